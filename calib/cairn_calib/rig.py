@@ -1,0 +1,123 @@
+"""A rig: the cameras of one sensor head and where each sits on it; `rig.json` on disk.
+
+    {"format": "cairn-rig", "version": 1, "name": "orpheus-head",
+     "cameras": {"tof": {"spectrum": "range", "camera": {...}, "T_rig_camera": [[...], ...]}, ...}}
+
+`T_rig_camera` maps points from the camera's frame to the rig's, in metres. Which camera sees which
+spectrum is part of the rig, so an image's meaning never depends on its file name.
+"""
+
+import hashlib
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from cairn_calib.camera import Camera
+from cairn_calib.poses import Transform, checked_transform
+from cairn_map.errors import BadInputError
+
+RIG_BYTES_MAX = 1 << 20
+Row = tuple[float, float, float, float]
+
+
+class Spectrum(StrEnum):
+    """What a camera's pixels mean."""
+
+    RANGE = "range"
+    """Time of flight: metres along the beam, and optionally the amplitude (near infrared) that came back."""
+    COLOUR = "colour"
+    """Visible: sRGB, 8 bits."""
+    THERMAL = "thermal"
+    """Far infrared: apparent temperature in kelvin."""
+
+
+class MountedCamera(BaseModel):
+    """One camera and its place on the rig."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    spectrum: Spectrum
+    camera: Camera
+    T_rig_camera: tuple[Row, Row, Row, Row]
+
+    @model_validator(mode="after")
+    def _rigid(self) -> Self:
+        try:
+            checked_transform(self.T_rig_camera, name="T_rig_camera")
+        except BadInputError as exc:
+            raise ValueError(exc.message) from exc
+        return self
+
+    @property
+    def transform(self) -> Transform:
+        """`T_rig_camera` as (4, 4) float64."""
+        return checked_transform(self.T_rig_camera, name="T_rig_camera")
+
+
+class Rig(BaseModel):
+    """The cameras of one head by name; at least one, and all that are needed to read its images."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    format: Literal["cairn-rig"] = "cairn-rig"
+    version: Literal[1] = 1
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+    cameras: Annotated[dict[str, MountedCamera], Field(min_length=1, max_length=32)]
+
+    def __getitem__(self, name: str) -> MountedCamera:
+        try:
+            return self.cameras[name]
+        except KeyError:
+            raise BadInputError(
+                "unknown_camera", f"rig {self.name} has no camera {name!r}; it has {', '.join(self.cameras)}"
+            ) from None
+
+    def of_spectrum(self, spectrum: Spectrum) -> list[str]:
+        """Names of the cameras of one spectrum, in the rig's order."""
+        return [name for name, mounted in self.cameras.items() if mounted.spectrum is spectrum]
+
+    def to_json(self) -> bytes:
+        """The rig as `rig.json` bytes; the mirror of `rig_from_json`."""
+        return self.model_dump_json(indent=1).encode() + b"\n"
+
+    def digest(self) -> str:
+        """SHA-256, in hex, of the JSON bytes; commits carry it, so that a bad calibration can be found and undone."""
+        return hashlib.sha256(self.to_json()).hexdigest()
+
+
+def mounted(spectrum: Spectrum, camera: Camera, T_rig_camera: Transform) -> MountedCamera:
+    """A camera at a place given as an array."""
+    rows = [tuple(float(v) for v in row) for row in np.asarray(T_rig_camera)]
+    return MountedCamera.model_validate({"spectrum": spectrum, "camera": camera, "T_rig_camera": rows})
+
+
+def rig_from_json(data: bytes) -> Rig:
+    """The rig in `rig.json` bytes.
+
+    Raises:
+        BadInputError: not JSON, too large, or a field is missing or out of range; the message names the field.
+    """
+    if len(data) > RIG_BYTES_MAX:
+        raise BadInputError("bad_rig", f"rig.json must be at most {RIG_BYTES_MAX} bytes, got {len(data)}")
+    try:
+        return Rig.model_validate_json(data)
+    except ValidationError as exc:
+        first = exc.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "document"
+        raise BadInputError("bad_rig", f"rig.json: {where}: {first['msg']}") from exc
+
+
+def load_rig(path: Path) -> Rig:
+    """The rig in a file.
+
+    Raises:
+        BadInputError: the file is missing or not a rig.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as exc:
+        raise BadInputError("bad_rig", f"cannot read {path}: {exc.strerror}") from exc
+    return rig_from_json(data)

@@ -1,0 +1,1 @@
+"""The robot's side: local map, outbox, sync and the command line."""

@@ -1,0 +1,1 @@
+"""Simulated robots in a room that is known exactly."""

@@ -1,0 +1,1 @@
+"""How images become evidence, and how a map is drawn."""

@@ -1,0 +1,200 @@
+"""A commit: one measurement's evidence under an id, with all that is needed to find and undo it later.
+
+    "CRCM" | version u8 | meta length u32 | meta (JSON) | cell count u32 | per cell: length u32, cell bytes
+
+Its SHA-256 is taken over the meta bytes and the cells' canonical digests, so that cells may be compressed anew.
+A retract is a commit without cells that names others; an amend is one with both.
+"""
+
+import hashlib
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from cairn_map.cell_code import DecodedCell, decode_canonical_cell, encode_cell
+from cairn_map.errors import BadInputError, DamagedDataError
+from cairn_map.evidence import Evidence
+from cairn_map.grid import CellKey, Geometry
+from cairn_map.ids import CommitId, commit_id_from_text
+
+MAGIC = b"CRCM"
+VERSION = 1
+HEAD = struct.Struct("<4sBI")
+META_BYTES_MAX = 1 << 20
+CELLS_MAX = 4096
+COMMIT_BYTES_MAX = 64 << 20
+"""Bytes of one encoded commit that a reader accepts."""
+RETRACTS_MAX = 4096
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Hex32 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class ScanPose(BaseModel):
+    """Where the rig was for one scan: translation (m), unit quaternion x y z w, one sigma for each (m, rad)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    time_s: Finite
+    t_map_rig: tuple[Finite, Finite, Finite]
+    q_map_rig: tuple[Finite, Finite, Finite, Finite]
+    sigma_m: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    sigma_rad: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+
+
+class CommitMeta(BaseModel):
+    """Everything a commit says about itself besides its evidence."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    id: Annotated[str, Field(max_length=96)]
+    geometry: Hex32
+    """Digest of the map's geometry: evidence for another grid is refused."""
+    parent: Hex32 | None = None
+    """SHA-256 of the author's previous commit."""
+    seen: Annotated[str, Field(max_length=128)] | None = None
+    """Cursor of the server's state that the author had when it made this."""
+    captured_s: tuple[Finite, Finite] | None = None
+    """First and last scan, UTC seconds since 1970."""
+    scans: Annotated[tuple[ScanPose, ...], Field(max_length=4096)] = ()
+    sensors: Annotated[tuple[Annotated[str, Field(max_length=64)], ...], Field(max_length=64)] = ()
+    rig: Hex32 | None = None
+    integrator: Annotated[str, Field(max_length=256)] = ""
+    """Name, version and parameters of what turned images into evidence."""
+    retracts: Annotated[tuple[Annotated[str, Field(max_length=96)], ...], Field(max_length=RETRACTS_MAX)] = ()
+    note: Annotated[str, Field(max_length=1024)] = ""
+    kind: Literal["commit"] = "commit"
+
+    @model_validator(mode="after")
+    def _ids_are_ids(self) -> Self:
+        try:
+            own = commit_id_from_text(self.id)
+            named = [commit_id_from_text(text) for text in self.retracts]
+        except BadInputError as exc:
+            raise ValueError(exc.message) from exc
+        if own in named or len(set(named)) != len(named):
+            raise ValueError("a commit names others to retract, each once")
+        return self
+
+    @property
+    def commit_id(self) -> CommitId:
+        """The id, parsed."""
+        return commit_id_from_text(self.id)
+
+    @property
+    def retracted_ids(self) -> tuple[CommitId, ...]:
+        """The ids that this commit takes out, parsed."""
+        return tuple(commit_id_from_text(text) for text in self.retracts)
+
+
+@dataclass(frozen=True, slots=True)
+class Commit:
+    """A whole commit: what it says, its cells' bytes and its SHA-256 (32 bytes)."""
+
+    meta: CommitMeta
+    cells: Mapping[CellKey, bytes]
+    sha: bytes
+    data: bytes
+
+    @property
+    def id(self) -> CommitId:
+        """The commit's id."""
+        return self.meta.commit_id
+
+
+def make_commit(meta: CommitMeta, diff: Mapping[CellKey, Evidence], geometry: Geometry) -> Commit:
+    """The commit of a measurement's evidence; cells without evidence are left out.
+
+    Raises:
+        BadInputError: negative evidence, too many cells, or larger than a reader would accept.
+    """
+    if meta.geometry != geometry.digest().hex():
+        raise BadInputError("other_geometry", "the commit's meta names another geometry than its evidence has")
+    cells: dict[CellKey, bytes] = {}
+    digests: list[bytes] = []
+    for key in sorted(key for key, evidence in diff.items() if len(evidence)):
+        if diff[key].is_signed:
+            raise BadInputError("negative_evidence", "a commit only adds evidence; to undo, name a commit in a retract")
+        encoded = encode_cell(key, diff[key], geometry)
+        cells[key] = encoded.data
+        digests.append(encoded.digest)
+    text = meta.model_dump_json(exclude_defaults=True).encode()
+    parts = [HEAD.pack(MAGIC, VERSION, len(text)), text, struct.pack("<I", len(cells))]
+    for data in cells.values():
+        parts += [struct.pack("<I", len(data)), data]
+    data = b"".join(parts)
+    _check_size(len(data), len(cells), len(text))
+    return Commit(meta, cells, _sha(text, digests), data)
+
+
+def open_commit(data: bytes) -> tuple[Commit, dict[CellKey, DecodedCell]]:
+    """The commit in bytes and all its evidence, validated completely: canonical cells, rising, of one geometry.
+
+    Raises:
+        DamagedDataError: cut off, contradictory, not canonical.
+        BadInputError: an unknown version, too large, or negative evidence.
+    """
+    meta, text, bodies = _split(data)
+    cells: dict[CellKey, bytes] = {}
+    decoded: dict[CellKey, DecodedCell] = {}
+    last = -1
+    for body in bodies:
+        cell = decode_canonical_cell(body)
+        if cell.key <= last or not len(cell.evidence):
+            raise DamagedDataError("bad_commit", "cells must have evidence and rise in number")
+        if cell.geometry.digest().hex() != meta.geometry:
+            raise BadInputError("other_geometry", "a cell of the commit has another geometry than its meta names")
+        if cell.evidence.is_signed:
+            raise BadInputError("negative_evidence", "a commit only adds evidence; to undo, name a commit in a retract")
+        last = cell.key
+        cells[cell.key], decoded[cell.key] = body, cell
+    sha = _sha(text, [cell.digest for cell in decoded.values()])
+    return Commit(meta, cells, sha, data), decoded
+
+
+def _split(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
+    if len(data) < HEAD.size or data[:4] != MAGIC:
+        raise DamagedDataError("bad_commit", "not a cairn commit: it must begin with CRCM and a whole head")
+    _, version, meta_bytes = HEAD.unpack_from(data)
+    if version != VERSION:
+        raise BadInputError("unknown_version", f"this reader knows commits of version {VERSION}, got {version}")
+    _check_size(len(data), 0, meta_bytes)
+    text = data[HEAD.size : HEAD.size + meta_bytes]
+    at = HEAD.size + meta_bytes + 4
+    if at > len(data):
+        raise DamagedDataError("bad_commit", "the commit is cut off in its meta")
+    try:
+        meta = CommitMeta.model_validate_json(text)
+    except ValidationError as exc:
+        first = exc.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "document"
+        raise DamagedDataError("bad_commit", f"commit meta: {where}: {first['msg']}") from exc
+    (count,) = struct.unpack_from("<I", data, at - 4)
+    _check_size(len(data), count, meta_bytes)
+    bodies: list[bytes] = []
+    for _ in range(count):
+        (size,) = struct.unpack_from("<I", data, at) if at + 4 <= len(data) else (len(data),)
+        bodies.append(data[at + 4 : at + 4 + size])
+        at += 4 + size
+    if at != len(data):
+        raise DamagedDataError("bad_commit", "the commit is cut off, or bytes are left over")
+    return meta, text, bodies
+
+
+def _check_size(size_bytes: int, cells: int, meta_bytes: int) -> None:
+    if size_bytes > COMMIT_BYTES_MAX or cells > CELLS_MAX or meta_bytes > META_BYTES_MAX:
+        raise BadInputError(
+            "too_large",
+            f"a commit has at most {COMMIT_BYTES_MAX} bytes, {CELLS_MAX} cells and {META_BYTES_MAX} bytes of meta; "
+            f"got {size_bytes}, {cells} and {meta_bytes}",
+        )
+
+
+def _sha(text: bytes, digests: list[bytes]) -> bytes:
+    sha = hashlib.sha256(b"cairn-commit-1" + struct.pack("<II", len(text), len(digests)) + text)
+    for digest in digests:
+        sha.update(digest)
+    return sha.digest()

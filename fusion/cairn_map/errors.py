@@ -1,0 +1,57 @@
+"""Every error that cairn raises on purpose, grouped by what a handler would do about it.
+
+    CairnError
+    ├── BadInputError      the caller must change what it asks: bad geometry, bad bytes, too large
+    │   └── DeniedError    the caller must show another token
+    ├── NotFoundError      nothing is there, and that is certain
+    ├── ConflictError      it contradicts what is already kept; asking again will not help
+    ├── DamagedDataError   bytes that should be sound are not; fetch them anew or restore
+    └── UnreachableError   the other side does not answer (now); try again later
+
+`kind` is a stable code in snake case. The same code travels in the server's RFC 9457 problem
+body and comes out of the client, so that `except ConflictError as exc: exc.kind` reads alike on
+both sides of the wire. Codes are added, never renamed.
+"""
+
+
+class CairnError(Exception):
+    """Root of the family; `kind` says which one, the message says what was expected and what came."""
+
+    def __init__(self, kind: str, message: str) -> None:
+        super().__init__(message)
+        self.kind = kind
+        self.message = message
+
+    def __reduce__(self) -> tuple[type["CairnError"], tuple[str, str]]:
+        return type(self), (self.kind, self.message)
+
+
+class BadInputError(CairnError):
+    """What was asked cannot be done as asked."""
+
+
+class DeniedError(BadInputError):
+    """The token is missing, unknown, or not for this."""
+
+
+class NotFoundError(CairnError):
+    """The thing named does not exist."""
+
+
+class ConflictError(CairnError):
+    """What was asked contradicts what is already kept."""
+
+
+class DamagedDataError(CairnError):
+    """Bytes that cannot be what they claim to be."""
+
+
+class UnreachableError(CairnError):
+    """The other side cannot be reached, or cannot answer now.
+
+    `retry_after_s` is the server's own wish, where it stated one.
+    """
+
+    def __init__(self, kind: str, message: str, retry_after_s: float | None = None) -> None:
+        super().__init__(kind, message)
+        self.retry_after_s = retry_after_s

@@ -1,0 +1,76 @@
+"""A map in memory: cells by number, each a sum of evidence. What a robot sees, and what a server folds.
+
+map.merge(diff)      add a measurement         map.unmerge(diff)      take it out again, exactly
+"""
+
+from collections.abc import Iterator, Mapping
+
+from cairn_map.brick_cell import BrickCell
+from cairn_map.errors import BadInputError
+from cairn_map.evidence import Evidence, empty_evidence
+from cairn_map.grid import CellKey, Geometry
+
+Diff = Mapping[CellKey, Evidence]
+
+
+class EvidenceMap:
+    """Sums of evidence over any number of cells; not thread-safe."""
+
+    def __init__(self, geometry: Geometry) -> None:
+        self.geometry = geometry
+        self._cells: dict[CellKey, BrickCell] = {}
+
+    def __iter__(self) -> Iterator[CellKey]:
+        return iter(sorted(self._cells))
+
+    def __len__(self) -> int:
+        return len(self._cells)
+
+    def __contains__(self, key: CellKey) -> bool:
+        return key in self._cells
+
+    def merge(self, diff: Diff) -> None:
+        """Add a diff.
+
+        Raises:
+            BadInputError: kind `evidence_overflow`; nothing was changed.
+        """
+        done: list[CellKey] = []
+        try:
+            for key, evidence in diff.items():
+                self._cells.setdefault(key, BrickCell(self.geometry)).merge(evidence)
+                done.append(key)
+        except BadInputError:
+            for key in done:
+                self._cells[key].unmerge(diff[key])
+            raise
+
+    def unmerge(self, diff: Diff) -> None:
+        """Take a diff out again; it must have been merged before, else sums become negative."""
+        for key, evidence in diff.items():
+            self._cells.setdefault(key, BrickCell(self.geometry)).unmerge(evidence)
+
+    def replace(self, key: CellKey, evidence: Evidence) -> None:
+        """Make one cell hold exactly this evidence."""
+        cell = BrickCell(self.geometry)
+        cell.merge(evidence)
+        self._cells[key] = cell
+
+    def evidence(self, key: CellKey) -> Evidence:
+        """Packed evidence of one cell; empty if nothing is known of it."""
+        cell = self._cells.get(key)
+        return cell.packed() if cell else empty_evidence(self.geometry)
+
+    def packed(self) -> dict[CellKey, Evidence]:
+        """Packed evidence of all cells that hold any, rising in number."""
+        everything = ((key, self._cells[key].packed()) for key in sorted(self._cells))
+        return {key: evidence for key, evidence in everything if len(evidence)}
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._cells.clear()
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory held by the cells' arrays."""
+        return sum(cell.size_bytes for cell in self._cells.values())

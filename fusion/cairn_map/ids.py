@@ -1,0 +1,83 @@
+"""Who made a commit, and which of theirs it is: `(robot, incarnation, n)`, written `robot.incarnation.n`.
+
+`incarnation` is drawn anew whenever a robot's commit store is made anew, so that numbers are never used twice
+although a disk was lost; `n` counts from 0 without gaps.
+"""
+
+import re
+import secrets
+from typing import NamedTuple, NewType
+
+from cairn_map.errors import BadInputError
+
+RobotName = NewType("RobotName", str)
+Incarnation = NewType("Incarnation", str)
+"""16 hex digits."""
+
+NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
+INCARNATION = re.compile(r"[0-9a-f]{16}")
+NUMBER = re.compile(r"0|[1-9][0-9]{0,14}")
+INITIAL = RobotName("initial")
+"""Author of the evidence that a map starts from."""
+
+
+class Author(NamedTuple):
+    """A robot in one incarnation of its commit store."""
+
+    robot: RobotName
+    incarnation: Incarnation
+
+    def __str__(self) -> str:
+        return f"{self.robot}.{self.incarnation}"
+
+
+class CommitId(NamedTuple):
+    """The n-th commit of an author."""
+
+    author: Author
+    n: int
+
+    def __str__(self) -> str:
+        return f"{self.author}.{self.n}"
+
+
+def new_incarnation() -> Incarnation:
+    """A random incarnation; two are equal once in 2^64."""
+    return Incarnation(secrets.token_hex(8))
+
+
+def robot_name(text: str) -> RobotName:
+    """A checked name of a robot.
+
+    Raises:
+        BadInputError: not 1-32 of a-z, 0-9, `_`, `-`, or beginning with a sign.
+    """
+    if not NAME.fullmatch(text):
+        raise BadInputError(
+            "bad_name", f"a name is 1-32 of a-z 0-9 _ - and begins with a letter or digit, got {text[:64]!r}"
+        )
+    return RobotName(text)
+
+
+def author_from_text(text: str) -> Author:
+    """The author written `robot.incarnation`.
+
+    Raises:
+        BadInputError: it is not.
+    """
+    robot, _, incarnation = text[:80].partition(".")
+    if not NAME.fullmatch(robot) or not INCARNATION.fullmatch(incarnation):
+        raise BadInputError("bad_id", f"an author is written robot.incarnation (16 hex digits), got {text[:80]!r}")
+    return Author(RobotName(robot), Incarnation(incarnation))
+
+
+def commit_id_from_text(text: str) -> CommitId:
+    """The commit id written `robot.incarnation.n`.
+
+    Raises:
+        BadInputError: it is not.
+    """
+    author, _, n = text[:96].rpartition(".")
+    if not NUMBER.fullmatch(n):
+        raise BadInputError("bad_id", f"a commit is written robot.incarnation.n, got {text[:96]!r}")
+    return CommitId(author_from_text(author), int(n))

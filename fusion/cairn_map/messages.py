@@ -1,0 +1,235 @@
+"""The JSON that client and server exchange, as models that check what they read.
+
+Fields that hold cursors, fingerprints or version vectors carry their text forms; the properties parse them.
+"""
+
+from typing import Annotated, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from cairn_map.cursor import Cursor, cursor_from_text
+from cairn_map.errors import DamagedDataError
+from cairn_map.fingerprint import Fingerprint, fingerprint_from_hex
+from cairn_map.grid import Geometry
+from cairn_map.sensor_model import SensorModel
+from cairn_map.version_vector import VersionVector, version_vector_from_json
+
+Message = TypeVar("Message", bound=BaseModel)
+CursorText = Annotated[str, Field(max_length=128)]
+FingerprintText = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
+ShaText = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+NameText = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]
+IdText = Annotated[str, Field(max_length=96)]
+VectorJson = dict[str, list[list[int]]]
+
+CURSORS_MAX = 100_000
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class CreateMap(_Model):
+    """Body of `PUT /maps/{map}`."""
+
+    geometry: Geometry = Geometry()
+    sensor_model: SensorModel = SensorModel()
+
+
+class MapInfo(_Model):
+    """What a server says about one map."""
+
+    name: NameText
+    geometry: Geometry
+    sensor_model: SensorModel
+    cursor: CursorText
+    cells: int
+    size_bytes: int
+    """Sum of the encoded cells."""
+    commits: int
+    branches: int
+    box_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None
+    """Lowest and highest corner of the cells that hold evidence; None while the map is empty."""
+
+
+class Register(_Model):
+    """Body of `POST /maps/{map}/branches`."""
+
+    robot: NameText
+    mode: Literal["high-end", "low-end", "viewer"] = "high-end"
+    incarnation: Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
+    sensors: Annotated[list[Annotated[str, Field(max_length=64)]], Field(max_length=64)] = []
+
+
+class Registered(_Model):
+    """Answer to a registration; the token is shown once and kept only as a hash."""
+
+    branch: NameText
+    token: str
+    map: MapInfo
+
+
+class BranchInfo(_Model):
+    """One robot as the server sees it."""
+
+    branch: NameText
+    mode: str
+    sensors: list[str]
+    cursor: CursorText | None
+    behind: int | None
+    """Log entries folded since the branch's cursor; None before its first fetch."""
+    last_seen_s: float
+
+
+class Pushed(_Model):
+    """Answer to a push: the commit is durable (`new`), or was already (`known`)."""
+
+    id: IdText
+    state: Literal["new", "known"]
+
+
+class CellCursor(_Model):
+    """One cell whose cursor differs from the request's default; None: hold nothing of it."""
+
+    cell: tuple[int, int, int]
+    cursor: CursorText | None
+
+
+class MissingRequest(_Model):
+    """Body of `POST /maps/{map}/branches/{branch}/missing`: what the asker holds."""
+
+    author: Annotated[str, Field(max_length=80)] | None = None
+    """`robot.incarnation` of the asker, whose own commits a delta leaves out."""
+    cursor: CursorText | None = None
+    """Cursor of every cell not listed; None: holds nothing."""
+    cells: Annotated[list[CellCursor], Field(max_length=CURSORS_MAX)] = []
+    kinds: list[Literal["delta", "state", "full"]] = ["delta", "full"]
+    """Kinds of frame that the asker can use now; `full` is always understood to be."""
+
+
+class ReplyHeader(_Model):
+    """First frame of a reply: the state that it leads to."""
+
+    to: CursorText
+    vector: VectorJson
+    """Ids folded at or before `to`."""
+    stable: VectorJson
+    """Ids that no restore can lose any more."""
+    tip: tuple[int, ShaText] | None = None
+    """Highest folded number of the asker's own incarnation, and its SHA-256."""
+    retracts: list[IdText] = []
+    """Retracting commits that are not yet stable."""
+
+    @property
+    def to_cursor(self) -> Cursor:
+        """`to`, parsed."""
+        return cursor_from_text(self.to)
+
+    @property
+    def coverage(self) -> VersionVector:
+        """`vector`, parsed."""
+        return version_vector_from_json(self.vector)
+
+    @property
+    def stable_vector(self) -> VersionVector:
+        """`stable`, parsed."""
+        return version_vector_from_json(self.stable)
+
+
+class Done(_Model):
+    """Last frame of a whole reply: cells without a frame stand at `to` as they are."""
+
+    to: CursorText
+    rest: FingerprintText
+    """Sum of the fingerprints of the server's cells that got no frame."""
+
+    @property
+    def to_cursor(self) -> Cursor:
+        """`to`, parsed."""
+        return cursor_from_text(self.to)
+
+    @property
+    def rest_fingerprint(self) -> Fingerprint:
+        """`rest`, parsed."""
+        return fingerprint_from_hex(self.rest)
+
+
+class More(_Model):
+    """Last frame of a reply that reached its size limit: ask again for the rest."""
+
+    to: CursorText
+
+
+class CellEntry(_Model):
+    """One row of the cell index."""
+
+    cell: tuple[int, int, int]
+    size_bytes: int
+    digest: ShaText
+    lm: int
+    """Log entry that last changed the cell."""
+    fingerprint: FingerprintText
+    voxels: int
+
+
+class CellIndex(_Model):
+    """Answer to `GET /maps/{map}/main/cells`, taken from one state of the map."""
+
+    cursor: CursorText
+    vector: VectorJson
+    cells: list[CellEntry]
+
+
+class Retract(_Model):
+    """Body of `POST /maps/{map}/retracts`; commits by id, or everything of one robot, or both."""
+
+    commits: Annotated[list[IdText], Field(max_length=4096)] = []
+    robot: NameText | None = None
+    note: Annotated[str, Field(max_length=1024)] = ""
+
+
+class Retracted(_Model):
+    """Answer to a retract: the retracting commit and what it names."""
+
+    id: IdText
+    commits: list[IdText]
+
+
+class LogEntry(_Model):
+    """One row of the log."""
+
+    seq: int
+    kind: Literal["+", "-"]
+    """Evidence folded in, or taken out again."""
+    id: IdText
+    sha: ShaText
+    size_bytes: int
+    cells: int
+    captured_s: tuple[float, float] | None
+    retracts: list[IdText]
+
+
+class Problem(BaseModel):
+    """RFC 9457 problem; `kind` is our stable code."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    type: str = "about:blank"
+    title: str = ""
+    status: int = 0
+    detail: str = ""
+    kind: str = "unknown"
+
+
+def message_from_json(model: type[Message], data: bytes | str) -> Message:
+    """A checked message.
+
+    Raises:
+        DamagedDataError: not JSON, or a field is missing, unknown or out of range.
+    """
+    try:
+        return model.model_validate_json(data)
+    except ValidationError as exc:
+        first = exc.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "document"
+        raise DamagedDataError("bad_message", f"{model.__name__}: {where}: {first['msg']}") from exc
