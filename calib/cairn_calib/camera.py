@@ -37,6 +37,9 @@ class Camera(BaseModel):
     centre_px: tuple[Annotated[float, Field(allow_inf_nan=False)], Annotated[float, Field(allow_inf_nan=False)]]
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
+    def __hash__(self) -> int:
+        return hash((self.width, self.height, self.focal_px, self.centre_px, self.distortion))
+
     def project(self, points: npt.NDArray[np.floating]) -> Floats:
         """Pixels at which points of the camera frame appear.
 

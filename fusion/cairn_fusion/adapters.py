@@ -11,8 +11,11 @@ import numpy.typing as npt
 from cairn_calib.camera import Camera
 from cairn_map.errors import BadInputError
 
+Image = npt.NDArray[np.generic]
+Ranges = npt.NDArray[np.float32]
 
-def range_from_z_depth(depth: npt.NDArray[np.generic], camera: Camera, *, units_per_m: float) -> npt.NDArray[np.float32]:
+
+def range_from_z_depth(depth: Image, camera: Camera, *, units_per_m: float) -> Ranges:
     """Ranges along the beam from a z-depth image.
 
     Eq. 4 of Kocmanova et al. backwards: d = z / (z component of the pixel's unit ray).
@@ -32,20 +35,18 @@ def range_from_z_depth(depth: npt.NDArray[np.generic], camera: Camera, *, units_
     return (z_m / camera.rays()[..., 2]).astype(np.float32)
 
 
-def range_from_radial(radial: npt.NDArray[np.generic], camera: Camera, *, units_per_m: float) -> npt.NDArray[np.float32]:
+def range_from_radial(radial: Image, camera: Camera, *, units_per_m: float) -> Ranges:
     """Ranges from an image that already holds distance along the beam; arguments as `range_from_z_depth`."""
     return _metres(radial, camera, units_per_m).astype(np.float32)
 
 
-def kelvin_from_counts(
-    counts: npt.NDArray[np.generic], *, kelvin_per_count: float, kelvin_at_zero: float = 0.0
-) -> npt.NDArray[np.float32]:
+def kelvin_from_counts(counts: Image, *, kelvin_per_count: float, kelvin_at_zero: float = 0.0) -> Ranges:
     """Apparent temperature from linear radiometric counts: (H, W) float32 kelvin; count 0 means no reading (NaN)."""
     values = counts.astype(np.float64)
     return np.where(values > 0, values * kelvin_per_count + kelvin_at_zero, np.nan).astype(np.float32)
 
 
-def _metres(image: npt.NDArray[np.generic], camera: Camera, units_per_m: float) -> npt.NDArray[np.float64]:
+def _metres(image: Image, camera: Camera, units_per_m: float) -> npt.NDArray[np.float64]:
     if not units_per_m > 0:
         raise BadInputError("bad_scale", f"units_per_m must be positive, got {units_per_m}")
     camera.check_image(image, name="depth image")

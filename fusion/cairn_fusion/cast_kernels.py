@@ -1,0 +1,108 @@
+"""Walking rays through voxels; marks each voxel of a scan at most once, hit before miss.
+
+The scratch is a dense index over the bricks of the scan's box and a pool of bricks of 512 marks. The pool cannot
+grow in here: a kernel stops before a ray that might not fit and says where to go on.
+"""
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+Ints = npt.NDArray[np.int64]
+Floats = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int32]
+Marks = npt.NDArray[np.uint8]
+
+MISS = 1
+HIT = 2
+SPREAD = np.array([0, 1, 8, 9, 64, 65, 72, 73], np.int64)
+"""Morton spread of three bits."""
+
+
+@nb.njit(inline="always")
+def _brick(x: int, y: int, z: int, dims: Ints) -> int:
+    brick: int = ((z >> 3) * dims[1] + (y >> 3)) * dims[0] + (x >> 3)
+    return brick
+
+
+@nb.njit(inline="always")
+def _inner(x: int, y: int, z: int) -> int:
+    inner: int = SPREAD[x & 7] | (SPREAD[y & 7] << 1) | (SPREAD[z & 7] << 2)
+    return inner
+
+
+@nb.njit(cache=True, nogil=True)
+def mark_hits_into(ends: Ints, dims: Ints, brick_of: Index, bricks: Ints, marks: Marks, used: int) -> int:
+    """Mark the end voxels (box coordinates) as HIT; the pool has room for one brick each. Returns bricks used."""
+    for n in range(ends.shape[0]):
+        b = _brick(ends[n, 0], ends[n, 1], ends[n, 2], dims)
+        if brick_of[b] < 0:
+            brick_of[b] = used
+            bricks[used] = b
+            marks[used, :] = 0
+            used += 1
+        marks[brick_of[b], _inner(ends[n, 0], ends[n, 1], ends[n, 2])] = HIT
+    return used
+
+
+@nb.njit(cache=True, nogil=True)
+def mark_misses_into(
+    origin: Floats,
+    targets: Floats,
+    ends: Ints,
+    first: int,
+    dims: Ints,
+    brick_of: Index,
+    bricks: Ints,
+    marks: Marks,
+    used: int,
+) -> tuple[int, int]:
+    """Mark what rays pass before their end voxel as MISS, unless it is a HIT (Amanatides and Woo 1987).
+
+    `origin` and `targets` are in voxels from the box's corner, `ends` the targets' voxels. An axis never steps
+    beyond its end voxel, so a ray arrives there whatever the rounding, and never leaves the box.
+    Returns the ray to go on with (all done: their number) and the bricks used.
+    """
+    step = np.empty(3, np.int64)
+    left = np.empty(3, np.int64)
+    at = np.empty(3, np.int64)
+    t_next = np.empty(3)
+    t_step = np.empty(3)
+    for n in range(first, ends.shape[0]):
+        crossings = 1
+        for a in range(3):
+            at[a] = np.int64(np.floor(origin[a]))
+            left[a] = abs(ends[n, a] - at[a])
+            crossings += abs((ends[n, a] >> 3) - (at[a] >> 3))
+            step[a] = 1 if ends[n, a] >= at[a] else -1
+            d = targets[n, a] - origin[a]
+            if left[a] == 0 or d == 0.0:
+                t_next[a] = np.inf
+                t_step[a] = 0.0
+                if left[a] != 0:
+                    t_next[a] = 0.0
+            else:
+                border = at[a] + 1 if step[a] > 0 else at[a]
+                t_next[a] = (border - origin[a]) / d
+                t_step[a] = abs(1.0 / d)
+        if used + crossings > marks.shape[0]:
+            return n, used
+        while left[0] + left[1] + left[2] > 0:
+            b = _brick(at[0], at[1], at[2], dims)
+            if brick_of[b] < 0:
+                brick_of[b] = used
+                bricks[used] = b
+                marks[used, :] = 0
+                used += 1
+            inner = _inner(at[0], at[1], at[2])
+            if marks[brick_of[b], inner] == 0:
+                marks[brick_of[b], inner] = MISS
+            a = 0
+            if t_next[1] < t_next[a]:
+                a = 1
+            if t_next[2] < t_next[a]:
+                a = 2
+            at[a] += step[a]
+            left[a] -= 1
+            t_next[a] = t_next[a] + t_step[a] if left[a] > 0 else np.inf
+    return ends.shape[0], used

@@ -1,0 +1,115 @@
+"""What other cameras saw of the points that the range camera measured (chapter IV of Kocmanova et al.).
+
+    range image --Eq. 1-4--> points in the range camera's frame --Eq. 5--> another camera's --Eq. 6--> its pixels
+
+A camera that stands elsewhere may see something else in front of a point. A z-buffer finds that out; its bins are
+as wide as the distance between neighbouring range pixels in the other image, else the sparse points of the coarse
+camera would let the background shine through between them.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.camera import Camera
+from cairn_calib.poses import Transform, inverse, transform_points
+from cairn_calib.rig import MountedCamera, Rig
+
+Floats = npt.NDArray[np.float64]
+Pixels = npt.NDArray[np.int64]
+
+BIN_MARGIN = 1.5
+"""Bin width over the spacing of projected range pixels: they spread a little with obliqueness."""
+DEPTH_TOLERANCE = 0.05
+DEPTH_TOLERANCE_M = 0.03
+"""A point is hidden if it lies deeper than the nearest of its bin by more than 5 % and 3 cm: noise and slant pass."""
+
+
+class Label(IntEnum):
+    """What became of a point in another camera's image."""
+
+    OK = 0
+    OCCLUDED = 1
+    OUT_OF_VIEW = 2
+    NO_RANGE = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Transfer:
+    """Where points appear in a camera: (N, 2) int64 pixels (x, y), valid where the label is OK; (N,) labels."""
+
+    pixels: Pixels
+    labels: npt.NDArray[np.uint8]
+
+    @property
+    def ok(self) -> npt.NDArray[np.bool_]:
+        """(N,) points that the camera sees."""
+        return np.asarray(self.labels == Label.OK)
+
+    def sample(self, image: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
+        """(M, ...) values of the image at the M points with label OK, nearest pixel."""
+        x, y = self.pixels[self.ok].T
+        return np.asarray(image[y, x])
+
+
+def points_from_range(range_m: npt.NDArray[np.floating], camera: Camera) -> Floats:
+    """Points that the time-of-flight camera saw, in its own frame.
+
+    Eq. 4 of Kocmanova et al.: the sensor measures along the beam, so the depth is z = d f / sqrt(x^2 + y^2 + f^2),
+    with x, y in pixels from the principal point; Eq. 1 gives X and Y. With one undistorted unit ray per pixel both
+    are one product, exact with lens distortion too.
+
+    Args:
+        range_m: (H, W), metres along each beam; NaN where nothing came back.
+        camera: the range camera.
+
+    Returns:
+        (H, W, 3) float64, metres, camera frame; NaN where `range_m` is NaN.
+
+    Raises:
+        BadInputError: `range_m` is not the size of the camera's image.
+    """
+    camera.check_image(range_m, name="range image")
+    return camera.rays() * range_m.astype(np.float64)[..., None]
+
+
+def transfer_points(points_src: Floats, rig: Rig, *, src: str, dst: str) -> Transfer:
+    """Where points of one camera's frame appear in another's image.
+
+    Args:
+        points_src: (N, 3), metres, frame of camera `src`; NaN for no range.
+        rig: with both cameras.
+        src: the range camera.
+        dst: the camera to look from.
+    """
+    T_dst_src = inverse(rig[dst].transform) @ rig[src].transform
+    points = transform_points(T_dst_src, points_src)
+    exact = rig[dst].camera.project(points)
+    labels = np.full(len(points), Label.OUT_OF_VIEW, np.uint8)
+    labels[np.isnan(points[:, 2])] = Label.NO_RANGE
+    seen = rig[dst].camera.contains(exact)
+    labels[seen] = Label.OK
+    pixels = np.zeros((len(points), 2), np.int64)
+    pixels[seen] = np.rint(exact[seen])
+    if not _same_centre(T_dst_src):
+        ratio = rig[dst].camera.focal_px[0] / rig[src].camera.focal_px[0]
+        hidden = _hidden(pixels[seen], points[seen, 2], rig[dst], bin_px=int(np.ceil(BIN_MARGIN * max(ratio, 1))))
+        labels[np.nonzero(seen)[0][hidden]] = Label.OCCLUDED
+    return Transfer(pixels, labels)
+
+
+def _same_centre(T_dst_src: Transform) -> bool:
+    """Without parallax nothing can hide anything: both cameras look along the same rays."""
+    return bool(np.linalg.norm(T_dst_src[:3, 3]) < 1e-9)
+
+
+def _hidden(pixels: Pixels, depth_m: Floats, mounted: MountedCamera, *, bin_px: int) -> npt.NDArray[np.bool_]:
+    columns = -(-mounted.camera.width // bin_px)
+    rows = -(-mounted.camera.height // bin_px)
+    bins = (pixels[:, 1] // bin_px) * columns + pixels[:, 0] // bin_px
+    nearest_m = np.full(rows * columns, np.inf)
+    np.minimum.at(nearest_m, bins, depth_m)
+    limit_m = nearest_m[bins] * (1 + DEPTH_TOLERANCE) + DEPTH_TOLERANCE_M
+    return np.asarray(depth_m > limit_m)
