@@ -7,6 +7,7 @@ A retract is a commit without cells that names others; an amend is one with both
 """
 
 import hashlib
+import json
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,9 +15,10 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from cairn_map.cell_code import DecodedCell, decode_canonical_cell, encode_cell
-from cairn_map.errors import BadInputError, DamagedDataError
-from cairn_map.evidence import Evidence
+from cairn_map.cell_code import VOXEL_BYTES, DecodedCell, decode_canonical_cell, encode_cell
+from cairn_map.cell_head import CellHead, decode_head
+from cairn_map.errors import BadInputError, DamagedDataError, first_error
+from cairn_map.evidence import Evidence, every_sum_has_weight
 from cairn_map.grid import CellKey, Geometry
 from cairn_map.ids import CommitId, commit_id_from_text
 
@@ -28,6 +30,9 @@ CELLS_MAX = 4096
 COMMIT_BYTES_MAX = 64 << 20
 """Bytes of one encoded commit that a reader accepts."""
 RETRACTS_MAX = 4096
+EVIDENCE_BYTES_MAX = 1 << 29
+"""Bytes of all evidence of a commit, unpacked: 44 M voxels. A measurement in a large room at 2 cm has 20 M; without
+a bound a commit of 64 MB could stand for terabytes of collapsed air."""
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Hex32 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -109,50 +114,88 @@ def make_commit(meta: CommitMeta, diff: Mapping[CellKey, Evidence], geometry: Ge
     """The commit of a measurement's evidence; cells without evidence are left out.
 
     Raises:
-        BadInputError: negative evidence, too many cells, or larger than a reader would accept.
+        BadInputError: negative evidence, sums without weight, too many cells, or larger than a reader would accept.
     """
     if meta.geometry != geometry.digest().hex():
         raise BadInputError("other_geometry", "the commit's meta names another geometry than its evidence has")
     cells: dict[CellKey, bytes] = {}
     digests: list[bytes] = []
     for key in sorted(key for key, evidence in diff.items() if len(evidence)):
-        if diff[key].is_signed:
-            raise BadInputError("negative_evidence", "a commit only adds evidence; to undo, name a commit in a retract")
+        _check_evidence(diff[key], geometry)
         encoded = encode_cell(key, diff[key], geometry)
         cells[key] = encoded.data
         digests.append(encoded.digest)
     text = meta.model_dump_json(exclude_defaults=True).encode()
-    parts = [HEAD.pack(MAGIC, VERSION, len(text)), text, struct.pack("<I", len(cells))]
-    for data in cells.values():
-        parts += [struct.pack("<I", len(data)), data]
-    data = b"".join(parts)
+    data = _joined(text, cells)
     _check_size(len(data), len(cells), len(text))
+    _check_evidence_size(sum(evidence.size_bytes for evidence in diff.values()), EVIDENCE_BYTES_MAX)
     return Commit(meta, cells, _sha(text, digests), data)
 
 
-def open_commit(data: bytes) -> tuple[Commit, dict[CellKey, DecodedCell]]:
+def renamed_commit(commit: Commit, meta: CommitMeta, digests: Mapping[CellKey, bytes]) -> Commit:
+    """The same evidence under another meta; `digests` are the cells' (32 bytes each)."""
+    text = meta.model_dump_json(exclude_defaults=True).encode()
+    return Commit(meta, commit.cells, _sha(text, [digests[key] for key in commit.cells]), _joined(text, commit.cells))
+
+
+def open_commit(
+    data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX
+) -> tuple[Commit, dict[CellKey, DecodedCell]]:
     """The commit in bytes and all its evidence, validated completely: canonical cells, rising, of one geometry.
+
+    Needs up to three times `evidence_bytes_max` of memory, whatever the bytes say.
 
     Raises:
         DamagedDataError: cut off, contradictory, not canonical.
-        BadInputError: an unknown version, too large, or negative evidence.
+        BadInputError: an unknown version, too large, negative evidence, or sums without weight.
     """
     meta, text, bodies = _split(data)
+    _check_heads([decode_head(body)[0] for body in bodies], meta, evidence_bytes_max)
     cells: dict[CellKey, bytes] = {}
     decoded: dict[CellKey, DecodedCell] = {}
-    last = -1
+    left = evidence_bytes_max
     for body in bodies:
-        cell = decode_canonical_cell(body)
-        if cell.key <= last or not len(cell.evidence):
-            raise DamagedDataError("bad_commit", "cells must have evidence and rise in number")
-        if cell.geometry.digest().hex() != meta.geometry:
-            raise BadInputError("other_geometry", "a cell of the commit has another geometry than its meta names")
-        if cell.evidence.is_signed:
-            raise BadInputError("negative_evidence", "a commit only adds evidence; to undo, name a commit in a retract")
-        last = cell.key
+        cell = decode_canonical_cell(body, evidence_bytes_max=left)
+        _check_evidence(cell.evidence, cell.geometry)
+        left -= cell.evidence.size_bytes
         cells[cell.key], decoded[cell.key] = body, cell
     sha = _sha(text, [cell.digest for cell in decoded.values()])
     return Commit(meta, cells, sha, data), decoded
+
+
+def _check_heads(heads: list[CellHead], meta: CommitMeta, evidence_bytes_max: int) -> None:
+    """Refuse by the heads alone what need not be decoded to be refused."""
+    last = -1
+    for head in heads:
+        if head.key <= last or not head.voxels:
+            raise DamagedDataError("bad_commit", "cells must have evidence and rise in number")
+        if head.signed:
+            raise BadInputError("negative_evidence", "a commit only adds evidence; to undo, name a commit in a retract")
+        if head.geometry.digest().hex() != meta.geometry:
+            raise BadInputError("other_geometry", "a cell of the commit has another geometry than its meta names")
+        last = head.key
+    _check_evidence_size(VOXEL_BYTES * sum(head.voxels for head in heads), evidence_bytes_max)
+
+
+def _check_evidence(evidence: Evidence, geometry: Geometry) -> None:
+    if evidence.is_signed:
+        raise BadInputError("negative_evidence", "a commit only adds evidence; to undo, name a commit in a retract")
+    if not every_sum_has_weight(evidence, geometry):
+        raise BadInputError("bad_evidence", "a channel has sums without weight")
+
+
+def _check_evidence_size(size_bytes: int, limit_bytes: int) -> None:
+    if size_bytes > limit_bytes:
+        raise BadInputError(
+            "too_large", f"a commit has at most {limit_bytes} bytes of evidence, got {size_bytes}; make two of it"
+        )
+
+
+def _joined(text: bytes, cells: Mapping[CellKey, bytes]) -> bytes:
+    parts = [HEAD.pack(MAGIC, VERSION, len(text)), text, struct.pack("<I", len(cells))]
+    for data in cells.values():
+        parts += [struct.pack("<I", len(data)), data]
+    return b"".join(parts)
 
 
 def _split(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
@@ -167,11 +210,11 @@ def _split(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
     if at > len(data):
         raise DamagedDataError("bad_commit", "the commit is cut off in its meta")
     try:
-        meta = CommitMeta.model_validate_json(text)
+        meta = CommitMeta.model_validate_json(text, strict=True)
+        # Readers differ in which of two equal keys they take, and the SHA-256 is the same for all of them.
+        json.loads(text.decode(), object_pairs_hook=_object, parse_int=float)
     except ValidationError as exc:
-        first = exc.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "document"
-        raise DamagedDataError("bad_commit", f"commit meta: {where}: {first['msg']}") from exc
+        raise DamagedDataError("bad_commit", f"commit meta: {first_error(exc)}") from None
     (count,) = struct.unpack_from("<I", data, at - 4)
     _check_size(len(data), count, meta_bytes)
     bodies: list[bytes] = []
@@ -182,6 +225,11 @@ def _split(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
     if at != len(data):
         raise DamagedDataError("bad_commit", "the commit is cut off, or bytes are left over")
     return meta, text, bodies
+
+
+def _object(pairs: list[tuple[str, object]]) -> None:
+    if len({key for key, _ in pairs}) != len(pairs):
+        raise DamagedDataError("bad_commit", "commit meta: a key is there twice")
 
 
 def _check_size(size_bytes: int, cells: int, meta_bytes: int) -> None:

@@ -5,14 +5,14 @@ Fields that hold cursors, fingerprints or version vectors carry their text forms
 
 from typing import Annotated, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 
 from cairn_map.cursor import Cursor, cursor_from_text
-from cairn_map.errors import DamagedDataError
+from cairn_map.errors import DamagedDataError, first_error
 from cairn_map.fingerprint import Fingerprint, fingerprint_from_hex
 from cairn_map.grid import Geometry
 from cairn_map.sensor_model import SensorModel
-from cairn_map.version_vector import VersionVector, version_vector_from_json
+from cairn_map.version_vector import AUTHORS_MAX, VersionVector, version_vector_from_json
 
 Message = TypeVar("Message", bound=BaseModel)
 CursorText = Annotated[str, Field(max_length=128)]
@@ -20,7 +20,9 @@ FingerprintText = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
 ShaText = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 NameText = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]
 IdText = Annotated[str, Field(max_length=96)]
-VectorJson = dict[str, list[list[int]]]
+# Fail fast, else a few megabytes of wrong intervals become gigabytes of error messages.
+Interval = Annotated[list[int], Field(min_length=2, max_length=2), FailFast()]
+VectorJson = Annotated[dict[str, Annotated[list[Interval], FailFast()]], Field(max_length=AUTHORS_MAX)]
 
 CURSORS_MAX = 100_000
 
@@ -103,18 +105,22 @@ class MissingRequest(_Model):
     cursor: CursorText | None = None
     """Cursor of every cell not listed; None: holds nothing."""
     cells: Annotated[list[CellCursor], Field(max_length=CURSORS_MAX)] = []
+    compare: bool = False
+    """Answer every listed cell with a `reset` frame: only its fingerprint."""
     kinds: list[Literal["delta", "state", "full"]] = ["delta", "full"]
     """Kinds of frame that the asker can use now; `full` is always understood to be."""
 
 
 class ReplyHeader(_Model):
-    """First frame of a reply: the state that it leads to."""
+    """First frame of a reply, and head of the cell index: one state of the map, and what a robot may conclude."""
 
     to: CursorText
     vector: VectorJson
     """Ids folded at or before `to`."""
     stable: VectorJson
     """Ids that no restore can lose any more."""
+    pending: VectorJson = {}
+    """Ids that are durable here but not folded yet: they need not be pushed, and count for nothing else."""
     tip: tuple[int, ShaText] | None = None
     """Highest folded number of the asker's own incarnation, and its SHA-256."""
     retracts: list[IdText] = []
@@ -129,6 +135,11 @@ class ReplyHeader(_Model):
     def coverage(self) -> VersionVector:
         """`vector`, parsed."""
         return version_vector_from_json(self.vector)
+
+    @property
+    def pending_vector(self) -> VersionVector:
+        """`pending`, parsed."""
+        return version_vector_from_json(self.pending)
 
     @property
     def stable_vector(self) -> VersionVector:
@@ -175,8 +186,7 @@ class CellEntry(_Model):
 class CellIndex(_Model):
     """Answer to `GET /maps/{map}/main/cells`, taken from one state of the map."""
 
-    cursor: CursorText
-    vector: VectorJson
+    header: ReplyHeader
     cells: list[CellEntry]
 
 
@@ -228,8 +238,6 @@ def message_from_json(model: type[Message], data: bytes | str) -> Message:
         DamagedDataError: not JSON, or a field is missing, unknown or out of range.
     """
     try:
-        return model.model_validate_json(data)
+        return model.model_validate_json(data, strict=True)
     except ValidationError as exc:
-        first = exc.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "document"
-        raise DamagedDataError("bad_message", f"{model.__name__}: {where}: {first['msg']}") from exc
+        raise DamagedDataError("bad_message", f"{model.__name__}: {first_error(exc)}") from None

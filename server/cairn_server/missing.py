@@ -1,0 +1,173 @@
+"""Fetch-missing: main minus branch, as frames (SYNC.md rules 3 to 10).
+
+The server keeps nothing about a branch but its row: the request says which state the asker holds, the chain
+proves it, and `lm` of each cell says whether it changed since. Per cell the smallest kind of frame wins.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from cairn_map.brick_cell import BrickCell
+from cairn_map.cell_code import decode_cell, encode_cell
+from cairn_map.cursor import ENTRY_FOLD, Cursor, cursor_from_text
+from cairn_map.errors import BadInputError, ConflictError
+from cairn_map.evidence import empty_evidence
+from cairn_map.fingerprint import ZERO, Fingerprint
+from cairn_map.frames import CellFrame, Frame, FrameKind
+from cairn_map.grid import CellKey, Geometry, cell_key
+from cairn_map.ids import Author, author_from_text
+from cairn_map.messages import Done, MissingRequest, More, ReplyHeader
+from cairn_map.version_vector import VersionVector
+from cairn_server.store import CellRow, Snapshot
+
+DELTA_ENTRIES_MAX = 32
+"""A delta of more log entries than this is not tried: it would hardly be smaller than the cell."""
+REPLY_BYTES_MAX = 64 << 20
+"""A longer reply ends with `more`, and the asker comes back for the rest."""
+
+
+@dataclass(slots=True)
+class Asker:
+    """What a request says the asker holds, with every cursor proven or not."""
+
+    author: Author | None
+    cursor: Cursor | None
+    cells: dict[CellKey, Cursor | None]
+    wants_delta: bool
+    compare: bool
+    unproven: set[Cursor] = field(default_factory=set)
+
+
+def asker_from_request(request: MissingRequest, snapshot: Snapshot) -> Asker:
+    """The asker, its cursors parsed and checked against the log.
+
+    Raises:
+        ConflictError: kind `other_log`: a cursor belongs to another server's log; drop it (HTTP 410).
+        BadInputError: a malformed id, cursor or cell.
+    """
+    asker = Asker(
+        author=author_from_text(request.author) if request.author else None,
+        cursor=_cursor(request.cursor),
+        cells={cell_key(entry.cell): _cursor(entry.cursor) for entry in request.cells},
+        wants_delta="delta" in request.kinds,
+        compare=request.compare,
+    )
+    if len(asker.cells) != len(request.cells):
+        raise BadInputError("bad_message", "a cell is named twice in the request")
+    head = snapshot.head.cursor
+    for cursor in {asker.cursor, *asker.cells.values()} - {None}:
+        assert cursor is not None  # noqa: S101 - narrows the type
+        if cursor.log_id != head.log_id:
+            raise ConflictError("other_log", "the cursor belongs to another server's log; start without one")
+        if not _is_proven(cursor, snapshot):
+            asker.unproven.add(cursor)
+    return asker
+
+
+def reply_frames(snapshot: Snapshot, asker: Asker, geometry: Geometry, *, stable: VersionVector) -> Iterator[Frame]:
+    """Header, frames of the cells that the asker misses, and the end; all from one snapshot."""
+    head = snapshot.head
+    yield header_of(snapshot, asker.author, stable=stable)
+    rest = ZERO
+    sent_bytes = 0
+    listed = dict(asker.cells)
+    rows = list(snapshot.cells())
+    for row in rows:
+        start = listed.pop(row.key, asker.cursor)
+        frame = _frame_for(snapshot, asker, row, start, geometry)
+        if frame is None:
+            rest += row.fingerprint
+            continue
+        sent_bytes += len(frame.payload)
+        yield frame
+        if sent_bytes > REPLY_BYTES_MAX:
+            yield More(to=str(head.cursor))
+            return
+    for key, start in listed.items():
+        unknown = _unknown_cell(key, asker, start, head.cursor, geometry)
+        if unknown is not None:
+            yield unknown
+    yield Done(to=str(head.cursor), rest=rest.hex())
+
+
+def header_of(snapshot: Snapshot, author: Author | None, *, stable: VersionVector) -> ReplyHeader:
+    """The state of a snapshot, as the author of some of its commits needs to know it."""
+    head = snapshot.head
+    tip = snapshot.tip(author) if author else None
+    return ReplyHeader(
+        to=str(head.cursor),
+        vector=head.vector.to_json(),
+        stable=stable.to_json(),
+        pending=snapshot.pending().to_json(),
+        tip=(tip[0], tip[1].hex()) if tip else None,
+        retracts=[str(commit) for commit in snapshot.retracting() if commit not in stable],
+    )
+
+
+def _frame_for(
+    snapshot: Snapshot, asker: Asker, row: CellRow, start: Cursor | None, geometry: Geometry
+) -> CellFrame | None:
+    if asker.compare or start in asker.unproven:
+        return _frame(FrameKind.RESET, row.key, start, snapshot.head.cursor, row.fingerprint)
+    if start is not None and row.lm <= start.seq:
+        return None
+    if start is not None and asker.wants_delta:
+        payload = _delta(snapshot, row, start, asker.author, geometry)
+        if payload is not None and len(payload) < row.size_bytes:
+            return CellFrame(
+                kind=FrameKind.DELTA,
+                cell=row.key,
+                from_cursor=start,
+                to_cursor=snapshot.head.cursor,
+                fingerprint=row.fingerprint,
+                own_excluded=True,
+                payload=payload,
+            )
+    stored = snapshot.cell(row.key)
+    body = stored.body if stored else b""
+    return _frame(FrameKind.FULL, row.key, start, snapshot.head.cursor, row.fingerprint, body)
+
+
+def _unknown_cell(key: CellKey, asker: Asker, start: Cursor | None, to: Cursor, geometry: Geometry) -> CellFrame | None:
+    """A cell that the asker names and the server never had: as good as empty."""
+    if asker.compare or start in asker.unproven:
+        return _frame(FrameKind.RESET, key, start, to, ZERO)
+    if start is None:
+        return _frame(FrameKind.FULL, key, None, to, ZERO, encode_cell(key, empty_evidence(geometry), geometry).data)
+    return None
+
+
+def _frame(
+    kind: FrameKind, key: CellKey, start: Cursor | None, to: Cursor, fingerprint: Fingerprint, payload: bytes = b""
+) -> CellFrame:
+    return CellFrame(kind=kind, cell=key, from_cursor=start, to_cursor=to, fingerprint=fingerprint, payload=payload)
+
+
+def _delta(snapshot: Snapshot, row: CellRow, start: Cursor, asker: Author | None, geometry: Geometry) -> bytes | None:
+    """Sum of what others did to a cell since `start`; None if that cannot be said or is not worth it."""
+    entries = snapshot.contributions(row.key, after_seq=start.seq)
+    if entries is None or len(entries) > DELTA_ENTRIES_MAX:
+        return None
+    foreign = [(kind, body) for kind, author, body in entries if kind != ENTRY_FOLD or author != asker]
+    if sum(len(body) for _, body in foreign) > 4 * row.size_bytes:
+        return None
+    if len(foreign) == 1 and foreign[0][0] == ENTRY_FOLD:
+        return foreign[0][1]  # one commit's diff is its own sum
+    total = BrickCell(geometry)
+    for kind, body in foreign:
+        diff = decode_cell(body).evidence
+        if kind == ENTRY_FOLD:
+            total.merge(diff)
+        else:
+            total.unmerge(diff)
+    evidence = total.packed()
+    return encode_cell(row.key, evidence, geometry).data if len(evidence) else b""
+
+
+def _cursor(text: str | None) -> Cursor | None:
+    return cursor_from_text(text) if text is not None else None
+
+
+def _is_proven(cursor: Cursor, snapshot: Snapshot) -> bool:
+    head = snapshot.head.cursor
+    return cursor.seq <= head.seq and snapshot.chain_at(cursor.seq) == cursor.chain

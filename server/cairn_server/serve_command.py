@@ -1,0 +1,116 @@
+"""Run the map server.
+
+    $ cairn serve --data ./cairn-data
+    cairn map server on http://127.0.0.1:8750, data in cairn-data
+
+Robots push their measurements to it and fetch what they miss; stop it with Ctrl-C or SIGTERM. Everything
+that it acknowledged is in DIR/cairn.sqlite, so a crash or a power cut loses nothing.
+
+Without a token it trusts whoever reaches it, and therefore only listens on this machine. To serve others,
+put a secret of at least 16 characters into a file and name it with --admin-token-file; robots register with
+--enrolment-token-file's secret. CAIRN_ADMIN_TOKEN and CAIRN_ENROLMENT_TOKEN do the same from the environment.
+"""
+
+import argparse
+import logging
+import os
+import signal
+import socket
+import sys
+from pathlib import Path
+from types import FrameType
+
+import uvicorn
+from pydantic import ValidationError
+
+from cairn_map.errors import BadInputError
+from cairn_server.routes import make_app
+from cairn_server.service import Service
+from cairn_server.settings import Settings
+from cairn_server.sqlite_store import SqliteStore
+
+BACKLOG = 128
+
+
+def main(argv: list[str]) -> int:
+    """Run until stopped."""
+    settings = _settings(argv)
+    settings.check_reach()
+    listener = _listen(settings)
+    service = Service(SqliteStore(settings.folder), settings)
+    host, port = listener.getsockname()[:2]
+    shown = f"[{host}]" if ":" in host else host
+    sys.stdout.write(f"cairn map server on http://{shown}:{port}, data in {settings.folder}\n")
+    sys.stdout.flush()
+    signal.signal(signal.SIGTERM, _stop)
+    try:
+        config = uvicorn.Config(make_app(service), log_level="warning", timeout_graceful_shutdown=10, lifespan="off")
+        uvicorn.Server(config).run(sockets=[listener])
+    except KeyboardInterrupt:
+        pass
+    finally:
+        service.close()
+    return 0
+
+
+def _stop(number: int, frame: FrameType | None) -> None:
+    """After uvicorn finished its answers it raises the signal again; end as Ctrl-C does, with everything closed."""
+    raise KeyboardInterrupt
+
+
+def _listen(settings: Settings) -> socket.socket:
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    # Named as TCP so that asyncio turns Nagle off for it: else each small answer waits 40 ms for an acknowledgement.
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((settings.host, settings.port))
+    except OSError as exc:
+        listener.close()
+        raise BadInputError(
+            "cannot_listen",
+            f"cannot listen on {settings.host}:{settings.port}: {exc.strerror}; another server may, try --port 0",
+        ) from exc
+    listener.listen(BACKLOG)
+    return listener
+
+
+def _settings(argv: list[str]) -> Settings:
+    defaults = Settings()
+    parser = argparse.ArgumentParser("cairn serve", description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--data", type=Path, default=defaults.folder, metavar="DIR", help="folder of the store")
+    parser.add_argument("--host", default=defaults.host, help=f"address to listen on ({defaults.host})")
+    parser.add_argument("--port", type=int, default=defaults.port, help=f"port, 0 for any free one ({defaults.port})")
+    parser.add_argument("--admin-token-file", type=Path, metavar="FILE", help="its secret may do everything")
+    parser.add_argument("--enrolment-token-file", type=Path, metavar="FILE", help="its secret may register robots")
+    parser.add_argument(
+        "--stable-after",
+        type=float,
+        default=defaults.stable_after_s,
+        metavar="SECONDS",
+        help="age at which a commit is in every backup, so that robots may drop it (86400)",
+    )
+    parser.add_argument("-v", "--verbose", action="store_true", help="log what is pushed and folded")
+    args = parser.parse_args(argv)
+    logging.basicConfig(level=logging.INFO if args.verbose else logging.WARNING, format="%(asctime)s %(message)s")
+    try:
+        return Settings(
+            folder=args.data,
+            host=args.host,
+            port=args.port,
+            admin_token=_secret(args.admin_token_file, "CAIRN_ADMIN_TOKEN"),
+            enrolment_token=_secret(args.enrolment_token_file, "CAIRN_ENROLMENT_TOKEN"),
+            stable_after_s=args.stable_after,
+        )
+    except ValidationError as exc:
+        first = exc.errors()[0]
+        raise BadInputError("bad_setting", f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from exc
+
+
+def _secret(path: Path | None, variable: str) -> str | None:
+    if path is None:
+        return os.environ.get(variable) or None
+    try:
+        return path.read_text().strip()
+    except OSError as exc:
+        raise BadInputError("bad_setting", f"cannot read {path}: {exc.strerror}") from exc

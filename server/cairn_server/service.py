@@ -1,0 +1,228 @@
+"""What the server does, without HTTP: create, register, push, fetch-missing, retract, read.
+
+Acknowledge only what is durable and fully validated; fold afterwards, in groups. One object for all requests,
+called from many threads.
+"""
+
+import time
+
+from cairn_map.commit import Commit, CommitMeta, make_commit, open_commit
+from cairn_map.cursor import Cursor
+from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, DeniedError, NotFoundError
+from cairn_map.evidence import largest
+from cairn_map.frames import encode_frame, start_of_reply
+from cairn_map.grid import CellKey, cell_of_key
+from cairn_map.ids import INITIAL, Author, CommitId, RobotName, commit_id_from_text, robot_name
+from cairn_map.messages import (
+    BranchInfo,
+    CellEntry,
+    CellIndex,
+    CreateMap,
+    MapInfo,
+    MissingRequest,
+    Register,
+    Registered,
+    Retract,
+    Retracted,
+)
+from cairn_server.auth import Caller, new_token, token_hash
+from cairn_server.folder import Folder
+from cairn_server.missing import asker_from_request, header_of, reply_frames
+from cairn_server.settings import Settings
+from cairn_server.stable import StableVectors
+from cairn_server.store import Branch, CellRow, Head, MapRow, NewCommit, Store
+
+OPERATOR = RobotName("operator")
+RESERVED_NAMES = frozenset({OPERATOR, INITIAL, RobotName("main")})
+
+
+class Service:
+    """The map server's operations on one store."""
+
+    def __init__(self, store: Store, settings: Settings) -> None:
+        self.store = store
+        self.settings = settings
+        self._folder = Folder(store)
+        self._stable = StableVectors(settings.stable_after_s)
+
+    def create_map(self, name: str, request: CreateMap) -> tuple[MapInfo, bool]:
+        """The map, and whether it is new."""
+        row, is_new = self.store.create_map(robot_name(name), request.geometry, request.sensor_model)
+        return self.map_info(row), is_new
+
+    def map_info(self, row: MapRow) -> MapInfo:
+        """A map's extent, sizes and head."""
+        with self.store.snapshot(row) as snapshot:
+            totals, head = snapshot.totals(), snapshot.head
+        edge_m = row.geometry.cell_edge_m
+        box_m = None
+        if totals.corner_cells:
+            low, high = totals.corner_cells
+            box_m = (
+                (low[0] * edge_m, low[1] * edge_m, low[2] * edge_m),
+                ((high[0] + 1) * edge_m, (high[1] + 1) * edge_m, (high[2] + 1) * edge_m),
+            )
+        return MapInfo(
+            name=row.name,
+            geometry=row.geometry,
+            sensor_model=row.sensor_model,
+            cursor=str(head.cursor),
+            cells=totals.cells,
+            size_bytes=totals.size_bytes,
+            commits=totals.commits,
+            branches=totals.branches,
+            box_m=box_m,
+        )
+
+    def register(self, row: MapRow, request: Register) -> Registered:
+        """A new token for a robot; registering again replaces the old one.
+
+        Raises:
+            BadInputError: kind `reserved_name`.
+        """
+        if request.robot in RESERVED_NAMES:
+            raise BadInputError(
+                "reserved_name", f"{request.robot} is not a robot's name; reserved are operator, initial, main"
+            )
+        token = new_token()
+        branch = Branch(request.robot, request.mode, tuple(request.sensors), None, time.time())
+        self.store.register(row, branch, token_hash(token))
+        return Registered(branch=request.robot, token=token, map=self.map_info(row))
+
+    def push(self, row: MapRow, caller: Caller, id_text: str, data: bytes) -> bool:
+        """Keep a commit; True if it is new. When this returns, no power cut can lose it.
+
+        Raises:
+            BadInputError: not a commit for this map, or not by this caller.
+            ConflictError: kind `id_taken`: the id is known with other bytes.
+        """
+        commit, decoded = open_commit(data)
+        _check_commit(row, caller, id_text, commit)
+        planes = [0] * (2 + row.geometry.plane_count)
+        for cell in decoded.values():
+            planes = [max(a, int(b)) for a, b in zip(planes, largest(cell.evidence, row.geometry), strict=True)]
+        try:
+            is_new = self.store.append(row, _new_commit(commit, tuple(planes)))
+        except ConflictError as exc:
+            self.store.audit(exc.kind, f"map {row.name}: {exc.message}; pushed by {caller.robot or caller.role}")
+            raise
+        if is_new:
+            self._folder.wake()
+        if caller.robot:
+            self.store.seen(row, caller.robot, None)
+        return is_new
+
+    def missing(self, row: MapRow, branch: str, request: MissingRequest) -> bytes:
+        """The frames that bring the asker to the head; one snapshot, wholly in memory before it is sent."""
+        with self.store.snapshot(row) as snapshot:
+            asker = asker_from_request(request, snapshot)
+            parts = [start_of_reply()]
+            stable = self._stable.of(row, snapshot)
+            parts += [encode_frame(f) for f in reply_frames(snapshot, asker, row.geometry, stable=stable)]
+        self.store.seen(row, branch, asker.cursor)
+        return b"".join(parts)
+
+    def retract(self, row: MapRow, request: Retract) -> Retracted:
+        """Undo commits exactly: by id, or everything of one robot that is here now. Durable on return.
+
+        Raises:
+            NotFoundError: kind `nothing_to_retract`: a robot without evidence, or no commit named.
+        """
+        targets = [commit_id_from_text(text) for text in request.commits]
+        if request.robot:
+            with self.store.snapshot(row) as snapshot:
+                targets += [commit for commit in snapshot.commits_of(request.robot) if commit not in targets]
+        if not targets:
+            raise NotFoundError("nothing_to_retract", "name commits, or a robot that has evidence in the map")
+        author = Author(OPERATOR, row.operator)
+
+        def build(n: int) -> NewCommit:
+            meta = CommitMeta(
+                id=str(CommitId(author, n)),
+                geometry=row.geometry.digest().hex(),
+                retracts=tuple(str(target) for target in targets),
+                note=request.note,
+            )
+            return _new_commit(make_commit(meta, {}, row.geometry), tuple([0] * (2 + row.geometry.plane_count)))
+
+        commit = self.store.append_built(row, author, build)
+        self.store.audit("retract", f"map {row.name}: {commit.id} takes out {len(targets)} commits: {request.note}")
+        self._folder.wake()
+        return Retracted(id=str(commit.id), commits=[str(target) for target in targets])
+
+    def cell_index(self, row: MapRow, author: Author | None) -> CellIndex:
+        """All cells that were ever touched, emptied ones included, from one state."""
+        with self.store.snapshot(row) as snapshot:
+            cells = list(snapshot.cells())
+            header = header_of(snapshot, author, stable=self._stable.of(row, snapshot))
+        return CellIndex(
+            header=header,
+            cells=[
+                CellEntry(
+                    cell=cell_of_key(cell.key),
+                    size_bytes=cell.size_bytes,
+                    digest=cell.digest.hex(),
+                    lm=cell.lm,
+                    fingerprint=cell.fingerprint.hex(),
+                    voxels=cell.voxels,
+                )
+                for cell in cells
+            ],
+        )
+
+    def cell(self, row: MapRow, key: CellKey) -> tuple[CellRow | None, Head]:
+        """One cell (None: never seen) and the state that it was read from."""
+        with self.store.snapshot(row) as snapshot:
+            return snapshot.cell(key), snapshot.head
+
+    def branches(self, row: MapRow) -> list[BranchInfo]:
+        """All robots, and how far behind each is."""
+        with self.store.snapshot(row) as snapshot:
+            head = snapshot.head.cursor
+        return [
+            BranchInfo(
+                branch=branch.name,
+                mode=branch.mode,
+                sensors=list(branch.sensors),
+                cursor=str(branch.cursor) if branch.cursor else None,
+                behind=_behind(branch.cursor, head),
+                last_seen_s=branch.last_seen_s,
+            )
+            for branch in self.store.branches(row)
+        ]
+
+    def close(self) -> None:
+        """Stop folding and close the store; what was acknowledged is folded after the next start."""
+        self._folder.close()
+        self.store.close()
+
+
+def _check_commit(row: MapRow, caller: Caller, id_text: str, commit: Commit) -> None:
+    if str(commit.id) != id_text:
+        raise BadInputError("other_id", f"the path names {id_text[:96]}, the commit calls itself {commit.id}")
+    if commit.meta.geometry != row.geometry.digest().hex():
+        raise BadInputError("other_geometry", f"the commit was made for another grid than map {row.name} has")
+    authors = {commit.id.author.robot, *(target.author.robot for target in commit.meta.retracted_ids)}
+    foreign = sorted(author for author in authors if not caller.may_author(author))
+    if foreign:
+        raise DeniedError("not_allowed", f"this token stands for {caller.robot or caller.role}, not for {foreign[0]}")
+    if not commit.cells and not commit.meta.retracts:
+        raise DamagedDataError("empty_commit", "a commit must hold evidence or name commits to retract")
+
+
+def _new_commit(commit: Commit, tops: tuple[int, ...]) -> NewCommit:
+    return NewCommit(
+        id=commit.id,
+        sha=commit.sha,
+        size_bytes=len(commit.data),
+        meta=commit.meta.model_dump_json(exclude_defaults=True).encode(),
+        retracts=commit.meta.retracted_ids,
+        diff=commit.cells,
+        tops=tops,
+    )
+
+
+def _behind(cursor: Cursor | None, head: Cursor) -> int | None:
+    if cursor is None or cursor.log_id != head.log_id:
+        return None
+    return max(0, head.seq - cursor.seq)

@@ -1,0 +1,41 @@
+"""The server's settings, all in one place, each with its unit and meaning."""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from cairn_map.errors import BadInputError
+
+LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
+
+
+class Settings(BaseModel):
+    """What `cairn serve` can be told."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    folder: Path = Path("cairn-data")
+    """Where the store is; made if missing."""
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 8750
+    """0: any free one."""
+    admin_token: Annotated[str, Field(min_length=16)] | None = None
+    """Who has it may do everything. Without it the server trusts everybody, and so only listens on loopback."""
+    enrolment_token: Annotated[str, Field(min_length=16)] | None = None
+    """Who has it may register robots; without it only the admin token may."""
+    stable_after_s: Annotated[float, Field(ge=0)] = 86_400.0
+    """A commit folded longer ago is in every backup that may still be restored, so robots may drop it."""
+
+    def check_reach(self) -> None:
+        """Refuse to serve strangers without a token.
+
+        Raises:
+            BadInputError: the host is not loopback and there is no admin token.
+        """
+        if self.admin_token is None and self.host not in LOOPBACK:
+            raise BadInputError(
+                "open_server",
+                f"without a token everybody who reaches {self.host} could change the maps; "
+                "give --admin-token-file, or listen on 127.0.0.1",
+            )

@@ -1,0 +1,113 @@
+"""Tables of the embedded store. A change of this text is a new `VERSION` and a migration."""
+
+import apsw
+
+from cairn_map.errors import BadInputError
+
+VERSION = 1
+
+DDL = """
+CREATE TABLE map (
+    number INTEGER PRIMARY KEY,
+    name TEXT NOT NULL UNIQUE,
+    geometry TEXT NOT NULL,
+    sensor_model TEXT NOT NULL,
+    operator TEXT NOT NULL,
+    log_id BLOB NOT NULL,
+    seq INTEGER NOT NULL,
+    chain BLOB NOT NULL,
+    vector TEXT NOT NULL,           -- ids folded so far, as JSON
+    tops TEXT NOT NULL              -- per plane: sum over all commits of their largest number
+);
+CREATE TABLE commits (
+    number INTEGER PRIMARY KEY AUTOINCREMENT,   -- order of arrival
+    map INTEGER NOT NULL REFERENCES map,
+    robot TEXT NOT NULL,
+    incarnation TEXT NOT NULL,
+    n INTEGER NOT NULL,
+    sha BLOB NOT NULL,
+    size_bytes INTEGER NOT NULL,
+    cells INTEGER NOT NULL,
+    meta BLOB NOT NULL,
+    retracts TEXT NOT NULL,         -- ids separated by spaces
+    received_s REAL NOT NULL,
+    folded_seq INTEGER,
+    folded_s REAL,
+    UNIQUE (map, robot, incarnation, n)
+);
+CREATE INDEX commits_pending ON commits (map, number) WHERE folded_seq IS NULL;
+CREATE INDEX commits_folded ON commits (map, folded_s) WHERE folded_seq IS NOT NULL;
+CREATE INDEX commits_retracting ON commits (map, number) WHERE retracts <> '';
+CREATE TABLE diff (
+    number INTEGER PRIMARY KEY,
+    commit_number INTEGER NOT NULL REFERENCES commits,
+    cell INTEGER NOT NULL,
+    body BLOB,                      -- NULL once it is not kept any more
+    UNIQUE (commit_number, cell)
+);
+CREATE TABLE log (
+    map INTEGER NOT NULL REFERENCES map,
+    seq INTEGER NOT NULL,
+    kind BLOB NOT NULL,
+    commit_number INTEGER NOT NULL REFERENCES commits,
+    chain BLOB NOT NULL,
+    PRIMARY KEY (map, seq)
+) WITHOUT ROWID;
+CREATE TABLE touched (
+    map INTEGER NOT NULL REFERENCES map,
+    cell INTEGER NOT NULL,
+    seq INTEGER NOT NULL,
+    PRIMARY KEY (map, cell, seq)
+) WITHOUT ROWID;
+CREATE TABLE retracted (
+    map INTEGER NOT NULL REFERENCES map,
+    id TEXT NOT NULL,
+    PRIMARY KEY (map, id)
+) WITHOUT ROWID;
+CREATE TABLE cell (
+    number INTEGER PRIMARY KEY,
+    map INTEGER NOT NULL REFERENCES map,
+    cell INTEGER NOT NULL,
+    lm INTEGER NOT NULL,
+    digest BLOB NOT NULL,
+    fingerprint BLOB NOT NULL,
+    voxels INTEGER NOT NULL,
+    size_bytes INTEGER NOT NULL,
+    body BLOB NOT NULL,
+    UNIQUE (map, cell)
+);
+CREATE INDEX cell_changed ON cell (map, lm);
+CREATE TABLE branch (
+    map INTEGER NOT NULL REFERENCES map,
+    name TEXT NOT NULL,
+    mode TEXT NOT NULL,
+    sensors TEXT NOT NULL,
+    cursor TEXT,
+    last_seen_s REAL NOT NULL,
+    token_hash BLOB NOT NULL UNIQUE,
+    PRIMARY KEY (map, name)
+) WITHOUT ROWID;
+CREATE TABLE audit (
+    number INTEGER PRIMARY KEY AUTOINCREMENT,
+    time_s REAL NOT NULL,
+    what TEXT NOT NULL,
+    detail TEXT NOT NULL
+);
+"""
+
+
+def ensure_schema(connection: apsw.Connection) -> None:
+    """Make the tables in a new file; check the version of an old one.
+
+    Raises:
+        BadInputError: the file belongs to another version of cairn, or to another program.
+    """
+    version = connection.pragma("user_version")
+    if version == VERSION:
+        return
+    if version != 0 or connection.execute("SELECT count(*) FROM sqlite_master").get:
+        raise BadInputError("store_version", f"the store has version {version}, this cairn needs {VERSION}")
+    connection.execute("BEGIN IMMEDIATE")
+    connection.execute(DDL)
+    connection.execute(f"PRAGMA user_version = {VERSION}")
+    connection.execute("COMMIT")

@@ -1,0 +1,207 @@
+"""Reading one state of a map from SQLite, inside one read transaction."""
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import apsw
+
+from cairn_map.commit import CommitMeta
+from cairn_map.cursor import Cursor, first_chain
+from cairn_map.fingerprint import fingerprint_from_bytes
+from cairn_map.grid import CellKey, cell_of_key
+from cairn_map.ids import Author, CommitId, commit_id_from_text
+from cairn_map.messages import LogEntry
+from cairn_map.version_vector import EMPTY, VersionVector, version_vector_from_json
+from cairn_server.sqlite_writer import first, rows
+from cairn_server.store import CellRow, Head, Totals
+
+CELL_COLUMNS = "cell, lm, digest, fingerprint, voxels, size_bytes"
+
+
+class SqliteSnapshot:
+    """`store.Snapshot` over one connection that is inside a read transaction."""
+
+    def __init__(self, connection: apsw.Connection, map_number: int, geometry_digest: bytes) -> None:
+        self._connection = connection
+        self._map = map_number
+        self._geometry_digest = geometry_digest
+        log_id, seq, chain, vector = first(
+            connection, "SELECT log_id, seq, chain, vector FROM map WHERE number = ?", (map_number,)
+        )
+        self._head = Head(cursor=Cursor(log_id, seq, chain), vector=version_vector_from_json(json.loads(vector)))
+
+    @property
+    def head(self) -> Head:
+        """The state."""
+        return self._head
+
+    def chain_at(self, seq: int) -> bytes | None:
+        """The chain after entry `seq` (0: of the empty log); None if there is no such entry."""
+        if seq == 0:
+            return first_chain(self._head.cursor.log_id, self._geometry_digest)
+        chain: bytes | None = first(
+            self._connection, "SELECT chain FROM log WHERE map = ? AND seq = ?", (self._map, seq)
+        )
+        return chain
+
+    def cell(self, key: CellKey) -> CellRow | None:
+        """One cell with its body."""
+        row = first(
+            self._connection,
+            f"SELECT {CELL_COLUMNS}, body FROM cell WHERE map = ? AND cell = ?",  # noqa: S608 - constant columns
+            (self._map, key),
+        )
+        return cell_row(row) if row else None
+
+    def cells(self, *, after_seq: int = -1) -> Iterator[CellRow]:
+        """All cells changed after a log entry, without bodies, rising in number."""
+        found = rows(
+            self._connection,
+            f"SELECT {CELL_COLUMNS} FROM cell WHERE map = ? AND lm > ? ORDER BY cell",  # noqa: S608 - constant columns
+            (self._map, after_seq),
+        )
+        for row in found:
+            yield cell_row(row)
+
+    def contributions(self, key: CellKey, *, after_seq: int) -> list[tuple[bytes, Author, bytes]] | None:
+        """Entries after `after_seq` that touch a cell: kind, author, diff; None if a diff is not kept any more."""
+        found = rows(
+            self._connection,
+            "SELECT log.kind, robot, incarnation, diff.body FROM touched"
+            " JOIN log ON log.map = touched.map AND log.seq = touched.seq"
+            " JOIN commits ON commits.number = log.commit_number"
+            " JOIN diff ON diff.commit_number = commits.number AND diff.cell = touched.cell"
+            " WHERE touched.map = ? AND touched.cell = ? AND touched.seq > ? ORDER BY touched.seq",
+            (self._map, key, after_seq),
+        )
+        if any(body is None for *_, body in found):
+            return None
+        return [(kind, Author(robot, incarnation), body) for kind, robot, incarnation, body in found]
+
+    def tip(self, author: Author) -> tuple[int, bytes] | None:
+        """Highest folded number of an author and its SHA-256."""
+        row: tuple[int, bytes] | None = first(
+            self._connection,
+            "SELECT n, sha FROM commits WHERE map = ? AND robot = ? AND incarnation = ? AND folded_seq IS NOT NULL"
+            " ORDER BY n DESC LIMIT 1",
+            (self._map, *author),
+        )
+        return row
+
+    def commits_of(self, robot: str) -> list[CommitId]:
+        """Every commit with evidence of a robot, all incarnations, that is not retracted."""
+        found = rows(
+            self._connection,
+            "SELECT robot, incarnation, n FROM commits WHERE map = ? AND robot = ? AND cells > 0"
+            " AND NOT EXISTS (SELECT 1 FROM retracted WHERE retracted.map = commits.map"
+            " AND id = robot || '.' || incarnation || '.' || n) ORDER BY number",
+            (self._map, robot),
+        )
+        return [CommitId(Author(r, i), n) for r, i, n in found]
+
+    def pending(self) -> VersionVector:
+        """Commits that are durable but not folded."""
+        found = rows(
+            self._connection,
+            "SELECT robot, incarnation, n FROM commits WHERE map = ? AND folded_seq IS NULL",
+            (self._map,),
+        )
+        return _vector(found)
+
+    def folded_before(self, time_s: float) -> VersionVector:
+        """Commits folded before a time."""
+        found = rows(
+            self._connection,
+            "SELECT robot, incarnation, n FROM commits WHERE map = ? AND folded_s < ? AND folded_seq IS NOT NULL",
+            (self._map, time_s),
+        )
+        return _vector(found)
+
+    def retracting(self) -> list[CommitId]:
+        """Commits that retract others."""
+        found = rows(
+            self._connection,
+            "SELECT robot, incarnation, n FROM commits WHERE map = ? AND retracts <> '' AND folded_seq IS NOT NULL"
+            " ORDER BY number",
+            (self._map,),
+        )
+        return [CommitId(Author(robot, incarnation), n) for robot, incarnation, n in found]
+
+    def log(self, *, after_seq: int, limit: int) -> list[LogEntry]:
+        """Log entries, oldest first."""
+        found = rows(
+            self._connection,
+            "SELECT seq, kind, robot, incarnation, n, sha, size_bytes, cells, meta, retracts FROM log"
+            " JOIN commits ON commits.number = log.commit_number WHERE log.map = ? AND seq > ? ORDER BY seq LIMIT ?",
+            (self._map, after_seq, limit),
+        )
+        return [_log_entry(*row) for row in found]
+
+    def totals(self) -> Totals:
+        """Sizes."""
+        cells, size = first(
+            self._connection,
+            "SELECT count(*), coalesce(sum(size_bytes), 0) FROM cell WHERE map = ? AND voxels > 0",
+            (self._map,),
+        )
+        keys = rows(self._connection, "SELECT cell FROM cell WHERE map = ? AND voxels > 0", (self._map,))
+        cells_found = [cell_of_key(key) for (key,) in keys]
+        corners = None
+        if cells_found:
+            corners = (
+                (min(c.i for c in cells_found), min(c.j for c in cells_found), min(c.k for c in cells_found)),
+                (max(c.i for c in cells_found), max(c.j for c in cells_found), max(c.k for c in cells_found)),
+            )
+        commits = first(self._connection, "SELECT count(*) FROM commits WHERE map = ?", (self._map,))
+        branches = first(self._connection, "SELECT count(*) FROM branch WHERE map = ?", (self._map,))
+        return Totals(cells=cells, size_bytes=size, commits=commits, branches=branches, corner_cells=corners)
+
+
+def cell_row(columns: tuple[Any, ...]) -> CellRow:
+    """A cell from its columns, the body last or left out."""
+    key, lm, digest, fingerprint, voxels, size_bytes, *body = columns
+    return CellRow(
+        key=CellKey(key),
+        lm=lm,
+        digest=digest,
+        fingerprint=fingerprint_from_bytes(fingerprint),
+        voxels=voxels,
+        body=body[0] if body else b"",
+        size_bytes=size_bytes,
+    )
+
+
+def _vector(found: list[tuple[Any, ...]]) -> VersionVector:
+    return EMPTY.with_commits(CommitId(Author(robot, incarnation), n) for robot, incarnation, n in found)
+
+
+def ids_from_text(text: str) -> tuple[CommitId, ...]:
+    """Ids separated by spaces."""
+    return tuple(commit_id_from_text(part) for part in text.split())
+
+
+def _log_entry(
+    seq: int,
+    kind: bytes,
+    robot: str,
+    incarnation: str,
+    n: int,
+    sha: bytes,
+    size_bytes: int,
+    cells: int,
+    meta: bytes,
+    retracts: str,
+) -> LogEntry:
+    return LogEntry.model_validate(
+        {
+            "seq": seq,
+            "kind": kind.decode(),
+            "id": f"{robot}.{incarnation}.{n}",
+            "sha": sha.hex(),
+            "size_bytes": size_bytes,
+            "cells": cells,
+            "captured_s": CommitMeta.model_validate_json(meta).captured_s,
+            "retracts": retracts.split(),
+        }
+    )

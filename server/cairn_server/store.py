@@ -1,0 +1,239 @@
+"""What the server needs of a database: one protocol, so that every store passes one contract suite.
+
+append    a validated commit, durable when it returns; touches no cell
+pending   commits that are not folded yet, in order of arrival
+fold      cells, log entries and the new head, all or nothing, only on top of the head that they were made from
+snapshot  a view of one state of the map: header and frames of a reply come from one of these
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from cairn_map.cursor import Cursor
+from cairn_map.fingerprint import Fingerprint
+from cairn_map.grid import CellKey, Geometry
+from cairn_map.ids import Author, CommitId, Incarnation
+from cairn_map.messages import LogEntry
+from cairn_map.sensor_model import SensorModel
+from cairn_map.version_vector import EMPTY, VersionVector
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapRow:
+    """A map as created; never changes."""
+
+    number: int
+    name: str
+    geometry: Geometry
+    sensor_model: SensorModel
+    operator: Incarnation
+    """Incarnation under which this server makes retracts for operators."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NewCommit:
+    """A validated commit on its way into the store."""
+
+    id: CommitId
+    sha: bytes
+    size_bytes: int
+    meta: bytes
+    """JSON."""
+    retracts: tuple[CommitId, ...]
+    diff: Mapping[CellKey, bytes]
+    tops: tuple[int, ...]
+    """Largest number of each plane; their sums over all commits bound every sum in the map."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredCommit:
+    """A commit as the folder reads it."""
+
+    number: int
+    id: CommitId
+    sha: bytes
+    retracts: tuple[CommitId, ...]
+    diff: Mapping[CellKey, bytes]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CellRow:
+    """A cell of the folded map."""
+
+    key: CellKey
+    lm: int
+    """Log entry that last changed it."""
+    digest: bytes
+    fingerprint: Fingerprint
+    voxels: int
+    body: bytes
+    """Empty where a listing did not ask for it."""
+    size_bytes: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Entry:
+    """One entry of the log: a commit folded (`+`) or taken out (`-`)."""
+
+    kind: bytes
+    commit: int
+    """Number of the commit in the store."""
+    chain: bytes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fold:
+    """What one fold changes, made from the state at `base`."""
+
+    base: Cursor
+    head: Cursor
+    vector: VersionVector
+    entries: tuple[Entry, ...]
+    cells: tuple[CellRow, ...]
+    retracted: tuple[CommitId, ...] = ()
+    """Ids whose retract took or will take effect; each once, for ever."""
+
+
+@dataclass(frozen=True, slots=True)
+class Branch:
+    """A registered robot."""
+
+    name: str
+    mode: str
+    sensors: tuple[str, ...]
+    cursor: Cursor | None
+    last_seen_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Totals:
+    """Sizes of a map."""
+
+    cells: int = 0
+    size_bytes: int = 0
+    commits: int = 0
+    branches: int = 0
+    corner_cells: tuple[tuple[int, int, int], tuple[int, int, int]] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Head:
+    """The newest folded state."""
+
+    cursor: Cursor
+    vector: VersionVector = field(default=EMPTY)
+
+
+class Snapshot(Protocol):
+    """One state of one map, for reading; close it before anything is written to a network."""
+
+    @property
+    def head(self) -> Head:
+        """The state."""
+
+    def chain_at(self, seq: int) -> bytes | None:
+        """The chain after entry `seq` (0: of the empty log); None if there is no such entry."""
+
+    def cell(self, key: CellKey) -> CellRow | None:
+        """One cell with its body."""
+
+    def cells(self, *, after_seq: int = -1) -> Iterator[CellRow]:
+        """All cells changed after a log entry, without bodies, rising in number."""
+
+    def contributions(self, key: CellKey, *, after_seq: int) -> list[tuple[bytes, Author, bytes]] | None:
+        """Entries after `after_seq` that touch a cell: kind, author, diff; None if a diff is not kept any more."""
+
+    def tip(self, author: Author) -> tuple[int, bytes] | None:
+        """Highest folded number of an author and its SHA-256."""
+
+    def commits_of(self, robot: str) -> list[CommitId]:
+        """Every commit with evidence of a robot, all incarnations, that is not retracted."""
+
+    def pending(self) -> VersionVector:
+        """Commits that are durable but not folded."""
+
+    def folded_before(self, time_s: float) -> VersionVector:
+        """Commits folded before a time."""
+
+    def retracting(self) -> list[CommitId]:
+        """Commits that retract others."""
+
+    def log(self, *, after_seq: int, limit: int) -> list[LogEntry]:
+        """Log entries, oldest first."""
+
+    def totals(self) -> Totals:
+        """Sizes."""
+
+
+class Store(Protocol):
+    """A place for maps; every method may be called from any thread."""
+
+    def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:
+        """The map and whether it is new; an equal one may exist already.
+
+        Raises:
+            ConflictError: one of that name exists with another geometry or sensor model.
+        """
+
+    def map(self, name: str) -> MapRow:
+        """The map of a name.
+
+        Raises:
+            NotFoundError: there is none.
+        """
+
+    def maps(self) -> list[MapRow]:
+        """All maps, by name."""
+
+    def append(self, row: MapRow, commit: NewCommit) -> bool:
+        """Keep a commit; True if it is new, False if the same one is kept already. Durable on return.
+
+        Raises:
+            ConflictError: kind `id_taken`: the id is kept with other bytes.
+            BadInputError: kind `evidence_overflow`: a sum could leave its range.
+        """
+
+    def append_built(self, row: MapRow, author: Author, build: Callable[[int], NewCommit]) -> NewCommit:
+        """Keep a commit that `build(n)` makes for the author's next number n."""
+
+    def pending(self, row: MapRow, *, limit: int) -> list[StoredCommit]:
+        """Commits that are not folded, in order of arrival, with their diffs."""
+
+    def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
+        """A folded commit with its diff, or None."""
+
+    def is_retracted(self, row: MapRow, commit: CommitId) -> bool:
+        """Whether a retract of this id has taken effect, or waits for it to come."""
+
+    def fold(self, row: MapRow, fold: Fold) -> bool:
+        """Write a fold if the head is still its base; False (and nothing written) otherwise."""
+
+    def snapshot(self, row: MapRow) -> AbstractContextManager[Snapshot]:
+        """One state of the map."""
+
+    def register(self, row: MapRow, branch: Branch, token_hash: bytes) -> None:
+        """Make a branch, or give an existing one a new token."""
+
+    def seen(self, row: MapRow, name: str, cursor: Cursor | None) -> None:
+        """Note that a branch was heard of, and where it stands; may be written later."""
+
+    def deregister(self, row: MapRow, name: str) -> None:
+        """Remove a branch and its token.
+
+        Raises:
+            NotFoundError: there is none of that name.
+        """
+
+    def branches(self, row: MapRow) -> list[Branch]:
+        """All branches, by name."""
+
+    def branch_of_token(self, row: MapRow, token_hash: bytes) -> str | None:
+        """The branch that a token was given to."""
+
+    def audit(self, what: str, detail: str) -> None:
+        """Note something that an administrator may have to look into; may be written later."""
+
+    def close(self) -> None:
+        """Finish what was accepted and close."""
