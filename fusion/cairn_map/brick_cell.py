@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from cairn_map import brick_kernels as kernels
 from cairn_map.errors import BadInputError
-from cairn_map.evidence import COUNT_MAX, SUM_MAX, Evidence
+from cairn_map.evidence import COUNT_MAX, SUM_MAX, Evidence, check_fits
 from cairn_map.grid import BRICK_DEPTH, Geometry
 
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -40,7 +40,8 @@ class BrickCell:
         """Add a diff.
 
         Raises:
-            BadInputError: kind `evidence_overflow`: a sum would leave its range; nothing was changed.
+            BadInputError: kind `evidence_overflow`: a sum would leave its range, or `bad_evidence`: it is of another
+                geometry; nothing was changed.
         """
         self._add(diff, 1)
 
@@ -48,7 +49,8 @@ class BrickCell:
         """Take a diff out again; after it, the cell is what it was before `merge(diff)`.
 
         Raises:
-            BadInputError: kind `evidence_overflow`: a sum would leave its range; nothing was changed.
+            BadInputError: kind `evidence_overflow`: a sum would leave its range, or `bad_evidence`: it is of another
+                geometry; nothing was changed.
         """
         self._add(diff, -1)
 
@@ -73,6 +75,7 @@ class BrickCell:
         return sum(array.nbytes for array in arrays)
 
     def _add(self, diff: Evidence, sign: int) -> None:
+        check_fits(diff, self._geometry)
         # Negative sums are legal on the way (a delta may come before what it takes away); the caller that holds a
         # finished state checks it by fingerprint.
         if not kernels.counts_fit(

@@ -10,7 +10,7 @@ Streams of channel c start at number 16 + 8 c: presence, weight, then the value 
 import numpy as np
 import numpy.typing as npt
 
-from cairn_map.errors import DamagedDataError
+from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence import SUM_MAX
 from cairn_map.grid import Geometry
 from cairn_map.octree_kernels import predict_sums, restore_sums, square_guesses
@@ -47,17 +47,22 @@ def encode_channels(
     return streams
 
 
-def decode_channels(streams: dict[int, bytes], geometry: Geometry, *, leaves: int, signed: bool) -> tuple[Ints, Ints]:
+def decode_channels(
+    streams: dict[int, bytes], geometry: Geometry, *, leaves: int, signed: bool, sampled_max: int
+) -> tuple[Ints, Ints]:
     """(S,) leaves that have samples, rising, and (S, P) samples; the mirror of `encode_channels`.
 
     Raises:
         DamagedDataError: a stream is missing, of the wrong length, or a sum is out of range.
+        BadInputError: kind `too_large`: more than `sampled_max` leaves have samples.
     """
     presences = [_presence(streams, c, leaves) for c in range(len(geometry.channels))]
     any_present = np.zeros(leaves, np.bool_)
     for present in presences:
         any_present |= present
     places = np.nonzero(any_present)[0]
+    if len(places) > sampled_max:
+        raise BadInputError("too_large", f"{len(places)} voxels with samples, at most {sampled_max} are read")
     samples = np.zeros((len(places), geometry.plane_count), np.int64)
     for c, channel in enumerate(geometry.channels):
         rows = np.nonzero(presences[c][places])[0]

@@ -15,7 +15,7 @@ from typing import Annotated, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from cairn_map.errors import BadInputError
 
@@ -52,7 +52,8 @@ class Channel(BaseModel):
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
     unit: Annotated[str, Field(max_length=16)] = ""
     step: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
-    zero: Annotated[float, Field(allow_inf_nan=False)] = 0.0
+    zero: Annotated[float, Field(allow_inf_nan=False), AfterValidator(lambda value: value + 0.0)] = 0.0
+    """Value of the sample 0; never -0.0, which is the same number with another digest."""
 
     @model_validator(mode="after")
     def _unit_is_short(self) -> Self:

@@ -9,13 +9,13 @@ A retract is a commit without cells that names others; an amend is one with both
 import hashlib
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from cairn_map.cell_code import VOXEL_BYTES, DecodedCell, decode_canonical_cell, encode_cell
+from cairn_map.cell_code import VOXEL_BYTES, DecodedCell, decode_canonical_cell, decode_cell, encode_cell
 from cairn_map.cell_head import CellHead, decode_head
 from cairn_map.errors import BadInputError, DamagedDataError, first_error
 from cairn_map.evidence import Evidence, every_sum_has_weight
@@ -33,6 +33,8 @@ RETRACTS_MAX = 4096
 EVIDENCE_BYTES_MAX = 1 << 29
 """Bytes of all evidence of a commit, unpacked: 44 M voxels. A measurement in a large room at 2 cm has 20 M; without
 a bound a commit of 64 MB could stand for terabytes of collapsed air."""
+BRICKS_MAX = 1 << 17
+"""Bricks of 8^3 voxels that a commit touches: 4 kB each once merged, though a single voxel costs 12 bytes here."""
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Hex32 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -129,13 +131,28 @@ def make_commit(meta: CommitMeta, diff: Mapping[CellKey, Evidence], geometry: Ge
     data = _joined(text, cells)
     _check_size(len(data), len(cells), len(text))
     _check_evidence_size(sum(evidence.size_bytes for evidence in diff.values()), EVIDENCE_BYTES_MAX)
+    _check_bricks(diff.values())
     return Commit(meta, cells, _sha(text, digests), data)
 
 
-def renamed_commit(commit: Commit, meta: CommitMeta, digests: Mapping[CellKey, bytes]) -> Commit:
-    """The same evidence under another meta; `digests` are the cells' (32 bytes each)."""
+def renamed_commit(data: bytes, *, commit: CommitId, parent: str | None) -> Commit:
+    """The evidence of a commit that was validated when it was kept, under another id."""
+    meta, cells = split_commit(data)
+    meta = meta.model_copy(update={"id": str(commit), "parent": parent})
     text = meta.model_dump_json(exclude_defaults=True).encode()
-    return Commit(meta, commit.cells, _sha(text, [digests[key] for key in commit.cells]), _joined(text, commit.cells))
+    digests = [decode_cell(body).digest for body in cells.values()]
+    return Commit(meta, cells, _sha(text, digests), _joined(text, cells))
+
+
+def split_commit(data: bytes) -> tuple[CommitMeta, dict[CellKey, bytes]]:
+    """Meta and cells' bytes of a commit that was validated when it was kept; no evidence is decoded.
+
+    Raises:
+        DamagedDataError: cut off or contradictory.
+        BadInputError: an unknown version, or larger than allowed.
+    """
+    meta, _, bodies = _split(data)
+    return meta, {decode_head(body)[0].key: body for body in bodies}
 
 
 def open_commit(
@@ -143,7 +160,7 @@ def open_commit(
 ) -> tuple[Commit, dict[CellKey, DecodedCell]]:
     """The commit in bytes and all its evidence, validated completely: canonical cells, rising, of one geometry.
 
-    Needs up to three times `evidence_bytes_max` of memory, whatever the bytes say.
+    Needs up to about twice `evidence_bytes_max` of memory, whatever the bytes say.
 
     Raises:
         DamagedDataError: cut off, contradictory, not canonical.
@@ -159,6 +176,7 @@ def open_commit(
         _check_evidence(cell.evidence, cell.geometry)
         left -= cell.evidence.size_bytes
         cells[cell.key], decoded[cell.key] = body, cell
+    _check_bricks(cell.evidence for cell in decoded.values())
     sha = _sha(text, [cell.digest for cell in decoded.values()])
     return Commit(meta, cells, sha, data), decoded
 
@@ -196,6 +214,12 @@ def _joined(text: bytes, cells: Mapping[CellKey, bytes]) -> bytes:
     for data in cells.values():
         parts += [struct.pack("<I", len(data)), data]
     return b"".join(parts)
+
+
+def _check_bricks(evidences: Iterable[Evidence]) -> None:
+    bricks = sum(evidence.brick_count for evidence in evidences)
+    if bricks > BRICKS_MAX:
+        raise BadInputError("too_large", f"a commit touches at most {BRICKS_MAX} bricks, got {bricks}; make two of it")
 
 
 def _split(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:

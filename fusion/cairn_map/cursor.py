@@ -43,8 +43,11 @@ def cursor_from_text(text: str) -> Cursor:
     try:
         if len(text) > 128 or len(parts) != 3 or not parts[1].isascii() or not parts[1].isdigit():
             raise ValueError
-        return Cursor(bytes.fromhex(parts[0]), int(parts[1]), bytes.fromhex(parts[2]))
-    except ValueError:
+        cursor = Cursor(bytes.fromhex(parts[0]), int(parts[1]), bytes.fromhex(parts[2]))
+        if str(cursor) != text:  # bytes.fromhex skips spaces and takes capitals; a cursor has one text only
+            raise ValueError
+        return cursor
+    except (ValueError, BadInputError):
         raise BadInputError("bad_cursor", f"a cursor is written log_id.seq.chain, got {text[:128]!r}") from None
 
 

@@ -13,6 +13,11 @@ body and comes out of the client, so that `except ConflictError as exc: exc.kind
 both sides of the wire. Codes are added, never renamed.
 """
 
+from pydantic import ValidationError
+
+COMPLAINTS_MAX = 1000
+"""About a kilobyte each."""
+
 
 class CairnError(Exception):
     """Root of the family; `kind` says which one, the message says what was expected and what came."""
@@ -55,3 +60,12 @@ class UnreachableError(CairnError):
     def __init__(self, kind: str, message: str, retry_after_s: float | None = None) -> None:
         super().__init__(kind, message)
         self.retry_after_s = retry_after_s
+
+
+def first_error(exc: ValidationError) -> str:
+    """Where and what the first complaint of a model is, short; the others may be a million, and are not even listed."""
+    if exc.error_count() > COMPLAINTS_MAX:
+        return f"more than {COMPLAINTS_MAX} fields are wrong"
+    first = exc.errors(include_url=False, include_context=False, include_input=False)[0]
+    where = ".".join(str(part) for part in first["loc"]) or "document"
+    return f"{where[:200]}: {first['msg'][:200]}"

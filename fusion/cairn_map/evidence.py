@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_map.errors import BadInputError
-from cairn_map.grid import Geometry
+from cairn_map.grid import BRICK_DEPTH, Geometry
 
 COUNT_MAX = (1 << 31) - 1
 SUM_MAX = 1 << 62
@@ -30,6 +30,14 @@ class Evidence:
     counts: npt.NDArray[np.int32]
     sampled: npt.NDArray[np.uint32]
     samples: npt.NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        V, S = self.voxels.shape[:1], self.sampled.shape[:1]
+        arrays = (self.voxels, self.counts, self.sampled, self.samples)
+        dtypes = [array.dtype for array in arrays]
+        shapes_fit = self.counts.shape == (*V, 2) and self.samples.shape[:-1] == S and len(V) == len(S) == 1
+        if not shapes_fit or dtypes != [np.uint32, np.int32, np.uint32, np.int64]:
+            raise BadInputError("bad_evidence", f"arrays do not fit: {[(a.dtype.name, a.shape) for a in arrays]}")
 
     def __hash__(self) -> int:
         return hash((len(self.voxels), len(self.sampled)))
@@ -45,6 +53,17 @@ class Evidence:
 
     def __len__(self) -> int:
         return len(self.voxels)
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory held by the arrays."""
+        return self.voxels.nbytes + self.counts.nbytes + self.sampled.nbytes + self.samples.nbytes
+
+    @property
+    def brick_count(self) -> int:
+        """Bricks of 8^3 voxels that it touches."""
+        bricks = self.voxels >> np.uint32(3 * BRICK_DEPTH)
+        return int(np.count_nonzero(bricks[1:] != bricks[:-1])) + min(1, len(bricks))
 
     @property
     def is_signed(self) -> bool:
@@ -87,9 +106,10 @@ def packed_evidence(
         )
     order = np.argsort(places, kind="stable")
     voxels, counts, samples = places[order], counts[order], samples[order]
-    if N and (int(voxels[-1]) >= 8**geometry.depth or (voxels[1:] == voxels[:-1]).any()):
+    if N and (int(voxels[0]) < 0 or int(voxels[-1]) >= 8**geometry.depth or (voxels[1:] == voxels[:-1]).any()):
         raise BadInputError("bad_evidence", "places must be different Morton codes inside the cell")
-    if (np.abs(counts) > COUNT_MAX).any() or (np.abs(samples) > SUM_MAX).any():
+    # Not np.abs: the magnitude of the least integer is itself, and negative.
+    if any((array > top).any() or (array < -top).any() for array, top in ((counts, COUNT_MAX), (samples, SUM_MAX))):
         raise BadInputError("evidence_overflow", f"counts are at most {COUNT_MAX}, sums at most {SUM_MAX}")
     has_samples = (samples != 0).any(axis=1)
     keep = has_samples | (counts != 0).any(axis=1)
@@ -109,3 +129,29 @@ def largest(evidence: Evidence, geometry: Geometry) -> npt.NDArray[np.int64]:
     if len(evidence.sampled):
         tops[2:] = evidence.samples.max(axis=0)
     return tops
+
+
+def check_fits(evidence: Evidence, geometry: Geometry) -> None:
+    """Refuse evidence of another geometry: kernels check no bounds, and would write outside their arrays.
+
+    Raises:
+        BadInputError: kind `bad_evidence`: a voxel outside the cell, a sampled row that is not there, or other planes.
+    """
+    outside = len(evidence) > 0 and int(evidence.voxels.max()) >= 8**geometry.depth
+    missing = len(evidence.sampled) > 0 and int(evidence.sampled.max()) >= len(evidence)
+    planes = evidence.samples.shape[1]
+    if outside or missing or planes != geometry.plane_count:
+        raise BadInputError(
+            "bad_evidence",
+            f"evidence does not fit a cell of depth {geometry.depth} with {geometry.plane_count} planes; "
+            f"it has {planes} planes, voxels outside: {outside}, samples without voxel: {missing}",
+        )
+
+
+def every_sum_has_weight(evidence: Evidence, geometry: Geometry) -> bool:
+    """Whether each channel's sums come with a weight, as every real sample does: means divide by it."""
+    for channel in geometry.channels:
+        sums = evidence.samples[:, geometry.planes_of(channel.name)]
+        if ((sums[:, -1] == 0) & (sums != 0).any(axis=1)).any():
+            return False
+    return True

@@ -3,7 +3,7 @@
 map.merge(diff)      add a measurement         map.unmerge(diff)      take it out again, exactly
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 from cairn_map.brick_cell import BrickCell
 from cairn_map.errors import BadInputError
@@ -11,6 +11,7 @@ from cairn_map.evidence import Evidence, empty_evidence
 from cairn_map.grid import CellKey, Geometry
 
 Diff = Mapping[CellKey, Evidence]
+Step = Callable[[BrickCell, Evidence], None]
 
 
 class EvidenceMap:
@@ -35,20 +36,15 @@ class EvidenceMap:
         Raises:
             BadInputError: kind `evidence_overflow`; nothing was changed.
         """
-        done: list[CellKey] = []
-        try:
-            for key, evidence in diff.items():
-                self._cells.setdefault(key, BrickCell(self.geometry)).merge(evidence)
-                done.append(key)
-        except BadInputError:
-            for key in done:
-                self._cells[key].unmerge(diff[key])
-            raise
+        self._apply(diff, BrickCell.merge, BrickCell.unmerge)
 
     def unmerge(self, diff: Diff) -> None:
-        """Take a diff out again; it must have been merged before, else sums become negative."""
-        for key, evidence in diff.items():
-            self._cells.setdefault(key, BrickCell(self.geometry)).unmerge(evidence)
+        """Take a diff out again; it must have been merged before, else sums become negative.
+
+        Raises:
+            BadInputError: kind `evidence_overflow`; nothing was changed.
+        """
+        self._apply(diff, BrickCell.unmerge, BrickCell.merge)
 
     def replace(self, key: CellKey, evidence: Evidence) -> None:
         """Make one cell hold exactly this evidence."""
@@ -74,3 +70,16 @@ class EvidenceMap:
     def size_bytes(self) -> int:
         """Memory held by the cells' arrays."""
         return sum(cell.size_bytes for cell in self._cells.values())
+
+    def _apply(self, diff: Diff, step: Step, undo: Step) -> None:
+        cells = {key: self._cells.get(key) or BrickCell(self.geometry) for key in diff}
+        done: list[CellKey] = []
+        try:
+            for key, evidence in diff.items():
+                step(cells[key], evidence)
+                done.append(key)
+        except BadInputError:
+            for key in done:
+                undo(cells[key], diff[key])
+            raise
+        self._cells.update(cells)

@@ -26,7 +26,7 @@ from cairn_map.cell_code import CELL_BYTES_MAX
 from cairn_map.cursor import CHAIN_BYTES, Cursor
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError
 from cairn_map.fingerprint import Fingerprint, fingerprint_from_bytes
-from cairn_map.grid import CellKey
+from cairn_map.grid import DEPTH_MAX, CellKey
 from cairn_map.messages import Done, More, ReplyHeader, message_from_json
 
 MAGIC = b"CRNS"
@@ -34,6 +34,10 @@ VERSION = 1
 PREFIX = struct.Struct("<IB")
 CELL_HEAD = struct.Struct(f"<QB16sq{CHAIN_BYTES}s16sq{CHAIN_BYTES}s16s")
 FRAME_BYTES_MAX = CELL_BYTES_MAX + (1 << 20)
+JSON_BYTES_MAX = 1 << 22
+"""Of a frame in JSON, whose objects need a hundred times its bytes: version vectors of some 60 000 robots."""
+BLOCK_LIMIT = 8 ** (DEPTH_MAX - 2)
+"""Block numbers are below it, in the deepest cell."""
 FLAG_OWN_EXCLUDED = 1
 NO_CURSOR = -1
 
@@ -115,15 +119,18 @@ class FrameReader:
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing is left over: false at the end means the reply was cut."""
-        return not self._buffer
+        """Whether a reply began and nothing is left over: false at the end means the reply was cut."""
+        return self._started and not self._buffer
 
     def _next(self) -> Frame | None:
         if len(self._buffer) < PREFIX.size:
             return None
         size, kind = PREFIX.unpack_from(self._buffer)
-        if size > FRAME_BYTES_MAX:
-            raise BadInputError("too_large", f"a frame has at most {FRAME_BYTES_MAX} bytes, this one claims {size}")
+        limit = FRAME_BYTES_MAX if kind in CELL_KINDS else JSON_BYTES_MAX
+        if size > limit:
+            raise BadInputError(
+                "too_large", f"a frame of type {kind} has at most {limit} bytes, this one claims {size}"
+            )
         end = PREFIX.size + size
         if len(self._buffer) < end + 4:
             return None
@@ -197,8 +204,8 @@ def _parsed_cell(kind: FrameKind, body: bytes) -> CellFrame:
         if at + 4 * count > len(body):
             raise DamagedDataError("bad_frame", "a state frame's blocks are cut off")
         blocks = np.frombuffer(body, "<u4", count, at).astype(np.uint32)
-        if (blocks[1:] <= blocks[:-1]).any():
-            raise DamagedDataError("bad_frame", "a state frame's blocks must rise")
+        if (blocks[1:] <= blocks[:-1]).any() or (blocks >= BLOCK_LIMIT).any():
+            raise DamagedDataError("bad_frame", "a state frame's blocks must rise and lie in the cell")
         at += 4 * count
     if key >= 1 << 63 or flags & ~FLAG_OWN_EXCLUDED or (kind is FrameKind.RESET and at != len(body)):
         raise DamagedDataError("bad_frame", "a cell frame has an impossible cell number, flag or payload")

@@ -10,6 +10,7 @@ Cells are numbered by signed (i, j, k) and, as one number, by the 63-bit Morton 
 
 import hashlib
 import json
+import re
 from typing import Annotated, NamedTuple, NewType, Self
 
 import numpy as np
@@ -30,6 +31,8 @@ CELL_LIMIT = 1 << 20
 BRICK_DEPTH = 3
 """A brick is 8^3 voxels, the three lowest octree depths."""
 DEPTH_MAX = 8
+CELL_TEXT = re.compile(",".join([r"(0|-?[1-9][0-9]{0,6})"] * 3))
+"""One way to write each cell: `int` alone would also take " 1", "+1", "1_0" and other scripts' digits."""
 NANOMETRES = 1e9
 
 
@@ -144,13 +147,10 @@ def cell_from_text(text: str) -> Cell:
     Raises:
         BadInputError: not three integers, or beyond the numbered space.
     """
-    parts = text.split(",")
-    try:
-        if len(text) > 64 or len(parts) != 3:
-            raise ValueError
-        cell = Cell(*(int(part) for part in parts))
-    except ValueError:
-        raise BadInputError("bad_cell", f"a cell is written i,j,k with integers, got {text[:64]!r}") from None
+    found = CELL_TEXT.fullmatch(text)
+    if not found:
+        raise BadInputError("bad_cell", f"a cell is written i,j,k with integers, got {text[:64]!r}")
+    cell = Cell(*(int(part) for part in found.groups()))
     cell_key(cell)
     return cell
 

@@ -17,6 +17,8 @@ Incarnation = NewType("Incarnation", str)
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
 INCARNATION = re.compile(r"[0-9a-f]{16}")
 NUMBER = re.compile(r"0|[1-9][0-9]{0,14}")
+NUMBER_LIMIT = 10**15
+"""Numbers of commits are below it: exact in a JSON reader that has only float64."""
 INITIAL = RobotName("initial")
 """Author of the evidence that a map starts from."""
 

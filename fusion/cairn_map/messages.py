@@ -11,6 +11,7 @@ from cairn_map.cursor import Cursor, cursor_from_text
 from cairn_map.errors import DamagedDataError, first_error
 from cairn_map.fingerprint import Fingerprint, fingerprint_from_hex
 from cairn_map.grid import Geometry
+from cairn_map.ids import NUMBER_LIMIT
 from cairn_map.sensor_model import SensorModel
 from cairn_map.version_vector import AUTHORS_MAX, VersionVector, version_vector_from_json
 
@@ -121,7 +122,7 @@ class ReplyHeader(_Model):
     """Ids that no restore can lose any more."""
     pending: VectorJson = {}
     """Ids that are durable here but not folded yet: they need not be pushed, and count for nothing else."""
-    tip: tuple[int, ShaText] | None = None
+    tip: tuple[Annotated[int, Field(ge=0, lt=NUMBER_LIMIT)], ShaText] | None = None
     """Highest folded number of the asker's own incarnation, and its SHA-256."""
     retracts: list[IdText] = []
     """Retracting commits that are not yet stable."""

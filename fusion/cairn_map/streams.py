@@ -34,12 +34,12 @@ def pack_streams(streams: Mapping[int, bytes]) -> bytes:
     return b"".join(parts)
 
 
-def unpack_streams(data: bytes, *, count: int) -> dict[int, bytes]:
+def unpack_streams(data: bytes, *, count: int, raw_bytes_max: int = RAW_BYTES_MAX) -> dict[int, bytes]:
     """Exactly `count` streams that fill `data`; the mirror of `pack_streams`.
 
     Raises:
         DamagedDataError: cut off, left over, not rising in number, or not of the stated length.
-        BadInputError: kind `too_large`: together they would be larger than `RAW_BYTES_MAX`.
+        BadInputError: kind `too_large`: together they would be larger than `raw_bytes_max`.
     """
     streams: dict[int, bytes] = {}
     at = total = 0
@@ -54,8 +54,8 @@ def unpack_streams(data: bytes, *, count: int) -> dict[int, bytes]:
         total += raw_bytes
         if number <= last or len(body) < stored_bytes:
             raise DamagedDataError("bad_stream", f"stream {number} is cut off or out of order")
-        if total > RAW_BYTES_MAX:
-            raise BadInputError("too_large", f"a cell's streams hold at most {RAW_BYTES_MAX} bytes")
+        if total > raw_bytes_max:
+            raise BadInputError("too_large", f"these streams can hold at most {raw_bytes_max} bytes, they claim more")
         last = number
         streams[number] = _raw(body, coding, raw_bytes, number)
     if at != len(data):
@@ -74,7 +74,7 @@ def bounded_zstd(data: bytes, *, size_bytes: int) -> bytes:
     """
     try:
         with zstandard.ZstdDecompressor(max_window_size=ZSTD_WINDOW_MAX).stream_reader(data) as reader:
-            raw = _read(reader, size_bytes + 1)
+            raw = reader.read(size_bytes + 1)
     except zstandard.ZstdError as exc:
         raise DamagedDataError("bad_zstd", f"not a zstd stream: {exc}") from exc
     if len(raw) != size_bytes:
@@ -111,12 +111,3 @@ def _raw(body: bytes, coding: int, raw_bytes: int, number: int) -> bytes:
     if coding != STORED or len(body) != raw_bytes:
         raise DamagedDataError("bad_stream", f"stream {number} has an unknown coding {coding} or a false length")
     return body
-
-
-def _read(reader: zstandard.ZstdDecompressionReader, limit_bytes: int) -> bytes:
-    parts: list[bytes] = []
-    left = limit_bytes
-    while left > 0 and (part := reader.read(min(left, 1 << 20))):
-        parts.append(part)
-        left -= len(part)
-    return b"".join(parts)

@@ -1,0 +1,256 @@
+"""The server's routes as functions; the only file that knows HTTP.
+
+Errors come out as the same `CairnError` that the server raised. What could not be asked at all, or should be asked
+again later, is `UnreachableError`. Every call is idempotent, so whoever calls may simply call again.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+import httpx
+from pydantic import TypeAdapter, ValidationError
+
+from cairn_map.commit import Commit
+from cairn_map.cursor import Cursor, cursor_from_text
+from cairn_map.errors import (
+    BadInputError,
+    CairnError,
+    ConflictError,
+    DamagedDataError,
+    DeniedError,
+    NotFoundError,
+    UnreachableError,
+)
+from cairn_map.fingerprint import Fingerprint, fingerprint_from_hex
+from cairn_map.frames import Frame, FrameReader
+from cairn_map.grid import Cell
+from cairn_map.ids import Author
+from cairn_map.messages import (
+    BranchInfo,
+    CellIndex,
+    CreateMap,
+    LogEntry,
+    MapInfo,
+    Message,
+    MissingRequest,
+    Problem,
+    Pushed,
+    Register,
+    Registered,
+    Retract,
+    Retracted,
+    VectorJson,
+    message_from_json,
+)
+from cairn_map.version_vector import VersionVector, version_vector_from_json
+
+TIMEOUT = httpx.Timeout(30.0, connect=5.0)
+ANSWER_BYTES_MAX = 64 << 20
+"""Longest JSON answer that is read."""
+ERROR_BYTES_MAX = 1 << 16
+
+
+@dataclass(slots=True)
+class Traffic:
+    """Body bytes sent and received so far."""
+
+    up_bytes: int = 0
+    down_bytes: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class FetchedCell:
+    """A cell as downloaded; `body` is None if it is still the one that the asker has."""
+
+    body: bytes | None
+    etag: str
+    cursor: Cursor
+    coverage: VersionVector
+    fingerprint: Fingerprint
+
+
+class MapApi:
+    """One server's routes; `server_url` such as `http://base:8750`."""
+
+    def __init__(self, server_url: str, *, token: str | None = None) -> None:
+        self.traffic = Traffic()
+        try:
+            self._client = httpx.Client(base_url=server_url.rstrip("/"), timeout=TIMEOUT)
+        except httpx.InvalidURL as exc:
+            raise BadInputError("bad_url", f"{server_url!r} is not a URL: {exc}") from exc
+        self.token = token
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._client.close()
+
+    def create_map(self, name: str, request: CreateMap) -> MapInfo:
+        """Create a map, or find the equal one."""
+        return message_from_json(MapInfo, self._ask("PUT", f"/maps/{name}", content=request.model_dump_json().encode()))
+
+    def maps(self) -> list[MapInfo]:
+        """All maps."""
+        return _list_of(MapInfo, self._ask("GET", "/maps"))
+
+    def map_info(self, name: str) -> MapInfo:
+        """One map."""
+        return message_from_json(MapInfo, self._ask("GET", f"/maps/{name}"))
+
+    def register(self, name: str, request: Register) -> Registered:
+        """Register a robot; later calls use the token that comes back."""
+        body = self._ask("POST", f"/maps/{name}/branches", content=request.model_dump_json().encode())
+        registered = message_from_json(Registered, body)
+        self.token = registered.token
+        return registered
+
+    def branches(self, name: str) -> list[BranchInfo]:
+        """All robots of a map."""
+        return _list_of(BranchInfo, self._ask("GET", f"/maps/{name}/branches"))
+
+    def deregister(self, name: str, branch: str) -> None:
+        """Deregister a robot."""
+        self._ask("DELETE", f"/maps/{name}/branches/{branch}")
+
+    def push(self, name: str, commit: Commit) -> Pushed:
+        """Push a commit; when this returns, the server has it for good."""
+        return message_from_json(Pushed, self._ask("PUT", f"/maps/{name}/commits/{commit.id}", content=commit.data))
+
+    def retract(self, name: str, request: Retract) -> Retracted:
+        """Undo commits exactly."""
+        body = self._ask("POST", f"/maps/{name}/retracts", content=request.model_dump_json().encode())
+        return message_from_json(Retracted, body)
+
+    def log(self, name: str, *, after: int = 0, limit: int = 100) -> list[LogEntry]:
+        """Log entries after a sequence number, oldest first."""
+        return _list_of(LogEntry, self._ask("GET", f"/maps/{name}/log", params={"after": after, "limit": limit}))
+
+    def cell_index(self, name: str, author: Author | None = None) -> CellIndex:
+        """All cells of a map, without their bytes."""
+        params = {"author": str(author)} if author else {}
+        return message_from_json(CellIndex, self._ask("GET", f"/maps/{name}/main/cells", params=params))
+
+    def cell(self, name: str, cell: Cell, *, etag: str | None = None) -> FetchedCell:
+        """One cell's octree, unless it is the one with this ETag."""
+        headers = {"If-None-Match": etag} if etag else {}
+        response = self._send("GET", f"/maps/{name}/main/cells/{cell}", headers=headers)
+        try:
+            coverage: VectorJson = TypeAdapter(VectorJson).validate_json(response.headers["Cairn-Coverage"])
+            return FetchedCell(
+                body=None if response.status_code == 304 else response.content,
+                etag=response.headers["ETag"],
+                cursor=cursor_from_text(response.headers["Cairn-Cursor"]),
+                coverage=version_vector_from_json(coverage),
+                fingerprint=fingerprint_from_hex(response.headers["Cairn-Fingerprint"]),
+            )
+        except (KeyError, ValidationError) as exc:
+            raise DamagedDataError("bad_message", f"the answer for cell {cell} lacks its headers: {exc}") from exc
+
+    def missing(self, name: str, branch: str, request: MissingRequest) -> Iterator[Frame]:
+        """Frames as they arrive.
+
+        Raises:
+            UnreachableError: the link broke; the frames before it were whole and may be kept.
+            DamagedDataError: the bytes are not frames.
+        """
+        reader = FrameReader()
+        body = request.model_dump_json(exclude_defaults=True).encode()
+        self.traffic.up_bytes += len(body)
+        path = f"/maps/{name}/branches/{branch}/missing"
+        try:
+            with self._client.stream("POST", path, content=body, headers=self._headers()) as response:
+                if response.status_code != 200:
+                    raise _error_of(response.status_code, next(response.iter_bytes(ERROR_BYTES_MAX), b""), response)
+                for part in response.iter_bytes(1 << 16):
+                    self.traffic.down_bytes += len(part)
+                    yield from reader.feed(part)
+        except httpx.TransportError as exc:
+            raise _unreachable(exc) from exc
+        if not reader.is_empty:
+            raise UnreachableError("cut_off", "the reply was cut off")
+
+    def _ask(self, method: str, path: str, **options: Any) -> bytes:
+        return self._send(method, path, **options).content
+
+    def _send(
+        self,
+        method: str,
+        path: str,
+        *,
+        content: bytes = b"",
+        headers: Mapping[str, str] | None = None,
+        params: Mapping[str, str | int] | None = None,
+    ) -> httpx.Response:
+        self.traffic.up_bytes += len(content)
+        sent = {**self._headers(), **(headers or {}), "Content-Type": _media_type(content)}
+        try:
+            with self._client.stream(method, path, headers=sent, content=content, params=params) as response:
+                _read_bounded(response)
+        except httpx.TransportError as exc:
+            raise _unreachable(exc) from exc
+        self.traffic.down_bytes += len(response.content)
+        if response.status_code >= 400:
+            raise _error_of(response.status_code, response.content, response)
+        return response
+
+    def _headers(self) -> dict[str, str]:
+        return {"Authorization": f"Bearer {self.token}"} if self.token else {}
+
+
+def _media_type(content: bytes) -> str:
+    return "application/json" if content.startswith(b"{") else "application/vnd.cairn.commit"
+
+
+def _read_bounded(response: httpx.Response) -> None:
+    """Read an answer whole, but never more than a cell may have."""
+    got = bytearray()
+    for part in response.iter_bytes():
+        got += part
+        if len(got) > ANSWER_BYTES_MAX:
+            raise BadInputError("too_large", f"the server's answer is longer than {ANSWER_BYTES_MAX} bytes")
+    response._content = bytes(got)
+
+
+def _list_of(model: type[Message], data: bytes) -> list[Message]:
+    try:
+        found: list[Message] = TypeAdapter(list[model]).validate_json(data)  # type: ignore[valid-type]
+        return found
+    except ValidationError as exc:
+        raise DamagedDataError("bad_message", f"the server's list is not sound: {exc.errors()[0]['msg']}") from exc
+
+
+def _unreachable(exc: httpx.TransportError) -> UnreachableError:
+    try:
+        where = str(exc.request.url.copy_with(path="/", query=None))
+    except RuntimeError:
+        where = "the server"
+    return UnreachableError("no_link", f"cannot reach {where} ({exc or type(exc).__name__}); is `cairn serve` running?")
+
+
+def _error_of(status: int, body: bytes, response: httpx.Response) -> CairnError:
+    """The server's problem as the error that it was there."""
+    try:
+        problem = Problem.model_validate_json(body)
+    except ValidationError:
+        problem = Problem(kind="http", detail=f"the server answered {status}: {body[:200].decode(errors='replace')}")
+    if status in (429, 502, 503, 504):
+        wait = response.headers.get("Retry-After", "")
+        return UnreachableError(problem.kind, problem.detail, float(wait) if wait.isdigit() else None)
+    families: dict[int, type[CairnError]] = {
+        401: DeniedError,
+        403: DeniedError,
+        404: NotFoundError,
+        409: ConflictError,
+        410: ConflictError,
+    }
+    family = families.get(status, BadInputError if status < 500 else DamagedDataError)
+    return family(problem.kind, problem.detail)

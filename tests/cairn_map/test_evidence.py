@@ -1,0 +1,110 @@
+"""Packed evidence has one form only."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.cairn_map.made import MIDDLE, PLAIN, SMALL, as_dict, random_evidence
+
+from cairn_map.errors import BadInputError
+from cairn_map.evidence import (
+    COUNT_MAX,
+    SUM_MAX,
+    Evidence,
+    empty_evidence,
+    every_sum_has_weight,
+    largest,
+    packed_evidence,
+)
+
+I64_MIN = -(1 << 63)
+
+
+def packed(places: list[int], counts: list[list[int]], samples: list[list[int]]) -> Evidence:
+    width = SMALL.plane_count
+    rows = np.array([row + [0] * (width - len(row)) for row in samples], np.int64).reshape(-1, width)
+    return packed_evidence(np.array(places, np.int64), np.array(counts, np.int64).reshape(-1, 2), rows, SMALL)
+
+
+@given(st.permutations(range(5)))
+def test_the_order_of_rows_does_not_matter(order: list[int]) -> None:
+    places, counts, samples = [9, 3, 5, 1, 7], [[1, 0], [0, 0], [0, 2], [0, 0], [3, 3]], [[], [], [], [4], [5]]
+    one = packed([places[n] for n in order], [counts[n] for n in order], [samples[n] for n in order])
+    assert one == packed(places, counts, samples)
+    assert one.voxels.tolist() == [1, 5, 7, 9]
+    assert one.sampled.tolist() == [0, 2]
+
+
+def test_zeros_are_left_out() -> None:
+    assert packed([4, 5], [[0, 0], [0, 0]], [[], []]) == empty_evidence(SMALL)
+
+
+@pytest.mark.parametrize("places", [[3, 3], [0, 512], [-1, 2]])
+def test_places_twice_or_outside_the_cell_are_refused(places: list[int]) -> None:
+    with pytest.raises(BadInputError, match="places must be different"):
+        packed(places, [[1, 0], [1, 0]], [[], []])
+
+
+@pytest.mark.parametrize("count", [COUNT_MAX + 1, -COUNT_MAX - 1, I64_MIN])
+def test_counts_beyond_their_range_are_refused(count: int) -> None:
+    with pytest.raises(BadInputError, match="counts are at most"):
+        packed([0], [[count, 0]], [[]])
+
+
+@pytest.mark.parametrize("value", [SUM_MAX + 1, -SUM_MAX - 1, I64_MIN])
+def test_sums_beyond_their_range_are_refused(value: int) -> None:
+    with pytest.raises(BadInputError, match="sums at most"):
+        packed([0], [[0, 0]], [[value]])
+
+
+def test_arrays_of_other_shapes_are_refused() -> None:
+    with pytest.raises(BadInputError, match="expected counts"):
+        packed_evidence(np.zeros(2, np.uint32), np.zeros((2, 2), np.int64), np.zeros((2, 1), np.int64), PLAIN)
+
+
+@pytest.mark.parametrize(
+    ("voxels", "counts", "sampled", "samples"),
+    [
+        (np.zeros(1, np.int64), np.zeros((1, 2), np.int32), np.zeros(0, np.uint32), np.zeros((0, 3), np.int64)),
+        (np.zeros(1, np.uint32), np.zeros((2, 2), np.int32), np.zeros(0, np.uint32), np.zeros((0, 3), np.int64)),
+        (np.zeros(1, np.uint32), np.zeros((1, 2), np.int32), np.zeros(1, np.uint32), np.zeros((0, 3), np.int64)),
+        (np.zeros(1, np.uint32), np.zeros((1, 2), np.int32), np.zeros(0, np.uint32), np.zeros(0, np.int64)),
+    ],
+    ids=["dtype", "counts", "samples", "dimensions"],
+)
+def test_evidence_of_arrays_that_do_not_fit_cannot_exist(voxels, counts, sampled, samples) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(BadInputError, match="arrays do not fit"):
+        Evidence(voxels, counts, sampled, samples)
+
+
+def test_equal_evidence_has_equal_hashes() -> None:
+    one, other = random_evidence(1, SMALL), random_evidence(1, SMALL)
+    assert one == other
+    assert hash(one) == hash(other)
+    assert one != random_evidence(2, SMALL)
+    assert one != "evidence"
+
+
+def test_largest_is_the_largest_of_each_plane() -> None:
+    evidence = packed([1, 2], [[5, 1], [2, 9]], [[7, 1], [3, 8]])
+    assert largest(evidence, SMALL).tolist() == [5, 9, 7, 8] + [0] * (SMALL.plane_count - 2)
+    assert not largest(empty_evidence(SMALL), SMALL).any()
+
+
+def test_a_sum_without_weight_is_noticed() -> None:
+    assert every_sum_has_weight(random_evidence(1, SMALL), SMALL)
+    assert every_sum_has_weight(packed([0], [[0, 0]], [[9, 9, 9, 1]]), SMALL)
+    assert not every_sum_has_weight(packed([0], [[0, 0]], [[9, 9, 9, 0]]), SMALL)
+
+
+def test_size_is_that_of_the_arrays() -> None:
+    evidence = random_evidence(1, SMALL)
+    assert evidence.size_bytes == 12 * len(evidence) + (4 + 8 * SMALL.plane_count) * len(evidence.sampled)
+    assert len(as_dict(evidence)) == len(evidence)
+
+
+def test_bricks_are_counted_once() -> None:
+    for seed in range(5):
+        evidence = random_evidence(seed, MIDDLE)
+        assert evidence.brick_count == len({place // 512 for place in as_dict(evidence)})
+    assert empty_evidence(MIDDLE).brick_count == 0

@@ -1,0 +1,114 @@
+"""Stored bytes of format version 1: made once, kept for ever.
+
+    python -m tests.formats.make_formats
+
+writes the files that are missing, never over one that is there: if the code writes other bytes today, the old ones
+must still decode. What they decode to is in `v1.json`.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from cairn_map.cell_code import encode_cell
+from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
+from cairn_map.commit import CommitMeta, ScanPose, make_commit
+from cairn_map.cursor import Cursor
+from cairn_map.evidence import Evidence, empty_evidence, packed_evidence
+from cairn_map.fingerprint import fingerprint
+from cairn_map.frames import CellFrame, FrameKind, encode_frame, start_of_reply
+from cairn_map.grid import Geometry, cell_key
+from cairn_map.messages import Done, More, ReplyHeader
+
+FOLDER = Path(__file__).parent
+DOSE = Channel(kind=ChannelKind.SCALAR, name="dose", unit="µSv/h", step=0.01, zero=-1.5)
+GEOMETRY = Geometry(voxel_edge_um=40_000, depth=4, channels=(COLOUR, INTENSITY, TEMPERATURE, DOSE))
+KEY = cell_key((-3, 2, 0))
+AUTHOR = "mole.0123456789abcdef"
+
+
+def evidence(sign: int = 1) -> Evidence:
+    """A floor with all channels, air above it."""
+    floor = np.arange(0, 4096, 37)
+    air = np.setdiff1d(np.arange(2048, 3072), floor)
+    places = np.concatenate([floor, air])
+    counts = np.where(np.arange(len(places))[:, None] < len(floor), [[3, 1]], [[0, 2]])
+    samples = np.zeros((len(places), GEOMETRY.plane_count), np.int64)
+    n = np.arange(len(floor))
+    w = 1 + n % 3
+    value = 5800 + n
+    samples[: len(floor)] = np.stack(
+        [n * w, 200 * w, (255 - n) * w, w, 90 * w + n, w, value * w, value**2 * w + n, w, n * w, w], axis=1
+    )
+    return packed_evidence(places.astype(np.uint32), sign * counts, sign * samples, GEOMETRY)
+
+
+def commit_bytes() -> bytes:
+    """An amend: evidence, and a retracted commit."""
+    pose = ScanPose(time_s=1.5e9, t_map_rig=(1.0, -2.0, 0.4), q_map_rig=(0.0, 0.0, 0.0, 1.0), sigma_m=0.01)
+    meta = CommitMeta(
+        id=f"{AUTHOR}.7",
+        geometry=GEOMETRY.digest().hex(),
+        parent="ab" * 32,
+        seen=str(cursor(5)),
+        captured_s=(1.5e9, 1.5e9 + 30),
+        scans=(pose,),
+        sensors=("tof", "ccd"),
+        rig="cd" * 32,
+        integrator="cairn 0.1",
+        retracts=(f"{AUTHOR}.6",),
+        note="größer",
+    )
+    return make_commit(meta, {KEY: evidence(), cell_key((0, 0, 0)): evidence()}, GEOMETRY).data
+
+
+def cursor(seq: int) -> Cursor:
+    """A made-up place in a made-up log."""
+    return Cursor(bytes(range(16)), seq, bytes(range(16, 32)))
+
+
+def reply_bytes() -> bytes:
+    """A frame of every kind."""
+    cell, sums = encode_cell(KEY, evidence(), GEOMETRY).data, fingerprint(evidence(), KEY)
+    signed = encode_cell(KEY, evidence(-1), GEOMETRY).data
+    common = {"cell": KEY, "to_cursor": cursor(9), "fingerprint": sums}
+    to = str(cursor(9))
+    frames = [
+        ReplyHeader(to=to, vector={AUTHOR: [[0, 4], [6, 7]]}, stable={AUTHOR: [[0, 3]]}, tip=(7, "ef" * 32)),
+        CellFrame(kind=FrameKind.DELTA, from_cursor=cursor(5), payload=signed, own_excluded=True, **common),
+        CellFrame(
+            kind=FrameKind.STATE, from_cursor=cursor(5), payload=cell, blocks=np.arange(64, dtype=np.uint32), **common
+        ),
+        CellFrame(kind=FrameKind.FULL, from_cursor=None, payload=cell, **common),
+        CellFrame(kind=FrameKind.RESET, from_cursor=cursor(5), **common),
+        More(to=to),
+        Done(to=to, rest=sums.hex()),
+    ]
+    return start_of_reply() + b"".join(encode_frame(frame) for frame in frames)
+
+
+def made() -> dict[str, bytes]:
+    """Name of each file, and its bytes as the code of today writes them."""
+    return {
+        "v1-all-channels.cell": encode_cell(KEY, evidence(), GEOMETRY).data,
+        "v1-signed.cell": encode_cell(KEY, evidence(-1), GEOMETRY).data,
+        "v1-empty.cell": encode_cell(KEY, empty_evidence(GEOMETRY), GEOMETRY).data,
+        "v1.commit": commit_bytes(),
+        "v1.reply": reply_bytes(),
+    }
+
+
+def main() -> None:
+    """Write what is missing."""
+    for name, data in made().items():
+        if not (FOLDER / name).exists():
+            (FOLDER / name).write_bytes(data)
+    if not (FOLDER / "v1.json").exists():
+        from tests.formats.test_stored_bytes import found
+
+        (FOLDER / "v1.json").write_text(json.dumps(found(), indent=1, sort_keys=True) + "\n")
+
+
+if __name__ == "__main__":
+    main()

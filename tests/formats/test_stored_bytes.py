@@ -1,0 +1,55 @@
+"""Bytes that were once written must decode for ever to what they meant; `make_formats.py` made them."""
+
+import json
+from pathlib import Path
+
+import pytest
+from tests import naive
+from tests.formats.make_formats import GEOMETRY, KEY, evidence
+
+from cairn_map.cell_code import decode_canonical_cell, decode_cell, encode_cell
+from cairn_map.commit import open_commit
+from cairn_map.fingerprint import fingerprint
+from cairn_map.frames import CellFrame, frames_of
+
+FOLDER = Path(__file__).parent
+CELLS = ("v1-all-channels.cell", "v1-signed.cell", "v1-empty.cell")
+
+
+def found() -> dict[str, object]:
+    """What the stored bytes say today."""
+    cells = {name: decode_cell((FOLDER / name).read_bytes()) for name in CELLS}
+    commit, _ = open_commit((FOLDER / "v1.commit").read_bytes())
+    frames = frames_of((FOLDER / "v1.reply").read_bytes())
+    payloads = [frame for frame in frames if isinstance(frame, CellFrame) and frame.payload]
+    return {
+        "geometry": GEOMETRY.digest().hex(),
+        "digests": {name: cell.digest.hex() for name, cell in cells.items()},
+        "fingerprints": {name: fingerprint(cell.evidence, cell.key).hex() for name, cell in cells.items()},
+        "commit": {"sha": commit.sha.hex(), "meta": json.loads(commit.meta.model_dump_json())},
+        "reply": [type(frame).__name__ + getattr(getattr(frame, "kind", None), "name", "") for frame in frames],
+        "payloads": [decode_cell(frame.payload).digest.hex() for frame in payloads],
+    }
+
+
+def test_stored_bytes_still_mean_what_they_meant() -> None:
+    assert found() == json.loads((FOLDER / "v1.json").read_text())
+
+
+@pytest.mark.parametrize(("name", "sign"), [(CELLS[0], 1), (CELLS[1], -1)])
+def test_stored_cells_hold_the_evidence_that_was_put_in(name: str, sign: int) -> None:
+    decoded = decode_canonical_cell((FOLDER / name).read_bytes())
+    assert decoded.evidence == evidence(sign)
+    assert (decoded.key, decoded.geometry) == (KEY, GEOMETRY)
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_evidence_of_stored_cells_still_gives_their_digest(name: str) -> None:
+    decoded = decode_cell((FOLDER / name).read_bytes())
+    assert encode_cell(decoded.key, decoded.evidence, decoded.geometry).digest == decoded.digest
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_the_second_decoder_reads_stored_cells_too(name: str) -> None:
+    data = (FOLDER / name).read_bytes()
+    assert naive.decode_cell(data)[0]["digest"] == decode_cell(data).digest
