@@ -166,8 +166,9 @@ class MapApi:
         body = request.model_dump_json(exclude_defaults=True).encode()
         self.traffic.up_bytes += len(body)
         path = f"/maps/{name}/branches/{branch}/missing"
+        headers = {**self._headers(), "Content-Type": _media_type(body)}
         try:
-            with self._client.stream("POST", path, content=body, headers=self._headers()) as response:
+            with self._client.stream("POST", path, content=body, headers=headers) as response:
                 if response.status_code != 200:
                     raise _error_of(response.status_code, next(response.iter_bytes(ERROR_BYTES_MAX), b""), response)
                 for part in response.iter_bytes(1 << 16):
