@@ -1,0 +1,99 @@
+"""The layouts that are known by their files, and the one door to all of them.
+
+    open_source(folder)  ->  detect_layout  ->  recording | apc_shelf | mm5
+
+The real layouts are presets of the generic folder of frames (`frame_folder.py`).
+"""
+
+from collections.abc import Sequence
+from enum import StrEnum
+from pathlib import Path
+
+from cairn_fusion.frame_folder import FrameFolderOptions, import_frames
+from cairn_fusion.recording import Recording, open_recording
+from cairn_fusion.recording_format import HEADER_FILE, RIG_FILE
+from cairn_map.errors import BadInputError
+
+APC_SHELF = FrameFolderOptions(
+    name="apc_shelf",
+    note="Amazon Picking Challenge shelf, RealSense F200 on an arm; frame times are made up.",
+    depth="frames/frame-{id}.depth.png",
+    colour="frames/frame-{id}.color.png",
+    pose="frames/frame-{id}.pose.txt",
+    intrinsics_file="K_color.txt",
+    depth_units_per_m=10_000,
+)
+MM5 = FrameFolderOptions(
+    name="mm5",
+    note="MM5 rig A; frame times are made up. Temperature = counts / 64 kelvin is inferred, not documented: "
+    "trust differences. Intrinsics and pose are estimates (focal length within 8 %).",
+    depth="frames/A/{id}.depth.png",
+    colour="frames/A/{id}.rgb.png",
+    thermal="frames/A/{id}.thermal.png",
+    pose="T_world_cam_A.txt",
+    intrinsics_file="K_approx.txt",
+    depth_units_per_m=1000,
+    kelvin_per_count=1 / 64,
+)
+
+
+def import_apc_shelf(folder: str | Path, *, scans_per_measurement: int = 1) -> Recording:
+    """The Amazon Picking Challenge shelf: RGB-D from an arm, camera-to-world poses, z-depth in 0.1 mm."""
+    return import_frames(folder, APC_SHELF, scans_per_measurement=scans_per_measurement)
+
+
+def import_mm5(folder: str | Path, frames: Sequence[str] | None = None, *, scans_per_measurement: int = 1) -> Recording:
+    """MM5, rig A: registered colour, depth and thermal from one pose; temperature scale inferred, see the note."""
+    return import_frames(folder, MM5, frames=frames, scans_per_measurement=scans_per_measurement)
+
+
+class Layout(StrEnum):
+    """The layouts that are recognised by the files in them."""
+
+    RECORDING = "recording"
+    APC_SHELF = "apc_shelf"
+    MM5 = "mm5"
+
+
+LAYOUT_FILES: dict[Layout, tuple[str, ...]] = {
+    Layout.RECORDING: (HEADER_FILE,),
+    Layout.APC_SHELF: ("K_color.txt", "frames"),
+    Layout.MM5: ("K_approx.txt", "T_world_cam_A.txt", "frames/A"),
+}
+
+
+def detect_layout(folder: str | Path) -> Layout:
+    """Which layout a folder has.
+
+    Raises:
+        BadInputError: `unknown_layout`; the message lists what was looked for.
+    """
+    root = Path(folder)
+    for layout, names in LAYOUT_FILES.items():
+        if all((root / name).exists() for name in names):
+            return layout
+    if (root / RIG_FILE).exists():  # an unfinished recording; opening it says so
+        return Layout.RECORDING
+    looked_for = "; ".join(f"{layout}: {' and '.join(names)}" for layout, names in LAYOUT_FILES.items())
+    raise BadInputError("unknown_layout", f"{root} has none of the known layouts; looked for {looked_for}")
+
+
+def open_source(
+    folder: str | Path,
+    *,
+    options: FrameFolderOptions | None = None,
+    frames: Sequence[str] | None = None,
+    scans_per_measurement: int | None = None,
+) -> Recording:
+    """A folder of any layout: by `options` where they are given, else by what `detect_layout` finds.
+
+    Raises:
+        BadInputError: unknown layout, `frames` of a recording (its lists say which), or as the importer that fits.
+    """
+    preset = options or {Layout.APC_SHELF: APC_SHELF, Layout.MM5: MM5}.get(detect_layout(folder))
+    if preset is not None:
+        group = 1 if scans_per_measurement is None else scans_per_measurement
+        return import_frames(folder, preset, frames=frames, scans_per_measurement=group)
+    if frames is not None:
+        raise BadInputError("unknown_frame", "a recording has no frame ids to choose by")
+    return open_recording(folder, scans_per_measurement=scans_per_measurement)
