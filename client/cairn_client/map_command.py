@@ -1,0 +1,177 @@
+"""Create, look at, download and correct maps on a server.
+
+    $ cairn map create http://127.0.0.1:8750/maps/lab --voxel 0.04
+    map lab: voxels of 4 cm, cells of 5.12 m, channels colour, intensity, temperature
+    $ cairn map ls http://127.0.0.1:8750
+    $ cairn map info http://127.0.0.1:8750/maps/lab
+    $ cairn map get http://127.0.0.1:8750/maps/lab 0,0,0 -o cell.ply
+    $ cairn map export http://127.0.0.1:8750/maps/lab --ply lab.ply --picture lab.png --cells lab/
+    $ cairn map log http://127.0.0.1:8750/maps/lab
+    $ cairn map retract http://127.0.0.1:8750/maps/lab --robot mole --note "wrong calibration"
+
+A map's URL is http://HOST:PORT/maps/NAME. A retract takes exactly the evidence of the named commits out again, on
+the server and on every robot; everything else stays as it is. Results go to standard output, progress to standard
+error; --json prints what programs want.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from cairn_client import map_export
+from cairn_client.api import MapApi
+from cairn_client.arguments import add_token, api_of, parser, say, shown_bytes
+from cairn_client.prior_data import push_prior_data
+from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
+from cairn_map.errors import BadInputError
+from cairn_map.grid import Geometry, geometry_for
+from cairn_map.messages import CreateMap, MapInfo, Retract
+
+Run = Callable[[argparse.Namespace], None]
+
+CHANNELS = {"colour": COLOUR, "intensity": INTENSITY, "temperature": TEMPERATURE}
+
+
+def main(argv: list[str]) -> int:
+    """Run one of the subcommands."""
+    args = _parser().parse_args(argv)
+    run: Run = args.run
+    run(args)
+    return 0
+
+
+def _create(args: argparse.Namespace) -> None:
+    api, name = api_of(args.map, args.token)
+    geometry = _geometry(args)
+    if args.source is not None:
+        info, count = push_prior_data(api, name, args.source, token=args.token)
+        _say_map(info)
+        say(f"started from {args.source}: {count} cells, as the commit of author `initial`")
+        return
+    _say_map(api.create_map(name, CreateMap(geometry=geometry)))
+
+
+def _ls(args: argparse.Namespace) -> None:
+    infos = MapApi(args.server, token=args.token).maps()
+    if args.json:
+        say(json.dumps([info.model_dump(mode="json") for info in infos]))
+        return
+    say(f"{'map':<24} {'voxel':>8} {'cells':>6} {'size':>9} {'commits':>8} {'robots':>7}")
+    for info in infos:
+        voxel = f"{info.geometry.voxel_edge_m * 100:g} cm"
+        size = shown_bytes(info.size_bytes)
+        say(f"{info.name:<24} {voxel:>8} {info.cells:>6} {size:>9} {info.commits:>8} {info.branches:>7}")
+    if not infos:
+        say("(none yet; make one with `cairn map create SERVER/maps/NAME`)")
+
+
+def _info(args: argparse.Namespace) -> None:
+    api, name = api_of(args.map, args.token)
+    info, branches = api.map_info(name), api.branches(name)
+    if args.json:
+        branch_json = [branch.model_dump(mode="json") for branch in branches]
+        say(json.dumps({**info.model_dump(mode="json"), "branch_list": branch_json}))
+        return
+    _say_map(info)
+    say(f"{info.cells} cells, {shown_bytes(info.size_bytes)}, {info.commits} commits; head {info.cursor}")
+    if info.box_m:
+        low, high = ("  ".join(f"{value:.2f}" for value in corner) for corner in info.box_m)
+        say(f"cells span ({low}) m to ({high}) m")
+    for branch in branches:
+        behind = "has not said what it holds" if branch.behind is None else f"{branch.behind} entries behind"
+        seen_s = time.time() - branch.last_seen_s
+        say(f"  {branch.branch:<16} {branch.mode:<9} {behind}, seen {seen_s:.0f} s ago, {', '.join(branch.sensors)}")
+
+
+def _log(args: argparse.Namespace) -> None:
+    api, name = api_of(args.map, args.token)
+    entries = api.log(name, after=args.after, limit=args.limit)
+    if args.json:
+        say(json.dumps([entry.model_dump(mode="json") for entry in entries]))
+        return
+    for entry in entries:
+        word = "folded" if entry.kind == "+" else "taken out"
+        extra = f"  retracts {', '.join(entry.retracts)}" if entry.retracts else ""
+        say(f"{entry.seq:>6}  {word:<9}  {entry.id}  {entry.cells} cells, {shown_bytes(entry.size_bytes)}{extra}")
+
+
+def _retract(args: argparse.Namespace) -> None:
+    api, name = api_of(args.map, args.token)
+    done = api.retract(name, Retract(commits=args.commit or [], robot=args.robot, note=args.note))
+    say(f"{done.id} takes out {len(done.commits)} commits:")
+    for commit in done.commits:
+        say(f"  {commit}")
+
+
+def _geometry(args: argparse.Namespace) -> Geometry:
+    channels = tuple(_channel(text) for text in args.channels.split(",")) if args.channels else ()
+    return geometry_for(voxel_edge_m=args.voxel, channels=channels)
+
+
+def _channel(text: str) -> Channel:
+    """`colour`, `intensity`, `temperature`, or a scalar `name:unit:step`."""
+    if text in CHANNELS:
+        return CHANNELS[text]
+    name, *rest = text.split(":")
+    try:
+        unit, step = rest
+        return Channel(kind=ChannelKind.SCALAR, name=name, unit=unit, step=float(step))
+    except ValueError as exc:
+        raise BadInputError(
+            "bad_channel",
+            f"a channel is {', '.join(CHANNELS)}, or a scalar NAME:UNIT:STEP such as dose:uSv/h:0.01; got {text!r}",
+        ) from exc
+
+
+def _say_map(info: MapInfo) -> None:
+    geometry = info.geometry
+    names = ", ".join(channel.name for channel in geometry.channels) or "none but occupancy"
+    say(
+        f"map {info.name}: voxels of {geometry.voxel_edge_m * 100:g} cm, "
+        f"cells of {geometry.cell_edge_m:g} m, channels {names}"
+    )
+
+
+def _parser() -> argparse.ArgumentParser:
+    top = parser("cairn map", __doc__)
+    commands = top.add_subparsers(required=True, metavar="COMMAND")
+
+    def command(
+        name: str, text: str, run: Callable[[argparse.Namespace], None], target: str
+    ) -> argparse.ArgumentParser:
+        added = commands.add_parser(name, help=text, description=text)
+        added.add_argument(target, help="http://HOST:PORT/maps/NAME" if target == "map" else "http://HOST:PORT")
+        add_token(added)
+        added.set_defaults(run=run)
+        return added
+
+    create = command("create", "create a map, empty or from prior data", _create, "map")
+    create.add_argument("--voxel", type=float, default=0.04, metavar="METRES", help="voxel edge (0.04)")
+    create.add_argument("--channels", default="colour,intensity,temperature", help="scalars as NAME:UNIT:STEP")
+    create.add_argument("--from", dest="source", metavar="DIR|URL", help="folder of cells, or another map's URL")
+    for name, text, run, target in (
+        ("ls", "list the maps of a server", _ls, "server"),
+        ("info", "extent, sizes and robots of a map", _info, "map"),
+        ("log", "what was folded and taken out, oldest first", _log, "map"),
+    ):
+        added = command(name, text, run, target)
+        added.add_argument("--json", action="store_true", help="print JSON")
+        if name == "log":
+            added.add_argument("--after", type=int, default=0, metavar="SEQ", help="entries after this one (0)")
+            added.add_argument("--limit", type=int, default=100, help="at most so many (100)")
+    get = command("get", "download one cell", map_export.get_cell, "map")
+    get.add_argument("cell", help="its number, i,j,k")
+    get.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=".cell, .npz or .ply")
+    export = command("export", "download a whole map", map_export.export_map, "map")
+    export.add_argument("--cells", type=Path, metavar="DIR", help="one file a cell, named by its number")
+    export.add_argument("--ply", type=Path, metavar="FILE", help="occupied voxels as a point cloud")
+    export.add_argument("--npz", type=Path, metavar="FILE", help="all known voxels as NumPy arrays")
+    export.add_argument("--picture", type=Path, metavar="FILE", help="PNG: colour, temperature, probability")
+    export.add_argument("--ceiling", type=float, metavar="METRES", help="picture: leave out what is higher")
+    retract = command("retract", "take commits out of a map again, exactly", _retract, "map")
+    retract.add_argument("--commit", action="append", metavar="ID", help="robot.incarnation.n, as `log` shows it")
+    retract.add_argument("--robot", help="everything that this robot pushed")
+    retract.add_argument("--note", default="", help="why; kept in the log")
+    return top

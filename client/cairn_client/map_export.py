@@ -1,0 +1,100 @@
+"""Maps as files: the `get` and `export` subcommands of `cairn map`."""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+from cairn_client.api import MapApi
+from cairn_client.arguments import api_of, say, shown_bytes, with_progress
+from cairn_map.cell_code import DecodedCell, decode_cell
+from cairn_map.cell_files import npz_file, ply_file
+from cairn_map.cell_folder import FolderHead, write_cell, write_head
+from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError
+from cairn_map.fingerprint import fingerprint
+from cairn_map.grid import Cell, cell_from_text, cell_key, cell_of_key
+from cairn_map.messages import MapInfo
+from cairn_map.voxels import Voxels, joined_voxels, voxels_of_evidence
+
+
+def get_cell(args: argparse.Namespace) -> None:
+    """Download one cell as an octree, NPZ or PLY, by the output's suffix."""
+    api, name = api_of(args.map, args.token)
+    output: Path = args.output
+    suffix = output.suffix
+    if suffix not in (".cell", ".npz", ".ply"):
+        raise BadInputError("unknown_format", f"a cell is written as .cell, .npz or .ply, got {output.name!r}")
+    info = api.map_info(name)
+    cell = cell_from_text(args.cell)
+    body, decoded = fetch_cell(api, name, cell)
+    if suffix == ".cell":
+        data = body
+    else:
+        voxels = _voxels(decoded, info, occupied_only=suffix == ".ply")
+        data = ply_file(voxels) if suffix == ".ply" else npz_file(voxels)
+    output.write_bytes(data)
+    say(f"cell {cell}: {len(decoded.evidence)} known voxels, {shown_bytes(len(data))} in {output}")
+
+
+def export_map(args: argparse.Namespace) -> None:
+    """Download all cells, and write what was asked for."""
+    if not (args.cells or args.ply or args.npz or args.picture):
+        raise BadInputError("nothing_asked", "say what to write: --cells DIR, --ply FILE, --npz FILE or --picture FILE")
+    api, name = api_of(args.map, args.token)
+    info = api.map_info(name)
+    cells = list(fetch_map(api, name))
+    if args.cells:
+        write_head(args.cells, FolderHead(geometry=info.geometry, sensor_model=info.sensor_model))
+        for body, cell in cells:
+            write_cell(args.cells, cell_of_key(cell.key), body)
+        say(f"{len(cells)} cells in {args.cells}/")
+    if not (args.ply or args.npz or args.picture):
+        return
+    if not cells:
+        raise NotFoundError("empty_map", f"map {name} holds nothing yet")
+    if args.npz:
+        _write(args.npz, npz_file(_all_voxels(cells, info, occupied_only=False)))
+    if args.ply or args.picture:
+        occupied = _all_voxels(cells, info, occupied_only=True)
+        if args.ply:
+            _write(args.ply, ply_file(occupied))
+        if args.picture:
+            from cairn_fusion.picture import write_map_picture  # OpenCV only where a picture is asked for
+
+            edge_m = info.geometry.voxel_edge_m
+            write_map_picture(args.picture, occupied, voxel_edge_m=edge_m, ceiling_m=args.ceiling)
+            say(f"{args.picture}: {len(occupied)} occupied voxels")
+
+
+def fetch_map(api: MapApi, name: str) -> Iterator[tuple[bytes, DecodedCell]]:
+    """All cells that hold evidence, each with its bytes, in order of their numbers."""
+    entries = [entry for entry in api.cell_index(name).cells if entry.voxels]
+    entries.sort(key=lambda entry: cell_key(entry.cell))
+    for entry in with_progress(entries, "cells", total=len(entries)):
+        yield fetch_cell(api, name, Cell(*entry.cell))
+
+
+def fetch_cell(api: MapApi, name: str, cell: Cell) -> tuple[bytes, DecodedCell]:
+    """One cell's bytes, and what they say.
+
+    Raises:
+        DamagedDataError: it is not the cell that the server says it is.
+    """
+    fetched = api.cell(name, cell)
+    body = fetched.body or b""
+    decoded = decode_cell(body)
+    if decoded.key != cell_key(cell) or fingerprint(decoded.evidence, decoded.key) != fetched.fingerprint:
+        raise DamagedDataError("fingerprint_mismatch", f"cell {cell} is not what the server says it is")
+    return body, decoded
+
+
+def _all_voxels(cells: list[tuple[bytes, DecodedCell]], info: MapInfo, *, occupied_only: bool) -> Voxels:
+    return joined_voxels([_voxels(cell, info, occupied_only=occupied_only) for _, cell in cells])
+
+
+def _voxels(cell: DecodedCell, info: MapInfo, *, occupied_only: bool) -> Voxels:
+    return voxels_of_evidence(cell.key, cell.evidence, cell.geometry, info.sensor_model, occupied_only=occupied_only)
+
+
+def _write(path: Path, data: bytes) -> None:
+    path.write_bytes(data)
+    say(f"{path}: {shown_bytes(len(data))}")

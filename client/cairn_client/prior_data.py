@@ -1,0 +1,65 @@
+"""A map that starts from prior data: a folder of cells or another map, as the first commits, author `initial`.
+
+They are commits like any other: every robot gets them by ordinary sync, and a retract takes them out again.
+"""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from cairn_client.api import MapApi
+from cairn_client.arguments import api_of
+from cairn_client.map_export import fetch_map
+from cairn_map.cell_code import DecodedCell
+from cairn_map.cell_folder import FolderHead, read_cells, read_head
+from cairn_map.commit import Commit, CommitMeta, make_commit
+from cairn_map.grid import Geometry
+from cairn_map.ids import INITIAL, Author, CommitId, new_incarnation
+from cairn_map.messages import CreateMap, MapInfo
+
+CELLS_A_COMMIT = 16
+"""So many cells of prior data go into one commit: it stays far below a commit's largest size."""
+
+
+def push_prior_data(api: MapApi, name: str, source: str, *, token: str | None) -> tuple[MapInfo, int]:
+    """Create a map with the grid and the evidence of a folder or another map; returns it and the count of cells.
+
+    Raises:
+        BadInputError: the source is neither a folder of cells nor a map's URL.
+        ConflictError: the map exists with another grid.
+    """
+    head, cells = _open(source, token)
+    api.create_map(name, CreateMap(geometry=head.geometry, sensor_model=head.sensor_model))
+    author = Author(INITIAL, new_incarnation())
+    count = 0
+    for n, group in enumerate(_groups(cells)):
+        api.push(name, _commit(CommitId(author, n), group, head.geometry, source))
+        count += len(group)
+    return api.map_info(name), count
+
+
+def _open(source: str, token: str | None) -> tuple[FolderHead, Iterable[DecodedCell]]:
+    if "://" not in source:
+        head = read_head(Path(source))
+        return head, read_cells(Path(source), head.geometry)
+    api, name = api_of(source, token)
+    info = api.map_info(name)
+    return FolderHead(geometry=info.geometry, sensor_model=info.sensor_model), (
+        cell for _, cell in fetch_map(api, name)
+    )
+
+
+def _groups(cells: Iterable[DecodedCell]) -> Iterator[list[DecodedCell]]:
+    group: list[DecodedCell] = []
+    for cell in cells:
+        if len(cell.evidence):
+            group.append(cell)
+        if len(group) == CELLS_A_COMMIT:
+            yield group
+            group = []
+    if group:
+        yield group
+
+
+def _commit(commit: CommitId, cells: list[DecodedCell], geometry: Geometry, source: str) -> Commit:
+    meta = CommitMeta(id=str(commit), geometry=geometry.digest().hex(), note=f"prior data from {source}"[:1024])
+    return make_commit(meta, {cell.key: cell.evidence for cell in cells}, geometry)

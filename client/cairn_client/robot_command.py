@@ -1,0 +1,197 @@
+"""Be a robot: replay a recording into a map, or keep a local copy of one.
+
+    $ cairn robot replay shelf/ --map http://127.0.0.1:8750/maps/shelf --voxel 0.01
+    replayed 15 scans as 15 commits in 1.9 s (7.9 images/s), 0 commits wait
+    $ cairn robot pull --map http://127.0.0.1:8750/maps/shelf --state copy/
+
+`replay` reads a recording folder (RECORDING.md), or a known layout as it was published (apc_shelf_rgbd, mm5_rgbdt),
+and maps it as a live robot would: each measurement becomes a commit, first kept in the state folder, then pushed.
+Without a link it goes on, and the next `replay` or `pull` with the same state folder pushes what waits. Two robots
+can share a recording: --share 1/2 takes every second measurement from the first on, --share 2/2 the others.
+
+`pull` fetches what the state folder's robot misses and pushes what waits there. With --mode low-end it fetches whole
+cells instead of differences, on request only those around a place (--near X,Y,Z --radius METRES).
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from cairn_client.api import MapApi
+from cairn_client.arguments import add_token, api_of, parser, say, shown_bytes, with_progress
+from cairn_client.replica_store import ReplicaStore
+from cairn_client.robot import Mode, Robot
+from cairn_client.sync import Wanted, within
+from cairn_fusion.importers import open_source
+from cairn_fusion.integrate import Integrator
+from cairn_fusion.recording import Recording
+from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel
+from cairn_map.errors import BadInputError, NotFoundError, UnreachableError
+from cairn_map.grid import Geometry, geometry_for
+from cairn_map.messages import CreateMap
+
+SYNC_EVERY_S = 2.0
+"""While replaying; at the end everything is pushed and fetched once more."""
+
+
+def main(argv: list[str]) -> int:
+    """Run one of the subcommands."""
+    args = _parser().parse_args(argv)
+    run: Callable[[argparse.Namespace], int] = args.run
+    return run(args)
+
+
+def _replay(args: argparse.Namespace) -> int:
+    source = open_source(args.recording, scans_per_measurement=args.scans_per_measurement)
+    geometry = _ensure_map(args, source)
+    name = args.name or _default_name(source.name)
+    stops = source.measurements()[args.share[0] - 1 :: args.share[1]]
+    start_s = time.monotonic()
+    commits = scans = 0
+    with Robot(
+        source.rig,
+        args.map,
+        directory=args.state or Path(f"cairn-{name}"),
+        name=name,
+        token=args.token,
+        mode=args.mode,
+        geometry=geometry,
+        integrator=Integrator(min_range_m=args.min_range, max_range_m=args.max_range),
+    ) as robot:
+        last_sync_s = start_s
+        for stop in with_progress(stops, source.name, total=len(stops)):
+            for index in stop:
+                robot.observe(source.scan(index))
+                scans += 1
+            commits += robot.commit() is not None
+            if time.monotonic() - last_sync_s > SYNC_EVERY_S:
+                _try_sync(robot)
+                last_sync_s = time.monotonic()
+        mapped_s = time.monotonic() - start_s
+        is_linked = _try_sync(robot)
+        waiting = robot.waiting
+        traffic = robot.traffic
+        say(
+            f"replayed {scans} scans as {commits} commits in {mapped_s:.1f} s ({scans / mapped_s:.1f} images/s), "
+            f"{shown_bytes(traffic.up_bytes)} up, {shown_bytes(traffic.down_bytes)} down, {waiting} commits wait"
+        )
+    if not is_linked:
+        say(f"no link to {args.map}: run `cairn robot pull` with the same --state when there is one")
+    return 0
+
+
+def _pull(args: argparse.Namespace) -> int:
+    api, map_name = api_of(args.map, args.token)
+    known = _robot_of(args.state)
+    name = args.name or known or "viewer"
+    mode: Mode = args.mode or ("high-end" if known and known != "viewer" else "viewer")
+    wanted = _wanted(args, api, map_name)
+    with Robot(None, args.map, directory=args.state, name=name, token=args.token, mode=mode, wanted=wanted) as robot:
+        report = robot.sync()
+        cells = robot.map.packed()
+        voxels = sum(len(evidence) for evidence in cells.values())
+        traffic = robot.traffic
+        say(
+            f"{len(cells)} cells, {voxels} known voxels in {args.state}; {report.pushed} commits pushed, "
+            f"{shown_bytes(traffic.down_bytes)} down"
+        )
+    return 0
+
+
+def _robot_of(state: Path) -> str | None:
+    """Whose folder this is, or None if it is nobody's yet."""
+    if not state.exists():
+        return None
+    store = ReplicaStore(state)
+    try:
+        return store.get("robot")
+    finally:
+        store.close()
+
+
+def _try_sync(robot: Robot) -> bool:
+    try:
+        robot.sync()
+    except UnreachableError:
+        return False
+    return True
+
+
+def _ensure_map(args: argparse.Namespace, source: Recording) -> Geometry | None:
+    """The map's geometry; makes the map if there is none. None: no link, and perhaps the state folder knows it."""
+    api, name = api_of(args.map, args.token)
+    try:
+        return api.map_info(name).geometry
+    except UnreachableError:
+        return geometry_for(voxel_edge_m=args.voxel, channels=_channels(source)) if args.voxel else None
+    except NotFoundError as exc:
+        if exc.kind != "no_map":
+            raise
+        if args.voxel is None:
+            raise BadInputError(
+                "no_map", f"there is no map {name} yet; make one with `cairn map create`, or give --voxel METRES"
+            ) from exc
+    geometry = geometry_for(voxel_edge_m=args.voxel, channels=_channels(source))
+    return api.create_map(name, CreateMap(geometry=geometry)).geometry
+
+
+def _channels(source: Recording) -> tuple[Channel, ...]:
+    """What the recording's first scan can fill."""
+    scan = source.scan(0)
+    has = ((COLOUR, bool(scan.colour)), (INTENSITY, scan.amplitude is not None), (TEMPERATURE, bool(scan.thermal)))
+    return tuple(channel for channel, found in has if found)
+
+
+def _default_name(text: str) -> str:
+    name = "".join(letter if letter.isascii() and letter.isalnum() else "-" for letter in text.lower()).strip("-")
+    return name[:32] or "robot"
+
+
+def _wanted(args: argparse.Namespace, api: MapApi, map_name: str) -> Wanted | None:
+    if args.near is None:
+        return None
+    if args.mode != "low-end":
+        raise BadInputError("bad_option", "--near goes with --mode low-end; a high-end copy holds the whole map")
+    return within(args.near, radius_m=args.radius, cell_edge_m=api.map_info(map_name).geometry.cell_edge_m)
+
+
+def _share(text: str) -> tuple[int, int]:
+    part, slash, parts = text.partition("/")
+    if not slash or not part.isdigit() or not parts.isdigit() or not 1 <= int(part) <= int(parts):
+        raise argparse.ArgumentTypeError(f"expected PART/PARTS such as 1/2, got {text!r}")
+    return int(part), int(parts)
+
+
+def _place(text: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected X,Y,Z in metres, got {text!r}") from None
+    return x, y, z
+
+
+def _parser() -> argparse.ArgumentParser:
+    top = parser("cairn robot", __doc__)
+    commands = top.add_subparsers(required=True, metavar="COMMAND")
+    replay = commands.add_parser("replay", help="map a recording", description="map a recording")
+    replay.add_argument("recording", type=Path, help="recording folder, or one of the known published layouts")
+    replay.add_argument("--voxel", type=float, metavar="METRES", help="make the map with this voxel edge if needed")
+    replay.add_argument("--share", type=_share, default=(1, 1), metavar="I/N", help="every N-th measurement from I on")
+    replay.add_argument("--scans-per-measurement", type=int, metavar="N", help="regroup the scans")
+    replay.add_argument("--min-range", type=float, default=Integrator().min_range_m, metavar="METRES")
+    replay.add_argument("--max-range", type=float, default=Integrator().max_range_m, metavar="METRES")
+    replay.add_argument("--state", type=Path, metavar="DIR", help="the robot's folder (cairn-NAME)")
+    replay.add_argument("--mode", choices=("high-end", "low-end"), default="high-end")
+    replay.set_defaults(run=_replay)
+    pull = commands.add_parser("pull", help="fetch what is missing", description="fetch what is missing")
+    pull.add_argument("--state", type=Path, required=True, metavar="DIR", help="the robot's folder")
+    pull.add_argument("--mode", choices=("high-end", "low-end", "viewer"))
+    pull.add_argument("--near", type=_place, metavar="X,Y,Z", help="low-end: only cells around this place, metres")
+    pull.add_argument("--radius", type=float, default=10.0, metavar="METRES", help="low-end: how far around (10)")
+    pull.set_defaults(run=_pull)
+    for command in (replay, pull):
+        command.add_argument("--map", required=True, metavar="URL", help="http://HOST:PORT/maps/NAME")
+        command.add_argument("--name", help="the robot's name on the map")
+        add_token(command)
+    return top

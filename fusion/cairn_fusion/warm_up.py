@@ -1,0 +1,18 @@
+"""Every kernel of this package, run once on a tiny scan, so that Numba compiles it ahead and keeps it."""
+
+import numpy as np
+
+from cairn_calib.camera import camera_from_field_of_view
+from cairn_calib.rig import Rig, Spectrum, mounted
+from cairn_fusion.integrate import Integrator, integrate_scan
+from cairn_fusion.scan import Scan
+from cairn_map.grid import Geometry
+
+
+def warm_up() -> None:
+    """Integrate a scan of two by two pixels, from images to evidence."""
+    camera = camera_from_field_of_view(2, 2, horizontal_deg=60.0)
+    rig = Rig(name="warm-up", cameras={"tof": mounted(Spectrum.RANGE, camera, np.eye(4))})
+    range_m = np.ones((2, 2), np.float32)
+    scan = Scan(time_s=0.0, T_map_rig=np.eye(4), range_camera="tof", range_m=range_m)
+    integrate_scan(scan, rig, Geometry(), integrator=Integrator())
