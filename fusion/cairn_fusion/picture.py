@@ -1,7 +1,7 @@
 """A map as a picture: the same occupied voxels three times, by colour, temperature and probability.
 
 Voxels are drawn as small cubes in a parallel view from above one corner, far ones first. Only faces that touch no
-other occupied voxel are drawn. The ceiling is cut off, else one would see nothing but the roof.
+other occupied voxel are drawn. Of a closed room one sees nothing but the roof, unless the ceiling is cut off.
 """
 
 from collections.abc import Callable
@@ -35,6 +35,7 @@ FACE_SHADE = ((0, 0.72), (1, 0.86), (2, 1.0))
 """Brightness of the faces towards the viewer along x, y, z."""
 ZERO_CELSIUS_K = 273.15
 PERCENTILES = (0.5, 99.8)
+FRAME_PERCENTILES = (3, 97)
 DARKEST = 36
 """Level of a palette at which painting begins: its first levels are as dark as the background."""
 
@@ -57,21 +58,29 @@ def write_map_picture(path: Path, voxels: Voxels, *, voxel_edge_m: float, ceilin
         path: of the PNG.
         voxels: occupied ones; may be none.
         voxel_edge_m: edge of a voxel.
-        ceiling_m: voxels above this height are left out; None cuts the upper half, to look inside rooms.
+        ceiling_m: voxels above this height are left out, to look inside rooms.
     """
-    z = voxels.centres_m[:, 2]
-    if ceiling_m is None and len(z):
-        ceiling_m = float((z.min() + z.max()) / 2)
-    keep = z <= (ceiling_m if ceiling_m is not None else np.inf)
+    keep = _in_frame(voxels, ceiling_m)
     numbers = voxels.numbers[keep]
     views = [_draw(panel, numbers, keep) for panel in _panels(voxels)]
     width = sum(view.shape[1] for view in views)
     footer = np.full((TITLE_PX, width, 3), BACKGROUND, np.uint8)
     note = f"{len(voxels)} occupied voxels of {voxel_edge_m * 100:g} cm"
-    if len(z):
-        note += f"; drawn up to {ceiling_m:.2f} m, scale 1 m = {_scale_px(numbers) / voxel_edge_m:.0f} px"
+    if len(numbers):
+        up_to = f"up to {ceiling_m:g} m" if ceiling_m is not None else "all heights"
+        note += f"; drawn: {up_to}, 1 m = {_scale_px(numbers) / voxel_edge_m:.0f} px"
     _text(footer, note, (MARGIN_PX, 26))
     write_colour(path, np.vstack([np.hstack(views), footer]))
+
+
+def _in_frame(voxels: Voxels, ceiling_m: float | None) -> npt.NDArray[np.bool_]:
+    """(N,) voxels to draw: below the ceiling, and no stray ones far away, for which all others would shrink."""
+    keep = voxels.centres_m[:, 2] <= (ceiling_m if ceiling_m is not None else np.inf)
+    if keep.any():
+        low, high = np.percentile(voxels.centres_m[keep], FRAME_PERCENTILES, axis=0)
+        slack = 0.1 * (high - low) + 0.05
+        keep &= ((voxels.centres_m >= low - slack) & (voxels.centres_m <= high + slack)).all(axis=1)
+    return np.asarray(keep)
 
 
 def _panels(voxels: Voxels) -> list[Panel]:

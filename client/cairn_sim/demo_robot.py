@@ -1,0 +1,130 @@
+"""A simulated robot of the demo: drives its path in a thread, maps as it goes, tells how far it is."""
+
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cairn_calib.rig import Rig
+from cairn_client.robot import Mode, Robot
+from cairn_map.errors import CairnError, UnreachableError
+from cairn_sim.drive import head_poses, stops
+from cairn_sim.heads import RANGE_CAMERA
+from cairn_sim.render import render_scan
+from cairn_sim.room import Room
+
+CLOCK_START_S = 1_760_000_000.0
+"""Time stamp of the first scan: the demo gives the same evidence each time."""
+SCAN_S = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """What one robot of the demo does."""
+
+    name: str
+    head: str
+    rig: Rig
+    path: str
+    mode: Mode
+    starts_after: int = 0
+    """Commits of the first robot that this one waits for before it joins."""
+    offline: Sequence[int] = ()
+    """Stops at which it has no link."""
+    scans: tuple[int, int] = (8, 3)
+    """Yaws and pitches of the head at each stop."""
+
+
+@dataclass(slots=True)
+class Progress:
+    """How far a robot is, for the table."""
+
+    state: str = "waits"
+    stops_done: int = 0
+    commits: int = 0
+    waiting: int = 0
+    up_bytes: int = 0
+    down_bytes: int = 0
+    cells: int = 0
+
+
+class DemoRobot:
+    """One robot with its thread; `robot` is open until `close`."""
+
+    def __init__(self, plan: Plan, room: Room, map_url: str, folder: Path, seed: int) -> None:
+        self.plan = plan
+        self.stop_count = len(stops(plan.path))
+        self.progress = Progress()
+        self.error: BaseException | None = None
+        self._room = room
+        self._rng = np.random.default_rng(seed)
+        self.robot = Robot(plan.rig, map_url, directory=folder / plan.name, name=plan.name, mode=plan.mode)
+        self.may_start = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=plan.name, daemon=True)
+
+    def start(self) -> None:
+        """Begin to wait for `may_start`, then to drive."""
+        self._thread.start()
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the robot is at the end of its path, or failed."""
+        return not self._thread.is_alive()
+
+    def close(self) -> None:
+        """Close the robot's directory."""
+        self.robot.close()
+
+    def sync(self) -> None:
+        """One round with the server, and note what it cost."""
+        self.robot.sync()
+        self._note()
+
+    def _run(self) -> None:
+        try:
+            self.may_start.wait()
+            for number, position in enumerate(stops(self.plan.path)):
+                self._measure(number, position)
+                self._sync_unless_offline(number)
+            self.progress.state = "arrived"
+        except CairnError as exc:
+            self.error = exc
+            self.progress.state = "failed"
+
+    def _measure(self, number: int, position: np.ndarray[tuple[int], np.dtype[np.float64]]) -> None:
+        yaws, pitches = self.plan.scans
+        for scan, T_map_rig in enumerate(head_poses(position, n_yaw=yaws, n_pitch=pitches)):
+            time_s = CLOCK_START_S + (number * yaws * pitches + scan) * SCAN_S
+            self.robot.observe(
+                render_scan(
+                    self._room,
+                    self.plan.rig,
+                    T_map_rig=T_map_rig,
+                    range_camera=RANGE_CAMERA,
+                    time_s=time_s,
+                    rng=self._rng,
+                )
+            )
+        self.progress.commits += self.robot.commit() is not None
+        self.progress.stops_done = number + 1
+
+    def _sync_unless_offline(self, number: int) -> None:
+        if number in self.plan.offline:
+            self.progress.state = "offline"
+            self._note()
+            return
+        self.progress.state = "maps"
+        try:
+            self.sync()
+        except UnreachableError:
+            self.progress.state = "no link"
+            time.sleep(0.1)
+
+    def _note(self) -> None:
+        self.progress.waiting = self.robot.waiting
+        self.progress.up_bytes = self.robot.traffic.up_bytes
+        self.progress.down_bytes = self.robot.traffic.down_bytes
+        self.progress.cells = len(self.robot.map)
