@@ -1,0 +1,204 @@
+"""Figures of the whole slice, measured in one run on this machine.
+
+    $ python -m tests.bench            # `make bench`
+    $ python -m tests.bench --smoke    # a few repeats only, to see that it still runs
+
+Times are medians of process CPU time for kernels, of wall time for what crosses a socket. The scene is the
+simulated room at 4 cm; where CAIRN_TEST_DATA is set, real recordings are replayed too.
+"""
+
+import argparse
+import os
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from cairn_client.api import MapApi
+from cairn_client.robot import Robot
+from cairn_fusion.importers import open_source
+from cairn_fusion.measurement import Measurement
+from cairn_fusion.scan import Scan
+from cairn_map.brick_cell import brick_cell
+from cairn_map.cell_code import decode_canonical_cell, decode_cell, encode_cell
+from cairn_map.channels import COLOUR, TEMPERATURE, Channel
+from cairn_map.commit import CommitMeta, make_commit
+from cairn_map.evidence_map import EvidenceMap
+from cairn_map.fingerprint import fingerprint
+from cairn_map.grid import Geometry, geometry_for
+from cairn_map.messages import CreateMap, Register
+from cairn_sim.drive import head_poses, stops
+from cairn_sim.heads import RANGE_CAMERA, full_head
+from cairn_sim.render import render_scan
+from cairn_sim.room import small_room
+
+Row = tuple[str, str, str]
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser("python -m tests.bench", description=__doc__)
+    parser.add_argument("--smoke", action="store_true", help="few repeats")
+    smoke = parser.parse_args().smoke
+    scans = _room_scans(stop_count=2 if smoke else 8, yaws=4 if smoke else 12)
+    rows = [*_kernel_rows(scans, repeats=3 if smoke else 15), *_server_rows(scans, pushes=20 if smoke else 300)]
+    rows += _recording_rows(smoke)
+    rows += _size_rows()
+    width = max(len(name) for name, _, _ in rows)
+    for name, value, unit in rows:
+        sys.stdout.write(f"{name:<{width}}  {value:>12}  {unit}\n")
+
+
+def _room_scans(*, stop_count: int, yaws: int) -> list[list[Scan]]:
+    """Scans by stop: the full head at a quarter of its colour and thermal resolution, three pitches."""
+    room, rig, rng = small_room(), full_head(scale=0.25), np.random.default_rng(1)
+    return [
+        [
+            render_scan(room, rig, T_map_rig=T, range_camera=RANGE_CAMERA, time_s=float(n), rng=rng)
+            for n, T in enumerate(head_poses(position, n_yaw=yaws, n_pitch=3))
+        ]
+        for position in stops("west")[:stop_count]
+    ]
+
+
+def _kernel_rows(scans: list[list[Scan]], *, repeats: int) -> Iterator[Row]:
+    geometry, rig = Geometry(), full_head(scale=0.25)
+    measurement = Measurement(rig, geometry)
+    measurement.add(scans[0][0])
+    per_scan_s = [_cpu_s(lambda scan=scan: measurement.add(scan)) for stop in scans for scan in stop]  # type: ignore[misc]
+    tof = [
+        Scan(time_s=s.time_s, T_map_rig=s.T_map_rig, range_camera=s.range_camera, range_m=s.range_m) for s in scans[0]
+    ]
+    tof_s = [_cpu_s(lambda scan=scan: Measurement(rig, geometry).add(scan)) for scan in tof]  # type: ignore[misc]
+    yield "integrate one scan, 5 cameras, 4 cm", f"{1e3 * statistics.median(per_scan_s):.1f}", "ms"
+    yield "integrate one scan, ToF alone, 4 cm", f"{1e3 * statistics.median(tof_s):.1f}", "ms"
+    diffs = []
+    for stop in scans:
+        one = Measurement(rig, geometry)
+        for scan in stop:
+            one.add(scan)
+        diffs.append(one.diff())
+    key, evidence = max(diffs[0].items(), key=lambda item: len(item[1]))
+    data = encode_cell(key, evidence, geometry).data
+    voxels = len(evidence)
+    yield "fullest cell of a measurement", f"{voxels}", "known voxels"
+    for name, work in (
+        ("encode it", lambda: encode_cell(key, evidence, geometry)),
+        ("decode it", lambda: decode_cell(data)),
+        ("decode and check canonical", lambda: decode_canonical_cell(data)),
+        ("merge it into a cell", lambda: brick_cell(geometry, [evidence])),
+        ("fingerprint it", lambda: fingerprint(evidence, key)),
+    ):
+        seconds = statistics.median(_cpu_s(work) for _ in range(repeats))
+        yield f"  {name}", f"{1e3 * seconds:.1f}", f"ms = {voxels / seconds / 1e6:.0f} Mvoxel/s"
+    commits = [
+        make_commit(CommitMeta(id=f"bench.{'0' * 16}.{n}", geometry=geometry.digest().hex()), diff, geometry)
+        for n, diff in enumerate(diffs)
+    ]
+    sizes = [len(commit.data) for commit in commits]
+    yield f"bytes pushed per measurement ({len(scans[0])} scans)", f"{statistics.median(sizes):.0f}", "B"
+    total = EvidenceMap(geometry)
+    for diff in diffs:
+        total.merge(diff)
+    cells = [len(encode_cell(k, e, geometry).data) for k, e in total.packed().items()]
+    known = sum(len(e) for e in total.packed().values())
+    yield f"map of {len(diffs)} measurements", f"{sum(cells)}", f"B in {len(cells)} cells, {known} known voxels"
+    yield "  bytes per cell, mean / largest", f"{statistics.mean(cells):.0f}", f"/ {max(cells)} B"
+    dense = len(cells) * 8 * 8**geometry.depth
+    yield "  against dense 8 B voxels (Table 3)", f"1:{dense / sum(cells):.0f}", ""
+    yield "  memory of the map", f"{total.size_bytes / 1e6:.0f}", "MB"
+
+
+def _server_rows(scans: list[list[Scan]], *, pushes: int) -> Iterator[Row]:
+    geometry, rig = Geometry(), full_head(scale=0.25)
+    one = Measurement(rig, geometry)
+    for scan in scans[0]:
+        one.add(scan)
+    diff = one.diff()
+    with tempfile.TemporaryDirectory() as folder, _server(Path(folder)) as url:
+        api = MapApi(url)
+        api.create_map("bench", CreateMap(geometry=geometry))
+        api.register("bench", Register(robot="bench", incarnation="0" * 16))
+        seconds: list[float] = []
+        for n in range(pushes + 3):
+            scan_poses = tuple(one.poses)
+            meta = CommitMeta(id=f"bench.{'0' * 16}.{n}", geometry=geometry.digest().hex(), scans=scan_poses)
+            commit = make_commit(meta, diff, geometry)
+            start = time.perf_counter()
+            api.push("bench", commit)
+            seconds.append(time.perf_counter() - start)
+        seconds = sorted(seconds[3:])
+        yield f"push {len(commit.data)} B over loopback, p50", f"{1e3 * statistics.median(seconds):.1f}", "ms"
+        yield "  p99", f"{1e3 * seconds[int(0.99 * (len(seconds) - 1))]:.1f}", "ms"
+        start = time.perf_counter()
+        while api.cell_index("bench").header.pending:
+            time.sleep(0.02)
+        yield "  then folded after", f"{time.perf_counter() - start:.2f}", "s"
+
+
+def _recording_rows(smoke: bool) -> Iterator[Row]:
+    root = os.environ.get("CAIRN_TEST_DATA")
+    if not root:
+        return
+    layouts: tuple[tuple[str, float, tuple[Channel, ...]], ...] = (
+        ("apc_shelf_rgbd", 0.01, (COLOUR,)),
+        ("mm5_rgbdt", 0.01, (COLOUR, TEMPERATURE)),
+    )
+    for name, voxel_m, channels in layouts:
+        source = open_source(Path(root) / name)
+        geometry = geometry_for(voxel_edge_m=voxel_m, channels=channels)
+        count = 3 if smoke else len(source)
+        with tempfile.TemporaryDirectory() as folder, _server(Path(folder) / "server") as url:
+            MapApi(url).create_map("bench", CreateMap(geometry=geometry))
+            with Robot(source.rig, f"{url}/maps/bench", directory=Path(folder) / "robot", name="bench") as robot:
+                robot.sync()
+                start = time.perf_counter()
+                for index in range(count):
+                    robot.observe(source.scan(index))
+                    robot.commit()
+                robot.sync()
+                seconds = time.perf_counter() - start
+                yield f"replay {name}, {voxel_m * 100:g} cm", f"{count / seconds:.1f}", "images/s, read, mapped, pushed"
+                yield "  bytes pushed per measurement (1 image)", f"{robot.traffic.up_bytes / count:.0f}", "B"
+
+
+def _size_rows() -> Iterator[Row]:
+    root = Path(__file__).parents[2]
+    for folder in sorted(root.glob("*/cairn_*")):
+        count = sum(len(path.read_text().splitlines()) for path in folder.glob("*.py"))
+        yield f"lines of {folder.name}", f"{count}", ""
+
+
+@contextmanager
+def _server(folder: Path) -> Iterator[str]:
+    command = [sys.executable, "-m", "cairn_client.main", "serve", "--data", str(folder), "--port", "0"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    try:
+        line = process.stdout.readline() if process.stdout else ""
+        found = re.search(r"http://\S+:\d+", line)
+        if found is None:
+            raise RuntimeError("the server did not start")
+        yield found.group(0)
+    finally:
+        process.terminate()
+        process.wait(timeout=60)
+        if process.stdout:
+            process.stdout.close()
+
+
+def _cpu_s(work: Callable[[], object]) -> float:
+    start = time.process_time()
+    work()
+    return time.process_time() - start
+
+
+if __name__ == "__main__":
+    main()
