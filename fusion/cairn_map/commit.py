@@ -111,6 +111,11 @@ class Commit:
         """The commit's id."""
         return self.meta.commit_id
 
+    @property
+    def text(self) -> bytes:
+        """The meta as it stands in the bytes, which the SHA-256 is over."""
+        return self.data[HEAD.size : HEAD.size + int(HEAD.unpack_from(self.data)[2])]
+
 
 def make_commit(meta: CommitMeta, diff: Mapping[CellKey, Evidence], geometry: Geometry) -> Commit:
     """The commit of a measurement's evidence; cells without evidence are left out.
@@ -132,7 +137,7 @@ def make_commit(meta: CommitMeta, diff: Mapping[CellKey, Evidence], geometry: Ge
     _check_size(len(data), len(cells), len(text))
     _check_evidence_size(sum(evidence.size_bytes for evidence in diff.values()), EVIDENCE_BYTES_MAX)
     _check_bricks(diff.values())
-    return Commit(meta, cells, _sha(text, digests), data)
+    return Commit(meta, cells, commit_sha(text, digests), data)
 
 
 def renamed_commit(data: bytes, *, commit: CommitId, parent: str | None) -> Commit:
@@ -141,7 +146,7 @@ def renamed_commit(data: bytes, *, commit: CommitId, parent: str | None) -> Comm
     meta = meta.model_copy(update={"id": str(commit), "parent": parent})
     text = meta.model_dump_json(exclude_defaults=True).encode()
     digests = [decode_cell(body).digest for body in cells.values()]
-    return Commit(meta, cells, _sha(text, digests), _joined(text, cells))
+    return Commit(meta, cells, commit_sha(text, digests), _joined(text, cells))
 
 
 def split_commit(data: bytes) -> tuple[CommitMeta, dict[CellKey, bytes]]:
@@ -177,7 +182,7 @@ def open_commit(
         left -= cell.evidence.size_bytes
         cells[cell.key], decoded[cell.key] = body, cell
     _check_bricks(cell.evidence for cell in decoded.values())
-    sha = _sha(text, [cell.digest for cell in decoded.values()])
+    sha = commit_sha(text, [cell.digest for cell in decoded.values()])
     return Commit(meta, cells, sha, data), decoded
 
 
@@ -265,7 +270,8 @@ def _check_size(size_bytes: int, cells: int, meta_bytes: int) -> None:
         )
 
 
-def _sha(text: bytes, digests: list[bytes]) -> bytes:
+def commit_sha(text: bytes, digests: list[bytes]) -> bytes:
+    """Identity of a commit: SHA-256 over its meta as it stands and its cells' digests."""
     sha = hashlib.sha256(b"cairn-commit-1" + struct.pack("<II", len(text), len(digests)) + text)
     for digest in digests:
         sha.update(digest)

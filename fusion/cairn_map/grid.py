@@ -15,7 +15,7 @@ from typing import Annotated, NamedTuple, NewType, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, FailFast, Field, model_validator
 
 from cairn_map.channels import STANDARD_CHANNELS, Channel
 from cairn_map.errors import BadInputError
@@ -56,7 +56,7 @@ class Geometry(BaseModel):
     """Micrometres: an integer, so that borders are exact."""
     depth: Annotated[int, Field(ge=BRICK_DEPTH, le=DEPTH_MAX)] = 7
     """A cell has 2^depth voxels along an edge."""
-    channels: Annotated[tuple[Channel, ...], Field(max_length=16)] = STANDARD_CHANNELS
+    channels: Annotated[tuple[Channel, ...], Field(max_length=16), FailFast()] = STANDARD_CHANNELS
 
     @model_validator(mode="after")
     def _names_differ(self) -> Self:

@@ -105,10 +105,10 @@ class MissingRequest(_Model):
     """`robot.incarnation` of the asker, whose own commits a delta leaves out."""
     cursor: CursorText | None = None
     """Cursor of every cell not listed; None: holds nothing."""
-    cells: Annotated[list[CellCursor], Field(max_length=CURSORS_MAX)] = []
+    cells: Annotated[list[CellCursor], Field(max_length=CURSORS_MAX), FailFast()] = []
     compare: bool = False
     """Answer every listed cell with a `reset` frame: only its fingerprint."""
-    kinds: list[Literal["delta", "state", "full"]] = ["delta", "full"]
+    kinds: Annotated[list[Literal["delta", "state", "full"]], Field(max_length=3), FailFast()] = ["delta", "full"]
     """Kinds of frame that the asker can use now; `full` is always understood to be."""
 
 
@@ -194,7 +194,7 @@ class CellIndex(_Model):
 class Retract(_Model):
     """Body of `POST /maps/{map}/retracts`; commits by id, or everything of one robot, or both."""
 
-    commits: Annotated[list[IdText], Field(max_length=4096)] = []
+    commits: Annotated[list[IdText], Field(max_length=4096), FailFast()] = []
     robot: NameText | None = None
     note: Annotated[str, Field(max_length=1024)] = ""
 

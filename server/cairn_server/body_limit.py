@@ -1,6 +1,8 @@
 """A bound on request bodies, before anything reads them whole (plain ASGI, no framework)."""
 
+import re
 from collections.abc import Awaitable, Callable, MutableMapping
+from contextlib import suppress
 from typing import Any
 
 from cairn_map.commit import COMMIT_BYTES_MAX
@@ -11,7 +13,13 @@ Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
 App = Callable[[MutableMapping[str, Any], Receive, Send], Awaitable[None]]
 
-JSON_BYTES_MAX = 8 << 20
+MISSING_BYTES_MAX = 16 << 20
+"""100 000 cells with a cursor each."""
+JSON_BYTES_MAX = 1 << 20
+LIMITS = (
+    (re.compile(r"/maps/[^/]*/commits/[^/]*"), COMMIT_BYTES_MAX),
+    (re.compile(r"/maps/[^/]*/branches/[^/]*/missing"), MISSING_BYTES_MAX),
+)
 
 
 class _TooLargeError(Exception):
@@ -29,36 +37,47 @@ class BodyLimit:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        limit = COMMIT_BYTES_MAX if "/commits/" in scope["path"] else JSON_BYTES_MAX
+        limit_bytes = limit_of(scope["path"])
         claimed = dict(scope["headers"]).get(b"content-length", b"0")
-        if not claimed.isdigit() or len(claimed) > 18 or int(claimed) > limit:
-            await _refuse(send, limit)
+        if not claimed.isdigit() or len(claimed) > 18 or int(claimed) > limit_bytes:
+            await _refuse(send, limit_bytes)
             return
-        got = 0
+        got_bytes = 0
         started = False
 
         async def counted() -> Message:
-            nonlocal got
+            nonlocal got_bytes
             message = await receive()
-            got += len(message.get("body", b""))
-            if got > limit:
+            got_bytes += len(message.get("body", b""))
+            if got_bytes > limit_bytes:
                 raise _TooLargeError
             return message
 
         async def noted(message: Message) -> None:
             nonlocal started
-            started = True
-            await send(message)
+            # The framework turns what is raised while it reads JSON into an answer of its own: drop that one.
+            if got_bytes <= limit_bytes or started:
+                started = True
+                await send(message)
 
-        try:
+        with suppress(_TooLargeError):
             await self._app(scope, counted, noted)
-        except _TooLargeError:
-            if not started:
-                await _refuse(send, limit)
+        if got_bytes > limit_bytes and not started:
+            await _refuse(send, limit_bytes)
 
 
-async def _refuse(send: Send, limit: int) -> None:
-    problem = Problem(title="too large", status=413, detail=f"a body has at most {limit} bytes here", kind="too_large")
+def limit_of(path: str) -> int:
+    """Most bytes of a body sent to a path."""
+    return next((size for pattern, size in LIMITS if pattern.fullmatch(path)), JSON_BYTES_MAX)
+
+
+async def send_problem(send: Send, status: int, kind: str, detail: str) -> None:
+    """Answer with a problem, and close: the body was not read."""
+    problem = Problem(title=kind.replace("_", " "), status=status, detail=detail, kind=kind)
     headers = [(b"content-type", b"application/problem+json"), (b"connection", b"close")]
-    await send({"type": "http.response.start", "status": 413, "headers": headers})
+    await send({"type": "http.response.start", "status": status, "headers": headers})
     await send({"type": "http.response.body", "body": problem.model_dump_json().encode()})
+
+
+async def _refuse(send: Send, limit_bytes: int) -> None:
+    await send_problem(send, 413, "too_large", f"a body has at most {limit_bytes} bytes here")

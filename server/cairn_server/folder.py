@@ -4,9 +4,9 @@ import logging
 import threading
 import time
 
-from cairn_map.errors import CairnError
-from cairn_server.folding import CellCache, fold_pending
-from cairn_server.store import Store
+from cairn_server.cell_cache import CACHE_BYTES, CellCache
+from cairn_server.folding import fold_pending
+from cairn_server.store import MapRow, Store
 
 log = logging.getLogger(__name__)
 
@@ -42,19 +42,38 @@ class Folder:
         while not self._closing.is_set():
             self._wake.wait()
             self._wake.clear()
-            try:
-                self._fold_all()
-            except CairnError as exc:
-                log.error("fold failed: %s: %s; trying again in %.0f s", exc.kind, exc.message, RETRY_S)
+            if not self._fold_all():
                 self._closing.wait(RETRY_S)
                 self._wake.set()
 
-    def _fold_all(self) -> None:
-        for row in self._store.maps():
-            cache = self._caches.setdefault(row.name, CellCache())
-            while not self._closing.is_set():
-                start_s = time.monotonic()
-                count = fold_pending(self._store, row, cache, limit=GROUP_MAX)
-                if not count:
-                    break
-                log.info("map %s: folded %d commits in %.0f ms", row.name, count, (time.monotonic() - start_s) * 1e3)
+    def _fold_all(self) -> bool:
+        """Fold until nothing is pending, a group of each map in turn; False if a map failed."""
+        failed: set[str] = set()
+        busy = True
+        while busy and not self._closing.is_set():
+            busy = False
+            try:
+                maps = self._store.maps()
+            except Exception:
+                log.exception("cannot list the maps")
+                return False
+            for row in maps:
+                if row.name in failed or self._closing.is_set():
+                    continue
+                try:
+                    busy |= self._fold_group(row, len(maps)) > 0
+                except Exception:
+                    # Whatever it is, the other maps go on, and this thread must live: nobody else folds.
+                    log.exception("map %s: fold failed; trying again in %.0f s", row.name, RETRY_S)
+                    failed.add(row.name)
+        return not failed
+
+    def _fold_group(self, row: MapRow, maps: int) -> int:
+        cache = self._caches.setdefault(row.name, CellCache(row.geometry))
+        cache.limit_bytes = CACHE_BYTES // maps
+        start_s = time.monotonic()
+        count = fold_pending(self._store, row, cache, limit=GROUP_MAX)
+        if count:
+            log.info("map %s: folded %d commits in %.0f ms", row.name, count, (time.monotonic() - start_s) * 1e3)
+        cache.trim()
+        return count

@@ -4,151 +4,161 @@
     retract of a folded commit    entry -     its diff is subtracted, once per target for ever
     a commit retracted before it came   both, one after the other (SYNC.md rule 11)
 
-A group of commits is folded at once, so that a cell is decoded and encoded once for all of them.
+A group of commits is folded at once, so that a cell is decoded and encoded once for all of them. A commit whose
+bytes are damaged at rest is set aside, so that it does not hold up the others; its robot will push it again.
 """
 
-from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from cairn_map.brick_cell import BrickCell
-from cairn_map.cell_code import decode_cell, encode_cell
+from cairn_map.cell_code import DecodedCell
+from cairn_map.commit import commit_sha
 from cairn_map.cursor import ENTRY_FOLD, ENTRY_UNFOLD, Cursor, next_chain
-from cairn_map.errors import CairnError, DamagedDataError
+from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence import Evidence
-from cairn_map.fingerprint import fingerprint
-from cairn_map.grid import CellKey, cell_of_key
+from cairn_map.grid import CellKey
 from cairn_map.ids import CommitId
-from cairn_server.store import CellRow, Entry, Fold, Head, MapRow, Store, StoredCommit
+from cairn_server.cell_cache import CellCache, Step
+from cairn_server.cells_at_rest import cell_to_change, decode_stored
+from cairn_server.store import Entry, Fold, Head, MapRow, Store, StoredCommit
 
-CACHE_BYTES = 512 << 20
-"""Memory for cells that were changed lately."""
+log = logging.getLogger(__name__)
+
+GROUP_BYTES_MAX = 64 << 20
+"""Commits folded at once have no more bytes than this, or are one."""
 
 
-@dataclass(slots=True)
-class CellCache:
-    """The cells changed last, in the form that adds fast; valid for one map at one head."""
-
-    cells: OrderedDict[CellKey, BrickCell] = field(default_factory=OrderedDict)
-
-    def trim(self, limit_bytes: int) -> None:
-        """Forget the cells that were not changed for longest."""
-        total = sum(cell.size_bytes for cell in self.cells.values())
-        while self.cells and total > limit_bytes:
-            _, cell = self.cells.popitem(last=False)
-            total -= cell.size_bytes
+class DamagedCommitError(DamagedDataError):
+    """A commit at rest is not what was pushed."""
 
 
 def fold_pending(store: Store, row: MapRow, cache: CellCache, *, limit: int) -> int:
     """Fold up to `limit` pending commits; returns how many were.
 
     Raises:
-        DamagedDataError: a cell or a diff at rest is not sound.
+        DamagedDataError: a cell at rest is not sound, and cannot be made anew.
     """
-    commits = store.pending(row, limit=limit)
+    commits = store.pending(row, limit=limit, size_bytes_max=GROUP_BYTES_MAX)
     if not commits:
         return 0
     with store.snapshot(row) as snapshot:
         head = snapshot.head
+    cache.begin(head.cursor)
+    written = False
     try:
         fold = plan_fold(store, row, head, commits, cache)
         written = store.fold(row, fold)
-    except CairnError:
-        cache.cells.clear()
-        raise
-    if not written:  # another folder was faster; its result is as good as ours
-        cache.cells.clear()
-        return 0
-    cache.trim(CACHE_BYTES)
-    return len(commits)
+    finally:
+        if not written:  # it failed, or another folder was faster, whose result is as good as ours
+            cache.clear()
+    cache.finish(fold.head)
+    for number, why in fold.damaged:
+        store.audit("damaged_commit", f"map {row.name}: commit number {number} is set aside: {why}")
+    return len(commits) if written else 0
 
 
 def plan_fold(store: Store, row: MapRow, head: Head, commits: Sequence[StoredCommit], cache: CellCache) -> Fold:
-    """What folding these commits on top of `head` changes."""
-    entries: list[Entry] = []
-    retracted: list[CommitId] = []
-    last_change: dict[CellKey, int] = {}
-    folded: dict[CommitId, StoredCommit] = {}
-    chain = head.cursor.chain
-
-    def enter(kind: bytes, commit: StoredCommit) -> None:
-        nonlocal chain
-        chain = next_chain(chain, kind, commit.id, commit.sha)
-        entries.append(Entry(kind=kind, commit=commit.number, chain=chain))
-        _apply(store, row, kind, commit, cache)
-        last_change.update(dict.fromkeys(commit.diff, head.cursor.seq + len(entries)))
-
+    """What folding these commits on top of `head` changes; `cache` stands at `head`."""
+    plan = _Plan(store, row, cache, head.cursor)
     for commit in commits:
-        enter(ENTRY_FOLD, commit)
-        folded[commit.id] = commit
-        if commit.id in retracted or store.is_retracted(row, commit.id):
-            enter(ENTRY_UNFOLD, commit)
-        for target in commit.retracts:
-            if target in retracted or store.is_retracted(row, target):
-                continue
-            retracted.append(target)
-            known = folded.get(target) or store.folded(row, target)
-            if known is not None:
-                enter(ENTRY_UNFOLD, known)
+        plan.take(commit)
     return Fold(
         base=head.cursor,
-        head=Cursor(head.cursor.log_id, head.cursor.seq + len(entries), chain),
-        vector=head.vector.with_commits(folded),
-        entries=tuple(entries),
-        cells=_cell_rows(row, last_change, cache),
-        retracted=tuple(retracted),
+        head=Cursor(head.cursor.log_id, head.cursor.seq + len(plan.entries), plan.chain),
+        vector=head.vector.with_commits(plan.folded),
+        entries=tuple(plan.entries),
+        cells=cache.rows(plan.last_change),
+        retracted=tuple(plan.retracted),
+        damaged=tuple(plan.damaged),
     )
 
 
-def _apply(store: Store, row: MapRow, kind: bytes, commit: StoredCommit, cache: CellCache) -> None:
-    for key, body in commit.diff.items():
-        diff = decode_cell(body).evidence
-        cell = _cell(store, row, key, cache)
-        if kind == ENTRY_FOLD:
-            cell.merge(diff)
-        else:
-            cell.unmerge(diff)
+@dataclass(slots=True)
+class _Plan:
+    store: Store
+    row: MapRow
+    cache: CellCache
+    start: Cursor
+    chain: bytes = b""
+    entries: list[Entry] = field(default_factory=list)
+    folded: dict[CommitId, StoredCommit] = field(default_factory=dict)
+    retracted: dict[CommitId, None] = field(default_factory=dict)
+    last_change: dict[CellKey, int] = field(default_factory=dict)
+    damaged: list[tuple[int, str]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.chain = self.start.chain
+
+    def take(self, commit: StoredCommit) -> None:
+        try:
+            self._enter(ENTRY_FOLD, commit)
+        except DamagedCommitError as exc:
+            log.error("commit %s is set aside: %s", commit.id, exc.message)
+            self.damaged.append((commit.number, exc.message))
+            return
+        self.folded[commit.id] = commit
+        if self._is_retracted(commit.id):
+            self._enter(ENTRY_UNFOLD, commit)
+        for target in commit.retracts:
+            if not self._is_retracted(target):
+                self._retract(target)
+
+    def _retract(self, target: CommitId) -> None:
+        known = self.folded.get(target) or self.store.folded(self.row, target)
+        try:
+            if known is not None:
+                self._enter(ENTRY_UNFOLD, known)
+        except DamagedCommitError as exc:
+            self.store.audit("retract_failed", f"map {self.row.name}: {target} stays in the map: {exc.message}")
+            return  # and is not noted as retracted, so that a later retract may succeed
+        self.retracted[target] = None
+
+    def _is_retracted(self, commit: CommitId) -> bool:
+        return commit in self.retracted or self.store.is_retracted(self.row, commit)
+
+    def _enter(self, kind: bytes, commit: StoredCommit) -> None:
+        self._apply(kind, commit)
+        self.chain = next_chain(self.chain, kind, commit.id, commit.sha)
+        self.entries.append(Entry(kind=kind, commit=commit.number, chain=self.chain))
+        self.last_change.update(dict.fromkeys(commit.diff, self.start.seq + len(self.entries)))
+
+    def _apply(self, kind: bytes, commit: StoredCommit) -> None:
+        """Add or subtract a commit's diff, all of it or nothing."""
+        step, undo = BrickCell.merge, BrickCell.unmerge
+        if kind == ENTRY_UNFOLD:
+            step, undo = undo, step
+        done: list[CellKey] = []
+        digests: list[bytes] = []
+        try:
+            for key, body in commit.diff.items():
+                decoded = _decoded(commit, key, body)
+                self._change(key, decoded.evidence, step, commit)
+                done.append(key)
+                digests.append(decoded.digest)
+            if commit_sha(commit.text, digests) != commit.sha:
+                raise DamagedCommitError("damaged_store", f"commit {commit.id} at rest does not have its SHA-256")
+        except DamagedCommitError:
+            for key in done:
+                self.cache.change(key, _decoded(commit, key, commit.diff[key]).evidence, undo, self._load)
+            raise
+
+    def _change(self, key: CellKey, evidence: Evidence, step: Step, commit: StoredCommit) -> None:
+        try:
+            self.cache.change(key, evidence, step, self._load)
+        except BadInputError as exc:
+            raise DamagedCommitError("damaged_store", f"commit {commit.id} at rest: {exc.message}") from exc
+
+    def _load(self, key: CellKey) -> BrickCell:
+        with self.store.snapshot(self.row) as snapshot:
+            return cell_to_change(snapshot, key, self.row.geometry)
 
 
-def _cell(store: Store, row: MapRow, key: CellKey, cache: CellCache) -> BrickCell:
-    cell = cache.cells.get(key)
-    if cell is None:
-        cell = BrickCell(row.geometry)
-        with store.snapshot(row) as snapshot:
-            stored = snapshot.cell(key)
-        if stored is not None:
-            cell.merge(stored_evidence(stored))
-        cache.cells[key] = cell
-    cache.cells.move_to_end(key)
-    return cell
-
-
-def stored_evidence(stored: CellRow) -> Evidence:
-    """The evidence of a cell at rest.
-
-    Raises:
-        DamagedDataError: kind `damaged_store`: its digest is not that of its bytes.
-    """
-    decoded = decode_cell(stored.body)
-    if decoded.digest != stored.digest:
-        raise DamagedDataError("damaged_store", f"cell {cell_of_key(stored.key)} at rest does not have its digest")
-    return decoded.evidence
-
-
-def _cell_rows(row: MapRow, last_change: Mapping[CellKey, int], cache: CellCache) -> tuple[CellRow, ...]:
-    rows: list[CellRow] = []
-    for key, lm in sorted(last_change.items()):
-        evidence = cache.cells[key].packed()
-        encoded = encode_cell(key, evidence, row.geometry)
-        rows.append(
-            CellRow(
-                key=key,
-                lm=lm,
-                digest=encoded.digest,
-                fingerprint=fingerprint(evidence, key),
-                voxels=len(evidence),
-                body=encoded.data,
-                size_bytes=len(encoded.data),
-            )
-        )
-    return tuple(rows)
+def _decoded(commit: StoredCommit, key: CellKey, body: bytes | None) -> DecodedCell:
+    if body is None:
+        raise DamagedCommitError("damaged_store", f"the diff of commit {commit.id} is not kept any more")
+    try:
+        return decode_stored(key, body)
+    except DamagedDataError as exc:
+        raise DamagedCommitError(exc.kind, f"commit {commit.id}: {exc.message}") from exc

@@ -7,17 +7,17 @@ proves it, and `lm` of each cell says whether it changed since. Per cell the sma
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from cairn_map.brick_cell import BrickCell
-from cairn_map.cell_code import decode_cell, encode_cell
+from cairn_map.cell_code import encode_cell
 from cairn_map.cursor import ENTRY_FOLD, Cursor, cursor_from_text
 from cairn_map.errors import BadInputError, ConflictError
 from cairn_map.evidence import empty_evidence
 from cairn_map.fingerprint import ZERO, Fingerprint
-from cairn_map.frames import CellFrame, Frame, FrameKind
+from cairn_map.frames import CELL_HEAD, CellFrame, Frame, FrameKind
 from cairn_map.grid import CellKey, Geometry, cell_key
 from cairn_map.ids import Author, author_from_text
 from cairn_map.messages import Done, MissingRequest, More, ReplyHeader
 from cairn_map.version_vector import VersionVector
+from cairn_server.cells_at_rest import sum_of_contributions
 from cairn_server.store import CellRow, Snapshot
 
 DELTA_ENTRIES_MAX = 32
@@ -78,7 +78,7 @@ def reply_frames(snapshot: Snapshot, asker: Asker, geometry: Geometry, *, stable
         if frame is None:
             rest += row.fingerprint
             continue
-        sent_bytes += len(frame.payload)
+        sent_bytes += CELL_HEAD.size + len(frame.payload)
         yield frame
         if sent_bytes > REPLY_BYTES_MAX:
             yield More(to=str(head.cursor))
@@ -120,7 +120,7 @@ def _frame_for(
                 from_cursor=start,
                 to_cursor=snapshot.head.cursor,
                 fingerprint=row.fingerprint,
-                own_excluded=True,
+                own_excluded=asker.author is not None,
                 payload=payload,
             )
     stored = snapshot.cell(row.key)
@@ -145,22 +145,16 @@ def _frame(
 
 def _delta(snapshot: Snapshot, row: CellRow, start: Cursor, asker: Author | None, geometry: Geometry) -> bytes | None:
     """Sum of what others did to a cell since `start`; None if that cannot be said or is not worth it."""
-    entries = snapshot.contributions(row.key, after_seq=start.seq)
-    if entries is None or len(entries) > DELTA_ENTRIES_MAX:
+    entries = snapshot.contributions(row.key, after_seq=start.seq, limit=DELTA_ENTRIES_MAX + 1)
+    if len(entries) > DELTA_ENTRIES_MAX or any(entry.size_bytes is None for entry in entries):
         return None
-    foreign = [(kind, body) for kind, author, body in entries if kind != ENTRY_FOLD or author != asker]
-    if sum(len(body) for _, body in foreign) > 4 * row.size_bytes:
+    # What takes an own commit out again is not own: the asker must hear of it (SYNC.md rule 11).
+    foreign = [entry for entry in entries if entry.kind != ENTRY_FOLD or entry.author != asker]
+    if sum(entry.size_bytes or 0 for entry in foreign) > 4 * row.size_bytes:
         return None
-    if len(foreign) == 1 and foreign[0][0] == ENTRY_FOLD:
-        return foreign[0][1]  # one commit's diff is its own sum
-    total = BrickCell(geometry)
-    for kind, body in foreign:
-        diff = decode_cell(body).evidence
-        if kind == ENTRY_FOLD:
-            total.merge(diff)
-        else:
-            total.unmerge(diff)
-    evidence = total.packed()
+    if len(foreign) == 1 and foreign[0].kind == ENTRY_FOLD:
+        return snapshot.diff(foreign[0].diff)  # one commit's diff is its own sum
+    evidence = sum_of_contributions(snapshot, row.key, foreign, geometry).packed()
     return encode_cell(row.key, evidence, geometry).data if len(evidence) else b""
 
 

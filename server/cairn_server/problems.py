@@ -6,6 +6,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from cairn_map.errors import (
     BadInputError,
@@ -22,6 +23,9 @@ log = logging.getLogger(__name__)
 
 MEDIA_TYPE = "application/problem+json"
 STATUS_OF_KIND = {"no_token": 401, "bad_token": 401, "too_large": 413, "other_log": 410, "damaged_store": 500}
+KIND_OF_STATUS = {404: "no_route", 405: "no_method"}
+"""Of what the framework refuses."""
+DETAIL_CHARACTERS_MAX = 1000
 STATUS_OF_FAMILY = (
     (DeniedError, 403),
     (BadInputError, 400),
@@ -59,8 +63,13 @@ def add_problem_handlers(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     def of_http(request: Request, exc: HTTPException) -> JSONResponse:
-        kind = {404: "no_route", 405: "no_method"}.get(exc.status_code, "http")
+        kind = KIND_OF_STATUS.get(exc.status_code, "http")
         return _problem(exc.status_code, kind, str(exc.detail), dict(exc.headers or {}))
+
+    @app.exception_handler(ClientDisconnect)
+    def of_cut_link(request: Request, exc: ClientDisconnect) -> JSONResponse:
+        log.info("%s %s: the link was cut before the body was whole", request.method, request.url.path[:200])
+        return _problem(400, "cut_off", "the body did not come whole", {})
 
     @app.exception_handler(Exception)
     def of_bug(request: Request, exc: Exception) -> JSONResponse:
@@ -69,5 +78,7 @@ def add_problem_handlers(app: FastAPI) -> None:
 
 
 def _problem(status: int, kind: str, detail: str, headers: dict[str, str]) -> JSONResponse:
+    # A complaint may quote what came: half a surrogate pair, or megabytes.
+    detail = detail[:DETAIL_CHARACTERS_MAX].encode(errors="replace").decode()
     problem = Problem(title=kind.replace("_", " "), status=status, detail=detail, kind=kind)
     return JSONResponse(problem.model_dump(), status, headers, media_type=MEDIA_TYPE)

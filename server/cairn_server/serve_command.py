@@ -17,6 +17,7 @@ import os
 import signal
 import socket
 import sys
+from contextlib import closing
 from pathlib import Path
 from types import FrameType
 
@@ -36,21 +37,23 @@ def main(argv: list[str]) -> int:
     """Run until stopped."""
     settings = _settings(argv)
     settings.check_reach()
-    listener = _listen(settings)
-    service = Service(SqliteStore(settings.folder), settings)
+    signal.signal(signal.SIGTERM, _stop)
+    with listen(settings.host, settings.port) as listener:
+        try:
+            with closing(Service(SqliteStore(settings.folder), settings)) as service:
+                _serve(service, listener)
+        except KeyboardInterrupt:
+            pass
+    return 0
+
+
+def _serve(service: Service, listener: socket.socket) -> None:
     host, port = listener.getsockname()[:2]
     shown = f"[{host}]" if ":" in host else host
-    sys.stdout.write(f"cairn map server on http://{shown}:{port}, data in {settings.folder}\n")
+    sys.stdout.write(f"cairn map server on http://{shown}:{port}, data in {service.settings.folder}\n")
     sys.stdout.flush()
-    signal.signal(signal.SIGTERM, _stop)
-    try:
-        config = uvicorn.Config(make_app(service), log_level="warning", timeout_graceful_shutdown=10, lifespan="off")
-        uvicorn.Server(config).run(sockets=[listener])
-    except KeyboardInterrupt:
-        pass
-    finally:
-        service.close()
-    return 0
+    config = uvicorn.Config(make_app(service), log_level="warning", timeout_graceful_shutdown=10, lifespan="off")
+    uvicorn.Server(config).run(sockets=[listener])
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
@@ -58,18 +61,23 @@ def _stop(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-def _listen(settings: Settings) -> socket.socket:
-    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+def listen(host: str, port: int) -> socket.socket:
+    """A listening socket.
+
+    Raises:
+        BadInputError: kind `cannot_listen`.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     # Named as TCP so that asyncio turns Nagle off for it: else each small answer waits 40 ms for an acknowledgement.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listener.bind((settings.host, settings.port))
+        listener.bind((host, port))
     except OSError as exc:
         listener.close()
         raise BadInputError(
             "cannot_listen",
-            f"cannot listen on {settings.host}:{settings.port}: {exc.strerror}; another server may, try --port 0",
+            f"cannot listen on {host}:{port}: {exc.strerror}; another server may, try --port 0",
         ) from exc
     listener.listen(BACKLOG)
     return listener
@@ -112,5 +120,5 @@ def _secret(path: Path | None, variable: str) -> str | None:
         return os.environ.get(variable) or None
     try:
         return path.read_text().strip()
-    except OSError as exc:
-        raise BadInputError("bad_setting", f"cannot read {path}: {exc.strerror}") from exc
+    except (OSError, UnicodeDecodeError) as exc:
+        raise BadInputError("bad_setting", f"cannot read {path}: {exc}") from exc

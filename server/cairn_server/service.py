@@ -4,11 +4,15 @@ Acknowledge only what is durable and fully validated; fold afterwards, in groups
 called from many threads.
 """
 
+import threading
 import time
+from collections.abc import Callable
 
-from cairn_map.commit import Commit, CommitMeta, make_commit, open_commit
+import numpy as np
+
+from cairn_map.commit import RETRACTS_MAX, Commit, CommitMeta, make_commit, open_commit, split_commit
 from cairn_map.cursor import Cursor
-from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, DeniedError, NotFoundError
+from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_map.evidence import largest
 from cairn_map.frames import encode_frame, start_of_reply
 from cairn_map.grid import CellKey, cell_of_key
@@ -28,11 +32,14 @@ from cairn_map.messages import (
 from cairn_server.auth import Caller, new_token, token_hash
 from cairn_server.folder import Folder
 from cairn_server.missing import asker_from_request, header_of, reply_frames
+from cairn_server.push_policy import check_claims, check_evidence
 from cairn_server.settings import Settings
 from cairn_server.stable import StableVectors
 from cairn_server.store import Branch, CellRow, Head, MapRow, NewCommit, Store
 
 OPERATOR = RobotName("operator")
+VALIDATING_MAX = 4
+"""Commits whose evidence is decoded at once: each may need a gigabyte."""
 RESERVED_NAMES = frozenset({OPERATOR, INITIAL, RobotName("main")})
 
 
@@ -43,6 +50,7 @@ class Service:
         self.store = store
         self.settings = settings
         self._folder = Folder(store)
+        self._validating = threading.BoundedSemaphore(VALIDATING_MAX)
         self._stable = StableVectors(settings.stable_after_s)
 
     def create_map(self, name: str, request: CreateMap) -> tuple[MapInfo, bool]:
@@ -93,16 +101,15 @@ class Service:
         """Keep a commit; True if it is new. When this returns, no power cut can lose it.
 
         Raises:
-            BadInputError: not a commit for this map, or not by this caller.
+            BadInputError: not a commit for this map, not by this caller, or against `push_policy`.
             ConflictError: kind `id_taken`: the id is known with other bytes.
         """
-        commit, decoded = open_commit(data)
-        _check_commit(row, caller, id_text, commit)
-        planes = [0] * (2 + row.geometry.plane_count)
-        for cell in decoded.values():
-            planes = [max(a, int(b)) for a, b in zip(planes, largest(cell.evidence, row.geometry), strict=True)]
+        meta, cells = split_commit(data)
+        check_claims(row, caller, id_text, meta, cells=len(cells))
+        with self._validating:
+            new = _validated(row, data)
         try:
-            is_new = self.store.append(row, _new_commit(commit, tuple(planes)))
+            is_new = self.store.append(row, new)
         except ConflictError as exc:
             self.store.audit(exc.kind, f"map {row.name}: {exc.message}; pushed by {caller.robot or caller.role}")
             raise
@@ -125,30 +132,30 @@ class Service:
     def retract(self, row: MapRow, request: Retract) -> Retracted:
         """Undo commits exactly: by id, or everything of one robot that is here now. Durable on return.
 
+        More targets than one commit can name become several; the last one's id is answered.
+
         Raises:
             NotFoundError: kind `nothing_to_retract`: a robot without evidence, or no commit named.
+            BadInputError: kind `not_retractable`: a retract is not retracted.
         """
-        targets = [commit_id_from_text(text) for text in request.commits]
+        targets = dict.fromkeys(commit_id_from_text(text) for text in request.commits)
         if request.robot:
             with self.store.snapshot(row) as snapshot:
-                targets += [commit for commit in snapshot.commits_of(request.robot) if commit not in targets]
+                targets |= dict.fromkeys(snapshot.commits_of(request.robot))
         if not targets:
             raise NotFoundError("nothing_to_retract", "name commits, or a robot that has evidence in the map")
+        if any(target.author.robot == OPERATOR for target in targets):
+            raise BadInputError("not_retractable", "a retract is not retracted; push the evidence anew")
+        names = [str(target) for target in targets]
         author = Author(OPERATOR, row.operator)
-
-        def build(n: int) -> NewCommit:
-            meta = CommitMeta(
-                id=str(CommitId(author, n)),
-                geometry=row.geometry.digest().hex(),
-                retracts=tuple(str(target) for target in targets),
-                note=request.note,
-            )
-            return _new_commit(make_commit(meta, {}, row.geometry), tuple([0] * (2 + row.geometry.plane_count)))
-
-        commit = self.store.append_built(row, author, build)
-        self.store.audit("retract", f"map {row.name}: {commit.id} takes out {len(targets)} commits: {request.note}")
+        builds = [
+            _retract_builder(row, author, names[start : start + RETRACTS_MAX], request.note)
+            for start in range(0, len(names), RETRACTS_MAX)
+        ]
+        ids = [str(self.store.append_built(row, author, build).id) for build in builds]
+        self.store.audit("retract", f"map {row.name}: {ids[-1]} takes out {len(names)} commits: {request.note}")
         self._folder.wake()
-        return Retracted(id=str(commit.id), commits=[str(target) for target in targets])
+        return Retracted(id=ids[-1], commits=names)
 
     def cell_index(self, row: MapRow, author: Author | None) -> CellIndex:
         """All cells that were ever touched, emptied ones included, from one state."""
@@ -197,17 +204,24 @@ class Service:
         self.store.close()
 
 
-def _check_commit(row: MapRow, caller: Caller, id_text: str, commit: Commit) -> None:
-    if str(commit.id) != id_text:
-        raise BadInputError("other_id", f"the path names {id_text[:96]}, the commit calls itself {commit.id}")
-    if commit.meta.geometry != row.geometry.digest().hex():
-        raise BadInputError("other_geometry", f"the commit was made for another grid than map {row.name} has")
-    authors = {commit.id.author.robot, *(target.author.robot for target in commit.meta.retracted_ids)}
-    foreign = sorted(author for author in authors if not caller.may_author(author))
-    if foreign:
-        raise DeniedError("not_allowed", f"this token stands for {caller.robot or caller.role}, not for {foreign[0]}")
-    if not commit.cells and not commit.meta.retracts:
-        raise DamagedDataError("empty_commit", "a commit must hold evidence or name commits to retract")
+def _validated(row: MapRow, data: bytes) -> NewCommit:
+    """A commit whose evidence was decoded, and is canonical and possible."""
+    commit, decoded = open_commit(data)
+    check_evidence(commit.meta, decoded, row.geometry)
+    tops = np.zeros(2 + row.geometry.plane_count, np.int64)
+    for cell in decoded.values():
+        tops = np.maximum(tops, largest(cell.evidence, row.geometry))
+    return _new_commit(commit, tuple(tops.tolist()))
+
+
+def _retract_builder(row: MapRow, author: Author, targets: list[str], note: str) -> Callable[[int], NewCommit]:
+    def build(n: int) -> NewCommit:
+        meta = CommitMeta(
+            id=str(CommitId(author, n)), geometry=row.geometry.digest().hex(), retracts=tuple(targets), note=note
+        )
+        return _new_commit(make_commit(meta, {}, row.geometry), (0,) * (2 + row.geometry.plane_count))
+
+    return build
 
 
 def _new_commit(commit: Commit, tops: tuple[int, ...]) -> NewCommit:
@@ -215,7 +229,8 @@ def _new_commit(commit: Commit, tops: tuple[int, ...]) -> NewCommit:
         id=commit.id,
         sha=commit.sha,
         size_bytes=len(commit.data),
-        meta=commit.meta.model_dump_json(exclude_defaults=True).encode(),
+        text=commit.text,
+        captured_s=commit.meta.captured_s,
         retracts=commit.meta.retracted_ids,
         diff=commit.cells,
         tops=tops,

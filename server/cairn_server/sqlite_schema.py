@@ -28,16 +28,27 @@ CREATE TABLE commits (
     sha BLOB NOT NULL,
     size_bytes INTEGER NOT NULL,
     cells INTEGER NOT NULL,
-    meta BLOB NOT NULL,
+    meta BLOB NOT NULL,             -- as pushed
+    captured_first_s REAL,
+    captured_last_s REAL,
     retracts TEXT NOT NULL,         -- ids separated by spaces
     received_s REAL NOT NULL,
     folded_seq INTEGER,
     folded_s REAL,
+    damaged TEXT,                   -- why it is set aside
     UNIQUE (map, robot, incarnation, n)
 );
-CREATE INDEX commits_pending ON commits (map, number) WHERE folded_seq IS NULL;
+CREATE INDEX commits_pending ON commits (map, number) WHERE folded_seq IS NULL AND damaged IS NULL;
 CREATE INDEX commits_folded ON commits (map, folded_s) WHERE folded_seq IS NOT NULL;
 CREATE INDEX commits_retracting ON commits (map, number) WHERE retracts <> '';
+CREATE TABLE author (
+    map INTEGER NOT NULL REFERENCES map,
+    robot TEXT NOT NULL,
+    incarnation TEXT NOT NULL,
+    top INTEGER NOT NULL,           -- highest number
+    intervals INTEGER NOT NULL,     -- of its numbers, folded or not
+    PRIMARY KEY (map, robot, incarnation)
+) WITHOUT ROWID;
 CREATE TABLE diff (
     number INTEGER PRIMARY KEY,
     commit_number INTEGER NOT NULL REFERENCES commits,

@@ -6,7 +6,6 @@ from typing import Any
 
 import apsw
 
-from cairn_map.commit import CommitMeta
 from cairn_map.cursor import Cursor, first_chain
 from cairn_map.fingerprint import fingerprint_from_bytes
 from cairn_map.grid import CellKey, cell_of_key
@@ -14,7 +13,7 @@ from cairn_map.ids import Author, CommitId, commit_id_from_text
 from cairn_map.messages import LogEntry
 from cairn_map.version_vector import EMPTY, VersionVector, version_vector_from_json
 from cairn_server.sqlite_writer import first, rows
-from cairn_server.store import CellRow, Head, Totals
+from cairn_server.store import CellRow, Contribution, Head, Totals
 
 CELL_COLUMNS = "cell, lm, digest, fingerprint, voxels, size_bytes"
 
@@ -64,20 +63,23 @@ class SqliteSnapshot:
         for row in found:
             yield cell_row(row)
 
-    def contributions(self, key: CellKey, *, after_seq: int) -> list[tuple[bytes, Author, bytes]] | None:
-        """Entries after `after_seq` that touch a cell: kind, author, diff; None if a diff is not kept any more."""
+    def contributions(self, key: CellKey, *, after_seq: int, limit: int | None = None) -> list[Contribution]:
+        """Entries after `after_seq` that touch a cell, oldest first, at most `limit`."""
         found = rows(
             self._connection,
-            "SELECT log.kind, robot, incarnation, diff.body FROM touched"
+            "SELECT log.kind, robot, incarnation, diff.number, length(diff.body) FROM touched"
             " JOIN log ON log.map = touched.map AND log.seq = touched.seq"
             " JOIN commits ON commits.number = log.commit_number"
             " JOIN diff ON diff.commit_number = commits.number AND diff.cell = touched.cell"
-            " WHERE touched.map = ? AND touched.cell = ? AND touched.seq > ? ORDER BY touched.seq",
-            (self._map, key, after_seq),
+            " WHERE touched.map = ? AND touched.cell = ? AND touched.seq > ? ORDER BY touched.seq LIMIT ?",
+            (self._map, key, after_seq, -1 if limit is None else limit),
         )
-        if any(body is None for *_, body in found):
-            return None
-        return [(kind, Author(robot, incarnation), body) for kind, robot, incarnation, body in found]
+        return [Contribution(kind, Author(robot, inc), number, size) for kind, robot, inc, number, size in found]
+
+    def diff(self, number: int) -> bytes | None:
+        """The bytes of a contribution; None if they are not kept any more."""
+        body: bytes | None = first(self._connection, "SELECT body FROM diff WHERE number = ?", (number,))
+        return body
 
     def tip(self, author: Author) -> tuple[int, bytes] | None:
         """Highest folded number of an author and its SHA-256."""
@@ -101,10 +103,10 @@ class SqliteSnapshot:
         return [CommitId(Author(r, i), n) for r, i, n in found]
 
     def pending(self) -> VersionVector:
-        """Commits that are durable but not folded."""
+        """Commits that are durable but not folded, without those that are set aside as damaged."""
         found = rows(
             self._connection,
-            "SELECT robot, incarnation, n FROM commits WHERE map = ? AND folded_seq IS NULL",
+            "SELECT robot, incarnation, n FROM commits WHERE map = ? AND folded_seq IS NULL AND damaged IS NULL",
             (self._map,),
         )
         return _vector(found)
@@ -132,8 +134,9 @@ class SqliteSnapshot:
         """Log entries, oldest first."""
         found = rows(
             self._connection,
-            "SELECT seq, kind, robot, incarnation, n, sha, size_bytes, cells, meta, retracts FROM log"
-            " JOIN commits ON commits.number = log.commit_number WHERE log.map = ? AND seq > ? ORDER BY seq LIMIT ?",
+            "SELECT seq, kind, robot, incarnation, n, sha, size_bytes, cells, captured_first_s, captured_last_s,"
+            " retracts FROM log JOIN commits ON commits.number = log.commit_number"
+            " WHERE log.map = ? AND seq > ? ORDER BY seq LIMIT ?",
             (self._map, after_seq, limit),
         )
         return [_log_entry(*row) for row in found]
@@ -190,7 +193,8 @@ def _log_entry(
     sha: bytes,
     size_bytes: int,
     cells: int,
-    meta: bytes,
+    first_s: float | None,
+    last_s: float | None,
     retracts: str,
 ) -> LogEntry:
     return LogEntry.model_validate(
@@ -201,7 +205,7 @@ def _log_entry(
             "sha": sha.hex(),
             "size_bytes": size_bytes,
             "cells": cells,
-            "captured_s": CommitMeta.model_validate_json(meta).captured_s,
+            "captured_s": None if first_s is None else (first_s, last_s),
             "retracts": retracts.split(),
         }
     )

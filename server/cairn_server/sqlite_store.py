@@ -3,21 +3,23 @@
 import json
 import logging
 import secrets
-import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import cast
 
 import apsw
 
 from cairn_map.cursor import Cursor, cursor_from_text, first_chain
-from cairn_map.errors import BadInputError, ConflictError, NotFoundError
-from cairn_map.evidence import COUNT_MAX, SUM_MAX
+from cairn_map.errors import BadInputError, ConflictError, NotFoundError, UnreachableError
 from cairn_map.grid import CellKey, Geometry
 from cairn_map.ids import Author, CommitId, Incarnation, new_incarnation
 from cairn_map.sensor_model import SensorModel
+from cairn_server.folder_lock import lock_folder
+from cairn_server.last_seen import LastSeen
+from cairn_server.sqlite_changes import append_commit, next_number, write_audit, write_fold
+from cairn_server.sqlite_readers import Readers
 from cairn_server.sqlite_schema import ensure_schema
 from cairn_server.sqlite_snapshot import SqliteSnapshot, ids_from_text
 from cairn_server.sqlite_writer import Values, Writer, connect, first, rows
@@ -32,16 +34,26 @@ class SqliteStore:
     """`store.Store` in a folder."""
 
     def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        self._path = folder / FILE_NAME
-        connection = connect(self._path)
+        """Open or make the store.
+
+        Raises:
+            ConflictError: kind `store_in_use`: another server works on it.
+            BadInputError: kind `store_version` or `bad_store`: no folder, or no store of this version.
+        """
+        path = folder / FILE_NAME
         try:
-            ensure_schema(connection)
-        finally:
-            connection.close()
-        self._writer = Writer(self._path)
-        self._local = threading.local()
-        self._readers: list[apsw.Connection] = []
+            folder.mkdir(parents=True, exist_ok=True)
+            self._lock = lock_folder(folder)
+        except OSError as exc:
+            raise BadInputError("bad_store", f"cannot keep a store in {folder}: {exc.strerror}") from exc
+        try:
+            _prepare(path)
+            self._writer = Writer(path)
+        except BaseException:
+            self._lock.close()
+            raise
+        self._readers = Readers(path)
+        self._seen = LastSeen()
 
     def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:
         """The map and whether it is new; an equal one may exist already."""
@@ -74,66 +86,59 @@ class SqliteStore:
 
     def map(self, name: str) -> MapRow:
         """The map of a name."""
-        for row in self._map_rows("WHERE name = ?", (name,)):
-            return row
+        found = self._map_rows("WHERE name = ?", (name,))
+        if found:
+            return found[0]
         raise NotFoundError("no_map", f"there is no map {name!r}; `cairn map ls` lists them")
 
     def maps(self) -> list[MapRow]:
         """All maps, by name."""
-        return list(self._map_rows("ORDER BY name", ()))
+        return self._map_rows("ORDER BY name", ())
 
     def append(self, row: MapRow, commit: NewCommit) -> bool:
         """Keep a commit; True if it is new, False if the same one is kept already. Durable on return."""
-        return self._writer.run(lambda connection: _append(connection, row, commit))
+        return self._writer.run(lambda connection: append_commit(connection, row, commit))
 
     def append_built(self, row: MapRow, author: Author, build: Callable[[int], NewCommit]) -> NewCommit:
         """Keep a commit that `build(n)` makes for the author's next number n."""
 
         def job(connection: apsw.Connection) -> NewCommit:
-            n: int = first(
-                connection,
-                "SELECT coalesce(max(n) + 1, 0) FROM commits WHERE map = ? AND robot = ? AND incarnation = ?",
-                (row.number, *author),
-            )
-            commit = build(n)
-            _append(connection, row, commit)
+            commit = build(next_number(connection, row, author))
+            append_commit(connection, row, commit)
             return commit
 
         return self._writer.run(job)
 
-    def pending(self, row: MapRow, *, limit: int) -> list[StoredCommit]:
-        """Commits that are not folded, in order of arrival, with their diffs."""
-        return self._commits("map = ? AND folded_seq IS NULL ORDER BY number LIMIT ?", (row.number, limit))
+    def pending(self, row: MapRow, *, limit: int, size_bytes_max: int) -> list[StoredCommit]:
+        """Commits to be folded, in order of arrival, with their diffs: at most `limit`, and one or within the size."""
+        clause = "map = ? AND folded_seq IS NULL AND damaged IS NULL ORDER BY number LIMIT ?"
+        return self._commits(clause, (row.number, limit), size_bytes_max=size_bytes_max)
 
     def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
         """A folded commit with its diff, or None."""
-        found = self._commits(
-            "map = ? AND robot = ? AND incarnation = ? AND n = ? AND folded_seq IS NOT NULL",
-            (row.number, *commit.author, commit.n),
-        )
+        clause = "map = ? AND robot = ? AND incarnation = ? AND n = ? AND folded_seq IS NOT NULL"
+        found = self._commits(clause, (row.number, *commit.author, commit.n), size_bytes_max=0)
         return found[0] if found else None
 
     def is_retracted(self, row: MapRow, commit: CommitId) -> bool:
         """Whether a retract of this id has taken effect, or waits for it to come."""
         query = "SELECT 1 FROM retracted WHERE map = ? AND id = ?"
-        return first(self._reader(), query, (row.number, str(commit))) is not None
+        with self._readers.reading() as reader:
+            return first(reader, query, (row.number, str(commit))) is not None
 
     def fold(self, row: MapRow, fold: Fold) -> bool:
         """Write a fold if the head is still its base; False (and nothing written) otherwise."""
-        return self._writer.run(lambda connection: _fold(connection, row, fold))
+        return self._writer.run(lambda connection: write_fold(connection, row, fold))
 
     @contextmanager
     def snapshot(self, row: MapRow) -> Iterator[SqliteSnapshot]:
         """One state of the map."""
-        connection = self._reader()
-        connection.execute("BEGIN")
-        try:
+        with self._readers.transaction() as connection:
             yield SqliteSnapshot(connection, row.number, row.geometry.digest())
-        finally:
-            connection.execute("ROLLBACK")
 
     def register(self, row: MapRow, branch: Branch, token_hash: bytes) -> None:
         """Make a branch, or give an existing one a new token."""
+        self._seen.forget(row.number, branch.name)
         values = (row.number, branch.name, branch.mode, json.dumps(branch.sensors), branch.last_seen_s, token_hash)
         self._writer.run(
             lambda connection: connection.execute(
@@ -146,12 +151,16 @@ class SqliteStore:
 
     def seen(self, row: MapRow, name: str, cursor: Cursor | None) -> None:
         """Note that a branch was heard of, and where it stands; may be written later."""
-        values = (time.time(), str(cursor) if cursor else None, row.number, name)
-        self._writer.submit(
-            lambda connection: connection.execute(
-                "UPDATE branch SET last_seen_s = ?, cursor = coalesce(?, cursor) WHERE map = ? AND name = ?", values
-            ).fetchall()
-        )
+        text = str(cursor) if cursor else None
+        if not self._seen.is_news(row.number, name, text):
+            return
+        values = (time.time(), text, row.number, name)
+        with suppress(UnreachableError):  # it is only a note, and what it is about was done
+            self._writer.submit(
+                lambda connection: connection.execute(
+                    "UPDATE branch SET last_seen_s = ?, cursor = coalesce(?, cursor) WHERE map = ? AND name = ?", values
+                ).fetchall()
+            )
 
     def deregister(self, row: MapRow, name: str) -> None:
         """Remove a branch and its token."""
@@ -162,14 +171,13 @@ class SqliteStore:
                 raise NotFoundError("no_branch", f"map {row.name} has no branch {name!r}")
 
         self._writer.run(job)
+        self._seen.forget(row.number, name)
 
     def branches(self, row: MapRow) -> list[Branch]:
         """All branches, by name."""
-        found = rows(
-            self._reader(),
-            "SELECT name, mode, sensors, cursor, last_seen_s FROM branch WHERE map = ? ORDER BY name",
-            (row.number,),
-        )
+        query = "SELECT name, mode, sensors, cursor, last_seen_s FROM branch WHERE map = ? ORDER BY name"
+        with self._readers.reading() as reader:
+            found = rows(reader, query, (row.number,))
         return [
             Branch(name, mode, tuple(json.loads(sensors)), cursor_from_text(cursor) if cursor else None, seen_s)
             for name, mode, sensors, cursor, seen_s in found
@@ -178,129 +186,67 @@ class SqliteStore:
     def branch_of_token(self, row: MapRow, token_hash: bytes) -> str | None:
         """The branch that a token was given to."""
         query = "SELECT name FROM branch WHERE map = ? AND token_hash = ?"
-        return cast("str | None", first(self._reader(), query, (row.number, token_hash)))
+        with self._readers.reading() as reader:
+            return cast("str | None", first(reader, query, (row.number, token_hash)))
 
     def audit(self, what: str, detail: str) -> None:
         """Note something that an administrator may have to look into; may be written later."""
-        log.warning("%s: %s", what, detail)
-        self._writer.submit(
-            lambda connection: connection.execute(
-                "INSERT INTO audit (time_s, what, detail) VALUES (?, ?, ?)", (time.time(), what, detail)
-            ).fetchall()
-        )
+        log.warning("%s: %r", what, detail)
+        with suppress(UnreachableError):
+            self._writer.submit(lambda connection: write_audit(connection, what, detail))
 
     def close(self) -> None:
         """Finish what was accepted and close."""
         self._writer.close()
-        for connection in self._readers:
-            connection.close()
+        self._readers.close()
+        self._lock.close()
 
-    def _reader(self) -> apsw.Connection:
-        """The reading connection of the calling thread."""
-        connection: apsw.Connection | None = getattr(self._local, "connection", None)
-        if connection is None:
-            connection = connect(self._path)
-            connection.execute("PRAGMA query_only = ON")
-            self._local.connection = connection
-            self._readers.append(connection)
-        return connection
-
-    def _map_rows(self, clause: str, values: Values) -> Iterator[MapRow]:
+    def _map_rows(self, clause: str, values: Values) -> list[MapRow]:
         query = f"SELECT number, name, geometry, sensor_model, operator FROM map {clause}"  # noqa: S608 - our own clause
-        for number, name, geometry, sensor_model, operator in rows(self._reader(), query, values):
-            yield MapRow(
+        with self._readers.reading() as reader:
+            found = rows(reader, query, values)
+        return [
+            MapRow(
                 number=number,
                 name=name,
                 geometry=Geometry.model_validate_json(geometry),
                 sensor_model=SensorModel.model_validate_json(sensor_model),
                 operator=Incarnation(operator),
             )
+            for number, name, geometry, sensor_model, operator in found
+        ]
 
-    def _commits(self, clause: str, values: Values) -> list[StoredCommit]:
-        reader = self._reader()
-        query = f"SELECT number, robot, incarnation, n, sha, retracts FROM commits WHERE {clause}"  # noqa: S608 - our own clause
+    def _commits(self, clause: str, values: Values, *, size_bytes_max: int) -> list[StoredCommit]:
+        """Commits in the order asked for, as long as their bytes stay within the size; the first in any case."""
+        columns = "number, robot, incarnation, n, sha, meta, retracts, size_bytes"
         found: list[StoredCommit] = []
-        for number, robot, incarnation, n, sha, retracts in rows(reader, query, values):
-            diff = rows(reader, "SELECT cell, body FROM diff WHERE commit_number = ? ORDER BY cell", (number,))
-            found.append(
-                StoredCommit(
-                    number=number,
-                    id=CommitId(Author(robot, incarnation), n),
-                    sha=sha,
-                    retracts=ids_from_text(retracts),
-                    diff={CellKey(cell): body for cell, body in diff},
+        total_bytes = 0
+        with self._readers.transaction() as reader:
+            query = f"SELECT {columns} FROM commits WHERE {clause}"  # noqa: S608 - our own clause
+            for number, robot, incarnation, n, sha, text, retracts, size_bytes in reader.execute(query, values):
+                total_bytes += size_bytes
+                if found and total_bytes > size_bytes_max:
+                    break
+                diff = rows(reader, "SELECT cell, body FROM diff WHERE commit_number = ? ORDER BY cell", (number,))
+                found.append(
+                    StoredCommit(
+                        number=number,
+                        id=CommitId(Author(robot, incarnation), n),
+                        sha=sha,
+                        text=text,
+                        retracts=ids_from_text(retracts),
+                        diff={CellKey(cell): body for cell, body in diff},
+                    )
                 )
-            )
         return found
 
 
-def _append(connection: apsw.Connection, row: MapRow, commit: NewCommit) -> bool:
-    key = (row.number, *commit.id.author, commit.id.n)
-    known = first(connection, "SELECT sha FROM commits WHERE map = ? AND robot = ? AND incarnation = ? AND n = ?", key)
-    if known is not None:
-        if known != commit.sha:
-            raise ConflictError("id_taken", f"commit {commit.id} is already here with other bytes")
-        return False
-    sums = json.loads(first(connection, "SELECT tops FROM map WHERE number = ?", (row.number,)))
-    sums = [total + top for total, top in zip(sums, commit.tops, strict=True)]
-    if max(sums[:2]) > COUNT_MAX or max(sums[2:], default=0) > SUM_MAX:
-        raise BadInputError("evidence_overflow", "the map could not take this much evidence without an overflow")
-    connection.execute("UPDATE map SET tops = ? WHERE number = ?", (json.dumps(sums), row.number))
-    connection.execute(
-        "INSERT INTO commits (map, robot, incarnation, n, sha, size_bytes, cells, meta, retracts, received_s)"
-        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-        (
-            *key,
-            commit.sha,
-            commit.size_bytes,
-            len(commit.diff),
-            commit.meta,
-            " ".join(map(str, commit.retracts)),
-            time.time(),
-        ),
-    )
-    number = connection.last_insert_rowid()
-    connection.executemany(
-        "INSERT INTO diff (commit_number, cell, body) VALUES (?, ?, ?)",
-        [(number, cell, body) for cell, body in commit.diff.items()],
-    )
-    return True
-
-
-def _fold(connection: apsw.Connection, row: MapRow, fold: Fold) -> bool:
-    head = first(connection, "SELECT seq, chain FROM map WHERE number = ?", (row.number,))
-    if head != (fold.base.seq, fold.base.chain):
-        return False
-    connection.execute(
-        "UPDATE map SET seq = ?, chain = ?, vector = ? WHERE number = ?",
-        (fold.head.seq, fold.head.chain, json.dumps(fold.vector.to_json()), row.number),
-    )
-    now_s = time.time()
-    for seq, entry in enumerate(fold.entries, start=fold.base.seq + 1):
-        connection.execute(
-            "INSERT INTO log (map, seq, kind, commit_number, chain) VALUES (?, ?, ?, ?, ?)",
-            (row.number, seq, entry.kind, entry.commit, entry.chain),
-        )
-        connection.execute(
-            "INSERT INTO touched (map, cell, seq) SELECT ?, cell, ? FROM diff WHERE commit_number = ?",
-            (row.number, seq, entry.commit),
-        )
-        connection.execute(
-            "UPDATE commits SET folded_seq = ?, folded_s = ? WHERE number = ? AND folded_seq IS NULL",
-            (seq, now_s, entry.commit),
-        )
-    connection.executemany(
-        "INSERT INTO retracted (map, id) VALUES (?, ?)", [(row.number, str(target)) for target in fold.retracted]
-    )
-    connection.executemany(
-        "INSERT INTO cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, body)"
-        " VALUES (?, ?, ?, ?, ?, ?, ?, ?)"
-        " ON CONFLICT (map, cell) DO UPDATE SET lm = excluded.lm, digest = excluded.digest,"
-        " fingerprint = excluded.fingerprint, voxels = excluded.voxels, size_bytes = excluded.size_bytes,"
-        " body = excluded.body",
-        [
-            (row.number, c.key, c.lm, c.digest, c.fingerprint.to_bytes(), c.voxels, c.size_bytes, c.body)
-            for c in fold.cells
-        ],
-    )
-    return True
+def _prepare(path: Path) -> None:
+    try:
+        connection = connect(path)
+        try:
+            ensure_schema(connection)
+        finally:
+            connection.close()
+    except apsw.Error as exc:
+        raise BadInputError("bad_store", f"{path} is not a store, or cannot be opened: {exc}") from exc

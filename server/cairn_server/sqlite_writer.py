@@ -4,16 +4,20 @@ A job's result is handed out only after COMMIT with `synchronous=FULL`: what was
 A job that raises is rolled back alone (savepoint); the others of its group go through.
 """
 
+import logging
 import queue
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 import apsw
 
 from cairn_map.errors import UnreachableError
+
+log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 Job = tuple[Callable[[apsw.Connection], Any], "Future[Any]"]
@@ -55,7 +59,7 @@ class Writer:
     """A thread that owns the writing connection."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self._connection = connect(path)
         self._jobs: queue.Queue[Job | None] = queue.Queue(QUEUE_MAX)
         self._lock = threading.Lock()
         self._closed = False
@@ -91,12 +95,11 @@ class Writer:
         self._thread.join()
 
     def _run(self) -> None:
-        connection = connect(self._path)
         try:
             while (group := self._group()) is not None:
-                _commit_group(connection, group)
+                _commit_group(self._connection, group)
         finally:
-            connection.close()
+            self._connection.close()
 
     def _group(self) -> list[Job] | None:
         first = self._jobs.get()
@@ -123,8 +126,10 @@ def _commit_group(connection: apsw.Connection, group: list[Job]) -> None:
             results.append((future, *_run_job(connection, job)))
         connection.execute("COMMIT")
     except apsw.Error as exc:
-        if connection.in_transaction:
-            connection.execute("ROLLBACK")
+        with suppress(apsw.Error):
+            if connection.in_transaction:
+                connection.execute("ROLLBACK")
+        log.error("the store could not write: %s", exc)
         failure = UnreachableError("store_failed", f"the store could not write: {exc}", retry_after_s=5.0)
         for _, future in group:
             future.set_exception(failure)

@@ -39,8 +39,9 @@ class NewCommit:
     id: CommitId
     sha: bytes
     size_bytes: int
-    meta: bytes
-    """JSON."""
+    text: bytes
+    """Its meta as it was pushed: the SHA-256 is over these bytes."""
+    captured_s: tuple[float, float] | None
     retracts: tuple[CommitId, ...]
     diff: Mapping[CellKey, bytes]
     tops: tuple[int, ...]
@@ -54,8 +55,22 @@ class StoredCommit:
     number: int
     id: CommitId
     sha: bytes
+    text: bytes
     retracts: tuple[CommitId, ...]
-    diff: Mapping[CellKey, bytes]
+    diff: Mapping[CellKey, bytes | None]
+    """None: not kept any more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contribution:
+    """What one log entry did to one cell."""
+
+    kind: bytes
+    author: Author
+    diff: int
+    """Number of the diff in the store."""
+    size_bytes: int | None
+    """None: not kept any more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,6 +109,8 @@ class Fold:
     cells: tuple[CellRow, ...]
     retracted: tuple[CommitId, ...] = ()
     """Ids whose retract took or will take effect; each once, for ever."""
+    damaged: tuple[tuple[int, str], ...] = ()
+    """Numbers of commits to set aside, and why: pushed again, they are pending again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,39 +149,55 @@ class Snapshot(Protocol):
     @property
     def head(self) -> Head:
         """The state."""
+        ...
 
     def chain_at(self, seq: int) -> bytes | None:
         """The chain after entry `seq` (0: of the empty log); None if there is no such entry."""
+        ...
 
     def cell(self, key: CellKey) -> CellRow | None:
         """One cell with its body."""
+        ...
 
     def cells(self, *, after_seq: int = -1) -> Iterator[CellRow]:
         """All cells changed after a log entry, without bodies, rising in number."""
+        ...
 
-    def contributions(self, key: CellKey, *, after_seq: int) -> list[tuple[bytes, Author, bytes]] | None:
-        """Entries after `after_seq` that touch a cell: kind, author, diff; None if a diff is not kept any more."""
+    def contributions(self, key: CellKey, *, after_seq: int, limit: int | None = None) -> list[Contribution]:
+        """Entries after `after_seq` that touch a cell, oldest first, at most `limit`."""
+        ...
+
+    def diff(self, number: int) -> bytes | None:
+        """The bytes of a contribution; None if they are not kept any more."""
+        ...
 
     def tip(self, author: Author) -> tuple[int, bytes] | None:
         """Highest folded number of an author and its SHA-256."""
+        ...
 
     def commits_of(self, robot: str) -> list[CommitId]:
         """Every commit with evidence of a robot, all incarnations, that is not retracted."""
+        ...
 
     def pending(self) -> VersionVector:
-        """Commits that are durable but not folded."""
+        """Commits that are durable but not folded, without those that are set aside as damaged."""
+        ...
 
     def folded_before(self, time_s: float) -> VersionVector:
         """Commits folded before a time."""
+        ...
 
     def retracting(self) -> list[CommitId]:
         """Commits that retract others."""
+        ...
 
     def log(self, *, after_seq: int, limit: int) -> list[LogEntry]:
         """Log entries, oldest first."""
+        ...
 
     def totals(self) -> Totals:
         """Sizes."""
+        ...
 
 
 class Store(Protocol):
@@ -176,6 +209,7 @@ class Store(Protocol):
         Raises:
             ConflictError: one of that name exists with another geometry or sensor model.
         """
+        ...
 
     def map(self, name: str) -> MapRow:
         """The map of a name.
@@ -183,41 +217,55 @@ class Store(Protocol):
         Raises:
             NotFoundError: there is none.
         """
+        ...
 
     def maps(self) -> list[MapRow]:
         """All maps, by name."""
+        ...
 
     def append(self, row: MapRow, commit: NewCommit) -> bool:
         """Keep a commit; True if it is new, False if the same one is kept already. Durable on return.
 
+        One that was set aside as damaged is new again.
+
         Raises:
             ConflictError: kind `id_taken`: the id is kept with other bytes.
-            BadInputError: kind `evidence_overflow`: a sum could leave its range.
+            BadInputError: kind `evidence_overflow`: a sum could leave its range; or its number is refused by
+                `push_policy.check_number`.
         """
+        ...
 
     def append_built(self, row: MapRow, author: Author, build: Callable[[int], NewCommit]) -> NewCommit:
         """Keep a commit that `build(n)` makes for the author's next number n."""
+        ...
 
-    def pending(self, row: MapRow, *, limit: int) -> list[StoredCommit]:
-        """Commits that are not folded, in order of arrival, with their diffs."""
+    def pending(self, row: MapRow, *, limit: int, size_bytes_max: int) -> list[StoredCommit]:
+        """Commits to be folded, in order of arrival, with their diffs: at most `limit`, and one or within the size."""
+        ...
 
     def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
         """A folded commit with its diff, or None."""
+        ...
 
     def is_retracted(self, row: MapRow, commit: CommitId) -> bool:
         """Whether a retract of this id has taken effect, or waits for it to come."""
+        ...
 
     def fold(self, row: MapRow, fold: Fold) -> bool:
         """Write a fold if the head is still its base; False (and nothing written) otherwise."""
+        ...
 
     def snapshot(self, row: MapRow) -> AbstractContextManager[Snapshot]:
         """One state of the map."""
+        ...
 
     def register(self, row: MapRow, branch: Branch, token_hash: bytes) -> None:
         """Make a branch, or give an existing one a new token."""
+        ...
 
     def seen(self, row: MapRow, name: str, cursor: Cursor | None) -> None:
         """Note that a branch was heard of, and where it stands; may be written later."""
+        ...
 
     def deregister(self, row: MapRow, name: str) -> None:
         """Remove a branch and its token.
@@ -225,15 +273,20 @@ class Store(Protocol):
         Raises:
             NotFoundError: there is none of that name.
         """
+        ...
 
     def branches(self, row: MapRow) -> list[Branch]:
         """All branches, by name."""
+        ...
 
     def branch_of_token(self, row: MapRow, token_hash: bytes) -> str | None:
         """The branch that a token was given to."""
+        ...
 
     def audit(self, what: str, detail: str) -> None:
         """Note something that an administrator may have to look into; may be written later."""
+        ...
 
     def close(self) -> None:
         """Finish what was accepted and close."""
+        ...

@@ -1,0 +1,120 @@
+"""Real servers for tests: in a thread, or as a process that can be killed."""
+
+import itertools
+import os
+import re
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import httpx
+import uvicorn
+from tests.cairn_map.made import SMALL
+
+from cairn_map.commit import Commit
+from cairn_map.grid import Geometry
+from cairn_map.messages import CreateMap, Retract
+from cairn_server.routes import make_app
+from cairn_server.serve_command import listen
+from cairn_server.service import Service
+from cairn_server.settings import Settings
+from cairn_server.sqlite_store import SqliteStore
+from cairn_server.store import MapRow
+
+DEADLINE_S = 60.0
+
+
+def until(condition: Callable[[], bool], what: str) -> None:
+    """Look again until it is so."""
+    end_s = time.monotonic() + DEADLINE_S
+    pause = threading.Event()
+    while not condition():
+        assert time.monotonic() < end_s, f"not in {DEADLINE_S} s: {what}"
+        pause.wait(0.002)
+
+
+class Live:
+    """A server in this process, reached through its socket."""
+
+    def __init__(self, folder: Path, **settings: Any) -> None:
+        self.service = Service(SqliteStore(folder), Settings(folder=folder, **settings))
+        self.app = make_app(self.service)
+        listener = listen("127.0.0.1", 0)
+        self.port: int = listener.getsockname()[1]
+        self._server = uvicorn.Server(uvicorn.Config(self.app, log_level="critical", lifespan="off"))
+        self._thread = threading.Thread(target=self._server.run, kwargs={"sockets": [listener]})
+        self._thread.start()
+        self.http = httpx.Client(base_url=f"http://127.0.0.1:{self.port}", timeout=DEADLINE_S)
+        self._names = (f"map{n}" for n in itertools.count())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.http.close()
+        self._server.should_exit = True
+        self._thread.join()
+        self.service.close()
+
+    def new_map(self, geometry: Geometry = SMALL) -> MapRow:
+        """An empty map of its own name."""
+        name = next(self._names)
+        self.service.create_map(name, CreateMap(geometry=geometry))
+        return self.service.store.map(name)
+
+    def push(self, row: MapRow, commit: Commit, **options: Any) -> httpx.Response:
+        """Push through HTTP."""
+        return self.http.put(f"/maps/{row.name}/commits/{commit.id}", content=commit.data, **options)
+
+    def retract(self, row: MapRow, *commits: Commit, **fields: Any) -> httpx.Response:
+        """Retract through HTTP."""
+        request = Retract(commits=[str(commit.id) for commit in commits], **fields)
+        return self.http.post(f"/maps/{row.name}/retracts", json=request.model_dump())
+
+    def folded(self, row: MapRow) -> None:
+        """Return when nothing is pending."""
+        until(lambda: self.pending(row) == 0, "everything is folded")
+
+    def pending(self, row: MapRow) -> int:
+        """Commits that are not folded yet."""
+        with self.service.store.snapshot(row) as snapshot:
+            return len(snapshot.pending())
+
+    def cells(self, row: MapRow) -> dict[int, bytes]:
+        """All cells' bytes, emptied ones left out, when everything is folded."""
+        self.folded(row)
+        with self.service.store.snapshot(row) as snapshot:
+            found = [snapshot.cell(cell.key) for cell in snapshot.cells() if cell.voxels]
+        return {cell.key: cell.body for cell in found if cell}
+
+
+class Process:
+    """`cairn serve` as a process of its own; `url` is None if it did not start."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "cairn_client.main", "serve", "--data", str(folder), "--port", "0", *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={name: value for name, value in os.environ.items() if not name.startswith("CAIRN_")},
+        )
+        assert self._process.stdout is not None
+        found = re.search(r"http://127\.0\.0\.1:\d+", self._process.stdout.readline())
+        self.url = found[0] if found else None
+
+    def send(self, number: int) -> None:
+        """A signal."""
+        self._process.send_signal(number)
+
+    def end(self) -> tuple[int, str]:
+        """Exit code and what it complained of, once it ended."""
+        _, errors = self._process.communicate(timeout=DEADLINE_S)
+        return self._process.returncode, errors

@@ -1,0 +1,109 @@
+"""PROTOCOL.md says what the code does: its routes, its kinds, its limits."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+from fastapi.routing import APIRoute
+from starlette.routing import Route
+from tests.cairn_server.live import Live
+
+from cairn_map.commit import COMMIT_BYTES_MAX, RETRACTS_MAX
+from cairn_map.messages import CURSORS_MAX
+from cairn_server import body_limit, missing, problems, push_policy, service, sqlite_changes
+
+ROOT = Path(__file__).parents[2]
+DOCUMENT = (ROOT / "server" / "PROTOCOL.md").read_text()
+ROUTE = re.compile(r"^\| ([A-Z]+) \| `(/[^`]*)` \| ([a-z, ]+) \| (.*) \|$", re.MULTILINE)
+KIND = re.compile(r"[a-z]+(_[a-z]+)*")
+RAISERS = ("_problem", "send_problem")
+
+
+def routes_of(live: Live) -> set[tuple[str, str]]:
+    """Of the app: the framework hides included routers, so they are found where they lie."""
+    found: set[tuple[str, str]] = set()
+    for route in _flat(live.app.routes):
+        methods = route.methods or set()
+        found |= {(method, route.path) for method in methods if method != "HEAD" or "GET" not in methods}
+    return found
+
+
+def _flat(routes: object) -> list[Route | APIRoute]:
+    found: list[Route | APIRoute] = []
+    for route in routes:  # type: ignore[attr-defined]
+        if isinstance(route, Route | APIRoute):
+            found.append(route)
+        else:
+            found += _flat(getattr(route, "original_router", route).routes)
+    return found
+
+
+def kinds_in(folder: str) -> set[str]:
+    """Text constants that errors and problems are made with."""
+    found: set[str] = set()
+    for path in (ROOT / folder).glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call):
+                name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+                if name.endswith("Error") or name in RAISERS:
+                    texts = [a.value for a in node.args if isinstance(a, ast.Constant) and isinstance(a.value, str)]
+                    found |= {text for text in texts if KIND.fullmatch(text)}
+    return found
+
+
+def documented_kinds() -> set[str]:
+    section = DOCUMENT.split("## 5. Problems")[1].split("## 6. Limits")[0]
+    rows = [line.split("|")[1] for line in section.splitlines() if line.startswith("| `")]
+    beside = section.split("Of the same family")[1]
+    return set(re.findall(r"`([a-z_]+)`", " ".join(rows) + beside))
+
+
+def test_the_route_table_is_that_of_the_app(live: Live) -> None:
+    assert {(found[1], found[2]) for found in ROUTE.finditer(DOCUMENT)} == routes_of(live)
+
+
+def test_every_kind_in_the_code_is_in_the_document_and_no_other() -> None:
+    code = kinds_in("server/cairn_server") | kinds_in("fusion/cairn_map")
+    code |= {*problems.KIND_OF_STATUS.values(), "http"}
+    assert code == documented_kinds()
+
+
+@pytest.mark.parametrize("kind", ["no_token", "too_large", "other_log", "damaged_store"])
+def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
+    row = next(line for line in DOCUMENT.splitlines() if line.startswith("| `") and f"`{kind}`" in line)
+    assert int(row.split("|")[2]) == problems.STATUS_OF_KIND[kind]
+
+
+@pytest.mark.parametrize(
+    ("row", "number"),
+    [
+        ("body of a push", COMMIT_BYTES_MAX),
+        ("body of `missing`", body_limit.MISSING_BYTES_MAX),
+        ("any other body", body_limit.JSON_BYTES_MAX),
+        ("cells listed in `missing`", CURSORS_MAX),
+        ("commits named in one retract request", RETRACTS_MAX),
+        ("reply to `missing`", missing.REPLY_BYTES_MAX),
+        ("commits whose evidence is decoded at once", service.VALIDATING_MAX),
+        ("problem's `detail`", problems.DETAIL_CHARACTERS_MAX),
+        ("audit log", sqlite_changes.AUDIT_ROWS_MAX),
+    ],
+)
+def test_the_limits_in_the_document_are_those_of_the_code(row: str, number: int) -> None:
+    cell = next(line for line in DOCUMENT.splitlines() if line.startswith(f"| {row} |")).split("|")[2]
+    written = re.search(r"\d+\^\d+|\d[\d ]*\d|\d", cell)
+    assert written
+    assert eval(written[0].replace("^", "**").replace(" ", "")) == number
+
+
+def test_the_limits_of_push_in_the_document_are_those_of_the_code() -> None:
+    policy = DOCUMENT.split("### 4.1 Push")[1].split("**Folding**")[0]
+    for text in (
+        f"<= {push_policy.WEIGHT_MAX} S",
+        f"n at most {push_policy.AHEAD_MAX:_} above".replace("_", " "),
+        f"at most {push_policy.AUTHOR_INTERVALS_MAX} gaps",
+        f"{push_policy.INCARNATIONS_MAX} incarnations",
+        f"{push_policy.AUTHORS_MAX // 2:_} authors".replace("_", " "),
+        f"at most {missing.DELTA_ENTRIES_MAX} entries",
+    ):
+        assert text in policy + DOCUMENT, text
