@@ -4,8 +4,9 @@
     replayed 15 scans as 15 commits in 1.9 s (7.9 images/s), 0 commits wait
     $ cairn robot pull --map http://127.0.0.1:8750/maps/shelf --state copy/
 
-`replay` reads a recording folder (RECORDING.md), or a known layout as it was published (apc_shelf_rgbd, mm5_rgbdt),
-and maps it as a live robot would: each measurement becomes a commit, first kept in the state folder, then pushed.
+`replay` reads a recording folder (RECORDING.md), a known layout as it was published (apc_shelf_rgbd, mm5_rgbdt), or
+any folder of frames that options describe (--depth, --pose, --intrinsics, ...: `cairn robot replay --help`). It maps
+as a live robot would: each measurement becomes a commit, first kept in the state folder, then pushed.
 Without a link it goes on, and the next `replay` or `pull` with the same state folder pushes what waits. Two robots
 can share a recording: --share 1/2 takes every second measurement from the first on, --share 2/2 the others.
 
@@ -20,6 +21,7 @@ from pathlib import Path
 
 from cairn_client.api import MapApi
 from cairn_client.arguments import add_token, api_of, parser, say, shown_bytes, with_progress
+from cairn_client.frame_arguments import add_frame_arguments, frame_options
 from cairn_client.replica_store import ReplicaStore
 from cairn_client.robot import Mode, Robot
 from cairn_client.sync import Wanted, within
@@ -43,7 +45,8 @@ def main(argv: list[str]) -> int:
 
 
 def _replay(args: argparse.Namespace) -> int:
-    source = open_source(args.recording, scans_per_measurement=args.scans_per_measurement)
+    options, size = frame_options(args), args.scans_per_measurement
+    source = open_source(args.recording, options=options, frames=args.frames, scans_per_measurement=size)
     geometry = _ensure_map(args, source)
     name = args.name or _default_name(source.name)
     stops = source.measurements()[args.share[0] - 1 :: args.share[1]]
@@ -183,6 +186,7 @@ def _parser() -> argparse.ArgumentParser:
     replay.add_argument("--max-range", type=float, default=Integrator().max_range_m, metavar="METRES")
     replay.add_argument("--state", type=Path, metavar="DIR", help="the robot's folder (cairn-NAME)")
     replay.add_argument("--mode", choices=("high-end", "low-end"), default="high-end")
+    add_frame_arguments(replay)
     replay.set_defaults(run=_replay)
     pull = commands.add_parser("pull", help="fetch what is missing", description="fetch what is missing")
     pull.add_argument("--state", type=Path, required=True, metavar="DIR", help="the robot's folder")

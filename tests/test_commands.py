@@ -1,0 +1,224 @@
+"""The commands as a user runs them: real processes, a real server, real files."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cairn_fusion.recording_writer import RecordingWriter
+from cairn_sim.drive import head_poses, stops
+from cairn_sim.heads import RANGE_CAMERA, full_head
+from cairn_sim.render import render_scan
+from cairn_sim.room import small_room
+
+COMMAND_S = 120
+VOXEL_M = "0.08"
+
+
+def cairn(*arguments: object, folder: Path, code: int = 0) -> str:
+    """Run a command in a folder; its standard output, or with another exit code what it complained about."""
+    command = [sys.executable, "-m", "cairn_client.main", *map(str, arguments)]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=COMMAND_S, check=False)
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout if code == 0 else done.stderr
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[str]:
+    command = [sys.executable, "-m", "cairn_client.main", "serve", "--data", str(tmp_path / "server"), "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        found = re.search(r"http://\S+:\d+", process.stdout.readline())
+        assert found is not None
+        yield found.group(0)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=30) == 0
+
+
+@pytest.fixture(scope="session")
+def room_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two stops of four scans in the simulated room, all channels, as a recording on disk."""
+    folder = tmp_path_factory.mktemp("recording") / "room"
+    room, rig, rng = small_room(), full_head(scale=0.1), np.random.default_rng(3)
+    time_s = 0.0
+    with RecordingWriter(folder, rig, name="room") as writer:
+        for position in stops("west")[:2]:
+            for T in head_poses(position, n_yaw=4, n_pitch=1):
+                time_s += 1.0
+                writer.add(render_scan(room, rig, T_map_rig=T, range_camera=RANGE_CAMERA, time_s=time_s, rng=rng))
+            writer.end_measurement()
+    return folder
+
+
+def digests(map_url: str, folder: Path, name: str) -> dict[str, bytes]:
+    """The cells of a map as `export --cells` writes them, without what the server's compressor may choose."""
+    from cairn_map.cell_folder import read_cells, read_head
+
+    cairn("map", "export", map_url, "--cells", name, folder=folder)
+    geometry = read_head(folder / name).geometry
+    return {str(cell.key): cell.digest for cell in read_cells(folder / name, geometry)}
+
+
+def test_two_robots_that_share_a_recording_make_the_map_of_one(
+    server: str, room_recording: Path, tmp_path: Path
+) -> None:
+    one, two = f"{server}/maps/one", f"{server}/maps/two"
+    out = cairn("robot", "replay", room_recording, "--map", one, "--voxel", VOXEL_M, folder=tmp_path)
+    assert re.search(r"replayed 8 scans as 2 commits in .* images/s\), .* 0 commits wait", out)
+    for part in ("1/2", "2/2"):
+        name = f"part{part[0]}"
+        cairn(
+            *("robot", "replay", room_recording, "--map", two, "--voxel", VOXEL_M, "--share", part, "--name", name),
+            folder=tmp_path,
+        )
+    assert digests(two, tmp_path, "cells-two") == digests(one, tmp_path, "cells-one") != {}
+
+
+def test_a_map_starts_from_a_folder_of_cells_or_from_another_map(
+    server: str, room_recording: Path, tmp_path: Path
+) -> None:
+    source = f"{server}/maps/source"
+    cairn("robot", "replay", room_recording, "--map", source, "--voxel", VOXEL_M, folder=tmp_path)
+    cells = digests(source, tmp_path, "cells")
+    cairn("map", "create", f"{server}/maps/from-folder", "--from", "cells", folder=tmp_path)
+    cairn("map", "create", f"{server}/maps/from-map", "--from", source, folder=tmp_path)
+    assert digests(f"{server}/maps/from-folder", tmp_path, "a") == cells
+    assert digests(f"{server}/maps/from-map", tmp_path, "b") == cells
+    log = json.loads(cairn("map", "log", f"{server}/maps/from-map", "--json", folder=tmp_path))
+    assert [entry["id"].partition(".")[0] for entry in log] == ["initial"]
+
+
+def test_retracting_a_robot_leaves_the_map_of_the_others(server: str, room_recording: Path, tmp_path: Path) -> None:
+    both, alone = f"{server}/maps/both", f"{server}/maps/alone"
+    for url, name, part in ((both, "good", "1/2"), (both, "bad", "2/2"), (alone, "good", "1/2")):
+        state = tmp_path / f"{name}-on-{url[-5:]}"
+        cairn(
+            *("robot", "replay", room_recording, "--map", url, "--voxel", VOXEL_M, "--share", part),
+            *("--name", name, "--state", state),
+            folder=tmp_path,
+        )
+    assert "takes out 1 commits" in cairn("map", "retract", both, "--robot", "bad", folder=tmp_path)
+    cairn("robot", "pull", "--map", both, "--state", "copy", folder=tmp_path)  # waits for nothing, but must not fail
+    expected = digests(alone, tmp_path, "expected")
+    for attempt in range(100):
+        if digests(both, tmp_path, f"try{attempt}") == expected:
+            return
+    pytest.fail("the retract was not folded")
+
+
+def test_a_low_end_copy_holds_only_the_cells_near_a_place(server: str, room_recording: Path, tmp_path: Path) -> None:
+    url = f"{server}/maps/near"
+    cairn("robot", "replay", room_recording, "--map", url, "--voxel", VOXEL_M, folder=tmp_path)
+    near = ("--mode", "low-end", "--near", "1,1,1", "--radius", "0.1")
+    assert "1 cells," in cairn("robot", "pull", "--map", url, "--state", "low", *near, folder=tmp_path)
+    whole = cairn("robot", "pull", "--map", url, "--state", "whole", "--mode", "low-end", folder=tmp_path)
+    viewer = cairn("robot", "pull", "--map", url, "--state", "viewer", folder=tmp_path)
+    assert whole.split(" in ")[0] == viewer.split(" in ")[0] != "1 cells"
+
+
+def test_a_robot_without_a_link_keeps_its_commits_until_there_is_one(
+    server: str, room_recording: Path, tmp_path: Path
+) -> None:
+    url = f"{server}/maps/later"
+    nowhere = "http://127.0.0.1:9/maps/later"
+    state = ("--state", "state", "--name", "lonely")
+    out = cairn(*("robot", "replay", room_recording, "--map", nowhere, "--voxel", VOXEL_M, *state), folder=tmp_path)
+    assert "2 commits wait" in out
+    cairn("map", "create", url, "--voxel", VOXEL_M, folder=tmp_path)
+    assert "2 commits pushed" in cairn("robot", "pull", "--map", url, "--state", "state", folder=tmp_path)
+    assert digests(url, tmp_path, "cells") != {}
+
+
+def test_cells_and_maps_download_as_files_that_other_programs_read(
+    server: str, room_recording: Path, tmp_path: Path
+) -> None:
+    url = f"{server}/maps/files"
+    cairn("robot", "replay", room_recording, "--map", url, "--voxel", VOXEL_M, folder=tmp_path)
+    cairn("map", "get", url, "0,0,0", "-o", "cell.npz", folder=tmp_path)
+    with np.load(tmp_path / "cell.npz") as arrays:
+        occupied = arrays["probability"] > 0.5
+        assert 290 < np.nanmedian(arrays["temperature_mean"][occupied]) < 300
+        assert (arrays["centres_m"] >= 0).all() and (arrays["centres_m"] < 5.12).all()
+    outputs = ("--ply", "map.ply", "--npz", "map.npz", "--picture", "map.png", "--ceiling", "1.7")
+    cairn("map", "export", url, *outputs, folder=tmp_path)
+    head = (tmp_path / "map.ply").read_bytes().partition(b"end_header\n")
+    count = int(re.search(rb"element vertex (\d+)", head[0]).group(1))  # type: ignore[union-attr]
+    assert count > 1000
+    assert len(head[2]) == count * (3 * 4 + 3 + 3 * 4 + 2 * 4)
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_errors_name_the_cause_and_have_an_exit_code_of_their_own(server: str, tmp_path: Path) -> None:
+    cairn("map", "create", f"{server}/maps/lab", folder=tmp_path)
+    assert "[no_cell]" in cairn("map", "get", f"{server}/maps/lab", "9,9,9", "-o", "x.ply", folder=tmp_path, code=3)
+    assert "[no_map]" in cairn("map", "info", f"{server}/maps/none", folder=tmp_path, code=3)
+    other = cairn("map", "create", f"{server}/maps/lab", "--voxel", "0.02", folder=tmp_path, code=4)
+    assert "another geometry" in other
+    assert "is `cairn serve` running?" in cairn("map", "ls", "http://127.0.0.1:9", folder=tmp_path, code=5)
+    assert "http://HOST:PORT/maps/NAME" in cairn("map", "info", server, folder=tmp_path, code=1)
+    assert "looked for" in cairn("robot", "replay", ".", "--map", f"{server}/maps/lab", folder=tmp_path, code=1)
+
+
+@pytest.mark.parametrize("command", ["map", "robot", "serve", "demo"])
+def test_help_of_a_command_is_its_module_docstring(command: str, tmp_path: Path) -> None:
+    first_line = cairn("--help", folder=tmp_path).partition(f"  {command} ")[2].splitlines()[0].strip()
+    assert first_line and first_line in cairn(command, "--help", folder=tmp_path)
+
+
+def test_a_robot_without_the_server_extra_is_told_what_to_install(tmp_path: Path) -> None:
+    (tmp_path / "fastapi.py").write_text("raise ModuleNotFoundError('No module named fastapi', name='fastapi')\n")
+    (tmp_path / "uvicorn.py").write_text("raise ModuleNotFoundError('No module named uvicorn', name='uvicorn')\n")
+    done = subprocess.run(
+        [sys.executable, "-m", "cairn_client.main", "serve"],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=COMMAND_S,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert 'pip install "cairn-robotics[server]"' in done.stderr
+
+
+def test_the_demo_ends_with_maps_that_agree(tmp_path: Path) -> None:
+    out = cairn("demo", "--quick", "--output", "demo", folder=tmp_path)
+    assert re.search(r"all equal: server, scout, mole, late hold the same \d+ cells,\s+byte for byte", out)
+    assert "every map equals one that never had it" in out
+    assert (tmp_path / "demo" / "map.png").stat().st_size > 10_000
+    assert (tmp_path / "demo" / "map.ply").read_bytes().startswith(b"ply\n")
+
+
+@pytest.mark.recording
+@pytest.mark.skipif("CAIRN_TEST_DATA" not in os.environ, reason="CAIRN_TEST_DATA names no folder of recordings")
+def test_two_robots_on_a_real_recording_make_the_map_of_one(server: str, tmp_path: Path) -> None:
+    recording = Path(os.environ["CAIRN_TEST_DATA"]) / "apc_shelf_rgbd"
+    one, two = f"{server}/maps/one", f"{server}/maps/two"
+    cairn("robot", "replay", recording, "--map", one, "--voxel", "0.01", "--name", "single", folder=tmp_path)
+    for part in ("1/2", "2/2"):
+        name = f"part{part[0]}"
+        cairn(
+            *("robot", "replay", recording, "--map", two, "--voxel", "0.01", "--share", part, "--name", name),
+            folder=tmp_path,
+        )
+    assert digests(two, tmp_path, "cells-two") == digests(one, tmp_path, "cells-one") != {}
+
+
+@pytest.mark.recording
+@pytest.mark.skipif("CAIRN_TEST_DATA" not in os.environ, reason="CAIRN_TEST_DATA names no folder of recordings")
+def test_a_folder_of_frames_described_by_options_makes_the_map_of_its_importer(server: str, tmp_path: Path) -> None:
+    recording = Path(os.environ["CAIRN_TEST_DATA"]) / "apc_shelf_rgbd"
+    ids = ("--frames", "000000,000007")
+    options = ("--depth", "frames/frame-{id}.depth.png", "--colour", "frames/frame-{id}.color.png")
+    options += ("--pose", "frames/frame-{id}.pose.txt", "--intrinsics", "K_color.txt", "--depth-units", "10000")
+    for name, more in (("known", ()), ("described", options)):
+        url = f"{server}/maps/{name}"
+        cairn(*("robot", "replay", recording, "--map", url, "--voxel", "0.02", *ids), *more, folder=tmp_path)
+    expected = digests(f"{server}/maps/known", tmp_path, "known")
+    assert digests(f"{server}/maps/described", tmp_path, "described") == expected != {}
