@@ -1,0 +1,71 @@
+# Everything starts here, on a machine that has only Python 3.11 or newer: `make demo`, `make test`.
+# Each target makes what it needs, once, in .venv; `make clean` takes it all away again.
+
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint bench clean system
+# Installing comes before compiling, in the order in which the targets name them.
+.NOTPARALLEL:
+
+PYTHON ?= python3
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+# By file, because the image is built once per worker that runs a test of it; in tests/conftest.py's order.
+WORKERS := --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+KERNELS := $(wildcard */cairn_*/*_kernels.py */cairn_*/warm_up.py)
+# Commands that tests need and pip cannot bring, and the Debian packages that have them.
+SYSTEM_PACKAGES := buildah mmdebstrap curl
+
+help:  ## show this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-6s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+demo: .venv/run.stamp .venv/kernels.stamp  ## three robots, one server, one map (DEMO_ARGS="...")
+	$(BIN)/cairn demo $(DEMO_ARGS)
+
+test: .venv/dev.stamp .venv/kernels.stamp | system  ## all tests (PYTEST_ARGS="...")
+	$(BIN)/python -m pytest $(WORKERS) $(PYTEST_ARGS)
+
+lint: .venv/dev.stamp  ## ruff, mypy, pyright
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright
+
+bench: .venv/dev.stamp .venv/kernels.stamp  ## measure (BENCH_ARGS="--smoke" for a short run)
+	$(BIN)/python -m tests.bench $(BENCH_ARGS)
+
+clean:  ## remove .venv, build/ and all caches
+	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+.venv/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+		|| { echo "cairn needs Python 3.11 or newer; name one with: make PYTHON=/path/to/python3" >&2; exit 1; }
+	$(PYTHON) -m venv .venv || { rm -rf .venv; exit 1; }
+
+.venv/run.stamp: pyproject.toml | .venv/bin/python
+	$(PIP) --editable '.[all]'
+	touch $@
+
+.venv/dev.stamp: pyproject.toml | .venv/bin/python
+	$(PIP) --editable '.[dev]'
+	touch $@ .venv/run.stamp
+
+.venv/kernels.stamp: $(KERNELS) | .venv/bin/python
+	$(BIN)/cairn compile
+	touch $@
+
+system:
+	@missing=(); for name in $(SYSTEM_PACKAGES); do command -v "$$name" >/dev/null || missing+=("$$name"); done; \
+	if (( $${#missing[@]} )); then \
+		if [[ $$(id -u) == 0 ]] && command -v apt-get >/dev/null; then \
+			echo "installing $${missing[*]} through apt"; \
+			export DEBIAN_FRONTEND=noninteractive; \
+			{ apt-get -qq update && apt-get -qq install --no-install-recommends "$${missing[@]}"; } >/dev/null 2>&1 </dev/null || true; \
+		fi; \
+		for name in "$${missing[@]}"; do \
+			command -v "$$name" >/dev/null || echo "$$name is missing: the image test will be skipped"; \
+		done; \
+	fi

@@ -1,0 +1,31 @@
+"""`cairn compile` runs every kernel; in a process of its own, since other tests call kernels too."""
+
+import subprocess
+import sys
+
+FIND_KERNELS_NOT_CALLED = """
+import sys
+from importlib import import_module
+from pathlib import Path
+
+from cairn_client.compile_command import main
+from numba.core.dispatcher import Dispatcher
+
+main([])
+for package in ("cairn_map", "cairn_fusion", "cairn_sim"):
+    folder = Path(import_module(package).__file__).parent
+    for path in sorted(folder.glob("*_kernels.py")):
+        module = import_module(f"{package}.{path.stem}")
+        for name, value in vars(module).items():
+            # Private and inlined kernels are called by others alone, and are kept within those.
+            if not isinstance(value, Dispatcher) or name.startswith("_") or value.targetoptions.get("inline"):
+                continue
+            if not value.signatures:
+                sys.exit(f"{module.__name__}.{name} is not called by {package}.warm_up")
+"""
+
+
+def test_every_kernel_is_compiled() -> None:
+    done = subprocess.run([sys.executable, "-c", FIND_KERNELS_NOT_CALLED], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert [line.partition(":")[0] for line in done.stdout.splitlines()] == ["fusion", "map", "sim"]
