@@ -5,6 +5,8 @@ Evidence here is a dict: place -> (hits, misses, samples), samples a tuple of al
 
 import hashlib
 import io
+import itertools
+import math
 import struct
 import zlib
 from collections.abc import Iterable, Iterator
@@ -378,3 +380,32 @@ def vector_of_ids(ids: Iterable[tuple[str, int]]) -> dict[str, list[list[int]]]:
         else:
             spans.append([n, n])
     return vector
+
+
+# --- Rays through voxels (cairn_fusion.cast_kernels) ------------------------------------------------------------
+
+
+def passes(start: tuple[float, ...], end: tuple[float, ...], voxel: tuple[int, ...], *, grown: float) -> bool:
+    """Whether a segment meets a voxel's cube, grown by so much on each side (or shrunken, if negative).
+
+    A statement about the solid, not a walk: the parameters at which each axis is inside must overlap.
+    """
+    first, last = 0.0, 1.0
+    for s, e, v in zip(start, end, voxel, strict=True):
+        low, high = v - grown, v + 1 + grown
+        if e == s:
+            if not low <= s <= high:
+                return False
+            continue
+        a, b = sorted(((low - s) / (e - s), (high - s) / (e - s)))
+        first, last = max(first, a), min(last, b)
+    return first <= last
+
+
+def voxels_passed(start: tuple[float, ...], end: tuple[float, ...], *, grown: float) -> set[tuple[int, ...]]:
+    """All voxels that a segment meets, each tried."""
+    spans = [
+        range(math.floor(min(s, e) - grown) - 1, math.floor(max(s, e) + grown) + 2)
+        for s, e in zip(start, end, strict=True)
+    ]
+    return {voxel for voxel in itertools.product(*spans) if passes(start, end, voxel, grown=grown)}

@@ -5,6 +5,7 @@ again later, is `UnreachableError`. Every call is idempotent, so whoever calls m
 """
 
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
@@ -50,6 +51,16 @@ TIMEOUT = httpx.Timeout(30.0, connect=5.0)
 ANSWER_BYTES_MAX = 64 << 20
 """Longest JSON answer that is read."""
 ERROR_BYTES_MAX = 1 << 16
+VECTOR: TypeAdapter[VectorJson] = TypeAdapter(VectorJson)
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A whole answer that is no error."""
+
+    status: int
+    headers: httpx.Headers
+    body: bytes
 
 
 @dataclass(slots=True)
@@ -142,15 +153,14 @@ class MapApi:
     def cell(self, name: str, cell: Cell, *, etag: str | None = None) -> FetchedCell:
         """One cell's octree, unless it is the one with this ETag."""
         headers = {"If-None-Match": etag} if etag else {}
-        response = self._send("GET", f"/maps/{name}/main/cells/{cell}", headers=headers)
+        answer = self._send("GET", f"/maps/{name}/main/cells/{cell}", headers=headers)
         try:
-            coverage: VectorJson = TypeAdapter(VectorJson).validate_json(response.headers["Cairn-Coverage"])
             return FetchedCell(
-                body=None if response.status_code == 304 else response.content,
-                etag=response.headers["ETag"],
-                cursor=cursor_from_text(response.headers["Cairn-Cursor"]),
-                coverage=version_vector_from_json(coverage),
-                fingerprint=fingerprint_from_hex(response.headers["Cairn-Fingerprint"]),
+                body=None if answer.status == httpx.codes.NOT_MODIFIED else answer.body,
+                etag=answer.headers["ETag"],
+                cursor=cursor_from_text(answer.headers["Cairn-Cursor"]),
+                coverage=version_vector_from_json(VECTOR.validate_json(answer.headers["Cairn-Coverage"])),
+                fingerprint=fingerprint_from_hex(answer.headers["Cairn-Fingerprint"]),
             )
         except (KeyError, ValidationError) as exc:
             raise DamagedDataError("bad_message", f"the answer for cell {cell} lacks its headers: {exc}") from exc
@@ -164,25 +174,29 @@ class MapApi:
         """
         reader = FrameReader()
         body = request.model_dump_json(exclude_defaults=True).encode()
-        self.traffic.up_bytes += len(body)
-        path = f"/maps/{name}/branches/{branch}/missing"
-        headers = {**self._headers(), "Content-Type": _media_type(body)}
-        try:
-            with self._client.stream("POST", path, content=body, headers=headers) as response:
-                if response.status_code != 200:
-                    raise _error_of(response.status_code, next(response.iter_bytes(ERROR_BYTES_MAX), b""), response)
-                for part in response.iter_bytes(1 << 16):
-                    self.traffic.down_bytes += len(part)
-                    yield from reader.feed(part)
-        except httpx.TransportError as exc:
-            raise _unreachable(exc) from exc
+        with self._open("POST", f"/maps/{name}/branches/{branch}/missing", content=body) as response:
+            for part in response.iter_bytes(1 << 16):
+                self.traffic.down_bytes += len(part)
+                yield from reader.feed(part)
         if not reader.is_empty:
             raise UnreachableError("cut_off", "the reply was cut off")
 
     def _ask(self, method: str, path: str, **options: Any) -> bytes:
-        return self._send(method, path, **options).content
+        return self._send(method, path, **options).body
 
-    def _send(
+    def _send(self, method: str, path: str, **options: Any) -> Answer:
+        """A whole answer, but never a longer one than a cell may have."""
+        body = bytearray()
+        with self._open(method, path, **options) as response:
+            for part in response.iter_bytes():
+                self.traffic.down_bytes += len(part)
+                body += part
+                if len(body) > ANSWER_BYTES_MAX:
+                    raise BadInputError("too_large", f"the server's answer is longer than {ANSWER_BYTES_MAX} bytes")
+            return Answer(response.status_code, response.headers, bytes(body))
+
+    @contextmanager
+    def _open(
         self,
         method: str,
         path: str,
@@ -190,35 +204,23 @@ class MapApi:
         content: bytes = b"",
         headers: Mapping[str, str] | None = None,
         params: Mapping[str, str | int] | None = None,
-    ) -> httpx.Response:
+    ) -> Iterator[httpx.Response]:
+        """An answer that begins well and is still to be read; an error of the server or the link as ours."""
+        sent = dict(headers or {})
+        if self.token:
+            sent["Authorization"] = f"Bearer {self.token}"
+        if content:
+            sent["Content-Type"] = "application/json" if content.startswith(b"{") else "application/vnd.cairn.commit"
         self.traffic.up_bytes += len(content)
-        sent = {**self._headers(), **(headers or {}), "Content-Type": _media_type(content)}
         try:
             with self._client.stream(method, path, headers=sent, content=content, params=params) as response:
-                _read_bounded(response)
+                if not response.is_success and response.status_code != httpx.codes.NOT_MODIFIED:
+                    raise _error_of(response, next(response.iter_bytes(ERROR_BYTES_MAX), b""))
+                yield response
         except httpx.TransportError as exc:
             raise _unreachable(exc) from exc
-        self.traffic.down_bytes += len(response.content)
-        if response.status_code >= 400:
-            raise _error_of(response.status_code, response.content, response)
-        return response
-
-    def _headers(self) -> dict[str, str]:
-        return {"Authorization": f"Bearer {self.token}"} if self.token else {}
-
-
-def _media_type(content: bytes) -> str:
-    return "application/json" if content.startswith(b"{") else "application/vnd.cairn.commit"
-
-
-def _read_bounded(response: httpx.Response) -> None:
-    """Read an answer whole, but never more than a cell may have."""
-    got = bytearray()
-    for part in response.iter_bytes():
-        got += part
-        if len(got) > ANSWER_BYTES_MAX:
-            raise BadInputError("too_large", f"the server's answer is longer than {ANSWER_BYTES_MAX} bytes")
-    response._content = bytes(got)
+        except httpx.DecodingError as exc:
+            raise DamagedDataError("bad_message", f"the server's answer cannot be decompressed: {exc}") from exc
 
 
 def _list_of(model: type[Message], data: bytes) -> list[Message]:
@@ -237,15 +239,16 @@ def _unreachable(exc: httpx.TransportError) -> UnreachableError:
     return UnreachableError("no_link", f"cannot reach {where} ({exc or type(exc).__name__}); is `cairn serve` running?")
 
 
-def _error_of(status: int, body: bytes, response: httpx.Response) -> CairnError:
+def _error_of(response: httpx.Response, body: bytes) -> CairnError:
     """The server's problem as the error that it was there."""
+    status = response.status_code
     try:
         problem = Problem.model_validate_json(body)
     except ValidationError:
         problem = Problem(kind="http", detail=f"the server answered {status}: {body[:200].decode(errors='replace')}")
     if status in (429, 502, 503, 504):
         wait = response.headers.get("Retry-After", "")
-        return UnreachableError(problem.kind, problem.detail, float(wait) if wait.isdigit() else None)
+        return UnreachableError(problem.kind, problem.detail, float(wait) if wait.isdecimal() else None)
     families: dict[int, type[CairnError]] = {
         401: DeniedError,
         403: DeniedError,

@@ -9,14 +9,13 @@ import logging
 import numpy as np
 import numpy.typing as npt
 
-from cairn_client.replica import Replica, base_cell
+from cairn_client.replica import UNPROVEN, Replica
 from cairn_client.replica_store import BaseCell
 from cairn_map.brick_cell import sum_evidence
 from cairn_map.cell_code import decode_cell
-from cairn_map.cursor import Cursor
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence import Evidence, empty_evidence
-from cairn_map.fingerprint import ZERO, Fingerprint, fingerprint
+from cairn_map.fingerprint import ZERO, fingerprint
 from cairn_map.frames import CellFrame, Frame, FrameKind
 from cairn_map.grid import CellKey, cell_of_key
 from cairn_map.messages import CellCursor, Done, MissingRequest, More, ReplyHeader
@@ -34,11 +33,14 @@ class Exchange:
     def __init__(self, replica: Replica, *, compare: bool = False) -> None:
         self._replica = replica
         with replica.lock:
+            self._author = replica.author
             self._default = replica.default_cursor
             self._asked = {key: cell.cursor for key, cell in replica.cells.items()}
         self._compare = compare
         self._header: ReplyHeader | None = None
+        self._coverage = EMPTY
         self._framed: set[CellKey] = set()
+        self._has_dropped = False
         self.is_done = False
         self.must_compare = False
 
@@ -46,7 +48,7 @@ class Exchange:
         """What this replica holds: the default cursor, and every cell that stands elsewhere."""
         listed = [(key, cursor) for key, cursor in self._asked.items() if self._compare or cursor != self._default]
         return MissingRequest(
-            author=str(self._replica.author),
+            author=str(self._author),
             cursor=str(self._default) if self._default else None,
             cells=[CellCursor(cell=cell_of_key(k), cursor=str(c) if c else None) for k, c in sorted(listed)],
             compare=self._compare,
@@ -61,25 +63,26 @@ class Exchange:
         with self._replica.lock:
             if isinstance(frame, ReplyHeader):
                 self._header = frame
-                self._replica.take_header(frame)
-                return
-            if self._header is None:
+                self._coverage = frame.coverage
+                self._replica.take_header(frame, asked_by=self._author)
+            elif self._header is None:
                 raise DamagedDataError("bad_frame", "a reply must begin with its header")
-            if isinstance(frame, CellFrame):
-                self._take_cell(frame, self._header)
-            elif isinstance(frame, Done):
-                self._finish(frame, self._header)
             elif isinstance(frame, More):
-                self.is_done = False
+                pass  # what came is kept; the next request asks for the rest
+            elif frame.to_cursor != self._header.to_cursor:
+                raise DamagedDataError("bad_frame", "a frame leads to another state than its header")
+            elif isinstance(frame, CellFrame):
+                self._take_cell(frame)
+            else:
+                self._finish(frame)
 
-    def _take_cell(self, frame: CellFrame, header: ReplyHeader) -> None:
-        if frame.to_cursor != header.to_cursor:
-            raise DamagedDataError("bad_frame", "a cell frame leads to another state than its header")
+    def _take_cell(self, frame: CellFrame) -> None:
         self._framed.add(frame.cell)
         held = self._replica.cells.get(frame.cell)
         stands_at = held.cursor if held else self._replica.default_cursor
         if frame.from_cursor != stands_at:  # rule 5: made for a state that this cell has left
             log.info("cell %s: frame for another cursor dropped", cell_of_key(frame.cell))
+            self._has_dropped = True
             return
         apply = {
             FrameKind.FULL: self._apply_full,
@@ -87,66 +90,55 @@ class Exchange:
             FrameKind.STATE: self._apply_state,
             FrameKind.RESET: self._apply_reset,
         }[frame.kind]
-        apply(frame, header)
+        apply(frame)
 
-    def _apply_full(self, frame: CellFrame, header: ReplyHeader) -> None:
+    def _apply_full(self, frame: CellFrame) -> None:
         evidence = self._payload(frame)
         if fingerprint(evidence, frame.cell) != frame.fingerprint:
             raise DamagedDataError(
                 "fingerprint_mismatch",
                 f"cell {cell_of_key(frame.cell)} came whole, but not with its fingerprint; the server may be damaged",
             )
-        self._hold(frame, header, evidence)
+        self._replica.hold(frame.cell, self._at_head(frame), evidence, body=frame.payload)
 
-    def _apply_delta(self, frame: CellFrame, header: ReplyHeader) -> None:
+    def _apply_delta(self, frame: CellFrame) -> None:
         own: list[Evidence] | None = []
         if frame.own_excluded:
             held = self._replica.cells.get(frame.cell)
-            news = header.coverage.minus(held.coverage) if held else header.coverage
-            author = self._replica.author
-            mine = [commit for commit in self._replica.commits if commit.author == author and commit in news]
-            own = self._replica.own_evidence(frame.cell, mine)
+            news = self._coverage.minus(held.coverage) if held else self._coverage
+            own = self._replica.outbox.own_evidence(frame.cell, news, self._author)
         if own is None:
             self._ask_whole(frame.cell, "own commits that a delta leaves out are not kept any more")
             return
         base = self._replica.base_evidence(frame.cell)
-        evidence = sum_evidence([base, *own, self._payload(frame)], self._replica.geometry)
-        self._hold_if_sound(frame, header, evidence)
+        self._hold_if_sound(frame, sum_evidence([base, *own, self._payload(frame)], self._replica.geometry))
 
-    def _apply_state(self, frame: CellFrame, header: ReplyHeader) -> None:
+    def _apply_state(self, frame: CellFrame) -> None:
         base = self._replica.base_evidence(frame.cell)
         blocks = frame.blocks if frame.blocks is not None else np.empty(0, np.uint32)
         kept = without_blocks(base, blocks)
-        self._hold_if_sound(frame, header, sum_evidence([kept, self._payload(frame)], self._replica.geometry))
+        self._hold_if_sound(frame, sum_evidence([kept, self._payload(frame)], self._replica.geometry))
 
-    def _apply_reset(self, frame: CellFrame, header: ReplyHeader) -> None:
+    def _apply_reset(self, frame: CellFrame) -> None:
         held = self._replica.cells.get(frame.cell)
-        if held is None:
-            if frame.fingerprint != ZERO:
-                empty = empty_evidence(self._replica.geometry)
-                unproven = BaseCell(None, EMPTY, ZERO)
-                self._replica.hold(frame.cell, unproven, empty)
-            return
-        if held.fingerprint == frame.fingerprint:
-            self._replica.move([frame.cell], to=frame.to_cursor, coverage=header.coverage)
-            self._replica.refresh_view(frame.cell)
-        else:
-            self._ask_whole(frame.cell, "the server went back to an older state")
+        if frame.fingerprint != (held.fingerprint if held else ZERO):
+            self._ask_whole(frame.cell, "the server has another state")
+        elif held:
+            self._replica.move([frame.cell], to=frame.to_cursor, coverage=self._coverage)
+        else:  # an empty cell has a coverage all the same: what was taken out again must not be shown as new
+            self._replica.hold_nothing(frame.cell, self._at_head(frame))
 
-    def _finish(self, done: Done, header: ReplyHeader) -> None:
+    def _finish(self, done: Done) -> None:
         """Rule 8: cells without a frame move to `to`, only if they are where they were and their sum agrees."""
-        rest = {key for key in self._asked if key not in self._framed}
-        if self._header is None or done.to_cursor != header.to_cursor:
-            raise DamagedDataError("bad_frame", "the reply ends at another state than its header")
-        moved = [key for key in rest if self._replica.cells[key].cursor == self._asked[key]]
-        total = Fingerprint()
-        for key in rest:
-            total += self._replica.cells[key].fingerprint
-        if len(moved) < len(rest) or total != done.rest_fingerprint:
+        if self._has_dropped:
+            return
+        rest = {key: self._replica.cells[key] for key in self._asked.keys() - self._framed}
+        total = sum((cell.fingerprint for cell in rest.values()), ZERO)
+        if any(cell.cursor != self._asked[key] for key, cell in rest.items()) or total != done.rest_fingerprint:
             log.warning("cells without a frame do not add up to the server's; comparing all fingerprints")
             self.must_compare = True
             return
-        self._replica.move(moved, to=done.to_cursor, coverage=header.coverage)
+        self._replica.move(rest, to=done.to_cursor, coverage=self._coverage)
         self._replica.set_default_cursor(done.to_cursor)
         self._replica.forget_stable_commits()
         self.is_done = True
@@ -159,22 +151,22 @@ class Exchange:
             raise DamagedDataError("bad_frame", f"the frame of cell {cell_of_key(frame.cell)} holds another cell")
         return cell.evidence
 
-    def _hold(self, frame: CellFrame, header: ReplyHeader, evidence: Evidence) -> None:
-        self._replica.hold(frame.cell, _based(frame.cell, evidence, frame.to_cursor, header), evidence)
+    def _at_head(self, frame: CellFrame) -> BaseCell:
+        return BaseCell(frame.to_cursor, self._coverage, frame.fingerprint)
 
-    def _hold_if_sound(self, frame: CellFrame, header: ReplyHeader, evidence: Evidence) -> None:
+    def _hold_if_sound(self, frame: CellFrame, evidence: Evidence) -> None:
         if fingerprint(evidence, frame.cell) == frame.fingerprint:
-            self._hold(frame, header, evidence)
+            self._replica.hold(frame.cell, self._at_head(frame), evidence)
         else:
             self._ask_whole(frame.cell, "the frame does not lead to the server's fingerprint")
 
     def _ask_whole(self, key: CellKey, why: str) -> None:
+        """The next request asks for the cell without a cursor; what is held of it is shown until then."""
         log.warning("cell %s: %s; asking for the whole cell", cell_of_key(key), why)
         if key in self._replica.cells:
             self._replica.move([key], to=None, coverage=None)
         else:
-            empty = empty_evidence(self._replica.geometry)
-            self._replica.hold(key, BaseCell(None, EMPTY, ZERO), empty)
+            self._replica.hold_nothing(key, UNPROVEN)
 
 
 def without_blocks(evidence: Evidence, blocks: npt.NDArray[np.uint32]) -> Evidence:
@@ -188,7 +180,3 @@ def without_blocks(evidence: Evidence, blocks: npt.NDArray[np.uint32]) -> Eviden
         new_row[evidence.sampled[kept_rows]].astype(np.uint32),
         evidence.samples[kept_rows],
     )
-
-
-def _based(key: CellKey, evidence: Evidence, cursor: Cursor, header: ReplyHeader) -> BaseCell:
-    return base_cell(key, evidence, cursor=cursor, coverage=header.coverage)

@@ -3,6 +3,9 @@
 import random
 from dataclasses import dataclass, field
 
+RETRY_AFTER_MAX_S = 3600.0
+"""A server that asks for more is not believed: its clock or its settings may be broken."""
+
 
 @dataclass(slots=True)
 class Backoff:
@@ -17,7 +20,7 @@ class Backoff:
         """Seconds to wait now."""
         top_s: float = min(self.last_s, self.first_s * 2.0**self._tries)
         self._tries = min(self._tries + 1, 16)
-        return max(self._random.uniform(0.1, 1) * top_s, retry_after_s or 0.0)
+        return max(self._random.uniform(0.1, 1) * top_s, min(retry_after_s or 0.0, RETRY_AFTER_MAX_S))
 
     def reset(self) -> None:
         """It worked: begin with the shortest wait again."""

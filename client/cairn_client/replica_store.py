@@ -1,7 +1,7 @@
 """What a robot must not forget, in one SQLite file: its name and number, its commits, the server's cells it holds.
 
-Every change is one transaction with `synchronous=FULL`, so that power may be cut between any two steps. All
-methods are called under the replica's lock.
+Every change is one transaction with `synchronous=FULL`, so that power may be cut between any two steps. One process
+at a time has the file open. All methods are called under the replica's lock.
 """
 
 import json
@@ -15,7 +15,7 @@ import apsw
 
 from cairn_map.commit import Commit
 from cairn_map.cursor import Cursor, cursor_from_text
-from cairn_map.errors import BadInputError
+from cairn_map.errors import BadInputError, CairnError, ConflictError, DamagedDataError, UnreachableError
 from cairn_map.fingerprint import Fingerprint, fingerprint_from_bytes
 from cairn_map.grid import CellKey
 from cairn_map.ids import Author, CommitId
@@ -23,6 +23,17 @@ from cairn_map.version_vector import VersionVector, version_vector_from_json
 
 FILE_NAME = "robot.sqlite"
 VERSION = 1
+BUSY_MS = 1000
+"""How long a folder may still be held by a robot that is just closing."""
+PRAGMAS = (
+    # One process at a time: two would give two commits the same number.
+    "locking_mode = EXCLUSIVE",
+    "page_size = 16384",
+    "journal_mode = WAL",
+    "synchronous = FULL",
+    "mmap_size = 0",
+    "journal_size_limit = 67108864",
+)
 DDL = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE commits (
@@ -43,7 +54,10 @@ CREATE TABLE cell (
     etag TEXT,
     body BLOB NOT NULL
 );
+CREATE INDEX cell_coverage ON cell (coverage);
 """
+ONE_COMMIT = "robot = ? AND incarnation = ? AND n = ?"
+Values = tuple[str | int | bytes | None, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +65,7 @@ class BaseCell:
     """The server's cell as this robot last had it, without its bytes."""
 
     cursor: Cursor | None
+    """None: not proven, to be fetched whole."""
     coverage: VersionVector
     fingerprint: Fingerprint
     etag: str | None = None
@@ -62,9 +77,9 @@ class KeptCommit:
 
     id: CommitId
     sha: bytes
-    acked: bool
     cells: tuple[CellKey, ...]
-    has_data: bool
+    acked: bool = False
+    has_data: bool = True
     """False where only the SHA is remembered."""
 
 
@@ -72,29 +87,55 @@ class ReplicaStore:
     """The file behind a replica."""
 
     def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        self._connection = apsw.Connection(str(folder / FILE_NAME))
-        self._connection.set_busy_timeout(10_000)
-        for pragma in ("page_size = 16384", "journal_mode = WAL", "synchronous = FULL", "mmap_size = 0"):
-            self._connection.execute(f"PRAGMA {pragma}")
-        version = self._connection.pragma("user_version")
+        """Open or make the file.
+
+        Raises:
+            ConflictError: kind `folder_in_use`: another process has it open.
+            DamagedDataError: it is no SQLite file, or a broken one.
+            BadInputError: it is of another version, or the folder cannot be made.
+        """
+        self._folder = folder
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as exc:
+            raise BadInputError("bad_folder", f"cannot make the folder {folder}: {exc.strerror}") from exc
+        with self._translated():
+            self._connection = apsw.Connection(str(folder / FILE_NAME))
+        try:
+            self._prepare()
+        except BaseException:
+            self._connection.close()
+            raise
+
+    def _prepare(self) -> None:
+        with self._translated():
+            self._connection.set_busy_timeout(BUSY_MS)
+            for pragma in PRAGMAS:
+                self._connection.execute(f"PRAGMA {pragma}")
+        version = self._first("PRAGMA user_version", ())
         if version == 0:
             with self.transaction():
                 self._connection.execute(DDL)
                 self._connection.execute(f"PRAGMA user_version = {VERSION}")
         elif version != VERSION:
-            raise BadInputError("store_version", f"{folder} has version {version}, this cairn needs {VERSION}")
+            raise BadInputError("store_version", f"{self._folder} has version {version}, this cairn needs {VERSION}")
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """All or nothing of what is written inside."""
-        self._connection.execute("BEGIN IMMEDIATE")
-        try:
-            yield
-        except BaseException:
-            self._connection.execute("ROLLBACK")
-            raise
-        self._connection.execute("COMMIT")
+        """All or nothing of what is written inside.
+
+        Raises:
+            UnreachableError: kind `store_failed`: the disk is full or broken; nothing was written.
+        """
+        with self._translated():
+            self._connection.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+                self._connection.execute("COMMIT")
+            except BaseException:
+                if self._connection.in_transaction:
+                    self._connection.execute("ROLLBACK")
+                raise
 
     def get(self, key: str) -> str | None:
         """A remembered text."""
@@ -112,66 +153,57 @@ class ReplicaStore:
 
     def commits(self) -> list[KeptCommit]:
         """All commits, in the order in which they came."""
-        rows: Any = self._connection.execute(
-            "SELECT robot, incarnation, n, sha, acked, cells, data IS NOT NULL FROM commits ORDER BY number"
+        rows = self._run(
+            "SELECT robot, incarnation, n, sha, cells, acked, data IS NOT NULL FROM commits ORDER BY number"
         )
         return [
-            KeptCommit(CommitId(Author(r, i), n), sha, bool(acked), tuple(json.loads(cells)), bool(has_data))
-            for r, i, n, sha, acked, cells, has_data in rows
+            KeptCommit(CommitId(Author(r, i), n), sha, tuple(json.loads(cells)), bool(acked), bool(has_data))
+            for r, i, n, sha, cells, acked, has_data in rows
         ]
 
     def commit_data(self, commit: CommitId) -> bytes | None:
         """Bytes of a commit, if they are still kept."""
-        data: bytes | None = self._first(
-            "SELECT data FROM commits WHERE robot = ? AND incarnation = ? AND n = ?", (*commit.author, commit.n)
-        )
+        data: bytes | None = self._first(f"SELECT data FROM commits WHERE {ONE_COMMIT}", _values(commit))  # noqa: S608
         return data
 
     def add_commit(self, commit: Commit) -> None:
         """Keep a commit."""
         self._run(
             "INSERT INTO commits (robot, incarnation, n, sha, cells, data) VALUES (?, ?, ?, ?, ?, ?)",
-            (*commit.id.author, commit.id.n, commit.sha, json.dumps(sorted(commit.cells)), commit.data),
+            (*_values(commit.id), commit.sha, json.dumps(sorted(commit.cells)), commit.data),
         )
 
     def set_acked(self, commit: CommitId) -> None:
         """Note that the server has exactly these bytes."""
-        self._run(
-            "UPDATE commits SET acked = 1 WHERE robot = ? AND incarnation = ? AND n = ?", (*commit.author, commit.n)
-        )
+        self._run(f"UPDATE commits SET acked = 1 WHERE {ONE_COMMIT}", _values(commit))  # noqa: S608
 
     def clear_acked(self) -> None:
         """Forget what the server said it has: it is another server now."""
-        self._run("UPDATE commits SET acked = 0", ())
+        self._run("UPDATE commits SET acked = 0")
 
     def forget_data(self, commits: Iterable[CommitId]) -> None:
         """Drop the bytes of commits that no restore can lose; their SHA stays."""
         for commit in commits:
-            self._run(
-                "UPDATE commits SET data = NULL WHERE robot = ? AND incarnation = ? AND n = ?",
-                (*commit.author, commit.n),
-            )
+            self._run(f"UPDATE commits SET data = NULL WHERE {ONE_COMMIT}", _values(commit))  # noqa: S608
 
     def remove_commit(self, commit: CommitId) -> None:
         """Remove a commit that lives on under another id."""
-        self._run("DELETE FROM commits WHERE robot = ? AND incarnation = ? AND n = ?", (*commit.author, commit.n))
+        self._run(f"DELETE FROM commits WHERE {ONE_COMMIT}", _values(commit))  # noqa: S608
 
     def cells(self) -> dict[CellKey, BaseCell]:
         """All cells held, without their bytes."""
-        vectors: dict[int, VersionVector] = {}
-        names: Any = self._connection.execute("SELECT name, vector FROM coverage")
-        for name, vector in names:
-            vectors[name] = version_vector_from_json(json.loads(vector))
-        found: dict[CellKey, BaseCell] = {}
-        rows: Any = self._connection.execute("SELECT cell, cursor, coverage, fingerprint, etag FROM cell")
-        for cell, cursor, coverage, fingerprint, etag in rows:
-            found[CellKey(cell)] = BaseCell(
-                cursor_from_text(cursor) if cursor else None,
-                vectors[coverage],
-                fingerprint_from_bytes(fingerprint),
-                etag,
+        vectors = {
+            name: version_vector_from_json(json.loads(vector))
+            for name, vector in self._run("SELECT name, vector FROM coverage")
+        }
+        return {
+            CellKey(cell): BaseCell(
+                cursor_from_text(cursor) if cursor else None, vectors[name], fingerprint_from_bytes(sums), etag
             )
-        return found
+            for cell, cursor, name, sums, etag in self._run(
+                "SELECT cell, cursor, coverage, fingerprint, etag FROM cell ORDER BY cell"
+            )
+        }
 
     def body(self, key: CellKey) -> bytes | None:
         """Bytes of a cell held."""
@@ -180,7 +212,7 @@ class ReplicaStore:
 
     def put_cell(self, key: CellKey, cell: BaseCell, *, body: bytes) -> None:
         """Hold a cell; its cursor, coverage and bytes change together."""
-        name = self._coverage(cell)
+        name = self._coverage(cell.coverage)
         self._run(
             "INSERT INTO cell (cell, cursor, coverage, fingerprint, etag, body) VALUES (?, ?, ?, ?, ?, ?)"
             " ON CONFLICT (cell) DO UPDATE SET cursor = excluded.cursor, coverage = excluded.coverage,"
@@ -188,34 +220,56 @@ class ReplicaStore:
             (key, str(cell.cursor) if cell.cursor else None, name, cell.fingerprint.to_bytes(), cell.etag, body),
         )
 
-    def move_cell(self, key: CellKey, cell: BaseCell) -> None:
-        """Give a held cell another cursor and coverage; its bytes stay."""
-        name = self._coverage(cell)
-        cursor = str(cell.cursor) if cell.cursor else None
-        self._run("UPDATE cell SET cursor = ?, coverage = ? WHERE cell = ?", (cursor, name, key))
+    def move_cells(self, keys: Iterable[CellKey], *, to: Cursor | None, coverage: VersionVector | None) -> None:
+        """Give held cells another cursor, and coverage unless None; their bytes stay."""
+        name = None if coverage is None else self._coverage(coverage)
+        for key in keys:
+            self._run(
+                "UPDATE cell SET cursor = ?, coverage = coalesce(?, coverage) WHERE cell = ?",
+                (str(to) if to else None, name, key),
+            )
+        self._run("DELETE FROM coverage WHERE name NOT IN (SELECT coverage FROM cell)")
 
     def drop_cells(self) -> None:
         """Hold nothing of the server any more."""
-        self._run("DELETE FROM cell", ())
-        self._run("DELETE FROM coverage", ())
-
-    def drop_unused_coverage(self) -> None:
-        """Forget version vectors that no cell refers to."""
-        self._run("DELETE FROM coverage WHERE name NOT IN (SELECT coverage FROM cell)", ())
+        self._run("DELETE FROM cell")
+        self._run("DELETE FROM coverage")
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file; may be called twice."""
         self._connection.close()
 
-    def _coverage(self, cell: BaseCell) -> int:
-        """Name under which the cell's coverage is kept: one row for all cells that share it."""
-        text = json.dumps(cell.coverage.to_json())
+    def _coverage(self, coverage: VersionVector) -> int:
+        """Name under which a coverage is kept: one row for all cells that share it."""
+        text = json.dumps(coverage.to_json())
         self._run("INSERT INTO coverage (vector) VALUES (?) ON CONFLICT (vector) DO NOTHING", (text,))
         name: int = self._first("SELECT name FROM coverage WHERE vector = ?", (text,))
         return name
 
-    def _first(self, query: str, values: tuple[Any, ...]) -> Any:
-        return self._connection.execute(query, values).get
+    def _first(self, query: str, values: Values) -> Any:
+        with self._translated():
+            return self._connection.execute(query, values).get
 
-    def _run(self, query: str, values: tuple[Any, ...]) -> None:
-        self._connection.execute(query, values).fetchall()
+    def _run(self, query: str, values: Values = ()) -> list[tuple[Any, ...]]:
+        with self._translated():
+            return self._connection.execute(query, values).fetchall()
+
+    @contextmanager
+    def _translated(self) -> Iterator[None]:
+        """SQLite's errors as ours."""
+        try:
+            yield
+        except apsw.Error as exc:
+            raise _failure(exc, self._folder) from exc
+
+
+def _failure(exc: apsw.Error, folder: Path) -> CairnError:
+    if isinstance(exc, apsw.BusyError):
+        return ConflictError("folder_in_use", f"another robot has {folder} open; stop it, or choose another folder")
+    if isinstance(exc, apsw.CorruptError | apsw.NotADBError):
+        return DamagedDataError("damaged_store", f"{folder / FILE_NAME} is damaged: {exc}; move it away to start anew")
+    return UnreachableError("store_failed", f"cannot use {folder / FILE_NAME}: {exc}")
+
+
+def _values(commit: CommitId) -> tuple[str, str, int]:
+    return commit.author.robot, commit.author.incarnation, commit.n

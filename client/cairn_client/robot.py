@@ -14,20 +14,23 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self
+from typing import Literal, Self, TypeVar
 from urllib.parse import urlsplit
+
+from pydantic import ValidationError
 
 from cairn_calib.rig import Rig
 from cairn_client.api import MapApi, Traffic
-from cairn_client.backoff import Backoff
+from cairn_client.outbox import UNNUMBERED
 from cairn_client.replica import Replica
 from cairn_client.replica_store import ReplicaStore
 from cairn_client.sync import RoundReport, Wanted, fetch_cells, fetch_missing, push_commits
+from cairn_client.sync_thread import SyncThread
 from cairn_fusion.integrate import Integrator
 from cairn_fusion.measurement import Measurement
 from cairn_fusion.scan import Scan
 from cairn_map.commit import Commit, CommitMeta
-from cairn_map.errors import BadInputError, CairnError, DeniedError, UnreachableError
+from cairn_map.errors import BadInputError, CairnError, DeniedError, first_error
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.grid import Geometry
 from cairn_map.ids import CommitId, robot_name
@@ -36,7 +39,7 @@ from cairn_map.messages import Register
 log = logging.getLogger(__name__)
 
 Mode = Literal["high-end", "low-end", "viewer"]
-FLUSH_TRIES = 3
+T = TypeVar("T")
 
 
 class Robot:
@@ -71,23 +74,27 @@ class Robot:
 
         Raises:
             BadInputError: bad URL or name, or the directory belongs to another robot or map.
+            ConflictError: another process has the directory open.
             UnreachableError: the geometry is not known and the server cannot be asked.
         """
         server_url, self._map_name = split_map_url(map_url)
         self.name = robot_name(name)
-        self.mode = mode
+        self.mode: Mode = mode
         self._rig = rig
         self._enrolment_token = token
         self._wanted = wanted
         self._api = MapApi(server_url, token=token)
-        store = ReplicaStore(Path(directory))
-        self._replica = Replica(store, robot=self.name, geometry=geometry or self._known_geometry(store))
-        self._api.token = store.get("token") or token
-        self._measurement = self._new_measurement(integrator or Integrator()) if rig else None
+        try:
+            self._replica = self._open(Path(directory), geometry)
+        except BaseException:
+            self._api.close()
+            raise
+        self._api.token = self._replica.token() or token
+        self._integrator = integrator or Integrator()
+        self._measurement = self._new_measurement()
         self._round = threading.Lock()
-        self._stop = threading.Event()
-        self._wake = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._thread: SyncThread | None = None
+        self._is_closed = False
 
     def __enter__(self) -> Self:
         return self
@@ -99,7 +106,10 @@ class Robot:
 
     @property
     def map(self) -> EvidenceMap:
-        """What the robot sees: the server's map as far as it is here, and its own commits."""
+        """What the robot sees: the server's map as far as it is here, and its own commits.
+
+        The thread that commits may read it at any time; another one only while it holds `replica.lock`.
+        """
         return self._replica.view
 
     @property
@@ -128,29 +138,26 @@ class Robot:
         self._measurement.add(scan)
 
     def commit(self, *, note: str = "", retracts: tuple[CommitId, ...] = ()) -> Commit | None:
-        """Close the open measurement and keep it durably; None if there is nothing in it."""
-        measurement = self._measurement
-        if measurement is None or self._rig is None or (not len(measurement) and not retracts):
-            return None
-        diff = measurement.diff()
+        """Close the open measurement and keep it durably; None if there is nothing in it.
+
+        Args:
+            note: up to 1024 characters for the map's log.
+            retracts: own commits that this one takes back; its evidence stands in their place.
+
+        Raises:
+            BadInputError: the commit would be too large, or its note too long; the measurement stays open.
+            UnreachableError: kind `store_failed`: the disk is full or broken; the measurement stays open.
+        """
+        diff = self._measurement.diff() if self._measurement else {}
         if not diff and not retracts:
-            log.warning("%d scans gave no evidence; nothing is committed", len(measurement))
-            self._measurement = self._new_measurement(measurement.integrator)
+            if self._measurement:
+                log.warning("%d scans gave no evidence; nothing is committed", len(self._measurement))
+                self._measurement = self._new_measurement()
             return None
-        meta = CommitMeta(
-            id=str(CommitId(self._replica.author, 0)),  # the replica gives the number
-            geometry=self._replica.geometry.digest().hex(),
-            captured_s=measurement.captured_s,
-            scans=tuple(measurement.poses),
-            sensors=tuple(self._rig.cameras),
-            rig=self._rig.digest(),
-            integrator=str(measurement.integrator),
-            retracts=tuple(str(target) for target in retracts),
-            note=note,
-        )
-        commit = self._replica.commit(diff, meta)
-        self._measurement = self._new_measurement(measurement.integrator)
-        self._wake.set()
+        commit = self._replica.commit(diff, self._meta(note, retracts))
+        self._measurement = self._new_measurement()
+        if self._thread is not None:
+            self._thread.wake()
         return commit
 
     def sync(self, *, on_push: Callable[[CommitId], None] | None = None) -> RoundReport:
@@ -161,76 +168,66 @@ class Robot:
             CairnError: the server refuses this robot, or its data is damaged.
         """
         with self._round:
-            if self._replica.store.get("token") is None:
-                self._register()
-            try:
-                return self._sync_once(on_push)
-            except DeniedError as exc:
-                if exc.kind != "bad_token":
-                    raise
-                self._register()  # the server was replaced, or somebody registered under this name
-                return self._sync_once(on_push)
+            return self._as_registered(lambda: self._sync_once(on_push))
 
     def start_sync(self, *, every_s: float = 5.0) -> None:
         """Sync in the background: after each commit, and at least every so many seconds while there is a link."""
         if self._thread is None:
-            self._thread = threading.Thread(target=self._sync_for_ever, args=(every_s,), name="cairn-sync", daemon=True)
-            self._thread.start()
+            self._thread = SyncThread(self.sync, every_s=every_s)
 
     def close(self) -> None:
-        """Commit what is open, push what waits if there is a link, and close; what could not be pushed stays."""
-        self._stop.set()
-        self._wake.set()
+        """Commit what is open, push what waits if there is a link, and close; what could not be pushed stays.
+
+        May be called twice.
+        """
+        if self._is_closed:
+            return
+        self._is_closed = True
         if self._thread is not None:
-            self._thread.join()
-        self.commit()
-        if self.mode != "viewer" and self._replica.store.get("token") and self.waiting:
-            try:
-                push_commits(self._replica, self._api, self._map_name)
-            except CairnError as exc:
-                log.warning("%d commits wait in the directory: %s", self.waiting, exc.message)
-        self._api.close()
-        self._replica.close()
+            self._thread.stop()
+        try:
+            self.commit()
+            self._flush()
+        finally:
+            self._api.close()
+            self._replica.close()
 
     def deregister(self) -> None:
         """Leave the map; the evidence stays there, and this directory keeps its own."""
         self._api.deregister(self._map_name, self.name)
-        with self._replica.store.transaction():
-            self._replica.store.put("token", None)
+        self._replica.set_token(None)
+
+    def _flush(self) -> None:
+        if self.mode == "viewer" or not self.waiting:
+            return
+        try:
+            self._as_registered(lambda: push_commits(self._replica, self._api, self._map_name))
+        except CairnError as exc:
+            log.warning("%d commits wait in the directory: %s", self.waiting, exc.message)
 
     def _sync_once(self, on_push: Callable[[CommitId], None] | None) -> RoundReport:
-        pushed = 0
+        pushes = RoundReport()
         if self.mode != "viewer":
-            pushed = push_commits(self._replica, self._api, self._map_name, on_push=on_push)
+            pushes = push_commits(self._replica, self._api, self._map_name, on_push=on_push)
         if self.mode == "low-end":
             report = fetch_cells(self._replica, self._api, self._map_name, wanted=self._wanted)
         else:
             report = fetch_missing(self._replica, self._api, self._map_name, self.name)
-        report.pushed = pushed
+        report.pushed, report.refused = pushes.pushed, pushes.refused
         return report
 
-    def _sync_for_ever(self, every_s: float) -> None:
-        backoff = Backoff()
-        wait_s = 0.0
-        while not self._stop.is_set():
-            self._wake.wait(wait_s)
-            self._wake.clear()
-            if self._stop.is_set():
-                return
-            try:
-                self.sync()
-                backoff.reset()
-                wait_s = every_s
-            except UnreachableError as exc:
-                wait_s = backoff.next_s(exc.retry_after_s)
-                log.info("no link (%s); trying again in %.1f s", exc.message, wait_s)
-                self._stop.wait(wait_s)
-                wait_s = 0.0
-            except CairnError as exc:
-                wait_s = backoff.next_s(None)
-                log.error("sync failed: %s: %s; trying again in %.1f s", exc.kind, exc.message, wait_s)
-                self._stop.wait(wait_s)
-                wait_s = 0.0
+    def _as_registered(self, action: Callable[[], T]) -> T:
+        """Do it as a robot that the server knows: register first if need be, and anew if the token is not good."""
+        if self._replica.token() is None:
+            self._register()
+        try:
+            return action()
+        except DeniedError as exc:
+            if exc.kind != "bad_token":
+                raise
+            self._replica.set_token(None)  # the server was replaced, or somebody registered under this name
+            self._register()
+            return action()
 
     def _register(self) -> None:
         self._api.token = self._enrolment_token
@@ -243,18 +240,42 @@ class Robot:
         registered = self._api.register(self._map_name, request)
         if registered.map.geometry != self._replica.geometry:
             raise BadInputError("other_geometry", f"map {self._map_name} has another grid than this robot's directory")
-        with self._replica.store.transaction():
-            self._replica.store.put("token", registered.token)
+        self._replica.set_token(registered.token)
 
-    def _known_geometry(self, store: ReplicaStore) -> Geometry:
-        remembered = store.get("geometry")
-        if remembered is not None:
-            return Geometry.model_validate_json(remembered)
-        return self._api.map_info(self._map_name).geometry
+    def _open(self, directory: Path, geometry: Geometry | None) -> Replica:
+        """The durable state; its grid is the given one, the remembered one, or the server's."""
+        store = ReplicaStore(directory)
+        try:
+            remembered = store.get("geometry")
+            if geometry is None and remembered is not None:
+                geometry = Geometry.model_validate_json(remembered)
+            if geometry is None:
+                geometry = self._api.map_info(self._map_name).geometry
+            return Replica(store, robot=self.name, map_name=self._map_name, geometry=geometry)
+        except BaseException:
+            store.close()
+            raise
 
-    def _new_measurement(self, integrator: Integrator) -> Measurement:
-        assert self._rig is not None  # noqa: S101 - narrows the type
-        return Measurement(self._rig, self._replica.geometry, integrator)
+    def _new_measurement(self) -> Measurement | None:
+        return Measurement(self._rig, self._replica.geometry, self._integrator) if self._rig else None
+
+    def _meta(self, note: str, retracts: tuple[CommitId, ...]) -> CommitMeta:
+        """What the commit of the open measurement says; the replica gives the number."""
+        measurement = self._measurement
+        try:
+            return CommitMeta(
+                id=str(CommitId(self._replica.author, UNNUMBERED)),
+                geometry=self._replica.geometry.digest().hex(),
+                captured_s=measurement.captured_s if measurement else None,
+                scans=tuple(measurement.poses) if measurement else (),
+                sensors=tuple(self._rig.cameras) if self._rig else (),
+                rig=self._rig.digest() if self._rig else None,
+                integrator=str(self._integrator),
+                retracts=tuple(str(target) for target in retracts),
+                note=note,
+            )
+        except ValidationError as exc:
+            raise BadInputError("bad_meta", f"the commit cannot say this of itself: {first_error(exc)}") from exc
 
 
 def split_map_url(map_url: str) -> tuple[str, str]:
@@ -263,8 +284,12 @@ def split_map_url(map_url: str) -> tuple[str, str]:
     Raises:
         BadInputError: it is not of that form.
     """
-    parts = urlsplit(map_url)
+    try:
+        parts = urlsplit(map_url)
+        is_host = bool(parts.hostname) and parts.port != 0  # reading the port checks it
+    except ValueError:
+        parts, is_host = urlsplit(""), False
     head, _, name = parts.path.rstrip("/").rpartition("/maps/")
-    if parts.scheme not in ("http", "https") or not parts.netloc or not name or "/" in name:
+    if parts.scheme not in ("http", "https") or not is_host or not name or "/" in name:
         raise BadInputError("bad_url", f"a map's URL is http://HOST:PORT/maps/NAME, got {map_url!r}")
     return f"{parts.scheme}://{parts.netloc}{head}", robot_name(name)

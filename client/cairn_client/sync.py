@@ -7,20 +7,19 @@ viewer     fetch as high-end does, push nothing
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 from cairn_client.api import MapApi
 from cairn_client.applying import Exchange
-from cairn_client.replica import Replica, base_cell
+from cairn_client.replica import Replica
 from cairn_client.replica_store import BaseCell
 from cairn_map.cell_code import decode_cell
-from cairn_map.commit import Commit, split_commit
-from cairn_map.errors import ConflictError, DamagedDataError, UnreachableError
-from cairn_map.fingerprint import fingerprint
-from cairn_map.grid import Cell, CellKey, cell_key
+from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, DeniedError, UnreachableError
+from cairn_map.fingerprint import ZERO, fingerprint
+from cairn_map.grid import Cell, cell_key, cell_of_key
 from cairn_map.ids import CommitId
 
 log = logging.getLogger(__name__)
@@ -29,47 +28,62 @@ ROUNDS_MAX = 64
 """Requests in one fetch: a reply may ask to come back for the rest, or to compare; it may not go on for ever."""
 
 
+Wanted = Callable[[Cell], bool]
+"""Which cells a low-end robot keeps."""
+
+
 @dataclass(slots=True)
 class RoundReport:
     """What one round did."""
 
     pushed: int = 0
+    refused: list[CommitId] = field(default_factory=list)
+    """Commits that the server will not take; they stay in the outbox, and the log says why."""
     frames: int = 0
     cells_fetched: int = 0
 
 
-Wanted = Callable[[Cell], bool]
-
-
 def push_commits(
     replica: Replica, api: MapApi, map_name: str, *, on_push: Callable[[CommitId], None] | None = None
-) -> int:
-    """Push every commit that the server may lack, oldest first; returns how many.
+) -> RoundReport:
+    """Push every commit that the server may lack, oldest first.
 
     Raises:
         UnreachableError: the link broke; what was acknowledged before stays so.
+        DeniedError: the server does not know this robot.
     """
-    pushed = 0
+    report = RoundReport()
     for commit_id in replica.push_set():
-        renamed_once = False
-        while True:
-            data = replica.commit_data(commit_id)
-            if data is None:
-                break
-            try:
-                api.push(map_name, _as_commit(replica, commit_id, data))
-            except ConflictError as exc:
-                if exc.kind != "id_taken" or renamed_once:
-                    raise
-                commit_id = replica.rename(commit_id)
-                renamed_once = True
-                continue
-            replica.acknowledge(commit_id)
-            pushed += 1
-            if on_push:
-                on_push(commit_id)
-            break
-    return pushed
+        try:
+            pushed = _push(replica, api, map_name, commit_id)
+        except DeniedError:
+            raise
+        except BadInputError as exc:  # one commit that cannot be taken must not hold up all that come after it
+            log.error("the server refuses commit %s: %s: %s", commit_id, exc.kind, exc.message)
+            report.refused.append(commit_id)
+            continue
+        replica.acknowledge(pushed)
+        report.pushed += 1
+        if on_push:
+            on_push(pushed)
+    return report
+
+
+def _push(replica: Replica, api: MapApi, map_name: str, commit_id: CommitId) -> CommitId:
+    """Push one commit; its id, which is a new one if the server has other bytes under the old (rule 13)."""
+    commit = replica.kept_commit(commit_id)
+    if commit is None:
+        raise BadInputError("no_bytes", f"the bytes of {commit_id} are not kept any more")
+    try:
+        api.push(map_name, commit)
+    except ConflictError as exc:
+        if exc.kind != "id_taken":
+            raise
+        renamed = replica.kept_commit(replica.rename(commit_id))
+        assert renamed is not None  # noqa: S101 - it was just kept
+        api.push(map_name, renamed)
+        return renamed.id
+    return commit_id
 
 
 def fetch_missing(replica: Replica, api: MapApi, map_name: str, branch: str) -> RoundReport:
@@ -102,17 +116,29 @@ def fetch_missing(replica: Replica, api: MapApi, map_name: str, branch: str) -> 
 def fetch_cells(replica: Replica, api: MapApi, map_name: str, *, wanted: Wanted | None = None) -> RoundReport:
     """Low-end: whole cells that changed since they were fetched last, all or the wanted ones.
 
+    The index tells which did, so that cells that are still the same cost no request.
+
     Raises:
         UnreachableError: the link broke; the cells before it are kept.
     """
     report = RoundReport()
-    index = api.cell_index(map_name, replica.author)
-    replica.take_header(index.header)
-    for entry in index.cells:
-        cell = Cell(*entry.cell)
-        if wanted is None or wanted(cell):
-            report.cells_fetched += fetch_cell(replica, api, map_name, cell)
-    replica.forget_stable_commits()
+    author = replica.author
+    index = api.cell_index(map_name, author)
+    to, coverage = index.header.to_cursor, index.header.coverage
+    digests = {cell_key(entry.cell): entry.digest for entry in index.cells}
+    with replica.lock:
+        if replica.header and replica.header.to_cursor.log_id != to.log_id:
+            log.warning("another server answers for map %s; starting without its old state", map_name)
+            replica.forget_server()
+        replica.take_header(index.header, asked_by=author)
+        same = [key for key, held in replica.cells.items() if held.etag == f'"{digests.get(key)}"']
+        replica.move(same, to=to, coverage=coverage)
+        for key in replica.cells.keys() - digests.keys():  # a server that was restored forgot them
+            replica.hold_nothing(key, BaseCell(to, coverage, ZERO))
+    for key in sorted(digests.keys() - set(same)):
+        if wanted is None or wanted(cell_of_key(key)):
+            report.cells_fetched += fetch_cell(replica, api, map_name, cell_of_key(key))
+    replica.forget_stable_commits(wanted=wanted)
     return report
 
 
@@ -126,16 +152,15 @@ def fetch_cell(replica: Replica, api: MapApi, map_name: str, cell: Cell) -> bool
     held = replica.cells.get(key)
     fetched = api.cell(map_name, cell, etag=held.etag if held else None)
     with replica.lock:
-        if fetched.body is None:
+        if fetched.body is None and held is not None:
             replica.move([key], to=fetched.cursor, coverage=fetched.coverage)
-            replica.refresh_view(key)
             return False
-        decoded = decode_cell(fetched.body)
-        if decoded.key != key or fingerprint(decoded.evidence, key) != fetched.fingerprint:
+        decoded = decode_cell(fetched.body or b"")
+        is_ours = decoded.key == key and decoded.geometry == replica.geometry
+        if not is_ours or fingerprint(decoded.evidence, key) != fetched.fingerprint:
             raise DamagedDataError("fingerprint_mismatch", f"cell {cell} is not what the server says it is")
-        based = base_cell(key, decoded.evidence, cursor=fetched.cursor, coverage=fetched.coverage)
-        tagged = BaseCell(based.cursor, based.coverage, based.fingerprint, fetched.etag)
-        replica.hold(key, tagged, decoded.evidence, body=fetched.body)
+        base = BaseCell(fetched.cursor, fetched.coverage, fetched.fingerprint, fetched.etag)
+        replica.hold(key, base, decoded.evidence, body=fetched.body)
         return True
 
 
@@ -151,13 +176,7 @@ def within(position_m: npt.ArrayLike, *, radius_m: float, cell_edge_m: float) ->
     return is_near
 
 
-def _as_commit(replica: Replica, commit_id: CommitId, data: bytes) -> Commit:
-    meta, cells = split_commit(data)
-    return Commit(meta, cells, replica.commits[commit_id].sha, data)
-
-
 def _has_unproven(replica: Replica) -> bool:
     """Whether a cell still waits to be fetched whole."""
     with replica.lock:
-        unproven: list[CellKey] = [key for key, cell in replica.cells.items() if cell.cursor is None]
-    return bool(unproven)
+        return any(cell.cursor is None for cell in replica.cells.values())

@@ -31,16 +31,35 @@ def _inner(x: int, y: int, z: int) -> int:
     return inner
 
 
+@nb.njit(nogil=True)
+def _with_brick(b: int, brick_of: Index, bricks: Ints, marks: Marks, used: int) -> int:
+    """Give a brick of the box a place in the pool if it has none; returns bricks used."""
+    if brick_of[b] < 0:
+        brick_of[b] = used
+        bricks[used] = b
+        marks[used, :] = 0
+        used += 1
+    return used
+
+
+@nb.njit(nogil=True)
+def _crossings(origin: float, target: float, at: int, end: int) -> tuple[float, float]:
+    """Along one axis, the ray's parameter at the first border that it crosses, and from one border to the next."""
+    if at == end:
+        return np.inf, 0.0
+    d = target - origin
+    if d == 0.0:  # the voxels differ by rounding only
+        return 0.0, 0.0
+    border = at + 1 if end > at else at
+    return (border - origin) / d, abs(1.0 / d)
+
+
 @nb.njit(cache=True, nogil=True)
 def mark_hits_into(ends: Ints, dims: Ints, brick_of: Index, bricks: Ints, marks: Marks, used: int) -> int:
     """Mark the end voxels (box coordinates) as HIT; the pool has room for one brick each. Returns bricks used."""
     for n in range(ends.shape[0]):
         b = _brick(ends[n, 0], ends[n, 1], ends[n, 2], dims)
-        if brick_of[b] < 0:
-            brick_of[b] = used
-            bricks[used] = b
-            marks[used, :] = 0
-            used += 1
+        used = _with_brick(b, brick_of, bricks, marks, used)
         marks[brick_of[b], _inner(ends[n, 0], ends[n, 1], ends[n, 2])] = HIT
     return used
 
@@ -63,37 +82,24 @@ def mark_misses_into(
     beyond its end voxel, so a ray arrives there whatever the rounding, and never leaves the box.
     Returns the ray to go on with (all done: their number) and the bricks used.
     """
+    at = np.empty(3, np.int64)
     step = np.empty(3, np.int64)
     left = np.empty(3, np.int64)
-    at = np.empty(3, np.int64)
     t_next = np.empty(3)
     t_step = np.empty(3)
     for n in range(first, ends.shape[0]):
-        crossings = 1
+        bricks_passed = 1
         for a in range(3):
             at[a] = np.int64(np.floor(origin[a]))
-            left[a] = abs(ends[n, a] - at[a])
-            crossings += abs((ends[n, a] >> 3) - (at[a] >> 3))
             step[a] = 1 if ends[n, a] >= at[a] else -1
-            d = targets[n, a] - origin[a]
-            if left[a] == 0 or d == 0.0:
-                t_next[a] = np.inf
-                t_step[a] = 0.0
-                if left[a] != 0:
-                    t_next[a] = 0.0
-            else:
-                border = at[a] + 1 if step[a] > 0 else at[a]
-                t_next[a] = (border - origin[a]) / d
-                t_step[a] = abs(1.0 / d)
-        if used + crossings > marks.shape[0]:
+            left[a] = abs(ends[n, a] - at[a])
+            bricks_passed += abs((ends[n, a] >> 3) - (at[a] >> 3))
+            t_next[a], t_step[a] = _crossings(origin[a], targets[n, a], at[a], ends[n, a])
+        if used + bricks_passed > marks.shape[0]:
             return n, used
         while left[0] + left[1] + left[2] > 0:
             b = _brick(at[0], at[1], at[2], dims)
-            if brick_of[b] < 0:
-                brick_of[b] = used
-                bricks[used] = b
-                marks[used, :] = 0
-                used += 1
+            used = _with_brick(b, brick_of, bricks, marks, used)
             inner = _inner(at[0], at[1], at[2])
             if marks[brick_of[b], inner] == 0:
                 marks[brick_of[b], inner] = MISS

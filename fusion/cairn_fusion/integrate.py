@@ -20,7 +20,7 @@ from cairn_calib.poses import transform_points
 from cairn_calib.rig import Rig
 from cairn_fusion.cast import SeenVoxels, seen_voxels
 from cairn_fusion.scan import Scan, check_scan
-from cairn_fusion.transfer import points_from_range, transfer_points
+from cairn_fusion.transfer import depth_steps, points_from_range, transfer_points
 from cairn_map.channels import Channel, ChannelKind
 from cairn_map.errors import BadInputError
 from cairn_map.evidence import Evidence, packed_evidence
@@ -68,14 +68,15 @@ def integrate_scan(scan: Scan, rig: Rig, geometry: Geometry, *, integrator: Inte
     range_m = np.where(
         (scan.range_m >= integrator.min_range_m) & (scan.range_m <= integrator.max_range_m), scan.range_m, np.nan
     )
-    points_tof = points_from_range(range_m, rig[scan.range_camera].camera).reshape(-1, 3)
-    returned = np.nonzero(np.isfinite(points_tof[:, 2]))[0]
-    points_tof = points_tof[returned]
+    image_points = points_from_range(range_m, rig[scan.range_camera].camera)
+    returned = np.nonzero(np.isfinite(image_points[..., 2]).ravel())[0]
+    points_tof = image_points.reshape(-1, 3)[returned]
+    steps_m = depth_steps(image_points).ravel()[returned]
     T_map_tof = scan.T_map_rig @ rig[scan.range_camera].transform
     points = transform_points(T_map_tof, points_tof)
     ends, first, voxel_of = _unique_voxels(voxels_of_points(points, geometry))
     samples = np.zeros((len(ends), geometry.plane_count), np.int64)
-    for channel, values, at in _samples(scan, rig, geometry, points_tof, returned):
+    for channel, values, at in _samples(scan, rig, geometry, points_tof, steps_m, returned):
         _add_mean_samples(samples[:, geometry.planes_of(channel.name)], channel, values, voxel_of[at])
     seen = seen_voxels(T_map_tof[:3, 3], points[first], ends, geometry)
     local = EvidenceMap(geometry)
@@ -97,7 +98,7 @@ def _unique_voxels(voxels: Ints) -> tuple[Ints, Ints, Ints]:
 
 
 def _samples(
-    scan: Scan, rig: Rig, geometry: Geometry, points_tof: Floats, returned: Ints
+    scan: Scan, rig: Rig, geometry: Geometry, points_tof: Floats, steps_m: Floats, returned: Ints
 ) -> Iterator[tuple[Channel, Floats, Ints]]:
     """For each channel of the map: values (M, C) and the points (M,) that they belong to."""
     for channel in geometry.channels:
@@ -113,7 +114,9 @@ def _samples(
         waiting = np.arange(len(points_tof))
         # The first camera speaks for what it sees; the next ones only fill what was hidden from those before.
         for name, image in images.items():
-            transfer = transfer_points(points_tof[waiting], rig, src=scan.range_camera, dst=name)
+            transfer = transfer_points(
+                points_tof[waiting], rig, src=scan.range_camera, dst=name, steps_m=steps_m[waiting]
+            )
             values = transfer.sample(image).astype(np.float64).reshape(-1, channel.value_count)
             valid = np.isfinite(values).all(axis=1)
             found = waiting[transfer.ok][valid]
@@ -138,8 +141,9 @@ def _packed_by_cell(seen: SeenVoxels, ends: Ints, samples: Ints, geometry: Geome
     order = np.lexsort((end_places, end_cells))
     end_cells, end_places, samples = end_cells[order], end_places[order], samples[order]
     cells, starts = np.unique(seen.cells, return_index=True)
+    bounds = np.append(starts, len(seen.cells))
     packed: dict[CellKey, Evidence] = {}
-    for cell, start, stop in zip(cells, starts, [*starts[1:], len(seen.cells)], strict=True):
+    for cell, start, stop in zip(cells, bounds[:-1], bounds[1:], strict=True):
         hit = seen.hit[start:stop]
         mine = slice(*np.searchsorted(end_cells, [cell, cell + np.uint64(1)]))
         full = np.zeros((stop - start, geometry.plane_count), np.int64)

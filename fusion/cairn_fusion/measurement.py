@@ -7,9 +7,13 @@ from cairn_calib.rig import Rig
 from cairn_fusion.integrate import Integrator, integrate_scan
 from cairn_fusion.scan import Scan
 from cairn_map.commit import ScanPose
+from cairn_map.errors import BadInputError
 from cairn_map.evidence import Evidence
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.grid import CellKey, Geometry
+
+SCANS_MAX = 4096
+"""Poses that a commit can state."""
 
 
 @dataclass(slots=True)
@@ -32,8 +36,10 @@ class Measurement:
         """Add a scan; returns its own evidence.
 
         Raises:
-            BadInputError: the scan does not fit the rig or the map; nothing was added.
+            BadInputError: the scan does not fit the rig or the map, or the measurement is full; nothing was added.
         """
+        if len(self) == SCANS_MAX:
+            raise BadInputError("measurement_full", f"a measurement has at most {SCANS_MAX} scans; commit it first")
         evidence = integrate_scan(scan, self.rig, self.geometry, integrator=self.integrator)
         self._sum.merge(evidence)
         x, y, z = (float(v) for v in scan.T_map_rig[:3, 3])

@@ -105,7 +105,7 @@ def _scalar_panel(title: str, values: Floats, palette: int, form: str) -> Panel:
 
 
 def _painted(levels: npt.NDArray[np.uint8], palette: int) -> Rgb:
-    bgr = np.asarray(cv2.applyColorMap(levels.reshape(-1, 1), palette))
+    bgr = np.asarray(cv2.applyColorMap(levels.reshape(-1, 1), palette), dtype=np.uint8)
     return np.ascontiguousarray(bgr[:, 0, ::-1])
 
 

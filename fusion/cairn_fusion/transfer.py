@@ -4,7 +4,8 @@
 
 A camera that stands elsewhere may see something else in front of a point. A z-buffer finds that out; its bins are
 as wide as the distance between neighbouring range pixels in the other image, else the sparse points of the coarse
-camera would let the background shine through between them.
+camera would let the background shine through between them. In so wide a bin a slanted surface, such as the floor far
+ahead, lies at many depths; how steep it is there is known from the neighbours in the range image.
 """
 
 from dataclasses import dataclass
@@ -24,7 +25,8 @@ BIN_MARGIN = 1.5
 """Bin width over the spacing of projected range pixels: they spread a little with obliqueness."""
 DEPTH_TOLERANCE = 0.05
 DEPTH_TOLERANCE_M = 0.03
-"""A point is hidden if it lies deeper than the nearest of its bin by more than 5 % and 3 cm: noise and slant pass."""
+"""A point is hidden if it lies deeper than the nearest of its bin by more than 5 %, 3 cm and what its surface's slant
+makes of the bin's width."""
 
 
 class Label(IntEnum):
@@ -75,7 +77,27 @@ def points_from_range(range_m: npt.NDArray[np.floating], camera: Camera) -> Floa
     return camera.rays() * range_m.astype(np.float64)[..., None]
 
 
-def transfer_points(points_src: Floats, rig: Rig, *, src: str, dst: str) -> Transfer:
+def depth_steps(points: Floats) -> Floats:
+    """How steep the surface is at each range pixel: depth to the next pixel, of rows and columns together.
+
+    Of the two neighbours on a line the closer in depth counts, so that the step beside an edge is not taken for slant.
+
+    Args:
+        points: (H, W, 3), metres, from `points_from_range`.
+
+    Returns:
+        (H, W) float64, metres, not negative; 0 where no neighbour has a range.
+    """
+    z = points[..., 2]
+    total = np.zeros(z.shape)
+    for axis in (0, 1):
+        step = np.abs(np.diff(z, axis=axis, prepend=np.nan, append=np.nan))
+        last, following = np.split(step, [-1], axis=axis)[0], np.split(step, [1], axis=axis)[1]
+        total += np.nan_to_num(np.fmin(last, following))
+    return total
+
+
+def transfer_points(points_src: Floats, rig: Rig, *, src: str, dst: str, steps_m: Floats | None = None) -> Transfer:
     """Where points of one camera's frame appear in another's image.
 
     Args:
@@ -83,6 +105,7 @@ def transfer_points(points_src: Floats, rig: Rig, *, src: str, dst: str) -> Tran
         rig: with both cameras.
         src: the range camera.
         dst: the camera to look from.
+        steps_m: (N,) `depth_steps` of the points; None: surfaces that face the camera.
     """
     T_dst_src = inverse(rig[dst].transform) @ rig[src].transform
     points = transform_points(T_dst_src, points_src)
@@ -95,7 +118,9 @@ def transfer_points(points_src: Floats, rig: Rig, *, src: str, dst: str) -> Tran
     pixels[seen] = np.rint(exact[seen])
     if not _same_centre(T_dst_src):
         ratio = rig[dst].camera.focal_px[0] / rig[src].camera.focal_px[0]
-        hidden = _hidden(pixels[seen], points[seen, 2], rig[dst], bin_px=int(np.ceil(BIN_MARGIN * max(ratio, 1))))
+        bin_px = int(np.ceil(BIN_MARGIN * max(ratio, 1)))
+        slant_m = np.zeros(len(points)) if steps_m is None else steps_m * (bin_px / ratio)
+        hidden = _hidden(pixels[seen], points[seen, 2], slant_m[seen], rig[dst], bin_px=bin_px)
         labels[np.nonzero(seen)[0][hidden]] = Label.OCCLUDED
     return Transfer(pixels, labels)
 
@@ -105,11 +130,13 @@ def _same_centre(T_dst_src: Transform) -> bool:
     return bool(np.linalg.norm(T_dst_src[:3, 3]) < 1e-9)
 
 
-def _hidden(pixels: Pixels, depth_m: Floats, mounted: MountedCamera, *, bin_px: int) -> npt.NDArray[np.bool_]:
+def _hidden(
+    pixels: Pixels, depth_m: Floats, slant_m: Floats, mounted: MountedCamera, *, bin_px: int
+) -> npt.NDArray[np.bool_]:
     columns = -(-mounted.camera.width // bin_px)
     rows = -(-mounted.camera.height // bin_px)
     bins = (pixels[:, 1] // bin_px) * columns + pixels[:, 0] // bin_px
     nearest_m = np.full(rows * columns, np.inf)
     np.minimum.at(nearest_m, bins, depth_m)
-    limit_m = nearest_m[bins] * (1 + DEPTH_TOLERANCE) + DEPTH_TOLERANCE_M
+    limit_m = nearest_m[bins] * (1 + DEPTH_TOLERANCE) + DEPTH_TOLERANCE_M + slant_m
     return np.asarray(depth_m > limit_m)

@@ -140,7 +140,7 @@ def add_samples_into(
 
 
 @nb.njit(inline="always")
-def _row_is_set(row: np.int32, samples: Samples) -> bool:
+def _row_is_set(row: int, samples: Samples) -> bool:
     if row < 0:
         return False
     for p in range(samples.shape[1]):
@@ -160,7 +160,7 @@ def count_rows(
         b = brick_of[bricks[n]]
         t = table_of[b]
         for inner in range(512):
-            row = row_of[t, inner] if t >= 0 else np.int32(-1)
+            row = int(row_of[t, inner]) if t >= 0 else -1
             has = _row_is_set(row, samples)
             if has:
                 S += 1
@@ -189,7 +189,7 @@ def pack_rows_into(
         b = brick_of[bricks[n]]
         t = table_of[b]
         for inner in range(512):
-            row = row_of[t, inner] if t >= 0 else np.int32(-1)
+            row = int(row_of[t, inner]) if t >= 0 else -1
             has = _row_is_set(row, samples)
             if has:
                 out_sampled[S] = V
