@@ -32,14 +32,12 @@ def _inner(x: int, y: int, z: int) -> int:
 
 
 @nb.njit(nogil=True)
-def _with_brick(b: int, brick_of: Index, bricks: Ints, marks: Marks, used: int) -> int:
-    """Give a brick of the box a place in the pool if it has none; returns bricks used."""
-    if brick_of[b] < 0:
-        brick_of[b] = used
-        bricks[used] = b
-        marks[used, :] = 0
-        used += 1
-    return used
+def _add_brick(b: int, brick_of: Index, bricks: Ints, marks: Marks, used: int) -> int:
+    """Give a brick of the box the next place in the pool; returns bricks used."""
+    brick_of[b] = used
+    bricks[used] = b
+    marks[used, :] = 0
+    return used + 1
 
 
 @nb.njit(nogil=True)
@@ -59,7 +57,8 @@ def mark_hits_into(ends: Ints, dims: Ints, brick_of: Index, bricks: Ints, marks:
     """Mark the end voxels (box coordinates) as HIT; the pool has room for one brick each. Returns bricks used."""
     for n in range(ends.shape[0]):
         b = _brick(ends[n, 0], ends[n, 1], ends[n, 2], dims)
-        used = _with_brick(b, brick_of, bricks, marks, used)
+        if brick_of[b] < 0:
+            used = _add_brick(b, brick_of, bricks, marks, used)
         marks[brick_of[b], _inner(ends[n, 0], ends[n, 1], ends[n, 2])] = HIT
     return used
 
@@ -99,7 +98,8 @@ def mark_misses_into(
             return n, used
         while left[0] + left[1] + left[2] > 0:
             b = _brick(at[0], at[1], at[2], dims)
-            used = _with_brick(b, brick_of, bricks, marks, used)
+            if brick_of[b] < 0:  # asked here and not in there: 4 ms a scan against 11
+                used = _add_brick(b, brick_of, bricks, marks, used)
             inner = _inner(at[0], at[1], at[2])
             if marks[brick_of[b], inner] == 0:
                 marks[brick_of[b], inner] = MISS

@@ -1,0 +1,194 @@
+"""A robot's own commits: numbered without gaps, kept until no restore can lose them, renamed if an id is taken.
+
+    add -> push_set -> acknowledge        the server has the bytes for good
+                    -> rename             the server has other bytes under this id (SYNC.md rule 13)
+    forget                                stable and covered everywhere (rule 12): the SHA stays, the bytes go
+
+All methods are called under the replica's lock.
+"""
+
+import logging
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+
+from cairn_client.replica_store import KeptCommit, ReplicaStore
+from cairn_map.cell_code import decode_cell
+from cairn_map.commit import Commit, CommitMeta, make_commit, renamed_commit, split_commit
+from cairn_map.errors import BadInputError
+from cairn_map.evidence import Evidence
+from cairn_map.grid import CellKey, Geometry
+from cairn_map.ids import NUMBER_LIMIT, Author, CommitId, Incarnation, RobotName, new_incarnation
+from cairn_map.messages import ReplyHeader
+from cairn_map.version_vector import EMPTY, VersionVector
+
+log = logging.getLogger(__name__)
+
+UNNUMBERED = NUMBER_LIMIT - 1
+"""Number in a meta that has not got its own yet: one that no commit in it can be named to retract."""
+
+
+class Outbox:
+    """The commits in a replica's store."""
+
+    def __init__(self, store: ReplicaStore, robot: RobotName, geometry: Geometry) -> None:
+        self._store = store
+        self._robot = robot
+        self._geometry = geometry
+        known = store.get("incarnation")
+        if known is None:
+            known = new_incarnation()
+            with store.transaction():
+                store.put("incarnation", known)
+        self._incarnation = Incarnation(known)
+        self._commits: dict[CommitId, KeptCommit] = {}
+        self._touching: dict[CellKey, dict[CommitId, None]] = {}
+        self._acked_since_header: set[CommitId] = set()
+        for kept in store.commits():
+            self._note(kept)
+
+    def __iter__(self) -> Iterator[KeptCommit]:
+        """Commits whose bytes are kept, oldest first."""
+        return (kept for kept in self._commits.values() if kept.has_data)
+
+    @property
+    def author(self) -> Author:
+        """The robot in its present incarnation."""
+        return Author(self._robot, self._incarnation)
+
+    @property
+    def cells(self) -> set[CellKey]:
+        """Cells that a kept commit touches."""
+        return set(self._touching)
+
+    def add(self, diff: Mapping[CellKey, Evidence], meta: CommitMeta | None, *, seen: str | None) -> Commit:
+        """Keep evidence as the next commit; durable on return."""
+        n = self._next_n()
+        known = {
+            "id": str(CommitId(self.author, n)),
+            "geometry": self._geometry.digest().hex(),
+            "parent": self._store.get("tip_sha"),
+            "seen": seen,
+        }
+        meta = CommitMeta.model_validate({**dict(meta or ()), **known})
+        commit = make_commit(meta, diff, self._geometry)
+        with self._store.transaction():
+            self._store.add_commit(commit)
+            self._set_next(n + 1, commit)
+        self._note(_kept(commit))
+        return commit
+
+    def push_set(self, header: ReplyHeader | None) -> list[CommitId]:
+        """Commits that the server may lack, oldest first.
+
+        All minus what the newest header covers, minus what is on the server's desk or was acknowledged since. A
+        commit that was never acknowledged is pushed even if its id is covered: after a roll-back of this robot's disk
+        another commit may have that id (rule 13).
+        """
+        covered = header.coverage if header else EMPTY
+        pending = header.pending_vector if header else EMPTY
+        return [
+            kept.id
+            for kept in self._commits.values()
+            if kept.has_data
+            and kept.id not in self._acked_since_header
+            and not (kept.acked and (kept.id in covered or kept.id in pending))
+        ]
+
+    def whole(self, commit: CommitId) -> Commit | None:
+        """A commit with its bytes; None if they are not kept any more."""
+        data = self._store.commit_data(commit)
+        if data is None:
+            return None
+        meta, cells = split_commit(data)
+        return Commit(meta, cells, self._commits[commit].sha, data)
+
+    def acknowledge(self, commit: CommitId) -> None:
+        """The server has these bytes for good. It counts for nothing else: only coverage says what a cell holds."""
+        with self._store.transaction():
+            self._store.set_acked(commit)
+        self._commits[commit] = replace(self._commits[commit], acked=True)
+        self._acked_since_header.add(commit)
+
+    def rename(self, commit: CommitId) -> Commit:
+        """Give a commit whose id is taken on the server a new one, in a new incarnation (rule 13)."""
+        data = self._store.commit_data(commit)
+        if data is None:
+            raise BadInputError("no_bytes", f"the bytes of {commit} are not kept any more")
+        if commit.author == self.author:
+            self.new_incarnation(f"the id {commit} is taken by other bytes")
+        n = self._next_n()
+        renamed = renamed_commit(data, commit=CommitId(self.author, n), parent=self._store.get("tip_sha"))
+        with self._store.transaction():
+            self._store.remove_commit(commit)
+            self._store.add_commit(renamed)
+            self._set_next(n + 1, renamed)
+        for key in self._commits.pop(commit).cells:
+            del self._touching[key][commit]
+        self._note(_kept(renamed))
+        return renamed
+
+    def new_incarnation(self, reason: str) -> None:
+        """Number commits anew under a fresh incarnation: this robot's disk was rolled back or lost."""
+        log.warning("robot %s takes a new incarnation: %s", self._robot, reason)
+        fresh = new_incarnation()
+        with self._store.transaction():
+            self._store.put("incarnation", fresh)
+            self._set_next(0, None)
+        self._incarnation = fresh
+
+    def check_tip(self, header: ReplyHeader, *, asked_by: Author) -> None:
+        """Note a newer header, and whether the server knows of commits that this disk forgot (rule 13)."""
+        self._acked_since_header.clear()
+        if header.tip is None or asked_by != self.author:
+            return
+        n, sha = header.tip
+        known = self._commits.get(CommitId(self.author, n))
+        if n >= self._next_n() or (known is not None and known.sha.hex() != sha):
+            self.new_incarnation(f"the server has commit {n} of it with bytes that are not here")
+
+    def forget(self, gone: Iterable[CommitId]) -> None:
+        """Drop the bytes of commits; their SHA stays."""
+        commits = list(gone)
+        if commits:
+            with self._store.transaction():
+                self._store.forget_data(commits)
+        for commit in commits:
+            self._commits[commit] = replace(self._commits[commit], has_data=False)
+
+    def reread(self) -> None:
+        """Take over what the store was changed to: whether commits are acknowledged."""
+        self._acked_since_header.clear()
+        for kept in self._store.commits():
+            self._note(kept)
+
+    def uncovered(self, key: CellKey, coverage: VersionVector) -> list[CommitId]:
+        """Commits with bytes that touch a cell and are not in its coverage, oldest first."""
+        touching = self._touching.get(key, ())
+        return [commit for commit in touching if self._commits[commit].has_data and commit not in coverage]
+
+    def own_evidence(self, key: CellKey, news: VersionVector, author: Author) -> list[Evidence] | None:
+        """What an author's commits among `news` say about a cell; None if the bytes of one are not kept any more."""
+        mine = [commit for commit in self._touching.get(key, ()) if commit.author == author and commit in news]
+        if not all(self._commits[commit].has_data for commit in mine):
+            return None
+        return [self.evidence(commit, key) for commit in mine]
+
+    def evidence(self, commit: CommitId, key: CellKey) -> Evidence:
+        """What one commit says about a cell that it touches."""
+        return decode_cell(split_commit(self._store.commit_data(commit) or b"")[1][key]).evidence
+
+    def _note(self, kept: KeptCommit) -> None:
+        self._commits[kept.id] = kept
+        for key in kept.cells:
+            self._touching.setdefault(key, {})[kept.id] = None
+
+    def _next_n(self) -> int:
+        return int(self._store.get("next_n") or 0)
+
+    def _set_next(self, n: int, tip: Commit | None) -> None:
+        self._store.put("next_n", str(n))
+        self._store.put("tip_sha", tip.sha.hex() if tip else None)
+
+
+def _kept(commit: Commit) -> KeptCommit:
+    return KeptCommit(commit.id, commit.sha, tuple(sorted(commit.cells)))

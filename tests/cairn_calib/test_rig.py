@@ -1,0 +1,93 @@
+"""rig.json: what is written comes back, what is wrong is named."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cairn_calib.camera import camera_from_field_of_view
+from cairn_calib.poses import look_at
+from cairn_calib.rig import Rig, Spectrum, load_rig, mounted, rig_from_json
+from cairn_map.errors import BadInputError
+
+RIG = Rig(
+    name="orpheus-head",
+    cameras={
+        "tof": mounted(Spectrum.RANGE, camera_from_field_of_view(176, 144, horizontal_deg=69), np.eye(4)),
+        "left": mounted(
+            Spectrum.THERMAL, camera_from_field_of_view(640, 512, horizontal_deg=45), look_at((0.1, 0, 0), (1, 2, 0))
+        ),
+    },
+)
+
+
+def changed(*path: str, to: object) -> bytes:
+    """The rig's JSON with one field set."""
+    document = json.loads(RIG.to_json())
+    at = document
+    for name in path[:-1]:
+        at = at[name]
+    at[path[-1]] = to
+    return json.dumps(document).encode()
+
+
+def test_a_rig_comes_back_from_its_json_with_the_same_digest() -> None:
+    again = rig_from_json(RIG.to_json())
+    assert again == RIG
+    assert again.digest() == RIG.digest()
+    assert again.to_json() == RIG.to_json()
+
+
+def test_another_calibration_has_another_digest() -> None:
+    moved = rig_from_json(changed("cameras", "tof", "T_rig_camera", to=look_at((0, 0, 1e-6), (1, 0, 0)).tolist()))
+    assert moved.digest() != RIG.digest()
+
+
+def test_a_transform_comes_back_as_it_was_given() -> None:
+    np.testing.assert_allclose(RIG["left"].transform, look_at((0.1, 0, 0), (1, 2, 0)), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "named"),
+    [
+        (("colour",), 1, "colour"),
+        (("cameras", "tof", "serial"), "7", "serial"),
+        (("cameras", "tof", "camera", "skew"), 0, "skew"),
+        (("cameras", "tof", "T_rig_camera"), (2 * np.eye(4)).tolist(), "T_rig_camera"),
+        (("cameras", "tof", "spectrum"), "x-ray", "spectrum"),
+        (("cameras",), {}, "cameras"),
+        (("version",), 2, "version"),
+        (("format",), "other", "format"),
+        (("name",), "../up", "name"),
+    ],
+)
+def test_what_is_unknown_or_wrong_is_refused_by_name(path: tuple[str, ...], value: object, named: str) -> None:
+    with pytest.raises(BadInputError, match=named):
+        rig_from_json(changed(*path, to=value))
+
+
+@pytest.mark.parametrize("data", [b"", b"[]", b"{", b" " * (1 << 21)])
+def test_what_is_no_rig_is_refused(data: bytes) -> None:
+    with pytest.raises(BadInputError):
+        rig_from_json(data)
+
+
+def test_a_file_that_is_missing_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError):
+        load_rig(tmp_path / "rig.json")
+
+
+def test_a_rig_is_loaded_from_its_file(tmp_path: Path) -> None:
+    (tmp_path / "rig.json").write_bytes(RIG.to_json())
+    assert load_rig(tmp_path / "rig.json") == RIG
+
+
+def test_an_unknown_camera_is_named_with_those_that_are_there() -> None:
+    with pytest.raises(BadInputError, match="tof, left"):
+        RIG["right"]
+
+
+def test_cameras_are_found_by_spectrum() -> None:
+    assert RIG.of_spectrum(Spectrum.THERMAL) == ["left"]
+    assert RIG.of_spectrum(Spectrum.COLOUR) == []

@@ -1,0 +1,375 @@
+"""Robots and a server in one process, whose links and disks fail on request.
+
+The server is the real `Service` on a real store; only the folding thread is replaced by folding on request, and what
+is stable by what the last backup holds. `DirectApi` has the methods of `MapApi` and calls the service; `FaultyApi`
+loses, repeats and cuts its answers.
+"""
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import pytest
+from tests.cairn_client.made import GEOMETRY, MAP, cells_of, random_diff
+
+from cairn_client import replica_store
+from cairn_client.api import FetchedCell
+from cairn_client.outbox import UNNUMBERED
+from cairn_client.replica import Replica
+from cairn_client.replica_store import ReplicaStore
+from cairn_client.sync import fetch_cells, fetch_missing, push_commits
+from cairn_map.cell_code import decode_cell
+from cairn_map.commit import Commit, CommitMeta, split_commit
+from cairn_map.errors import UnreachableError
+from cairn_map.evidence_map import EvidenceMap
+from cairn_map.fingerprint import fingerprint
+from cairn_map.frames import Frame, FrameReader
+from cairn_map.grid import Cell, CellKey, cell_key
+from cairn_map.ids import Author, CommitId, RobotName, commit_id_from_text
+from cairn_map.messages import CellIndex, CreateMap, MissingRequest, Pushed, Retract
+from cairn_map.version_vector import EMPTY, VersionVector
+from cairn_server import service as service_module
+from cairn_server import sqlite_store, sqlite_writer
+from cairn_server.auth import Caller, Role
+from cairn_server.cell_cache import CellCache
+from cairn_server.folding import fold_pending
+from cairn_server.service import OPERATOR, Service
+from cairn_server.settings import Settings
+from cairn_server.sqlite_store import SqliteStore
+
+MODES = ("high-end", "high-end", "low-end", "viewer")
+PUSHES = (0, 1, 2)
+FINAL_ROUNDS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """What happens to the n-th call of a round: lost before or after the server did it, done twice, or cut."""
+
+    call: int
+    kind: str
+    frames: int = 0
+
+
+class FoldOnRequest:
+    """In the place of the folding thread."""
+
+    def __init__(self, store: object) -> None:
+        pass
+
+    def wake(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+class StableBackup:
+    """In the place of a setting of time: what the last backup holds."""
+
+    def __init__(self, vector: VersionVector) -> None:
+        self._vector = vector
+
+    def of(self, row: object, snapshot: object) -> VersionVector:
+        return self._vector
+
+
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No flush to disk (nobody cuts the power of these tests), and no folding thread."""
+    pragmas = tuple(p for p in replica_store.PRAGMAS if "synchronous" not in p)
+    monkeypatch.setattr(replica_store, "PRAGMAS", (*pragmas, "synchronous = OFF"))
+    connect = sqlite_writer.connect
+
+    def connect_quickly(path: Path) -> Any:
+        connection = connect(path)
+        connection.execute("PRAGMA synchronous = OFF")
+        return connection
+
+    monkeypatch.setattr(sqlite_writer, "connect", connect_quickly)
+    monkeypatch.setattr(sqlite_store, "connect", connect_quickly)
+    monkeypatch.setattr(service_module, "Folder", FoldOnRequest)
+
+
+class DirectApi:
+    """`MapApi` without HTTP."""
+
+    def __init__(self, world: "World", robot: str) -> None:
+        self._world = world
+        self._caller = Caller(Role.ROBOT, robot)
+
+    def push(self, name: str, commit: Commit) -> Pushed:
+        service = self._world.service
+        is_new = service.push(service.store.map(name), self._caller, str(commit.id), commit.data)
+        return Pushed(id=str(commit.id), state="new" if is_new else "known")
+
+    def missing(self, name: str, branch: str, request: MissingRequest) -> Iterator[Frame]:
+        service = self._world.service
+        request = MissingRequest.model_validate_json(request.model_dump_json())
+        yield from FrameReader().feed(service.missing(service.store.map(name), branch, request))
+
+    def cell_index(self, name: str, author: Author) -> CellIndex:
+        service = self._world.service
+        index = service.cell_index(service.store.map(name), author)
+        return CellIndex.model_validate_json(index.model_dump_json())
+
+    def cell(self, name: str, cell: Cell, *, etag: str | None = None) -> FetchedCell:
+        service = self._world.service
+        stored, head = service.cell(service.store.map(name), cell_key(cell))
+        assert stored is not None
+        found = f'"{stored.digest.hex()}"'
+        body = None if etag == found else stored.body
+        return FetchedCell(body, found, head.cursor, head.vector, stored.fingerprint)
+
+
+class FaultyApi:
+    """An API one of whose calls goes wrong."""
+
+    def __init__(self, api: DirectApi, fault: Fault | None) -> None:
+        self._api = api
+        self._fault = fault
+        self._calls = 0
+
+    def push(self, name: str, commit: Commit) -> Pushed:
+        pushed: Pushed = self._call(self._api.push, name, commit)
+        return pushed
+
+    def missing(self, name: str, branch: str, request: MissingRequest) -> Iterator[Frame]:
+        fault = self._next()
+        self._lose(fault, "before")
+        for n, frame in enumerate(list(self._api.missing(name, branch, request))):
+            if fault and fault.kind in ("cut", "after") and n == fault.frames:
+                raise UnreachableError("cut_off", "cut")
+            yield frame
+
+    def cell_index(self, name: str, author: Author) -> CellIndex:
+        index: CellIndex = self._call(self._api.cell_index, name, author)
+        return index
+
+    def cell(self, name: str, cell: Cell, *, etag: str | None = None) -> FetchedCell:
+        fetched: FetchedCell = self._call(self._api.cell, name, cell, etag=etag)
+        return fetched
+
+    def _next(self) -> Fault | None:
+        self._calls += 1
+        return self._fault if self._fault and self._fault.call == self._calls - 1 else None
+
+    def _lose(self, fault: Fault | None, kind: str) -> None:
+        if fault and fault.kind == kind:
+            raise UnreachableError("no_link", f"lost {kind}")
+
+    def _call(self, function: Any, *args: Any, **options: Any) -> Any:
+        fault = self._next()
+        self._lose(fault, "before")
+        answer = function(*args, **options)
+        if fault and fault.kind == "twice":
+            answer = function(*args, **options)
+        self._lose(fault, "after")
+        return answer
+
+
+StoredNote = tuple[str, dict[CellKey, bytes]]
+
+
+def stored_commits(folder: Path) -> dict[CommitId, StoredNote]:
+    """Note and cells of every commit that the server of a folder has."""
+    connection = sqlite_writer.connect(folder / sqlite_store.FILE_NAME)
+    try:
+        found: dict[CommitId, StoredNote] = {}
+        query = "SELECT number, robot || '.' || incarnation || '.' || n, meta FROM commits"
+        for number, text, meta in connection.execute(query).fetchall():
+            cells = connection.execute("SELECT cell, body FROM diff WHERE commit_number = ?", (number,)).fetchall()
+            found[commit_id_from_text(text)] = (CommitMeta.model_validate_json(meta).note, dict(cells))
+        return found
+    finally:
+        connection.close()
+
+
+class World:
+    """A server and some robots, each in a folder."""
+
+    def __init__(self, folder: Path, modes: tuple[str, ...] = MODES) -> None:
+        self._folder = folder
+        self._modes = modes
+        self._stable = EMPTY
+        self._serial = 0
+        self._start_server()
+        self.service.create_map(MAP, CreateMap(geometry=GEOMETRY))
+        self.robots: list[Replica] = [self._open(r) for r in range(len(modes))]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for robot in self.robots:
+            robot.close()
+        self.service.close()
+
+    # What can happen
+
+    def commit(self, robot: int, seed: int) -> None:
+        """A robot maps something."""
+        self._commit(robot, seed, ())
+
+    def amend(self, robot: int, which: int) -> None:
+        """A robot takes one of the commits that it still has back, and puts other evidence in its place."""
+        own = self.robots[robot].commits
+        if own:
+            self._commit(robot, which, (str(own[which % len(own)]),))
+
+    def retract(self, which: int) -> None:
+        """An operator takes out a commit that may or may not have come yet."""
+        known = {commit for robot in self.robots for commit in robot.commits} | self._stored().keys()
+        targets = sorted(str(commit) for commit in known if commit.author.robot != OPERATOR)
+        if targets:
+            self.service.retract(self._row, Retract(commits=[targets[which % len(targets)]]))
+
+    def sync(self, robot: int, fault: Fault | None = None) -> None:
+        """A robot's round, which the fault may end early."""
+        api: Any = FaultyApi(DirectApi(self, f"r{robot}"), fault)
+        try:
+            self._round(robot, api)
+        except UnreachableError:
+            assert fault is not None
+
+    def fold(self, limit: int) -> None:
+        """The server folds some of what waits."""
+        fold_pending(self.service.store, self._row, self._cache, limit=limit)
+
+    def restart_server(self) -> None:
+        """The server stops and starts again on the same store."""
+        self.service.close()
+        self._start_server()
+
+    def back_up(self) -> None:
+        """A backup is made, and older ones are thrown away; what it holds is stable."""
+        self.service.close()
+        self._copy("server", "backup")
+        self._start_server()
+        with self.service.store.snapshot(self._row) as snapshot:
+            self._stable = snapshot.head.vector
+        self._start_stable()
+
+    def restore(self) -> None:
+        """The server's folder is replaced by the backup."""
+        if (self._folder / "backup").exists():
+            self.service.close()
+            self._copy("backup", "server")
+            self._start_server()
+
+    def restart_robot(self, robot: int) -> None:
+        """A robot's program stops without a word and starts again."""
+        self.robots[robot].close()
+        self.robots[robot] = self._open(robot)
+
+    def save_disk(self, robot: int) -> None:
+        """Somebody copies a robot's folder."""
+        self.robots[robot].close()
+        self._copy(f"r{robot}", f"saved{robot}")
+        self.robots[robot] = self._open(robot)
+
+    def roll_back_disk(self, robot: int) -> None:
+        """Somebody puts that copy back."""
+        if (self._folder / f"saved{robot}").exists():
+            self.robots[robot].close()
+            self._copy(f"saved{robot}", f"r{robot}")
+            self.robots[robot] = self._open(robot)
+
+    def lose_disk(self, robot: int) -> None:
+        """A robot's folder is gone."""
+        self.robots[robot].close()
+        shutil.rmtree(self._folder / f"r{robot}")
+        self.robots[robot] = self._open(robot)
+
+    # What must hold
+
+    def settle(self) -> None:
+        """A few rounds without faults, everything folded."""
+        for _ in range(FINAL_ROUNDS):
+            for robot in range(len(self.robots)):
+                self.sync(robot)
+            self.fold(1000)
+
+    def check(self) -> None:
+        """After `settle` all maps are equal, equal to the sum of all commits, and no commit was lost."""
+        held = self._notes_held()
+        self.settle()
+        expected = cells_of(self._sum_of_commits())
+        with self.service.store.snapshot(self._row) as snapshot:
+            rows = {row.key: (row.digest, row.fingerprint.hex()) for row in snapshot.cells() if row.voxels}
+        assert rows == expected
+        for robot in self.robots:
+            assert cells_of(robot.view) == expected
+            assert not robot.push_set()
+            for key, cell in robot.cells.items():
+                assert base_fingerprint(robot, key) == cell.fingerprint.hex()
+        assert self._notes_stored() == held
+
+    def _commit(self, robot: int, seed: int, retracts: tuple[str, ...]) -> None:
+        self._serial += 1
+        author = self.robots[robot].author
+        unnumbered = str(CommitId(author, UNNUMBERED))
+        meta = CommitMeta(id=unnumbered, geometry=GEOMETRY.digest().hex(), retracts=retracts, note=f"{self._serial}")
+        self.robots[robot].commit(random_diff(seed), meta)
+
+    def _round(self, robot: int, api: Any) -> None:
+        replica = self.robots[robot]
+        if robot in PUSHES:
+            assert not push_commits(replica, api, MAP).refused
+        if self._modes[robot] == "low-end":
+            fetch_cells(replica, api, MAP)
+        else:
+            fetch_missing(replica, api, MAP, f"r{robot}")
+
+    def _open(self, robot: int) -> Replica:
+        store = ReplicaStore(self._folder / f"r{robot}")
+        return Replica(store, robot=RobotName(f"r{robot}"), map_name=MAP, geometry=GEOMETRY)
+
+    def _start_server(self) -> None:
+        folder = self._folder / "server"
+        self.service = Service(SqliteStore(folder), Settings(folder=folder))
+        self._cache = CellCache(GEOMETRY)
+        self._start_stable()
+
+    def _start_stable(self) -> None:
+        self.service._stable = StableBackup(self._stable)  # type: ignore[assignment]
+
+    @property
+    def _row(self) -> Any:
+        return self.service.store.map(MAP)
+
+    def _copy(self, source: str, target: str) -> None:
+        shutil.rmtree(self._folder / target, ignore_errors=True)
+        shutil.copytree(self._folder / source, self._folder / target)
+
+    def _stored(self) -> dict[CommitId, StoredNote]:
+        return stored_commits(self._folder / "server")
+
+    def _sum_of_commits(self) -> EvidenceMap:
+        stored = self._stored()
+        total = EvidenceMap(GEOMETRY)
+        for commit, (_, cells) in stored.items():
+            if not self.service.store.is_retracted(self._row, commit):
+                total.merge({key: decode_cell(body).evidence for key, body in cells.items()})
+        return total
+
+    def _notes_stored(self) -> set[str]:
+        return {note for note, _ in self._stored().values()} - {""}
+
+    def _notes_held(self) -> set[str]:
+        notes = self._notes_stored()
+        for r in PUSHES[: len(self.robots)]:
+            for commit in self.robots[r].commits:
+                data = self.robots[r].commit_data(commit)
+                assert data is not None
+                notes.add(split_commit(data)[0].note)
+        return notes
+
+
+def base_fingerprint(robot: Replica, key: CellKey) -> str:
+    """Fingerprint of a base as it is on the robot's disk."""
+    return fingerprint(robot.base_evidence(key), key).hex()
