@@ -235,6 +235,8 @@ class World:
             self._round(robot, api)
         except UnreachableError:
             assert fault is not None
+        else:
+            self._check_level(robot)
 
     def fold(self, limit: int) -> None:
         """The server folds some of what waits."""
@@ -315,6 +317,24 @@ class World:
         unnumbered = str(CommitId(author, UNNUMBERED))
         meta = CommitMeta(id=unnumbered, geometry=GEOMETRY.digest().hex(), retracts=retracts, note=f"{self._serial}")
         self.robots[robot].commit(random_diff(seed), meta)
+
+    def _check_level(self, robot: int) -> None:
+        """After a whole round a robot shows the server's map, and what of its own is not in it."""
+        replica = self.robots[robot]
+        expected = EvidenceMap(GEOMETRY)
+        with self.service.store.snapshot(self._row) as snapshot:
+            for listed in snapshot.cells():
+                row = snapshot.cell(listed.key)
+                assert row is not None
+                expected.merge({row.key: decode_cell(row.body).evidence})
+            folded = snapshot.head.vector
+        for commit in replica.commits:
+            if commit not in folded:
+                data = replica.commit_data(commit)
+                assert data is not None
+                cells = split_commit(data)[1]
+                expected.merge({key: decode_cell(body).evidence for key, body in cells.items()})
+        assert cells_of(replica.view) == cells_of(expected)
 
     def _round(self, robot: int, api: Any) -> None:
         replica = self.robots[robot]
