@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 from cairn_client.api import MapApi
 from cairn_client.robot import Robot
-from cairn_map.cell_code import decode_cell, encode_cell
+from cairn_map.cell_code import cell_digest, decode_cell
 from cairn_map.commit import split_commit
 from cairn_map.errors import DamagedDataError, UnreachableError
 from cairn_map.evidence import Evidence
@@ -86,4 +86,4 @@ def wait_for_fold(api: MapApi, map_name: str, is_folded: Callable[[set[str]], bo
 
 
 def _identity(key: CellKey, evidence: Evidence, view: EvidenceMap) -> Identity:
-    return encode_cell(key, evidence, view.geometry).digest.hex(), fingerprint(evidence, key).hex()
+    return cell_digest(key, evidence, view.geometry).hex(), fingerprint(evidence, key).hex()

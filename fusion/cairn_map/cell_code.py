@@ -55,6 +55,21 @@ def encode_cell(key: CellKey, evidence: Evidence, geometry: Geometry) -> Encoded
     Raises:
         BadInputError: kind `bad_evidence`: it is not of this geometry.
     """
+    head, streams = _canonical(key, evidence, geometry)
+    return EncodedCell(head + pack_streams(streams), _digest(head, streams))
+
+
+def cell_digest(key: CellKey, evidence: Evidence, geometry: Geometry) -> bytes:
+    """The digest that `encode_cell` gives, without compressing anything.
+
+    Raises:
+        BadInputError: kind `bad_evidence`: it is not of this geometry.
+    """
+    return _digest(*_canonical(key, evidence, geometry))
+
+
+def _canonical(key: CellKey, evidence: Evidence, geometry: Geometry) -> tuple[bytes, dict[int, bytes]]:
+    """Head and uncompressed streams of one cell."""
     check_fits(evidence, geometry)
     signed = evidence.is_signed
     octree, rows = build_octree(evidence, depth=geometry.depth)
@@ -68,7 +83,7 @@ def encode_cell(key: CellKey, evidence: Evidence, geometry: Geometry) -> Encoded
             key=key, geometry=geometry, voxels=len(evidence), leaves=len(rows), streams=len(streams), signed=signed
         )
     )
-    return EncodedCell(head + pack_streams(streams), _digest(head, streams))
+    return head, streams
 
 
 def decode_cell(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) -> DecodedCell:
@@ -111,7 +126,7 @@ def decode_canonical_cell(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYT
         BadInputError: as `decode_cell`.
     """
     cell = decode_cell(data, evidence_bytes_max=evidence_bytes_max)
-    if encode_cell(cell.key, cell.evidence, cell.geometry).digest != cell.digest:
+    if cell_digest(cell.key, cell.evidence, cell.geometry) != cell.digest:
         raise DamagedDataError("not_canonical", f"cell {cell_of_key(cell.key)} is not in canonical form")
     return cell
 

@@ -173,7 +173,7 @@ def _size_rows() -> Iterator[Row]:
     root = Path(__file__).parents[2]
     for folder in sorted(root.glob("*/cairn_*")):
         count = sum(len(path.read_text().splitlines()) for path in folder.glob("*.py"))
-        yield f"lines of {folder.name}", f"{count}", ""
+        yield f"lines in {folder.relative_to(root)}", f"{count}", ""
 
 
 @contextmanager
