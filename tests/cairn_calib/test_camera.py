@@ -17,7 +17,7 @@ cameras = st.builds(
     Camera,
     width=st.just(320),
     height=st.just(240),
-    focal_px=st.tuples(st.floats(300, 500), st.floats(300, 500)),
+    focal_px=st.tuples(st.floats(400, 700), st.floats(400, 700)),
     centre_px=st.tuples(st.floats(140, 180), st.floats(100, 140)),
     distortion=st.tuples(st.floats(-0.2, 0.2), st.floats(-0.1, 0.1), small, small, small),
 )
