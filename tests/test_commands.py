@@ -93,6 +93,9 @@ def test_a_map_starts_from_a_folder_of_cells_or_from_another_map(
     assert digests(f"{server}/maps/from-map", tmp_path, "b") == cells
     log = json.loads(cairn("map", "log", f"{server}/maps/from-map", "--json", folder=tmp_path))
     assert [entry["id"].partition(".")[0] for entry in log] == ["initial"]
+    again = cairn("map", "create", f"{server}/maps/from-folder", "--from", "cells", folder=tmp_path)
+    assert "pushed before, and are not added again" in again
+    assert digests(f"{server}/maps/from-folder", tmp_path, "c") == cells
 
 
 def test_retracting_a_robot_leaves_the_map_of_the_others(server: str, room_recording: Path, tmp_path: Path) -> None:

@@ -41,6 +41,8 @@ class Exchange:
         self._coverage = EMPTY
         self._framed: set[CellKey] = set()
         self._has_dropped = False
+        self.damaged: list[CellKey] = []
+        """Cells that came whole, but not sound: they are asked for again, and the others are not held up."""
         self.is_done = False
         self.must_compare = False
 
@@ -58,7 +60,7 @@ class Exchange:
         """Apply one frame of the answer.
 
         Raises:
-            DamagedDataError: frames in an impossible order, or a whole cell whose fingerprint does not fit it.
+            DamagedDataError: frames in an impossible order.
         """
         with self._replica.lock:
             if isinstance(frame, ReplyHeader):
@@ -90,15 +92,18 @@ class Exchange:
             FrameKind.STATE: self._apply_state,
             FrameKind.RESET: self._apply_reset,
         }[frame.kind]
-        apply(frame)
+        try:
+            apply(frame)
+        except DamagedDataError as exc:
+            if frame.kind is FrameKind.FULL:
+                self.damaged.append(frame.cell)
+            if frame.kind is not FrameKind.FULL or held is None:
+                self._ask_whole(frame.cell, exc.message)
 
     def _apply_full(self, frame: CellFrame) -> None:
         evidence = self._payload(frame)
         if fingerprint(evidence, frame.cell) != frame.fingerprint:
-            raise DamagedDataError(
-                "fingerprint_mismatch",
-                f"cell {cell_of_key(frame.cell)} came whole, but not with its fingerprint; the server may be damaged",
-            )
+            raise DamagedDataError("fingerprint_mismatch", "it came whole, but not with its fingerprint")
         self._replica.hold(frame.cell, self._at_head(frame), evidence, body=frame.payload)
 
     def _apply_delta(self, frame: CellFrame) -> None:

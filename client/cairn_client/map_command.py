@@ -46,9 +46,11 @@ def _create(args: argparse.Namespace) -> None:
     api, name = api_of(args.map, args.token)
     geometry = _geometry(args)
     if args.source is not None:
-        info, count = push_prior_data(api, name, args.source, token=args.token)
+        info, count, added = push_prior_data(api, name, args.source, token=args.token)
         _say_map(info)
         say(f"started from {args.source}: {count} cells, as the commit of author `initial`")
+        if added < count:
+            say(f"{count - added} of them were pushed before, and are not added again (nor if they were retracted)")
         return
     _say_map(api.create_map(name, CreateMap(geometry=geometry)))
 
@@ -80,9 +82,9 @@ def _info(args: argparse.Namespace) -> None:
         low, high = ("  ".join(f"{value:.2f}" for value in corner) for corner in info.box_m)
         say(f"cells span ({low}) m to ({high}) m")
     for branch in branches:
-        behind = "has not said what it holds" if branch.behind is None else f"{branch.behind} entries behind"
-        seen_s = time.time() - branch.last_seen_s
-        say(f"  {branch.branch:<16} {branch.mode:<9} {behind}, seen {seen_s:.0f} s ago, {', '.join(branch.sensors)}")
+        lag = "held nothing" if branch.behind is None else f"{branch.behind} entries behind"
+        seen_s, sensors = time.time() - branch.last_seen_s, ", ".join(branch.sensors)
+        say(f"  {branch.branch:<16} {branch.mode:<9} {lag} when it last asked, seen {seen_s:.0f} s ago, {sensors}")
 
 
 def _log(args: argparse.Namespace) -> None:

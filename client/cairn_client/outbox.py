@@ -61,7 +61,14 @@ class Outbox:
         return set(self._touching)
 
     def add(self, diff: Mapping[CellKey, Evidence], meta: CommitMeta | None, *, seen: str | None) -> Commit:
-        """Keep evidence as the next commit; durable on return."""
+        """Keep evidence as the next commit; durable on return.
+
+        Raises:
+            BadInputError: kind `not_own`: it retracts another robot's commit; only an operator may.
+        """
+        foreign = [target for target in (meta.retracted_ids if meta else ()) if target.author.robot != self._robot]
+        if foreign:
+            raise BadInputError("not_own", f"{foreign[0]} is not {self._robot}'s own; an operator can retract it")
         n = self._next_n()
         known = {
             "id": str(CommitId(self.author, n)),
@@ -118,14 +125,30 @@ class Outbox:
             self.new_incarnation(f"the id {commit} is taken by other bytes")
         n = self._next_n()
         renamed = renamed_commit(data, commit=CommitId(self.author, n), parent=self._store.get("tip_sha"))
+        amends = list(self._naming(commit, renamed.id))
         with self._store.transaction():
             self._store.remove_commit(commit)
             self._store.add_commit(renamed)
             self._set_next(n + 1, renamed)
+            for amend in amends:
+                self._store.replace_commit(amend)
         for key in self._commits.pop(commit).cells:
             del self._touching[key][commit]
-        self._note(_kept(renamed))
+        for changed in (renamed, *amends):
+            self._note(_kept(changed))
         return renamed
+
+    def _naming(self, old: CommitId, new: CommitId) -> Iterator[Commit]:
+        """Commits that retract one which gets a new id, saying the new one; on the server the old is another's.
+
+        Commits are pushed oldest first, so none of these can have been pushed before the one they name.
+        """
+        for kept in self._commits.values():
+            data = None if kept.acked else self._store.commit_data(kept.id)
+            meta = split_commit(data)[0] if data else None
+            if data is not None and meta is not None and old in meta.retracted_ids:
+                targets = tuple(str(new if target == old else target) for target in meta.retracted_ids)
+                yield renamed_commit(data, commit=kept.id, parent=meta.parent, retracts=targets)
 
     def new_incarnation(self, reason: str) -> None:
         """Number commits anew under a fresh incarnation: this robot's disk was rolled back or lost."""
@@ -174,7 +197,11 @@ class Outbox:
         return [self.evidence(commit, key) for commit in mine]
 
     def evidence(self, commit: CommitId, key: CellKey) -> Evidence:
-        """What one commit says about a cell that it touches."""
+        """What one commit says about a cell that it touches.
+
+        Raises:
+            DamagedDataError: its bytes at rest are not sound any more.
+        """
         return decode_cell(split_commit(self._store.commit_data(commit) or b"")[1][key]).evidence
 
     def _note(self, kept: KeptCommit) -> None:

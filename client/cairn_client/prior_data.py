@@ -3,6 +3,7 @@
 They are commits like any other: every robot gets them by ordinary sync, and a retract takes them out again.
 """
 
+import hashlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -13,15 +14,18 @@ from cairn_map.cell_code import DecodedCell
 from cairn_map.cell_folder import FolderHead, read_cells, read_head
 from cairn_map.commit import Commit, CommitMeta, make_commit
 from cairn_map.grid import Geometry
-from cairn_map.ids import INITIAL, Author, CommitId, new_incarnation
+from cairn_map.ids import INITIAL, Author, CommitId, Incarnation
 from cairn_map.messages import CreateMap, MapInfo
 
 CELLS_A_COMMIT = 16
 """So many cells of prior data go into one commit: it stays far below a commit's largest size."""
 
 
-def push_prior_data(api: MapApi, name: str, source: str, *, token: str | None) -> tuple[MapInfo, int]:
-    """Create a map with the grid and the evidence of a folder or another map; returns it and the count of cells.
+def push_prior_data(api: MapApi, name: str, source: str, *, token: str | None) -> tuple[MapInfo, int, int]:
+    """Create a map with the grid and the evidence of a folder or another map; returns it, the
+    count of cells, and how many of them were added.
+
+    It may be repeated after a cut link: evidence that is there already is not added again.
 
     Raises:
         BadInputError: the source is neither a folder of cells nor a map's URL.
@@ -29,12 +33,14 @@ def push_prior_data(api: MapApi, name: str, source: str, *, token: str | None) -
     """
     head, cells = _open(source, token)
     api.create_map(name, CreateMap(geometry=head.geometry, sensor_model=head.sensor_model))
-    author = Author(INITIAL, new_incarnation())
-    count = 0
+    count = added = 0
+    author: Author | None = None
     for n, group in enumerate(_groups(cells)):
-        api.push(name, _commit(CommitId(author, n), group, head.geometry, source))
+        author = author or Author(INITIAL, _incarnation(group))
+        pushed = api.push(name, _commit(CommitId(author, n), group, head.geometry))
         count += len(group)
-    return api.map_info(name), count
+        added += len(group) if pushed.state == "new" else 0
+    return api.map_info(name), count, added
 
 
 def _open(source: str, token: str | None) -> tuple[FolderHead, Iterable[DecodedCell]]:
@@ -60,6 +66,11 @@ def _groups(cells: Iterable[DecodedCell]) -> Iterator[list[DecodedCell]]:
         yield group
 
 
-def _commit(commit: CommitId, cells: list[DecodedCell], geometry: Geometry, source: str) -> Commit:
-    meta = CommitMeta(id=str(commit), geometry=geometry.digest().hex(), note=f"prior data from {source}"[:1024])
+def _incarnation(cells: list[DecodedCell]) -> Incarnation:
+    """An incarnation that follows from the first commit's evidence, so that doing it again adds nothing."""
+    return Incarnation(hashlib.sha256(b"".join(cell.digest for cell in cells)).hexdigest()[:16])
+
+
+def _commit(commit: CommitId, cells: list[DecodedCell], geometry: Geometry) -> Commit:
+    meta = CommitMeta(id=str(commit), geometry=geometry.digest().hex(), note="prior data")
     return make_commit(meta, {cell.key: cell.evidence for cell in cells}, geometry)

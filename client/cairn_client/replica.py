@@ -18,7 +18,7 @@ from cairn_map.brick_cell import sum_evidence
 from cairn_map.cell_code import decode_cell, encode_cell
 from cairn_map.commit import Commit, CommitMeta
 from cairn_map.cursor import Cursor, cursor_from_text
-from cairn_map.errors import BadInputError, CairnError
+from cairn_map.errors import BadInputError, CairnError, DamagedDataError
 from cairn_map.evidence import Evidence, empty_evidence
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.fingerprint import ZERO, fingerprint
@@ -202,7 +202,7 @@ class Replica:
 
     def refresh_view(self, key: CellKey, *, base: Evidence | None = None) -> None:
         """Make the view of a cell its base plus the commits that the base lacks."""
-        own = [self.outbox.evidence(commit, key) for commit in self._uncovered(key)]
+        own = [evidence for commit in self._uncovered(key) if (evidence := self._sound(commit, key)) is not None]
         shown = self.base_evidence(key) if base is None else base
         self.view.replace(key, sum_evidence([shown, *own], self.geometry) if own else shown)
 
@@ -210,6 +210,14 @@ class Replica:
         """Close the file."""
         with self.lock:
             self.store.close()
+
+    def _sound(self, commit: CommitId, key: CellKey) -> Evidence | None:
+        """What a kept commit says about a cell; None, and a complaint, if the disk damaged it."""
+        try:
+            return self.outbox.evidence(commit, key)
+        except DamagedDataError as exc:
+            log.error("commit %s at rest is damaged and left out of the map: %s", commit, exc.message)
+            return None
 
     def _uncovered(self, key: CellKey) -> list[CommitId]:
         cell = self.cells.get(key)

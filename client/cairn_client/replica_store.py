@@ -173,6 +173,13 @@ class ReplicaStore:
             (*_values(commit.id), commit.sha, json.dumps(sorted(commit.cells)), commit.data),
         )
 
+    def replace_commit(self, commit: Commit) -> None:
+        """Keep a commit with other bytes in its old place."""
+        self._run(
+            "UPDATE commits SET sha = ?, data = ? WHERE robot = ? AND incarnation = ? AND n = ?",
+            (commit.sha, commit.data, *commit.id.author, commit.id.n),
+        )
+
     def set_acked(self, commit: CommitId) -> None:
         """Note that the server has exactly these bytes."""
         self._run(f"UPDATE commits SET acked = 1 WHERE {ONE_COMMIT}", _values(commit))  # noqa: S608

@@ -142,10 +142,12 @@ class Robot:
 
         Args:
             note: up to 1024 characters for the map's log.
-            retracts: own commits that this one takes back; its evidence stands in their place.
+            retracts: own commits that this one takes back; its evidence stands in their place, on this robot too
+                once the server has folded it.
 
         Raises:
-            BadInputError: the commit would be too large, or its note too long; the measurement stays open.
+            BadInputError: the commit would be too large, its note too long, or it retracts what is not this robot's;
+                the measurement stays open.
             UnreachableError: kind `store_failed`: the disk is full or broken; the measurement stays open.
         """
         diff = self._measurement.diff() if self._measurement else {}
@@ -193,7 +195,10 @@ class Robot:
             self._replica.close()
 
     def deregister(self) -> None:
-        """Leave the map; the evidence stays there, and this directory keeps its own."""
+        """Leave the map; the evidence stays there, and this directory keeps its own. Ends the background sync."""
+        if self._thread is not None:
+            self._thread.stop()
+            self._thread = None
         self._api.deregister(self._map_name, self.name)
         self._replica.set_token(None)
 

@@ -56,9 +56,13 @@ def push_commits(
     for commit_id in replica.push_set():
         try:
             pushed = _push(replica, api, map_name, commit_id)
-        except DeniedError:
-            raise
-        except BadInputError as exc:  # one commit that cannot be taken must not hold up all that come after it
+        except DeniedError as exc:
+            if exc.kind != "not_allowed":  # the token is not good: that is no fault of the commit
+                raise
+            log.error("the server refuses commit %s: %s", commit_id, exc.message)
+            report.refused.append(commit_id)
+            continue
+        except (BadInputError, DamagedDataError) as exc:  # it must not hold up all that come after it
             log.error("the server refuses commit %s: %s: %s", commit_id, exc.kind, exc.message)
             report.refused.append(commit_id)
             continue
@@ -107,6 +111,9 @@ def fetch_missing(replica: Replica, api: MapApi, map_name: str, branch: str) -> 
             log.warning("another server answers for map %s; starting without its old state", map_name)
             replica.forget_server()
             continue
+        if exchange.damaged:
+            names = ", ".join(str(cell_of_key(key)) for key in exchange.damaged)
+            raise DamagedDataError("fingerprint_mismatch", f"the server's cells {names} are damaged; all others came")
         compare = exchange.must_compare
         if exchange.is_done and not _has_unproven(replica):
             return report

@@ -140,10 +140,13 @@ def make_commit(meta: CommitMeta, diff: Mapping[CellKey, Evidence], geometry: Ge
     return Commit(meta, cells, commit_sha(text, digests), data)
 
 
-def renamed_commit(data: bytes, *, commit: CommitId, parent: str | None) -> Commit:
-    """The evidence of a commit that was validated when it was kept, under another id."""
+def renamed_commit(
+    data: bytes, *, commit: CommitId, parent: str | None, retracts: tuple[str, ...] | None = None
+) -> Commit:
+    """The evidence of a commit that was validated when it was kept, under another id, or naming other targets."""
     meta, cells = split_commit(data)
-    meta = meta.model_copy(update={"id": str(commit), "parent": parent})
+    targets = meta.retracts if retracts is None else retracts
+    meta = meta.model_copy(update={"id": str(commit), "parent": parent, "retracts": targets})
     text = meta.model_dump_json(exclude_defaults=True).encode()
     digests = [decode_cell(body).digest for body in cells.values()]
     return Commit(meta, cells, commit_sha(text, digests), _joined(text, cells))

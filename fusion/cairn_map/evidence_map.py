@@ -69,7 +69,7 @@ class EvidenceMap:
     @property
     def size_bytes(self) -> int:
         """Memory held by the cells' arrays."""
-        return sum(cell.size_bytes for cell in self._cells.values())
+        return sum(cell.size_bytes for cell in list(self._cells.values()))
 
     def _apply(self, diff: Diff, step: Step, undo: Step) -> None:
         cells = {key: self._cells.get(key) or BrickCell(self.geometry) for key in diff}

@@ -4,21 +4,24 @@ The server keeps nothing about a branch but its row: the request says which stat
 proves it, and `lm` of each cell says whether it changed since. Per cell the smallest kind of frame wins.
 """
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from cairn_map.cell_code import encode_cell
 from cairn_map.cursor import ENTRY_FOLD, Cursor, cursor_from_text
-from cairn_map.errors import BadInputError, ConflictError
+from cairn_map.errors import BadInputError, ConflictError, DamagedDataError
 from cairn_map.evidence import empty_evidence
 from cairn_map.fingerprint import ZERO, Fingerprint
 from cairn_map.frames import CELL_HEAD, CellFrame, Frame, FrameKind
-from cairn_map.grid import CellKey, Geometry, cell_key
+from cairn_map.grid import CellKey, Geometry, cell_key, cell_of_key
 from cairn_map.ids import Author, author_from_text
 from cairn_map.messages import Done, MissingRequest, More, ReplyHeader
 from cairn_map.version_vector import VersionVector
 from cairn_server.cells_at_rest import sum_of_contributions
 from cairn_server.store import CellRow, Snapshot
+
+log = logging.getLogger(__name__)
 
 DELTA_ENTRIES_MAX = 32
 """A delta of more log entries than this is not tried: it would hardly be smaller than the cell."""
@@ -154,7 +157,11 @@ def _delta(snapshot: Snapshot, row: CellRow, start: Cursor, asker: Author | None
         return None
     if len(foreign) == 1 and foreign[0].kind == ENTRY_FOLD:
         return snapshot.diff(foreign[0].diff)  # one commit's diff is its own sum
-    evidence = sum_of_contributions(snapshot, row.key, foreign, geometry).packed()
+    try:
+        evidence = sum_of_contributions(snapshot, row.key, foreign, geometry).packed()
+    except DamagedDataError as exc:
+        log.error("cell %s: a diff at rest is damaged, sending the whole cell: %s", cell_of_key(row.key), exc.message)
+        return None
     return encode_cell(row.key, evidence, geometry).data if len(evidence) else b""
 
 

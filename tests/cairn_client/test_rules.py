@@ -206,8 +206,8 @@ def test_a_frame_that_does_not_lead_to_its_fingerprint_is_rolled_back(mole: Repl
 
 def test_a_whole_cell_that_does_not_have_its_fingerprint_is_reported(mole: Replica) -> None:
     at(mole, C1, X)
-    with pytest.raises(DamagedDataError):
-        exchanged(mole, header(C2), cell_frame(FrameKind.FULL, C2, Y, start=C1, payload=Z))
+    exchange = exchanged(mole, header(C2), cell_frame(FrameKind.FULL, C2, Y, start=C1, payload=Z))
+    assert exchange.damaged == [A]
     assert mole.cells[A].cursor == C1
     assert mole.view.evidence(A) == X
 
@@ -224,8 +224,10 @@ def test_a_state_frame_overwrites_its_blocks_and_a_present_zero_means_zero(mole:
 def test_a_frame_with_another_cell_in_it_is_refused(mole: Replica) -> None:
     frame = cell_frame(FrameKind.FULL, C1, X, key=A)
     foreign_payload = encode_cell(B, X, GEOMETRY).data
-    with pytest.raises(DamagedDataError):
-        exchanged(mole, header(C1), type(frame)(**{**_fields(frame), "payload": foreign_payload}))
+    exchange = exchanged(mole, header(C1), type(frame)(**{**_fields(frame), "payload": foreign_payload}))
+    assert exchange.damaged == [A]
+    assert mole.cells[A].cursor is None
+    assert len(mole.view.evidence(A)) == 0
 
 
 # Rule 8: the end
