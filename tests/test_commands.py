@@ -71,7 +71,7 @@ def test_two_robots_that_share_a_recording_make_the_map_of_one(
 ) -> None:
     one, two = f"{server}/maps/one", f"{server}/maps/two"
     out = cairn("robot", "replay", room_recording, "--map", one, "--voxel", VOXEL_M, folder=tmp_path)
-    assert re.search(r"replayed 8 scans as 2 commits in .* images/s\), .* 0 commits wait", out)
+    assert re.search(r"replayed 8 scans as 2 commits in .* scans/s\), .* 0 commits wait", out)
     for part in ("1/2", "2/2"):
         name = f"part{part[0]}"
         cairn(
@@ -167,6 +167,53 @@ def test_errors_name_the_cause_and_have_an_exit_code_of_their_own(server: str, t
     assert "is `cairn serve` running?" in cairn("map", "ls", "http://127.0.0.1:9", folder=tmp_path, code=5)
     assert "http://HOST:PORT/maps/NAME" in cairn("map", "info", server, folder=tmp_path, code=1)
     assert "looked for" in cairn("robot", "replay", ".", "--map", f"{server}/maps/lab", folder=tmp_path, code=1)
+
+
+def test_a_recording_is_not_counted_twice_by_accident(server: str, room_recording: Path, tmp_path: Path) -> None:
+    url = f"{server}/maps/twice"
+    replay = ("robot", "replay", room_recording, "--map", url)
+    cairn(*replay, "--voxel", VOXEL_M, folder=tmp_path)
+    once = digests(url, tmp_path, "once")
+    assert "--again" in cairn(*replay, folder=tmp_path, code=1)
+    assert "voxels of 8 cm, not 2 cm" in cairn(*replay, "--voxel", "0.02", "--again", folder=tmp_path, code=1)
+    assert digests(url, tmp_path, "still-once") == once
+    cairn(*replay, "--again", folder=tmp_path)
+    assert digests(url, tmp_path, "twice") != once
+
+
+def test_after_a_replay_the_server_knows_that_the_robot_is_level(
+    server: str, room_recording: Path, tmp_path: Path
+) -> None:
+    url = f"{server}/maps/level"
+    cairn("robot", "replay", room_recording, "--map", url, "--voxel", VOXEL_M, folder=tmp_path)
+    cairn("robot", "pull", "--map", url, "--state", "cairn-room", folder=tmp_path)
+    assert "0 entries behind" in cairn("map", "info", url, folder=tmp_path)
+
+
+def test_files_that_cannot_be_written_and_cells_with_negative_numbers(
+    server: str, room_recording: Path, tmp_path: Path
+) -> None:
+    url = f"{server}/maps/out"
+    cairn("robot", "replay", room_recording, "--map", url, "--voxel", VOXEL_M, folder=tmp_path)
+    assert "[bad_output]" in cairn("map", "export", url, "--ply", "no/such/x.ply", folder=tmp_path, code=1)
+    assert "[bad_output]" in cairn("map", "get", url, "0,0,0", "-o", "no/such/x.ply", folder=tmp_path, code=1)
+    assert "-9,0,0" in cairn("map", "get", url, "-9,0,0", "-o", "x.ply", folder=tmp_path, code=3)
+
+
+def test_a_server_refuses_tokens_that_protect_nothing(tmp_path: Path) -> None:
+    (tmp_path / "one").write_text("a secret of many letters")
+    only = ("serve", "--port", "0", "--enrolment-token-file", "one")
+    assert "[weak_tokens]" in cairn(*only, folder=tmp_path, code=1)
+    assert "[weak_tokens]" in cairn(*only, "--admin-token-file", "one", folder=tmp_path, code=1)
+
+
+def test_the_example_robot_shares_what_it_sees(server: str, tmp_path: Path) -> None:
+    cairn("map", "create", f"{server}/maps/lab", folder=tmp_path)
+    script = Path(__file__).parent.parent / "docs" / "examples" / "simulated_robot.py"
+    command = [sys.executable, str(script), f"{server}/maps/lab"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=COMMAND_S, check=True)
+    assert re.search(r"commit walle\.[0-9a-f]{16}\.1: \d+ cells, \d+ bytes", done.stdout)
+    assert " 0 commits wait" in done.stdout
 
 
 @pytest.mark.parametrize("command", ["map", "robot", "serve", "demo"])

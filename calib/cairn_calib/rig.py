@@ -110,14 +110,14 @@ def rig_from_json(data: bytes) -> Rig:
         raise BadInputError("bad_rig", f"rig.json: {where}: {first['msg']}") from exc
 
 
-def load_rig(path: Path) -> Rig:
+def load_rig(path: Path | str) -> Rig:
     """The rig in a file.
 
     Raises:
         BadInputError: the file is missing or not a rig.
     """
     try:
-        data = path.read_bytes()
+        data = Path(path).read_bytes()
     except OSError as exc:
         raise BadInputError("bad_rig", f"cannot read {path}: {exc.strerror}") from exc
     return rig_from_json(data)

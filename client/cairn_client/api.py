@@ -87,6 +87,8 @@ class MapApi:
 
     def __init__(self, server_url: str, *, token: str | None = None) -> None:
         self.traffic = Traffic()
+        if not server_url.startswith(("http://", "https://")) or "/maps/" in server_url:
+            raise BadInputError("bad_url", f"a server's URL is http://HOST:PORT, got {server_url!r}")
         try:
             self._client = httpx.Client(base_url=server_url.rstrip("/"), timeout=TIMEOUT)
         except httpx.InvalidURL as exc:
@@ -211,9 +213,9 @@ class MapApi:
             sent["Authorization"] = f"Bearer {self.token}"
         if content:
             sent["Content-Type"] = "application/json" if content.startswith(b"{") else "application/vnd.cairn.commit"
-        self.traffic.up_bytes += len(content)
         try:
             with self._client.stream(method, path, headers=sent, content=content, params=params) as response:
+                self.traffic.up_bytes += len(content)
                 if not response.is_success and response.status_code != httpx.codes.NOT_MODIFIED:
                     raise _error_of(response, next(response.iter_bytes(ERROR_BYTES_MAX), b""))
                 yield response

@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import re
 import sys
 from collections.abc import Iterable, Iterator
 from typing import TypeVar
@@ -28,6 +29,11 @@ def add_token(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def allow_negative_lists(parser: argparse.ArgumentParser) -> None:
+    """Take `-1,0,0` for a value and not for an option, as argparse by itself does with `-1` alone."""
+    parser._negative_number_matcher = re.compile(r"^-\d[-\d.,]*$")
+
+
 def api_of(map_url: str, token: str | None) -> tuple[MapApi, str]:
     """The server of a map's URL, and the map's name."""
     server, name = split_map_url(map_url)
@@ -50,6 +56,13 @@ def with_progress(items: Iterable[Item], what: str, *, total: int) -> Iterator[I
 def say(text: str = "") -> None:
     """A line of the command's result."""
     sys.stdout.write(text + "\n")
+
+
+def shown_length(metres: float) -> str:
+    """A length for people."""
+    if metres < 0.01:
+        return f"{metres * 1000:g} mm"
+    return f"{metres * 100:g} cm" if metres < 1 else f"{metres:g} m"
 
 
 def shown_bytes(count: float) -> str:

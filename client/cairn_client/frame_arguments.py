@@ -53,8 +53,9 @@ def frame_options(args: argparse.Namespace) -> FrameFolderOptions | None:
         return FrameFolderOptions.model_validate(given)
     except ValidationError as exc:
         first = exc.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "options of a folder of frames"
-        raise BadInputError("bad_option", f"{where}: {first['msg']}; see `cairn robot replay --help`") from exc
+        where = f"--{first['loc'][0]}" if first["loc"] else "a folder of frames"
+        what = "is missing" if first["type"] == "missing" else first["msg"]
+        raise BadInputError("bad_option", f"{where}: {what}; see `cairn robot replay --help`") from exc
 
 
 def _intrinsics(text: str) -> dict[str, object]:

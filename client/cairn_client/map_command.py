@@ -18,16 +18,17 @@ import argparse
 import json
 import time
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 
 from cairn_client import map_export
 from cairn_client.api import MapApi
-from cairn_client.arguments import add_token, api_of, parser, say, shown_bytes
+from cairn_client.arguments import add_token, allow_negative_lists, api_of, parser, say, shown_bytes, shown_length
 from cairn_client.prior_data import push_prior_data
 from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
 from cairn_map.errors import BadInputError
 from cairn_map.grid import Geometry, geometry_for
-from cairn_map.messages import CreateMap, MapInfo, Retract
+from cairn_map.messages import CreateMap, LogEntry, MapInfo, Retract
 
 Run = Callable[[argparse.Namespace], None]
 
@@ -62,7 +63,7 @@ def _ls(args: argparse.Namespace) -> None:
         return
     say(f"{'map':<24} {'voxel':>8} {'cells':>6} {'size':>9} {'commits':>8} {'robots':>7}")
     for info in infos:
-        voxel = f"{info.geometry.voxel_edge_m * 100:g} cm"
+        voxel = shown_length(info.geometry.voxel_edge_m)
         size = shown_bytes(info.size_bytes)
         say(f"{info.name:<24} {voxel:>8} {info.cells:>6} {size:>9} {info.commits:>8} {info.branches:>7}")
     if not infos:
@@ -93,10 +94,30 @@ def _log(args: argparse.Namespace) -> None:
     if args.json:
         say(json.dumps([entry.model_dump(mode="json") for entry in entries]))
         return
+    taken_out = {entry.id: entry.seq for entry in entries if entry.kind == "-"}
     for entry in entries:
-        word = "folded" if entry.kind == "+" else "taken out"
-        extra = f"  retracts {', '.join(entry.retracts)}" if entry.retracts else ""
-        say(f"{entry.seq:>6}  {word:<9}  {entry.id}  {entry.cells} cells, {shown_bytes(entry.size_bytes)}{extra}")
+        say(_log_line(entry, taken_out.get(entry.id)))
+    if not entries:
+        say("(nothing yet)")
+
+
+def _log_line(entry: LogEntry, taken_out: int | None) -> str:
+    """One entry: what happened, by whom, when it was captured, how much, and what became of it."""
+    word = "folded" if entry.kind == "+" else "taken out"
+    size = f"{entry.cells} cells, {shown_bytes(entry.size_bytes)}"
+    line = f"{entry.seq:>6}  {word:<9}  {_shown_time(entry.captured_s):<19}  {entry.id}  {size}"
+    if entry.retracts:
+        more = f" and {len(entry.retracts) - 1} more" if len(entry.retracts) > 1 else ""
+        line += f"  retracts {entry.retracts[0]}{more}"
+    return line + (f"  (taken out by {taken_out})" if entry.kind == "+" and taken_out else "")
+
+
+def _shown_time(captured_s: tuple[float, float] | None) -> str:
+    """When a measurement began, UTC."""
+    try:
+        return datetime.fromtimestamp(captured_s[0], UTC).strftime("%Y-%m-%d %H:%M:%S") if captured_s else "-"
+    except (OverflowError, ValueError, OSError):
+        return "-"
 
 
 def _retract(args: argparse.Namespace) -> None:
@@ -131,7 +152,7 @@ def _say_map(info: MapInfo) -> None:
     geometry = info.geometry
     names = ", ".join(channel.name for channel in geometry.channels) or "none but occupancy"
     say(
-        f"map {info.name}: voxels of {geometry.voxel_edge_m * 100:g} cm, "
+        f"map {info.name}: voxels of {shown_length(geometry.voxel_edge_m)}, "
         f"cells of {geometry.cell_edge_m:g} m, channels {names}"
     )
 
@@ -165,6 +186,7 @@ def _parser() -> argparse.ArgumentParser:
             added.add_argument("--limit", type=int, default=100, help="at most so many (100)")
     get = command("get", "download one cell", map_export.get_cell, "map")
     get.add_argument("cell", help="its number, i,j,k")
+    allow_negative_lists(get)
     get.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=".cell, .npz or .ply")
     export = command("export", "download a whole map", map_export.export_map, "map")
     export.add_argument("--cells", type=Path, metavar="DIR", help="one file a cell, named by its number")

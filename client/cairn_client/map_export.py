@@ -1,6 +1,7 @@
 """Maps as files: the `get` and `export` subcommands of `cairn map`."""
 
 import argparse
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,6 +24,7 @@ def get_cell(args: argparse.Namespace) -> None:
     suffix = output.suffix
     if suffix not in (".cell", ".npz", ".ply"):
         raise BadInputError("unknown_format", f"a cell is written as .cell, .npz or .ply, got {output.name!r}")
+    _check_outputs(output)
     info = api.map_info(name)
     cell = cell_from_text(args.cell)
     body, decoded = fetch_cell(api, name, cell)
@@ -39,6 +41,7 @@ def export_map(args: argparse.Namespace) -> None:
     """Download all cells, and write what was asked for."""
     if not (args.cells or args.ply or args.npz or args.picture):
         raise BadInputError("nothing_asked", "say what to write: --cells DIR, --ply FILE, --npz FILE or --picture FILE")
+    _check_outputs(args.ply, args.npz, args.picture)
     api, name = api_of(args.map, args.token)
     info = api.map_info(name)
     cells = list(fetch_map(api, name))
@@ -85,6 +88,17 @@ def fetch_cell(api: MapApi, name: str, cell: Cell) -> tuple[bytes, DecodedCell]:
     if decoded.key != cell_key(cell) or fingerprint(decoded.evidence, decoded.key) != fetched.fingerprint:
         raise DamagedDataError("fingerprint_mismatch", f"cell {cell} is not what the server says it is")
     return body, decoded
+
+
+def _check_outputs(*paths: Path | None) -> None:
+    """Refuse files that cannot be written, before anything is downloaded.
+
+    Raises:
+        BadInputError: kind `bad_output`.
+    """
+    for path in paths:
+        if path is not None and (path.is_dir() or not os.access(path.absolute().parent, os.W_OK)):
+            raise BadInputError("bad_output", f"cannot write {path}: is {path.absolute().parent} a folder to write in?")
 
 
 def _all_voxels(cells: list[tuple[bytes, DecodedCell]], info: MapInfo, *, occupied_only: bool) -> Voxels:

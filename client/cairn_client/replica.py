@@ -247,6 +247,7 @@ class Replica:
                 known = self.store.get(key)
                 if known is not None and known != value:
                     raise BadInputError(
-                        "other_replica", f"this folder belongs to another {key}: {known[:120]}; choose another folder"
+                        "other_replica",
+                        f"the robot's folder belongs to another {key}: {known[:120]}; choose another (--state)",
                     )
                 self.store.put(key, value)

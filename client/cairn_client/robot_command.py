@@ -1,7 +1,8 @@
 """Be a robot: replay a recording into a map, or keep a local copy of one.
 
     $ cairn robot replay shelf/ --map http://127.0.0.1:8750/maps/shelf --voxel 0.01
-    replayed 15 scans as 15 commits in 1.9 s (7.9 images/s), 0 commits wait
+    shelf: 15 scans; the first has 26% of its pixels, median range 0.57 m
+    replayed 15 scans as 15 commits in 1.9 s (7.9 scans/s), 302.0 kB up, 62.8 kB down, 0 commits wait
     $ cairn robot pull --map http://127.0.0.1:8750/maps/shelf --state copy/
 
 `replay` reads a recording folder (RECORDING.md), a known layout as it was published (apc_shelf_rgbd, mm5_rgbdt), or
@@ -19,8 +20,19 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from cairn_client.api import MapApi
-from cairn_client.arguments import add_token, api_of, parser, say, shown_bytes, with_progress
+from cairn_client.arguments import (
+    add_token,
+    allow_negative_lists,
+    api_of,
+    parser,
+    say,
+    shown_bytes,
+    shown_length,
+    with_progress,
+)
 from cairn_client.frame_arguments import add_frame_arguments, frame_options
 from cairn_client.replica_store import ReplicaStore
 from cairn_client.robot import Mode, Robot
@@ -33,6 +45,7 @@ from cairn_map.errors import BadInputError, NotFoundError, UnreachableError
 from cairn_map.grid import Geometry, geometry_for
 from cairn_map.messages import CreateMap
 
+REPLAYED_FILE = "replayed.txt"
 SYNC_EVERY_S = 2.0
 """While replaying; at the end everything is pushed and fetched once more."""
 
@@ -45,22 +58,30 @@ def main(argv: list[str]) -> int:
 
 
 def _replay(args: argparse.Namespace) -> int:
+    integrator = Integrator(min_range_m=args.min_range, max_range_m=args.max_range)
     options, size = frame_options(args), args.scans_per_measurement
     source = open_source(args.recording, options=options, frames=args.frames, scans_per_measurement=size)
+    _say_range(source)
     geometry = _ensure_map(args, source)
     name = args.name or _default_name(source.name)
+    state = args.state or Path(f"cairn-{name}")
+    part = f"{args.recording.resolve()} {args.share[0]}/{args.share[1]}"
+    if not args.again and part in _replayed(state):
+        raise BadInputError(
+            "replayed_before", f"{state} has replayed this recording already; --again counts its evidence once more"
+        )
     stops = source.measurements()[args.share[0] - 1 :: args.share[1]]
     start_s = time.monotonic()
     commits = scans = 0
     with Robot(
         source.rig,
         args.map,
-        directory=args.state or Path(f"cairn-{name}"),
+        directory=state,
         name=name,
         token=args.token,
         mode=args.mode,
         geometry=geometry,
-        integrator=Integrator(min_range_m=args.min_range, max_range_m=args.max_range),
+        integrator=integrator,
     ) as robot:
         last_sync_s = start_s
         for stop in with_progress(stops, source.name, total=len(stops)):
@@ -71,17 +92,33 @@ def _replay(args: argparse.Namespace) -> int:
             if time.monotonic() - last_sync_s > SYNC_EVERY_S:
                 _try_sync(robot)
                 last_sync_s = time.monotonic()
+        with (state / REPLAYED_FILE).open("a") as file:
+            file.write(f"{part}\n")
         mapped_s = time.monotonic() - start_s
-        is_linked = _try_sync(robot)
-        waiting = robot.waiting
-        traffic = robot.traffic
-        say(
-            f"replayed {scans} scans as {commits} commits in {mapped_s:.1f} s ({scans / mapped_s:.1f} images/s), "
-            f"{shown_bytes(traffic.up_bytes)} up, {shown_bytes(traffic.down_bytes)} down, {waiting} commits wait"
-        )
+        # The second round tells the server where this robot stands now.
+        is_linked = _try_sync(robot) and _try_sync(robot)
+        waiting, traffic = robot.waiting, robot.traffic
+    say(
+        f"replayed {scans} scans as {commits} commits in {mapped_s:.1f} s ({scans / mapped_s:.1f} scans/s), "
+        f"{shown_bytes(traffic.up_bytes)} up, {shown_bytes(traffic.down_bytes)} down, {waiting} commits wait"
+    )
     if not is_linked:
-        say(f"no link to {args.map}: run `cairn robot pull` with the same --state when there is one")
+        say(f"no link to {args.map}: `cairn robot pull --map URL --state {state}` pushes them when there is one")
     return 0
+
+
+def _say_range(source: Recording) -> None:
+    """Ranges of the first scan: who sees 5 m for a shelf at arm's length has given the wrong depth units."""
+    range_m = source.scan(0).range_m
+    seen = range_m[np.isfinite(range_m)]
+    median = f"median range {np.median(seen):.2f} m" if len(seen) else "no range at all"
+    say(f"{source.name}: {len(source)} scans; the first has {len(seen) / range_m.size:.0%} of its pixels, {median}")
+
+
+def _replayed(state: Path) -> set[str]:
+    """Recordings, with the share, that a robot's folder has replayed."""
+    path = state / REPLAYED_FILE
+    return set(path.read_text().splitlines()) if path.exists() else set()
 
 
 def _pull(args: argparse.Namespace) -> int:
@@ -92,6 +129,7 @@ def _pull(args: argparse.Namespace) -> int:
     wanted = _wanted(args, api, map_name)
     with Robot(None, args.map, directory=args.state, name=name, token=args.token, mode=mode, wanted=wanted) as robot:
         report = robot.sync()
+        robot.sync()  # tells the server where this robot stands now
         cells = robot.map.packed()
         voxels = sum(len(evidence) for evidence in cells.values())
         traffic = robot.traffic
@@ -124,8 +162,9 @@ def _try_sync(robot: Robot) -> bool:
 def _ensure_map(args: argparse.Namespace, source: Recording) -> Geometry | None:
     """The map's geometry; makes the map if there is none. None: no link, and perhaps the state folder knows it."""
     api, name = api_of(args.map, args.token)
+    wished = geometry_for(voxel_edge_m=args.voxel) if args.voxel is not None else None
     try:
-        return api.map_info(name).geometry
+        geometry = api.map_info(name).geometry
     except UnreachableError:
         return geometry_for(voxel_edge_m=args.voxel, channels=_channels(source)) if args.voxel else None
     except NotFoundError as exc:
@@ -135,8 +174,15 @@ def _ensure_map(args: argparse.Namespace, source: Recording) -> Geometry | None:
             raise BadInputError(
                 "no_map", f"there is no map {name} yet; make one with `cairn map create`, or give --voxel METRES"
             ) from exc
-    geometry = geometry_for(voxel_edge_m=args.voxel, channels=_channels(source))
-    return api.create_map(name, CreateMap(geometry=geometry)).geometry
+        made = geometry_for(voxel_edge_m=args.voxel, channels=_channels(source))
+        return api.create_map(name, CreateMap(geometry=made)).geometry
+    if wished is not None and wished.voxel_edge_um != geometry.voxel_edge_um:
+        raise BadInputError(
+            "other_geometry",
+            f"map {name} has voxels of {shown_length(geometry.voxel_edge_m)}, not {shown_length(wished.voxel_edge_m)}; "
+            "leave --voxel out, or choose another map",
+        )
+    return geometry
 
 
 def _channels(source: Recording) -> tuple[Channel, ...]:
@@ -180,10 +226,19 @@ def _parser() -> argparse.ArgumentParser:
     replay = commands.add_parser("replay", help="map a recording", description="map a recording")
     replay.add_argument("recording", type=Path, help="recording folder, or one of the known published layouts")
     replay.add_argument("--voxel", type=float, metavar="METRES", help="make the map with this voxel edge if needed")
+    replay.add_argument("--again", action="store_true", help="replay what this robot has replayed before once more")
     replay.add_argument("--share", type=_share, default=(1, 1), metavar="I/N", help="every N-th measurement from I on")
     replay.add_argument("--scans-per-measurement", type=int, metavar="N", help="regroup the scans")
-    replay.add_argument("--min-range", type=float, default=Integrator().min_range_m, metavar="METRES")
-    replay.add_argument("--max-range", type=float, default=Integrator().max_range_m, metavar="METRES")
+    replay.add_argument(
+        "--min-range", type=float, default=Integrator().min_range_m, metavar="METRES", help="ignore what is nearer"
+    )
+    replay.add_argument(
+        "--max-range",
+        type=float,
+        default=Integrator().max_range_m,
+        metavar="METRES",
+        help="ignore what is farther (10)",
+    )
     replay.add_argument("--state", type=Path, metavar="DIR", help="the robot's folder (cairn-NAME)")
     replay.add_argument("--mode", choices=("high-end", "low-end"), default="high-end")
     add_frame_arguments(replay)
@@ -194,6 +249,7 @@ def _parser() -> argparse.ArgumentParser:
     pull.add_argument("--near", type=_place, metavar="X,Y,Z", help="low-end: only cells around this place, metres")
     pull.add_argument("--radius", type=float, default=10.0, metavar="METRES", help="low-end: how far around (10)")
     pull.set_defaults(run=_pull)
+    allow_negative_lists(pull)
     for command in (replay, pull):
         command.add_argument("--map", required=True, metavar="URL", help="http://HOST:PORT/maps/NAME")
         command.add_argument("--name", help="the robot's name on the map")

@@ -75,7 +75,13 @@ def detect_layout(folder: str | Path) -> Layout:
     if (root / RIG_FILE).exists():  # an unfinished recording; opening it says so
         return Layout.RECORDING
     looked_for = "; ".join(f"{layout}: {' and '.join(names)}" for layout, names in LAYOUT_FILES.items())
-    raise BadInputError("unknown_layout", f"{root} has none of the known layouts; looked for {looked_for}")
+    if not root.is_dir():
+        raise BadInputError("unknown_layout", f"there is no folder {root}")
+    raise BadInputError(
+        "unknown_layout",
+        f"{root} has none of the known layouts; looked for {looked_for}; or describe its frames with "
+        "--depth, --pose and --intrinsics",
+    )
 
 
 def open_source(

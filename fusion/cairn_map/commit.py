@@ -10,7 +10,7 @@ import hashlib
 import json
 import struct
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -101,10 +101,13 @@ class CommitMeta(BaseModel):
 class Commit:
     """A whole commit: what it says, its cells' bytes and its SHA-256 (32 bytes)."""
 
-    meta: CommitMeta
-    cells: Mapping[CellKey, bytes]
-    sha: bytes
-    data: bytes
+    meta: CommitMeta = field(repr=False)
+    cells: Mapping[CellKey, bytes] = field(repr=False)
+    sha: bytes = field(repr=False)
+    data: bytes = field(repr=False)
+
+    def __str__(self) -> str:
+        return f"commit {self.id}: {len(self.cells)} cells, {len(self.data)} bytes"
 
     @property
     def id(self) -> CommitId:

@@ -63,8 +63,11 @@ def caller_of(token: str | None, row: MapRow | None, store: Store, settings: Set
     if settings.admin_token is None and token is None:
         return Caller(Role.ADMIN)
     if token is None:
-        raise DeniedError("no_token", "this server wants a token: Authorization: Bearer TOKEN")
-    raise DeniedError("bad_token", "the token is not known here; it may have been replaced by a new registration")
+        raise DeniedError(
+            "no_token",
+            "this server wants a token: Authorization: Bearer TOKEN (the cairn command: --token, CAIRN_TOKEN)",
+        )
+    raise DeniedError("bad_token", "the token is wrong, or another registration under the same name replaced it")
 
 
 def require(caller: Caller, *roles: Role) -> None:
@@ -74,7 +77,10 @@ def require(caller: Caller, *roles: Role) -> None:
         DeniedError: kind `not_allowed`.
     """
     if caller.role is not Role.ADMIN and caller.role not in roles:
-        raise DeniedError("not_allowed", f"a token of role {caller.role} may not do this")
+        raise DeniedError(
+            "not_allowed",
+            f"this takes {' or '.join([*roles, Role.ADMIN])} rights; the token shown is of role {caller.role}",
+        )
 
 
 def _is(token: str | None, expected: str | None) -> bool:

@@ -31,6 +31,12 @@ from cairn_server.settings import Settings
 from cairn_server.sqlite_store import SqliteStore
 
 BACKLOG = 128
+FLAG_OF_SETTING = {
+    "port": "--port",
+    "admin_token": "--admin-token-file or CAIRN_ADMIN_TOKEN",
+    "enrolment_token": "--enrolment-token-file or CAIRN_ENROLMENT_TOKEN",
+    "stable_after_s": "--stable-after",
+}
 
 
 def main(argv: list[str]) -> int:
@@ -112,7 +118,8 @@ def _settings(argv: list[str]) -> Settings:
         )
     except ValidationError as exc:
         first = exc.errors()[0]
-        raise BadInputError("bad_setting", f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from exc
+        flag = FLAG_OF_SETTING.get(str(first["loc"][0]), str(first["loc"][0]))
+        raise BadInputError("bad_setting", f"{flag}: {first['msg']}") from exc
 
 
 def _secret(path: Path | None, variable: str) -> str | None:

@@ -143,7 +143,8 @@ class Service:
             with self.store.snapshot(row) as snapshot:
                 targets |= dict.fromkeys(snapshot.commits_of(request.robot))
         if not targets:
-            raise NotFoundError("nothing_to_retract", "name commits, or a robot that has evidence in the map")
+            who = f"{request.robot} has no evidence in map {row.name}" if request.robot else "no commit is named"
+            raise NotFoundError("nothing_to_retract", f"{who}; `cairn map log` shows what there is")
         if any(target.author.robot == OPERATOR for target in targets):
             raise BadInputError("not_retractable", "a retract is not retracted; push the evidence anew")
         names = [str(target) for target in targets]

@@ -28,11 +28,18 @@ class Settings(BaseModel):
     """A commit folded longer ago is in every backup that may still be restored, so robots may drop it."""
 
     def check_reach(self) -> None:
-        """Refuse to serve strangers without a token.
+        """Refuse to serve strangers without a token, and tokens that protect nothing.
 
         Raises:
-            BadInputError: the host is not loopback and there is no admin token.
+            BadInputError: the host is not loopback and there is no admin token; or an enrolment token without an admin
+                token, or equal to it.
         """
+        if self.enrolment_token is not None and self.admin_token in (None, self.enrolment_token):
+            raise BadInputError(
+                "weak_tokens",
+                "an enrolment token needs another admin token beside it (--admin-token-file): without one everybody "
+                "may do everything, and with the same one every robot may",
+            )
         if self.admin_token is None and self.host not in LOOPBACK:
             raise BadInputError(
                 "open_server",
