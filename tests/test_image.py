@@ -81,7 +81,8 @@ def image() -> Iterator[Image]:
         (KEPT / "storage.conf").write_text(
             f'[storage]\ndriver = "vfs"\ngraphroot = "{KEPT}/storage"\nrunroot = "{KEPT}/run"\n'
         )
-        buildah("rm", "--all")  # what a killed run left
+        buildah("rm", "--all")  # what a killed run left: half an image is half a gigabyte
+        buildah("rmi", "--prune", "--force")
         name = built_image(wheels())
         yield Image(name, json.loads(buildah("inspect", "--type", "image", name))["Docker"]["config"])
 

@@ -84,8 +84,9 @@ def _info(args: argparse.Namespace) -> None:
         say(f"cells span ({low}) m to ({high}) m")
     for branch in branches:
         lag = "held nothing" if branch.behind is None else f"{branch.behind} entries behind"
+        lag = "fetches whole cells" if branch.mode == "low-end" else f"{lag} when it last asked"
         seen_s, sensors = time.time() - branch.last_seen_s, ", ".join(branch.sensors)
-        say(f"  {branch.branch:<16} {branch.mode:<9} {lag} when it last asked, seen {seen_s:.0f} s ago, {sensors}")
+        say(f"  {branch.branch:<16} {branch.mode:<9} {lag}, seen {seen_s:.0f} s ago, {sensors}")
 
 
 def _log(args: argparse.Namespace) -> None:
