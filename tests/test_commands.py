@@ -198,6 +198,10 @@ def test_files_that_cannot_be_written_and_cells_with_negative_numbers(
     assert "[bad_output]" in cairn("map", "export", url, "--ply", "no/such/x.ply", folder=tmp_path, code=1)
     assert "[bad_output]" in cairn("map", "get", url, "0,0,0", "-o", "no/such/x.ply", folder=tmp_path, code=1)
     assert "-9,0,0" in cairn("map", "get", url, "-9,0,0", "-o", "x.ply", folder=tmp_path, code=3)
+    low_end = ("--mode", "low-end", "--near", "-1,0.5,1")
+    assert "cells," in cairn("robot", "pull", "--map", url, "--state", "low", *low_end, folder=tmp_path)
+    bent = ("--depth", "{id}.png", "--pose", "pose.txt", "--intrinsics", "9,9,9,9", "--distortion", "-0.1,0,0,0,0")
+    assert "[no_frames]" in cairn("robot", "replay", "cells", "--map", url, *bent, folder=tmp_path, code=1)
 
 
 def test_a_server_refuses_tokens_that_protect_nothing(tmp_path: Path) -> None:

@@ -249,8 +249,8 @@ def _parser() -> argparse.ArgumentParser:
     pull.add_argument("--near", type=_place, metavar="X,Y,Z", help="low-end: only cells around this place, metres")
     pull.add_argument("--radius", type=float, default=10.0, metavar="METRES", help="low-end: how far around (10)")
     pull.set_defaults(run=_pull)
-    allow_negative_lists(pull)
     for command in (replay, pull):
+        allow_negative_lists(command)
         command.add_argument("--map", required=True, metavar="URL", help="http://HOST:PORT/maps/NAME")
         command.add_argument("--name", help="the robot's name on the map")
         add_token(command)

@@ -4,7 +4,6 @@ Voxels are drawn as small cubes in a parallel view from above one corner, far on
 other occupied voxel are drawn. Of a closed room one sees nothing but the roof, unless the ceiling is cut off.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -138,14 +137,10 @@ def _draw_cubes(image: Rgb, numbers: npt.NDArray[np.int64], rgb: Rgb) -> None:
     faces = [_face(axis, toward[axis]) @ plane * scale for axis in range(3)]
     origins = (numbers - middle) @ plane * scale + screen
     shaded = [np.rint(rgb * shade).astype(int).tolist() for _, shade in FACE_SHADE]
-    is_open: list[Callable[[list[int]], bool]] = [
-        lambda at, axis=axis: _beside(at, axis, toward[axis]) not in occupied  # type: ignore[misc]
-        for axis in range(3)
-    ]
     for row in np.argsort(-(numbers @ away), kind="stable").tolist():
         at = numbers[row].tolist()
         for axis in range(3):
-            if is_open[axis](at):
+            if _beside(at, axis, toward[axis]) not in occupied:
                 outline = np.rint((origins[row] + faces[axis]) * 16).astype(np.int32)
                 cv2.fillConvexPoly(image, outline, shaded[axis][row], lineType=cv2.LINE_8, shift=4)
 

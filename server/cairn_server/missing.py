@@ -58,8 +58,7 @@ def asker_from_request(request: MissingRequest, snapshot: Snapshot) -> Asker:
     if len(asker.cells) != len(request.cells):
         raise BadInputError("bad_message", "a cell is named twice in the request")
     head = snapshot.head.cursor
-    for cursor in {asker.cursor, *asker.cells.values()} - {None}:
-        assert cursor is not None  # noqa: S101 - narrows the type
+    for cursor in {cursor for cursor in (asker.cursor, *asker.cells.values()) if cursor is not None}:
         if cursor.log_id != head.log_id:
             raise ConflictError("other_log", "the cursor belongs to another server's log; start without one")
         if not _is_proven(cursor, snapshot):
