@@ -7,16 +7,15 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cairn_fusion.recording_writer import RecordingWriter
-from cairn_sim.drive import head_poses, stops
-from cairn_sim.heads import RANGE_CAMERA, full_head
-from cairn_sim.render import render_scan
-from cairn_sim.room import small_room
+from cairn_sim.record import Plan, record
+from cairn_sim.robots import ROBOTS
+from cairn_sim.scene_file import load_scene
 
 COMMAND_S = 120
 VOXEL_M = "0.08"
@@ -46,14 +45,9 @@ def server(tmp_path: Path) -> Iterator[str]:
 def room_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two stops of four scans in the simulated room, all channels, as a recording on disk."""
     folder = tmp_path_factory.mktemp("recording") / "room"
-    room, rig, rng = small_room(), full_head(scale=0.1), np.random.default_rng(3)
-    time_s = 0.0
-    with RecordingWriter(folder, rig, name="room") as writer:
-        for position in stops("west")[:2]:
-            for T in head_poses(position, n_yaw=4, n_pitch=1):
-                time_s += 1.0
-                writer.add(render_scan(room, rig, T_map_rig=T, range_camera=RANGE_CAMERA, time_s=time_s, rng=rng))
-            writer.end_measurement()
+    scene, robot = load_scene("small-room"), replace(ROBOTS["orpheus"], scans=(4, 1))
+    plan = Plan(scene=scene, robot=robot, path="west", seed=3, scale=0.1, truth="none", last_stop=2)
+    assert len(list(record(plan, folder, scene_text=""))) == 8
     return folder
 
 

@@ -35,7 +35,12 @@ MAY_IMPORT = {
 }
 
 MAY_NAME = {
-    "cv2": ["cairn_fusion/images.py", "cairn_fusion/picture.py"],
+    "cv2": [
+        "cairn_fusion/images.py",
+        "cairn_fusion/picture.py",
+        "cairn_sim/contact_sheet.py",
+        "cairn_sim/render.py",
+    ],
     "fastapi": ["cairn_server/*routes.py", "cairn_server/problems.py", "cairn_server/serve_command.py"],
     "starlette": ["cairn_server/*routes.py", "cairn_server/problems.py", "cairn_server/serve_command.py"],
     "uvicorn": ["cairn_server/serve_command.py"],

@@ -4,7 +4,8 @@
      "cameras": {"tof": {"spectrum": "range", "camera": {...}, "T_rig_camera": [[...], ...]}, ...}}
 
 `T_rig_camera` maps points from the camera's frame to the rig's, in metres. Which camera sees which
-spectrum is part of the rig, so an image's meaning never depends on its file name.
+spectrum is part of the rig, so an image's meaning never depends on its file name. A camera without `model` is a
+pinhole; a spinning lidar says `"model": "spinning"`.
 """
 
 import hashlib
@@ -13,9 +14,10 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 
 from cairn_calib.camera import Camera
+from cairn_calib.lidar import AnyCamera, SpinningLidar
 from cairn_calib.poses import Transform, checked_transform
 from cairn_map.errors import BadInputError
 
@@ -34,13 +36,30 @@ class Spectrum(StrEnum):
     """Far infrared: apparent temperature in kelvin."""
 
 
+def _model_of(camera: object) -> str | None:
+    """Which model a camera in a document has; None: one that there is not."""
+    if isinstance(camera, SpinningLidar):
+        return "spinning"
+    if not isinstance(camera, dict) or "model" not in camera:
+        return "pinhole"
+    return "spinning" if camera["model"] == "spinning" else None
+
+
 class MountedCamera(BaseModel):
-    """One camera and its place on the rig."""
+    """One camera and its place on the rig; a lidar's spectrum is range."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     spectrum: Spectrum
-    camera: Camera
+    # One model is tried, not both: the message of a refusal is about what was meant.
+    camera: Annotated[
+        Annotated[Camera, Tag("pinhole")] | Annotated[SpinningLidar, Tag("spinning")],
+        Discriminator(
+            _model_of,
+            custom_error_type="camera_model",
+            custom_error_message="model must be 'spinning' (a lidar), or absent (a pinhole)",
+        ),
+    ]
     T_rig_camera: tuple[Row, Row, Row, Row]
 
     @model_validator(mode="after")
@@ -49,6 +68,12 @@ class MountedCamera(BaseModel):
             checked_transform(self.T_rig_camera, name="T_rig_camera")
         except BadInputError as exc:
             raise ValueError(exc.message) from exc
+        return self
+
+    @model_validator(mode="after")
+    def _lidar_measures_range(self) -> Self:
+        if isinstance(self.camera, SpinningLidar) and self.spectrum is not Spectrum.RANGE:
+            raise ValueError(f"a spinning lidar's spectrum must be range, got {self.spectrum}")
         return self
 
     @property
@@ -88,7 +113,7 @@ class Rig(BaseModel):
         return hashlib.sha256(self.to_json()).hexdigest()
 
 
-def mounted(spectrum: Spectrum, camera: Camera, T_rig_camera: Transform) -> MountedCamera:
+def mounted(spectrum: Spectrum, camera: AnyCamera, T_rig_camera: Transform) -> MountedCamera:
     """A camera at a place given as an array."""
     rows = [tuple(float(v) for v in row) for row in np.asarray(T_rig_camera)]
     return MountedCamera.model_validate({"spectrum": spectrum, "camera": camera, "T_rig_camera": rows})

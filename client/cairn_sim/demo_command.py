@@ -5,7 +5,7 @@
     all equal: server, scout, mole and late hold the same 12 cells, byte for byte
 
 It starts a server on a free port of this machine, lets three robots with different cameras drive through a
-simulated room (one of them loses its link for a while, one joins late and is low-end), shows who has what, compares
+simulated building (one of them loses its link for a while, one joins late and is low-end), shows who has what, compares
 every cell of every map, takes one commit out again and compares with a map that never had it. The result lies in
 ./demo: map.ply for a point cloud viewer, map.png to look at, and the server's data to serve again.
 """
@@ -45,33 +45,36 @@ from cairn_sim.demo_check import (
 )
 from cairn_sim.demo_robot import DemoRobot, Plan
 from cairn_sim.heads import colour_and_tof_head, full_head, thermal_and_tof_head
-from cairn_sim.room import small_room
+from cairn_sim.scene import Scene
+from cairn_sim.scene_file import load_scene
+from cairn_sim.trajectories import stops
 
-MAP = "room"
+MAP = "building"
 IMAGE_SCALE = 0.25
 """Colour and thermal images a quarter as wide: enough for voxels of 4 cm, and quickly rendered."""
-CEILING_M = 1.7
+CEILING_M = 0.9
+"""Where the picture cuts the map: over the heads, under the ceiling's 1.7 m."""
 QUICK_SCANS = (4, 1)
 """Yaws and pitches of `--quick`: the same story with a poorer map."""
 SERVER_START_S = 60.0
 MARKER = "cairn-demo"
 
 
-def plans() -> list[Plan]:
+def plans(scene: Scene) -> list[Plan]:
     """The team: the first maps everything, the second goes offline, the third is low-end and joins late."""
     return [
         Plan(
             name="scout",
             head="2 colour, 2 thermal, ToF",
             rig=full_head(scale=IMAGE_SCALE),
-            path="west",
+            stops=stops(scene, "labs")[1:24:3],
             mode="high-end",
         ),
         Plan(
             name="mole",
             head="thermal, ToF",
             rig=thermal_and_tof_head(scale=IMAGE_SCALE),
-            path="doorway",
+            stops=stops(scene, "corridors")[6:13],
             mode="high-end",
             starts_after=1,
             offline=(2, 3, 4),
@@ -80,7 +83,7 @@ def plans() -> list[Plan]:
             name="late",
             head="colour, ToF",
             rig=colour_and_tof_head(scale=IMAGE_SCALE),
-            path="east",
+            stops=stops(scene, "corridors")[17:27:2],
             mode="low-end",
             starts_after=3,
         ),
@@ -97,10 +100,10 @@ def main(argv: list[str]) -> int:
         console.print(f"server on {url}, its data in {args.output / 'server'}")
         api = MapApi(url)
         api.create_map(MAP, CreateMap(geometry=geometry_for(voxel_edge_m=args.voxel)))
-        room = small_room()
+        scene = load_scene("building")
         map_url = f"{url}/maps/{MAP}"
-        chosen = [replace(plan, scans=QUICK_SCANS) if args.quick else plan for plan in plans()]
-        team = [DemoRobot(plan, room, map_url, args.output / "robots", args.seed + n) for n, plan in enumerate(chosen)]
+        chosen = [replace(plan, scans=QUICK_SCANS) if args.quick else plan for plan in plans(scene)]
+        team = [DemoRobot(plan, scene, map_url, args.output / "robots", args.seed + n) for n, plan in enumerate(chosen)]
         for member in team:
             console.print(f"  {member.plan.name}: {member.plan.head}; {member.plan.mode}, {member.stop_count} stops")
         try:

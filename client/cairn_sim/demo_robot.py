@@ -6,19 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
+from cairn_calib.poses import Transform
 from cairn_calib.rig import Rig
 from cairn_client.robot import Mode, Robot
 from cairn_map.errors import CairnError, UnreachableError
-from cairn_sim.drive import head_poses, stops
 from cairn_sim.heads import RANGE_CAMERA
+from cairn_sim.kinematics import Manipulator, measurement_joints
+from cairn_sim.record import CLOCK_START_S, SCAN_S
 from cairn_sim.render import render_scan
-from cairn_sim.room import Room
-
-CLOCK_START_S = 1_760_000_000.0
-"""Time stamp of the first scan: the demo gives the same evidence each time."""
-SCAN_S = 0.5
+from cairn_sim.scene import Scene
+from cairn_sim.sensors import Noise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,14 +25,15 @@ class Plan:
     name: str
     head: str
     rig: Rig
-    path: str
+    stops: Sequence[Transform]
+    """`T_map_robot` where it measures."""
     mode: Mode
     starts_after: int = 0
     """Commits of the first robot that this one waits for before it joins."""
     offline: Sequence[int] = ()
     """Stops at which it has no link."""
     scans: tuple[int, int] = (8, 3)
-    """Yaws and pitches of the head at each stop."""
+    """Pans and tilts of the head at each stop."""
 
 
 @dataclass(slots=True)
@@ -54,13 +52,13 @@ class Progress:
 class DemoRobot:
     """One robot with its thread; `robot` is open until `close`."""
 
-    def __init__(self, plan: Plan, room: Room, map_url: str, folder: Path, seed: int) -> None:
+    def __init__(self, plan: Plan, scene: Scene, map_url: str, folder: Path, seed: int) -> None:
         self.plan = plan
-        self.stop_count = len(stops(plan.path))
+        self.stop_count = len(plan.stops)
         self.progress = Progress()
         self.error: BaseException | None = None
-        self._room = room
-        self._rng = np.random.default_rng(seed)
+        self._scene = scene
+        self._noise = Noise(seed)
         self.robot = Robot(plan.rig, map_url, directory=folder / plan.name, name=plan.name, mode=plan.mode)
         self.may_start = threading.Event()
         self._thread = threading.Thread(target=self._run, name=plan.name, daemon=True)
@@ -86,30 +84,32 @@ class DemoRobot:
     def _run(self) -> None:
         try:
             self.may_start.wait()
-            for number, position in enumerate(stops(self.plan.path)):
-                self._measure(number, position)
+            for number, T_map_robot in enumerate(self.plan.stops):
+                self._measure(number, T_map_robot)
                 self._sync_unless_offline(number)
             self.progress.state = "arrived"
         except CairnError as exc:
             self.error = exc
             self.progress.state = "failed"
 
-    def _measure(self, number: int, position: np.ndarray[tuple[int], np.dtype[np.float64]]) -> None:
-        yaws, pitches = self.plan.scans
-        for scan, T_map_rig in enumerate(head_poses(position, n_yaw=yaws, n_pitch=pitches)):
-            time_s = CLOCK_START_S + (number * yaws * pitches + scan) * SCAN_S
+    def _measure(self, stop: int, T_map_robot: Transform) -> None:
+        joints = measurement_joints(*self.plan.scans)
+        for scan, joint in enumerate(joints):
+            number = stop * len(joints) + scan
             self.robot.observe(
                 render_scan(
-                    self._room,
+                    self._scene,
                     self.plan.rig,
-                    T_map_rig=T_map_rig,
+                    T_map_rig=T_map_robot @ Manipulator().T_robot_rig(joint),
                     range_camera=RANGE_CAMERA,
-                    time_s=time_s,
-                    rng=self._rng,
+                    time_s=CLOCK_START_S + number * SCAN_S,
+                    noise=self._noise,
+                    number=number,
+                    threads=1,
                 )
             )
         self.progress.commits += self.robot.commit() is not None
-        self.progress.stops_done = number + 1
+        self.progress.stops_done = stop + 1
 
     def _sync_unless_offline(self, number: int) -> None:
         if number in self.plan.offline:

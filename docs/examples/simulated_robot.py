@@ -8,18 +8,21 @@ $ python docs/examples/simulated_robot.py http://127.0.0.1:8750/maps/lab
 import sys
 
 from cairn_client.robot import Robot
-from cairn_sim.drive import head_poses, stops
-from cairn_sim.heads import RANGE_CAMERA, full_head
+from cairn_sim.heads import RANGE_CAMERA
 from cairn_sim.render import render_scan
-from cairn_sim.room import small_room
+from cairn_sim.robots import ROBOTS
+from cairn_sim.scene_file import load_scene
+from cairn_sim.sensors import Noise
+from cairn_sim.trajectories import stops
 
-rig, room = full_head(scale=0.25), small_room()
+scene, walle, noise = load_scene("small-room"), ROBOTS["orpheus"], Noise(seed=1)
+rig = walle.rig_of(0.25)  # colour and thermal images a quarter as wide
 with Robot(rig, sys.argv[1], directory="robot-state", name="walle") as robot:
-    for position in stops("west")[:2]:
-        for n, T_map_rig in enumerate(head_poses(position, n_yaw=8, n_pitch=3)):
-            robot.observe(
-                render_scan(room, rig, T_map_rig=T_map_rig, range_camera=RANGE_CAMERA, time_s=float(n), rng=None)
-            )
+    for stop, T_map_robot in enumerate(stops(scene, "west")[:2]):
+        for scan, T_map_rig in enumerate(walle.head_poses(T_map_robot)):
+            number = stop * walle.scans_per_stop + scan
+            pose = {"T_map_rig": T_map_rig, "time_s": float(number)}
+            robot.observe(render_scan(scene, rig, range_camera=RANGE_CAMERA, noise=noise, number=number, **pose))
         sys.stdout.write(f"{robot.commit()}\n")  # durable from here on, link or no link
         robot.sync()
     sys.stdout.write(f"{len(robot.map)} cells, {robot.waiting} commits wait\n")

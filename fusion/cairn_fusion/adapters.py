@@ -8,14 +8,14 @@ image's corners, so the caller must say which one it has by choosing the functio
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.camera import Camera
+from cairn_calib.lidar import AnyCamera
 from cairn_map.errors import BadInputError
 
 Image = npt.NDArray[np.generic]
 Ranges = npt.NDArray[np.float32]
 
 
-def range_from_z_depth(depth: Image, camera: Camera, *, units_per_m: float) -> Ranges:
+def range_from_z_depth(depth: Image, camera: AnyCamera, *, units_per_m: float) -> Ranges:
     """Ranges along the beam from a z-depth image.
 
     Eq. 4 of Kocmanova et al. backwards: d = z / (z component of the pixel's unit ray).
@@ -35,7 +35,7 @@ def range_from_z_depth(depth: Image, camera: Camera, *, units_per_m: float) -> R
     return (z_m / camera.rays()[..., 2]).astype(np.float32)
 
 
-def range_from_radial(radial: Image, camera: Camera, *, units_per_m: float) -> Ranges:
+def range_from_radial(radial: Image, camera: AnyCamera, *, units_per_m: float) -> Ranges:
     """Ranges from an image that already holds distance along the beam; arguments as `range_from_z_depth`."""
     return _metres(radial, camera, units_per_m).astype(np.float32)
 
@@ -46,7 +46,7 @@ def kelvin_from_counts(counts: Image, *, kelvin_per_count: float, kelvin_at_zero
     return np.where(values > 0, values * kelvin_per_count + kelvin_at_zero, np.nan).astype(np.float32)
 
 
-def _metres(image: Image, camera: Camera, units_per_m: float) -> npt.NDArray[np.float64]:
+def _metres(image: Image, camera: AnyCamera, units_per_m: float) -> npt.NDArray[np.float64]:
     if not units_per_m > 0:
         raise BadInputError("bad_scale", f"units_per_m must be positive, got {units_per_m}")
     camera.check_image(image, name="depth image")

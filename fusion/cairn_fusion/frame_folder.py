@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from cairn_calib.brown import Coefficients
 from cairn_calib.camera import Camera
 from cairn_calib.poses import Transform, checked_transform, inverse
 from cairn_calib.rig import Rig, Spectrum, mounted
@@ -57,7 +58,7 @@ class FrameFolderOptions(BaseModel):
     """3x3 matrix in text; else `focal_px` and `centre_px`."""
     focal_px: tuple[Positive, Positive] | None = None
     centre_px: tuple[Finite, Finite] | None = None
-    distortion: tuple[Finite, Finite, Finite, Finite, Finite] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)
     depth_units_per_m: Positive = 1000.0
     depth_convention: Convention = Convention.Z
     pose_convention: PoseConvention = PoseConvention.CAMERA_TO_MAP

@@ -16,7 +16,7 @@ from types import ModuleType
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.camera import MAX_SIDE_PX
+from cairn_calib.raster import MAX_SIDE_PX
 from cairn_map.errors import BadInputError, DamagedDataError
 
 FILE_BYTES_MAX = 256 << 20

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from cairn_calib.camera import Camera
+from cairn_calib.lidar import AnyCamera
 from cairn_calib.rig import Rig, Spectrum
 from cairn_fusion.adapters import kelvin_from_counts, range_from_radial, range_from_z_depth
 from cairn_fusion.timed_lists import read_text
@@ -171,13 +171,13 @@ def contained(folder: Path, relative: str) -> Path:
     return path
 
 
-def decode_range(counts: Counts, camera: Camera, encoding: RangeEncoding) -> Metres:
+def decode_range(counts: Counts, camera: AnyCamera, encoding: RangeEncoding) -> Metres:
     """(H, W) float32 metres along the beam from counts; 0 becomes NaN."""
     convert = range_from_z_depth if encoding.convention is Convention.Z else range_from_radial
     return convert(counts, camera, units_per_m=encoding.units_per_m)
 
 
-def encode_range(range_m: Metres, camera: Camera, encoding: RangeEncoding) -> Counts:
+def encode_range(range_m: Metres, camera: AnyCamera, encoding: RangeEncoding) -> Counts:
     """(H, W) uint16 counts, rounded to the nearest; NaN becomes 0, and nothing else does.
 
     Raises:

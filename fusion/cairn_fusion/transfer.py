@@ -14,7 +14,7 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.camera import Camera
+from cairn_calib.lidar import AnyCamera
 from cairn_calib.poses import Transform, inverse, transform_points
 from cairn_calib.rig import MountedCamera, Rig
 
@@ -56,7 +56,7 @@ class Transfer:
         return np.asarray(image[y, x])
 
 
-def points_from_range(range_m: npt.NDArray[np.floating], camera: Camera) -> Floats:
+def points_from_range(range_m: npt.NDArray[np.floating], camera: AnyCamera) -> Floats:
     """Points that the time-of-flight camera saw, in its own frame.
 
     Eq. 4 of Kocmanova et al.: the sensor measures along the beam, so the depth is z = d f / sqrt(x^2 + y^2 + f^2),

@@ -12,7 +12,7 @@ from cairn_map.errors import BadInputError
 
 law = settings(max_examples=50, deadline=None, database=None)
 small = st.floats(-0.02, 0.02)
-# As strong as it may be for every pixel to have a ray that the iteration finds.
+# As strong as it may be for every pixel to have a ray; stronger ones and the fold: test_brown.py.
 cameras = st.builds(
     Camera,
     width=st.just(320),
@@ -42,7 +42,7 @@ def test_project_undoes_unproject(camera: Camera) -> None:
     pixels = grid(camera)
     rays = camera.unproject(pixels)
     np.testing.assert_allclose(np.linalg.norm(rays, axis=-1), 1, rtol=1e-12)
-    np.testing.assert_allclose(camera.project(rays * 3.7), pixels, atol=1e-7)
+    np.testing.assert_allclose(camera.project(rays * 3.7), pixels, rtol=0, atol=1e-9)
 
 
 @law
@@ -51,17 +51,6 @@ def test_projection_is_that_of_opencv(camera: Camera, seed: int) -> None:
     points = np.random.default_rng(seed).uniform([-1, -1, 2], [1, 1, 5], (50, 3))
     expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix(camera), np.array(camera.distortion))
     np.testing.assert_allclose(camera.project(points), expected.reshape(-1, 2), atol=1e-9)
-
-
-@pytest.mark.parametrize("camera", [BARREL, BARREL.model_copy(update={"distortion": (0.2, 0.05, 0.0, -1e-3, 0.02)})])
-def test_rays_are_those_of_opencv(camera: Camera) -> None:
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
-    pixels = grid(camera)
-    distortion = np.array(camera.distortion)
-    ideal = cv2.undistortImagePoints(pixels.reshape(-1, 1, 2), matrix(camera), distortion, None, criteria)
-    plane = (ideal.reshape(-1, 2) - camera.centre_px) / camera.focal_px
-    rays = camera.unproject(pixels)
-    np.testing.assert_allclose(rays[:, :2] / rays[:, 2:], plane, atol=1e-9)
 
 
 def test_the_ray_of_each_pixel_is_the_one_through_it() -> None:
@@ -83,9 +72,14 @@ def test_what_is_not_in_front_has_no_pixel(z: float) -> None:
 def test_a_pixel_that_no_ray_reaches_has_no_ray() -> None:
     # Strong barrel distortion folds back: r (1 - r^2 / 2) is never above 0.55.
     camera = Camera(width=100, height=100, focal_px=(50, 50), centre_px=(0, 0), distortion=(-0.5, 0, 0, 0, 0))
-    with np.errstate(over="ignore", invalid="ignore"):
-        assert np.isnan(camera.unproject(np.array([90.0, 0.0]))).all()
+    assert np.isnan(camera.unproject(np.array([90.0, 0.0]))).all()
     assert not np.isnan(camera.unproject(np.array([10.0, 0.0]))).any()
+
+
+def test_a_point_far_off_the_axis_is_not_folded_back_into_the_image() -> None:
+    camera = Camera(width=100, height=100, focal_px=(50, 50), centre_px=(0, 0), distortion=(-0.5, 0, 0, 0, 0))
+    assert np.isnan(camera.project(np.array([1.3, 0.0, 1.0]))).all()
+    np.testing.assert_allclose(camera.project(np.array([0.8, 0.0, 1.0])), [50 * 0.8 * (1 - 0.32), 0])
 
 
 def test_an_image_contains_its_pixels_to_their_outer_edges() -> None:
@@ -114,6 +108,8 @@ def test_an_image_of_another_size_is_refused() -> None:
         {"focal_px": (0, 1)},
         {"focal_px": (np.inf, 1)},
         {"centre_px": (np.nan, 0)},
+        {"distortion": (np.nan, 0, 0, 0, 0)},
+        {"distortion": (0, 0, 0, 0, 1e13)},
         {"skew": 1},
     ],
 )

@@ -1,0 +1,144 @@
+r"""Brown's distortion of the normalised image plane, and its inverse by Newton's method.
+
+    (x, y)  --distorted-->  (x', y')      five coefficients k1, k2, p1, p2, k3, in OpenCV's order
+    (x, y) <--undistorted-- (x', y')
+
+      r'   __              The radial part r' = r (1 + k1 r^2 + k2 r^4 + k3 r^6) rises up to a turning point and
+      |   /  \             may fall again: the model folds the outer scene back over the inner. Only the part
+      |  /    \             before the fold describes a lens, so a point behind it has no image, and a place in
+      +-------------- r    the image that no point before it reaches has no origin. Both are NaN.
+
+Brown 1971, "Close-range camera calibration"; CONVENTIONS.md has the formulae.
+"""
+
+from functools import lru_cache
+from typing import Annotated
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field
+
+Floats = npt.NDArray[np.float64]
+
+COEFFICIENT_MAX = 1e12
+"""Far above any lens's (k3 of a 2 degree one may reach 1e8), far below an overflow."""
+Coefficient = Annotated[float, Field(ge=-COEFFICIENT_MAX, le=COEFFICIENT_MAX, allow_inf_nan=False)]
+Coefficients = tuple[Coefficient, Coefficient, Coefficient, Coefficient, Coefficient]
+
+RADIUS_MAX = 1e3
+"""Of the plane, where nothing folds: 89.9 degrees off the axis."""
+TABLE_SIZE = 4096
+"""Radii of the table that Newton starts from, 0.5 % apart: two steps later it is exact."""
+CHUNK = 1 << 14
+"""Points at a time, so that a step stays in the processor's cache: 0.2 s against 0.5 s for 1280 x 960."""
+STEPS = 30
+STEP_AGAIN = 1e-11
+"""Error of the plane beyond which another step is worth it; the step itself squares it."""
+TOLERANCE = 5e-13
+"""Error of the plane, relative beyond 1: 7e-10 px at a focal length of 1300 px. What is worse has no origin."""
+PULL_BACK = 0.98
+"""Of the radius of a guess that went over the fold."""
+
+
+def distorted(plane: Floats, coefficients: Coefficients) -> Floats:
+    """(..., 2) normalised image plane without distortion to the plane with it; NaN beyond the fold."""
+    if not any(coefficients):
+        return plane
+    radius = np.hypot(plane[..., 0], plane[..., 1])
+    # Taken out before: far away the polynomial overflows.
+    near = np.where((radius < radius_limit(coefficients))[..., None], plane, np.nan)
+    x, y = near[..., 0], near[..., 1]
+    unfolded = jacobian(x, y, coefficients)[3] > 0
+    return np.where(unfolded[..., None], np.stack(_brown(x, y, coefficients), axis=-1), np.nan)
+
+
+def undistorted(plane: Floats, coefficients: Coefficients) -> Floats:
+    """The mirror of `distorted`: (..., 2) the plane without distortion; NaN where no point before the fold goes."""
+    if not any(coefficients):
+        return plane
+    flat = plane.reshape(-1, 2)
+    result = np.empty_like(flat)
+    for start in range(0, len(flat), CHUNK):
+        part = slice(start, start + CHUNK)
+        result[part, 0], result[part, 1] = _newton(flat[part, 0], flat[part, 1], coefficients)
+    return result.reshape(plane.shape)
+
+
+@lru_cache(maxsize=64)
+def radius_limit(coefficients: Coefficients) -> float:
+    """The radius at which the radial part first turns, at most RADIUS_MAX.
+
+    There its derivative 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3, s = r^2, is zero.
+    """
+    k1, k2, _, _, k3 = coefficients
+    # In u = 1 / s the polynomial begins with 1 whatever the coefficients; its largest root is the first turn.
+    roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
+    u = float(np.max(roots.real[roots.imag == 0], initial=0.0))
+    return RADIUS_MAX if u * RADIUS_MAX**2 <= 1 else 1 / float(np.sqrt(u))
+
+
+def jacobian(x: Floats, y: Floats, coefficients: Coefficients) -> tuple[Floats, Floats, Floats, Floats]:
+    """dx'/dx, dx'/dy = dy'/dx (Brown's is symmetric), dy'/dy, and the determinant."""
+    k1, k2, p1, p2, k3 = coefficients
+    s = x * x + y * y
+    radial = _radial(s, coefficients)
+    slope = 2 * (k1 + s * (2 * k2 + s * 3 * k3))
+    xx = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
+    xy = x * y * slope + 2 * p1 * x + 2 * p2 * y
+    yy = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
+    return xx, xy, yy, xx * yy - xy * xy
+
+
+def _newton(x_to: Floats, y_to: Floats, coefficients: Coefficients) -> tuple[Floats, Floats]:
+    """The origins (N,), (N,) of places in the distorted plane.
+
+    The start is the radial part alone, inverted by table: near the answer and before the fold, where a start at
+    the place itself may step over it.
+    """
+    radius_to = np.hypot(x_to, y_to)
+    radii, reached = _radial_table(coefficients)
+    # The tangential part moves a point by 3 |p| r^2 at most.
+    reach = reached[-1] + 3 * np.hypot(*coefficients[2:4]) * radii[-1] ** 2
+    radius_to = np.where(radius_to <= reach, radius_to, np.nan)
+    scale = np.interp(radius_to, reached[:-1], radii[:-1]) / np.maximum(radius_to, np.finfo(np.float64).tiny)
+    x, y = x_to * scale, y_to * scale
+    for _ in range(STEPS):
+        x_at, y_at = _brown(x, y, coefficients)
+        x_error, y_error = x_at - x_to, y_at - y_to
+        xx, xy, yy, det = jacobian(x, y, coefficients)
+        inside = det > 0
+        det = np.where(inside, det, 1.0)
+        x = np.where(inside, x - (yy * x_error - xy * y_error) / det, x * PULL_BACK)
+        y = np.where(inside, y - (xx * y_error - xy * x_error) / det, y * PULL_BACK)
+        radius = np.hypot(x, y)
+        over = radius >= radii[-1]
+        x[over], y[over] = (v[over] * (PULL_BACK * radii[-1] / radius[over]) for v in (x, y))
+        if not np.any(np.abs(x_error) + np.abs(y_error) > STEP_AGAIN):
+            break
+    x_at, y_at = _brown(x, y, coefficients)
+    right = np.hypot(x_at - x_to, y_at - y_to) <= TOLERANCE * np.maximum(radius_to, 1)
+    found = right & (jacobian(x, y, coefficients)[3] > 0)
+    return np.where(found, x, np.nan), np.where(found, y, np.nan)
+
+
+@lru_cache(maxsize=64)
+def _radial_table(coefficients: Coefficients) -> tuple[Floats, Floats]:
+    """Rising radii up to the limit, and where the radial part takes them."""
+    limit = radius_limit(coefficients)
+    radii = np.append(0.0, np.geomspace(1e-9 * limit, limit, TABLE_SIZE))
+    return radii, radii * _radial(radii * radii, coefficients)
+
+
+def _radial(s: Floats, coefficients: Coefficients) -> Floats:
+    k1, k2, _, _, k3 = coefficients
+    return 1 + s * (k1 + s * (k2 + s * k3))
+
+
+def _brown(x: Floats, y: Floats, coefficients: Coefficients) -> tuple[Floats, Floats]:
+    _, _, p1, p2, _ = coefficients
+    s = x * x + y * y
+    radial = _radial(s, coefficients)
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (s + 2 * x * x),
+        y * radial + p1 * (s + 2 * y * y) + 2 * p2 * x * y,
+    )

@@ -1,0 +1,221 @@
+"""A simulated robot's recording, with the truth beside it.
+
+    lab-1/             a recording as any other (RECORDING.md): images, and the poses that the robot believed
+      truth/
+        truth.json     how it was made: scene, robot, path, seed, errors
+        scene.toml     the scene
+        trajectory.txt the true poses, T_map_rig
+        <camera>/000000.npz   the truth behind each image (`truth.CameraTruth`)
+
+Scans are rendered side by side and written in order. Every image's noise depends on the seed, the camera and the scan's
+number alone, so the same plan gives the same bytes on one machine, whatever the number of cores.
+"""
+
+import json
+import os
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+from cairn_calib.poses import Transform
+from cairn_calib.rig import Rig, Spectrum
+from cairn_fusion.recording_format import RangeEncoding
+from cairn_fusion.recording_writer import RecordingWriter
+from cairn_fusion.scan import Scan
+from cairn_fusion.trajectory import trajectory_line
+from cairn_map.errors import BadInputError
+from cairn_sim.heads import RANGE_CAMERA
+from cairn_sim.render import SENSORS, render_scan
+from cairn_sim.robots import SimRobot
+from cairn_sim.scene import Scene
+from cairn_sim.sensors import Noise, RangeSensor
+from cairn_sim.trajectories import PoseErrors, believed, drive, stops
+from cairn_sim.truth import CameraTruth, camera_truth
+
+CLOCK_START_S = 1_760_000_000.0
+"""Time stamp of the first scan."""
+SCAN_S = 0.5
+"""From one head pose to the next, at a stop."""
+MILLIMETRES_REACH_M = 65.0
+AHEAD = 2
+"""Scans rendered before their turn to be written, for each thread."""
+Truths = Literal["none", "range", "all"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """What to record."""
+
+    scene: Scene
+    robot: SimRobot
+    path: str
+    seed: int = 1
+    perfect: bool = False
+    """Whether sensors are without noise."""
+    scale: float = 1.0
+    """Of colour and thermal images."""
+    truth: Truths = "range"
+    """For which images the truth is written."""
+    errors: PoseErrors = field(default_factory=PoseErrors)
+    backlash_rad: float = 0.0
+    """Play of the manipulator's gears; a tenth of it shakes them."""
+    speed_m_s: float = 0.0
+    """0: the robot stops along the path; else it drives through, and every scan is a measurement."""
+    rate_hz: float = 5.0
+    """Scans a second of a drive."""
+    first_stop: int = 0
+    last_stop: int | None = None
+    """The first stop that is not recorded; None for all."""
+
+    @property
+    def noise(self) -> Noise | None:
+        """The source of the images' noise."""
+        return None if self.perfect else Noise(self.seed)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shot:
+    """One scan to take."""
+
+    number: int
+    time_s: float
+    T_map_rig: Transform
+    """Where the head truly is."""
+    T_believed: Transform
+    """Where the robot says it is."""
+    ends_stop: bool
+
+
+def shots_of(plan: Plan) -> list[Shot]:
+    """All scans of a plan, in order.
+
+    Raises:
+        BadInputError: the scene has no such path, or no such stops.
+    """
+    rng = Noise(plan.seed).of_poses()
+    if plan.speed_m_s > 0:
+        places, scan_s = drive(plan.scene, plan.path, speed_m_s=plan.speed_m_s, rate_hz=plan.rate_hz), 1 / plan.rate_hz
+    else:
+        places, scan_s = stops(plan.scene, plan.path), SCAN_S
+    thought = believed(places, plan.errors, rng)
+    shots: list[Shot] = []
+    moving = replace(plan.robot, scans=(1, 1)) if plan.speed_m_s > 0 else plan.robot
+    for stop, (place, own) in enumerate(zip(places, thought, strict=True)):
+        told = moving.head_poses(own)
+        gap = plan.backlash_rad
+        true = (
+            moving.true_head_poses(place, gap_rad=gap, sigma_rad=gap / 10, rng=rng) if gap else moving.head_poses(place)
+        )
+        for n, (T, T_believed) in enumerate(zip(true, told, strict=True)):
+            number = stop * len(told) + n
+            ends = n == len(told) - 1
+            shots.append(
+                Shot(
+                    number=number,
+                    time_s=CLOCK_START_S + number * scan_s,
+                    T_map_rig=T,
+                    T_believed=T_believed,
+                    ends_stop=ends,
+                )
+            )
+    per_stop = moving.scans_per_stop
+    chosen = shots[plan.first_stop * per_stop : None if plan.last_stop is None else plan.last_stop * per_stop]
+    if not chosen:
+        raise BadInputError("no_stops", f"path {plan.path} has {len(places)} stops, none of them chosen")
+    return chosen
+
+
+def scans_of(plan: Plan, shots: Sequence[Shot], rig: Rig) -> Iterator[tuple[Shot, Scan, dict[str, CameraTruth]]]:
+    """Each shot with its scan and the truth behind its images, in order; rendered side by side on all cores."""
+    cameras = {"none": [], "range": [RANGE_CAMERA], "all": list(rig.cameras)}[plan.truth]
+
+    def take(shot: Shot) -> tuple[Shot, Scan, dict[str, CameraTruth]]:
+        scan = render_scan(
+            plan.scene,
+            rig,
+            T_map_rig=shot.T_map_rig,
+            range_camera=RANGE_CAMERA,
+            time_s=shot.time_s,
+            noise=plan.noise,
+            number=shot.number,
+            sensors=plan.robot.sensors,
+            threads=1,
+        )
+        truths = {name: camera_truth(plan.scene, rig, name, T_map_rig=shot.T_map_rig) for name in cameras}
+        return shot, replace(scan, T_map_rig=shot.T_believed), truths
+
+    threads = os.cpu_count() or 1
+    with ThreadPoolExecutor(threads) as pool:
+        waiting: deque[Future[tuple[Shot, Scan, dict[str, CameraTruth]]]] = deque()
+        try:
+            for shot in shots:
+                waiting.append(pool.submit(take, shot))
+                if len(waiting) > AHEAD * threads:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def record(plan: Plan, folder: Path, *, scene_text: str) -> Iterator[Shot]:
+    """Write the recording of a plan, and its truth, into a new folder; yields each shot when its scan is written.
+
+    Args:
+        plan: what to record.
+        folder: new or empty.
+        scene_text: the scene's file, kept beside the truth.
+
+    The recording is finished when the iterator came to its end; one that is left early stays unfinished.
+
+    Raises:
+        ConflictError: the folder holds something already.
+        BadInputError: the scene has no such path.
+    """
+    shots, rig = shots_of(plan), plan.robot.rig_of(plan.scale)
+    sensor = plan.robot.sensors.get(RANGE_CAMERA, SENSORS[Spectrum.RANGE])
+    reach_m = sensor.wrap_m if isinstance(sensor, RangeSensor) else 0.0
+    encoding = RangeEncoding(units_per_m=1000.0 if reach_m < MILLIMETRES_REACH_M else 500.0)
+    name = f"{plan.scene.name}-{plan.robot.name}-{plan.path}"
+    with RecordingWriter(folder, rig, name=name, note=_note(plan), range_encoding=encoding) as writer:
+        truth = folder / "truth"
+        truth.mkdir()
+        (truth / "scene.toml").write_text(scene_text, encoding="utf-8")
+        (truth / "truth.json").write_text(json.dumps(_about(plan, rig), indent=1) + "\n", encoding="utf-8")
+        with (truth / "trajectory.txt").open("w", encoding="utf-8", newline="\n") as poses:
+            poses.write("# time tx ty tz qx qy qz qw (T_map_rig, true)\n")
+            for index, (shot, scan, truths) in enumerate(scans_of(plan, shots, rig)):
+                writer.add(scan)
+                poses.write(trajectory_line(shot.time_s, shot.T_map_rig))
+                for camera, behind in truths.items():
+                    (truth / camera).mkdir(exist_ok=True)
+                    behind.write(truth / camera / f"{index:06d}.npz")
+                if shot.ends_stop:
+                    writer.end_measurement()
+                yield shot
+
+
+def _note(plan: Plan) -> str:
+    return (
+        f"Simulated: {plan.robot.about}; scene {plan.scene.name}, path {plan.path}, seed {plan.seed}. Truth in truth/."
+    )
+
+
+def _about(plan: Plan, rig: Rig) -> dict[str, object]:
+    return {
+        "format": "cairn-truth",
+        "version": 1,
+        "scene": plan.scene.name,
+        "robot": plan.robot.name,
+        "path": plan.path,
+        "seed": plan.seed,
+        "perfect": plan.perfect,
+        "errors": asdict(plan.errors),
+        "backlash_rad": plan.backlash_rad,
+        "cameras": list(rig.cameras),
+        "solids": [solid.name for solid in plan.scene.solids],
+    }

@@ -1,0 +1,73 @@
+"""`cairn sim` as a user types it."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cairn_fusion.recording import open_recording
+from cairn_map.errors import BadInputError, ConflictError
+from cairn_sim.sim_command import main
+
+
+def test_scene_lists_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scene"]) == 0
+    out = capsys.readouterr().out
+    for word in ("building", "small-room", "yard", "experiment", "orpheus", "lidar", "handheld", "599 solids"):
+        assert word in out
+
+
+def test_scene_describes_and_copies_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    copy = tmp_path / "mine.toml"
+    assert main(["scene", "small-room", "--write", str(copy)]) == 0
+    copy.write_text(copy.read_text().replace('name = "small-room"', 'name = "mine"'))
+    assert main(["scene", str(copy)]) == 0
+    assert "mine: 38 solids" in capsys.readouterr().out
+    with pytest.raises(BadInputError, match="there already"):
+        main(["scene", "small-room", "--write", str(copy)])
+    with pytest.raises(BadInputError, match="knows no path in mine"):
+        main(["show", str(copy)])
+
+
+def test_show_writes_a_sheet_of_every_image_and_the_scene_from_above(tmp_path: Path) -> None:
+    picture = tmp_path / "view.png"
+    assert main(["show", "small-room", "--scale", "0.25", "--stop", "2", "--scan", "13", "--output", str(picture)]) == 0
+    sheet, plan = cv2.imread(str(picture)), cv2.imread(str(tmp_path / "view-plan.png"))
+    assert sheet is not None and plan is not None
+    assert sheet.shape[0] > 1200 and plan.shape[1] > 800
+    # Six pictures, none of them empty.
+    for row in np.array_split(sheet, 3):
+        for tile in np.array_split(row, 2, axis=1):
+            assert tile.std() > 10
+
+
+@pytest.mark.parametrize("robot", ["tof", "lidar", "handheld"])
+def test_show_knows_every_robot(robot: str, tmp_path: Path) -> None:
+    assert main(["show", "yard", "--robot", robot, "--output", str(tmp_path / "view.png")]) == 0
+    assert (tmp_path / "view.png").stat().st_size > 10_000
+
+
+def test_record_writes_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "lab"
+    arguments = ["record", "building", str(folder), "--robot", "tof", "--path", "labs", "--stops", "3:4", "--seed", "7"]
+    assert main(arguments) == 0
+    assert "1 measurements, 36 scans" in capsys.readouterr().out
+    assert len(open_recording(folder)) == 36
+    assert (folder / "truth" / "tof" / "000035.npz").exists()
+    with pytest.raises(ConflictError, match="must be empty"):
+        main(arguments)
+
+
+@pytest.mark.parametrize("stops", ["x", "3-4", "-1:2", ":"])
+def test_stops_that_are_none_are_refused(stops: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["record", "small-room", str(tmp_path / "a"), f"--stops={stops}"])
+    assert "from 0" in capsys.readouterr().err
+
+
+def test_stops_beyond_the_path_are_refused_with_how_many_there_are(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="has 8 stops"):
+        main(["record", "small-room", str(tmp_path / "a"), "--stops", "50:"])
+    with pytest.raises(BadInputError, match="has no stop 50"):
+        main(["show", "small-room", "--stop", "50"])
