@@ -14,7 +14,7 @@ from cairn_sim.scene_format import ZERO_C_K
 
 Rgb = npt.NDArray[np.uint8]
 
-TILE_PX = (640, 512)
+TILE_PX = (480, 384)
 """Width and height of one picture on the sheet."""
 CAPTION_PX = 30
 BACKGROUND = (24, 26, 30)

@@ -28,7 +28,7 @@ from cairn_sim.scene_format import ZERO_C_K
 from cairn_sim.trajectories import PoseErrors, path_names, stops
 
 TRUTHS = ("none", "range", "all")
-MEGABYTES_PER_SCAN = {"orpheus": 7.0, "tof": 0.12, "lidar": 0.16, "handheld": 1.6}
+MEGABYTES_PER_SCAN = {"orpheus": 4.8, "tof": 0.24, "lidar": 0.2, "handheld": 3.1}
 """Of a recording at full size with the truth of the range camera, measured in the building."""
 
 
@@ -73,8 +73,8 @@ def _record(args: argparse.Namespace) -> int:
     shots = shots_of(plan)
     stop_count = sum(shot.ends_stop for shot in shots)
     say(f"{plan.robot.name} in {plan.scene.name}, path {plan.path}: {stop_count} measurements, {len(shots)} scans")
-    if args.scale == 1 and plan.robot.name in MEGABYTES_PER_SCAN:
-        say(f"  takes about {len(shots) * MEGABYTES_PER_SCAN[plan.robot.name] / 1000:.1f} GB; --scale 0.25 is smaller")
+    if args.scale == 1:
+        say(f"  takes about {len(shots) * MEGABYTES_PER_SCAN[plan.robot.name] / 1000:.2g} GB")
     for _ in with_progress(record(plan, args.output, scene_text=_text(args.scene)), "scans", total=len(shots)):
         pass
     say(f"wrote {args.output}; its truth is in {args.output / 'truth'}")

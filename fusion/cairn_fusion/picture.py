@@ -19,7 +19,7 @@ from cairn_map.voxels import Voxels
 Floats = npt.NDArray[np.float64]
 Rgb = npt.NDArray[np.uint8]
 
-PANEL_PX = (620, 560)
+PANEL_PX = (800, 520)
 """Width and height of one view."""
 TITLE_PX = 40
 LEGEND_PX = 56

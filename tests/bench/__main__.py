@@ -17,9 +17,10 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
+from tests.bench.simulation import simulation_rows
 
 from cairn_client.api import MapApi
 from cairn_client.robot import Robot
@@ -34,10 +35,10 @@ from cairn_map.evidence_map import EvidenceMap
 from cairn_map.fingerprint import fingerprint
 from cairn_map.grid import Geometry, geometry_for
 from cairn_map.messages import CreateMap, Register
-from cairn_sim.drive import head_poses, stops
-from cairn_sim.heads import RANGE_CAMERA, full_head
-from cairn_sim.render import render_scan
-from cairn_sim.room import small_room
+from cairn_sim.heads import full_head
+from cairn_sim.record import Plan, scans_of, shots_of
+from cairn_sim.robots import ROBOTS
+from cairn_sim.scene_file import load_scene
 
 Row = tuple[str, str, str]
 
@@ -49,6 +50,7 @@ def main() -> None:
     smoke = parser.parse_args().smoke
     scans = _room_scans(stop_count=2 if smoke else 8, yaws=4 if smoke else 12)
     rows = [*_kernel_rows(scans, repeats=3 if smoke else 15), *_server_rows(scans, pushes=20 if smoke else 300)]
+    rows += simulation_rows(smoke)
     rows += _recording_rows(smoke)
     rows += _size_rows()
     width = max(len(name) for name, _, _ in rows)
@@ -57,15 +59,14 @@ def main() -> None:
 
 
 def _room_scans(*, stop_count: int, yaws: int) -> list[list[Scan]]:
-    """Scans by stop: the full head at a quarter of its colour and thermal resolution, three pitches."""
-    room, rig, rng = small_room(), full_head(scale=0.25), np.random.default_rng(1)
-    return [
-        [
-            render_scan(room, rig, T_map_rig=T, range_camera=RANGE_CAMERA, time_s=float(n), rng=rng)
-            for n, T in enumerate(head_poses(position, n_yaw=yaws, n_pitch=3))
-        ]
-        for position in stops("west")[:stop_count]
-    ]
+    """Scans by stop: the full head at a quarter of its colour and thermal resolution, three tilts."""
+    robot = replace(ROBOTS["orpheus"], scans=(yaws, 3))
+    plan = Plan(
+        scene=load_scene("small-room"), robot=robot, path="west", scale=0.25, truth="none", last_stop=stop_count
+    )
+    scans = [scan for _, scan, _ in scans_of(plan, shots_of(plan), robot.rig_of(plan.scale))]
+    count = robot.scans_per_stop
+    return [scans[n : n + count] for n in range(0, len(scans), count)]
 
 
 def _kernel_rows(scans: list[list[Scan]], *, repeats: int) -> Iterator[Row]:
