@@ -54,6 +54,8 @@ clean:  ## remove .venv, build/ and all caches
 	touch $@ .venv/run.stamp
 
 .venv/kernels.stamp: $(KERNELS) | .venv/bin/python
+	# Numba keeps a kernel by its own file's age: one that calls a kernel of another file would stay as it was.
+	find . -path ./.venv -prune -o -name '*.nb[ic]' -exec rm -f {} +
 	$(BIN)/cairn compile
 	touch $@
 

@@ -24,7 +24,13 @@ def main(argv: list[str]) -> int:
     parser("cairn compile", __doc__).parse_args(argv)
     for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
         start_s = time.monotonic()
-        warm_up: Callable[[], None] = point.load()
+        try:
+            warm_up: Callable[[], None] = point.load()
+        except ModuleNotFoundError as exc:
+            if not point.extras:
+                raise
+            sys.stdout.write(f"{point.name}: left out, it needs {exc.name}: pip install cairn-robotics{point.extras}\n")
+            continue
         warm_up()
         sys.stdout.write(f"{point.name}: ready after {time.monotonic() - start_s:.1f} s\n")
     return 0

@@ -42,7 +42,7 @@ def contact_sheet(scan: Scan) -> Rgb:
     return np.vstack([np.hstack(tiles[n : n + 2]) for n in range(0, len(tiles), 2)])
 
 
-def plan_picture(scene: Scene, poses: Sequence[Transform], marked: int | None = None) -> Rgb:
+def view_from_above(scene: Scene, poses: Sequence[Transform], marked: int | None = None) -> Rgb:
     """(H, W, 3) sRGB: a scene from above, cut a little over the heads, with the robots' poses in it.
 
     Args:

@@ -33,7 +33,7 @@ PASS_LEFT = 0.85
 @njit(cache=True, nogil=True, error_model="numpy")
 def edge_pixels(hits: Hits, width: int, height: int, order: Ints) -> Longs:
     """(E,) numbers, in the given order of all pixels, of those beside, above or below one that shows something else."""
-    _, _, _, seen, second, _, _, incidence, way, _ = hits
+    _, _, _, seen, second, _, _, incidence, way, _, _ = hits
     mark = np.zeros(width * height, np.uint8)
     for y in range(height):
         for x in range(width):
@@ -68,6 +68,9 @@ def finer_rays(rays: Floats, pixels: Longs, n: int) -> Floats:
     for e in range(len(pixels)):
         y, x = pixels[e] // width, pixels[e] % width
         left, right, up, down = max(x - 1, 0), min(x + 1, width - 1), max(y - 1, 0), min(y + 1, height - 1)
+        # Where a lens folds back, the next pixel has no ray: the step is then taken on the other side alone.
+        left, right = x if np.isnan(rays[y, left, 0]) else left, x if np.isnan(rays[y, right, 0]) else right
+        up, down = y if np.isnan(rays[up, x, 0]) else up, y if np.isnan(rays[down, x, 0]) else down
         for j in range(n):
             for i in range(n):
                 # Staggered: no two in a row or column of the grid, so that an edge along it moves smoothly over them.
@@ -89,8 +92,10 @@ def finer_rays(rays: Floats, pixels: Longs, n: int) -> Floats:
 def colours(
     hits: Hits, colours_srgb: Singles, grain: Floats, sky_srgb: Singles, light: Floats, ambient: float
 ) -> Singles:
-    """(N, 3) sRGB, 0 to 255: the material's, times its grain, times an even light and one from afar; no shadows."""
-    _, _, _, seen, second, pattern, normal, _, _, passes = hits
+    """(N, 3) sRGB, 0 to 255: the material's, its grain, and light: the even share, and one from afar that a face
+    turned away from it lacks twice (so no place is black, and opposite walls differ). No shadows.
+    """
+    _, _, _, seen, second, pattern, normal, _, _, passes, _ = hits
     out = np.empty((len(seen), 3), np.float32)
     for i in range(len(seen)):
         k = seen[i]
@@ -109,7 +114,7 @@ def colours(
 @njit(cache=True, nogil=True, error_model="numpy")
 def surface_values(hits: Hits, values: Singles, nothing: float) -> Singles:
     """(N,) of the (P, 2) values the one of the material that is seen; `nothing` where none is."""
-    _, _, _, seen, second, _, _, _, _, _ = hits
+    _, _, _, seen, second, _, _, _, _, _, _ = hits
     out = np.empty(len(seen), np.float32)
     for i in range(len(seen)):
         out[i] = values[seen[i], second[i]] if seen[i] >= 0 else nothing
@@ -119,7 +124,7 @@ def surface_values(hits: Hits, values: Singles, nothing: float) -> Singles:
 @njit(cache=True, nogil=True, error_model="numpy")
 def returns(hits: Hits, diffuse: Singles, gloss: Singles, retroreflection: Singles) -> Singles:
     """(N,) light that returns to a lamp beside the lens, 1 from white 1 m ahead; through glass there and back."""
-    _, _, path_m, seen, second, _, _, incidence, _, passes = hits
+    _, _, path_m, seen, second, _, _, incidence, _, passes, _ = hits
     out = np.zeros(len(seen), np.float32)
     for i in range(len(seen)):
         k = seen[i]

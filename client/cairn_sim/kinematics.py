@@ -24,6 +24,10 @@ TILT_MAX_RAD = math.radians(45)
 """With the ToF camera's 56 degrees: all but 17 degrees around straight up and straight down are seen."""
 
 
+PARKED_RAD = -0.1
+"""Pan and tilt before the first command: so that every gear has a side from which it comes."""
+
+
 @dataclass(frozen=True, slots=True)
 class Joints:
     """The three joints, radians."""
@@ -79,14 +83,14 @@ def measurement_joints(n_pan: int = 12, n_tilt: int = 3) -> list[Joints]:
 def with_backlash(
     joints: Sequence[Joints], *, gap_rad: float, sigma_rad: float, rng: np.random.Generator
 ) -> list[Joints]:
-    """Where gears with play truly put joints that were told to go somewhere, one after the other.
+    """Where gears with play truly put joints that were told to go somewhere, one after the other, after parking.
 
     A gear stops half a gap short of where it was sent, on the side that it came from; load shakes it by `sigma_rad`.
     """
     told = np.array([(j.pan_rad, j.tilt_rad) for j in joints]).reshape(-1, 2)
     side = np.zeros(2)
     true = []
-    for before, now in zip(np.vstack([told[:1], told]), told, strict=False):
+    for before, now in zip(np.vstack([np.full((1, 2), PARKED_RAD), told]), told, strict=False):
         side = np.where(now != before, np.sign(now - before), side)
         true.append(now - side * gap_rad / 2 + sigma_rad * rng.standard_normal(2))
     return [

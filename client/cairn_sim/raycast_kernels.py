@@ -12,6 +12,7 @@ import numpy.typing as npt
 from numba import njit
 
 from cairn_sim.solid_kernels import FAR, SIDE, Shapes, enter, grain_at, surface_at, turn_at
+from cairn_sim.surfaces import Optics
 from cairn_sim.tree_kernels import STACK, candidates_into, first_entry, spread_into
 
 Floats = npt.NDArray[np.float64]
@@ -19,8 +20,8 @@ Singles = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int32]
 Marks = npt.NDArray[np.uint8]
 
-GLASS, MIRROR = 1, 2
-"""`Optics` of a surface, and bits of `Hits.way`."""
+GLASS, MIRROR = int(Optics.GLASS), int(Optics.MIRROR)
+"""Bits of `Hits.way`, too."""
 PASSES_MAX = 8
 """Panes and mirrors on a ray's way; behind so many it sees nothing."""
 
@@ -48,6 +49,8 @@ class Hits(NamedTuple):
     """(N,) bits: 1 through glass, 2 round a mirror."""
     passes: Marks
     """(N,) panes and mirrors on the way."""
+    straight_m: Floats
+    """(N,) metres to where the light's way ends or turns, for the first time: what is before it is in plain sight."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -70,7 +73,7 @@ def cast_rays(
         opaque: whether glass and mirrors stop the ray, as they do in the far infrared.
     """
     n = len(rays)
-    range_m, path_m = np.empty(n), np.empty(n)
+    range_m, path_m, straight_m = np.empty(n), np.empty(n), np.empty(n)
     solid, seen = np.empty(n, np.int32), np.empty(n, np.int32)
     second, way, passes = np.empty(n, np.uint8), np.empty(n, np.uint8), np.empty(n, np.uint8)
     grain, incidence = np.empty(n, np.float32), np.empty(n, np.float32)
@@ -101,11 +104,14 @@ def cast_rays(
             solid[i] = k
             range_m[i] = t if k >= 0 else np.inf
             gone_m, behind, path, crossed = 0.0, 0.0, np.uint8(0), np.uint8(0)
+            straight_m[i] = np.inf
             nx, ny, nz, u, v, along = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             while k >= 0:
                 x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
                 nx, ny, nz, u, v = surface_at(x, y, z, k, face, kind, frame, half_m)
                 along = dx * nx + dy * ny + dz * nz
+                if gone_m == 0.0 and (opaque or optics[k] != GLASS):
+                    straight_m[i] = t
                 if opaque or optics[k] == 0:
                     break
                 behind = t
@@ -130,7 +136,7 @@ def cast_rays(
                 nx, ny, nz, along = 0.0, 0.0, 0.0, 0.0
             normal[i, 0], normal[i, 1], normal[i, 2] = nx, ny, nz
             incidence[i] = -along
-    return Hits(range_m, solid, path_m, seen, second, grain, normal, incidence, way, passes)
+    return Hits(range_m, solid, path_m, seen, second, grain, normal, incidence, way, passes, straight_m)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -9,7 +9,7 @@ from cairn_calib.lidar import AnyCamera
 from cairn_calib.poses import Transform, checked_transform, inverse, transform_points
 from cairn_calib.rig import Rig, Spectrum
 from cairn_map.errors import BadInputError
-from cairn_sim.raycast_kernels import MIRROR, Hits, cast_rays
+from cairn_sim.raycast_kernels import Hits, cast_rays
 from cairn_sim.scene import Scene
 
 Floats = npt.NDArray[np.float64]
@@ -38,7 +38,8 @@ def cast(scene: Scene, camera: AnyCamera, T_map_camera: Transform, *, opaque: bo
     inside = int(scene.solid_at(T[:3, 3]))
     if inside >= 0:
         raise BadInputError(
-            "camera_in_solid", f"a camera must be in free space, got one in {scene.solids[inside].name}"
+            "camera_in_solid",
+            f"a camera at {np.round(T[:3, 3], 2).tolist()} m is inside {scene.solids[inside].name}; move the robot",
         )
     order, starts = tiles(camera.width, camera.height)
     return cast_rays(
@@ -82,6 +83,5 @@ def visible_from(
     directions = own[seen] / distance_m[:, None]
     opaque = mounted.spectrum is Spectrum.THERMAL
     hits = cast_directions(scene, directions, T_map_camera, bundle=POINTS_OF_BUNDLE, opaque=opaque)
-    reach_m = np.where(hits.way & MIRROR, hits.range_m, np.maximum(hits.range_m, hits.path_m))
-    seen[seen] = reach_m >= distance_m - VISIBLE_SLACK_M
+    seen[seen] = hits.straight_m >= distance_m - VISIBLE_SLACK_M
     return np.asarray(seen.reshape(points_map.shape[:-1]))

@@ -1,6 +1,7 @@
 """A simulated robot's recording, with the truth beside it.
 
     lab-1/             a recording as any other (RECORDING.md): images, and the poses that the robot believed
+      raw/           thermal images as the camera counted, 16-bit PNG (when asked for)
       truth/
         truth.json     how it was made: scene, robot, path, seed, errors
         scene.toml     the scene
@@ -12,6 +13,7 @@ number alone, so the same plan gives the same bytes on one machine, whatever the
 """
 
 import json
+import math
 import os
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -22,6 +24,7 @@ from typing import Literal
 
 from cairn_calib.poses import Transform
 from cairn_calib.rig import Rig, Spectrum
+from cairn_fusion.images import write_grey16
 from cairn_fusion.recording_format import RangeEncoding
 from cairn_fusion.recording_writer import RecordingWriter
 from cairn_fusion.scan import Scan
@@ -31,7 +34,7 @@ from cairn_sim.heads import RANGE_CAMERA
 from cairn_sim.render import SENSORS, render_scan
 from cairn_sim.robots import SimRobot
 from cairn_sim.scene import Scene
-from cairn_sim.sensors import Noise, RangeSensor
+from cairn_sim.sensors import Noise, RangeSensor, ThermalSensor
 from cairn_sim.trajectories import PoseErrors, believed, drive, stops
 from cairn_sim.truth import CameraTruth, camera_truth
 
@@ -57,6 +60,8 @@ class Plan:
     """Whether sensors are without noise."""
     scale: float = 1.0
     """Of colour and thermal images."""
+    raw: bool = False
+    """Whether thermal images are written as raw counts, too."""
     truth: Truths = "range"
     """For which images the truth is written."""
     errors: PoseErrors = field(default_factory=PoseErrors)
@@ -70,6 +75,16 @@ class Plan:
     last_stop: int | None = None
     """The first stop that is not recorded; None for all."""
 
+    def __post_init__(self) -> None:
+        if self.seed < 0 or not (0 <= self.speed_m_s < math.inf and 0 < self.rate_hz < math.inf):
+            raise BadInputError(
+                "bad_plan",
+                "a recording needs a seed from 0, a speed from 0 m/s and a rate above 0 Hz, got "
+                f"{self.seed}, {self.speed_m_s:g}, {self.rate_hz:g}",
+            )
+        if not 0 <= self.backlash_rad < 1:
+            raise BadInputError("bad_plan", f"backlash must be 0 to 1 rad (57 degrees), got {self.backlash_rad:g} rad")
+
     @property
     def noise(self) -> Noise | None:
         """The source of the images' noise."""
@@ -81,6 +96,10 @@ class Shot:
     """One scan to take."""
 
     number: int
+    """Of all scans of the path."""
+    stop: int
+    scan: int
+    """Of the stop."""
     time_s: float
     T_map_rig: Transform
     """Where the head truly is."""
@@ -89,43 +108,45 @@ class Shot:
     ends_stop: bool
 
 
+def places_of(plan: Plan) -> list[Transform]:
+    """`T_map_robot`, true, at each of a plan's measurements, chosen or not.
+
+    Raises:
+        BadInputError: the scene has no such path.
+    """
+    if plan.speed_m_s > 0:
+        return drive(plan.scene, plan.path, speed_m_s=plan.speed_m_s, rate_hz=plan.rate_hz)
+    return stops(plan.scene, plan.path)
+
+
 def shots_of(plan: Plan) -> list[Shot]:
-    """All scans of a plan, in order.
+    """The scans of a plan, in order.
 
     Raises:
         BadInputError: the scene has no such path, or no such stops.
     """
-    rng = Noise(plan.seed).of_poses()
-    if plan.speed_m_s > 0:
-        places, scan_s = drive(plan.scene, plan.path, speed_m_s=plan.speed_m_s, rate_hz=plan.rate_hz), 1 / plan.rate_hz
-    else:
-        places, scan_s = stops(plan.scene, plan.path), SCAN_S
-    thought = believed(places, plan.errors, rng)
-    shots: list[Shot] = []
-    moving = replace(plan.robot, scans=(1, 1)) if plan.speed_m_s > 0 else plan.robot
-    for stop, (place, own) in enumerate(zip(places, thought, strict=True)):
-        told = moving.head_poses(own)
-        gap = plan.backlash_rad
-        true = (
-            moving.true_head_poses(place, gap_rad=gap, sigma_rad=gap / 10, rng=rng) if gap else moving.head_poses(place)
-        )
-        for n, (T, T_believed) in enumerate(zip(true, told, strict=True)):
-            number = stop * len(told) + n
-            ends = n == len(told) - 1
-            shots.append(
-                Shot(
-                    number=number,
-                    time_s=CLOCK_START_S + number * scan_s,
-                    T_map_rig=T,
-                    T_believed=T_believed,
-                    ends_stop=ends,
-                )
-            )
-    per_stop = moving.scans_per_stop
-    chosen = shots[plan.first_stop * per_stop : None if plan.last_stop is None else plan.last_stop * per_stop]
-    if not chosen:
+    rng, places = Noise(plan.seed).of_poses(), places_of(plan)
+    if not places[plan.first_stop : plan.last_stop]:
         raise BadInputError("no_stops", f"path {plan.path} has {len(places)} stops, none of them chosen")
-    return chosen
+    robot = replace(plan.robot, scans=(1, 1)) if plan.speed_m_s > 0 else plan.robot
+    scan_s = 1 / plan.rate_hz if plan.speed_m_s > 0 else SCAN_S
+    told = [T for place in believed(places, plan.errors, rng) for T in robot.head_poses(place)]
+    gap = plan.backlash_rad
+    true = robot.true_head_poses(places, gap_rad=gap, sigma_rad=gap / 10, rng=rng)
+    shots = [
+        Shot(
+            number=number,
+            stop=number // robot.scans_per_stop,
+            scan=number % robot.scans_per_stop,
+            time_s=CLOCK_START_S + number * scan_s,
+            T_map_rig=T,
+            T_believed=T_believed,
+            ends_stop=(number + 1) % robot.scans_per_stop == 0,
+        )
+        for number, (T, T_believed) in enumerate(zip(true, told, strict=True))
+    ]
+    last = len(places) if plan.last_stop is None else plan.last_stop
+    return [shot for shot in shots if plan.first_stop <= shot.stop < last]
 
 
 def scans_of(plan: Plan, shots: Sequence[Shot], rig: Rig) -> Iterator[tuple[Shot, Scan, dict[str, CameraTruth]]]:
@@ -191,12 +212,27 @@ def record(plan: Plan, folder: Path, *, scene_text: str) -> Iterator[Shot]:
             for index, (shot, scan, truths) in enumerate(scans_of(plan, shots, rig)):
                 writer.add(scan)
                 poses.write(trajectory_line(shot.time_s, shot.T_map_rig))
+                if plan.raw:
+                    _write_raw(scan, plan.robot, folder, index)
                 for camera, behind in truths.items():
                     (truth / camera).mkdir(exist_ok=True)
                     behind.write(truth / camera / f"{index:06d}.npz")
                 if shot.ends_stop:
                     writer.end_measurement()
                 yield shot
+
+
+def _write_raw(scan: Scan, robot: SimRobot, folder: Path, index: int) -> None:
+    for camera, kelvin in scan.thermal.items():
+        (folder / "raw" / camera).mkdir(parents=True, exist_ok=True)
+        write_grey16(folder / "raw" / camera / f"{index:06d}.png", _thermal_sensor(robot, camera).raw_counts(kelvin))
+
+
+def _thermal_sensor(robot: SimRobot, camera: str) -> ThermalSensor:
+    sensor = robot.sensors.get(camera, SENSORS[Spectrum.THERMAL])
+    if not isinstance(sensor, ThermalSensor):
+        raise BadInputError("bad_sensor", f"camera {camera} of {robot.name} needs a thermal sensor, has {sensor}")
+    return sensor
 
 
 def _note(plan: Plan) -> str:
@@ -217,5 +253,6 @@ def _about(plan: Plan, rig: Rig) -> dict[str, object]:
         "errors": asdict(plan.errors),
         "backlash_rad": plan.backlash_rad,
         "cameras": list(rig.cameras),
+        "thermal": {name: asdict(_thermal_sensor(plan.robot, name)) for name in rig.of_spectrum(Spectrum.THERMAL)},
         "solids": [solid.name for solid in plan.scene.solids],
     }

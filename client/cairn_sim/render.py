@@ -64,7 +64,7 @@ class View:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Grain:
+class ImageNoise:
     """The noise of one image: a generator, and the camera's fixed pattern, (H, W) standard normal."""
 
     rng: np.random.Generator
@@ -118,16 +118,16 @@ def render_scan(
     def render(name: str) -> tuple[npt.NDArray[np.generic], ...]:
         view = view_of(scene, rig, name, T_map_rig=T_map_rig)
         sensor = (sensors or {}).get(name, SENSORS[rig[name].spectrum])
-        grain = None
+        own = None
         if noise is not None:
-            grain = Grain(rng=noise.of_image(name, number), pattern=noise.fixed_pattern(name, view.shape))
+            own = ImageNoise(rng=noise.of_image(name, number), pattern=noise.fixed_pattern(name, view.shape))
         match sensor:
             case ColourSensor():
-                return (colour_image(view, sensor, grain),)
+                return (colour_image(view, sensor, own),)
             case ThermalSensor():
-                return (thermal_image(view, sensor, grain),)
+                return (thermal_image(view, sensor, own),)
             case RangeSensor():
-                return range_images(view, sensor, grain)
+                return range_images(view, sensor, own)
 
     workers = min(threads or os.cpu_count() or 1, len(names))
     if workers == 1:
@@ -147,7 +147,7 @@ def render_scan(
     )
 
 
-def colour_image(view: View, sensor: ColourSensor, grain: Grain | None) -> npt.NDArray[np.uint8]:
+def colour_image(view: View, sensor: ColourSensor, noise: ImageNoise | None) -> npt.NDArray[np.uint8]:
     """(H, W, 3) sRGB. The light multiplies sRGB values: nobody measures radiance here."""
     srgb, grains = view.scene.surfaces.colours_srgb, view.scene.shapes.texture[:, 4].copy()
     sky = np.array(view.scene.sky_srgb, dtype=np.float32)
@@ -155,50 +155,50 @@ def colour_image(view: View, sensor: ColourSensor, grain: Grain | None) -> npt.N
     def shade(hits: Hits) -> Singles:
         return colours(hits, srgb, grains, sky, LIGHT, AMBIENT)
 
-    values = _shaded(view, shade, 1 if grain is None else sensor.fineness, opaque=False).reshape(*view.shape, 3)
-    if grain is not None:
+    values = _shaded(view, shade, 1 if noise is None else sensor.fineness, opaque=False).reshape(*view.shape, 3)
+    if noise is not None:
         if sensor.vignetting:
-            cosine = view.camera.rays()[..., 2:].clip(0)
+            cosine = np.nan_to_num(view.camera.rays()[..., 2:], nan=1.0).clip(0)
             values *= (cosine ** (4 * sensor.vignetting / SRGB_GAMMA)).astype(np.float32)
         values = _blurred(values, sensor.blur_px)
-        values += sensor.sigma(values) * grain.rng.standard_normal(values.shape, dtype=np.float32)
+        values += sensor.sigma(values) * noise.rng.standard_normal(values.shape, dtype=np.float32)
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-def thermal_image(view: View, sensor: ThermalSensor, grain: Grain | None) -> Singles:
+def thermal_image(view: View, sensor: ThermalSensor, noise: ImageNoise | None) -> Singles:
     """(H, W) float32 kelvin, apparent: what the counts of `thermal_counts` mean."""
-    if grain is not None:
-        return sensor.kelvin_of(thermal_counts(view, sensor, grain).astype(np.float64)).astype(np.float32)
+    if noise is not None:
+        return sensor.kelvin_of(thermal_counts(view, sensor, noise).astype(np.float64)).astype(np.float32)
     radiance = _shaded(view, _radiance(view.scene, sensor), 1, opaque=True)
     return sensor.kelvin_of(radiance.astype(np.float64)).astype(np.float32).reshape(view.shape)
 
 
-def thermal_counts(view: View, sensor: ThermalSensor, grain: Grain) -> Counts:
+def thermal_counts(view: View, sensor: ThermalSensor, noise: ImageNoise) -> Counts:
     """(H, W) uint16 raw counts; 1 to 65535."""
     shade = _radiance(view.scene, sensor)
     counts = _blurred(_shaded(view, shade, sensor.fineness, opaque=True).reshape(view.shape), sensor.blur_px)
     per_kelvin = np.float32(sensor.counts_per_kelvin)
-    counts += np.float32(sensor.fixed_pattern_k) * per_kelvin * grain.pattern
-    counts += np.float32(sensor.netd_k) * per_kelvin * grain.rng.standard_normal(view.shape, dtype=np.float32)
+    counts += np.float32(sensor.fixed_pattern_k) * per_kelvin * noise.pattern
+    counts += np.float32(sensor.netd_k) * per_kelvin * noise.rng.standard_normal(view.shape, dtype=np.float32)
     return np.clip(np.rint(counts), 1, COUNT_MAX).astype(np.uint16)
 
 
-def range_images(view: View, sensor: RangeSensor, grain: Grain | None) -> tuple[Singles, Counts]:
+def range_images(view: View, sensor: RangeSensor, noise: ImageNoise | None) -> tuple[Singles, Counts]:
     """Range, (H, W) float32 metres along the beam, NaN where there is none; amplitude, (H, W) uint16 counts."""
     received = _returned(view, sensor, view.hits)
     range_m = view.hits.path_m.copy()
-    if grain is None:
+    if noise is None:
         range_m[range_m > sensor.wrap_m] = np.nan
         received[np.isnan(range_m)] = 0
     else:
         _mix_into(range_m, received, view, sensor)
-        spill = sensor.spill(received, grain.rng)
+        spill = sensor.spill(received, noise.rng)
         range_m, clean = bloomed(range_m, received, spill, view.camera.width, sensor.wrap_m)
-        received = clean + np.float32(sensor.amplitude_sigma) * grain.rng.standard_normal(
+        received = clean + np.float32(sensor.amplitude_sigma) * noise.rng.standard_normal(
             len(received), dtype=np.float32
         )
         lost = np.isinf(range_m) | (received < sensor.amplitude_min) | (received >= sensor.amplitude_max)
-        range_m += sensor.range_sigma_m(clean) * grain.rng.standard_normal(len(range_m))
+        range_m += sensor.range_sigma_m(clean) * noise.rng.standard_normal(len(range_m))
         range_m[lost] = np.nan
         range_m %= sensor.wrap_m
     range_m[range_m <= 0] = np.nan

@@ -15,21 +15,20 @@ from cairn_calib.poses import Transform
 from cairn_calib.rig import Rig
 from cairn_map.errors import BadInputError
 from cairn_sim.heads import RANGE_CAMERA, full_head, handheld_head, lidar_head, tof_head
-from cairn_sim.kinematics import T_FORWARD_CAMERA, Joints, Manipulator, measurement_joints, with_backlash
+from cairn_sim.kinematics import T_FORWARD_CAMERA, Manipulator, measurement_joints, with_backlash
 from cairn_sim.sensors import RangeSensor, Sensor
 from cairn_sim.solids import placed
 
 LIDAR = RangeSensor(
     wrap_m=120.0,
-    amplitude_at_1m=60_000.0,
-    amplitude_min=6.0,
-    amplitude_sigma=1.0,
+    amplitude_min=2.0,
+    amplitude_sigma=0.3,
     sigma_min_m=0.02,
     sigma_m=0.02,
     fineness=1,
     blooming=0.0,
 )
-"""2 cm at every range, 60 m to a surface of 0.4; a beam is thin and does not mix, and nothing wraps."""
+"""2 cm at every range from 0.6 m on, 60 m to a surface of 0.4; a beam is thin and does not mix, and nothing wraps."""
 DEPTH = RangeSensor(amplitude_min=300.0, sigma_min_m=0.003, sigma_m=0.008)
 """A depth camera for the hand: up to some 6 m of plaster."""
 
@@ -59,20 +58,21 @@ class SimRobot:
         """`T_map_rig` of each scan at one stop, as the joints were told."""
         if self.manipulator is None:
             return [T_map_robot @ placed((0, 0, self.fixed_m)) @ T_FORWARD_CAMERA]
-        return self._at(T_map_robot, self.manipulator, measurement_joints(*self.scans))
+        return [T_map_robot @ self.manipulator.T_robot_rig(joints) for joints in measurement_joints(*self.scans)]
 
     def true_head_poses(
-        self, T_map_robot: Transform, *, gap_rad: float, sigma_rad: float, rng: np.random.Generator
+        self, T_map_robots: Sequence[Transform], *, gap_rad: float, sigma_rad: float, rng: np.random.Generator
     ) -> list[Transform]:
-        """`T_map_rig` of each scan at one stop, as gears with play truly put the head."""
+        """`T_map_rig` of each scan at all stops, one after the other, as gears with play truly put the head."""
         if self.manipulator is None:
-            return self.head_poses(T_map_robot)
-        joints = with_backlash(measurement_joints(*self.scans), gap_rad=gap_rad, sigma_rad=sigma_rad, rng=rng)
-        return self._at(T_map_robot, self.manipulator, joints)
-
-    @staticmethod
-    def _at(T_map_robot: Transform, manipulator: Manipulator, joints: Sequence[Joints]) -> list[Transform]:
-        return [T_map_robot @ manipulator.T_robot_rig(j) for j in joints]
+            return [T for place in T_map_robots for T in self.head_poses(place)]
+        told = measurement_joints(*self.scans)
+        true = with_backlash(told * len(T_map_robots), gap_rad=gap_rad, sigma_rad=sigma_rad, rng=rng)
+        return [
+            place @ self.manipulator.T_robot_rig(joints)
+            for n, place in enumerate(T_map_robots)
+            for joints in true[n * len(told) : (n + 1) * len(told)]
+        ]
 
 
 ROBOTS: Mapping[str, SimRobot] = {

@@ -14,7 +14,7 @@ from cairn_map.errors import BadInputError
 from cairn_sim.distance_kernels import nearest_solids
 from cairn_sim.solid_kernels import Shapes, second_at
 from cairn_sim.solids import Box, Cylinder, Plane, Solid, Sphere
-from cairn_sim.surfaces import Material, Rgb
+from cairn_sim.surfaces import TEMPERATURE_K, Material, Rgb
 from cairn_sim.tree import tree_of
 
 Floats = npt.NDArray[np.float64]
@@ -22,8 +22,8 @@ Singles = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int32]
 
 AMBIENT_K = 293.15
-SOLIDS_MAX = 32767
-"""So that a solid's number fits 16 bits."""
+SOLIDS_MAX = 20_000
+"""A solid's number fits 16 bits; and a scene file of a few lines may ask for millions."""
 BOUNDS_MARGIN_M = 1e-9 * np.array([-1, -1, -1, 1, 1, 1])
 """So that rounding never lets a ray slip past a box around a solid whose face is the box's own."""
 KINDS: tuple[type, ...] = (Box, Cylinder, Sphere, Plane)
@@ -75,10 +75,15 @@ class Scene:
         """(...) int32, number of the solid nearest to each (..., 3) point, or that it lies deepest in; -1 for NaN."""
         return self._nearest(points)[1]
 
-    def temperature_k_at(self, points: npt.NDArray[np.floating]) -> Floats:
-        """(...) kelvin of the surface nearest to each (..., 3) point: true, not apparent; NaN for NaN."""
+    def temperature_k_at(self, points: npt.NDArray[np.floating], solids: Ints | None = None) -> Floats:
+        """(...) kelvin of the surface nearest to each (..., 3) point: true, not apparent; NaN for NaN.
+
+        Args:
+            points: map frame, metres.
+            solids: (...) whose surface is meant; None for the nearest's. NaN for -1.
+        """
         p = np.asarray(points, dtype=np.float64)
-        nearest = self._nearest(p)[1].reshape(-1)
+        nearest = (self._nearest(p)[1] if solids is None else solids).reshape(-1)
         second = second_at(np.ascontiguousarray(p.reshape(-1, 3)), nearest, self.shapes)
         kelvin = self.surfaces.temperature_k[nearest, second].astype(np.float64)
         return np.where(nearest < 0, np.nan, kelvin).reshape(p.shape[:-1])
@@ -116,6 +121,11 @@ def scene_of(
     given = tuple(solids)
     if not 1 <= len(given) <= SOLIDS_MAX:
         raise BadInputError("bad_scene", f"a scene needs 1 to {SOLIDS_MAX} solids, got {len(given)}")
+    if not all(TEMPERATURE_K[0] <= kelvin <= TEMPERATURE_K[1] for kelvin in (ambient_k, sky_k)):
+        raise BadInputError(
+            "bad_scene",
+            f"surroundings and sky need {TEMPERATURE_K[0]} to {TEMPERATURE_K[1]} K, got {ambient_k:g} and {sky_k:g}",
+        )
     pairs = [solid.surface.materials for solid in given]
     return Scene(
         name=name,

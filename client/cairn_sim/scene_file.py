@@ -53,8 +53,8 @@ from pydantic import ValidationError
 
 from cairn_calib.poses import Transform
 from cairn_map.errors import COMPLAINTS_MAX, BadInputError
-from cairn_sim.scene import Scene, scene_of
-from cairn_sim.scene_format import SOLIDS_MAX, ZERO_C_K, PlaceEntry, SceneFile, SolidEntry, SurfaceEntry, Turn
+from cairn_sim.scene import SOLIDS_MAX, Scene, scene_of
+from cairn_sim.scene_format import ZERO_C_K, PlaceEntry, SceneFile, SolidEntry, SurfaceEntry, Turn
 from cairn_sim.solids import Angles3, Box, Cylinder, Metres3, Plane, Shape, Solid, Sphere, placed
 from cairn_sim.surfaces import Material, Optics, Rgb, Surface
 

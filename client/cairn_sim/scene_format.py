@@ -5,13 +5,13 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field, model_validator
 
-SOLIDS_MAX = 20_000
-"""After placing; a file of a few lines may ask for millions."""
+from cairn_sim.scene import SOLIDS_MAX
+
 ZERO_C_K = 273.15
 
 Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[^\x00-\x1f\x7f]*$")]
 Colour = Annotated[str, Field(pattern=r"^#[0-9A-Fa-f]{6}$")]
-Celsius = Annotated[float, Field(strict=True, gt=-ZERO_C_K, lt=4000)]
+Celsius = Annotated[float, Field(strict=True, ge=-220, lt=4000)]
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
 Metres = Annotated[float, Field(strict=True, ge=-1e6, le=1e6)]
 Size = Annotated[float, Field(strict=True, ge=1e-4, le=1e6)]

@@ -34,7 +34,7 @@ class ColourSensor:
     shot_per_value: float = 0.02
     """Variance that each of the 255 adds: sigma is 3.0 in black and 3.75 in white."""
     blur_px: float = 0.6
-    """Sigma of the lens; with the pixel's area a modulation of about 0.4 at Nyquist."""
+    """Sigma of the lens; with the pixel's area the contrast of the finest stripes, one pixel each, falls to 0.11."""
     vignetting: float = 1.0
     """Exponent of the cos^4 law: 1 for a lens that nobody corrected, 0 for none."""
     fineness: int = 2
@@ -65,12 +65,16 @@ class ThermalSensor:
     planck_o: float = 0.0
 
     def counts_of(self, kelvin: Floats) -> Floats:
-        """Raw counts, not rounded, of a black body; 40 a kelvin at 300 K, and 820 K is the last before saturation."""
+        """Raw counts, not rounded, of a black body; 41 a kelvin at 300 K. 16 bits end at 831 K, and at 117 K."""
         return np.asarray(self.planck_r / (np.exp(self.planck_b / kelvin) - self.planck_f) + self.planck_o)
 
     def kelvin_of(self, counts: Floats) -> Floats:
         """The mirror of `counts_of`."""
         return np.asarray(self.planck_b / np.log(self.planck_r / (counts - self.planck_o) + self.planck_f))
+
+    def raw_counts(self, kelvin: Singles) -> Counts:
+        """(H, W) uint16, what the camera counted where a thermal image says so; exact for a noisy image."""
+        return np.clip(np.rint(self.counts_of(kelvin.astype(np.float64))), 1, COUNT_MAX).astype(np.uint16)
 
     @property
     def counts_per_kelvin(self) -> float:

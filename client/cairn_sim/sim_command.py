@@ -3,7 +3,7 @@
     $ cairn sim scene                                  # the scenes, robots and paths that come with cairn
     $ cairn sim show building --path labs --stop 3     # what a head sees there, as pictures
     $ cairn sim record building lab-1 --path experiment --robot tof
-    $ cairn robot replay lab-1 http://127.0.0.1:8750/maps/lab
+    $ cairn robot replay lab-1 --map http://127.0.0.1:8750/maps/lab
 
 A recording is like a real robot's; the truth behind every image lies beside it, in its folder truth/. The path
 `experiment` of the building is the paper's: 54 stops of 36 scans. The same seed gives the same bytes.
@@ -11,25 +11,28 @@ A recording is like a real robot's; the truth behind every image lies beside it,
 
 import argparse
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 
 from cairn_client.arguments import parser, say, with_progress
 from cairn_fusion.images import write_colour
 from cairn_map.errors import BadInputError
-from cairn_sim.contact_sheet import contact_sheet, plan_picture
+from cairn_sim.contact_sheet import contact_sheet, view_from_above
 from cairn_sim.heads import RANGE_CAMERA
-from cairn_sim.record import Plan, record, shots_of
+from cairn_sim.record import Plan, places_of, record, shots_of
 from cairn_sim.render import render_scan
 from cairn_sim.robots import ROBOTS, robot_named
 from cairn_sim.scene import Scene
 from cairn_sim.scene_file import SHIPPED, load_scene, shipped_text
 from cairn_sim.scene_format import ZERO_C_K
-from cairn_sim.trajectories import PoseErrors, path_names, stops
+from cairn_sim.targets import TARGET_SCENES
+from cairn_sim.trajectories import PoseErrors, path_names
 
-TRUTHS = ("none", "range", "all")
 MEGABYTES_PER_SCAN = {"orpheus": 4.8, "tof": 0.24, "lidar": 0.2, "handheld": 3.1}
 """Of a recording at full size with the truth of the range camera, measured in the building."""
+TRUTH_FACTORS = {"none": 0.95, "range": 1.0, "all": 2.1}
 
 
 def main(argv: list[str]) -> int:
@@ -42,25 +45,28 @@ def main(argv: list[str]) -> int:
 def _scene(args: argparse.Namespace) -> int:
     """List what there is, or check and describe one scene."""
     if args.scene is None:
-        for name in SHIPPED:
-            scene = load_scene(name)
+        for name in [*SHIPPED, *TARGET_SCENES]:
+            scene = _load(name)
             say(f"{name:12} {len(scene.solids):4} solids; paths: {', '.join(path_names(name))}")
         say()
         for robot in ROBOTS.values():
             say(f"{robot.name:12} {robot.about}")
         return 0
-    scene = load_scene(args.scene)
+    scene = _load(args.scene)
     if args.write is not None:
         if args.write.exists():
             raise BadInputError("file_exists", f"{args.write} is there already; choose another name")
-        args.write.write_text(_text(args.scene), encoding="utf-8")
+        with _output(args.write):
+            args.write.write_text(_text(args.scene), encoding="utf-8")
         say(f"wrote {args.write}; change it, and give its path wherever a scene is asked for")
         return 0
     kelvin = scene.surfaces.temperature_k
     bounds = scene.shapes.bounds[abs(scene.shapes.bounds).max(axis=1) < math.inf]
-    low, high = bounds[:, :3].min(axis=0), bounds[:, 3:].max(axis=0)
     say(f"{scene.name}: {len(scene.solids)} solids")
-    say("  spans        " + ", ".join(f"{a} {x:.2f} to {y:.2f} m" for a, x, y in zip("xyz", low, high, strict=True)))
+    if len(bounds):
+        low, high = bounds[:, :3].min(axis=0), bounds[:, 3:].max(axis=0)
+        span = ", ".join(f"{a} {x:.2f} to {y:.2f} m" for a, x, y in zip("xyz", low, high, strict=True))
+        say(f"  spans        {span}")
     low_c, high_c, ambient_c = (k - ZERO_C_K for k in (kelvin.min(), kelvin.max(), scene.ambient_k))
     say(f"  temperature  {low_c:.1f} to {high_c:.1f} C, around it {ambient_c:.1f} C")
     say(f"  paths        {', '.join(path_names(scene.name)) or '(none: cairn knows paths of its own scenes only)'}")
@@ -74,7 +80,8 @@ def _record(args: argparse.Namespace) -> int:
     stop_count = sum(shot.ends_stop for shot in shots)
     say(f"{plan.robot.name} in {plan.scene.name}, path {plan.path}: {stop_count} measurements, {len(shots)} scans")
     if args.scale == 1:
-        say(f"  takes about {len(shots) * MEGABYTES_PER_SCAN[plan.robot.name] / 1000:.2g} GB")
+        size_mb = len(shots) * MEGABYTES_PER_SCAN[plan.robot.name] * TRUTH_FACTORS[args.truth]
+        say(f"  takes about {size_mb / 1000:.2g} GB")
     for _ in with_progress(record(plan, args.output, scene_text=_text(args.scene)), "scans", total=len(shots)):
         pass
     say(f"wrote {args.output}; its truth is in {args.output / 'truth'}")
@@ -84,9 +91,12 @@ def _record(args: argparse.Namespace) -> int:
 def _show(args: argparse.Namespace) -> int:
     """Write the pictures."""
     plan = _plan(args)
-    shots = [shot for shot in shots_of(plan) if shot.number == args.stop * plan.robot.scans_per_stop + args.scan]
+    shots = [shot for shot in shots_of(plan) if (shot.stop, shot.scan) == (args.stop, args.scan)]
     if not shots:
         raise BadInputError("no_stops", f"path {plan.path} has no stop {args.stop} with a scan {args.scan}")
+    above = args.output.with_name(f"{args.output.stem}-plan.png") if args.output.name else args.output
+    with _output(args.output):
+        args.output.touch()
     scan = render_scan(
         plan.scene,
         plan.robot.rig_of(plan.scale),
@@ -97,16 +107,25 @@ def _show(args: argparse.Namespace) -> int:
         number=shots[0].number,
         sensors=plan.robot.sensors,
     )
-    above = args.output.with_name(f"{args.output.stem}-plan.png")
-    write_colour(args.output, contact_sheet(scan))
-    write_colour(above, plan_picture(plan.scene, stops(plan.scene, plan.path), args.stop))
+    with _output(args.output):
+        write_colour(args.output, contact_sheet(scan))
+        write_colour(above, view_from_above(plan.scene, places_of(plan), args.stop))
     say(f"wrote {args.output}: what {plan.robot.name} sees at stop {args.stop}, scan {args.scan}, of {plan.path}")
     say(f"wrote {above}: {plan.scene.name} from above")
     return 0
 
 
+@contextmanager
+def _output(path: Path) -> Iterator[None]:
+    """Say what is wrong with a file that cannot be written."""
+    try:
+        yield
+    except OSError as exc:
+        raise BadInputError("bad_output", f"cannot write {path}: {exc.strerror}") from exc
+
+
 def _plan(args: argparse.Namespace) -> Plan:
-    scene = load_scene(args.scene)
+    scene = _load(args.scene)
     errors = PoseErrors(**{field.name: getattr(args, field.name) for field in fields(PoseErrors)})
     return Plan(
         scene=scene,
@@ -116,6 +135,7 @@ def _plan(args: argparse.Namespace) -> Plan:
         perfect=args.perfect,
         scale=args.scale,
         truth=args.truth,
+        raw=args.raw,
         errors=errors,
         backlash_rad=math.radians(args.backlash_deg),
         speed_m_s=args.speed,
@@ -125,8 +145,15 @@ def _plan(args: argparse.Namespace) -> Plan:
     )
 
 
+def _load(scene: str) -> Scene:
+    """A scene by name or file."""
+    return TARGET_SCENES[scene]() if scene in TARGET_SCENES else load_scene(scene)
+
+
 def _text(scene: str) -> str:
     """The file of a scene that was loaded."""
+    if scene in TARGET_SCENES:
+        return f"# {scene}: made by cairn_sim.targets, which has no file\n"
     return shipped_text(scene) if scene in SHIPPED else Path(scene).read_text(encoding="utf-8")
 
 
@@ -139,7 +166,7 @@ def _first_path(scene: Scene) -> str:
 
 def _span(text: str) -> tuple[int, int | None]:
     first, colon, last = text.partition(":")
-    if not all(part.isdigit() or not part for part in (first, last)) or not text.strip(":"):
+    if not all(part.isdecimal() or not part for part in (first, last)) or not text.strip(":"):
         raise argparse.ArgumentTypeError(f"stops are FROM:TO, FROM: or one number, from 0, got {text!r}")
     if not colon:
         return int(first), int(first) + 1
@@ -150,15 +177,19 @@ def _parser() -> argparse.ArgumentParser:
     options = parser("cairn sim", __doc__)
     actions = options.add_subparsers(dest="action", required=True, metavar="ACTION")
     scene = actions.add_parser("scene", help="list scenes and robots; check and describe one scene")
-    scene.add_argument("scene", nargs="?", help=f"{', '.join(SHIPPED)}, or a scene file")
+    scene.add_argument("scene", nargs="?", help=f"{', '.join([*SHIPPED, *TARGET_SCENES])}, or a scene file")
     scene.add_argument("--write", type=Path, metavar="FILE", help="write the scene's text there, to change it")
     recording = actions.add_parser("record", help="write what a robot records along a path, and the truth")
     show = actions.add_parser("show", help="write what a robot sees at one stop as PNG, and the scene from above")
     for one in (recording, show):
-        one.add_argument("scene", help=f"{', '.join(SHIPPED)}, or a scene file")
+        one.add_argument("scene", help=f"{', '.join([*SHIPPED, *TARGET_SCENES])}, or a scene file")
     recording.add_argument("output", type=Path, metavar="FOLDER", help="new or empty")
-    recording.add_argument("--truth", choices=TRUTHS, default="range", help="for which images (range)")
-    show.set_defaults(truth="none")
+    recording.add_argument("--truth", choices=list(TRUTH_FACTORS), default="range", help="for which images (range)")
+    recording.add_argument(
+        "--stops", type=_span, default=(0, None), metavar="FROM:TO", help="a part of the stops (all)"
+    )
+    recording.add_argument("--raw", action="store_true", help="thermal images as raw counts, too")
+    show.set_defaults(truth="none", raw=False, stops=(0, None))
     show.add_argument("--output", type=Path, default=Path("view.png"), metavar="FILE", help="picture (view.png)")
     show.add_argument("--stop", type=int, default=0, help="of the path, from 0 (0)")
     show.add_argument("--scan", type=int, default=0, help="of the stop, from 0 (0)")
@@ -173,7 +204,6 @@ def _add_plan(options: argparse.ArgumentParser) -> None:
     options.add_argument("--seed", type=int, default=1, help="of all noise (1)")
     options.add_argument("--perfect", action="store_true", help="sensors without noise: each pixel is the truth")
     options.add_argument("--scale", type=float, default=1.0, help="of colour and thermal images, above 0 to 1 (1)")
-    options.add_argument("--stops", type=_span, default=(0, None), metavar="FROM:TO", help="a part of the stops (all)")
     options.add_argument(
         "--speed", type=float, default=0.0, metavar="M/S", help="drive through, scan by scan (0: stop)"
     )

@@ -53,7 +53,7 @@ class Shapes(NamedTuple):
     leaves: Ints
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def enter(
     ox: float,
     oy: float,
@@ -132,7 +132,7 @@ def _enter_sphere(px: float, py: float, pz: float, ex: float, ey: float, ez: flo
     return (-b - math.sqrt(root), SIDE) if root > 0.0 else (-1.0, SIDE)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def inverse_of(d: float) -> float:
     """1 / d, finite where the direction is parallel to the planes."""
     return 1.0 / d if abs(d) > PARALLEL else FAR
@@ -148,7 +148,7 @@ def _own(x: float, y: float, z: float, frame: Floats, k: int) -> tuple[float, fl
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def surface_at(
     x: float, y: float, z: float, k: int, face: int, kind: Bytes, f: Floats, half_m: Floats
 ) -> tuple[float, float, float, float, float]:
@@ -207,14 +207,14 @@ def second_at(points: Floats, solids: Ints, shapes: Shapes) -> Marks:
     return second
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def turn_at(u: float, v: float, k: int, texture: Floats) -> int:
     """Which of a surface's two materials shows."""
     turns = math.floor((u - texture[k, 2]) * texture[k, 0]) + math.floor((v - texture[k, 3]) * texture[k, 1])
     return int(turns) & 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def grain_at(u: float, v: float, salt: int) -> float:
     """Smooth pseudo-random pattern, -1 to 1: values on a lattice of step 1 and one of step 1/3, interpolated."""
     return 0.65 * _lattice(u, v, salt) + 0.35 * _lattice(3.0 * u, 3.0 * v, salt + 1)

@@ -16,6 +16,8 @@ from enum import IntEnum
 from cairn_map.errors import BadInputError
 
 Rgb = tuple[int, int, int]
+TEMPERATURE_K = (50, 5000)
+"""What a material, the surroundings and the sky may have: colder sends nothing that a float holds."""
 
 
 class Optics(IntEnum):
@@ -46,11 +48,15 @@ class Material:
 
     def __post_init__(self) -> None:
         fractions = (self.emissivity, self.reflectivity_nir, self.gloss_nir)
-        if not (0 < self.temperature_k < 5000 and all(0 <= f <= 1 for f in fractions) and self.retroreflection >= 1):
+        if not (
+            TEMPERATURE_K[0] <= self.temperature_k <= TEMPERATURE_K[1]
+            and all(0 <= f <= 1 for f in fractions)
+            and self.retroreflection >= 1
+        ):
             raise BadInputError(
                 "bad_surface",
-                "a material needs kelvin above 0, fractions in 0..1 and a retroreflection of at least 1, got "
-                f"{self.temperature_k} K, {fractions}, {self.retroreflection}",
+                f"a material needs {TEMPERATURE_K[0]} to {TEMPERATURE_K[1]} K, fractions in 0..1 and a retroreflection "
+                f"of at least 1, got {self.temperature_k} K, {fractions}, {self.retroreflection}",
             )
         if not all(0 <= value <= 255 for value in self.colour_srgb):
             raise BadInputError("bad_surface", f"a colour is three numbers in 0..255, got {self.colour_srgb}")

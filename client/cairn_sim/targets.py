@@ -15,7 +15,7 @@ the discs' diameters. Numbers and sizes of squares are not printed; ours are the
 constants.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 
@@ -23,6 +23,7 @@ import numpy as np
 
 from cairn_calib.poses import Points, Transform, transform_points
 from cairn_map.errors import BadInputError
+from cairn_sim.kinematics import T_FORWARD_CAMERA
 from cairn_sim.scene import Scene, scene_of
 from cairn_sim.solids import Box, Cylinder, Metres3, Solid, placed
 from cairn_sim.surfaces import Material, Rgb, Surface
@@ -191,3 +192,25 @@ def laboratory() -> list[Solid]:
         slab("wall left", (176, 186, 196), ROOM_K - 0.4, 0.55, (3, 3.1, 1.4), (8.4, 0.2, 3.2)),
         slab("wall right", (196, 182, 176), ROOM_K + 0.3, 0.55, (3, -3.1, 1.4), (8.4, 0.2, 3.2)),
     ]
+
+
+def _facing_the_robot(x_m: float, y_m: float, z_m: float) -> Transform:
+    """`T_map_board` of a thing that faces -x."""
+    return placed((x_m, y_m, z_m)) @ T_FORWARD_CAMERA
+
+
+def _example_calibration() -> Scene:
+    """The board upright in the bare room, 2.2 m ahead."""
+    board = Board()
+    middle = _facing_the_robot(2.2, 0.0, 1.15)
+    return calibration_scene(middle @ placed((-board.centre[0], -board.centre[1], 0.0)), board)
+
+
+def _example_targets() -> Scene:
+    """Three discs at three distances in the bare room."""
+    places = ((3.0, -0.7, 1.0, 0.2), (3.6, 0.1, 1.4, 0.3), (4.3, 0.9, 0.8, 0.3))
+    return target_scene([(_facing_the_robot(x, y, z), diameter_m) for x, y, z, diameter_m in places])
+
+
+TARGET_SCENES: Mapping[str, Callable[[], Scene]] = {"calibration": _example_calibration, "targets": _example_targets}
+"""By the scene's name: one board, three discs; each stands still, and robots look at it from several stops."""

@@ -26,12 +26,16 @@ Xy = tuple[float, float]
 
 EXPERIMENT = "experiment"
 """The path of the building that is the paper's: `labs`, then `corridors`."""
+POSES_MAX = 100_000
+"""Of one drive."""
+ERROR_MAX = 100.0
+"""Of a pose, metres or radians: more is a slip of the pen."""
 CORNER_M = 0.6
 """How far before a waypoint a drive begins to turn."""
 
 
 @dataclass(frozen=True, slots=True)
-class Path:
+class Route:
     """A line on the ground, and where a robot stops on it."""
 
     waypoints: tuple[Xy, ...]
@@ -45,21 +49,23 @@ class Path:
     """Where along the path, as shares of its length, the stops stand closer."""
 
 
-PATHS: Mapping[str, Mapping[str, Path]] = MappingProxyType(
+PATHS: Mapping[str, Mapping[str, Route]] = MappingProxyType(
     {
         "small-room": {
-            "west": Path(
+            "west": Route(
                 ((0.9, 1.0), (0.8, 1.7), (0.8, 3.1), (1.2, 3.6), (1.9, 3.8), (2.6, 3.8), (2.6, 3.1)), 1.1, 0.68
             ),
-            "doorway": Path(((1.9, 1.6), (2.2, 2.3), (2.9, 2.45), (5.2, 2.45)), 1.1, 0.65),
-            "east": Path(((5.0, 1.2), (4.8, 1.8), (5.1, 2.4), (5.0, 3.1), (4.75, 4.4)), 1.1, 0.66),
+            "doorway": Route(((1.9, 1.6), (2.2, 2.3), (2.9, 2.45), (5.2, 2.45)), 1.1, 0.65),
+            "east": Route(((5.0, 1.2), (4.8, 1.8), (5.1, 2.4), (5.0, 3.1), (4.75, 4.4)), 1.1, 0.66),
         },
         "building": {
-            "labs": Path(((15.2, 6.2), (15.2, 23.7)), -0.1, 0.7, 0.1),
-            "corridors": Path(((1.3, 0.0), (30.8, 0.0), (30.8, -8.3)), -0.1, 1.4, 0.4, (0.35, 0.55)),
+            "labs": Route(((15.2, 6.2), (15.2, 23.7)), -0.1, 0.7, 0.1),
+            "corridors": Route(((1.3, 0.0), (30.8, 0.0), (30.8, -8.3)), -0.1, 1.4, 0.4, (0.35, 0.55)),
         },
+        "calibration": {"views": Route(((0.0, -0.8), (0.7, 0.0), (0.0, 0.8)), 1.1, 0.4)},
+        "targets": {"approach": Route(((-0.5, 0.0), (1.8, 0.0)), 1.1, 0.45)},
         "yard": {
-            "loop": Path(((-6.0, -6.0), (5.25, -6.0), (5.25, 6.8), (-6.0, 6.8), (-6.0, -5.0)), 3.0, 2.0),
+            "loop": Route(((-6.0, -6.0), (5.25, -6.0), (5.25, 6.8), (-6.0, 6.8), (-6.0, -5.0)), 3.0, 2.0),
         },
     }
 )
@@ -95,10 +101,15 @@ def drive(scene: Scene, path: str, *, speed_m_s: float, rate_hz: float) -> list[
         raise BadInputError("bad_drive", f"a drive needs a speed and a rate above 0, got {speed_m_s} and {rate_hz}")
     line = _path(scene, path)
     length_m = float(_lengths(line.waypoints)[-1])
+    if not length_m * rate_hz / speed_m_s <= POSES_MAX:
+        raise BadInputError(
+            "bad_drive",
+            f"a drive has at most {POSES_MAX} poses; {length_m:.0f} m at {speed_m_s:g} m/s and {rate_hz:g} Hz: more",
+        )
     return [on_ground(scene, line, at) for at in np.arange(0.0, length_m, speed_m_s / rate_hz)]
 
 
-def on_ground(scene: Scene, path: Path, at_m: float) -> Transform:
+def on_ground(scene: Scene, path: Route, at_m: float) -> Transform:
     """`T_map_robot` of a robot that stands on the ground, `at_m` metres along a path: its z is the ground's normal.
 
     Raises:
@@ -131,6 +142,11 @@ class PoseErrors:
     drift_rad: float = 0.0
     """Sigma of the heading's random walk after one metre of way."""
 
+    def __post_init__(self) -> None:
+        for name in ("sigma_m", "sigma_rad", "drift", "drift_rad"):
+            if not 0 <= getattr(self, name) <= ERROR_MAX:
+                raise BadInputError("bad_pose_error", f"{name} must be 0 to {ERROR_MAX:g}, got {getattr(self, name):g}")
+
 
 def believed(true: Sequence[Transform], errors: PoseErrors, rng: np.random.Generator) -> list[Transform]:
     """The poses that a robot reports when it truly is at `true`, `T_map_rig` or `T_map_robot`.
@@ -156,7 +172,7 @@ def believed(true: Sequence[Transform], errors: PoseErrors, rng: np.random.Gener
     return poses
 
 
-def _path(scene: Scene, path: str) -> Path:
+def _path(scene: Scene, path: str) -> Route:
     known = PATHS.get(scene.name, {})
     if path not in known:
         raise BadInputError(
@@ -180,7 +196,7 @@ def _along(waypoints: Sequence[Xy], at_m: float) -> tuple[Xy, float]:
     return (x, y), math.atan2(float(dy), float(dx))
 
 
-def _stop_lengths(path: Path, length_m: float) -> Floats:
+def _stop_lengths(path: Route, length_m: float) -> Floats:
     """Metres along the path of each stop, both ends included; closer together in the busy part."""
     count = round(length_m / path.spacing_m) + 1
     if path.spread_m == 0:

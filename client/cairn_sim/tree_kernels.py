@@ -14,7 +14,7 @@ STACK = 64
 """Above `tree.DEPTH_MAX`."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def first_entry(
     ox: float,
     oy: float,
@@ -46,7 +46,7 @@ def first_entry(
             best, which, best_face = t, k, face
     ix, iy, iz = inverse_of(dx), inverse_of(dy), inverse_of(dz)
     node, top = 0, 0
-    if not _near(ox, oy, oz, ix, iy, iz, nodes, 0, best) <= best:
+    if len(leaves) == 0 or not _near(ox, oy, oz, ix, iy, iz, nodes, 0, best) <= best:
         return best, which, best_face
     while True:
         count = links[node, 1]
@@ -89,7 +89,7 @@ def _near(
     return near if near <= far else np.inf
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def spread_into(spread: Floats, directions: Floats, R: Floats, rays: Floats, order: Ints, start: int, end: int) -> None:
     """A bundle's rays in the map frame, and (3, 2) their lowest and highest component along each axis but for NaN."""
     for a in range(3):
@@ -103,7 +103,7 @@ def spread_into(spread: Floats, directions: Floats, R: Floats, rays: Floats, ord
         spread[a, 0], spread[a, 1] = low, high
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def candidates_into(
     candidates: Ints,
     nears: Floats,
@@ -121,7 +121,8 @@ def candidates_into(
     for at in range(len(endless)):
         candidates[count], nears[count] = endless[at], 0.0
         count += 1
-    stack[0], top = 0, 1
+    # Without a tree its only node is no branch; and of a bundle without rays nothing is known.
+    stack[0], top = 0, 1 if len(leaves) > 0 and spread[0, 0] <= spread[0, 1] else 0
     while top > 0:
         top -= 1
         node = int(stack[top])

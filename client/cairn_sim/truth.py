@@ -5,7 +5,7 @@ solid           (H, W) int16     number of the solid there in the scene; -1 for 
 temperature_k   (H, W) float32   of that surface, true and not apparent; NaN for none
 way             (H, W) uint8     how visible and near infrared light goes on from there: 0 it does not, bit 0 through
                                  glass, bit 1 round a mirror; 0 for a thermal camera, which sees the pane
-visible         (H, W) uint16    bit n: the rig's camera number n sees that surface point; its own bit always
+visible         (H, W) uint32    bit n: the rig's camera number n sees that surface point; its own bit always
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from cairn_calib.poses import Transform, transform_points
 from cairn_calib.rig import Rig
-from cairn_sim.image_kernels import surface_values
 from cairn_sim.rays import visible_from
 from cairn_sim.render import view_of
 from cairn_sim.scene import Scene
@@ -30,7 +29,7 @@ class CameraTruth:
     solid: npt.NDArray[np.int16]
     temperature_k: npt.NDArray[np.float32]
     way: npt.NDArray[np.uint8]
-    visible: npt.NDArray[np.uint16]
+    visible: npt.NDArray[np.uint32]
 
     def write(self, path: Path) -> None:
         """A compressed NPZ file with an array of each name, the same bytes for the same truth."""
@@ -52,21 +51,20 @@ def camera_truth(scene: Scene, rig: Rig, camera: str, *, T_map_rig: Transform) -
     """
     view = view_of(scene, rig, camera, T_map_rig=T_map_rig)
     hits, shape = view.hits, view.shape
-    first = hits._replace(seen=hits.solid, second=np.where(hits.way == 0, hits.second, 0).astype(np.uint8))
     with np.errstate(invalid="ignore"):  # a ray that meets nothing has no point
         points = transform_points(
             view.T_map_camera, view.camera.rays() * np.where(hits.solid < 0, np.nan, hits.range_m).reshape(*shape, 1)
         )
-    visible = np.zeros(shape, np.uint16)
+    visible = np.zeros(shape, np.uint32)
     for n, name in enumerate(rig.cameras):
         seen = (
             visible_from(scene, points, rig, name, T_map_rig=T_map_rig) if name != camera else ~np.isnan(points[..., 0])
         )
-        visible |= (seen.astype(np.uint16) << np.uint16(n)).astype(np.uint16)
+        visible |= seen.astype(np.uint32) << np.uint32(n)
     return CameraTruth(
         range_m=hits.range_m.reshape(shape),
         solid=hits.solid.astype(np.int16).reshape(shape),
-        temperature_k=surface_values(first, scene.surfaces.temperature_k, np.nan).reshape(shape),
+        temperature_k=scene.temperature_k_at(points, hits.solid.reshape(shape)).astype(np.float32),
         way=hits.way.reshape(shape),
         visible=visible,
     )

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from cairn_sim.solid_kernels import BOX, CYLINDER, FAR, PARALLEL, SPHERE
+from cairn_sim.solid_kernels import BOX, CYLINDER, SPHERE, inverse_of
 
 Floats = npt.NDArray[np.float64]
 Longs = npt.NDArray[np.int64]
@@ -169,7 +169,7 @@ def mark_seen_into(
         if 0 <= hx < nx and 0 <= hy < ny and 0 <= hz < nz:
             marks[hx, hy, hz] = HIT
         dx, dy, dz = directions[n, 0] * per_m, directions[n, 1] * per_m, directions[n, 2] * per_m
-        ix, iy, iz = _inverse(dx), _inverse(dy), _inverse(dz)
+        ix, iy, iz = inverse_of(dx), inverse_of(dy), inverse_of(dz)
         ax, bx = _inside(ox, ix, nx)
         ay, by = _inside(oy, iy, ny)
         az, bz = _inside(oz, iz, nz)
@@ -205,11 +205,6 @@ def _voxel(at_m: float, edge_nm: int) -> int:
     """As `grid.voxels_of_points`: rounded to nanometres, then the floor in integers."""
     voxel: int = np.int64(np.rint(at_m * 1e9)) // edge_nm  # type: ignore[assignment]
     return voxel
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _inverse(d: float) -> float:
-    return 1.0 / d if abs(d) > PARALLEL else FAR
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

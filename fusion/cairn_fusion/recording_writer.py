@@ -61,7 +61,7 @@ class RecordingWriter:
 
     Raises:
         ConflictError: the folder holds something already.
-        BadInputError: a name that cannot be written.
+        BadInputError: a name that cannot be written, or a folder that cannot be made.
     """
 
     def __init__(
@@ -84,10 +84,13 @@ class RecordingWriter:
             self._header = RecordingHeader(name=name, note=note, range={})
         except ValueError as exc:
             raise BadInputError("bad_recording", f"not a recording's name and note: {name!r}") from exc
-        self.folder.mkdir(parents=True, exist_ok=True)
-        if any(self.folder.iterdir()):
-            raise ConflictError("recording_exists", f"{self.folder} must be empty to record into it")
-        (self.folder / RIG_FILE).write_bytes(rig.to_json())
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if any(self.folder.iterdir()):
+                raise ConflictError("recording_exists", f"{self.folder} must be empty to record into it")
+            (self.folder / RIG_FILE).write_bytes(rig.to_json())
+        except OSError as exc:
+            raise BadInputError("bad_output", f"cannot record into {self.folder}: {exc.strerror}") from exc
         self._stack = ExitStack()
         self._lists: dict[str, TextIO] = {}
         self._recorded: dict[tuple[str, str], None] = {}

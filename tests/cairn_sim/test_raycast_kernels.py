@@ -234,7 +234,7 @@ def test_solids_and_surfaces_that_cannot_be_are_refused() -> None:
         Solid("flat", Box((1, 0, 1)), GREY, placed((0, 0, 0)))
     with pytest.raises(BadInputError, match="finite sizes above 0"):
         Solid("endless", Sphere(math.inf), GREY, placed((0, 0, 0)))
-    with pytest.raises(BadInputError, match="kelvin above 0"):
+    with pytest.raises(BadInputError, match="needs 50 to 5000 K"):
         Material(temperature_k=-5.0)
     with pytest.raises(BadInputError, match="same optics"):
         Surface(Material(), Material(optics=Optics.GLASS))

@@ -2,11 +2,14 @@
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 
+from cairn_calib.camera import Camera
+from cairn_calib.lidar import SpinningLidar
 from cairn_calib.poses import Transform, inverse, look_at, transform_points
-from cairn_calib.rig import Rig
+from cairn_calib.rig import Rig, Spectrum, mounted
 from cairn_fusion.scan import Scan, check_scan
 from cairn_fusion.transfer import points_from_range
 from cairn_map.errors import BadInputError
@@ -19,13 +22,13 @@ from cairn_sim.heads import (
     thermal_and_tof_head,
     tof_head,
 )
-from cairn_sim.rays import cast
+from cairn_sim.rays import cast, cast_directions
 from cairn_sim.render import render_scan
 from cairn_sim.robots import ROBOTS
 from cairn_sim.scene import Scene, scene_of
 from cairn_sim.scene_file import load_scene
 from cairn_sim.sensors import Noise
-from cairn_sim.solids import Box, Solid, placed
+from cairn_sim.solids import Box, Plane, Solid, placed
 from cairn_sim.surfaces import Material, Optics, Surface
 from cairn_sim.trajectories import stops
 
@@ -101,24 +104,24 @@ def test_ranges_in_the_small_room_are_those_of_its_planes() -> None:
 def test_hit_points_project_to_the_centres_of_their_pixels(head: str, scene: str) -> None:
     known = load_scene(scene)
     T_map_rig = head_pose(known, "west" if scene == "small-room" else "labs", stop=4, scan=14)
-    for mounted in HEADS[head].cameras.values():
-        T_map_camera = T_map_rig @ mounted.transform
-        hits = cast(known, mounted.camera, T_map_camera)
-        shape = mounted.camera.height, mounted.camera.width
-        rays = mounted.camera.rays() @ T_map_camera[:3, :3].T
+    for eye in HEADS[head].cameras.values():
+        T_map_camera = T_map_rig @ eye.transform
+        hits = cast(known, eye.camera, T_map_camera)
+        shape = eye.camera.height, eye.camera.width
+        rays = eye.camera.rays() @ T_map_camera[:3, :3].T
         points = T_map_camera[:3, 3] + hits.range_m.reshape(*shape, 1) * rays
-        pixels = mounted.camera.project(transform_points(inverse(T_map_camera), points))
+        pixels = eye.camera.project(transform_points(inverse(T_map_camera), points))
         x, y = np.meshgrid(np.arange(shape[1]), np.arange(shape[0]))
         np.testing.assert_allclose(pixels, np.stack([x, y], axis=-1), rtol=0, atol=1e-6)
         assert np.abs(known.distance_m(points)).max() < 1e-9
 
 
 def test_full_images_project_back_too() -> None:
-    mounted = full_head()["colour_left"]
-    T_map_camera = head_pose(ROOM, "west", stop=1, scan=17) @ mounted.transform
-    hits = cast(ROOM, mounted.camera, T_map_camera)
-    points = hits.range_m[:, None] * mounted.camera.rays().reshape(-1, 3)
-    pixels = mounted.camera.project(points).reshape(960, 1280, 2)
+    eye = full_head()["colour_left"]
+    T_map_camera = head_pose(ROOM, "west", stop=1, scan=17) @ eye.transform
+    hits = cast(ROOM, eye.camera, T_map_camera)
+    points = hits.range_m[:, None] * eye.camera.rays().reshape(-1, 3)
+    pixels = eye.camera.project(points).reshape(960, 1280, 2)
     x, y = np.meshgrid(np.arange(1280), np.arange(960))
     np.testing.assert_allclose(pixels, np.stack([x, y], axis=-1), rtol=0, atol=1e-6)
 
@@ -216,9 +219,44 @@ def test_the_place_of_a_surface_has_one_colour_from_wherever_it_is_seen() -> Non
 
 
 def test_camera_in_a_wall_and_a_camera_that_is_none_are_refused() -> None:
-    with pytest.raises(BadInputError, match="got one in wall"):
+    with pytest.raises(BadInputError, match="is inside wall"):
         render(scene_of([wall(-0.1)]), tof_head(), AT_WALL)
     with pytest.raises(BadInputError, match="has no camera 'eye'"):
         render_scan(ROOM, tof_head(), T_map_rig=AT_WALL, range_camera="eye", time_s=0.0)
     with pytest.raises(BadInputError, match="must be a range camera"):
         render_scan(ROOM, full_head(scale=0.1), T_map_rig=AT_WALL, range_camera="colour_left", time_s=0.0)
+
+
+FOLDING = Camera(
+    width=320, height=240, focal_px=(120.0, 120.0), centre_px=(159.5, 119.5), distortion=(-0.4, 0.0, 0.0, 0.0, 0.0)
+)
+"""A lens that folds back within its image: the corners have no rays."""
+
+
+def test_pixels_without_a_ray_hold_nothing_and_do_not_touch_their_neighbours() -> None:
+    ground = scene_of([Solid("ground", Plane(), WALL, placed((0, 0, -2)))])
+    rig = Rig(
+        name="folding",
+        cameras={
+            name: mounted(spectrum, FOLDING, look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0)))
+            for name, spectrum in (("tof", Spectrum.RANGE), ("c", Spectrum.COLOUR), ("t", Spectrum.THERMAL))
+        },
+    )
+    blind = np.isnan(FOLDING.rays()[..., 0])
+    assert 0.05 < blind.mean() < 0.9
+    T = look_at((0, 0, 0), (0.01, 0, -1))
+    beside = cv2.dilate(blind.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    for noise in (None, 1):
+        scan = render(ground, rig, T, seed=noise)
+        assert np.isnan(scan.range_m[blind]).all() and np.isfinite(scan.range_m[~beside]).mean() > 0.8
+        rim = cv2.dilate(blind.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool) & ~beside
+        assert abs(float(np.median(scan.thermal["t"][rim])) - 300) < 0.5
+        assert np.median(scan.colour["c"][rim & ~cv2.dilate(blind.astype(np.uint8), np.ones((7, 7))).astype(bool)]) > 20
+
+
+def test_rays_without_direction_in_a_scene_without_a_tree_meet_nothing() -> None:
+    blind = SpinningLidar(width=4, height=1, elevations_deg=(0.0,))
+    ground = scene_of([Solid("ground", Plane(), WALL, placed((0, 0, -2)))])
+    nothing = cast_directions(ground, np.full((9, 3), np.nan), AT_WALL, bundle=3, opaque=False)
+    assert (nothing.solid == -1).all()
+    assert (cast(ground, blind, AT_WALL).solid == -1).all()

@@ -71,3 +71,47 @@ def test_stops_beyond_the_path_are_refused_with_how_many_there_are(tmp_path: Pat
         main(["record", "small-room", str(tmp_path / "a"), "--stops", "50:"])
     with pytest.raises(BadInputError, match="has no stop 50"):
         main(["show", "small-room", "--stop", "50"])
+
+
+@pytest.mark.parametrize("scene", ["calibration", "targets"])
+def test_board_and_discs_can_be_shown_and_recorded(scene: str, tmp_path: Path) -> None:
+    assert (
+        main(["show", scene, "--scale", "0.25", "--stop", "1", "--scan", "12", "--output", str(tmp_path / "v.png")])
+        == 0
+    )
+    arguments = ["record", scene, str(tmp_path / "rec"), "--scale", "0.25", "--stops", "1", "--raw"]
+    assert main(arguments) == 0
+    assert len(list((tmp_path / "rec" / "raw" / "thermal_left").iterdir())) == 36
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["show", "small-room", "--output", "/nowhere/x.png"],
+        ["show", "small-room", "--output", "/"],
+        ["scene", "small-room", "--write", "/nowhere/x.toml"],
+        ["record", "small-room", "/proc/rec"],
+    ],
+)
+def test_what_cannot_be_written_is_refused_by_name(arguments: list[str]) -> None:
+    with pytest.raises(BadInputError, match=r"cannot (write|record into) /"):
+        main(arguments)
+
+
+def test_only_scans_that_a_stop_has_are_shown(tmp_path: Path) -> None:
+    for scan in ("36", "-5"):
+        with pytest.raises(BadInputError, match="no stop 1 with a scan"):
+            main(["show", "small-room", "--stop", "1", "--scan", scan])
+    picture = tmp_path / "v.png"
+    assert main(["show", "small-room", "--robot", "tof", "--speed", "1", "--stop", "2", "--output", str(picture)]) == 0
+
+
+def test_a_scene_of_the_ground_alone_is_described(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "ground.toml"
+    file.write_text(
+        'format = "cairn-scene"\nversion = 1\nname = "ground"\nambient_c = 20.0\n'
+        '[materials]\ngrass = {colour = "#406030"}\n'
+        '[areas.all]\nsolids = [{name = "ground", plane = true, at = [0, 0, 0], surface = "grass"}]\n'
+    )
+    assert main(["scene", str(file)]) == 0
+    assert "ground: 1 solids" in capsys.readouterr().out

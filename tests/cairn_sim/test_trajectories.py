@@ -98,7 +98,7 @@ def test_backlash_stops_half_a_gap_short_on_the_side_of_arrival() -> None:
     rng = np.random.default_rng(1)
     told = [Joints(pan_rad=p) for p in (0.0, 0.5, 1.0, 0.5, 0.5)]
     true = with_backlash(told, gap_rad=0.02, sigma_rad=0.0, rng=rng)
-    np.testing.assert_allclose([j.pan_rad for j in true], [0.0, 0.49, 0.99, 0.51, 0.51])
+    np.testing.assert_allclose([j.pan_rad for j in true], [-0.01, 0.49, 0.99, 0.51, 0.51])
     shaken = with_backlash(told * 2000, gap_rad=0.0, sigma_rad=0.01, rng=rng)
     errors = np.array([t.pan_rad - j.pan_rad for t, j in zip(shaken, told * 2000, strict=True)])
     assert errors.std() == pytest.approx(0.01, rel=0.05)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from cairn_calib.poses import look_at, transform_points
+from cairn_fusion.images import read_grey16
 from cairn_fusion.recording import open_recording
 from cairn_fusion.trajectory import read_trajectory
 from cairn_map.errors import BadInputError, ConflictError
@@ -181,3 +182,39 @@ def test_a_recording_that_is_left_early_is_unfinished_and_nothing_is_overwritten
         write(plan(), tmp_path / "rec")
     with pytest.raises(BadInputError, match="has 8 stops, none of them chosen"):
         shots_of(plan(first_stop=40, last_stop=None))
+
+
+def test_a_mirror_behind_a_pane_is_in_sight_where_it_is_seen() -> None:
+    pane = Solid("pane", Box((0.01, 9, 9)), Surface(Material(optics=Optics.GLASS)), placed((1, 0, 0)))
+    mirror = Solid("mirror", Box((0.01, 9, 9)), Surface(Material(optics=Optics.MIRROR)), placed((3.005, 0, 0)))
+    behind = Solid("wall", Box((1, 9, 9)), Surface(Material()), placed((5, 0, 0)))
+    points = np.array([[3.0, 0, 0], [4.5, 0, 0], [0.995, 0, 0]])
+    T = look_at((0, 0, 0), (1, 0, 0))
+    scene = scene_of([pane, mirror, behind])
+    assert visible_from(scene, points, RIG, "colour_left", T_map_rig=T).tolist() == [True, False, True]
+    assert visible_from(scene, points, RIG, "thermal_left", T_map_rig=T).tolist() == [False, False, True]
+
+
+def test_raw_counts_say_what_the_thermal_images_say(tmp_path: Path) -> None:
+    folder = write(plan(raw=True, truth="none", last_stop=1), tmp_path / "rec")
+    about = json.loads((folder / "truth" / "truth.json").read_text())["thermal"]["thermal_left"]
+    counts = read_grey16(folder / "raw" / "thermal_left" / "000001.png").astype(float)
+    kelvin = about["planck_b"] / np.log(about["planck_r"] / (counts - about["planck_o"]) + about["planck_f"])
+    np.testing.assert_allclose(open_recording(folder).scan(1).thermal["thermal_left"], kelvin, rtol=0, atol=0.0051)
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [{"seed": -1}, {"speed_m_s": -1.0}, {"speed_m_s": float("nan")}, {"rate_hz": 0.0}, {"backlash_rad": -0.1}],
+)
+def test_plans_that_cannot_be_are_refused(numbers: dict[str, float]) -> None:
+    with pytest.raises(BadInputError, match=r"needs a seed|backlash must be"):
+        plan(**numbers)
+
+
+def test_pose_errors_and_drives_that_cannot_be_are_refused() -> None:
+    for value in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(BadInputError, match="drift must be 0 to 100"):
+            PoseErrors(drift=value)
+    with pytest.raises(BadInputError, match="at most 100000 poses"):
+        shots_of(plan(speed_m_s=1e-9))

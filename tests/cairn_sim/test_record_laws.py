@@ -1,0 +1,129 @@
+"""What a recording and its truth must have of the plan: the robot's own sensors, its gears' play, its times, its scene.
+
+What these tests do not show: that the noise is right; test_sensors.py does.
+"""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cairn_calib.poses import Transform, look_at, transform_points
+from cairn_fusion.recording import open_recording
+from cairn_fusion.trajectory import read_trajectory
+from cairn_sim.heads import RANGE_CAMERA, full_head, tof_head
+from cairn_sim.record import CLOCK_START_S, Plan, record, shots_of
+from cairn_sim.robots import LIDAR, ROBOTS
+from cairn_sim.scene import scene_of
+from cairn_sim.scene_file import load_scene, shipped_text
+from cairn_sim.sim_command import main
+from cairn_sim.solids import Box, Floats, Solid, placed
+from cairn_sim.surfaces import Material, Optics, Surface
+from cairn_sim.truth import camera_truth
+
+ROOM = load_scene("small-room")
+
+
+def pan_error_rad(true: Transform, told: Transform) -> float:
+    """How far the head is turned about the vertical from where it was told to look."""
+    ahead = (math.atan2(T[1, 2], T[0, 2]) for T in (true, told))
+    error = next(ahead) - next(ahead)
+    return (error + math.pi) % (2 * math.pi) - math.pi
+
+
+def test_a_lidar_records_ranges_two_centimetres_around_the_truth(tmp_path: Path) -> None:
+    plan = Plan(scene=ROOM, robot=ROBOTS["lidar"], path="west", last_stop=2)
+    list(record(plan, tmp_path / "rec", scene_text=shipped_text("small-room")))
+    recording, errors = open_recording(tmp_path / "rec"), []
+    for index in range(2):
+        truth = np.load(tmp_path / "rec" / "truth" / RANGE_CAMERA / f"{index:06d}.npz")
+        range_m = recording.scan(index).range_m
+        errors.append((range_m - truth["range_m"])[np.isfinite(range_m) & (truth["way"] == 0)])
+    error_m = np.concatenate(errors)
+    assert len(error_m) > 30_000
+    assert error_m.std() == pytest.approx(LIDAR.sigma_m, rel=0.03) and LIDAR.sigma_m == 0.02
+    assert abs(error_m.mean()) < 0.001
+
+
+def test_gears_with_play_stop_half_of_it_short_and_shake_by_a_tenth() -> None:
+    gap_rad = 0.01
+    shots = shots_of(Plan(scene=ROOM, robot=ROBOTS["tof"], path="west", backlash_rad=gap_rad))
+    errors_rad = np.array([pan_error_rad(shot.T_map_rig, shot.T_believed) for shot in shots])
+    assert len(errors_rad) == 288 and abs(np.sign(errors_rad).mean()) < 0.5
+    off_rad = np.abs(errors_rad) - gap_rad / 2
+    assert abs(off_rad.mean()) < gap_rad / 10 / 3
+    assert off_rad.std() == pytest.approx(gap_rad / 10, rel=0.15)
+
+
+def test_backlash_of_one_degree_puts_the_true_head_half_a_degree_off(tmp_path: Path) -> None:
+    folder = tmp_path / "rec"
+    options = ["--robot", "tof", "--stops", "0:1", "--perfect", "--truth", "none", "--backlash-deg", "1"]
+    assert main(["record", "small-room", str(folder), *options]) == 0
+    recording, true = open_recording(folder), read_trajectory(folder / "truth" / "trajectory.txt")
+    scans = [recording.scan(index) for index in range(len(recording))]
+    errors_rad = [pan_error_rad(true.pose_at(scan.time_s, max_gap_s=0.0), scan.T_map_rig) for scan in scans]
+    assert np.degrees(np.median(np.abs(errors_rad))) == pytest.approx(0.5, abs=0.06)
+    assert np.degrees(np.max(np.abs(errors_rad))) < 1
+
+
+@pytest.mark.parametrize("rate_hz", [2.0, 4.0, 10.0])
+def test_a_drive_takes_as_many_scans_a_second_as_planned_and_goes_as_fast(rate_hz: float) -> None:
+    plan = Plan(scene=load_scene("building"), robot=ROBOTS["lidar"], path="labs", speed_m_s=1.0, rate_hz=rate_hz)
+    shots = shots_of(plan)
+    times_s = np.array([shot.time_s for shot in shots])
+    assert times_s[0] == CLOCK_START_S
+    np.testing.assert_allclose(np.diff(times_s), 1 / rate_hz, rtol=0, atol=1e-6)
+    places = np.array([shot.T_map_rig[:3, 3] for shot in shots])
+    np.testing.assert_allclose(np.linalg.norm(np.diff(places, axis=0), axis=1), 1 / rate_hz, rtol=0, atol=1e-9)
+
+
+def test_times_of_a_part_are_those_of_the_whole_and_rise_everywhere() -> None:
+    for speed_m_s in (0.0, 0.7):
+        plan = Plan(scene=ROOM, robot=ROBOTS["tof"], path="west", speed_m_s=speed_m_s, rate_hz=3.0)
+        whole = [shot.time_s for shot in shots_of(plan)]
+        per_stop = 1 if speed_m_s else 36
+        assert [shot.time_s for shot in shots_of(replace(plan, first_stop=2, last_stop=4))] == whole[
+            2 * per_stop : 4 * per_stop
+        ]
+        assert (np.diff(whole) > 0).all()
+
+
+WARM, COLD = Material(temperature_k=330.0), Material(temperature_k=270.0)
+PERIOD_M, PHASE_M = np.array([0.31, 0.23]), np.array([0.04, -0.07])
+
+
+def checker_kelvin(points: Floats) -> Floats:
+    """The temperature of a checkered wall across x, by place, from how `Surface` describes its squares."""
+    squares = np.floor((points[..., 1:] - PHASE_M) / PERIOD_M).sum(axis=-1)
+    return np.where(squares % 2 == 0, WARM.temperature_k, COLD.temperature_k)
+
+
+@pytest.mark.parametrize("optics", list(Optics))
+@pytest.mark.parametrize("camera", [RANGE_CAMERA, "thermal_left"])
+def test_the_truth_is_as_warm_as_the_square_of_the_first_surface(optics: Optics, camera: str) -> None:
+    one, two = (replace(m, optics=optics) for m in (WARM, COLD))
+    checker = Surface(one, two, (PERIOD_M[0], PERIOD_M[1]), (PHASE_M[0], PHASE_M[1]))
+    stripes = Surface(Material(temperature_k=350.0), Material(temperature_k=250.0), (0.11, math.inf))
+    around = [Solid(f"wall {x}", Box((1, 90, 90)), stripes, placed((x, 0, 0))) for x in (-4.5, 4.5)]
+    scene = scene_of([*around, Solid("checker", Box((0.01, 90, 90)), checker, placed((2.005, 0, 0)))])
+    rig, T_map_rig = full_head(scale=0.1), look_at((0.1, 0.2, 0.3), (2, 0.6, 0.1))
+    truth = camera_truth(scene, rig, camera, T_map_rig=T_map_rig)
+    rays = rig[camera].camera.rays()
+    points = transform_points(T_map_rig @ rig[camera].transform, rays * truth.range_m[..., None])
+    assert (truth.solid == 2).all()
+    expected = checker_kelvin(points)
+    np.testing.assert_array_equal(truth.temperature_k, expected.astype(np.float32))
+    np.testing.assert_array_equal(truth.temperature_k, scene.temperature_k_at(points))
+    assert 0.3 < (expected == 330).mean() < 0.7
+
+
+def test_the_truth_of_a_shipped_scene_is_as_warm_as_the_scene_says_at_that_point() -> None:
+    scene, rig = load_scene("building"), tof_head()
+    T_map_rig = look_at((17.0, 20.6, 0.0), (17.5, 19.5, -0.2))
+    truth = camera_truth(scene, rig, RANGE_CAMERA, T_map_rig=T_map_rig)
+    points = transform_points(T_map_rig, rig[RANGE_CAMERA].camera.rays() * truth.range_m[..., None])
+    same = truth.temperature_k == scene.temperature_k_at(points).astype(np.float32)
+    # A point of a face that another solid touches may lie a rounding deeper in that.
+    assert same.mean() > 0.995 and (truth.way == 2).any()
