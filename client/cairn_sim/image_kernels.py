@@ -33,7 +33,7 @@ PASS_LEFT = 0.85
 @njit(cache=True, nogil=True, error_model="numpy")
 def edge_pixels(hits: Hits, width: int, height: int, order: Ints) -> Longs:
     """(E,) numbers, in the given order of all pixels, of those beside, above or below one that shows something else."""
-    _, _, _, seen, second, _, _, incidence, way, _, _ = hits
+    _, _, _, seen, second, _, _, incidence, way, passes, _ = hits
     mark = np.zeros(width * height, np.uint8)
     for y in range(height):
         for x in range(width):
@@ -43,6 +43,7 @@ def edge_pixels(hits: Hits, width: int, height: int, order: Ints) -> Longs:
                     seen[here] != seen[there]
                     or second[here] != second[there]
                     or way[here] != way[there]
+                    or passes[here] != passes[there]
                     or abs(incidence[here] - incidence[there]) > LIGHT_STEP
                 ):
                     mark[here] = 1

@@ -122,7 +122,10 @@ def cast_rays(
                 path |= np.uint8(optics[k])
                 crossed += np.uint8(1)
                 k = -1
-                if crossed <= PASSES_MAX:
+                if crossed > PASSES_MAX:
+                    # Nothing is seen behind so many panes, nor is it in sight.
+                    straight_m[i] = t if gone_m == 0.0 else straight_m[i]
+                else:
                     t, k, face = first_entry(
                         ox, oy, oz, dx, dy, dz, behind, kind, frame, half_m, endless, nodes, links, leaves, stack, nears
                     )

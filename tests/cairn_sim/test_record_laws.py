@@ -127,3 +127,15 @@ def test_the_truth_of_a_shipped_scene_is_as_warm_as_the_scene_says_at_that_point
     same = truth.temperature_k == scene.temperature_k_at(points).astype(np.float32)
     # A point of a face that another solid touches may lie a rounding deeper in that.
     assert same.mean() > 0.995 and (truth.way == 2).any()
+
+
+def test_the_truth_is_as_warm_as_the_solid_that_it_names_where_two_are_flush() -> None:
+    walls = []
+    for depth_m, kelvin in ((1.0, 280.0), (0.3, 300.0), (2.2, 320.0)):
+        T = look_at((0, 0, 0), (1.0, 0.7, 0.3))
+        T[:3, 3] = T[:3, 2] * (3 + depth_m / 2)
+        walls.append(Solid(f"wall of {kelvin} K", Box((90, 90, depth_m)), Surface(Material(temperature_k=kelvin)), T))
+    scene = scene_of(walls)
+    truth = camera_truth(scene, tof_head(), RANGE_CAMERA, T_map_rig=look_at((0, 0, 0), (1.0, 0.6, 0.2)))
+    assert len(np.unique(truth.solid)) > 1
+    np.testing.assert_array_equal(truth.temperature_k, scene.surfaces.temperature_k[truth.solid, 0])

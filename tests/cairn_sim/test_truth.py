@@ -218,3 +218,12 @@ def test_pose_errors_and_drives_that_cannot_be_are_refused() -> None:
             PoseErrors(drift=value)
     with pytest.raises(BadInputError, match="at most 100000 poses"):
         shots_of(plan(speed_m_s=1e-9))
+
+
+@pytest.mark.parametrize(("panes", "in_sight"), [(8, True), (9, False)])
+def test_what_is_too_dim_to_be_seen_is_not_in_sight(panes: int, in_sight: bool) -> None:
+    glass = Surface(Material(optics=Optics.GLASS))
+    solids = [Solid(f"pane {n}", Box((0.01, 9, 9)), glass, placed((1 + 0.1 * n, 0, 0))) for n in range(panes)]
+    solids.append(Solid("wall", Box((1, 9, 9)), Surface(Material()), placed((3.5, 0, 0))))
+    point, T = np.array([[3.0, 0, 0]]), look_at((0, 0, 0), (1, 0, 0))
+    assert visible_from(scene_of(solids), point, RIG, "colour_left", T_map_rig=T).tolist() == [in_sight]
