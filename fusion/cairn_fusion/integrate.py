@@ -1,27 +1,31 @@
 """A scan as evidence: the paper's chapter IV from images to voxels.
 
-    points   in the range camera's frame            Eq. 1-4
-    samples  colour, temperature, amplitude          Eq. 5-6 with a z-buffer; only what a camera really saw
-    cast     hits and misses                         inverse sensor model, one count per voxel and scan
+    returns  points of the map                       Eq. 1-5
+    samples  what cameras saw of them                Eq. 5-6: `samples`
+    hits     where beams ended, misses where the image looks through      `tally`, `carve`; for lidars `cast`
     pack     evidence by cell
 
-Each voxel that was hit gets at most one sample per channel and scan: the mean of the pixels that fell on it, with
-weight 1. So a voxel's weights never exceed its hits, however fine the images are, and samples stay small numbers.
-The result depends on the scan alone, never on the map.
+Inverse sensor model: one count per voxel and scan, and a hit wins over a miss. The result depends on the scan alone,
+never on the map, nor on how many scans are added in what order on how many threads.
 """
 
-from collections.abc import Iterator
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.poses import transform_points
+from cairn_calib.poses import Transform, checked_transform, transform_points
 from cairn_calib.rig import Rig
+from cairn_fusion.carve import MARGIN_VOXELS, Window, carving_of, window_of
 from cairn_fusion.cast import SeenVoxels, seen_voxels
-from cairn_fusion.scan import Scan, check_scan
-from cairn_fusion.transfer import depth_steps, points_from_range, transfer_points
-from cairn_map.channels import Channel, ChannelKind
+from cairn_fusion.samples import Returns, returns_of, sample_sums
+from cairn_fusion.scan import Scan
+from cairn_fusion.tally import Tally, same_box, tally_around
+from cairn_map.channels import ChannelKind
 from cairn_map.errors import BadInputError
 from cairn_map.evidence import Evidence, packed_evidence
 from cairn_map.evidence_map import EvidenceMap
@@ -31,6 +35,15 @@ Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 
+class Method(StrEnum):
+    """How free space is found."""
+
+    CARVE = "carve"
+    """Projectively, where the camera's image fits in a plane; else as `CAST`."""
+    CAST = "cast"
+    """Ray by ray: for lidars, and as the slow twin."""
+
+
 @dataclass(frozen=True, slots=True)
 class Integrator:
     """How scans become evidence; its text goes into every commit."""
@@ -38,6 +51,7 @@ class Integrator:
     min_range_m: float = 0.1
     max_range_m: float = 10.0
     """Beyond it a time-of-flight camera wraps round; a return there is ignored, not taken for free space."""
+    method: Method = Method.CARVE
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_range_m < self.max_range_m < float("inf"):
@@ -46,43 +60,156 @@ class Integrator:
             )
 
     def __str__(self) -> str:
-        return f"cairn-cast 1 min_range_m={self.min_range_m:g} max_range_m={self.max_range_m:g}"
+        return f"cairn-{self.method} 2 min_range_m={self.min_range_m:g} max_range_m={self.max_range_m:g}"
+
+
+class Integration:
+    """Scans being integrated, one after the other; not thread-safe. Memory: see `tally`."""
+
+    def __init__(self, rig: Rig, geometry: Geometry, integrator: Integrator, *, around_m: Floats | None = None) -> None:
+        """Args: around_m: (3,) where the first tally is to be centred; None: where the first scan was taken."""
+        self._rig = rig
+        self._geometry = geometry
+        self._integrator = integrator
+        self._around_m = around_m
+        self._sum = EvidenceMap(geometry)
+        self._tally: Tally | None = None
+
+    def add(self, scan: Scan) -> None:
+        """Add a scan.
+
+        Raises:
+            BadInputError: an image does not fit its camera, the scan names a channel that the map lacks, or reaches
+                beyond the numbered space; nothing was added.
+        """
+        limits, rig = self._integrator, self._rig
+        returns = returns_of(scan, rig, min_range_m=limits.min_range_m, max_range_m=limits.max_range_m)
+        scalars = _scalar_evidence(scan, self._geometry)
+        window = window_of(rig[scan.range_camera].camera) if limits.method is Method.CARVE else None
+        if window is None:
+            self._sum.merge(_cast(scan, rig, self._geometry, returns))
+        elif len(returns.pixels):
+            self._carve(scan, returns, window)
+        self._sum.merge(scalars)
+
+    def add_points(self, points: npt.NDArray[np.floating], T_map_sensor: Transform) -> None:
+        """Add a sweep of a sensor whose points have no order, ray by ray.
+
+        Args:
+            points: (N, 3) metres, sensor frame, all seen from its origin; NaN where nothing came back.
+            T_map_sensor: where it was.
+
+        Raises:
+            BadInputError: not (N, 3), or it reaches beyond the numbered space; nothing was added.
+        """
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise BadInputError("bad_points", f"points must be (N, 3), got {points.shape}")
+        T = checked_transform(T_map_sensor, name="T_map_sensor")
+        own = points.astype(np.float64)
+        range_m = np.linalg.norm(own, axis=1)
+        kept = own[(range_m >= self._integrator.min_range_m) & (range_m <= self._integrator.max_range_m)]
+        points_map = transform_points(T, kept)
+        ends, first, _ = _unique_voxels(voxels_of_points(points_map, self._geometry))
+        seen = seen_voxels(T[:3, 3], points_map[first], ends, self._geometry)
+        samples = np.zeros((len(ends), self._geometry.plane_count), np.int64)
+        self._sum.merge(_packed_by_cell(seen, ends, samples, self._geometry))
+
+    def diff(self) -> dict[CellKey, Evidence]:
+        """The evidence of all scans, by cell."""
+        if self._tally is not None and not len(self._sum):
+            # Most measurements end here: all scans in one tally, nothing to add up.
+            return self._tally.packed()
+        self._close_tally()
+        return self._sum.packed()
+
+    def absorb(self, other: "Integration") -> None:
+        """Add all that another integration of the same rig, geometry and integrator holds; leaves the other empty."""
+        if self._tally is not None and other._tally is not None and same_box(self._tally, other._tally):
+            self._tally.absorb(other._tally)
+            other._tally = None
+        self._sum.merge(other.diff())
+
+    def _carve(self, scan: Scan, returns: Returns, window: Window) -> None:
+        """Hits where beams ended, misses where the image looks through."""
+        edge_m = self._geometry.voxel_edge_m
+        tally = self._tally_around(returns)
+        try:
+            voxel_of, count = tally.number_hits(returns.points_map)
+            tally.add_hits(sample_sums(scan, self._rig, self._geometry, returns, voxel_of, count))
+            tally.add_misses(
+                carving_of(
+                    window.clear_ranges(returns.range_m, MARGIN_VOXELS * edge_m),
+                    window,
+                    returns.T_map_tof,
+                    corner=tally.corner,
+                    dims=tally.dims,
+                    voxel_edge_m=edge_m,
+                    min_range_m=self._integrator.min_range_m,
+                )
+            )
+        finally:
+            tally.end_scan()
+
+    def _tally_around(self, returns: Returns) -> Tally:
+        origin_m = returns.T_map_tof[:3, 3]
+        farthest_m = float(np.nanmax(returns.range_m))
+        if self._tally is None or not self._tally.holds(origin_m, farthest_m):
+            self._close_tally()
+            limit_m = self._integrator.max_range_m
+            if self._around_m is not None:
+                self._tally = tally_around(self._around_m, farthest_m, self._geometry, max_range_m=limit_m)
+                self._around_m = None
+            if self._tally is None or not self._tally.holds(origin_m, farthest_m):
+                self._tally = tally_around(origin_m, farthest_m, self._geometry, max_range_m=limit_m)
+        return self._tally
+
+    def _close_tally(self) -> None:
+        if self._tally is not None:
+            self._sum.merge(self._tally.packed())
+            self._tally = None
 
 
 def integrate_scan(scan: Scan, rig: Rig, geometry: Geometry, *, integrator: Integrator) -> dict[CellKey, Evidence]:
-    """The evidence of one scan, by cell.
-
-    Args:
-        scan: images and pose; checked against the rig.
-        rig: the head that took it.
-        geometry: of the map.
-        integrator: range limits.
-
-    Returns:
-        Packed evidence; every voxel has one hit or one miss, or only a scalar sample.
+    """The evidence of one scan, by cell: every voxel has one hit or one miss, or only a scalar sample.
 
     Raises:
-        BadInputError: an image does not fit its camera, or the scan reaches beyond the numbered space.
+        BadInputError: as `Integration.add`.
     """
-    check_scan(scan, rig)
-    range_m = np.where(
-        (scan.range_m >= integrator.min_range_m) & (scan.range_m <= integrator.max_range_m), scan.range_m, np.nan
-    )
-    image_points = points_from_range(range_m, rig[scan.range_camera].camera)
-    returned = np.nonzero(np.isfinite(image_points[..., 2]).ravel())[0]
-    points_tof = image_points.reshape(-1, 3)[returned]
-    steps_m = depth_steps(image_points).ravel()[returned]
-    T_map_tof = scan.T_map_rig @ rig[scan.range_camera].transform
-    points = transform_points(T_map_tof, points_tof)
-    ends, first, voxel_of = _unique_voxels(voxels_of_points(points, geometry))
-    samples = np.zeros((len(ends), geometry.plane_count), np.int64)
-    for channel, values, at in _samples(scan, rig, geometry, points_tof, steps_m, returned):
-        _add_mean_samples(samples[:, geometry.planes_of(channel.name)], channel, values, voxel_of[at])
-    seen = seen_voxels(T_map_tof[:3, 3], points[first], ends, geometry)
-    local = EvidenceMap(geometry)
-    local.merge(_packed_by_cell(seen, ends, samples, geometry))
-    local.merge(_scalar_evidence(scan, geometry))
-    return local.packed()
+    one = Integration(rig, geometry, integrator)
+    one.add(scan)
+    return one.diff()
+
+
+def integrate_scans(
+    scans: Sequence[Scan], rig: Rig, geometry: Geometry, *, integrator: Integrator, threads: int | None = None
+) -> dict[CellKey, Evidence]:
+    """The evidence of many scans, by cell; the same bits on any number of threads, because all of it is integers.
+
+    Raises:
+        BadInputError: as `Integration.add`.
+    """
+    count = max(1, min(threads or os.cpu_count() or 1, len(scans)))
+    # Around one place, so that their sums lie in the same box and add up brick by brick.
+    around_m = scans[0].T_map_rig[:3, 3] if scans else None
+    parts = [Integration(rig, geometry, integrator, around_m=around_m) for _ in range(count)]
+
+    def work(n: int) -> None:
+        for scan in scans[n::count]:
+            parts[n].add(scan)
+
+    with ThreadPoolExecutor(count) as pool:
+        list(pool.map(work, range(count)))
+    for part in parts[1:]:
+        parts[0].absorb(part)
+    return parts[0].diff()
+
+
+def _cast(scan: Scan, rig: Rig, geometry: Geometry, returns: Returns) -> dict[CellKey, Evidence]:
+    """The evidence of one scan but for its scalars, ray by ray."""
+    ends, first, voxel_of = _unique_voxels(voxels_of_points(returns.points_map, geometry))
+    samples = sample_sums(scan, rig, geometry, returns, voxel_of, len(ends))
+    seen = seen_voxels(returns.T_map_tof[:3, 3], returns.points_map[first], ends, geometry)
+    return _packed_by_cell(seen, ends, samples, geometry)
 
 
 def _unique_voxels(voxels: Ints) -> tuple[Ints, Ints, Ints]:
@@ -95,45 +222,6 @@ def _unique_voxels(voxels: Ints) -> tuple[Ints, Ints, Ints]:
     flat = (shifted[:, 2] * span[1] + shifted[:, 1]) * span[0] + shifted[:, 0]
     _, first, voxel_of = np.unique(flat, return_index=True, return_inverse=True)
     return voxels[first], first, voxel_of
-
-
-def _samples(
-    scan: Scan, rig: Rig, geometry: Geometry, points_tof: Floats, steps_m: Floats, returned: Ints
-) -> Iterator[tuple[Channel, Floats, Ints]]:
-    """For each channel of the map: values (M, C) and the points (M,) that they belong to."""
-    for channel in geometry.channels:
-        if channel.kind is ChannelKind.COLOUR:
-            images: dict[str, npt.NDArray[np.generic]] = dict(scan.colour)
-        elif channel.kind is ChannelKind.TEMPERATURE:
-            images = dict(scan.thermal)
-        elif channel.kind is ChannelKind.INTENSITY and scan.amplitude is not None:
-            yield channel, scan.amplitude.reshape(-1, 1)[returned].astype(np.float64), np.arange(len(returned))
-            continue
-        else:
-            continue
-        waiting = np.arange(len(points_tof))
-        # The first camera speaks for what it sees; the next ones only fill what was hidden from those before.
-        for name, image in images.items():
-            transfer = transfer_points(
-                points_tof[waiting], rig, src=scan.range_camera, dst=name, steps_m=steps_m[waiting]
-            )
-            values = transfer.sample(image).astype(np.float64).reshape(-1, channel.value_count)
-            valid = np.isfinite(values).all(axis=1)
-            found = waiting[transfer.ok][valid]
-            yield channel, values[valid], found
-            waiting = np.setdiff1d(waiting, found, assume_unique=True)
-
-
-def _add_mean_samples(sums: Ints, channel: Channel, values: Floats, voxel_of: Ints) -> None:
-    """Write one sample of weight 1, the mean of its values, to every voxel that has none of this channel yet."""
-    pixels = np.bincount(voxel_of, minlength=len(sums))
-    free = (pixels > 0) & (sums[:, -1] == 0)
-    for c in range(channel.value_count):
-        totals = np.bincount(voxel_of, weights=values[:, c], minlength=len(sums))
-        sums[free, c] = channel.quantise(totals[free] / pixels[free])
-    if channel.kind is ChannelKind.TEMPERATURE:
-        sums[free, 1] = sums[free, 0] ** 2
-    sums[free, -1] = 1
 
 
 def _packed_by_cell(seen: SeenVoxels, ends: Ints, samples: Ints, geometry: Geometry) -> dict[CellKey, Evidence]:

@@ -2,14 +2,16 @@
 
 from dataclasses import dataclass, field
 
-from cairn_calib.poses import quaternion_from_transform
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.poses import Transform, quaternion_from_transform
 from cairn_calib.rig import Rig
-from cairn_fusion.integrate import Integrator, integrate_scan
+from cairn_fusion.integrate import Integration, Integrator
 from cairn_fusion.scan import Scan
 from cairn_map.commit import ScanPose
 from cairn_map.errors import BadInputError
 from cairn_map.evidence import Evidence
-from cairn_map.evidence_map import EvidenceMap
 from cairn_map.grid import CellKey, Geometry
 
 SCANS_MAX = 4096
@@ -24,32 +26,48 @@ class Measurement:
     geometry: Geometry
     integrator: Integrator = field(default_factory=Integrator)
     poses: list[ScanPose] = field(default_factory=list)
-    _sum: EvidenceMap = field(init=False)
+    _integration: Integration = field(init=False)
 
     def __post_init__(self) -> None:
-        self._sum = EvidenceMap(self.geometry)
+        self._integration = Integration(self.rig, self.geometry, self.integrator)
 
     def __len__(self) -> int:
         return len(self.poses)
 
-    def add(self, scan: Scan) -> dict[CellKey, Evidence]:
-        """Add a scan; returns its own evidence.
+    def add(self, scan: Scan) -> None:
+        """Add a scan.
 
         Raises:
             BadInputError: the scan does not fit the rig or the map, or the measurement is full; nothing was added.
         """
+        self._check_room()
+        self._integration.add(scan)
+        self._note_pose(scan.time_s, scan.T_map_rig)
+
+    def add_points(
+        self, points: npt.NDArray[np.floating], T_map_sensor: Transform, *, T_map_rig: Transform, time_s: float
+    ) -> None:
+        """Add a sweep of unordered points as `Integration.add_points`; the commit says where the rig was.
+
+        Raises:
+            BadInputError: the points are none, or the measurement is full; nothing was added.
+        """
+        self._check_room()
+        self._integration.add_points(points, T_map_sensor)
+        self._note_pose(time_s, T_map_rig)
+
+    def _check_room(self) -> None:
         if len(self) == SCANS_MAX:
             raise BadInputError("measurement_full", f"a measurement has at most {SCANS_MAX} scans; commit it first")
-        evidence = integrate_scan(scan, self.rig, self.geometry, integrator=self.integrator)
-        self._sum.merge(evidence)
-        x, y, z = (float(v) for v in scan.T_map_rig[:3, 3])
-        q = [float(v) for v in quaternion_from_transform(scan.T_map_rig)]
-        self.poses.append(ScanPose(time_s=scan.time_s, t_map_rig=(x, y, z), q_map_rig=(q[0], q[1], q[2], q[3])))
-        return evidence
+
+    def _note_pose(self, time_s: float, T_map_rig: Transform) -> None:
+        x, y, z = (float(v) for v in T_map_rig[:3, 3])
+        q = [float(v) for v in quaternion_from_transform(T_map_rig)]
+        self.poses.append(ScanPose(time_s=time_s, t_map_rig=(x, y, z), q_map_rig=(q[0], q[1], q[2], q[3])))
 
     def diff(self) -> dict[CellKey, Evidence]:
         """The evidence of all scans, by cell."""
-        return self._sum.packed()
+        return self._integration.diff()
 
     @property
     def captured_s(self) -> tuple[float, float] | None:

@@ -4,7 +4,7 @@ import numpy as np
 
 from cairn_calib.camera import camera_from_field_of_view
 from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_fusion.integrate import Integrator, integrate_scan
+from cairn_fusion.integrate import Integrator, Method, integrate_scan, integrate_scans
 from cairn_fusion.scan import Scan
 from cairn_map.grid import Geometry
 
@@ -15,4 +15,5 @@ def warm_up() -> None:
     rig = Rig(name="warm-up", cameras={"tof": mounted(Spectrum.RANGE, camera, np.eye(4))})
     range_m = np.ones((2, 2), np.float32)
     scan = Scan(time_s=0.0, T_map_rig=np.eye(4), range_camera="tof", range_m=range_m)
-    integrate_scan(scan, rig, Geometry(), integrator=Integrator())
+    integrate_scans([scan, scan], rig, Geometry(), integrator=Integrator(), threads=2)
+    integrate_scan(scan, rig, Geometry(), integrator=Integrator(method=Method.CAST))

@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from tests.bench.integration import integration_rows
 from tests.bench.simulation import simulation_rows
 
 from cairn_client.api import MapApi
@@ -50,6 +51,7 @@ def main() -> None:
     smoke = parser.parse_args().smoke
     scans = _room_scans(stop_count=2 if smoke else 8, yaws=4 if smoke else 12)
     rows = [*_kernel_rows(scans, repeats=3 if smoke else 15), *_server_rows(scans, pushes=20 if smoke else 300)]
+    rows += integration_rows(smoke)
     rows += simulation_rows(smoke)
     rows += _recording_rows(smoke)
     rows += _size_rows()

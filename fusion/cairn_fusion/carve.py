@@ -1,0 +1,171 @@
+"""Free space from a range image, projectively: a pinhole window on the camera, and the bricks that it looks through.
+
+Whatever the camera's lens, its image is first looked up through a pinhole window of the same fineness (`window_of`), so
+that a voxel's centre finds its pixel by one division. Hits are not decided here: they lie where the beams ended.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.lidar import AnyCamera
+from cairn_calib.poses import Transform
+from cairn_fusion.carve_kernels import BRICK_RADIUS, clear_ranges, cull_bricks_into, pyramid
+
+Floats = npt.NDArray[np.float64]
+Singles = npt.NDArray[np.float32]
+Ints = npt.NDArray[np.int64]
+Index = npt.NDArray[np.int32]
+
+DEPTH_SHARE_MIN = 0.2
+"""Least cosine of a ray to the optical axis, 78 degrees, that a pinhole window can hold; wider lenses are cast."""
+MARGIN_VOXELS = 1.0
+"""How far before a surface a voxel's centre must be to be free: a little more than half a voxel's diagonal, 0.87.
+
+In the building at 4 cm, of the surface voxels carved away / of the free ones found: 4.3 / 92.9 % at 0.5, 3.1 / 92.6 %
+at 0.85, 2.2 / 91.8 % at 1.2; casting rays: 30.6 / 95.1 %.
+"""
+BRICK_VOXELS = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """A pinhole image that shows what a camera sees."""
+
+    width: int
+    height: int
+    lens: Floats
+    """(4,) fx, fy, cx, cy of the padded window, with half a pixel added, so that rounding down finds the pixel."""
+    pixel_of: Index
+    """(height width,) number of the camera's pixel that each of the window's shows; one past the last for none."""
+
+    def clear_ranges(self, range_m: Singles, margin_m: float) -> Singles:
+        """(height + 2, width + 2) how far each pixel of the window is certainly clear; 0 where nothing is known."""
+        seen = np.append(np.nan_to_num(range_m.ravel(), nan=0.0), np.float32(0.0)).astype(np.float32)
+        return clear_ranges(seen[self.pixel_of], self.width, self.height, margin_m)
+
+
+@lru_cache(maxsize=32)
+def window_of(camera: AnyCamera) -> Window | None:
+    """The window on a camera; None for one that looks around too far for a plane."""
+    rays = camera.rays()
+    known = np.isfinite(rays[..., 2])
+    if not known.any() or rays[known][:, 2].min() < DEPTH_SHARE_MIN:
+        return None
+    plane = rays[..., :2] / rays[..., 2:]
+    low, high = plane[known].min(axis=0), plane[known].max(axis=0)
+    fx, fy = (float(f) for f in camera.focal_px)
+    width, height = (int(np.ceil(span)) + 1 for span in (high - low) * (fx, fy))
+    x, y = np.meshgrid(np.arange(width) / fx + low[0], np.arange(height) / fy + low[1])
+    pixels = camera.project(np.stack([x, y, np.ones_like(x)], axis=-1))
+    shown = camera.contains(pixels)
+    nearest = np.rint(np.where(shown[..., None], pixels, 0)).astype(np.int64)
+    number = np.where(shown, nearest[..., 1] * camera.width + nearest[..., 0], camera.width * camera.height)
+    lens = np.array([fx, fy, 1.5 - low[0] * fx, 1.5 - low[1] * fy])
+    return Window(width, height, lens, number.ravel().astype(np.int32))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Carving:
+    """What a view looks through: numbers of bricks of a box, whether all of each is free, and what kernels need."""
+
+    bricks: Index
+    kinds: Index
+    squares: Singles
+    """Padded image of how far each pixel is clear, squared."""
+    lens: Singles
+    corners_view: Singles
+    """(3, K) the centre of each brick's first voxel, camera frame, metres."""
+    offsets_view: Singles
+    """(3, 512) from there to each voxel's centre, in Morton order."""
+    min_square: float
+
+
+def carving_of(
+    clear_m: Singles,
+    window: Window,
+    T_map_camera: Transform,
+    *,
+    corner: Ints,
+    dims: Ints,
+    voxel_edge_m: float,
+    min_range_m: float,
+) -> Carving:
+    """The bricks of a box that a view looks through.
+
+    Args:
+        clear_m: of `Window.clear_ranges`.
+        window: on the camera.
+        T_map_camera: where it was.
+        corner: (3,) the box's first voxel.
+        dims: (3,) bricks of the box.
+        voxel_edge_m: of the map.
+        min_range_m: nothing nearer is free.
+    """
+    R: Floats = T_map_camera[:3, :3]
+    t: Floats = T_map_camera[:3, 3]
+    brick_m = BRICK_VOXELS * voxel_edge_m
+    corner_view = (corner * voxel_edge_m - t) @ R
+    axes_view = R * brick_m
+    least, largest, shapes = pyramid(clear_m)
+    reach_m = float(largest[shapes[-1, 0]])
+    low, high = _bricks_around(t, reach_m, R, window, np.asarray(corner * voxel_edge_m), dims, brick_m)
+    found = np.empty((4096, 2), np.int32)
+    while True:
+        count = cull_bricks_into(
+            *(found, low, high, dims, corner_view, axes_view, window.lens, BRICK_RADIUS * voxel_edge_m, min_range_m),
+            *(least, largest, shapes),
+        )
+        if count <= len(found):
+            break
+        found = np.empty((count + count // 4, 2), np.int32)
+    found = found[:count]
+    xyz = np.stack(
+        [found[:, 0] % dims[0], found[:, 0] // dims[0] % dims[1], found[:, 0] // (dims[0] * dims[1])], axis=1
+    )
+    return Carving(
+        bricks=found[:, 0].copy(),
+        kinds=found[:, 1].copy(),
+        squares=np.square(clear_m),
+        lens=window.lens.astype(np.float32),
+        corners_view=_in_view((corner + BRICK_VOXELS * xyz + 0.5) * voxel_edge_m, R, t),
+        offsets_view=_in_view(MORTON_XYZ * voxel_edge_m, R, np.zeros(3)),
+        min_square=min_range_m**2,
+    )
+
+
+def _in_view(points_m: Floats, R: Floats, t: Floats) -> Singles:
+    """(3, N) points of the map in the camera's frame.
+
+    From whole voxel numbers, and number by number: which box a brick is found in, and with how many others, must not
+    change a bit of where it lies, or the evidence would not depend on the scan alone.
+    """
+    x, y, z = (points_m - t).T
+    return np.stack([x * R[0, a] + y * R[1, a] + z * R[2, a] for a in range(3)]).astype(np.float32)
+
+
+def _bricks_around(
+    t: Floats, reach_m: float, R: Floats, window: Window, corner_m: Floats, dims: Ints, brick_m: float
+) -> tuple[Ints, Ints]:
+    """First and last brick of the box along each axis that a view can reach: around its eye and its image's corners."""
+    fx, fy, cx, cy = window.lens
+    x = (np.array([0, window.width + 2]) - cx) / fx
+    y = (np.array([0, window.height + 2]) - cy) / fy
+    # Of all rays of the window none goes farther along an axis than its corners' rays do at full depth.
+    ends = np.array([(a, b, 1.0) for a in x for b in y]) * reach_m @ R.T
+    low, high = np.minimum(ends.min(axis=0), 0), np.maximum(ends.max(axis=0), 0)
+    low, high = np.maximum(low, -reach_m), np.minimum(high, reach_m)
+    first = np.floor((t + low - corner_m) / brick_m - 0.1).astype(np.int64)
+    last = np.floor((t + high - corner_m) / brick_m + 0.1).astype(np.int64)
+    return np.clip(first, 0, dims - 1), np.clip(last, -1, dims - 1)
+
+
+def _morton_xyz() -> Floats:
+    """(512, 3) x, y, z of a brick's voxels in Morton order."""
+    places = np.arange(512)
+    return np.stack([sum((places >> (3 * b + a) & 1) << b for b in range(3)) for a in range(3)], axis=1).astype(float)
+
+
+MORTON_XYZ = _morton_xyz()

@@ -1,0 +1,89 @@
+"""How fast a ToF measurement of the building becomes evidence, and how true the evidence is."""
+
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+from cairn_fusion.integrate import Integrator, Method, integrate_scans
+from cairn_fusion.scan import Scan
+from cairn_map.evidence import Evidence
+from cairn_map.grid import CellKey, Geometry, geometry_for
+from cairn_sim.heads import RANGE_CAMERA
+from cairn_sim.record import Plan, scans_of, shots_of
+from cairn_sim.robots import ROBOTS
+from cairn_sim.scene_file import load_scene
+from cairn_sim.scores import Scores, scores_of
+from cairn_sim.sensors import RangeSensor
+from cairn_sim.truth_grid import box_of_cell, truths_of
+
+Row = tuple[str, str, str]
+Diff = dict[CellKey, Evidence]
+FIVE_MM = RangeSensor(
+    sigma_min_m=0.005, sigma_m=0.0050001, sigma_max_m=0.005001, amplitude_min=0.0, amplitude_sigma=0.0
+)
+"""5 mm at every range, and no return too weak: the noise of the prototype that the figures compare with."""
+
+
+def integration_rows(smoke: bool) -> Iterator[Row]:
+    """One line each."""
+    robot, scene = ROBOTS["tof"], load_scene("building")
+    plan = Plan(scene=scene, robot=robot, path="labs", truth="none", first_stop=8, last_stop=9)
+    scans = [scan for _, scan, _ in scans_of(plan, shots_of(plan), robot.rig_of(1.0))]
+    rays = sum(int((scan.range_m > 0).sum()) for scan in scans)
+    rig = robot.rig_of(1.0)
+
+    def work(geometry: Geometry, method: Method, threads: int) -> Callable[[], Diff]:
+        limits = Integrator(method=method)
+        return lambda: integrate_scans(scans, rig, geometry, integrator=limits, threads=threads)
+
+    for edge_m in (0.08, 0.04) if smoke else (0.08, 0.04, 0.02):
+        geometry = geometry_for(voxel_edge_m=edge_m)
+        carve_s = _cpu_s(work(geometry, Method.CARVE, 1), 2 if smoke else 7)
+        name = f"integrate {len(scans)} ToF images, {edge_m * 100:g} cm, 1 thread"
+        yield name, f"{1e3 * carve_s:.0f}", f"ms CPU = {rays / carve_s / 1e6:.1f} M rays/s"
+        if not smoke:
+            cast_s = _cpu_s(work(geometry, Method.CAST, 1), 1 if edge_m < 0.04 else 3)
+            yield "  ray by ray", f"{1e3 * cast_s:.0f}", f"ms CPU, {cast_s / carve_s:.1f} x as long"
+            one_s, two_s = (_wall_s(work(geometry, Method.CARVE, n), 5) for n in (1, 2))
+            yield "  2 threads", f"{1e3 * two_s:.0f}", f"ms wall, {one_s / two_s:.2f} x as fast"
+    if not smoke:
+        yield from _truth_rows(plan, scans)
+
+
+def _truth_rows(plan: Plan, standard: list[Scan]) -> Iterator[Row]:
+    geometry, rig = geometry_for(voxel_edge_m=0.04), plan.robot.rig_of(1.0)
+    quiet = replace(plan, robot=replace(plan.robot, sensors={RANGE_CAMERA: FIVE_MM}))
+    five_mm = [scan for _, scan, _ in scans_of(quiet, shots_of(quiet), rig)]
+    diffs = {
+        f"  {noise}, {method}": integrate_scans(scans, rig, geometry, integrator=Integrator(method=method))
+        for noise, scans in (("sigma 5 mm", five_mm), ("standard noise", standard))
+        for method in (Method.CARVE, Method.CAST)
+    }
+    keys = sorted(set().union(*diffs.values()))
+    boxes = [box_of_cell(key, geometry) for key in keys]
+    poses = [scan.T_map_rig @ rig[RANGE_CAMERA].transform for scan in standard]
+    truths = truths_of(plan.scene, boxes, camera=rig[RANGE_CAMERA].camera, T_map_cameras=poses, fineness=3)
+    yield "evidence of that measurement against the truth, 4 cm", f"{len(keys)}", "cells"
+    for name, diff in diffs.items():
+        scores: list[Scores] = [scores_of(truth, diff, geometry) for truth in truths]
+        yield name, "", str(sum(scores[1:], scores[0]))
+
+
+def _cpu_s(work: Callable[[], object], repeats: int) -> float:
+    work()
+    seconds = []
+    for _ in range(repeats):
+        start = time.process_time()
+        work()
+        seconds.append(time.process_time() - start)
+    return statistics.median(seconds)
+
+
+def _wall_s(work: Callable[[], object], repeats: int) -> float:
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds)
