@@ -107,11 +107,12 @@ def carving_of(
     R: Floats = T_map_camera[:3, :3]
     t: Floats = T_map_camera[:3, 3]
     brick_m = BRICK_VOXELS * voxel_edge_m
-    corner_view = (corner * voxel_edge_m - t) @ R
+    corner_m: Floats = corner.astype(np.float64) * voxel_edge_m
+    corner_view = (corner_m - t) @ R
     axes_view = R * brick_m
     least, largest, shapes = pyramid(clear_m)
     reach_m = float(largest[shapes[-1, 0]])
-    low, high = _bricks_around(t, reach_m, R, window, np.asarray(corner * voxel_edge_m), dims, brick_m)
+    low, high = _bricks_around(t, reach_m, R, window, corner_m, dims, brick_m)
     found = np.empty((4096, 2), np.int32)
     while True:
         count = cull_bricks_into(
@@ -125,12 +126,13 @@ def carving_of(
     xyz = np.stack(
         [found[:, 0] % dims[0], found[:, 0] // dims[0] % dims[1], found[:, 0] // (dims[0] * dims[1])], axis=1
     )
+    first_m: Floats = ((corner + BRICK_VOXELS * xyz).astype(np.float64) + 0.5) * voxel_edge_m
     return Carving(
         bricks=found[:, 0].copy(),
         kinds=found[:, 1].copy(),
         squares=np.square(clear_m),
         lens=window.lens.astype(np.float32),
-        corners_view=_in_view((corner + BRICK_VOXELS * xyz + 0.5) * voxel_edge_m, R, t),
+        corners_view=_in_view(first_m, R, t),
         offsets_view=_in_view(MORTON_XYZ * voxel_edge_m, R, np.zeros(3)),
         min_square=min_range_m**2,
     )

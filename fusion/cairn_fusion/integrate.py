@@ -85,7 +85,8 @@ class Integration:
         limits, rig = self._integrator, self._rig
         returns = returns_of(scan, rig, min_range_m=limits.min_range_m, max_range_m=limits.max_range_m)
         scalars = _scalar_evidence(scan, self._geometry)
-        window = window_of(rig[scan.range_camera].camera) if limits.method is Method.CARVE else None
+        camera = rig[scan.range_camera].camera
+        window = window_of(camera) if limits.method is Method.CARVE else None  # pyright: ignore[reportArgumentType]
         if window is None:
             self._sum.merge(_cast(scan, rig, self._geometry, returns))
         elif len(returns.pixels):

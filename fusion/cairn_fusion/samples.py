@@ -65,7 +65,9 @@ def sample_sums(scan: Scan, rig: Rig, geometry: Geometry, returns: Returns, voxe
 def _samples(scan: Scan, rig: Rig, geometry: Geometry, returns: Returns) -> Iterator[tuple[Channel, Floats, Ints]]:
     """For each channel of the map: values (M, C) and the points (M,) that they belong to."""
     returned = returns.pixels
+    # Needed by images alone: found when the first one comes.
     image_points: Floats | None = None
+    points_tof, steps_m = np.empty((0, 3)), np.empty(0)
     for channel in geometry.channels:
         if channel.kind is ChannelKind.COLOUR:
             images: dict[str, npt.NDArray[np.generic]] = dict(scan.colour)

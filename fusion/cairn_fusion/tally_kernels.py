@@ -169,8 +169,8 @@ def count_known(slots: Index, misses: Counts, table_of: Index, hits: Counts) -> 
         table = table_of[slot]
         for i in range(512):
             struck = table >= 0 and hits[table, i] > 0
-            hit += struck
-            known += struck or misses[slot, i] > 0
+            hit += 1 if struck else 0
+            known += 1 if struck or misses[slot, i] > 0 else 0
     return known, hit
 
 
