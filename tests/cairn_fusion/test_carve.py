@@ -218,4 +218,4 @@ def test_carving_keeps_the_surfaces_that_rays_erase() -> None:
     assert kept.carved < 0.03 < erased.carved
     assert kept.recall >= erased.recall
     assert kept.false_free < 0.004 and kept.false_free < erased.false_free
-    assert kept.recall_free > erased.recall_free - 0.06
+    assert kept.recall_free > erased.recall_free - 0.1
