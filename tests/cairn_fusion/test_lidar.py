@@ -10,10 +10,18 @@ from cairn_calib.poses import look_at
 from cairn_calib.rig import Rig, Spectrum, mounted
 from cairn_fusion.integrate import Integrator
 from cairn_fusion.measurement import Measurement
-from cairn_fusion.recording_format import RangeEncoding, decode_range, encode_range
+from cairn_fusion.recording_format import (
+    Convention,
+    RangeEncoding,
+    RecordingHeader,
+    check_cameras,
+    decode_range,
+    encode_range,
+)
 from cairn_fusion.scan import Scan
 from cairn_fusion.transfer import points_from_range
 from cairn_map.channels import COLOUR
+from cairn_map.errors import BadInputError
 from cairn_map.grid import Geometry, centres_of_voxels, voxels_in_cell
 
 RADIUS_M = 2.0
@@ -89,3 +97,10 @@ def test_a_sweep_is_recorded_as_other_range_images_are() -> None:
     encoding = RangeEncoding()
     again = decode_range(encode_range(tower(), LIDAR, encoding), LIDAR, encoding)
     np.testing.assert_allclose(again, tower(), atol=0.00051)
+
+
+def test_depth_along_an_axis_that_a_lidar_does_not_have_is_refused() -> None:
+    header = RecordingHeader(name="sweep", range={"lidar": RangeEncoding(convention=Convention.Z)})
+    with pytest.raises(BadInputError, match="must be along the beam"):
+        check_cameras(header, RIG)
+    check_cameras(RecordingHeader(name="sweep", range={"lidar": RangeEncoding()}), RIG)
