@@ -9,6 +9,7 @@ Inverse sensor model: one count per voxel and scan, and a hit wins over a miss. 
 never on the map, nor on how many scans are added in what order on how many threads.
 """
 
+import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -52,15 +53,21 @@ class Integrator:
     max_range_m: float = 10.0
     """Beyond it a time-of-flight camera wraps round; a return there is ignored, not taken for free space."""
     method: Method = Method.CARVE
+    flying_step_m: float = 0.05
+    """What a pixel must differ from both its neighbours by to be taken for a mixture of them (`flying_kernels`), and
+    so for no return; of images that are carved. Infinite: none is."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_range_m < self.max_range_m < float("inf"):
             raise BadInputError(
                 "bad_range", f"0 <= min_range_m < max_range_m must hold, got {self.min_range_m}, {self.max_range_m}"
             )
+        if not self.flying_step_m > 0:
+            raise BadInputError("bad_range", f"flying_step_m must be above 0, got {self.flying_step_m}")
 
     def __str__(self) -> str:
-        return f"cairn-{self.method} 2 min_range_m={self.min_range_m:g} max_range_m={self.max_range_m:g}"
+        limits = f"min_range_m={self.min_range_m:g} max_range_m={self.max_range_m:g}"
+        return f"cairn-{self.method} 2 {limits} flying_step_m={self.flying_step_m:g}"
 
 
 class Integration:
@@ -82,11 +89,16 @@ class Integration:
             BadInputError: an image does not fit its camera, the scan names a channel that the map lacks, or reaches
                 beyond the numbered space; nothing was added.
         """
-        limits, rig = self._integrator, self._rig
-        returns = returns_of(scan, rig, min_range_m=limits.min_range_m, max_range_m=limits.max_range_m)
-        scalars = _scalar_evidence(scan, self._geometry)
-        camera = rig[scan.range_camera].camera
+        limits, rig, camera = self._integrator, self._rig, self._rig[scan.range_camera].camera
         window = window_of(camera) if limits.method is Method.CARVE else None  # pyright: ignore[reportArgumentType]
+        returns = returns_of(
+            scan,
+            rig,
+            min_range_m=limits.min_range_m,
+            max_range_m=limits.max_range_m,
+            flying_step_m=limits.flying_step_m if window is not None else math.inf,
+        )
+        scalars = _scalar_evidence(scan, self._geometry)
         if window is None:
             self._sum.merge(_cast(scan, rig, self._geometry, returns))
         elif len(returns.pixels):

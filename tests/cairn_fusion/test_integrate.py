@@ -1,5 +1,6 @@
 """What a scan says about voxels: the laws of evidence, samples, and real recordings."""
 
+import math
 from pathlib import Path
 
 import cv2
@@ -33,7 +34,8 @@ from cairn_map.grid import (
 law = settings(max_examples=25, deadline=None, database=None)
 DOSE = Channel(kind=ChannelKind.SCALAR, name="dose", unit="uSv/h", step=0.01)
 GEOMETRY = Geometry(voxel_edge_um=50_000, depth=4, channels=(COLOUR, INTENSITY, TEMPERATURE, DOSE))
-INTEGRATOR = Integrator(min_range_m=0.1, max_range_m=2.5)
+INTEGRATOR = Integrator(min_range_m=0.1, max_range_m=2.5, flying_step_m=math.inf)
+"""Random images are all steps: nothing in them flies."""
 TOF = Camera(width=12, height=9, focal_px=(9.0, 9.0), centre_px=(5.5, 4.0))
 THERMAL = Camera(width=48, height=36, focal_px=(36.0, 36.0), centre_px=(23.5, 17.5))
 KELVIN = 300.0
