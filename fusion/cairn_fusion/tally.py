@@ -153,12 +153,6 @@ class Tally:
         }
         return {key: evidence for key, evidence in packed.items() if len(evidence)}
 
-    @property
-    def size_bytes(self) -> int:
-        """Memory held by the arrays."""
-        arrays = (self._brick_of, self._misses, self._hits, self._row_of, self._local_of, self._samples)
-        return sum(array.nbytes for array in arrays)
-
     def _evidence(self, slots: Index, numbers: Index) -> Evidence:
         V, S = kernels.count_known(slots, self._misses, self._table_of, self._hits)
         voxels, counts = np.empty(V, np.uint32), np.empty((V, 2), np.int32)
