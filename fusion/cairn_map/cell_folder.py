@@ -13,7 +13,8 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from cairn_map.cell_code import CELL_BYTES_MAX, DecodedCell, decode_canonical_cell
+from cairn_map.cell_code import DecodedCell, decode_canonical_cell
+from cairn_map.cell_reading import CELL_BYTES_MAX
 from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.grid import Cell, Geometry, cell_key
 from cairn_map.sensor_model import SensorModel

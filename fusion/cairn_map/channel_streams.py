@@ -7,14 +7,17 @@
 Streams of channel c start at number 16 + 8 c: presence, weight, then the value planes in order.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.channels import Channel
 from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence import SUM_MAX
 from cairn_map.grid import Geometry
-from cairn_map.octree_kernels import predict_sums, restore_sums, square_guesses
-from cairn_map.streams import decode_column, encode_column
+from cairn_map.streams import decode_column, encode_column, required
+from cairn_map.sum_kernels import predict_sums, restore_sums, square_guesses
 
 Ints = npt.NDArray[np.int64]
 Words = npt.NDArray[np.uint64]
@@ -23,65 +26,91 @@ FIRST_STREAM = 16
 STREAMS_PER_CHANNEL = 8
 
 
-def encode_channels(
-    leaf_rows: Ints, samples: Ints, geometry: Geometry, *, leaves: int, signed: bool
-) -> dict[int, bytes]:
-    """Streams of all channels; `leaf_rows` (S,) names the leaf of each row of `samples`."""
-    streams: dict[int, bytes] = {}
-    for c, channel in enumerate(geometry.channels):
+@dataclass(frozen=True, slots=True, eq=False)
+class ChannelRows:
+    """The samples of one channel: (S,) leaves that have some, rising, and their (S, planes) sums."""
+
+    leaves: Ints
+    sums: Ints
+
+
+def stream_of_channel(c: int) -> int:
+    """Number of the first stream of the channel number c."""
+    return FIRST_STREAM + STREAMS_PER_CHANNEL * c
+
+
+def split_samples(sampled: Ints, samples: Ints, geometry: Geometry) -> list[ChannelRows]:
+    """By channel: the (S, P) samples of the (S,) leaves."""
+    found: list[ChannelRows] = []
+    for channel in geometry.channels:
         sums = samples[:, geometry.planes_of(channel.name)]
-        present = (sums != 0).any(axis=1)
-        sums = sums[present]
-        bits = np.zeros(leaves, np.uint8)
-        bits[leaf_rows[present]] = 1
-        number = FIRST_STREAM + STREAMS_PER_CHANNEL * c
-        weights = np.ascontiguousarray(sums[:, -1])
-        streams[number] = np.packbits(bits, bitorder="little").tobytes()
-        streams[number + 1] = encode_column(words(weights, signed))
-        for p in range(channel.value_count):
-            plane = np.ascontiguousarray(sums[:, p])
-            streams[number + 2 + p] = encode_column(predict_sums(plane, weights))
-        if "square_sum" in channel.planes:
-            guesses = square_guesses(np.ascontiguousarray(sums[:, 0]), weights)
-            streams[number + 3] = encode_column(_zigzag(sums[:, 1].astype(np.uint64) - guesses))
+        present = np.nonzero(sums.any(axis=1))[0]
+        found.append(ChannelRows(sampled[present], sums[present]))
+    return found
+
+
+def join_samples(
+    channels: list[ChannelRows], geometry: Geometry, *, leaves: int, signed: bool, sampled_max: int
+) -> tuple[Ints, Ints]:
+    """(S,) leaves that have samples, rising, and (S, P) samples; the mirror of `split_samples`.
+
+    Raises:
+        DamagedDataError: a row of zeros, or a sum out of range.
+        BadInputError: kind `too_large`: more than `sampled_max` leaves have samples.
+    """
+    has_samples = np.zeros(leaves, np.bool_)
+    for rows in channels:
+        has_samples[rows.leaves] = True
+    sampled = np.nonzero(has_samples)[0]
+    check_count(len(sampled), sampled_max)
+    samples = np.zeros((len(sampled), geometry.plane_count), np.int64)
+    low = -SUM_MAX if signed else 0
+    for channel, rows in zip(geometry.channels, channels, strict=True):
+        sums = rows.sums
+        if sums.size and (sums.min() < low or sums.max() > SUM_MAX or not sums.any(axis=1).all()):
+            raise DamagedDataError("bad_stream", f"channel {channel.name} holds a sum that is zero or out of range")
+        at = slice(None) if len(rows.leaves) == len(sampled) else np.searchsorted(sampled, rows.leaves)
+        samples[at, geometry.planes_of(channel.name)] = sums
+    return sampled, samples
+
+
+def encode_channel(number: int, channel: Channel, rows: ChannelRows, *, leaves: int, signed: bool) -> dict[int, bytes]:
+    """Streams of one channel, raw; the first has this number."""
+    bits = np.zeros(leaves, np.uint8)
+    bits[rows.leaves] = 1
+    planes = np.ascontiguousarray(rows.sums.T)
+    weights = planes[-1]
+    streams = {number: np.packbits(bits, bitorder="little").tobytes()}
+    streams[number + 1] = encode_column(words(weights, signed))
+    for p in range(channel.value_count):
+        streams[number + 2 + p] = encode_column(predict_sums(planes[p], weights))
+    if "square_sum" in channel.planes:
+        guesses = square_guesses(planes[0], weights)
+        streams[number + 3] = encode_column(_zigzag(planes[1].astype(np.uint64) - guesses))
     return streams
 
 
-def decode_channels(
-    streams: dict[int, bytes], geometry: Geometry, *, leaves: int, signed: bool, sampled_max: int
-) -> tuple[Ints, Ints]:
-    """(S,) leaves that have samples, rising, and (S, P) samples; the mirror of `encode_channels`.
+def decode_channel(
+    number: int, channel: Channel, streams: dict[int, bytes], *, leaves: int, signed: bool, sampled_max: int
+) -> ChannelRows:
+    """The mirror of `encode_channel`; sums may still be out of range, which `join_samples` looks at.
 
     Raises:
-        DamagedDataError: a stream is missing, of the wrong length, or a sum is out of range.
+        DamagedDataError: a stream is missing or of the wrong length.
         BadInputError: kind `too_large`: more than `sampled_max` leaves have samples.
     """
-    presences = [_presence(streams, c, leaves) for c in range(len(geometry.channels))]
-    any_present = np.zeros(leaves, np.bool_)
-    for present in presences:
-        any_present |= present
-    places = np.nonzero(any_present)[0]
-    if len(places) > sampled_max:
-        raise BadInputError("too_large", f"{len(places)} voxels with samples, at most {sampled_max} are read")
-    samples = np.zeros((len(places), geometry.plane_count), np.int64)
-    for c, channel in enumerate(geometry.channels):
-        rows = np.nonzero(presences[c][places])[0]
-        number = FIRST_STREAM + STREAMS_PER_CHANNEL * c
-        weights = numbers(_column(streams, number + 1, len(rows)), signed, limit=SUM_MAX)
-        planes = [
-            restore_sums(_column(streams, number + 2 + p, len(rows)), weights) for p in range(channel.value_count)
-        ]
-        if "square_sum" in channel.planes:
-            residuals = _unzigzag(_column(streams, number + 3, len(rows)))
-            planes.append((residuals + square_guesses(planes[0], weights)).astype(np.int64))
-        sums = np.stack([*planes, weights], axis=1)
-        low = -SUM_MAX if signed else 0
-        if (sums < low).any() or (sums > SUM_MAX).any() or not (sums != 0).any(axis=1).all():
-            raise DamagedDataError("bad_stream", f"channel {channel.name} holds a sum that is zero or out of range")
-        samples[rows, geometry.planes_of(channel.name)] = sums
-    if len(streams) != 4 + sum(2 + len(channel.planes) - 1 for channel in geometry.channels):
-        raise DamagedDataError("bad_stream", "there are streams that no channel owns")
-    return places, samples
+    present = np.nonzero(_presence(required(streams, number), leaves))[0]
+    count = len(present)
+    check_count(count, sampled_max)
+    weights = numbers(decode_column(required(streams, number + 1), rows=count), signed, limit=SUM_MAX)
+    planes = [
+        restore_sums(decode_column(required(streams, number + 2 + p), rows=count), weights)
+        for p in range(channel.value_count)
+    ]
+    if "square_sum" in channel.planes:
+        residuals = _unzigzag(decode_column(required(streams, number + 3), rows=count))
+        planes.append((residuals + square_guesses(planes[0], weights)).astype(np.int64))
+    return ChannelRows(present, np.stack([*planes, weights], axis=1))
 
 
 def words(values: Ints, signed: bool) -> Words:
@@ -97,35 +126,28 @@ def numbers(raw: Words, signed: bool, *, limit: int) -> Ints:
         DamagedDataError: a magnitude above `limit`.
     """
     values = (_unzigzag(raw) if signed else raw).astype(np.int64)
-    if (values > limit).any() or (values < (-limit if signed else 0)).any():
+    if len(values) and (values.max() > limit or values.min() < (-limit if signed else 0)):
         raise DamagedDataError("bad_stream", f"a count or weight is beyond {limit}")
     return values
 
 
-def required(streams: dict[int, bytes], number: int) -> bytes:
-    """One stream.
+def check_count(count: int, sampled_max: int) -> None:
+    """Refuse more rows than a reader wants.
 
     Raises:
-        DamagedDataError: it is missing.
+        BadInputError: kind `too_large`.
     """
-    try:
-        return streams[number]
-    except KeyError:
-        raise DamagedDataError("bad_stream", f"stream {number} is missing") from None
+    if count > sampled_max:
+        raise BadInputError("too_large", f"{count} voxels with samples, at most {sampled_max} are read")
 
 
-def _column(streams: dict[int, bytes], number: int, rows: int) -> Words:
-    return decode_column(required(streams, number), rows=rows)
-
-
-def _presence(streams: dict[int, bytes], c: int, leaves: int) -> npt.NDArray[np.bool_]:
-    raw = required(streams, FIRST_STREAM + STREAMS_PER_CHANNEL * c)
+def _presence(raw: bytes, leaves: int) -> npt.NDArray[np.bool_]:
     if len(raw) != (leaves + 7) // 8:
         raise DamagedDataError("bad_stream", f"presence of {leaves} leaves needs {(leaves + 7) // 8} bytes")
     bits = np.unpackbits(np.frombuffer(raw, np.uint8), bitorder="little")
     if bits[leaves:].any():
         raise DamagedDataError("bad_stream", "presence bits beyond the last leaf must be 0")
-    return bits[:leaves].astype(np.bool_)
+    return bits[:leaves].view(np.bool_)
 
 
 def _zigzag(raw: Words) -> Words:

@@ -15,8 +15,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from cairn_map.cell_code import VOXEL_BYTES, DecodedCell, decode_canonical_cell, decode_cell, encode_cell
+from cairn_map.cell_code import DecodedCell, decode_canonical_cell, decode_cell, encode_cell
 from cairn_map.cell_head import CellHead, decode_head
+from cairn_map.cell_reading import VOXEL_BYTES
 from cairn_map.errors import BadInputError, DamagedDataError, first_error
 from cairn_map.evidence import Evidence, every_sum_has_weight
 from cairn_map.grid import CellKey, Geometry

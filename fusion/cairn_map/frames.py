@@ -22,7 +22,7 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
-from cairn_map.cell_code import CELL_BYTES_MAX
+from cairn_map.cell_reading import CELL_BYTES_MAX
 from cairn_map.cursor import CHAIN_BYTES, Cursor
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError
 from cairn_map.fingerprint import Fingerprint, fingerprint_from_bytes

@@ -2,6 +2,9 @@
 
 A node's eight children with equal counts and no samples collapse into one leaf, as far up as they can, but never
 the root. So the tree is a function of the evidence alone.
+
+Rows come in Morton order, so nodes of a depth are finished in the order in which their masks are written, and the
+leaves of a node that collapses are the last eight that were found. One pass does it.
 """
 
 import numba as nb
@@ -13,58 +16,168 @@ Words = npt.NDArray[np.uint32]
 Counts = npt.NDArray[np.int32]
 Ints = npt.NDArray[np.int64]
 
-INNER = -1
-FIXED = -2
+NO_ROW = -1
 
 
 @nb.njit(cache=True, nogil=True)
-def collapse_into(
-    keys: Words,
-    states: Ints,
-    counts: Counts,
-    leaf_starts: npt.NDArray[np.bool_],
-    child_masks: Bytes,
-    leaf_masks: Bytes,
-    is_root: bool,
-) -> tuple[int, int]:
-    """One depth up, in place: nodes (keys, states) become their parents; returns (parents, masks written).
+def build_into(
+    voxels: Words, counts: Counts, sampled: Words, child_masks: Bytes, leaf_masks: Bytes, masks: Ints, leaf_rows: Ints
+) -> int:
+    """Masks and leaves of the octree of V rows; returns how many leaves there are.
 
-    A state is INNER, FIXED (a voxel with samples) or the row whose counts the leaf holds. Masks are written for
-    parents that stay inner; rows that a collapse makes superfluous lose their `leaf_starts`.
+    `child_masks` and `leaf_masks` are (depth, room), `masks` (depth,) zeros that take how many each depth has, and
+    `leaf_rows` (V,) takes the row at which each leaf begins.
     """
-    parents = 0
-    masks = 0
+    depth = masks.shape[0]
+    V = voxels.shape[0]
+    children = np.zeros(depth, np.uint8)
+    leaves = np.zeros(depth, np.uint8)
+    # The row that the children of an open node stand for while they are all leaves with equal counts; else NO_ROW.
+    alike = np.full(depth, NO_ROW, np.int64)
+    count = 0
+    s = 0
     n = 0
-    while n < keys.shape[0]:
-        parent = keys[n] >> np.uint32(3)
-        child_mask = np.uint8(0)
-        leaf_mask = np.uint8(0)
-        first = n
-        equal = True
-        while n < keys.shape[0] and keys[n] >> np.uint32(3) == parent:
-            bit = np.uint8(1) << np.uint8(keys[n] & np.uint32(7))
-            child_mask |= bit
-            if states[n] != INNER:
-                leaf_mask |= bit
-            alike = states[n] >= 0 and states[first] >= 0
-            if alike:
-                for c in range(2):
-                    alike = alike and counts[states[n], c] == counts[states[first], c]
-            equal = equal and alike
-            n += 1
-        if equal and child_mask == 255 and not is_root:
-            for m in range(first + 1, n):
-                leaf_starts[states[m]] = False
-            state = states[first]
+    while n < V:
+        parent = voxels[n] >> np.uint32(3)
+        end = n + 1
+        while end < V and voxels[end] >> np.uint32(3) == parent:
+            end += 1
+        while s < sampled.shape[0] and sampled[s] < n:
+            s += 1
+        fixed = s < sampled.shape[0] and sampled[s] < end
+        if end - n == 8 and not fixed and _equal_counts(counts, n):
+            leaf_rows[count] = n
+            count += 1
+            _add_child(children, leaves, alike, counts, depth - 2, np.int64(parent) & 7, n)
         else:
-            child_masks[masks] = child_mask
-            leaf_masks[masks] = leaf_mask
-            masks += 1
-            state = INNER
-        keys[parents] = parent
-        states[parents] = state
-        parents += 1
-    return parents, masks
+            mask = np.uint8(0)
+            for m in range(n, end):
+                leaf_rows[count] = m
+                count += 1
+                mask |= np.uint8(1) << np.uint8(voxels[m] & np.uint32(7))
+            child_masks[depth - 1, masks[depth - 1]] = mask
+            masks[depth - 1] += 1
+            _add_child(children, leaves, alike, counts, depth - 2, np.int64(parent) & 7, NO_ROW)
+        n = end
+        d = depth - 2
+        key = np.int64(parent) >> 3
+        after = np.int64(voxels[n]) >> 6 if n < V else -1
+        while d >= 0 and key != after:
+            if d > 0 and alike[d] != NO_ROW and children[d] == 255:
+                count -= 7
+                _add_child(children, leaves, alike, counts, d - 1, key & 7, alike[d])
+            else:
+                child_masks[d, masks[d]] = children[d]
+                leaf_masks[d, masks[d]] = leaves[d]
+                masks[d] += 1
+                if d > 0:
+                    _add_child(children, leaves, alike, counts, d - 1, key & 7, NO_ROW)
+            children[d] = leaves[d] = 0
+            d -= 1
+            key >>= 3
+            after = after >> 3 if after >= 0 else -1
+    return count
+
+
+@nb.njit(nogil=True)
+def _equal_counts(counts: Counts, n: int) -> bool:
+    """Whether eight rows from n on have equal counts."""
+    different = 0
+    for m in range(n + 1, n + 8):
+        different |= (counts[m, 0] ^ counts[n, 0]) | (counts[m, 1] ^ counts[n, 1])
+    return different == 0
+
+
+@nb.njit(nogil=True)
+def _add_child(
+    children: Bytes, leaves: Bytes, alike: Ints, counts: Counts, d: int, c: int | np.int64, row: int | np.int64
+) -> None:
+    """Add child c to the open node of depth d: a leaf that stands for a row, or an inner node (NO_ROW)."""
+    if children[d] == 0:
+        alike[d] = row
+    elif (
+        row == NO_ROW
+        or alike[d] == NO_ROW
+        or counts[row, 0] != counts[alike[d], 0]
+        or counts[row, 1] != counts[alike[d], 1]
+    ):
+        alike[d] = NO_ROW
+    children[d] |= np.uint8(1 << c)
+    if row != NO_ROW:
+        leaves[d] |= np.uint8(1 << c)
+
+
+@nb.njit(cache=True, nogil=True)
+def measure_masks(child_masks: Bytes, leaf_masks: Bytes, firsts: Ints, stop: int) -> tuple[int, int, int]:
+    """Numbers of child masks, leaf masks and leaves above depth `stop`, or -1 three times if the masks are not sound.
+
+    `firsts` (depth + 1,) takes the place of the first child mask of each depth, and where the last one ends.
+    """
+    depth = firsts.shape[0] - 1
+    nodes = min(1, child_masks.shape[0])
+    at = leaf_at = leaves = 0
+    for d in range(stop):
+        firsts[d] = at
+        if at + nodes > child_masks.shape[0] or (d < depth - 1 and leaf_at + nodes > leaf_masks.shape[0]):
+            return -1, -1, -1
+        below = 0
+        for n in range(nodes):
+            mask = child_masks[at + n]
+            leaf = mask if d == depth - 1 else leaf_masks[leaf_at + n]
+            if mask == 0 or leaf & ~mask != 0:
+                return -1, -1, -1
+            for c in range(8):
+                leaves += (leaf >> c) & 1
+                below += ((mask & ~leaf) >> c) & 1
+        at += nodes
+        if d < depth - 1:
+            leaf_at += nodes
+        nodes = below
+    firsts[stop] = at
+    return at, leaf_at, leaves
+
+
+@nb.njit(cache=True, nogil=True)
+def list_leaves_into(
+    child_masks: Bytes, leaf_masks: Bytes, firsts: Ints, stop: int, starts: Words, sizes: Ints
+) -> None:
+    """First voxel and size of each leaf, in Morton order; inner nodes at depth `stop` count as leaves there.
+
+    The masks are sound (`measure_masks`), and there is room for all.
+    """
+    depth = firsts.shape[0] - 1
+    places = firsts.copy()
+    keys = np.zeros(depth + 1, np.int64)
+    children = np.zeros(depth + 1, np.uint8)
+    leaves = np.zeros(depth + 1, np.uint8)
+    if child_masks.shape[0] == 0:
+        return
+    children[0], leaves[0] = child_masks[0], (leaf_masks[0] if depth > 1 else child_masks[0])
+    places[0] = 1
+    d = 0
+    count = 0
+    while d >= 0:
+        if children[d] == 0:
+            d -= 1
+            continue
+        c = 0
+        while (children[d] >> c) & 1 == 0:
+            c += 1
+        children[d] &= np.uint8(children[d] - 1)
+        key = 8 * keys[d] + c
+        if d == stop - 1 or (leaves[d] >> c) & 1:
+            shift = 3 * (depth - 1 - d)
+            starts[count] = np.uint32(key << shift)
+            sizes[count] = 1 << shift
+            count += 1
+            continue
+        d += 1
+        at = places[d]
+        places[d] = at + 1
+        keys[d] = key
+        children[d] = child_masks[at]
+        # Leaf masks stand in the child masks' order, and only the last depth has none.
+        leaves[d] = leaf_masks[at] if d < depth - 1 else child_masks[at]
 
 
 @nb.njit(cache=True, nogil=True)
@@ -72,59 +185,21 @@ def expand_into(starts: Words, sizes: Ints, leaf_counts: Counts, voxels: Words, 
     """Write one row per voxel of every leaf; the outputs have room for the sum of the sizes."""
     V = 0
     for n in range(starts.shape[0]):
+        hits, misses = leaf_counts[n, 0], leaf_counts[n, 1]
         for step in range(sizes[n]):
             voxels[V] = starts[n] + np.uint32(step)
-            counts[V, 0] = leaf_counts[n, 0]
-            counts[V, 1] = leaf_counts[n, 1]
+            counts[V, 0] = hits
+            counts[V, 1] = misses
             V += 1
 
 
 @nb.njit(cache=True, nogil=True)
-def predict_sums(values: Ints, weights: Ints) -> npt.NDArray[np.uint64]:
-    """Residuals of a sum plane: value minus (previous value * weight // previous weight), in words mod 2^64.
-
-    Encoder's half; nothing is predicted for the first row or where the previous weight is 0.
-    """
-    out = np.empty(values.shape[0], np.uint64)
-    for n in range(values.shape[0]):
-        guess = np.uint64(0)
-        if n > 0 and weights[n - 1] != 0:
-            guess = np.uint64(values[n - 1]) * np.uint64(weights[n]) // np.uint64(weights[n - 1])
-        out[n] = zigzag(np.uint64(values[n]) - guess)
+def leaves_of_rows(leaf_rows: Ints, rows: Words) -> Ints:
+    """(S,) the leaf at which each of the rows, rising, begins; every one of them begins a leaf."""
+    out = np.empty(rows.shape[0], np.int64)
+    leaf = 0
+    for n in range(rows.shape[0]):
+        while leaf_rows[leaf] < rows[n]:
+            leaf += 1
+        out[n] = leaf
     return out
-
-
-@nb.njit(cache=True, nogil=True)
-def restore_sums(residuals: npt.NDArray[np.uint64], weights: Ints) -> Ints:
-    """Decoder's half of `predict_sums`."""
-    out = np.empty(residuals.shape[0], np.int64)
-    for n in range(residuals.shape[0]):
-        guess = np.uint64(0)
-        if n > 0 and weights[n - 1] != 0:
-            guess = np.uint64(out[n - 1]) * np.uint64(weights[n]) // np.uint64(weights[n - 1])
-        out[n] = np.int64(guess + unzigzag(residuals[n]))
-    return out
-
-
-@nb.njit(cache=True, nogil=True)
-def square_guesses(sums: Ints, weights: Ints) -> npt.NDArray[np.uint64]:
-    """What a sum of squares is if all samples were alike: q^2 w + 2 q (s - q w), q = s // w, in words mod 2^64."""
-    out = np.zeros(sums.shape[0], np.uint64)
-    for n in range(sums.shape[0]):
-        if weights[n] != 0:
-            s, w = np.uint64(sums[n]), np.uint64(weights[n])
-            q = s // w
-            out[n] = q * q * w + np.uint64(2) * q * (s - q * w)
-    return out
-
-
-@nb.njit(inline="always")
-def zigzag(word: np.uint64) -> np.uint64:
-    """Two's complement word to a word that is small for small magnitudes: 0, -1, 1, -2 become 0, 1, 2, 3."""
-    return (word << np.uint64(1)) ^ (np.uint64(0) - (word >> np.uint64(63)))
-
-
-@nb.njit(inline="always")
-def unzigzag(word: np.uint64) -> np.uint64:
-    """The mirror of `zigzag`."""
-    return (word >> np.uint64(1)) ^ (np.uint64(0) - (word & np.uint64(1)))

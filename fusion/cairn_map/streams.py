@@ -1,6 +1,7 @@
-"""Named byte streams, each compressed on its own, and read back under a cap.
+"""Named byte streams, each coded on its own, and read back under a cap.
 
-    stream on disk:  id u8 | coding u8 (0 as it is, 1 zstd) | raw length u32 | stored length u32 | bytes
+    stream on disk:  id u8 | coding u8 | raw length u32 | stored length u32 | bytes
+    coding           0 as it is, 1 zstd, 2 modelled: said by the stored bytes of its group's first stream (`small_code`)
 
 A column of integers becomes a stream of byte planes: `k u8`, then all lowest bytes, all second bytes, ... up to
 the k-th; k is the least that holds the largest value, so a column has one form only.
@@ -8,6 +9,7 @@ the k-th; k is the least that holds the largest value, so a column has one form 
 
 import struct
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -18,30 +20,59 @@ from cairn_map.errors import BadInputError, DamagedDataError
 ZSTD_LEVEL = 3
 ZSTD_WINDOW_MAX = 1 << 23
 HEAD = struct.Struct("<BBII")
-STORED, ZSTD = 0, 1
+STORED, ZSTD, MODELLED = 0, 1, 2
 RAW_BYTES_MAX = 1 << 28
 """Of all streams of a cell together: sixteen bytes for each voxel of the largest cell."""
 
 
-def pack_streams(streams: Mapping[int, bytes]) -> bytes:
-    """Streams in the order given, each with its head, compressed where that helps."""
-    parts: list[bytes] = []
+@dataclass(frozen=True, slots=True)
+class StoredStream:
+    """A stream as it stands in a cell's bytes: nothing of it is decoded, and `raw_bytes` is only claimed."""
+
+    number: int
+    coding: int
+    raw_bytes: int
+    body: bytes
+
+    def raw(self) -> bytes:
+        """The raw bytes.
+
+        Raises:
+            DamagedDataError: of an unknown coding, or not of the stated length.
+        """
+        if self.coding == ZSTD:
+            return bounded_zstd(self.body, size_bytes=self.raw_bytes)
+        if self.coding != STORED or len(self.body) != self.raw_bytes:
+            raise DamagedDataError(
+                "bad_stream", f"stream {self.number} has an unknown coding {self.coding} or a false length"
+            )
+        return self.body
+
+
+def stored_streams(streams: Mapping[int, bytes]) -> list[StoredStream]:
+    """Streams in the order given, compressed where that helps."""
     compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL, write_content_size=False, write_checksum=False)
+    stored: list[StoredStream] = []
     for number, raw in streams.items():
         packed = compressor.compress(raw) if len(raw) > 16 else raw
         coding, body = (ZSTD, packed) if len(packed) < len(raw) else (STORED, raw)
-        parts += [HEAD.pack(number, coding, len(raw), len(body)), body]
-    return b"".join(parts)
+        stored.append(StoredStream(number, coding, len(raw), body))
+    return stored
 
 
-def unpack_streams(data: bytes, *, count: int, raw_bytes_max: int = RAW_BYTES_MAX) -> dict[int, bytes]:
-    """Exactly `count` streams that fill `data`; the mirror of `pack_streams`.
+def join_streams(streams: list[StoredStream]) -> bytes:
+    """Streams with their heads, one after the other."""
+    return b"".join(HEAD.pack(s.number, s.coding, s.raw_bytes, len(s.body)) + s.body for s in streams)
+
+
+def split_streams(data: bytes, *, count: int, raw_bytes_max: int = RAW_BYTES_MAX) -> dict[int, StoredStream]:
+    """Exactly `count` streams that fill `data`, by number; the mirror of `join_streams`.
 
     Raises:
-        DamagedDataError: cut off, left over, not rising in number, or not of the stated length.
+        DamagedDataError: cut off, left over, or not rising in number.
         BadInputError: kind `too_large`: together they would be larger than `raw_bytes_max`.
     """
-    streams: dict[int, bytes] = {}
+    streams: dict[int, StoredStream] = {}
     at = total = 0
     last = -1
     for _ in range(count):
@@ -57,7 +88,7 @@ def unpack_streams(data: bytes, *, count: int, raw_bytes_max: int = RAW_BYTES_MA
         if total > raw_bytes_max:
             raise BadInputError("too_large", f"these streams can hold at most {raw_bytes_max} bytes, they claim more")
         last = number
-        streams[number] = _raw(body, coding, raw_bytes, number)
+        streams[number] = StoredStream(number, coding, raw_bytes, body)
     if at != len(data):
         raise DamagedDataError("bad_stream", f"{len(data) - at} bytes are left over after the last stream")
     return streams
@@ -72,22 +103,42 @@ def bounded_zstd(data: bytes, *, size_bytes: int) -> bytes:
     Raises:
         DamagedDataError: not zstd, shorter, or longer.
     """
-    try:
-        with zstandard.ZstdDecompressor(max_window_size=ZSTD_WINDOW_MAX).stream_reader(data) as reader:
-            raw = reader.read(size_bytes + 1)
-    except zstandard.ZstdError as exc:
-        raise DamagedDataError("bad_zstd", f"not a zstd stream: {exc}") from exc
+    raw = zstd_prefix(data, size_bytes=size_bytes + 1)
     if len(raw) != size_bytes:
         raise DamagedDataError("bad_zstd", f"a zstd stream must hold {size_bytes} bytes, got {len(raw)} or more")
     return raw
+
+
+def zstd_prefix(data: bytes, *, size_bytes: int) -> bytes:
+    """The first `size_bytes` of what a zstd frame holds, or all of it if that is less.
+
+    Raises:
+        DamagedDataError: not zstd.
+    """
+    try:
+        with zstandard.ZstdDecompressor(max_window_size=ZSTD_WINDOW_MAX).stream_reader(data) as reader:
+            return reader.read(size_bytes)
+    except zstandard.ZstdError as exc:
+        raise DamagedDataError("bad_zstd", f"not a zstd stream: {exc}") from exc
+
+
+def required(streams: Mapping[int, bytes], number: int) -> bytes:
+    """One stream.
+
+    Raises:
+        DamagedDataError: it is missing.
+    """
+    try:
+        return streams[number]
+    except KeyError:
+        raise DamagedDataError("bad_stream", f"stream {number} is missing") from None
 
 
 def encode_column(words: npt.NDArray[np.uint64]) -> bytes:
     """Byte planes of (N,) uint64, lowest plane first, as many as the largest needs."""
     top = int(words.max()) if len(words) else 0
     planes = (top.bit_length() + 7) // 8
-    columns = words.astype("<u8").view(np.uint8).reshape(-1, 8)[:, :planes]
-    return bytes([planes]) + np.ascontiguousarray(columns.T).tobytes()
+    return bytes([planes]) + b"".join((words >> np.uint64(8 * p)).astype(np.uint8).tobytes() for p in range(planes))
 
 
 def decode_column(stream: bytes, *, rows: int) -> npt.NDArray[np.uint64]:
@@ -99,15 +150,7 @@ def decode_column(stream: bytes, *, rows: int) -> npt.NDArray[np.uint64]:
     planes = stream[0] if stream else 9
     if planes > 8 or len(stream) != 1 + planes * rows:
         raise DamagedDataError("bad_stream", f"a column of {rows} rows has {len(stream)} bytes for {planes} planes")
-    columns = np.zeros((rows, 8), np.uint8)
-    columns[:, :planes] = np.frombuffer(stream, np.uint8, offset=1).reshape(planes, rows).T
-    words: npt.NDArray[np.uint64] = columns.view("<u8").reshape(rows).astype(np.uint64)
+    words = np.zeros(rows, np.uint64)
+    for p in range(planes):
+        words |= np.frombuffer(stream, np.uint8, rows, 1 + p * rows).astype(np.uint64) << np.uint64(8 * p)
     return words
-
-
-def _raw(body: bytes, coding: int, raw_bytes: int, number: int) -> bytes:
-    if coding == ZSTD:
-        return bounded_zstd(body, size_bytes=raw_bytes)
-    if coding != STORED or len(body) != raw_bytes:
-        raise DamagedDataError("bad_stream", f"stream {number} has an unknown coding {coding} or a false length")
-    return body

@@ -27,7 +27,7 @@ from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence import SUM_MAX, Evidence, empty_evidence, packed_evidence
 from cairn_map.grid import Geometry, cell_key
 from cairn_map.octree import build_octree
-from cairn_map.streams import HEAD, unpack_streams
+from cairn_map.streams import HEAD, split_streams
 
 CELLS = st.tuples(*[st.integers(-(1 << 20), (1 << 20) - 1)] * 3)
 MADE = st.builds(
@@ -41,9 +41,10 @@ SIGNED = any_evidence(SMALL, low=-SUM_MAX)
 def recoded(data: bytes, *, level: int | None) -> bytes:
     """The same cell with streams compressed at another level, or not at all."""
     head, head_bytes = decode_head(data)
-    streams = unpack_streams(data[len(head_bytes) :], count=head.streams)
+    streams = split_streams(data[len(head_bytes) :], count=head.streams)
     out = head_bytes
-    for number, raw in streams.items():
+    for number, stream in streams.items():
+        raw = stream.raw()
         packed = raw if level is None else zstandard.ZstdCompressor(level=level, write_checksum=True).compress(raw)
         out += HEAD.pack(number, level is not None, len(raw), len(packed)) + packed
     return out

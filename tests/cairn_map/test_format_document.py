@@ -8,7 +8,7 @@ import pytest
 from tests import naive
 from tests.cairn_map.made import as_dict
 
-from cairn_map import cell_code, commit, frames, ids, streams, version_vector
+from cairn_map import cell_reading, commit, frames, ids, streams, version_vector
 from cairn_map.cell_code import encode_cell
 from cairn_map.channels import TEMPERATURE
 from cairn_map.commit import CommitMeta, make_commit
@@ -61,10 +61,10 @@ def test_the_digests_in_the_document_are_those_of_the_code() -> None:
 @pytest.mark.parametrize(
     ("row", "numbers"),
     [
-        ("cell file", [cell_code.CELL_BYTES_MAX]),
+        ("cell file", [cell_reading.CELL_BYTES_MAX]),
         ("raw bytes of a cell's streams, together", [streams.RAW_BYTES_MAX]),
         ("zstd window", [streams.ZSTD_WINDOW_MAX]),
-        ("packed evidence of a cell", [cell_code.EVIDENCE_BYTES_MAX]),
+        ("packed evidence of a cell", [cell_reading.EVIDENCE_BYTES_MAX]),
         ("commit", [commit.COMMIT_BYTES_MAX, commit.CELLS_MAX, commit.META_BYTES_MAX]),
         ("packed evidence of a commit", [commit.EVIDENCE_BYTES_MAX]),
         ("bricks (8^3 voxels) that a commit touches", [commit.BRICKS_MAX]),

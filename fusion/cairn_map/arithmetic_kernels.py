@@ -1,0 +1,142 @@
+"""Adaptive binary arithmetic coding: one decision after the other, each under a probability that learns.
+
+    coder    low, high, code, position, decoding      the interval [low, high], 32 bits each
+    data     uint8      what is written, or read
+    odds     uint32     one per context: probability of a 1 in the upper 22 bits, times seen in the lower 10
+
+Encoding and decoding are one function: when encoding, `code_bit` writes the bit that it is given and returns it; when
+decoding, it ignores what it is given and returns what was written. So a model is written once, and cannot disagree
+with itself. Only integers: the same bytes on every machine. FORMAT.md section 14 is the norm.
+
+While it works a coder is a tuple, which the compiler keeps in registers: fifteen times as fast as one in an array.
+Between kernels it is an array.
+"""
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+Coder = npt.NDArray[np.int64]
+Live = tuple[int, int, int, int, bool]
+"""A coder at work."""
+Data = npt.NDArray[np.uint8]
+Odds = npt.NDArray[np.uint32]
+
+LOW, HIGH, CODE, AT, DECODING = 0, 1, 2, 3, 4
+TOP = 0xFFFFFFFF
+EVEN = np.uint32(1 << 31)
+"""Odds of a context that nothing is known of."""
+SEEN_MAX = 255
+STEPS = np.array([(1 << 17) // (2 * n + 3) for n in range(SEEN_MAX + 1)], np.int64)
+"""By times seen: how far a probability moves towards the bit, in 1/65536: 2/3, 2/5, 2/7, ... a mean, then a memory."""
+
+
+@nb.njit(nogil=True, forceinline=True)
+def signed(number: np.integer) -> int:
+    """Any integer as int64: what is unsigned would make sums with what is not floats."""
+    return np.int64(number)  # type: ignore[return-value]
+
+
+@nb.njit(cache=True, nogil=True)
+def start_encoding() -> Coder:
+    """A coder that will write from the start of its data."""
+    coder = np.zeros(5, np.int64)
+    coder[HIGH] = TOP
+    return coder
+
+
+@nb.njit(cache=True, nogil=True)
+def start_decoding(data: Data) -> Coder:
+    """A coder that reads `data` from the start."""
+    coder = start_encoding()
+    coder[DECODING] = 1
+    coder[AT] = 4
+    for at in range(4):
+        coder[CODE] = (coder[CODE] << 8) | byte_at(data, at)
+    return coder
+
+
+@nb.njit(nogil=True, forceinline=True)
+def resumed(coder: Coder) -> Live:
+    """A coder at work, as it was left."""
+    return coder[LOW], coder[HIGH], coder[CODE], coder[AT], coder[DECODING] == 1
+
+
+@nb.njit(nogil=True, forceinline=True)
+def suspend_into(coder: Coder, live: Live) -> None:
+    """Keep a coder for the next kernel."""
+    coder[LOW], coder[HIGH], coder[CODE], coder[AT] = live[0], live[1], live[2], live[3]
+
+
+@nb.njit(nogil=True, forceinline=True)
+def code_bit(live: Live, data: Data, odds: Odds, context: int, bit: int) -> tuple[int, Live]:
+    """Code one bit under a context, and let the context learn it."""
+    # At least 1/65536: an interval must not become empty.
+    bit, live = split(live, data, max(signed(odds[context]) >> 16, 1), 16, bit)
+    learn(odds, context, bit)
+    return bit, live
+
+
+@nb.njit(nogil=True, forceinline=True)
+def split(live: Live, data: Data, chance: int, bits: int, bit: int) -> tuple[int, Live]:
+    """Code one bit whose probability of being 1 is chance / 2^bits.
+
+    Behind the end of `data` zeros are read, and nothing is written: `finish_encoding` tells.
+    """
+    low, high, code, at, decoding = live
+    middle = low + (((high - low) * chance) >> bits)
+    if decoding:
+        bit = 1 if code <= middle else 0
+    if bit:
+        high = middle
+    else:
+        low = middle + 1
+    while (low ^ high) & 0xFF000000 == 0:
+        if decoding:
+            code = ((code << 8) & TOP) | byte_at(data, at)
+        elif at < data.shape[0]:
+            data[at] = high >> 24
+        at += 1
+        low = (low << 8) & TOP
+        high = ((high << 8) & TOP) | 255
+    return bit, (low, high, code, at, decoding)
+
+
+@nb.njit(nogil=True, forceinline=True)
+def learn(odds: Odds, context: int, bit: int) -> None:
+    """Move a context's probability towards the bit that came."""
+    odd = signed(odds[context])
+    seen, chance = odd & 1023, odd >> 10
+    if bit:
+        chance += (((1 << 22) - 1 - chance) * STEPS[seen]) >> 16
+    else:
+        chance -= (chance * STEPS[seen]) >> 16
+    odds[context] = np.uint32((chance << 10) | min(seen + 1, SEEN_MAX))
+
+
+@nb.njit(nogil=True, forceinline=True)
+def byte_at(data: Data, at: int) -> int:
+    """A byte, or 0 behind the end."""
+    return signed(data[at]) if at < data.shape[0] else 0
+
+
+@nb.njit(cache=True, nogil=True)
+def finish_encoding(coder: Coder, data: Data) -> int:
+    """Write the fewest bytes that name the interval; returns bytes written, or -1 if there was no room."""
+    for count in range(1, 5):
+        mask = TOP >> (8 * count)
+        value = (coder[LOW] + mask) & ~mask
+        if value <= coder[HIGH]:
+            if coder[AT] + count > data.shape[0]:
+                return -1
+            for n in range(count):
+                data[coder[AT] + n] = (value >> (24 - 8 * n)) & 255
+            return signed(coder[AT]) + count
+    return -1
+
+
+@nb.njit(cache=True, nogil=True)
+def finish_decoding(coder: Coder, data: Data) -> bool:
+    """Whether exactly the bytes that an encoder writes were read: of the four read ahead it leaves up to three away."""
+    left: int = signed(coder[AT]) - data.shape[0]
+    return left >= 0 and left <= 3

@@ -1,0 +1,86 @@
+"""A cell's evidence by leaf: what its streams say, however they are coded.
+
+evidence  <->  content  <->  raw streams, which are canonical          `channel_streams` for samples
+                        <->  modelled streams, which are small         `small_code`
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map import channel_streams
+from cairn_map.errors import DamagedDataError
+from cairn_map.evidence import COUNT_MAX, Evidence
+from cairn_map.grid import Geometry
+from cairn_map.octree import Octree, build_octree
+from cairn_map.octree_kernels import expand_into, leaves_of_rows
+from cairn_map.streams import decode_column, encode_column, required
+
+CHILD_MASKS, LEAF_MASKS, HITS, MISSES = 1, 2, 3, 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CellContent:
+    """An octree, and what its N leaves hold."""
+
+    octree: Octree
+    counts: npt.NDArray[np.int32]
+    """(N, 2) hits and misses."""
+    sampled: npt.NDArray[np.int64]
+    """(S,) leaves that have samples, rising."""
+    samples: npt.NDArray[np.int64]
+    """(S, P) sums."""
+
+
+def content_of(evidence: Evidence, geometry: Geometry) -> CellContent:
+    """Packed evidence by leaf."""
+    octree, rows = build_octree(evidence, depth=geometry.depth)
+    return CellContent(octree, evidence.counts[rows], leaves_of_rows(rows, evidence.sampled), evidence.samples)
+
+
+def evidence_of(content: CellContent) -> Evidence:
+    """The mirror of `content_of`.
+
+    Raises:
+        DamagedDataError: a leaf says nothing, or one of several voxels has samples.
+    """
+    octree, counts, sampled = content.octree, content.counts, content.sampled
+    if (octree.sizes[sampled] != 1).any():
+        raise DamagedDataError("bad_cell", "a collapsed leaf cannot hold samples")
+    says = (counts[:, 0] | counts[:, 1]) != 0
+    says[sampled] = True
+    if not says.all():
+        raise DamagedDataError("bad_cell", "a leaf without evidence must not be there")
+    ends = np.cumsum(octree.sizes)
+    V = int(ends[-1]) if len(ends) else 0
+    rows = (ends[sampled] - 1).astype(np.uint32)
+    evidence = Evidence(np.empty(V, np.uint32), np.empty((V, 2), np.int32), rows, content.samples)
+    expand_into(octree.starts, octree.sizes, counts, evidence.voxels, evidence.counts)
+    return evidence
+
+
+def topology_streams(octree: Octree) -> dict[int, bytes]:
+    """The masks, raw."""
+    return {CHILD_MASKS: octree.child_masks.tobytes(), LEAF_MASKS: octree.leaf_masks.tobytes()}
+
+
+def count_streams(counts: npt.NDArray[np.int32], *, signed: bool) -> dict[int, bytes]:
+    """Hits and misses of the leaves, raw."""
+    return {
+        number: encode_column(channel_streams.words(counts[:, column].astype(np.int64), signed))
+        for number, column in ((HITS, 0), (MISSES, 1))
+    }
+
+
+def counts_of_streams(streams: dict[int, bytes], *, leaves: int, signed: bool) -> npt.NDArray[np.int32]:
+    """The mirror of `count_streams`.
+
+    Raises:
+        DamagedDataError: a stream is missing, of the wrong length, or a count is out of range.
+    """
+    counts = np.empty((leaves, 2), np.int32)
+    for number, column in ((HITS, 0), (MISSES, 1)):
+        words = decode_column(required(streams, number), rows=leaves)
+        counts[:, column] = channel_streams.numbers(words, signed, limit=COUNT_MAX)
+    return counts
