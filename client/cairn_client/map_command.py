@@ -188,7 +188,7 @@ def _parser() -> argparse.ArgumentParser:
     get = command("get", "download one cell", map_export.get_cell, "map")
     get.add_argument("cell", help="its number, i,j,k")
     allow_negative_lists(get)
-    get.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=".cell, .npz or .ply")
+    get.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=".cell, .npz, .ply or .view")
     export = command("export", "download a whole map", map_export.export_map, "map")
     export.add_argument("--cells", type=Path, metavar="DIR", help="one file a cell, named by its number")
     export.add_argument("--ply", type=Path, metavar="FILE", help="occupied voxels as a point cloud")

@@ -8,7 +8,7 @@ from pathlib import Path
 from cairn_client.api import MapApi
 from cairn_client.arguments import api_of, say, shown_bytes, with_progress
 from cairn_map.cell_code import DecodedCell, decode_cell
-from cairn_map.cell_files import npz_file, ply_file
+from cairn_map.cell_files import cell_file, npz_file, ply_file
 from cairn_map.cell_folder import FolderHead, write_cell, write_head
 from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError
 from cairn_map.fingerprint import fingerprint
@@ -18,12 +18,12 @@ from cairn_map.voxels import Voxels, joined_voxels, voxels_of_evidence
 
 
 def get_cell(args: argparse.Namespace) -> None:
-    """Download one cell as an octree, NPZ or PLY, by the output's suffix."""
+    """Download one cell as an octree, NPZ, PLY or view, by the output's suffix."""
     api, name = api_of(args.map, args.token)
     output: Path = args.output
     suffix = output.suffix
-    if suffix not in (".cell", ".npz", ".ply"):
-        raise BadInputError("unknown_format", f"a cell is written as .cell, .npz or .ply, got {output.name!r}")
+    if suffix not in (".cell", ".npz", ".ply", ".view"):
+        raise BadInputError("unknown_format", f"a cell is written as .cell, .npz, .ply or .view, got {output.name!r}")
     _check_outputs(output)
     info = api.map_info(name)
     cell = cell_from_text(args.cell)
@@ -31,8 +31,8 @@ def get_cell(args: argparse.Namespace) -> None:
     if suffix == ".cell":
         data = body
     else:
-        voxels = _voxels(decoded, info, occupied_only=suffix == ".ply")
-        data = ply_file(voxels) if suffix == ".ply" else npz_file(voxels)
+        key, model = cell_key(cell), info.sensor_model
+        data, _ = cell_file(suffix[1:], key, decoded.evidence, info.geometry, model)
     output.write_bytes(data)
     say(f"cell {cell}: {len(decoded.evidence)} known voxels, {shown_bytes(len(data))} in {output}")
 

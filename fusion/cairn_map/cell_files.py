@@ -1,4 +1,4 @@
-"""Voxels as ordinary files: PLY for viewers, NPZ for NumPy."""
+"""A cell as other files: PLY for viewers, NPZ for NumPy, a view for robots that only drive."""
 
 import io
 
@@ -10,10 +10,16 @@ from cairn_map.errors import BadInputError
 from cairn_map.evidence import Evidence
 from cairn_map.grid import CellKey, Geometry
 from cairn_map.sensor_model import SensorModel
+from cairn_map.view_code import encode_view
 from cairn_map.voxels import Voxels, voxels_of_evidence
 
 CELL_MEDIA_TYPE = "application/vnd.cairn.cell"
-MEDIA_TYPES = {"npz": "application/x-npz", "ply": "application/vnd.cairn.ply"}
+MEDIA_TYPES = {
+    "npz": "application/x-npz",
+    "ply": "application/vnd.cairn.ply",
+    "view": "application/vnd.cairn.view",
+}
+FORMS = "octree (no suffix), .npz, .ply or .view"
 GREY = 128
 """Of voxels that no colour camera saw."""
 
@@ -21,13 +27,15 @@ GREY = 128
 def cell_file(
     suffix: str, key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel
 ) -> tuple[bytes, str]:
-    """One cell as a file of the given suffix, and its media type: all known voxels in NPZ, the occupied in PLY.
+    """One cell as a file of the given suffix, and its media type: all known voxels in NPZ, the occupied in PLY, view.
 
     Raises:
         BadInputError: kind `unknown_format`.
     """
     if suffix not in MEDIA_TYPES:
-        raise BadInputError("unknown_format", f"cells come as octree (no suffix), .npz or .ply, not as .{suffix[:16]}")
+        raise BadInputError("unknown_format", f"cells come as {FORMS}, not as .{suffix[:16]}")
+    if suffix == "view":
+        return encode_view(key, evidence, geometry, model), MEDIA_TYPES[suffix]
     voxels = voxels_of_evidence(key, evidence, geometry, model, occupied_only=suffix == "ply")
     return (ply_file(voxels) if suffix == "ply" else npz_file(voxels)), MEDIA_TYPES[suffix]
 

@@ -34,7 +34,7 @@ LOWER = np.array([0, 1, 2, 3, 4, 5, 12], np.int64)
 @nb.njit(cache=True, nogil=True)
 def index_leaves(starts: Words, sizes: Ints, depth: int) -> tuple[Index, Index]:
     """From places to leaves: for each brick of 8^3 its table, or -2 - its only leaf, or -1; and (T, 512) tables."""
-    brick_of = np.full(8 ** (depth - 3), NONE, np.int32)
+    brick_of = np.full(8 ** max(depth - 3, 0), NONE, np.int32)
     tables = 0
     for n in range(starts.shape[0]):
         brick = signed(starts[n]) >> 9

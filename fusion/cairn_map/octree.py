@@ -41,7 +41,7 @@ def build_octree(evidence: Evidence, *, depth: int) -> tuple[Octree, npt.NDArray
     rows = rows[:leaves].copy()
     octree = Octree(
         np.concatenate([child_masks[d, : masks[d]] for d in range(depth)]),
-        np.concatenate([leaf_masks[d, : masks[d]] for d in range(depth - 1)]),
+        np.concatenate([leaf_masks[d, : masks[d]] for d in range(depth - 1)] or [np.empty(0, np.uint8)]),
         evidence.voxels[rows],
         np.diff(rows, append=V),
     )

@@ -45,7 +45,7 @@ def build_into(
         while s < sampled.shape[0] and sampled[s] < n:
             s += 1
         fixed = s < sampled.shape[0] and sampled[s] < end
-        if end - n == 8 and not fixed and _equal_counts(counts, n):
+        if depth > 1 and end - n == 8 and not fixed and _equal_counts(counts, n):
             leaf_rows[count] = n
             count += 1
             _add_child(children, leaves, alike, counts, depth - 2, np.int64(parent) & 7, n)
@@ -57,7 +57,8 @@ def build_into(
                 mask |= np.uint8(1) << np.uint8(voxels[m] & np.uint32(7))
             child_masks[depth - 1, masks[depth - 1]] = mask
             masks[depth - 1] += 1
-            _add_child(children, leaves, alike, counts, depth - 2, np.int64(parent) & 7, NO_ROW)
+            if depth > 1:
+                _add_child(children, leaves, alike, counts, depth - 2, np.int64(parent) & 7, NO_ROW)
         n = end
         d = depth - 2
         key = np.int64(parent) >> 3

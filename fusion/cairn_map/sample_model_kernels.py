@@ -24,6 +24,7 @@ GUESSED_MAX = 1 << 40
 """A sum from which on nothing is guessed: products of it would leave 64 bits."""
 WEIGHT_MAX = 1 << 16
 """Likewise a weight."""
+RANK_MAX = (1 << 16) - 1
 TABLE = 2048
 """Numbers of contexts of one opinion, each of SLOTS."""
 
@@ -173,6 +174,37 @@ def code_squares(coder: Coder, data: Data, squares: Ints, sums: Ints, rests: Int
         if squares[s] < 0 or squares[s] > SUM_MAX:
             return False
         spreads[s] = min(abs(rest), GUESSED_MAX)
+    suspend_into(coder, live)
+    return True
+
+
+@nb.njit(cache=True, nogil=True)
+def code_ranks(coder: Coder, data: Data, ranks: Ints, near: Index) -> bool:
+    """Code (S,) ranks, most of them low; False if one that was read is out of range.
+
+    Opinions: the mean of the neighbours' ranks; those across the faces; how many of them are the first.
+    """
+    live = resumed(coder)
+    odds, loud = np.full(3 * TABLE * SLOTS, EVEN, np.uint32), start_weights(SLOTS, 3)
+    tails, contexts = np.full(TAILS, EVEN, np.uint32), np.empty(3, np.int64)
+    for s in range(ranks.shape[0]):
+        total = worth = count = firsts = faces = 0
+        for i in range(near.shape[1]):
+            row = near[s, i]
+            if row != NONE:
+                total += NEARNESS[i] * ranks[row]
+                worth += NEARNESS[i]
+                count += 1
+                firsts += 1 if ranks[row] == 0 else 0
+            if i < 3:
+                faces = 9 * faces + (min(ranks[row], 7) if row != NONE else 8)
+        mean = min(half_log(4 * total // worth), 40) if count else 41
+        contexts[0] = (mean * 4 + min(count, 3)) * SLOTS
+        contexts[1] = (TABLE + faces) * SLOTS
+        contexts[2] = (2 * TABLE + firsts * 14 + count) * SLOTS
+        ranks[s], live = code_number(live, data, odds, contexts, loud, 0, tails, 0, ranks[s])
+        if ranks[s] < 0 or ranks[s] > RANK_MAX:
+            return False
     suspend_into(coder, live)
     return True
 

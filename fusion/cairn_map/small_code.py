@@ -15,24 +15,27 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from cairn_map.arithmetic_kernels import finish_decoding, finish_encoding, start_decoding, start_encoding
+from cairn_map.arithmetic_kernels import finish_decoding, start_decoding
 from cairn_map.cell_content import CellContent
 from cairn_map.channel_streams import ChannelRows
 from cairn_map.channels import Channel
 from cairn_map.count_model_kernels import code_counts
 from cairn_map.errors import DamagedDataError
 from cairn_map.mask_model_kernels import code_masks
+from cairn_map.modelled import (
+    NUMBERS_PER_BYTE,
+    Bytes,
+    Code,
+    Coder,
+    check_effort,
+    read_modelled,
+    write_modelled,
+)
 from cairn_map.neighbour_kernels import earlier_rows, index_leaves
 from cairn_map.octree import Octree
 from cairn_map.sample_model_kernels import code_presence, code_squares, code_sums, code_weights
 
-Bytes = npt.NDArray[np.uint8]
 Ints = npt.NDArray[np.int64]
-Coder = npt.NDArray[np.int64]
-
-NUMBERS_PER_BYTE = 1024
-"""Leaves or masks that a stored byte may stand for: so a few bytes cannot keep a reader busy for minutes."""
-Code = Callable[[Coder, Bytes], bool]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +71,7 @@ def decode_masks(data: bytes, *, child_count: int, leaf_count: int, depth: int, 
     Raises:
         DamagedDataError: there are other numbers of masks.
     """
-    _check_effort(child_count + leaf_count, data)
+    check_effort(child_count + leaf_count, data)
     child_masks, leaf_masks = np.zeros(child_count, np.uint8), np.zeros(leaf_count, np.uint8)
     read = np.frombuffer(data, np.uint8).copy()
     coder = start_decoding(read)
@@ -92,8 +95,8 @@ def decode_counts(data: bytes, ground: Ground) -> npt.NDArray[np.int32]:
         DamagedDataError: a count is out of range.
     """
     counts = np.zeros((len(ground.octree.starts), 2), np.int32)
-    _check_effort(len(counts), data)
-    _decode(_counts_coder(counts, ground), data)
+    check_effort(len(counts), data)
+    read_modelled(_counts_coder(counts, ground), data)
     return counts
 
 
@@ -129,7 +132,7 @@ def decode_channel(
     Raises:
         DamagedDataError: a weight or sum is out of range.
     """
-    _check_effort(len(hits), data)
+    check_effort(len(hits), data)
     found: list[ChannelRows] = []
 
     def code(coder: Coder, read: Bytes) -> bool:
@@ -141,7 +144,7 @@ def decode_channel(
         found.append(ChannelRows(leaves, sums))
         return _code_rows(coder, read, channel, leaves, sums, hits, before, ground)
 
-    _decode(code, data)
+    read_modelled(code, data)
     return found[0]
 
 
@@ -199,20 +202,5 @@ def _code_rows(
 
 def _encoded(code: Code, numbers: int, room: int) -> bytes | None:
     """What a model writes, unless it needs more room or a reader would refuse so few bytes for so many numbers."""
-    data, coder = np.empty(room, np.uint8), start_encoding()
-    code(coder, data)
-    size = finish_encoding(coder, data)
-    return None if numbers > NUMBERS_PER_BYTE * size else data[:size].tobytes()
-
-
-def _decode(code: Code, data: bytes) -> None:
-    # A copy that may be written: kernels that code read and write through the same argument.
-    read = np.frombuffer(data, np.uint8).copy()
-    coder = start_decoding(read)
-    if not code(coder, read) or not finish_decoding(coder, read):
-        raise DamagedDataError("bad_stream", "a modelled stream is cut off, left over or holds a number out of range")
-
-
-def _check_effort(numbers: int, data: bytes) -> None:
-    if numbers > NUMBERS_PER_BYTE * len(data):
-        raise DamagedDataError("bad_stream", f"{len(data)} modelled bytes cannot say {numbers} masks or leaves")
+    data = write_modelled(code, room=room)
+    return None if data is None or numbers > NUMBERS_PER_BYTE * len(data) else data

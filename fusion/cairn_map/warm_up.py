@@ -11,10 +11,12 @@ from cairn_map.cell_code import Profile, decode_canonical_cell, encode_cell
 from cairn_map.evidence import packed_evidence
 from cairn_map.fingerprint import fingerprint
 from cairn_map.grid import BRICK_DEPTH, Geometry, cell_key, voxels_in_cell
+from cairn_map.sensor_model import SensorModel
+from cairn_map.view_code import decode_view, encode_view
 
 
 def warm_up() -> None:
-    """Encode, decode, merge, take out again and fingerprint a few voxels, one of them with samples."""
+    """Encode, decode, view, merge, take out again and fingerprint some voxels, half of them with samples."""
     geometry = Geometry(depth=BRICK_DEPTH)
     key = cell_key((0, 0, 0))
     # As many as make models pay: profile small falls back to the fast one otherwise.
@@ -26,6 +28,7 @@ def warm_up() -> None:
     small = encode_cell(key, made, geometry, profile=Profile.SMALL).data
     read = decode_canonical_cell(small).evidence
     read = decode_canonical_cell(encode_cell(key, read, geometry).data).evidence
+    decode_view(encode_view(key, read, geometry, SensorModel()))
     cell = BrickCell(geometry)
     for evidence in (made, read):
         cell.merge(evidence)

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Depends, FastAPI, Header, Query, Request, Respons
 from fastapi.responses import HTMLResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
-from cairn_map.cell_files import CELL_MEDIA_TYPE, MEDIA_TYPES, cell_file
+from cairn_map.cell_files import CELL_MEDIA_TYPE, FORMS, MEDIA_TYPES, cell_file
 from cairn_map.errors import BadInputError, NotFoundError
 from cairn_map.grid import cell_from_text, cell_key
 from cairn_map.ids import author_from_text
@@ -217,11 +217,11 @@ def get_cell(
     row: Map,
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
-    """One cell: the octree, or by suffix `.npz` and `.ply`; strong ETag, cursor and coverage in the headers."""
+    """One cell: the octree, or by suffix `.npz`, `.ply`, `.view`; strong ETag, cursor and coverage in the headers."""
     number, dot, suffix = cell.partition(".")
     key = cell_key(cell_from_text(number))
     if dot and suffix not in MEDIA_TYPES:
-        raise BadInputError("unknown_format", f"cells come as octree (no suffix), .npz or .ply, not as .{suffix[:16]}")
+        raise BadInputError("unknown_format", f"cells come as {FORMS}, not as .{suffix[:16]}")
     stored, head = service.cell(row, key)
     if stored is None:
         raise NotFoundError("no_cell", f"nobody has seen cell {number} of map {row.name}")
