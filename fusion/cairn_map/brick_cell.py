@@ -6,6 +6,8 @@ change nothing when a sum would leave its range. `packed` gives the canonical fo
 
 from collections.abc import Iterable
 
+import numpy as np
+
 from cairn_map.brick_counts import BrickCounts
 from cairn_map.evidence import Evidence, check_fits
 from cairn_map.grid import Geometry
@@ -53,6 +55,7 @@ class BrickCell:
 
     def _add(self, diff: Evidence, sign: int) -> None:
         check_fits(diff, self._geometry)
+        diff = _in_rows(diff)
         # Negative sums are legal on the way (a delta may come before what it takes away); the caller that holds a
         # finished state checks it by fingerprint.
         bound = self._counts.bound_after(diff.voxels, diff.counts, sign)
@@ -79,3 +82,17 @@ def difference(new: Evidence, old: Evidence, geometry: Geometry) -> Evidence:
     cell = brick_cell(geometry, [new])
     cell.unmerge(old)
     return cell.packed()
+
+
+def _in_rows(evidence: Evidence) -> Evidence:
+    """The same evidence, its arrays in one piece and row by row, as kernels read them."""
+    arrays = (evidence.voxels, evidence.counts, evidence.sampled, evidence.samples)
+    if all(array.flags.c_contiguous for array in arrays):
+        return evidence
+    voxels, counts, sampled, samples = arrays
+    return Evidence(
+        np.ascontiguousarray(voxels),
+        np.ascontiguousarray(counts),
+        np.ascontiguousarray(sampled),
+        np.ascontiguousarray(samples),
+    )

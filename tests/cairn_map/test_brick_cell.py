@@ -157,6 +157,17 @@ def test_merging_changes_no_argument() -> None:
     assert diff == copy
 
 
+def test_arrays_may_lie_in_memory_as_they_like() -> None:
+    diff = random_evidence(4, MIDDLE)
+    columns = Evidence(
+        np.repeat(diff.voxels, 2)[::2],
+        np.asfortranarray(diff.counts),
+        np.repeat(diff.sampled, 2)[::2],
+        np.asfortranarray(diff.samples),
+    )
+    assert sum_evidence([columns, diff], MIDDLE) == sum_evidence([diff, diff], MIDDLE)
+
+
 @pytest.mark.parametrize("diff", [one_voxel(1), one_voxel(0, 1), one_voxel(0, 0, 0, 0, SUM_MAX)])
 def test_a_sum_that_would_overflow_is_refused_and_nothing_changes(diff: Evidence) -> None:
     full = one_voxel(COUNT_MAX, *[SUM_MAX] * SMALL.plane_count)
