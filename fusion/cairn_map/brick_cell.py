@@ -58,8 +58,8 @@ class BrickCell:
         diff = _in_rows(diff)
         # Negative sums are legal on the way (a delta may come before what it takes away); the caller that holds a
         # finished state checks it by fingerprint.
+        bounds = self._samples.bounds_after(diff, sign)  # first, so that the counts are still in the cache when added
         bound = self._counts.bound_after(diff.voxels, diff.counts, sign)
-        bounds = self._samples.bounds_after(diff, sign)
         self._counts.add(diff.voxels, diff.counts, sign, bound=bound)
         self._samples.add(diff, sign, bounds=bounds)
 
