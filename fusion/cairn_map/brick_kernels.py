@@ -14,7 +14,7 @@ Counts = npt.NDArray[np.int32]
 Pool = npt.NDArray[np.int16] | npt.NDArray[np.int32]
 
 U = np.uint64
-"""Type of the index in hot loops: a signed one is tested for being negative, which takes twice the time."""
+"""Type of the index in hot loops: a signed one is tested for being negative, which takes up to twice the time."""
 
 
 @nb.njit(inline="always")

@@ -23,7 +23,7 @@ U = np.uint64
 
 @nb.njit(cache=True, nogil=True)
 def largest_sums_into(sums: Sums, largest: Magnitudes) -> None:
-    """Raise (8 P,) `largest` to the magnitudes in (N, P) sums; eight rows at once, which is three times as fast."""
+    """Raise (8 P,) `largest` to the magnitudes in (N, P) sums; eight rows at once, which is twice as fast."""
     flat = sums.reshape(-1)
     for start in range(U(0), U(flat.shape[0]), U(largest.shape[0])):
         for i in range(min(U(largest.shape[0]), U(flat.shape[0]) - start)):
