@@ -62,6 +62,14 @@ def merged(a: Evidence, b: Evidence, *, sign: int = 1) -> Evidence:
     return total
 
 
+def fits(evidence: Evidence) -> bool:
+    """Whether every number is one that a cell can hold."""
+    return all(
+        max(abs(hits), abs(misses)) < 1 << 31 and all(abs(value) <= 1 << 62 for value in samples)
+        for hits, misses, samples in evidence.values()
+    )
+
+
 # --- Columns (FORMAT.md 5) --------------------------------------------------------------------------------------
 
 

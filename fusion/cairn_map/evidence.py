@@ -132,20 +132,27 @@ def largest(evidence: Evidence, geometry: Geometry) -> npt.NDArray[np.int64]:
 
 
 def check_fits(evidence: Evidence, geometry: Geometry) -> None:
-    """Refuse evidence of another geometry: kernels check no bounds, and would write outside their arrays.
+    """Refuse evidence that is not packed, or of another geometry: kernels check nothing, and would write anywhere.
 
     Raises:
-        BadInputError: kind `bad_evidence`: a voxel outside the cell, a sampled row that is not there, or other planes.
+        BadInputError: kind `bad_evidence`: voxels or sampled rows that do not rise, a voxel outside the cell, a sampled
+            row that is not there, or other planes.
     """
-    outside = len(evidence) > 0 and int(evidence.voxels.max()) >= 8**geometry.depth
-    missing = len(evidence.sampled) > 0 and int(evidence.sampled.max()) >= len(evidence)
+    unsorted = not (_rise(evidence.voxels) and _rise(evidence.sampled))
+    outside = len(evidence) > 0 and int(evidence.voxels[-1]) >= 8**geometry.depth
+    missing = len(evidence.sampled) > 0 and int(evidence.sampled[-1]) >= len(evidence)
     planes = evidence.samples.shape[1]
-    if outside or missing or planes != geometry.plane_count:
+    if unsorted or outside or missing or planes != geometry.plane_count:
         raise BadInputError(
             "bad_evidence",
             f"evidence does not fit a cell of depth {geometry.depth} with {geometry.plane_count} planes; "
-            f"it has {planes} planes, voxels outside: {outside}, samples without voxel: {missing}",
+            f"it has {planes} planes, unsorted rows: {unsorted}, voxels outside: {outside}, "
+            f"samples without voxel: {missing}",
         )
+
+
+def _rise(numbers: npt.NDArray[np.uint32]) -> bool:
+    return bool((numbers[1:] > numbers[:-1]).all())
 
 
 def every_sum_has_weight(evidence: Evidence, geometry: Geometry) -> bool:

@@ -4,11 +4,14 @@ Through the public functions, because a kernel is compiled anew for each type of
 decoding gives them, are another type than those that a robot made.
 """
 
+from contextlib import suppress
+
 import numpy as np
 
-from cairn_map.brick_cell import BrickCell
+from cairn_map.brick_cell import brick_cell
 from cairn_map.cell_code import Profile, decode_canonical_cell, encode_cell
-from cairn_map.evidence import packed_evidence
+from cairn_map.errors import BadInputError
+from cairn_map.evidence import COUNT_MAX, SUM_MAX, Evidence, packed_evidence
 from cairn_map.fingerprint import fingerprint
 from cairn_map.grid import BRICK_DEPTH, Geometry, cell_key, voxels_in_cell
 from cairn_map.sensor_model import SensorModel
@@ -16,23 +19,36 @@ from cairn_map.view_code import decode_view, encode_view
 
 
 def warm_up() -> None:
-    """Encode, decode, view, merge, take out again and fingerprint some voxels, half of them with samples."""
+    """Encode, decode, view, merge, take out again and fingerprint a few voxels, with numbers small, large and too large."""
     geometry = Geometry(depth=BRICK_DEPTH)
     key = cell_key((0, 0, 0))
-    # As many as make models pay: profile small falls back to the fast one otherwise.
+    small, large = _many_voxels(geometry), _two_voxels(geometry, COUNT_MAX)
+    made = [small, large, _two_voxels(geometry, 1)]
+    modelled = decode_canonical_cell(encode_cell(key, small, geometry, profile=Profile.SMALL).data).evidence
+    read = [decode_canonical_cell(encode_cell(key, it, geometry).data).evidence for it in (modelled, *made[1:])]
+    for evidence in (*made, *read):
+        for held in (small, large):
+            cell = brick_cell(geometry, [held])
+            for change in (cell.merge, cell.unmerge):
+                with suppress(BadInputError):
+                    change(evidence)
+            cell.packed()
+        fingerprint(evidence, key)
+        voxels_in_cell(evidence.voxels, key, geometry)
+    decode_view(encode_view(key, modelled, geometry, SensorModel()))
+
+
+def _many_voxels(geometry: Geometry) -> Evidence:
+    """As many as make models pay: profile small falls back to the fast one otherwise."""
     places = np.arange(0, 512, 3, dtype=np.uint32)
     noise = (places * np.uint32(2654435761)) >> np.uint32(20)
     counts = np.stack([places % 2, noise % 5], axis=1).astype(np.int32)
     samples = np.where(places[:, None] % 2 == 1, np.ones(geometry.plane_count, np.int64), 0)
-    made = packed_evidence(places, counts, samples, geometry)
-    small = encode_cell(key, made, geometry, profile=Profile.SMALL).data
-    read = decode_canonical_cell(small).evidence
-    read = decode_canonical_cell(encode_cell(key, read, geometry).data).evidence
-    decode_view(encode_view(key, read, geometry, SensorModel()))
-    cell = BrickCell(geometry)
-    for evidence in (made, read):
-        cell.merge(evidence)
-        cell.unmerge(evidence)
-        fingerprint(evidence, key)
-        voxels_in_cell(evidence.voxels, key, geometry)
-    cell.packed()
+    return packed_evidence(places, counts, samples, geometry)
+
+
+def _two_voxels(geometry: Geometry, count: int) -> Evidence:
+    """A count, and sums as large as they may be."""
+    counts = np.array([[0, 1], [count, 0]])
+    samples = np.array([[0] * geometry.plane_count, [SUM_MAX] * geometry.plane_count], np.int64)
+    return packed_evidence(np.array([0, 511], np.uint32), counts, samples, geometry)

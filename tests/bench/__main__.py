@@ -15,12 +15,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 from tests.bench.integration import integration_rows
+from tests.bench.peers import peer_rows
 from tests.bench.simulation import simulation_rows
 
 from cairn_client.api import MapApi
@@ -32,9 +33,10 @@ from cairn_map.brick_cell import brick_cell
 from cairn_map.cell_code import decode_canonical_cell, decode_cell, encode_cell
 from cairn_map.channels import COLOUR, TEMPERATURE, Channel
 from cairn_map.commit import CommitMeta, make_commit
+from cairn_map.evidence import Evidence
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.fingerprint import fingerprint
-from cairn_map.grid import Geometry, geometry_for
+from cairn_map.grid import CellKey, Geometry, geometry_for
 from cairn_map.messages import CreateMap, Register
 from cairn_sim.heads import full_head
 from cairn_sim.record import Plan, scans_of, shots_of
@@ -52,6 +54,7 @@ def main() -> None:
     scans = _room_scans(stop_count=2 if smoke else 8, yaws=4 if smoke else 12)
     rows = [*_kernel_rows(scans, repeats=3 if smoke else 15), *_server_rows(scans, pushes=20 if smoke else 300)]
     rows += integration_rows(smoke)
+    rows += peer_rows(smoke)
     rows += simulation_rows(smoke)
     rows += _recording_rows(smoke)
     rows += _size_rows()
@@ -116,7 +119,23 @@ def _kernel_rows(scans: list[list[Scan]], *, repeats: int) -> Iterator[Row]:
     yield "  bytes per cell, mean / largest", f"{statistics.mean(cells):.0f}", f"/ {max(cells)} B"
     dense = len(cells) * 8 * 8**geometry.depth
     yield "  against dense 8 B voxels (Table 3)", f"1:{dense / sum(cells):.0f}", ""
-    yield "  memory of the map", f"{total.size_bytes / 1e6:.0f}", "MB"
+    yield "  memory of the map", f"{total.size_bytes / 1e6:.1f}", f"MB = {total.size_bytes / known:.1f} B a known voxel"
+    yield from _merge_rows(total, diffs[-1], repeats=repeats)
+
+
+def _merge_rows(total: EvidenceMap, diff: Mapping[CellKey, Evidence], *, repeats: int) -> Iterator[Row]:
+    """How fast a measurement is taken out of the map that holds it, and put in again."""
+    seconds = [(_cpu_s(lambda: total.unmerge(diff)), _cpu_s(lambda: total.merge(diff))) for _ in range(repeats)]
+    known = sum(len(evidence) for evidence in diff.values())
+    bricks = sum(evidence.brick_count for evidence in diff.values())
+    for name, times in zip(("take a measurement out of it", "merge it again"), zip(*seconds, strict=True), strict=True):
+        median_s = statistics.median(times)
+        known_rate, slot_rate = known / median_s / 1e6, 512 * bricks / median_s / 1e6
+        yield (
+            f"  {name}",
+            f"{1e3 * median_s:.1f}",
+            f"ms = {known_rate:.0f} M known voxels/s, {slot_rate:.0f} M of its bricks",
+        )
 
 
 def _server_rows(scans: list[list[Scan]], *, pushes: int) -> Iterator[Row]:

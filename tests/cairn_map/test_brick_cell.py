@@ -5,15 +5,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests import naive
-from tests.cairn_map.made import GEOMETRIES, KEY, MIDDLE, SMALL, any_evidence, as_dict, random_evidence
+from tests.cairn_map.made import DOSE, GEOMETRIES, KEY, MIDDLE, PLAIN, SMALL, any_evidence, as_dict, random_evidence
 
 from cairn_map.brick_cell import BrickCell, brick_cell, difference, sum_evidence
 from cairn_map.cell_code import encode_cell
+from cairn_map.channels import TEMPERATURE
 from cairn_map.errors import BadInputError
 from cairn_map.evidence import COUNT_MAX, SUM_MAX, Evidence, empty_evidence, packed_evidence
 from cairn_map.fingerprint import fingerprint
 from cairn_map.grid import Geometry
 
+TWO_CHANNELS = Geometry(voxel_edge_um=50_000, depth=4, channels=(TEMPERATURE, DOSE))
+"""Eight bricks."""
 SIGNED = any_evidence(SMALL, low=-(1 << 60), high=1 << 60)
 SMALL_DIFFS = any_evidence(SMALL, high=1 << 20)
 
@@ -22,6 +25,70 @@ def one_voxel(hits: int, *sums: int, geometry: Geometry = SMALL, place: int = 3)
     samples = np.zeros((1, geometry.plane_count), np.int64)
     samples[0, : len(sums)] = sums
     return packed_evidence(np.array([place], np.uint32), np.array([[hits, 0]]), samples, geometry)
+
+
+def voxels_as_given(voxels: list[int], *, sampled: list[int] | None = None) -> Evidence:
+    rows = np.array(sampled or [], np.uint32)
+    samples = np.ones((len(rows), SMALL.plane_count), np.int64)
+    return Evidence(np.array(voxels, np.uint32), np.ones((len(voxels), 2), np.int32), rows, samples)
+
+
+def edges(limit: int) -> st.SearchStrategy[int]:
+    """Numbers beside those where 15, 16, 31 and 62 bits end, of either sign, within a limit."""
+    tops = [1 << bits for bits in (0, 14, 15, 16, 30, 31, 61, 62)]
+    near = sorted({sign * (top + step) for top in tops for sign in (1, -1) for step in (-1, 0, 1)})
+    return st.sampled_from([number for number in near if abs(number) <= limit])
+
+
+@st.composite
+def edge_evidence(draw: st.DrawFn) -> Evidence:
+    """One voxel with samples, one without, and perhaps a brick of voxels all alike."""
+    geometry, counts, sums = TWO_CHANNELS, edges(COUNT_MAX), edges(SUM_MAX)
+    voxels = {1: (draw(counts), draw(counts)), draw(st.sampled_from([2, 600])): (draw(counts), 0)}
+    voxels |= dict.fromkeys(range(1024, 1536), (draw(counts), 0)) if draw(st.booleans()) else {}
+    samples = np.zeros((len(voxels), geometry.plane_count), np.int64)
+    samples[draw(st.integers(0, 1))] = [draw(sums) for _ in range(geometry.plane_count)]
+    return packed_evidence(np.array(list(voxels), np.uint32), np.array(list(voxels.values())), samples, geometry)
+
+
+@given(st.lists(st.tuples(edge_evidence(), st.sampled_from([1, -1])), min_size=1, max_size=6))
+def test_numbers_of_any_size_are_summed_or_refused_as_the_twin_says(steps: list[tuple[Evidence, int]]) -> None:
+    cell, total = BrickCell(TWO_CHANNELS), naive.Evidence()
+    for diff, sign in steps:
+        expected = naive.merged(total, as_dict(diff), sign=sign)
+        change = cell.merge if sign == 1 else cell.unmerge
+        if naive.fits(expected):
+            change(diff)
+            total = expected
+        else:
+            with pytest.raises(BadInputError) as refused:
+                change(diff)
+            assert refused.value.kind == "evidence_overflow"
+        assert as_dict(cell.packed()) == total
+
+
+@given(st.lists(st.tuples(st.integers(0, 1000), st.sampled_from([1, -1])), max_size=5))
+def test_bricks_and_runs_and_rows_are_summed_as_the_twin_says(steps: list[tuple[int, int]]) -> None:
+    cell, total = BrickCell(MIDDLE), naive.Evidence()
+    for seed, sign in steps:
+        diff = random_evidence(seed, MIDDLE, voxels=400, air=4)
+        (cell.merge if sign == 1 else cell.unmerge)(diff)
+        total = naive.merged(total, as_dict(diff), sign=sign)
+    assert as_dict(cell.packed()) == total
+
+
+@pytest.mark.parametrize(("count", "bits"), [(1 << 14, 16), (1 << 15, 32), (COUNT_MAX, 32)])
+def test_counts_take_the_bits_that_they_need(count: int, bits: int) -> None:
+    empty, cell = BrickCell(PLAIN), brick_cell(PLAIN, [one_voxel(count - 1, geometry=PLAIN)])
+    cell.merge(one_voxel(1, geometry=PLAIN))
+    assert cell.size_bytes - empty.size_bytes == 512 * 2 * bits // 8
+
+
+@pytest.mark.parametrize(("sums", "wide"), [((1 << 30, 5), 0), ((1 << 31, 5), 1), ((5, SUM_MAX, 1 << 40), 2)])
+def test_planes_take_the_bits_that_they_need(sums: tuple[int, ...], wide: int) -> None:
+    without, cell = brick_cell(SMALL, [one_voxel(1)]), brick_cell(SMALL, [one_voxel(1)])
+    cell.merge(one_voxel(0, *sums))
+    assert cell.size_bytes - without.size_bytes == 4 + 4 + 4 * SMALL.plane_count + 8 * wide
 
 
 @given(SIGNED, SIGNED)
@@ -90,6 +157,17 @@ def test_merging_changes_no_argument() -> None:
     assert diff == copy
 
 
+def test_arrays_may_lie_in_memory_as_they_like() -> None:
+    diff = random_evidence(4, MIDDLE)
+    columns = Evidence(
+        np.repeat(diff.voxels, 2)[::2],
+        np.asfortranarray(diff.counts),
+        np.repeat(diff.sampled, 2)[::2],
+        np.asfortranarray(diff.samples),
+    )
+    assert sum_evidence([columns, diff], MIDDLE) == sum_evidence([diff, diff], MIDDLE)
+
+
 @pytest.mark.parametrize("diff", [one_voxel(1), one_voxel(0, 1), one_voxel(0, 0, 0, 0, SUM_MAX)])
 def test_a_sum_that_would_overflow_is_refused_and_nothing_changes(diff: Evidence) -> None:
     full = one_voxel(COUNT_MAX, *[SUM_MAX] * SMALL.plane_count)
@@ -123,8 +201,18 @@ def test_a_sum_that_would_overflow_downwards_is_refused_and_nothing_changes() ->
             np.array([1], np.uint32),
             np.ones((1, SMALL.plane_count), np.int64),
         ),
+        voxels_as_given([600, 3]),
+        voxels_as_given([3, 3]),
+        voxels_as_given([3, 4], sampled=[1, 0]),
     ],
-    ids=["voxels outside the cell", "other planes", "samples without a voxel"],
+    ids=[
+        "voxels outside the cell",
+        "other planes",
+        "samples without a voxel",
+        "voxels that fall, from outside",
+        "a voxel twice",
+        "samples that fall",
+    ],
 )
 def test_evidence_of_another_geometry_never_reaches_the_kernels(stranger: Evidence) -> None:
     cell = brick_cell(SMALL, [one_voxel(1)])

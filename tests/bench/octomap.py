@@ -1,0 +1,80 @@
+"""OctoMap beside us: Debian's `liboctomap-dev`, driven by a small program that is compiled when the benchmark runs."""
+
+import shutil
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.poses import transform_points
+from cairn_calib.rig import Rig
+from cairn_fusion.scan import Scan
+from cairn_fusion.transfer import points_from_range
+
+SOURCE = Path(__file__).with_name("octomap_driver.cpp")
+HEADER = Path("/usr/include/octomap/octomap.h")
+RANGE_MAX_M = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class OctomapRun:
+    """What inserting took, and the leaves of the pruned tree."""
+
+    cpu_s: float
+    leaves: int
+
+
+def missing() -> str:
+    """Why OctoMap cannot be measured here; empty if it can."""
+    if shutil.which("g++") is None:
+        return "no g++ (apt-get install g++)"
+    return "" if HEADER.exists() else "no OctoMap (apt-get install liboctomap-dev)"
+
+
+def compiled_driver(folder: Path) -> Path:
+    """The driver, compiled for this machine."""
+    driver = folder / "octomap_driver"
+    options = ["-O3", "-march=native", "-DNDEBUG", "-o", str(driver)]
+    subprocess.run(["g++", *options, str(SOURCE), "-loctomap", "-loctomath"], check=True)
+    return driver
+
+
+def write_scans(path: Path, scans: Sequence[Scan], rig: Rig) -> int:
+    """The points of range images within 10 m, map frame, as the driver reads them; returns how many there are."""
+    total = 0
+    with path.open("wb") as file:
+        for scan in scans:
+            mounted = rig[scan.range_camera]
+            T_map_camera = scan.T_map_rig @ mounted.transform
+            seen = np.nan_to_num(scan.range_m, nan=np.inf) <= RANGE_MAX_M
+            points = transform_points(T_map_camera, points_from_range(scan.range_m, mounted.camera)[seen])
+            file.write(T_map_camera[:3, 3].astype("<f4").tobytes() + np.int32(len(points)).tobytes())
+            file.write(points.astype("<f4").tobytes())
+            total += len(points)
+    return total
+
+
+def write_colours(path: Path, centres_m: npt.NDArray[np.float64], colours: npt.NDArray[np.uint8]) -> None:
+    """(N, 3) centres of voxels and their (N, 3) colours, as the driver reads them."""
+    rows = np.zeros(len(centres_m), np.dtype([("xyz", "<f4", 3), ("rgba", np.uint8, 4)]))
+    rows["xyz"] = centres_m
+    rows["rgba"][:, :3] = colours
+    path.write_bytes(rows.tobytes())
+
+
+def insert_scans(driver: Path, scans: Path, *, voxel_edge_m: float) -> OctomapRun:
+    """Occupancy alone, into an `OcTree`."""
+    return _run([str(driver), str(scans), str(voxel_edge_m), str(RANGE_MAX_M)])
+
+
+def colour_tree(driver: Path, scans: Path, colours: Path, out: Path, *, voxel_edge_m: float) -> OctomapRun:
+    """The same as a `ColorOcTree` with these colours, written to `out` (.ot)."""
+    return _run([str(driver), str(scans), str(voxel_edge_m), str(RANGE_MAX_M), str(colours), str(out)])
+
+
+def _run(command: list[str]) -> OctomapRun:
+    cpu_s, leaves = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+    return OctomapRun(float(cpu_s), int(leaves))
