@@ -296,5 +296,5 @@ def split_map_url(map_url: str) -> tuple[str, str]:
         parts, is_host = urlsplit(""), False
     head, _, name = parts.path.rstrip("/").rpartition("/maps/")
     if parts.scheme not in ("http", "https") or not is_host or not name or "/" in name:
-        raise BadInputError("bad_url", f"a map's URL is http://HOST:PORT/maps/NAME, got {map_url!r}")
+        raise BadInputError("bad_url", f"a map's URL is http://HOST:PORT/maps/NAME, got {map_url[:200]!r}")
     return f"{parts.scheme}://{parts.netloc}{head}", robot_name(name)
