@@ -22,6 +22,7 @@ from pathlib import Path
 
 from tests.bench.integration import integration_rows
 from tests.bench.simulation import simulation_rows
+from tests.bench.start import start_rows
 
 from cairn_client.api import MapApi
 from cairn_client.robot import Robot
@@ -53,6 +54,7 @@ def main() -> None:
     rows = [*_kernel_rows(scans, repeats=3 if smoke else 15), *_server_rows(scans, pushes=20 if smoke else 300)]
     rows += integration_rows(smoke)
     rows += simulation_rows(smoke)
+    rows += start_rows(smoke)
     rows += _recording_rows(smoke)
     rows += _size_rows()
     width = max(len(name) for name, _, _ in rows)

@@ -95,8 +95,8 @@ def _other_streams(data: bytes, rng: random.Random, mutate: Mutate, *, is_sound:
     head, head_bytes = decode_head(data)
     streams = _streams(data[len(head_bytes) :])
     for _ in range(rng.choice((1, 1, 2, 4))):
-        number = rng.choice(list(streams))
-        streams[number] = mutate(streams[number])
+        number = rng.choice(list(streams) or [CHILD_MASKS])
+        streams[number] = mutate(streams.get(number, b""))
     if is_sound:
         head = replace(head, signed=head.signed ^ (rng.random() < 0.05))
         head, streams = _agreed(head, streams)
