@@ -166,6 +166,7 @@ def _texts() -> Iterator[tuple[str, str, bytes]]:
         "commit": f"{ROBOT}.12",
         "author": ROBOT,
         "robot": "mole-2",
+        "cell": "0,-12,3",
         "fingerprint": "0f" * 16,
         "url": "http://base:8750/maps/lab",
     }

@@ -34,7 +34,7 @@ from cairn_map.errors import BadInputError, CairnError
 from cairn_map.evidence import Evidence
 from cairn_map.fingerprint import fingerprint, fingerprint_from_hex
 from cairn_map.frames import FrameReader, encode_frame, frames_of, start_of_reply
-from cairn_map.grid import CellKey, Geometry
+from cairn_map.grid import CellKey, Geometry, cell_from_text
 from cairn_map.ids import author_from_text, commit_id_from_text, robot_name
 from cairn_map.version_vector import version_vector_from_json
 from cairn_sim.scene_file import load_scene
@@ -168,6 +168,7 @@ def read_text(data: bytes) -> None:
         "commit": commit_id_from_text,
         "author": author_from_text,
         "robot": robot_name,
+        "cell": cell_from_text,
     }
     if kind in parsers:
         assert str(parsers[kind](rest)) == rest

@@ -1,20 +1,39 @@
 """Every input of the corpus once more, and a minute of fuzzing shared by all targets; `make soak` takes longer."""
 
+import os
 import random
+import subprocess
+import sys
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 from tests.fuzz.make_corpus import seeds
-from tests.fuzz.one_target import CORPUS
-from tests.fuzz.soak import FINDINGS, soak
+from tests.fuzz.one_target import CORPUS, FOUND
+from tests.fuzz.soak import FINDINGS, ROOT, soak
 from tests.fuzz.targets import TARGETS, survives
 
 SECONDS = 60 // len(TARGETS) - 2
 """Of each target, after some two seconds for starting."""
 INPUTS = sorted(CORPUS.glob("*/*.input"))
 
+BROKEN_TARGET = """
+import sys
+from pathlib import Path
+from tests.fuzz import one_target, targets
+
+def greedy(data: bytes) -> None:
+    if len(data) > 64:
+        bytearray(2 * one_target.MEMORY_BYTES_MAX)
+
+targets.TARGETS["text"] = targets.Target(greedy)
+one_target.fuzz("text", seconds=60, grown=Path(sys.argv[1]), findings=Path(sys.argv[2]))
+"""
+
+needs_atheris = pytest.mark.skipif(
+    find_spec("atheris") is None, reason="atheris is not installed: it has wheels for Linux on x86-64 only"
+)
 every_target = pytest.mark.parametrize("name", TARGETS)
 
 
@@ -56,9 +75,23 @@ def test_mutators_get_past_checksums(name: str) -> None:
     assert len(set(taken) - set(sound)) >= 5
 
 
-@pytest.mark.skipif(find_spec("atheris") is None, reason="atheris is not installed: it has wheels for Linux on x86-64")
+@needs_atheris
 @every_target
 def test_a_short_fuzz_finds_nothing(name: str) -> None:
     report = soak(name, seconds=SECONDS, findings=FINDINGS)
     assert not report.failure, f"{report.failure}\n{report.how_to_repeat}"
     assert report.inputs > 0
+
+
+@needs_atheris
+def test_too_much_memory_is_a_finding(tmp_path: Path) -> None:
+    grown, findings = tmp_path / "grown", tmp_path / "findings"
+    grown.mkdir()
+    findings.mkdir()
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    command = [sys.executable, "-c", BROKEN_TARGET, str(grown), str(findings)]
+    done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == FOUND
+    assert "MemoryError" in done.stdout
+    (found,) = findings.iterdir()
+    assert len(found.read_bytes()) > 64
