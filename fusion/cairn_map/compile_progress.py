@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from functools import cache
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
     from numba.core.dispatcher import Dispatcher
@@ -70,7 +70,8 @@ def show_compiling() -> None:
             if len(self.starts_s) == 1:
                 kernels = list(known_kernels())
                 ready = sum(bool(kernel.signatures) for kernel in kernels)
-                self.progress.begin(event.data["dispatcher"].py_func.__name__, ready=ready, total=len(kernels))
+                details: Any = event.data
+                self.progress.begin(details["dispatcher"].py_func.__name__, ready=ready, total=len(kernels))
 
         def on_end(self, event: Event) -> None:
             start_s = self.starts_s.pop()

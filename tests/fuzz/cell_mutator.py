@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 import zstandard
 
-from cairn_map.cell_code import decode_cell, encode_cell
+from cairn_map.cell_code import Profile, decode_cell, encode_cell
 from cairn_map.cell_head import CellHead, decode_head, encode_head
 from cairn_map.errors import CairnError
 from cairn_map.evidence import COUNT_MAX, SUM_MAX, packed_evidence
@@ -24,7 +24,7 @@ Mutate = Callable[[bytes], bytes]
 Streams = dict[int, bytes]
 
 STREAM_HEAD = struct.Struct("<BBII")
-STORED, ZSTD = 0, 1
+STORED, ZSTD, MODELLED = 0, 1, 2
 CHILD_MASKS, LEAF_MASKS, HITS, MISSES = 1, 2, 3, 4
 FIRST_CHANNEL, STREAMS_PER_CHANNEL = 16, 8
 RAW_BYTES_MAX = 1 << 16
@@ -82,7 +82,7 @@ def _other_evidence(data: bytes, rng: random.Random) -> bytes:
         keep = draw.random(len(places)) < 0.8
         places, counts, samples = places[keep], counts[keep], samples[keep]
     made = packed_evidence(places.astype(np.uint32), counts, samples, geometry)
-    return encode_cell(CellKey(cell.key), made, geometry).data
+    return encode_cell(CellKey(cell.key), made, geometry, profile=rng.choice(list(Profile))).data
 
 
 def _other_geometry(geometry: Geometry, rng: random.Random) -> Geometry:
@@ -93,34 +93,42 @@ def _other_geometry(geometry: Geometry, rng: random.Random) -> Geometry:
 
 def _other_streams(data: bytes, rng: random.Random, mutate: Mutate, *, is_sound: bool) -> bytes:
     head, head_bytes = decode_head(data)
-    streams = _streams(data[len(head_bytes) :])
+    streams, modelled = _streams(data[len(head_bytes) :])
     for _ in range(rng.choice((1, 1, 2, 4))):
         number = rng.choice(list(streams) or [CHILD_MASKS])
         streams[number] = mutate(streams.get(number, b""))
-    if is_sound:
+    if is_sound and not modelled:
         head = replace(head, signed=head.signed ^ (rng.random() < 0.05))
         head, streams = _agreed(head, streams)
         head_bytes = encode_head(head)
     elif rng.random() < 0.2:
         head_bytes = mutate(head_bytes)
     is_packed = rng.random() < 0.5
-    return head_bytes + b"".join(_stream(number, raw, is_packed) for number, raw in streams.items())
+    return head_bytes + b"".join(
+        STREAM_HEAD.pack(number, MODELLED, modelled[number], len(raw)) + raw
+        if number in modelled
+        else _stream(number, raw, is_packed)
+        for number, raw in streams.items()
+    )
 
 
-def _streams(data: bytes) -> Streams:
-    """Raw streams by number; what is compressed in another way stays as it is."""
+def _streams(data: bytes) -> tuple[Streams, dict[int, int]]:
+    """Raw streams by number; what is modelled stays as it is, and comes with the raw length that it claims."""
     streams: Streams = {}
+    modelled: dict[int, int] = {}
     at = 0
     while at < len(data):
-        number, coding, _, stored = STREAM_HEAD.unpack_from(data, at)
+        number, coding, raw_bytes, stored = STREAM_HEAD.unpack_from(data, at)
         at += STREAM_HEAD.size
         body = data[at : at + stored]
         at += stored
         if coding == ZSTD:
             with zstandard.ZstdDecompressor(max_window_size=1 << 23).stream_reader(body) as reader:
                 body = reader.read(RAW_BYTES_MAX)
+        elif coding == MODELLED:
+            modelled[number] = raw_bytes
         streams[number] = body
-    return streams
+    return streams, modelled
 
 
 def _stream(number: int, raw: bytes, is_packed: bool) -> bytes:

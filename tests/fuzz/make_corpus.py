@@ -25,7 +25,7 @@ from cairn_calib.rig import Rig, Spectrum, mounted
 from cairn_fusion.recording_writer import RecordingWriter
 from cairn_fusion.scan import Scan
 from cairn_fusion.trajectory import trajectory_line
-from cairn_map.cell_code import encode_cell
+from cairn_map.cell_code import Profile, encode_cell
 from cairn_map.cell_folder import FolderHead
 from cairn_map.evidence import Evidence, empty_evidence
 from cairn_map.fingerprint import fingerprint
@@ -126,7 +126,11 @@ def _cells() -> Iterator[tuple[str, str, bytes]]:
         evidence = made_evidence(n, geometry, voxels=12, air=0 if geometry.depth > 3 else 2)
         data = encode_cell(KEY, evidence, geometry).data
         yield "cell", f"geometry-{n}", data
+        small = encode_cell(KEY, evidence, geometry, profile=Profile.SMALL).data
         yield "cell", f"geometry-{n}-plain", recoded(data, level=None)
+        yield "cell", f"geometry-{n}-small", small
+        yield "cell-part", f"geometry-{n}", data
+        yield "cell-part", f"geometry-{n}-small", small
     evidence = made_evidence(0, SMALL, voxels=8, air=1)
     signed = Evidence(evidence.voxels, -evidence.counts, evidence.sampled, -evidence.samples)
     yield "cell", "signed", encode_cell(KEY, signed, SMALL).data

@@ -26,15 +26,16 @@ from cairn_fusion.recording import open_recording
 from cairn_fusion.trajectory import interpolated, read_trajectory, trajectory_line
 from cairn_map import messages
 from cairn_map.brick_cell import brick_cell
-from cairn_map.cell_code import decode_canonical_cell, decode_cell, encode_cell
+from cairn_map.cell_code import Profile, decode_canonical_cell, decode_cell, encode_cell
 from cairn_map.cell_folder import read_head
+from cairn_map.cell_reading import cell_reader
 from cairn_map.commit import commit_sha, open_commit, renamed_commit, split_commit
 from cairn_map.cursor import cursor_from_text
 from cairn_map.errors import BadInputError, CairnError
 from cairn_map.evidence import Evidence
 from cairn_map.fingerprint import fingerprint, fingerprint_from_hex
 from cairn_map.frames import FrameReader, encode_frame, frames_of, start_of_reply
-from cairn_map.grid import CellKey, Geometry, cell_from_text
+from cairn_map.grid import DEPTH_MAX, CellKey, Geometry, cell_from_text
 from cairn_map.ids import author_from_text, commit_id_from_text, robot_name
 from cairn_map.version_vector import version_vector_from_json
 from cairn_sim.scene_file import load_scene
@@ -84,11 +85,28 @@ def read_cell(data: bytes) -> None:
     """A cell of evidence; sound evidence has one canonical coding, and `decode_canonical_cell` takes only that."""
     cell = decode_cell(data, evidence_bytes_max=EVIDENCE_BYTES_MAX)
     check_evidence(cell.key, cell.evidence, cell.geometry)
-    encoded = encode_cell(cell.key, cell.evidence, cell.geometry)
-    again = decode_canonical_cell(encoded.data)
-    assert (again.key, again.geometry, again.evidence) == (cell.key, cell.geometry, cell.evidence)
-    assert again.digest == encoded.digest
+    for profile in Profile:
+        encoded = encode_cell(cell.key, cell.evidence, cell.geometry, profile=profile)
+        again = decode_canonical_cell(encoded.data)
+        assert (again.key, again.geometry, again.evidence) == (cell.key, cell.geometry, cell.evidence)
+        assert again.digest == encoded.digest
     assert decode_canonical_cell(data, evidence_bytes_max=EVIDENCE_BYTES_MAX).digest == encoded.digest
+
+
+def read_cell_partly(data: bytes) -> None:
+    """A cell read as far as one asks: the octree to each depth, then channels from the last to the first."""
+    for depth in range(1, DEPTH_MAX + 1):
+        try:
+            octree = cell_reader(data, evidence_bytes_max=EVIDENCE_BYTES_MAX).topology(depth)
+        except CairnError:
+            break
+        assert len(octree.starts) == len(octree.sizes)
+        assert int(octree.sizes.sum()) <= 8**DEPTH_MAX
+    reader = cell_reader(data, evidence_bytes_max=EVIDENCE_BYTES_MAX)
+    for c in reversed(range(len(reader.head.geometry.channels))):
+        reader.channel(c)
+    counts = reader.counts()
+    assert counts.shape == (reader.head.leaves, 2)
 
 
 def check_evidence(key: CellKey, evidence: Evidence, geometry: Geometry) -> None:
@@ -245,6 +263,7 @@ def read_scene(data: bytes) -> None:
 
 TARGETS: dict[str, Target] = {
     "cell": Target(read_cell, mutated_cell),
+    "cell-part": Target(read_cell_partly, mutated_cell),
     "commit": Target(read_commit, mutated_commit),
     "reply": Target(read_reply, mutated_reply),
     "message": Target(read_message, mutated_sections),
