@@ -5,7 +5,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint bench clean system
+.PHONY: help demo test soak lint bench clean system
 # Installing comes before compiling, in the order in which the targets name them.
 .NOTPARALLEL:
 
@@ -14,6 +14,8 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # By file, because the image is built once per worker that runs a test of it; in tests/conftest.py's order.
 WORKERS := --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+# Of each target.
+SOAK_SECONDS ?= 600
 KERNELS := $(wildcard */cairn_*/*_kernels.py */cairn_*/warm_up.py)
 # Commands that tests need and pip cannot bring, and the Debian packages that have them.
 SYSTEM_PACKAGES := buildah mmdebstrap curl
@@ -26,6 +28,9 @@ demo: .venv/run.stamp .venv/kernels.stamp  ## three robots, one server, one map 
 
 test: .venv/dev.stamp .venv/kernels.stamp | system  ## all tests (PYTEST_ARGS="...")
 	$(BIN)/python -m pytest $(WORKERS) $(PYTEST_ARGS)
+
+soak: .venv/dev.stamp  ## fuzz every decoder (SOAK_SECONDS=600 of each, SOAK_ARGS="cell")
+	$(BIN)/python -m tests.fuzz --seconds $(SOAK_SECONDS) $(SOAK_ARGS)
 
 lint: .venv/dev.stamp  ## ruff, mypy, pyright
 	$(BIN)/ruff check .

@@ -47,7 +47,12 @@ MAY_NAME = {
     "httpx": ["cairn_client/api.py"],
     "apsw": ["cairn_server/sqlite_*.py", "cairn_client/replica_store.py"],
     "psycopg": [],
-    "numba": ["cairn_map/*_kernels.py", "cairn_fusion/*_kernels.py", "cairn_sim/*_kernels.py"],
+    "numba": [
+        "cairn_map/*_kernels.py",
+        "cairn_map/compile_progress.py",
+        "cairn_fusion/*_kernels.py",
+        "cairn_sim/*_kernels.py",
+    ],
 }
 
 EMPTY_NAMES = {"utils", "util", "helpers", "helper", "common", "manager", "base", "misc"}

@@ -29,11 +29,12 @@ def checked_transform(values: npt.ArrayLike, *, name: str = "transform") -> Tran
     if not np.allclose(T[3], (0, 0, 0, 1), atol=1e-9):
         raise BadInputError("bad_transform", f"{name} must end in the row 0 0 0 1, got {T[3].tolist()}")
     R = T[:3, :3]
-    deviation = float(np.abs(R.T @ R - np.eye(3)).max())
-    if deviation > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation, det = float(np.abs(R.T @ R - np.eye(3)).max()), float(np.linalg.det(R))
+    # Not `deviation > ...`: of numbers beyond 1e154 it may be NaN.
+    if not deviation <= ROTATION_TOLERANCE or det < 0:
         raise BadInputError(
-            "bad_transform",
-            f"{name} must hold a rotation: R^T R is off by {deviation:.2g}, det R is {np.linalg.det(R):.3g}",
+            "bad_transform", f"{name} must hold a rotation: R^T R is off by {deviation:.2g}, det R is {det:.3g}"
         )
     U, _, Vt = np.linalg.svd(R)
     T[:3, :3] = U @ Vt

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, Validatio
 from cairn_calib.camera import Camera
 from cairn_calib.lidar import AnyCamera, SpinningLidar
 from cairn_calib.poses import Transform, checked_transform
-from cairn_map.errors import BadInputError
+from cairn_map.errors import BadInputError, first_error
 
 RIG_BYTES_MAX = 1 << 20
 Row = tuple[float, float, float, float]
@@ -130,9 +130,7 @@ def rig_from_json(data: bytes) -> Rig:
     try:
         return Rig.model_validate_json(data)
     except ValidationError as exc:
-        first = exc.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "document"
-        raise BadInputError("bad_rig", f"rig.json: {where}: {first['msg']}") from exc
+        raise BadInputError("bad_rig", f"rig.json: {first_error(exc)}") from exc
 
 
 def load_rig(path: Path | str) -> Rig:

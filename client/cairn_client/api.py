@@ -23,6 +23,7 @@ from cairn_map.errors import (
     DeniedError,
     NotFoundError,
     UnreachableError,
+    first_error,
 )
 from cairn_map.fingerprint import Fingerprint, fingerprint_from_hex
 from cairn_map.frames import Frame, FrameReader
@@ -230,7 +231,7 @@ def _list_of(model: type[Message], data: bytes) -> list[Message]:
         found: list[Message] = TypeAdapter(list[model]).validate_json(data)  # type: ignore[valid-type]
         return found
     except ValidationError as exc:
-        raise DamagedDataError("bad_message", f"the server's list is not sound: {exc.errors()[0]['msg']}") from exc
+        raise DamagedDataError("bad_message", f"the server's list is not sound: {first_error(exc)}") from exc
 
 
 def _unreachable(exc: httpx.TransportError) -> UnreachableError:

@@ -11,6 +11,7 @@ from importlib.metadata import EntryPoint, entry_points, version
 from importlib.util import find_spec
 from pathlib import Path
 
+from cairn_map.compile_progress import show_compiling
 from cairn_map.errors import (
     CairnError,
     ConflictError,
@@ -63,6 +64,7 @@ def _run(point: EntryPoint, arguments: list[str]) -> int:
             f'cairn {point.name}: {exc.name} is not installed; get it with pip install "cairn-robotics[{extra}]"\n'
         )
         return FAILED
+    show_compiling()
     result: int = module.main(arguments)
     return result
 

@@ -13,7 +13,6 @@ import logging
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Literal, Self, TypeVar
 from urllib.parse import urlsplit
 
@@ -30,6 +29,7 @@ from cairn_fusion.integrate import Integrator
 from cairn_fusion.measurement import Measurement
 from cairn_fusion.scan import Scan
 from cairn_map.commit import Commit, CommitMeta
+from cairn_map.compile_progress import show_compiling
 from cairn_map.errors import BadInputError, CairnError, DeniedError, first_error
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.grid import Geometry
@@ -77,6 +77,7 @@ class Robot:
             ConflictError: another process has the directory open.
             UnreachableError: the geometry is not known and the server cannot be asked.
         """
+        show_compiling()
         server_url, self._map_name = split_map_url(map_url)
         self.name = robot_name(name)
         self.mode: Mode = mode
@@ -99,9 +100,7 @@ class Robot:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     @property
@@ -296,5 +295,5 @@ def split_map_url(map_url: str) -> tuple[str, str]:
         parts, is_host = urlsplit(""), False
     head, _, name = parts.path.rstrip("/").rpartition("/maps/")
     if parts.scheme not in ("http", "https") or not is_host or not name or "/" in name:
-        raise BadInputError("bad_url", f"a map's URL is http://HOST:PORT/maps/NAME, got {map_url!r}")
+        raise BadInputError("bad_url", f"a map's URL is http://HOST:PORT/maps/NAME, got {map_url[:200]!r}")
     return f"{parts.scheme}://{parts.netloc}{head}", robot_name(name)

@@ -17,7 +17,7 @@ from cairn_calib.lidar import AnyCamera, SpinningLidar
 from cairn_calib.rig import Rig, Spectrum
 from cairn_fusion.adapters import kelvin_from_counts, range_from_radial, range_from_z_depth
 from cairn_fusion.timed_lists import read_text
-from cairn_map.errors import BadInputError
+from cairn_map.errors import BadInputError, first_error
 
 HEADER_FILE = "recording.json"
 RIG_FILE = "rig.json"
@@ -103,9 +103,7 @@ def header_from_json(text: str) -> RecordingHeader:
     try:
         return RecordingHeader.model_validate_json(text)
     except ValidationError as exc:
-        first = exc.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "document"
-        raise BadInputError("bad_recording", f"{HEADER_FILE}: {where}: {first['msg']}") from exc
+        raise BadInputError("bad_recording", f"{HEADER_FILE}: {first_error(exc)}") from exc
 
 
 def read_header(folder: Path) -> RecordingHeader:
@@ -152,7 +150,8 @@ def check_camera_name(name: str) -> None:
     """Refuse a camera whose name cannot be a file's."""
     if not CAMERA_NAME.fullmatch(name) or name in RESERVED_NAMES:
         raise BadInputError(
-            "bad_recording", f"a recorded camera's name must be letters, digits, _ or -, and not reserved, got {name!r}"
+            "bad_recording",
+            f"a recorded camera's name must be letters, digits, _ or -, and not reserved, got {name[:80]!r}",
         )
 
 

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from cairn_map.cell_code import DecodedCell, decode_canonical_cell
 from cairn_map.cell_reading import CELL_BYTES_MAX
-from cairn_map.errors import BadInputError, DamagedDataError
+from cairn_map.errors import BadInputError, DamagedDataError, first_error
 from cairn_map.grid import Cell, Geometry, cell_key
 from cairn_map.sensor_model import SensorModel
 
@@ -66,7 +66,7 @@ def read_head(folder: Path) -> FolderHead:
     except OSError as exc:
         raise BadInputError("no_map_folder", f"{folder} is not a folder of cells: {path.name}: {exc.strerror}") from exc
     except ValidationError as exc:
-        raise BadInputError("no_map_folder", f"{path} does not describe a map: {exc.errors()[0]['msg']}") from exc
+        raise BadInputError("no_map_folder", f"{path} does not describe a map: {first_error(exc)}") from exc
 
 
 def read_cells(folder: Path, geometry: Geometry) -> Iterator[DecodedCell]:

@@ -64,9 +64,12 @@ def fingerprint_from_hex(text: str) -> Fingerprint:
     """The mirror of `Fingerprint.hex`.
 
     Raises:
-        DamagedDataError: not 32 hex digits.
+        DamagedDataError: not 32 hex digits, in lower case.
     """
     try:
-        return fingerprint_from_bytes(bytes.fromhex(text))
+        found = fingerprint_from_bytes(bytes.fromhex(text))
+        if found.hex() != text:  # bytes.fromhex skips spaces and takes capitals; a fingerprint has one text only
+            raise ValueError
+        return found
     except ValueError:
         raise DamagedDataError("bad_fingerprint", f"a fingerprint is 32 hex digits, got {text[:40]!r}") from None

@@ -19,7 +19,7 @@ from cairn_map.view_code import decode_view, encode_view
 
 
 def warm_up() -> None:
-    """Encode, decode, view, merge, take out again and fingerprint a few voxels, with numbers small, large and too large."""
+    """Encode, decode, view, merge, take out again and fingerprint a few voxels, with numbers of every size."""
     geometry = Geometry(depth=BRICK_DEPTH)
     key = cell_key((0, 0, 0))
     small, large = _many_voxels(geometry), _two_voxels(geometry, COUNT_MAX)

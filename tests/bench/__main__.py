@@ -23,6 +23,7 @@ from pathlib import Path
 from tests.bench.integration import integration_rows
 from tests.bench.peers import peer_rows
 from tests.bench.simulation import simulation_rows
+from tests.bench.start import start_rows
 
 from cairn_client.api import MapApi
 from cairn_client.robot import Robot
@@ -56,6 +57,7 @@ def main() -> None:
     rows += integration_rows(smoke)
     rows += peer_rows(smoke)
     rows += simulation_rows(smoke)
+    rows += start_rows(smoke)
     rows += _recording_rows(smoke)
     rows += _size_rows()
     width = max(len(name) for name, _, _ in rows)

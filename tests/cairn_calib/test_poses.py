@@ -80,6 +80,9 @@ def test_rounding_in_a_text_file_is_taken_out_of_a_rotation() -> None:
         np.diag([1.0, 1, 1, 2]),
         np.eye(4) + np.eye(4)[[3, 0, 1, 2]] * 0.01,  # a perspective row
         np.eye(4) + np.diag([0.001, 0, 0], 1),  # a shear
+        np.block(
+            [[1e200 * np.array([[1.0, -1], [1, 1]]), np.zeros((2, 2))], [np.zeros((2, 2)), np.eye(2)]]
+        ),  # inf - inf
     ],
 )
 def test_what_is_not_rigid_is_refused(wrong: np.ndarray) -> None:  # type: ignore[type-arg]

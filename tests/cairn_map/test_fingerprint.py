@@ -59,7 +59,7 @@ def test_fingerprints_come_back_from_bytes_and_hex(first: int, second: int) -> N
     assert one - one == ZERO
 
 
-@pytest.mark.parametrize("text", ["", "00", "0" * 31, "0" * 33, "g" * 32, "é" * 32])
+@pytest.mark.parametrize("text", ["", "00", "0" * 31, "0" * 33, "g" * 32, "é" * 32, "A" * 32, " " + "0" * 32])
 def test_other_texts_are_no_fingerprint(text: str) -> None:
     with pytest.raises(DamagedDataError):
         fingerprint_from_hex(text)

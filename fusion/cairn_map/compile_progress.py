@@ -1,0 +1,92 @@
+"""What is said while kernels are compiled, which the first start on a machine waits for: half a minute of silence else.
+
+    compiling kernels, only this once: carve_window, 7 of 25, 12 s
+
+On a terminal it is one line, which is gone when the kernel is done; in a log a line every few seconds. Kernels that are
+read from Numba's cache say nothing.
+"""
+
+import sys
+import time
+from collections.abc import Iterator
+from functools import cache
+from typing import TYPE_CHECKING, Any, TextIO
+
+if TYPE_CHECKING:
+    from numba.core.dispatcher import Dispatcher
+
+LOG_EVERY_S = 5.0
+LOG_AFTER_S = 1.0
+"""Of compiling altogether: less is not worth a line."""
+CLEAR_LINE = "\r\x1b[K"
+
+
+class CompileProgress:
+    """Says which kernel is being compiled, how many of those at hand are ready, and how long it has taken so far."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        """Args: stream: where to; None: whatever `sys.stderr` is at the time."""
+        self._stream = stream
+        self._taken_s = 0.0
+        self._logged_s = LOG_AFTER_S - LOG_EVERY_S
+
+    def begin(self, kernel: str, *, ready: int, total: int) -> None:
+        """Say that a kernel is being compiled, while `ready` of `total` are."""
+        line = f"compiling kernels, only this once: {kernel}, {min(ready + 1, total)} of {total}, {self._taken_s:.0f} s"
+        stream = self._stream or sys.stderr
+        if stream.isatty():
+            stream.write(CLEAR_LINE + line)
+            stream.flush()
+        elif self._taken_s >= self._logged_s + LOG_EVERY_S:
+            self._logged_s = self._taken_s
+            stream.write(line + "\n")
+
+    def end(self, seconds: float) -> None:
+        """Take note of how long it took."""
+        self._taken_s += seconds
+        stream = self._stream or sys.stderr
+        if stream.isatty():
+            stream.write(CLEAR_LINE)
+            stream.flush()
+
+
+@cache
+def show_compiling() -> None:
+    """Say from now on, on standard error, what is being compiled; a second call does nothing.
+
+    Numba is imported here and not above, so that commands without kernels start without it.
+    """
+    from numba.core.event import Event, Listener, register
+
+    class Compiling(Listener):
+        """Hears of every kernel, in whatever thread; a kernel that another one calls is compiled within that one."""
+
+        def __init__(self) -> None:
+            self.progress = CompileProgress()
+            self.starts_s: list[float] = []
+
+        def on_start(self, event: Event) -> None:
+            self.starts_s.append(time.monotonic())
+            if len(self.starts_s) == 1:
+                kernels = list(known_kernels())
+                ready = sum(bool(kernel.signatures) for kernel in kernels)
+                details: Any = event.data
+                self.progress.begin(details["dispatcher"].py_func.__name__, ready=ready, total=len(kernels))
+
+        def on_end(self, event: Event) -> None:
+            start_s = self.starts_s.pop()
+            if not self.starts_s:
+                self.progress.end(time.monotonic() - start_s)
+
+    register("numba:compile", Compiling())  # type: ignore[no-untyped-call]
+
+
+def known_kernels() -> "Iterator[Dispatcher]":
+    """Every kernel of a `*_kernels` module that was imported and that Numba keeps on disk, once."""
+    from numba.core.dispatcher import Dispatcher
+
+    names = [name for name in sys.modules if name.startswith("cairn_") and name.endswith("_kernels")]
+    values = {id(value): value for name in names for value in vars(sys.modules[name]).values()}
+    for value in values.values():
+        if isinstance(value, Dispatcher) and value.stats.cache_path is not None:
+            yield value

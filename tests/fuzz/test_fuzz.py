@@ -1,0 +1,97 @@
+"""Every input of the corpus once more, and a minute of fuzzing shared by all targets; `make soak` takes longer."""
+
+import os
+import random
+import subprocess
+import sys
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from tests.fuzz.make_corpus import seeds
+from tests.fuzz.one_target import CORPUS, FOUND
+from tests.fuzz.soak import FINDINGS, ROOT, soak
+from tests.fuzz.targets import TARGETS, survives
+
+SECONDS = 60 // len(TARGETS) - 2
+"""Of each target, after some two seconds for starting."""
+INPUTS = sorted(CORPUS.glob("*/*.input"))
+
+BROKEN_TARGET = """
+import sys
+from pathlib import Path
+from tests.fuzz import one_target, targets
+
+def greedy(data: bytes) -> None:
+    if len(data) > 64:
+        bytearray(2 * one_target.MEMORY_BYTES_MAX)
+
+targets.TARGETS["text"] = targets.Target(greedy)
+one_target.fuzz("text", seconds=60, grown=Path(sys.argv[1]), findings=Path(sys.argv[2]))
+"""
+
+needs_atheris = pytest.mark.skipif(
+    find_spec("atheris") is None, reason="atheris is not installed: it has wheels for Linux on x86-64 only"
+)
+every_target = pytest.mark.parametrize("name", TARGETS)
+
+
+def bytewise(rng: random.Random) -> Callable[[bytes], bytes]:
+    """A few other bytes: what stands in for libFuzzer's own changes."""
+
+    def changed(data: bytes) -> bytes:
+        made = bytearray(data)
+        for _ in range(rng.randrange(1, 4)):
+            made[rng.randrange(len(made) + 1) :][: rng.randrange(2)] = b""
+            at = rng.randrange(len(made) + 1)
+            made[at : at + rng.randrange(3)] = rng.randbytes(rng.randrange(3))
+        return bytes(made)
+
+    return changed
+
+
+@pytest.mark.parametrize("path", INPUTS, ids=lambda path: f"{path.parent.name}-{path.stem}")
+def test_every_input_of_the_corpus_is_refused_or_gives_something_sound(path: Path) -> None:
+    survives(TARGETS[path.parent.name], path.read_bytes())
+
+
+def test_every_target_has_seeds_and_every_seed_a_target() -> None:
+    assert {path.parent.name for path in INPUTS} == set(TARGETS) == {target for target, _, _ in seeds()}
+
+
+def test_every_seed_is_sound_today() -> None:
+    assert [(target, name) for target, name, data in seeds() if not survives(TARGETS[target], data)] == []
+
+
+@every_target
+def test_mutators_get_past_checksums(name: str) -> None:
+    target, rng = TARGETS[name], random.Random(7)
+    if target.mutated is None:
+        pytest.skip("has no mutator of its own")
+    sound = [data for other, _, data in seeds() if other == name]
+    made = [target.mutated(rng.choice(sound), rng, bytewise(rng)) for _ in range(100)]
+    taken = [data for data in made if survives(target, data)]
+    assert len(set(taken) - set(sound)) >= 5
+
+
+@needs_atheris
+@every_target
+def test_a_short_fuzz_finds_nothing(name: str) -> None:
+    report = soak(name, seconds=SECONDS, findings=FINDINGS)
+    assert not report.failure, f"{report.failure}\n{report.how_to_repeat}"
+    assert report.inputs > 0
+
+
+@needs_atheris
+def test_too_much_memory_is_a_finding(tmp_path: Path) -> None:
+    grown, findings = tmp_path / "grown", tmp_path / "findings"
+    grown.mkdir()
+    findings.mkdir()
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    command = [sys.executable, "-c", BROKEN_TARGET, str(grown), str(findings)]
+    done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == FOUND
+    assert "MemoryError" in done.stdout
+    (found,) = findings.iterdir()
+    assert len(found.read_bytes()) > 64
