@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from cairn_calib.lidar import AnyCamera
 from cairn_calib.poses import Transform
-from cairn_fusion.carve_kernels import BRICK_RADIUS, clear_ranges, cull_bricks_into, pyramid
+from cairn_fusion.carve_kernels import clear_ranges
+from cairn_fusion.cull_kernels import BRICK_VOXELS, cull_bricks_into, split_bricks_into, window_extremes
 
 Floats = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]
@@ -27,7 +28,6 @@ MARGIN_VOXELS = 1.0
 In the building at 4 cm, of the surface voxels carved away / of the free ones found: 4.3 / 92.9 % at 0.5, 3.1 / 92.6 %
 at 0.85, 2.2 / 91.8 % at 1.2; casting rays: 30.6 / 95.1 %.
 """
-BRICK_VOXELS = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,8 +43,7 @@ class Window:
 
     def clear_ranges(self, range_m: Singles, margin_m: float) -> Singles:
         """(height + 2, width + 2) how far each pixel of the window is certainly clear; 0 where nothing is known."""
-        seen = np.append(np.nan_to_num(range_m.ravel(), nan=0.0), np.float32(0.0)).astype(np.float32)
-        return clear_ranges(seen[self.pixel_of], self.width, self.height, margin_m)
+        return clear_ranges(range_m.ravel(), self.pixel_of, self.width, self.height, margin_m)
 
 
 @lru_cache(maxsize=32)
@@ -69,10 +68,11 @@ def window_of(camera: AnyCamera) -> Window | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Carving:
-    """What a view looks through: numbers of bricks of a box, whether all of each is free, and what kernels need."""
+    """What a view looks through: numbers of bricks of a box, which octants of each, and what kernels need."""
 
     bricks: Index
-    kinds: Index
+    masks: Index
+    """(K,) of `cull_kernels`."""
     squares: Singles
     """Padded image of how far each pixel is clear, squared."""
     lens: Singles
@@ -104,32 +104,25 @@ def carving_of(
         voxel_edge_m: of the map.
         min_range_m: nothing nearer is free.
     """
-    R: Floats = T_map_camera[:3, :3]
+    R: Floats = np.ascontiguousarray(T_map_camera[:3, :3])
     t: Floats = T_map_camera[:3, 3]
     brick_m = BRICK_VOXELS * voxel_edge_m
     corner_m: Floats = corner.astype(np.float64) * voxel_edge_m
-    corner_view = (corner_m - t) @ R
-    axes_view = R * brick_m
-    least, largest, shapes = pyramid(clear_m)
-    reach_m = float(largest[shapes[-1, 0]])
+    reach_m = float(clear_m.max())
     low, high = _bricks_around(t, reach_m, R, window, corner_m, dims, brick_m)
-    found = np.empty((4096, 2), np.int32)
-    while True:
-        count = cull_bricks_into(
-            *(found, low, high, dims, corner_view, axes_view, window.lens, BRICK_RADIUS * voxel_edge_m, min_range_m),
-            *(least, largest, shapes),
-        )
-        if count <= len(found):
-            break
-        found = np.empty((count + count // 4, 2), np.int32)
+    view = (corner_m - t, voxel_edge_m, R, window.lens, min_range_m, reach_m, window_extremes(clear_m))
+    found = np.empty((1 << 16, 2), np.int32)
+    count = cull_bricks_into(found, low, high, dims, *view)
+    if count > len(found):
+        found = np.empty((count, 2), np.int32)
+        cull_bricks_into(found, low, high, dims, *view)
     found = found[:count]
-    xyz = np.stack(
-        [found[:, 0] % dims[0], found[:, 0] // dims[0] % dims[1], found[:, 0] // (dims[0] * dims[1])], axis=1
-    )
+    bricks, masks = found[: split_bricks_into(found, dims, *view)].T.copy()
+    xyz = np.stack([bricks % dims[0], bricks // dims[0] % dims[1], bricks // (dims[0] * dims[1])], axis=1)
     first_m: Floats = ((corner + BRICK_VOXELS * xyz).astype(np.float64) + 0.5) * voxel_edge_m
     return Carving(
-        bricks=found[:, 0].copy(),
-        kinds=found[:, 1].copy(),
+        bricks=bricks,
+        masks=masks,
         squares=np.square(clear_m),
         lens=window.lens.astype(np.float32),
         corners_view=_in_view(first_m, R, t),

@@ -11,10 +11,12 @@ never on the map, nor on how many scans are added in what order on how many thre
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
+from threading import Lock
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +27,7 @@ from cairn_fusion.carve import MARGIN_VOXELS, Window, carving_of, window_of
 from cairn_fusion.cast import SeenVoxels, seen_voxels
 from cairn_fusion.samples import Returns, returns_of, sample_sums
 from cairn_fusion.scan import Scan
-from cairn_fusion.tally import Tally, same_box, tally_around
+from cairn_fusion.tally import Each, ScanHits, Tally, tally_around
 from cairn_map.channels import ChannelKind
 from cairn_map.errors import BadInputError
 from cairn_map.evidence import Evidence, packed_evidence
@@ -71,7 +73,7 @@ class Integrator:
 
 
 class Integration:
-    """Scans being integrated, one after the other; not thread-safe. Memory: see `tally`."""
+    """Scans being integrated, by any number of threads, which take turns only to count. Memory: see `tally`."""
 
     def __init__(self, rig: Rig, geometry: Geometry, integrator: Integrator, *, around_m: Floats | None = None) -> None:
         """Args: around_m: (3,) where the first tally is to be centred; None: where the first scan was taken."""
@@ -79,8 +81,11 @@ class Integration:
         self._geometry = geometry
         self._integrator = integrator
         self._around_m = around_m
+        self._lock = Lock()
         self._sum = EvidenceMap(geometry)
-        self._tally: Tally | None = None
+        self._tallies: dict[Tally, int] = {}
+        """And how many threads are adding to each."""
+        self._idle: list[ScanHits] = []
 
     def add(self, scan: Scan) -> None:
         """Add a scan.
@@ -100,10 +105,10 @@ class Integration:
         )
         scalars = _scalar_evidence(scan, self._geometry)
         if window is None:
-            self._sum.merge(_cast(scan, rig, self._geometry, returns))
+            self._merge(_cast(scan, rig, self._geometry, returns))
         elif len(returns.pixels):
             self._carve(scan, returns, window)
-        self._sum.merge(scalars)
+        self._merge(scalars)
 
     def add_points(self, points: npt.NDArray[np.floating], T_map_sensor: Transform) -> None:
         """Add a sweep of a sensor whose points have no order, ray by ray.
@@ -125,61 +130,80 @@ class Integration:
         ends, first, _ = _unique_voxels(voxels_of_points(points_map, self._geometry))
         seen = seen_voxels(T[:3, 3], points_map[first], ends, self._geometry)
         samples = np.zeros((len(ends), self._geometry.plane_count), np.int64)
-        self._sum.merge(_packed_by_cell(seen, ends, samples, self._geometry))
+        self._merge(_packed_by_cell(seen, ends, samples, self._geometry))
 
-    def diff(self) -> dict[CellKey, Evidence]:
-        """The evidence of all scans, by cell."""
-        if self._tally is not None and not len(self._sum):
+    def diff(self, each: Each = map) -> dict[CellKey, Evidence]:
+        """The evidence of all scans, by cell; `each` as for `Tally.packed`. Not while scans are being added."""
+        if len(self._tallies) == 1 and not len(self._sum):
             # Most measurements end here: all scans in one tally, nothing to add up.
-            return self._tally.packed()
-        self._close_tally()
+            return next(iter(self._tallies)).packed(each)
+        self._close_idle_tallies(each)
         return self._sum.packed()
 
-    def absorb(self, other: "Integration") -> None:
-        """Add all that another integration of the same rig, geometry and integrator holds; leaves the other empty."""
-        if self._tally is not None and other._tally is not None and same_box(self._tally, other._tally):
-            self._tally.absorb(other._tally)
-            other._tally = None
-        self._sum.merge(other.diff())
+    def _merge(self, diff: dict[CellKey, Evidence]) -> None:
+        with self._lock:
+            self._sum.merge(diff)
 
     def _carve(self, scan: Scan, returns: Returns, window: Window) -> None:
         """Hits where beams ended, misses where the image looks through."""
         edge_m = self._geometry.voxel_edge_m
-        tally = self._tally_around(returns)
-        try:
-            voxel_of, count = tally.number_hits(returns.points_map)
-            tally.add_hits(sample_sums(scan, self._rig, self._geometry, returns, voxel_of, count))
-            tally.add_misses(
-                carving_of(
-                    window.clear_ranges(returns.range_m, MARGIN_VOXELS * edge_m),
-                    window,
-                    returns.T_map_tof,
-                    corner=tally.corner,
-                    dims=tally.dims,
-                    voxel_edge_m=edge_m,
-                    min_range_m=self._integrator.min_range_m,
-                )
+        with self._tally_around(returns) as tally, self._hits() as hits:
+            voxel_of, count = hits.number(returns.points_map, tally)
+            sums = sample_sums(scan, self._rig, self._geometry, returns, voxel_of, count)
+            carving = carving_of(
+                window.clear_ranges(returns.range_m, MARGIN_VOXELS * edge_m),
+                window,
+                returns.T_map_tof,
+                corner=tally.corner,
+                dims=tally.dims,
+                voxel_edge_m=edge_m,
+                min_range_m=self._integrator.min_range_m,
             )
-        finally:
-            tally.end_scan()
+            tally.add_hits(hits, sums)
+            tally.add_misses(hits, carving)
 
-    def _tally_around(self, returns: Returns) -> Tally:
+    @contextmanager
+    def _hits(self) -> Iterator[ScanHits]:
+        """A scratch that no other thread uses."""
+        with self._lock:
+            hits = self._idle.pop() if self._idle else ScanHits()
+        try:
+            yield hits
+        finally:
+            hits.forget()
+            with self._lock:
+                self._idle.append(hits)
+
+    @contextmanager
+    def _tally_around(self, returns: Returns) -> Iterator[Tally]:
+        """A tally that holds a scan, and stays open meanwhile; those that nobody uses are closed when a new one opens."""
         origin_m = returns.T_map_tof[:3, 3]
         farthest_m = float(np.nanmax(returns.range_m))
-        if self._tally is None or not self._tally.holds(origin_m, farthest_m):
-            self._close_tally()
-            limit_m = self._integrator.max_range_m
-            if self._around_m is not None:
-                self._tally = tally_around(self._around_m, farthest_m, self._geometry, max_range_m=limit_m)
-                self._around_m = None
-            if self._tally is None or not self._tally.holds(origin_m, farthest_m):
-                self._tally = tally_around(origin_m, farthest_m, self._geometry, max_range_m=limit_m)
-        return self._tally
+        with self._lock:
+            tally = next((tally for tally in self._tallies if tally.holds(origin_m, farthest_m)), None)
+            if tally is None:
+                self._close_idle_tallies()
+                tally = self._new_tally(origin_m, farthest_m)
+            self._tallies[tally] = self._tallies.get(tally, 0) + 1
+        try:
+            yield tally
+        finally:
+            with self._lock:
+                self._tallies[tally] -= 1
 
-    def _close_tally(self) -> None:
-        if self._tally is not None:
-            self._sum.merge(self._tally.packed())
-            self._tally = None
+    def _new_tally(self, origin_m: Floats, farthest_m: float) -> Tally:
+        limit_m = self._integrator.max_range_m
+        if self._around_m is not None:
+            tally = tally_around(self._around_m, farthest_m, self._geometry, max_range_m=limit_m)
+            self._around_m = None
+            if tally.holds(origin_m, farthest_m):
+                return tally
+        return tally_around(origin_m, farthest_m, self._geometry, max_range_m=limit_m)
+
+    def _close_idle_tallies(self, each: Each = map) -> None:
+        for tally in [tally for tally, users in self._tallies.items() if not users]:
+            self._sum.merge(tally.packed(each))
+            del self._tallies[tally]
 
 
 def integrate_scan(scan: Scan, rig: Rig, geometry: Geometry, *, integrator: Integrator) -> dict[CellKey, Evidence]:
@@ -202,19 +226,12 @@ def integrate_scans(
         BadInputError: as `Integration.add`.
     """
     count = max(1, min(threads or os.cpu_count() or 1, len(scans)))
-    # Around one place, so that their sums lie in the same box and add up brick by brick.
     around_m = scans[0].T_map_rig[:3, 3] if scans else None
-    parts = [Integration(rig, geometry, integrator, around_m=around_m) for _ in range(count)]
-
-    def work(n: int) -> None:
-        for scan in scans[n::count]:
-            parts[n].add(scan)
-
+    integration = Integration(rig, geometry, integrator, around_m=around_m)
     with ThreadPoolExecutor(count) as pool:
-        list(pool.map(work, range(count)))
-    for part in parts[1:]:
-        parts[0].absorb(part)
-    return parts[0].diff()
+        # Whoever is done takes the next scan.
+        list(pool.map(integration.add, scans))
+        return integration.diff(pool.map)
 
 
 def _cast(scan: Scan, rig: Rig, geometry: Geometry, returns: Returns) -> dict[CellKey, Evidence]:

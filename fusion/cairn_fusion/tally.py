@@ -9,7 +9,10 @@ that does not fit goes into a new tally. Counts are 16 bits: a measurement has a
 voxel once.
 """
 
-from typing import TypeVar
+import math
+from collections.abc import Callable, Iterable
+from threading import Lock
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +30,7 @@ Ints = npt.NDArray[np.int64]
 Index = npt.NDArray[np.int32]
 Counts = npt.NDArray[np.uint16]
 Scalar = TypeVar("Scalar", bound=np.generic)
+Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 MOVE_M = 1.0
 """How far the head may move within a tally."""
@@ -34,12 +38,52 @@ BOX_BRICKS = 1 << 24
 """64 MB of index: 20 m across at 1 cm."""
 BOX_BRICKS_MAX = 1 << 27
 """512 MB of index: 40 m at 1 cm."""
-ROOM_MIN = 4096
-"""Entries of a first array; what is not written costs no memory."""
+RESERVED = 1 << 26
+"""Bytes of a first array: what is not written costs no memory. More than the 32 MB that glibc may keep and clear again."""
+
+
+class ScanHits:
+    """The voxels that one scan hit: numbered, and found by brick. Of one thread; used again for scan after scan."""
+
+    def __init__(self) -> None:
+        self._table_of: Index = np.empty(0, np.int32)
+        self._bricks: Index = np.empty(0, np.int32)
+        self._struck: Index = np.empty((0, 512), np.int32)
+        self._used = 0
+        self.voxels: Ints = np.empty(0, np.int64)
+        """(U,) brick number of the box times 512 plus place, by number."""
+
+    def number(self, points_m: Floats, tally: "Tally") -> tuple[Index, int]:
+        """Number the different voxels of a tally's box that (N, 3) points hit: (N,) each point's, and how many.
+
+        Raises:
+            BadInputError: a point lies outside the box.
+        """
+        voxels = kernels.hit_voxels(points_m, tally.geometry.voxel_edge_um * 1000, tally.corner, tally.dims)
+        if (voxels < 0).any():
+            raise BadInputError("scan_too_large", "a point lies outside the tally's box")
+        bricks = int(np.prod(tally.dims))
+        self._table_of = _grown(self._table_of, bricks, 0)
+        self._bricks = _grown(self._bricks, min(len(voxels), bricks), 0)
+        self._used = kernels.claim_into(voxels, 9, self._table_of, self._bricks, 0)
+        self._struck = _grown(self._struck, self._used, 0)
+        touched = np.empty(len(voxels), np.int64)
+        numbers, count = kernels.number_hits_into(voxels, self._table_of, self._struck, touched)
+        self.voxels = touched[:count]
+        return numbers, count
+
+    def tables_of(self, bricks: Index) -> tuple[Index, Index]:
+        """(K,) each brick's row of a (T, 512) array that is 0 where no voxel is hit, -1 for none; and that array."""
+        return self._table_of[bricks] - np.int32(1), self._struck
+
+    def forget(self) -> None:
+        """Make ready for the next scan."""
+        kernels.forget_hits_into(self._bricks[: self._used], self._table_of, self._struck, self.voxels)
+        self._used, self.voxels = 0, self.voxels[:0]
 
 
 class Tally:
-    """Counts and sums of some scans; not thread-safe."""
+    """Counts and sums of some scans; thread-safe: one thread may add hits while another adds misses."""
 
     def __init__(self, geometry: Geometry, centre_m: Floats, *, reach_m: float) -> None:
         self.geometry = geometry
@@ -50,134 +94,92 @@ class Tally:
         """(3,) the box's first voxel."""
         self.dims: Ints = high - low + 1
         """(3,) bricks of the box."""
-        self._brick_of = np.full(int(np.prod(self.dims)), -1, np.int32)
-        self._bricks: Index = np.empty(0, np.int32)
+        bricks = int(np.prod(self.dims))
+        self._misses_lock, self._hits_lock = Lock(), Lock()
+        self._slot_of, self._table_of = np.zeros(bricks, np.int32), np.zeros(bricks, np.int32)
+        self._seen_bricks: Index = np.empty(0, np.int32)
         self._misses: Counts = np.empty((0, 512), np.uint16)
-        self._table_of: Index = np.empty(0, np.int32)
-        self._hits: Counts = np.empty((0, 512), np.uint16)
+        self._hit_bricks: Index = np.empty(0, np.int32)
         self._row_of: Index = np.empty((0, 512), np.int32)
-        self._local_of: Index = np.empty((0, 512), np.int32)
+        self._hits: Index = np.empty(0, np.int32)
         self._samples: Ints = np.empty((0, geometry.plane_count), np.int64)
-        self._used = self._tables = self._rows = 0
-        self._touched: Ints = np.empty(0, np.int64)
+        self._slots = self._tables = self._rows = 0
 
     def holds(self, origin_m: Floats, farthest_m: float) -> bool:
         """Whether a scan from there, which reaches so far, fits."""
         return float(np.abs(origin_m - self._centre_m).max()) + farthest_m <= self._reach_m
 
-    def number_hits(self, points_m: Floats) -> tuple[Index, int]:
-        """Number the different voxels that a scan's (N, 3) points hit: (N,) each point's, and how many there are."""
-        voxels = kernels.hit_voxels(points_m, self.geometry.voxel_edge_um * 1000, self.corner, self.dims)
-        if (voxels < 0).any():
-            raise BadInputError("scan_too_large", "a point lies outside the tally's box")
-        self._claim(voxels, 9)
-        tables = self._tables + min(len(voxels), self._used - self._tables)
-        self._hits = _grown(self._hits, tables, self._tables)
-        self._row_of = _grown(self._row_of, tables, self._tables)
-        self._local_of = _grown(self._local_of, tables, self._tables)
-        used = kernels.claim_tables_into(voxels, self._brick_of, self._table_of, self._tables)
-        self._hits[self._tables : used] = 0
-        self._row_of[self._tables : used] = -1
-        self._local_of[self._tables : used] = -1
-        self._tables = used
-        touched = np.empty(len(voxels), np.int64)
-        numbers, count = kernels.number_hits_into(voxels, self._brick_of, self._table_of, self._local_of, touched)
-        self._touched = touched[:count]
-        return numbers, count
+    def add_hits(self, hits: ScanHits, sums: Ints) -> None:
+        """Count a hit, and add a row of (U, P) sums, for each voxel that a scan hit."""
+        voxels = hits.voxels
+        with self._hits_lock:
+            self._hit_bricks = _grown(self._hit_bricks, self._tables + len(voxels), self._tables)
+            tables = kernels.claim_into(voxels, 9, self._table_of, self._hit_bricks, self._tables)
+            self._row_of = _grown(self._row_of, tables, self._tables)
+            rows = kernels.claim_rows_into(voxels, self._table_of, self._row_of, self._rows)
+            self._hits = _grown(self._hits, rows, self._rows)
+            self._samples = _grown(self._samples, rows, self._rows)
+            self._tables, self._rows = tables, rows
+            kernels.add_hits_into(self._hits, self._samples, self._table_of, self._row_of, voxels, sums)
 
-    def add_hits(self, sums: Ints) -> None:
-        """Count a hit, and add a row of (U, P) sums, for each voxel that `number_hits` numbered."""
-        touched = self._touched
-        self._samples = _grown(self._samples, self._rows + len(touched), self._rows)
-        self._rows = kernels.add_hits_into(self._hits, self._row_of, self._samples, touched, sums, self._rows)
+    def add_misses(self, hits: ScanHits, carving: Carving) -> None:
+        """Count a miss in what a view looks through, but not where the same scan hit."""
+        tables, struck = hits.tables_of(carving.bricks)
+        bricks = carving.bricks.astype(np.int64)
+        with self._misses_lock:
+            self._seen_bricks = _grown(self._seen_bricks, self._slots + len(bricks), self._slots)
+            slots = kernels.claim_into(bricks, 0, self._slot_of, self._seen_bricks, self._slots)
+            self._misses = _grown(self._misses, slots, self._slots)
+            self._slots = slots
+            carve_into(
+                self._misses.reshape(-1, 8, 64),
+                self._slot_of[bricks] - np.int32(1),
+                carving.masks,
+                carving.corners_view,
+                carving.offsets_view.reshape(3, 8, 64),
+                carving.squares,
+                carving.lens,
+                carving.min_square,
+                tables,
+                struck.reshape(-1, 8, 64),
+            )
 
-    def add_misses(self, carving: Carving) -> None:
-        """Count a miss in what a view looks through, but not where the present scan hit."""
-        self._claim(carving.bricks.astype(np.int64), 0)
-        carve_into(
-            self._misses,
-            self._brick_of[carving.bricks],
-            carving.kinds,
-            carving.corners_view,
-            carving.offsets_view,
-            carving.squares,
-            carving.lens,
-            carving.min_square,
-            self._table_of,
-            self._local_of,
-        )
+    def packed(self, each: Each = map) -> dict[CellKey, Evidence]:
+        """Packed evidence of all cells that hold any, rising in number.
 
-    def end_scan(self) -> None:
-        """Forget which voxels the present scan hit."""
-        kernels.forget_hits_into(self._local_of, self._touched)
-        self._touched = self._touched[:0]
-
-    def absorb(self, other: "Tally") -> None:
-        """Add all of another tally of the same box."""
-        self._claim(other._bricks[: other._used].astype(np.int64), 0)
-        self._hits = _grown(self._hits, self._tables + other._tables, self._tables)
-        self._row_of = _grown(self._row_of, self._tables + other._tables, self._tables)
-        self._local_of = _grown(self._local_of, self._tables + other._tables, self._tables)
-        self._local_of[self._tables : self._tables + other._tables] = -1
-        self._samples = _grown(self._samples, self._rows + other._rows, self._rows)
-        self._tables, self._rows = kernels.absorb_into(
-            self._brick_of[other._bricks[: other._used]],
-            self._misses,
-            self._table_of,
-            self._hits,
-            self._row_of,
-            self._samples,
-            self._tables,
-            self._rows,
-            other._misses,
-            other._table_of,
-            other._hits,
-            other._row_of,
-            other._samples,
-        )
-
-    def packed(self) -> dict[CellKey, Evidence]:
-        """Packed evidence of all cells that hold any, rising in number."""
-        bricks = self._bricks[: self._used].astype(np.int64)
-        dims = self.dims
-        xyz = np.stack([bricks % dims[0], bricks // dims[0] % dims[1], bricks // (dims[0] * dims[1])], axis=1)
-        xyz += self.corner >> BRICK_DEPTH
+        Args:
+            each: as `map`, which calls the function for one cell after the other; a pool's may do some at once.
+        """
+        hit = self._hit_bricks[: self._tables]
+        bricks = np.concatenate([self._seen_bricks[: self._slots], hit[self._slot_of[hit] == 0]]).astype(np.int64)
+        w, h = int(self.dims[0]), int(self.dims[1])
+        xyz = np.stack([bricks % w, bricks // w % h, bricks // (w * h)], axis=1) + (self.corner >> BRICK_DEPTH)
         up = self.geometry.depth - BRICK_DEPTH
-        cells = interleave((xyz >> up) + CELL_LIMIT)
-        numbers = interleave(xyz & ((1 << up) - 1)).astype(np.int32)
-        order = np.lexsort((numbers, cells))
-        keys, starts = np.unique(cells[order], return_index=True)
-        packed = {
-            CellKey(int(key)): self._evidence(part.astype(np.int32), numbers[part])
-            for key, part in zip(keys, np.split(order, starts[1:]), strict=True)
-        }
-        return {key: evidence for key, evidence in packed.items() if len(evidence)}
+        # From the first cell of the box: all bits of a brick's number and its cell's in one.
+        numbers = interleave(xyz - (self.corner >> self.geometry.depth << up))
+        order = np.argsort(numbers)
+        xyz, bricks, numbers = xyz[order], bricks[order], numbers[order]
+        first = np.flatnonzero(np.diff(numbers >> np.uint64(3 * up), prepend=np.uint64((1 << 64) - 1)))
+        keys = [CellKey(int(key)) for key in interleave((xyz[first] >> up) + CELL_LIMIT)]
+        inner = (numbers & np.uint64((1 << 3 * up) - 1)).astype(np.int32)
+        cells = zip(keys, np.split(bricks, first[1:]), np.split(inner, first[1:]), strict=True) if len(keys) else ()
+        # The largest first, so that no thread is left with one when the others are done.
+        largest_first = sorted(cells, key=lambda cell: -len(cell[1]))
+        packed = each(lambda cell: (cell[0], self._evidence(cell[1], cell[2])), largest_first)
+        return {key: evidence for key, evidence in sorted(packed) if len(evidence)}
 
-    def _evidence(self, slots: Index, numbers: Index) -> Evidence:
-        V, S = kernels.count_known(slots, self._misses, self._table_of, self._hits)
+    def _evidence(self, bricks: Ints, numbers: Index) -> Evidence:
+        slots, tables = self._slot_of[bricks] - np.int32(1), self._table_of[bricks] - np.int32(1)
+        V, S = kernels.count_known(slots, tables, self._misses, self._row_of)
         voxels, counts = np.empty(V, np.uint32), np.empty((V, 2), np.int32)
         sampled, samples = np.empty(S, np.uint32), np.empty((S, self.geometry.plane_count), np.int64)
         rows = kernels.pack_known_into(
-            *(slots, numbers, self._misses, self._table_of, self._hits, self._row_of, self._samples),
+            *(slots, tables, numbers, self._misses, self._row_of, self._hits, self._samples),
             *(voxels, counts, sampled, samples),
         )
-        return Evidence(voxels, counts, sampled[:rows].copy(), samples[:rows].copy())
-
-    def _claim(self, numbers: Ints, shift: int) -> None:
-        """Make sure that bricks have places in the pool."""
-        room = self._used + min(len(numbers), len(self._brick_of) - self._used)
-        self._bricks = _grown(self._bricks, room, self._used)
-        used = kernels.claim_bricks_into(numbers, shift, self._brick_of, self._bricks, self._used)
-        self._misses = _grown(self._misses, used, self._used)
-        self._table_of = _grown(self._table_of, used, self._used)
-        self._misses[self._used : used] = 0
-        self._table_of[self._used : used] = -1
-        self._used = used
-
-
-def same_box(one: Tally, other: Tally) -> bool:
-    """Whether one can absorb the other."""
-    return bool(np.array_equal(one.corner, other.corner) and np.array_equal(one.dims, other.dims))
+        if rows < S:
+            sampled, samples = sampled[:rows].copy(), samples[:rows].copy()
+        return Evidence(voxels, counts, sampled, samples)
 
 
 def tally_around(origin_m: Floats, farthest_m: float, geometry: Geometry, *, max_range_m: float) -> Tally:
@@ -198,9 +200,13 @@ def tally_around(origin_m: Floats, farthest_m: float, geometry: Geometry, *, max
 
 
 def _grown(array: npt.NDArray[Scalar], needed: int, used: int) -> npt.NDArray[Scalar]:
-    """The array with room for `needed` entries, of which `used` are kept; doubles, so that copies stay few."""
+    """The array with room for `needed` entries, of which the first `used` are kept and all others are 0.
+
+    At least doubled, so that copies stay few; from `RESERVED` on, because fresh addresses are zero without being written.
+    """
     if needed <= len(array):
         return array
-    grown = np.empty((max(needed, 2 * len(array), ROOM_MIN), *array.shape[1:]), array.dtype)
+    entry = max(1, array.dtype.itemsize * math.prod(array.shape[1:]))
+    grown = np.zeros((max(needed, 2 * len(array), RESERVED // entry), *array.shape[1:]), array.dtype)
     grown[:used] = array[:used]
     return grown

@@ -9,8 +9,6 @@ Index = npt.NDArray[np.int32]
 Counts = npt.NDArray[np.uint16]
 Floats = npt.NDArray[np.float64]
 
-SPREAD = np.array([0, 1, 8, 9, 64, 65, 72, 73], np.int64)
-"""Morton spread of three bits."""
 NANOMETRES = 1e9
 
 
@@ -34,178 +32,181 @@ def returned_points(range_m: npt.NDArray[np.float32], rays: Floats, T_map_camera
     return pixels[:count].copy(), points[:count].copy()
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def hit_voxels(points_m: Floats, voxel_edge_nm: int, corner: Ints, dims: Ints) -> Ints:
     """(N,) brick number times 512 plus place of the voxel that holds each (N, 3) point, map frame; -1 outside the box.
 
-    The rule of FORMAT.md section 2: whole nanometres, then floor.
+    The rule of FORMAT.md section 2: whole nanometres, then floor. The quotient of floats is right or one too large.
     """
     out = np.empty(len(points_m), np.int64)
+    edge = np.float64(voxel_edge_nm)
+    x0, y0, z0, w, h, d = corner[0], corner[1], corner[2], dims[0], dims[1], dims[2]
     for n in range(len(points_m)):
-        x = np.int64(np.rint(points_m[n, 0] * NANOMETRES)) // voxel_edge_nm - corner[0]
-        y = np.int64(np.rint(points_m[n, 1] * NANOMETRES)) // voxel_edge_nm - corner[1]
-        z = np.int64(np.rint(points_m[n, 2] * NANOMETRES)) // voxel_edge_nm - corner[2]
-        bx, by, bz = x >> 3, y >> 3, z >> 3
-        if bx < 0 or by < 0 or bz < 0 or bx >= dims[0] or by >= dims[1] or bz >= dims[2]:
-            out[n] = -1
-            continue
-        brick = (bz * dims[1] + by) * dims[0] + bx
-        out[n] = (brick << 9) | SPREAD[x & 7] | (SPREAD[y & 7] << 1) | (SPREAD[z & 7] << 2)
+        x, y, z = points_m[n, 0] * NANOMETRES, points_m[n, 1] * NANOMETRES, points_m[n, 2] * NANOMETRES
+        x, y, z = np.rint(x), np.rint(y), np.rint(z)
+        i, j, k = np.int64(np.floor(x / edge)), np.int64(np.floor(y / edge)), np.int64(np.floor(z / edge))
+        i -= np.int64(i * voxel_edge_nm > np.int64(x)) + x0
+        j -= np.int64(j * voxel_edge_nm > np.int64(y)) + y0
+        k -= np.int64(k * voxel_edge_nm > np.int64(z)) + z0
+        bx, by, bz = i >> 3, j >> 3, k >> 3
+        place = (i & 1) | (i & 2) << 2 | (i & 4) << 4
+        place |= (j & 1) << 1 | (j & 2) << 3 | (j & 4) << 5
+        place |= (k & 1) << 2 | (k & 2) << 4 | (k & 4) << 6
+        inside = (bx >= 0) & (by >= 0) & (bz >= 0) & (bx < w) & (by < h) & (bz < d)
+        out[n] = ((bz * h + by) * w + bx) << 9 | place if inside else -1
     return out
 
 
 @nb.njit(cache=True, nogil=True)
-def claim_bricks_into(numbers: Ints, shift: int, brick_of: Index, bricks: Index, used: int) -> int:
-    """Give each brick that has no place in the pool the next one; returns places used. Clear them afterwards."""
+def claim_into(numbers: Ints, shift: int, place_of: Index, bricks: Index, used: int) -> int:
+    """Give each brick that has no place the next one; returns places used.
+
+    `place_of` (bricks of the box,) is one more than a brick's place, 0 for none; `bricks` has room for all.
+    """
     for n in range(len(numbers)):
         brick = numbers[n] >> shift
-        if brick_of[brick] < 0:
-            brick_of[brick] = used
+        if place_of[brick] == 0:
             bricks[used] = brick
             used += 1
+            place_of[brick] = used
     return used
 
 
 @nb.njit(cache=True, nogil=True)
-def claim_tables_into(voxels: Ints, brick_of: Index, table_of: Index, used: int) -> int:
-    """Give each brick with hits a table; returns tables used."""
-    for n in range(len(voxels)):
-        slot = brick_of[voxels[n] >> 9]
-        if table_of[slot] < 0:
-            table_of[slot] = used
-            used += 1
-    return used
-
-
-@nb.njit(cache=True, nogil=True)
-def number_hits_into(
-    voxels: Ints, brick_of: Index, table_of: Index, local_of: Index, touched: Ints
-) -> tuple[Index, int]:
+def number_hits_into(voxels: Ints, table_of: Index, struck: Index, touched: Ints) -> tuple[Index, int]:
     """Number the different voxels of a scan's hits as they come; (N,) the number of each point's voxel, and how many.
 
-    `touched` takes each voxel's place, table times 512 plus place, by number.
+    Args:
+        voxels: (N,) of `hit_voxels`.
+        table_of: of `claim_into`.
+        struck: (T, 512) becomes one more than the number of a voxel; 0 before.
+        touched: (N,) takes the voxels by number.
     """
     numbers = np.empty(len(voxels), np.int32)
     count = 0
     for n in range(len(voxels)):
-        table, place = table_of[brick_of[voxels[n] >> 9]], voxels[n] & 511
-        if local_of[table, place] < 0:
-            local_of[table, place] = count
-            touched[count] = (np.int64(table) << 9) | place
+        table, place = table_of[voxels[n] >> 9] - 1, voxels[n] & 511
+        number = struck[table, place]
+        if number == 0:
+            touched[count] = voxels[n]
             count += 1
-        numbers[n] = local_of[table, place]
+            struck[table, place] = number = count
+        numbers[n] = number - 1
     return numbers, count
 
 
 @nb.njit(cache=True, nogil=True)
-def add_hits_into(hits: Counts, row_of: Index, samples: Ints, touched: Ints, sums: Ints, rows: int) -> int:
-    """Count a hit in each touched voxel, and add its row of sums; returns rows used. `samples` has room for all."""
+def forget_hits_into(bricks: Index, table_of: Index, struck: Index, touched: Ints) -> None:
+    """Undo `number_hits_into` and `claim_into`."""
     for n in range(len(touched)):
-        table, place = touched[n] >> 9, touched[n] & 511
-        hits[table, place] += np.uint16(1)
-        if row_of[table, place] < 0:
-            row_of[table, place] = rows
-            samples[rows, :] = 0
-            rows += 1
+        struck[table_of[touched[n] >> 9] - 1, touched[n] & 511] = 0
+    for n in range(len(bricks)):
+        table_of[bricks[n]] = 0
+
+
+@nb.njit(cache=True, nogil=True)
+def claim_rows_into(voxels: Ints, table_of: Index, row_of: Index, used: int) -> int:
+    """Give each voxel that has no row the next one; `row_of` (T, 512) is one more, 0 for none. Returns rows used."""
+    for n in range(len(voxels)):
+        table, place = table_of[voxels[n] >> 9] - 1, voxels[n] & 511
+        if row_of[table, place] == 0:
+            used += 1
+            row_of[table, place] = used
+    return used
+
+
+@nb.njit(cache=True, nogil=True)
+def add_hits_into(hits: Index, samples: Ints, table_of: Index, row_of: Index, voxels: Ints, sums: Ints) -> None:
+    """Count a hit in the row of each voxel, and add its (N, P) sums."""
+    for n in range(len(voxels)):
+        row = row_of[table_of[voxels[n] >> 9] - 1, voxels[n] & 511] - 1
+        hits[row] += np.int32(1)
         for p in range(sums.shape[1]):
-            samples[row_of[table, place], p] += sums[n, p]
-    return rows
+            samples[row, p] += sums[n, p]
 
 
 @nb.njit(cache=True, nogil=True)
-def forget_hits_into(local_of: Index, touched: Ints) -> None:
-    """Undo `number_hits_into`."""
-    for n in range(len(touched)):
-        local_of[touched[n] >> 9, touched[n] & 511] = -1
-
-
-@nb.njit(cache=True, nogil=True)
-def absorb_into(
-    slots: Index,
-    misses: Counts,
-    table_of: Index,
-    hits: Counts,
-    row_of: Index,
-    samples: Ints,
-    tables: int,
-    rows: int,
-    other_misses: Counts,
-    other_table_of: Index,
-    other_hits: Counts,
-    other_row_of: Index,
-    other_samples: Ints,
-) -> tuple[int, int]:
-    """Add another tally's bricks, which have these slots here; there is room. Returns tables and rows used."""
-    for b in range(len(slots)):
-        slot, other = slots[b], other_table_of[b]
-        for i in range(512):
-            misses[slot, i] += other_misses[b, i]
-        if other < 0:
-            continue
-        if table_of[slot] < 0:
-            table_of[slot] = tables
-            hits[tables, :] = 0
-            row_of[tables, :] = -1
-            tables += 1
-        table = table_of[slot]
-        for i in range(512):
-            if other_row_of[other, i] < 0:
-                continue
-            hits[table, i] += other_hits[other, i]
-            if row_of[table, i] < 0:
-                row_of[table, i] = rows
-                samples[rows, :] = 0
-                rows += 1
-            for p in range(samples.shape[1]):
-                samples[row_of[table, i], p] += other_samples[other_row_of[other, i], p]
-    return tables, rows
-
-
-@nb.njit(cache=True, nogil=True)
-def count_known(slots: Index, misses: Counts, table_of: Index, hits: Counts) -> tuple[int, int]:
-    """Voxels with a count, and those of them with a hit, in some bricks of the pool."""
+def count_known(slots: Index, tables: Index, misses: Counts, row_of: Index) -> tuple[int, int]:
+    """Voxels with a count, and those of them with a hit, in bricks with these slots and tables, -1 for none."""
     known, hit = 0, 0
-    for slot in slots:
-        table = table_of[slot]
-        for i in range(512):
-            struck = table >= 0 and hits[table, i] > 0
-            hit += 1 if struck else 0
-            known += 1 if struck or misses[slot, i] > 0 else 0
+    for b in range(len(slots)):
+        slot, table = slots[b], tables[b]
+        if table < 0:
+            for i in range(512):
+                known += np.int64(misses[slot, i] > 0)
+        elif slot < 0:
+            for i in range(512):
+                hit += np.int64(row_of[table, i] > 0)
+                known += np.int64(row_of[table, i] > 0)
+        else:
+            for i in range(512):
+                hit += np.int64(row_of[table, i] > 0)
+                known += np.int64((misses[slot, i] > 0) | (row_of[table, i] > 0))
     return known, hit
 
 
 @nb.njit(cache=True, nogil=True)
 def pack_known_into(
     slots: Index,
+    tables: Index,
     numbers: Index,
     misses: Counts,
-    table_of: Index,
-    hits: Counts,
     row_of: Index,
+    hits: Index,
     sums: Ints,
     places: npt.NDArray[np.uint32],
     counts: Index,
     sampled: npt.NDArray[np.uint32],
     samples: Ints,
 ) -> int:
-    """Write the known voxels of a cell's bricks, given in rising order of number; returns rows of samples written."""
-    at, row = 0, 0
+    """Write the known voxels of a cell's bricks, given in rising order of number; returns rows of samples written.
+
+    As `count_known` for the first arguments; the last four are what `Evidence` holds.
+    """
+    kept, seen = np.empty(512, np.uint32), np.empty(512, np.uint16)
+    # Unsigned: Numba counts signed numbers from the end if they are negative, and asks each time.
+    at, row = np.uint64(0), np.uint64(0)
     for b in range(len(slots)):
-        slot, table = slots[b], table_of[slots[b]]
+        slot, table = slots[b], tables[b]
+        first = np.uint32(numbers[b]) << np.uint32(9)
         for i in range(512):
-            struck = table >= 0 and hits[table, i] > 0
-            if not (struck or misses[slot, i] > 0):
-                continue
-            places[at] = (np.uint32(numbers[b]) << np.uint32(9)) | np.uint32(i)
-            counts[at, 0] = hits[table, i] if struck else 0
-            counts[at, 1] = misses[slot, i]
-            if struck:
+            seen[i] = misses[slot, i] if slot >= 0 else np.uint16(0)
+        known = 0
+        for i in range(512):
+            known += np.int64(seen[i] > 0)
+        if known == 512 and table < 0:
+            for i in range(512):
+                places[at + np.uint64(i)] = first | np.uint32(i)
+                counts[at + np.uint64(i), 0] = 0
+                counts[at + np.uint64(i), 1] = seen[i]
+            at += np.uint64(512)
+            continue
+        known = np.uint64(0)
+        if table < 0:
+            for i in range(512):
+                kept[known] = i
+                known += np.uint64(seen[i] > 0)
+        else:
+            for i in range(512):
+                kept[known] = i
+                known += np.uint64((seen[i] > 0) | (row_of[table, i] > 0))
+        for n in range(known):
+            i = kept[n]
+            places[at + n] = first | i
+            counts[at + n, 0] = 0
+            counts[at + n, 1] = seen[i]
+        if table >= 0:
+            for n in range(known):
+                struck = row_of[table, kept[n]] - 1
+                if struck < 0:
+                    continue
+                counts[at + n, 0] = hits[struck]
                 some = False
                 for p in range(sums.shape[1]):
-                    samples[row, p] = sums[row_of[table, i], p]
-                    some |= samples[row, p] != 0
+                    samples[row, p] = sums[struck, p]
+                    some |= sums[struck, p] != 0
                 if some:
-                    sampled[row] = at
-                    row += 1
-            at += 1
-    return row
+                    sampled[row] = at + n
+                    row += np.uint64(1)
+        at += known
+    return np.int64(row)

@@ -14,7 +14,7 @@ from cairn_calib.rig import Rig, Spectrum, mounted
 from cairn_fusion.carve import MARGIN_VOXELS, Window, carving_of, window_of
 from cairn_fusion.integrate import Integrator, Method, integrate_scan, integrate_scans
 from cairn_fusion.scan import Scan
-from cairn_fusion.tally import Tally, tally_around
+from cairn_fusion.tally import ScanHits, Tally, tally_around
 from cairn_map.channels import INTENSITY
 from cairn_map.errors import BadInputError
 from cairn_map.evidence import Evidence
@@ -153,8 +153,11 @@ def test_a_scan_means_the_same_in_whatever_box_it_is_counted(seed: int) -> None:
         for shift_m in (0.0, 0.123, 0.777):
             tally = Tally(GEOMETRY, scan.T_map_rig[:3, 3] + shift_m, reach_m=4.0 + shift_m)
             box = {"corner": tally.corner, "dims": tally.dims}
+            hits = ScanHits()
+            hits.number(np.empty((0, 3)), tally)
             tally.add_misses(
-                carving_of(clear, window, scan.T_map_rig, **box, voxel_edge_m=GEOMETRY.voxel_edge_m, min_range_m=0.3)
+                hits,
+                carving_of(clear, window, scan.T_map_rig, **box, voxel_edge_m=GEOMETRY.voxel_edge_m, min_range_m=0.3),
             )
             packed.append(tally.packed())
         assert packed[0] == packed[1] == packed[2] != {}
