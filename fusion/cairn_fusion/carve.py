@@ -13,7 +13,13 @@ import numpy.typing as npt
 from cairn_calib.lidar import AnyCamera
 from cairn_calib.poses import Transform
 from cairn_fusion.carve_kernels import clear_ranges
-from cairn_fusion.cull_kernels import BRICK_VOXELS, cull_bricks_into, split_bricks_into, window_extremes
+from cairn_fusion.cull_kernels import (
+    BRICK_VOXELS,
+    LEVELS_MAX,
+    cull_bricks_into,
+    split_bricks_into,
+    window_extremes_into,
+)
 
 Floats = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]
@@ -70,17 +76,44 @@ def window_of(camera: AnyCamera) -> Window | None:
 class Carving:
     """What a view looks through: numbers of bricks of a box, which octants of each, and what kernels need."""
 
-    bricks: Index
+    bricks: Ints
     masks: Index
     """(K,) of `cull_kernels`."""
     squares: Singles
     """Padded image of how far each pixel is clear, squared."""
     lens: Singles
     corners_view: Singles
-    """(3, K) the centre of each brick's first voxel, camera frame, metres."""
+    """(3, K or more) the centre of each brick's first voxel, camera frame, metres.
+
+    From whole voxel numbers, and number by number: which box a brick is found in, and with how many others, must not
+    change a bit of where it lies, or the evidence would not depend on the scan alone.
+    """
     offsets_view: Singles
     """(3, 512) from there to each voxel's centre, in Morton order."""
     min_square: float
+
+
+class Scratch:
+    """Memory that one thread uses for view after view: fresh memory comes page by page, and takes longer."""
+
+    def __init__(self) -> None:
+        self._extremes: Singles = np.empty((0, 0, 0), np.float32)
+        self._found: Index = np.empty((1 << 14, 2), np.int32)
+
+    def extremes(self, clear_m: Singles) -> Singles:
+        """Of `window_extremes_into`, for an image of this size."""
+        height, width = clear_m.shape
+        levels = min(LEVELS_MAX, min(width, height).bit_length())
+        if self._extremes.shape != (levels, height, 2 * width):
+            self._extremes = np.empty((levels, height, 2 * width), np.float32)
+        window_extremes_into(self._extremes, clear_m)
+        return self._extremes
+
+    def found(self, count: int) -> Index:
+        """At least (count, 2)."""
+        if count > len(self._found):
+            self._found = np.empty((2 * count, 2), np.int32)
+        return self._found
 
 
 def carving_of(
@@ -92,6 +125,7 @@ def carving_of(
     dims: Ints,
     voxel_edge_m: float,
     min_range_m: float,
+    scratch: Scratch,
 ) -> Carving:
     """The bricks of a box that a view looks through.
 
@@ -103,41 +137,33 @@ def carving_of(
         dims: (3,) bricks of the box.
         voxel_edge_m: of the map.
         min_range_m: nothing nearer is free.
+        scratch: of this thread.
     """
     R: Floats = np.ascontiguousarray(T_map_camera[:3, :3])
-    t: Floats = T_map_camera[:3, 3]
-    brick_m = BRICK_VOXELS * voxel_edge_m
+    t: Floats = np.ascontiguousarray(T_map_camera[:3, 3])
     corner_m: Floats = corner.astype(np.float64) * voxel_edge_m
     reach_m = float(clear_m.max())
-    low, high = _bricks_around(t, reach_m, R, window, corner_m, dims, brick_m)
-    view = (corner_m - t, voxel_edge_m, R, window.lens, min_range_m, reach_m, window_extremes(clear_m))
-    found = np.empty((1 << 16, 2), np.int32)
-    count = cull_bricks_into(found, low, high, dims, *view)
-    if count > len(found):
-        found = np.empty((count, 2), np.int32)
-        cull_bricks_into(found, low, high, dims, *view)
-    found = found[:count]
-    bricks, masks = found[: split_bricks_into(found, dims, *view)].T.copy()
-    xyz = np.stack([bricks % dims[0], bricks // dims[0] % dims[1], bricks // (dims[0] * dims[1])], axis=1)
-    first_m: Floats = ((corner + BRICK_VOXELS * xyz).astype(np.float64) + 0.5) * voxel_edge_m
+    low, high = _bricks_around(t, reach_m, R, window, corner_m, dims, BRICK_VOXELS * voxel_edge_m)
+    view = (corner_m - t, voxel_edge_m, R, window.lens, min_range_m, reach_m, scratch.extremes(clear_m))
+    count = cull_bricks_into(scratch.found(0), low, high, dims, *view)
+    if count > len(scratch.found(0)):
+        cull_bricks_into(scratch.found(count), low, high, dims, *view)
+    found, corners_view = scratch.found(count)[:count], np.empty((3, count), np.float32)
+    count = split_bricks_into(found, corners_view, dims, corner, t, *view)
     return Carving(
-        bricks=bricks,
-        masks=masks,
+        bricks=found[:count, 0].astype(np.int64),
+        masks=found[:count, 1].copy(),
         squares=np.square(clear_m),
         lens=window.lens.astype(np.float32),
-        corners_view=_in_view(first_m, R, t),
-        offsets_view=_in_view(MORTON_XYZ * voxel_edge_m, R, np.zeros(3)),
+        corners_view=corners_view,
+        offsets_view=_offsets_in_view(R, voxel_edge_m),
         min_square=min_range_m**2,
     )
 
 
-def _in_view(points_m: Floats, R: Floats, t: Floats) -> Singles:
-    """(3, N) points of the map in the camera's frame.
-
-    From whole voxel numbers, and number by number: which box a brick is found in, and with how many others, must not
-    change a bit of where it lies, or the evidence would not depend on the scan alone.
-    """
-    x, y, z = (points_m - t).T
+def _offsets_in_view(R: Floats, voxel_edge_m: float) -> Singles:
+    """(3, 512) from the first voxel's centre of a brick to each voxel's, camera frame."""
+    x, y, z = (MORTON_XYZ * voxel_edge_m).T
     return np.stack([x * R[0, a] + y * R[1, a] + z * R[2, a] for a in range(3)]).astype(np.float32)
 
 

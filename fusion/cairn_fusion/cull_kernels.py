@@ -7,8 +7,6 @@ the nearest is free. Both are found by four look-ups, whatever the rectangle, in
 Farach-Colton 2000). An answer is certain or mixed, so where cubes begin changes how long it takes, never the evidence.
 """
 
-import math
-
 import numba as nb
 import numpy as np
 import numpy.typing as npt
@@ -29,8 +27,8 @@ ALL_FREE = 0xFF
 MASKS = np.array([0, 1, 256], np.int64)
 """By what is seen of an octant."""
 NEAREST, FARTHEST, LEFT, RIGHT, TOP, BOTTOM, NEAR, FAR, SIGHT = range(0, 72, 8)
-"""Rows of what is known of a cube's parts: one array, because LLVM makes no vectors of eight numbers if they may overlap
-with others."""
+"""Where what is known of a cube's eight parts begins, in one array: LLVM makes no vectors of so few numbers if it would
+first have to ask whether two arrays overlap."""
 SLACK_VOXELS = 0.01
 SLACK_SHARE = 1e-5
 SLACK_PX = 0.02
@@ -38,22 +36,18 @@ SLACK_PX = 0.02
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def window_extremes(clear: Singles) -> Singles:
-    """(L, H, 2 W) of the square of 2^l pixels that begins at each pixel, where it fits: least value, minus the largest.
+def window_extremes_into(extremes: Singles, clear: Singles) -> None:
+    """Fill (L, H, 2 W): least value and minus the largest of the square of 2^l pixels that begins at each pixel.
 
-    So that both are minima, and lie side by side.
+    So both are minima, and lie side by side. Where a square does not fit, nothing is written.
     """
     height, width = clear.shape
-    levels = 1
-    while levels < LEVELS_MAX and 1 << levels <= min(width, height):
-        levels += 1
-    extremes = np.empty((levels, height, 2 * width), np.float32)
     for y in range(height):
         for x in range(width):
             extremes[0, y, 2 * x] = clear[y, x]
             extremes[0, y, 2 * x + 1] = -clear[y, x]
     pairs = np.empty(2 * width, np.float32)
-    for level in range(1, levels):
+    for level in range(1, len(extremes)):
         half = 1 << (level - 1)
         beside = pairs[2 * half :]
         for y in range(height - 2 * half + 1):
@@ -62,7 +56,6 @@ def window_extremes(clear: Singles) -> Singles:
                 pairs[i] = above[i] if above[i] < below[i] else below[i]
             for i in range(len(beside)):
                 out[i] = pairs[i] if pairs[i] < beside[i] else beside[i]
-    return extremes
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -92,7 +85,7 @@ def cull_bricks_into(
         lens: fx, fy, cx, cy of the padded image, with half a pixel added to the centre.
         min_range_m: nothing nearer is free.
         farthest_m: nothing farther is seen.
-        extremes: of `window_extremes` of the padded image.
+        extremes: of `window_extremes_into`, of the padded image.
     """
     brick_m = BRICK_VOXELS * edge_m
     stack = np.empty((8 * ROOT_LEVEL, 4), np.int64)
@@ -135,7 +128,10 @@ def cull_bricks_into(
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def split_bricks_into(
     found: Index,
+    corners_view: Singles,
     dims: Ints,
+    corner: Ints,
+    eye_m: Floats,
     corner_eye: Floats,
     edge_m: float,
     R: Floats,
@@ -146,21 +142,29 @@ def split_bricks_into(
 ) -> int:
     """Look at the octants of the bricks that `cull_bricks_into` found with mask 0; returns how many bricks are left.
 
-    Not done there: so one brick need not wait for the one before.
+    Not done there: so one brick need not wait for the one before. `corners_view` (3, N) takes the centre of each
+    brick's first voxel, camera frame. `corner` is the box's first voxel, `eye_m` the eye.
     """
     brick_m = BRICK_VOXELS * edge_m
     parts, levels = np.empty(9 * 8), _levels(max(extremes.shape[1], extremes.shape[2]), len(extremes))
     count = 0
     for k in range(len(found)):
         brick, mask = np.int64(found[k, 0]), np.int64(found[k, 1])
+        row = brick // dims[0]
+        bx, by, bz = brick - row * dims[0], row % dims[1], row // dims[1]
         if mask == 0:
-            x = corner_eye[0] + (brick % dims[0] + 0.5) * brick_m
-            y = corner_eye[1] + (brick // dims[0] % dims[1] + 0.5) * brick_m
-            z = corner_eye[2] + (brick // (dims[0] * dims[1]) + 0.5) * brick_m
+            x = corner_eye[0] + (bx + 0.5) * brick_m
+            y = corner_eye[1] + (by + 0.5) * brick_m
+            z = corner_eye[2] + (bz + 0.5) * brick_m
             _rects_into(parts, x, y, z, 0.25 * brick_m, edge_m, R, lens, farthest_m, extremes)
             _sights_into(parts, min_range_m, levels, extremes)
             for n in range(8):
                 mask |= MASKS[np.uint64(parts[SIGHT + n])] << n
+        x = (np.float64(corner[0] + BRICK_VOXELS * bx) + 0.5) * edge_m - eye_m[0]
+        y = (np.float64(corner[1] + BRICK_VOXELS * by) + 0.5) * edge_m - eye_m[1]
+        z = (np.float64(corner[2] + BRICK_VOXELS * bz) + 0.5) * edge_m - eye_m[2]
+        for a in range(3):
+            corners_view[a, count] = x * R[0, a] + y * R[1, a] + z * R[2, a]
         found[count, 0], found[count, 1] = brick, mask
         count += 1 if mask != 0 else 0
     return count
@@ -181,7 +185,8 @@ def _rects_into(
 ) -> None:
     """Of a cube's eight parts: which pixels each covers, and the squares of its least and largest distance.
 
-    The cube's centre is given from the eye, map frame; `step` is from there to the parts' centres along each axis. A part's sight becomes MIXED or NOT_SEEN where that is plain already, else FREE.
+    The cube's centre is given from the eye, map frame; `step` is from there to the parts' centres along each axis.
+    A part's sight becomes MIXED or NOT_SEEN where that is plain already, else FREE.
     """
     r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
     r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
@@ -230,17 +235,20 @@ def _sights_into(parts: Floats, min_range_m: float, levels: Index, extremes: Sin
     height, width, one = extremes.shape[1], extremes.shape[2] >> 1, np.uint64(1)
     for n in range(8):
         x0, x1, y0, y1 = int(parts[LEFT + n]), int(parts[RIGHT + n]), int(parts[TOP + n]), int(parts[BOTTOM + n])
-        level = levels[max(x1 - x0, y1 - y0)]
-        side = 1 << level
+        shift = levels[max(x1 - x0, y1 - y0)]
+        side = 1 << shift
         x0, y0 = min(x0, width - side), min(y0, height - side)
         x1, y1 = max(x1 - side + 1, x0), max(y1 - side + 1, y0)
         # Unsigned: Numba counts signed numbers from the end if they are negative, and asks each time.
-        level, x0, x1, y0, y1 = np.uint64(level), np.uint64(2 * x0), np.uint64(2 * x1), np.uint64(y0), np.uint64(y1)
-        a, b, c, d = extremes[level, y0, x0], extremes[level, y0, x1], extremes[level, y1, x0], extremes[level, y1, x1]
+        level, top, bottom = np.uint64(shift), np.uint64(y0), np.uint64(y1)
+        left, right = np.uint64(2 * x0), np.uint64(2 * x1)
+        a, b = extremes[level, top, left], extremes[level, top, right]
+        c, d = extremes[level, bottom, left], extremes[level, bottom, right]
         a, c = a if a < b else b, c if c < d else d
         parts[NEAR + n] = a if a < c else c
-        x0, x1 = x0 + one, x1 + one
-        a, b, c, d = extremes[level, y0, x0], extremes[level, y0, x1], extremes[level, y1, x0], extremes[level, y1, x1]
+        left, right = left + one, right + one
+        a, b = extremes[level, top, left], extremes[level, top, right]
+        c, d = extremes[level, bottom, left], extremes[level, bottom, right]
         a, c = a if a < b else b, c if c < d else d
         parts[FAR + n] = a if a < c else c
     min_square = min_range_m * min_range_m

@@ -158,6 +158,7 @@ class Integration:
                 dims=tally.dims,
                 voxel_edge_m=edge_m,
                 min_range_m=self._integrator.min_range_m,
+                scratch=hits.scratch,
             )
             tally.add_hits(hits, sums)
             tally.add_misses(hits, carving)
@@ -176,7 +177,7 @@ class Integration:
 
     @contextmanager
     def _tally_around(self, returns: Returns) -> Iterator[Tally]:
-        """A tally that holds a scan, and stays open meanwhile; those that nobody uses are closed when a new one opens."""
+        """A tally that holds a scan, and stays open meanwhile; idle ones are closed when a new one opens."""
         origin_m = returns.T_map_tof[:3, 3]
         farthest_m = float(np.nanmax(returns.range_m))
         with self._lock:

@@ -1,9 +1,9 @@
 """A measurement's evidence while it grows: bricks of 8^3 voxels around the head, counted scan by scan.
 
-    brick_of [brick of the box] -> slot       misses   [slot, 512]     every brick that was seen
-    table_of [slot] -> table                  hits     [table, 512]    only bricks with hits
-                                              row_of   [table, 512] -> row of samples
+    slot_of  [brick of the box] -> slot       misses   [slot, 512]     every brick that was seen
+    table_of [brick of the box] -> table      row_of   [table, 512] -> row of hits and samples, only bricks with hits
 
+Hits and misses share nothing, so that one thread can add a scan's hits while another adds another scan's misses.
 The box is as large as the sensor reaches from where the first scan was taken, and a little more: the head moves. A scan
 that does not fit goes into a new tally. Counts are 16 bits: a measurement has at most 4096 scans, and a scan counts a
 voxel once.
@@ -11,6 +11,7 @@ voxel once.
 
 import math
 from collections.abc import Callable, Iterable
+from itertools import pairwise
 from threading import Lock
 from typing import Any, TypeVar
 
@@ -18,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_fusion import tally_kernels as kernels
-from cairn_fusion.carve import Carving
+from cairn_fusion.carve import Carving, Scratch
 from cairn_fusion.carve_kernels import carve_into
 from cairn_map.errors import BadInputError
 from cairn_map.evidence import Evidence
@@ -39,7 +40,7 @@ BOX_BRICKS = 1 << 24
 BOX_BRICKS_MAX = 1 << 27
 """512 MB of index: 40 m at 1 cm."""
 RESERVED = 1 << 26
-"""Bytes of a first array: what is not written costs no memory. More than the 32 MB that glibc may keep and clear again."""
+"""Bytes of a first array; what is not written costs no memory. Above the 32 MB that glibc may keep, and then clears."""
 
 
 class ScanHits:
@@ -50,6 +51,8 @@ class ScanHits:
         self._bricks: Index = np.empty(0, np.int32)
         self._struck: Index = np.empty((0, 512), np.int32)
         self._used = 0
+        self.scratch = Scratch()
+        """For the views of the same thread."""
         self.voxels: Ints = np.empty(0, np.int64)
         """(U,) brick number of the box times 512 plus place, by number."""
 
@@ -72,7 +75,7 @@ class ScanHits:
         self.voxels = touched[:count]
         return numbers, count
 
-    def tables_of(self, bricks: Index) -> tuple[Index, Index]:
+    def tables_of(self, bricks: Ints) -> tuple[Index, Index]:
         """(K,) each brick's row of a (T, 512) array that is 0 where no voxel is hit, -1 for none; and that array."""
         return self._table_of[bricks] - np.int32(1), self._struck
 
@@ -101,8 +104,7 @@ class Tally:
         self._misses: Counts = np.empty((0, 512), np.uint16)
         self._hit_bricks: Index = np.empty(0, np.int32)
         self._row_of: Index = np.empty((0, 512), np.int32)
-        self._hits: Index = np.empty(0, np.int32)
-        self._samples: Ints = np.empty((0, geometry.plane_count), np.int64)
+        self._sums: Ints = np.empty((0, 1 + geometry.plane_count), np.int64)
         self._slots = self._tables = self._rows = 0
 
     def holds(self, origin_m: Floats, farthest_m: float) -> bool:
@@ -116,16 +118,16 @@ class Tally:
             self._hit_bricks = _grown(self._hit_bricks, self._tables + len(voxels), self._tables)
             tables = kernels.claim_into(voxels, 9, self._table_of, self._hit_bricks, self._tables)
             self._row_of = _grown(self._row_of, tables, self._tables)
-            rows = kernels.claim_rows_into(voxels, self._table_of, self._row_of, self._rows)
-            self._hits = _grown(self._hits, rows, self._rows)
-            self._samples = _grown(self._samples, rows, self._rows)
-            self._tables, self._rows = tables, rows
-            kernels.add_hits_into(self._hits, self._samples, self._table_of, self._row_of, voxels, sums)
+            rows = np.empty(len(voxels), np.int32)
+            used = kernels.claim_rows_into(voxels, self._table_of, self._row_of, rows, self._rows)
+            self._sums = _grown(self._sums, used, self._rows)
+            self._tables, self._rows = tables, used
+            kernels.add_hits_into(self._sums, rows, sums)
 
     def add_misses(self, hits: ScanHits, carving: Carving) -> None:
         """Count a miss in what a view looks through, but not where the same scan hit."""
         tables, struck = hits.tables_of(carving.bricks)
-        bricks = carving.bricks.astype(np.int64)
+        bricks = carving.bricks
         with self._misses_lock:
             self._seen_bricks = _grown(self._seen_bricks, self._slots + len(bricks), self._slots)
             slots = kernels.claim_into(bricks, 0, self._slot_of, self._seen_bricks, self._slots)
@@ -162,24 +164,30 @@ class Tally:
         first = np.flatnonzero(np.diff(numbers >> np.uint64(3 * up), prepend=np.uint64((1 << 64) - 1)))
         keys = [CellKey(int(key)) for key in interleave((xyz[first] >> up) + CELL_LIMIT)]
         inner = (numbers & np.uint64((1 << 3 * up) - 1)).astype(np.int32)
-        cells = zip(keys, np.split(bricks, first[1:]), np.split(inner, first[1:]), strict=True) if len(keys) else ()
-        # The largest first, so that no thread is left with one when the others are done.
-        largest_first = sorted(cells, key=lambda cell: -len(cell[1]))
-        packed = each(lambda cell: (cell[0], self._evidence(cell[1], cell[2])), largest_first)
-        return {key: evidence for key, evidence in sorted(packed) if len(evidence)}
-
-    def _evidence(self, bricks: Ints, numbers: Index) -> Evidence:
+        if not len(keys):
+            return {}
         slots, tables = self._slot_of[bricks] - np.int32(1), self._table_of[bricks] - np.int32(1)
-        V, S = kernels.count_known(slots, tables, self._misses, self._row_of)
+        parts = [slice(*ends) for ends in pairwise([*first.tolist(), len(bricks)])]
+        counted = [kernels.count_known(slots[part], tables[part], self._misses, self._row_of) for part in parts]
+        ends = np.cumsum([(0, 0), *counted], axis=0)
+        V, S = ends[-1].tolist()
+        # One array for all cells, as large as may be: memory by the page costs more than all that is written to it.
         voxels, counts = np.empty(V, np.uint32), np.empty((V, 2), np.int32)
         sampled, samples = np.empty(S, np.uint32), np.empty((S, self.geometry.plane_count), np.int64)
-        rows = kernels.pack_known_into(
-            *(slots, tables, numbers, self._misses, self._row_of, self._hits, self._samples),
-            *(voxels, counts, sampled, samples),
-        )
-        if rows < S:
-            sampled, samples = sampled[:rows].copy(), samples[:rows].copy()
-        return Evidence(voxels, counts, sampled, samples)
+
+        def evidence(n: int) -> Evidence:
+            part, of_voxels, of_samples = parts[n], slice(*ends[n : n + 2, 0]), slice(*ends[n : n + 2, 1])
+            rows = kernels.pack_known_into(
+                *(slots[part], tables[part], inner[part], self._misses, self._row_of, self._sums),
+                *(voxels[of_voxels], counts[of_voxels], sampled[of_samples], samples[of_samples]),
+            )
+            own = slice(of_samples.start, of_samples.start + rows)
+            return Evidence(voxels[of_voxels], counts[of_voxels], sampled[own], samples[own])
+
+        # The largest first, so that no thread is left with one when the others are done.
+        largest_first = sorted((n for n in range(len(keys)) if counted[n][0]), key=lambda n: -counted[n][0])
+        packed = zip(largest_first, each(evidence, largest_first), strict=True)
+        return {keys[n]: part for n, part in sorted(packed, key=lambda cell: keys[cell[0]])}
 
 
 def tally_around(origin_m: Floats, farthest_m: float, geometry: Geometry, *, max_range_m: float) -> Tally:
@@ -202,7 +210,7 @@ def tally_around(origin_m: Floats, farthest_m: float, geometry: Geometry, *, max
 def _grown(array: npt.NDArray[Scalar], needed: int, used: int) -> npt.NDArray[Scalar]:
     """The array with room for `needed` entries, of which the first `used` are kept and all others are 0.
 
-    At least doubled, so that copies stay few; from `RESERVED` on, because fresh addresses are zero without being written.
+    At least doubled, so that copies stay few; from `RESERVED` on, because fresh memory is 0 without being written.
     """
     if needed <= len(array):
         return array

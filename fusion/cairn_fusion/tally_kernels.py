@@ -36,18 +36,19 @@ def returned_points(range_m: npt.NDArray[np.float32], rays: Floats, T_map_camera
 def hit_voxels(points_m: Floats, voxel_edge_nm: int, corner: Ints, dims: Ints) -> Ints:
     """(N,) brick number times 512 plus place of the voxel that holds each (N, 3) point, map frame; -1 outside the box.
 
-    The rule of FORMAT.md section 2: whole nanometres, then floor. The quotient of floats is right or one too large.
+    The rule of FORMAT.md section 2: whole nanometres, then floor. The product of floats is right or next to it.
     """
     out = np.empty(len(points_m), np.int64)
-    edge = np.float64(voxel_edge_nm)
+    edge, share = voxel_edge_nm, 1.0 / np.float64(voxel_edge_nm)
     x0, y0, z0, w, h, d = corner[0], corner[1], corner[2], dims[0], dims[1], dims[2]
     for n in range(len(points_m)):
         x, y, z = points_m[n, 0] * NANOMETRES, points_m[n, 1] * NANOMETRES, points_m[n, 2] * NANOMETRES
         x, y, z = np.rint(x), np.rint(y), np.rint(z)
-        i, j, k = np.int64(np.floor(x / edge)), np.int64(np.floor(y / edge)), np.int64(np.floor(z / edge))
-        i -= np.int64(i * voxel_edge_nm > np.int64(x)) + x0
-        j -= np.int64(j * voxel_edge_nm > np.int64(y)) + y0
-        k -= np.int64(k * voxel_edge_nm > np.int64(z)) + z0
+        i, j, k = np.int64(np.floor(x * share)), np.int64(np.floor(y * share)), np.int64(np.floor(z * share))
+        over_x, over_y, over_z = np.int64(x) - i * edge, np.int64(y) - j * edge, np.int64(z) - k * edge
+        i += np.int64(over_x >= edge) - np.int64(over_x < 0) - x0
+        j += np.int64(over_y >= edge) - np.int64(over_y < 0) - y0
+        k += np.int64(over_z >= edge) - np.int64(over_z < 0) - z0
         bx, by, bz = i >> 3, j >> 3, k >> 3
         place = (i & 1) | (i & 2) << 2 | (i & 4) << 4
         place |= (j & 1) << 1 | (j & 2) << 3 | (j & 4) << 5
@@ -105,30 +106,35 @@ def forget_hits_into(bricks: Index, table_of: Index, struck: Index, touched: Int
 
 
 @nb.njit(cache=True, nogil=True)
-def claim_rows_into(voxels: Ints, table_of: Index, row_of: Index, used: int) -> int:
-    """Give each voxel that has no row the next one; `row_of` (T, 512) is one more, 0 for none. Returns rows used."""
+def claim_rows_into(voxels: Ints, table_of: Index, row_of: Index, rows: Index, used: int) -> int:
+    """Give each voxel that has no row the next one; returns rows used.
+
+    `row_of` (T, 512) is one more than a voxel's row, 0 for none; `rows` (N,) takes the row of each.
+    """
     for n in range(len(voxels)):
         table, place = table_of[voxels[n] >> 9] - 1, voxels[n] & 511
-        if row_of[table, place] == 0:
+        row = row_of[table, place]
+        if row == 0:
             used += 1
-            row_of[table, place] = used
+            row_of[table, place] = row = used
+        rows[n] = row - 1
     return used
 
 
 @nb.njit(cache=True, nogil=True)
-def add_hits_into(hits: Index, samples: Ints, table_of: Index, row_of: Index, voxels: Ints, sums: Ints) -> None:
-    """Count a hit in the row of each voxel, and add its (N, P) sums."""
-    for n in range(len(voxels)):
-        row = row_of[table_of[voxels[n] >> 9] - 1, voxels[n] & 511] - 1
-        hits[row] += np.int32(1)
-        for p in range(sums.shape[1]):
-            samples[row, p] += sums[n, p]
+def add_hits_into(sums: Ints, rows: Index, added: Ints) -> None:
+    """Count a hit in some rows of (R, 1 + P) sums, all different, and add their (N, P) samples."""
+    for n in range(len(rows)):
+        row = rows[n]
+        sums[row, 0] += 1
+        for p in range(added.shape[1]):
+            sums[row, 1 + p] += added[n, p]
 
 
 @nb.njit(cache=True, nogil=True)
 def count_known(slots: Index, tables: Index, misses: Counts, row_of: Index) -> tuple[int, int]:
     """Voxels with a count, and those of them with a hit, in bricks with these slots and tables, -1 for none."""
-    known, hit = 0, 0
+    known, hit = np.int64(0), np.int64(0)
     for b in range(len(slots)):
         slot, table = slots[b], tables[b]
         if table < 0:
@@ -142,7 +148,7 @@ def count_known(slots: Index, tables: Index, misses: Counts, row_of: Index) -> t
             for i in range(512):
                 hit += np.int64(row_of[table, i] > 0)
                 known += np.int64((misses[slot, i] > 0) | (row_of[table, i] > 0))
-    return known, hit
+    return int(known), int(hit)
 
 
 @nb.njit(cache=True, nogil=True)
@@ -152,7 +158,6 @@ def pack_known_into(
     numbers: Index,
     misses: Counts,
     row_of: Index,
-    hits: Index,
     sums: Ints,
     places: npt.NDArray[np.uint32],
     counts: Index,
@@ -169,17 +174,22 @@ def pack_known_into(
     for b in range(len(slots)):
         slot, table = slots[b], tables[b]
         first = np.uint32(numbers[b]) << np.uint32(9)
+        if slot >= 0:
+            for i in range(512):
+                seen[i] = misses[slot, i]
+        else:
+            seen[:] = 0
+        missed = np.int64(0)
         for i in range(512):
-            seen[i] = misses[slot, i] if slot >= 0 else np.uint16(0)
-        known = 0
-        for i in range(512):
-            known += np.int64(seen[i] > 0)
-        if known == 512 and table < 0:
+            missed += np.int64(seen[i] > 0)
+        if missed == 512 and table < 0:
             for i in range(512):
                 places[at + np.uint64(i)] = first | np.uint32(i)
                 counts[at + np.uint64(i), 0] = 0
                 counts[at + np.uint64(i), 1] = seen[i]
             at += np.uint64(512)
+            continue
+        if missed == 0 and table < 0:
             continue
         known = np.uint64(0)
         if table < 0:
@@ -200,13 +210,13 @@ def pack_known_into(
                 struck = row_of[table, kept[n]] - 1
                 if struck < 0:
                     continue
-                counts[at + n, 0] = hits[struck]
+                counts[at + n, 0] = sums[struck, 0]
                 some = False
-                for p in range(sums.shape[1]):
-                    samples[row, p] = sums[struck, p]
-                    some |= sums[struck, p] != 0
+                for p in range(samples.shape[1]):
+                    samples[row, p] = sums[struck, 1 + p]
+                    some |= sums[struck, 1 + p] != 0
                 if some:
                     sampled[row] = at + n
                     row += np.uint64(1)
         at += known
-    return np.int64(row)
+    return int(row)

@@ -152,12 +152,18 @@ def test_a_scan_means_the_same_in_whatever_box_it_is_counted(seed: int) -> None:
         packed = []
         for shift_m in (0.0, 0.123, 0.777):
             tally = Tally(GEOMETRY, scan.T_map_rig[:3, 3] + shift_m, reach_m=4.0 + shift_m)
-            box = {"corner": tally.corner, "dims": tally.dims}
             hits = ScanHits()
             hits.number(np.empty((0, 3)), tally)
             tally.add_misses(
                 hits,
-                carving_of(clear, window, scan.T_map_rig, **box, voxel_edge_m=GEOMETRY.voxel_edge_m, min_range_m=0.3),
+                carving_of(
+                    *(clear, window, scan.T_map_rig),
+                    corner=tally.corner,
+                    dims=tally.dims,
+                    voxel_edge_m=GEOMETRY.voxel_edge_m,
+                    min_range_m=0.3,
+                    scratch=hits.scratch,
+                ),
             )
             packed.append(tally.packed())
         assert packed[0] == packed[1] == packed[2] != {}
