@@ -1,7 +1,7 @@
-"""Which voxels of which bricks a range image looks through; projectively, brick by brick.
+"""Which voxels of which bricks a range image looks through; projectively, octant by octant.
 
-    bricks in the view's box --sphere against the image's pyramids--> passed: not seen | free: all of it | mixed
-    mixed  --512 voxel centres into the image--> a miss where the centre is nearer than what the pixel saw
+    bricks --`cull_kernels`--> octants that are not seen | free: all of it | mixed
+    mixed  --64 voxel centres into the image--> a miss where the centre is nearer than what the pixel saw
 
 A brick costs three loops: where each centre falls, what is there, whether it is nearer. The first and the last are
 arithmetic alone, and so become vector instructions; together a voxel takes about a nanosecond.

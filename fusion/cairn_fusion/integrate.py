@@ -11,12 +11,10 @@ never on the map, nor on how many scans are added in what order on how many thre
 
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
-from threading import Lock
 
 import numpy as np
 import numpy.typing as npt
@@ -27,11 +25,11 @@ from cairn_fusion.carve import MARGIN_VOXELS, Window, carving_of, window_of
 from cairn_fusion.cast import SeenVoxels, seen_voxels
 from cairn_fusion.samples import Returns, returns_of, sample_sums
 from cairn_fusion.scan import Scan
-from cairn_fusion.tally import Each, ScanHits, Tally, tally_around
+from cairn_fusion.tallies import Tallies
+from cairn_fusion.tally import Each
 from cairn_map.channels import ChannelKind
 from cairn_map.errors import BadInputError
 from cairn_map.evidence import Evidence, packed_evidence
-from cairn_map.evidence_map import EvidenceMap
 from cairn_map.grid import CellKey, Geometry, split_voxels, voxels_of_points
 
 Floats = npt.NDArray[np.float64]
@@ -80,12 +78,7 @@ class Integration:
         self._rig = rig
         self._geometry = geometry
         self._integrator = integrator
-        self._around_m = around_m
-        self._lock = Lock()
-        self._sum = EvidenceMap(geometry)
-        self._tallies: dict[Tally, int] = {}
-        """And how many threads are adding to each."""
-        self._idle: list[ScanHits] = []
+        self._tallies = Tallies(geometry, max_range_m=integrator.max_range_m, around_m=around_m)
 
     def add(self, scan: Scan) -> None:
         """Add a scan.
@@ -105,10 +98,10 @@ class Integration:
         )
         scalars = _scalar_evidence(scan, self._geometry)
         if window is None:
-            self._merge(_cast(scan, rig, self._geometry, returns))
+            self._tallies.merge(_cast(scan, rig, self._geometry, returns))
         elif len(returns.pixels):
             self._carve(scan, returns, window)
-        self._merge(scalars)
+        self._tallies.merge(scalars)
 
     def add_points(self, points: npt.NDArray[np.floating], T_map_sensor: Transform) -> None:
         """Add a sweep of a sensor whose points have no order, ray by ray.
@@ -130,24 +123,17 @@ class Integration:
         ends, first, _ = _unique_voxels(voxels_of_points(points_map, self._geometry))
         seen = seen_voxels(T[:3, 3], points_map[first], ends, self._geometry)
         samples = np.zeros((len(ends), self._geometry.plane_count), np.int64)
-        self._merge(_packed_by_cell(seen, ends, samples, self._geometry))
+        self._tallies.merge(_packed_by_cell(seen, ends, samples, self._geometry))
 
     def diff(self, each: Each = map) -> dict[CellKey, Evidence]:
         """The evidence of all scans, by cell; `each` as for `Tally.packed`. Not while scans are being added."""
-        if len(self._tallies) == 1 and not len(self._sum):
-            # Most measurements end here: all scans in one tally, nothing to add up.
-            return next(iter(self._tallies)).packed(each)
-        self._close_idle_tallies(each)
-        return self._sum.packed()
-
-    def _merge(self, diff: dict[CellKey, Evidence]) -> None:
-        with self._lock:
-            self._sum.merge(diff)
+        return self._tallies.packed(each)
 
     def _carve(self, scan: Scan, returns: Returns, window: Window) -> None:
         """Hits where beams ended, misses where the image looks through."""
         edge_m = self._geometry.voxel_edge_m
-        with self._tally_around(returns) as tally, self._hits() as hits:
+        farthest_m = float(np.nanmax(returns.range_m))
+        with self._tallies.around(returns.T_map_tof[:3, 3], farthest_m) as (tally, hits):
             voxel_of, count = hits.number(returns.points_map, tally)
             sums = sample_sums(scan, self._rig, self._geometry, returns, voxel_of, count)
             carving = carving_of(
@@ -162,49 +148,6 @@ class Integration:
             )
             tally.add_hits(hits, sums)
             tally.add_misses(hits, carving)
-
-    @contextmanager
-    def _hits(self) -> Iterator[ScanHits]:
-        """A scratch that no other thread uses."""
-        with self._lock:
-            hits = self._idle.pop() if self._idle else ScanHits()
-        try:
-            yield hits
-        finally:
-            hits.forget()
-            with self._lock:
-                self._idle.append(hits)
-
-    @contextmanager
-    def _tally_around(self, returns: Returns) -> Iterator[Tally]:
-        """A tally that holds a scan, and stays open meanwhile; idle ones are closed when a new one opens."""
-        origin_m = returns.T_map_tof[:3, 3]
-        farthest_m = float(np.nanmax(returns.range_m))
-        with self._lock:
-            tally = next((tally for tally in self._tallies if tally.holds(origin_m, farthest_m)), None)
-            if tally is None:
-                self._close_idle_tallies()
-                tally = self._new_tally(origin_m, farthest_m)
-            self._tallies[tally] = self._tallies.get(tally, 0) + 1
-        try:
-            yield tally
-        finally:
-            with self._lock:
-                self._tallies[tally] -= 1
-
-    def _new_tally(self, origin_m: Floats, farthest_m: float) -> Tally:
-        limit_m = self._integrator.max_range_m
-        if self._around_m is not None:
-            tally = tally_around(self._around_m, farthest_m, self._geometry, max_range_m=limit_m)
-            self._around_m = None
-            if tally.holds(origin_m, farthest_m):
-                return tally
-        return tally_around(origin_m, farthest_m, self._geometry, max_range_m=limit_m)
-
-    def _close_idle_tallies(self, each: Each = map) -> None:
-        for tally in [tally for tally, users in self._tallies.items() if not users]:
-            self._sum.merge(tally.packed(each))
-            del self._tallies[tally]
 
 
 def integrate_scan(scan: Scan, rig: Rig, geometry: Geometry, *, integrator: Integrator) -> dict[CellKey, Evidence]:
