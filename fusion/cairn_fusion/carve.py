@@ -143,7 +143,8 @@ def carving_of(
     t: Floats = np.ascontiguousarray(T_map_camera[:3, 3])
     corner_m: Floats = corner.astype(np.float64) * voxel_edge_m
     reach_m = float(clear_m.max())
-    low, high = _bricks_around(t, reach_m, R, window, corner_m, dims, BRICK_VOXELS * voxel_edge_m)
+    around = (t - corner_m + np.array([[-reach_m], [reach_m]])) / (BRICK_VOXELS * voxel_edge_m)
+    low, high = np.clip(np.floor(around + np.array([[-0.1], [0.1]])).astype(np.int64), [[0], [-1]], dims - 1)
     view = (corner_m - t, voxel_edge_m, R, window.lens, min_range_m, reach_m, scratch.extremes(clear_m))
     count = cull_bricks_into(scratch.found(0), low, high, dims, *view)
     if count > len(scratch.found(0)):
@@ -163,30 +164,14 @@ def carving_of(
 
 def _offsets_in_view(R: Floats, voxel_edge_m: float) -> Singles:
     """(3, 512) from the first voxel's centre of a brick to each voxel's, camera frame."""
-    x, y, z = (MORTON_XYZ * voxel_edge_m).T
+    x, y, z = MORTON_XYZ * voxel_edge_m
     return np.stack([x * R[0, a] + y * R[1, a] + z * R[2, a] for a in range(3)]).astype(np.float32)
 
 
-def _bricks_around(
-    t: Floats, reach_m: float, R: Floats, window: Window, corner_m: Floats, dims: Ints, brick_m: float
-) -> tuple[Ints, Ints]:
-    """First and last brick of the box along each axis that a view can reach: around its eye and its image's corners."""
-    fx, fy, cx, cy = window.lens
-    x = (np.array([0, window.width + 2]) - cx) / fx
-    y = (np.array([0, window.height + 2]) - cy) / fy
-    # Of all rays of the window none goes farther along an axis than its corners' rays do at full depth.
-    ends = np.array([(a, b, 1.0) for a in x for b in y]) * reach_m @ R.T
-    low, high = np.minimum(ends.min(axis=0), 0), np.maximum(ends.max(axis=0), 0)
-    low, high = np.maximum(low, -reach_m), np.minimum(high, reach_m)
-    first = np.floor((t + low - corner_m) / brick_m - 0.1).astype(np.int64)
-    last = np.floor((t + high - corner_m) / brick_m + 0.1).astype(np.int64)
-    return np.clip(first, 0, dims - 1), np.clip(last, -1, dims - 1)
-
-
 def _morton_xyz() -> Floats:
-    """(512, 3) x, y, z of a brick's voxels in Morton order."""
+    """(3, 512) x, y, z of a brick's voxels in Morton order."""
     places = np.arange(512)
-    return np.stack([sum((places >> (3 * b + a) & 1) << b for b in range(3)) for a in range(3)], axis=1).astype(float)
+    return np.stack([sum((places >> (3 * b + a) & 1) << b for b in range(3)) for a in range(3)]).astype(float)
 
 
 MORTON_XYZ = _morton_xyz()

@@ -197,6 +197,13 @@ def _rects_into(
     right, bottom = (extremes.shape[2] >> 1) - 1.0, extremes.shape[1] - 1.0
     widest = (1 << len(extremes)) - 1.0
     limit = farthest_m * farthest_m
+    # The planes through the eye and the image's edges, as x / z and y / z, and how far a part reaches across them.
+    u0, u1 = (1.0 - SLACK_PX - cx) / fx, (right + SLACK_PX - cx) / fx
+    v0, v1 = (1.0 - SLACK_PX - cy) / fy, (bottom + SLACK_PX - cy) / fy
+    past_u0 = half * (abs(r00 - u0 * r02) + abs(r10 - u0 * r12) + abs(r20 - u0 * r22))
+    past_u1 = half * (abs(r00 - u1 * r02) + abs(r10 - u1 * r12) + abs(r20 - u1 * r22))
+    past_v0 = half * (abs(r01 - v0 * r02) + abs(r11 - v0 * r12) + abs(r21 - v0 * r22))
+    past_v1 = half * (abs(r01 - v1 * r02) + abs(r11 - v1 * r12) + abs(r21 - v1 * r22))
     for n in range(8):
         x, y, z = x0 + (2 * (n & 1) - 1) * step, y0 + ((n & 2) - 1) * step, z0 + ((n >> 1 & 2) - 1) * step
         ax, ay, az = abs(x), abs(y), abs(z)
@@ -206,22 +213,23 @@ def _rects_into(
         depth = x * r02 + y * r12 + z * r22
         ahead = depth - span > 0.01 * span
         # Of the cube's points none is farther from the centre's pixel: |x - u z| there, over the least depth.
+        across, down = x * r00 + y * r10 + z * r20, x * r01 + y * r11 + z * r21
+        beside = (across - u0 * depth <= -past_u0) | (across - u1 * depth >= past_u1)
+        beside |= (down - v0 * depth <= -past_v0) | (down - v1 * depth >= past_v1)
         inverse = 1.0 / (depth if ahead else 1.0)
         nearby = half / (depth - span if ahead else 1.0)
-        u = (x * r00 + y * r10 + z * r20) * inverse
-        v = (x * r01 + y * r11 + z * r21) * inverse
+        u, v = across * inverse, down * inverse
         du = fx * nearby * (abs(r00 - u * r02) + abs(r10 - u * r12) + abs(r20 - u * r22)) + SLACK_PX
         dv = fy * nearby * (abs(r01 - v * r02) + abs(r11 - v * r12) + abs(r21 - v * r22)) + SLACK_PX
         u, v = fx * u + cx, fy * v + cy
-        passed = (u + du < 1.0) | (v + dv < 1.0) | (u - du >= right) | (v - dv >= bottom)
-        u0, u1 = min(max(u - du, 0.0), right), min(max(u + du, 0.0), right)
-        v0, v1 = min(max(v - dv, 0.0), bottom), min(max(v + dv, 0.0), bottom)
-        unseen = (nearest >= limit) | (depth + span <= 0.0) | (ahead & passed)
+        left_px, right_px = min(max(u - du, 0.0), right), min(max(u + du, 0.0), right)
+        top_px, bottom_px = min(max(v - dv, 0.0), bottom), min(max(v + dv, 0.0), bottom)
+        unseen = (nearest >= limit) | (depth + span <= 0.0) | beside
         # What is wider than the windows is too near to be decided on as a whole.
-        whole = ahead & (u1 - u0 < widest) & (v1 - v0 < widest)
+        whole = ahead & (right_px - left_px < widest) & (bottom_px - top_px < widest)
         parts[NEAREST + n] = nearest
         parts[FARTHEST + n] = (dx * dx + dy * dy + dz * dz) * (1.0 + SLACK_SHARE)
-        parts[LEFT + n], parts[RIGHT + n], parts[TOP + n], parts[BOTTOM + n] = u0, u1, v0, v1
+        parts[LEFT + n], parts[RIGHT + n], parts[TOP + n], parts[BOTTOM + n] = left_px, right_px, top_px, bottom_px
         parts[SIGHT + n] = NOT_SEEN if unseen else (FREE if whole else MIXED)
 
 
