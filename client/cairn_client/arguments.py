@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from cairn_client.api import MapApi
-from cairn_client.robot import split_map_url
+from cairn_client.map_url import split_map_url
 
 Item = TypeVar("Item")
 TOKEN_VARIABLE = "CAIRN_TOKEN"  # noqa: S105 - the variable's name

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 from cairn_client.replica_store import KeptCommit, ReplicaStore
-from cairn_map.cell_code import decode_cell
+from cairn_map.cell_code import Profile, decode_cell
 from cairn_map.commit import Commit, CommitMeta, make_commit, renamed_commit, split_commit
 from cairn_map.errors import BadInputError
 from cairn_map.evidence import Evidence
@@ -60,7 +60,14 @@ class Outbox:
         """Cells that a kept commit touches."""
         return set(self._touching)
 
-    def add(self, diff: Mapping[CellKey, Evidence], meta: CommitMeta | None, *, seen: str | None) -> Commit:
+    def add(
+        self,
+        diff: Mapping[CellKey, Evidence],
+        meta: CommitMeta | None,
+        *,
+        seen: str | None,
+        profile: Profile = Profile.FAST,
+    ) -> Commit:
         """Keep evidence as the next commit; durable on return.
 
         Raises:
@@ -77,7 +84,7 @@ class Outbox:
             "seen": seen,
         }
         meta = CommitMeta.model_validate({**dict(meta or ()), **known})
-        commit = make_commit(meta, diff, self._geometry)
+        commit = make_commit(meta, diff, self._geometry, profile=profile)
         with self._store.transaction():
             self._store.add_commit(commit)
             self._set_next(n + 1, commit)

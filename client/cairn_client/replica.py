@@ -15,7 +15,7 @@ from dataclasses import replace
 from cairn_client.outbox import Outbox
 from cairn_client.replica_store import BaseCell, KeptCommit, ReplicaStore
 from cairn_map.brick_cell import sum_evidence
-from cairn_map.cell_code import decode_cell, encode_cell
+from cairn_map.cell_code import Profile, decode_cell, encode_cell
 from cairn_map.commit import Commit, CommitMeta
 from cairn_map.cursor import Cursor, cursor_from_text
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError
@@ -77,15 +77,19 @@ class Replica:
         with self.lock, self.store.transaction():
             self.store.put("token", token)
 
-    def commit(self, diff: Mapping[CellKey, Evidence], meta: CommitMeta | None = None) -> Commit:
+    def commit(
+        self, diff: Mapping[CellKey, Evidence], meta: CommitMeta | None = None, *, profile: Profile = Profile.FAST
+    ) -> Commit:
         """Keep evidence as the next commit, durably, and see it in the view.
 
         Args:
             diff: packed evidence by cell.
             meta: what to say about it; id, geometry, parent and cursor are filled in here.
+            profile: how its bytes are spent.
         """
         with self.lock:
-            commit = self.outbox.add(diff, meta, seen=str(self.default_cursor) if self.default_cursor else None)
+            seen = str(self.default_cursor) if self.default_cursor else None
+            commit = self.outbox.add(diff, meta, seen=seen, profile=profile)
             self.view.merge({key: diff[key] for key in commit.cells})
             return commit
 

@@ -14,12 +14,12 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, Self, TypeVar
-from urllib.parse import urlsplit
 
 from pydantic import ValidationError
 
 from cairn_calib.rig import Rig
 from cairn_client.api import MapApi, Traffic
+from cairn_client.map_url import split_map_url
 from cairn_client.outbox import UNNUMBERED
 from cairn_client.replica import Replica
 from cairn_client.replica_store import ReplicaStore
@@ -28,6 +28,7 @@ from cairn_client.sync_thread import SyncThread
 from cairn_fusion.integrate import Integrator
 from cairn_fusion.measurement import Measurement
 from cairn_fusion.scan import Scan
+from cairn_map.cell_code import Profile
 from cairn_map.commit import Commit, CommitMeta
 from cairn_map.compile_progress import show_compiling
 from cairn_map.errors import BadInputError, CairnError, DeniedError, first_error
@@ -136,18 +137,19 @@ class Robot:
             raise BadInputError("no_rig", "this robot was opened without a rig, so it cannot read scans")
         self._measurement.add(scan)
 
-    def commit(self, *, note: str = "", retracts: tuple[CommitId, ...] = ()) -> Commit | None:
+    def commit(
+        self, *, note: str = "", retracts: tuple[CommitId, ...] = (), profile: Profile = Profile.FAST
+    ) -> Commit | None:
         """Close the open measurement and keep it durably; None if there is nothing in it.
 
         Args:
             note: up to 1024 characters for the map's log.
-            retracts: own commits that this one takes back; its evidence stands in their place, on this robot too
-                once the server has folded it.
+            retracts: own commits that it takes back and stands for, on this robot too once the server has folded it.
+            profile: small spends more work, up to a second, on four tenths fewer bytes.
 
         Raises:
-            BadInputError: the commit would be too large, its note too long, or it retracts what is not this robot's;
-                the measurement stays open.
-            UnreachableError: kind `store_failed`: the disk is full or broken; the measurement stays open.
+            BadInputError: the commit would be too large, its note too long, or it retracts what is not this robot's.
+            UnreachableError: kind `store_failed`: the disk is full or broken. The measurement stays open in any case.
         """
         diff = self._measurement.diff() if self._measurement else {}
         if not diff and not retracts:
@@ -155,7 +157,7 @@ class Robot:
                 log.warning("%d scans gave no evidence; nothing is committed", len(self._measurement))
                 self._measurement = self._new_measurement()
             return None
-        commit = self._replica.commit(diff, self._meta(note, retracts))
+        commit = self._replica.commit(diff, self._meta(note, retracts), profile=profile)
         self._measurement = self._new_measurement()
         if self._thread is not None:
             self._thread.wake()
@@ -280,20 +282,3 @@ class Robot:
             )
         except ValidationError as exc:
             raise BadInputError("bad_meta", f"the commit cannot say this of itself: {first_error(exc)}") from exc
-
-
-def split_map_url(map_url: str) -> tuple[str, str]:
-    """Server and map of `http://HOST:PORT/maps/NAME`.
-
-    Raises:
-        BadInputError: it is not of that form.
-    """
-    try:
-        parts = urlsplit(map_url)
-        is_host = bool(parts.hostname) and parts.port != 0  # reading the port checks it
-    except ValueError:
-        parts, is_host = urlsplit(""), False
-    head, _, name = parts.path.rstrip("/").rpartition("/maps/")
-    if parts.scheme not in ("http", "https") or not is_host or not name or "/" in name:
-        raise BadInputError("bad_url", f"a map's URL is http://HOST:PORT/maps/NAME, got {map_url[:200]!r}")
-    return f"{parts.scheme}://{parts.netloc}{head}", robot_name(name)

@@ -40,6 +40,7 @@ from cairn_client.sync import Wanted, within
 from cairn_fusion.importers import open_source
 from cairn_fusion.integrate import Integrator
 from cairn_fusion.recording import Recording
+from cairn_map.cell_code import Profile
 from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel
 from cairn_map.errors import BadInputError, NotFoundError, UnreachableError
 from cairn_map.grid import Geometry, geometry_for
@@ -88,7 +89,7 @@ def _replay(args: argparse.Namespace) -> int:
             for index in stop:
                 robot.observe(source.scan(index))
                 scans += 1
-            commits += robot.commit() is not None
+            commits += robot.commit(profile=Profile(args.profile)) is not None
             if time.monotonic() - last_sync_s > SYNC_EVERY_S:
                 _try_sync(robot)
                 last_sync_s = time.monotonic()
@@ -241,6 +242,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     replay.add_argument("--state", type=Path, metavar="DIR", help="the robot's folder (cairn-NAME)")
     replay.add_argument("--mode", choices=("high-end", "low-end"), default="high-end")
+    replay.add_argument(
+        "--profile",
+        choices=list(Profile),
+        default=Profile.FAST,
+        help="small: four tenths fewer bytes, more work (fast)",
+    )
     add_frame_arguments(replay)
     replay.set_defaults(run=_replay)
     pull = commands.add_parser("pull", help="fetch what is missing", description="fetch what is missing")

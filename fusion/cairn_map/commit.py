@@ -15,7 +15,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from cairn_map.cell_code import DecodedCell, decode_canonical_cell, decode_cell, encode_cell
+from cairn_map.cell_code import DecodedCell, Profile, decode_canonical_cell, decode_cell, encode_cell
 from cairn_map.cell_head import CellHead, decode_head
 from cairn_map.cell_reading import VOXEL_BYTES
 from cairn_map.errors import BadInputError, DamagedDataError, first_error
@@ -121,8 +121,10 @@ class Commit:
         return self.data[HEAD.size : HEAD.size + int(HEAD.unpack_from(self.data)[2])]
 
 
-def make_commit(meta: CommitMeta, diff: Mapping[CellKey, Evidence], geometry: Geometry) -> Commit:
-    """The commit of a measurement's evidence; cells without evidence are left out.
+def make_commit(
+    meta: CommitMeta, diff: Mapping[CellKey, Evidence], geometry: Geometry, *, profile: Profile = Profile.FAST
+) -> Commit:
+    """The commit of a measurement's evidence; cells without evidence are left out. Its SHA is that of every profile.
 
     Raises:
         BadInputError: negative evidence, sums without weight, too many cells, or larger than a reader would accept.
@@ -133,7 +135,7 @@ def make_commit(meta: CommitMeta, diff: Mapping[CellKey, Evidence], geometry: Ge
     digests: list[bytes] = []
     for key in sorted(key for key, evidence in diff.items() if len(evidence)):
         _check_evidence(diff[key], geometry)
-        encoded = encode_cell(key, diff[key], geometry)
+        encoded = encode_cell(key, diff[key], geometry, profile=profile)
         cells[key] = encoded.data
         digests.append(encoded.digest)
     text = meta.model_dump_json(exclude_defaults=True).encode()

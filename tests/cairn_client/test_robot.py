@@ -17,8 +17,10 @@ from tests.cairn_client.world import stored_commits
 
 from cairn_client.api import MapApi
 from cairn_client.backoff import RETRY_AFTER_MAX_S, Backoff
-from cairn_client.robot import Robot, split_map_url
+from cairn_client.map_url import split_map_url
+from cairn_client.robot import Robot
 from cairn_fusion.integrate import integrate_scan
+from cairn_map.cell_code import Profile
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, DeniedError, UnreachableError
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.messages import Register
@@ -75,6 +77,24 @@ def test_two_robots_share_a_map(server: LiveServer, tmp_path: Path) -> None:
         for robot in (mole, bat):
             robot.sync()
             assert cells_of(robot.map) == cells_of(evidence_of(1, 2))
+
+
+def test_a_small_commit_says_the_same_in_fewer_bytes(server: LiveServer, tmp_path: Path) -> None:
+    with robot_in(tmp_path, server.map_url) as mole, robot_in(tmp_path, name="bat") as bat:
+        commits = []
+        for robot, profile in ((mole, Profile.SMALL), (bat, Profile.FAST)):
+            for seed in range(1, 6):
+                robot.observe(scan_of(seed))
+            commits.append(robot.commit(profile=profile))
+        small, fast = commits
+        assert small is not None
+        assert fast is not None
+        assert len(small.data) < 0.9 * len(fast.data)
+        assert mole.sync().pushed == 1
+    server.wait_for_fold()
+    with robot_in(tmp_path, server.map_url, name="owl") as owl:
+        owl.sync()
+        assert cells_of(owl.map) == cells_of(evidence_of(*range(1, 6)))
 
 
 def test_a_viewer_sees_and_does_not_push(server: LiveServer, tmp_path: Path) -> None:

@@ -47,6 +47,8 @@ from cairn_map.messages import (
     Retract,
 )
 from cairn_map.sensor_model import SensorModel
+from cairn_map.view import Chance, Extent, ViewStyle
+from cairn_map.view_code import encode_view
 
 CORPUS = Path(__file__).parent / "corpus"
 SUFFIX = ".input"
@@ -131,6 +133,9 @@ def _cells() -> Iterator[tuple[str, str, bytes]]:
         yield "cell", f"geometry-{n}-small", small
         yield "cell-part", f"geometry-{n}", data
         yield "cell-part", f"geometry-{n}-small", small
+        for extent, chance in zip(Extent, Chance, strict=True):
+            style = ViewStyle(depth=3, extent=extent, chance=chance)
+            yield "view", f"geometry-{n}-{extent}", encode_view(KEY, evidence, geometry, SensorModel(), style=style)
     evidence = made_evidence(0, SMALL, voxels=8, air=1)
     signed = Evidence(evidence.voxels, -evidence.counts, evidence.sampled, -evidence.samples)
     yield "cell", "signed", encode_cell(KEY, signed, SMALL).data

@@ -18,7 +18,7 @@ from tests.fuzz.sections import in_folder, mutated_sections, sections_of
 from tests.fuzz.wrapping_mutator import mutated_commit, mutated_reply
 
 from cairn_calib.rig import rig_from_json
-from cairn_client.robot import split_map_url
+from cairn_client.map_url import split_map_url
 from cairn_fusion.frame_folder import FrameFolderOptions, import_frames
 from cairn_fusion.images import image_header, read_colour, read_grey16
 from cairn_fusion.importers import detect_layout
@@ -38,6 +38,7 @@ from cairn_map.frames import FrameReader, encode_frame, frames_of, start_of_repl
 from cairn_map.grid import DEPTH_MAX, CellKey, Geometry, cell_from_text
 from cairn_map.ids import author_from_text, commit_id_from_text, robot_name
 from cairn_map.version_vector import version_vector_from_json
+from cairn_map.view_code import decode_view
 from cairn_sim.scene_file import load_scene
 
 Mutate = Callable[[bytes], bytes]
@@ -107,6 +108,18 @@ def read_cell_partly(data: bytes) -> None:
         reader.channel(c)
     counts = reader.counts()
     assert counts.shape == (reader.head.leaves, 2)
+
+
+def read_view(data: bytes) -> None:
+    """A view: its rows name its nodes, and it reads as physical values."""
+    view = decode_view(data, nodes_max=1 << 18).view
+    assert (np.diff(view.nodes.astype(np.int64)) > 0).all()
+    for rows, values in ((view.coloured, view.rgb), (view.warm, view.temperatures)):
+        assert len(rows) == len(values)
+        assert not len(rows) or int(rows[-1]) < len(view)
+    assert ((view.probability >= 0) & (view.probability <= 1)).all()
+    assert view.colour.shape == view.rgb.shape
+    assert view.temperature_k.shape == view.temperatures.shape
 
 
 def check_evidence(key: CellKey, evidence: Evidence, geometry: Geometry) -> None:
@@ -264,6 +277,7 @@ def read_scene(data: bytes) -> None:
 TARGETS: dict[str, Target] = {
     "cell": Target(read_cell, mutated_cell),
     "cell-part": Target(read_cell_partly, mutated_cell),
+    "view": Target(read_view),
     "commit": Target(read_commit, mutated_commit),
     "reply": Target(read_reply, mutated_reply),
     "message": Target(read_message, mutated_sections),
