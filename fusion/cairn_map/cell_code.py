@@ -7,7 +7,10 @@ the SHA-256 over them is the cell's identity; so bytes at rest may be compressed
 """
 
 import hashlib
+import os
 import struct
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -82,6 +85,20 @@ def encode_cell(
                     body = data if number == first else b""
                     stored[number] = StoredStream(number, MODELLED, len(streams[number]), body)
     return EncodedCell(head + join_streams(list(stored.values())), _digest(head, streams))
+
+
+def encode_cells(
+    diff: Mapping[CellKey, Evidence], geometry: Geometry, *, profile: Profile = Profile.FAST, threads: int | None = None
+) -> dict[CellKey, EncodedCell]:
+    """The bytes of many cells, rising in number, on as many threads as there are processors unless told otherwise.
+
+    Raises:
+        BadInputError: as `encode_cell`.
+    """
+    keys = sorted(diff)
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+        encoded = pool.map(lambda key: encode_cell(key, diff[key], geometry, profile=profile), keys)
+        return dict(zip(keys, encoded, strict=True))
 
 
 def cell_digest(key: CellKey, evidence: Evidence, geometry: Geometry) -> bytes:

@@ -36,7 +36,10 @@ class CellContent:
 def content_of(evidence: Evidence, geometry: Geometry) -> CellContent:
     """Packed evidence by leaf."""
     octree, rows = build_octree(evidence, depth=geometry.depth)
-    return CellContent(octree, evidence.counts[rows], leaves_of_rows(rows, evidence.sampled), evidence.samples)
+    # Pairs as one number each: a third of the time of picking rows.
+    pairs = np.ascontiguousarray(evidence.counts).view(np.int64)[:, 0]
+    counts = pairs[rows].view(np.int32).reshape(-1, 2)
+    return CellContent(octree, counts, leaves_of_rows(rows, evidence.sampled), evidence.samples)
 
 
 def evidence_of(content: CellContent) -> Evidence:

@@ -44,7 +44,7 @@ def split_samples(sampled: Ints, samples: Ints, geometry: Geometry) -> list[Chan
     found: list[ChannelRows] = []
     for channel in geometry.channels:
         sums = samples[:, geometry.planes_of(channel.name)]
-        present = np.nonzero(sums.any(axis=1))[0]
+        present = np.nonzero(_says_something(sums))[0]
         found.append(ChannelRows(sampled[present], sums[present]))
     return found
 
@@ -64,12 +64,14 @@ def join_samples(
     sampled = np.nonzero(has_samples)[0]
     check_count(len(sampled), sampled_max)
     samples = np.zeros((len(sampled), geometry.plane_count), np.int64)
+    row_of = np.empty(leaves, np.int64)
+    row_of[sampled] = np.arange(len(sampled))
     low = -SUM_MAX if signed else 0
     for channel, rows in zip(geometry.channels, channels, strict=True):
         sums = rows.sums
-        if sums.size and (sums.min() < low or sums.max() > SUM_MAX or not sums.any(axis=1).all()):
+        if sums.size and (sums.min() < low or sums.max() > SUM_MAX or not _says_something(sums).all()):
             raise DamagedDataError("bad_stream", f"channel {channel.name} holds a sum that is zero or out of range")
-        at = slice(None) if len(rows.leaves) == len(sampled) else np.searchsorted(sampled, rows.leaves)
+        at = slice(None) if len(rows.leaves) == len(sampled) else row_of[rows.leaves]
         samples[at, geometry.planes_of(channel.name)] = sums
     return sampled, samples
 
@@ -125,7 +127,8 @@ def numbers(raw: Words, signed: bool, *, limit: int) -> Ints:
     Raises:
         DamagedDataError: a magnitude above `limit`.
     """
-    values = (_unzigzag(raw) if signed else raw).astype(np.int64)
+    # As int64 a word of 2^63 and more is negative: out of range, too.
+    values = (_unzigzag(raw) if signed else raw).view(np.int64)
     if len(values) and (values.max() > limit or values.min() < (-limit if signed else 0)):
         raise DamagedDataError("bad_stream", f"a count or weight is beyond {limit}")
     return values
@@ -139,6 +142,12 @@ def check_count(count: int, sampled_max: int) -> None:
     """
     if count > sampled_max:
         raise BadInputError("too_large", f"{count} voxels with samples, at most {sampled_max} are read")
+
+
+def _says_something(sums: Ints) -> npt.NDArray[np.bool_]:
+    """(S,) which rows are not all zeros: nearly always those with a weight."""
+    says = sums[:, -1] != 0
+    return says if says.all() else says | sums.any(axis=1)
 
 
 def _presence(raw: bytes, leaves: int) -> npt.NDArray[np.bool_]:

@@ -15,7 +15,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from cairn_map.cell_code import DecodedCell, Profile, decode_canonical_cell, decode_cell, encode_cell
+from cairn_map.cell_code import DecodedCell, Profile, decode_canonical_cell, decode_cell, encode_cells
 from cairn_map.cell_head import CellHead, decode_head
 from cairn_map.cell_reading import VOXEL_BYTES
 from cairn_map.errors import BadInputError, DamagedDataError, first_error
@@ -131,13 +131,12 @@ def make_commit(
     """
     if meta.geometry != geometry.digest().hex():
         raise BadInputError("other_geometry", "the commit's meta names another geometry than its evidence has")
-    cells: dict[CellKey, bytes] = {}
-    digests: list[bytes] = []
-    for key in sorted(key for key, evidence in diff.items() if len(evidence)):
-        _check_evidence(diff[key], geometry)
-        encoded = encode_cell(key, diff[key], geometry, profile=profile)
-        cells[key] = encoded.data
-        digests.append(encoded.digest)
+    held = {key: evidence for key, evidence in diff.items() if len(evidence)}
+    for evidence in held.values():
+        _check_evidence(evidence, geometry)
+    encoded = encode_cells(held, geometry, profile=profile)
+    cells = {key: cell.data for key, cell in encoded.items()}
+    digests = [cell.digest for cell in encoded.values()]
     text = meta.model_dump_json(exclude_defaults=True).encode()
     data = _joined(text, cells)
     _check_size(len(data), len(cells), len(text))

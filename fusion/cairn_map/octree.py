@@ -39,11 +39,14 @@ def build_octree(evidence: Evidence, *, depth: int) -> tuple[Octree, npt.NDArray
         evidence.voxels, evidence.counts, evidence.sampled, child_masks, leaf_masks, masks, rows
     )
     rows = rows[:leaves].copy()
+    sizes = np.empty(leaves, np.int64)
+    np.subtract(rows[1:], rows[:-1], out=sizes[:-1])
+    sizes[-1:] = V - rows[-1:]
     octree = Octree(
         np.concatenate([child_masks[d, : masks[d]] for d in range(depth)]),
         np.concatenate([leaf_masks[d, : masks[d]] for d in range(depth - 1)] or [np.empty(0, np.uint8)]),
         evidence.voxels[rows],
-        np.diff(rows, append=V),
+        sizes,
     )
     return octree, rows
 

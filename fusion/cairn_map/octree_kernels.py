@@ -175,10 +175,20 @@ def list_leaves_into(
         d += 1
         at = places[d]
         places[d] = at + 1
+        if d == depth - 1:
+            # Most nodes are here, and all of their children are voxels.
+            mask = child_masks[at]
+            for c in range(8):
+                if (mask >> c) & 1:
+                    starts[count] = np.uint32(8 * key + c)
+                    sizes[count] = 1
+                    count += 1
+            d -= 1
+            continue
         keys[d] = key
         children[d] = child_masks[at]
         # Leaf masks stand in the child masks' order, and only the last depth has none.
-        leaves[d] = leaf_masks[at] if d < depth - 1 else child_masks[at]
+        leaves[d] = leaf_masks[at]
 
 
 @nb.njit(cache=True, nogil=True)

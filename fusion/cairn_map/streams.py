@@ -150,7 +150,11 @@ def decode_column(stream: bytes, *, rows: int) -> npt.NDArray[np.uint64]:
     planes = stream[0] if stream else 9
     if planes > 8 or len(stream) != 1 + planes * rows:
         raise DamagedDataError("bad_stream", f"a column of {rows} rows has {len(stream)} bytes for {planes} planes")
-    words = np.zeros(rows, np.uint64)
-    for p in range(planes):
-        words |= np.frombuffer(stream, np.uint8, rows, 1 + p * rows).astype(np.uint64) << np.uint64(8 * p)
+    # The first plane is most of it, and often all.
+    columns = (np.frombuffer(stream, np.uint8, rows, 1 + p * rows).astype(np.uint64) for p in range(planes))
+    words = next(columns, None)
+    if words is None:
+        return np.zeros(rows, np.uint64)
+    for p, column in enumerate(columns, 1):
+        words |= column << np.uint64(8 * p)
     return words
