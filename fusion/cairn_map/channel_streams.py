@@ -147,7 +147,7 @@ def check_count(count: int, sampled_max: int) -> None:
 def _says_something(sums: Ints) -> npt.NDArray[np.bool_]:
     """(S,) which rows are not all zeros: nearly always those with a weight."""
     says = sums[:, -1] != 0
-    return says if says.all() else says | sums.any(axis=1)
+    return says if says.all() else np.asarray(says | sums.any(axis=1))
 
 
 def _presence(raw: bytes, leaves: int) -> npt.NDArray[np.bool_]:
