@@ -5,7 +5,8 @@
 
 `T_rig_camera` maps points from the camera's frame to the rig's, in metres. Which camera sees which
 spectrum is part of the rig, so an image's meaning never depends on its file name. A camera without `model` is a
-pinhole; a spinning lidar says `"model": "spinning"`.
+pinhole; a spinning lidar says `"model": "spinning"`. What is optional and not said is not in the document either:
+`sensing` of a range camera, `calibration_sigma_px` of a camera, the robot's `body`.
 """
 
 import hashlib
@@ -15,11 +16,14 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 
+from cairn_calib.body import Body
 from cairn_calib.camera import Camera
 from cairn_calib.lidar import AnyCamera, SpinningLidar
 from cairn_calib.poses import Transform, checked_transform
+from cairn_calib.sensing import LIDAR, TIME_OF_FLIGHT, RangeSensing
 from cairn_map.errors import BadInputError, first_error
 
 RIG_BYTES_MAX = 1 << 20
@@ -62,6 +66,10 @@ class MountedCamera(BaseModel):
         ),
     ]
     T_rig_camera: tuple[Row, Row, Row, Row]
+    sensing: RangeSensing | None = None
+    """Of a range camera."""
+    calibration_sigma_px: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
+    """How far off, in its own pixels, points of the range camera are expected in it: one axis, standard deviation."""
 
     @model_validator(mode="after")
     def _rigid(self) -> Self:
@@ -77,10 +85,26 @@ class MountedCamera(BaseModel):
             raise ValueError(f"a spinning lidar's spectrum must be range, got {self.spectrum}")
         return self
 
+    @model_validator(mode="after")
+    def _range_is_sensed_by_range_cameras(self) -> Self:
+        if self.sensing is not None and self.spectrum is not Spectrum.RANGE:
+            raise ValueError(f"sensing is of range cameras, not of {self.spectrum}")
+        return self
+
     @property
     def transform(self) -> Transform:
         """`T_rig_camera` as (4, 4) float64, read-only."""
         return _transform_of(self.T_rig_camera)
+
+    @property
+    def known_sensing(self) -> RangeSensing:
+        """What is said of a range camera; nothing, where nothing is said."""
+        return self.sensing or RangeSensing()
+
+    def range_sigma_m(self, range_m: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+        """(...) standard deviation of the range camera at ranges, metres: as stated, else as is usual."""
+        usual = LIDAR if isinstance(self.camera, SpinningLidar) else TIME_OF_FLIGHT
+        return self.known_sensing.sigma_at(range_m, usual=usual)
 
 
 @lru_cache(maxsize=256)
@@ -100,6 +124,8 @@ class Rig(BaseModel):
     version: Literal[1] = 1
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
     cameras: Annotated[dict[str, MountedCamera], Field(min_length=1, max_length=32)]
+    body: Body | None = None
+    """Of the robot that carries it."""
 
     def __getitem__(self, name: str) -> MountedCamera:
         try:
@@ -115,7 +141,7 @@ class Rig(BaseModel):
 
     def to_json(self) -> bytes:
         """The rig as `rig.json` bytes; the mirror of `rig_from_json`."""
-        return self.model_dump_json(indent=1).encode() + b"\n"
+        return self.model_dump_json(indent=1, exclude_none=True).encode() + b"\n"
 
     def digest(self) -> str:
         """SHA-256, in hex, of the JSON bytes; commits carry it, so that a bad calibration can be found and undone."""

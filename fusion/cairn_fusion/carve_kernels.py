@@ -7,8 +7,6 @@ A brick costs three loops: where each centre falls, what is there, whether it is
 arithmetic alone, and so become vector instructions; together a voxel takes about a nanosecond.
 """
 
-import math
-
 import numba as nb
 import numpy as np
 import numpy.typing as npt
@@ -21,40 +19,6 @@ Singles = npt.NDArray[np.float32]
 
 ALL_FREE = 0xFF
 """Mask of a brick of which all octants are free; see `cull_kernels`."""
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def clear_ranges(range_m: Singles, pixel_of: Index, width: int, height: int, margin_m: float) -> Singles:
-    """(height + 2, width + 2) how far each pixel of a window is certainly clear; 0 where it saw nothing, and around it.
-
-    A pixel is as clear as the nearest that any of its eight neighbours saw, less a margin: so a slanted surface and a
-    thing that ends between two pixels are not looked through. Neighbours that saw nothing do not count.
-    `range_m` (N,) are the camera's pixels, `pixel_of` the one that each of the window's shows, N for none.
-    """
-    nothing = np.float32(math.inf)
-    seen = np.full((height + 2, width + 2), nothing)
-    for y in range(height):
-        row = seen[y + 1]
-        for x in range(width):
-            pixel = pixel_of[y * width + x]
-            if pixel < len(range_m) and range_m[pixel] > 0.0:
-                row[x + 1] = range_m[pixel]
-    nearest = np.empty((height + 2, width), np.float32)
-    for y in range(height + 2):
-        row, to = seen[y], nearest[y]
-        for x in range(width):
-            least = row[x] if row[x] < row[x + 1] else row[x + 1]
-            to[x] = least if least < row[x + 2] else row[x + 2]
-    clear = np.zeros((height + 2, width + 2), np.float32)
-    for y in range(height):
-        row, to = seen[y + 1], clear[y + 1]
-        a, b, c = nearest[y], nearest[y + 1], nearest[y + 2]
-        for x in range(width):
-            least = a[x] if a[x] < b[x] else b[x]
-            least = least if least < c[x] else c[x]
-            left = np.float32(least - margin_m)
-            to[x + 1] = left if row[x + 1] < nothing and left > 0.0 else np.float32(0.0)
-    return clear
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

@@ -34,7 +34,9 @@ class SeenVoxels:
     hit: npt.NDArray[np.bool_]
 
 
-def seen_voxels(origin_m: Floats, ends_m: Floats, ends: Ints, geometry: Geometry) -> SeenVoxels:
+def seen_voxels(
+    origin_m: Floats, ends_m: Floats, ends: Ints, geometry: Geometry, *, hits: Ints | None = None
+) -> SeenVoxels:
     """What rays from one origin saw.
 
     Args:
@@ -42,13 +44,16 @@ def seen_voxels(origin_m: Floats, ends_m: Floats, ends: Ints, geometry: Geometry
         ends_m: (N, 3) metres, map frame: one end point in each voxel of `ends`.
         ends: (N, 3) voxel numbers, all different.
         geometry: of the map.
+        hits: (M, 3) voxels that were hit, all different; None: those where the rays end. A ray that ends in a voxel
+            which was not hit, because it is clear only so far, says nothing of that voxel.
 
     Raises:
         BadInputError: the scan spans more bricks than fit in memory; limit the range or coarsen the map.
     """
     start = voxels_of_points(origin_m, geometry)
-    low = np.minimum(ends.min(axis=0, initial=1 << 62), start[0]) >> BRICK_DEPTH
-    high = np.maximum(ends.max(axis=0, initial=-(1 << 62)), start[0]) >> BRICK_DEPTH
+    struck = ends if hits is None else hits
+    reached = np.concatenate([ends, struck, start])
+    low, high = reached.min(axis=0) >> BRICK_DEPTH, reached.max(axis=0) >> BRICK_DEPTH
     dims = high - low + 1
     if float(np.prod(dims.astype(np.float64))) > BOX_BRICKS_MAX:
         size_m = dims * 8 * geometry.voxel_edge_m
@@ -59,12 +64,12 @@ def seen_voxels(origin_m: Floats, ends_m: Floats, ends: Ints, geometry: Geometry
         )
     corner = low << BRICK_DEPTH
     brick_of = np.full(int(np.prod(dims)), -1, np.int32)
-    bricks = np.empty(len(ends) + 1024, np.int64)
+    bricks = np.empty(len(struck) + 1024, np.int64)
     marks = np.empty((len(bricks), 512), np.uint8)
     box_ends = ends - corner
     origin = _inside(origin_m, start[0], geometry) - corner
     targets = ends_m / geometry.voxel_edge_m - corner
-    used = mark_hits_into(box_ends, dims, brick_of, bricks, marks, 0)
+    used = mark_hits_into(struck - corner, dims, brick_of, bricks, marks, 0)
     ray = 0
     while ray < len(ends):
         ray, used = mark_misses_into(origin, targets, box_ends, ray, dims, brick_of, bricks, marks, used)

@@ -2,7 +2,8 @@
 
     returns  points of the map                       Eq. 1-5
     samples  what cameras saw of them                Eq. 5-6: `samples`
-    hits     where beams ended, misses where the image looks through      `tally`, `carve`; for lidars `cast`
+    clear    how far each beam is certainly free                           `clear`
+    hits     where beams ended, misses where the image looks through      `tally`, `carve`; for lidars `beams`
     pack     evidence by cell
 
 Inverse sensor model: one count per voxel and scan, and a hit wins over a miss. The result depends on the scan alone,
@@ -19,11 +20,14 @@ from enum import StrEnum
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.poses import Transform, checked_transform, transform_points
+from cairn_calib.poses import Transform, checked_transform, inverse, transform_points
 from cairn_calib.rig import Rig
-from cairn_fusion.carve import MARGIN_VOXELS, Window, carving_of, window_of
-from cairn_fusion.cast import SeenVoxels, seen_voxels
-from cairn_fusion.samples import Returns, returns_of, sample_sums
+from cairn_calib.sensing import LIDAR
+from cairn_fusion.beams import beam_evidence, clear_ends, silent_ends
+from cairn_fusion.carve import Window, carving_of, window_of
+from cairn_fusion.clear import clear_image
+from cairn_fusion.returns import Returns, returns_of
+from cairn_fusion.samples import sample_sums
 from cairn_fusion.scan import Scan
 from cairn_fusion.tallies import Tallies
 from cairn_fusion.tally import Each
@@ -56,6 +60,9 @@ class Integrator:
     flying_step_m: float = 0.05
     """What a pixel must differ from both its neighbours by to be taken for a mixture of them (`flying_kernels`), and
     so for no return; of images that are carved. Infinite: none is."""
+    noise_sigmas: float = 2.0
+    """How many standard deviations of the range, by the rig's `sensing`, free space keeps from a surface; never less
+    than one voxel."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_range_m < self.max_range_m < float("inf"):
@@ -64,10 +71,12 @@ class Integrator:
             )
         if not self.flying_step_m > 0:
             raise BadInputError("bad_range", f"flying_step_m must be above 0, got {self.flying_step_m}")
+        if not 0 <= self.noise_sigmas < float("inf"):
+            raise BadInputError("bad_range", f"noise_sigmas must be finite, from 0, got {self.noise_sigmas}")
 
     def __str__(self) -> str:
         limits = f"min_range_m={self.min_range_m:g} max_range_m={self.max_range_m:g}"
-        return f"cairn-{self.method} 2 {limits} flying_step_m={self.flying_step_m:g}"
+        return f"cairn-{self.method} 3 {limits} flying_step_m={self.flying_step_m:g} noise_sigmas={self.noise_sigmas:g}"
 
 
 class Integration:
@@ -98,17 +107,26 @@ class Integration:
         )
         scalars = _scalar_evidence(scan, self._geometry)
         if window is None:
-            self._tallies.merge(_cast(scan, rig, self._geometry, returns))
-        elif len(returns.pixels):
+            self._cast(scan, returns)
+        elif returns.reach_m > 0:
             self._carve(scan, returns, window)
         self._tallies.merge(scalars)
 
-    def add_points(self, points: npt.NDArray[np.floating], T_map_sensor: Transform) -> None:
+    def add_points(
+        self,
+        points: npt.NDArray[np.floating],
+        T_map_sensor: Transform,
+        *,
+        range_camera: str | None = None,
+        T_map_body: Transform | None = None,
+    ) -> None:
         """Add a sweep of a sensor whose points have no order, ray by ray.
 
         Args:
             points: (N, 3) metres, sensor frame, all seen from its origin; NaN where nothing came back.
             T_map_sensor: where it was.
+            range_camera: the rig's camera whose noise they have; None: a lidar's usual noise.
+            T_map_body: where the frame of the rig's body was; None: nothing is taken for the robot's body.
 
         Raises:
             BadInputError: not (N, 3), or it reaches beyond the numbered space; nothing was added.
@@ -118,12 +136,15 @@ class Integration:
         T = checked_transform(T_map_sensor, name="T_map_sensor")
         own = points.astype(np.float64)
         range_m = np.linalg.norm(own, axis=1)
-        kept = own[(range_m >= self._integrator.min_range_m) & (range_m <= self._integrator.max_range_m)]
-        points_map = transform_points(T, kept)
-        ends, first, _ = _unique_voxels(voxels_of_points(points_map, self._geometry))
-        seen = seen_voxels(T[:3, 3], points_map[first], ends, self._geometry)
-        samples = np.zeros((len(ends), self._geometry.plane_count), np.int64)
-        self._tallies.merge(_packed_by_cell(seen, ends, samples, self._geometry))
+        kept = (range_m >= self._integrator.min_range_m) & (range_m <= self._integrator.max_range_m)
+        if self._rig.body is not None and T_map_body is not None:
+            T_body_sensor = inverse(checked_transform(T_map_body, name="T_map_body")) @ T
+            kept &= ~self._rig.body.holds(transform_points(T_body_sensor, own))
+        of = None if range_camera is None else self._rig[range_camera]
+        sigma_m = LIDAR.sigma_at(range_m[kept], usual=LIDAR) if of is None else of.range_sigma_m(range_m[kept])
+        points_map = transform_points(T, own[kept])
+        clear_m = self._clear_ends(T[:3, 3], points_map, sigma_m)
+        self._tallies.merge(beam_evidence(T[:3, 3], points_map, clear_m, self._geometry, sums_of=self._no_sums))
 
     def diff(self, each: Each = map) -> dict[CellKey, Evidence]:
         """The evidence of all scans, by cell; `each` as for `Tally.packed`. Not while scans are being added."""
@@ -132,12 +153,13 @@ class Integration:
     def _carve(self, scan: Scan, returns: Returns, window: Window) -> None:
         """Hits where beams ended, misses where the image looks through."""
         edge_m = self._geometry.voxel_edge_m
-        farthest_m = float(np.nanmax(returns.range_m))
-        with self._tallies.around(returns.T_map_tof[:3, 3], farthest_m) as (tally, hits):
+        mounted, sigmas = self._rig[scan.range_camera], self._integrator.noise_sigmas
+        clear_m = clear_image(returns, mounted, voxel_edge_m=edge_m, noise_sigmas=sigmas)
+        with self._tallies.around(returns.T_map_tof[:3, 3], returns.reach_m) as (tally, hits):
             voxel_of, count = hits.number(returns.points_map, tally)
             sums = sample_sums(scan, self._rig, self._geometry, returns, voxel_of, count)
             carving = carving_of(
-                window.clear_ranges(returns.range_m, MARGIN_VOXELS * edge_m),
+                window.shown(clear_m),
                 window,
                 returns.T_map_tof,
                 corner=tally.corner,
@@ -148,6 +170,26 @@ class Integration:
             )
             tally.add_hits(hits, sums)
             tally.add_misses(hits, carving)
+
+    def _cast(self, scan: Scan, returns: Returns) -> None:
+        """Hits where beams ended, misses along each beam."""
+        mounted, origin_m = self._rig[scan.range_camera], returns.T_map_tof[:3, 3]
+        sigma_m = mounted.range_sigma_m(returns.range_m.ravel()[returns.pixels])
+        clear_m = np.concatenate(
+            [self._clear_ends(origin_m, returns.points_map, sigma_m), silent_ends(returns, mounted.camera.rays())]
+        )
+
+        def sums_of(voxel_of: Ints, count: int) -> Ints:
+            return sample_sums(scan, self._rig, self._geometry, returns, voxel_of, count)
+
+        self._tallies.merge(beam_evidence(origin_m, returns.points_map, clear_m, self._geometry, sums_of=sums_of))
+
+    def _clear_ends(self, origin_m: Floats, points_map: Floats, sigma_m: Floats) -> Floats:
+        edge_m, sigmas = self._geometry.voxel_edge_m, self._integrator.noise_sigmas
+        return clear_ends(origin_m, points_map, sigma_m, voxel_edge_m=edge_m, noise_sigmas=sigmas)
+
+    def _no_sums(self, _: Ints, count: int) -> Ints:
+        return np.zeros((count, self._geometry.plane_count), np.int64)
 
 
 def integrate_scan(scan: Scan, rig: Rig, geometry: Geometry, *, integrator: Integrator) -> dict[CellKey, Evidence]:
@@ -176,44 +218,6 @@ def integrate_scans(
         # Whoever is done takes the next scan.
         list(pool.map(integration.add, scans))
         return integration.diff(pool.map)
-
-
-def _cast(scan: Scan, rig: Rig, geometry: Geometry, returns: Returns) -> dict[CellKey, Evidence]:
-    """The evidence of one scan but for its scalars, ray by ray."""
-    ends, first, voxel_of = _unique_voxels(voxels_of_points(returns.points_map, geometry))
-    samples = sample_sums(scan, rig, geometry, returns, voxel_of, len(ends))
-    seen = seen_voxels(returns.T_map_tof[:3, 3], returns.points_map[first], ends, geometry)
-    return _packed_by_cell(seen, ends, samples, geometry)
-
-
-def _unique_voxels(voxels: Ints) -> tuple[Ints, Ints, Ints]:
-    """Different voxels (U, 3), the first point in each (U,), and the number of each point's voxel (N,)."""
-    if not len(voxels):
-        return voxels, np.empty(0, np.int64), np.empty(0, np.int64)
-    low = voxels.min(axis=0)
-    span = voxels.max(axis=0) - low + 1
-    shifted = voxels - low
-    flat = (shifted[:, 2] * span[1] + shifted[:, 1]) * span[0] + shifted[:, 0]
-    _, first, voxel_of = np.unique(flat, return_index=True, return_inverse=True)
-    return voxels[first], first, voxel_of
-
-
-def _packed_by_cell(seen: SeenVoxels, ends: Ints, samples: Ints, geometry: Geometry) -> dict[CellKey, Evidence]:
-    end_cells, end_places = split_voxels(ends, geometry)
-    order = np.lexsort((end_places, end_cells))
-    end_cells, end_places, samples = end_cells[order], end_places[order], samples[order]
-    cells, starts = np.unique(seen.cells, return_index=True)
-    bounds = np.append(starts, len(seen.cells))
-    packed: dict[CellKey, Evidence] = {}
-    for cell, start, stop in zip(cells, bounds[:-1], bounds[1:], strict=True):
-        hit = seen.hit[start:stop]
-        mine = slice(*np.searchsorted(end_cells, [cell, cell + np.uint64(1)]))
-        full = np.zeros((stop - start, geometry.plane_count), np.int64)
-        # Hits and end points of a cell are the same voxels in the same order.
-        full[hit] = samples[mine]
-        counts = np.stack([hit, ~hit], axis=1).astype(np.int32)
-        packed[CellKey(int(cell))] = packed_evidence(seen.places[start:stop], counts, full, geometry)
-    return packed
 
 
 def _scalar_evidence(scan: Scan, geometry: Geometry) -> dict[CellKey, Evidence]:

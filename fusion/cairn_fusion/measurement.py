@@ -45,15 +45,25 @@ class Measurement:
         self._note_pose(scan.time_s, scan.T_map_rig)
 
     def add_points(
-        self, points: npt.NDArray[np.floating], T_map_sensor: Transform, *, T_map_rig: Transform, time_s: float
+        self,
+        points: npt.NDArray[np.floating],
+        T_map_sensor: Transform,
+        *,
+        T_map_rig: Transform,
+        time_s: float,
+        range_camera: str | None = None,
+        T_map_body: Transform | None = None,
     ) -> None:
         """Add a sweep of unordered points as `Integration.add_points`; the commit says where the rig was.
+
+        A body whose place is not given is in the rig's frame.
 
         Raises:
             BadInputError: the points are none, or the measurement is full; nothing was added.
         """
         self._check_room()
-        self._integration.add_points(points, T_map_sensor)
+        body = T_map_rig if T_map_body is None else T_map_body
+        self._integration.add_points(points, T_map_sensor, range_camera=range_camera, T_map_body=body)
         self._note_pose(time_s, T_map_rig)
 
     def _check_room(self) -> None:

@@ -21,6 +21,7 @@ from cairn_calib.poses import Transform
 from cairn_calib.rig import RIG_BYTES_MAX, Rig, rig_from_json
 from cairn_fusion.images import read_colour, read_grey16
 from cairn_fusion.recording_format import (
+    BODY_FILE,
     CHANNEL,
     MEASUREMENTS_FILE,
     RIG_FILE,
@@ -79,6 +80,7 @@ class ScanFiles:
     colour: Mapping[str, Path] = field(default_factory=dict)
     thermal: Mapping[str, Path] = field(default_factory=dict)
     scalars: Mapping[str, float] = field(default_factory=dict)
+    T_map_body: Transform | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -128,6 +130,7 @@ class Recording:
                 for name, path in files.thermal.items()
             },
             scalars=files.scalars,
+            T_map_body=files.T_map_body,
         )
         check_scan(scan, self.rig)
         return scan
@@ -178,6 +181,8 @@ def measurements_of(scan_count: int, scans_per_measurement: int) -> tuple[range,
 def _scan_files(folder: Path, header: RecordingHeader) -> tuple[ScanFiles, ...]:
     """One entry per range image, in order of time; other cameras' images by nearest time within `max_gap_s`."""
     trajectory = read_trajectory(contained(folder, TRAJECTORY_FILE))
+    body_path = contained(folder, BODY_FILE)
+    body = read_trajectory(body_path) if body_path.exists() else None
     ranges = {name: _image_list(folder, f"{name}.txt") for name in header.range}
     amplitudes = {name: _image_list(folder, f"{name}.amplitude.txt") for name in header.amplitude}
     colours = {name: _image_list(folder, f"{name}.txt") for name in header.colour}
@@ -193,6 +198,7 @@ def _scan_files(folder: Path, header: RecordingHeader) -> tuple[ScanFiles, ...]:
             colour=_near(colours, time_s, header.max_gap_s),
             thermal=_near(thermals, time_s, header.max_gap_s),
             scalars=_near(scalars, time_s, header.max_gap_s),
+            T_map_body=None if body is None else body.pose_at(time_s, max_gap_s=header.max_pose_gap_s),
         )
         for camera, images in ranges.items()
         for time_s, path in zip(images.times_s.tolist(), images.values, strict=True)

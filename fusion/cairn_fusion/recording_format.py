@@ -22,6 +22,8 @@ from cairn_map.errors import BadInputError, first_error
 HEADER_FILE = "recording.json"
 RIG_FILE = "rig.json"
 TRAJECTORY_FILE = "trajectory.txt"
+BODY_FILE = "trajectory.body.txt"
+"""No camera's list can have this name: a camera's has no dot."""
 MEASUREMENTS_FILE = "measurements.txt"
 SCALARS_FILE = "scalars.txt"
 HEADER_BYTES_MAX = 1 << 20

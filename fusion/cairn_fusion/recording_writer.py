@@ -17,6 +17,7 @@ import numpy as np
 from cairn_calib.rig import Rig
 from cairn_fusion.images import write_colour, write_grey16
 from cairn_fusion.recording_format import (
+    BODY_FILE,
     CHANNEL,
     HEADER_FILE,
     MEASUREMENTS_FILE,
@@ -38,6 +39,7 @@ RANGE_ENCODING = RangeEncoding()
 THERMAL_ENCODING = ThermalEncoding()
 LIST_COMMENTS: Mapping[str, str] = {
     TRAJECTORY_FILE: "# time tx ty tz qx qy qz qw (T_map_rig)\n",
+    BODY_FILE: "# time tx ty tz qx qy qz qw (T_map_body)\n",
     MEASUREMENTS_FILE: "# first_time last_time\n",
     SCALARS_FILE: "# time channel value\n",
 }
@@ -116,8 +118,9 @@ class RecordingWriter:
         """Write one scan's images and lines; scans come in order of time.
 
         Raises:
-            BadInputError: the scan does not fit the rig, is not later than the one before, or has a value that the
-                encodings cannot hold. Nothing of it is in the lists then.
+            BadInputError: the scan does not fit the rig, is not later than the one before, has a value that the
+                encodings cannot hold, or says where the body was when others did not, or the other way round.
+                Nothing of it is in the lists then.
         """
         if self._finished:
             raise ConflictError("recording_exists", f"{self.folder} is finished; nothing can be added")
@@ -129,10 +132,14 @@ class RecordingWriter:
                 raise BadInputError(
                     "bad_scan", f"a channel's name and a finite number expected, got {channel!r} {value}"
                 )
+        if self._scan_count and (scan.T_map_body is not None) != (BODY_FILE in self._lists):
+            raise BadInputError("bad_scan", "either every scan of a recording says where the body was, or none does")
         time_s = float(scan.time_s)
         for list_name, relative in self._write_images(scan).items():
             self._list(list_name).write(f"{time_s!r} {relative}\n")
         self._list(TRAJECTORY_FILE).write(trajectory_line(time_s, scan.T_map_rig))
+        if scan.T_map_body is not None:
+            self._list(BODY_FILE).write(trajectory_line(time_s, scan.T_map_body))
         for channel, value in scan.scalars.items():
             self._list(SCALARS_FILE).write(f"{time_s!r} {channel} {float(value)!r}\n")
         self._scan_count += 1

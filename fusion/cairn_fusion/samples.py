@@ -7,18 +7,14 @@ Each voxel that was hit gets at most one sample per channel and scan: the mean o
 weight 1. So a voxel's weights never exceed its hits, however fine the images are, and samples stay small numbers.
 """
 
-import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.poses import Transform
 from cairn_calib.rig import Rig
-from cairn_fusion.flying_kernels import flying_pixels
-from cairn_fusion.scan import Scan, check_scan
-from cairn_fusion.tally_kernels import returned_points
+from cairn_fusion.returns import Returns
+from cairn_fusion.scan import Scan
 from cairn_fusion.transfer import depth_steps, points_from_range, transfer_points
 from cairn_map.channels import Channel, ChannelKind
 from cairn_map.grid import Geometry
@@ -26,38 +22,6 @@ from cairn_map.grid import Geometry
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Numbers = npt.NDArray[np.integer]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Returns:
-    """What came back to the range camera of a scan: N points."""
-
-    T_map_tof: Transform
-    range_m: npt.NDArray[np.float32]
-    """(H, W) within limits; NaN elsewhere."""
-    pixels: npt.NDArray[np.int32]
-    """(N,) numbers of the pixels."""
-    points_map: Floats
-    """(N, 3)"""
-
-
-def returns_of(
-    scan: Scan, rig: Rig, *, min_range_m: float, max_range_m: float, flying_step_m: float = math.inf
-) -> Returns:
-    """The points of a scan (Eq. 1-5), without those out of limits and without flying pixels.
-
-    Raises:
-        BadInputError: an image does not fit its camera.
-    """
-    check_scan(scan, rig)
-    within = (scan.range_m >= min_range_m) & (scan.range_m <= max_range_m)
-    if flying_step_m < math.inf:
-        within &= ~flying_pixels(scan.range_m, flying_step_m)
-    range_m = np.where(within, scan.range_m, np.float32(np.nan))
-    mounted = rig[scan.range_camera]
-    T_map_tof = scan.T_map_rig @ mounted.transform
-    pixels, points_map = returned_points(range_m, mounted.camera.rays(), T_map_tof)
-    return Returns(T_map_tof, range_m, pixels, points_map)
 
 
 def sample_sums(scan: Scan, rig: Rig, geometry: Geometry, returns: Returns, voxel_of: Numbers, count: int) -> Ints:

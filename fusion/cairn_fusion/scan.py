@@ -5,6 +5,7 @@
     colour       {camera: (H, W, 3) uint8}     sRGB, in R, G, B order
     thermal      {camera: (H, W) float32}      apparent temperature, kelvin; NaN = no reading
     scalars      {channel: float}              named readings at the rig's origin (dose, gas, ...)
+    T_map_body   where the robot's body was, so that its own points can be left out
 
 Other conventions (z-depth, millimetres, raw counts) enter through `adapters.py` only.
 """
@@ -35,9 +36,13 @@ class Scan:
     colour: Mapping[str, npt.NDArray[np.uint8]] = field(default_factory=dict)
     thermal: Mapping[str, npt.NDArray[np.float32]] = field(default_factory=dict)
     scalars: Mapping[str, float] = field(default_factory=dict)
+    T_map_body: Transform | None = None
+    """Where the frame of the rig's body is; None: the body's boxes are in the rig's frame."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_map_rig", checked_transform(self.T_map_rig, name="T_map_rig"))
+        if self.T_map_body is not None:
+            object.__setattr__(self, "T_map_body", checked_transform(self.T_map_body, name="T_map_body"))
         if not np.isfinite(self.time_s):
             raise BadInputError("bad_scan", f"time_s must be finite seconds, got {self.time_s}")
 

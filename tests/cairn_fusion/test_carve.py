@@ -11,8 +11,10 @@ from cairn_calib.camera import Camera
 from cairn_calib.lidar import SpinningLidar
 from cairn_calib.poses import Transform, inverse, look_at, transform_points
 from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_fusion.carve import MARGIN_VOXELS, Window, carving_of, window_of
+from cairn_fusion.carve import Window, carving_of, window_of
+from cairn_fusion.clear import clear_image
 from cairn_fusion.integrate import Integrator, Method, integrate_scan, integrate_scans
+from cairn_fusion.returns import returns_of
 from cairn_fusion.scan import Scan
 from cairn_fusion.tally import ScanHits, Tally, tally_around
 from cairn_map.channels import INTENSITY
@@ -64,17 +66,16 @@ def misses(diff: dict[CellKey, Evidence], geometry: Geometry = GEOMETRY) -> set[
     }
 
 
-def naive_clear(window: Window, range_m: Singles, margin_m: float) -> Floats:
-    seen = np.append(np.nan_to_num(range_m.ravel()), 0)[window.pixel_of].reshape(window.height, window.width)
-    around = np.pad(np.where(seen > 0, seen, np.inf), 1, constant_values=np.inf)
-    shifted = [around[v : v + window.height, u : u + window.width] for v in range(3) for u in range(3)]
-    return np.where(seen > 0, np.maximum(np.min(shifted, axis=0) - margin_m, 0), 0)
+def clear_of(scan: Scan, camera: Camera) -> Singles:
+    """(H, W) how far each pixel is clear; test_clear.py has the slow twin."""
+    rig = rig_of(camera)
+    returns = returns_of(scan, rig, min_range_m=LIMITS.min_range_m, max_range_m=LIMITS.max_range_m)
+    return clear_image(returns, rig["tof"], voxel_edge_m=GEOMETRY.voxel_edge_m, noise_sigmas=LIMITS.noise_sigmas)
 
 
-def naive_slack(scan: Scan, window: Window, voxels: npt.NDArray[np.int64]) -> Floats:
+def naive_slack(scan: Scan, camera: Camera, window: Window, voxels: npt.NDArray[np.int64]) -> Floats:
     """By how many metres each voxel's centre is in clear sight of the window, negative where it is not."""
-    near = np.where(scan.range_m <= LIMITS.max_range_m, scan.range_m, np.nan)
-    clear = naive_clear(window, near, MARGIN_VOXELS * GEOMETRY.voxel_edge_m)
+    clear = np.append(clear_of(scan, camera).ravel(), 0)[window.pixel_of].reshape(window.height, window.width)
     own = transform_points(inverse(scan.T_map_rig), centres_of_voxels(voxels, GEOMETRY))
     fx, fy, cx, cy = window.lens
     ahead = own[:, 2] > 0
@@ -101,7 +102,7 @@ def test_carving_agrees_with_its_slow_twin(lens: str, seed: int) -> None:
     }
     centre = np.floor(scan.T_map_rig[:3, 3] / 0.05).astype(int)
     box = np.stack(np.meshgrid(*(np.arange(c - 62, c + 62) for c in centre), indexing="ij"), axis=-1).reshape(-1, 3)
-    slack = naive_slack(scan, window, box)
+    slack = naive_slack(scan, camera, window, box)
     for voxel, metres in zip(map(tuple, box.tolist()), slack, strict=True):
         if abs(metres) < 1e-5 or voxel in hits:
             continue
@@ -148,7 +149,7 @@ def test_a_scan_means_the_same_in_whatever_box_it_is_counted(seed: int) -> None:
     window = window_of(BARREL)
     assert window is not None
     for scan in scans:
-        clear = window.clear_ranges(scan.range_m, MARGIN_VOXELS * GEOMETRY.voxel_edge_m)
+        clear = window.shown(clear_of(scan, BARREL))
         packed = []
         for shift_m in (0.0, 0.123, 0.777):
             tally = Tally(GEOMETRY, scan.T_map_rig[:3, 3] + shift_m, reach_m=4.0 + shift_m)

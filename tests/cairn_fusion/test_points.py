@@ -11,7 +11,7 @@ from cairn_calib.poses import Transform, inverse
 from cairn_calib.rig import Rig, Spectrum, mounted
 from cairn_fusion.integrate import Integration, Integrator, Method, integrate_scan
 from cairn_fusion.measurement import Measurement
-from cairn_fusion.samples import returns_of
+from cairn_fusion.returns import returns_of
 from cairn_map.errors import BadInputError
 from cairn_map.evidence import Evidence
 from cairn_map.grid import CellKey, Geometry, geometry_for, voxels_in_cell

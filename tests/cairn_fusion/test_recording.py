@@ -1,6 +1,7 @@
 import json
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -102,6 +103,37 @@ def test_a_second_writing_of_what_was_read_is_byte_equal(folder: Path, tmp_path:
     assert files == sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file())
     for name in set(files) - {Path("trajectory.txt")}:  # a quaternion may differ in its last digit
         assert (folder / name).read_bytes() == (again / name).read_bytes(), name
+
+
+def test_the_bodys_pose_comes_back_and_old_recordings_have_none(folder: Path, tmp_path: Path) -> None:
+    assert not (folder / "trajectory.body.txt").exists()
+    assert all(scan.T_map_body is None for scan in open_recording(folder))
+    bodies = [transform_from_quaternion((n, 2.0, 3.0), (0, 0, 0.6, 0.8)) for n in range(3)]
+    scans = [replace(random_scan(n), T_map_body=T) for n, T in enumerate(bodies)]
+    path = written(tmp_path / "body", scans)
+    for read, T in zip(open_recording(path), bodies, strict=True):
+        assert read.T_map_body is not None
+        np.testing.assert_allclose(read.T_map_body, T, atol=1e-9)
+    (path / "trajectory.body.txt").write_text(f"{scans[0].time_s!r} 0 0 0 0 0 0 1\n")
+    with pytest.raises(BadInputError, match="body"):
+        open_recording(path)
+
+
+@pytest.mark.parametrize("first", [None, np.eye(4)])
+def test_only_some_scans_with_a_bodys_pose_are_refused(tmp_path: Path, first: object) -> None:
+    scans = [replace(random_scan(0), T_map_body=first), random_scan(1)]  # type: ignore[arg-type]
+    scans[1] = replace(scans[1], T_map_body=np.eye(4) if first is None else None)
+    with pytest.raises(BadInputError, match="body"):
+        written(tmp_path / "some", scans)
+
+
+def test_a_camera_may_be_called_body(tmp_path: Path) -> None:
+    rig = Rig(name="head", cameras={"body": mounted(Spectrum.RANGE, TOF, np.eye(4))})
+    scan = replace(random_scan(0), range_camera="body", colour={}, thermal={}, T_map_body=np.eye(4))
+    with RecordingWriter(tmp_path / "r", rig, name="r") as recording:
+        recording.add(scan)
+    (read,) = open_recording(tmp_path / "r")
+    assert read.range_camera == "body" and read.T_map_body is not None
 
 
 def test_a_recording_is_a_scan_source(folder: Path) -> None:

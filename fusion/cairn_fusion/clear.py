@@ -1,0 +1,37 @@
+"""How far the beams of a scan are certainly clear: what a sensor's noise, slanted surfaces and edges leave of them.
+
+carved images    nearest neighbour - max(1 voxel, k sigma)      `clear_kernels`: edges and slants widen it
+single beams     range - max(1 voxel, k sigma)                  lidars: their neighbours are far apart
+silence          `no_return_clears_m`, where the rig states it  else a beam to which nothing came back says nothing
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig import MountedCamera
+from cairn_fusion.clear_kernels import clear_distances
+from cairn_fusion.returns import Returns
+
+Floats = npt.NDArray[np.float64]
+Singles = npt.NDArray[np.float32]
+
+MARGIN_VOXELS = 1.0
+"""How far before a surface a voxel's centre must be to be free: a little more than half a voxel's diagonal, 0.87."""
+
+
+def margins_m(sigma_m: Floats, *, voxel_edge_m: float, noise_sigmas: float) -> Floats:
+    """(...) what to keep before a surface whose range has a standard deviation, metres; NaN for NaN."""
+    return np.asarray(np.maximum(MARGIN_VOXELS * voxel_edge_m, noise_sigmas * sigma_m))
+
+
+def clear_image(returns: Returns, mounted: MountedCamera, *, voxel_edge_m: float, noise_sigmas: float) -> Singles:
+    """(H, W) how far each pixel of an image without gaps between its pixels is clear, metres; 0 for not known."""
+    sigma_m = mounted.range_sigma_m(returns.shield_m)
+    return clear_distances(
+        np.where(returns.silent, np.float32(np.inf), returns.range_m),
+        returns.shield_m,
+        margins_m(sigma_m, voxel_edge_m=voxel_edge_m, noise_sigmas=noise_sigmas).astype(np.float32),
+        returns.silent_m,
+        float(max(mounted.camera.focal_px)),
+        voxel_edge_m,
+    )

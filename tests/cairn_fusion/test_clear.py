@@ -1,0 +1,238 @@
+"""How far beams are certainly clear: the kernel against its slow twin, and what noise, slant, edges and silence do."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from cairn_calib.body import Body, BodyBox
+from cairn_calib.camera import Camera
+from cairn_calib.lidar import SpinningLidar
+from cairn_calib.poses import look_at
+from cairn_calib.rig import Rig, Spectrum, mounted
+from cairn_calib.sensing import RangeSensing
+from cairn_fusion.clear_kernels import EDGE_STEP_M, GRAZING_MAX, GRAZING_SHARE, SLANT_SHARE, clear_distances
+from cairn_fusion.integrate import Integration, Integrator, Method, integrate_scan
+from cairn_fusion.scan import Scan
+from cairn_map.channels import INTENSITY
+from cairn_map.evidence import Evidence
+from cairn_map.grid import CellKey, Geometry, centres_of_voxels, voxels_in_cell
+
+EDGE_M = 0.05
+GEOMETRY = Geometry(voxel_edge_um=50_000, depth=4, channels=(INTENSITY,))
+CAMERA = Camera(width=40, height=30, focal_px=(60.0, 60.0), centre_px=(19.5, 14.5))
+LIDAR = SpinningLidar(width=180, height=4, elevations_deg=(6.0, 2.0, -2.0, -6.0))
+LIMITS = Integrator(min_range_m=0.1, max_range_m=5.0)
+AHEAD = look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+"""Looks along the map's x."""
+
+Floats = npt.NDArray[np.float64]
+Singles = npt.NDArray[np.float32]
+Diff = dict[CellKey, Evidence]
+
+
+def rig_of(camera: Camera | SpinningLidar = CAMERA, body: Body | None = None, **sensing: object) -> Rig:
+    tof = mounted(Spectrum.RANGE, camera, np.eye(4))
+    return Rig(
+        name="eye", cameras={"tof": tof.model_copy(update={"sensing": RangeSensing.model_validate(sensing)})}, body=body
+    )
+
+
+def scan_of(range_m: Floats, **fields: object) -> Scan:
+    known = {"time_s": 0.0, "T_map_rig": AHEAD, "range_camera": "tof", "range_m": range_m.astype(np.float32)}
+    return Scan(**(known | fields))  # type: ignore[arg-type]
+
+
+def wall(distance_m: float, slant: float = 0.0) -> Floats:
+    """Ranges to a plane across the optical axis, turned about the image's upright by a slope."""
+    rays = CAMERA.rays()
+    return distance_m / (rays[..., 2] - slant * rays[..., 0])
+
+
+def seen(diff: Diff, column: int) -> Floats:
+    """(N, 3) centres of the voxels with hits (0) or misses (1)."""
+    return np.concatenate(
+        [
+            centres_of_voxels(voxels_in_cell(e.voxels[e.counts[:, column] > 0], key, GEOMETRY), GEOMETRY)
+            for key, e in diff.items()
+        ]
+        or [np.empty((0, 3))]
+    )
+
+
+def integrated(scan: Scan, rig: Rig, integrator: Integrator = LIMITS) -> Diff:
+    return integrate_scan(scan, rig, GEOMETRY, integrator=integrator)
+
+
+def naive(seen_m: Singles, shield_m: Singles, margins_m: Singles, silent_m: float, focal_px: float) -> Floats:
+    height, width = seen_m.shape
+    clear = np.zeros((height, width))
+    padded = np.pad(shield_m.astype(np.float64), 1, constant_values=np.nan)
+    for y, x in np.ndindex(height, width):
+        own = silent_m if np.isinf(seen_m[y, x]) else float(seen_m[y, x])
+        if not own > 0:
+            continue
+        middle = padded[y + 1, x + 1]
+        steps = [
+            np.nan_to_num(np.fmin(abs(one - middle), abs(other - middle)))
+            for one, other in ((padded[y + 1, x], padded[y + 1, x + 2]), (padded[y, x + 1], padded[y + 2, x + 1]))
+        ]
+        nearest, margin = own, float(np.nan_to_num(margins_m[y, x]))
+        for v, u in np.ndindex(height, width):
+            ring = max(abs(v - y), abs(u - x))
+            near = float(shield_m[v, u])
+            if ring > 2 or not near < nearest:
+                continue
+            is_edge = own - near > EDGE_STEP_M + 2 * SLANT_SHARE * sum(steps) and near / focal_px <= EDGE_M
+            if ring <= 1 or is_edge:
+                nearest, margin = near, float(margins_m[v, u])
+        grazing = GRAZING_SHARE * math.hypot(1, math.hypot(*steps) * focal_px / own)
+        clear[y, x] = max(nearest - margin * min(max(grazing, 1), GRAZING_MAX), 0)
+    return clear
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_clear_distances_agree_with_their_slow_twin(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:13, :17]
+    shield_m = 2.0 + 0.05 * x + 0.8 * (x > 8) - 1.2 * ((y == 5) & (x % 4 < 2)) + 0.02 * rng.standard_normal((13, 17))
+    shield_m[rng.random(shield_m.shape) < 0.15] = np.nan
+    seen_m = np.where(rng.random(shield_m.shape) < 0.9, shield_m, np.nan)
+    seen_m[np.isnan(shield_m) & (rng.random(shield_m.shape) < 0.5)] = np.inf
+    margins_m = np.where(np.isnan(shield_m), np.nan, rng.uniform(0.05, 0.3, shield_m.shape))
+    args = [a.astype(np.float32) for a in (seen_m, shield_m, margins_m)]
+    for focal_px in (30.0, 300.0):
+        clear = clear_distances(*args, 4.0, focal_px, EDGE_M)  # type: ignore[call-arg, arg-type]
+        np.testing.assert_allclose(clear, naive(*args, 4.0, focal_px), atol=1e-5)  # type: ignore[arg-type]
+        assert (clear[np.isinf(seen_m)] > 0).any() and (clear[np.isnan(seen_m)] == 0).all()
+
+
+@pytest.mark.parametrize(("sigma_m", "k", "kept_m"), [(0.001, 2.0, EDGE_M), (0.1, 2.0, 0.2), (0.1, 0.0, EDGE_M)])
+@pytest.mark.parametrize("camera", [CAMERA, LIDAR])
+def test_free_space_keeps_from_a_surface_by_a_voxel_and_by_its_noise(
+    camera: Camera | SpinningLidar, sigma_m: float, k: float, kept_m: float
+) -> None:
+    rig = rig_of(camera, sigma_m=((0.0, sigma_m),))
+    rays = camera.rays() @ AHEAD[:3, :3].T
+    with np.errstate(divide="ignore"):
+        range_m = np.where(rays[..., 0] > 0.5, 2.02 / rays[..., 0], np.nan)
+    free = seen(integrated(scan_of(range_m), rig, replace(LIMITS, noise_sigmas=k)), 1)
+    near_axis = np.abs(free[:, 1:]).max(axis=1) < 0.08
+    farthest_m = free[near_axis, 0].max()
+    # A ray's last voxel is the one before that in which it stops; a voxel's centre is half a voxel off its faces.
+    assert 2.02 - kept_m - 1.6 * EDGE_M <= farthest_m <= 2.02 - kept_m + 0.5 * EDGE_M
+
+
+def test_noise_that_grows_with_range_keeps_farther_from_what_is_farther() -> None:
+    rig = rig_of(sigma_m=((1.0, 0.001), (4.0, 0.1)))
+    off_m = [d - seen(integrated(scan_of(wall(d)), rig), 1)[:, 0].max() for d in (1.02, 4.02)]
+    assert off_m[0] < 0.1 and off_m[1] > 0.18
+
+
+def test_a_grazing_surface_keeps_its_margin_across_it() -> None:
+    slope = 6.0
+    scan = scan_of(wall(3.0, -slope))
+    across_m = {}
+    for name, share in (("carve", Method.CARVE), ("cast", Method.CAST)):
+        free = seen(integrated(scan, rig_of(), replace(LIMITS, method=share, flying_step_m=math.inf)), 1)
+        # The plane z - slant x = 3 of the camera; its x is the map's -y, its z the map's x.
+        across_m[name] = ((3.0 - free[:, 0] + slope * free[:, 1]) / math.hypot(1, slope)).min()
+    assert across_m["carve"] > 0.4 * EDGE_M > across_m["cast"]
+
+
+def edge_scan() -> Floats:
+    """A post 1 m ahead, its right half of the image; the pixel beside it mixed; a wall at 3 m."""
+    range_m = np.full((30, 40), 3.0)
+    range_m[:, 20:] = 1.0
+    range_m[:, 19] = 1.6
+    return range_m
+
+
+def test_a_mixed_pixel_is_no_hit_but_still_shields_its_neighbour() -> None:
+    diff = integrated(scan_of(edge_scan()), rig_of())
+    hits, free = seen(diff, 0), seen(diff, 1)
+    assert not ((hits[:, 0] > 1.2) & (hits[:, 0] < 2.5)).any()
+    # Column u is at y = -(u - 19.5) / 60 of the depth: the second beside the post is 18, free from 17 on.
+    beyond = free[free[:, 0] > 1.2]
+    assert len(beyond) > 100
+    assert (beyond[:, 1] / beyond[:, 0]).min() > 1.9 / 60
+    without = integrated(scan_of(edge_scan()[:, ::1]), rig_of(), replace(LIMITS, flying_step_m=math.inf))
+    assert seen(without, 0)[:, 0].max() > 1.5
+
+
+def test_silence_clears_nothing_unless_the_rig_says_so() -> None:
+    for camera in (CAMERA, LIDAR):
+        nothing = scan_of(np.full((camera.height, camera.width), np.nan))
+        assert integrated(nothing, rig_of(camera)) == {}
+        free = seen(integrated(nothing, rig_of(camera, no_return_clears_m=2.0)), 1)
+        assert 1.85 < np.linalg.norm(free, axis=1).max() < 2.05
+        short = replace(LIMITS, max_range_m=1.0)
+        nearer = seen(integrated(nothing, rig_of(camera, no_return_clears_m=2.0), short), 1)
+        assert np.linalg.norm(nearer, axis=1).max() < 1.05
+
+
+@pytest.mark.parametrize("nothing", [np.inf, 0.0, -1.0, 7.0])
+def test_a_range_out_of_limits_is_not_silence(nothing: float) -> None:
+    assert integrated(scan_of(np.full((30, 40), nothing)), rig_of(no_return_clears_m=2.0)) == {}
+
+
+def test_a_full_pixel_gives_no_range_and_clears_nothing() -> None:
+    amplitude = np.full((30, 40), 500, np.uint16)
+    amplitude[:, 20:] = 1000
+    for range_m in (wall(2.02), np.full((30, 40), np.nan)):
+        rig = rig_of(saturated_amplitude=1000, no_return_clears_m=2.0)
+        diff = integrated(scan_of(range_m, amplitude=amplitude), rig)
+        free = seen(diff, 1)
+        assert (free[:, 1] > -0.03).all() and len(free) > 500
+        assert (seen(diff, 0)[:, 1] > -0.03).all()
+    both = integrated(scan_of(wall(2.02), amplitude=amplitude), rig_of())
+    assert seen(both, 0)[:, 1].min() < -0.3
+
+
+ARM = Body(frame="robot", boxes=(BodyBox(name="arm", low_m=(0.5, -1.0, -1.0), high_m=(0.8, 0.0, 1.0)),))
+"""Ahead of the camera, to the right of its axis, when the body stands where the map does."""
+
+
+@pytest.mark.parametrize("camera", [CAMERA, LIDAR])
+@pytest.mark.parametrize("silence_m", [None, 2.0])
+def test_the_robots_own_body_is_no_evidence(camera: Camera | SpinningLidar, silence_m: float | None) -> None:
+    rays = camera.rays() @ AHEAD[:3, :3].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ahead = np.where(rays[..., 0] > 0.7, 2.02 / rays[..., 0], np.nan)
+        arm = np.where((rays[..., 0] > 0.7) & (rays[..., 1] < -0.01), 0.6 / rays[..., 0], ahead)
+    arm[: camera.height // 2] = np.where(arm < 1, np.nan, arm)[: camera.height // 2]  # half of it is black
+    where = {"T_map_rig": AHEAD, "T_map_body": np.eye(4), "amplitude": np.full(arm.shape, 7, np.uint16)}
+    with_body, without = (
+        integrated(scan_of(arm, **where), rig_of(camera, body, no_return_clears_m=silence_m)) for body in (ARM, None)
+    )
+    assert (np.abs(seen(without, 0)[:, 0] - 0.6) < 0.06).any()
+    hits, free = seen(with_body, 0), seen(with_body, 1)
+    assert len(hits) > 20 and not (hits[:, 0] < 1.5).any()
+    in_shadow = (free[:, 1] < -0.03 * free[:, 0] - EDGE_M) & (np.abs(np.arctan2(free[:, 1], free[:, 0])) < 0.7)
+    assert not in_shadow.any() and len(free) > 200
+
+
+def test_without_its_pose_the_body_is_in_the_rigs_frame() -> None:
+    rig = rig_of(CAMERA, Body(frame="head", boxes=(BodyBox(name="hood", low_m=(-1, -1, 0.4), high_m=(1, 1, 0.6)),)))
+    assert integrated(scan_of(wall(0.5), T_map_rig=look_at((3, 4, 5), (9, 2, 1))), rig) == {}
+    elsewhere = scan_of(wall(0.5), T_map_rig=look_at((3, 4, 5), (9, 2, 1)), T_map_body=np.eye(4))
+    assert len(integrated(elsewhere, rig)) > 0
+
+
+def test_points_without_order_leave_the_body_out_and_keep_from_surfaces() -> None:
+    points = np.array([[0.6, -0.3, 0.0], [2.02, 0.3, 0.0]])
+    body = {"T_map_body": np.eye(4)}
+    found = []
+    for fields in ({}, body, {"range_camera": "tof"} | body):
+        cloud = Integration(rig_of(CAMERA, ARM, sigma_m=((0.0, 0.2),)), GEOMETRY, LIMITS)
+        cloud.add_points(points, np.eye(4), **fields)  # type: ignore[arg-type]
+        found.append(cloud.diff())
+    assert [len(seen(diff, 0)) for diff in found] == [2, 1, 1]
+    assert seen(found[1], 1)[:, 0].max() > 1.85 and 1.5 < seen(found[2], 1)[:, 0].max() < 1.65
+
+
+def test_the_text_of_an_integrator_names_all_that_it_does() -> None:
+    texts = {str(LIMITS), str(replace(LIMITS, noise_sigmas=3.0)), str(replace(LIMITS, method=Method.CAST))}
+    assert len(texts) == 3
