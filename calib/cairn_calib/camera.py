@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from cairn_calib.brown import Coefficients, distorted, undistorted
+from cairn_calib.brown import Coefficients, distorted, jacobian, undistorted
 from cairn_calib.raster import Raster
 
 Floats = npt.NDArray[np.float64]
@@ -45,6 +45,25 @@ class Camera(Raster):
         plane = p[..., :2] / z[..., None]
         pixels: Floats = distorted(plane, self.distortion) * np.array(self.focal_px) + np.array(self.centre_px)
         return pixels
+
+    def pixel_gradients(self, points: npt.NDArray[np.floating]) -> Floats:
+        """How pixels move with points: the derivatives of `project`.
+
+        Args:
+            points: (..., 3), metres, camera frame.
+
+        Returns:
+            (..., 2, 3) float64, pixels a metre; NaN where `project` gives NaN because of z.
+        """
+        p = np.asarray(points, dtype=np.float64)
+        z = np.where(p[..., 2] > 0, p[..., 2], np.nan)
+        x, y = p[..., 0] / z, p[..., 1] / z
+        xx, xy, yy, _ = jacobian(x, y, self.distortion)
+        lens = np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-2)
+        one, none = 1 / z, np.zeros_like(z)
+        plane = np.stack([np.stack([one, none, -x / z], axis=-1), np.stack([none, one, -y / z], axis=-1)], axis=-2)
+        gradients: Floats = np.array(self.focal_px)[:, None] * (lens @ plane)
+        return gradients
 
     def unproject(self, pixels: npt.NDArray[np.floating]) -> Floats:
         """Unit rays through pixels; the mirror of `project`.

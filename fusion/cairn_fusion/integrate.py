@@ -63,6 +63,8 @@ class Integrator:
     noise_sigmas: float = 2.0
     """How many standard deviations of the range, by the rig's `sensing`, free space keeps from a surface; never less
     than one voxel."""
+    sample_spread_voxels: float = 1.0
+    """How uncertain, in voxels, the place of a colour or temperature may be (`certainty`); beyond it there is none."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_range_m < self.max_range_m < float("inf"):
@@ -73,10 +75,13 @@ class Integrator:
             raise BadInputError("bad_range", f"flying_step_m must be above 0, got {self.flying_step_m}")
         if not 0 <= self.noise_sigmas < float("inf"):
             raise BadInputError("bad_range", f"noise_sigmas must be finite, from 0, got {self.noise_sigmas}")
+        if not self.sample_spread_voxels > 0:
+            raise BadInputError("bad_range", f"sample_spread_voxels must be above 0, got {self.sample_spread_voxels}")
 
     def __str__(self) -> str:
         limits = f"min_range_m={self.min_range_m:g} max_range_m={self.max_range_m:g}"
-        return f"cairn-{self.method} 3 {limits} flying_step_m={self.flying_step_m:g} noise_sigmas={self.noise_sigmas:g}"
+        surfaces = f"flying_step_m={self.flying_step_m:g} noise_sigmas={self.noise_sigmas:g}"
+        return f"cairn-{self.method} 3 {limits} {surfaces} sample_spread_voxels={self.sample_spread_voxels:g}"
 
 
 class Integration:
@@ -157,7 +162,7 @@ class Integration:
         clear_m = clear_image(returns, mounted, voxel_edge_m=edge_m, noise_sigmas=sigmas)
         with self._tallies.around(returns.T_map_tof[:3, 3], returns.reach_m) as (tally, hits):
             voxel_of, count = hits.number(returns.points_map, tally)
-            sums = sample_sums(scan, self._rig, self._geometry, returns, voxel_of, count)
+            sums = self._sample_sums(scan, returns, voxel_of, count)
             carving = carving_of(
                 window.shown(clear_m),
                 window,
@@ -180,9 +185,13 @@ class Integration:
         )
 
         def sums_of(voxel_of: Ints, count: int) -> Ints:
-            return sample_sums(scan, self._rig, self._geometry, returns, voxel_of, count)
+            return self._sample_sums(scan, returns, voxel_of, count)
 
         self._tallies.merge(beam_evidence(origin_m, returns.points_map, clear_m, self._geometry, sums_of=sums_of))
+
+    def _sample_sums(self, scan: Scan, returns: Returns, voxel_of: npt.NDArray[np.integer], count: int) -> Ints:
+        limit_m = self._integrator.sample_spread_voxels * self._geometry.voxel_edge_m
+        return sample_sums(scan, self._rig, self._geometry, returns, voxel_of, count, spread_max_m=limit_m)
 
     def _clear_ends(self, origin_m: Floats, points_map: Floats, sigma_m: Floats) -> Floats:
         edge_m, sigmas = self._geometry.voxel_edge_m, self._integrator.noise_sigmas

@@ -7,12 +7,14 @@ Each voxel that was hit gets at most one sample per channel and scan: the mean o
 weight 1. So a voxel's weights never exceed its hits, however fine the images are, and samples stay small numbers.
 """
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.rig import Rig
+from cairn_fusion.certainty import spread_m
 from cairn_fusion.returns import Returns
 from cairn_fusion.scan import Scan
 from cairn_fusion.transfer import depth_steps, points_from_range, transfer_points
@@ -24,20 +26,34 @@ Ints = npt.NDArray[np.int64]
 Numbers = npt.NDArray[np.integer]
 
 
-def sample_sums(scan: Scan, rig: Rig, geometry: Geometry, returns: Returns, voxel_of: Numbers, count: int) -> Ints:
-    """(count, P) sums of the scan's voxels: one sample of weight 1 for each channel that a camera saw there."""
+def sample_sums(
+    scan: Scan,
+    rig: Rig,
+    geometry: Geometry,
+    returns: Returns,
+    voxel_of: Numbers,
+    count: int,
+    *,
+    spread_max_m: float = math.inf,
+) -> Ints:
+    """(count, P) sums of the scan's voxels: one sample of weight 1 for each channel that a camera saw there.
+
+    Colours and temperatures whose place is uncertain by more than `spread_max_m` are left out (`certainty`).
+    """
     sums = np.zeros((count, geometry.plane_count), np.int64)
-    for channel, values, at in _samples(scan, rig, geometry, returns):
+    for channel, values, at in _samples(scan, rig, geometry, returns, spread_max_m):
         _add_mean_samples(sums[:, geometry.planes_of(channel.name)], channel, values, voxel_of[at])
     return sums
 
 
-def _samples(scan: Scan, rig: Rig, geometry: Geometry, returns: Returns) -> Iterator[tuple[Channel, Floats, Ints]]:
+def _samples(
+    scan: Scan, rig: Rig, geometry: Geometry, returns: Returns, spread_max_m: float
+) -> Iterator[tuple[Channel, Floats, Ints]]:
     """For each channel of the map: values (M, C) and the points (M,) that they belong to."""
     returned = returns.pixels
     # Needed by images alone: found when the first one comes.
     image_points: Floats | None = None
-    points_tof, steps_m = np.empty((0, 3)), np.empty(0)
+    points_tof, steps_m, sigma_m = np.empty((0, 3)), np.empty(0), np.empty(0)
     for channel in geometry.channels:
         if channel.kind is ChannelKind.COLOUR:
             images: dict[str, npt.NDArray[np.generic]] = dict(scan.colour)
@@ -52,6 +68,7 @@ def _samples(scan: Scan, rig: Rig, geometry: Geometry, returns: Returns) -> Iter
             image_points = points_from_range(returns.range_m, rig[scan.range_camera].camera)
             points_tof = image_points.reshape(-1, 3)[returned]
             steps_m = depth_steps(image_points).ravel()[returned]
+            sigma_m = rig[scan.range_camera].range_sigma_m(returns.range_m.ravel()[returned])
         waiting = np.arange(len(returned))
         # The first camera speaks for what it sees; the next ones only fill what was hidden from those before.
         for name, image in images.items():
@@ -60,6 +77,10 @@ def _samples(scan: Scan, rig: Rig, geometry: Geometry, returns: Returns) -> Iter
             )
             values = transfer.sample(image).astype(np.float64).reshape(-1, channel.value_count)
             valid = np.isfinite(values).all(axis=1)
+            if spread_max_m < math.inf:
+                seen = waiting[transfer.ok]
+                spread = spread_m(points_tof[seen], sigma_m[seen], rig, src=scan.range_camera, dst=name)
+                valid &= spread <= spread_max_m
             found = waiting[transfer.ok][valid]
             yield channel, values[valid], found
             waiting = np.setdiff1d(waiting, found, assume_unique=True)

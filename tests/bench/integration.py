@@ -5,18 +5,24 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig import Rig
+from cairn_calib.sensing import RangeSensing
 from cairn_fusion.integrate import Integrator, Method, integrate_scans
 from cairn_fusion.scan import Scan
 from cairn_map.evidence import Evidence
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.grid import CellKey, Geometry, geometry_for
+from cairn_map.sensor_model import SensorModel
 from cairn_sim.heads import RANGE_CAMERA
 from cairn_sim.record import Plan, scans_of, shots_of
 from cairn_sim.robots import ROBOTS
 from cairn_sim.scene_file import load_scene
-from cairn_sim.scores import Scores, scores_of
+from cairn_sim.scores import FREE, Scores, map_states, scores_of
 from cairn_sim.sensors import RangeSensor
-from cairn_sim.truth_grid import box_of_cell, truths_of
+from cairn_sim.truth_grid import Truth, box_of_cell, truths_of
 
 Row = tuple[str, str, str]
 Diff = dict[CellKey, Evidence]
@@ -24,6 +30,7 @@ FIVE_MM = RangeSensor(
     sigma_min_m=0.005, sigma_m=0.0050001, sigma_max_m=0.005001, amplitude_min=0.0, amplitude_sigma=0.0
 )
 """5 mm at every range, and no return too weak: the noise of the prototype that the figures compare with."""
+SHARES = ("below 1/8", "below 1/2", "below 1", "all")
 
 
 def integration_rows(smoke: bool) -> Iterator[Row]:
@@ -84,27 +91,58 @@ def _truth_rows(plan: Plan, standard: list[Scan]) -> Iterator[Row]:
 
 
 def _path_rows(plan: Plan) -> Iterator[Row]:
-    """All laboratories: 26 measurements, 936 scans, occupancy alone."""
-    geometry, rig = geometry_for(voxel_edge_m=0.04, channels=()), plan.robot.rig_of(1.0)
+    """All laboratories: 26 measurements, 936 scans, occupancy alone; with and without what glass and mirrors show."""
+    geometry = geometry_for(voxel_edge_m=0.04, channels=())
     maps: dict[str, Diff] = {}
-    for noise, sensors in (("sigma 5 mm", {RANGE_CAMERA: FIVE_MM}), ("standard noise", {})):
-        path = replace(plan, robot=replace(plan.robot, sensors=sensors), first_stop=0, last_stop=None)
-        total, stop, seconds = EvidenceMap(geometry), [], 0.0
-        for shot, scan, _ in scans_of(path, shots_of(path), rig):
-            stop.append(scan)
-            if shot.ends_stop:
-                start = time.perf_counter()
-                total.merge(integrate_scans(stop, rig, geometry, integrator=Integrator()))
-                seconds += time.perf_counter() - start
-                stop = []
-        maps[noise] = total.packed()
-        yield f"map 936 scans of the laboratories, 4 cm, {noise}", f"{seconds:.1f}", "s wall"
-    poses = [shot.T_map_rig for shot in shots_of(replace(plan, first_stop=0, last_stop=None))][::2]
+    ways: list[npt.NDArray[np.bool_]] = []
+    whole = replace(plan, first_stop=0, last_stop=None, truth="range")
+    for noise, sensors, rig in (
+        ("sigma 5 mm", {RANGE_CAMERA: FIVE_MM}, _rig_with(plan, sigma_m=((0.0, 0.005),))),
+        ("standard noise", {}, plan.robot.rig_of(1.0)),
+    ):
+        path = replace(whole, robot=replace(plan.robot, sensors=sensors), truth="none" if ways else "range")
+        scans, direct = [], []
+        for n, (_, scan, truths) in enumerate(scans_of(path, shots_of(path), rig)):
+            if truths:
+                ways.append(truths[RANGE_CAMERA].way > 0)
+            scans.append(scan)
+            direct.append(replace(scan, range_m=np.where(ways[n], np.float32(np.nan), scan.range_m)))
+        start = time.perf_counter()
+        maps[noise] = _map_of(scans, plan.robot.scans_per_stop, rig, geometry)
+        yield (
+            f"map {len(scans)} scans of the laboratories, 4 cm, {noise}",
+            f"{time.perf_counter() - start:.1f}",
+            "s wall",
+        )
+        maps[f"{noise}, no glass, no mirror"] = _map_of(direct, plan.robot.scans_per_stop, rig, geometry)
+    poses = [shot.T_map_rig for shot in shots_of(whole)][::2]
     boxes = [box_of_cell(key, geometry) for key in sorted(set().union(*maps.values()))]
-    truths = truths_of(plan.scene, boxes, camera=rig[RANGE_CAMERA].camera, T_map_cameras=poses, fineness=2)
-    for noise, diff in maps.items():
-        scores = [scores_of(truth, diff, geometry) for truth in truths]
-        yield f"  {noise}, against the truth", "", str(sum(scores[1:], scores[0]))
+    camera = plan.robot.rig_of(1.0)[RANGE_CAMERA].camera
+    found = truths_of(plan.scene, boxes, camera=camera, T_map_cameras=poses, fineness=2)
+    for name, diff in maps.items():
+        scores = [scores_of(truth, diff, geometry) for truth in found]
+        yield f"  {name}, against the truth", "", str(sum(scores[1:], scores[0]))
+        counts = sum((_free_by_share(truth, diff, geometry) for truth in found), np.zeros(4, np.int64))
+        yield "    false free by share of solid", "", ", ".join(f"{k} {n}" for k, n in zip(SHARES, counts, strict=True))
+
+
+def _rig_with(plan: Plan, **sensing: object) -> Rig:
+    rig = plan.robot.rig_of(1.0)
+    tof = rig[RANGE_CAMERA].model_copy(update={"sensing": RangeSensing.model_validate(sensing)})
+    return rig.model_copy(update={"cameras": {**rig.cameras, RANGE_CAMERA: tof}})
+
+
+def _map_of(scans: list[Scan], size: int, rig: Rig, geometry: Geometry) -> Diff:
+    total = EvidenceMap(geometry)
+    for stop in (scans[n : n + size] for n in range(0, len(scans), size)):
+        total.merge(integrate_scans(stop, rig, geometry, integrator=Integrator()))
+    return total.packed()
+
+
+def _free_by_share(truth: Truth, diff: Diff, geometry: Geometry) -> npt.NDArray[np.int64]:
+    """(4,) voxels called free that touch a solid, by how much of them is solid: the bounds of `SHARES`."""
+    free = map_states(truth.box, diff, geometry, model=SensorModel()) == FREE
+    return np.histogram(truth.solid_samples[free], [1, 8, 32, 64, 65])[0]
 
 
 def _cpu_s(work: Callable[[], object], repeats: int) -> float:

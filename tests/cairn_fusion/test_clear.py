@@ -234,5 +234,5 @@ def test_points_without_order_leave_the_body_out_and_keep_from_surfaces() -> Non
 
 
 def test_the_text_of_an_integrator_names_all_that_it_does() -> None:
-    texts = {str(LIMITS), str(replace(LIMITS, noise_sigmas=3.0)), str(replace(LIMITS, method=Method.CAST))}
-    assert len(texts) == 3
+    others = ({"noise_sigmas": 3.0}, {"method": Method.CAST}, {"sample_spread_voxels": 0.5}, {"flying_step_m": 1.0})
+    assert len({str(LIMITS), *(str(replace(LIMITS, **other)) for other in others)}) == 5  # type: ignore[arg-type]

@@ -1,0 +1,118 @@
+"""How certain a transferred pixel is: its covariance against differences and against noise, and what is left out."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from cairn_calib.camera import Camera
+from cairn_calib.lidar import SpinningLidar
+from cairn_calib.poses import inverse, look_at, transform_points
+from cairn_calib.rig import Rig, Spectrum, mounted
+from cairn_calib.sensing import RangeSensing
+from cairn_fusion.certainty import pixel_covariance, spread_m, spread_px
+from cairn_fusion.integrate import Integrator, Method, integrate_scan
+from cairn_fusion.scan import Scan
+from cairn_map.channels import TEMPERATURE
+from cairn_map.errors import BadInputError
+from cairn_map.grid import Geometry
+from cairn_sim.heads import full_head
+
+HEAD = full_head(scale=0.25)
+CAMERAS = ["colour_left", "colour_right", "thermal_left", "thermal_right"]
+Floats = npt.NDArray[np.float64]
+
+
+def points(count: int = 200) -> Floats:
+    """Before the ToF camera, 0.6 to 8 m away."""
+    rng = np.random.default_rng(1)
+    rays = HEAD["tof"].camera.rays().reshape(-1, 3)
+    return rays[rng.integers(len(rays), size=count)] * rng.uniform(0.6, 8.0, (count, 1))
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_pixel_gradients_agree_with_differences(name: str) -> None:
+    camera = HEAD[name].camera
+    assert isinstance(camera, Camera)
+    own = transform_points(inverse(HEAD[name].transform), points())
+    own = own[camera.contains(camera.project(own))]
+    step_m = 1e-5
+    for axis in range(3):
+        ahead, behind = own.copy(), own.copy()
+        ahead[:, axis] += step_m
+        behind[:, axis] -= step_m
+        differences = (camera.project(ahead) - camera.project(behind)) / (2 * step_m)
+        np.testing.assert_allclose(camera.pixel_gradients(own)[..., axis], differences, rtol=1e-5, atol=1e-5)
+    assert len(own) > 50 and np.isnan(camera.pixel_gradients(np.array([0.0, 0.0, -1.0]))).all()
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_the_covariance_is_that_of_points_with_noisy_ranges(name: str) -> None:
+    camera, rng = HEAD[name].camera, np.random.default_rng(2)
+    chosen = points(40)
+    seen = camera.contains(camera.project(transform_points(inverse(HEAD[name].transform), chosen)))
+    for point in chosen[seen][:6]:
+        sigma_m = 0.002 * np.linalg.norm(point)
+        noisy = point * (1 + 0.002 * rng.standard_normal((40_000, 1)))
+        pixels = camera.project(transform_points(inverse(HEAD[name].transform), noisy))
+        found = pixel_covariance(point[None], np.array([sigma_m]), HEAD, src="tof", dst=name)[0]
+        np.testing.assert_allclose(found, np.cov(pixels.T), rtol=0.05, atol=1e-4 * np.trace(found))
+
+
+def test_calibration_adds_to_both_axes_and_without_a_baseline_range_noise_does_nothing() -> None:
+    tof = HEAD["tof"]
+    beside = tof.model_copy(update={"spectrum": Spectrum.COLOUR, "calibration_sigma_px": 0.7})
+    rig = Rig(name="one", cameras={"tof": tof, "colour": beside})
+    covariance = pixel_covariance(points(), np.full(200, 0.5), rig, src="tof", dst="colour")
+    np.testing.assert_allclose(covariance, np.broadcast_to(0.49 * np.eye(2), (200, 2, 2)), atol=1e-9)
+    np.testing.assert_allclose(spread_px(covariance), 0.7)
+
+
+def test_the_spread_is_the_longer_axis() -> None:
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    covariance = turn @ np.diag([9.0, 1.0]) @ turn.T
+    np.testing.assert_allclose(spread_px(covariance[None]), 3.0)
+
+
+def test_a_lidar_has_no_pixel_covariance() -> None:
+    lidar = mounted(Spectrum.RANGE, SpinningLidar(width=8, height=1, elevations_deg=(0.0,)), np.eye(4))
+    rig = Rig(name="two", cameras={"tof": HEAD["tof"], "lidar": lidar})
+    with pytest.raises(BadInputError, match="pinhole"):
+        pixel_covariance(points(), np.ones(200), rig, src="tof", dst="lidar")
+
+
+GEOMETRY = Geometry(voxel_edge_um=50_000, depth=4, channels=(TEMPERATURE,))
+
+
+@pytest.mark.parametrize("method", list(Method))
+def test_samples_whose_place_is_too_uncertain_are_left_out_and_hits_stay(method: Method) -> None:
+    camera = Camera(width=40, height=30, focal_px=(40.0, 40.0), centre_px=(19.5, 14.5))
+    tof = mounted(Spectrum.RANGE, camera, np.eye(4)).model_copy(update={"sensing": RangeSensing(sigma_m=((0.0, 0.5),))})
+    thermal = mounted(Spectrum.THERMAL, camera, look_at((0.2, 0, 0), (0.2, 0, 1), up=(0, -1, 0)))
+    rig = Rig(name="head", cameras={"tof": tof, "ir": thermal})
+    # A wall with its left half at 1 m and its right half at 4 m.
+    z_m = np.where(np.arange(40) < 20, 1.0, 4.0)
+    range_m = (z_m / camera.rays()[..., 2]).astype(np.float32)
+    scan = Scan(
+        time_s=0.0,
+        T_map_rig=np.eye(4),
+        range_camera="tof",
+        range_m=range_m,
+        thermal={"ir": np.full((30, 40), 300, np.float32)},
+    )
+    # Across the line of sight 0.5 m of range noise are 0.5 * 0.2 / z: 10 cm on the near half, 2.5 cm on the far one.
+    near, far = (
+        spread_m(np.array([[x, 0, z]]), np.array([0.5]), rig, src="tof", dst="ir")[0]
+        for x, z in ((-0.1, 1.0), (0.5, 4.0))
+    )
+    assert 0.08 < near < 0.12 and 0.02 < far < 0.03
+    limits = Integrator(method=method, flying_step_m=math.inf)
+    depths = []
+    for voxels in (math.inf, 1.0, 0.1):
+        diff = integrate_scan(scan, rig, GEOMETRY, integrator=replace(limits, sample_spread_voxels=voxels))
+        depths.append(sum(int((e.samples[:, -1] > 0).sum()) for e in diff.values()))
+        assert sum(int((e.counts[:, 0] > 0).sum()) for e in diff.values()) > 500
+        assert all((e.samples[:, -1] <= 1).all() for e in diff.values())
+    assert depths[0] > depths[1] > depths[2] == 0
