@@ -120,7 +120,7 @@ def test_culling_leaves_out_and_takes_as_free_only_what_is(seed: int, edge_um: i
     assert window is not None
     scan = scan_at(np.array([0.3, -0.2, 0.1]), seed)
     edge_m = geometry.voxel_edge_m
-    clear = window.clear_ranges(scan.range_m, edge_m)
+    clear = window.shown(np.nan_to_num(np.maximum(scan.range_m - np.float32(edge_m), 0)))
     box = tally_around(scan.T_map_rig[:3, 3], 4.0, geometry, max_range_m=4.0)
     culled = carving_of(
         *(clear, window, scan.T_map_rig),
