@@ -214,7 +214,7 @@ def test_the_example_robot_shares_what_it_sees(server: str, tmp_path: Path) -> N
     assert " 0 commits wait" in done.stdout
 
 
-@pytest.mark.parametrize("command", ["map", "robot", "serve", "demo"])
+@pytest.mark.parametrize("command", ["map", "robot", "serve", "demo", "experiment"])
 def test_help_of_a_command_is_its_module_docstring(command: str, tmp_path: Path) -> None:
     first_line = cairn("--help", folder=tmp_path).partition(f"  {command} ")[2].splitlines()[0].strip()
     assert first_line and first_line in cairn(command, "--help", folder=tmp_path)

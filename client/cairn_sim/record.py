@@ -149,8 +149,10 @@ def shots_of(plan: Plan) -> list[Shot]:
     return [shot for shot in shots if plan.first_stop <= shot.stop < last]
 
 
-def scans_of(plan: Plan, shots: Sequence[Shot], rig: Rig) -> Iterator[tuple[Shot, Scan, dict[str, CameraTruth]]]:
-    """Each shot with its scan and the truth behind its images, in order; rendered side by side on all cores."""
+def scans_of(
+    plan: Plan, shots: Sequence[Shot], rig: Rig, *, threads: int | None = None
+) -> Iterator[tuple[Shot, Scan, dict[str, CameraTruth]]]:
+    """Each shot with its scan and the truth behind its images, in order; rendered side by side (None: on all cores)."""
     cameras = {"none": [], "range": [RANGE_CAMERA], "all": list(rig.cameras)}[plan.truth]
 
     def take(shot: Shot) -> tuple[Shot, Scan, dict[str, CameraTruth]]:
@@ -168,13 +170,13 @@ def scans_of(plan: Plan, shots: Sequence[Shot], rig: Rig) -> Iterator[tuple[Shot
         truths = {name: camera_truth(plan.scene, rig, name, T_map_rig=shot.T_map_rig) for name in cameras}
         return shot, replace(scan, T_map_rig=shot.T_believed), truths
 
-    threads = os.cpu_count() or 1
-    with ThreadPoolExecutor(threads) as pool:
+    workers = threads or os.cpu_count() or 1
+    with ThreadPoolExecutor(workers) as pool:
         waiting: deque[Future[tuple[Shot, Scan, dict[str, CameraTruth]]]] = deque()
         try:
             for shot in shots:
                 waiting.append(pool.submit(take, shot))
-                if len(waiting) > AHEAD * threads:
+                if len(waiting) > AHEAD * workers:
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()

@@ -71,9 +71,7 @@ class Measurement:
             raise BadInputError("measurement_full", f"a measurement has at most {SCANS_MAX} scans; commit it first")
 
     def _note_pose(self, time_s: float, T_map_rig: Transform) -> None:
-        x, y, z = (float(v) for v in T_map_rig[:3, 3])
-        q = [float(v) for v in quaternion_from_transform(T_map_rig)]
-        self.poses.append(ScanPose(time_s=time_s, t_map_rig=(x, y, z), q_map_rig=(q[0], q[1], q[2], q[3])))
+        self.poses.append(scan_pose(time_s, T_map_rig))
 
     def diff(self) -> dict[CellKey, Evidence]:
         """The evidence of all scans, by cell."""
@@ -84,3 +82,10 @@ class Measurement:
         """First and last scan's time, UTC seconds; None without scans."""
         times = [pose.time_s for pose in self.poses]
         return (min(times), max(times)) if times else None
+
+
+def scan_pose(time_s: float, T_map_rig: Transform) -> ScanPose:
+    """Where the rig was for one scan, as a commit states it."""
+    x, y, z = (float(v) for v in T_map_rig[:3, 3])
+    q = [float(v) for v in quaternion_from_transform(T_map_rig)]
+    return ScanPose(time_s=time_s, t_map_rig=(x, y, z), q_map_rig=(q[0], q[1], q[2], q[3]))

@@ -1,0 +1,56 @@
+"""The ways to write a cell that the experiment compares. One more is one more entry of `CODINGS`."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from cairn_map.cell_code import decode_cell, encode_cell
+from cairn_map.evidence import Evidence
+from cairn_map.grid import CellKey, Geometry
+from cairn_map.sensor_model import SensorModel
+from cairn_sim.pointer_octree import decode_pointer_octree, encode_pointer_octree, occupied_voxels
+
+Encode = Callable[[CellKey, Evidence, Geometry, SensorModel], bytes]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Coding:
+    """One way."""
+
+    name: str
+    """Short: it heads a column and keys `report.json`."""
+    holds: str
+    """What can be read from the bytes."""
+    encode: Encode
+    """Packed evidence to bytes."""
+    decode: Callable[[bytes], object]
+    """Bytes to what they hold; `Evidence` where that is all."""
+
+
+def _exact(key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel) -> bytes:
+    return encode_cell(key, evidence, geometry).data
+
+
+def _decoded_exact(data: bytes) -> Evidence:
+    return decode_cell(data).evidence
+
+
+def _pointer_octree(key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel) -> bytes:
+    return encode_pointer_octree(occupied_voxels(key, evidence, geometry, model))
+
+
+EXACT = Coding(
+    name="cairn, exact",
+    holds="all evidence, exactly: hits and misses of every voxel that was seen, free ones too; sums of colour, "
+    "intensity, temperature and its square, and their weights. It can be added to, and retracted from.",
+    encode=_exact,
+    decode=_decoded_exact,
+)
+"""What a map's folder holds."""
+POINTER_OCTREE = Coding(
+    name="pointer octree, zip",
+    holds="the paper's method: of occupied voxels the log-odds, one colour and one temperature (8 B), under zip. "
+    "Free and unknown are one; nothing can be added or taken out.",
+    encode=_pointer_octree,
+    decode=decode_pointer_octree,
+)
+CODINGS: tuple[Coding, ...] = (EXACT, POINTER_OCTREE)
