@@ -152,6 +152,7 @@ class ResolutionFigures:
             "rays_per_s": rays / seconds,
             "rays_per_cpu_s": rays / cpu_s,
             "measurement_median_s": median(one.integrate_s for one in self.measurements),
+            "measurement_median_cpu_s": median(one.integrate_cpu_s for one in self.measurements),
             "commit_median_s": median(one.commit_s for one in self.measurements),
             "merge_median_s": median(one.merge_s for one in self.measurements),
         }

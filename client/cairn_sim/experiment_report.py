@@ -33,6 +33,7 @@ p, dl { max-width: 75ch; } .lead { color: #46505e; margin-top: 0; }
 table { border-collapse: collapse; margin: .8rem 0; font-variant-numeric: tabular-nums; font-size: .92rem; }
 th, td { padding: .28rem .7rem; text-align: right; vertical-align: top; border-bottom: 1px solid #e6e9ee; }
 thead th { border-bottom: 1px solid #98a2b0; text-align: center; } tbody th { text-align: left; font-weight: 500; }
+th, td { white-space: nowrap; } td.means { white-space: normal; }
 td.paper { color: #6b4d12; background: #fbf6ea; } td.means { text-align: left; color: #46505e; }
 tr.group th { padding-top: .8rem; font-weight: 700; } tr.strong td { font-weight: 700; }
 dt { font-weight: 600; } dd { margin: 0 0 .5rem 0; }

@@ -108,6 +108,7 @@ def rate_rows() -> list[tuple[str, Read, str]]:
         ("million rays / s", rate("rays_per_s", 1e-6), "A ray is a range pixel to which light came back; wall clock."),
         ("million rays / CPU s", rate("rays_per_cpu_s", 1e-6), "The same by CPU time of all threads together."),
         ("ms / measurement", rate("measurement_median_s", 1e3), "All scans of one stop to evidence; median, wall."),
+        ("CPU ms / measurement", rate("measurement_median_cpu_s", 1e3), "The same by CPU time of all threads."),
         ("ms / commit", rate("commit_median_s", 1e3), "Writing that evidence as a commit; median, one thread."),
         ("ms / merge", rate("merge_median_s", 1e3), "Adding it to the map; median, one thread."),
         ("map in memory, MB", lambda one: shown(one.map_memory_bytes / MIB), "Bricks of the whole map."),
@@ -131,7 +132,7 @@ def commit_rows() -> list[tuple[str, Read, str]]:
         ),
         (
             "cells in a commit, median",
-            lambda one: shown(median(m.cells for m in one.measurements)),
+            lambda one: f"{median(m.cells for m in one.measurements):g}",
             "That one stop adds evidence to.",
         ),
     ]
