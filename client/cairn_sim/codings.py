@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from cairn_map.cell_code import decode_cell, encode_cell
+from cairn_map.cell_code import Profile, decode_cell, encode_cell
 from cairn_map.evidence import Evidence
 from cairn_map.grid import CellKey, Geometry
 from cairn_map.sensor_model import SensorModel
@@ -26,8 +26,12 @@ class Coding:
     """Bytes to what they hold; `Evidence` where that is all."""
 
 
-def _exact(key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel) -> bytes:
-    return encode_cell(key, evidence, geometry).data
+def _fast(key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel) -> bytes:
+    return encode_cell(key, evidence, geometry, profile=Profile.FAST).data
+
+
+def _small(key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel) -> bytes:
+    return encode_cell(key, evidence, geometry, profile=Profile.SMALL).data
 
 
 def _decoded_exact(data: bytes) -> Evidence:
@@ -38,14 +42,20 @@ def _pointer_octree(key: CellKey, evidence: Evidence, geometry: Geometry, model:
     return encode_pointer_octree(occupied_voxels(key, evidence, geometry, model))
 
 
-EXACT = Coding(
-    name="cairn, exact",
+EXACT_FAST = Coding(
+    name="cairn, exact, fast",
     holds="all evidence, exactly: hits and misses of every voxel that was seen, free ones too; sums of colour, "
     "intensity, temperature and its square, and their weights. It can be added to, and retracted from.",
-    encode=_exact,
+    encode=_fast,
     decode=_decoded_exact,
 )
 """What a map's folder holds."""
+EXACT_SMALL = Coding(
+    name="cairn, exact, small",
+    holds="the same, with the same digest, in fewer bytes and more time.",
+    encode=_small,
+    decode=_decoded_exact,
+)
 POINTER_OCTREE = Coding(
     name="pointer octree, zip",
     holds="the paper's method: of occupied voxels the log-odds, one colour and one temperature (8 B), under zip. "
@@ -53,4 +63,4 @@ POINTER_OCTREE = Coding(
     encode=_pointer_octree,
     decode=decode_pointer_octree,
 )
-CODINGS: tuple[Coding, ...] = (EXACT, POINTER_OCTREE)
+CODINGS: tuple[Coding, ...] = (EXACT_FAST, EXACT_SMALL, POINTER_OCTREE)

@@ -1,7 +1,7 @@
 """The finished map's cells: how full they are, how large and how fast each coding is, and their folder.
 
 Every cell is written once in every coding and read back, in one thread; times are CPU times, so that other work on
-the machine does not count. What `EXACT` reads back must be what went in, or the experiment stops.
+the machine does not count. What an exact coding reads back must be what went in, or the experiment stops.
 """
 
 import shutil
@@ -20,7 +20,7 @@ from cairn_map.evidence import Evidence
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.grid import CellKey, cell_of_key
 from cairn_map.sensor_model import SensorModel
-from cairn_sim.codings import CODINGS, EXACT
+from cairn_sim.codings import CODINGS, EXACT_FAST
 from cairn_sim.experiment_figures import CellFigures, CodedCell
 
 T = TypeVar("T")
@@ -52,7 +52,7 @@ def measure_cells(
 
 
 def _figures(whole: EvidenceMap, key: CellKey, model: SensorModel) -> tuple[Evidence, CellFigures, bytes]:
-    """A cell's evidence, its figures, and its bytes as `EXACT` writes them."""
+    """A cell's evidence, its figures, and its bytes as `EXACT_FAST` writes them."""
     geometry = whole.geometry
     evidence, pack_s = _timed(lambda: whole.evidence(key))
     _, unpack_s = _timed(lambda: brick_cell(geometry, [evidence]))
@@ -64,7 +64,7 @@ def _figures(whole: EvidenceMap, key: CellKey, model: SensorModel) -> tuple[Evid
         if isinstance(decoded, Evidence) and decoded != evidence:
             raise DamagedDataError("bad_cell", f"cell {cell_of_key(key)} came back from {coding.name!r} as another")
         coded[coding.name] = CodedCell(size_bytes=len(data), encode_s=encode_s, decode_s=decode_s)
-        if coding is EXACT:
+        if coding is EXACT_FAST:
             exact = data
     figures = CellFigures(
         cell=str(cell_of_key(key)),

@@ -104,10 +104,7 @@ def _head(run: RunFigures) -> str:
         if missing
         else ""
     )
-    cards: list[tuple[str, str]] = []
-    for one in done:
-        name = one.coding_names[0]
-        cards.append((f"1:{shown(one.totals(name).ratio)}", f"{one.title}, {name}"))
+    cards = [(f"1:{shown(last.totals(name).ratio)}", f"{last.title}: {name}") for name in last.coding_names]
     cards.append((f"{shown(last.rates()['images_per_s'])} / s", f"range images mapped at {last.title}"))
     best = next((one for one in reversed(done) if one.truth), None)
     if best is not None and best.truth is not None:
