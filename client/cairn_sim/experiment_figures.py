@@ -84,6 +84,8 @@ class CodingTotals:
     map_bytes: int
     ratio: float
     """Uncompressed map over compressed map."""
+    bits_per_occupied: float | None
+    """Of the compressed map, for each occupied voxel; None without any. Empty cells make a ratio large, not this."""
     encode_median_s: float
     decode_median_s: float
 
@@ -134,10 +136,12 @@ class ResolutionFigures:
         """A coding's share of Table 3."""
         coded = [cell.coded[coding] for cell in self.cells]
         map_bytes = sum(one.size_bytes for one in coded)
+        occupied = sum(cell.occupied for cell in self.cells)
         return CodingTotals(
             mean_cell_bytes=map_bytes / len(coded),
             map_bytes=map_bytes,
             ratio=self.uncompressed_bytes / map_bytes,
+            bits_per_occupied=8 * map_bytes / occupied if occupied else None,
             encode_median_s=median(one.encode_s for one in coded),
             decode_median_s=median(one.decode_s for one in coded),
         )

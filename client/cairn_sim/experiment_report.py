@@ -68,7 +68,8 @@ def report_page(run: RunFigures, plan: PlanView, stops: Stops) -> str:
         _picture(plan, stops),
         "<h2>Table 3: how small the map is</h2>",
         f"<p>A cell is a cube of {edge_m:g} m. Uncompressed, it takes 8 bytes for each of its voxels, known or not; "
-        "compressed, what the coding writes. The ratio is uncompressed map to compressed map.</p>",
+        "compressed, what the coding writes. The ratio is uncompressed map to compressed map; it grows with the air in "
+        "the cells, bits per occupied voxel do not.</p>",
         table_three(done),
         f'<p class="note">{escape(INCONSISTENT)}</p>',
         codings_list(names),

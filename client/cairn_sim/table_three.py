@@ -69,6 +69,7 @@ def table_three(resolutions: Sequence[ResolutionFigures]) -> str:
             row("compressed cube, average, MB", _of(name, _mean_cell), lambda paper: paper.compressed_cube),
             row("compressed map, MB", _of(name, _map_size), lambda paper: paper.compressed_map),
             row("ratio", _of(name, _ratio), lambda paper: paper.ratio, "strong"),
+            row("bits per occupied voxel", _of(name, _bits), lambda _: MISSING),
         ]
     head = f"<thead><tr><td></td>{heads}</tr><tr><td></td>{whose}</tr></thead>"
     return f"<table>{head}<tbody>{''.join(rows)}</tbody></table>"
@@ -88,6 +89,10 @@ def _map_size(total: CodingTotals) -> str:
 
 def _ratio(total: CodingTotals) -> str:
     return f"1:{shown(total.ratio)}"
+
+
+def _bits(total: CodingTotals) -> str:
+    return MISSING if total.bits_per_occupied is None else shown(total.bits_per_occupied)
 
 
 def codings_list(names: Sequence[str]) -> str:

@@ -111,6 +111,7 @@ def test_totals_are_the_papers_arithmetic() -> None:
     assert (total.mean_cell_bytes, total.map_bytes) == (200_000, 400_000)
     assert total.ratio == pytest.approx((32 << 20) / 400_000)
     assert total.encode_median_s == pytest.approx(0.015)
+    assert total.bits_per_occupied == pytest.approx(8 * 400_000 / 128)
     assert resolution(0.02).cube_bytes == 128 << 20
     assert four.cells_with_obstacles == 1
     assert four.rates()["rays_per_cpu_s"] == pytest.approx(1e6)
