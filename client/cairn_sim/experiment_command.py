@@ -28,10 +28,9 @@ from cairn_map.errors import BadInputError
 from cairn_sim.experiment import Settings, run_experiment
 from cairn_sim.experiment_figures import Json, ResolutionFigures
 from cairn_sim.experiment_robots import ExperimentRobot, recorded_robot, simulated_robots
+from cairn_sim.experiment_tables import MIB, shown
 from cairn_sim.robots import ROBOTS, robot_named
 from cairn_sim.scene_file import load_scene
-
-MIB = 1 << 20
 
 
 def main(argv: list[str]) -> int:
@@ -59,7 +58,7 @@ def main(argv: list[str]) -> int:
 
 def _line(resolution: ResolutionFigures) -> str:
     codings = "; ".join(
-        f"{name} {total.map_bytes / MIB:.1f} MiB, 1:{total.ratio:.0f}"
+        f"{name} {shown(total.map_bytes / MIB)} MB, 1:{total.ratio:.0f}"
         for name in resolution.coding_names
         for total in [resolution.totals(name)]
     )
@@ -104,6 +103,16 @@ def _count(text: str) -> int:
     return int(text)
 
 
+def _centimetres(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < 1000:
+        raise argparse.ArgumentTypeError(f"a voxel edge is a number of centimetres such as 4, got {text!r}")
+    return value
+
+
 def _parser() -> argparse.ArgumentParser:
     options = parser("cairn experiment", __doc__)
     options.add_argument(
@@ -111,7 +120,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     options.add_argument(
         "--resolutions",
-        type=float,
+        type=_centimetres,
         nargs="+",
         default=[8.0, 4.0, 2.0],
         metavar="CM",

@@ -234,7 +234,9 @@ def test_an_interrupted_run_keeps_finished_resolutions_and_nothing_half(tmp_path
     assert len(cells_of(output / "map-16cm")) == report["resolutions"][0]["derived"]["nonempty_cells"]
 
 
-@pytest.mark.parametrize("arguments", [["--stops", "0"], ["--threads", "x"], ["--robot", "nobody"]])
+@pytest.mark.parametrize(
+    "arguments", [["--stops", "0"], ["--threads", "x"], ["--robot", "nobody"], ["--resolutions", "nan"]]
+)
 def test_options_that_make_no_sense_are_refused(arguments: list[str], tmp_path: Path) -> None:
     with pytest.raises(SystemExit):
         main([*arguments, "--output", str(tmp_path / "out")])
