@@ -122,7 +122,7 @@ def commit_rows() -> list[tuple[str, Read, str]]:
         return lambda one: shown(quartiles([float(m.commit_bytes) for m in one.measurements])[number] / KIB)
 
     return [
-        ("smallest, kB", quartile(0), "Bytes that a robot sends for one stop, once."),
+        ("smallest, kB", quartile(0), "Bytes that a robot sends for one stop, once; kB are 2^10 bytes."),
         ("median, kB", quartile(2), "Half of the commits are smaller."),
         ("largest, kB", quartile(4), "A commit of more than 64 MB would be refused."),
         (
