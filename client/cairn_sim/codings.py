@@ -7,6 +7,8 @@ from cairn_map.cell_code import Profile, decode_cell, encode_cell
 from cairn_map.evidence import Evidence
 from cairn_map.grid import CellKey, Geometry
 from cairn_map.sensor_model import SensorModel
+from cairn_map.view import FULL_STYLE
+from cairn_map.view_code import decode_view, encode_view
 from cairn_sim.pointer_octree import decode_pointer_octree, encode_pointer_octree, occupied_voxels
 
 Encode = Callable[[CellKey, Evidence, Geometry, SensorModel], bytes]
@@ -38,6 +40,14 @@ def _decoded_exact(data: bytes) -> Evidence:
     return decode_cell(data).evidence
 
 
+def _view(key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel) -> bytes:
+    return encode_view(key, evidence, geometry, model)
+
+
+def _full_view(key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel) -> bytes:
+    return encode_view(key, evidence, geometry, model, style=FULL_STYLE)
+
+
 def _pointer_octree(key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel) -> bytes:
     return encode_pointer_octree(occupied_voxels(key, evidence, geometry, model))
 
@@ -56,6 +66,19 @@ EXACT_SMALL = Coding(
     encode=_small,
     decode=_decoded_exact,
 )
+FULL_VIEW = Coding(
+    name="cairn, view, full",
+    holds="the paper's fields of occupied voxels in full: log-odds in 0.001, 8-8-8 bits of colour, 0.01 K. "
+    "To be looked at, never merged.",
+    encode=_full_view,
+    decode=decode_view,
+)
+VIEW = Coding(
+    name="cairn, view",
+    holds="the same voxels for eyes: probability in 1/255, 8-8-8 bits of colour, temperature in 0.1 K.",
+    encode=_view,
+    decode=decode_view,
+)
 POINTER_OCTREE = Coding(
     name="pointer octree, zip",
     holds="the paper's method: of occupied voxels the log-odds, one colour and one temperature (8 B), under zip. "
@@ -63,4 +86,4 @@ POINTER_OCTREE = Coding(
     encode=_pointer_octree,
     decode=decode_pointer_octree,
 )
-CODINGS: tuple[Coding, ...] = (EXACT_FAST, EXACT_SMALL, POINTER_OCTREE)
+CODINGS: tuple[Coding, ...] = (EXACT_FAST, EXACT_SMALL, FULL_VIEW, VIEW, POINTER_OCTREE)
