@@ -130,7 +130,10 @@ def _parser() -> argparse.ArgumentParser:
     options.add_argument("--stops", type=_count, metavar="N", help="only the first N of each robot (all)")
     options.add_argument("--robot", default="orpheus", choices=list(ROBOTS), help="simulated on both paths (orpheus)")
     options.add_argument(
-        "--scale", type=float, default=0.5, help="of colour and thermal images: what voxels of 2 cm can show (0.5)"
+        "--scale",
+        type=float,
+        default=0.25,
+        help="of colour and thermal images; two colour pixels see 2 cm at 3 m (0.25)",
     )
     options.add_argument("--seed", type=int, default=1, help="of all noise (1)")
     options.add_argument("--threads", type=_count, metavar="N", help="that render and map (all cores)")
