@@ -46,6 +46,7 @@ def clear_distances(
     """
     height, width = seen_m.shape
     clear = np.zeros((height, width), np.float32)
+    least = _least_around(shield_m)
     for y in range(height):
         for x in range(width):
             seen = min(np.float64(seen_m[y, x]), silent_m) if math.isinf(seen_m[y, x]) else np.float64(seen_m[y, x])
@@ -56,20 +57,41 @@ def clear_distances(
             nearest, margin = seen, 0.0
             if shield_m[y, x] > 0.0:
                 margin = np.float64(margins_m[y, x])
-            for v in range(max(y - RINGS, 0), min(y + RINGS + 1, height)):
-                for u in range(max(x - RINGS, 0), min(x + RINGS + 1, width)):
+            for v in range(max(y - 1, 0), min(y + 2, height)):
+                for u in range(max(x - 1, 0), min(x + 2, width)):
                     near = np.float64(shield_m[v, u])
-                    if not near < nearest:
-                        continue
-                    if (abs(v - y) > 1 or abs(u - x) > 1) and (
-                        seen - near <= edge or near > EDGE_SHARE * voxel_edge_m * focal_px
-                    ):
-                        continue
-                    nearest, margin = near, np.float64(margins_m[v, u])
+                    if near < nearest:
+                        nearest, margin = near, np.float64(margins_m[v, u])
+            # Beyond these no pixel of the outer ring counts: on most of an image none is looked at.
+            limit = min(nearest, min(seen - edge, EDGE_SHARE * voxel_edge_m * focal_px))
+            if least[y, x] <= limit:
+                for v in range(max(y - RINGS, 0), min(y + RINGS + 1, height)):
+                    for u in range(max(x - RINGS, 0), min(x + RINGS + 1, width)):
+                        near = np.float64(shield_m[v, u])
+                        if near < nearest and near < seen - edge and near <= EDGE_SHARE * voxel_edge_m * focal_px:
+                            nearest, margin = near, np.float64(margins_m[v, u])
             slope = math.sqrt(across * across + down * down) * focal_px / seen
             grazing = min(max(GRAZING_SHARE * math.sqrt(1.0 + slope * slope), 1.0), GRAZING_MAX)
             clear[y, x] = max(nearest - grazing * margin, 0.0)
     return clear
+
+
+@nb.njit(cache=True, nogil=True)
+def _least_around(shield_m: Singles) -> Singles:
+    """(H, W) the nearest of each pixel and the two rings around it; infinite for none."""
+    height, width = shield_m.shape
+    rows, least = np.full((height, width), np.inf, np.float32), np.full((height, width), np.inf, np.float32)
+    for y in range(height):
+        for x in range(width):
+            for u in range(max(x - RINGS, 0), min(x + RINGS + 1, width)):
+                if shield_m[y, u] < rows[y, x]:
+                    rows[y, x] = shield_m[y, u]
+    for y in range(height):
+        for v in range(max(y - RINGS, 0), min(y + RINGS + 1, height)):
+            for x in range(width):
+                if rows[v, x] < least[y, x]:
+                    least[y, x] = rows[v, x]
+    return least
 
 
 @nb.njit(inline="always")
