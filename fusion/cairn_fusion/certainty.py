@@ -21,6 +21,9 @@ from cairn_map.errors import BadInputError
 
 Floats = npt.NDArray[np.float64]
 
+STRETCH_MAX = 8.0
+"""By how much a lens may stretch what it shows, for `is_certain`."""
+
 
 def pixel_covariance(points_src: Floats, sigma_m: Floats, rig: Rig, *, src: str, dst: str) -> Floats:
     """(N, 2, 2) covariance, px^2, of where points of one camera's frame appear in another's image.
@@ -57,3 +60,19 @@ def spread_m(points_src: Floats, sigma_m: Floats, rig: Rig, *, src: str, dst: st
     T_dst_src = inverse(rig[dst].transform) @ rig[src].transform
     depth_m = transform_points(T_dst_src, points_src)[:, 2]
     return np.asarray(spread_px(covariance) * depth_m / min(rig[dst].camera.focal_px))
+
+
+def is_certain(points_src: Floats, sigma_m: Floats, rig: Rig, *, src: str, dst: str, limit_m: float) -> bool:
+    """Whether no sample of these points can be uncertain by more than a limit: then nobody needs to work it out.
+
+    J moves a pixel by at most some f / z a metre, more only off the axis and where a lens stretches: here, eight times
+    as much is allowed for. With a baseline of 0.1 m and 5 mm at 1 m that is 4 mm.
+    """
+    if not len(points_src):
+        return True
+    T_dst_src = inverse(rig[dst].transform) @ rig[src].transform
+    distance_m = np.linalg.norm(points_src, axis=1)
+    parallax_m = np.linalg.norm(T_dst_src[:3, 3]) * float((sigma_m / distance_m).max())
+    farthest_m = float(distance_m.max()) + float(np.linalg.norm(T_dst_src[:3, 3]))
+    calibration_m = (rig[dst].calibration_sigma_px or 0.0) * farthest_m / min(rig[dst].camera.focal_px)
+    return bool(STRETCH_MAX * (parallax_m + calibration_m) <= limit_m)

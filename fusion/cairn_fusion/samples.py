@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.rig import Rig
-from cairn_fusion.certainty import spread_m
+from cairn_fusion.certainty import is_certain, spread_m
 from cairn_fusion.returns import Returns
 from cairn_fusion.scan import Scan
 from cairn_fusion.transfer import depth_steps, points_from_range, transfer_points
@@ -77,11 +77,11 @@ def _samples(
             )
             values = transfer.sample(image).astype(np.float64).reshape(-1, channel.value_count)
             valid = np.isfinite(values).all(axis=1)
-            if spread_max_m < math.inf:
-                seen = waiting[transfer.ok]
-                spread = spread_m(points_tof[seen], sigma_m[seen], rig, src=scan.range_camera, dst=name)
-                valid &= spread <= spread_max_m
-            found = waiting[transfer.ok][valid]
+            seen = waiting[transfer.ok]
+            of = (points_tof[seen], sigma_m[seen], rig)
+            if not is_certain(*of, src=scan.range_camera, dst=name, limit_m=spread_max_m):
+                valid &= spread_m(*of, src=scan.range_camera, dst=name) <= spread_max_m
+            found = seen[valid]
             yield channel, values[valid], found
             waiting = np.setdiff1d(waiting, found, assume_unique=True)
 

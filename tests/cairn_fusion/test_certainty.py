@@ -12,7 +12,7 @@ from cairn_calib.lidar import SpinningLidar
 from cairn_calib.poses import inverse, look_at, transform_points
 from cairn_calib.rig import Rig, Spectrum, mounted
 from cairn_calib.sensing import RangeSensing
-from cairn_fusion.certainty import pixel_covariance, spread_m, spread_px
+from cairn_fusion.certainty import is_certain, pixel_covariance, spread_m, spread_px
 from cairn_fusion.integrate import Integrator, Method, integrate_scan
 from cairn_fusion.scan import Scan
 from cairn_map.channels import TEMPERATURE
@@ -116,3 +116,16 @@ def test_samples_whose_place_is_too_uncertain_are_left_out_and_hits_stay(method:
         assert sum(int((e.counts[:, 0] > 0).sum()) for e in diff.values()) > 500
         assert all((e.samples[:, -1] <= 1).all() for e in diff.values())
     assert depths[0] > depths[1] > depths[2] == 0
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize("sigma_px", [None, 0.5, 8.0])
+@pytest.mark.parametrize("noise", [0.0, 0.001, 0.05])
+def test_what_is_taken_for_certain_is(name: str, sigma_px: float | None, noise: float) -> None:
+    seen = HEAD[name].model_copy(update={"calibration_sigma_px": sigma_px})
+    rig = HEAD.model_copy(update={"cameras": {**HEAD.cameras, name: seen}})
+    chosen = points()
+    sigma_m = noise * np.linalg.norm(chosen, axis=1)
+    worst_m = float(np.nanmax(spread_m(chosen, sigma_m, rig, src="tof", dst=name)))
+    assert not is_certain(chosen, sigma_m, rig, src="tof", dst=name, limit_m=0.999 * worst_m - 1e-12)
+    assert is_certain(chosen, sigma_m, rig, src="tof", dst=name, limit_m=200 * worst_m + 1e-12)
