@@ -9,10 +9,12 @@ import itertools
 import math
 import struct
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import zstandard
+from tests import naive_modelled
+from tests.naive_modelled import Coder
 
 Voxel = tuple[int, int, tuple[int, ...]]
 Evidence = dict[int, Voxel]
@@ -21,6 +23,7 @@ WORD = 1 << 64
 PLANES = {1: 4, 2: 2, 3: 3, 4: 2}
 """Of each kind of channel: colour, intensity, temperature, scalar."""
 TEMPERATURE = 3
+STORED, ZSTD, MODELLED = range(3)
 CODES = {"colour": 1, "intensity": 2, "temperature": 3, "scalar": 4}
 
 
@@ -217,24 +220,9 @@ def encode_cell(header: dict[str, Any], evidence: Evidence) -> tuple[bytes, byte
     is_signed = any(n < 0 for hits, misses, samples in evidence.values() for n in (hits, misses, *samples))
     plain = zigzag if is_signed else int
     streams = dict(zip((1, 2), masks_of(root, depth), strict=True))
-    streams[3] = encode_column([plain(voxel[0]) for voxel in leaves])
-    streams[4] = encode_column([plain(voxel[1]) for voxel in leaves])
-    at = 0
-    for c, (code, *_) in enumerate(channels):
-        rows = [voxel[2][at : at + PLANES[code]] for voxel in leaves]
-        at += PLANES[code]
-        present = [n for n, row in enumerate(rows) if any(row)]
-        bits = sum(1 << n for n in present)
-        streams[16 + 8 * c] = bits.to_bytes((len(leaves) + 7) // 8, "little")
-        *planes, weights = zip(*(rows[n] for n in present), strict=True) if present else ((),) * PLANES[code]
-        streams[17 + 8 * c] = encode_column([plain(w) for w in weights])
-        for p, plane in enumerate(planes):
-            if code == TEMPERATURE and p == 1:
-                guesses = [square_guess(total, w) for total, w in zip(planes[0], weights, strict=True)]
-            else:
-                guesses = [mean_guess(n, list(plane), list(weights)) for n in range(len(plane))]
-            residuals = [zigzag(value - guess) for value, guess in zip(plane, guesses, strict=True)]
-            streams[18 + 8 * c + p] = encode_column(residuals)
+    streams |= _count_streams([voxel[:2] for voxel in leaves], plain)
+    for c, (code, rows) in enumerate(_rows_by_channel(leaves, channels)):
+        streams |= _channel_streams(16 + 8 * c, code, rows, len(leaves), plain)
     head = struct.pack("<4sBBBBI", b"CRNC", 1, 1, depth, int(is_signed), header["voxel_edge_um"])
     head += struct.pack("<iii", *header["cell"])
     head += struct.pack("<IIBB", len(evidence), len(leaves), len(channels), len(streams))
@@ -245,6 +233,25 @@ def encode_cell(header: dict[str, Any], evidence: Evidence) -> tuple[bytes, byte
         struct.pack("<BBII", number, 0, len(raw), len(raw)) + raw for number, raw in sorted(streams.items())
     )
     return head + body, cell_digest(head, streams)
+
+
+def modelled_groups(header: dict[str, Any], evidence: Evidence) -> dict[int, bytes]:
+    """The stored bytes of each group of modelled streams, by the number of its first stream."""
+    depth = header["depth"]
+    root = tree_of(evidence, depth)
+    found = leaves_of(root, depth)
+    leaves, counts = [_cube(place, size) for place, size, _ in found], [voxel[:2] for _, _, voxel in found]
+    coders = {1: Coder(), 3: Coder()}
+    if root:
+        naive_modelled.code_masks(coders[1], depth, _mask_pairs(*masks_of(root, depth)))
+    naive_modelled.code_counts(coders[3], leaves, counts)
+    before: dict[int, int] = {}
+    for c, (code, rows) in enumerate(_rows_by_channel([voxel for _, _, voxel in found], header["channels"])):
+        coder = coders[16 + 8 * c] = Coder()
+        hits = [count[0] for count in counts]
+        naive_modelled.code_channel(coder, leaves, hits, before, PLANES[code], code == TEMPERATURE, rows)
+        before = {leaf: row[-1] for leaf, row in rows.items()}
+    return {first: coder.end() for first, coder in coders.items()}
 
 
 def decode_cell(data: bytes) -> tuple[dict[str, Any], Evidence]:
@@ -260,8 +267,12 @@ def decode_cell(data: bytes) -> tuple[dict[str, Any], Evidence]:
         name, unit = file.read(name_bytes).decode(), file.read(unit_bytes).decode()
         channels.append((code, name, unit, *struct.unpack("<dd", file.read(16))))
     head = data[: file.tell()]
-    streams = dict(_stream(file) for _ in range(stream_count))
+    stored = dict(_stored_stream(file) for _ in range(stream_count))
     assert not file.read()
+    streams = _raw_streams(stored, depth, leaf_count, channels)
+    assert all(len(streams[number]) == raw_bytes for number, (_, raw_bytes, _) in stored.items())
+    assert len(streams) == stream_count
+    assert not flags & 1 or all(coding != MODELLED for coding, _, _ in stored.values())
 
     leaves = leaves_of_masks(streams[1], streams[2], depth)
     assert len(leaves) == leaf_count
@@ -286,17 +297,109 @@ def cell_digest(head: bytes, streams: dict[int, bytes]) -> bytes:
     return hashlib.sha256(head + b"".join(parts)).digest()
 
 
-def _stream(file: io.BytesIO) -> tuple[int, bytes]:
+def _stored_stream(file: io.BytesIO) -> tuple[int, tuple[int, int, bytes]]:
     number, coding, raw_bytes, stored_bytes = struct.unpack("<BBII", file.read(10))
-    stored = file.read(stored_bytes)
-    if coding == 1:
-        stored = zstandard.ZstdDecompressor().decompressobj().decompress(stored)
-    assert len(stored) == raw_bytes
-    return number, stored
+    return number, (coding, raw_bytes, file.read(stored_bytes))
+
+
+def _raw_streams(
+    stored: dict[int, tuple[int, int, bytes]], depth: int, leaf_count: int, channels: list[Any]
+) -> dict[int, bytes]:
+    """All streams as they would be without any coding."""
+    raw: dict[int, bytes] = {}
+
+    def is_modelled(numbers: list[int]) -> bool:
+        codings = {stored[number][0] for number in numbers}
+        assert codings == {MODELLED} or MODELLED not in codings
+        assert MODELLED not in codings or not any(stored[number][2] for number in numbers[1:])
+        if MODELLED not in codings:
+            raw.update({number: _unpacked(*stored[number]) for number in numbers})
+        return MODELLED in codings
+
+    if is_modelled([1, 2]):
+        coder = Coder(stored[1][2])
+        raw |= _mask_streams(naive_modelled.code_masks(coder, depth, None) if leaf_count else [], depth)
+        coder.end()
+    leaves = [_cube(place, size) for place, size in leaves_of_masks(raw[1], raw[2], depth)]
+    if is_modelled([3, 4]):
+        coder = Coder(stored[3][2])
+        raw |= _count_streams(naive_modelled.code_counts(coder, leaves, None), int)
+        coder.end()
+    hits, before = decode_column(raw[3], leaf_count), dict[int, int]()
+    for c, (code, *_) in enumerate(channels):
+        first = 16 + 8 * c
+        if is_modelled(list(range(first, first + 1 + PLANES[code]))):
+            coder = Coder(stored[first][2])
+            rows = naive_modelled.code_channel(
+                coder, leaves, hits, before, PLANES[code], code == TEMPERATURE, None
+            )
+            coder.end()
+            raw |= _channel_streams(first, code, rows, leaf_count, int)
+        before = {leaf: row[-1] for leaf, row in _channel_rows(raw, first, code, leaf_count, int).items()}
+    return raw
+
+
+def _unpacked(coding: int, raw_bytes: int, body: bytes) -> bytes:
+    if coding == ZSTD:
+        body = zstandard.ZstdDecompressor().decompressobj().decompress(body)
+    assert coding in (STORED, ZSTD)
+    assert len(body) == raw_bytes
+    return body
+
+
+def _cube(place: int, size: int) -> naive_modelled.Leaf:
+    """(First voxel, edge) of a leaf of so many voxels."""
+    return deinterleave(place), 1 << ((size.bit_length() - 1) // 3)
+
+
+def _mask_pairs(child_masks: bytes, leaf_masks: bytes) -> list[tuple[int, int]]:
+    """(child mask, leaf mask) of each inner node; all children of the last ones are leaves."""
+    return list(zip(child_masks, leaf_masks + child_masks[len(leaf_masks) :], strict=True))
+
+
+def _mask_streams(pairs: list[tuple[int, int]], depth: int) -> dict[int, bytes]:
+    """The mirror of `_mask_pairs`: the last depth has no leaf masks."""
+    nodes = above = 0
+    below = min(1, len(pairs))
+    for _ in range(depth):
+        nodes, above = nodes + below, nodes
+        below = sum((mask & ~leaf).bit_count() for mask, leaf in pairs[above:nodes])
+    return {1: bytes(mask for mask, _ in pairs), 2: bytes(leaf for _, leaf in pairs[:above])}
+
+
+def _rows_by_channel(leaves: list[Voxel], channels: list[Any]) -> Iterator[tuple[int, dict[int, tuple[int, ...]]]]:
+    """(Kind code, row of sums by leaf) of each channel; rows of zeros left out."""
+    at = 0
+    for code, *_ in channels:
+        rows = {n: voxel[2][at : at + PLANES[code]] for n, voxel in enumerate(leaves)}
+        at += PLANES[code]
+        yield code, {n: row for n, row in rows.items() if any(row)}
+
+
+def _count_streams(counts: list[tuple[int, int]], plain: Callable[[int], int]) -> dict[int, bytes]:
+    return {3 + column: encode_column([plain(count[column]) for count in counts]) for column in range(2)}
+
+
+def _channel_streams(
+    first: int, code: int, rows: dict[int, tuple[int, ...]], leaf_count: int, plain: Callable[[int], int]
+) -> dict[int, bytes]:
+    *planes, weights = [[row[p] for row in rows.values()] for p in range(PLANES[code])]
+    streams = {
+        first: sum(1 << n for n in rows).to_bytes((leaf_count + 7) // 8, "little"),
+        first + 1: encode_column([plain(w) for w in weights]),
+    }
+    for p, plane in enumerate(planes):
+        if code == TEMPERATURE and p == 1:
+            guesses = [square_guess(total, w) for total, w in zip(planes[0], weights, strict=True)]
+        else:
+            guesses = [mean_guess(n, plane, weights) for n in range(len(plane))]
+        residuals = [zigzag(value - guess) for value, guess in zip(plane, guesses, strict=True)]
+        streams[first + 2 + p] = encode_column(residuals)
+    return streams
 
 
 def _channel_rows(
-    streams: dict[int, bytes], first: int, code: int, leaf_count: int, plain: Any
+    streams: dict[int, bytes], first: int, code: int, leaf_count: int, plain: Callable[[int], int]
 ) -> dict[int, tuple[int, ...]]:
     bits = int.from_bytes(streams[first], "little")
     present = [n for n in range(leaf_count) if bits >> n & 1]
