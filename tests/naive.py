@@ -183,6 +183,19 @@ def leaves_of(root: Node | None, depth: int) -> list[tuple[int, int, Voxel]]:
     return list(walk(root, 0, 0)) if root else []
 
 
+def leaves_above(root: Node | None, depth: int, stop: int) -> list[tuple[int, int]]:
+    """(first place, size in voxels) of each leaf no deeper than `stop`, where inner nodes are leaves, too."""
+
+    def walk(node: Node, number: int, d: int) -> Iterator[tuple[int, int]]:
+        if node.is_leaf or d == stop:
+            yield number << (3 * (depth - d)), 8 ** (depth - d)
+        else:
+            for c, child in node.children.items():
+                yield from walk(child, number * 8 + c, d + 1)
+
+    return list(walk(root, 0, 0)) if root else []
+
+
 def leaves_of_masks(child_masks: bytes, leaf_masks: bytes, depth: int) -> list[tuple[int, int]]:
     """(first place, size in voxels) of each leaf, in Morton order."""
     children, leaves = io.BytesIO(child_masks), io.BytesIO(leaf_masks)
@@ -214,23 +227,18 @@ def encode_cell(header: dict[str, Any], evidence: Evidence) -> tuple[bytes, byte
 
     `header` has depth, voxel_edge_um, cell and channels (kind code, name, unit, step, zero).
     """
-    depth, channels = header["depth"], header["channels"]
-    root = tree_of(evidence, depth)
-    leaves = [voxel for _, _, voxel in leaves_of(root, depth)]
-    is_signed = any(n < 0 for hits, misses, samples in evidence.values() for n in (hits, misses, *samples))
-    plain = zigzag if is_signed else int
-    streams = dict(zip((1, 2), masks_of(root, depth), strict=True))
-    streams |= _count_streams([voxel[:2] for voxel in leaves], plain)
-    for c, (code, rows) in enumerate(_rows_by_channel(leaves, channels)):
-        streams |= _channel_streams(16 + 8 * c, code, rows, len(leaves), plain)
-    head = struct.pack("<4sBBBBI", b"CRNC", 1, 1, depth, int(is_signed), header["voxel_edge_um"])
-    head += struct.pack("<iii", *header["cell"])
-    head += struct.pack("<IIBB", len(evidence), len(leaves), len(channels), len(streams))
-    for code, name, unit, step, zero in channels:
-        head += bytes([code, len(name.encode()), len(unit.encode())]) + name.encode() + unit.encode()
-        head += struct.pack("<dd", step, zero)
+    head, streams = _head_and_streams(header, evidence)
+    body = b"".join(struct.pack("<BBII", number, STORED, len(raw), len(raw)) + raw for number, raw in streams.items())
+    return head + body, cell_digest(head, streams)
+
+
+def encode_modelled_cell(header: dict[str, Any], evidence: Evidence) -> tuple[bytes, bytes]:
+    """Likewise with every group modelled, whether it pays or not."""
+    head, streams = _head_and_streams(header, evidence)
+    groups = modelled_groups(header, evidence)
     body = b"".join(
-        struct.pack("<BBII", number, 0, len(raw), len(raw)) + raw for number, raw in sorted(streams.items())
+        struct.pack("<BBII", number, MODELLED, len(raw), len(groups.get(number, b""))) + groups.get(number, b"")
+        for number, raw in streams.items()
     )
     return head + body, cell_digest(head, streams)
 
@@ -297,6 +305,25 @@ def cell_digest(head: bytes, streams: dict[int, bytes]) -> bytes:
     return hashlib.sha256(head + b"".join(parts)).digest()
 
 
+def _head_and_streams(header: dict[str, Any], evidence: Evidence) -> tuple[bytes, dict[int, bytes]]:
+    depth, channels = header["depth"], header["channels"]
+    root = tree_of(evidence, depth)
+    leaves = [voxel for _, _, voxel in leaves_of(root, depth)]
+    is_signed = any(n < 0 for hits, misses, samples in evidence.values() for n in (hits, misses, *samples))
+    plain = zigzag if is_signed else int
+    streams = dict(zip((1, 2), masks_of(root, depth), strict=True))
+    streams |= _count_streams([voxel[:2] for voxel in leaves], plain)
+    for c, (code, rows) in enumerate(_rows_by_channel(leaves, channels)):
+        streams |= _channel_streams(16 + 8 * c, code, rows, len(leaves), plain)
+    head = struct.pack("<4sBBBBI", b"CRNC", 1, 1, depth, int(is_signed), header["voxel_edge_um"])
+    head += struct.pack("<iii", *header["cell"])
+    head += struct.pack("<IIBB", len(evidence), len(leaves), len(channels), len(streams))
+    for code, name, unit, step, zero in channels:
+        head += bytes([code, len(name.encode()), len(unit.encode())]) + name.encode() + unit.encode()
+        head += struct.pack("<dd", step, zero)
+    return head, streams
+
+
 def _stored_stream(file: io.BytesIO) -> tuple[int, tuple[int, int, bytes]]:
     number, coding, raw_bytes, stored_bytes = struct.unpack("<BBII", file.read(10))
     return number, (coding, raw_bytes, file.read(stored_bytes))
@@ -330,9 +357,7 @@ def _raw_streams(
         first = 16 + 8 * c
         if is_modelled(list(range(first, first + 1 + PLANES[code]))):
             coder = Coder(stored[first][2])
-            rows = naive_modelled.code_channel(
-                coder, leaves, hits, before, PLANES[code], code == TEMPERATURE, None
-            )
+            rows = naive_modelled.code_channel(coder, leaves, hits, before, PLANES[code], code == TEMPERATURE, None)
             coder.end()
             raw |= _channel_streams(first, code, rows, leaf_count, int)
         before = {leaf: row[-1] for leaf, row in _channel_rows(raw, first, code, leaf_count, int).items()}

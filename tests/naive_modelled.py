@@ -280,9 +280,7 @@ def code_counts(coder: Coder, leaves: list[Leaf], counts: list[tuple[int, int]] 
 class _Around:
     """What a leaf's counts are guessed from."""
 
-    def __init__(
-        self, faces: list[int | None], edges: list[int | None], f: int, e: int, above: int, edge: int
-    ) -> None:
+    def __init__(self, faces: list[int | None], edges: list[int | None], f: int, e: int, above: int, edge: int) -> None:
         self.faces, self.edges, self.F, self.E, self.above = faces, edges, f, e, above
         self.big = edge > 1
         self.size = 0 if edge == 1 else 1 if edge == 2 else 2
@@ -376,7 +374,7 @@ def _code_presence(
     for n, leaf in enumerate(leaves):
         if leaf[1] == 1:
             faces = digits(2, [int(f in there) for f in places.beside(leaf, FACES)])
-            if model.one(("row", min(hits[n], 3), n in before, faces), int(rows is not None and n in rows)):
+            if model.one(("row", min(hits[n], 3), before.get(n, 0) > 0, faces), int(rows is not None and n in rows)):
                 there[n] = None
     return list(there)
 
@@ -421,8 +419,13 @@ def _code_values(
         numbers.append([])
         for p in range(planes):
             counted = [(b, c) for b, c in beside[s] if 0 < weights[b] < HEAVY and sums[b][p] < KEPT]
-            guess, error, spread, n = _value_guess(counted, [row[p] if p < len(row) else 0 for row in sums],
-                                                   [row[p] if p < len(row) else 0 for row in numbers], weights, w)
+            guess, error, spread, n = _value_guess(
+                counted,
+                [row[p] if p < len(row) else 0 for row in sums],
+                [row[p] if p < len(row) else 0 for row in numbers],
+                weights,
+                w,
+            )
             last = numbers[s][-1] if p else None
             previous = 0 if last is None else 2 * min(half_log(min(abs(last), KEPT)), 30) + (last < 0)
             opinions = [(min(w, 23), error), (previous, min(error // 2, 15)), (spread, min(half_log(w), 11))]

@@ -24,6 +24,7 @@ from cairn_map.cell_content import (
 from cairn_map.cell_head import CellHead, decode_head
 from cairn_map.channel_streams import ChannelRows
 from cairn_map.errors import BadInputError, DamagedDataError
+from cairn_map.modelled import check_effort
 from cairn_map.octree import Octree, parse_octree
 from cairn_map.small_code import Ground
 from cairn_map.streams import MODELLED, RAW_BYTES_MAX, STORED, ZSTD, StoredStream, split_streams, zstd_prefix
@@ -208,7 +209,17 @@ def cell_reader(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) ->
     stored = split_streams(
         data[len(head_bytes) :], count=head.streams, raw_bytes_max=min(RAW_BYTES_MAX, head.raw_bytes_max)
     )
+    _check_effort(head, stored)
     return CellReader(head, head_bytes, stored, sampled_max)
+
+
+def _check_effort(head: CellHead, stored: dict[int, StoredStream]) -> None:
+    """Refuse modelled groups of too few bytes on the head's word, before a leaf is looked for."""
+    masks = sum(stored[number].raw_bytes for number in (CHILD_MASKS, LEAF_MASKS) if number in stored)
+    firsts = [HITS, *(channel_streams.stream_of_channel(c) for c in range(len(head.geometry.channels)))]
+    for first, numbers in {CHILD_MASKS: masks, **dict.fromkeys(firsts, head.leaves)}.items():
+        if first in stored and stored[first].coding == MODELLED:
+            check_effort(numbers, stored[first].body)
 
 
 def _prefix(stream: StoredStream, most: int) -> bytes:

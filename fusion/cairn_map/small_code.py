@@ -27,7 +27,6 @@ from cairn_map.modelled import (
     Bytes,
     Code,
     Coder,
-    check_effort,
     read_modelled,
     write_modelled,
 )
@@ -71,7 +70,6 @@ def decode_masks(data: bytes, *, child_count: int, leaf_count: int, depth: int, 
     Raises:
         DamagedDataError: there are other numbers of masks.
     """
-    check_effort(child_count + leaf_count, data)
     child_masks, leaf_masks = np.zeros(child_count, np.uint8), np.zeros(leaf_count, np.uint8)
     read = np.frombuffer(data, np.uint8).copy()
     coder = start_decoding(read)
@@ -95,7 +93,6 @@ def decode_counts(data: bytes, ground: Ground) -> npt.NDArray[np.int32]:
         DamagedDataError: a count is out of range.
     """
     counts = np.zeros((len(ground.octree.starts), 2), np.int32)
-    check_effort(len(counts), data)
     read_modelled(_counts_coder(counts, ground), data)
     return counts
 
@@ -132,7 +129,6 @@ def decode_channel(
     Raises:
         DamagedDataError: a weight or sum is out of range.
     """
-    check_effort(len(hits), data)
     found: list[ChannelRows] = []
 
     def code(coder: Coder, read: Bytes) -> bool:

@@ -49,6 +49,40 @@ def random_evidence(seed: int, geometry: Geometry, *, voxels: int = 40, air: int
     return packed_evidence(places.astype(np.uint32), counts, samples, geometry)
 
 
+def surface_evidence(seed: int, geometry: Geometry) -> Evidence:
+    """Evidence as scans of a wall make it: a smooth sheet with smooth colours, noise on both, seen-through air before it.
+
+    Counts fall off to one side; the air's misses are alike in large parts, so that it collapses; some of the sheet
+    has no samples, and some of its voxels were missed.
+    """
+    rng = np.random.default_rng(seed)
+    side = 2**geometry.depth
+    x, y = np.meshgrid(np.arange(side), np.arange(side), indexing="ij")
+    tilt = rng.uniform(-0.3, 0.3, 2)
+    height = side * rng.uniform(0.4, 0.6) + tilt[0] * (x - side / 2) + tilt[1] * (y - side / 2)
+    height = np.clip(np.rint(height + side / 16 * np.sin(x * 6 / side)), 0, side - 1).astype(np.int64)
+    z = np.arange(side)[None, None, :]
+    air, wall = z < height[..., None], (z == height[..., None]) & (rng.random((side, side, 1)) < 0.95)
+    xyz = np.stack(np.nonzero(air | wall), axis=1)
+    hit = wall[tuple(xyz.T)]
+    near = 1 + xyz[:, 0] * 4 // side
+    hits = np.where(hit, near + rng.poisson(1, len(xyz)), 0)
+    counts = np.stack([hits, np.where(hit, rng.poisson(0.3, len(xyz)), near + (rng.random(len(xyz)) < 0.02))], axis=1)
+    samples = np.zeros((len(xyz), geometry.plane_count), np.int64)
+    for channel in geometry.channels:
+        rows = np.nonzero(hit & (xyz[:, 1] < side * 0.8))[0]
+        weights = np.maximum(counts[rows, 0] - (rng.random(len(rows)) < 0.1), 1)
+        shades = 60 + rng.uniform(0, 3, channel.value_count) * (xyz[rows, :1] + 2 * xyz[rows, 1:2]) * 16 / side
+        noise = rng.normal(0, 2, (len(rows), channel.value_count))
+        sums = np.maximum(np.rint(shades * weights[:, None] + noise * np.sqrt(weights)[:, None]), 0).astype(np.int64)
+        columns = list(sums.T)
+        if "square_sum" in channel.planes:
+            columns.append(sums[:, 0] ** 2 // weights + weights * rng.integers(1, 9, len(rows)))
+        samples[rows, geometry.planes_of(channel.name)] = np.stack([*columns, weights], axis=1)
+    places = np.array([naive.interleave(*voxel) for voxel in xyz.tolist()], np.uint32)
+    return packed_evidence(places, counts, samples, geometry)
+
+
 @st.composite
 def any_evidence(draw: st.DrawFn, geometry: Geometry, low: int = 0, high: int = 1 << 62) -> Evidence:
     """Few voxels with numbers of any size."""
