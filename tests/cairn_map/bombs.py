@@ -22,6 +22,7 @@ from cairn_map.evidence import empty_evidence, packed_evidence
 from cairn_map.frames import frames_of, start_of_reply
 from cairn_map.grid import Geometry, cell_key
 from cairn_map.streams import HEAD as STREAM_HEAD
+from cairn_map.streams import MODELLED
 
 DEEP = Geometry(depth=8, channels=())
 COLOURS = tuple(Channel(kind=ChannelKind.COLOUR, name=f"c{n}") for n in range(16))
@@ -78,6 +79,23 @@ def cell_of_samples() -> bytes:
         raws[17 + 8 * c] = b"\x01" + b"\x01" * leaves
         raws |= {18 + 8 * c + p: b"\x00" for p in range(3)}
     return head(geometry, leaves, leaves, len(raws)) + b"".join(stream(n, raw) for n, raw in raws.items())
+
+
+def modelled(group: dict[int, int], body: bytes) -> bytes:
+    """Streams of one group, modelled, by their stated raw lengths."""
+    first = min(group)
+    return b"".join(
+        STREAM_HEAD.pack(n, MODELLED, size, len(body) if n == first else 0) + (body if n == first else b"")
+        for n, size in group.items()
+    )
+
+
+def modelled_air(masks: bytes, counts: bytes) -> bytes:
+    """16 M leaves: their masks, if none are given under zstd, and counts that a model says in so many bytes."""
+    child, leaf = (8**8 - 1) // 7, (8**7 - 1) // 7
+    plain = stream(1, b"\xff" * child) + stream(2, bytes(leaf))
+    topology = modelled({1: child, 2: leaf}, masks) if masks else plain
+    return head(DEEP, FULL, FULL, 4) + topology + modelled({3: 1 + FULL, 4: 1 + FULL}, counts)
 
 
 def commit_of(cells: list[bytes], geometry: Geometry = DEEP, *, count: int | None = None) -> bytes:
@@ -144,6 +162,13 @@ BOMBS: dict[str, Bomb] = {
             head(DEEP, FULL, FULL, 4) + stream(1, b"\xff" * (1 << 24)) + b"".join(stream(n, b"") for n in (2, 3, 4))
         ),
     ),
+    "cell: 16 M leaves of which a model tells in 2 bytes": (decode_cell, lambda: modelled_air(b"", b"\1\2")),
+    "cell: 2 M masks of which a model tells in 2 bytes": (decode_cell, lambda: modelled_air(b"\1\2", bytes(16384))),
+    "cell: 2 M masks of which a model tells in just enough bytes": (
+        decode_cell,
+        lambda: modelled_air(bytes(2700), bytes(16384)),
+    ),
+    "cell: modelled masks of 4 GiB": (decode_cell, lambda: head(DEEP, 1, 1, 2) + modelled({1: U32, 2: U32}, b"\1")),
     "cell: a gigabyte of samples": (decode_small_cell, cell_of_samples),
     "commit: a gigabyte of samples": (
         open_commit,

@@ -83,6 +83,13 @@ def surface_evidence(seed: int, geometry: Geometry) -> Evidence:
     return packed_evidence(places, counts, samples, geometry)
 
 
+def voxels_below(evidence: Evidence, place: int) -> Evidence:
+    """What of it lies before a place."""
+    V = int(np.searchsorted(evidence.voxels, place))
+    S = int(np.searchsorted(evidence.sampled, V))
+    return Evidence(evidence.voxels[:V], evidence.counts[:V], evidence.sampled[:S], evidence.samples[:S])
+
+
 @st.composite
 def any_evidence(draw: st.DrawFn, geometry: Geometry, low: int = 0, high: int = 1 << 62) -> Evidence:
     """Few voxels with numbers of any size."""

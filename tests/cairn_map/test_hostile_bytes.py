@@ -9,27 +9,32 @@ import subprocess
 import sys
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests import naive
 from tests.cairn_map.bombs import BOMBS, DEEP, cell_of_air, commit_of, largest_commit, reply
-from tests.cairn_map.made import KEY, SMALL, as_dict, made_commit, made_frames, random_evidence
+from tests.cairn_map.made import KEY, SMALL, as_dict, made_commit, made_frames, random_evidence, surface_evidence, voxels_below
 from tests.cairn_map.test_cell_code import recoded
 
 from cairn_map.brick_cell import brick_cell
-from cairn_map.cell_code import decode_cell, encode_cell
+from cairn_map.cell_code import Profile, decode_cell, encode_cell
+from cairn_map.cell_head import decode_head
+from cairn_map.cell_reading import cell_reader
 from cairn_map.commit import open_commit
 from cairn_map.errors import CairnError
 from cairn_map.evidence import Evidence
 from cairn_map.fingerprint import fingerprint
 from cairn_map.frames import FrameKind, encode_frame, frames_of, start_of_reply
 from cairn_map.grid import Geometry
+from cairn_map.streams import join_streams
 
 EVIDENCE = random_evidence(8, SMALL, voxels=12, air=1)
 CELL = encode_cell(KEY, EVIDENCE, SMALL).data
 PLAIN_CELL = recoded(CELL, level=None)
+MODELLED_CELL = encode_cell(KEY, voxels_below(surface_evidence(1, SMALL), 256), SMALL, profile=Profile.SMALL).data
 COMMIT = made_commit().data
 PLAIN_COMMIT = commit_of([PLAIN_CELL], SMALL)
 FRAMES = made_frames()
@@ -69,11 +74,12 @@ Reader = Callable[[bytes], None]
 READERS: list[tuple[Reader, bytes]] = [
     (read_cell, CELL),
     (read_cell, PLAIN_CELL),
+    (read_cell, MODELLED_CELL),
     (read_commit, COMMIT),
     (read_commit, PLAIN_COMMIT),
     (read_reply, REPLY),
 ]
-IDS = ["cell", "plain cell", "commit", "plain commit", "reply"]
+IDS = ["cell", "plain cell", "modelled cell", "commit", "plain commit", "reply"]
 every_reader = pytest.mark.parametrize(("read", "sound"), READERS, ids=IDS)
 
 
@@ -147,6 +153,30 @@ def test_damage_under_a_sound_checksum_is_refused_or_gives_something_sound(
     for at in data.draw(st.lists(st.integers(0, len(body) - 1), max_size=4)):
         body[at] = data.draw(st.integers(0, 255))
     survives(read_reply, reply(kind, bytes(body)))
+
+
+@pytest.mark.parametrize("first", [1, 3, 16, 24, 32, 40])
+def test_modelled_bytes_that_are_cut_or_followed_by_more_are_refused_or_give_something_sound(first: int) -> None:
+    """Under lengths that fit, so that the models read them."""
+    _, head = decode_head(MODELLED_CELL)
+    streams = cell_reader(MODELLED_CELL).stored
+    body = streams[first].body
+    others = [body[:size] for size in range(len(body))] + [
+        body + bytes([more]) * count for more in (0, 255) for count in (1, 4)
+    ]
+    for other in others:
+        changed = streams | {first: replace(streams[first], body=other)}
+        survives(read_cell, head + join_streams(list(changed.values())))
+
+
+@given(st.sampled_from([1, 3, 16, 24, 32, 40]), st.binary(max_size=200), st.integers(0, 60))
+def test_noise_in_place_of_modelled_bytes_is_refused_or_gives_something_sound(
+    first: int, noise: bytes, kept: int
+) -> None:
+    _, head = decode_head(MODELLED_CELL)
+    streams = cell_reader(MODELLED_CELL).stored
+    changed = streams | {first: replace(streams[first], body=streams[first].body[:kept] + noise)}
+    survives(read_cell, head + join_streams(list(changed.values())))
 
 
 @pytest.mark.parametrize("name", BOMBS)
