@@ -16,7 +16,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests import naive
 from tests.cairn_map.bombs import BOMBS, DEEP, cell_of_air, commit_of, largest_commit, reply
-from tests.cairn_map.made import KEY, SMALL, as_dict, made_commit, made_frames, random_evidence, surface_evidence, voxels_below
+from tests.cairn_map.made import (
+    KEY,
+    SMALL,
+    as_dict,
+    made_commit,
+    made_frames,
+    random_evidence,
+    surface_evidence,
+    voxels_below,
+)
 from tests.cairn_map.test_cell_code import recoded
 
 from cairn_map.brick_cell import brick_cell

@@ -10,8 +10,9 @@ import json
 from pathlib import Path
 
 import numpy as np
+from tests.naive import interleave
 
-from cairn_map.cell_code import encode_cell
+from cairn_map.cell_code import Profile, encode_cell
 from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
 from cairn_map.commit import CommitMeta, ScanPose, make_commit
 from cairn_map.cursor import Cursor
@@ -42,6 +43,25 @@ def evidence(sign: int = 1) -> Evidence:
         [n * w, 200 * w, (255 - n) * w, w, 90 * w + n, w, value * w, value**2 * w + n, w, n * w, w], axis=1
     )
     return packed_evidence(places.astype(np.uint32), sign * counts, sign * samples, GEOMETRY)
+
+
+def wall() -> Evidence:
+    """A tilted wall with all channels, seen-through air before it: what models pay for."""
+    x, y, z = np.indices((16, 16, 16)).reshape(3, -1)
+    surface = 8 + (2 * x + y) // 12
+    noise = (x * 73 + y * 151 + z * 283) % 7
+    hit = (z == surface) & (noise > 0)
+    there = (z < surface) | hit
+    x, y, z, noise, hit = x[there], y[there], z[there], noise[there], hit[there]
+    counts = np.where(hit[:, None], np.stack([2 + noise // 2, noise % 2], axis=1), [[0, 3]])
+    w = np.where(hit & (y < 14), 1 + noise // 3, 0)
+    value = 5800 + 3 * x + y + noise
+    red, green, blue = 100 + 4 * x + noise, 80 + 3 * y, 200 - 5 * x
+    samples = np.stack(
+        [red * w, green * w, blue * w, w, (90 + noise) * w, w, value * w, value**2 * w + noise * w, w, x * w, w], axis=1
+    )
+    places = [interleave(*voxel) for voxel in zip(x.tolist(), y.tolist(), z.tolist(), strict=True)]
+    return packed_evidence(np.array(places, np.uint32), counts, samples, GEOMETRY)
 
 
 def commit_bytes() -> bytes:
@@ -92,6 +112,7 @@ def made() -> dict[str, bytes]:
     """Name of each file, and its bytes as the code of today writes them."""
     return {
         "v1-all-channels.cell": encode_cell(KEY, evidence(), GEOMETRY).data,
+        "v1-small.cell": encode_cell(KEY, wall(), GEOMETRY, profile=Profile.SMALL).data,
         "v1-signed.cell": encode_cell(KEY, evidence(-1), GEOMETRY).data,
         "v1-empty.cell": encode_cell(KEY, empty_evidence(GEOMETRY), GEOMETRY).data,
         "v1.commit": commit_bytes(),

@@ -5,15 +5,17 @@ from pathlib import Path
 
 import pytest
 from tests import naive
-from tests.formats.make_formats import GEOMETRY, KEY, evidence
+from tests.formats.make_formats import GEOMETRY, KEY, evidence, wall
 
 from cairn_map.cell_code import decode_canonical_cell, decode_cell, encode_cell
+from cairn_map.cell_reading import cell_reader
 from cairn_map.commit import open_commit
 from cairn_map.fingerprint import fingerprint
 from cairn_map.frames import CellFrame, frames_of
+from cairn_map.streams import MODELLED
 
 FOLDER = Path(__file__).parent
-CELLS = ("v1-all-channels.cell", "v1-signed.cell", "v1-empty.cell")
+CELLS = ("v1-all-channels.cell", "v1-signed.cell", "v1-empty.cell", "v1-small.cell")
 
 
 def found() -> dict[str, object]:
@@ -41,6 +43,12 @@ def test_stored_cells_hold_the_evidence_that_was_put_in(name: str, sign: int) ->
     decoded = decode_canonical_cell((FOLDER / name).read_bytes())
     assert decoded.evidence == evidence(sign)
     assert (decoded.key, decoded.geometry) == (KEY, GEOMETRY)
+
+
+def test_the_stored_modelled_cell_holds_its_evidence_in_modelled_streams_alone() -> None:
+    data = (FOLDER / "v1-small.cell").read_bytes()
+    assert {stream.coding for stream in cell_reader(data).stored.values()} == {MODELLED}
+    assert decode_canonical_cell(data).evidence == wall()
 
 
 @pytest.mark.parametrize("name", CELLS)
