@@ -14,7 +14,7 @@ from typing import Any
 
 import zstandard
 from tests import naive_modelled
-from tests.naive_modelled import Coder
+from tests.naive_coding import Coder
 
 Voxel = tuple[int, int, tuple[int, ...]]
 Evidence = dict[int, Voxel]

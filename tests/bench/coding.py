@@ -1,8 +1,8 @@
 """How small evidence becomes in both profiles, and how fast: a robot's measurement, and the map of its path.
 
 Beside both stand the raw streams under zstd at its level 19, which knows bytes alone, and what no coder can do without:
-the noise of the sensors. Dense-equivalent rates count 8 bytes for each voxel of the cells, known or not, over process CPU
-time; the digest's SHA-256, which a reader may leave away, is stated on its own and subtracted.
+the noise of the sensors. Dense-equivalent rates count 8 bytes for each voxel of the cells, known or not, over process
+CPU time; the digest's SHA-256, which a reader may leave away, is stated on its own and subtracted.
 """
 
 import hashlib
@@ -106,7 +106,7 @@ def _size_rows(
     yield row("all streams", None)
     yield row("topology and counts", set(TOPOLOGY_AND_COUNTS))
     without = _without_values(cells, geometry)
-    geometry_without = replace_channels(geometry)
+    geometry_without = _weights_alone(geometry)
     slim = [encode_cell(key, part, geometry_without, profile=Profile.SMALL).data for key, part in without.items()]
     # The values there are all zeros; what they still cost is counted.
     ours = sum(_stored_bytes(data, None) for data in slim)
@@ -118,8 +118,8 @@ def _size_rows(
         yield row(channel.name, set(range(first, first + 1 + len(channel.planes))))
 
 
-def replace_channels(geometry: Geometry) -> Geometry:
-    """The geometry with channels of one value plane each."""
+def _weights_alone(geometry: Geometry) -> Geometry:
+    """The geometry with as many channels, of one value plane each."""
     channels = tuple(Channel(kind=ChannelKind.SCALAR, name=f"w{c}") for c in range(len(geometry.channels)))
     return Geometry(voxel_edge_um=geometry.voxel_edge_um, depth=geometry.depth, channels=channels)
 
@@ -136,13 +136,13 @@ def _without_values(cells: Diff, geometry: Geometry) -> Diff:
 
 
 def _noise_rows(diff: Diff, again: Diff, geometry: Geometry) -> Iterator[Row]:
-    """What the noise alone costs: entropy of a row's sums about what they would be without it.
+    """What the noise alone costs: the entropy of a row's sums about what they would be without it.
 
     Two measurements that differ in the noise's seed alone differ in a voxel's means by d, whose variance is
-    s^2 (1 / w + 1 / w'), and its sum's own deviation is s sqrt(w). For a normal d of any deviation the mean of log |d| is that
-    of the log deviation less (gamma + ln 2) / 2; so the mean entropy needs no voxels of equal noise. A sum is a whole
-    number; with a uniform number below 1 added, its differential entropy is its entropy. It is an estimate, not a
-    bound: noise that is not normal has less, and what two planes share would be counted twice.
+    s^2 (1 / w + 1 / w'), and its sum's own deviation is s sqrt(w). For a normal d of any deviation the mean of log |d|
+    is that of the log deviation less (gamma + ln 2) / 2; so the mean entropy needs no voxels of equal noise. A sum is
+    a whole number; with a uniform number below 1 added, its differential entropy is its entropy. It is an estimate,
+    not a bound: noise that is not normal has less, and what planes share counts for each.
     """
     rng = np.random.default_rng(1)
     coded = [encode_cell(key, part, geometry, profile=Profile.SMALL).data for key, part in diff.items()]
@@ -160,12 +160,8 @@ def _noise_rows(diff: Diff, again: Diff, geometry: Geometry) -> Iterator[Row]:
         first = stream_of_channel(c)
         stored = sum(_stored_bytes(data, set(range(first, first + 1 + len(channel.planes)))) for data in coded)
         rows = sum(int((part.samples[:, planes] != 0).any(axis=1).sum()) for part in diff.values())
-        yield (
-            f"  noise of {channel.name}, {plain} planes",
-            f"{bits:.1f}",
-            f"bits a row of {len(a)}; stored, with presence, weights{', squares' if plain < len(channel.planes) - 1 else ''}:"
-            f" {8 * stored / rows:.1f}",
-        )
+        name = f"  noise of {channel.name}'s sums"
+        yield name, f"{bits:.1f}", f"bits a row, of {len(a)} rows; all planes as stored: {8 * stored / rows:.1f}"
 
 
 def _common(a: Diff, b: Diff) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[type-arg]

@@ -50,7 +50,7 @@ def random_evidence(seed: int, geometry: Geometry, *, voxels: int = 40, air: int
 
 
 def surface_evidence(seed: int, geometry: Geometry) -> Evidence:
-    """Evidence as scans of a wall make it: a smooth sheet with smooth colours, noise on both, seen-through air before it.
+    """Evidence as scans of a wall make it: a smooth sheet, smooth colours, noise on both, seen-through air before it.
 
     Counts fall off to one side; the air's misses are alike in large parts, so that it collapses; some of the sheet
     has no samples, and some of its voxels were missed.

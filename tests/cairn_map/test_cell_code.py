@@ -4,7 +4,6 @@ import struct
 
 import numpy as np
 import pytest
-import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
 from tests import naive
@@ -19,15 +18,15 @@ from tests.cairn_map.made import (
     header_of,
     random_evidence,
 )
+from tests.cairn_map.stored import recoded
 
 from cairn_map.brick_cell import difference
 from cairn_map.cell_code import decode_canonical_cell, decode_cell, encode_cell
-from cairn_map.cell_head import decode_head
 from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence import SUM_MAX, Evidence, empty_evidence, packed_evidence
 from cairn_map.grid import Geometry, cell_key
 from cairn_map.octree import build_octree
-from cairn_map.streams import HEAD, split_streams
+from cairn_map.streams import HEAD
 
 CELLS = st.tuples(*[st.integers(-(1 << 20), (1 << 20) - 1)] * 3)
 MADE = st.builds(
@@ -36,18 +35,6 @@ MADE = st.builds(
     st.sampled_from(GEOMETRIES),
 )
 SIGNED = any_evidence(SMALL, low=-SUM_MAX)
-
-
-def recoded(data: bytes, *, level: int | None) -> bytes:
-    """The same cell with streams compressed at another level, or not at all."""
-    head, head_bytes = decode_head(data)
-    streams = split_streams(data[len(head_bytes) :], count=head.streams)
-    out = head_bytes
-    for number, stream in streams.items():
-        raw = stream.raw()
-        packed = raw if level is None else zstandard.ZstdCompressor(level=level, write_checksum=True).compress(raw)
-        out += HEAD.pack(number, level is not None, len(raw), len(packed)) + packed
-    return out
 
 
 @given(MADE, CELLS)

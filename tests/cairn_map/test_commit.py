@@ -19,7 +19,7 @@ from tests.cairn_map.made import (
     made_meta,
     random_evidence,
 )
-from tests.cairn_map.test_cell_code import recoded
+from tests.cairn_map.stored import recoded
 
 from cairn_map.brick_cell import difference
 from cairn_map.cell_code import encode_cell

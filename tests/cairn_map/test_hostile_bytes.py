@@ -26,19 +26,16 @@ from tests.cairn_map.made import (
     surface_evidence,
     voxels_below,
 )
-from tests.cairn_map.test_cell_code import recoded
+from tests.cairn_map.stored import GROUPS, bodies_of, recoded, with_streams
 
 from cairn_map.brick_cell import brick_cell
 from cairn_map.cell_code import Profile, decode_cell, encode_cell
-from cairn_map.cell_head import decode_head
-from cairn_map.cell_reading import cell_reader
 from cairn_map.commit import open_commit
 from cairn_map.errors import CairnError
 from cairn_map.evidence import Evidence
 from cairn_map.fingerprint import fingerprint
 from cairn_map.frames import FrameKind, encode_frame, frames_of, start_of_reply
 from cairn_map.grid import Geometry
-from cairn_map.streams import join_streams
 
 EVIDENCE = random_evidence(8, SMALL, voxels=12, air=1)
 CELL = encode_cell(KEY, EVIDENCE, SMALL).data
@@ -164,28 +161,24 @@ def test_damage_under_a_sound_checksum_is_refused_or_gives_something_sound(
     survives(read_reply, reply(kind, bytes(body)))
 
 
-@pytest.mark.parametrize("first", [1, 3, 16, 24, 32, 40])
+@pytest.mark.parametrize("first", list(GROUPS))
 def test_modelled_bytes_that_are_cut_or_followed_by_more_are_refused_or_give_something_sound(first: int) -> None:
     """Under lengths that fit, so that the models read them."""
-    _, head = decode_head(MODELLED_CELL)
-    streams = cell_reader(MODELLED_CELL).stored
-    body = streams[first].body
+    stream = bodies_of(MODELLED_CELL)[first]
+    body = stream.body
     others = [body[:size] for size in range(len(body))] + [
         body + bytes([more]) * count for more in (0, 255) for count in (1, 4)
     ]
     for other in others:
-        changed = streams | {first: replace(streams[first], body=other)}
-        survives(read_cell, head + join_streams(list(changed.values())))
+        survives(read_cell, with_streams(MODELLED_CELL, replace(stream, body=other)))
 
 
-@given(st.sampled_from([1, 3, 16, 24, 32, 40]), st.binary(max_size=200), st.integers(0, 60))
+@given(st.sampled_from(list(GROUPS)), st.binary(max_size=200), st.integers(0, 60))
 def test_noise_in_place_of_modelled_bytes_is_refused_or_gives_something_sound(
     first: int, noise: bytes, kept: int
 ) -> None:
-    _, head = decode_head(MODELLED_CELL)
-    streams = cell_reader(MODELLED_CELL).stored
-    changed = streams | {first: replace(streams[first], body=streams[first].body[:kept] + noise)}
-    survives(read_cell, head + join_streams(list(changed.values())))
+    stream = bodies_of(MODELLED_CELL)[first]
+    survives(read_cell, with_streams(MODELLED_CELL, replace(stream, body=stream.body[:kept] + noise)))
 
 
 @pytest.mark.parametrize("name", BOMBS)

@@ -1,10 +1,8 @@
-"""Modelled streams, profile small: against a twin written from the page, their laws, and reading in parts."""
-
-from collections.abc import Callable
+"""Modelled streams, profile small: against a twin written from the page, and their laws."""
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tests import naive
 from tests.cairn_map.made import (
@@ -20,17 +18,14 @@ from tests.cairn_map.made import (
     random_evidence,
     surface_evidence,
 )
-from tests.cairn_map.test_cell_code import recoded
+from tests.cairn_map.stored import GROUPS, bodies_of, recoded, with_streams
 
 from cairn_map.cell_code import Profile, decode_canonical_cell, decode_cell, encode_cell, recompressed_cell
-from cairn_map.cell_head import decode_head
-from cairn_map.cell_reading import cell_reader
-from cairn_map.channel_streams import stream_of_channel
 from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
-from cairn_map.errors import CairnError, DamagedDataError
+from cairn_map.errors import DamagedDataError
 from cairn_map.evidence import COUNT_MAX, SUM_MAX, Evidence, empty_evidence, packed_evidence
 from cairn_map.grid import Geometry
-from cairn_map.streams import MODELLED, STORED, StoredStream, join_streams
+from cairn_map.streams import MODELLED
 
 CELL = (-1, 0, 2)
 SIXTEEN = Geometry(depth=4, channels=tuple(Channel(kind=ChannelKind.INTENSITY, name=f"i{n}") for n in range(16)))
@@ -49,34 +44,7 @@ SMOOTH = st.builds(
     st.sampled_from((SMALL, PLAIN, WARM)),
 )
 EXTREME = st.sampled_from(ALL).flatmap(lambda geometry: st.tuples(any_evidence(geometry), st.just(geometry)))
-GROUPS = {1: [1, 2], 3: [3, 4], 16: [16, 17, 18, 19, 20], 24: [24, 25, 26], 32: [32, 33, 34, 35], 40: [40, 41, 42]}
-"""Of `SMALL`: each group's streams by the first."""
 Made = tuple[Evidence, Geometry]
-
-
-def bodies_of(data: bytes) -> dict[int, StoredStream]:
-    """The streams of a cell as they are stored."""
-    return cell_reader(data).stored
-
-
-def with_streams(data: bytes, **changed: StoredStream) -> bytes:
-    """The cell with some streams, s1, s2, ..., changed."""
-    _, head = decode_head(data)
-    streams = bodies_of(data) | {int(name[1:]): stream for name, stream in changed.items()}
-    return head + join_streams(list(streams.values()))
-
-
-def garbled(data: bytes, keep: Callable[[int], bool]) -> bytes:
-    """The cell with other bytes, as many, in all streams but those to keep."""
-    streams = bodies_of(data).values()
-    return with_streams(
-        data,
-        **{
-            f"s{s.number}": StoredStream(s.number, s.coding, s.raw_bytes, bytes(b ^ 0x5A for b in s.body))
-            for s in streams
-            if not keep(s.number)
-        },
-    )
 
 
 def full_evidence(geometry: Geometry) -> Evidence:
@@ -243,136 +211,8 @@ def test_a_modelled_signed_cell_is_refused(first: int) -> None:
         encode_cell(KEY, evidence, SMALL, profile=Profile.SMALL).data,
         recoded(encode_cell(KEY, evidence, SMALL).data, level=None),
     )
-    group = {f"s{number}": bodies_of(small)[number] for number in GROUPS[first]}
-    mixed = bytearray(with_streams(raw, **group))
+    mixed = bytearray(with_streams(raw, *(bodies_of(small)[number] for number in GROUPS[first])))
     assert decode_cell(bytes(mixed)).evidence == evidence
     mixed[7] |= 1
     with pytest.raises(DamagedDataError, match="modelled in part, or in a signed cell"):
         decode_cell(bytes(mixed))
-
-
-# --- Reading in part --------------------------------------------------------------------------------------------
-
-
-def topology(data: bytes, depth: int) -> list[tuple[int, int]]:
-    octree = cell_reader(data).topology(depth)
-    return list(zip(octree.starts.tolist(), octree.sizes.tolist(), strict=True))
-
-
-@settings(max_examples=25)
-@given(st.one_of(RANDOM, SMOOTH), st.sampled_from(Profile))
-def test_topology_is_what_the_evidence_says_whatever_the_other_streams_do(made: Made, profile: Profile) -> None:
-    evidence, geometry = made
-    root = naive.tree_of(as_dict(evidence), geometry.depth)
-    data = encode_cell(KEY, evidence, geometry, profile=profile).data
-    for depth in range(1, geometry.depth + 1):
-        expected = naive.leaves_above(root, geometry.depth, depth)
-        assert topology(data, depth) == expected
-        assert topology(garbled(data, lambda number: number <= 2), depth) == expected
-
-
-@pytest.mark.parametrize("geometry", [SMALL, MIDDLE])
-def test_masks_behind_the_depth_asked_for_are_not_looked_at(geometry: Geometry) -> None:
-    evidence = surface_evidence(3, geometry)
-    data = recoded(encode_cell(KEY, evidence, geometry).data, level=None)
-    octree = cell_reader(data).octree()
-    for depth in range(1, geometry.depth):
-        sound = cell_reader(data).topology(depth)
-        child, leaf = len(sound.child_masks), len(sound.leaf_masks)
-        streams = bodies_of(data)
-        masks = {
-            f"s{number}": StoredStream(
-                number, STORED, streams[number].raw_bytes, streams[number].body[:kept] + bytes(count - kept)
-            )
-            for number, kept, count in ((1, child, len(octree.child_masks)), (2, leaf, len(octree.leaf_masks)))
-        }
-        cut = with_streams(data, **masks)
-        assert topology(cut, depth) == topology(data, depth)
-        with pytest.raises(CairnError):
-            cell_reader(cut).octree()
-
-
-@pytest.mark.parametrize("profile", Profile)
-@pytest.mark.parametrize("c", range(len(SMALL.channels)))
-def test_a_channel_alone_is_that_of_the_whole_whatever_later_streams_do(profile: Profile, c: int) -> None:
-    evidence = surface_evidence(6, SMALL)
-    data = encode_cell(KEY, evidence, SMALL, profile=profile).data
-    later = garbled(data, lambda number: number < stream_of_channel(c + 1))
-    for cell in (data, later):
-        reader = cell_reader(cell)
-        rows, starts = reader.channel(c), reader.octree().starts
-        found = dict(zip(starts[rows.leaves].tolist(), map(tuple, rows.sums.tolist()), strict=True))
-        planes = SMALL.planes_of(SMALL.channels[c].name)
-        expected = {place: sums[planes] for place, (_, _, sums) in as_dict(evidence).items() if any(sums[planes])}
-        assert found == expected
-
-
-@pytest.mark.parametrize("c", range(len(SMALL.channels)))
-def test_a_fast_channel_is_read_without_those_before_it(c: int) -> None:
-    data = encode_cell(KEY, surface_evidence(6, SMALL), SMALL).data
-    own = garbled(data, lambda number: number < 16 or number // 8 == stream_of_channel(c) // 8)
-    found, expected = cell_reader(own).channel(c), cell_reader(data).channel(c)
-    assert found.leaves.tolist() == expected.leaves.tolist()
-    assert found.sums.tolist() == expected.sums.tolist()
-
-
-# --- Damage that needs a hand ------------------------------------------------------------------------------------
-
-SURFACE = encode_cell(KEY, surface_evidence(1, SMALL), SMALL, profile=Profile.SMALL).data
-
-
-def refused(data: bytes) -> CairnError:
-    with pytest.raises(CairnError) as caught:
-        decode_cell(data)
-    return caught.value
-
-
-@pytest.mark.parametrize("number", [number for group in GROUPS.values() for number in group])
-def test_a_raw_length_that_does_not_fit_is_refused(number: int) -> None:
-    stream = bodies_of(SURFACE)[number]
-    for off in (-1, 1):
-        other = StoredStream(number, MODELLED, stream.raw_bytes + off, stream.body)
-        assert refused(with_streams(SURFACE, **{f"s{number}": other})).kind in ("bad_stream", "bad_octree", "bad_cell")
-
-
-@pytest.mark.parametrize("number", [number for group in GROUPS.values() for number in group])
-def test_a_group_modelled_in_part_is_refused(number: int) -> None:
-    raw = bodies_of(recoded(encode_cell(KEY, surface_evidence(1, SMALL), SMALL).data, level=None))[number]
-    assert "modelled in part" in refused(with_streams(SURFACE, **{f"s{number}": raw})).message
-
-
-@pytest.mark.parametrize("number", [number for group in GROUPS.values() for number in group[1:]])
-def test_stored_bytes_of_what_the_first_stream_says_are_refused(number: int) -> None:
-    stream = StoredStream(number, MODELLED, bodies_of(SURFACE)[number].raw_bytes, b"\0")
-    assert "modelled in part" in refused(with_streams(SURFACE, **{f"s{number}": stream})).message
-
-
-@pytest.mark.parametrize("first", GROUPS)
-@pytest.mark.parametrize("change", ["cut", "longer", "nothing", "a zero before"])
-def test_a_group_of_other_length_is_refused(first: int, change: str) -> None:
-    """By more than three bytes: up to three that a reader takes for zeros may be left away."""
-    stream = bodies_of(SURFACE)[first]
-    body = {
-        "cut": stream.body[:-8],
-        "longer": stream.body + bytes(4),
-        "nothing": b"",
-        "a zero before": b"\0" + stream.body,
-    }[change]
-    refused(with_streams(SURFACE, **{f"s{first}": StoredStream(first, MODELLED, stream.raw_bytes, body)}))
-
-
-def test_stored_bytes_that_are_too_few_for_the_leaves_are_refused_on_the_heads_word() -> None:
-    """And so before the masks are looked at, which here are none."""
-    head, _ = decode_head(SURFACE)
-    for first in GROUPS:
-        streams = [StoredStream(n, STORED, 0, b"") for group in GROUPS.values() for n in group]
-        streams = [
-            StoredStream(s.number, MODELLED, 70_000 if first == 1 else 0, b"\1" * 2 if s.number == first else b"")
-            if s.number in GROUPS[first]
-            else s
-            for s in streams
-        ]
-        data = bytearray(SURFACE[: len(decode_head(SURFACE)[1])])
-        data[6], data[24:32] = 8, (20_000).to_bytes(4, "little") * 2
-        assert "cannot say" in str(refused(bytes(data) + join_streams(streams)))
-    assert head.leaves < 20_000

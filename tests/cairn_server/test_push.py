@@ -41,7 +41,7 @@ def test_the_same_id_with_other_bytes_is_refused_and_audited(live: Live, caplog:
 
 
 def test_a_recompressed_commit_is_the_same_commit(live: Live) -> None:
-    from tests.cairn_map.test_cell_code import recoded
+    from tests.cairn_map.stored import recoded
     from tests.cairn_map.test_commit import commit_bytes
 
     row = live.new_map()

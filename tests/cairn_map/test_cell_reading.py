@@ -1,0 +1,139 @@
+"""Cells read in part, and groups of streams that do not fit each other."""
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests import naive
+from tests.cairn_map.made import KEY, MIDDLE, SMALL, as_dict, surface_evidence
+from tests.cairn_map.stored import GROUPS, bodies_of, garbled, recoded, with_streams
+from tests.cairn_map.test_small_code import RANDOM, SMOOTH, Made
+
+from cairn_map.cell_code import Profile, decode_cell, encode_cell
+from cairn_map.cell_head import decode_head
+from cairn_map.cell_reading import cell_reader
+from cairn_map.channel_streams import stream_of_channel
+from cairn_map.errors import CairnError
+from cairn_map.grid import Geometry
+from cairn_map.streams import MODELLED, STORED, StoredStream, join_streams
+
+
+def topology(data: bytes, depth: int) -> list[tuple[int, int]]:
+    octree = cell_reader(data).topology(depth)
+    return list(zip(octree.starts.tolist(), octree.sizes.tolist(), strict=True))
+
+
+@settings(max_examples=25)
+@given(st.one_of(RANDOM, SMOOTH), st.sampled_from(Profile))
+def test_topology_is_what_the_evidence_says_whatever_the_other_streams_do(made: Made, profile: Profile) -> None:
+    evidence, geometry = made
+    root = naive.tree_of(as_dict(evidence), geometry.depth)
+    data = encode_cell(KEY, evidence, geometry, profile=profile).data
+    for depth in range(1, geometry.depth + 1):
+        expected = naive.leaves_above(root, geometry.depth, depth)
+        assert topology(data, depth) == expected
+        assert topology(garbled(data, lambda number: number <= 2), depth) == expected
+
+
+@pytest.mark.parametrize("geometry", [SMALL, MIDDLE])
+def test_masks_behind_the_depth_asked_for_are_not_looked_at(geometry: Geometry) -> None:
+    evidence = surface_evidence(3, geometry)
+    data = recoded(encode_cell(KEY, evidence, geometry).data, level=None)
+    for depth in range(1, geometry.depth):
+        sound = cell_reader(data).topology(depth)
+        child, leaf = len(sound.child_masks), len(sound.leaf_masks)
+        masks = [
+            replace(stream, body=stream.body[:kept] + bytes(len(stream.body) - kept))
+            for stream, kept in ((bodies_of(data)[1], child), (bodies_of(data)[2], leaf))
+        ]
+        cut = with_streams(data, *masks)
+        assert topology(cut, depth) == topology(data, depth)
+        with pytest.raises(CairnError):
+            cell_reader(cut).octree()
+
+
+@pytest.mark.parametrize("profile", Profile)
+@pytest.mark.parametrize("c", range(len(SMALL.channels)))
+def test_a_channel_alone_is_that_of_the_whole_whatever_later_streams_do(profile: Profile, c: int) -> None:
+    evidence = surface_evidence(6, SMALL)
+    data = encode_cell(KEY, evidence, SMALL, profile=profile).data
+    later = garbled(data, lambda number: number < stream_of_channel(c + 1))
+    for cell in (data, later):
+        reader = cell_reader(cell)
+        rows, starts = reader.channel(c), reader.octree().starts
+        found = dict(zip(starts[rows.leaves].tolist(), map(tuple, rows.sums.tolist()), strict=True))
+        planes = SMALL.planes_of(SMALL.channels[c].name)
+        expected = {place: sums[planes] for place, (_, _, sums) in as_dict(evidence).items() if any(sums[planes])}
+        assert found == expected
+
+
+@pytest.mark.parametrize("c", range(len(SMALL.channels)))
+def test_a_fast_channel_is_read_without_those_before_it(c: int) -> None:
+    data = encode_cell(KEY, surface_evidence(6, SMALL), SMALL).data
+    own = garbled(data, lambda number: number < 16 or number // 8 == stream_of_channel(c) // 8)
+    found, expected = cell_reader(own).channel(c), cell_reader(data).channel(c)
+    assert found.leaves.tolist() == expected.leaves.tolist()
+    assert found.sums.tolist() == expected.sums.tolist()
+
+
+# --- Damage that needs a hand ------------------------------------------------------------------------------------
+
+SURFACE = encode_cell(KEY, surface_evidence(1, SMALL), SMALL, profile=Profile.SMALL).data
+
+
+def refused(data: bytes) -> CairnError:
+    with pytest.raises(CairnError) as caught:
+        decode_cell(data)
+    return caught.value
+
+
+@pytest.mark.parametrize("number", [number for group in GROUPS.values() for number in group])
+def test_a_raw_length_that_does_not_fit_is_refused(number: int) -> None:
+    stream = bodies_of(SURFACE)[number]
+    for off in (-1, 1):
+        other = StoredStream(number, MODELLED, stream.raw_bytes + off, stream.body)
+        assert refused(with_streams(SURFACE, other)).kind in ("bad_stream", "bad_octree", "bad_cell")
+
+
+@pytest.mark.parametrize("number", [number for group in GROUPS.values() for number in group])
+def test_a_group_modelled_in_part_is_refused(number: int) -> None:
+    raw = bodies_of(recoded(encode_cell(KEY, surface_evidence(1, SMALL), SMALL).data, level=None))[number]
+    assert "modelled in part" in refused(with_streams(SURFACE, raw)).message
+
+
+@pytest.mark.parametrize("number", [number for group in GROUPS.values() for number in group[1:]])
+def test_stored_bytes_of_what_the_first_stream_says_are_refused(number: int) -> None:
+    stream = StoredStream(number, MODELLED, bodies_of(SURFACE)[number].raw_bytes, b"\0")
+    assert "modelled in part" in refused(with_streams(SURFACE, stream)).message
+
+
+@pytest.mark.parametrize("first", GROUPS)
+@pytest.mark.parametrize("change", ["cut", "longer", "nothing", "a zero before"])
+def test_a_group_of_other_length_is_refused(first: int, change: str) -> None:
+    """By more than three bytes: up to three that a reader takes for zeros may be left away."""
+    stream = bodies_of(SURFACE)[first]
+    body = {
+        "cut": stream.body[:-8],
+        "longer": stream.body + bytes(4),
+        "nothing": b"",
+        "a zero before": b"\0" + stream.body,
+    }[change]
+    refused(with_streams(SURFACE, StoredStream(first, MODELLED, stream.raw_bytes, body)))
+
+
+def test_stored_bytes_that_are_too_few_for_the_leaves_are_refused_on_the_heads_word() -> None:
+    """And so before the masks are looked at, which here are none."""
+    head, _ = decode_head(SURFACE)
+    for first in GROUPS:
+        streams = [StoredStream(n, STORED, 0, b"") for group in GROUPS.values() for n in group]
+        streams = [
+            StoredStream(s.number, MODELLED, 70_000 if first == 1 else 0, b"\1" * 2 if s.number == first else b"")
+            if s.number in GROUPS[first]
+            else s
+            for s in streams
+        ]
+        data = bytearray(SURFACE[: len(decode_head(SURFACE)[1])])
+        data[6], data[24:32] = 8, (20_000).to_bytes(4, "little") * 2
+        assert "cannot say" in str(refused(bytes(data) + join_streams(streams)))
+    assert head.leaves < 20_000
