@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from tests.bench.coding import coding_rows
 from tests.bench.integration import integration_rows
 from tests.bench.peers import peer_rows
 from tests.bench.simulation import simulation_rows
@@ -31,7 +32,7 @@ from cairn_fusion.importers import open_source
 from cairn_fusion.measurement import Measurement
 from cairn_fusion.scan import Scan
 from cairn_map.brick_cell import brick_cell
-from cairn_map.cell_code import decode_canonical_cell, decode_cell, encode_cell
+from cairn_map.cell_code import decode_canonical_cell, encode_cell
 from cairn_map.channels import COLOUR, TEMPERATURE, Channel
 from cairn_map.commit import CommitMeta, make_commit
 from cairn_map.evidence import Evidence
@@ -54,6 +55,7 @@ def main() -> None:
     smoke = parser.parse_args().smoke
     scans = _room_scans(stop_count=2 if smoke else 8, yaws=4 if smoke else 12)
     rows = [*_kernel_rows(scans, repeats=3 if smoke else 15), *_server_rows(scans, pushes=20 if smoke else 300)]
+    rows += coding_rows(smoke)
     rows += integration_rows(smoke)
     rows += peer_rows(smoke)
     rows += simulation_rows(smoke)
@@ -98,8 +100,6 @@ def _kernel_rows(scans: list[list[Scan]], *, repeats: int) -> Iterator[Row]:
     voxels = len(evidence)
     yield "fullest cell of a measurement", f"{voxels}", "known voxels"
     for name, work in (
-        ("encode it", lambda: encode_cell(key, evidence, geometry)),
-        ("decode it", lambda: decode_cell(data)),
         ("decode and check canonical", lambda: decode_canonical_cell(data)),
         ("merge it into a cell", lambda: brick_cell(geometry, [evidence])),
         ("fingerprint it", lambda: fingerprint(evidence, key)),
@@ -115,13 +115,9 @@ def _kernel_rows(scans: list[list[Scan]], *, repeats: int) -> Iterator[Row]:
     total = EvidenceMap(geometry)
     for diff in diffs:
         total.merge(diff)
-    cells = [len(encode_cell(k, e, geometry).data) for k, e in total.packed().items()]
     known = sum(len(e) for e in total.packed().values())
-    yield f"map of {len(diffs)} measurements", f"{sum(cells)}", f"B in {len(cells)} cells, {known} known voxels"
-    yield "  bytes per cell, mean / largest", f"{statistics.mean(cells):.0f}", f"/ {max(cells)} B"
-    dense = len(cells) * 8 * 8**geometry.depth
-    yield "  against dense 8 B voxels (Table 3)", f"1:{dense / sum(cells):.0f}", ""
-    yield "  memory of the map", f"{total.size_bytes / 1e6:.1f}", f"MB = {total.size_bytes / known:.1f} B a known voxel"
+    name, size_bytes = f"memory of a map of {len(diffs)} measurements", total.size_bytes
+    yield name, f"{size_bytes / 1e6:.1f}", f"MB = {size_bytes / known:.1f} B a known voxel"
     yield from _merge_rows(total, diffs[-1], repeats=repeats)
 
 

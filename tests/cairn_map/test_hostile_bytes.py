@@ -40,7 +40,7 @@ from cairn_map.grid import Geometry
 EVIDENCE = random_evidence(8, SMALL, voxels=12, air=1)
 CELL = encode_cell(KEY, EVIDENCE, SMALL).data
 PLAIN_CELL = recoded(CELL, level=None)
-MODELLED_CELL = encode_cell(KEY, voxels_below(surface_evidence(1, SMALL), 256), SMALL, profile=Profile.SMALL).data
+MODELLED_CELL = encode_cell(KEY, voxels_below(surface_evidence(1, SMALL), 128), SMALL, profile=Profile.SMALL).data
 COMMIT = made_commit().data
 PLAIN_COMMIT = commit_of([PLAIN_CELL], SMALL)
 FRAMES = made_frames()
