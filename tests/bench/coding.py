@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 import zstandard
 
 from cairn_fusion.integrate import Integrator, integrate_scans
@@ -30,6 +31,7 @@ from cairn_sim.scene_file import load_scene
 
 Row = tuple[str, str, str]
 Diff = dict[CellKey, Evidence]
+Ints = npt.NDArray[np.int64]
 DENSE_VOXEL_BYTES = 8
 TOPOLOGY_AND_COUNTS = (CHILD_MASKS, LEAF_MASKS, HITS, MISSES)
 
@@ -69,7 +71,7 @@ def _diffs(plan: Plan, geometry: Geometry) -> list[Diff]:
 
 def _set_rows(name: str, cells: Diff, geometry: Geometry, *, repeats: int) -> Iterator[Row]:
     """Rates and sizes of some cells."""
-    voxels, sampled = (sum(len(part) for part in parts) for parts in _parts(cells))
+    voxels, sampled = sum(map(len, cells.values())), sum(len(part.sampled) for part in cells.values())
     yield name, f"{len(cells)}", f"cells, {voxels} voxels, {sampled} with samples"
     fast, small = (_encoded(cells, geometry, profile) for profile in Profile)
     raw = [{n: s.raw() for n, s in cell_reader(data).stored.items()} for data in fast]
@@ -164,19 +166,16 @@ def _noise_rows(diff: Diff, again: Diff, geometry: Geometry) -> Iterator[Row]:
         yield name, f"{bits:.1f}", f"bits a row, of {len(a)} rows; all planes as stored: {8 * stored / rows:.1f}"
 
 
-def _common(a: Diff, b: Diff) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[type-arg]
+def _common(a: Diff, b: Diff) -> tuple[Ints, Ints]:
     """(R, P) samples of the voxels that both have samples of."""
-    found: list[list[np.ndarray]] = [[], []]  # type: ignore[type-arg]
+    left: list[Ints] = []
+    right: list[Ints] = []
     for key in sorted(a.keys() & b.keys()):
-        places = [part.voxels[part.sampled] for part in (a[key], b[key])]
-        _, *rows = np.intersect1d(*places, assume_unique=True, return_indices=True)
-        for out, part, row in zip(found, (a[key], b[key]), rows, strict=True):
-            out.append(part.samples[row])
-    return np.concatenate(found[0]), np.concatenate(found[1])
-
-
-def _parts(cells: Diff) -> tuple[list[np.ndarray], list[np.ndarray]]:  # type: ignore[type-arg]
-    return [part.voxels for part in cells.values()], [part.sampled for part in cells.values()]
+        one, other = a[key], b[key]
+        places, others = one.voxels[one.sampled], other.voxels[other.sampled]
+        left.append(one.samples[np.isin(places, others)])
+        right.append(other.samples[np.isin(others, places)])
+    return np.concatenate(left), np.concatenate(right)
 
 
 def _encoded(cells: Diff, geometry: Geometry, profile: Profile) -> list[bytes]:
