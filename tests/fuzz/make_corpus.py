@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import BaseModel
 from tests.cairn_map.made import GEOMETRIES, KEY, PLAIN, ROBOT, SMALL, made_commit, made_cursor, made_frames
 from tests.cairn_map.made import random_evidence as made_evidence
-from tests.cairn_map.test_cell_code import recoded
+from tests.cairn_map.stored import recoded
 from tests.fuzz.sections import joined
 
 from cairn_calib.camera import camera_from_field_of_view
