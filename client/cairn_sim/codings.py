@@ -7,7 +7,7 @@ from cairn_map.cell_code import Profile, decode_cell, encode_cell
 from cairn_map.evidence import Evidence
 from cairn_map.grid import CellKey, Geometry
 from cairn_map.sensor_model import SensorModel
-from cairn_map.view import FULL_STYLE
+from cairn_map.view import FULL_STYLE, Colours, ViewStyle
 from cairn_map.view_code import decode_view, encode_view
 from cairn_sim.pointer_octree import decode_pointer_octree, encode_pointer_octree, occupied_voxels
 
@@ -48,6 +48,10 @@ def _full_view(key: CellKey, evidence: Evidence, geometry: Geometry, model: Sens
     return encode_view(key, evidence, geometry, model, style=FULL_STYLE)
 
 
+def _coarse_view(key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel) -> bytes:
+    return encode_view(key, evidence, geometry, model, style=ViewStyle(colours=Colours.RGB_565))
+
+
 def _pointer_octree(key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel) -> bytes:
     return encode_pointer_octree(occupied_voxels(key, evidence, geometry, model))
 
@@ -79,6 +83,12 @@ VIEW = Coding(
     encode=_view,
     decode=decode_view,
 )
+COARSE_VIEW = Coding(
+    name="cairn, view, 5-6-5",
+    holds="the same with 5, 6 and 5 bits of red, green and blue.",
+    encode=_coarse_view,
+    decode=decode_view,
+)
 POINTER_OCTREE = Coding(
     name="pointer octree, zip",
     holds="the paper's method: of occupied voxels the log-odds, one colour and one temperature (8 B), under zip. "
@@ -86,4 +96,4 @@ POINTER_OCTREE = Coding(
     encode=_pointer_octree,
     decode=decode_pointer_octree,
 )
-CODINGS: tuple[Coding, ...] = (EXACT_FAST, EXACT_SMALL, FULL_VIEW, VIEW, POINTER_OCTREE)
+CODINGS: tuple[Coding, ...] = (EXACT_FAST, EXACT_SMALL, FULL_VIEW, VIEW, COARSE_VIEW, POINTER_OCTREE)

@@ -122,7 +122,7 @@ def _miss_contexts_into(
             value = signed(counts[near[i], 1])
             low, high, total, last = min(low, value), max(high, value), total + value, value
             known += 1
-            error += signed(errors[near[i]])
+            error += signed(errors[signed(near[i])])
             faces += 2 if counts[near[i], 0] > 0 else 1
     guess = last
     if known == 3:

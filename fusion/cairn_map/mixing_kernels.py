@@ -62,14 +62,14 @@ def code_mixed(
     opinions = contexts.shape[0]
     total = 0
     for i in range(opinions):
-        total += STRETCH[signed(odds[contexts[i] + slot]) >> 20] * weights[row, i]
+        total += STRETCH[signed(odds[signed(contexts[i]) + slot]) >> 20] * weights[row, i]
     chance = SQUASH[min(max(total >> 16, -STRETCH_MAX), STRETCH_MAX) + STRETCH_MAX + 1]
     bit, live = split(live, data, chance, 12, bit)
     error = ((bit << 12) - chance) * LEARNING
     for i in range(opinions):
-        opinion = STRETCH[signed(odds[contexts[i] + slot]) >> 20]
-        weights[row, i] += (opinion * error + ONE // 2) >> 16
-        learn(odds, contexts[i] + slot, bit)
+        context = signed(contexts[i]) + slot
+        weights[row, i] += (STRETCH[signed(odds[context]) >> 20] * error + ONE // 2) >> 16
+        learn(odds, context, bit)
     return bit, live
 
 

@@ -91,7 +91,7 @@ def earlier_rows(starts: Words, leaves: Ints, brick_of: Index, leaf_of: Index, d
     rows = np.full((leaves.shape[0], STEPS.shape[0]), NONE, np.int32)
     row_of = np.full(starts.shape[0], NONE, np.int32)
     for s in range(leaves.shape[0]):
-        place = signed(starts[leaves[s]])
+        place = signed(starts[signed(leaves[s])])
         for i in range(STEPS.shape[0]):
             leaf = leaf_at(brick_of, leaf_of, beside(place, i, depth))
             # What comes later has no number yet.

@@ -66,7 +66,7 @@ def build_into(
         while d >= 0 and key != after:
             if d > 0 and alike[d] != NO_ROW and children[d] == 255:
                 count -= 7
-                _add_child(children, leaves, alike, counts, d - 1, key & 7, alike[d])
+                _add_child(children, leaves, alike, counts, d - 1, key & 7, alike[d])  # pyright: ignore[reportArgumentType]
             else:
                 child_masks[d, masks[d]] = children[d]
                 leaf_masks[d, masks[d]] = leaves[d]

@@ -69,8 +69,9 @@ def code_weights(coder: Coder, data: Data, weights: Ints, references: Ints, near
     for s in range(weights.shape[0]):
         error = count = 0
         for i in range(near.shape[1]):
-            if near[s, i] != NONE:
-                error += errors[near[s, i]]
+            row = signed(near[s, i])
+            if row != NONE:
+                error += signed(errors[row])
                 count += 1
         error = min(half_log((4 * error) // count), 40) if count else 41
         reference = references[s]
