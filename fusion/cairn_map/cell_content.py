@@ -76,14 +76,17 @@ def count_streams(counts: npt.NDArray[np.int32], *, signed: bool) -> dict[int, b
     }
 
 
-def counts_of_streams(streams: dict[int, bytes], *, leaves: int, signed: bool) -> npt.NDArray[np.int32]:
-    """The mirror of `count_streams`.
+def counts_of_streams(
+    streams: dict[int, bytes], *, leaves: int, signed: bool, part: slice | None = None
+) -> npt.NDArray[np.int32]:
+    """The mirror of `count_streams`; of a part of the leaves, if one is given.
 
     Raises:
         DamagedDataError: a stream is missing, of the wrong length, or a count is out of range.
     """
-    counts = np.empty((leaves, 2), np.int32)
+    first, stop = (0, leaves) if part is None else (part.start, part.stop)
+    counts = np.empty((stop - first, 2), np.int32)
     for number, column in ((HITS, 0), (MISSES, 1)):
-        words = decode_column(required(streams, number), rows=leaves)
+        words = decode_column(required(streams, number), rows=leaves, first=first, stop=stop)
         counts[:, column] = channel_streams.numbers(words, signed, limit=COUNT_MAX)
     return counts

@@ -24,6 +24,7 @@ from cairn_map.cell_content import (
 from cairn_map.cell_head import CellHead, decode_head
 from cairn_map.channel_streams import ChannelRows
 from cairn_map.errors import BadInputError, DamagedDataError
+from cairn_map.grid import BRICK_DEPTH
 from cairn_map.modelled import check_effort
 from cairn_map.octree import Octree, parse_octree
 from cairn_map.small_code import Ground
@@ -127,6 +128,37 @@ class CellReader:
             self._channels[c] = rows
         return self._channels[c]
 
+    def bricks(self, first: int, stop: int) -> CellContent:
+        """What bricks of 8^3 voxels hold, from number `first` to before `stop`; leaves that reach beyond are cut off.
+
+        The octree is read whole. Of the other streams, unless they are modelled, only the counts of these leaves are,
+        and the samples up to them: no sum can be told without those before it.
+
+        Raises:
+            BadInputError: kind `bad_depth`: no such bricks; or as `content`.
+            DamagedDataError: as `content`.
+        """
+        head, octree = self.head, self.octree()
+        if not 0 <= first <= stop <= 8 ** (head.geometry.depth - BRICK_DEPTH):
+            raise BadInputError("bad_depth", f"a cell of depth {head.geometry.depth} has no bricks {first} to {stop}")
+        low, high = first << 3 * BRICK_DEPTH, stop << 3 * BRICK_DEPTH
+        begins = octree.starts.astype(np.int64)
+        lo, hi = int(np.searchsorted(begins + octree.sizes, low, "right")), int(np.searchsorted(begins, high))
+        hi = max(lo, hi)
+        if self._is_modelled([HITS, MISSES]):
+            counts = self.counts()[lo:hi]
+        else:
+            self._read([HITS, MISSES])
+            counts = counts_of_streams(self.raw, leaves=head.leaves, signed=head.signed, part=slice(lo, hi))
+        channels = [_between(self._channel_before(c, hi), lo, hi) for c in range(len(head.geometry.channels))]
+        sampled, samples = channel_streams.join_samples(
+            channels, head.geometry, leaves=hi - lo, signed=head.signed, sampled_max=self.sampled_max
+        )
+        starts = np.maximum(begins[lo:hi], low)
+        sizes = np.minimum(begins[lo:hi] + octree.sizes[lo:hi], high) - starts
+        part = Octree(octree.child_masks, octree.leaf_masks, starts.astype(np.uint32), sizes)
+        return CellContent(part, counts, sampled, samples)
+
     def content(self) -> CellContent:
         """All of it.
 
@@ -143,6 +175,23 @@ class CellReader:
             parts, head.geometry, leaves=head.leaves, signed=head.signed, sampled_max=self.sampled_max
         )
         return CellContent(octree, counts, sampled, samples)
+
+    def _channel_before(self, c: int, stop: int) -> ChannelRows:
+        """The samples of the leaves before one, or of all."""
+        first, channel = channel_streams.stream_of_channel(c), self.head.geometry.channels[c]
+        numbers = list(range(first, first + 1 + len(channel.planes)))
+        if c in self._channels or self._is_modelled(numbers):
+            return self.channel(c)
+        self._read(numbers)
+        return channel_streams.decode_channel(
+            first,
+            channel,
+            self.raw,
+            leaves=self.head.leaves,
+            signed=self.head.signed,
+            sampled_max=self.sampled_max,
+            stop=stop,
+        )
 
     def _topology(self, stop: int) -> Octree:
         depth = self.head.geometry.depth
@@ -220,6 +269,12 @@ def _check_effort(head: CellHead, stored: dict[int, StoredStream]) -> None:
     for first, numbers in {CHILD_MASKS: masks, **dict.fromkeys(firsts, head.leaves)}.items():
         if first in stored and stored[first].coding == MODELLED:
             check_effort(numbers, stored[first].body)
+
+
+def _between(rows: ChannelRows, first: int, stop: int) -> ChannelRows:
+    """Of the leaves from one to before another, numbered from the first on."""
+    part = slice(*np.searchsorted(rows.leaves, [first, stop]))
+    return ChannelRows(rows.leaves[part] - first, rows.sums[part])
 
 
 def _prefix(stream: StoredStream, most: int) -> bytes:

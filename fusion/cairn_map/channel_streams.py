@@ -93,9 +93,18 @@ def encode_channel(number: int, channel: Channel, rows: ChannelRows, *, leaves: 
 
 
 def decode_channel(
-    number: int, channel: Channel, streams: dict[int, bytes], *, leaves: int, signed: bool, sampled_max: int
+    number: int,
+    channel: Channel,
+    streams: dict[int, bytes],
+    *,
+    leaves: int,
+    signed: bool,
+    sampled_max: int,
+    stop: int | None = None,
 ) -> ChannelRows:
     """The mirror of `encode_channel`; sums may still be out of range, which `join_samples` looks at.
+
+    With `stop`, of the leaves before that one: each row stands on the one before it, so nothing can be left out there.
 
     Raises:
         DamagedDataError: a stream is missing or of the wrong length.
@@ -104,15 +113,16 @@ def decode_channel(
     present = np.nonzero(_presence(required(streams, number), leaves))[0]
     count = len(present)
     check_count(count, sampled_max)
-    weights = numbers(decode_column(required(streams, number + 1), rows=count), signed, limit=SUM_MAX)
+    last = count if stop is None else int(np.searchsorted(present, stop))
+    weights = numbers(decode_column(required(streams, number + 1), rows=count, stop=last), signed, limit=SUM_MAX)
     planes = [
-        restore_sums(decode_column(required(streams, number + 2 + p), rows=count), weights)
+        restore_sums(decode_column(required(streams, number + 2 + p), rows=count, stop=last), weights)
         for p in range(channel.value_count)
     ]
     if "square_sum" in channel.planes:
-        residuals = _unzigzag(decode_column(required(streams, number + 3), rows=count))
+        residuals = _unzigzag(decode_column(required(streams, number + 3), rows=count, stop=last))
         planes.append((residuals + square_guesses(planes[0], weights)).astype(np.int64))
-    return ChannelRows(present, np.stack([*planes, weights], axis=1))
+    return ChannelRows(present[:last], np.stack([*planes, weights], axis=1))
 
 
 def words(values: Ints, signed: bool) -> Words:

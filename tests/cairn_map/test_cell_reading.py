@@ -11,10 +11,11 @@ from tests.cairn_map.stored import GROUPS, bodies_of, garbled, recoded, with_str
 from tests.cairn_map.test_small_code import RANDOM, SMOOTH, Made
 
 from cairn_map.cell_code import Profile, decode_cell, encode_cell
+from cairn_map.cell_content import evidence_of
 from cairn_map.cell_head import decode_head
 from cairn_map.cell_reading import cell_reader
 from cairn_map.channel_streams import stream_of_channel
-from cairn_map.errors import CairnError
+from cairn_map.errors import BadInputError, CairnError
 from cairn_map.grid import Geometry
 from cairn_map.streams import MODELLED, STORED, StoredStream, join_streams
 
@@ -137,3 +138,37 @@ def test_stored_bytes_that_are_too_few_for_the_leaves_are_refused_on_the_heads_w
         data[6], data[24:32] = 8, (20_000).to_bytes(4, "little") * 2
         assert "cannot say" in str(refused(bytes(data) + join_streams(streams)))
     assert head.leaves < 20_000
+
+
+@settings(max_examples=40)
+@given(st.one_of(RANDOM, SMOOTH), st.sampled_from(Profile), st.data())
+def test_bricks_alone_hold_what_the_whole_holds_there(made: Made, profile: Profile, data: st.DataObject) -> None:
+    evidence, geometry = made
+    count = 8 ** (geometry.depth - 3)
+    first = data.draw(st.integers(0, count))
+    stop = data.draw(st.integers(first, count))
+    encoded = encode_cell(KEY, evidence, geometry, profile=profile).data
+    part = evidence_of(cell_reader(encoded).bricks(first, stop))
+    whole = as_dict(evidence)
+    assert as_dict(part) == {place: held for place, held in whole.items() if first << 9 <= place < stop << 9}
+
+
+def test_bricks_that_no_cell_has_are_refused() -> None:
+    reader = cell_reader(encode_cell(KEY, surface_evidence(3, MIDDLE), MIDDLE).data)
+    for first, stop in ((-1, 1), (2, 1), (0, 65)):
+        with pytest.raises(BadInputError, match="bricks"):
+            reader.bricks(first, stop)
+
+
+def test_samples_behind_the_bricks_asked_for_are_not_looked_at() -> None:
+    evidence = surface_evidence(3, MIDDLE)
+    data = recoded(encode_cell(KEY, evidence, MIDDLE).data, level=None)
+    head = cell_reader(data).head
+    # The highest byte of every plane of counts and sums belongs to the last leaf.
+    bodies = {number: stream for number, stream in bodies_of(data).items() if number in (3, 4) and stream.body[0] == 1}
+    assert bodies
+    damaged = with_streams(data, *(replace(s, body=s.body[:-1] + b"\xff") for s in bodies.values()))
+    sound = evidence_of(cell_reader(data).bricks(0, 20))
+    assert head.voxels > len(sound) > 0
+    assert evidence_of(cell_reader(damaged).bricks(0, 20)) == sound
+    assert decode_cell(damaged).evidence != evidence
