@@ -77,7 +77,7 @@ def encode_cell(
     parts = channel_streams.split_samples(content.sampled, content.samples, geometry)
     head, streams = _canonical(key, content, parts, geometry, voxels=len(evidence), signed=signed)
     stored = {stream.number: stream for stream in stored_streams(streams)}
-    if profile is Profile.SMALL and not signed:
+    if Profile(profile) is Profile.SMALL and not signed:
         for first, data in _modelled(content, parts, geometry).items():
             group = [number for number in streams if _group(number) == _group(first)]
             if data is not None and len(data) < sum(len(stored[number].body) for number in group):

@@ -7,14 +7,13 @@ CPU time; the digest's SHA-256, which a reader may leave away, is stated on its 
 
 import hashlib
 import math
-import statistics
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 import zstandard
+from tests.bench.timing import cpu_s
 
 from cairn_fusion.integrate import Integrator, integrate_scans
 from cairn_map.cell_code import Profile, decode_cell, encode_cell
@@ -75,7 +74,7 @@ def _set_rows(name: str, cells: Diff, geometry: Geometry, *, repeats: int) -> It
     yield name, f"{len(cells)}", f"cells, {voxels} voxels, {sampled} with samples"
     fast, small = (_encoded(cells, geometry, profile) for profile in Profile)
     raw = [{n: s.raw() for n, s in cell_reader(data).stored.items()} for data in fast]
-    digest_s = _cpu_s(lambda: [hashlib.sha256(stream).digest() for cell in raw for stream in cell.values()], repeats)
+    digest_s = cpu_s(lambda: [hashlib.sha256(stream).digest() for cell in raw for stream in cell.values()], repeats)
     dense = len(cells) * DENSE_VOXEL_BYTES * 8**geometry.depth
     yield "  digest, in each time below", f"{1e3 * digest_s:.1f}", "ms CPU, subtracted from the rates"
     for profile, coded in ((Profile.FAST, fast), (Profile.SMALL, small)):
@@ -84,7 +83,7 @@ def _set_rows(name: str, cells: Diff, geometry: Geometry, *, repeats: int) -> It
             "decode": lambda coded=coded: [decode_cell(data) for data in coded],  # type: ignore[misc]
         }
         for what, work in works.items():
-            seconds = _cpu_s(work, repeats)
+            seconds = cpu_s(work, repeats)
             rate = dense / (seconds - digest_s) / 1e9
             yield f"  {what}, {profile}", f"{1e3 * seconds:.0f}", f"ms CPU = {rate:.2f} GB/s dense-equivalent"
     yield from _size_rows(fast, small, raw, cells, geometry, dense)
@@ -191,13 +190,3 @@ def _zstd_bytes(raw: dict[int, bytes], numbers: set[int] | None) -> int:
     compressor = zstandard.ZstdCompressor(level=19, write_content_size=False, write_checksum=False)
     wanted = [stream for n, stream in raw.items() if numbers is None or n in numbers]
     return sum(min(len(stream), len(compressor.compress(stream))) for stream in wanted)
-
-
-def _cpu_s(work: Callable[[], object], repeats: int) -> float:
-    work()
-    seconds = []
-    for _ in range(repeats):
-        start = time.process_time()
-        work()
-        seconds.append(time.process_time() - start)
-    return statistics.median(seconds)

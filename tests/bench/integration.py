@@ -1,12 +1,12 @@
 """How fast a ToF measurement of the building becomes evidence, and how true the evidence is."""
 
-import statistics
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
+from tests.bench.timing import cpu_s, wall_s
 
 from cairn_calib.rig import Rig
 from cairn_calib.sensing import RangeSensing
@@ -47,13 +47,13 @@ def integration_rows(smoke: bool) -> Iterator[Row]:
 
     for edge_m in (0.08, 0.04) if smoke else (0.08, 0.04, 0.02):
         geometry = geometry_for(voxel_edge_m=edge_m)
-        carve_s = _cpu_s(work(geometry, Method.CARVE, 1), 2 if smoke else 7)
+        carve_s = cpu_s(work(geometry, Method.CARVE, 1), 2 if smoke else 7)
         name = f"integrate {len(scans)} ToF images, {edge_m * 100:g} cm, 1 thread"
         yield name, f"{1e3 * carve_s:.0f}", f"ms CPU = {rays / carve_s / 1e6:.1f} M rays/s"
         if not smoke:
-            cast_s = _cpu_s(work(geometry, Method.CAST, 1), 1 if edge_m < 0.04 else 3)
+            cast_s = cpu_s(work(geometry, Method.CAST, 1), 1 if edge_m < 0.04 else 3)
             yield "  ray by ray", f"{1e3 * cast_s:.0f}", f"ms CPU, {cast_s / carve_s:.1f} x as long"
-            one_s, two_s = (_wall_s(work(geometry, Method.CARVE, n), 5) for n in (1, 2))
+            one_s, two_s = (wall_s(work(geometry, Method.CARVE, n), 5) for n in (1, 2))
             yield "  2 threads", f"{1e3 * two_s:.0f}", f"ms wall, {one_s / two_s:.2f} x as fast"
     if not smoke:
         yield from _all_cameras_rows(plan)
@@ -67,7 +67,7 @@ def _all_cameras_rows(plan: Plan) -> Iterator[Row]:
     rig, geometry = full.robot.rig_of(0.25), geometry_for(voxel_edge_m=0.04)
     scans = [scan for _, scan, _ in scans_of(full, shots_of(full), rig)]
     integrator = Integrator()
-    seconds = _cpu_s(lambda: integrate_scans(scans, rig, geometry, integrator=integrator, threads=1), 5)
+    seconds = cpu_s(lambda: integrate_scans(scans, rig, geometry, integrator=integrator, threads=1), 5)
     yield f"integrate {len(scans)} scans of all cameras, 4 cm, 1 thread", f"{1e3 * seconds:.0f}", "ms CPU"
 
 
@@ -143,22 +143,3 @@ def _free_by_share(truth: Truth, diff: Diff, geometry: Geometry) -> npt.NDArray[
     """(4,) voxels called free that touch a solid, by how much of them is solid: the bounds of `SHARES`."""
     free = map_states(truth.box, diff, geometry, model=SensorModel()) == FREE
     return np.histogram(truth.solid_samples[free], [1, 8, 32, 64, 65])[0]
-
-
-def _cpu_s(work: Callable[[], object], repeats: int) -> float:
-    work()
-    seconds = []
-    for _ in range(repeats):
-        start = time.process_time()
-        work()
-        seconds.append(time.process_time() - start)
-    return statistics.median(seconds)
-
-
-def _wall_s(work: Callable[[], object], repeats: int) -> float:
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        seconds.append(time.perf_counter() - start)
-    return statistics.median(seconds)

@@ -11,14 +11,14 @@ import importlib
 import statistics
 import struct
 import tempfile
-import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import zstandard
 from tests.bench import octomap
+from tests.bench.timing import cpu_s
 
 from cairn_calib.rig import Rig
 from cairn_fusion.integrate import Integrator, integrate_scans
@@ -69,7 +69,7 @@ def _time_rows(
     coloured = geometry_for(voxel_edge_m=edge_m, channels=(COLOUR, TEMPERATURE))
     repeats = 5 if edge_m > 0.03 else 2
     bare_s, coloured_s = (
-        _cpu_s(lambda geometry=geometry: integrate_scans(scans, rig, geometry, integrator=Integrator(), threads=1), n)  # type: ignore[misc]
+        cpu_s(lambda geometry=geometry: integrate_scans(scans, rig, geometry, integrator=Integrator(), threads=1), n)  # type: ignore[misc]
         for geometry, n in ((bare, repeats), (coloured, repeats))
     )
     yield f"integrate {len(scans)} scans, {points} points, {edge_m * 100:g} cm", "", ""
@@ -167,13 +167,3 @@ def _zstd(data: bytes, level: int) -> bytes:
 
 def _against(ours: int, size: int) -> str:
     return f"B = {size / ours:.2f} x ours, fast"
-
-
-def _cpu_s(work: Callable[[], object], repeats: int) -> float:
-    work()
-    seconds = []
-    for _ in range(repeats):
-        start = time.process_time()
-        work()
-        seconds.append(time.process_time() - start)
-    return statistics.median(seconds)
