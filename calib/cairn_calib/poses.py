@@ -29,7 +29,7 @@ def checked_transform(values: npt.ArrayLike, *, name: str = "transform") -> Tran
     if not np.allclose(T[3], (0, 0, 0, 1), atol=1e-9):
         raise BadInputError("bad_transform", f"{name} must end in the row 0 0 0 1, got {T[3].tolist()}")
     R = T[:3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         deviation, det = float(np.abs(R.T @ R - np.eye(3)).max()), float(np.linalg.det(R))
     # Not `deviation > ...`: of numbers beyond 1e154 it may be NaN.
     if not deviation <= ROTATION_TOLERANCE or det < 0:
