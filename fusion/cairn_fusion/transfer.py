@@ -14,9 +14,12 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
+from cairn_calib.brown import radius_limit
+from cairn_calib.camera import Camera
 from cairn_calib.lidar import AnyCamera
 from cairn_calib.poses import Transform, inverse, transform_points
-from cairn_calib.rig import MountedCamera, Rig
+from cairn_calib.rig import Rig
+from cairn_fusion.transfer_kernels import hide_into, project_into
 
 Floats = npt.NDArray[np.float64]
 Pixels = npt.NDArray[np.int64]
@@ -107,36 +110,29 @@ def transfer_points(points_src: Floats, rig: Rig, *, src: str, dst: str, steps_m
         dst: the camera to look from.
         steps_m: (N,) `depth_steps` of the points; None: surfaces that face the camera.
     """
-    T_dst_src = inverse(rig[dst].transform) @ rig[src].transform
-    points = transform_points(T_dst_src, points_src)
-    exact = rig[dst].camera.project(points)
-    labels = np.full(len(points), Label.OUT_OF_VIEW, np.uint8)
-    labels[np.isnan(points[:, 2])] = Label.NO_RANGE
-    seen = rig[dst].camera.contains(exact)
-    labels[seen] = Label.OK
-    pixels = np.zeros((len(points), 2), np.int64)
-    pixels[seen] = np.rint(exact[seen])
+    T_dst_src, seen_by = inverse(rig[dst].transform) @ rig[src].transform, rig[dst].camera
+    N = len(points_src)
+    pixels, depth_m, labels = np.empty((N, 2), np.int64), np.empty(N), np.empty(N, np.uint8)
+    if isinstance(seen_by, Camera):
+        lens = np.array([*seen_by.focal_px, *seen_by.centre_px])
+        coefficients, limit = np.array(seen_by.distortion), radius_limit(seen_by.distortion)
+        points, size = np.ascontiguousarray(points_src, dtype=np.float64), (seen_by.width, seen_by.height)
+        project_into(pixels, depth_m, labels, points, T_dst_src, lens, coefficients, limit, *size)
+    else:
+        points = transform_points(T_dst_src, points_src)
+        exact = seen_by.project(points)
+        seen = seen_by.contains(exact)
+        labels[:] = np.where(np.isnan(points[:, 2]), Label.NO_RANGE, np.where(seen, Label.OK, Label.OUT_OF_VIEW))
+        pixels[:], depth_m[:] = np.rint(np.where(seen[:, None], exact, 0)), points[:, 2]
     if not _same_centre(T_dst_src):
-        ratio = rig[dst].camera.focal_px[0] / rig[src].camera.focal_px[0]
+        ratio = seen_by.focal_px[0] / rig[src].camera.focal_px[0]
         bin_px = int(np.ceil(BIN_MARGIN * max(ratio, 1)))
-        slant_m = np.zeros(len(points)) if steps_m is None else steps_m * (bin_px / ratio)
-        hidden = _hidden(pixels[seen], points[seen, 2], slant_m[seen], rig[dst], bin_px=bin_px)
-        labels[np.nonzero(seen)[0][hidden]] = Label.OCCLUDED
+        slant_m = np.zeros(N) if steps_m is None else steps_m * (bin_px / ratio)
+        bins = (-(-seen_by.width // bin_px), -(-seen_by.height // bin_px))
+        hide_into(labels, pixels, depth_m, slant_m, bin_px, *bins, DEPTH_TOLERANCE, DEPTH_TOLERANCE_M)
     return Transfer(pixels, labels)
 
 
 def _same_centre(T_dst_src: Transform) -> bool:
     """Without parallax nothing can hide anything: both cameras look along the same rays."""
     return bool(np.linalg.norm(T_dst_src[:3, 3]) < 1e-9)
-
-
-def _hidden(
-    pixels: Pixels, depth_m: Floats, slant_m: Floats, mounted: MountedCamera, *, bin_px: int
-) -> npt.NDArray[np.bool_]:
-    columns = -(-mounted.camera.width // bin_px)
-    rows = -(-mounted.camera.height // bin_px)
-    bins = (pixels[:, 1] // bin_px) * columns + pixels[:, 0] // bin_px
-    nearest_m = np.full(rows * columns, np.inf)
-    np.minimum.at(nearest_m, bins, depth_m)
-    limit_m = nearest_m[bins] * (1 + DEPTH_TOLERANCE) + DEPTH_TOLERANCE_M + slant_m
-    return np.asarray(depth_m > limit_m)

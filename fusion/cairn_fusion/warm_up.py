@@ -10,10 +10,22 @@ from cairn_map.grid import Geometry
 
 
 def warm_up() -> None:
-    """Integrate a scan of two by two pixels, from images to evidence."""
+    """Integrate a scan of three images of two by two pixels, from images to evidence."""
     camera = camera_from_field_of_view(2, 2, horizontal_deg=60.0)
-    rig = Rig(name="warm-up", cameras={"tof": mounted(Spectrum.RANGE, camera, np.eye(4))})
-    range_m = np.ones((2, 2), np.float32)
-    scan = Scan(time_s=0.0, T_map_rig=np.eye(4), range_camera="tof", range_m=range_m)
+    beside = np.eye(4)
+    beside[0, 3] = 0.01
+    spectra = {"tof": Spectrum.RANGE, "colour": Spectrum.COLOUR, "thermal": Spectrum.THERMAL}
+    cameras = {name: mounted(spectrum, camera, beside) for name, spectrum in spectra.items()}
+    rig = Rig(name="warm-up", cameras=cameras | {"tof": mounted(Spectrum.RANGE, camera, np.eye(4))})
+    image = np.ones((2, 2), np.float32)
+    scan = Scan(
+        time_s=0.0,
+        T_map_rig=np.eye(4),
+        range_camera="tof",
+        range_m=image,
+        amplitude=np.ones((2, 2), np.uint16),
+        colour={"colour": np.zeros((2, 2, 3), np.uint8)},
+        thermal={"thermal": 300 * image},
+    )
     integrate_scans([scan, scan], rig, Geometry(), integrator=Integrator(), threads=2)
     integrate_scan(scan, rig, Geometry(), integrator=Integrator(method=Method.CAST))

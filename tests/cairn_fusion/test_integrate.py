@@ -254,6 +254,17 @@ def test_a_second_camera_fills_what_the_first_did_not_see_and_no_more() -> None:
     assert all(both[x] == kelvin for x, kelvin in left.items() if not np.isnan(kelvin))
 
 
+def test_what_the_first_camera_sees_still_hides_what_is_behind_it_from_the_second() -> None:
+    twin = RIG.model_copy(update={"cameras": {**RIG.cameras, "right": RIG["left"]}})
+    range_m, _ = wall_behind_a_post()
+    kelvin = np.full((36, 48), KELVIN, np.float32)
+    alone, both = (
+        integrate_scan(scan_of(range_m, thermal=thermal), twin, GEOMETRY, integrator=INTEGRATOR)
+        for thermal in ({"left": kelvin}, {"left": kelvin, "right": kelvin + 20})
+    )
+    assert both == alone
+
+
 def test_a_pixel_without_temperature_leaves_its_voxel_without() -> None:
     range_m, _ = wall_behind_a_post()
     scan = scan_of(range_m, thermal={"left": np.full((36, 48), np.nan, np.float32)})
