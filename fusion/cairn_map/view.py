@@ -129,21 +129,12 @@ def view_of(evidence: Evidence, geometry: Geometry, model: SensorModel, style: V
     depth = geometry.depth if style.depth is None else style.depth
     if not 1 <= depth <= geometry.depth:
         raise BadInputError("bad_style", f"a view's depth must be 1 to {geometry.depth}, got {depth}")
-    # Only counts make a voxel known; one that holds scalar readings alone is not.
-    known = np.nonzero((evidence.counts[:, 0] | evidence.counts[:, 1]) != 0)[0]
-    up = np.uint32(3 * (geometry.depth - depth))
-    nodes, starts = np.unique(evidence.voxels[known] >> up, return_index=True)
-    odds = model.log_odds(evidence.counts[known])
-    highest = np.maximum.reduceat(odds, starts) if len(starts) else odds
-    keep = np.ones(len(nodes), np.bool_)
-    if style.extent is Extent.OCCUPIED:
-        keep = highest > log_odds(model.p_occupied)
-    nodes, highest = nodes[keep], highest[keep]
+    nodes, highest = _nodes(evidence, model, style.extent, up=3 * (geometry.depth - depth))
     if style.chance is Chance.BYTE:
         chances = np.rint(255 / (1 + np.exp(-highest)))
     else:
         chances = np.rint(highest / LOG_ODDS_STEP) + LOG_ODDS_ZERO
-    sampled = evidence.voxels[evidence.sampled] >> up
+    sampled = evidence.voxels[evidence.sampled] >> np.uint32(3 * (geometry.depth - depth))
     colour = next((c for c in geometry.channels if c.kind is ChannelKind.COLOUR), None)
     thermal = next((c for c in geometry.channels if c.kind is ChannelKind.TEMPERATURE), None)
     coloured, rgb = np.empty(0, np.int64), np.empty((0, len(TOPS[style.colours])), np.int64)
@@ -156,6 +147,21 @@ def view_of(evidence: Evidence, geometry: Geometry, model: SensorModel, style: V
         warm, kelvin = _temperatures(sums, thermal, sampled, nodes)
         temperatures = np.rint(np.maximum(kelvin[:, :columns], 0) / style.temperature_step_k).astype(np.int64)
     return View(depth, style, nodes, chances.astype(np.int64), coloured, rgb, warm, temperatures)
+
+
+def _nodes(evidence: Evidence, model: SensorModel, extent: Extent, *, up: int) -> tuple[npt.NDArray[np.uint32], Floats]:
+    """Nodes that are told, and their highest log-odds; `up` bits of places are left out."""
+    least = log_odds(model.p_occupied) if extent is Extent.OCCUPIED else -np.inf
+    hits, misses = evidence.counts.T
+    # Counts alone make a voxel known: one that holds scalar readings is not. And what was never hit is below a half.
+    told = np.nonzero(hits != 0 if least >= 0 else (hits | misses) != 0)[0]
+    nodes, odds = evidence.voxels[told], model.log_odds(evidence.counts[told])
+    if up and len(nodes):
+        nodes = nodes >> np.uint32(up)
+        starts = np.nonzero(np.diff(nodes, prepend=~nodes[:1]))[0]
+        nodes, odds = nodes[starts], np.maximum.reduceat(odds, starts)
+    keep = odds > least
+    return nodes[keep], odds[keep]
 
 
 def _colours(
