@@ -2,7 +2,7 @@
 
     $ cairn experiment --resolutions 4 --output experiment
     2 robots, 54 measurements, 1944 scans; maps at 4 cm
-    4 cm: 56 cells; cairn, exact, fast 23.1 MB, 1:39; ...; pointer octree, zip 6.96 MB, 1:129; ... recall 92.2%
+    4 cm: 56 cells; cairn, exact, fast 22.9 MB, 1:39; ...; pointer octree, zip 7.18 MB, 1:125; ... recall 92.6%
     wrote experiment/report.html and experiment/report.json
 
 Two simulated robots drive through three laboratories and a corridor (VI.C of the paper); each stop's 36 scans become
