@@ -5,6 +5,7 @@ the noise of the sensors. Dense-equivalent rates count 8 bytes for each voxel of
 CPU time; the digest's SHA-256, which a reader may leave away, is stated on its own and subtracted.
 """
 
+import functools
 import hashlib
 import math
 from collections.abc import Callable, Iterator
@@ -13,10 +14,10 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import zstandard
-from tests.bench.timing import cpu_s
+from tests.bench.timing import cpu_s, wall_s
 
 from cairn_fusion.integrate import Integrator, integrate_scans
-from cairn_map.cell_code import Profile, decode_cell, encode_cell
+from cairn_map.cell_code import Profile, decode_cell, encode_cell, encode_cells
 from cairn_map.cell_content import CHILD_MASKS, HITS, LEAF_MASKS, MISSES
 from cairn_map.cell_reading import cell_reader
 from cairn_map.channel_streams import stream_of_channel
@@ -86,6 +87,12 @@ def _set_rows(name: str, cells: Diff, geometry: Geometry, *, repeats: int) -> It
             seconds = cpu_s(work, repeats)
             rate = dense / (seconds - digest_s) / 1e9
             yield f"  {what}, {profile}", f"{1e3 * seconds:.0f}", f"ms CPU = {rate:.2f} GB/s dense-equivalent"
+    for profile in Profile:
+        one_s, two_s = (
+            wall_s(functools.partial(encode_cells, cells, geometry, profile=profile, threads=threads), repeats)
+            for threads in (1, 2)
+        )
+        yield f"  encode on 2 threads, {profile}", f"{1e3 * two_s:.0f}", f"ms wall, {one_s / two_s:.2f} x as fast"
     yield from _size_rows(fast, small, raw, cells, geometry, dense)
 
 

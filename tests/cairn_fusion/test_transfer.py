@@ -147,3 +147,23 @@ def test_a_slanted_plane_hides_nothing_of_itself(tilt_deg: float, camera: Camera
     )
     assert not (transfer.labels == Label.OCCLUDED).any()
     assert transfer.ok.sum() > 300
+
+
+@pytest.mark.parametrize("distortion", [(0.0,) * 5, (-0.3, 0.1, 0.002, -0.003, -0.02), (-0.6, 0.0, 0.0, 0.0, 0.0)])
+def test_points_appear_where_the_camera_says(distortion: tuple[float, float, float, float, float]) -> None:
+    camera = Camera(width=64, height=48, focal_px=(50.0, 52.0), centre_px=(31.0, 24.5), distortion=distortion)
+    beside = np.eye(4)
+    beside[0, 3] = 0.1
+    tof = Camera(width=8, height=6, focal_px=(6.0, 6.0), centre_px=(3.5, 2.5))
+    cameras = {"tof": mounted(Spectrum.RANGE, tof, np.eye(4)), "seen": mounted(Spectrum.COLOUR, camera, beside)}
+    rig = Rig(name="two", cameras=cameras)
+    points = np.random.default_rng(4).uniform(-3, 3, (4000, 3))
+    points[:50] = np.nan
+    transfer = transfer_points(points, rig, src="tof", dst="seen")
+    exact = camera.project(points - beside[:3, 3])
+    inside = camera.contains(exact)
+    in_view = np.isin(transfer.labels, [Label.OK, Label.OCCLUDED])
+    assert 50 < inside.sum() < 2000
+    np.testing.assert_array_equal(in_view, inside)
+    np.testing.assert_array_equal(transfer.pixels[inside], np.rint(exact[inside]).astype(np.int64))
+    assert (transfer.labels[:50] == Label.NO_RANGE).all()
