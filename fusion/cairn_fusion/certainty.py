@@ -20,6 +20,7 @@ from cairn_calib.rig import Rig
 from cairn_map.errors import BadInputError
 
 Floats = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 
 STRETCH_MAX = 8.0
 """By how much a lens may stretch what it shows, for `is_certain`."""
@@ -62,17 +63,14 @@ def spread_m(points_src: Floats, sigma_m: Floats, rig: Rig, *, src: str, dst: st
     return np.asarray(spread_px(covariance) * depth_m / min(rig[dst].camera.focal_px))
 
 
-def is_certain(points_src: Floats, sigma_m: Floats, rig: Rig, *, src: str, dst: str, limit_m: float) -> bool:
-    """Whether no sample of these points can be uncertain by more than a limit: then nobody needs to work it out.
+def is_certain(range_m: Floats, sigma_m: Floats, rig: Rig, *, src: str, dst: str, limit_m: float) -> Flags:
+    """(N,) points at these ranges whose samples cannot be uncertain by more than a limit: nobody needs to work it out.
 
     J moves a pixel by at most some f / z a metre, more only off the axis and where a lens stretches: here, eight times
     as much is allowed for. With a baseline of 0.1 m and 5 mm at 1 m that is 4 mm.
     """
-    if not len(points_src):
-        return True
     T_dst_src = inverse(rig[dst].transform) @ rig[src].transform
-    distance_m = np.linalg.norm(points_src, axis=1)
-    parallax_m = np.linalg.norm(T_dst_src[:3, 3]) * float((sigma_m / distance_m).max())
-    farthest_m = float(distance_m.max()) + float(np.linalg.norm(T_dst_src[:3, 3]))
-    calibration_m = (rig[dst].calibration_sigma_px or 0.0) * farthest_m / min(rig[dst].camera.focal_px)
-    return bool(STRETCH_MAX * (parallax_m + calibration_m) <= limit_m)
+    baseline_m = float(np.linalg.norm(T_dst_src[:3, 3]))
+    calibration = (rig[dst].calibration_sigma_px or 0.0) / min(rig[dst].camera.focal_px)
+    bound_m = STRETCH_MAX * (baseline_m * (sigma_m / range_m) + calibration * (range_m + baseline_m))
+    return np.asarray(bound_m <= limit_m)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.rig import MountedCamera
-from cairn_fusion.clear_kernels import clear_distances
+from cairn_fusion.clear_kernels import nearest_around
 from cairn_fusion.returns import Returns
 
 Floats = npt.NDArray[np.float64]
@@ -26,12 +26,13 @@ def margins_m(sigma_m: Floats, *, voxel_edge_m: float, noise_sigmas: float) -> F
 
 def clear_image(returns: Returns, mounted: MountedCamera, *, voxel_edge_m: float, noise_sigmas: float) -> Singles:
     """(H, W) how far each pixel of an image without gaps between its pixels is clear, metres; 0 for not known."""
-    sigma_m = mounted.range_sigma_m(returns.shield_m)
-    return clear_distances(
+    nearest_m, share = nearest_around(
         np.where(returns.silent, np.float32(np.inf), returns.range_m),
         returns.shield_m,
-        margins_m(sigma_m, voxel_edge_m=voxel_edge_m, noise_sigmas=noise_sigmas).astype(np.float32),
         returns.silent_m,
         float(max(mounted.camera.focal_px)),
         voxel_edge_m,
     )
+    sigma_m = mounted.range_sigma_m(nearest_m)
+    kept_m = share * margins_m(sigma_m, voxel_edge_m=voxel_edge_m, noise_sigmas=noise_sigmas).astype(np.float32)
+    return np.asarray(np.maximum(nearest_m - kept_m, np.float32(0.0)))

@@ -31,98 +31,111 @@ GRAZING_MAX = 3.0
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def clear_distances(
-    seen_m: Singles, shield_m: Singles, margins_m: Singles, silent_m: float, focal_px: float, voxel_edge_m: float
-) -> Singles:
-    """(H, W) metres that each pixel's beam is clear; 0 where it says nothing.
+def nearest_around(
+    seen_m: Singles, shield_m: Singles, silent_m: float, focal_px: float, voxel_edge_m: float
+) -> tuple[Singles, Singles]:
+    """(H, W) the nearest that counts for each pixel, metres, and how many times its margin to keep from that.
+
+    Both are 0 where the pixel says nothing, the second also where it is silent and nothing beside it is nearer.
+    Row by row without branches, and so in vector instructions.
 
     Args:
         seen_m: (H, W) ranges of pixels that may clear; infinite where nothing came back and that means empty; else NaN.
         shield_m: (H, W) the nearest that a pixel saw, at most `seen_m`; NaN for nothing.
-        margins_m: (H, W) what to keep before what `shield_m` says.
         silent_m: how far an infinite one is clear.
         focal_px: pixels per radian.
         voxel_edge_m: of the map.
     """
     height, width = seen_m.shape
-    clear = np.zeros((height, width), np.float32)
-    least = _least_around(shield_m)
-    # With a border of nothing, so that the loop over neighbours has one length: a quarter off the time.
-    padded, wide = _padded(shield_m), width + 2
+    wide = width + 2 * RINGS
+    # With a border of nothing, so that no neighbour is missing.
+    known = np.full((height + 2 * RINGS, wide), np.float32(np.inf))
     for y in range(height):
+        row, given = known[y + RINGS, RINGS : RINGS + width], shield_m[y]
         for x in range(width):
-            seen = min(np.float64(seen_m[y, x]), silent_m) if math.isinf(seen_m[y, x]) else np.float64(seen_m[y, x])
-            if not seen > 0.0:
-                continue
-            across, down = _step(shield_m, y, x, 0, 1), _step(shield_m, y, x, 1, 0)
-            edge = EDGE_STEP_M + RINGS * SLANT_SHARE * (across + down)
-            nearest, margin = seen, 0.0
-            if shield_m[y, x] > 0.0:
-                margin = np.float64(margins_m[y, x])
-            best = np.uint64(y * wide + x)
-            least_m = padded[best]
-            for k in range(1, 9):
-                place = np.uint64(y * wide + x + k // 3 * wide + k % 3)
-                if padded[place] < least_m:
-                    least_m, best = padded[place], place
-            if np.float64(least_m) < nearest:
-                nearest = np.float64(least_m)
-                margin = np.float64(margins_m[np.int64(best) // wide - 1, np.int64(best) % wide - 1])
-            # Beyond these no pixel of the outer ring counts: on most of an image none is looked at.
-            limit = min(nearest, min(seen - edge, EDGE_SHARE * voxel_edge_m * focal_px))
-            if least[y, x] <= limit:
-                for v in range(max(y - RINGS, 0), min(y + RINGS + 1, height)):
-                    for u in range(max(x - RINGS, 0), min(x + RINGS + 1, width)):
-                        near = np.float64(shield_m[v, u])
-                        if near < nearest and near < seen - edge and near <= EDGE_SHARE * voxel_edge_m * focal_px:
-                            nearest, margin = near, np.float64(margins_m[v, u])
-            slope = math.sqrt(across * across + down * down) * focal_px / seen
-            grazing = min(max(GRAZING_SHARE * math.sqrt(1.0 + slope * slope), 1.0), GRAZING_MAX)
-            clear[y, x] = max(nearest - grazing * margin, 0.0)
-    return clear
+            row[x] = given[x] if given[x] > np.float32(0.0) else np.float32(np.inf)
+    near, far = np.empty((height + 2 * RINGS, wide), np.float32), np.empty((height + 2 * RINGS, wide), np.float32)
+    near[:], far[:] = np.inf, np.inf
+    for y in range(RINGS, height + RINGS):
+        _least_of_row_into(near[y, RINGS : RINGS + width], far[y, RINGS : RINGS + width], known[y], width)
+    nearest, share = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    edge_at_most = EDGE_SHARE * voxel_edge_m * focal_px
+    for y in range(height):
+        _nearest_of_row_into(nearest[y], share[y], seen_m[y], known, near, far, y, silent_m, focal_px, edge_at_most)
+    return nearest, share
 
 
 @nb.njit(cache=True, nogil=True)
-def _padded(shield_m: Singles) -> Singles:
-    """((H + 2) (W + 2),) row by row, a pixel of nothing around it; infinite for nothing."""
-    height, width = shield_m.shape
-    padded = np.full((height + 2, width + 2), np.float32(np.inf))
-    for y in range(height):
-        for x in range(width):
-            if shield_m[y, x] > 0.0:
-                padded[y + 1, x + 1] = shield_m[y, x]
-    return padded.ravel()
+def _least_of_row_into(near: Singles, far: Singles, known: Singles, width: int) -> None:
+    """The least of each pixel of a row and one beside it, and two beside it; `known` has `RINGS` more at both ends."""
+    a, b, c, d, e = (
+        known[:width],
+        known[1 : 1 + width],
+        known[2 : 2 + width],
+        known[3 : 3 + width],
+        known[4 : 4 + width],
+    )
+    for x in range(width):
+        inner = b[x] if b[x] < c[x] else c[x]
+        inner = inner if inner < d[x] else d[x]
+        outer = a[x] if a[x] < e[x] else e[x]
+        near[x] = inner
+        far[x] = inner if inner < outer else outer
 
 
-@nb.njit(cache=True, nogil=True)
-def _least_around(shield_m: Singles) -> Singles:
-    """(H, W) the nearest of each pixel and the two rings around it; infinite for none."""
-    height, width = shield_m.shape
-    rows, least = np.full((height, width), np.inf, np.float32), np.full((height, width), np.inf, np.float32)
-    for y in range(height):
-        for x in range(width):
-            for u in range(max(x - RINGS, 0), min(x + RINGS + 1, width)):
-                if shield_m[y, u] < rows[y, x]:
-                    rows[y, x] = shield_m[y, u]
-    for y in range(height):
-        for v in range(max(y - RINGS, 0), min(y + RINGS + 1, height)):
-            for x in range(width):
-                if rows[v, x] < least[y, x]:
-                    least[y, x] = rows[v, x]
-    return least
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _nearest_of_row_into(
+    nearest: Singles,
+    share: Singles,
+    seen_m: Singles,
+    known: Singles,
+    near: Singles,
+    far: Singles,
+    y: int,
+    silent_m: float,
+    focal_px: float,
+    edge_at_most: float,
+) -> None:
+    """Row y of `nearest_around`; `known`, `near` and `far` have a border of `RINGS`."""
+    width = len(seen_m)
+    up, own, down = known[y + 1, RINGS:][:width], known[y + 2, RINGS:][:width], known[y + 3, RINGS:][:width]
+    left, right = known[y + 2, RINGS - 1 :][:width], known[y + 2, RINGS + 1 :][:width]
+    near0, near1, near2 = near[y + 1, RINGS:][:width], near[y + 2, RINGS:][:width], near[y + 3, RINGS:][:width]
+    far0, far1, far2 = far[y, RINGS:][:width], far[y + 1, RINGS:][:width], far[y + 2, RINGS:][:width]
+    far3, far4 = far[y + 3, RINGS:][:width], far[y + 4, RINGS:][:width]
+    for x in range(width):
+        middle = np.float64(own[x])
+        across = step_beside(np.float64(left[x]), middle, np.float64(right[x]))
+        along = step_beside(np.float64(up[x]), middle, np.float64(down[x]))
+        seen = np.float64(silent_m) if seen_m[x] == np.float32(np.inf) else np.float64(seen_m[x])
+        ring1 = near0[x] if near0[x] < near1[x] else near1[x]
+        ring1 = ring1 if ring1 < near2[x] else near2[x]
+        ring2 = far0[x] if far0[x] < far1[x] else far1[x]
+        ring2 = ring2 if ring2 < far2[x] else far2[x]
+        ring2 = ring2 if ring2 < far3[x] else far3[x]
+        ring2 = ring2 if ring2 < far4[x] else far4[x]
+        least, shielded = np.float64(ring1), np.float64(ring2)
+        # Of the outer ring only another surface counts. If its nearest does not, none of it does.
+        step = EDGE_STEP_M + RINGS * SLANT_SHARE * (across + along)
+        is_edge = (shielded < seen - step) & (shielded <= edge_at_most) & (shielded < least)
+        least = shielded if is_edge else least
+        slope = math.sqrt(across * across + along * along) * focal_px / seen
+        grazing = min(max(GRAZING_SHARE * math.sqrt(1.0 + slope * slope), 1.0), GRAZING_MAX)
+        says = seen > 0.0
+        is_free = not least < seen and not own[x] < np.float32(np.inf)
+        least = seen if is_free else least
+        nearest[x] = np.float32(least if says else 0.0)
+        share[x] = np.float32(grazing if says and not is_free else 0.0)
 
 
-@nb.njit(inline="always")
-def _step(shield_m: Singles, y: int, x: int, dy: int, dx: int) -> float:
-    """How much farther the surface is from one pixel of a line to the next; beside an edge, on this side of it."""
+@nb.njit(forceinline=True)
+def step_beside(before: float, here: float, after: float) -> float:
+    """How much farther the surface is from one pixel of a line to the next; beside an edge, on this side of it.
+
+    Infinite is not known: then there is none.
+    """
+    one, other = abs(before - here), abs(after - here)
     least = np.inf
-    here = np.float64(shield_m[y, x])
-    if y >= dy and x >= dx:
-        step = abs(np.float64(shield_m[y - dy, x - dx]) - here)
-        if step < least:
-            least = step
-    if y + dy < shield_m.shape[0] and x + dx < shield_m.shape[1]:
-        step = abs(np.float64(shield_m[y + dy, x + dx]) - here)
-        if step < least:
-            least = step
+    least = one if one < least else least
+    least = other if other < least else least
     return least if least < np.inf else 0.0

@@ -5,6 +5,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_fusion.transfer_kernels import OK
+from cairn_map.channels import SAMPLE_MAX
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -45,3 +46,34 @@ def add_pixels_into(
         counts[voxel_of[n]] += 1
         for c in range(image.shape[2]):
             totals[voxel_of[n], c] += np.float64(image[y, x, c])
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def write_means_into(
+    sums: Ints, first: int, last: int, totals: Floats, counts: Ints, zero: float, step: float, is_squared: bool
+) -> bool:
+    """Write a sample of weight 1, the mean of its pixels, to each voxel that has none yet; whether all are in range.
+
+    Args:
+        sums: (U, P)
+        first: the channel's first plane.
+        last: its weight.
+        totals: (U, C) sums of values.
+        counts: (U,) pixels.
+        zero: value of the sample 0.
+        step: of `cairn_map.channels.Channel.quantise`.
+        is_squared: whether the square of the one value is kept too.
+    """
+    for n in range(counts.shape[0]):
+        if counts[n] == 0 or sums[n, last] != 0:
+            continue
+        for c in range(totals.shape[1]):
+            sample = np.rint((totals[n, c] / counts[n] - zero) / step)
+            # A comparison with NaN is false.
+            if not (sample >= 0.0 and sample <= SAMPLE_MAX):
+                return False
+            sums[n, first + c] = np.int64(sample)
+        if is_squared:
+            sums[n, first + 1] = sums[n, first] ** 2
+        sums[n, last] = 1
+    return True

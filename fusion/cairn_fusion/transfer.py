@@ -19,7 +19,7 @@ from cairn_calib.camera import Camera
 from cairn_calib.lidar import AnyCamera
 from cairn_calib.poses import Transform, inverse, transform_points
 from cairn_calib.rig import Rig
-from cairn_fusion.transfer_kernels import hide_into, project_into
+from cairn_fusion.transfer_kernels import hide_into, project_into, steps_of
 
 Floats = npt.NDArray[np.float64]
 Pixels = npt.NDArray[np.int64]
@@ -91,13 +91,7 @@ def depth_steps(points: Floats) -> Floats:
     Returns:
         (H, W) float64, metres, not negative; 0 where no neighbour has a range.
     """
-    z = points[..., 2]
-    total = np.zeros(z.shape)
-    for axis in (0, 1):
-        step = np.abs(np.diff(z, axis=axis, prepend=np.nan, append=np.nan))
-        last, following = np.split(step, [-1], axis=axis)[0], np.split(step, [1], axis=axis)[1]
-        total += np.nan_to_num(np.fmin(last, following))
-    return total
+    return steps_of(np.ascontiguousarray(points[..., 2]))
 
 
 def transfer_points(points_src: Floats, rig: Rig, *, src: str, dst: str, steps_m: Floats | None = None) -> Transfer:

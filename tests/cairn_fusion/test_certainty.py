@@ -125,7 +125,11 @@ def test_what_is_taken_for_certain_is(name: str, sigma_px: float | None, noise: 
     seen = HEAD[name].model_copy(update={"calibration_sigma_px": sigma_px})
     rig = HEAD.model_copy(update={"cameras": {**HEAD.cameras, name: seen}})
     chosen = points()
-    sigma_m = noise * np.linalg.norm(chosen, axis=1)
-    worst_m = float(np.nanmax(spread_m(chosen, sigma_m, rig, src="tof", dst=name)))
-    assert not is_certain(chosen, sigma_m, rig, src="tof", dst=name, limit_m=0.999 * worst_m - 1e-12)
-    assert is_certain(chosen, sigma_m, rig, src="tof", dst=name, limit_m=200 * worst_m + 1e-12)
+    range_m = np.linalg.norm(chosen, axis=1)
+    sigma_m = noise * range_m
+    spreads_m = spread_m(chosen, sigma_m, rig, src="tof", dst=name)
+    worst_m = float(np.nanmax(spreads_m))
+    for limit_m in np.quantile(spreads_m[np.isfinite(spreads_m)], [0.0, 0.5, 1.0]):
+        certain = is_certain(range_m, sigma_m, rig, src="tof", dst=name, limit_m=0.999 * limit_m - 1e-12)
+        assert not (certain & (spreads_m >= limit_m)).any()
+    assert is_certain(range_m, sigma_m, rig, src="tof", dst=name, limit_m=200 * worst_m + 1e-12).all()

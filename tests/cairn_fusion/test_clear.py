@@ -13,7 +13,7 @@ from cairn_calib.lidar import SpinningLidar
 from cairn_calib.poses import look_at
 from cairn_calib.rig import Rig, Spectrum, mounted
 from cairn_calib.sensing import RangeSensing
-from cairn_fusion.clear_kernels import EDGE_STEP_M, GRAZING_MAX, GRAZING_SHARE, SLANT_SHARE, clear_distances
+from cairn_fusion.clear_kernels import EDGE_STEP_M, GRAZING_MAX, GRAZING_SHARE, SLANT_SHARE, nearest_around
 from cairn_fusion.integrate import Integration, Integrator, Method, integrate_scan
 from cairn_fusion.scan import Scan
 from cairn_map.channels import INTENSITY
@@ -66,7 +66,11 @@ def integrated(scan: Scan, rig: Rig, integrator: Integrator = LIMITS) -> Diff:
     return integrate_scan(scan, rig, GEOMETRY, integrator=integrator)
 
 
-def naive(seen_m: Singles, shield_m: Singles, margins_m: Singles, silent_m: float, focal_px: float) -> Floats:
+def margin_m(range_m: Floats) -> Floats:
+    return 0.05 + 0.04 * range_m
+
+
+def naive(seen_m: Singles, shield_m: Singles, silent_m: float, focal_px: float) -> Floats:
     height, width = seen_m.shape
     clear = np.zeros((height, width))
     padded = np.pad(shield_m.astype(np.float64), 1, constant_values=np.nan)
@@ -79,7 +83,7 @@ def naive(seen_m: Singles, shield_m: Singles, margins_m: Singles, silent_m: floa
             np.nan_to_num(np.fmin(abs(one - middle), abs(other - middle)))
             for one, other in ((padded[y + 1, x], padded[y + 1, x + 2]), (padded[y, x + 1], padded[y + 2, x + 1]))
         ]
-        nearest, margin = own, float(np.nan_to_num(margins_m[y, x]))
+        nearest, margin = own, float(np.nan_to_num(margin_m(shield_m[y, x])))
         for v, u in np.ndindex(height, width):
             ring = max(abs(v - y), abs(u - x))
             near = float(shield_m[v, u])
@@ -87,24 +91,24 @@ def naive(seen_m: Singles, shield_m: Singles, margins_m: Singles, silent_m: floa
                 continue
             is_edge = own - near > EDGE_STEP_M + 2 * SLANT_SHARE * sum(steps) and near / focal_px <= EDGE_M
             if ring <= 1 or is_edge:
-                nearest, margin = near, float(margins_m[v, u])
+                nearest, margin = near, float(margin_m(shield_m[v, u]))
         grazing = GRAZING_SHARE * math.hypot(1, math.hypot(*steps) * focal_px / own)
         clear[y, x] = max(nearest - margin * min(max(grazing, 1), GRAZING_MAX), 0)
     return clear
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_clear_distances_agree_with_their_slow_twin(seed: int) -> None:
+def test_what_is_nearest_agrees_with_its_slow_twin(seed: int) -> None:
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:13, :17]
     shield_m = 2.0 + 0.05 * x + 0.8 * (x > 8) - 1.2 * ((y == 5) & (x % 4 < 2)) + 0.02 * rng.standard_normal((13, 17))
     shield_m[rng.random(shield_m.shape) < 0.15] = np.nan
     seen_m = np.where(rng.random(shield_m.shape) < 0.9, shield_m, np.nan)
     seen_m[np.isnan(shield_m) & (rng.random(shield_m.shape) < 0.5)] = np.inf
-    margins_m = np.where(np.isnan(shield_m), np.nan, rng.uniform(0.05, 0.3, shield_m.shape))
-    args = [a.astype(np.float32) for a in (seen_m, shield_m, margins_m)]
+    args = [a.astype(np.float32) for a in (seen_m, shield_m)]
     for focal_px in (30.0, 300.0):
-        clear = clear_distances(*args, 4.0, focal_px, EDGE_M)  # type: ignore[call-arg, arg-type]
+        nearest_m, share = nearest_around(*args, 4.0, focal_px, EDGE_M)  # type: ignore[call-arg, arg-type]
+        clear = np.maximum(nearest_m - share * margin_m(nearest_m), 0)
         np.testing.assert_allclose(clear, naive(*args, 4.0, focal_px), atol=1e-5)  # type: ignore[arg-type]
         assert (clear[np.isinf(seen_m)] > 0).any() and (clear[np.isnan(seen_m)] == 0).all()
 
