@@ -14,8 +14,8 @@ from cairn_map.errors import DamagedDataError
 from cairn_map.evidence import COUNT_MAX, Evidence
 from cairn_map.grid import Geometry
 from cairn_map.octree import Octree, build_octree
-from cairn_map.octree_kernels import expand_into, leaves_of_rows
-from cairn_map.streams import decode_column, encode_column, required
+from cairn_map.octree_kernels import expand_content_into, leaves_of_rows
+from cairn_map.streams import column_planes, encode_column, required
 
 CHILD_MASKS, LEAF_MASKS, HITS, MISSES = 1, 2, 3, 4
 
@@ -49,17 +49,13 @@ def evidence_of(content: CellContent) -> Evidence:
         DamagedDataError: a leaf says nothing, or one of several voxels has samples.
     """
     octree, counts, sampled = content.octree, content.counts, content.sampled
-    if (octree.sizes[sampled] != 1).any():
-        raise DamagedDataError("bad_cell", "a collapsed leaf cannot hold samples")
-    says = (counts[:, 0] | counts[:, 1]) != 0
-    says[sampled] = True
-    if not says.all():
-        raise DamagedDataError("bad_cell", "a leaf without evidence must not be there")
-    ends = np.cumsum(octree.sizes)
-    V = int(ends[-1]) if len(ends) else 0
-    rows = (ends[sampled] - 1).astype(np.uint32)
-    evidence = Evidence(np.empty(V, np.uint32), np.empty((V, 2), np.int32), rows, content.samples)
-    expand_into(octree.starts, octree.sizes, counts, evidence.voxels, evidence.counts)
+    V = int(octree.sizes.sum())
+    evidence = Evidence(
+        np.empty(V, np.uint32), np.empty((V, 2), np.int32), np.empty(len(sampled), np.uint32), content.samples
+    )
+    rows = (evidence.voxels, evidence.counts, evidence.sampled)
+    if not expand_content_into(octree.starts, octree.sizes, counts, sampled, *rows):
+        raise DamagedDataError("bad_cell", "a leaf says nothing, or a collapsed one holds samples")
     return evidence
 
 
@@ -87,6 +83,6 @@ def counts_of_streams(
     first, stop = (0, leaves) if part is None else (part.start, part.stop)
     counts = np.empty((stop - first, 2), np.int32)
     for number, column in ((HITS, 0), (MISSES, 1)):
-        words = decode_column(required(streams, number), rows=leaves, first=first, stop=stop)
-        counts[:, column] = channel_streams.numbers(words, signed, limit=COUNT_MAX)
+        planes = column_planes(required(streams, number), rows=leaves)[:, first:stop]
+        channel_streams.numbers_into(counts[:, column], planes, signed=signed, limit=COUNT_MAX)
     return counts

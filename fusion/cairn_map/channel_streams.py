@@ -16,14 +16,18 @@ from cairn_map.channels import Channel
 from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence import SUM_MAX
 from cairn_map.grid import Geometry
-from cairn_map.streams import decode_column, encode_column, required
-from cairn_map.sum_kernels import predict_sums, restore_sums, square_guesses
+from cairn_map.streams import column_planes, encode_column, required, words_of_planes
+from cairn_map.sum_kernels import predict_sums, restore_squares_into, restore_sums_into, square_guesses
 
 Ints = npt.NDArray[np.int64]
 Words = npt.NDArray[np.uint64]
 
+Planes = npt.NDArray[np.uint8]
+
 FIRST_STREAM = 16
 STREAMS_PER_CHANNEL = 8
+SMALL_PLANES = 3
+"""So many bytes hold no number that is out of range."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,14 +68,12 @@ def join_samples(
     sampled = np.nonzero(has_samples)[0]
     check_count(len(sampled), sampled_max)
     samples = np.zeros((len(sampled), geometry.plane_count), np.int64)
-    row_of = np.empty(leaves, np.int64)
-    row_of[sampled] = np.arange(len(sampled))
     low = -SUM_MAX if signed else 0
     for channel, rows in zip(geometry.channels, channels, strict=True):
         sums = rows.sums
         if sums.size and (sums.min() < low or sums.max() > SUM_MAX or not _says_something(sums).all()):
             raise DamagedDataError("bad_stream", f"channel {channel.name} holds a sum that is zero or out of range")
-        at = slice(None) if len(rows.leaves) == len(sampled) else row_of[rows.leaves]
+        at = slice(None) if len(rows.leaves) == len(sampled) else np.searchsorted(sampled, rows.leaves)
         samples[at, geometry.planes_of(channel.name)] = sums
     return sampled, samples
 
@@ -114,15 +116,14 @@ def decode_channel(
     count = len(present)
     check_count(count, sampled_max)
     last = count if stop is None else int(np.searchsorted(present, stop))
-    weights = numbers(decode_column(required(streams, number + 1), rows=count, stop=last), signed, limit=SUM_MAX)
-    planes = [
-        restore_sums(decode_column(required(streams, number + 2 + p), rows=count, stop=last), weights)
-        for p in range(channel.value_count)
-    ]
+    sums = np.empty((last, len(channel.planes)), np.int64)
+    columns = [column_planes(required(streams, number + 1 + p), rows=count) for p in range(len(channel.planes))]
+    numbers_into(sums[:, -1], columns[0][:, :last], signed=signed, limit=SUM_MAX)
+    for p in range(channel.value_count):
+        restore_sums_into(sums, p, columns[1 + p])
     if "square_sum" in channel.planes:
-        residuals = _unzigzag(decode_column(required(streams, number + 3), rows=count, stop=last))
-        planes.append((residuals + square_guesses(planes[0], weights)).astype(np.int64))
-    return ChannelRows(present[:last], np.stack([*planes, weights], axis=1))
+        restore_squares_into(sums, columns[2])
+    return ChannelRows(present[:last], sums)
 
 
 def words(values: Ints, signed: bool) -> Words:
@@ -131,17 +132,23 @@ def words(values: Ints, signed: bool) -> Words:
     return _zigzag(raw) if signed else raw
 
 
-def numbers(raw: Words, signed: bool, *, limit: int) -> Ints:
-    """The mirror of `words`.
+def numbers_into(out: npt.NDArray[np.signedinteger], planes: Planes, *, signed: bool, limit: int) -> None:
+    """The mirror of `words`, from (k, N) of `column_planes` to (N,).
 
     Raises:
-        DamagedDataError: a magnitude above `limit`.
+        DamagedDataError: a magnitude above `limit`, which is no less than three bytes hold.
     """
+    if not signed and len(planes) <= SMALL_PLANES:
+        out[:] = planes[0] if len(planes) else 0
+        for p, plane in enumerate(planes[1:], 1):
+            out |= plane.astype(out.dtype) << out.dtype.type(8 * p)
+        return
+    raw = words_of_planes(planes)
     # As int64 a word of 2^63 and more is negative: out of range, too.
     values = (_unzigzag(raw) if signed else raw).view(np.int64)
     if len(values) and (values.max() > limit or values.min() < (-limit if signed else 0)):
         raise DamagedDataError("bad_stream", f"a count or weight is beyond {limit}")
-    return values
+    out[:] = values
 
 
 def check_count(count: int, sampled_max: int) -> None:

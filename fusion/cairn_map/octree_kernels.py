@@ -205,6 +205,33 @@ def expand_into(starts: Words, sizes: Ints, leaf_counts: Counts, voxels: Words, 
 
 
 @nb.njit(cache=True, nogil=True)
+def expand_content_into(
+    starts: Words, sizes: Ints, leaf_counts: Counts, sampled: Ints, voxels: Words, counts: Counts, rows: Words
+) -> bool:
+    """`expand_into`, and the row of each of the (S,) leaves `sampled`, which rise.
+
+    Returns False, and stops, where a leaf of several voxels has samples, or one without has no counts.
+    """
+    V, s = np.uint64(0), 0
+    pairs, out = leaf_counts.reshape(-1), counts.reshape(-1)
+    for n in range(starts.shape[0]):
+        hits, misses = pairs[np.uint64(2 * n)], pairs[np.uint64(2 * n + 1)]
+        if s < sampled.shape[0] and sampled[s] == n:
+            if sizes[n] != 1:
+                return False
+            rows[s] = V
+            s += 1
+        elif hits | misses == 0:
+            return False
+        for step in range(np.uint64(sizes[n])):
+            voxels[V] = starts[n] + np.uint32(step)
+            out[V + V] = hits
+            out[V + V + np.uint64(1)] = misses
+            V += np.uint64(1)
+    return True
+
+
+@nb.njit(cache=True, nogil=True)
 def leaves_of_rows(leaf_rows: Ints, rows: Words) -> Ints:
     """(S,) the leaf at which each of the rows, rising, begins; every one of them begins a leaf."""
     out = np.empty(rows.shape[0], np.int64)

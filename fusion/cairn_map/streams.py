@@ -141,8 +141,8 @@ def encode_column(words: npt.NDArray[np.uint64]) -> bytes:
     return bytes([planes]) + b"".join((words >> np.uint64(8 * p)).astype(np.uint8).tobytes() for p in range(planes))
 
 
-def decode_column(stream: bytes, *, rows: int, first: int = 0, stop: int | None = None) -> npt.NDArray[np.uint64]:
-    """(rows,) uint64, or those from `first` to before `stop`; the mirror of `encode_column`.
+def column_planes(stream: bytes, *, rows: int) -> npt.NDArray[np.uint8]:
+    """(k, rows) planes of a column, lowest first, k from 0 to 8; nothing is copied.
 
     Raises:
         DamagedDataError: the stream's length is not that of its planes.
@@ -150,12 +150,12 @@ def decode_column(stream: bytes, *, rows: int, first: int = 0, stop: int | None 
     planes = stream[0] if stream else 9
     if planes > 8 or len(stream) != 1 + planes * rows:
         raise DamagedDataError("bad_stream", f"a column of {rows} rows has {len(stream)} bytes for {planes} planes")
-    # The first plane is most of it, and often all.
-    count = (rows if stop is None else stop) - first
-    columns = (np.frombuffer(stream, np.uint8, count, 1 + p * rows + first).astype(np.uint64) for p in range(planes))
-    words = next(columns, None)
-    if words is None:
-        return np.zeros(count, np.uint64)
-    for p, column in enumerate(columns, 1):
-        words |= column << np.uint64(8 * p)
+    return np.frombuffer(stream, np.uint8, offset=min(1, len(stream) - 1))[: planes * rows].reshape(planes, rows)
+
+
+def words_of_planes(planes: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint64]:
+    """(rows,) of `column_planes`; the mirror of `encode_column`."""
+    words = np.zeros(planes.shape[1], np.uint64)
+    for p, plane in enumerate(planes):
+        words |= plane.astype(np.uint64) << np.uint64(8 * p)
     return words

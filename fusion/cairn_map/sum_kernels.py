@@ -6,6 +6,7 @@ import numpy.typing as npt
 
 Ints = npt.NDArray[np.int64]
 Words = npt.NDArray[np.uint64]
+Planes = npt.NDArray[np.uint8]
 
 
 @nb.njit(cache=True, nogil=True)
@@ -24,15 +25,35 @@ def predict_sums(values: Ints, weights: Ints) -> Words:
 
 
 @nb.njit(cache=True, nogil=True)
-def restore_sums(residuals: Words, weights: Ints) -> Ints:
-    """Decoder's half of `predict_sums`."""
-    out = np.empty(residuals.shape[0], np.int64)
-    for n in range(residuals.shape[0]):
-        guess = np.uint64(0)
-        if n > 0 and weights[n - 1] != 0:
-            guess = np.uint64(out[n - 1]) * np.uint64(weights[n]) // np.uint64(weights[n - 1])
-        out[n] = np.int64(guess + unzigzag(residuals[n]))
-    return out
+def restore_sums_into(sums: Ints, p: int, planes: Planes) -> None:
+    """Decoder's half of `predict_sums`: column p of (N, P) sums, whose last holds the weights, from (k, N) planes."""
+    last = sums.shape[1] - 1
+    value, weight = np.uint64(0), np.uint64(0)
+    for n in range(sums.shape[0]):
+        guess, own = np.uint64(0), np.uint64(sums[n, last])
+        if weight != 0:
+            guess = value * own // weight
+        value, weight = guess + unzigzag(_word(planes, n)), own
+        sums[n, p] = np.int64(value)
+
+
+@nb.njit(cache=True, nogil=True)
+def restore_squares_into(sums: Ints, planes: Planes) -> None:
+    """Column 1 of (N, 3) sums, of which the others are there, from the (k, N) planes of what `square_guesses` left."""
+    for n in range(sums.shape[0]):
+        guess, weight = np.uint64(0), np.uint64(sums[n, 2])
+        if weight != 0:
+            guess = square_guess(np.uint64(sums[n, 0]), weight)
+        sums[n, 1] = np.int64(guess + unzigzag(_word(planes, n)))
+
+
+@nb.njit(forceinline=True)
+def _word(planes: Planes, n: int) -> np.uint64:
+    """The number that the planes of `streams.column_planes` spell."""
+    word = np.uint64(0)
+    for p in range(planes.shape[0]):
+        word |= np.uint64(planes[p, n]) << np.uint64(8 * p)
+    return word
 
 
 @nb.njit(cache=True, nogil=True)
