@@ -13,7 +13,8 @@ from enum import StrEnum
 
 from cairn_map.errors import DeniedError
 from cairn_server.settings import Settings
-from cairn_server.store import MapRow, Store
+from cairn_server.store import Store
+from cairn_server.store_rows import MapRow
 
 
 class Role(StrEnum):

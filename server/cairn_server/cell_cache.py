@@ -15,7 +15,7 @@ from cairn_map.evidence import Evidence
 from cairn_map.fingerprint import fingerprint
 from cairn_map.grid import CellKey, Geometry
 from cairn_server.cells_at_rest import stored_evidence
-from cairn_server.store import CellRow
+from cairn_server.store_rows import CellRow
 
 CACHE_BYTES = 512 << 20
 """Memory for the cells under change of all maps."""

@@ -9,7 +9,8 @@ from cairn_map.cursor import ENTRY_FOLD
 from cairn_map.errors import CairnError, DamagedDataError
 from cairn_map.evidence import Evidence
 from cairn_map.grid import CellKey, Geometry, cell_of_key
-from cairn_server.store import CellRow, Contribution, Snapshot
+from cairn_server.store import Snapshot
+from cairn_server.store_rows import CellRow, Contribution
 
 log = logging.getLogger(__name__)
 

@@ -6,7 +6,8 @@ import time
 
 from cairn_server.cell_cache import CACHE_BYTES, CellCache
 from cairn_server.folding import fold_pending
-from cairn_server.store import MapRow, Store
+from cairn_server.store import Store
+from cairn_server.store_rows import MapRow
 
 log = logging.getLogger(__name__)
 

@@ -22,7 +22,8 @@ from cairn_map.grid import CellKey
 from cairn_map.ids import CommitId
 from cairn_server.cell_cache import CellCache, Step
 from cairn_server.cells_at_rest import cell_to_change, decode_stored
-from cairn_server.store import Entry, Fold, Head, MapRow, Store, StoredCommit
+from cairn_server.store import Store
+from cairn_server.store_rows import Entry, Fold, Head, MapRow, StoredCommit
 
 log = logging.getLogger(__name__)
 

@@ -19,7 +19,8 @@ from cairn_map.ids import Author, author_from_text
 from cairn_map.messages import Done, MissingRequest, More, ReplyHeader
 from cairn_map.version_vector import VersionVector
 from cairn_server.cells_at_rest import sum_of_contributions
-from cairn_server.store import CellRow, Snapshot
+from cairn_server.store import Snapshot
+from cairn_server.store_rows import CellRow
 
 log = logging.getLogger(__name__)
 

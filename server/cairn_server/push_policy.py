@@ -18,7 +18,7 @@ from cairn_map.grid import CellKey, Geometry, cell_of_key
 from cairn_map.ids import INITIAL, CommitId
 from cairn_map.version_vector import AUTHORS_MAX, INTERVALS_MAX
 from cairn_server.auth import Caller
-from cairn_server.store import MapRow
+from cairn_server.store_rows import MapRow
 
 WEIGHT_MAX = 1024
 """Of one scan's sample in one voxel; cairn's own integrator gives 1."""

@@ -35,7 +35,8 @@ from cairn_server.missing import asker_from_request, header_of, reply_frames
 from cairn_server.push_policy import check_claims, check_evidence
 from cairn_server.settings import Settings
 from cairn_server.stable import StableVectors
-from cairn_server.store import Branch, CellRow, Head, MapRow, NewCommit, Store
+from cairn_server.store import Store
+from cairn_server.store_rows import Branch, CellRow, Head, MapRow, NewCommit
 
 OPERATOR = RobotName("operator")
 VALIDATING_MAX = 4

@@ -10,7 +10,7 @@ from cairn_map.evidence import COUNT_MAX, SUM_MAX
 from cairn_map.ids import CommitId
 from cairn_server.push_policy import Numbering, check_number
 from cairn_server.sqlite_writer import first
-from cairn_server.store import Fold, MapRow, NewCommit
+from cairn_server.store_rows import Fold, MapRow, NewCommit
 
 AUDIT_ROWS_MAX = 100_000
 

@@ -1,12 +1,14 @@
-"""Tables of the embedded store. A change of this text is a new `VERSION` and a migration."""
+"""Tables of the embedded store, step by step: a store of version n has taken the first n steps.
+
+A step that was released never changes. A new store takes them all; an older one takes what it lacks, in one
+transaction, when a server opens it. `tests/formats` keeps a store of every version.
+"""
 
 import apsw
 
 from cairn_map.errors import BadInputError
 
-VERSION = 1
-
-DDL = """
+FIRST = """
 CREATE TABLE map (
     number INTEGER PRIMARY KEY,
     name TEXT NOT NULL UNIQUE,
@@ -106,19 +108,37 @@ CREATE TABLE audit (
 );
 """
 
+STAMPS = """
+ALTER TABLE map ADD COLUMN seal_key BLOB NOT NULL DEFAULT x'';
+UPDATE map SET seal_key = randomblob(32);           -- by which the server knows its own retracts again
+ALTER TABLE commits ADD COLUMN rig BLOB;            -- SHA-256 of rig.json
+UPDATE commits SET rig = unhex(json_extract(CAST(meta AS TEXT), '$.rig'));
+ALTER TABLE commits ADD COLUMN gone INTEGER NOT NULL DEFAULT 0;     -- its evidence is not kept any more
+ALTER TABLE cell ADD COLUMN stamps BLOB NOT NULL DEFAULT x'';       -- log entry that last changed each block
+ALTER TABLE branch ADD COLUMN incarnation TEXT NOT NULL DEFAULT '';
+CREATE INDEX commits_kept ON commits (map, folded_s) WHERE gone = 0 AND folded_seq IS NOT NULL;
+"""
+
+STEPS = (FIRST, STAMPS)
+
 
 def ensure_schema(connection: apsw.Connection) -> None:
-    """Make the tables in a new file; check the version of an old one.
+    """Make the tables in a new file, or what an older one lacks of them.
 
     Raises:
-        BadInputError: the file belongs to another version of cairn, or to another program.
+        BadInputError: the file belongs to a newer version of cairn, or to another program.
     """
     version = connection.pragma("user_version")
-    if version == VERSION:
+    if version == len(STEPS):
         return
-    if version != 0 or connection.execute("SELECT count(*) FROM sqlite_master").get:
-        raise BadInputError("store_version", f"the store has version {version}, this cairn needs {VERSION}")
+    if not 0 <= version < len(STEPS):
+        raise BadInputError(
+            "store_version", f"the store has version {version}; this cairn knows versions to {len(STEPS)}: update it"
+        )
+    if version == 0 and connection.execute("SELECT count(*) FROM sqlite_master").get:
+        raise BadInputError("store_version", "the file is a database of another program")
     connection.execute("BEGIN IMMEDIATE")
-    connection.execute(DDL)
-    connection.execute(f"PRAGMA user_version = {VERSION}")
+    for step in STEPS[version:]:
+        connection.execute(step)
+    connection.execute(f"PRAGMA user_version = {len(STEPS)}")
     connection.execute("COMMIT")

@@ -13,7 +13,7 @@ from cairn_map.ids import Author, CommitId, commit_id_from_text
 from cairn_map.messages import LogEntry
 from cairn_map.version_vector import EMPTY, VersionVector, version_vector_from_json
 from cairn_server.sqlite_writer import first, rows
-from cairn_server.store import CellRow, Contribution, Head, Totals
+from cairn_server.store_rows import CellRow, Contribution, Head, Totals
 
 CELL_COLUMNS = "cell, lm, digest, fingerprint, voxels, size_bytes"
 

@@ -23,7 +23,7 @@ from cairn_server.sqlite_readers import Readers
 from cairn_server.sqlite_schema import ensure_schema
 from cairn_server.sqlite_snapshot import SqliteSnapshot, ids_from_text
 from cairn_server.sqlite_writer import Values, Writer, connect, first, rows
-from cairn_server.store import Branch, Fold, MapRow, NewCommit, StoredCommit
+from cairn_server.store_rows import Branch, Fold, MapRow, NewCommit, StoredCommit
 
 log = logging.getLogger(__name__)
 
@@ -67,8 +67,8 @@ class SqliteStore:
             log_id = secrets.token_bytes(16)
             tops = [0] * (2 + geometry.plane_count)
             connection.execute(
-                "INSERT INTO map (name, geometry, sensor_model, operator, log_id, seq, chain, vector, tops)"
-                " VALUES (?, ?, ?, ?, ?, 0, ?, '{}', ?)",
+                "INSERT INTO map (name, geometry, sensor_model, operator, log_id, seq, chain, vector, tops, seal_key)"
+                " VALUES (?, ?, ?, ?, ?, 0, ?, '{}', ?, randomblob(32))",
                 (
                     name,
                     geometry.model_dump_json(),

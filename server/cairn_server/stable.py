@@ -4,7 +4,8 @@ import threading
 import time
 
 from cairn_map.version_vector import EMPTY, VersionVector
-from cairn_server.store import MapRow, Snapshot
+from cairn_server.store import Snapshot
+from cairn_server.store_rows import MapRow
 
 KEEP_S = 10.0
 """The answer is kept this long: it only ever grows, so an old one is safe."""

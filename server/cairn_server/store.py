@@ -6,141 +6,17 @@ fold      cells, log entries and the new head, all or nothing, only on top of th
 snapshot  a view of one state of the map: header and frames of a reply come from one of these
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
 from typing import Protocol
 
 from cairn_map.cursor import Cursor
-from cairn_map.fingerprint import Fingerprint
 from cairn_map.grid import CellKey, Geometry
-from cairn_map.ids import Author, CommitId, Incarnation
+from cairn_map.ids import Author, CommitId
 from cairn_map.messages import LogEntry
 from cairn_map.sensor_model import SensorModel
-from cairn_map.version_vector import EMPTY, VersionVector
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MapRow:
-    """A map as created; never changes."""
-
-    number: int
-    name: str
-    geometry: Geometry
-    sensor_model: SensorModel
-    operator: Incarnation
-    """Incarnation under which this server makes retracts for operators."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NewCommit:
-    """A validated commit on its way into the store."""
-
-    id: CommitId
-    sha: bytes
-    size_bytes: int
-    text: bytes
-    """Its meta as it was pushed: the SHA-256 is over these bytes."""
-    captured_s: tuple[float, float] | None
-    retracts: tuple[CommitId, ...]
-    diff: Mapping[CellKey, bytes]
-    tops: tuple[int, ...]
-    """Largest number of each plane; their sums over all commits bound every sum in the map."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StoredCommit:
-    """A commit as the folder reads it."""
-
-    number: int
-    id: CommitId
-    sha: bytes
-    text: bytes
-    retracts: tuple[CommitId, ...]
-    diff: Mapping[CellKey, bytes | None]
-    """None: not kept any more."""
-
-
-@dataclass(frozen=True, slots=True)
-class Contribution:
-    """What one log entry did to one cell."""
-
-    kind: bytes
-    author: Author
-    diff: int
-    """Number of the diff in the store."""
-    size_bytes: int | None
-    """None: not kept any more."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CellRow:
-    """A cell of the folded map."""
-
-    key: CellKey
-    lm: int
-    """Log entry that last changed it."""
-    digest: bytes
-    fingerprint: Fingerprint
-    voxels: int
-    body: bytes
-    """Empty where a listing did not ask for it."""
-    size_bytes: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Entry:
-    """One entry of the log: a commit folded (`+`) or taken out (`-`)."""
-
-    kind: bytes
-    commit: int
-    """Number of the commit in the store."""
-    chain: bytes
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fold:
-    """What one fold changes, made from the state at `base`."""
-
-    base: Cursor
-    head: Cursor
-    vector: VersionVector
-    entries: tuple[Entry, ...]
-    cells: tuple[CellRow, ...]
-    retracted: tuple[CommitId, ...] = ()
-    """Ids whose retract took or will take effect; each once, for ever."""
-    damaged: tuple[tuple[int, str], ...] = ()
-    """Numbers of commits to set aside, and why: pushed again, they are pending again."""
-
-
-@dataclass(frozen=True, slots=True)
-class Branch:
-    """A registered robot."""
-
-    name: str
-    mode: str
-    sensors: tuple[str, ...]
-    cursor: Cursor | None
-    last_seen_s: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Totals:
-    """Sizes of a map."""
-
-    cells: int = 0
-    size_bytes: int = 0
-    commits: int = 0
-    branches: int = 0
-    corner_cells: tuple[tuple[int, int, int], tuple[int, int, int]] | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Head:
-    """The newest folded state."""
-
-    cursor: Cursor
-    vector: VersionVector = field(default=EMPTY)
+from cairn_map.version_vector import VersionVector
+from cairn_server.store_rows import Branch, CellRow, Contribution, Fold, Head, MapRow, NewCommit, StoredCommit, Totals
 
 
 class Snapshot(Protocol):

@@ -24,7 +24,7 @@ from cairn_server.serve_command import listen
 from cairn_server.service import Service
 from cairn_server.settings import Settings
 from cairn_server.sqlite_store import SqliteStore
-from cairn_server.store import MapRow
+from cairn_server.store_rows import MapRow
 
 DEADLINE_S = 60.0
 

@@ -21,7 +21,8 @@ from cairn_map.version_vector import EMPTY, VersionVector
 from cairn_server.cell_cache import CellCache
 from cairn_server.folding import fold_pending
 from cairn_server.service import _new_commit
-from cairn_server.store import Branch, Fold, Head, MapRow, NewCommit, Store
+from cairn_server.store import Store
+from cairn_server.store_rows import Branch, Fold, Head, MapRow, NewCommit
 
 NAMES = (f"map{n}" for n in itertools.count())
 COMMITS = [pushed(n, n + shift, author) for shift, author in enumerate((MOLE, WREN)) for n in range(3)]

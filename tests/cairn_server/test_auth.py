@@ -15,7 +15,7 @@ from cairn_map.errors import BadInputError
 from cairn_map.ids import INITIAL, Author, Incarnation
 from cairn_server.serve_command import main
 from cairn_server.settings import Settings
-from cairn_server.store import MapRow
+from cairn_server.store_rows import MapRow
 
 ADMIN, ENROLLER = "a" * 20, "e" * 20
 TABLE = {(found[1], found[2]): found[3] for found in ROUTE.finditer(DOCUMENT)}

@@ -18,7 +18,7 @@ from cairn_map.fingerprint import fingerprint
 from cairn_map.grid import cell_of_key
 from cairn_map.messages import CellIndex
 from cairn_map.version_vector import version_vector_from_json
-from cairn_server.store import MapRow
+from cairn_server.store_rows import MapRow
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from cairn_server import folder
 from cairn_server.cell_cache import CellCache
 from cairn_server.folding import fold_pending
 from cairn_server.sqlite_store import SqliteStore
-from cairn_server.store import MapRow
+from cairn_server.store_rows import MapRow
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from cairn_map.frames import Frame, FrameKind, frames_of
 from cairn_map.grid import cell_of_key
 from cairn_map.messages import Done, MissingRequest, More, ReplyHeader
 from cairn_server import missing
-from cairn_server.store import MapRow
+from cairn_server.store_rows import MapRow
 
 
 def ask(live: Live, row: MapRow, request: MissingRequest) -> httpx.Response:

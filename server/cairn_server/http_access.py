@@ -1,0 +1,81 @@
+"""Who calls and what of: the dependencies that routes share. Checks of rights are made here, by `auth`."""
+
+from collections.abc import Callable
+from typing import Annotated
+
+from fastapi import Depends, Request
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+
+from cairn_map.errors import NotFoundError
+from cairn_server.auth import Caller, Role, caller_of, require
+from cairn_server.service import Service
+from cairn_server.store_rows import MapRow
+
+bearer = HTTPBearer(auto_error=False)
+
+
+def service_of(request: Request) -> Service:
+    """The app's service."""
+    service: Service = request.app.state.service
+    return service
+
+
+Operations = Annotated[Service, Depends(service_of)]
+Credentials = Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]
+
+
+def map_of(name: str, service: Operations, credentials: Credentials) -> MapRow:
+    """The map named in the path; strangers are not told which names there are."""
+    try:
+        return service.store.map(name)
+    except NotFoundError:
+        anybody(service, credentials)
+        raise
+
+
+Map = Annotated[MapRow, Depends(map_of)]
+
+
+def anybody(service: Operations, credentials: Credentials) -> Caller:
+    """Who calls, where no map is named yet."""
+    return caller_of(credentials.credentials if credentials else None, None, service.store, service.settings)
+
+
+def caller_on_map(service: Operations, row: Map, credentials: Credentials) -> Caller:
+    """Who calls; robots' tokens count on their own map only."""
+    return caller_of(credentials.credentials if credentials else None, row, service.store, service.settings)
+
+
+OnMap = Annotated[Caller, Depends(caller_on_map)]
+
+
+def allowed(*roles: Role) -> Callable[[Caller], Caller]:
+    """A dependency: the caller on a map, if it is an admin or has one of these roles."""
+
+    def check(caller: OnMap) -> Caller:
+        require(caller, *roles)
+        return caller
+
+    return check
+
+
+def admin(caller: Annotated[Caller, Depends(anybody)]) -> Caller:
+    """The caller, if it is an admin."""
+    require(caller)
+    return caller
+
+
+def own_branch(branch: str, caller: OnMap) -> Caller:
+    """The caller, if it is an admin or the robot of the branch in the path."""
+    require(caller, *([Role.ROBOT] if caller.robot == branch else []))
+    return caller
+
+
+async def body_of(request: Request) -> bytes:
+    """The whole body; `BodyLimit` bounds it."""
+    return await request.body()
+
+
+ADMIN = [Depends(admin)]
+READERS = [Depends(allowed(Role.ROBOT))]
+OWNERS = [Depends(own_branch)]
