@@ -7,10 +7,10 @@ whole.
 import logging
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_client.replica import UNPROVEN, Replica
 from cairn_client.replica_store import BaseCell
+from cairn_map.blocks import without_blocks
 from cairn_map.brick_cell import sum_evidence
 from cairn_map.cell_code import decode_cell
 from cairn_map.errors import DamagedDataError
@@ -22,9 +22,6 @@ from cairn_map.messages import CellCursor, Done, MissingRequest, More, ReplyHead
 from cairn_map.version_vector import EMPTY
 
 log = logging.getLogger(__name__)
-
-BLOCK_BITS = 6
-"""A 4^3 block is a voxel's Morton code without its six lowest bits."""
 
 
 class Exchange:
@@ -54,6 +51,7 @@ class Exchange:
             cursor=str(self._default) if self._default else None,
             cells=[CellCursor(cell=cell_of_key(k), cursor=str(c) if c else None) for k, c in sorted(listed)],
             compare=self._compare,
+            kinds=["delta", "state", "full"],
         )
 
     def take(self, frame: Frame) -> None:
@@ -172,16 +170,3 @@ class Exchange:
             self._replica.move([key], to=None, coverage=None)
         else:
             self._replica.hold_nothing(key, UNPROVEN)
-
-
-def without_blocks(evidence: Evidence, blocks: npt.NDArray[np.uint32]) -> Evidence:
-    """Packed evidence without the voxels of the given 4^3 blocks."""
-    keep = ~np.isin(evidence.voxels >> np.uint32(BLOCK_BITS), blocks)
-    kept_rows = keep[evidence.sampled]
-    new_row = np.cumsum(keep) - 1
-    return Evidence(
-        evidence.voxels[keep],
-        evidence.counts[keep],
-        new_row[evidence.sampled[kept_rows]].astype(np.uint32),
-        evidence.samples[kept_rows],
-    )

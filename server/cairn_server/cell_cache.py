@@ -8,20 +8,22 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
+from cairn_map.blocks import Blocks
 from cairn_map.brick_cell import BrickCell
 from cairn_map.cell_code import encode_cell
 from cairn_map.cursor import Cursor
 from cairn_map.evidence import Evidence
 from cairn_map.fingerprint import fingerprint
 from cairn_map.grid import CellKey, Geometry
-from cairn_server.cells_at_rest import stored_evidence
+from cairn_server.cells_at_rest import stored_evidence, stored_stamps
+from cairn_server.stamps import Stamps, encode_stamps
 from cairn_server.store_rows import CellRow
 
 CACHE_BYTES = 512 << 20
 """Memory for the cells under change of all maps."""
 
 Step = Callable[[BrickCell, Evidence], None]
-Load = Callable[[CellKey], BrickCell]
+Load = Callable[[CellKey], tuple[BrickCell, Stamps]]
 
 
 class CellCache:
@@ -32,7 +34,7 @@ class CellCache:
         self.size_bytes = 0
         self._geometry = geometry
         self._cursor: Cursor | None = None
-        self._cells: OrderedDict[CellKey, BrickCell] = OrderedDict()
+        self._cells: OrderedDict[CellKey, tuple[BrickCell, Stamps]] = OrderedDict()
         self._sizes: dict[CellKey, int] = {}
         self._changed: set[CellKey] = set()
         self._drafts: dict[CellKey, CellRow] = {}
@@ -49,18 +51,15 @@ class CellCache:
         Raises:
             BadInputError: a sum would leave its range; nothing was changed.
         """
-        cell = self._cells.get(key)
-        if cell is None:
-            draft = self._drafts.get(key)
-            cell = self._from_draft(draft) if draft else load(key)
+        cell, stamps = self._taken(key, load)
         step(cell, diff)
-        self._drafts.pop(key, None)
-        self._changed.add(key)
-        self._cells[key] = cell
-        self._cells.move_to_end(key)
-        self.size_bytes += cell.size_bytes - self._sizes.get(key, 0)
-        self._sizes[key] = cell.size_bytes
-        self.trim()
+        self._keep(key, cell, stamps)
+
+    def stamp(self, key: CellKey, blocks: Blocks, seq: int, load: Load) -> None:
+        """Note that a log entry changed these blocks of a cell."""
+        cell, stamps = self._taken(key, load)
+        stamps[blocks] = seq
+        self._keep(key, cell, stamps)
 
     def rows(self, last_change: Mapping[CellKey, int]) -> tuple[CellRow, ...]:
         """The changed cells encoded, rising in number, each with the log entry that last changed it."""
@@ -90,20 +89,35 @@ class CellCache:
             del self._cells[key]
             self.size_bytes -= self._sizes.pop(key)
 
-    def _from_draft(self, draft: CellRow) -> BrickCell:
-        cell = BrickCell(self._geometry)
-        cell.merge(stored_evidence(draft))
-        return cell
+    def _taken(self, key: CellKey, load: Load) -> tuple[BrickCell, Stamps]:
+        kept, draft = self._cells.get(key), self._drafts.get(key)
+        if kept is None and draft is not None:
+            cell = BrickCell(self._geometry)
+            cell.merge(stored_evidence(draft))
+            return cell, stored_stamps(draft, self._geometry)
+        return load(key) if kept is None else kept
+
+    def _keep(self, key: CellKey, cell: BrickCell, stamps: Stamps) -> None:
+        self._drafts.pop(key, None)
+        self._changed.add(key)
+        self._cells[key] = cell, stamps
+        self._cells.move_to_end(key)
+        size_bytes = cell.size_bytes + stamps.nbytes
+        self.size_bytes += size_bytes - self._sizes.get(key, 0)
+        self._sizes[key] = size_bytes
+        self.trim()
 
     def _encoded(self, key: CellKey) -> CellRow:
-        evidence = self._cells[key].packed()
+        cell, stamps = self._cells[key]
+        evidence = cell.packed()
         encoded = encode_cell(key, evidence, self._geometry)
         return CellRow(
             key=key,
-            lm=0,
+            lm=int(stamps.max()),
             digest=encoded.digest,
             fingerprint=fingerprint(evidence, key),
             voxels=len(evidence),
             body=encoded.data,
             size_bytes=len(encoded.data),
+            stamps=encode_stamps(stamps),
         )

@@ -9,6 +9,7 @@ from cairn_map.cursor import ENTRY_FOLD
 from cairn_map.errors import CairnError, DamagedDataError
 from cairn_map.evidence import Evidence
 from cairn_map.grid import CellKey, Geometry, cell_of_key
+from cairn_server.stamps import Stamps, decode_stamps, no_stamps
 from cairn_server.store import Snapshot
 from cairn_server.store_rows import CellRow, Contribution
 
@@ -60,7 +61,16 @@ def sum_of_contributions(
     return total
 
 
-def cell_to_change(snapshot: Snapshot, key: CellKey, geometry: Geometry) -> BrickCell:
+def stored_stamps(stored: CellRow, geometry: Geometry) -> Stamps:
+    """The stamps of a cell at rest; where they are damaged, more than was changed."""
+    try:
+        return decode_stamps(stored.stamps, depth=geometry.depth, lm=stored.lm)
+    except DamagedDataError as exc:
+        log.error("cell %s: %s; taking all of it for changed", cell_of_key(stored.key), exc.message)
+        return decode_stamps(b"", depth=geometry.depth, lm=stored.lm)
+
+
+def cell_to_change(snapshot: Snapshot, key: CellKey, geometry: Geometry) -> tuple[BrickCell, Stamps]:
     """A cell of the map, to be changed; a damaged one is summed up anew from all that the log says about it.
 
     Raises:
@@ -69,10 +79,13 @@ def cell_to_change(snapshot: Snapshot, key: CellKey, geometry: Geometry) -> Bric
     stored = snapshot.cell(key)
     cell = BrickCell(geometry)
     if stored is None:
-        return cell
+        return cell, no_stamps(geometry.depth)
+    stamps = stored_stamps(stored, geometry)
     try:
         cell.merge(stored_evidence(stored))
     except DamagedDataError as exc:
+        if stored.gone_seq:
+            raise
         log.error("%s; making it anew from the log", exc.message)
-        return sum_of_contributions(snapshot, key, snapshot.contributions(key, after_seq=0), geometry)
-    return cell
+        return sum_of_contributions(snapshot, key, snapshot.contributions(key, after_seq=0), geometry), stamps
+    return cell, stamps

@@ -12,6 +12,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from cairn_map.blocks import Blocks, blocks_of
 from cairn_map.brick_cell import BrickCell
 from cairn_map.cell_code import DecodedCell
 from cairn_map.commit import commit_sha
@@ -22,6 +23,7 @@ from cairn_map.grid import CellKey
 from cairn_map.ids import CommitId
 from cairn_server.cell_cache import CellCache, Step
 from cairn_server.cells_at_rest import cell_to_change, decode_stored
+from cairn_server.stamps import Stamps
 from cairn_server.store import Store
 from cairn_server.store_rows import Entry, Fold, Head, MapRow, StoredCommit
 
@@ -120,23 +122,26 @@ class _Plan:
         return commit in self.retracted or self.store.is_retracted(self.row, commit)
 
     def _enter(self, kind: bytes, commit: StoredCommit) -> None:
-        self._apply(kind, commit)
+        blocks = self._apply(kind, commit)
         self.chain = next_chain(self.chain, kind, commit.id, commit.sha)
         self.entries.append(Entry(kind=kind, commit=commit.number, chain=self.chain))
-        self.last_change.update(dict.fromkeys(commit.diff, self.start.seq + len(self.entries)))
+        seq = self.start.seq + len(self.entries)
+        self.last_change.update(dict.fromkeys(commit.diff, seq))
+        for key, changed in blocks.items():
+            self.cache.stamp(key, changed, seq, self._load)
 
-    def _apply(self, kind: bytes, commit: StoredCommit) -> None:
-        """Add or subtract a commit's diff, all of it or nothing."""
+    def _apply(self, kind: bytes, commit: StoredCommit) -> dict[CellKey, Blocks]:
+        """Add or subtract a commit's diff, all of it or nothing; the blocks that it touches."""
         step, undo = BrickCell.merge, BrickCell.unmerge
         if kind == ENTRY_UNFOLD:
             step, undo = undo, step
-        done: list[CellKey] = []
+        done: dict[CellKey, Blocks] = {}
         digests: list[bytes] = []
         try:
             for key, body in commit.diff.items():
                 decoded = _decoded(commit, key, body)
                 self._change(key, decoded.evidence, step, commit)
-                done.append(key)
+                done[key] = blocks_of(decoded.evidence)
                 digests.append(decoded.digest)
             if commit_sha(commit.text, digests) != commit.sha:
                 raise DamagedCommitError("damaged_store", f"commit {commit.id} at rest does not have its SHA-256")
@@ -144,6 +149,7 @@ class _Plan:
             for key in done:
                 self.cache.change(key, _decoded(commit, key, commit.diff[key]).evidence, undo, self._load)
             raise
+        return done
 
     def _change(self, key: CellKey, evidence: Evidence, step: Step, commit: StoredCommit) -> None:
         try:
@@ -151,7 +157,7 @@ class _Plan:
         except BadInputError as exc:
             raise DamagedCommitError("damaged_store", f"commit {commit.id} at rest: {exc.message}") from exc
 
-    def _load(self, key: CellKey) -> BrickCell:
+    def _load(self, key: CellKey) -> tuple[BrickCell, Stamps]:
         with self.store.snapshot(self.row) as snapshot:
             return cell_to_change(snapshot, key, self.row.geometry)
 

@@ -9,23 +9,22 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from cairn_map.cell_code import encode_cell
-from cairn_map.cursor import ENTRY_FOLD, Cursor, cursor_from_text
-from cairn_map.errors import BadInputError, ConflictError, DamagedDataError
+from cairn_map.cursor import Cursor, cursor_from_text
+from cairn_map.errors import BadInputError, ConflictError
 from cairn_map.evidence import empty_evidence
 from cairn_map.fingerprint import ZERO, Fingerprint
 from cairn_map.frames import CELL_HEAD, CellFrame, Frame, FrameKind
-from cairn_map.grid import CellKey, Geometry, cell_key, cell_of_key
+from cairn_map.grid import CellKey, Geometry, cell_key
 from cairn_map.ids import Author, author_from_text
 from cairn_map.messages import Done, MissingRequest, More, ReplyHeader
 from cairn_map.version_vector import VersionVector
-from cairn_server.cells_at_rest import sum_of_contributions
+from cairn_server.cell_changes import change_since
+from cairn_server.read_cache import ReadCache
 from cairn_server.store import Snapshot
 from cairn_server.store_rows import CellRow
 
 log = logging.getLogger(__name__)
 
-DELTA_ENTRIES_MAX = 32
-"""A delta of more log entries than this is not tried: it would hardly be smaller than the cell."""
 REPLY_BYTES_MAX = 64 << 20
 """A longer reply ends with `more`, and the asker comes back for the rest."""
 
@@ -37,7 +36,7 @@ class Asker:
     author: Author | None
     cursor: Cursor | None
     cells: dict[CellKey, Cursor | None]
-    wants_delta: bool
+    kinds: frozenset[str]
     compare: bool
     unproven: set[Cursor] = field(default_factory=set)
 
@@ -53,7 +52,7 @@ def asker_from_request(request: MissingRequest, snapshot: Snapshot) -> Asker:
         author=author_from_text(request.author) if request.author else None,
         cursor=_cursor(request.cursor),
         cells={cell_key(entry.cell): _cursor(entry.cursor) for entry in request.cells},
-        wants_delta="delta" in request.kinds,
+        kinds=frozenset(request.kinds),
         compare=request.compare,
     )
     if len(asker.cells) != len(request.cells):
@@ -67,7 +66,9 @@ def asker_from_request(request: MissingRequest, snapshot: Snapshot) -> Asker:
     return asker
 
 
-def reply_frames(snapshot: Snapshot, asker: Asker, geometry: Geometry, *, stable: VersionVector) -> Iterator[Frame]:
+def reply_frames(
+    snapshot: Snapshot, asker: Asker, geometry: Geometry, cache: ReadCache, *, stable: VersionVector
+) -> Iterator[Frame]:
     """Header, frames of the cells that the asker misses, and the end; all from one snapshot."""
     head = snapshot.head
     yield header_of(snapshot, asker.author, stable=stable)
@@ -77,7 +78,7 @@ def reply_frames(snapshot: Snapshot, asker: Asker, geometry: Geometry, *, stable
     rows = list(snapshot.cells())
     for row in rows:
         start = listed.pop(row.key, asker.cursor)
-        frame = _frame_for(snapshot, asker, row, start, geometry)
+        frame = _frame_for(snapshot, asker, row, start, geometry, cache)
         if frame is None:
             rest += row.fingerprint
             continue
@@ -108,24 +109,16 @@ def header_of(snapshot: Snapshot, author: Author | None, *, stable: VersionVecto
 
 
 def _frame_for(
-    snapshot: Snapshot, asker: Asker, row: CellRow, start: Cursor | None, geometry: Geometry
+    snapshot: Snapshot, asker: Asker, row: CellRow, start: Cursor | None, geometry: Geometry, cache: ReadCache
 ) -> CellFrame | None:
     if asker.compare or start in asker.unproven:
         return _frame(FrameKind.RESET, row.key, start, snapshot.head.cursor, row.fingerprint)
     if start is not None and row.lm <= start.seq:
         return None
-    if start is not None and asker.wants_delta:
-        payload = _delta(snapshot, row, start, asker.author, geometry)
-        if payload is not None and len(payload) < row.size_bytes:
-            return CellFrame(
-                kind=FrameKind.DELTA,
-                cell=row.key,
-                from_cursor=start,
-                to_cursor=snapshot.head.cursor,
-                fingerprint=row.fingerprint,
-                own_excluded=asker.author is not None,
-                payload=payload,
-            )
+    if start is not None:
+        change = change_since(snapshot, row, start, geometry, cache, asker=asker.author, kinds=asker.kinds)
+        if change is not None:
+            return change
     stored = snapshot.cell(row.key)
     body = stored.body if stored else b""
     return _frame(FrameKind.FULL, row.key, start, snapshot.head.cursor, row.fingerprint, body)
@@ -144,25 +137,6 @@ def _frame(
     kind: FrameKind, key: CellKey, start: Cursor | None, to: Cursor, fingerprint: Fingerprint, payload: bytes = b""
 ) -> CellFrame:
     return CellFrame(kind=kind, cell=key, from_cursor=start, to_cursor=to, fingerprint=fingerprint, payload=payload)
-
-
-def _delta(snapshot: Snapshot, row: CellRow, start: Cursor, asker: Author | None, geometry: Geometry) -> bytes | None:
-    """Sum of what others did to a cell since `start`; None if that cannot be said or is not worth it."""
-    entries = snapshot.contributions(row.key, after_seq=start.seq, limit=DELTA_ENTRIES_MAX + 1)
-    if len(entries) > DELTA_ENTRIES_MAX or any(entry.size_bytes is None for entry in entries):
-        return None
-    # What takes an own commit out again is not own: the asker must hear of it (SYNC.md rule 11).
-    foreign = [entry for entry in entries if entry.kind != ENTRY_FOLD or entry.author != asker]
-    if sum(entry.size_bytes or 0 for entry in foreign) > 4 * row.size_bytes:
-        return None
-    if len(foreign) == 1 and foreign[0].kind == ENTRY_FOLD:
-        return snapshot.diff(foreign[0].diff)  # one commit's diff is its own sum
-    try:
-        evidence = sum_of_contributions(snapshot, row.key, foreign, geometry).packed()
-    except DamagedDataError as exc:
-        log.error("cell %s: a diff at rest is damaged, sending the whole cell: %s", cell_of_key(row.key), exc.message)
-        return None
-    return encode_cell(row.key, evidence, geometry).data if len(evidence) else b""
 
 
 def _cursor(text: str | None) -> Cursor | None:

@@ -33,6 +33,7 @@ from cairn_server.auth import Caller, new_token, token_hash
 from cairn_server.folder import Folder
 from cairn_server.missing import asker_from_request, header_of, reply_frames
 from cairn_server.push_policy import check_claims, check_evidence
+from cairn_server.read_cache import ReadCache
 from cairn_server.settings import Settings
 from cairn_server.stable import StableVectors
 from cairn_server.store import Store
@@ -53,6 +54,7 @@ class Service:
         self._folder = Folder(store)
         self._validating = threading.BoundedSemaphore(VALIDATING_MAX)
         self._stable = StableVectors(settings.stable_after_s)
+        self._reads = ReadCache()
 
     def create_map(self, name: str, request: CreateMap) -> tuple[MapInfo, bool]:
         """The map, and whether it is new."""
@@ -126,7 +128,7 @@ class Service:
             asker = asker_from_request(request, snapshot)
             parts = [start_of_reply()]
             stable = self._stable.of(row, snapshot)
-            parts += [encode_frame(f) for f in reply_frames(snapshot, asker, row.geometry, stable=stable)]
+            parts += [encode_frame(f) for f in reply_frames(snapshot, asker, row.geometry, self._reads, stable=stable)]
         self.store.seen(row, branch, asker.cursor)
         return b"".join(parts)
 

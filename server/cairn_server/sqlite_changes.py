@@ -94,13 +94,13 @@ def write_audit(connection: apsw.Connection, what: str, detail: str) -> None:
 
 def _write_cells(connection: apsw.Connection, row: MapRow, fold: Fold) -> None:
     connection.executemany(
-        "INSERT INTO cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, body)"
-        " VALUES (?, ?, ?, ?, ?, ?, ?, ?)"
+        "INSERT INTO cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, body, stamps)"
+        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
         " ON CONFLICT (map, cell) DO UPDATE SET lm = excluded.lm, digest = excluded.digest,"
         " fingerprint = excluded.fingerprint, voxels = excluded.voxels, size_bytes = excluded.size_bytes,"
-        " body = excluded.body",
+        " body = excluded.body, stamps = excluded.stamps",
         [
-            (row.number, c.key, c.lm, c.digest, c.fingerprint.to_bytes(), c.voxels, c.size_bytes, c.body)
+            (row.number, c.key, c.lm, c.digest, c.fingerprint.to_bytes(), c.voxels, c.size_bytes, c.body, c.stamps)
             for c in fold.cells
         ],
     )

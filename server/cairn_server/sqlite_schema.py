@@ -115,6 +115,7 @@ ALTER TABLE commits ADD COLUMN rig BLOB;            -- SHA-256 of rig.json
 UPDATE commits SET rig = unhex(json_extract(CAST(meta AS TEXT), '$.rig'));
 ALTER TABLE commits ADD COLUMN gone INTEGER NOT NULL DEFAULT 0;     -- its evidence is not kept any more
 ALTER TABLE cell ADD COLUMN stamps BLOB NOT NULL DEFAULT x'';       -- log entry that last changed each block
+ALTER TABLE cell ADD COLUMN gone_seq INTEGER NOT NULL DEFAULT 0;    -- the newest entry of which the evidence is gone
 ALTER TABLE branch ADD COLUMN incarnation TEXT NOT NULL DEFAULT '';
 CREATE INDEX commits_kept ON commits (map, folded_s) WHERE gone = 0 AND folded_seq IS NOT NULL;
 """

@@ -15,7 +15,7 @@ from cairn_map.version_vector import EMPTY, VersionVector, version_vector_from_j
 from cairn_server.sqlite_writer import first, rows
 from cairn_server.store_rows import CellRow, Contribution, Head, Totals
 
-CELL_COLUMNS = "cell, lm, digest, fingerprint, voxels, size_bytes"
+CELL_COLUMNS = "cell, lm, digest, fingerprint, voxels, size_bytes, gone_seq"
 
 
 class SqliteSnapshot:
@@ -48,7 +48,7 @@ class SqliteSnapshot:
         """One cell with its body."""
         row = first(
             self._connection,
-            f"SELECT {CELL_COLUMNS}, body FROM cell WHERE map = ? AND cell = ?",  # noqa: S608 - constant columns
+            f"SELECT {CELL_COLUMNS}, body, stamps FROM cell WHERE map = ? AND cell = ?",  # noqa: S608 - constant columns
             (self._map, key),
         )
         return cell_row(row) if row else None
@@ -162,15 +162,17 @@ class SqliteSnapshot:
 
 
 def cell_row(columns: tuple[Any, ...]) -> CellRow:
-    """A cell from its columns, the body last or left out."""
-    key, lm, digest, fingerprint, voxels, size_bytes, *body = columns
+    """A cell from its columns, body and stamps last or left out."""
+    key, lm, digest, fingerprint, voxels, size_bytes, gone_seq, *rest = columns
     return CellRow(
         key=CellKey(key),
         lm=lm,
         digest=digest,
         fingerprint=fingerprint_from_bytes(fingerprint),
         voxels=voxels,
-        body=body[0] if body else b"",
+        body=rest[0] if rest else b"",
+        stamps=rest[1] if rest else b"",
+        gone_seq=gone_seq,
         size_bytes=size_bytes,
     )
 

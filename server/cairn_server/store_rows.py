@@ -77,6 +77,10 @@ class CellRow:
     body: bytes
     """Empty where a listing did not ask for it."""
     size_bytes: int
+    stamps: bytes = b""
+    """Of `stamps`; empty where a listing did not ask for them."""
+    gone_seq: int = 0
+    """The newest log entry of which the evidence is not kept any more; a fold does not change it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,8 +19,9 @@ from cairn_map.version_vector import EMPTY, VersionVector
 class NaiveAsker:
     """Base, cursor and coverage of each cell, and the asker's own commits."""
 
-    def __init__(self, author: Author | None) -> None:
+    def __init__(self, author: Author | None, *, asks_for: tuple[str, ...] = ("delta", "full")) -> None:
         self.author = author
+        self.asks_for = asks_for
         self.own: dict[int, Commit] = {}
         self.base: Cells = {}
         self.cursor: str | None = None
@@ -32,7 +33,9 @@ class NaiveAsker:
         """What it holds."""
         cells = [CellCursor(cell=cell_of_key(key), cursor=cursor) for key, cursor in self.cursors.items()]
         author = str(self.author) if self.author else None
-        return MissingRequest.model_validate({"author": author, "cursor": self.cursor, "cells": cells} | fields)
+        return MissingRequest.model_validate(
+            {"author": author, "cursor": self.cursor, "cells": cells, "kinds": list(self.asks_for)} | fields
+        )
 
     def take(self, frames: Iterable[Frame]) -> bool:
         """Apply a reply; whether it was whole."""
@@ -69,6 +72,12 @@ class NaiveAsker:
                 if commit.id in news and key in commit.cells:
                     total = naive.merged(total, as_dict(decode_cell(commit.cells[key]).evidence))
             self.base[key] = naive.merged(total, payload)
+        elif frame.kind is FrameKind.STATE:
+            assert frame.blocks is not None
+            changed = set(frame.blocks.tolist())
+            assert {voxel // 64 for voxel in payload} <= changed
+            kept = {voxel: sums for voxel, sums in self.base[key].items() if voxel // 64 not in changed}
+            self.base[key] = kept | payload
         else:
             raise AssertionError("this asker does not know such frames")
         assert naive.fingerprint(self.base[key], key) == (frame.fingerprint.first, frame.fingerprint.second)

@@ -14,7 +14,7 @@ from cairn_map.fingerprint import ZERO
 from cairn_map.frames import Frame, FrameKind, frames_of
 from cairn_map.grid import cell_of_key
 from cairn_map.messages import Done, MissingRequest, More, ReplyHeader
-from cairn_server import missing
+from cairn_server import cell_changes, missing
 from cairn_server.store_rows import MapRow
 
 
@@ -37,7 +37,8 @@ def fetch(live: Live, row: MapRow, asker: NaiveAsker) -> list[Frame]:
 @given(st.data())
 def test_an_asker_that_comes_now_and_then_always_ends_with_the_server_s_map(live: Live, data: st.DataObject) -> None:
     row = live.new_map()
-    asker = NaiveAsker(data.draw(st.sampled_from([MOLE, WREN, None])))
+    kinds = data.draw(st.sampled_from([("delta", "full"), ("state", "full"), ("delta", "state", "full"), ()]))
+    asker = NaiveAsker(data.draw(st.sampled_from([MOLE, WREN, None])), asks_for=kinds)
     commits = [pushed(n, data.draw(st.integers(0, 5)), author) for author in (MOLE, WREN) for n in range(4)]
     steps = data.draw(st.lists(st.sampled_from(["push", "push", "retract", "fetch"]), max_size=12))
     waiting = list(data.draw(st.permutations(commits)))
@@ -214,7 +215,7 @@ def test_many_entries_are_not_even_tried_as_a_delta(live: Live, monkeypatch: pyt
     asker = NaiveAsker(MOLE)
     live.push(row, pushed(0, 0, WREN))
     fetch(live, row, asker)
-    monkeypatch.setattr(missing, "DELTA_ENTRIES_MAX", 2)
+    monkeypatch.setattr(cell_changes, "DELTA_ENTRIES_MAX", 2)
     for n in range(1, 4):
         live.push(row, pushed(n, 0, WREN))
     found = cell_frames(fetch(live, row, asker))

@@ -11,7 +11,7 @@ from tests.cairn_server.live import Live
 
 from cairn_map.commit import COMMIT_BYTES_MAX, RETRACTS_MAX
 from cairn_map.messages import CURSORS_MAX
-from cairn_server import body_limit, missing, problems, push_policy, service, sqlite_changes
+from cairn_server import body_limit, cell_changes, missing, problems, push_policy, service, sqlite_changes
 
 ROOT = Path(__file__).parents[2]
 DOCUMENT = (ROOT / "server" / "PROTOCOL.md").read_text()
@@ -104,6 +104,6 @@ def test_the_limits_of_push_in_the_document_are_those_of_the_code() -> None:
         f"at most {push_policy.AUTHOR_INTERVALS_MAX} gaps",
         f"{push_policy.INCARNATIONS_MAX} incarnations",
         f"{push_policy.AUTHORS_MAX // 2:_} authors".replace("_", " "),
-        f"at most {missing.DELTA_ENTRIES_MAX} entries",
+        f"at most {cell_changes.DELTA_ENTRIES_MAX} entries",
     ):
         assert text in policy + DOCUMENT, text
