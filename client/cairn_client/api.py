@@ -28,7 +28,7 @@ from cairn_map.errors import (
 from cairn_map.fingerprint import Fingerprint, fingerprint_from_hex
 from cairn_map.frames import Frame, FrameReader
 from cairn_map.grid import Cell
-from cairn_map.ids import Author
+from cairn_map.ids import Author, CommitId
 from cairn_map.messages import (
     BranchInfo,
     CellIndex,
@@ -135,9 +135,16 @@ class MapApi:
         """Deregister a robot."""
         self._ask("DELETE", f"/maps/{name}/branches/{branch}")
 
-    def push(self, name: str, commit: Commit) -> Pushed:
-        """Push a commit; when this returns, the server has it for good."""
-        return message_from_json(Pushed, self._ask("PUT", f"/maps/{name}/commits/{commit.id}", content=commit.data))
+    def push(self, name: str, commit: Commit, *, seal: str | None = None) -> Pushed:
+        """Push a commit; when this returns, the server has it for good. `seal`: of a retract that is the server's."""
+        headers = {"Cairn-Seal": seal} if seal else {}
+        path = f"/maps/{name}/commits/{commit.id}"
+        return message_from_json(Pushed, self._ask("PUT", path, content=commit.data, headers=headers))
+
+    def commit(self, name: str, commit: CommitId) -> tuple[bytes, str | None]:
+        """A commit's bytes as they were pushed, and the seal on a retract that is the server's."""
+        answer = self._send("GET", f"/maps/{name}/commits/{commit}")
+        return answer.body, answer.headers.get("Cairn-Seal")
 
     def retract(self, name: str, request: Retract) -> Retracted:
         """Undo commits exactly."""

@@ -91,6 +91,20 @@ class Outbox:
         self._note(_kept(commit))
         return commit
 
+    def keep_sealed(self, commit: Commit, seal: str) -> None:
+        """Keep a server's own retract, to push it back if the server is restored to a time before it (rule 11)."""
+        with self._store.transaction():
+            self._store.add_commit(commit, seal=seal)
+        self._note(replace(_kept(commit), acked=True, seal=seal))
+
+    def knows(self, commit: CommitId) -> bool:
+        """Whether it is here, or was."""
+        return commit in self._commits
+
+    def seal(self, commit: CommitId) -> str | None:
+        """The seal that a kept commit bears."""
+        return self._commits[commit].seal
+
     def push_set(self, header: ReplyHeader | None) -> list[CommitId]:
         """Commits that the server may lack, oldest first.
 

@@ -23,7 +23,7 @@ from cairn_map.evidence import Evidence, empty_evidence
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.fingerprint import ZERO, fingerprint
 from cairn_map.grid import Cell, CellKey, Geometry, cell_of_key
-from cairn_map.ids import Author, CommitId, RobotName
+from cairn_map.ids import OPERATOR, Author, CommitId, RobotName, commit_id_from_text
 from cairn_map.messages import ReplyHeader, message_from_json
 from cairn_map.version_vector import EMPTY, VersionVector
 
@@ -113,6 +113,27 @@ class Replica:
         with self.lock:
             self.outbox.acknowledge(commit)
 
+    def lacking_retracts(self) -> list[CommitId]:
+        """The operator's retracts that a restore could still lose, and that are not kept here yet."""
+        with self.lock:
+            named = [commit_id_from_text(text) for text in (self.header.retracts if self.header else [])]
+            return [commit for commit in named if commit.author.robot == OPERATOR and not self.outbox.knows(commit)]
+
+    def keep_sealed(self, commit: Commit, seal: str) -> None:
+        """Keep a server's own retract, to push it back if the server loses it."""
+        with self.lock:
+            self.outbox.keep_sealed(commit, seal)
+
+    def seal(self, commit: CommitId) -> str | None:
+        """The seal that a kept commit bears."""
+        with self.lock:
+            return self.outbox.seal(commit)
+
+    def forget_commit(self, commit: CommitId) -> None:
+        """Drop the bytes of a commit that is of no use any more."""
+        with self.lock:
+            self.outbox.forget([commit])
+
     def rename(self, commit: CommitId) -> CommitId:
         """Give a commit whose id is taken on the server a new one; its coverage there was another commit's."""
         with self.lock:
@@ -184,6 +205,8 @@ class Replica:
             held = list(self.cells)
             self.cells.clear()
             self.outbox.reread()
+            # Another server does not know the first one's seal.
+            self.outbox.forget([kept.id for kept in self.outbox if kept.seal is not None])
             for key in held:
                 self.refresh_view(key)
 

@@ -22,7 +22,7 @@ from cairn_map.ids import Author, CommitId
 from cairn_map.version_vector import VersionVector, version_vector_from_json
 
 FILE_NAME = "robot.sqlite"
-VERSION = 1
+VERSION = 2
 BUSY_MS = 1000
 """How long a folder may still be held by a robot that is just closing."""
 PRAGMAS = (
@@ -43,6 +43,7 @@ CREATE TABLE commits (
     acked INTEGER NOT NULL DEFAULT 0,   -- the server said once that it has exactly these bytes
     cells TEXT NOT NULL,                -- numbers of the cells it touches, as JSON
     data BLOB,                          -- NULL once the commit may be forgotten
+    seal TEXT,                          -- of a server's own retract, kept for it
     UNIQUE (robot, incarnation, n)
 );
 CREATE TABLE coverage (name INTEGER PRIMARY KEY, vector TEXT NOT NULL UNIQUE);
@@ -81,6 +82,8 @@ class KeptCommit:
     acked: bool = False
     has_data: bool = True
     """False where only the SHA is remembered."""
+    seal: str | None = None
+    """Of a server's own retract, which is kept to be pushed back if the server loses it."""
 
 
 class ReplicaStore:
@@ -116,6 +119,10 @@ class ReplicaStore:
         if version == 0:
             with self.transaction():
                 self._connection.execute(DDL)
+                self._connection.execute(f"PRAGMA user_version = {VERSION}")
+        elif version == 1:
+            with self.transaction():
+                self._connection.execute("ALTER TABLE commits ADD COLUMN seal TEXT")
                 self._connection.execute(f"PRAGMA user_version = {VERSION}")
         elif version != VERSION:
             raise BadInputError("store_version", f"{self._folder} has version {version}, this cairn needs {VERSION}")
@@ -154,11 +161,11 @@ class ReplicaStore:
     def commits(self) -> list[KeptCommit]:
         """All commits, in the order in which they came."""
         rows = self._run(
-            "SELECT robot, incarnation, n, sha, cells, acked, data IS NOT NULL FROM commits ORDER BY number"
+            "SELECT robot, incarnation, n, sha, cells, acked, data IS NOT NULL, seal FROM commits ORDER BY number"
         )
         return [
-            KeptCommit(CommitId(Author(r, i), n), sha, tuple(json.loads(cells)), bool(acked), bool(has_data))
-            for r, i, n, sha, cells, acked, has_data in rows
+            KeptCommit(CommitId(Author(r, i), n), sha, tuple(json.loads(cells)), bool(acked), bool(has_data), seal)
+            for r, i, n, sha, cells, acked, has_data, seal in rows
         ]
 
     def commit_data(self, commit: CommitId) -> bytes | None:
@@ -166,11 +173,12 @@ class ReplicaStore:
         data: bytes | None = self._first(f"SELECT data FROM commits WHERE {ONE_COMMIT}", _values(commit))  # noqa: S608
         return data
 
-    def add_commit(self, commit: Commit) -> None:
-        """Keep a commit."""
+    def add_commit(self, commit: Commit, *, seal: str | None = None) -> None:
+        """Keep a commit; one with a seal is the server's own, which has it already."""
         self._run(
-            "INSERT INTO commits (robot, incarnation, n, sha, cells, data) VALUES (?, ?, ?, ?, ?, ?)",
-            (*_values(commit.id), commit.sha, json.dumps(sorted(commit.cells)), commit.data),
+            "INSERT INTO commits (robot, incarnation, n, sha, cells, data, seal, acked)"
+            " VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+            (*_values(commit.id), commit.sha, json.dumps(sorted(commit.cells)), commit.data, seal, seal is not None),
         )
 
     def replace_commit(self, commit: Commit) -> None:

@@ -17,7 +17,15 @@ from cairn_client.applying import Exchange
 from cairn_client.replica import Replica
 from cairn_client.replica_store import BaseCell
 from cairn_map.cell_code import decode_cell
-from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, DeniedError, UnreachableError
+from cairn_map.commit import open_commit
+from cairn_map.errors import (
+    BadInputError,
+    CairnError,
+    ConflictError,
+    DamagedDataError,
+    DeniedError,
+    UnreachableError,
+)
 from cairn_map.fingerprint import ZERO, fingerprint
 from cairn_map.grid import Cell, cell_key, cell_of_key
 from cairn_map.ids import CommitId
@@ -56,6 +64,10 @@ def push_commits(
     for commit_id in replica.push_set():
         try:
             pushed = _push(replica, api, map_name, commit_id)
+        except ConflictError as exc:
+            log.error("the server will not take commit %s: %s: %s", commit_id, exc.kind, exc.message)
+            report.refused.append(commit_id)
+            continue
         except DeniedError as exc:
             if exc.kind != "not_allowed":  # the token is not good: that is no fault of the commit
                 raise
@@ -78,16 +90,43 @@ def _push(replica: Replica, api: MapApi, map_name: str, commit_id: CommitId) -> 
     commit = replica.kept_commit(commit_id)
     if commit is None:
         raise BadInputError("no_bytes", f"the bytes of {commit_id} are not kept any more")
+    seal = replica.seal(commit_id)
     try:
-        api.push(map_name, commit)
+        api.push(map_name, commit, seal=seal)
     except ConflictError as exc:
-        if exc.kind != "id_taken":
+        if exc.kind == "evidence_gone":
+            # The server forgot what this commit takes out: it takes it from whoever still has it (rule 11).
+            for target in commit.meta.retracted_ids:
+                if (kept := replica.kept_commit(target)) is not None:
+                    api.push(map_name, kept)
+            api.push(map_name, commit)
+            return commit_id
+        if exc.kind != "id_taken" or seal is not None:
             raise
         renamed = replica.kept_commit(replica.rename(commit_id))
         assert renamed is not None  # noqa: S101 - it was just kept
         api.push(map_name, renamed)
         return renamed.id
     return commit_id
+
+
+def keep_retracts(replica: Replica, api: MapApi, map_name: str) -> None:
+    """Fetch and keep the operator's retracts until no restore of the server can lose them (SYNC.md rule 11).
+
+    Raises:
+        UnreachableError: the link broke; the others are fetched next time.
+    """
+    for commit_id in replica.lacking_retracts():
+        try:
+            data, seal = api.commit(map_name, commit_id)
+            commit, _ = open_commit(data)
+        except CairnError as exc:
+            if isinstance(exc, UnreachableError | DeniedError):
+                raise
+            log.error("the operator's retract %s cannot be kept: %s", commit_id, exc.message)
+            continue
+        if seal is not None and commit.id == commit_id and not commit.cells:
+            replica.keep_sealed(commit, seal)
 
 
 def fetch_missing(replica: Replica, api: MapApi, map_name: str, branch: str) -> RoundReport:
@@ -116,6 +155,7 @@ def fetch_missing(replica: Replica, api: MapApi, map_name: str, branch: str) -> 
             raise DamagedDataError("fingerprint_mismatch", f"the server's cells {names} are damaged; all others came")
         compare = exchange.must_compare
         if exchange.is_done and not _has_unproven(replica):
+            keep_retracts(replica, api, map_name)
             return report
     raise UnreachableError("no_end", f"no end of the answer after {ROUNDS_MAX} requests", retry_after_s=30.0)
 
@@ -146,6 +186,7 @@ def fetch_cells(replica: Replica, api: MapApi, map_name: str, *, wanted: Wanted 
         if wanted is None or wanted(cell_of_key(key)):
             report.cells_fetched += fetch_cell(replica, api, map_name, cell_of_key(key))
     replica.forget_stable_commits(wanted=wanted)
+    keep_retracts(replica, api, map_name)
     return report
 
 

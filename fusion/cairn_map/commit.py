@@ -138,11 +138,22 @@ def make_commit(
     cells = {key: cell.data for key, cell in encoded.items()}
     digests = [cell.digest for cell in encoded.values()]
     text = meta.model_dump_json(exclude_defaults=True).encode()
-    data = _joined(text, cells)
+    data = commit_bytes(text, cells)
     _check_size(len(data), len(cells), len(text))
     _check_evidence_size(sum(evidence.size_bytes for evidence in diff.values()), EVIDENCE_BYTES_MAX)
     _check_bricks(diff.values())
     return Commit(meta, cells, commit_sha(text, digests), data)
+
+
+def sha_without_evidence(data: bytes) -> bytes | None:
+    """SHA-256 of a commit in bytes that holds no evidence; None of one that does.
+
+    Raises:
+        DamagedDataError: cut off or contradictory.
+        BadInputError: an unknown version, or larger than allowed.
+    """
+    _, text, bodies = _split(data)
+    return None if bodies else commit_sha(text, [])
 
 
 def renamed_commit(
@@ -154,7 +165,7 @@ def renamed_commit(
     meta = meta.model_copy(update={"id": str(commit), "parent": parent, "retracts": targets})
     text = meta.model_dump_json(exclude_defaults=True).encode()
     digests = [decode_cell(body).digest for body in cells.values()]
-    return Commit(meta, cells, commit_sha(text, digests), _joined(text, cells))
+    return Commit(meta, cells, commit_sha(text, digests), commit_bytes(text, cells))
 
 
 def split_commit(data: bytes) -> tuple[CommitMeta, dict[CellKey, bytes]]:
@@ -222,7 +233,8 @@ def _check_evidence_size(size_bytes: int, limit_bytes: int) -> None:
         )
 
 
-def _joined(text: bytes, cells: Mapping[CellKey, bytes]) -> bytes:
+def commit_bytes(text: bytes, cells: Mapping[CellKey, bytes]) -> bytes:
+    """A commit's bytes, from its meta as it stands in them and its cells' bytes, rising in number."""
     parts = [HEAD.pack(MAGIC, VERSION, len(text)), text, struct.pack("<I", len(cells))]
     for data in cells.values():
         parts += [struct.pack("<I", len(data)), data]

@@ -21,6 +21,8 @@ NUMBER_LIMIT = 10**15
 """Numbers of commits are below it: exact in a JSON reader that has only float64."""
 INITIAL = RobotName("initial")
 """Author of the evidence that a map starts from."""
+OPERATOR = RobotName("operator")
+"""The author of the retracts that a server makes for its operators."""
 
 
 class Author(NamedTuple):

@@ -25,7 +25,10 @@ IdText = Annotated[str, Field(max_length=96)]
 Interval = Annotated[list[int], Field(min_length=2, max_length=2), FailFast()]
 VectorJson = Annotated[dict[str, Annotated[list[Interval], FailFast()]], Field(max_length=AUTHORS_MAX)]
 
+Time = Annotated[float, Field(allow_inf_nan=False)]
+
 CURSORS_MAX = 100_000
+SELECTING_PARTS = ("robot", "rig", "pushed_after_s", "pushed_before_s", "captured_after_s", "captured_before_s")
 
 
 class _Model(BaseModel):
@@ -192,17 +195,32 @@ class CellIndex(_Model):
 
 
 class Retract(_Model):
-    """Body of `POST /maps/{map}/retracts`; commits by id, or everything of one robot, or both."""
+    """Body of `POST /maps/{map}/retracts`: commits by id, and all that are here now and fit every other part named."""
 
     commits: Annotated[list[IdText], Field(max_length=4096), FailFast()] = []
     robot: NameText | None = None
+    rig: ShaText | None = None
+    """SHA-256 of the `rig.json` that they were made with."""
+    pushed_after_s: Time | None = None
+    pushed_before_s: Time | None = None
+    """When the server received them, UTC seconds since 1970."""
+    captured_after_s: Time | None = None
+    captured_before_s: Time | None = None
+    """When a scan of them was taken."""
     note: Annotated[str, Field(max_length=1024)] = ""
+    preview: bool = False
+    """Only say which commits it would name."""
+
+    @property
+    def selects(self) -> bool:
+        """Whether it names commits by what they are, not only by id."""
+        return any(getattr(self, part) is not None for part in SELECTING_PARTS)
 
 
 class Retracted(_Model):
-    """Answer to a retract: the retracting commit and what it names."""
+    """Answer to a retract: the retracting commit, None for a preview, and what it names."""
 
-    id: IdText
+    id: IdText | None
     commits: list[IdText]
 
 

@@ -82,7 +82,7 @@ def _delta(snapshot: Snapshot, row: CellRow, start: Cursor, asker: Author | None
         return None
     # What takes an own commit out again is not own: the asker must hear of it (SYNC.md rule 11).
     foreign = [entry for entry in entries if entry.kind != ENTRY_FOLD or entry.author != asker]
-    if sum(entry.size_bytes or 0 for entry in foreign) > 4 * row.size_bytes:
+    if sum(entry.size_bytes for entry in foreign) > 4 * row.size_bytes:
         return None
     if len(foreign) == 1 and foreign[0].kind == ENTRY_FOLD:
         return snapshot.diff(foreign[0].diff)  # one commit's diff is its own sum

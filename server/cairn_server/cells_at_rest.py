@@ -52,7 +52,7 @@ def sum_of_contributions(
     for contribution in contributions:
         body = snapshot.diff(contribution.diff)
         if body is None:
-            raise DamagedDataError("damaged_store", f"a diff of cell {cell_of_key(key)} is not kept any more")
+            raise DamagedDataError("damaged_store", f"a diff of cell {cell_of_key(key)} is not there")
         evidence = decode_stored(key, body).evidence
         if contribution.kind == ENTRY_FOLD:
             total.merge(evidence)

@@ -13,6 +13,8 @@ log = logging.getLogger(__name__)
 
 GROUP_MAX = 64
 """Commits folded at once."""
+FORGET_EVERY_S = 60.0
+"""How often it is looked for evidence that need not be kept any more."""
 RETRY_S = 5.0
 """A fold that failed (a full disk, a damaged cell) is tried again after this."""
 
@@ -20,8 +22,10 @@ RETRY_S = 5.0
 class Folder:
     """Folds all maps of a store until closed."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, *, keep_evidence_s: float) -> None:
         self._store = store
+        self._keep_evidence_s = keep_evidence_s
+        self._forget_next_s = 0.0
         self._wake = threading.Event()
         self._closing = threading.Event()
         self._caches: dict[str, CellCache] = {}
@@ -41,7 +45,7 @@ class Folder:
 
     def _run(self) -> None:
         while not self._closing.is_set():
-            self._wake.wait()
+            self._wake.wait(FORGET_EVERY_S)
             self._wake.clear()
             if not self._fold_all():
                 self._closing.wait(RETRY_S)
@@ -50,6 +54,7 @@ class Folder:
     def _fold_all(self) -> bool:
         """Fold until nothing is pending, a group of each map in turn; False if a map failed."""
         failed: set[str] = set()
+        maps: list[MapRow] = []
         busy = True
         while busy and not self._closing.is_set():
             busy = False
@@ -67,7 +72,26 @@ class Folder:
                     # Whatever it is, the other maps go on, and this thread must live: nobody else folds.
                     log.exception("map %s: fold failed; trying again in %.0f s", row.name, RETRY_S)
                     failed.add(row.name)
-        return not failed
+        return not (failed or self._forget_old(maps))
+
+    def _forget_old(self, maps: list[MapRow]) -> bool:
+        """Drop what need not be kept any more, now and then; whether that failed."""
+        if time.monotonic() < self._forget_next_s or self._closing.is_set():
+            return False
+        try:
+            counts = [self._forget_group(row) for row in maps]
+        except Exception:
+            log.exception("old evidence cannot be dropped")
+            return True
+        if max(counts, default=0) < GROUP_MAX:
+            self._forget_next_s = time.monotonic() + min(FORGET_EVERY_S, self._keep_evidence_s)
+        else:
+            self._wake.set()  # there is more; folding goes first
+        return False
+
+    def _forget_group(self, row: MapRow) -> int:
+        before_s = time.time() - self._keep_evidence_s
+        return self._store.forget_evidence(row, before_s=before_s, limit=GROUP_MAX)
 
     def _fold_group(self, row: MapRow, maps: int) -> int:
         cache = self._caches.setdefault(row.name, CellCache(row.geometry))

@@ -132,6 +132,8 @@ class _Plan:
 
     def _apply(self, kind: bytes, commit: StoredCommit) -> dict[CellKey, Blocks]:
         """Add or subtract a commit's diff, all of it or nothing; the blocks that it touches."""
+        if commit.gone:
+            raise DamagedCommitError("damaged_store", f"the evidence of commit {commit.id} is not kept any more")
         step, undo = BrickCell.merge, BrickCell.unmerge
         if kind == ENTRY_UNFOLD:
             step, undo = undo, step
@@ -162,9 +164,7 @@ class _Plan:
             return cell_to_change(snapshot, key, self.row.geometry)
 
 
-def _decoded(commit: StoredCommit, key: CellKey, body: bytes | None) -> DecodedCell:
-    if body is None:
-        raise DamagedCommitError("damaged_store", f"the diff of commit {commit.id} is not kept any more")
+def _decoded(commit: StoredCommit, key: CellKey, body: bytes) -> DecodedCell:
     try:
         return decode_stored(key, body)
     except DamagedDataError as exc:

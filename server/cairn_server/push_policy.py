@@ -15,7 +15,7 @@ from cairn_map.commit import CommitMeta
 from cairn_map.errors import BadInputError, DamagedDataError, DeniedError
 from cairn_map.evidence import Evidence
 from cairn_map.grid import CellKey, Geometry, cell_of_key
-from cairn_map.ids import INITIAL, CommitId
+from cairn_map.ids import INITIAL, OPERATOR, CommitId
 from cairn_map.version_vector import AUTHORS_MAX, INTERVALS_MAX
 from cairn_server.auth import Caller
 from cairn_server.store_rows import MapRow
@@ -103,7 +103,9 @@ def check_number(commit: CommitId, numbering: Numbering) -> None:
         )
     is_new = known.top is None
     too_many = known.authors_in_map >= AUTHORS_MAX // 2 or known.intervals_in_map >= INTERVALS_MAX // 2
-    if too_many or (is_new and known.incarnations >= INCARNATIONS_MAX):
+    # A server's own retracts have an incarnation for each of its starts.
+    spent = is_new and known.incarnations >= INCARNATIONS_MAX and commit.author.robot != OPERATOR
+    if too_many or spent:
         raise BadInputError(
             "too_many_authors",
             f"{commit.author} has {known.incarnations} incarnations (at most {INCARNATIONS_MAX}), the map "

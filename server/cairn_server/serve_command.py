@@ -36,6 +36,7 @@ FLAG_OF_SETTING = {
     "admin_token": "--admin-token-file or CAIRN_ADMIN_TOKEN",
     "enrolment_token": "--enrolment-token-file or CAIRN_ENROLMENT_TOKEN",
     "stable_after_s": "--stable-after",
+    "keep_evidence_s": "--keep-evidence",
 }
 
 
@@ -104,6 +105,13 @@ def _settings(argv: list[str]) -> Settings:
         metavar="SECONDS",
         help="age at which a commit is in every backup, so that robots may drop it (86400)",
     )
+    parser.add_argument(
+        "--keep-evidence",
+        type=float,
+        default=defaults.keep_evidence_s,
+        metavar="SECONDS",
+        help="how long commits can be retracted without their robots' help; 0 stores only the last version (2592000)",
+    )
     parser.add_argument("-v", "--verbose", action="store_true", help="log what is pushed and folded")
     args = parser.parse_args(argv)
     logging.basicConfig(level=logging.INFO if args.verbose else logging.WARNING, format="%(asctime)s %(message)s")
@@ -115,6 +123,7 @@ def _settings(argv: list[str]) -> Settings:
             admin_token=_secret(args.admin_token_file, "CAIRN_ADMIN_TOKEN"),
             enrolment_token=_secret(args.enrolment_token_file, "CAIRN_ENROLMENT_TOKEN"),
             stable_after_s=args.stable_after,
+            keep_evidence_s=args.keep_evidence,
         )
     except ValidationError as exc:
         first = exc.errors()[0]

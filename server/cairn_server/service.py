@@ -6,17 +6,16 @@ called from many threads.
 
 import threading
 import time
-from collections.abc import Callable
 
 import numpy as np
 
-from cairn_map.commit import RETRACTS_MAX, Commit, CommitMeta, make_commit, open_commit, split_commit
+from cairn_map.commit import Commit, commit_bytes, open_commit, split_commit
 from cairn_map.cursor import Cursor
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_map.evidence import largest
 from cairn_map.frames import encode_frame, start_of_reply
 from cairn_map.grid import CellKey, cell_of_key
-from cairn_map.ids import INITIAL, Author, CommitId, RobotName, commit_id_from_text, robot_name
+from cairn_map.ids import INITIAL, OPERATOR, Author, RobotName, commit_id_from_text, new_incarnation, robot_name
 from cairn_map.messages import (
     BranchInfo,
     CellEntry,
@@ -29,17 +28,17 @@ from cairn_map.messages import (
     Retract,
     Retracted,
 )
-from cairn_server.auth import Caller, new_token, token_hash
+from cairn_server.auth import Caller, Role, new_token, token_hash
 from cairn_server.folder import Folder
 from cairn_server.missing import asker_from_request, header_of, reply_frames
 from cairn_server.push_policy import check_claims, check_evidence
 from cairn_server.read_cache import ReadCache
+from cairn_server.retracting import is_sealed, retract_builders, seal_of, targets_of
 from cairn_server.settings import Settings
 from cairn_server.stable import StableVectors
 from cairn_server.store import Store
 from cairn_server.store_rows import Branch, CellRow, Head, MapRow, NewCommit
 
-OPERATOR = RobotName("operator")
 VALIDATING_MAX = 4
 """Commits whose evidence is decoded at once: each may need a gigabyte."""
 RESERVED_NAMES = frozenset({OPERATOR, INITIAL, RobotName("main")})
@@ -51,10 +50,12 @@ class Service:
     def __init__(self, store: Store, settings: Settings) -> None:
         self.store = store
         self.settings = settings
-        self._folder = Folder(store)
+        self._folder = Folder(store, keep_evidence_s=settings.keep_evidence_s)
         self._validating = threading.BoundedSemaphore(VALIDATING_MAX)
         self._stable = StableVectors(settings.stable_after_s)
         self._reads = ReadCache()
+        self.operator = new_incarnation()
+        """Of the retracts made here. A new one with every start: a restored server must not number over lost ones."""
 
     def create_map(self, name: str, request: CreateMap) -> tuple[MapInfo, bool]:
         """The map, and whether it is new."""
@@ -100,15 +101,18 @@ class Service:
         self.store.register(row, branch, token_hash(token))
         return Registered(branch=request.robot, token=token, map=self.map_info(row))
 
-    def push(self, row: MapRow, caller: Caller, id_text: str, data: bytes) -> bool:
+    def push(self, row: MapRow, caller: Caller, id_text: str, data: bytes, *, seal: str | None = None) -> bool:
         """Keep a commit; True if it is new. When this returns, no power cut can lose it.
+
+        Anybody may push back a retract that bears this server's own seal.
 
         Raises:
             BadInputError: not a commit for this map, not by this caller, or against `push_policy`.
             ConflictError: kind `id_taken`: the id is known with other bytes.
         """
         meta, cells = split_commit(data)
-        check_claims(row, caller, id_text, meta, cells=len(cells))
+        speaks_for = Caller(Role.ADMIN) if is_sealed(row, data, seal) else caller
+        check_claims(row, speaks_for, id_text, meta, cells=len(cells))
         with self._validating:
             new = _validated(row, data)
         try:
@@ -133,33 +137,41 @@ class Service:
         return b"".join(parts)
 
     def retract(self, row: MapRow, request: Retract) -> Retracted:
-        """Undo commits exactly: by id, or everything of one robot that is here now. Durable on return.
+        """Undo commits exactly. Durable on return.
 
         More targets than one commit can name become several; the last one's id is answered.
 
         Raises:
-            NotFoundError: kind `nothing_to_retract`: a robot without evidence, or no commit named.
+            NotFoundError: kind `nothing_to_retract`: none is named, or none fits.
             BadInputError: kind `not_retractable`: a retract is not retracted.
+            ConflictError: kind `evidence_gone`: push a commit's bytes again first.
         """
-        targets = dict.fromkeys(commit_id_from_text(text) for text in request.commits)
-        if request.robot:
-            with self.store.snapshot(row) as snapshot:
-                targets |= dict.fromkeys(snapshot.commits_of(request.robot))
-        if not targets:
-            who = f"{request.robot} has no evidence in map {row.name}" if request.robot else "no commit is named"
-            raise NotFoundError("nothing_to_retract", f"{who}; `cairn map log` shows what there is")
-        if any(target.author.robot == OPERATOR for target in targets):
-            raise BadInputError("not_retractable", "a retract is not retracted; push the evidence anew")
+        with self.store.snapshot(row) as snapshot:
+            targets = targets_of(request, snapshot)
         names = [str(target) for target in targets]
-        author = Author(OPERATOR, row.operator)
-        builds = [
-            _retract_builder(row, author, names[start : start + RETRACTS_MAX], request.note)
-            for start in range(0, len(names), RETRACTS_MAX)
-        ]
-        ids = [str(self.store.append_built(row, author, build).id) for build in builds]
+        if request.preview:
+            return Retracted(id=None, commits=names)
+        author = Author(OPERATOR, self.operator)
+        builders = retract_builders(row, author, targets, request.note)
+        ids = [str(self.store.append_built(row, author, build).id) for build in builders]
         self.store.audit("retract", f"map {row.name}: {ids[-1]} takes out {len(names)} commits: {request.note}")
         self._folder.wake()
         return Retracted(id=ids[-1], commits=names)
+
+    def commit(self, row: MapRow, id_text: str) -> tuple[bytes, bytes, str | None]:
+        """A commit's bytes as they were pushed, its SHA-256, and the seal on a retract that this server made.
+
+        Raises:
+            NotFoundError: kind `no_commit`.
+            ConflictError: kind `evidence_gone`.
+        """
+        found = self.store.commit(row, commit_id_from_text(id_text))
+        if found is None:
+            raise NotFoundError("no_commit", f"nobody pushed {id_text[:96]} to map {row.name}")
+        if found.gone:
+            raise ConflictError("evidence_gone", f"the bytes of {found.id} are not kept any more")
+        seal = seal_of(row, found.sha) if found.id.author.robot == OPERATOR else None
+        return commit_bytes(found.text, dict(sorted(found.diff.items()))), found.sha, seal
 
     def cell_index(self, row: MapRow, author: Author | None) -> CellIndex:
         """All cells that were ever touched, emptied ones included, from one state."""
@@ -218,16 +230,6 @@ def _validated(row: MapRow, data: bytes) -> NewCommit:
     return _new_commit(commit, tuple(tops.tolist()))
 
 
-def _retract_builder(row: MapRow, author: Author, targets: list[str], note: str) -> Callable[[int], NewCommit]:
-    def build(n: int) -> NewCommit:
-        meta = CommitMeta(
-            id=str(CommitId(author, n)), geometry=row.geometry.digest().hex(), retracts=tuple(targets), note=note
-        )
-        return _new_commit(make_commit(meta, {}, row.geometry), (0,) * (2 + row.geometry.plane_count))
-
-    return build
-
-
 def _new_commit(commit: Commit, tops: tuple[int, ...]) -> NewCommit:
     return NewCommit(
         id=commit.id,
@@ -238,6 +240,7 @@ def _new_commit(commit: Commit, tops: tuple[int, ...]) -> NewCommit:
         retracts=commit.meta.retracted_ids,
         diff=commit.cells,
         tops=tops,
+        rig=bytes.fromhex(commit.meta.rig) if commit.meta.rig else None,
     )
 
 

@@ -27,6 +27,10 @@ class Settings(BaseModel):
     stable_after_s: Annotated[float, Field(ge=0)] = 86_400.0
     """A commit folded longer ago is in every backup that may still be restored, so robots may drop it."""
 
+    keep_evidence_s: Annotated[float, Field(ge=0)] = 30 * 86_400.0
+    """How long after it was folded a commit's evidence is kept, so that it can be retracted, and differences be sent;
+    0: only the last version of the map is stored."""
+
     def check_reach(self) -> None:
         """Refuse to serve strangers without a token, and tokens that protect nothing.
 

@@ -5,10 +5,12 @@ import time
 
 import apsw
 
+from cairn_map.cursor import ENTRY_FOLD
 from cairn_map.errors import BadInputError, ConflictError
 from cairn_map.evidence import COUNT_MAX, SUM_MAX
 from cairn_map.ids import CommitId
 from cairn_server.push_policy import Numbering, check_number
+from cairn_server.sqlite_retention import check_kept, is_retracted, remember_evidence
 from cairn_server.sqlite_writer import first
 from cairn_server.store_rows import Fold, MapRow, NewCommit
 
@@ -18,20 +20,24 @@ AUDIT_ROWS_MAX = 100_000
 def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit) -> bool:
     """Keep a commit; False if the same one is kept already."""
     key = (row.number, *commit.id.author, commit.id.n)
-    query = "SELECT number, sha, damaged FROM commits WHERE map = ? AND robot = ? AND incarnation = ? AND n = ?"
+    query = "SELECT number, sha, damaged, gone FROM commits WHERE map = ? AND robot = ? AND incarnation = ? AND n = ?"
     known = first(connection, query, key)
     if known is not None:
-        number, sha, damaged = known
+        number, sha, damaged, gone = known
         if sha != commit.sha:
             raise ConflictError("id_taken", f"commit {commit.id} is already here with other bytes")
         if damaged is not None:
             _repair(connection, number, commit)
+        elif gone and not is_retracted(connection, row, commit.id):
+            remember_evidence(connection, number, commit)
+            _insert_diff(connection, number, commit)
         return damaged is not None
+    check_kept(connection, row, commit.retracts)
     _note_number(connection, row, commit.id)
     _note_tops(connection, row, commit.tops)
     connection.execute(
         "INSERT INTO commits (map, robot, incarnation, n, sha, size_bytes, cells, meta, captured_first_s,"
-        " captured_last_s, retracts, received_s) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        " captured_last_s, retracts, received_s, rig) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         (
             *key,
             commit.sha,
@@ -41,6 +47,7 @@ def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit) -
             *(commit.captured_s or (None, None)),
             " ".join(map(str, commit.retracts)),
             time.time(),
+            commit.rig,
         ),
     )
     _insert_diff(connection, connection.last_insert_rowid(), commit)
@@ -73,8 +80,10 @@ def write_fold(connection: apsw.Connection, row: MapRow, fold: Fold) -> bool:
             (row.number, seq, entry.commit),
         )
         connection.execute(
-            "UPDATE commits SET folded_seq = ?, folded_s = ? WHERE number = ? AND folded_seq IS NULL",
-            (seq, now_s, entry.commit),
+            "UPDATE commits SET folded_seq = ?, folded_s = ? WHERE number = ? AND folded_seq IS NULL"
+            if entry.kind == ENTRY_FOLD
+            else "UPDATE commits SET unfolded_seq = ? WHERE number = ?",
+            (seq, now_s, entry.commit) if entry.kind == ENTRY_FOLD else (seq, entry.commit),
         )
     connection.executemany(
         "INSERT INTO retracted (map, id) VALUES (?, ?)", [(row.number, str(target)) for target in fold.retracted]

@@ -117,7 +117,10 @@ ALTER TABLE commits ADD COLUMN gone INTEGER NOT NULL DEFAULT 0;     -- its evide
 ALTER TABLE cell ADD COLUMN stamps BLOB NOT NULL DEFAULT x'';       -- log entry that last changed each block
 ALTER TABLE cell ADD COLUMN gone_seq INTEGER NOT NULL DEFAULT 0;    -- the newest entry of which the evidence is gone
 ALTER TABLE branch ADD COLUMN incarnation TEXT NOT NULL DEFAULT '';
-CREATE INDEX commits_kept ON commits (map, folded_s) WHERE gone = 0 AND folded_seq IS NOT NULL;
+ALTER TABLE commits ADD COLUMN unfolded_seq INTEGER;                -- log entry that took it out again
+UPDATE commits SET unfolded_seq =
+    (SELECT seq FROM log WHERE log.map = commits.map AND commit_number = number AND kind = CAST('-' AS BLOB));
+CREATE INDEX commits_kept ON commits (map, folded_s) WHERE gone = 0 AND cells > 0 AND folded_seq IS NOT NULL;
 """
 
 STEPS = (FIRST, STAMPS)

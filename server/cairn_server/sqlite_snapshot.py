@@ -13,7 +13,7 @@ from cairn_map.ids import Author, CommitId, commit_id_from_text
 from cairn_map.messages import LogEntry
 from cairn_map.version_vector import EMPTY, VersionVector, version_vector_from_json
 from cairn_server.sqlite_writer import first, rows
-from cairn_server.store_rows import CellRow, Contribution, Head, Totals
+from cairn_server.store_rows import CellRow, Contribution, Head, Selection, Totals
 
 CELL_COLUMNS = "cell, lm, digest, fingerprint, voxels, size_bytes, gone_seq"
 
@@ -91,14 +91,17 @@ class SqliteSnapshot:
         )
         return row
 
-    def commits_of(self, robot: str) -> list[CommitId]:
-        """Every commit with evidence of a robot, all incarnations, that is not retracted."""
+    def commits_where(self, selection: Selection) -> list[CommitId]:
+        """Every commit with evidence that fits and is not retracted, folded or not, in order of arrival."""
+        robot, rig, pushed_s, captured_s = selection.robot, selection.rig, selection.pushed_s, selection.captured_s
         found = rows(
             self._connection,
-            "SELECT robot, incarnation, n FROM commits WHERE map = ? AND robot = ? AND cells > 0"
+            "SELECT robot, incarnation, n FROM commits WHERE map = ? AND cells > 0"
+            " AND (? IS NULL OR robot = ?) AND (? IS NULL OR rig = ?) AND received_s BETWEEN ? AND ?"
+            " AND coalesce(captured_last_s, -9e999) >= ? AND coalesce(captured_first_s, 9e999) <= ?"
             " AND NOT EXISTS (SELECT 1 FROM retracted WHERE retracted.map = commits.map"
             " AND id = robot || '.' || incarnation || '.' || n) ORDER BY number",
-            (self._map, robot),
+            (self._map, robot, robot, rig, rig, *pushed_s, *captured_s),
         )
         return [CommitId(Author(r, i), n) for r, i, n in found]
 

@@ -14,12 +14,13 @@ import apsw
 from cairn_map.cursor import Cursor, cursor_from_text, first_chain
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError, UnreachableError
 from cairn_map.grid import CellKey, Geometry
-from cairn_map.ids import Author, CommitId, Incarnation, new_incarnation
+from cairn_map.ids import Author, CommitId, new_incarnation
 from cairn_map.sensor_model import SensorModel
 from cairn_server.folder_lock import lock_folder
 from cairn_server.last_seen import LastSeen
 from cairn_server.sqlite_changes import append_commit, next_number, write_audit, write_fold
 from cairn_server.sqlite_readers import Readers
+from cairn_server.sqlite_retention import forget_evidence
 from cairn_server.sqlite_schema import ensure_schema
 from cairn_server.sqlite_snapshot import SqliteSnapshot, ids_from_text
 from cairn_server.sqlite_writer import Values, Writer, connect, first, rows
@@ -114,9 +115,20 @@ class SqliteStore:
         clause = "map = ? AND folded_seq IS NULL AND damaged IS NULL ORDER BY number LIMIT ?"
         return self._commits(clause, (row.number, limit), size_bytes_max=size_bytes_max)
 
+    def commit(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
+        """A commit with its diff, folded or not; None if there is none."""
+        return self._commit("map = ? AND robot = ? AND incarnation = ? AND n = ?", row, commit)
+
     def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
         """A folded commit with its diff, or None."""
         clause = "map = ? AND robot = ? AND incarnation = ? AND n = ? AND folded_seq IS NOT NULL"
+        return self._commit(clause, row, commit)
+
+    def forget_evidence(self, row: MapRow, *, before_s: float, limit: int) -> int:
+        """Drop the evidence and the meta of up to `limit` commits folded, and last pushed, before a time; how many."""
+        return self._writer.run(lambda connection: forget_evidence(connection, row, before_s, limit))
+
+    def _commit(self, clause: str, row: MapRow, commit: CommitId) -> StoredCommit | None:
         found = self._commits(clause, (row.number, *commit.author, commit.n), size_bytes_max=0)
         return found[0] if found else None
 
@@ -202,7 +214,7 @@ class SqliteStore:
         self._lock.close()
 
     def _map_rows(self, clause: str, values: Values) -> list[MapRow]:
-        query = f"SELECT number, name, geometry, sensor_model, operator FROM map {clause}"  # noqa: S608 - our own clause
+        query = f"SELECT number, name, geometry, sensor_model, seal_key FROM map {clause}"  # noqa: S608 - our own clause
         with self._readers.reading() as reader:
             found = rows(reader, query, values)
         return [
@@ -211,19 +223,19 @@ class SqliteStore:
                 name=name,
                 geometry=Geometry.model_validate_json(geometry),
                 sensor_model=SensorModel.model_validate_json(sensor_model),
-                operator=Incarnation(operator),
+                seal_key=seal_key,
             )
-            for number, name, geometry, sensor_model, operator in found
+            for number, name, geometry, sensor_model, seal_key in found
         ]
 
     def _commits(self, clause: str, values: Values, *, size_bytes_max: int) -> list[StoredCommit]:
         """Commits in the order asked for, as long as their bytes stay within the size; the first in any case."""
-        columns = "number, robot, incarnation, n, sha, meta, retracts, size_bytes"
+        columns = "number, robot, incarnation, n, sha, meta, retracts, gone, size_bytes"
         found: list[StoredCommit] = []
         total_bytes = 0
         with self._readers.transaction() as reader:
             query = f"SELECT {columns} FROM commits WHERE {clause}"  # noqa: S608 - our own clause
-            for number, robot, incarnation, n, sha, text, retracts, size_bytes in reader.execute(query, values):
+            for number, robot, incarnation, n, sha, text, retracts, gone, size_bytes in reader.execute(query, values):
                 total_bytes += size_bytes
                 if found and total_bytes > size_bytes_max:
                     break
@@ -235,7 +247,8 @@ class SqliteStore:
                         sha=sha,
                         text=text,
                         retracts=ids_from_text(retracts),
-                        diff={CellKey(cell): body for cell, body in diff},
+                        diff={CellKey(cell): body or b"" for cell, body in diff},
+                        gone=bool(gone),
                     )
                 )
         return found

@@ -16,7 +16,18 @@ from cairn_map.ids import Author, CommitId
 from cairn_map.messages import LogEntry
 from cairn_map.sensor_model import SensorModel
 from cairn_map.version_vector import VersionVector
-from cairn_server.store_rows import Branch, CellRow, Contribution, Fold, Head, MapRow, NewCommit, StoredCommit, Totals
+from cairn_server.store_rows import (
+    Branch,
+    CellRow,
+    Contribution,
+    Fold,
+    Head,
+    MapRow,
+    NewCommit,
+    Selection,
+    StoredCommit,
+    Totals,
+)
 
 
 class Snapshot(Protocol):
@@ -40,7 +51,10 @@ class Snapshot(Protocol):
         ...
 
     def contributions(self, key: CellKey, *, after_seq: int, limit: int | None = None) -> list[Contribution]:
-        """Entries after `after_seq` that touch a cell, oldest first, at most `limit`."""
+        """Entries after `after_seq` that touch a cell, oldest first, at most `limit`.
+
+        Those up to the cell's `gone_seq` may be missing.
+        """
         ...
 
     def diff(self, number: int) -> bytes | None:
@@ -51,8 +65,8 @@ class Snapshot(Protocol):
         """Highest folded number of an author and its SHA-256."""
         ...
 
-    def commits_of(self, robot: str) -> list[CommitId]:
-        """Every commit with evidence of a robot, all incarnations, that is not retracted."""
+    def commits_where(self, selection: Selection) -> list[CommitId]:
+        """Every commit with evidence that fits and is not retracted, folded or not, in order of arrival."""
         ...
 
     def pending(self) -> VersionVector:
@@ -100,12 +114,13 @@ class Store(Protocol):
         ...
 
     def append(self, row: MapRow, commit: NewCommit) -> bool:
-        """Keep a commit; True if it is new, False if the same one is kept already. Durable on return.
+        """Keep a commit; True if it is new, False if the same one is known already. Durable on return.
 
-        One that was set aside as damaged is new again.
+        One that was set aside as damaged is new again. Of a known one the evidence is kept again if it was gone.
 
         Raises:
-            ConflictError: kind `id_taken`: the id is kept with other bytes.
+            ConflictError: kind `id_taken`: the id is kept with other bytes; or `evidence_gone`: it retracts a commit
+                whose evidence is not kept any more. Pushed again, with the same bytes, that is kept again.
             BadInputError: kind `evidence_overflow`: a sum could leave its range; or its number is refused by
                 `push_policy.check_number`.
         """
@@ -119,8 +134,19 @@ class Store(Protocol):
         """Commits to be folded, in order of arrival, with their diffs: at most `limit`, and one or within the size."""
         ...
 
+    def commit(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
+        """A commit with its diff, folded or not; None if there is none."""
+        ...
+
     def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
         """A folded commit with its diff, or None."""
+        ...
+
+    def forget_evidence(self, row: MapRow, *, before_s: float, limit: int) -> int:
+        """Drop the evidence and the meta of up to `limit` commits folded, and last pushed, before a time; how many.
+
+        Not of those that a pending commit retracts. Cells note the newest entry that this concerns (`gone_seq`).
+        """
         ...
 
     def is_retracted(self, row: MapRow, commit: CommitId) -> bool:

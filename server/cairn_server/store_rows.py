@@ -1,12 +1,13 @@
 """What a store holds, as rows: maps, commits, cells, the log, branches."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from cairn_map.cursor import Cursor
 from cairn_map.fingerprint import Fingerprint
 from cairn_map.grid import CellKey, Geometry
-from cairn_map.ids import Author, CommitId, Incarnation
+from cairn_map.ids import Author, CommitId
 from cairn_map.sensor_model import SensorModel
 from cairn_map.version_vector import EMPTY, VersionVector
 
@@ -19,8 +20,8 @@ class MapRow:
     name: str
     geometry: Geometry
     sensor_model: SensorModel
-    operator: Incarnation
-    """Incarnation under which this server makes retracts for operators."""
+    seal_key: bytes = field(default=b"", repr=False)
+    """By which the server knows again the retracts that it made."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,6 +38,8 @@ class NewCommit:
     diff: Mapping[CellKey, bytes]
     tops: tuple[int, ...]
     """Largest number of each plane; their sums over all commits bound every sum in the map."""
+    rig: bytes | None = None
+    """SHA-256 of the rig that its sensors were described by."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,8 +51,10 @@ class StoredCommit:
     sha: bytes
     text: bytes
     retracts: tuple[CommitId, ...]
-    diff: Mapping[CellKey, bytes | None]
-    """None: not kept any more."""
+    diff: Mapping[CellKey, bytes]
+    """Empty if it is gone, too."""
+    gone: bool = False
+    """Its evidence and its meta are not kept any more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +65,7 @@ class Contribution:
     author: Author
     diff: int
     """Number of the diff in the store."""
-    size_bytes: int | None
-    """None: not kept any more."""
+    size_bytes: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,6 +110,18 @@ class Fold:
     """Ids whose retract took or will take effect; each once, for ever."""
     damaged: tuple[tuple[int, str], ...] = ()
     """Numbers of commits to set aside, and why: pushed again, they are pending again."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Selection:
+    """Which commits with evidence an operator means: all that fit every part that is not None."""
+
+    robot: str | None = None
+    rig: bytes | None = None
+    pushed_s: tuple[float, float] = (-math.inf, math.inf)
+    """When the server received it, UTC seconds since 1970."""
+    captured_s: tuple[float, float] = (-math.inf, math.inf)
+    """Some scan of it was taken then; commits that state no time only fit the default."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,6 +27,7 @@ folds = st.tuples(st.just("fold"), st.integers(1, 5))
 rare = st.one_of(
     st.tuples(st.just("amend"), mappers, numbers),
     st.tuples(st.just("retract"), numbers),
+    st.tuples(st.just("forget_evidence")),
     st.tuples(st.just("restart_server")),
     st.tuples(st.just("back_up")),
     st.tuples(st.just("restore")),
@@ -82,3 +83,21 @@ def test_pushing_twice_changes_nothing(seeds: list[int]) -> None:
         world.sync(0, Fault(0, "twice"))
         world.check()
         assert (world.service.store.map("lab"), cells_of(world.robots[0].view)) == before
+
+
+def test_an_operator_s_retract_survives_the_restore_of_a_backup_from_before_it() -> None:
+    with tempfile.TemporaryDirectory() as folder, World(Path(folder)) as world:
+        for seed in (1, 2):
+            world.commit(0, seed)
+        world.sync(0)
+        world.fold(9)
+        world.back_up()
+        world.retract(0)
+        world.fold(9)
+        for robot in range(len(MODES)):
+            world.sync(robot)
+        once = cells_of(world.robots[0].view)
+        world.restore()
+        world.settle()
+        assert all(cells_of(robot.view) == once for robot in world.robots)
+        world.check()

@@ -215,7 +215,7 @@ def test_a_commit_that_the_server_refuses_does_not_hold_up_the_others(server: Li
         map_commit(robot, 2)
         push = robot._api.push
 
-        def picky(name: str, commit: object) -> object:
+        def picky(name: str, commit: object, **options: object) -> object:
             if str(commit.id) == refused:  # type: ignore[attr-defined]
                 raise BadInputError("too_much_evidence", "no")
             return push(name, commit)  # type: ignore[arg-type]

@@ -328,7 +328,7 @@ class OtherServer:
         self.coverage = coverage
         self.pushed: list[CommitId] = []
 
-    def push(self, name: str, commit: object) -> None:
+    def push(self, name: str, commit: object, *, seal: str | None = None) -> None:
         self.pushed.append(commit.id)  # type: ignore[attr-defined]
 
     def missing(self, name: str, branch: str, request: MissingRequest) -> Iterator[object]:
@@ -443,7 +443,7 @@ class TakenIds:
         self.taken = taken
         self.pushed: list[CommitId] = []
 
-    def push(self, name: str, commit: object) -> None:
+    def push(self, name: str, commit: object, *, seal: str | None = None) -> None:
         commit_id: CommitId = commit.id  # type: ignore[attr-defined]
         if commit_id in self.taken:
             raise ConflictError("id_taken", "other bytes")

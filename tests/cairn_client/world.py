@@ -23,12 +23,12 @@ from cairn_client.replica_store import ReplicaStore
 from cairn_client.sync import fetch_cells, fetch_missing, push_commits
 from cairn_map.cell_code import decode_cell
 from cairn_map.commit import Commit, CommitMeta, split_commit
-from cairn_map.errors import UnreachableError
+from cairn_map.errors import ConflictError, UnreachableError
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.fingerprint import fingerprint
 from cairn_map.frames import Frame, FrameReader
 from cairn_map.grid import Cell, CellKey, cell_key
-from cairn_map.ids import Author, CommitId, RobotName, commit_id_from_text
+from cairn_map.ids import OPERATOR, Author, CommitId, RobotName, commit_id_from_text
 from cairn_map.messages import CellIndex, CreateMap, MissingRequest, Pushed, Retract
 from cairn_map.version_vector import EMPTY, VersionVector
 from cairn_server import service as service_module
@@ -36,7 +36,7 @@ from cairn_server import sqlite_store, sqlite_writer
 from cairn_server.auth import Caller, Role
 from cairn_server.cell_cache import CellCache
 from cairn_server.folding import fold_pending
-from cairn_server.service import OPERATOR, Service
+from cairn_server.service import Service
 from cairn_server.settings import Settings
 from cairn_server.sqlite_store import SqliteStore
 
@@ -57,7 +57,7 @@ class Fault:
 class FoldOnRequest:
     """In the place of the folding thread."""
 
-    def __init__(self, store: object) -> None:
+    def __init__(self, store: object, *, keep_evidence_s: float) -> None:
         pass
 
     def wake(self) -> None:
@@ -100,9 +100,14 @@ class DirectApi:
         self._world = world
         self._caller = Caller(Role.ROBOT, robot)
 
-    def push(self, name: str, commit: Commit) -> Pushed:
+    def commit(self, name: str, commit: CommitId) -> tuple[bytes, str | None]:
         service = self._world.service
-        is_new = service.push(service.store.map(name), self._caller, str(commit.id), commit.data)
+        data, _, seal = service.commit(service.store.map(name), str(commit))
+        return data, seal
+
+    def push(self, name: str, commit: Commit, *, seal: str | None = None) -> Pushed:
+        service = self._world.service
+        is_new = service.push(service.store.map(name), self._caller, str(commit.id), commit.data, seal=seal)
         return Pushed(id=str(commit.id), state="new" if is_new else "known")
 
     def missing(self, name: str, branch: str, request: MissingRequest) -> Iterator[Frame]:
@@ -132,8 +137,12 @@ class FaultyApi:
         self._fault = fault
         self._calls = 0
 
-    def push(self, name: str, commit: Commit) -> Pushed:
-        pushed: Pushed = self._call(self._api.push, name, commit)
+    def commit(self, name: str, commit: CommitId) -> tuple[bytes, str | None]:
+        found: tuple[bytes, str | None] = self._call(self._api.commit, name, commit)
+        return found
+
+    def push(self, name: str, commit: Commit, *, seal: str | None = None) -> Pushed:
+        pushed: Pushed = self._call(self._api.push, name, commit, seal=seal)
         return pushed
 
     def missing(self, name: str, branch: str, request: MissingRequest) -> Iterator[Frame]:
@@ -173,13 +182,16 @@ class FaultyApi:
 StoredNote = tuple[str, dict[CellKey, bytes]]
 
 
-def stored_commits(folder: Path) -> dict[CommitId, StoredNote]:
-    """Note and cells of every commit that the server of a folder has."""
+def stored_commits(folder: Path) -> dict[CommitId, StoredNote | None]:
+    """Note and cells of every commit that the server of a folder has; None where they are not kept any more."""
     connection = sqlite_writer.connect(folder / sqlite_store.FILE_NAME)
     try:
-        found: dict[CommitId, StoredNote] = {}
-        query = "SELECT number, robot || '.' || incarnation || '.' || n, meta FROM commits"
-        for number, text, meta in connection.execute(query).fetchall():
+        found: dict[CommitId, StoredNote | None] = {}
+        query = "SELECT number, robot || '.' || incarnation || '.' || n, meta, gone FROM commits"
+        for number, text, meta, gone in connection.execute(query).fetchall():
+            if gone:
+                found[commit_id_from_text(text)] = None
+                continue
             cells = connection.execute("SELECT cell, body FROM diff WHERE commit_number = ?", (number,)).fetchall()
             found[commit_id_from_text(text)] = (CommitMeta.model_validate_json(meta).note, dict(cells))
         return found
@@ -195,6 +207,8 @@ class World:
         self._modes = modes
         self._stable = EMPTY
         self._serial = 0
+        self._seen: dict[CommitId, StoredNote] = {}
+        """Commits as they were before the server forgot their evidence."""
         self._start_server()
         self.service.create_map(MAP, CreateMap(geometry=GEOMETRY))
         self.robots: list[Replica] = [self._open(r) for r in range(len(modes))]
@@ -217,7 +231,7 @@ class World:
 
     def amend(self, robot: int, which: int) -> None:
         """A robot takes one of the commits that it still has back, and puts other evidence in its place."""
-        own = self.robots[robot].commits
+        own = [commit for commit in self.robots[robot].commits if commit.author.robot != OPERATOR]
         if own:
             self._commit(robot, which, (str(own[which % len(own)]),))
 
@@ -226,7 +240,15 @@ class World:
         known = {commit for robot in self.robots for commit in robot.commits} | self._stored().keys()
         targets = sorted(str(commit) for commit in known if commit.author.robot != OPERATOR)
         if targets:
-            self.service.retract(self._row, Retract(commits=[targets[which % len(targets)]]))
+            try:
+                self.service.retract(self._row, Retract(commits=[targets[which % len(targets)]]))
+            except ConflictError as exc:
+                assert exc.kind == "evidence_gone"
+
+    def forget_evidence(self) -> None:
+        """The server drops the evidence of all that it has folded."""
+        self._stored()
+        self.service.store.forget_evidence(self._row, before_s=float("inf"), limit=1000)
 
     def sync(self, robot: int, fault: Fault | None = None) -> None:
         """A robot's round, which the fault may end early."""
@@ -299,7 +321,9 @@ class World:
     def check(self) -> None:
         """After `settle` all maps are equal, equal to the sum of all commits, and no commit was lost."""
         held = self._notes_held()
+        sealed = self._sealed_targets()
         self.settle()
+        assert all(self.service.store.is_retracted(self._row, target) for target in sealed)
         expected = cells_of(self._sum_of_commits())
         with self.service.store.snapshot(self._row) as snapshot:
             rows = {row.key: (row.digest, row.fingerprint.hex()) for row in snapshot.cells() if row.voxels}
@@ -367,7 +391,15 @@ class World:
         shutil.copytree(self._folder / source, self._folder / target)
 
     def _stored(self) -> dict[CommitId, StoredNote]:
-        return stored_commits(self._folder / "server")
+        stored = stored_commits(self._folder / "server")
+        self._seen |= {commit: note for commit, note in stored.items() if note is not None}
+        return {commit: note or self._seen[commit] for commit, note in stored.items()}
+
+    def _sealed_targets(self) -> set[CommitId]:
+        """What operators' retracts name that some robot keeps: no restore may bring it back (rule 11)."""
+        kept = [(robot, commit) for robot in self.robots for commit in robot.commits if commit.author.robot == OPERATOR]
+        data = [robot.commit_data(commit) for robot, commit in kept]
+        return {target for text in data if text for target in split_commit(text)[0].retracted_ids}
 
     def _sum_of_commits(self) -> EvidenceMap:
         stored = self._stored()
@@ -387,7 +419,7 @@ class World:
                 data = self.robots[r].commit_data(commit)
                 assert data is not None
                 notes.add(split_commit(data)[0].note)
-        return notes
+        return notes - {""}
 
 
 def base_fingerprint(robot: Replica, key: CellKey) -> str:

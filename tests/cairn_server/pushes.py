@@ -29,6 +29,7 @@ def pushed(
     retracts: Iterable[Commit] = (),
     cells: Mapping[CellKey, Evidence] | None = None,
     scans: int = SCANS,
+    rig: str | None = None,
 ) -> Commit:
     """The n-th commit of an author; the seed says what it saw, in two of three cells."""
     pose = ScanPose(time_s=1.5e9, t_map_rig=(0.0, 0.0, 0.4), q_map_rig=(0.0, 0.0, 0.0, 1.0))
@@ -38,6 +39,7 @@ def pushed(
         scans=(pose,) * scans,
         captured_s=(1.5e9, 1.5e9 + n),
         retracts=tuple(str(commit.id) for commit in retracts),
+        rig=rig,
     )
     if cells is None:
         keys = [KEYS[seed % 3], KEYS[(seed + 1) % 3]]

@@ -22,7 +22,7 @@ from cairn_server.cell_cache import CellCache
 from cairn_server.folding import fold_pending
 from cairn_server.service import _new_commit
 from cairn_server.store import Store
-from cairn_server.store_rows import Branch, Fold, Head, MapRow, NewCommit
+from cairn_server.store_rows import Branch, Fold, Head, MapRow, NewCommit, Selection
 
 NAMES = (f"map{n}" for n in itertools.count())
 COMMITS = [pushed(n, n + shift, author) for shift, author in enumerate((MOLE, WREN)) for n in range(3)]
@@ -116,7 +116,7 @@ class StoreContract:
                 tips = [(c.id.n, c.sha) for c in model.folded if c.id.author == author]
                 assert snapshot.tip(author) == max(tips, default=None)
                 mine = [c.id for c in model.arrived if c.id.author == author and c.cells and c.id not in model.named]
-                assert snapshot.commits_of(author.robot) == mine
+                assert snapshot.commits_where(Selection(robot=author.robot)) == mine
             assert snapshot.retracting() == [commit.id for commit in model.folded if commit.meta.retracts]
 
     def compare_chain(self, head: Head, chain: list[bytes | None], model: Model) -> None:

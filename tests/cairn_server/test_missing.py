@@ -234,7 +234,7 @@ def test_the_header_tells_what_a_robot_may_conclude(live: Live, monkeypatch: pyt
     assert header.vector[str(MOLE)] == [[0, 1]]
     assert header.tip == (1, commits[1].sha.hex())
     assert header.stable == {}
-    assert header.retracts == [f"operator.{row.operator}.0"]
+    assert header.retracts == [f"operator.{live.service.operator}.0"]
     monkeypatch.setattr(live.service._folder, "wake", lambda: None)
     live.push(row, pushed(2, 2))
     header = frames_of(ask(live, row, NaiveAsker(MOLE).request()).content)[0]

@@ -1,5 +1,8 @@
 """Retract: exactly as if it had never been pushed."""
 
+import time
+
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.cairn_server.live import Live
@@ -7,7 +10,11 @@ from tests.cairn_server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 from tests.cairn_server.test_push import kind_of
 
 from cairn_map.cell_code import decode_cell
+from cairn_map.errors import DeniedError
 from cairn_map.grid import cell_of_key
+from cairn_map.ids import OPERATOR, Author
+from cairn_server.auth import Caller, Role
+from cairn_server.retracting import seal_of
 
 
 @settings(max_examples=9)
@@ -103,7 +110,7 @@ def test_a_commit_named_twice_is_retracted_once(live: Live) -> None:
 def test_a_robot_with_more_commits_than_one_retract_can_name_is_retracted_by_several(
     live: Live, monkeypatch: object
 ) -> None:
-    monkeypatch.setattr("cairn_server.service.RETRACTS_MAX", 2)  # type: ignore[attr-defined]
+    monkeypatch.setattr("cairn_server.retracting.RETRACTS_MAX", 2)  # type: ignore[attr-defined]
     row = live.new_map()
     commits = [pushed(n, n) for n in range(5)]
     for commit in commits:
@@ -117,6 +124,56 @@ def test_nothing_and_retracts_cannot_be_retracted(live: Live) -> None:
     row = live.new_map()
     assert kind_of(live.retract(row)) == "nothing_to_retract"
     assert kind_of(live.retract(row, robot="nobody")) == "nothing_to_retract"
-    target = f"operator.{row.operator}.0"
+    target = f"operator.{live.service.operator}.0"
     answer = live.http.post(f"/maps/{row.name}/retracts", json={"commits": [target]})
     assert kind_of(answer) == "not_retractable"
+
+
+def test_commits_are_meant_by_robot_rig_and_time_and_a_preview_changes_nothing(live: Live) -> None:
+    row = live.new_map()
+    old, new = "ab" * 32, "cd" * 32
+    commits = [
+        pushed(n, n, author, rig=rig) for author, rig in ((MOLE, old), (WREN, old), (WREN, new)) for n in range(2)
+    ]
+    commits[4:] = [pushed(n + 2, n, WREN, rig=new) for n in range(2)]
+    times_s = []
+    for commit in commits:
+        live.push(row, commit)
+        times_s.append(time.time())
+    names = [str(commit.id) for commit in commits]
+
+    def meant(**fields: object) -> list[int]:
+        answer = live.retract(row, preview=True, **fields)
+        assert answer.status_code in (201, 404), answer.text
+        return [names.index(name) for name in answer.json().get("commits", [])]
+
+    assert meant(rig=old) == [0, 1, 2, 3]
+    assert meant(robot="wren", rig=old) == [2, 3]
+    assert meant(pushed_after_s=times_s[2]) == [3, 4, 5]
+    assert meant(robot="wren", pushed_after_s=times_s[2], pushed_before_s=times_s[4]) == [3, 4]
+    assert meant(captured_after_s=1.5e9 + 1.5) == [4, 5]  # the n-th commit's last scan is at 1.5e9 + n
+    assert meant(captured_before_s=1.5e9 - 1) == meant(robot="nobody") == []
+    assert read(live.cells(row)) == sum_of(commits)
+    answer = live.retract(row, robot="wren", rig=new)
+    assert answer.json()["commits"] == names[4:]
+    assert read(live.cells(row)) == sum_of(commits[:4])
+
+
+def test_a_retract_may_be_pushed_back_by_anybody_with_this_map_s_seal_on_it_and_by_nobody_without(live: Live) -> None:
+    row, commit = live.new_map(), pushed(0, 1)
+    live.push(row, commit)
+    name = live.retract(row, commit).json()["id"]
+    live.folded(row)
+    answer = live.http.get(f"/maps/{row.name}/commits/{name}")
+    seal = answer.headers["Cairn-Seal"]
+    service, robot = live.service, Caller(Role.ROBOT, "mole")
+    for wrong in (None, "0" * 64, seal_of(row, commit.sha)):
+        with pytest.raises(DeniedError):
+            service.push(row, robot, name, answer.content, seal=wrong)
+    other = live.new_map()
+    with pytest.raises(DeniedError):
+        service.push(other, robot, name, answer.content, seal=seal)
+    evidence = pushed(0, 1, Author(OPERATOR, MOLE.incarnation))
+    with pytest.raises(DeniedError):
+        service.push(row, robot, str(evidence.id), evidence.data, seal=seal_of(row, evidence.sha))
+    assert not service.push(row, robot, name, answer.content, seal=seal)
