@@ -13,6 +13,7 @@ from typing import Any, Self
 import httpx
 from pydantic import TypeAdapter, ValidationError
 
+from cairn_map.access_messages import CreateToken, NewSecret, TokenInfo
 from cairn_map.commit import Commit
 from cairn_map.cursor import Cursor, cursor_from_text
 from cairn_map.errors import (
@@ -150,6 +151,23 @@ class MapApi:
         """Undo commits exactly."""
         body = self._ask("POST", f"/maps/{name}/retracts", content=request.model_dump_json().encode())
         return message_from_json(Retracted, body)
+
+    def create_token(self, token: str, request: CreateToken) -> NewSecret:
+        """Create a token; its secret is shown this once."""
+        body = self._ask("PUT", f"/tokens/{token}", content=request.model_dump_json().encode())
+        return message_from_json(NewSecret, body)
+
+    def rotate_token(self, token: str) -> NewSecret:
+        """Another secret for a token."""
+        return message_from_json(NewSecret, self._ask("POST", f"/tokens/{token}/rotate"))
+
+    def revoke_token(self, token: str) -> None:
+        """End a token."""
+        self._ask("DELETE", f"/tokens/{token}")
+
+    def tokens(self) -> list[TokenInfo]:
+        """All tokens, without their secrets."""
+        return _list_of(TokenInfo, self._ask("GET", "/tokens"))
 
     def log(self, name: str, *, after: int = 0, limit: int = 100) -> list[LogEntry]:
         """Log entries after a sequence number, oldest first."""

@@ -1,13 +1,19 @@
-"""Who may do what: a bearer token stands for a role; robots' tokens are bound to one map and one robot.
+"""Who may do what: a bearer token stands for a role, on one map or on all.
 
 admin     everything                           `admin_token`, or anybody while there is none (loopback only)
+operator  read, retract
+robot     read, push its own commits, fetch    given at registration; of one map and one robot
+reader    read
 enroller  register robots                      `enrolment_token`
-robot     push its own commits, fetch, read    given at registration, kept as SHA-256 only
+
+Whoever may read may do it with any of the first four. Tokens are kept as SHA-256 only (`token_store`); the two secrets
+of the settings are kept by whoever starts the server.
 """
 
 import hashlib
 import hmac
 import secrets
+import time
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -15,14 +21,17 @@ from cairn_map.errors import DeniedError
 from cairn_server.settings import Settings
 from cairn_server.store import Store
 from cairn_server.store_rows import MapRow
+from cairn_server.token_store import Token
 
 
 class Role(StrEnum):
     """What a token stands for."""
 
     ADMIN = "admin"
-    ENROLLER = "enroller"
+    OPERATOR = "operator"
     ROBOT = "robot"
+    READER = "reader"
+    ENROLLER = "enroller"
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,10 +40,22 @@ class Caller:
 
     role: Role
     robot: str | None = None
+    name: str = ""
+    """Of the token, for the audit log."""
+    map_number: int | None = None
+    """The one map that the token counts on; None: all."""
 
     def may_author(self, robot: str) -> bool:
         """Whether commits of this robot may come from here."""
         return self.role is Role.ADMIN or self.robot == robot
+
+    def counts_on(self, map_number: int | None) -> bool:
+        """Whether the token counts on a map (None: on the server as a whole)."""
+        return self.map_number in (None, map_number)
+
+
+ADMIN_FILE, ENROLLER_FILE, LOCAL = Caller(Role.ADMIN, name="admin"), Caller(Role.ENROLLER, name="enroller"), "local"
+RESERVED_TOKEN_NAMES = frozenset({ADMIN_FILE.name, ENROLLER_FILE.name, LOCAL, "server"})
 
 
 def new_token() -> str:
@@ -48,27 +69,30 @@ def token_hash(token: str) -> bytes:
 
 
 def caller_of(token: str | None, row: MapRow | None, store: Store, settings: Settings) -> Caller:
-    """Who shows this token.
+    """Who shows this token, to do something with a map, or (None) with none in particular.
 
     Raises:
-        DeniedError: kind `no_token` or `bad_token`.
+        DeniedError: kind `no_token` or `bad_token`; the latter also on a map that the token is not for.
     """
-    if token is not None and row is not None:
-        robot = store.branch_of_token(row, token_hash(token))
-        if robot is not None:
-            return Caller(Role.ROBOT, robot)
-    if _is(token, settings.admin_token):
-        return Caller(Role.ADMIN)
-    if _is(token, settings.enrolment_token):
-        return Caller(Role.ENROLLER)
-    if settings.admin_token is None and token is None:
-        return Caller(Role.ADMIN)
     if token is None:
+        if settings.admin_token is None:
+            return Caller(Role.ADMIN, name=LOCAL)
         raise DeniedError(
             "no_token",
             "this server wants a token: Authorization: Bearer TOKEN (the cairn command: --token, CAIRN_TOKEN)",
         )
-    raise DeniedError("bad_token", "the token is wrong, or another registration under the same name replaced it")
+    caller = _holder(token, store, settings)
+    if caller is None or not (row is None or caller.counts_on(row.number)):
+        raise bad_token()
+    return caller
+
+
+def bad_token() -> DeniedError:
+    """The one answer to whoever shows a token that is worth nothing here."""
+    return DeniedError(
+        "bad_token",
+        "the token is wrong, of another map, or ended: expired, revoked, or replaced by a rotation or registration",
+    )
 
 
 def require(caller: Caller, *roles: Role) -> None:
@@ -84,5 +108,38 @@ def require(caller: Caller, *roles: Role) -> None:
         )
 
 
-def _is(token: str | None, expected: str | None) -> bool:
-    return token is not None and expected is not None and hmac.compare_digest(token.encode(), expected.encode())
+def require_all_maps(caller: Caller) -> None:
+    """Refuse an admin of one map what concerns the server.
+
+    Raises:
+        DeniedError: kind `not_allowed`.
+    """
+    if caller.map_number is not None:
+        raise DeniedError("not_allowed", "this takes an admin token of all maps; the token shown is of one map")
+
+
+def has_ended(token: Token, settings: Settings, *, now_s: float) -> bool:
+    """Whether a token is over its time, or its robot was silent for longer than `branch_expiry_s`."""
+    if token.expires_s is not None:
+        return now_s >= token.expires_s
+    if token.role != "robot" or settings.branch_expiry_s is None:
+        return False
+    return now_s >= max(token.created_s, token.last_used_s or 0.0) + settings.branch_expiry_s
+
+
+def _holder(token: str, store: Store, settings: Settings) -> Caller | None:
+    known = store.tokens.of_hash(token_hash(token))
+    if known is not None:
+        if has_ended(known, settings, now_s=time.time()):
+            return None
+        store.tokens.used(known.name)
+        return Caller(Role(known.role), known.robot, known.name, known.map_number)
+    if _is(token, settings.admin_token):
+        return ADMIN_FILE
+    if _is(token, settings.enrolment_token):
+        return ENROLLER_FILE
+    return None
+
+
+def _is(token: str, expected: str | None) -> bool:
+    return expected is not None and hmac.compare_digest(token.encode(), expected.encode())

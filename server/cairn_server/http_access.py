@@ -7,11 +7,13 @@ from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from cairn_map.errors import NotFoundError
-from cairn_server.auth import Caller, Role, caller_of, require
+from cairn_server.auth import Caller, Role, bad_token, caller_of, require, require_all_maps
 from cairn_server.service import Service
 from cairn_server.store_rows import MapRow
 
 bearer = HTTPBearer(auto_error=False)
+READING = (Role.READER, Role.ROBOT, Role.OPERATOR)
+"""Who may read a map."""
 
 
 def service_of(request: Request) -> Service:
@@ -29,7 +31,8 @@ def map_of(name: str, service: Operations, credentials: Credentials) -> MapRow:
     try:
         return service.store.map(name)
     except NotFoundError:
-        anybody(service, credentials)
+        if anybody(service, credentials).map_number is not None:
+            raise bad_token() from None
         raise
 
 
@@ -42,7 +45,7 @@ def anybody(service: Operations, credentials: Credentials) -> Caller:
 
 
 def caller_on_map(service: Operations, row: Map, credentials: Credentials) -> Caller:
-    """Who calls; robots' tokens count on their own map only."""
+    """Who calls; a token of one map counts on that map only."""
     return caller_of(credentials.credentials if credentials else None, row, service.store, service.settings)
 
 
@@ -60,8 +63,15 @@ def allowed(*roles: Role) -> Callable[[Caller], Caller]:
 
 
 def admin(caller: Annotated[Caller, Depends(anybody)]) -> Caller:
-    """The caller, if it is an admin."""
+    """The caller, if it is an admin of all maps."""
     require(caller)
+    require_all_maps(caller)
+    return caller
+
+
+def reader(caller: Annotated[Caller, Depends(anybody)]) -> Caller:
+    """The caller, if it may read some map or all."""
+    require(caller, *READING)
     return caller
 
 
@@ -77,5 +87,5 @@ async def body_of(request: Request) -> bytes:
 
 
 ADMIN = [Depends(admin)]
-READERS = [Depends(allowed(Role.ROBOT))]
+READERS = [Depends(allowed(*READING))]
 OWNERS = [Depends(own_branch)]

@@ -5,43 +5,50 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Query, Response
 
 from cairn_map.messages import BranchInfo, CreateMap, LogEntry, MapInfo, Register, Registered, Retract, Retracted
-from cairn_server.auth import Role
-from cairn_server.http_access import ADMIN, OWNERS, READERS, Map, Operations, allowed
+from cairn_server.auth import Caller, Role
+from cairn_server.http_access import READERS, READING, Map, Operations, admin, allowed, own_branch, reader
 
 LOG_PAGE_MAX = 1000
 
 router = APIRouter()
 
 
-@router.get("/maps", dependencies=ADMIN)
-def list_maps(service: Operations) -> list[MapInfo]:
-    """All maps."""
-    return [service.map_info(row) for row in service.store.maps()]
+@router.get("/maps")
+def list_maps(service: Operations, caller: Annotated[Caller, Depends(reader)]) -> list[MapInfo]:
+    """The maps that the token counts on."""
+    return [service.map_info(row) for row in service.store.maps() if caller.counts_on(row.number)]
 
 
-@router.put("/maps/{name}", status_code=201, dependencies=ADMIN)
+@router.put("/maps/{name}", status_code=201)
 def create_map(
     name: str,
     body: CreateMap,
     service: Operations,
+    caller: Annotated[Caller, Depends(admin)],
     response: Response,
 ) -> MapInfo:
     """Create a map; 200 if an equal one exists."""
     info, is_new = service.create_map(name, body)
+    if is_new:
+        service.store.audit_log.add(caller.name, "create_map", name)
     response.status_code = 201 if is_new else 200
     return info
 
 
-@router.get("/maps/{name}", dependencies=[Depends(allowed(Role.ROBOT, Role.ENROLLER))])
+@router.get("/maps/{name}", dependencies=[Depends(allowed(*READING, Role.ENROLLER))])
 def get_map(service: Operations, row: Map) -> MapInfo:
     """One map's extent, sizes and head."""
     return service.map_info(row)
 
 
-@router.post("/maps/{name}/branches", status_code=201, dependencies=[Depends(allowed(Role.ENROLLER))])
-def register(body: Register, service: Operations, row: Map) -> Registered:
+@router.post("/maps/{name}/branches", status_code=201)
+def register(
+    body: Register, service: Operations, row: Map, caller: Annotated[Caller, Depends(allowed(Role.ENROLLER))]
+) -> Registered:
     """Register a robot; registering again replaces its token."""
-    return service.register(row, body)
+    registered = service.register(row, body)
+    service.store.audit_log.add(caller.name, "register", f"map {row.name}: {body.robot}")
+    return registered
 
 
 @router.get("/maps/{name}/branches", dependencies=READERS)
@@ -50,16 +57,19 @@ def list_branches(service: Operations, row: Map) -> list[BranchInfo]:
     return service.branches(row)
 
 
-@router.delete("/maps/{name}/branches/{branch}", status_code=204, dependencies=OWNERS)
-def deregister(branch: str, service: Operations, row: Map) -> None:
+@router.delete("/maps/{name}/branches/{branch}", status_code=204)
+def deregister(branch: str, service: Operations, row: Map, caller: Annotated[Caller, Depends(own_branch)]) -> None:
     """Deregister a robot; its evidence stays."""
     service.store.deregister(row, branch)
+    service.store.audit_log.add(caller.name, "deregister", f"map {row.name}: {branch}")
 
 
-@router.post("/maps/{name}/retracts", status_code=201, dependencies=[Depends(allowed())])
-def retract(body: Retract, service: Operations, row: Map) -> Retracted:
+@router.post("/maps/{name}/retracts", status_code=201)
+def retract(
+    body: Retract, service: Operations, row: Map, caller: Annotated[Caller, Depends(allowed(Role.OPERATOR))]
+) -> Retracted:
     """Undo commits exactly."""
-    return service.retract(row, body)
+    return service.retract(row, body, by=caller)
 
 
 @router.get("/maps/{name}/log", dependencies=READERS)

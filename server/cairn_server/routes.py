@@ -3,7 +3,7 @@
 from fastapi import APIRouter, FastAPI
 from fastapi.responses import HTMLResponse
 
-from cairn_server import cell_routes, map_routes, sync_routes
+from cairn_server import access_routes, cell_routes, map_routes, sync_routes
 from cairn_server.body_limit import BodyLimit
 from cairn_server.own_origin import OwnOrigin
 from cairn_server.problems import add_problem_handlers
@@ -14,7 +14,7 @@ PAGE = """<!doctype html><title>cairn</title><h1>cairn map server</h1>
 <code>cairn map ls</code> lists the maps in a terminal.</p>"""
 
 router = APIRouter()
-ROUTERS = (router, map_routes.router, sync_routes.router, cell_routes.router)
+ROUTERS = (router, map_routes.router, sync_routes.router, cell_routes.router, access_routes.router)
 
 
 @router.get("/healthz")

@@ -37,6 +37,7 @@ FLAG_OF_SETTING = {
     "enrolment_token": "--enrolment-token-file or CAIRN_ENROLMENT_TOKEN",
     "stable_after_s": "--stable-after",
     "keep_evidence_s": "--keep-evidence",
+    "branch_expiry_s": "--branch-expiry",
 }
 
 
@@ -112,6 +113,12 @@ def _settings(argv: list[str]) -> Settings:
         metavar="SECONDS",
         help="how long commits can be retracted without their robots' help; 0 stores only the last version (2592000)",
     )
+    parser.add_argument(
+        "--branch-expiry",
+        type=float,
+        metavar="SECONDS",
+        help="end a robot's token when nobody showed it for so long; it registers again (never)",
+    )
     parser.add_argument("-v", "--verbose", action="store_true", help="log what is pushed and folded")
     args = parser.parse_args(argv)
     logging.basicConfig(level=logging.INFO if args.verbose else logging.WARNING, format="%(asctime)s %(message)s")
@@ -124,6 +131,7 @@ def _settings(argv: list[str]) -> Settings:
             enrolment_token=_secret(args.enrolment_token_file, "CAIRN_ENROLMENT_TOKEN"),
             stable_after_s=args.stable_after,
             keep_evidence_s=args.keep_evidence,
+            branch_expiry_s=args.branch_expiry,
         )
     except ValidationError as exc:
         first = exc.errors()[0]

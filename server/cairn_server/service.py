@@ -118,7 +118,7 @@ class Service:
         try:
             is_new = self.store.append(row, new)
         except ConflictError as exc:
-            self.store.audit(exc.kind, f"map {row.name}: {exc.message}; pushed by {caller.robot or caller.role}")
+            self.store.audit_log.add(caller.name, exc.kind, f"map {row.name}: {exc.message}")
             raise
         if is_new:
             self._folder.wake()
@@ -136,7 +136,7 @@ class Service:
         self.store.seen(row, branch, asker.cursor)
         return b"".join(parts)
 
-    def retract(self, row: MapRow, request: Retract) -> Retracted:
+    def retract(self, row: MapRow, request: Retract, *, by: Caller) -> Retracted:
         """Undo commits exactly. Durable on return.
 
         More targets than one commit can name become several; the last one's id is answered.
@@ -154,7 +154,8 @@ class Service:
         author = Author(OPERATOR, self.operator)
         builders = retract_builders(row, author, targets, request.note)
         ids = [str(self.store.append_built(row, author, build).id) for build in builders]
-        self.store.audit("retract", f"map {row.name}: {ids[-1]} takes out {len(names)} commits: {request.note}")
+        detail = f"map {row.name}: {ids[-1]} takes out {len(names)} commits: {request.note}"
+        self.store.audit_log.add(by.name, "retract", detail)
         self._folder.wake()
         return Retracted(id=ids[-1], commits=names)
 

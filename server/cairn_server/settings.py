@@ -26,6 +26,8 @@ class Settings(BaseModel):
     """Who has it may register robots; without it only the admin token may."""
     stable_after_s: Annotated[float, Field(ge=0)] = 86_400.0
     """A commit folded longer ago is in every backup that may still be restored, so robots may drop it."""
+    branch_expiry_s: Annotated[float, Field(ge=60)] | None = None
+    """A robot's token ends when nobody showed it for so long; None: never. The robot registers again."""
 
     keep_evidence_s: Annotated[float, Field(ge=0)] = 30 * 86_400.0
     """How long after it was folded a commit's evidence is kept, so that it can be retracted, and differences be sent;

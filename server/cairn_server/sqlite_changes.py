@@ -14,8 +14,6 @@ from cairn_server.sqlite_retention import check_kept, is_retracted, remember_evi
 from cairn_server.sqlite_writer import first
 from cairn_server.store_rows import Fold, MapRow, NewCommit
 
-AUDIT_ROWS_MAX = 100_000
-
 
 def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit) -> bool:
     """Keep a commit; False if the same one is kept already."""
@@ -93,12 +91,6 @@ def write_fold(connection: apsw.Connection, row: MapRow, fold: Fold) -> bool:
     )
     _write_cells(connection, row, fold)
     return True
-
-
-def write_audit(connection: apsw.Connection, what: str, detail: str) -> None:
-    """One more line of the audit log, of which the newest are kept."""
-    connection.execute("INSERT INTO audit (time_s, what, detail) VALUES (?, ?, ?)", (time.time(), what, detail))
-    connection.execute("DELETE FROM audit WHERE number <= ?", (connection.last_insert_rowid() - AUDIT_ROWS_MAX,))
 
 
 def _write_cells(connection: apsw.Connection, row: MapRow, fold: Fold) -> None:

@@ -123,7 +123,46 @@ UPDATE commits SET unfolded_seq =
 CREATE INDEX commits_kept ON commits (map, folded_s) WHERE gone = 0 AND cells > 0 AND folded_seq IS NOT NULL;
 """
 
-STEPS = (FIRST, STAMPS)
+ACCESS = """
+CREATE TABLE token (
+    name TEXT PRIMARY KEY,
+    role TEXT NOT NULL,
+    map INTEGER REFERENCES map,     -- NULL: all maps
+    robot TEXT,
+    hash BLOB NOT NULL UNIQUE,      -- SHA-256 of the secret
+    created_s REAL NOT NULL,
+    expires_s REAL,
+    last_used_s REAL
+);
+INSERT INTO token (name, role, map, robot, hash, created_s, last_used_s)
+    SELECT map.name || ':' || branch.name, 'robot', branch.map, branch.name, token_hash, last_seen_s, last_seen_s
+    FROM branch JOIN map ON map.number = branch.map;
+CREATE TABLE branch_without_token (
+    map INTEGER NOT NULL REFERENCES map,
+    name TEXT NOT NULL,
+    mode TEXT NOT NULL,
+    sensors TEXT NOT NULL,
+    cursor TEXT,
+    last_seen_s REAL NOT NULL,
+    incarnation TEXT NOT NULL DEFAULT '',
+    PRIMARY KEY (map, name)
+) WITHOUT ROWID;
+INSERT INTO branch_without_token SELECT map, name, mode, sensors, cursor, last_seen_s, incarnation FROM branch;
+DROP TABLE branch;
+ALTER TABLE branch_without_token RENAME TO branch;
+ALTER TABLE audit ADD COLUMN who TEXT NOT NULL DEFAULT 'server';
+ALTER TABLE audit ADD COLUMN chain BLOB NOT NULL DEFAULT x'';       -- over the line before and this one
+CREATE TABLE robot_day (            -- what each robot's quotas of the day have seen
+    map INTEGER NOT NULL REFERENCES map,
+    robot TEXT NOT NULL,
+    day INTEGER NOT NULL,           -- since 1970, UTC
+    size_bytes INTEGER NOT NULL,
+    cells INTEGER NOT NULL,
+    PRIMARY KEY (map, robot)
+) WITHOUT ROWID;
+"""
+
+STEPS = (FIRST, STAMPS, ACCESS)
 
 
 def ensure_schema(connection: apsw.Connection) -> None:

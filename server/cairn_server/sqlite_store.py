@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import cast
 
 import apsw
 
@@ -18,11 +17,12 @@ from cairn_map.ids import Author, CommitId, new_incarnation
 from cairn_map.sensor_model import SensorModel
 from cairn_server.folder_lock import lock_folder
 from cairn_server.last_seen import LastSeen
-from cairn_server.sqlite_changes import append_commit, next_number, write_audit, write_fold
+from cairn_server.sqlite_changes import append_commit, next_number, write_fold
 from cairn_server.sqlite_readers import Readers
 from cairn_server.sqlite_retention import forget_evidence
 from cairn_server.sqlite_schema import ensure_schema
 from cairn_server.sqlite_snapshot import SqliteSnapshot, ids_from_text
+from cairn_server.sqlite_tokens import SqliteAuditLog, SqliteTokens, put_registration, remove_tokens_of, write_audit
 from cairn_server.sqlite_writer import Values, Writer, connect, first, rows
 from cairn_server.store_rows import Branch, Fold, MapRow, NewCommit, StoredCommit
 
@@ -55,6 +55,8 @@ class SqliteStore:
             raise
         self._readers = Readers(path)
         self._seen = LastSeen()
+        self.tokens = SqliteTokens(self._writer, self._readers)
+        self.audit_log = SqliteAuditLog(self._writer, self._readers)
 
     def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:
         """The map and whether it is new; an equal one may exist already."""
@@ -151,15 +153,18 @@ class SqliteStore:
     def register(self, row: MapRow, branch: Branch, token_hash: bytes) -> None:
         """Make a branch, or give an existing one a new token."""
         self._seen.forget(row.number, branch.name)
-        values = (row.number, branch.name, branch.mode, json.dumps(branch.sensors), branch.last_seen_s, token_hash)
-        self._writer.run(
-            lambda connection: connection.execute(
-                "INSERT INTO branch (map, name, mode, sensors, last_seen_s, token_hash) VALUES (?, ?, ?, ?, ?, ?)"
+        values = (row.number, branch.name, branch.mode, json.dumps(branch.sensors), branch.last_seen_s)
+
+        def job(connection: apsw.Connection) -> None:
+            connection.execute(
+                "INSERT INTO branch (map, name, mode, sensors, last_seen_s) VALUES (?, ?, ?, ?, ?)"
                 " ON CONFLICT (map, name) DO UPDATE SET mode = excluded.mode, sensors = excluded.sensors,"
-                " last_seen_s = excluded.last_seen_s, token_hash = excluded.token_hash",
+                " last_seen_s = excluded.last_seen_s",
                 values,
-            ).fetchall()
-        )
+            )
+            put_registration(connection, row, branch.name, token_hash)
+
+        self._writer.run(job)
 
     def seen(self, row: MapRow, name: str, cursor: Cursor | None) -> None:
         """Note that a branch was heard of, and where it stands; may be written later."""
@@ -181,6 +186,7 @@ class SqliteStore:
             connection.execute("DELETE FROM branch WHERE map = ? AND name = ?", (row.number, name))
             if not connection.changes():
                 raise NotFoundError("no_branch", f"map {row.name} has no branch {name!r}")
+            remove_tokens_of(connection, row, name)
 
         self._writer.run(job)
         self._seen.forget(row.number, name)
@@ -195,20 +201,16 @@ class SqliteStore:
             for name, mode, sensors, cursor, seen_s in found
         ]
 
-    def branch_of_token(self, row: MapRow, token_hash: bytes) -> str | None:
-        """The branch that a token was given to."""
-        query = "SELECT name FROM branch WHERE map = ? AND token_hash = ?"
-        with self._readers.reading() as reader:
-            return cast("str | None", first(reader, query, (row.number, token_hash)))
-
     def audit(self, what: str, detail: str) -> None:
         """Note something that an administrator may have to look into; may be written later."""
         log.warning("%s: %r", what, detail)
         with suppress(UnreachableError):
-            self._writer.submit(lambda connection: write_audit(connection, what, detail))
+            self._writer.submit(lambda connection: write_audit(connection, "server", what, detail))
 
     def close(self) -> None:
         """Finish what was accepted and close."""
+        with suppress(UnreachableError):  # closed before
+            self.tokens.write_used()
         self._writer.close()
         self._readers.close()
         self._lock.close()

@@ -28,6 +28,7 @@ from cairn_server.store_rows import (
     StoredCommit,
     Totals,
 )
+from cairn_server.token_store import AuditLog, Tokens
 
 
 class Snapshot(Protocol):
@@ -92,6 +93,16 @@ class Snapshot(Protocol):
 
 class Store(Protocol):
     """A place for maps; every method may be called from any thread."""
+
+    @property
+    def tokens(self) -> Tokens:
+        """Who may do what."""
+        ...
+
+    @property
+    def audit_log(self) -> AuditLog:
+        """Who did what."""
+        ...
 
     def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:
         """The map and whether it is new; an equal one may exist already.
@@ -162,7 +173,7 @@ class Store(Protocol):
         ...
 
     def register(self, row: MapRow, branch: Branch, token_hash: bytes) -> None:
-        """Make a branch, or give an existing one a new token."""
+        """Make a branch and its token (`registration_name`), or give an existing one another secret."""
         ...
 
     def seen(self, row: MapRow, name: str, cursor: Cursor | None) -> None:
@@ -170,7 +181,7 @@ class Store(Protocol):
         ...
 
     def deregister(self, row: MapRow, name: str) -> None:
-        """Remove a branch and its token.
+        """Remove a branch and all tokens of its robot.
 
         Raises:
             NotFoundError: there is none of that name.
@@ -179,10 +190,6 @@ class Store(Protocol):
 
     def branches(self, row: MapRow) -> list[Branch]:
         """All branches, by name."""
-        ...
-
-    def branch_of_token(self, row: MapRow, token_hash: bytes) -> str | None:
-        """The branch that a token was given to."""
         ...
 
     def audit(self, what: str, detail: str) -> None:

@@ -217,12 +217,12 @@ class StoreContract:
         assert store.append_built(row, MOLE, lambda n: new_of(pushed(n, n))).id.n == 1
 
     def test_a_branch_is_a_row_and_a_token(self, store: Store) -> None:
-        row, other = self.new_map(store), self.new_map(store)
-        for token in (b"first", b"second"):
-            store.register(row, Branch("mole", "viewer", ("tof",), None, 5.0), token + row.name.encode())
-        assert store.branch_of_token(row, b"first" + row.name.encode()) is None
-        assert store.branch_of_token(row, b"second" + row.name.encode()) == "mole"
-        assert store.branch_of_token(other, b"second" + row.name.encode()) is None
+        row = self.new_map(store)
+        for secret in (b"first", b"second"):
+            store.register(row, Branch("mole", "viewer", ("tof",), None, 5.0), secret + row.name.encode())
+        assert store.tokens.of_hash(b"first" + row.name.encode()) is None
+        token = store.tokens.of_hash(b"second" + row.name.encode())
+        assert token and (token.map_number, token.robot) == (row.number, "mole")
         with store.snapshot(row) as snapshot:
             cursor = snapshot.head.cursor
         store.seen(row, "mole", cursor)
@@ -232,5 +232,6 @@ class StoreContract:
         assert (branch.name, branch.mode, branch.sensors, branch.cursor) == ("mole", "viewer", ("tof",), cursor)
         store.deregister(row, "mole")
         assert store.branches(row) == []
+        assert store.tokens.of_hash(b"second" + row.name.encode()) is None
         with pytest.raises(NotFoundError):
             store.deregister(row, "mole")

@@ -1,4 +1,4 @@
-"""Who may do what: every route with every kind of token, as PROTOCOL.md's table says; and browsers."""
+"""Who may do what besides the matrix (`test_access_matrix`): whose commits, whose tokens; and browsers."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,8 +7,8 @@ import httpx
 import pytest
 from tests.cairn_server.live import Live
 from tests.cairn_server.pushes import MOLE, WREN, pushed
+from tests.cairn_server.test_access_matrix import TABLE
 from tests.cairn_server.test_body_limit import raw
-from tests.cairn_server.test_protocol_document import DOCUMENT, ROUTE, routes_of
 from tests.cairn_server.test_push import kind_of
 
 from cairn_map.errors import BadInputError
@@ -18,8 +18,6 @@ from cairn_server.settings import Settings
 from cairn_server.store_rows import MapRow
 
 ADMIN, ENROLLER = "a" * 20, "e" * 20
-TABLE = {(found[1], found[2]): found[3] for found in ROUTE.finditer(DOCUMENT)}
-CALLERS = ("admin", "enroller", "own robot", "robot", "robot of another map", "bad", "none")
 
 
 @pytest.fixture(scope="module")
@@ -40,51 +38,10 @@ def robot_token(live: Live, row: MapRow, name: str) -> str:
     return str(answer.json()["token"])
 
 
-def is_expected(roles: str, caller: str) -> bool:
-    """Whether the document lets this caller in."""
-    if caller == "admin" or roles == "anybody":
-        return True
-    allowed = roles.split(", ")
-    if caller == "own robot":
-        return "robot" in allowed or "own robot" in allowed
-    return caller in allowed
-
-
-@pytest.mark.parametrize("route", TABLE, ids=lambda route: " ".join(route))
-def test_each_caller_may_do_what_the_document_says_and_no_more(guarded: Live, route: tuple[str, str]) -> None:
-    method, path = route
-    row, other = guarded.new_map(), guarded.new_map()
-    place = {"name": row.name, "branch": "mole", "commit": str(pushed(0, 0).id), "cell": "0,0,0"}
-    for caller in CALLERS:
-        headers = {
-            "admin": bearer(ADMIN),
-            "enroller": bearer(ENROLLER),
-            "own robot": bearer(robot_token(guarded, row, "mole")),
-            "robot": bearer(robot_token(guarded, row, "wren")),
-            "robot of another map": bearer(robot_token(guarded, other, "mole")),
-            "bad": bearer("x" * 43),
-            "none": {},
-        }[caller]
-        # A robot's push must be its own commit to be let in; the matrix asks about the route.
-        place["commit"] = str(pushed(0, 0, WREN if caller == "robot" else MOLE).id)
-        content = pushed(0, 0, WREN if caller == "robot" else MOLE).data if "commits" in path else b"{}"
-        headers |= {"Content-Type": "application/json"}
-        answer = guarded.http.request(method, path.format(**place), content=content, headers=headers)
-        allowed = is_expected(TABLE[route], caller)
-        assert (answer.status_code not in (401, 403)) == allowed, (caller, answer.status_code, answer.text)
-        if caller in ("bad", "none", "robot of another map") and not allowed:
-            assert answer.status_code == 401
-            assert answer.headers["WWW-Authenticate"] == "Bearer"
-
-
-def test_the_matrix_has_every_route_of_the_app(guarded: Live) -> None:
-    assert TABLE.keys() == routes_of(guarded)
-
-
 @pytest.mark.parametrize("route", TABLE, ids=lambda route: " ".join(route))
 def test_an_open_server_lets_everybody_without_a_token_do_everything(live: Live, route: tuple[str, str]) -> None:
     method, path = route
-    place = {"name": live.new_map().name, "branch": "mole", "commit": "x", "cell": "0,0,0"}
+    place = {"name": live.new_map().name, "branch": "mole", "commit": "x", "cell": "0,0,0", "token": "nobody"}
     answer = live.http.request(method, path.format(**place), content=b"{}")
     assert answer.status_code not in (401, 403)
 

@@ -19,6 +19,7 @@ COMMIT = pushed(0, 0)
 CURSOR = f"{'0' * 32}.1.{'0' * 32}"
 SOUND: dict[str, list[bytes]] = {
     "PUT /maps/{name}": [b"{}", b'{"geometry":{"voxel_edge_um":50000,"depth":3,"channels":[]}}'],
+    "PUT /tokens/{token}": [b'{"role":"reader","lifetime_s":9}', b'{"role":"robot","robot":"mole","map":"lab"}'],
     "POST /maps/{name}/branches": [b'{"robot":"mole","incarnation":"0123456789abcdef"}'],
     "PUT /maps/{name}/commits/{commit}": [COMMIT.data],
     "POST /maps/{name}/retracts": [b'{"robot":"mole"}', json.dumps({"commits": [str(COMMIT.id)]}).encode()],
@@ -45,6 +46,7 @@ SEGMENTS = {
     "name": ["lab", "lab", "lab", "LAB", "la"],
     "branch": ["mole", "operator"],
     "commit": [str(COMMIT.id), str(COMMIT.id), "mole.0123456789abcdef.999999999999999", "mole"],
+    "token": ["eye", "eye", "lab:mole", "admin"],
     "cell": ["0,0,0", "-1,0,2", "0,0,0.ply", "0,0,0.npz", "1e3,0,0", "9999999,0,0"],
 }
 

@@ -11,7 +11,7 @@ from tests.cairn_server.live import Live
 
 from cairn_map.commit import COMMIT_BYTES_MAX, RETRACTS_MAX
 from cairn_map.messages import CURSORS_MAX
-from cairn_server import body_limit, cell_changes, missing, problems, push_policy, service, sqlite_changes
+from cairn_server import body_limit, cell_changes, missing, problems, push_policy, service, sqlite_tokens
 
 ROOT = Path(__file__).parents[2]
 DOCUMENT = (ROOT / "server" / "PROTOCOL.md").read_text()
@@ -86,7 +86,7 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("reply to `missing`", missing.REPLY_BYTES_MAX),
         ("commits whose evidence is decoded at once", service.VALIDATING_MAX),
         ("problem's `detail`", problems.DETAIL_CHARACTERS_MAX),
-        ("audit log", sqlite_changes.AUDIT_ROWS_MAX),
+        ("audit log", sqlite_tokens.AUDIT_ROWS_MAX),
     ],
 )
 def test_the_limits_in_the_document_are_those_of_the_code(row: str, number: int) -> None:

@@ -31,12 +31,13 @@ def test_push_twice_changes_nothing(live: Live) -> None:
     assert len(live.http.get(f"/maps/{row.name}/log").json()) == 1
 
 
-def test_the_same_id_with_other_bytes_is_refused_and_audited(live: Live, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_same_id_with_other_bytes_is_refused_and_audited(live: Live) -> None:
     row = live.new_map()
     live.push(row, pushed(0, 1))
     refused = live.push(row, pushed(0, 2))
     assert (refused.status_code, kind_of(refused)) == (409, "id_taken")
-    assert "id_taken" in caplog.text
+    last = live.http.get("/audit", params={"limit": 1000}).json()[-1]
+    assert (last["who"], last["what"]) == ("local", "id_taken")
     assert read(live.cells(row)) == sum_of([pushed(0, 1)])
 
 

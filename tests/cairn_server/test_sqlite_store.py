@@ -13,7 +13,7 @@ from tests.cairn_server.store_contract import StoreContract, new_of
 
 from cairn_map.errors import BadInputError, ConflictError, UnreachableError
 from cairn_map.sensor_model import SensorModel
-from cairn_server import sqlite_changes, sqlite_readers
+from cairn_server import sqlite_readers, sqlite_tokens
 from cairn_server.sqlite_changes import append_commit
 from cairn_server.sqlite_store import FILE_NAME, SqliteStore
 
@@ -137,7 +137,7 @@ def test_a_failure_of_the_file_fails_the_group_and_the_writer_goes_on(fresh: Sql
 
 
 def test_the_audit_log_keeps_its_newest_lines(fresh: SqliteStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sqlite_changes, "AUDIT_ROWS_MAX", 3)
+    monkeypatch.setattr(sqlite_tokens, "AUDIT_ROWS_MAX", 3)
     for n in range(9):
         fresh.audit("test", str(n))
     found = fresh._writer.run(lambda connection: connection.execute("SELECT detail FROM audit").fetchall())
