@@ -53,7 +53,7 @@ MAY_NAME = {
         "cairn_server/problems.py",
         "cairn_server/serve_command.py",
     ],
-    "uvicorn": ["cairn_server/serve_command.py"],
+    "uvicorn": ["cairn_server/serve_command.py", "cairn_server/http_*.py"],
     "httpx": ["cairn_client/api.py"],
     "apsw": ["cairn_server/sqlite_*.py", "cairn_client/replica_store.py"],
     "psycopg": [],

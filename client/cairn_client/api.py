@@ -4,9 +4,11 @@ Errors come out as the same `CairnError` that the server raised. What could not 
 again later, is `UnreachableError`. Every call is idempotent, so whoever calls may simply call again.
 """
 
+import ssl
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -85,14 +87,17 @@ class FetchedCell:
 
 
 class MapApi:
-    """One server's routes; `server_url` such as `http://base:8750`."""
+    """One server's routes; `server_url` such as `http://base:8750`.
 
-    def __init__(self, server_url: str, *, token: str | None = None) -> None:
+    Of https the certificate must be signed by `ca_file` (PEM), else by SSL_CERT_FILE, else by who is known everywhere.
+    """
+
+    def __init__(self, server_url: str, *, token: str | None = None, ca_file: Path | None = None) -> None:
         self.traffic = Traffic()
         if not server_url.startswith(("http://", "https://")) or "/maps/" in server_url:
             raise BadInputError("bad_url", f"a server's URL is http://HOST:PORT, got {server_url!r}")
         try:
-            self._client = httpx.Client(base_url=server_url.rstrip("/"), timeout=TIMEOUT)
+            self._client = httpx.Client(base_url=server_url.rstrip("/"), timeout=TIMEOUT, verify=_verified(ca_file))
         except httpx.InvalidURL as exc:
             raise BadInputError("bad_url", f"{server_url!r} is not a URL: {exc}") from exc
         self.token = token
@@ -259,11 +264,22 @@ def _list_of(model: type[Message], data: bytes) -> list[Message]:
         raise DamagedDataError("bad_message", f"the server's list is not sound: {first_error(exc)}") from exc
 
 
+def _verified(ca_file: Path | None) -> ssl.SSLContext | bool:
+    try:
+        return ssl.create_default_context(cafile=ca_file) if ca_file else True
+    except OSError as exc:  # ssl.SSLError is one
+        raise BadInputError("bad_setting", f"{ca_file} is no file of certificates: {exc}") from exc
+
+
 def _unreachable(exc: httpx.TransportError) -> UnreachableError:
     try:
         where = str(exc.request.url.copy_with(path="/", query=None))
     except RuntimeError:
         where = "the server"
+    if "CERTIFICATE_VERIFY_FAILED" in str(exc):
+        return UnreachableError(
+            "no_link", f"{where} shows a certificate of nobody we know; name its issuer's file in SSL_CERT_FILE"
+        )
     return UnreachableError("no_link", f"cannot reach {where} ({exc or type(exc).__name__}); is `cairn serve` running?")
 
 

@@ -22,7 +22,7 @@ class OwnOrigin:
 
     async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
         """One request."""
-        if scope["type"] != "http" or self._is_own(scope["headers"]):
+        if scope["type"] != "http" or self._is_own(scope["scheme"], scope["headers"]):
             await self._app(scope, receive, send)
             return
         await send_problem(
@@ -33,12 +33,12 @@ class OwnOrigin:
             "127.0.0.1, [::1] or localhost",
         )
 
-    def _is_own(self, headers: list[tuple[bytes, bytes]]) -> bool:
+    def _is_own(self, scheme: str, headers: list[tuple[bytes, bytes]]) -> bool:
         hosts = {value.decode("latin-1") for name, value in headers if name == b"host"}
         origins = {value.decode("latin-1") for name, value in headers if name == b"origin"}
         if len(hosts) != 1 or _name(f"//{next(iter(hosts))}") not in self._hosts:
             return False
-        return origins <= {f"http://{host}" for host in hosts}
+        return origins <= {f"{scheme}://{host}" for host in hosts}
 
 
 def _name(url: str) -> str | None:

@@ -9,6 +9,7 @@ that it acknowledged is in DIR/cairn.sqlite, so a crash or a power cut loses not
 Without a token it trusts whoever reaches it, and therefore only listens on this machine. To serve others,
 put a secret of at least 16 characters into a file and name it with --admin-token-file; robots register with
 --enrolment-token-file's secret. CAIRN_ADMIN_TOKEN and CAIRN_ENROLMENT_TOKEN do the same from the environment.
+`cairn token` gives tokens for less than everything. Beyond a network that you trust, use --tls-cert and --tls-key.
 """
 
 import argparse
@@ -22,13 +23,17 @@ from pathlib import Path
 from types import FrameType
 
 import uvicorn
+from fastapi import FastAPI
 from pydantic import ValidationError
 
 from cairn_map.errors import BadInputError
+from cairn_server.http_deadlines import protocol_of
 from cairn_server.routes import make_app
 from cairn_server.service import Service
-from cairn_server.settings import Settings
+from cairn_server.settings import LOOPBACK, Settings
 from cairn_server.sqlite_store import SqliteStore
+
+log = logging.getLogger(__name__)
 
 BACKLOG = 128
 FLAG_OF_SETTING = {
@@ -38,6 +43,8 @@ FLAG_OF_SETTING = {
     "stable_after_s": "--stable-after",
     "keep_evidence_s": "--keep-evidence",
     "branch_expiry_s": "--branch-expiry",
+    "limit_concurrency": "--limit-concurrency",
+    "body_bytes_per_s": "--min-rate",
 }
 
 
@@ -45,6 +52,7 @@ def main(argv: list[str]) -> int:
     """Run until stopped."""
     settings = _settings(argv)
     settings.check_reach()
+    settings.check_tls()
     signal.signal(signal.SIGTERM, _stop)
     with listen(settings.host, settings.port) as listener:
         try:
@@ -56,12 +64,38 @@ def main(argv: list[str]) -> int:
 
 
 def _serve(service: Service, listener: socket.socket) -> None:
+    config = config_of(make_app(service), service.settings)
     host, port = listener.getsockname()[:2]
     shown = f"[{host}]" if ":" in host else host
-    sys.stdout.write(f"cairn map server on http://{shown}:{port}, data in {service.settings.folder}\n")
+    scheme = "https" if config.is_ssl else "http"
+    if scheme == "http" and host not in LOOPBACK:
+        log.warning("tokens and maps travel in the clear: give --tls-cert and --tls-key, or put a TLS proxy before it")
+    sys.stdout.write(f"cairn map server on {scheme}://{shown}:{port}, data in {service.settings.folder}\n")
     sys.stdout.flush()
-    config = uvicorn.Config(make_app(service), log_level="warning", timeout_graceful_shutdown=10, lifespan="off")
     uvicorn.Server(config).run(sockets=[listener])
+
+
+def config_of(app: FastAPI, settings: Settings, *, log_level: str = "warning") -> uvicorn.Config:
+    """How the HTTP library serves the app.
+
+    Raises:
+        BadInputError: kind `bad_setting`: no certificate, or not with this key.
+    """
+    config = uvicorn.Config(
+        app,
+        http=protocol_of(settings),
+        log_level=log_level,
+        timeout_graceful_shutdown=10,
+        lifespan="off",
+        limit_concurrency=settings.limit_concurrency,
+        ssl_certfile=settings.tls_cert,
+        ssl_keyfile=settings.tls_key,
+    )
+    try:
+        config.load()
+    except OSError as exc:  # ssl.SSLError is one
+        raise BadInputError("bad_setting", f"--tls-cert {settings.tls_cert}, --tls-key: {exc}") from exc
+    return config
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
@@ -119,6 +153,22 @@ def _settings(argv: list[str]) -> Settings:
         metavar="SECONDS",
         help="end a robot's token when nobody showed it for so long; it registers again (never)",
     )
+    parser.add_argument("--tls-cert", type=Path, metavar="FILE", help="certificate chain (PEM): speak https only")
+    parser.add_argument("--tls-key", type=Path, metavar="FILE", help="its private key (PEM)")
+    parser.add_argument(
+        "--limit-concurrency",
+        type=int,
+        default=defaults.limit_concurrency,
+        metavar="N",
+        help=f"connections served at once, more are answered 503 ({defaults.limit_concurrency})",
+    )
+    parser.add_argument(
+        "--min-rate",
+        type=float,
+        default=defaults.body_bytes_per_s,
+        metavar="BYTES",
+        help="cut links that carry less than so many bytes a second, after half a minute (1000)",
+    )
     parser.add_argument("-v", "--verbose", action="store_true", help="log what is pushed and folded")
     args = parser.parse_args(argv)
     logging.basicConfig(level=logging.INFO if args.verbose else logging.WARNING, format="%(asctime)s %(message)s")
@@ -132,6 +182,10 @@ def _settings(argv: list[str]) -> Settings:
             stable_after_s=args.stable_after,
             keep_evidence_s=args.keep_evidence,
             branch_expiry_s=args.branch_expiry,
+            tls_cert=args.tls_cert,
+            tls_key=args.tls_key,
+            limit_concurrency=args.limit_concurrency,
+            body_bytes_per_s=args.min_rate,
         )
     except ValidationError as exc:
         first = exc.errors()[0]

@@ -28,6 +28,27 @@ class Settings(BaseModel):
     """A commit folded longer ago is in every backup that may still be restored, so robots may drop it."""
     branch_expiry_s: Annotated[float, Field(ge=60)] | None = None
     """A robot's token ends when nobody showed it for so long; None: never. The robot registers again."""
+    tls_cert: Path | None = None
+    """Certificate chain, PEM; with it (and `tls_key`) the server speaks https only."""
+    tls_key: Path | None = None
+    """Its private key, PEM."""
+    limit_concurrency: Annotated[int, Field(ge=2, le=100_000)] = 500
+    """Connections that are served at once; some more are answered 503."""
+    head_s: Annotated[float, Field(gt=0)] = 15.0
+    """A request's head must have come so soon after the connection, or after the answer before."""
+    body_grace_s: Annotated[float, Field(gt=0)] = 30.0
+    """So long a body may take, and an answer to be taken, and"""
+    body_bytes_per_s: Annotated[float, Field(gt=0)] = 1000.0
+    """beyond it no slower than this."""
+
+    def check_tls(self) -> None:
+        """Refuse half of what TLS needs.
+
+        Raises:
+            BadInputError: kind `bad_setting`.
+        """
+        if (self.tls_cert is None) != (self.tls_key is None):
+            raise BadInputError("bad_setting", "TLS takes both a certificate (--tls-cert) and its key (--tls-key)")
 
     keep_evidence_s: Annotated[float, Field(ge=0)] = 30 * 86_400.0
     """How long after it was folded a commit's evidence is kept, so that it can be retracted, and differences be sent;

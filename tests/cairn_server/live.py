@@ -20,7 +20,7 @@ from cairn_map.commit import Commit
 from cairn_map.grid import Geometry
 from cairn_map.messages import CreateMap, Retract
 from cairn_server.routes import make_app
-from cairn_server.serve_command import listen
+from cairn_server.serve_command import config_of, listen
 from cairn_server.service import Service
 from cairn_server.settings import Settings
 from cairn_server.sqlite_store import SqliteStore
@@ -46,7 +46,7 @@ class Live:
         self.app = make_app(self.service)
         listener = listen("127.0.0.1", 0)
         self.port: int = listener.getsockname()[1]
-        self._server = uvicorn.Server(uvicorn.Config(self.app, log_level="critical", lifespan="off"))
+        self._server = uvicorn.Server(config_of(self.app, self.service.settings, log_level="critical"))
         self._thread = threading.Thread(target=self._server.run, kwargs={"sockets": [listener]})
         self._thread.start()
         self.http = httpx.Client(base_url=f"http://127.0.0.1:{self.port}", timeout=DEADLINE_S)
@@ -107,7 +107,7 @@ class Process:
             env={name: value for name, value in os.environ.items() if not name.startswith("CAIRN_")},
         )
         assert self._process.stdout is not None
-        found = re.search(r"http://127\.0\.0\.1:\d+", self._process.stdout.readline())
+        found = re.search(r"https?://127\.0\.0\.1:\d+", self._process.stdout.readline())
         self.url = found[0] if found else None
 
     def send(self, number: int) -> None:

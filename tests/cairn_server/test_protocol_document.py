@@ -12,6 +12,7 @@ from tests.cairn_server.live import Live
 from cairn_map.commit import COMMIT_BYTES_MAX, RETRACTS_MAX
 from cairn_map.messages import CURSORS_MAX
 from cairn_server import body_limit, cell_changes, missing, problems, push_policy, service, sqlite_tokens
+from cairn_server.settings import Settings
 
 ROOT = Path(__file__).parents[2]
 DOCUMENT = (ROOT / "server" / "PROTOCOL.md").read_text()
@@ -86,10 +87,13 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("reply to `missing`", missing.REPLY_BYTES_MAX),
         ("commits whose evidence is decoded at once", service.VALIDATING_MAX),
         ("problem's `detail`", problems.DETAIL_CHARACTERS_MAX),
+        ("until a request's head is whole", Settings().head_s),
+        ("until a body is whole, or an answer taken", Settings().body_grace_s),
+        ("connections served at once", Settings().limit_concurrency),
         ("audit log", sqlite_tokens.AUDIT_ROWS_MAX),
     ],
 )
-def test_the_limits_in_the_document_are_those_of_the_code(row: str, number: int) -> None:
+def test_the_limits_in_the_document_are_those_of_the_code(row: str, number: float) -> None:
     cell = next(line for line in DOCUMENT.splitlines() if line.startswith(f"| {row} |")).split("|")[2]
     written = re.search(r"\d+\^\d+|\d[\d ]*\d|\d", cell)
     assert written
