@@ -290,7 +290,7 @@ def _error_of(response: httpx.Response, body: bytes) -> CairnError:
         problem = Problem.model_validate_json(body)
     except ValidationError:
         problem = Problem(kind="http", detail=f"the server answered {status}: {body[:200].decode(errors='replace')}")
-    if status in (429, 502, 503, 504):
+    if status in (429, 502, 503, 504, 507):
         wait = response.headers.get("Retry-After", "")
         return UnreachableError(problem.kind, problem.detail, float(wait) if wait.isdecimal() else None)
     families: dict[int, type[CairnError]] = {

@@ -4,7 +4,9 @@ import logging
 import threading
 import time
 
+from cairn_map.errors import CairnError
 from cairn_server.cell_cache import CACHE_BYTES, CellCache
+from cairn_server.fold_health import FoldHealth
 from cairn_server.folding import fold_pending
 from cairn_server.store import Store
 from cairn_server.store_rows import MapRow
@@ -16,14 +18,16 @@ GROUP_MAX = 64
 FORGET_EVERY_S = 60.0
 """How often it is looked for evidence that need not be kept any more."""
 RETRY_S = 5.0
-"""A fold that failed (a full disk, a damaged cell) is tried again after this."""
+"""A fold that failed (a full disk, a damaged cell) is tried again after this at the latest, the first time soon."""
+FIRST_RETRY_S = 0.2
 
 
 class Folder:
     """Folds all maps of a store until closed."""
 
-    def __init__(self, store: Store, *, keep_evidence_s: float) -> None:
+    def __init__(self, store: Store, health: FoldHealth, *, keep_evidence_s: float) -> None:
         self._store = store
+        self._health = health
         self._keep_evidence_s = keep_evidence_s
         self._forget_next_s = 0.0
         self._wake = threading.Event()
@@ -37,6 +41,10 @@ class Folder:
         """Say that there may be something to fold."""
         self._wake.set()
 
+    def is_alive(self) -> bool:
+        """Whether anybody folds."""
+        return self._thread.is_alive()
+
     def close(self) -> None:
         """Stop after the fold under way."""
         self._closing.set()
@@ -44,11 +52,15 @@ class Folder:
         self._thread.join()
 
     def _run(self) -> None:
+        retry_s = FIRST_RETRY_S
         while not self._closing.is_set():
             self._wake.wait(FORGET_EVERY_S)
             self._wake.clear()
-            if not self._fold_all():
-                self._closing.wait(RETRY_S)
+            if self._fold_all():
+                retry_s = FIRST_RETRY_S
+            else:
+                self._closing.wait(min(retry_s, RETRY_S))
+                retry_s = min(2 * retry_s, RETRY_S)
                 self._wake.set()
 
     def _fold_all(self) -> bool:
@@ -68,10 +80,12 @@ class Folder:
                     continue
                 try:
                     busy |= self._fold_group(row, len(maps)) > 0
-                except Exception:
+                except Exception as exc:
                     # Whatever it is, the other maps go on, and this thread must live: nobody else folds.
-                    log.exception("map %s: fold failed; trying again in %.0f s", row.name, RETRY_S)
+                    # An error of ours says all in its message.
+                    log.error("map %s: fold failed, to be tried again: %s", row.name, exc, exc_info=_unexpected(exc))
                     failed.add(row.name)
+                    self._health.failed(row.name, exc)
         return not (failed or self._forget_old(maps))
 
     def _forget_old(self, maps: list[MapRow]) -> bool:
@@ -98,7 +112,12 @@ class Folder:
         cache.limit_bytes = CACHE_BYTES // maps
         start_s = time.monotonic()
         count = fold_pending(self._store, row, cache, limit=GROUP_MAX)
+        self._health.folded(row.name, count, time.monotonic() - start_s)
         if count:
             log.info("map %s: folded %d commits in %.0f ms", row.name, count, (time.monotonic() - start_s) * 1e3)
         cache.trim()
         return count
+
+
+def _unexpected(exc: Exception) -> Exception | None:
+    return None if isinstance(exc, CairnError) else exc

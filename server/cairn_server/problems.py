@@ -22,7 +22,14 @@ from cairn_map.messages import Problem
 log = logging.getLogger(__name__)
 
 MEDIA_TYPE = "application/problem+json"
-STATUS_OF_KIND = {"no_token": 401, "bad_token": 401, "too_large": 413, "other_log": 410, "damaged_store": 500}
+STATUS_OF_KIND = {
+    "no_token": 401,
+    "bad_token": 401,
+    "too_large": 413,
+    "other_log": 410,
+    "damaged_store": 500,
+    "disk_full": 507,
+}
 KIND_OF_STATUS = {404: "no_route", 405: "no_method"}
 """Of what the framework refuses."""
 DETAIL_CHARACTERS_MAX = 1000

@@ -3,10 +3,11 @@
 from fastapi import APIRouter, FastAPI
 from fastapi.responses import HTMLResponse
 
-from cairn_server import access_routes, cell_routes, map_routes, sync_routes
+from cairn_server import access_routes, cell_routes, map_routes, operations_routes, sync_routes
 from cairn_server.body_limit import BodyLimit
 from cairn_server.own_origin import OwnOrigin
 from cairn_server.problems import add_problem_handlers
+from cairn_server.request_trail import RequestTrail
 from cairn_server.service import Service
 
 PAGE = """<!doctype html><title>cairn</title><h1>cairn map server</h1>
@@ -14,7 +15,14 @@ PAGE = """<!doctype html><title>cairn</title><h1>cairn map server</h1>
 <code>cairn map ls</code> lists the maps in a terminal.</p>"""
 
 router = APIRouter()
-ROUTERS = (router, map_routes.router, sync_routes.router, cell_routes.router, access_routes.router)
+ROUTERS = (
+    router,
+    map_routes.router,
+    sync_routes.router,
+    cell_routes.router,
+    access_routes.router,
+    operations_routes.router,
+)
 
 
 @router.get("/healthz")
@@ -46,4 +54,5 @@ def make_app(service: Service) -> FastAPI:
     app.add_middleware(BodyLimit)
     if service.settings.admin_token is None:
         app.add_middleware(OwnOrigin, host=service.settings.host)
+    app.add_middleware(RequestTrail, figures=service.figures)
     return app

@@ -28,6 +28,7 @@ from pydantic import ValidationError
 
 from cairn_map.errors import BadInputError
 from cairn_server.http_deadlines import protocol_of
+from cairn_server.log_format import LogForm, start_logging
 from cairn_server.routes import make_app
 from cairn_server.service import Service
 from cairn_server.settings import LOOPBACK, Settings
@@ -36,6 +37,9 @@ from cairn_server.sqlite_store import SqliteStore
 log = logging.getLogger(__name__)
 
 BACKLOG = 128
+GRACE_S = 6
+"""For answers under way, once the server is told to stop; the fold under way and closing the store come after it."""
+MEGABYTE = 1 << 20
 FLAG_OF_SETTING = {
     "port": "--port",
     "admin_token": "--admin-token-file or CAIRN_ADMIN_TOKEN",
@@ -45,6 +49,8 @@ FLAG_OF_SETTING = {
     "branch_expiry_s": "--branch-expiry",
     "limit_concurrency": "--limit-concurrency",
     "body_bytes_per_s": "--min-rate",
+    "disk_free_min_bytes": "--disk-free-min",
+    "fold_lag_max_s": "--fold-lag-max",
 }
 
 
@@ -72,7 +78,20 @@ def _serve(service: Service, listener: socket.socket) -> None:
         log.warning("tokens and maps travel in the clear: give --tls-cert and --tls-key, or put a TLS proxy before it")
     sys.stdout.write(f"cairn map server on {scheme}://{shown}:{port}, data in {service.settings.folder}\n")
     sys.stdout.flush()
-    uvicorn.Server(config).run(sockets=[listener])
+    _Server(config, service).run(sockets=[listener])
+
+
+class _Server(uvicorn.Server):
+    """A server that is not ready from the moment on that it is told to stop."""
+
+    def __init__(self, config: uvicorn.Config, service: Service) -> None:
+        super().__init__(config)
+        self._service = service
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """A signal to stop."""
+        self._service.readiness.is_closing = True
+        super().handle_exit(sig, frame)
 
 
 def config_of(app: FastAPI, settings: Settings, *, log_level: str = "warning") -> uvicorn.Config:
@@ -84,8 +103,10 @@ def config_of(app: FastAPI, settings: Settings, *, log_level: str = "warning") -
     config = uvicorn.Config(
         app,
         http=protocol_of(settings),
+        log_config=None,
         log_level=log_level,
-        timeout_graceful_shutdown=10,
+        access_log=False,
+        timeout_graceful_shutdown=GRACE_S,
         lifespan="off",
         limit_concurrency=settings.limit_concurrency,
         ssl_certfile=settings.tls_cert,
@@ -169,9 +190,26 @@ def _settings(argv: list[str]) -> Settings:
         metavar="BYTES",
         help="cut links that carry less than so many bytes a second, after half a minute (1000)",
     )
-    parser.add_argument("-v", "--verbose", action="store_true", help="log what is pushed and folded")
+    parser.add_argument(
+        "--disk-free-min",
+        type=float,
+        default=defaults.disk_free_min_bytes / MEGABYTE,
+        metavar="MB",
+        help="with less space than this, pushes get 507 and the server is not ready (64)",
+    )
+    parser.add_argument(
+        "--fold-lag-max",
+        type=float,
+        default=defaults.fold_lag_max_s,
+        metavar="SECONDS",
+        help="while a commit waits longer to be folded, the server is not ready (600)",
+    )
+    parser.add_argument("--metrics-open", action="store_true", help="anybody may read /metrics, not only an admin")
+    forms = [str(form) for form in LogForm]
+    parser.add_argument("--log-format", choices=forms, default=forms[0], help=f"how log lines look ({forms[0]})")
+    parser.add_argument("-v", "--verbose", action="store_true", help="log every request and fold")
     args = parser.parse_args(argv)
-    logging.basicConfig(level=logging.INFO if args.verbose else logging.WARNING, format="%(asctime)s %(message)s")
+    start_logging(LogForm(args.log_format), logging.INFO if args.verbose else logging.WARNING)
     try:
         return Settings(
             folder=args.data,
@@ -186,11 +224,20 @@ def _settings(argv: list[str]) -> Settings:
             tls_key=args.tls_key,
             limit_concurrency=args.limit_concurrency,
             body_bytes_per_s=args.min_rate,
+            disk_free_min_bytes=_bytes_of(args.disk_free_min),
+            fold_lag_max_s=args.fold_lag_max,
+            metrics_open=args.metrics_open,
         )
     except ValidationError as exc:
         first = exc.errors()[0]
         flag = FLAG_OF_SETTING.get(str(first["loc"][0]), str(first["loc"][0]))
         raise BadInputError("bad_setting", f"{flag}: {first['msg']}") from exc
+
+
+def _bytes_of(megabytes: float) -> int:
+    if not 0 <= megabytes < 1 << 30:
+        raise BadInputError("bad_setting", f"--disk-free-min is in megabytes, 0 or more, got {megabytes}")
+    return int(megabytes * MEGABYTE)
 
 
 def _secret(path: Path | None, variable: str) -> str | None:

@@ -6,6 +6,7 @@ called from many threads.
 
 import threading
 import time
+from itertools import chain
 
 import numpy as np
 
@@ -29,11 +30,14 @@ from cairn_map.messages import (
     Retracted,
 )
 from cairn_server.auth import Caller, Role, new_token, token_hash
+from cairn_server.fold_health import FoldHealth
 from cairn_server.folder import Folder
 from cairn_server.missing import asker_from_request, header_of, reply_frames
 from cairn_server.push_policy import check_claims, check_evidence
 from cairn_server.read_cache import ReadCache
+from cairn_server.readiness import Readiness
 from cairn_server.retracting import is_sealed, retract_builders, seal_of, targets_of
+from cairn_server.server_figures import ServerFigures, process_lines, store_lines
 from cairn_server.settings import Settings
 from cairn_server.stable import StableVectors
 from cairn_server.store import Store
@@ -50,7 +54,10 @@ class Service:
     def __init__(self, store: Store, settings: Settings) -> None:
         self.store = store
         self.settings = settings
-        self._folder = Folder(store, keep_evidence_s=settings.keep_evidence_s)
+        self.figures = ServerFigures()
+        self.folds = FoldHealth(self.figures)
+        self._folder = Folder(store, self.folds, keep_evidence_s=settings.keep_evidence_s)
+        self.readiness = Readiness(store.health, self.folds, settings, self._folder.is_alive)
         self._validating = threading.BoundedSemaphore(VALIDATING_MAX)
         self._stable = StableVectors(settings.stable_after_s)
         self._reads = ReadCache()
@@ -107,9 +114,11 @@ class Service:
         Anybody may push back a retract that bears this server's own seal.
 
         Raises:
+            UnreachableError: kind `disk_full`.
             BadInputError: not a commit for this map, not by this caller, or against `push_policy`.
             ConflictError: kind `id_taken`: the id is known with other bytes.
         """
+        self.store.health.check_space(self.settings.disk_free_min_bytes)
         meta, cells = split_commit(data)
         speaks_for = Caller(Role.ADMIN) if is_sealed(row, data, seal) else caller
         check_claims(row, speaks_for, id_text, meta, cells=len(cells))
@@ -132,7 +141,8 @@ class Service:
             asker = asker_from_request(request, snapshot)
             parts = [start_of_reply()]
             stable = self._stable.of(row, snapshot)
-            parts += [encode_frame(f) for f in reply_frames(snapshot, asker, row.geometry, self._reads, stable=stable)]
+            frames = reply_frames(snapshot, asker, row.geometry, self._reads, stable=stable)
+            parts += [encode_frame(f) for f in self.figures.counted(frames)]
         self.store.seen(row, branch, asker.cursor)
         return b"".join(parts)
 
@@ -215,8 +225,14 @@ class Service:
             for branch in self.store.branches(row)
         ]
 
+    def metrics_text(self) -> str:
+        """All figures for Prometheus."""
+        parts = [self.figures.lines(), store_lines(self.store.health.figures(), self.store.health.backlogs())]
+        return "\n".join([*chain(*parts, process_lines()), ""])
+
     def close(self) -> None:
         """Stop folding and close the store; what was acknowledged is folded after the next start."""
+        self.readiness.is_closing = True
         self._folder.close()
         self.store.close()
 

@@ -53,6 +53,13 @@ class Settings(BaseModel):
     keep_evidence_s: Annotated[float, Field(ge=0)] = 30 * 86_400.0
     """How long after it was folded a commit's evidence is kept, so that it can be retracted, and differences be sent;
     0: only the last version of the map is stored."""
+    disk_free_min_bytes: Annotated[int, Field(ge=0)] = 64 << 20
+    """With less than this free on the store's disk, pushes are refused (507), and the server is not ready. What was
+    acknowledged is folded into the rest."""
+    fold_lag_max_s: Annotated[float, Field(gt=0)] = 600.0
+    """While a commit waits longer to be folded, the server is not ready."""
+    metrics_open: bool = False
+    """Whether anybody may read `/metrics`, which names the maps; else an admin only."""
 
     def check_reach(self) -> None:
         """Refuse to serve strangers without a token, and tokens that protect nothing.

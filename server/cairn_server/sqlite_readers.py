@@ -11,6 +11,7 @@ from pathlib import Path
 import apsw
 
 from cairn_map.errors import UnreachableError
+from cairn_server.sqlite_failures import read_failure
 from cairn_server.sqlite_writer import connect
 
 IDLE_MAX = 16
@@ -37,7 +38,7 @@ class Readers:
         try:
             yield connection
         except apsw.Error as exc:
-            raise UnreachableError("store_failed", f"the store could not read: {exc}", retry_after_s=5.0) from exc
+            raise read_failure(exc) from exc
         finally:
             self._give_back(connection)
 

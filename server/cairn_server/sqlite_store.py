@@ -18,6 +18,7 @@ from cairn_map.sensor_model import SensorModel
 from cairn_server.folder_lock import lock_folder
 from cairn_server.last_seen import LastSeen
 from cairn_server.sqlite_changes import append_commit, next_number, write_fold
+from cairn_server.sqlite_health import SqliteHealth
 from cairn_server.sqlite_readers import Readers
 from cairn_server.sqlite_retention import forget_evidence
 from cairn_server.sqlite_schema import ensure_schema
@@ -57,6 +58,7 @@ class SqliteStore:
         self._seen = LastSeen()
         self.tokens = SqliteTokens(self._writer, self._readers)
         self.audit_log = SqliteAuditLog(self._writer, self._readers)
+        self.health = SqliteHealth(path, self._writer, self._readers)
 
     def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:
         """The map and whether it is new; an equal one may exist already."""

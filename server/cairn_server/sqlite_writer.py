@@ -16,6 +16,8 @@ from typing import Any, TypeVar
 import apsw
 
 from cairn_map.errors import UnreachableError
+from cairn_server.sqlite_checkpoint import IDLE_S, Checkpoints
+from cairn_server.sqlite_failures import write_failure
 
 log = logging.getLogger(__name__)
 
@@ -60,6 +62,9 @@ class Writer:
 
     def __init__(self, path: Path) -> None:
         self._connection = connect(path)
+        self.checkpoints = Checkpoints(self._connection, path, busy_ms=BUSY_MS)
+        self.written = 0
+        self.failures: dict[str, int] = {}
         self._jobs: queue.Queue[Job | None] = queue.Queue(QUEUE_MAX)
         self._lock = threading.Lock()
         self._closed = False
@@ -86,6 +91,16 @@ class Writer:
         """Run a job and wait until it is durable."""
         return self.submit(job).result()
 
+    @property
+    def queued(self) -> int:
+        """Jobs that wait."""
+        return self._jobs.qsize()
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether anybody works on them."""
+        return self._thread.is_alive()
+
     def close(self) -> None:
         """Finish all jobs and close the connection; may be called twice."""
         with self._lock:
@@ -97,12 +112,24 @@ class Writer:
     def _run(self) -> None:
         try:
             while (group := self._group()) is not None:
-                _commit_group(self._connection, group)
+                if not group:
+                    self.checkpoints.when_idle()
+                    continue
+                failure = _commit_group(self._connection, group)
+                if failure is None:
+                    self.written += 1
+                else:
+                    self.failures[failure.kind] = self.failures.get(failure.kind, 0) + 1
+                self.checkpoints.after_work()
         finally:
             self._connection.close()
 
     def _group(self) -> list[Job] | None:
-        first = self._jobs.get()
+        """Jobs for one transaction; empty after a while without any, None when closed."""
+        try:
+            first = self._jobs.get(timeout=IDLE_S)
+        except queue.Empty:
+            return []
         if first is None:
             return None
         group = [first]
@@ -118,27 +145,29 @@ class Writer:
         return group
 
 
-def _commit_group(connection: apsw.Connection, group: list[Job]) -> None:
+def _commit_group(connection: apsw.Connection, group: list[Job]) -> UnreachableError | None:
+    """Write a group and answer its threads; what went wrong, if nothing was written."""
     results: list[tuple[Future[Any], Any, BaseException | None]] = []
     try:
         connection.execute("BEGIN IMMEDIATE")
         for job, future in group:
             results.append((future, *_run_job(connection, job)))
         connection.execute("COMMIT")
-    except apsw.Error as exc:
+    except (apsw.Error, MemoryError) as exc:  # whatever it is, this thread must live: nobody else writes
+        failure = write_failure(exc, connection)
         with suppress(apsw.Error):
             if connection.in_transaction:
                 connection.execute("ROLLBACK")
-        log.error("the store could not write: %s", exc)
-        failure = UnreachableError("store_failed", f"the store could not write: {exc}", retry_after_s=5.0)
+        log.error("%s", failure.message)
         for _, future in group:
             future.set_exception(failure)
-        return
+        return failure
     for future, value, error in results:
         if error is None:
             future.set_result(value)
         else:
             future.set_exception(error)
+    return None
 
 
 def _run_job(connection: apsw.Connection, job: Callable[[apsw.Connection], Any]) -> tuple[Any, BaseException | None]:

@@ -110,6 +110,11 @@ class Process:
         found = re.search(r"https?://127\.0\.0\.1:\d+", self._process.stdout.readline())
         self.url = found[0] if found else None
 
+    @property
+    def pid(self) -> int:
+        """Of the process."""
+        return self._process.pid
+
     def send(self, number: int) -> None:
         """A signal."""
         self._process.send_signal(number)

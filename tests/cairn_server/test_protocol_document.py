@@ -70,7 +70,7 @@ def test_every_kind_in_the_code_is_in_the_document_and_no_other() -> None:
     assert code == documented_kinds()
 
 
-@pytest.mark.parametrize("kind", ["no_token", "too_large", "other_log", "damaged_store"])
+@pytest.mark.parametrize("kind", ["no_token", "too_large", "other_log", "damaged_store", "disk_full"])
 def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
     row = next(line for line in DOCUMENT.splitlines() if line.startswith("| `") and f"`{kind}`" in line)
     assert int(row.split("|")[2]) == problems.STATUS_OF_KIND[kind]

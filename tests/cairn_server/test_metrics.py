@@ -1,0 +1,142 @@
+"""`GET /metrics`: what is counted, and that it is the format that Prometheus reads."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tests.cairn_server.live import Live
+from tests.cairn_server.prometheus_text import families_of, value
+from tests.cairn_server.pushes import MOLE, pushed
+from tests.cairn_server.test_protocol_document import DOCUMENT
+
+from cairn_server import folder, metrics
+from cairn_server.metrics import Counter, Histogram
+
+PUSH = "/maps/{name}/commits/{commit}"
+
+
+@pytest.fixture
+def fresh(tmp_path: Path) -> Iterator[Live]:
+    """A server that has counted nothing yet."""
+    with Live(tmp_path) as server:
+        yield server
+
+
+def text_of(live: Live) -> str:
+    answer = live.http.get("/metrics")
+    assert answer.headers["Content-Type"] == metrics.MEDIA_TYPE
+    return answer.text
+
+
+def test_the_names_in_the_document_are_those_of_the_page(live: Live) -> None:
+    section = DOCUMENT.split("### 4.4")[1].split("## 5.")[0]
+    named = [part.strip("` ") for line in section.splitlines() if "_" in line for part in line.split("|")[1:2]]
+    names = {name for text in named for name in text.replace("`", "").split(", ") if name.startswith(("cairn", "proc"))}
+    assert names == set(families_of(text_of(live)))
+
+
+def test_pushes_are_counted_by_outcome_with_their_bytes(fresh: Live) -> None:
+    row = fresh.new_map()
+    commit = pushed(0, 0)
+    for _ in range(3):
+        fresh.push(row, commit)
+    fresh.push(row, pushed(0, 1))
+    fresh.http.put("/maps/no-such-map/commits/x", content=b"x")
+    text = text_of(fresh)
+    assert value(text, "cairn_pushes_total", map=row.name, outcome="new") == 1
+    assert value(text, "cairn_pushes_total", map=row.name, outcome="known") == 2
+    assert value(text, "cairn_pushes_total", map="", outcome="id_taken") == 1
+    assert value(text, "cairn_pushes_total", map="", outcome="no_map") == 1
+    assert value(text, "cairn_push_bytes_total", map=row.name) == len(commit.data)
+    assert value(text, "cairn_errors_total", kind="id_taken") == 1
+    assert value(text, "cairn_http_received_bytes_total", method="PUT", route=PUSH) >= 4 * len(commit.data)
+    assert value(text, "cairn_http_requests_total", method="PUT", route=PUSH, status="200") == 2
+    assert value(text, "cairn_http_request_duration_seconds_count", method="PUT", route=PUSH) == 5
+
+
+def test_frames_are_counted_by_kind(fresh: Live) -> None:
+    row = fresh.new_map()
+    fresh.push(row, pushed(0, 0))
+    fresh.folded(row)
+    reply = fresh.http.post(f"/maps/{row.name}/branches/mole/missing", json={})
+    text = text_of(fresh)
+    assert value(text, "cairn_fetch_frames_total", kind="full") == 2
+    assert 0 < value(text, "cairn_fetch_frame_bytes_total", kind="full") < len(reply.content)
+    assert value(text, "cairn_fetch_frames_total", kind="delta") == 0
+
+
+def test_what_waits_to_be_folded_shows_until_it_is(fresh: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    row = fresh.new_map()
+    monkeypatch.setattr(folder, "RETRY_S", 0.01)
+    with monkeypatch.context() as broken:
+        broken.setattr(folder, "fold_pending", _no_memory)
+        fresh.push(row, pushed(0, 0))
+        begin_s = time.monotonic()
+        while not value(text := text_of(fresh), "cairn_fold_failures_total", map=row.name):
+            assert time.monotonic() < begin_s + 20
+        assert value(text, "cairn_pending_commits", map=row.name) == 1
+        assert 0 < value(text, "cairn_pending_oldest_age_seconds", map=row.name) < 20
+    fresh.folded(row)
+    text = text_of(fresh)
+    assert value(text, "cairn_pending_oldest_age_seconds", map=row.name) == 0
+    assert value(text, "cairn_folded_commits_total", map=row.name) == 1
+    assert value(text, "cairn_fold_duration_seconds_count", map=row.name) == 1
+
+
+def test_the_store_and_the_process_show_their_sizes(live: Live) -> None:
+    live.new_map()
+    text = text_of(live)
+    for name in ("cairn_store_size_bytes", "cairn_wal_size_bytes", "cairn_disk_free_bytes", "process_open_fds"):
+        assert value(text, name) > 0
+    assert value(text, "cairn_writer_failures_total", kind="disk_full") == 0
+
+
+def test_names_that_strangers_try_make_no_series(tmp_path: Path) -> None:
+    with Live(tmp_path, admin_token="a" * 20, metrics_open=True) as live:
+        before = text_of(live).count("\n")
+        for n in range(20):
+            live.http.put(f"/maps/guess{n}/commits/{pushed(n, 0).id}", content=b"x")
+            live.http.request(f"ODD{n}", f"/guess{n}")
+        assert text_of(live).count("\n") < before + 120
+        assert "guess" not in text_of(live)
+        assert "ODD" not in text_of(live)
+
+
+def test_a_family_has_a_bound_and_escapes_what_is_in_labels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics, "SERIES_MAX", 3)
+    counter = Counter("cairn_test_total", "A test.", ("a", "b"))
+    histogram = Histogram("cairn_test_seconds", "A test.", ("a",), ends=(1.0, 2.0))
+    ugly = 'quote " back \\ line \n {brace},'
+    counter.add(2, ugly, "")
+    for n in range(5):
+        counter.add(1, str(n), "x")
+        histogram.observe(float(n), str(n))
+    text = "\n".join([*counter.lines(), *histogram.lines(), ""])
+    assert value(text, "cairn_test_total", a=ugly, b="") == 2
+    assert value(text, "cairn_test_total", a="other", b="other") == 3
+    assert value(text, "cairn_test_seconds_bucket", a="other", le="+Inf") == 2
+    assert value(text, "cairn_test_seconds_bucket", a="1", le="1.0") == 1
+
+
+def test_counting_costs_microseconds() -> None:
+    counter = Counter("cairn_test_total", "A test.", ("a",))
+    begin_s = time.perf_counter()
+    for _ in range(10_000):
+        counter.add(1, "x")
+    assert (time.perf_counter() - begin_s) / 10_000 < 50e-6  # 0.4 us where it was written
+
+
+def _no_memory(*arguments: object, **options: object) -> int:
+    raise MemoryError
+
+
+def test_who_registered_may_not_read_the_figures_of_all_maps(tmp_path: Path) -> None:
+    with Live(tmp_path, admin_token="a" * 20) as live:
+        row = live.new_map()
+        headers = {"Authorization": "Bearer " + "a" * 20}
+        body = {"robot": "mole", "incarnation": MOLE.incarnation}
+        token = live.http.post(f"/maps/{row.name}/branches", json=body, headers=headers).json()["token"]
+        assert live.http.get("/metrics", headers={"Authorization": f"Bearer {token}"}).status_code == 401
+        assert live.http.get("/metrics").status_code == 401
+        assert live.http.get("/metrics", headers=headers).status_code == 200
