@@ -66,7 +66,7 @@ def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *,
         raise DamagedDataError("empty_commit", "a commit must hold evidence or name commits to retract")
 
 
-def check_evidence(meta: CommitMeta, cells: Mapping[CellKey, DecodedCell], geometry: Geometry) -> None:
+def check_evidence(meta: CommitMeta, cells: Mapping[CellKey, DecodedCell]) -> None:
     """Refuse more evidence than the commit's scans can have given; prior data (author `initial`) had other scans.
 
     Raises:
@@ -76,7 +76,7 @@ def check_evidence(meta: CommitMeta, cells: Mapping[CellKey, DecodedCell], geome
         return
     scans = max(1, len(meta.scans))
     for key, cell in cells.items():
-        complaint = _excess(cell.evidence, geometry, scans)
+        complaint = _excess(cell.evidence, cell.geometry, scans)
         if complaint:
             raise BadInputError("too_much_evidence", f"cell {cell_of_key(key)}: {complaint} from {scans} scans")
 

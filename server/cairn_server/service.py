@@ -4,16 +4,12 @@ Acknowledge only what is durable and fully validated; fold afterwards, in groups
 called from many threads.
 """
 
-import threading
 import time
 from itertools import chain
 
-import numpy as np
-
-from cairn_map.commit import Commit, commit_bytes, open_commit, split_commit
+from cairn_map.commit import Commit, commit_bytes, split_commit
 from cairn_map.cursor import Cursor
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
-from cairn_map.evidence import largest
 from cairn_map.frames import encode_frame, start_of_reply
 from cairn_map.grid import CellKey, cell_of_key
 from cairn_map.ids import INITIAL, OPERATOR, Author, RobotName, commit_id_from_text, new_incarnation, robot_name
@@ -30,10 +26,11 @@ from cairn_map.messages import (
     Retracted,
 )
 from cairn_server.auth import Caller, Role, new_token, token_hash
+from cairn_server.commit_checks import CommitChecks
 from cairn_server.fold_health import FoldHealth
 from cairn_server.folder import Folder
 from cairn_server.missing import asker_from_request, header_of, reply_frames
-from cairn_server.push_policy import check_claims, check_evidence
+from cairn_server.push_policy import check_claims
 from cairn_server.read_cache import ReadCache
 from cairn_server.readiness import Readiness
 from cairn_server.retracting import is_sealed, retract_builders, seal_of, targets_of
@@ -43,8 +40,6 @@ from cairn_server.stable import StableVectors
 from cairn_server.store import Store
 from cairn_server.store_rows import Branch, CellRow, Head, MapRow, NewCommit
 
-VALIDATING_MAX = 4
-"""Commits whose evidence is decoded at once: each may need a gigabyte."""
 RESERVED_NAMES = frozenset({OPERATOR, INITIAL, RobotName("main")})
 
 
@@ -58,7 +53,7 @@ class Service:
         self.folds = FoldHealth(self.figures)
         self._folder = Folder(store, self.folds, keep_evidence_s=settings.keep_evidence_s)
         self.readiness = Readiness(store.health, self.folds, settings, self._folder.is_alive)
-        self._validating = threading.BoundedSemaphore(VALIDATING_MAX)
+        self._checks = CommitChecks(settings)
         self._stable = StableVectors(settings.stable_after_s)
         self._reads = ReadCache()
         self.operator = new_incarnation()
@@ -122,8 +117,9 @@ class Service:
         meta, cells = split_commit(data)
         speaks_for = Caller(Role.ADMIN) if is_sealed(row, data, seal) else caller
         check_claims(row, speaks_for, id_text, meta, cells=len(cells))
-        with self._validating:
-            new = _validated(row, data)
+        checked = self._checks.check(data, cells)
+        tops = checked.tops or (0,) * (2 + row.geometry.plane_count)
+        new = _new_commit(Commit(meta, cells, checked.sha, data), tops)
         try:
             is_new = self.store.append(row, new)
         except ConflictError as exc:
@@ -233,18 +229,9 @@ class Service:
     def close(self) -> None:
         """Stop folding and close the store; what was acknowledged is folded after the next start."""
         self.readiness.is_closing = True
+        self._checks.close()
         self._folder.close()
         self.store.close()
-
-
-def _validated(row: MapRow, data: bytes) -> NewCommit:
-    """A commit whose evidence was decoded, and is canonical and possible."""
-    commit, decoded = open_commit(data)
-    check_evidence(commit.meta, decoded, row.geometry)
-    tops = np.zeros(2 + row.geometry.plane_count, np.int64)
-    for cell in decoded.values():
-        tops = np.maximum(tops, largest(cell.evidence, row.geometry))
-    return _new_commit(commit, tuple(tops.tolist()))
 
 
 def _new_commit(commit: Commit, tops: tuple[int, ...]) -> NewCommit:

@@ -60,6 +60,12 @@ class Settings(BaseModel):
     """While a commit waits longer to be folded, the server is not ready."""
     metrics_open: bool = False
     """Whether anybody may read `/metrics`, which names the maps; else an admin only."""
+    check_workers: Annotated[int, Field(ge=1)] = 2
+    """Processes that check dear commits, made when the first one comes."""
+    check_cpu_s: Annotated[float, Field(gt=0)] = 20.0
+    """Processor time that one commit may take there; 36 scans of five cameras at 2 cm take 6 s in profile small."""
+    check_memory_bytes: Annotated[int, Field(ge=1 << 24)] = 3 << 29
+    """Memory that it may take there; 2^29 bytes of evidence need twice their size."""
 
     def check_reach(self) -> None:
         """Refuse to serve strangers without a token, and tokens that protect nothing.

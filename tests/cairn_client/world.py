@@ -60,6 +60,9 @@ class FoldOnRequest:
     def __init__(self, store: object, health: object, *, keep_evidence_s: float) -> None:
         pass
 
+    def is_alive(self) -> bool:
+        return True
+
     def wake(self) -> None:
         pass
 

@@ -11,7 +11,17 @@ from tests.cairn_server.live import Live
 
 from cairn_map.commit import COMMIT_BYTES_MAX, RETRACTS_MAX
 from cairn_map.messages import CURSORS_MAX
-from cairn_server import body_limit, cell_changes, missing, problems, push_policy, service, sqlite_tokens
+from cairn_server import (
+    body_limit,
+    cell_changes,
+    check_pool,
+    commit_checks,
+    commit_cost,
+    missing,
+    problems,
+    push_policy,
+    sqlite_tokens,
+)
 from cairn_server.settings import Settings
 
 ROOT = Path(__file__).parents[2]
@@ -85,7 +95,11 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("cells listed in `missing`", CURSORS_MAX),
         ("commits named in one retract request", RETRACTS_MAX),
         ("reply to `missing`", missing.REPLY_BYTES_MAX),
-        ("commits whose evidence is decoded at once", service.VALIDATING_MAX),
+        ("raw bytes of all streams of a commit", commit_cost.ALLOWANCE_BYTES),
+        ("modelled numbers of a commit (masks; leaves once for each modelled group)", commit_cost.ALLOWANCE_NUMBERS),
+        ("the same, of any commit", commit_cost.NUMBERS_MAX),
+        ("ordinary commits checked at once", commit_checks.THREADS_MAX),
+        ("dear commits that wait for a worker", check_pool.WAITING_MAX),
         ("problem's `detail`", problems.DETAIL_CHARACTERS_MAX),
         ("until a request's head is whole", Settings().head_s),
         ("until a body is whole, or an answer taken", Settings().body_grace_s),
@@ -98,6 +112,13 @@ def test_the_limits_in_the_document_are_those_of_the_code(row: str, number: floa
     written = re.search(r"\d+\^\d+|\d[\d ]*\d|\d", cell)
     assert written
     assert eval(written[0].replace("^", "**").replace(" ", "")) == number
+
+
+def test_the_bounds_of_cost_in_the_document_are_those_of_the_code() -> None:
+    defaults = Settings()
+    assert f"and {commit_cost.PER_BYTE} for each byte of its body" in DOCUMENT
+    assert f"| {defaults.check_cpu_s:.0f} s; 3 * 2^29 bytes (settings) |" in DOCUMENT
+    assert defaults.check_memory_bytes == 3 * 2**29
 
 
 def test_the_limits_of_push_in_the_document_are_those_of_the_code() -> None:

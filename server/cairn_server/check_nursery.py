@@ -1,0 +1,122 @@
+"""The process that workers are forked from: it has loaded all kernels, so a new worker is ready in milliseconds.
+
+    server ── control socket ──> nursery (one thread, kernels warm) ── fork ──> worker, worker, ...
+       └───────────────────── a socket for each worker ──────────────────────────┘
+
+    $ python -m cairn_server.check_nursery FD MEMORY_BYTES      # only the server starts it
+
+A worker gets commits, each as a length (u64) and its bytes, and answers each with a length and JSON. It holds nothing
+of the server's: no store, no token, no listening socket. It dies with the nursery, which dies with the server: the
+kernel tells both (a closed socket, PR_SET_PDEATHSIG), even if the server was killed. Nothing is ever forked from a
+process with threads.
+"""
+
+import ctypes
+import json
+import os
+import resource
+import signal
+import socket
+import struct
+import sys
+from pathlib import Path
+
+from cairn_map.errors import CairnError
+from cairn_map.warm_up import warm_up
+from cairn_server.checking import check_commit
+
+LENGTH = struct.Struct("<Q")
+PR_SET_PDEATHSIG = 1
+RETIRED_SHARE = 4
+"""A worker that ever held more than this part of its memory is replaced after its answer, so that memory goes back."""
+
+
+def main(control_fd: int, memory_bytes: int) -> None:
+    """Fork a worker for each socket that comes, until the server is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel buries workers
+    warm_up()
+    with socket.socket(fileno=control_fd) as control:
+        while True:
+            message, fds, _, _ = socket.recv_fds(control, 1, 1)
+            if not message:
+                return
+            if os.fork() == 0:
+                control.close()
+                _be_worker(fds[0], memory_bytes)
+            os.close(fds[0])
+
+
+def _be_worker(fd: int, memory_bytes: int) -> None:
+    try:
+        _die_with_parent()
+        limit, start_bytes = _address_space_bytes() + memory_bytes, _peak_bytes()
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        with socket.socket(fileno=fd) as jobs:
+            jobs.sendall(LENGTH.pack(os.getpid()))
+            while (data := received(jobs)) is not None:
+                answer = answer_to(data)
+                retires = "memory" in answer or _peak_bytes() - start_bytes > memory_bytes // RETIRED_SHARE
+                send(jobs, json.dumps(answer | {"retires": retires}).encode())
+                if retires:
+                    return
+    except OSError:
+        pass  # the server is gone, or wants this worker no more
+    finally:
+        os._exit(0)
+
+
+def answer_to(data: bytes) -> dict[str, object]:
+    """What a check found, as JSON."""
+    try:
+        checked = check_commit(data)
+    except CairnError as exc:
+        return {"family": type(exc).__name__, "kind": exc.kind, "message": exc.message}
+    except MemoryError:
+        return {"memory": True}
+    return {"sha": checked.sha.hex(), "tops": checked.tops}
+
+
+def send(channel: socket.socket, data: bytes) -> None:
+    """A length, and as many bytes."""
+    channel.sendall(LENGTH.pack(len(data)))
+    channel.sendall(data)
+
+
+def received(channel: socket.socket) -> bytes | None:
+    """What `send` sent; None if the other side closed instead."""
+    head = _exactly(channel, LENGTH.size)
+    return None if head is None else _exactly(channel, LENGTH.unpack(head)[0])
+
+
+def _exactly(channel: socket.socket, size_bytes: int) -> bytes | None:
+    data = bytearray(size_bytes)
+    view, at = memoryview(data), 0
+    while at < size_bytes:
+        got = channel.recv_into(view[at:])
+        if not got:
+            return None
+        at += got
+    return bytes(data)
+
+
+def _die_with_parent() -> None:
+    parent = os.getppid()
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+    if os.getppid() != parent or parent == 1:
+        os._exit(0)  # it died meanwhile
+
+
+def _address_space_bytes() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+
+
+def _peak_bytes() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), int(sys.argv[2]))

@@ -1,0 +1,34 @@
+"""What is checked of a commit before it is kept: all of it. Pure; runs in a thread, or in a worker process.
+
+Bytes go in; what comes out is small: the commit's SHA-256 and the largest number of each plane. Everything else that is
+kept of a commit stands in its bytes.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cairn_map.commit import open_commit
+from cairn_map.evidence import largest
+from cairn_server.push_policy import check_evidence
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """What is known of a commit once it was decoded, canonical and possible."""
+
+    sha: bytes
+    tops: tuple[int, ...]
+    """Largest number of each plane; none for a commit without cells."""
+
+
+def check_commit(data: bytes) -> Checked:
+    """Decode a commit, and find it sound.
+
+    Raises:
+        DamagedDataError, BadInputError: as `open_commit` and `push_policy.check_evidence`.
+    """
+    commit, decoded = open_commit(data)
+    check_evidence(commit.meta, decoded)
+    tops = [largest(cell.evidence, cell.geometry) for cell in decoded.values()]
+    return Checked(commit.sha, tuple(np.max(tops, axis=0).tolist()) if tops else ())

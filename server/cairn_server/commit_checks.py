@@ -1,0 +1,49 @@
+"""Where a commit is checked: an ordinary one in the thread that brought it, a dear one in a worker process.
+
+What is ordinary is known beforehand, from the heads (`commit_cost`), and bounded: so no commit keeps the server's own
+process busy for longer than a blink, or makes it grow.
+"""
+
+import threading
+from collections.abc import Mapping
+
+from cairn_map.grid import CellKey
+from cairn_server.check_pool import CheckPool
+from cairn_server.checking import Checked, check_commit
+from cairn_server.commit_cost import check_cost, cost_of
+from cairn_server.settings import Settings
+
+ORDINARY_S = 0.05
+"""Commits that may cost no more are checked in threads."""
+THREADS_MAX = 4
+"""Of them at once."""
+
+
+class CommitChecks:
+    """Checks commits; called from many threads."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.ordinary_s = ORDINARY_S
+        self._threads = threading.BoundedSemaphore(THREADS_MAX)
+        self._pool = CheckPool(
+            workers=settings.check_workers, limit_s=settings.check_cpu_s, memory_bytes=settings.check_memory_bytes
+        )
+
+    def check(self, data: bytes, cells: Mapping[CellKey, bytes]) -> Checked:
+        """What a whole commit holds; its cells are what `split_commit` gave.
+
+        Raises:
+            BadInputError: kind `too_costly`; or as `check_commit`.
+            DamagedDataError: as `check_commit`.
+            UnreachableError: kind `busy`, `check_failed` or `shutting_down`: later.
+        """
+        cost = cost_of(cells.values())
+        check_cost(cost, size_bytes=len(data))
+        if cost.seconds > self.ordinary_s:
+            return self._pool.check(data)
+        with self._threads:
+            return check_commit(data)
+
+    def close(self) -> None:
+        """End the workers."""
+        self._pool.close()
