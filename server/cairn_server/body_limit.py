@@ -71,12 +71,13 @@ def limit_of(path: str) -> int:
     return next((size for pattern, size in LIMITS if pattern.fullmatch(path)), JSON_BYTES_MAX)
 
 
-async def send_problem(send: Send, status: int, kind: str, detail: str) -> None:
-    """Answer with a problem, and close: the body was not read."""
+async def send_problem(send: Send, status: int, kind: str, detail: str, *, answer_to: str = "http") -> None:
+    """Answer a request, or a WebSocket's handshake, with a problem, and close: the body was not read."""
     problem = Problem(title=kind.replace("_", " "), status=status, detail=detail, kind=kind)
     headers = [(b"content-type", b"application/problem+json"), (b"connection", b"close")]
-    await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": problem.model_dump_json().encode()})
+    prefix = "" if answer_to == "http" else "websocket."
+    await send({"type": f"{prefix}http.response.start", "status": status, "headers": headers})
+    await send({"type": f"{prefix}http.response.body", "body": problem.model_dump_json().encode()})
 
 
 async def _refuse(send: Send, limit_bytes: int) -> None:

@@ -3,6 +3,7 @@
 import logging
 import threading
 import time
+from collections.abc import Callable
 
 from cairn_map.errors import CairnError
 from cairn_server.cell_cache import CACHE_BYTES, CellCache
@@ -25,9 +26,12 @@ FIRST_RETRY_S = 0.2
 class Folder:
     """Folds all maps of a store until closed."""
 
-    def __init__(self, store: Store, health: FoldHealth, *, keep_evidence_s: float) -> None:
+    def __init__(
+        self, store: Store, health: FoldHealth, *, keep_evidence_s: float, on_fold: Callable[[MapRow], None]
+    ) -> None:
         self._store = store
         self._health = health
+        self._on_fold = on_fold
         self._keep_evidence_s = keep_evidence_s
         self._forget_next_s = 0.0
         self._wake = threading.Event()
@@ -114,6 +118,7 @@ class Folder:
         count = fold_pending(self._store, row, cache, limit=GROUP_MAX)
         self._health.folded(row.name, count, time.monotonic() - start_s)
         if count:
+            self._on_fold(row)
             log.info("map %s: folded %d commits in %.0f ms", row.name, count, (time.monotonic() - start_s) * 1e3)
         cache.trim()
         return count

@@ -86,6 +86,8 @@ async def body_of(request: Request) -> bytes:
     return await request.body()
 
 
+map_reader = allowed(*READING)
+
 ADMIN = [Depends(admin)]
-READERS = [Depends(allowed(*READING))]
+READERS = [Depends(map_reader)]
 OWNERS = [Depends(own_branch)]

@@ -60,7 +60,7 @@ def list_branches(service: Operations, row: Map) -> list[BranchInfo]:
 @router.delete("/maps/{name}/branches/{branch}", status_code=204)
 def deregister(branch: str, service: Operations, row: Map, caller: Annotated[Caller, Depends(own_branch)]) -> None:
     """Deregister a robot; its evidence stays."""
-    service.store.deregister(row, branch)
+    service.deregister(row, branch)
     service.store.audit_log.add(caller.name, "deregister", f"map {row.name}: {branch}")
 
 

@@ -22,7 +22,7 @@ class OwnOrigin:
 
     async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
         """One request."""
-        if scope["type"] != "http" or self._is_own(scope["scheme"], scope["headers"]):
+        if scope["type"] == "lifespan" or self._is_own(scope["scheme"], scope["headers"]):
             await self._app(scope, receive, send)
             return
         await send_problem(
@@ -31,6 +31,7 @@ class OwnOrigin:
             "foreign_origin",
             "without --admin-token-file this server answers only requests of its own pages and of programs, sent to "
             "127.0.0.1, [::1] or localhost",
+            answer_to=scope["type"],
         )
 
     def _is_own(self, scheme: str, headers: list[tuple[bytes, bytes]]) -> bool:
@@ -38,7 +39,8 @@ class OwnOrigin:
         origins = {value.decode("latin-1") for name, value in headers if name == b"origin"}
         if len(hosts) != 1 or _name(f"//{next(iter(hosts))}") not in self._hosts:
             return False
-        return origins <= {f"{scheme}://{host}" for host in hosts}
+        page = {"ws": "http", "wss": "https"}.get(scheme, scheme)
+        return origins <= {f"{page}://{host}" for host in hosts}
 
 
 def _name(url: str) -> str | None:

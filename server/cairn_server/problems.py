@@ -29,6 +29,8 @@ STATUS_OF_KIND = {
     "other_log": 410,
     "damaged_store": 500,
     "disk_full": 507,
+    "upgrade_required": 426,
+    "too_many_streams": 429,
 }
 KIND_OF_STATUS = {404: "no_route", 405: "no_method"}
 """Of what the framework refuses."""
@@ -50,17 +52,24 @@ def status_of(error: CairnError) -> int:
     return next((status for family, status in STATUS_OF_FAMILY if isinstance(error, family)), 500)
 
 
+def answer_to(exc: CairnError) -> JSONResponse:
+    """An error as a problem."""
+    headers: dict[str, str] = {}
+    if isinstance(exc, UnreachableError) and exc.retry_after_s is not None:
+        headers["Retry-After"] = f"{exc.retry_after_s:.0f}"
+    if status_of(exc) == 401:
+        headers["WWW-Authenticate"] = "Bearer"
+    if status_of(exc) == 426:
+        headers |= {"Upgrade": "websocket", "Connection": "Upgrade"}
+    return _problem(status_of(exc), exc.kind, exc.message, headers)
+
+
 def add_problem_handlers(app: FastAPI) -> None:
     """Make every error of the app a problem."""
 
     @app.exception_handler(CairnError)
     def of_cairn(request: Request, exc: CairnError) -> JSONResponse:
-        headers: dict[str, str] = {}
-        if isinstance(exc, UnreachableError) and exc.retry_after_s is not None:
-            headers["Retry-After"] = f"{exc.retry_after_s:.0f}"
-        if status_of(exc) == 401:
-            headers["WWW-Authenticate"] = "Bearer"
-        return _problem(status_of(exc), exc.kind, exc.message, headers)
+        return answer_to(exc)
 
     @app.exception_handler(RequestValidationError)
     def of_validation(request: Request, exc: RequestValidationError) -> JSONResponse:

@@ -3,7 +3,7 @@
 from fastapi import APIRouter, FastAPI
 from fastapi.responses import HTMLResponse
 
-from cairn_server import access_routes, cell_routes, map_routes, operations_routes, sync_routes
+from cairn_server import access_routes, cell_routes, live_routes, map_routes, operations_routes, sync_routes
 from cairn_server.body_limit import BodyLimit
 from cairn_server.own_origin import OwnOrigin
 from cairn_server.problems import add_problem_handlers
@@ -22,6 +22,7 @@ ROUTERS = (
     cell_routes.router,
     access_routes.router,
     operations_routes.router,
+    live_routes.router,
 )
 
 

@@ -21,6 +21,7 @@ import sys
 from contextlib import closing
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import uvicorn
 from fastapi import FastAPI
@@ -40,6 +41,8 @@ BACKLOG = 128
 GRACE_S = 6
 """For answers under way, once the server is told to stop; the fold under way and closing the store come after it."""
 MEGABYTE = 1 << 20
+WEBSOCKETS: dict[str, Any] = {"ws": "websockets-sansio", "ws_max_size": 1 << 12, "ws_per_message_deflate": False}
+"""Listeners send next to nothing, and must cost little."""
 FLAG_OF_SETTING = {
     "port": "--port",
     "admin_token": "--admin-token-file or CAIRN_ADMIN_TOKEN",
@@ -82,7 +85,7 @@ def _serve(service: Service, listener: socket.socket) -> None:
 
 
 class _Server(uvicorn.Server):
-    """A server that is not ready from the moment on that it is told to stop."""
+    """At a signal it is not ready any more, and live streams, which have no end of their own, are told."""
 
     def __init__(self, config: uvicorn.Config, service: Service) -> None:
         super().__init__(config)
@@ -91,6 +94,7 @@ class _Server(uvicorn.Server):
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """A signal to stop."""
         self._service.readiness.is_closing = True
+        self._service.live.close()
         super().handle_exit(sig, frame)
 
 
@@ -111,6 +115,7 @@ def config_of(app: FastAPI, settings: Settings, *, log_level: str = "warning") -
         limit_concurrency=settings.limit_concurrency,
         ssl_certfile=settings.tls_cert,
         ssl_keyfile=settings.tls_key,
+        **WEBSOCKETS,
     )
     try:
         config.load()

@@ -13,6 +13,7 @@ from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_map.frames import encode_frame, start_of_reply
 from cairn_map.grid import CellKey, cell_of_key
 from cairn_map.ids import INITIAL, OPERATOR, Author, RobotName, commit_id_from_text, new_incarnation, robot_name
+from cairn_map.live_events import RobotSign
 from cairn_map.messages import (
     BranchInfo,
     CellEntry,
@@ -29,6 +30,7 @@ from cairn_server.auth import Caller, Role, new_token, token_hash
 from cairn_server.commit_checks import CommitChecks
 from cairn_server.fold_health import FoldHealth
 from cairn_server.folder import Folder
+from cairn_server.live import Hub
 from cairn_server.missing import asker_from_request, header_of, reply_frames
 from cairn_server.push_policy import check_claims
 from cairn_server.read_cache import ReadCache
@@ -51,7 +53,8 @@ class Service:
         self.settings = settings
         self.figures = ServerFigures()
         self.folds = FoldHealth(self.figures)
-        self._folder = Folder(store, self.folds, keep_evidence_s=settings.keep_evidence_s)
+        self.live = Hub(store)
+        self._folder = Folder(store, self.folds, keep_evidence_s=settings.keep_evidence_s, on_fold=self.live.folded)
         self.readiness = Readiness(store.health, self.folds, settings, self._folder.is_alive)
         self._checks = CommitChecks(settings)
         self._stable = StableVectors(settings.stable_after_s)
@@ -101,6 +104,7 @@ class Service:
         token = new_token()
         branch = Branch(request.robot, request.mode, tuple(request.sensors), None, time.time())
         self.store.register(row, branch, token_hash(token))
+        self.live.robot_came(row, RobotSign(branch=branch.name, mode=branch.mode, time_s=branch.last_seen_s))
         return Registered(branch=request.robot, token=token, map=self.map_info(row))
 
     def push(self, row: MapRow, caller: Caller, id_text: str, data: bytes, *, seal: str | None = None) -> bool:
@@ -129,6 +133,7 @@ class Service:
             self._folder.wake()
         if caller.robot:
             self.store.seen(row, caller.robot, None)
+            self.live.robot_heard(row, caller.robot)
         return is_new
 
     def missing(self, row: MapRow, branch: str, request: MissingRequest) -> bytes:
@@ -140,6 +145,7 @@ class Service:
             frames = reply_frames(snapshot, asker, row.geometry, self._reads, stable=stable)
             parts += [encode_frame(f) for f in self.figures.counted(frames)]
         self.store.seen(row, branch, asker.cursor)
+        self.live.robot_heard(row, branch, **({"cursor": str(asker.cursor)} if asker.cursor else {}))
         return b"".join(parts)
 
     def retract(self, row: MapRow, request: Retract, *, by: Caller) -> Retracted:
@@ -221,6 +227,15 @@ class Service:
             for branch in self.store.branches(row)
         ]
 
+    def deregister(self, row: MapRow, branch: str) -> None:
+        """Remove a robot and its token; its evidence stays.
+
+        Raises:
+            NotFoundError: kind `no_branch`.
+        """
+        self.store.deregister(row, branch)
+        self.live.robot_left(row, branch)
+
     def metrics_text(self) -> str:
         """All figures for Prometheus."""
         parts = [self.figures.lines(), store_lines(self.store.health.figures(), self.store.health.backlogs())]
@@ -229,6 +244,7 @@ class Service:
     def close(self) -> None:
         """Stop folding and close the store; what was acknowledged is folded after the next start."""
         self.readiness.is_closing = True
+        self.live.close()
         self._checks.close()
         self._folder.close()
         self.store.close()

@@ -57,7 +57,7 @@ class Fault:
 class FoldOnRequest:
     """In the place of the folding thread."""
 
-    def __init__(self, store: object, health: object, *, keep_evidence_s: float) -> None:
+    def __init__(self, *parts: object, **settings: object) -> None:
         pass
 
     def is_alive(self) -> bool:

@@ -59,6 +59,7 @@ class Live:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.http.close()
+        self.service.live.close()
         self._server.should_exit = True
         self._thread.join()
         self.service.close()
@@ -77,6 +78,18 @@ class Live:
         """Retract through HTTP."""
         request = Retract(commits=[str(commit.id) for commit in commits], **fields)
         return self.http.post(f"/maps/{row.name}/retracts", json=request.model_dump())
+
+    def ask(self, method: str, url: str, **options: Any) -> httpx.Response:
+        """An answer; of a stream without end only its head."""
+        return self.answer_to(self.http.build_request(method, url, **options))
+
+    def answer_to(self, request: httpx.Request) -> httpx.Response:
+        """The same for a request as it is."""
+        answer = self.http.send(request, stream=True)
+        if not answer.headers.get("Content-Type", "").startswith("text/event-stream"):
+            answer.read()
+        answer.close()
+        return answer
 
     def folded(self, row: MapRow) -> None:
         """Return when nothing is pending."""

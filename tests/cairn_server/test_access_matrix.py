@@ -145,7 +145,7 @@ def ask(holders: Holders, route: tuple[str, str], holder: Holder, place: str, ro
     }
     content = commit.data if "{commit}" in path else b"{}"
     headers = {"Content-Type": "application/json", **holders.headers_of(holder)}
-    return holders.live.http.request(method, path.format_map(parts), content=content, headers=headers)
+    return holders.live.ask(method, path.format_map(parts), content=content, headers=headers)
 
 
 @pytest.mark.parametrize("route", TABLE, ids=" ".join)

@@ -42,7 +42,7 @@ def robot_token(live: Live, row: MapRow, name: str) -> str:
 def test_an_open_server_lets_everybody_without_a_token_do_everything(live: Live, route: tuple[str, str]) -> None:
     method, path = route
     place = {"name": live.new_map().name, "branch": "mole", "commit": "x", "cell": "0,0,0", "token": "nobody"}
-    answer = live.http.request(method, path.format(**place), content=b"{}")
+    answer = live.ask(method, path.format(**place), content=b"{}")
     assert answer.status_code not in (401, 403)
 
 

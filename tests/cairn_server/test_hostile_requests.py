@@ -133,7 +133,7 @@ def check(live: Live, method: str, target: str, body: bytes, headers: dict[str, 
     """Send it as it is; the answer is no failure, and a problem if it is an error."""
     raw_headers = [(name.encode(), value.encode("latin-1")) for name, value in headers.items()]
     url = live.http.base_url.copy_with(raw_path=target.encode("ascii"))
-    answer = live.http.send(live.http.build_request(method, url, content=body, headers=raw_headers))
+    answer = live.answer_to(live.http.build_request(method, url, content=body, headers=raw_headers))
     assert answer.status_code < 500, answer.text
     if answer.status_code >= 400 and method != "HEAD":
         assert answer.headers["Content-Type"] == "application/problem+json", answer.text

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 from fastapi.routing import APIRoute
-from starlette.routing import Route
+from starlette.routing import Route, WebSocketRoute
 from tests.cairn_server.live import Live
 
+from cairn_map import live_events
 from cairn_map.commit import COMMIT_BYTES_MAX, RETRACTS_MAX
 from cairn_map.messages import CURSORS_MAX
 from cairn_server import (
@@ -17,6 +18,7 @@ from cairn_server import (
     check_pool,
     commit_checks,
     commit_cost,
+    live,
     missing,
     problems,
     push_policy,
@@ -45,7 +47,7 @@ def _flat(routes: object) -> list[Route | APIRoute]:
     for route in routes:  # type: ignore[attr-defined]
         if isinstance(route, Route | APIRoute):
             found.append(route)
-        else:
+        elif not isinstance(route, WebSocketRoute):  # one for plain HTTP stands beside it
             found += _flat(getattr(route, "original_router", route).routes)
     return found
 
@@ -100,6 +102,9 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("the same, of any commit", commit_cost.NUMBERS_MAX),
         ("ordinary commits checked at once", commit_checks.THREADS_MAX),
         ("dear commits that wait for a worker", check_pool.WAITING_MAX),
+        ("live streams of one token", live.LISTENERS_OF_TOKEN_MAX),
+        ("live streams", live.LISTENERS_MAX),
+        ("cells in one live event", live_events.CELLS_MAX),
         ("problem's `detail`", problems.DETAIL_CHARACTERS_MAX),
         ("until a request's head is whole", Settings().head_s),
         ("until a body is whole, or an answer taken", Settings().body_grace_s),
