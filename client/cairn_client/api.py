@@ -15,20 +15,16 @@ from typing import Any, Self
 import httpx
 from pydantic import TypeAdapter, ValidationError
 
+from cairn_client.answers import FetchedCell, Traffic, error_of, list_of
 from cairn_map.access_messages import CreateToken, NewSecret, TokenInfo
 from cairn_map.commit import Commit
-from cairn_map.cursor import Cursor, cursor_from_text
+from cairn_map.cursor import cursor_from_text
 from cairn_map.errors import (
     BadInputError,
-    CairnError,
-    ConflictError,
     DamagedDataError,
-    DeniedError,
-    NotFoundError,
     UnreachableError,
-    first_error,
 )
-from cairn_map.fingerprint import Fingerprint, fingerprint_from_hex
+from cairn_map.fingerprint import fingerprint_from_hex
 from cairn_map.frames import Frame, FrameReader
 from cairn_map.grid import Cell
 from cairn_map.ids import Author, CommitId
@@ -38,9 +34,7 @@ from cairn_map.messages import (
     CreateMap,
     LogEntry,
     MapInfo,
-    Message,
     MissingRequest,
-    Problem,
     Pushed,
     Register,
     Registered,
@@ -49,7 +43,7 @@ from cairn_map.messages import (
     VectorJson,
     message_from_json,
 )
-from cairn_map.version_vector import VersionVector, version_vector_from_json
+from cairn_map.version_vector import version_vector_from_json
 
 TIMEOUT = httpx.Timeout(30.0, connect=5.0)
 ANSWER_BYTES_MAX = 64 << 20
@@ -65,25 +59,6 @@ class Answer:
     status: int
     headers: httpx.Headers
     body: bytes
-
-
-@dataclass(slots=True)
-class Traffic:
-    """Body bytes sent and received so far."""
-
-    up_bytes: int = 0
-    down_bytes: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class FetchedCell:
-    """A cell as downloaded; `body` is None if it is still the one that the asker has."""
-
-    body: bytes | None
-    etag: str
-    cursor: Cursor
-    coverage: VersionVector
-    fingerprint: Fingerprint
 
 
 class MapApi:
@@ -120,7 +95,7 @@ class MapApi:
 
     def maps(self) -> list[MapInfo]:
         """All maps."""
-        return _list_of(MapInfo, self._ask("GET", "/maps"))
+        return list_of(MapInfo, self._ask("GET", "/maps"))
 
     def map_info(self, name: str) -> MapInfo:
         """One map."""
@@ -135,7 +110,7 @@ class MapApi:
 
     def branches(self, name: str) -> list[BranchInfo]:
         """All robots of a map."""
-        return _list_of(BranchInfo, self._ask("GET", f"/maps/{name}/branches"))
+        return list_of(BranchInfo, self._ask("GET", f"/maps/{name}/branches"))
 
     def deregister(self, name: str, branch: str) -> None:
         """Deregister a robot."""
@@ -172,11 +147,11 @@ class MapApi:
 
     def tokens(self) -> list[TokenInfo]:
         """All tokens, without their secrets."""
-        return _list_of(TokenInfo, self._ask("GET", "/tokens"))
+        return list_of(TokenInfo, self._ask("GET", "/tokens"))
 
     def log(self, name: str, *, after: int = 0, limit: int = 100) -> list[LogEntry]:
         """Log entries after a sequence number, oldest first."""
-        return _list_of(LogEntry, self._ask("GET", f"/maps/{name}/log", params={"after": after, "limit": limit}))
+        return list_of(LogEntry, self._ask("GET", f"/maps/{name}/log", params={"after": after, "limit": limit}))
 
     def cell_index(self, name: str, author: Author | None = None) -> CellIndex:
         """All cells of a map, without their bytes."""
@@ -248,27 +223,13 @@ class MapApi:
             with self._client.stream(method, path, headers=sent, content=content, params=params) as response:
                 self.traffic.up_bytes += len(content)
                 if not response.is_success and response.status_code != httpx.codes.NOT_MODIFIED:
-                    raise _error_of(response, next(response.iter_bytes(ERROR_BYTES_MAX), b""))
+                    body = next(response.iter_bytes(ERROR_BYTES_MAX), b"")
+                    raise error_of(response.status_code, response.headers.get("Retry-After", ""), body)
                 yield response
         except httpx.TransportError as exc:
             raise _unreachable(exc) from exc
         except httpx.DecodingError as exc:
             raise DamagedDataError("bad_message", f"the server's answer cannot be decompressed: {exc}") from exc
-
-
-def _list_of(model: type[Message], data: bytes) -> list[Message]:
-    try:
-        found: list[Message] = TypeAdapter(list[model]).validate_json(data)  # type: ignore[valid-type]
-        return found
-    except ValidationError as exc:
-        raise DamagedDataError("bad_message", f"the server's list is not sound: {first_error(exc)}") from exc
-
-
-def _verified(ca_file: Path | None) -> ssl.SSLContext | bool:
-    try:
-        return ssl.create_default_context(cafile=ca_file) if ca_file else True
-    except OSError as exc:  # ssl.SSLError is one
-        raise BadInputError("bad_setting", f"{ca_file} is no file of certificates: {exc}") from exc
 
 
 def _unreachable(exc: httpx.TransportError) -> UnreachableError:
@@ -283,22 +244,8 @@ def _unreachable(exc: httpx.TransportError) -> UnreachableError:
     return UnreachableError("no_link", f"cannot reach {where} ({exc or type(exc).__name__}); is `cairn serve` running?")
 
 
-def _error_of(response: httpx.Response, body: bytes) -> CairnError:
-    """The server's problem as the error that it was there."""
-    status = response.status_code
+def _verified(ca_file: Path | None) -> ssl.SSLContext | bool:
     try:
-        problem = Problem.model_validate_json(body)
-    except ValidationError:
-        problem = Problem(kind="http", detail=f"the server answered {status}: {body[:200].decode(errors='replace')}")
-    if status in (429, 502, 503, 504, 507):
-        wait = response.headers.get("Retry-After", "")
-        return UnreachableError(problem.kind, problem.detail, float(wait) if wait.isdecimal() else None)
-    families: dict[int, type[CairnError]] = {
-        401: DeniedError,
-        403: DeniedError,
-        404: NotFoundError,
-        409: ConflictError,
-        410: ConflictError,
-    }
-    family = families.get(status, BadInputError if status < 500 else DamagedDataError)
-    return family(problem.kind, problem.detail)
+        return ssl.create_default_context(cafile=ca_file) if ca_file else True
+    except OSError as exc:  # ssl.SSLError is one
+        raise BadInputError("bad_setting", f"{ca_file} is no file of certificates: {exc}") from exc

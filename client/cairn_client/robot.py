@@ -18,7 +18,8 @@ from typing import Literal, Self, TypeVar
 from pydantic import ValidationError
 
 from cairn_calib.rig import Rig
-from cairn_client.api import MapApi, Traffic
+from cairn_client.answers import Traffic
+from cairn_client.api import MapApi
 from cairn_client.map_url import split_map_url
 from cairn_client.outbox import UNNUMBERED
 from cairn_client.replica import Replica

@@ -3,8 +3,7 @@
 from fastapi import APIRouter, Depends
 from fastapi.responses import PlainTextResponse
 
-from cairn_server.auth import require
-from cairn_server.http_access import Credentials, Operations, anybody
+from cairn_server.http_access import Credentials, Operations, admin, anybody
 from cairn_server.metrics import MEDIA_TYPE
 
 router = APIRouter()
@@ -13,7 +12,7 @@ router = APIRouter()
 def metrics_reader(service: Operations, credentials: Credentials) -> None:
     """Pass who may read the figures: an admin, or with `--metrics-open` anybody."""
     if not service.settings.metrics_open:
-        require(anybody(service, credentials))
+        admin(anybody(service, credentials))
 
 
 @router.get("/readyz")

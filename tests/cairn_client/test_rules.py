@@ -22,7 +22,7 @@ from tests.cairn_client.made import (
     seen,
 )
 
-from cairn_client.api import FetchedCell
+from cairn_client.answers import FetchedCell
 from cairn_client.applying import Exchange
 from cairn_client.replica import Replica
 from cairn_client.sync import fetch_cells, fetch_missing, push_commits

@@ -16,7 +16,7 @@ import pytest
 from tests.cairn_client.made import GEOMETRY, MAP, cells_of, random_diff
 
 from cairn_client import replica_store
-from cairn_client.api import FetchedCell
+from cairn_client.answers import FetchedCell
 from cairn_client.outbox import UNNUMBERED
 from cairn_client.replica import Replica
 from cairn_client.replica_store import ReplicaStore

@@ -122,7 +122,6 @@ class Process:
         assert self._process.stdout is not None
         found = re.search(r"https?://127\.0\.0\.1:\d+", self._process.stdout.readline())
         self.url = found[0] if found else None
-        self.pid = self._process.pid
 
     @property
     def pid(self) -> int:

@@ -137,6 +137,6 @@ def test_who_registered_may_not_read_the_figures_of_all_maps(tmp_path: Path) -> 
         headers = {"Authorization": "Bearer " + "a" * 20}
         body = {"robot": "mole", "incarnation": MOLE.incarnation}
         token = live.http.post(f"/maps/{row.name}/branches", json=body, headers=headers).json()["token"]
-        assert live.http.get("/metrics", headers={"Authorization": f"Bearer {token}"}).status_code == 401
+        assert live.http.get("/metrics", headers={"Authorization": f"Bearer {token}"}).status_code == 403
         assert live.http.get("/metrics").status_code == 401
         assert live.http.get("/metrics", headers=headers).status_code == 200
