@@ -17,23 +17,34 @@ from cairn_map.errors import DamagedDataError
 from cairn_map.evidence import Evidence, empty_evidence
 from cairn_map.fingerprint import ZERO, fingerprint
 from cairn_map.frames import CellFrame, Frame, FrameKind
-from cairn_map.grid import CellKey, cell_of_key
+from cairn_map.grid import Cell, CellKey, cell_of_key
 from cairn_map.messages import CellCursor, Done, MissingRequest, More, ReplyHeader
 from cairn_map.version_vector import EMPTY
 
 log = logging.getLogger(__name__)
 
 
+Box = tuple[Cell, Cell]
+"""Lowest and highest cell, inclusive."""
+
+
+def is_within(key: CellKey, box: Box | None) -> bool:
+    """Whether a cell lies in a box; None is everywhere."""
+    return box is None or all(a <= b <= c for a, b, c in zip(box[0], cell_of_key(key), box[1], strict=True))
+
+
 class Exchange:
     """One request for what is missing, and the frames of its answer."""
 
-    def __init__(self, replica: Replica, *, compare: bool = False) -> None:
+    def __init__(self, replica: Replica, *, compare: bool = False, box: Box | None = None) -> None:
+        """Args: box: lowest and highest cell (inclusive) to ask for; None: all."""
         self._replica = replica
         with replica.lock:
             self._author = replica.author
             self._default = replica.default_cursor
-            self._asked = {key: cell.cursor for key, cell in replica.cells.items()}
+            self._asked = {key: cell.cursor for key, cell in replica.cells.items() if is_within(key, box)}
         self._compare = compare
+        self._box = box
         self._header: ReplyHeader | None = None
         self._coverage = EMPTY
         self._framed: set[CellKey] = set()
@@ -52,6 +63,7 @@ class Exchange:
             cells=[CellCursor(cell=cell_of_key(k), cursor=str(c) if c else None) for k, c in sorted(listed)],
             compare=self._compare,
             kinds=["delta", "state", "full"],
+            box=self._box,
         )
 
     def take(self, frame: Frame) -> None:
@@ -142,7 +154,8 @@ class Exchange:
             self.must_compare = True
             return
         self._replica.move(rest, to=done.to_cursor, coverage=self._coverage)
-        self._replica.set_default_cursor(done.to_cursor)
+        if self._box is None:
+            self._replica.set_default_cursor(done.to_cursor)
         self._replica.forget_stable_commits()
         self.is_done = True
 

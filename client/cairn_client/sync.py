@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_client.api import MapApi
-from cairn_client.applying import Exchange
+from cairn_client.applying import Box, Exchange, is_within
 from cairn_client.replica import Replica
 from cairn_client.replica_store import BaseCell
 from cairn_map.cell_code import decode_cell
@@ -129,8 +129,8 @@ def keep_retracts(replica: Replica, api: MapApi, map_name: str) -> None:
             replica.keep_sealed(commit, seal)
 
 
-def fetch_missing(replica: Replica, api: MapApi, map_name: str, branch: str) -> RoundReport:
-    """Bring every held cell to the server's head; what arrives before a cut is kept.
+def fetch_missing(replica: Replica, api: MapApi, map_name: str, branch: str, *, box: Box | None = None) -> RoundReport:
+    """Bring every held cell to the server's head, or those in a box; what arrives before a cut is kept.
 
     Raises:
         UnreachableError: the link broke, or the server keeps asking to come back.
@@ -139,7 +139,7 @@ def fetch_missing(replica: Replica, api: MapApi, map_name: str, branch: str) -> 
     report = RoundReport()
     compare = False
     for _ in range(ROUNDS_MAX):
-        exchange = Exchange(replica, compare=compare)
+        exchange = Exchange(replica, compare=compare, box=box)
         try:
             for frame in api.missing(map_name, branch, exchange.request()):
                 exchange.take(frame)
@@ -154,7 +154,7 @@ def fetch_missing(replica: Replica, api: MapApi, map_name: str, branch: str) -> 
             names = ", ".join(str(cell_of_key(key)) for key in exchange.damaged)
             raise DamagedDataError("fingerprint_mismatch", f"the server's cells {names} are damaged; all others came")
         compare = exchange.must_compare
-        if exchange.is_done and not _has_unproven(replica):
+        if exchange.is_done and not _has_unproven(replica, box):
             keep_retracts(replica, api, map_name)
             return report
     raise UnreachableError("no_end", f"no end of the answer after {ROUNDS_MAX} requests", retry_after_s=30.0)
@@ -224,7 +224,7 @@ def within(position_m: npt.ArrayLike, *, radius_m: float, cell_edge_m: float) ->
     return is_near
 
 
-def _has_unproven(replica: Replica) -> bool:
+def _has_unproven(replica: Replica, box: Box | None) -> bool:
     """Whether a cell still waits to be fetched whole."""
     with replica.lock:
-        return any(cell.cursor is None for cell in replica.cells.values())
+        return any(cell.cursor is None for key, cell in replica.cells.items() if is_within(key, box))

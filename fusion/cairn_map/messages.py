@@ -111,6 +111,10 @@ class MissingRequest(_Model):
     cells: Annotated[list[CellCursor], Field(max_length=CURSORS_MAX), FailFast()] = []
     compare: bool = False
     """Answer every listed cell with a `reset` frame: only its fingerprint."""
+    box: tuple[tuple[int, int, int], tuple[int, int, int]] | None = None
+    """Lowest and highest cell (inclusive) that the asker wants to hear of; None: all."""
+    size_bytes_max: Annotated[int, Field(ge=1)] | None = None
+    """After so many bytes of cell frames the reply ends with `more`; None: the server's own limit."""
     kinds: Annotated[list[Literal["delta", "state", "full"]], Field(max_length=3), FailFast()] = ["delta", "full"]
     """Kinds of frame that the asker can use now; `full` is always understood to be."""
 

@@ -14,7 +14,7 @@ from cairn_map.errors import BadInputError, ConflictError
 from cairn_map.evidence import empty_evidence
 from cairn_map.fingerprint import ZERO, Fingerprint
 from cairn_map.frames import CELL_HEAD, CellFrame, Frame, FrameKind
-from cairn_map.grid import CellKey, Geometry, cell_key
+from cairn_map.grid import Cell, CellKey, Geometry, cell_key, cell_of_key
 from cairn_map.ids import Author, author_from_text
 from cairn_map.messages import Done, MissingRequest, More, ReplyHeader
 from cairn_map.version_vector import VersionVector
@@ -38,7 +38,16 @@ class Asker:
     cells: dict[CellKey, Cursor | None]
     kinds: frozenset[str]
     compare: bool
+    box: tuple[Cell, Cell] | None = None
+    size_bytes_max: int = REPLY_BYTES_MAX
     unproven: set[Cursor] = field(default_factory=set)
+
+    def wants(self, key: CellKey) -> bool:
+        """Whether a cell lies in the box that is asked for."""
+        if self.box is None:
+            return True
+        low, high = self.box
+        return all(a <= b <= c for a, b, c in zip(low, cell_of_key(key), high, strict=True))
 
 
 def asker_from_request(request: MissingRequest, snapshot: Snapshot) -> Asker:
@@ -53,6 +62,8 @@ def asker_from_request(request: MissingRequest, snapshot: Snapshot) -> Asker:
         cursor=_cursor(request.cursor),
         cells={cell_key(entry.cell): _cursor(entry.cursor) for entry in request.cells},
         kinds=frozenset(request.kinds),
+        box=(Cell(*request.box[0]), Cell(*request.box[1])) if request.box else None,
+        size_bytes_max=min(request.size_bytes_max or REPLY_BYTES_MAX, REPLY_BYTES_MAX),
         compare=request.compare,
     )
     if len(asker.cells) != len(request.cells):
@@ -75,8 +86,7 @@ def reply_frames(
     rest = ZERO
     sent_bytes = 0
     listed = dict(asker.cells)
-    rows = list(snapshot.cells())
-    for row in rows:
+    for row in [row for row in snapshot.cells() if asker.wants(row.key)]:
         start = listed.pop(row.key, asker.cursor)
         frame = _frame_for(snapshot, asker, row, start, geometry, cache)
         if frame is None:
@@ -84,10 +94,10 @@ def reply_frames(
             continue
         sent_bytes += CELL_HEAD.size + len(frame.payload)
         yield frame
-        if sent_bytes > REPLY_BYTES_MAX:
+        if sent_bytes > asker.size_bytes_max:
             yield More(to=str(head.cursor))
             return
-    for key, start in listed.items():
+    for key, start in ((key, start) for key, start in listed.items() if asker.wants(key)):
         unknown = _unknown_cell(key, asker, start, head.cursor, geometry)
         if unknown is not None:
             yield unknown

@@ -28,6 +28,7 @@ rare = st.one_of(
     st.tuples(st.just("amend"), mappers, numbers),
     st.tuples(st.just("retract"), numbers),
     st.tuples(st.just("forget_evidence")),
+    st.tuples(st.just("sync_box"), robots, st.integers(0, 1)),
     st.tuples(st.just("restart_server")),
     st.tuples(st.just("back_up")),
     st.tuples(st.just("restore")),

@@ -17,6 +17,7 @@ from tests.cairn_client.made import GEOMETRY, MAP, cells_of, random_diff
 
 from cairn_client import replica_store
 from cairn_client.answers import FetchedCell
+from cairn_client.applying import is_within
 from cairn_client.outbox import UNNUMBERED
 from cairn_client.replica import Replica
 from cairn_client.replica_store import ReplicaStore
@@ -25,7 +26,7 @@ from cairn_map.cell_code import decode_cell
 from cairn_map.commit import Commit, CommitMeta, split_commit
 from cairn_map.errors import ConflictError, UnreachableError
 from cairn_map.evidence_map import EvidenceMap
-from cairn_map.fingerprint import fingerprint
+from cairn_map.fingerprint import ZERO, fingerprint
 from cairn_map.frames import Frame, FrameReader
 from cairn_map.grid import Cell, CellKey, cell_key
 from cairn_map.ids import OPERATOR, Author, CommitId, RobotName, commit_id_from_text
@@ -262,6 +263,19 @@ class World:
             assert fault is not None
         else:
             self._check_level(robot)
+
+    def sync_box(self, robot: int, side: int) -> None:
+        """A robot fetches only what lies on one side."""
+        if self._modes[robot] != "low-end":
+            box = (Cell(-9, -9, -9), Cell(-1, 9, 9)) if side else (Cell(0, -9, -9), Cell(9, 9, 9))
+            api: Any = DirectApi(self, f"r{robot}")
+            fetch_missing(self.robots[robot], api, MAP, f"r{robot}", box=box)
+            inside = [key for key in self.robots[robot].cells if is_within(key, box)]
+            with self.service.store.snapshot(self._row) as snapshot:
+                rows = {row.key: row for row in snapshot.cells() if is_within(row.key, box)}
+            for key in rows.keys() | set(inside):
+                held = self.robots[robot].cells[key].fingerprint
+                assert held == (rows[key].fingerprint if key in rows else ZERO)
 
     def fold(self, limit: int) -> None:
         """The server folds some of what waits."""

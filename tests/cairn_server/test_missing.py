@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.cairn_server.live import Live
 from tests.cairn_server.naive_asker import KEY_FAR, NaiveAsker, cell_frames, fingerprint_sum
-from tests.cairn_server.pushes import MOLE, WREN, pushed, read, sum_of
+from tests.cairn_server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 from tests.cairn_server.test_push import kind_of
 
 from cairn_map.cursor import Cursor, cursor_from_text
@@ -249,3 +249,34 @@ def test_a_cell_named_twice_is_refused(live: Live) -> None:
     row = live.new_map()
     cells = [{"cell": (0, 0, 0), "cursor": None}] * 2
     assert kind_of(ask(live, row, MissingRequest.model_validate({"cells": cells}))) == "bad_message"
+
+
+def test_a_box_limits_frames_and_what_done_speaks_of(live: Live) -> None:
+    row, asker = live.new_map(), NaiveAsker(MOLE)
+    for n in range(3):
+        live.push(row, pushed(n, n, WREN))
+    live.folded(row)
+    inside = [key for key in KEYS if cell_of_key(key).i >= 0]
+    box = ((0, -1, -1), (1, 0, 9))
+    frames = frames_of(ask(live, row, asker.request(box=box)).content)
+    assert cell_frames(frames).keys() == set(inside) < set(KEYS)
+    head = cursor_from_text(frames[0].to)  # type: ignore[union-attr]
+    assert isinstance(frames[-1], Done) and frames[-1].rest_fingerprint == ZERO
+    frames = frames_of(ask(live, row, asker.request(cursor=str(head), box=box)).content)
+    with live.service.store.snapshot(row) as snapshot:
+        total = sum((cell.fingerprint for cell in snapshot.cells() if cell.key in inside), ZERO)
+    assert cell_frames(frames) == {}
+    assert isinstance(frames[-1], Done) and frames[-1].rest_fingerprint == total
+
+
+def test_an_asker_with_a_byte_budget_gets_the_cells_one_after_the_other(live: Live) -> None:
+    row, asker = live.new_map(), NaiveAsker(MOLE)
+    commits = [pushed(n, n, WREN) for n in range(3)]
+    for commit in commits:
+        live.push(row, commit)
+    live.folded(row)
+    sizes = []
+    while not asker.take(frames := frames_of(ask(live, row, asker.request(size_bytes_max=1)).content)):
+        sizes.append(len(cell_frames(frames)))
+    assert sizes == [1, 1, 1]
+    assert asker.map() == sum_of(commits)
