@@ -45,6 +45,7 @@ from cairn_map.messages import (
 )
 from cairn_map.version_vector import version_vector_from_json
 
+PROTOCOL_VERSION = "1"
 TIMEOUT = httpx.Timeout(30.0, connect=5.0)
 ANSWER_BYTES_MAX = 64 << 20
 """Longest JSON answer that is read."""
@@ -214,7 +215,7 @@ class MapApi:
         params: Mapping[str, str | int] | None = None,
     ) -> Iterator[httpx.Response]:
         """An answer that begins well and is still to be read; an error of the server or the link as ours."""
-        sent = dict(headers or {})
+        sent = {"Cairn-Protocol": PROTOCOL_VERSION, **(headers or {})}
         if self.token:
             sent["Authorization"] = f"Bearer {self.token}"
         if content:

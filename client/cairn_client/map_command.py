@@ -7,7 +7,7 @@
     $ cairn map get http://127.0.0.1:8750/maps/lab 0,0,0 -o cell.ply
     $ cairn map export http://127.0.0.1:8750/maps/lab --ply lab.ply --picture lab.png --cells lab/
     $ cairn map log http://127.0.0.1:8750/maps/lab
-    $ cairn map retract http://127.0.0.1:8750/maps/lab --robot mole --note "wrong calibration"
+    $ cairn map retract http://127.0.0.1:8750/maps/lab --robot mole --pushed-after 14:05 --dry-run
 
 A map's URL is http://HOST:PORT/maps/NAME. A retract takes exactly the evidence of the named commits out again, on
 the server and on every robot; everything else stays as it is. Results go to standard output, progress to standard
@@ -25,10 +25,11 @@ from cairn_client import map_export
 from cairn_client.api import MapApi
 from cairn_client.arguments import add_token, allow_negative_lists, api_of, parser, say, shown_bytes, shown_length
 from cairn_client.prior_data import push_prior_data
+from cairn_client.retract_command import add_retract_arguments, retract
 from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
 from cairn_map.errors import BadInputError
 from cairn_map.grid import Geometry, geometry_for
-from cairn_map.messages import CreateMap, LogEntry, MapInfo, Retract
+from cairn_map.messages import CreateMap, LogEntry, MapInfo
 
 Run = Callable[[argparse.Namespace], None]
 
@@ -121,14 +122,6 @@ def _shown_time(captured_s: tuple[float, float] | None) -> str:
         return "-"
 
 
-def _retract(args: argparse.Namespace) -> None:
-    api, name = api_of(args.map, args.token)
-    done = api.retract(name, Retract(commits=args.commit or [], robot=args.robot, note=args.note))
-    say(f"{done.id} takes out {len(done.commits)} commits:")
-    for commit in done.commits:
-        say(f"  {commit}")
-
-
 def _geometry(args: argparse.Namespace) -> Geometry:
     channels = tuple(_channel(text) for text in args.channels.split(",")) if args.channels else ()
     return geometry_for(voxel_edge_m=args.voxel, channels=channels)
@@ -195,8 +188,5 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--npz", type=Path, metavar="FILE", help="all known voxels as NumPy arrays")
     export.add_argument("--picture", type=Path, metavar="FILE", help="PNG: colour, temperature, probability")
     export.add_argument("--ceiling", type=float, metavar="METRES", help="picture: leave out what is higher")
-    retract = command("retract", "take commits out of a map again, exactly", _retract, "map")
-    retract.add_argument("--commit", action="append", metavar="ID", help="robot.incarnation.n, as `log` shows it")
-    retract.add_argument("--robot", help="everything that this robot pushed")
-    retract.add_argument("--note", default="", help="why; kept in the log")
+    add_retract_arguments(command("retract", "take commits out of a map again, exactly", retract, "map"))
     return top

@@ -7,6 +7,7 @@ from cairn_server import access_routes, cell_routes, live_routes, map_routes, op
 from cairn_server.body_limit import BodyLimit
 from cairn_server.own_origin import OwnOrigin
 from cairn_server.problems import add_problem_handlers
+from cairn_server.protocol_version import ProtocolVersion
 from cairn_server.request_trail import RequestTrail
 from cairn_server.service import Service
 
@@ -53,6 +54,7 @@ def make_app(service: Service) -> FastAPI:
         app.include_router(part)
     add_problem_handlers(app)
     app.add_middleware(BodyLimit)
+    app.add_middleware(ProtocolVersion)
     if service.settings.admin_token is None:
         app.add_middleware(OwnOrigin, host=service.settings.host)
     app.add_middleware(RequestTrail, figures=service.figures)

@@ -181,3 +181,12 @@ def test_the_server_still_serves_and_folds_afterwards(live: Live) -> None:
     assert live.http.get("/healthz").json() == {"status": "ok"}
     assert live.push(row, COMMIT).status_code == 201
     assert live.cells(row).keys() == COMMIT.cells.keys()
+
+
+def test_a_request_of_another_version_of_the_protocol_is_refused_by_a_kind_of_its_own(live: Live) -> None:
+    for version, status in (("1", 200), ("2", 400), ("", 400)):
+        answer = live.http.get("/maps", headers={"Cairn-Protocol": version})
+        assert (answer.status_code, answer.json()["kind"] if status == 400 else "") == (
+            status,
+            "unknown_protocol" if status == 400 else "",
+        )
