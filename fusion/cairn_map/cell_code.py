@@ -107,10 +107,7 @@ def cell_digest(key: CellKey, evidence: Evidence, geometry: Geometry) -> bytes:
     Raises:
         BadInputError: kind `bad_evidence`: it is not of this geometry.
     """
-    check_fits(evidence, geometry)
-    content = content_of(evidence, geometry)
-    parts = channel_streams.split_samples(content.sampled, content.samples, geometry)
-    return _digest(*_canonical(key, content, parts, geometry, voxels=len(evidence), signed=evidence.is_signed))
+    return _digest(*_encoded(key, evidence, geometry))
 
 
 def decode_cell(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) -> DecodedCell:
@@ -124,11 +121,7 @@ def decode_cell(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) ->
         DamagedDataError: cut off, contradictory or out of range.
         BadInputError: a version or kind of cell that this reader does not know, or too large.
     """
-    reader = cell_reader(data, evidence_bytes_max=evidence_bytes_max)
-    evidence = evidence_of(reader.content())
-    # In the order in which streams stand, which is that of their numbers.
-    streams = {number: reader.raw[number] for number in reader.stored}
-    return DecodedCell(reader.head.key, reader.head.geometry, evidence, _digest(reader.head_bytes, streams))
+    return _decoded(data, evidence_bytes_max)[0]
 
 
 def decode_canonical_cell(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) -> DecodedCell:
@@ -138,8 +131,8 @@ def decode_canonical_cell(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYT
         DamagedDataError: kind `not_canonical`, or as `decode_cell`.
         BadInputError: as `decode_cell`.
     """
-    cell = decode_cell(data, evidence_bytes_max=evidence_bytes_max)
-    if cell_digest(cell.key, cell.evidence, cell.geometry) != cell.digest:
+    cell, head, streams = _decoded(data, evidence_bytes_max)
+    if _encoded(cell.key, cell.evidence, cell.geometry) != (head, streams):
         raise DamagedDataError("not_canonical", f"cell {cell_of_key(cell.key)} is not in canonical form")
     return cell
 
@@ -152,6 +145,24 @@ def recompressed_cell(data: bytes, *, profile: Profile) -> bytes:
     """
     cell = decode_canonical_cell(data)
     return encode_cell(cell.key, cell.evidence, cell.geometry, profile=profile).data
+
+
+def _decoded(data: bytes, evidence_bytes_max: int) -> tuple[DecodedCell, bytes, dict[int, bytes]]:
+    """What a cell's bytes say, its head's bytes and its raw streams."""
+    reader = cell_reader(data, evidence_bytes_max=evidence_bytes_max)
+    evidence = evidence_of(reader.content())
+    # In the order in which streams stand, which is that of their numbers.
+    streams = {number: reader.raw[number] for number in reader.stored}
+    digest = _digest(reader.head_bytes, streams)
+    return DecodedCell(reader.head.key, reader.head.geometry, evidence, digest), reader.head_bytes, streams
+
+
+def _encoded(key: CellKey, evidence: Evidence, geometry: Geometry) -> tuple[bytes, dict[int, bytes]]:
+    """Head and raw streams of evidence that may not fit."""
+    check_fits(evidence, geometry)
+    content = content_of(evidence, geometry)
+    parts = channel_streams.split_samples(content.sampled, content.samples, geometry)
+    return _canonical(key, content, parts, geometry, voxels=len(evidence), signed=evidence.is_signed)
 
 
 def _canonical(

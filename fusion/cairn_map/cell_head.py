@@ -6,6 +6,7 @@ bounds the voxels, the leaves and the raw bytes of all streams together.
 
 import struct
 from dataclasses import dataclass
+from functools import lru_cache
 
 from pydantic import ValidationError
 
@@ -85,12 +86,11 @@ def decode_head(data: bytes) -> tuple[CellHead, bytes]:
     if flags & ~FLAG_SIGNED or not all(-CELL_LIMIT <= v < CELL_LIMIT for v in (i, j, k)):
         raise DamagedDataError("bad_cell", "unknown flags, or a cell number out of range")
     at = FIXED_PART.size
-    channels: list[Channel] = []
     try:
         for _ in range(channel_count):
-            channel, at = _channel(data, at)
-            channels.append(channel)
-        geometry = Geometry(voxel_edge_um=edge_um, depth=depth, channels=tuple(channels))
+            _, name_bytes, unit_bytes = CHANNEL_SIZES.unpack_from(data, at)
+            at += CHANNEL_SIZES.size + name_bytes + unit_bytes + CHANNEL_SCALE.size
+        geometry = _geometry(edge_um, depth, channel_count, data[FIXED_PART.size : at])
     except (struct.error, UnicodeDecodeError, ValidationError) as exc:
         raise DamagedDataError("bad_cell", f"the cell's head is damaged: {str(exc).splitlines()[0]}") from exc
     if not leaves <= voxels <= 8**depth:
@@ -104,6 +104,17 @@ def decode_head(data: bytes) -> tuple[CellHead, bytes]:
         signed=bool(flags & FLAG_SIGNED),
     )
     return head, data[:at]
+
+
+@lru_cache(maxsize=16)
+def _geometry(edge_um: int, depth: int, channel_count: int, data: bytes) -> Geometry:
+    """The cells of a map, and of all that is pushed to it, have the same."""
+    channels: list[Channel] = []
+    at = 0
+    for _ in range(channel_count):
+        channel, at = _channel(data, at)
+        channels.append(channel)
+    return Geometry(voxel_edge_um=edge_um, depth=depth, channels=tuple(channels))
 
 
 def _channel(data: bytes, at: int) -> tuple[Channel, int]:

@@ -41,6 +41,10 @@ VALUE_PLANES = {
     ChannelKind.TEMPERATURE: ("sum",),
     ChannelKind.SCALAR: ("sum",),
 }
+PLANES = {
+    kind: (*planes, *(("square_sum",) if kind is ChannelKind.TEMPERATURE else ()), "weight")
+    for kind, planes in VALUE_PLANES.items()
+}
 
 
 class Channel(BaseModel):
@@ -69,8 +73,7 @@ class Channel(BaseModel):
     @property
     def planes(self) -> tuple[str, ...]:
         """Names of the sums kept, in the order of the sample matrix's columns; the weight is last."""
-        squares = ("square_sum",) if self.kind is ChannelKind.TEMPERATURE else ()
-        return (*VALUE_PLANES[self.kind], *squares, "weight")
+        return PLANES[self.kind]
 
     def quantise(self, values: npt.NDArray[np.floating]) -> npt.NDArray[np.int64]:
         """Samples as integers, rounded half to even.

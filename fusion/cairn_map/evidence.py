@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_map.errors import BadInputError
+from cairn_map.evidence_kernels import bounds_of_counts, sums_without_weight
 from cairn_map.grid import BRICK_DEPTH, Geometry
 
 COUNT_MAX = (1 << 31) - 1
@@ -122,10 +123,10 @@ def packed_evidence(
 
 
 def largest(evidence: Evidence, geometry: Geometry) -> npt.NDArray[np.int64]:
-    """(2 + P,) largest number of each plane; the server sums these to refuse what could overflow."""
+    """(2 + P,) largest number of each plane, of counts at least 0; the server adds these up against overflow."""
     tops = np.zeros(2 + geometry.plane_count, np.int64)
     if len(evidence.voxels):
-        tops[:2] = evidence.counts.max(axis=0)
+        tops[:2] = bounds_of_counts(evidence.counts)[1:3]
     if len(evidence.sampled):
         tops[2:] = evidence.samples.max(axis=0)
     return tops
@@ -158,7 +159,7 @@ def _rise(numbers: npt.NDArray[np.uint32]) -> bool:
 def every_sum_has_weight(evidence: Evidence, geometry: Geometry) -> bool:
     """Whether each channel's sums come with a weight, as every real sample does: means divide by it."""
     for channel in geometry.channels:
-        sums = evidence.samples[:, geometry.planes_of(channel.name)]
-        if ((sums[:, -1] == 0) & (sums != 0).any(axis=1)).any():
+        planes = geometry.planes_of(channel.name)
+        if sums_without_weight(evidence.samples, planes.start, planes.stop - 1):
             return False
     return True

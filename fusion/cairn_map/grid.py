@@ -11,6 +11,7 @@ Cells are numbered by signed (i, j, k) and, as one number, by the 63-bit Morton 
 import hashlib
 import json
 import re
+from functools import lru_cache
 from typing import Annotated, NamedTuple, NewType, Self
 
 import numpy as np
@@ -105,8 +106,14 @@ class Geometry(BaseModel):
 
     def digest(self) -> bytes:
         """SHA-256 (32 bytes) over the geometry as JSON with sorted keys; two maps can share evidence only if equal."""
-        text = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), ensure_ascii=True)
-        return hashlib.sha256(text.encode()).digest()
+        return _digest(self.voxel_edge_um, self.depth, self.channels)
+
+
+@lru_cache(maxsize=64)
+def _digest(voxel_edge_um: int, depth: int, channels: tuple[Channel, ...]) -> bytes:
+    geometry = Geometry(voxel_edge_um=voxel_edge_um, depth=depth, channels=channels)
+    text = json.dumps(geometry.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return hashlib.sha256(text.encode()).digest()
 
 
 def geometry_for(*, voxel_edge_m: float, channels: tuple[Channel, ...] = STANDARD_CHANNELS) -> Geometry:
@@ -124,6 +131,7 @@ def geometry_for(*, voxel_edge_m: float, channels: tuple[Channel, ...] = STANDAR
     return Geometry(voxel_edge_um=edge_um, depth=depth, channels=channels)
 
 
+@lru_cache(maxsize=4096)
 def cell_key(cell: tuple[int, int, int]) -> CellKey:
     """The 63-bit number of a cell.
 
@@ -135,6 +143,7 @@ def cell_key(cell: tuple[int, int, int]) -> CellKey:
     return CellKey(int(interleave(np.array([cell], dtype=np.int64) + CELL_LIMIT)[0]))
 
 
+@lru_cache(maxsize=4096)
 def cell_of_key(key: int) -> Cell:
     """Signed indices of a cell number; the mirror of `cell_key`."""
     i, j, k = deinterleave(np.array([key], dtype=np.uint64))[0] - CELL_LIMIT

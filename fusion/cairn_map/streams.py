@@ -8,6 +8,7 @@ the k-th; k is the least that holds the largest value, so a column has one form 
 """
 
 import struct
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -21,6 +22,8 @@ ZSTD_LEVEL = 3
 ZSTD_WINDOW_MAX = 1 << 23
 HEAD = struct.Struct("<BBII")
 STORED, ZSTD, MODELLED = 0, 1, 2
+_idle: deque[zstandard.ZstdDecompressor] = deque(maxlen=4)
+"""Each serves one reader at a time; to make one takes longer than to decompress a small stream. Its window stays."""
 RAW_BYTES_MAX = 1 << 28
 """Of all streams of a cell together: sixteen bytes for each voxel of the largest cell."""
 
@@ -116,10 +119,16 @@ def zstd_prefix(data: bytes, *, size_bytes: int) -> bytes:
         DamagedDataError: not zstd.
     """
     try:
-        with zstandard.ZstdDecompressor(max_window_size=ZSTD_WINDOW_MAX).stream_reader(data) as reader:
+        decompressor = _idle.pop()
+    except IndexError:
+        decompressor = zstandard.ZstdDecompressor(max_window_size=ZSTD_WINDOW_MAX)
+    try:
+        with decompressor.stream_reader(data) as reader:
             return reader.read(size_bytes)
     except zstandard.ZstdError as exc:
         raise DamagedDataError("bad_zstd", f"not a zstd stream: {exc}") from exc
+    finally:
+        _idle.append(decompressor)
 
 
 def required(streams: Mapping[int, bytes], number: int) -> bytes:

@@ -11,7 +11,14 @@ import numpy as np
 from cairn_map.brick_cell import brick_cell
 from cairn_map.cell_code import Profile, decode_canonical_cell, encode_cell
 from cairn_map.errors import BadInputError
-from cairn_map.evidence import COUNT_MAX, SUM_MAX, Evidence, packed_evidence
+from cairn_map.evidence import (
+    COUNT_MAX,
+    SUM_MAX,
+    Evidence,
+    every_sum_has_weight,
+    largest,
+    packed_evidence,
+)
 from cairn_map.fingerprint import fingerprint
 from cairn_map.grid import BRICK_DEPTH, Geometry, cell_key, voxels_in_cell
 from cairn_map.sensor_model import SensorModel
@@ -34,6 +41,8 @@ def warm_up() -> None:
                     change(evidence)
             cell.packed()
         fingerprint(evidence, key)
+        largest(evidence, geometry)
+        every_sum_has_weight(evidence, geometry)
         voxels_in_cell(evidence.voxels, key, geometry)
     decode_view(encode_view(key, modelled, geometry, SensorModel()))
 

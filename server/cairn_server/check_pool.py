@@ -217,7 +217,7 @@ class CheckPool:
         self._control, far = socket.socketpair()
         with far:
             self._nursery = subprocess.Popen(  # noqa: S603 - our own program, and two numbers
-                [sys.executable, "-m", "cairn_server.check_nursery", str(far.fileno()), str(self._memory_bytes)],
+                [sys.executable, "-P", "-m", "cairn_server.check_nursery", str(far.fileno()), str(self._memory_bytes)],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=[far.fileno()],

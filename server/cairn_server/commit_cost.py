@@ -26,8 +26,9 @@ ALLOWANCE_NUMBERS = 1 << 20
 PER_BYTE = 64
 """Raw bytes, or modelled numbers, that each byte pushed may stand for, beyond the allowance. Those of one scan or of 36
 are 3 to 13, whatever the voxel edge."""
+RAW_BYTES_MAX = 1 << 28
 NUMBERS_MAX = 1 << 25
-"""Of all modelled numbers of a commit; 36 scans of five cameras at 2 cm have 23 million."""
+"""Of a whole commit, whatever its size; 36 scans of five cameras at 2 cm have 24 MB raw and 30 million numbers."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +69,7 @@ def check_cost(cost: CommitCost, *, size_bytes: int) -> None:
     Raises:
         BadInputError: kind `too_costly`.
     """
-    raw_bytes_max = ALLOWANCE_BYTES + PER_BYTE * size_bytes
+    raw_bytes_max = min(RAW_BYTES_MAX, ALLOWANCE_BYTES + PER_BYTE * size_bytes)
     numbers_max = min(NUMBERS_MAX, ALLOWANCE_NUMBERS + PER_BYTE * size_bytes)
     if cost.raw_bytes > raw_bytes_max or cost.numbers > numbers_max:
         raise BadInputError(

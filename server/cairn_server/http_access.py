@@ -1,6 +1,10 @@
-"""Who calls and what of: the dependencies that routes share. Checks of rights are made here, by `auth`."""
+"""Who calls and what of: the dependencies that routes share. Checks of rights are made here, by `auth`.
 
-from collections.abc import Callable
+Those that wait for nothing are `async`, which here only means that no other thread is needed to run them: a change of
+threads takes longer than they do, and each push would make five.
+"""
+
+from collections.abc import Awaitable, Callable
 from typing import Annotated
 
 from fastapi import Depends, Request
@@ -16,7 +20,7 @@ READING = (Role.READER, Role.ROBOT, Role.OPERATOR)
 """Who may read a map."""
 
 
-def service_of(request: Request) -> Service:
+async def service_of(request: Request) -> Service:
     """The app's service."""
     service: Service = request.app.state.service
     return service
@@ -52,10 +56,10 @@ def caller_on_map(service: Operations, row: Map, credentials: Credentials) -> Ca
 OnMap = Annotated[Caller, Depends(caller_on_map)]
 
 
-def allowed(*roles: Role) -> Callable[[Caller], Caller]:
+def allowed(*roles: Role) -> Callable[[Caller], Awaitable[Caller]]:
     """A dependency: the caller on a map, if it is an admin or has one of these roles."""
 
-    def check(caller: OnMap) -> Caller:
+    async def check(caller: OnMap) -> Caller:
         require(caller, *roles)
         return caller
 
@@ -75,7 +79,7 @@ def reader(caller: Annotated[Caller, Depends(anybody)]) -> Caller:
     return caller
 
 
-def own_branch(branch: str, caller: OnMap) -> Caller:
+async def own_branch(branch: str, caller: OnMap) -> Caller:
     """The caller, if it is an admin or the robot of the branch in the path."""
     require(caller, *([Role.ROBOT] if caller.robot == branch else []))
     return caller

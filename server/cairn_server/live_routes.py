@@ -23,7 +23,8 @@ from starlette.types import Receive, Scope, Send
 
 from cairn_map.errors import BadInputError, CairnError, DeniedError
 from cairn_map.live_events import Beat, LiveEvent, Seen, seen_from_text
-from cairn_server.http_access import READERS, Credentials, Map, Operations, caller_on_map, map_of, map_reader
+from cairn_server.auth import require
+from cairn_server.http_access import READERS, READING, Credentials, Map, Operations, caller_on_map, map_of
 from cairn_server.live import Listener
 from cairn_server.problems import answer_to
 from cairn_server.service import Service
@@ -90,7 +91,7 @@ class _Stream:
     def _may_listen(self) -> bool:
         """Whether the token is still good."""
         try:
-            map_reader(caller_on_map(self._service, self._row, self._credentials))
+            require(caller_on_map(self._service, self._row, self._credentials), *READING)
         except DeniedError:
             return False
         except CairnError as exc:  # not to know is not to be refused
@@ -192,7 +193,7 @@ async def _until_left(socket: WebSocket) -> None:
 
 def _admitted(service: Service, name: str, credentials: HTTPAuthorizationCredentials | None) -> MapRow:
     row = map_of(name, service, credentials)
-    map_reader(caller_on_map(service, row, credentials))
+    require(caller_on_map(service, row, credentials), *READING)
     return row
 
 

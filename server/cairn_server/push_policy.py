@@ -7,13 +7,12 @@ and use up the range of the sums for everybody; ids full of gaps would grow ever
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-
 from cairn_map.cell_code import DecodedCell
 from cairn_map.channels import SAMPLE_MAX
 from cairn_map.commit import CommitMeta
 from cairn_map.errors import BadInputError, DamagedDataError, DeniedError
 from cairn_map.evidence import Evidence
+from cairn_map.evidence_kernels import bounds_of_counts
 from cairn_map.grid import CellKey, Geometry, cell_of_key
 from cairn_map.ids import INITIAL, OPERATOR, CommitId
 from cairn_map.version_vector import AUTHORS_MAX, INTERVALS_MAX
@@ -115,7 +114,7 @@ def check_number(commit: CommitId, numbering: Numbering) -> None:
 
 def _excess(evidence: Evidence, geometry: Geometry, scans: int) -> str | None:
     """What is too much, or None."""
-    counts = int(evidence.counts.sum(axis=1, dtype=np.int64).max(initial=0))
+    counts = bounds_of_counts(evidence.counts)[3]
     if counts > scans:
         return f"{counts} counts in one voxel"
     for channel in geometry.channels:

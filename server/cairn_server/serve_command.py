@@ -43,6 +43,9 @@ GRACE_S = 6
 MEGABYTE = 1 << 20
 WEBSOCKETS: dict[str, Any] = {"ws": "websockets-sansio", "ws_max_size": 1 << 12, "ws_per_message_deflate": False}
 """Listeners send next to nothing, and must cost little."""
+SWITCH_S = 0.0005
+"""How soon a thread that computes lets another one have the interpreter: a push needs it some ten times on its way, and
+would wait for the folder each time."""
 FLAG_OF_SETTING = {
     "port": "--port",
     "admin_token": "--admin-token-file or CAIRN_ADMIN_TOKEN",
@@ -63,6 +66,7 @@ def main(argv: list[str]) -> int:
     settings.check_reach()
     settings.check_tls()
     signal.signal(signal.SIGTERM, _stop)
+    sys.setswitchinterval(SWITCH_S)
     with listen(settings.host, settings.port) as listener:
         try:
             with closing(Service(SqliteStore(settings.folder), settings)) as service:

@@ -62,8 +62,8 @@ class Settings(BaseModel):
     """Whether anybody may read `/metrics`, which names the maps; else an admin only."""
     check_workers: Annotated[int, Field(ge=1)] = 2
     """Processes that check dear commits, made when the first one comes."""
-    check_cpu_s: Annotated[float, Field(gt=0)] = 20.0
-    """Processor time that one commit may take there; 36 scans of five cameras at 2 cm take 6 s in profile small."""
+    check_cpu_s: Annotated[float, Field(gt=0)] = 60.0
+    """Processor time that one commit may take there; what its heads may claim takes some 20 s at most."""
     check_memory_bytes: Annotated[int, Field(ge=1 << 24)] = 3 << 29
     """Memory that it may take there; 2^29 bytes of evidence need twice their size."""
 

@@ -59,6 +59,7 @@ class SqliteStore:
         self.tokens = SqliteTokens(self._writer, self._readers)
         self.audit_log = SqliteAuditLog(self._writer, self._readers)
         self.health = SqliteHealth(path, self._writer, self._readers)
+        self._maps: dict[str, MapRow] = {}  # which never change
 
     def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:
         """The map and whether it is new; an equal one may exist already."""
@@ -91,8 +92,12 @@ class SqliteStore:
 
     def map(self, name: str) -> MapRow:
         """The map of a name."""
+        kept = self._maps.get(name)
+        if kept is not None:
+            return kept
         found = self._map_rows("WHERE name = ?", (name,))
         if found:
+            self._maps[name] = found[0]
             return found[0]
         raise NotFoundError("no_map", f"there is no map {name!r}; `cairn map ls` lists them")
 

@@ -23,6 +23,7 @@ from pathlib import Path
 from tests.bench.coding import coding_rows
 from tests.bench.integration import integration_rows
 from tests.bench.peers import peer_rows
+from tests.bench.server import server_rows
 from tests.bench.simulation import simulation_rows
 from tests.bench.start import start_rows
 
@@ -58,6 +59,7 @@ def main() -> None:
     rows += coding_rows(smoke)
     rows += integration_rows(smoke)
     rows += peer_rows(smoke)
+    rows += server_rows(smoke)
     rows += simulation_rows(smoke)
     rows += start_rows(smoke)
     rows += _recording_rows(smoke)

@@ -16,6 +16,7 @@ from cairn_map.evidence import (
     largest,
     packed_evidence,
 )
+from cairn_map.evidence_kernels import bounds_of_counts, sums_without_weight
 
 I64_MIN = -(1 << 63)
 
@@ -108,3 +109,23 @@ def test_bricks_are_counted_once() -> None:
         evidence = random_evidence(seed, MIDDLE)
         assert evidence.brick_count == len({place // 512 for place in as_dict(evidence)})
     assert empty_evidence(MIDDLE).brick_count == 0
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 6))
+def test_bounds_of_counts_are_those_of_every_row(seed: int, rows: int) -> None:
+    rng = np.random.default_rng(seed)
+    counts = rng.choice([-COUNT_MAX, -1, 0, 1, 7, COUNT_MAX], (rows, 2)).astype(np.int32)
+    pairs = [(int(hits), int(misses)) for hits, misses in counts]
+    assert bounds_of_counts(counts) == (
+        min([0, *(n for pair in pairs for n in pair)]),
+        max([0, *(hits for hits, _ in pairs)]),
+        max([0, *(misses for _, misses in pairs)]),
+        max([0, *(sum(pair) for pair in pairs)]),
+    )
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 4))
+def test_a_sum_without_weight_is_found_in_any_row(seed: int, rows: int) -> None:
+    samples = np.random.default_rng(seed).choice([0, 0, 1, -1, 1 << 62], (rows, 5))
+    expected = any(row[3] == 0 and any(row[p] for p in (1, 2)) for row in samples.tolist())
+    assert sums_without_weight(samples, 1, 3) == expected

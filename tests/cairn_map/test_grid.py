@@ -154,3 +154,10 @@ def test_equal_geometries_have_equal_digests_although_one_says_minus_zero() -> N
 def test_planes_of_a_channel_that_is_not_there_are_an_error() -> None:
     with pytest.raises(BadInputError, match="no channel 'dose'"):
         FIVE_CM.planes_of("dose")
+
+
+def test_a_changed_copy_of_a_geometry_has_a_digest_of_its_own() -> None:
+    one = Geometry()
+    other = one.model_copy(update={"depth": 5}) if one.digest() else one
+    assert other.digest() == Geometry(depth=5).digest() != one.digest()
+    assert other.plane_count == one.plane_count

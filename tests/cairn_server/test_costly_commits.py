@@ -144,15 +144,15 @@ def test_a_commit_that_takes_long_is_refused_and_the_worker_replaced(
 
 
 def test_a_commit_that_takes_much_memory_is_refused_and_large_workers_are_not_kept(tmp_path: Path) -> None:
-    with Live(tmp_path, check_workers=1, check_memory_bytes=1 << 25) as server:
+    with Live(tmp_path, check_workers=1, check_memory_bytes=1 << 26) as server:
         server.service._checks.ordinary_s = 0.0
-        row = server.new_map(LARGE)
-        assert kind_of(server.push(row, of_cells(40))) == (400, "too_costly")
-        assert server.push(row, of_cells(1)).status_code == 201
+        small, large = server.new_map(), server.new_map(LARGE)
+        assert kind_of(server.push(large, of_cells(60))) == (400, "too_costly")
+        assert server.push(small, pushed(0, 1)).status_code == 201
         (before,) = workers_of(server)
-        assert server.push(row, of_cells(6, n=1)).status_code == 201
+        assert server.push(large, of_cells(10)).status_code == 201
         until(lambda: not is_alive(before), "it retired")
-        assert server.push(row, of_cells(1, n=2)).status_code == 201
+        assert server.push(small, pushed(1, 1)).status_code == 201
 
 
 def test_a_worker_that_is_killed_in_the_middle_costs_one_more_try(strict: Live) -> None:

@@ -99,7 +99,7 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("reply to `missing`", missing.REPLY_BYTES_MAX),
         ("raw bytes of all streams of a commit", commit_cost.ALLOWANCE_BYTES),
         ("modelled numbers of a commit (masks; leaves once for each modelled group)", commit_cost.ALLOWANCE_NUMBERS),
-        ("the same, of any commit", commit_cost.NUMBERS_MAX),
+        ("both, of any commit", commit_cost.RAW_BYTES_MAX),
         ("ordinary commits checked at once", commit_checks.THREADS_MAX),
         ("dear commits that wait for a worker", check_pool.WAITING_MAX),
         ("live streams of one token", live.LISTENERS_OF_TOKEN_MAX),
@@ -123,6 +123,8 @@ def test_the_bounds_of_cost_in_the_document_are_those_of_the_code() -> None:
     defaults = Settings()
     assert f"and {commit_cost.PER_BYTE} for each byte of its body" in DOCUMENT
     assert f"| {defaults.check_cpu_s:.0f} s; 3 * 2^29 bytes (settings) |" in DOCUMENT
+    assert commit_cost.NUMBERS_MAX == 2**25
+    assert "; 2^25 modelled numbers |" in DOCUMENT
     assert defaults.check_memory_bytes == 3 * 2**29
 
 
