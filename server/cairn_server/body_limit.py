@@ -75,6 +75,8 @@ async def send_problem(send: Send, status: int, kind: str, detail: str, *, answe
     """Answer a request, or a WebSocket's handshake, with a problem, and close: the body was not read."""
     problem = Problem(title=kind.replace("_", " "), status=status, detail=detail, kind=kind)
     headers = [(b"content-type", b"application/problem+json"), (b"connection", b"close")]
+    if status == 401:
+        headers.append((b"www-authenticate", b"Bearer"))
     prefix = "" if answer_to == "http" else "websocket."
     await send({"type": f"{prefix}http.response.start", "status": status, "headers": headers})
     await send({"type": f"{prefix}http.response.body", "body": problem.model_dump_json().encode()})

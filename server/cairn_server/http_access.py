@@ -73,7 +73,7 @@ def admin(caller: Annotated[Caller, Depends(anybody)]) -> Caller:
     return caller
 
 
-def reader(caller: Annotated[Caller, Depends(anybody)]) -> Caller:
+def reader_somewhere(caller: Annotated[Caller, Depends(anybody)]) -> Caller:
     """The caller, if it may read some map or all."""
     require(caller, *READING)
     return caller
@@ -90,8 +90,8 @@ async def body_of(request: Request) -> bytes:
     return await request.body()
 
 
-map_reader = allowed(*READING)
+reader = allowed(*READING)
 
 ADMIN = [Depends(admin)]
-READERS = [Depends(map_reader)]
+READERS = [Depends(reader)]
 OWNERS = [Depends(own_branch)]

@@ -27,6 +27,7 @@ STATUS_OF_KIND = {
     "bad_token": 401,
     "too_large": 413,
     "other_log": 410,
+    "quota": 429,
     "damaged_store": 500,
     "disk_full": 507,
     "upgrade_required": 426,

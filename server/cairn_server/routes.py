@@ -5,6 +5,7 @@ from fastapi.responses import HTMLResponse
 
 from cairn_server import access_routes, cell_routes, live_routes, map_routes, operations_routes, sync_routes
 from cairn_server.body_limit import BodyLimit
+from cairn_server.http_gate import TokenFirst
 from cairn_server.own_origin import OwnOrigin
 from cairn_server.problems import add_problem_handlers
 from cairn_server.protocol_version import ProtocolVersion
@@ -53,6 +54,7 @@ def make_app(service: Service) -> FastAPI:
     for part in ROUTERS:
         app.include_router(part)
     add_problem_handlers(app)
+    app.add_middleware(TokenFirst, service=service)
     app.add_middleware(BodyLimit)
     app.add_middleware(ProtocolVersion)
     if service.settings.admin_token is None:

@@ -32,7 +32,7 @@ from cairn_server.http_deadlines import protocol_of
 from cairn_server.log_format import LogForm, start_logging
 from cairn_server.routes import make_app
 from cairn_server.service import Service
-from cairn_server.settings import LOOPBACK, Settings
+from cairn_server.settings import LOOPBACK, Quotas, Settings
 from cairn_server.sqlite_store import SqliteStore
 
 log = logging.getLogger(__name__)
@@ -57,6 +57,13 @@ FLAG_OF_SETTING = {
     "body_bytes_per_s": "--min-rate",
     "disk_free_min_bytes": "--disk-free-min",
     "fold_lag_max_s": "--fold-lag-max",
+}
+QUOTA_FLAGS = {
+    "commits_per_minute": ("--quota-commits", "N", "commits that a robot may push in a minute"),
+    "bytes_per_day": ("--quota-bytes", "BYTES", "bytes that a robot may push in a day (UTC)"),
+    "cells_per_day": ("--quota-cells", "N", "cells that a robot's commits may touch in a day, together"),
+    "cells_per_commit": ("--quota-commit-cells", "N", "cells that one commit may touch"),
+    "map_extent_m": ("--map-extent", "METRES", "longest edge of the box of a map's cells"),
 }
 
 
@@ -217,6 +224,12 @@ def _settings(argv: list[str]) -> Settings:
     forms = [str(form) for form in LogForm]
     parser.add_argument("--log-format", choices=forms, default=forms[0], help=f"how log lines look ({forms[0]})")
     parser.add_argument("-v", "--verbose", action="store_true", help="log every request and fold")
+    for name, (flag, unit, text) in QUOTA_FLAGS.items():
+        default = getattr(defaults.quotas, name)
+        shown = "none" if default is None else f"{default:.0f}"
+        parser.add_argument(
+            flag, dest=name, type=float, metavar=unit, default=default, help=f"{text}; 0: any ({shown})"
+        )
     args = parser.parse_args(argv)
     start_logging(LogForm(args.log_format), logging.INFO if args.verbose else logging.WARNING)
     try:
@@ -229,6 +242,7 @@ def _settings(argv: list[str]) -> Settings:
             stable_after_s=args.stable_after,
             keep_evidence_s=args.keep_evidence,
             branch_expiry_s=args.branch_expiry,
+            quotas=Quotas.model_validate({name: getattr(args, name) or None for name in QUOTA_FLAGS}),
             tls_cert=args.tls_cert,
             tls_key=args.tls_key,
             limit_concurrency=args.limit_concurrency,
@@ -239,7 +253,8 @@ def _settings(argv: list[str]) -> Settings:
         )
     except ValidationError as exc:
         first = exc.errors()[0]
-        flag = FLAG_OF_SETTING.get(str(first["loc"][0]), str(first["loc"][0]))
+        name = str(first["loc"][0])
+        flag = QUOTA_FLAGS[name][0] if name in QUOTA_FLAGS else FLAG_OF_SETTING.get(name, name)
         raise BadInputError("bad_setting", f"{flag}: {first['msg']}") from exc
 
 

@@ -33,8 +33,10 @@ from cairn_server.folder import Folder
 from cairn_server.live import Hub
 from cairn_server.missing import asker_from_request, header_of, reply_frames
 from cairn_server.push_policy import check_claims
+from cairn_server.quotas import Meter
 from cairn_server.read_cache import ReadCache
 from cairn_server.readiness import Readiness
+from cairn_server.refusals import Refusals
 from cairn_server.retracting import is_sealed, retract_builders, seal_of, targets_of
 from cairn_server.server_figures import ServerFigures, process_lines, store_lines
 from cairn_server.settings import Settings
@@ -57,6 +59,8 @@ class Service:
         self._folder = Folder(store, self.folds, keep_evidence_s=settings.keep_evidence_s, on_fold=self.live.folded)
         self.readiness = Readiness(store.health, self.folds, settings, self._folder.is_alive)
         self._checks = CommitChecks(settings)
+        self._refusals = Refusals()
+        self._meter = Meter(store, settings.quotas)
         self._stable = StableVectors(settings.stable_after_s)
         self._reads = ReadCache()
         self.operator = new_incarnation()
@@ -113,22 +117,26 @@ class Service:
         Anybody may push back a retract that bears this server's own seal.
 
         Raises:
-            UnreachableError: kind `disk_full`.
-            BadInputError: not a commit for this map, not by this caller, or against `push_policy`.
+            BadInputError: not a commit for this map, not by this caller, or against `push_policy` or `quotas`.
+            UnreachableError: kind `quota`: more than the robot may push now; or `disk_full`.
             ConflictError: kind `id_taken`: the id is known with other bytes.
         """
         self.store.health.check_space(self.settings.disk_free_min_bytes)
         meta, cells = split_commit(data)
         speaks_for = Caller(Role.ADMIN) if is_sealed(row, data, seal) else caller
         check_claims(row, speaks_for, id_text, meta, cells=len(cells))
-        checked = self._checks.check(data, cells)
-        tops = checked.tops or (0,) * (2 + row.geometry.plane_count)
-        new = _new_commit(Commit(meta, cells, checked.sha, data), tops)
-        try:
-            is_new = self.store.append(row, new)
-        except ConflictError as exc:
-            self.store.audit_log.add(caller.name, exc.kind, f"map {row.name}: {exc.message}")
-            raise
+        with self._meter.spending(row, caller, size_bytes=len(data), cells=cells) as keep:
+            checked = self._checks.check(data, cells)
+            tops = checked.tops or (0,) * (2 + row.geometry.plane_count)
+            new = _new_commit(Commit(meta, cells, checked.sha, data), tops)
+            try:
+                is_new = self.store.append(row, new)
+            except ConflictError as exc:
+                if self._refusals.is_worth_a_line(caller.name):
+                    self.store.audit_log.add(caller.name, exc.kind, f"map {row.name}: {exc.message}")
+                raise
+            if is_new:
+                keep()
         if is_new:
             self._folder.wake()
         if caller.robot:

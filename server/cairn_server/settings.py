@@ -10,6 +10,24 @@ from cairn_map.errors import BadInputError
 LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 
 
+Count = Annotated[int, Field(ge=1)]
+
+
+class Quotas(BaseModel):
+    """How much each robot may push to a map; None: as much as it likes. Administrators may everything."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    commits_per_minute: Count | None = 6000
+    """A hundred a second: a robot that was offline for long may catch up."""
+    bytes_per_day: Count | None = 64_000_000_000
+    cells_per_day: Count | None = 4_000_000
+    cells_per_commit: Count | None = None
+    """FORMAT.md allows 4096 in any case."""
+    map_extent_m: Annotated[float, Field(gt=0)] | None = 100_000.0
+    """Longest edge of the box of all cells of a map: a robot that lost its way must not put cells far away."""
+
+
 class Settings(BaseModel):
     """What `cairn serve` can be told."""
 
@@ -28,6 +46,7 @@ class Settings(BaseModel):
     """A commit folded longer ago is in every backup that may still be restored, so robots may drop it."""
     branch_expiry_s: Annotated[float, Field(ge=60)] | None = None
     """A robot's token ends when nobody showed it for so long; None: never. The robot registers again."""
+    quotas: Quotas = Quotas()
     tls_cert: Path | None = None
     """Certificate chain, PEM; with it (and `tls_key`) the server speaks https only."""
     tls_key: Path | None = None

@@ -152,14 +152,6 @@ DROP TABLE branch;
 ALTER TABLE branch_without_token RENAME TO branch;
 ALTER TABLE audit ADD COLUMN who TEXT NOT NULL DEFAULT 'server';
 ALTER TABLE audit ADD COLUMN chain BLOB NOT NULL DEFAULT x'';       -- over the line before and this one
-CREATE TABLE robot_day (            -- what each robot's quotas of the day have seen
-    map INTEGER NOT NULL REFERENCES map,
-    robot TEXT NOT NULL,
-    day INTEGER NOT NULL,           -- since 1970, UTC
-    size_bytes INTEGER NOT NULL,
-    cells INTEGER NOT NULL,
-    PRIMARY KEY (map, robot)
-) WITHOUT ROWID;
 """
 
 STEPS = (FIRST, STAMPS, ACCESS)

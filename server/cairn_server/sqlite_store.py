@@ -24,6 +24,7 @@ from cairn_server.sqlite_retention import forget_evidence
 from cairn_server.sqlite_schema import ensure_schema
 from cairn_server.sqlite_snapshot import SqliteSnapshot, ids_from_text
 from cairn_server.sqlite_tokens import SqliteAuditLog, SqliteTokens, put_registration, remove_tokens_of, write_audit
+from cairn_server.sqlite_uses import SqliteUses
 from cairn_server.sqlite_writer import Values, Writer, connect, first, rows
 from cairn_server.store_rows import Branch, Fold, MapRow, NewCommit, StoredCommit
 
@@ -57,6 +58,7 @@ class SqliteStore:
         self._readers = Readers(path)
         self._seen = LastSeen()
         self.tokens = SqliteTokens(self._writer, self._readers)
+        self.uses = SqliteUses(self._readers)
         self.audit_log = SqliteAuditLog(self._writer, self._readers)
         self.health = SqliteHealth(path, self._writer, self._readers)
         self._maps: dict[str, MapRow] = {}  # which never change

@@ -1,5 +1,6 @@
 """Who may do what besides the matrix (`test_access_matrix`): whose commits, whose tokens; and browsers."""
 
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -170,3 +171,21 @@ def test_an_open_server_answers_nobody_who_names_no_host_or_two(live: Live, host
 def test_a_server_with_a_token_may_have_any_name(guarded: Live) -> None:
     headers = {"Host": "maps.example.org", "Origin": "https://example.org", **bearer(ADMIN)}
     assert guarded.http.get("/maps", headers=headers).status_code == 200
+
+
+@pytest.mark.parametrize("authorization", ["", "Authorization: Bearer " + "x" * 43, "Authorization: Basic eDp4"])
+@pytest.mark.parametrize("request_line", ["PUT commits/mole.0123456789abcdef.0", "POST branches/mole/missing"])
+def test_a_strangers_body_is_not_waited_for(guarded: Live, request_line: str, authorization: str) -> None:
+    method, path = request_line.split()
+    lines = [f"{method} /maps/{guarded.new_map().name}/{path} HTTP/1.1", "Host: x", "Content-Length: 100000"]
+    with socket.create_connection(("127.0.0.1", guarded.port), timeout=30) as link:
+        link.sendall("\r\n".join([*lines, *([authorization] if authorization else []), "", ""]).encode())
+        assert link.recv(1 << 16).startswith(b"HTTP/1.1 401")  # though none of the body came, nor will
+
+
+def test_a_token_that_was_good_a_moment_ago_opens_no_door(guarded: Live) -> None:
+    row = guarded.new_map()
+    mole = bearer(robot_token(guarded, row, "mole"))
+    assert guarded.push(row, pushed(0, 0), headers=mole).status_code == 201
+    robot_token(guarded, row, "mole")
+    assert guarded.push(row, pushed(1, 1), headers=mole).status_code == 401

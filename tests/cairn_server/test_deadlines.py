@@ -115,7 +115,7 @@ def _sent_in_vain(link: socket.socket, data: bytes) -> None:
 
 
 def test_beyond_its_places_a_server_says_so_and_then_nothing(tmp_path: Path) -> None:
-    with Live(tmp_path, limit_concurrency=PLACES) as live, ExitStack() as links:
+    with Live(tmp_path, limit_concurrency=PLACES, head_s=600) as live, ExitStack() as links:
         protocols = live._server.server_state.connections
         for _ in range(PLACES - 1):
             links.enter_context(connected(live))

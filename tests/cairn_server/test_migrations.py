@@ -65,3 +65,16 @@ def test_a_store_of_a_newer_version_is_refused_and_left_alone(tmp_path: Path) ->
     with pytest.raises(BadInputError, match="update it"):
         SqliteStore(tmp_path)
     assert path.read_bytes() == before
+
+
+def test_a_robot_of_an_older_store_keeps_its_token(tmp_path: Path) -> None:
+    connection = apsw.Connection(str(unpacked("v1.sqlite.zst", tmp_path)))
+    [(kept,)] = connection.execute("SELECT token_hash FROM branch")
+    connection.close()
+    store = SqliteStore(tmp_path)
+    token = store.tokens.of_hash(kept)
+    assert token is not None
+    assert (token.name, token.role, token.map_name, token.robot) == ("lab:mole", "robot", "lab", "mole")
+    store.deregister(store.map("lab"), "mole")
+    assert store.tokens.of_hash(kept) is None
+    store.close()

@@ -24,7 +24,7 @@ from cairn_server import (
     push_policy,
     sqlite_tokens,
 )
-from cairn_server.settings import Settings
+from cairn_server.settings import Quotas, Settings
 
 ROOT = Path(__file__).parents[2]
 DOCUMENT = (ROOT / "server" / "PROTOCOL.md").read_text()
@@ -82,7 +82,7 @@ def test_every_kind_in_the_code_is_in_the_document_and_no_other() -> None:
     assert code == documented_kinds()
 
 
-@pytest.mark.parametrize("kind", ["no_token", "too_large", "other_log", "damaged_store", "disk_full"])
+@pytest.mark.parametrize("kind", ["no_token", "too_large", "other_log", "quota", "damaged_store", "disk_full"])
 def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
     row = next(line for line in DOCUMENT.splitlines() if line.startswith("| `") and f"`{kind}`" in line)
     assert int(row.split("|")[2]) == problems.STATUS_OF_KIND[kind]
@@ -109,6 +109,10 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("until a request's head is whole", Settings().head_s),
         ("until a body is whole, or an answer taken", Settings().body_grace_s),
         ("connections served at once", Settings().limit_concurrency),
+        ("commits a minute", Quotas().commits_per_minute),
+        ("bytes a day", Quotas().bytes_per_day),
+        ("cells a day, of all commits together", Quotas().cells_per_day),
+        ("longest edge of the box of a map's cells, this commit's included", Quotas().map_extent_m),
         ("audit log", sqlite_tokens.AUDIT_ROWS_MAX),
     ],
 )

@@ -16,7 +16,7 @@ from cairn_client import token_command
 from cairn_client.api import MapApi
 from cairn_map.access_messages import AuditEntry, CreateToken
 from cairn_map.errors import BadInputError, ConflictError, DeniedError, NotFoundError
-from cairn_server import auth, sqlite_tokens
+from cairn_server import auth, refusals, sqlite_tokens
 from cairn_server.settings import Settings
 from cairn_server.sqlite_store import SqliteStore
 from cairn_server.token_store import Token
@@ -283,3 +283,26 @@ def test_no_route_changes_the_audit_log(guarded: Live) -> None:
     for method in ("PUT", "POST", "DELETE", "PATCH"):
         for path in ("/audit", "/audit/1"):
             assert guarded.http.request(method, path, headers=bearer(ADMIN)).status_code in (404, 405)
+
+
+def test_a_robot_cannot_push_others_lines_out_of_the_audit_log_by_refusals(
+    guarded: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(refusals, "NOTED_PER_HOUR", 3)
+    row = guarded.new_map()
+    mole, wren = (bearer(robot_token(guarded, row, name)) for name in ("mole", "wren"))
+    guarded.push(row, pushed(0, 0), headers=mole)
+    guarded.push(row, pushed(0, 0, WREN), headers=wren)
+    for _ in range(9):
+        assert guarded.push(row, pushed(0, 1), headers=mole).status_code == 409
+    assert guarded.push(row, pushed(0, 1, WREN), headers=wren).status_code == 409
+    found = [entry.who for entry in audit(guarded) if entry.what == "id_taken" and entry.who.startswith(row.name)]
+    assert found == [f"{row.name}:mole"] * 3 + [f"{row.name}:wren"]
+
+
+def test_refusals_are_noted_again_in_the_next_hour() -> None:
+    now_s = [7.0 * refusals.HOUR_S]
+    counter = refusals.Refusals(steady_s=lambda: now_s[0])
+    assert [counter.is_worth_a_line("x") for _ in range(100)] == [True] * 60 + [False] * 40
+    now_s[0] += refusals.HOUR_S
+    assert counter.is_worth_a_line("x")
