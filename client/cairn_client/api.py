@@ -43,7 +43,8 @@ from cairn_map.messages import (
     VectorJson,
     message_from_json,
 )
-from cairn_map.version_vector import version_vector_from_json
+from cairn_map.robot_status import RobotStatus
+from cairn_map.version_vector import EMPTY, VersionVector, vector_digest, version_vector_from_json
 
 PROTOCOL_VERSION = "1"
 TIMEOUT = httpx.Timeout(30.0, connect=5.0)
@@ -70,6 +71,8 @@ class MapApi:
 
     def __init__(self, server_url: str, *, token: str | None = None, ca_file: Path | None = None) -> None:
         self.traffic = Traffic()
+        self._vector = EMPTY
+        """The last one that came whole: many cells come with the same."""
         if not server_url.startswith(("http://", "https://")) or "/maps/" in server_url:
             raise BadInputError("bad_url", f"a server's URL is http://HOST:PORT, got {server_url!r}")
         try:
@@ -112,6 +115,18 @@ class MapApi:
     def branches(self, name: str) -> list[BranchInfo]:
         """All robots of a map."""
         return list_of(BranchInfo, self._ask("GET", f"/maps/{name}/branches"))
+
+    def put_status(self, name: str, branch: str, status: RobotStatus) -> None:
+        """Tell where a robot is and how it is doing."""
+        self._ask("PUT", f"/maps/{name}/branches/{branch}/status", content=status.model_dump_json().encode())
+
+    def put_view(self, name: str, branch: str, picture: bytes) -> None:
+        """Show what a robot sees: JPEG or PNG."""
+        self._ask("PUT", f"/maps/{name}/branches/{branch}/view", content=picture)
+
+    def view(self, name: str, branch: str) -> bytes:
+        """A robot's latest picture."""
+        return self._ask("GET", f"/maps/{name}/branches/{branch}/view")
 
     def deregister(self, name: str, branch: str) -> None:
         """Deregister a robot."""
@@ -157,7 +172,14 @@ class MapApi:
     def cell_index(self, name: str, author: Author | None = None) -> CellIndex:
         """All cells of a map, without their bytes."""
         params = {"author": str(author)} if author else {}
-        return message_from_json(CellIndex, self._ask("GET", f"/maps/{name}/main/cells", params=params))
+        index = message_from_json(CellIndex, self._ask("GET", f"/maps/{name}/main/cells", params=params))
+        self._vector = index.header.coverage
+        return index
+
+    def vector_at(self, name: str, cursor: str) -> VersionVector:
+        """The ids that a server had folded at a cursor."""
+        body = self._ask("GET", f"/maps/{name}/main/vector", params={"at": cursor})
+        return version_vector_from_json(VECTOR.validate_json(body))
 
     def cell(self, name: str, cell: Cell, *, etag: str | None = None) -> FetchedCell:
         """One cell's octree, unless it is the one with this ETag."""
@@ -168,7 +190,7 @@ class MapApi:
                 body=None if answer.status == httpx.codes.NOT_MODIFIED else answer.body,
                 etag=answer.headers["ETag"],
                 cursor=cursor_from_text(answer.headers["Cairn-Cursor"]),
-                coverage=version_vector_from_json(VECTOR.validate_json(answer.headers["Cairn-Coverage"])),
+                coverage=self._coverage(name, answer.headers),
                 fingerprint=fingerprint_from_hex(answer.headers["Cairn-Fingerprint"]),
             )
         except (KeyError, ValidationError) as exc:
@@ -189,6 +211,17 @@ class MapApi:
                 yield from reader.feed(part)
         if not reader.is_empty:
             raise UnreachableError("cut_off", "the reply was cut off")
+
+    def _coverage(self, name: str, headers: httpx.Headers) -> VersionVector:
+        """The version vector that a cell came with: as it is, or by a digest, of the one known last or asked for."""
+        if "Cairn-Coverage" in headers:
+            return version_vector_from_json(VECTOR.validate_json(headers["Cairn-Coverage"]))
+        digest = headers["Cairn-Coverage-Digest"]
+        if vector_digest(self._vector) != digest:
+            self._vector = self.vector_at(name, headers["Cairn-Cursor"])
+        if vector_digest(self._vector) != digest:
+            raise DamagedDataError("bad_message", "the server's version vector does not have the digest that it states")
+        return self._vector
 
     def _ask(self, method: str, path: str, **options: Any) -> bytes:
         return self._send(method, path, **options).body

@@ -6,7 +6,8 @@
     $ cairn map info http://127.0.0.1:8750/maps/lab
     $ cairn map get http://127.0.0.1:8750/maps/lab 0,0,0 -o cell.ply
     $ cairn map export http://127.0.0.1:8750/maps/lab --ply lab.ply --picture lab.png --cells lab/
-    $ cairn map log http://127.0.0.1:8750/maps/lab
+    $ cairn map log http://127.0.0.1:8750/maps/lab --graph
+    $ cairn map branches http://127.0.0.1:8750/maps/lab
     $ cairn map retract http://127.0.0.1:8750/maps/lab --robot mole --pushed-after 14:05 --dry-run
 
 A map's URL is http://HOST:PORT/maps/NAME. A retract takes exactly the evidence of the named commits out again, on
@@ -24,6 +25,8 @@ from pathlib import Path
 from cairn_client import map_export
 from cairn_client.api import MapApi
 from cairn_client.arguments import add_token, allow_negative_lists, api_of, parser, say, shown_bytes, shown_length
+from cairn_client.branch_table import branch_table
+from cairn_client.log_graph import log_graph
 from cairn_client.prior_data import push_prior_data
 from cairn_client.retract_command import add_retract_arguments, retract
 from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
@@ -96,11 +99,29 @@ def _log(args: argparse.Namespace) -> None:
     if args.json:
         say(json.dumps([entry.model_dump(mode="json") for entry in entries]))
         return
+    if args.graph:
+        for line in log_graph(entries):
+            say(line)
+        if len(entries) == args.limit:
+            say(f"(perhaps more: --after {entries[-1].seq})")
+        return
     taken_out = {entry.id: entry.seq for entry in entries if entry.kind == "-"}
     for entry in entries:
         say(_log_line(entry, taken_out.get(entry.id)))
     if not entries:
         say("(nothing yet)")
+
+
+def _branches(args: argparse.Namespace) -> None:
+    api, name = api_of(args.map, args.token)
+    branches = api.branches(name)
+    if args.json:
+        say(json.dumps([branch.model_dump(mode="json") for branch in branches]))
+        return
+    for line in branch_table(branches):
+        say(line)
+    if not branches:
+        say("(none yet; a robot registers by itself when it first syncs)")
 
 
 def _log_line(entry: LogEntry, taken_out: int | None) -> str:
@@ -171,6 +192,7 @@ def _parser() -> argparse.ArgumentParser:
     for name, text, run, target in (
         ("ls", "list the maps of a server", _ls, "server"),
         ("info", "extent, sizes and robots of a map", _info, "map"),
+        ("branches", "the robots of a map: lag, last sign of life, pose", _branches, "map"),
         ("log", "what was folded and taken out, oldest first", _log, "map"),
     ):
         added = command(name, text, run, target)
@@ -178,6 +200,7 @@ def _parser() -> argparse.ArgumentParser:
         if name == "log":
             added.add_argument("--after", type=int, default=0, metavar="SEQ", help="entries after this one (0)")
             added.add_argument("--limit", type=int, default=100, help="at most so many (100)")
+            added.add_argument("--graph", action="store_true", help="lines from each commit to those that it hangs on")
     get = command("get", "download one cell", map_export.get_cell, "map")
     get.add_argument("cell", help="its number, i,j,k")
     allow_negative_lists(get)

@@ -168,6 +168,11 @@ class ReplicaStore:
             for r, i, n, sha, cells, acked, has_data, seal in rows
         ]
 
+    def data_bytes(self, commits: Iterable[CommitId]) -> int:
+        """How many bytes of these commits are kept."""
+        query = f"SELECT coalesce(sum(length(data)), 0) FROM commits WHERE {ONE_COMMIT}"  # noqa: S608
+        return sum(int(self._first(query, _values(commit)) or 0) for commit in commits)
+
     def commit_data(self, commit: CommitId) -> bytes | None:
         """Bytes of a commit, if they are still kept."""
         data: bytes | None = self._first(f"SELECT data FROM commits WHERE {ONE_COMMIT}", _values(commit))  # noqa: S608

@@ -22,6 +22,7 @@ from cairn_client.answers import Traffic
 from cairn_client.api import MapApi
 from cairn_client.map_url import split_map_url
 from cairn_client.outbox import UNNUMBERED
+from cairn_client.own_status import OwnStatus
 from cairn_client.replica import Replica
 from cairn_client.replica_store import ReplicaStore
 from cairn_client.sync import RoundReport, Wanted, fetch_cells, fetch_missing, push_commits
@@ -95,6 +96,7 @@ class Robot:
         self._api.token = self._replica.token() or token
         self._integrator = integrator or Integrator()
         self._measurement = self._new_measurement()
+        self.status = OwnStatus()
         self._round = threading.Lock()
         self._thread: SyncThread | None = None
         self._is_closed = False
@@ -137,6 +139,7 @@ class Robot:
         if self._measurement is None:
             raise BadInputError("no_rig", "this robot was opened without a rig, so it cannot read scans")
         self._measurement.add(scan)
+        self.status.pose = self._measurement.poses[-1]
 
     def commit(
         self, *, note: str = "", retracts: tuple[CommitId, ...] = (), profile: Profile = Profile.FAST
@@ -221,6 +224,7 @@ class Robot:
         else:
             report = fetch_missing(self._replica, self._api, self._map_name, self.name)
         report.pushed, report.refused = pushes.pushed, pushes.refused
+        self.status.tell(self._replica, self._api, self._map_name, branch=self.name, mode=self.mode)
         return report
 
     def _as_registered(self, action: Callable[[], T]) -> T:

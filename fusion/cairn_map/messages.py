@@ -12,6 +12,7 @@ from cairn_map.errors import DamagedDataError, first_error
 from cairn_map.fingerprint import Fingerprint, fingerprint_from_hex
 from cairn_map.grid import Geometry
 from cairn_map.ids import NUMBER_LIMIT
+from cairn_map.robot_status import RobotStatus
 from cairn_map.sensor_model import SensorModel
 from cairn_map.version_vector import AUTHORS_MAX, VersionVector, version_vector_from_json
 
@@ -84,7 +85,15 @@ class BranchInfo(_Model):
     cursor: CursorText | None
     behind: int | None
     """Log entries folded since the branch's cursor; None before its first fetch."""
+    behind_bytes: int | None = None
+    """Bytes of others' commits in them; None before its first fetch, or if that was too long ago."""
+    incarnation: str = ""
+    """With which it registered last."""
     last_seen_s: float
+    status: RobotStatus | None = None
+    """The last that it told."""
+    view_s: float | None = None
+    """When its latest picture came; None: there is none."""
 
 
 class Pushed(_Model):
@@ -240,6 +249,10 @@ class LogEntry(_Model):
     cells: int
     captured_s: tuple[float, float] | None
     retracts: list[IdText]
+    parent: ShaText | None = None
+    """SHA-256 of the author's commit before it."""
+    seen: CursorText | None = None
+    """State of the server that the author had when it made it."""
 
 
 class Problem(BaseModel):

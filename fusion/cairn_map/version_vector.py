@@ -5,6 +5,8 @@
 A version vector is a value; adding makes a new one.
 """
 
+import hashlib
+import json
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -71,6 +73,16 @@ class VersionVector:
 
 
 EMPTY = VersionVector()
+
+
+def vector_text(vector: VersionVector) -> str:
+    """A vector as the one JSON text that its digest is over: authors sorted, no spaces."""
+    return json.dumps(vector.to_json(), separators=(",", ":"))
+
+
+def vector_digest(vector: VersionVector) -> str:
+    """Hex of the SHA-256 of a vector's text."""
+    return hashlib.sha256(vector_text(vector).encode()).hexdigest()
 
 
 def version_vector_from_json(value: Mapping[str, Iterable[Iterable[int]]]) -> VersionVector:

@@ -16,9 +16,13 @@ App = Callable[[MutableMapping[str, Any], Receive, Send], Awaitable[None]]
 MISSING_BYTES_MAX = 16 << 20
 """100 000 cells with a cursor each."""
 JSON_BYTES_MAX = 1 << 20
+STATUS_BYTES_MAX = 1 << 14
+VIEW_BYTES_MAX = 1 << 20
 LIMITS = (
     (re.compile(r"/maps/[^/]*/commits/[^/]*"), COMMIT_BYTES_MAX),
     (re.compile(r"/maps/[^/]*/branches/[^/]*/missing"), MISSING_BYTES_MAX),
+    (re.compile(r"/maps/[^/]*/branches/[^/]*/status"), STATUS_BYTES_MAX),
+    (re.compile(r"/maps/[^/]*/branches/[^/]*/view"), VIEW_BYTES_MAX),
 )
 
 

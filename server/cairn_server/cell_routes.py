@@ -1,54 +1,126 @@
 """Routes of main's cells. Nothing is decided here."""
 
-import json
 from typing import Annotated
 
-from fastapi import APIRouter, Header, Query, Response
+from fastapi import APIRouter, Header, Query, Request, Response
 
 from cairn_map.cell_files import CELL_MEDIA_TYPE, FORMS, MEDIA_TYPES, cell_file
+from cairn_map.cursor import cursor_from_text
 from cairn_map.errors import BadInputError, NotFoundError
-from cairn_map.grid import cell_from_text, cell_key
+from cairn_map.grid import CellKey, cell_from_text, cell_key
 from cairn_map.ids import author_from_text
 from cairn_map.messages import CellIndex
+from cairn_map.version_vector import vector_digest, vector_text
+from cairn_map.view import ViewStyle
+from cairn_map.view_code import encode_view
 from cairn_server.cells_at_rest import stored_evidence
 from cairn_server.http_access import READERS, Map, Operations
+from cairn_server.http_ranges import is_same, part_of
+from cairn_server.problems import answer_to
+from cairn_server.store_rows import CellRow, Head, MapRow
+from cairn_server.vectors import box_from_text
+
+COVERAGE_BYTES_MAX = 4096
+"""Of the header `Cairn-Coverage`: a longer one would be refused by proxies and by small HTTP libraries."""
 
 router = APIRouter()
 
 
 @router.get("/maps/{name}/main/cells", dependencies=READERS)
-def cell_index(service: Operations, row: Map, author: Annotated[str | None, Query(max_length=80)] = None) -> CellIndex:
-    """All cells that were ever touched, from one state."""
-    return service.cell_index(row, author_from_text(author) if author else None)
+def cell_index(
+    service: Operations,
+    row: Map,
+    author: Annotated[str | None, Query(max_length=80)] = None,
+    box: Annotated[str | None, Query(max_length=80, description="i0,j0,k0,i1,j1,k1: only these, ends included")] = None,
+) -> CellIndex:
+    """All cells that were ever touched, or those in a box, from one state."""
+    index = service.cell_index(row, author_from_text(author) if author else None)
+    if box is None:
+        return index
+    inside = box_from_text(box)
+    return index.model_copy(update={"cells": [entry for entry in index.cells if inside(entry.cell)]})
 
 
+@router.get("/maps/{name}/main/vector", dependencies=READERS)
+def vector(service: Operations, row: Map, at: Annotated[str, Query(max_length=128)]) -> Response:
+    """The version vector at a cursor: what `Cairn-Coverage` says where it is short enough."""
+    found = service.vector_at(row, cursor_from_text(at))
+    return Response(vector_text(found), media_type="application/json", headers={"ETag": f'"{vector_digest(found)}"'})
+
+
+@router.head("/maps/{name}/main/cells/{cell}", dependencies=READERS)
 @router.get("/maps/{name}/main/cells/{cell}", dependencies=READERS)
 def get_cell(
     cell: str,
+    request: Request,
     service: Operations,
     row: Map,
+    depth: Annotated[
+        int | None, Query(ge=1, le=64, description="octree depth of a view; only without suffix or .view")
+    ] = None,
     if_none_match: Annotated[str | None, Header()] = None,
+    if_range: Annotated[str | None, Header()] = None,
+    range_: Annotated[str | None, Header(alias="Range")] = None,
 ) -> Response:
     """One cell: the octree, or by suffix `.npz`, `.ply`, `.view`; strong ETag, cursor and coverage in the headers."""
     number, dot, suffix = cell.partition(".")
     key = cell_key(cell_from_text(number))
-    if dot and suffix not in MEDIA_TYPES:
-        raise BadInputError("unknown_format", f"cells come as {FORMS}, not as .{suffix[:16]}")
+    form = _form(dot, suffix, depth, row)
     stored, head = service.cell(row, key)
     if stored is None:
         raise NotFoundError("no_cell", f"nobody has seen cell {number} of map {row.name}")
-    etag = f'"{stored.digest.hex()}{dot}{suffix}"'
+    etag = f'"{stored.digest.hex()}{form}"'
     headers = {
         "ETag": etag,
         "Cache-Control": "no-cache",
+        "Accept-Ranges": "bytes",
         "Cairn-Cursor": str(head.cursor),
-        "Cairn-Coverage": json.dumps(head.vector.to_json(), separators=(",", ":")),
         "Cairn-Fingerprint": stored.fingerprint.hex(),
+        **_coverage(head),
     }
-    if if_none_match and (if_none_match.strip() == "*" or etag in [t.strip() for t in if_none_match.split(",")]):
+    if is_same(etag, if_none_match):
         return Response(status_code=304, headers=headers)
+    data, media_type = _file(suffix, depth, key, stored, row)
+    if suffix:
+        headers["Content-Disposition"] = f'attachment; filename="{row.name}_{number}.{suffix}"'
+    try:
+        part = part_of(len(data), range_ if request.method == "GET" else None, etag=etag, if_range=if_range)
+    except BadInputError as exc:
+        refused = answer_to(exc)
+        refused.headers["Content-Range"] = f"bytes */{len(data)}"
+        return refused
+    if part is None:
+        return Response(data, media_type=media_type, headers=headers)
+    start, stop = part
+    headers["Content-Range"] = f"bytes {start}-{stop - 1}/{len(data)}"
+    return Response(data[start:stop], 206, media_type=media_type, headers=headers)
+
+
+def _form(dot: str, suffix: str, depth: int | None, row: MapRow) -> str:
+    """What the ETag says beside the digest."""
+    if dot and suffix not in MEDIA_TYPES:
+        raise BadInputError("unknown_format", f"cells come as {FORMS}, not as .{suffix[:16]}")
+    if depth is None:
+        return f"{dot}{suffix}"
+    if suffix not in ("", "view"):
+        raise BadInputError("unknown_format", f"only a view has a depth, a .{suffix} has none")
+    if depth > row.geometry.depth:
+        raise BadInputError("bad_style", f"a view's depth must be 1 to {row.geometry.depth}, got {depth}")
+    return f".view.{depth}"
+
+
+def _file(suffix: str, depth: int | None, key: CellKey, stored: CellRow, row: MapRow) -> tuple[bytes, str]:
+    if depth is not None:
+        evidence, style = stored_evidence(stored), ViewStyle(depth=depth)
+        return encode_view(key, evidence, row.geometry, row.sensor_model, style=style), MEDIA_TYPES["view"]
     if not suffix:
-        return Response(stored.body, media_type=CELL_MEDIA_TYPE, headers=headers)
-    data, media_type = cell_file(suffix, key, stored_evidence(stored), row.geometry, row.sensor_model)
-    headers["Content-Disposition"] = f'attachment; filename="{row.name}_{number}.{suffix}"'
-    return Response(data, media_type=media_type, headers=headers)
+        return stored.body, CELL_MEDIA_TYPE
+    return cell_file(suffix, key, stored_evidence(stored), row.geometry, row.sensor_model)
+
+
+def _coverage(head: Head) -> dict[str, str]:
+    """The version vector at the cursor, or, if it is long, its digest: the asker may know it, or asks for it."""
+    text = vector_text(head.vector)
+    if len(text) <= COVERAGE_BYTES_MAX:
+        return {"Cairn-Coverage": text}
+    return {"Cairn-Coverage-Digest": vector_digest(head.vector)}

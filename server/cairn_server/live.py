@@ -14,8 +14,11 @@ import time
 from collections import Counter
 from collections.abc import Callable
 
+from pydantic import ValidationError
+
 from cairn_map.errors import CairnError, UnreachableError
 from cairn_map.live_events import CHAIN_DIGITS, Beat, Hello, LiveEvent, RobotHeard, RobotSign, Seen
+from cairn_map.robot_status import RobotStatus
 from cairn_server.live_changes import LiveChanges
 from cairn_server.live_robots import LiveRobots
 from cairn_server.store import Store
@@ -212,12 +215,22 @@ class Listener:
 
 
 def _signs(store: Store, row: MapRow) -> list[RobotSign]:
+    statuses = store.notes.statuses(row)
     return [
         RobotSign(
             branch=branch.name,
             mode=branch.mode,
             time_s=branch.last_seen_s,
             cursor=str(branch.cursor) if branch.cursor else None,
+            status=_status(statuses.get(branch.name)),
         )
         for branch in store.branches(row)
     ]
+
+
+def _status(text: str | None) -> RobotStatus | None:
+    """A kept status; None if there is none, or not one of this version."""
+    try:
+        return RobotStatus.model_validate_json(text) if text else None
+    except ValidationError:
+        return None

@@ -83,7 +83,8 @@ class LiveChanges:
             for key, lm in reversed(self._cells.items()):
                 if lm <= seen.seq or len(cells) > CELLS_MAX:
                     break
-                cells.append((*cell_of_key(key), lm))
+                i, j, k = cell_of_key(key)
+                cells.append((i, j, k, lm))
         is_many = seen.seq < self._floor or len(cells) > CELLS_MAX
         moved = Seen(head.seq, head.chain.hex()[:CHAIN_DIGITS], seen.tick)
         events: list[LiveEvent] = []

@@ -51,7 +51,7 @@ class LiveRobots:
         with self._lock:
             if self._signs is not None:
                 old = self._there(self._signs, sign.branch) or sign
-                self._hear(old.model_copy(update={"mode": sign.mode, "time_s": sign.time_s, "cursor": sign.cursor}))
+                self._hear(old.model_copy(update={"mode": sign.mode, "time_s": sign.time_s}))
 
     def heard(self, branch: str, **news: object) -> bool:
         """Something was heard of a robot; False if none of that name is known to be there."""

@@ -30,6 +30,7 @@ STATUS_OF_KIND = {
     "quota": 429,
     "damaged_store": 500,
     "disk_full": 507,
+    "bad_range": 416,
     "upgrade_required": 426,
     "too_many_streams": 429,
 }

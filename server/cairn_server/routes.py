@@ -1,11 +1,21 @@
 """The app: all routes of PROTOCOL.md over a `Service`, and what stands before them."""
 
-from fastapi import APIRouter, FastAPI
+from fastapi import APIRouter, FastAPI, Request
 from fastapi.responses import HTMLResponse
 
-from cairn_server import access_routes, cell_routes, live_routes, map_routes, operations_routes, sync_routes
+from cairn_server import (
+    access_routes,
+    cell_routes,
+    live_routes,
+    map_routes,
+    operations_routes,
+    robot_routes,
+    sync_routes,
+)
 from cairn_server.body_limit import BodyLimit
+from cairn_server.docs_page import docs_page
 from cairn_server.http_gate import TokenFirst
+from cairn_server.http_openapi import openapi_of
 from cairn_server.own_origin import OwnOrigin
 from cairn_server.problems import add_problem_handlers
 from cairn_server.protocol_version import ProtocolVersion
@@ -13,7 +23,7 @@ from cairn_server.request_trail import RequestTrail
 from cairn_server.service import Service
 
 PAGE = """<!doctype html><title>cairn</title><h1>cairn map server</h1>
-<p>It runs. <a href="maps">Maps</a>, <a href="openapi.json">routes</a>;
+<p>It runs. <a href="maps">Maps</a>, <a href="docs">routes</a>;
 <code>cairn map ls</code> lists the maps in a terminal.</p>"""
 
 router = APIRouter()
@@ -25,6 +35,7 @@ ROUTERS = (
     access_routes.router,
     operations_routes.router,
     live_routes.router,
+    robot_routes.router,
 )
 
 
@@ -40,6 +51,13 @@ def page() -> str:
     return PAGE
 
 
+@router.get("/docs", response_class=HTMLResponse)
+def docs(request: Request) -> HTMLResponse:
+    """The routes for people."""
+    headers = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'"}
+    return HTMLResponse(docs_page(openapi_of(request.app)), headers=headers)
+
+
 def make_app(service: Service) -> FastAPI:
     """The app over a service; whoever made the service closes it."""
     app = FastAPI(
@@ -53,6 +71,7 @@ def make_app(service: Service) -> FastAPI:
     app.state.service = service
     for part in ROUTERS:
         app.include_router(part)
+    app.openapi = lambda: openapi_of(app)  # type: ignore[method-assign]
     add_problem_handlers(app)
     app.add_middleware(TokenFirst, service=service)
     app.add_middleware(BodyLimit)

@@ -26,7 +26,9 @@ from cairn_map.messages import (
     Retract,
     Retracted,
 )
+from cairn_map.version_vector import VersionVector
 from cairn_server.auth import Caller, Role, new_token, token_hash
+from cairn_server.branch_list import branch_infos
 from cairn_server.commit_checks import CommitChecks
 from cairn_server.fold_health import FoldHealth
 from cairn_server.folder import Folder
@@ -38,11 +40,13 @@ from cairn_server.read_cache import ReadCache
 from cairn_server.readiness import Readiness
 from cairn_server.refusals import Refusals
 from cairn_server.retracting import is_sealed, retract_builders, seal_of, targets_of
+from cairn_server.robot_reports import RobotReports
 from cairn_server.server_figures import ServerFigures, process_lines, store_lines
 from cairn_server.settings import Settings
 from cairn_server.stable import StableVectors
 from cairn_server.store import Store
 from cairn_server.store_rows import Branch, CellRow, Head, MapRow, NewCommit
+from cairn_server.vectors import vector_at
 
 RESERVED_NAMES = frozenset({OPERATOR, INITIAL, RobotName("main")})
 
@@ -56,6 +60,7 @@ class Service:
         self.figures = ServerFigures()
         self.folds = FoldHealth(self.figures)
         self.live = Hub(store)
+        self.reports = RobotReports(store, self.live)
         self._folder = Folder(store, self.folds, keep_evidence_s=settings.keep_evidence_s, on_fold=self.live.folded)
         self.readiness = Readiness(store.health, self.folds, settings, self._folder.is_alive)
         self._checks = CommitChecks(settings)
@@ -106,7 +111,7 @@ class Service:
                 "reserved_name", f"{request.robot} is not a robot's name; reserved are operator, initial, main"
             )
         token = new_token()
-        branch = Branch(request.robot, request.mode, tuple(request.sensors), None, time.time())
+        branch = Branch(request.robot, request.mode, tuple(request.sensors), None, time.time(), request.incarnation)
         self.store.register(row, branch, token_hash(token))
         self.live.robot_came(row, RobotSign(branch=branch.name, mode=branch.mode, time_s=branch.last_seen_s))
         return Registered(branch=request.robot, token=token, map=self.map_info(row))
@@ -219,21 +224,14 @@ class Service:
         with self.store.snapshot(row) as snapshot:
             return snapshot.cell(key), snapshot.head
 
+    def vector_at(self, row: MapRow, cursor: Cursor) -> VersionVector:
+        """The ids folded at or before a cursor of late."""
+        with self.store.snapshot(row) as snapshot:
+            return vector_at(snapshot, cursor)
+
     def branches(self, row: MapRow) -> list[BranchInfo]:
         """All robots, and how far behind each is."""
-        with self.store.snapshot(row) as snapshot:
-            head = snapshot.head.cursor
-        return [
-            BranchInfo(
-                branch=branch.name,
-                mode=branch.mode,
-                sensors=list(branch.sensors),
-                cursor=str(branch.cursor) if branch.cursor else None,
-                behind=_behind(branch.cursor, head),
-                last_seen_s=branch.last_seen_s,
-            )
-            for branch in self.store.branches(row)
-        ]
+        return branch_infos(self.store, row, self.live.robots(row))
 
     def deregister(self, row: MapRow, branch: str) -> None:
         """Remove a robot and its token; its evidence stays.
@@ -242,6 +240,7 @@ class Service:
             NotFoundError: kind `no_branch`.
         """
         self.store.deregister(row, branch)
+        self.reports.forget(row, branch)
         self.live.robot_left(row, branch)
 
     def metrics_text(self) -> str:
@@ -255,6 +254,7 @@ class Service:
         self.live.close()
         self._checks.close()
         self._folder.close()
+        self.reports.close()
         self.store.close()
 
 
@@ -270,9 +270,3 @@ def _new_commit(commit: Commit, tops: tuple[int, ...]) -> NewCommit:
         tops=tops,
         rig=bytes.fromhex(commit.meta.rig) if commit.meta.rig else None,
     )
-
-
-def _behind(cursor: Cursor | None, head: Cursor) -> int | None:
-    if cursor is None or cursor.log_id != head.log_id:
-        return None
-    return max(0, head.seq - cursor.seq)

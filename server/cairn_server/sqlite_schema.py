@@ -154,7 +154,17 @@ ALTER TABLE audit ADD COLUMN who TEXT NOT NULL DEFAULT 'server';
 ALTER TABLE audit ADD COLUMN chain BLOB NOT NULL DEFAULT x'';       -- over the line before and this one
 """
 
-STEPS = (FIRST, STAMPS, ACCESS)
+BRANCH_STATUS = """
+CREATE TABLE branch_status (
+    map INTEGER NOT NULL,
+    name TEXT NOT NULL,
+    status TEXT NOT NULL,           -- the last one, as JSON
+    PRIMARY KEY (map, name),
+    FOREIGN KEY (map, name) REFERENCES branch (map, name) ON DELETE CASCADE
+) WITHOUT ROWID;
+"""
+
+STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS)
 
 
 def ensure_schema(connection: apsw.Connection) -> None:

@@ -16,6 +16,15 @@ from cairn_server.sqlite_writer import first, rows
 from cairn_server.store_rows import CellRow, Contribution, Head, Selection, Totals
 
 CELL_COLUMNS = "cell, lm, digest, fingerprint, voxels, size_bytes, gone_seq"
+PARENT, SEEN = (
+    f"CASE WHEN json_valid(CAST(meta AS TEXT)) THEN json_extract(CAST(meta AS TEXT), '$.{name}') END"
+    for name in ("parent", "seen")
+)
+"""Of a commit's meta; NULL, too, if that is damaged."""
+LOG_COLUMNS = (
+    "seq, kind, robot, incarnation, n, sha, size_bytes, cells, captured_first_s, captured_last_s, retracts,"
+    f" {PARENT}, {SEEN}"
+)
 
 
 class SqliteSnapshot:
@@ -137,8 +146,7 @@ class SqliteSnapshot:
         """Log entries, oldest first."""
         found = rows(
             self._connection,
-            "SELECT seq, kind, robot, incarnation, n, sha, size_bytes, cells, captured_first_s, captured_last_s,"
-            " retracts FROM log JOIN commits ON commits.number = log.commit_number"
+            f"SELECT {LOG_COLUMNS} FROM log JOIN commits ON commits.number = log.commit_number"  # noqa: S608 - constants
             " WHERE log.map = ? AND seq > ? ORDER BY seq LIMIT ?",
             (self._map, after_seq, limit),
         )
@@ -201,6 +209,8 @@ def _log_entry(
     first_s: float | None,
     last_s: float | None,
     retracts: str,
+    parent: str | None,
+    seen: str | None,
 ) -> LogEntry:
     return LogEntry.model_validate(
         {
@@ -212,5 +222,7 @@ def _log_entry(
             "cells": cells,
             "captured_s": None if first_s is None else (first_s, last_s),
             "retracts": retracts.split(),
+            "parent": parent,
+            "seen": seen,
         }
     )

@@ -17,6 +17,7 @@ from cairn_map.ids import Author, CommitId, new_incarnation
 from cairn_map.sensor_model import SensorModel
 from cairn_server.folder_lock import lock_folder
 from cairn_server.last_seen import LastSeen
+from cairn_server.sqlite_branch_notes import SqliteBranchNotes
 from cairn_server.sqlite_changes import append_commit, next_number, write_fold
 from cairn_server.sqlite_health import SqliteHealth
 from cairn_server.sqlite_readers import Readers
@@ -62,6 +63,7 @@ class SqliteStore:
         self.audit_log = SqliteAuditLog(self._writer, self._readers)
         self.health = SqliteHealth(path, self._writer, self._readers)
         self._maps: dict[str, MapRow] = {}  # which never change
+        self.notes = SqliteBranchNotes(self._writer, self._readers)
 
     def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:
         """The map and whether it is new; an equal one may exist already."""
@@ -162,13 +164,17 @@ class SqliteStore:
     def register(self, row: MapRow, branch: Branch, token_hash: bytes) -> None:
         """Make a branch, or give an existing one a new token."""
         self._seen.forget(row.number, branch.name)
-        values = (row.number, branch.name, branch.mode, json.dumps(branch.sensors), branch.last_seen_s)
+        sensors = json.dumps(branch.sensors)
+        values = (row.number, branch.name, branch.mode, sensors, branch.last_seen_s, branch.incarnation)
 
         def job(connection: apsw.Connection) -> None:
             connection.execute(
-                "INSERT INTO branch (map, name, mode, sensors, last_seen_s) VALUES (?, ?, ?, ?, ?)"
+                "INSERT INTO branch (map, name, mode, sensors, last_seen_s, incarnation) VALUES (?, ?, ?, ?, ?, ?)"
                 " ON CONFLICT (map, name) DO UPDATE SET mode = excluded.mode, sensors = excluded.sensors,"
-                " last_seen_s = excluded.last_seen_s",
+                " last_seen_s = excluded.last_seen_s,"
+                # A new incarnation may have lost its disk: where it stands is not known before it fetches.
+                " cursor = CASE WHEN branch.incarnation = excluded.incarnation THEN cursor END,"
+                " incarnation = excluded.incarnation",
                 values,
             )
             put_registration(connection, row, branch.name, token_hash)
@@ -202,12 +208,12 @@ class SqliteStore:
 
     def branches(self, row: MapRow) -> list[Branch]:
         """All branches, by name."""
-        query = "SELECT name, mode, sensors, cursor, last_seen_s FROM branch WHERE map = ? ORDER BY name"
+        query = "SELECT name, mode, sensors, cursor, last_seen_s, incarnation FROM branch WHERE map = ? ORDER BY name"
         with self._readers.reading() as reader:
             found = rows(reader, query, (row.number,))
         return [
-            Branch(name, mode, tuple(json.loads(sensors)), cursor_from_text(cursor) if cursor else None, seen_s)
-            for name, mode, sensors, cursor, seen_s in found
+            Branch(name, mode, tuple(json.loads(sensors)), cursor_from_text(cursor) if cursor else None, seen_s, born)
+            for name, mode, sensors, cursor, seen_s, born in found
         ]
 
     def audit(self, what: str, detail: str) -> None:

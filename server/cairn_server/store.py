@@ -16,6 +16,7 @@ from cairn_map.ids import Author, CommitId
 from cairn_map.messages import LogEntry
 from cairn_map.sensor_model import SensorModel
 from cairn_map.version_vector import VersionVector
+from cairn_server.branch_notes import BranchNotes
 from cairn_server.quota_store import Uses
 from cairn_server.store_health import StoreHealth
 from cairn_server.store_rows import (
@@ -114,6 +115,11 @@ class Store(Protocol):
     @property
     def uses(self) -> Uses:
         """How much was pushed."""
+        ...
+
+    @property
+    def notes(self) -> BranchNotes:
+        """What else is kept of branches."""
         ...
 
     def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:

@@ -133,6 +133,8 @@ class Branch:
     sensors: tuple[str, ...]
     cursor: Cursor | None
     last_seen_s: float
+    incarnation: str = ""
+    """With which it registered last; empty in stores of old."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,6 +13,7 @@ from tests.cairn_server.test_push import kind_of
 
 from cairn_map.cell_code import decode_cell
 from cairn_map.cell_files import CELL_MEDIA_TYPE
+from cairn_map.commit import make_commit
 from cairn_map.cursor import cursor_from_text
 from cairn_map.fingerprint import fingerprint
 from cairn_map.grid import cell_of_key
@@ -139,3 +140,16 @@ def test_an_equal_map_is_found_and_another_of_its_name_refused(live: Live, row: 
     assert live.http.put(f"/maps/{row.name}", json=body).status_code == 200
     other = live.http.put(f"/maps/{row.name}", json={"geometry": {"voxel_edge_um": 10_000}})
     assert (other.status_code, kind_of(other)) == (409, "map_exists")
+
+
+def test_log_entries_tell_their_parent_and_what_their_author_had_seen(live: Live) -> None:
+    made = live.new_map()
+    first = pushed(0, 0)
+    seen = live.http.get(f"/maps/{made.name}").json()["cursor"]
+    meta = pushed(1, 1).meta.model_copy(update={"parent": first.sha.hex(), "seen": seen})
+    for commit in (first, make_commit(meta, {}, made.geometry)):
+        live.push(made, commit)
+    live.push(made, make_commit(meta.model_copy(update={"retracts": (str(first.id),)}), {}, made.geometry))
+    live.folded(made)
+    entries = live.http.get(f"/maps/{made.name}/log").json()
+    assert [(entry["parent"], entry["seen"]) for entry in entries][:2] == [(None, None), (first.sha.hex(), seen)]

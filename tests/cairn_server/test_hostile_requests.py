@@ -23,6 +23,8 @@ SOUND: dict[str, list[bytes]] = {
     "POST /maps/{name}/branches": [b'{"robot":"mole","incarnation":"0123456789abcdef"}'],
     "PUT /maps/{name}/commits/{commit}": [COMMIT.data],
     "POST /maps/{name}/retracts": [b'{"robot":"mole"}', json.dumps({"commits": [str(COMMIT.id)]}).encode()],
+    "PUT /maps/{name}/branches/{branch}/status": [b'{"time_s":1,"battery":0.5,"note":"x"}'],
+    "PUT /maps/{name}/branches/{branch}/view": [b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"],
     "POST /maps/{name}/branches/{branch}/missing": [
         MissingRequest().model_dump_json().encode(),
         json.dumps({"cursor": CURSOR, "cells": [{"cell": [0, 0, 0], "cursor": None}]}).encode(),
@@ -107,8 +109,10 @@ HEADERS = st.fixed_dictionaries(
     },
 )
 QUERIES = st.dictionaries(
-    st.sampled_from(["after", "limit", "author", "box", "é"]),
-    st.sampled_from(["", "0", "-1", "1e9", str(10**30), "mole.0123456789abcdef", "\0", "x" * 5000, "NaN"]),
+    st.sampled_from(["after", "limit", "author", "box", "depth", "at", "é"]),
+    st.sampled_from(
+        ["", "0", "-1", "1e9", str(10**30), "mole.0123456789abcdef", "\0", "x" * 5000, "NaN", "0,0,0,1,1,1", CURSOR]
+    ),
     max_size=3,
 )
 

@@ -15,6 +15,7 @@ from cairn_map.messages import CURSORS_MAX
 from cairn_server import (
     body_limit,
     cell_changes,
+    cell_routes,
     check_pool,
     commit_checks,
     commit_cost,
@@ -93,6 +94,8 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
     [
         ("body of a push", COMMIT_BYTES_MAX),
         ("body of `missing`", body_limit.MISSING_BYTES_MAX),
+        ("body of a status", body_limit.STATUS_BYTES_MAX),
+        ("body of a view", body_limit.VIEW_BYTES_MAX),
         ("any other body", body_limit.JSON_BYTES_MAX),
         ("cells listed in `missing`", CURSORS_MAX),
         ("commits named in one retract request", RETRACTS_MAX),
@@ -104,6 +107,7 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("dear commits that wait for a worker", check_pool.WAITING_MAX),
         ("live streams of one token", live.LISTENERS_OF_TOKEN_MAX),
         ("live streams", live.LISTENERS_MAX),
+        ("header `Cairn-Coverage`", cell_routes.COVERAGE_BYTES_MAX),
         ("cells in one live event", live_events.CELLS_MAX),
         ("problem's `detail`", problems.DETAIL_CHARACTERS_MAX),
         ("until a request's head is whole", Settings().head_s),

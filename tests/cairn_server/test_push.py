@@ -163,5 +163,5 @@ def test_a_busy_robot_s_row_is_written_now_and_then_only(live: Live) -> None:
     for n in (0, 1):
         live.push(row, pushed(n, 1), headers=headers)
         live.new_map()  # is written after what was only noted before it
-        seen.append(live.http.get(f"/maps/{row.name}/branches").json())
+        seen.append(live.service.store.branches(row))
     assert seen[0] == seen[1]

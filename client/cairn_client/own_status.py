@@ -1,0 +1,48 @@
+"""What a robot tells of itself with every sync: where it is, what waits, how it is doing. Losing one costs nothing."""
+
+import logging
+import time
+from dataclasses import dataclass
+
+from pydantic import ValidationError
+
+from cairn_client.api import MapApi
+from cairn_client.replica import Replica
+from cairn_map.commit import ScanPose
+from cairn_map.errors import CairnError, first_error
+from cairn_map.robot_status import Mode, RobotStatus
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class OwnStatus:
+    """Set its fields at any time; the next sync tells them."""
+
+    pose: ScanPose | None = None
+    """Of the last scan, unless something better is known."""
+    battery: float | None = None
+    """Charge, 0 to 1."""
+    note: str = ""
+    """Anything else for people, to 256 characters."""
+
+    def tell(self, replica: Replica, api: MapApi, map_name: str, *, branch: str, mode: Mode) -> None:
+        """Send it; a failure is logged and is no failure of the sync."""
+        try:
+            with replica.lock:
+                waiting = replica.push_set()
+                waiting_bytes = replica.store.data_bytes(waiting)
+            status = RobotStatus(
+                time_s=time.time(),
+                pose=self.pose,
+                mode=mode,
+                waiting=len(waiting),
+                waiting_bytes=waiting_bytes,
+                battery=self.battery,
+                note=self.note,
+            )
+            api.put_status(map_name, branch, status)
+        except ValidationError as exc:
+            log.warning("this robot's status cannot be told: %s", first_error(exc))
+        except CairnError as exc:
+            log.info("this robot's status was not taken: %s: %s", exc.kind, exc.message)
