@@ -20,6 +20,7 @@ STATUS_BYTES_MAX = 1 << 14
 VIEW_BYTES_MAX = 1 << 20
 LIMITS = (
     (re.compile(r"/maps/[^/]*/commits/[^/]*"), COMMIT_BYTES_MAX),
+    (re.compile(r"/maps/[^/]*/main/cells/[^/]*"), COMMIT_BYTES_MAX),
     (re.compile(r"/maps/[^/]*/branches/[^/]*/missing"), MISSING_BYTES_MAX),
     (re.compile(r"/maps/[^/]*/branches/[^/]*/status"), STATUS_BYTES_MAX),
     (re.compile(r"/maps/[^/]*/branches/[^/]*/view"), VIEW_BYTES_MAX),

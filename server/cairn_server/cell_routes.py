@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Header, Query, Request, Response
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
 
 from cairn_map.cell_files import CELL_MEDIA_TYPE, FORMS, MEDIA_TYPES, cell_file
 from cairn_map.cursor import cursor_from_text
@@ -14,7 +14,7 @@ from cairn_map.version_vector import vector_digest, vector_text
 from cairn_map.view import ViewStyle
 from cairn_map.view_code import encode_view
 from cairn_server.cells_at_rest import stored_evidence
-from cairn_server.http_access import READERS, Map, Operations
+from cairn_server.http_access import READERS, Map, Operations, body_of
 from cairn_server.http_ranges import is_same, part_of
 from cairn_server.problems import answer_to
 from cairn_server.store_rows import CellRow, Head, MapRow
@@ -124,3 +124,9 @@ def _coverage(head: Head) -> dict[str, str]:
     if len(text) <= COVERAGE_BYTES_MAX:
         return {"Cairn-Coverage": text}
     return {"Cairn-Coverage-Digest": vector_digest(head.vector)}
+
+
+@router.put("/maps/{name}/main/cells/{cell}", status_code=204, dependencies=READERS)
+def heal_cell(cell: str, service: Operations, row: Map, data: Annotated[bytes, Depends(body_of)]) -> None:
+    """Put right a cell that the server's disk damaged: only the very bytes that it had are taken."""
+    service.heal_cell(row, cell_key(cell_from_text(cell)), data)

@@ -1,19 +1,27 @@
 """Cells as the store has them, checked when they are read; and made anew from the log when they are damaged."""
 
 import logging
+import threading
+import zlib
+from collections import OrderedDict
 from collections.abc import Iterable
+from dataclasses import replace
 
 from cairn_map.brick_cell import BrickCell
-from cairn_map.cell_code import DecodedCell, decode_cell
+from cairn_map.cell_code import DecodedCell, decode_cell, encode_cell
 from cairn_map.cursor import ENTRY_FOLD
 from cairn_map.errors import CairnError, DamagedDataError
 from cairn_map.evidence import Evidence
+from cairn_map.fingerprint import Fingerprint, fingerprint
 from cairn_map.grid import CellKey, Geometry, cell_of_key
 from cairn_server.stamps import Stamps, decode_stamps, no_stamps
 from cairn_server.store import Snapshot
 from cairn_server.store_rows import CellRow, Contribution
 
 log = logging.getLogger(__name__)
+
+SOUND_MAX = 50_000
+"""Cells remembered as sound, some 300 bytes each."""
 
 
 def stored_evidence(stored: CellRow) -> Evidence:
@@ -25,7 +33,53 @@ def stored_evidence(stored: CellRow) -> Evidence:
     decoded = decode_stored(stored.key, stored.body)
     if decoded.digest != stored.digest:
         raise DamagedDataError("damaged_store", f"cell {cell_of_key(stored.key)} at rest does not have its digest")
+    if fingerprint(decoded.evidence, stored.key) != stored.fingerprint:
+        raise DamagedDataError("damaged_store", f"cell {cell_of_key(stored.key)} at rest does not have its fingerprint")
     return decoded.evidence
+
+
+def sound_cell(snapshot: Snapshot, key: CellKey, geometry: Geometry, healed: list[CellRow]) -> CellRow | None:
+    """A cell whose bytes may be sent, made anew from the log if those at rest are damaged; None: never seen.
+
+    Bytes that were found sound are remembered by their checksum, so that only new ones are decoded. What was made anew
+    is added to `healed`, for the caller to write once nothing is read any more.
+
+    Raises:
+        DamagedDataError: kind `damaged_store`: it is damaged, and the log does not tell any more what it was.
+    """
+    stored = snapshot.cell(key)
+    if stored is None or _SOUND.knows(stored):
+        return stored
+    try:
+        stored_evidence(stored)
+    except DamagedDataError as exc:
+        log.error("%s; making it anew from the log", exc.message)
+        anew = _proven_anew(snapshot, stored, geometry, exc)
+        healed.append(anew)
+        return anew
+    _SOUND.note(stored)
+    return stored
+
+
+def rebuilt_cell(snapshot: Snapshot, stored: CellRow, geometry: Geometry) -> CellRow:
+    """What the log says that a cell is.
+
+    Raises:
+        DamagedDataError: kind `damaged_store`: a diff is not sound, or not kept any more.
+    """
+    if stored.gone_seq:
+        raise DamagedDataError("damaged_store", "evidence that it was made from is not kept any more")
+    contributions = snapshot.contributions(stored.key, after_seq=0)
+    evidence = sum_of_contributions(snapshot, stored.key, contributions, geometry).packed()
+    encoded = encode_cell(stored.key, evidence, geometry)
+    return replace(
+        stored,
+        digest=encoded.digest,
+        fingerprint=fingerprint(evidence, stored.key),
+        voxels=len(evidence),
+        body=encoded.data,
+        size_bytes=len(encoded.data),
+    )
 
 
 def decode_stored(key: CellKey, body: bytes) -> DecodedCell:
@@ -35,9 +89,12 @@ def decode_stored(key: CellKey, body: bytes) -> DecodedCell:
         DamagedDataError: kind `damaged_store`.
     """
     try:
-        return decode_cell(body)
+        decoded = decode_cell(body)
     except CairnError as exc:
         raise DamagedDataError("damaged_store", f"cell {cell_of_key(key)} at rest: {exc.message}") from exc
+    if decoded.key != key:
+        raise DamagedDataError("damaged_store", f"cell {cell_of_key(key)} at rest is cell {cell_of_key(decoded.key)}")
+    return decoded
 
 
 def sum_of_contributions(
@@ -84,8 +141,52 @@ def cell_to_change(snapshot: Snapshot, key: CellKey, geometry: Geometry) -> tupl
     try:
         cell.merge(stored_evidence(stored))
     except DamagedDataError as exc:
-        if stored.gone_seq:
-            raise
         log.error("%s; making it anew from the log", exc.message)
-        return sum_of_contributions(snapshot, key, snapshot.contributions(key, after_seq=0), geometry), stamps
+        cell.merge(stored_evidence(_proven_anew(snapshot, stored, geometry, exc)))
     return cell, stamps
+
+
+def _proven_anew(snapshot: Snapshot, stored: CellRow, geometry: Geometry, why: DamagedDataError) -> CellRow:
+    """A damaged cell made anew, if its digest or its fingerprint says that the log still tells all of it."""
+    try:
+        anew = rebuilt_cell(snapshot, stored, geometry)
+    except DamagedDataError as exc:
+        raise DamagedDataError(
+            "damaged_store",
+            f"{why.message}, and cannot be made anew: {exc.message}; send the cell as it was, or restore a backup",
+        ) from exc
+    if anew.digest != stored.digest and anew.fingerprint != stored.fingerprint:
+        raise DamagedDataError(
+            "damaged_store",
+            f"{why.message}, and its commits do not add up to it; send the cell as it was, or restore a backup",
+        )
+    return anew
+
+
+class _SoundBodies:
+    """Cells whose bytes were found to be what their digest says, by checksum; thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._known: OrderedDict[tuple[bytes, Fingerprint, int, int], None] = OrderedDict()
+
+    def knows(self, stored: CellRow) -> bool:
+        """Whether these very bytes were found sound."""
+        facts = _facts(stored)
+        with self._lock:
+            return facts in self._known
+
+    def note(self, stored: CellRow) -> None:
+        """They were."""
+        facts = _facts(stored)
+        with self._lock:
+            self._known[facts] = None
+            if len(self._known) > SOUND_MAX:
+                self._known.popitem(last=False)
+
+
+def _facts(stored: CellRow) -> tuple[bytes, Fingerprint, int, int]:
+    return stored.digest, stored.fingerprint, len(stored.body), zlib.crc32(stored.body)
+
+
+_SOUND = _SoundBodies()

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from cairn_map.cell_code import encode_cell
 from cairn_map.cursor import Cursor, cursor_from_text
-from cairn_map.errors import BadInputError, ConflictError
+from cairn_map.errors import BadInputError, ConflictError, DamagedDataError
 from cairn_map.evidence import empty_evidence
 from cairn_map.fingerprint import ZERO, Fingerprint
 from cairn_map.frames import CELL_HEAD, CellFrame, Frame, FrameKind
@@ -19,6 +19,7 @@ from cairn_map.ids import Author, author_from_text
 from cairn_map.messages import Done, MissingRequest, More, ReplyHeader
 from cairn_map.version_vector import VersionVector
 from cairn_server.cell_changes import change_since
+from cairn_server.cells_at_rest import sound_cell
 from cairn_server.read_cache import ReadCache
 from cairn_server.store import Snapshot
 from cairn_server.store_rows import CellRow
@@ -41,6 +42,8 @@ class Asker:
     box: tuple[Cell, Cell] | None = None
     size_bytes_max: int = REPLY_BYTES_MAX
     unproven: set[Cursor] = field(default_factory=set)
+    healed: list[CellRow] = field(default_factory=list)
+    """Damaged cells that were made anew for it."""
 
     def wants(self, key: CellKey) -> bool:
         """Whether a cell lies in the box that is asked for."""
@@ -129,9 +132,18 @@ def _frame_for(
         change = change_since(snapshot, row, start, geometry, cache, asker=asker.author, kinds=asker.kinds)
         if change is not None:
             return change
-    stored = snapshot.cell(row.key)
-    body = stored.body if stored else b""
+    body = _body(snapshot, row.key, geometry, asker.healed)
     return _frame(FrameKind.FULL, row.key, start, snapshot.head.cursor, row.fingerprint, body)
+
+
+def _body(snapshot: Snapshot, key: CellKey, geometry: Geometry, healed: list[CellRow]) -> bytes:
+    """A cell's bytes; none if they are damaged for good, which its asker reports, while all other cells come."""
+    try:
+        stored = sound_cell(snapshot, key, geometry, healed)
+    except DamagedDataError as exc:
+        log.error("cell %s is sent without its bytes: %s", cell_of_key(key), exc.message)
+        return b""
+    return stored.body if stored else b""
 
 
 def _unknown_cell(key: CellKey, asker: Asker, start: Cursor | None, to: Cursor, geometry: Geometry) -> CellFrame | None:

@@ -10,6 +10,12 @@ Without a token it trusts whoever reaches it, and therefore only listens on this
 put a secret of at least 16 characters into a file and name it with --admin-token-file; robots register with
 --enrolment-token-file's secret. CAIRN_ADMIN_TOKEN and CAIRN_ENROLMENT_TOKEN do the same from the environment.
 `cairn token` gives tokens for less than everything. Beyond a network that you trust, use --tls-cert and --tls-key.
+
+Three more commands look after the folder (docs/operations.md); each explains itself with --help:
+
+    cairn serve backup --data DIR FILE      copy the store into one file, while the server runs
+    cairn serve restore FILE --data DIR     make a folder out of such a file
+    cairn serve check --data DIR            read everything and say what is damaged; --repair heals it
 """
 
 import argparse
@@ -18,6 +24,7 @@ import os
 import signal
 import socket
 import sys
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from types import FrameType
@@ -28,6 +35,7 @@ from fastapi import FastAPI
 from pydantic import ValidationError
 
 from cairn_map.errors import BadInputError
+from cairn_server import backup_command, check_command, restore_command
 from cairn_server.http_deadlines import protocol_of
 from cairn_server.log_format import LogForm, start_logging
 from cairn_server.routes import make_app
@@ -46,6 +54,11 @@ WEBSOCKETS: dict[str, Any] = {"ws": "websockets-sansio", "ws_max_size": 1 << 12,
 SWITCH_S = 0.0005
 """How soon a thread that computes lets another one have the interpreter: a push needs it some ten times on its way, and
 would wait for the folder each time."""
+COMMANDS: dict[str, Callable[[list[str]], int]] = {
+    "backup": backup_command.main,
+    "restore": restore_command.main,
+    "check": check_command.main,
+}
 FLAG_OF_SETTING = {
     "port": "--port",
     "admin_token": "--admin-token-file or CAIRN_ADMIN_TOKEN",
@@ -68,7 +81,9 @@ QUOTA_FLAGS = {
 
 
 def main(argv: list[str]) -> int:
-    """Run until stopped."""
+    """Run until stopped, or one of the commands beside that."""
+    if argv and argv[0] in COMMANDS:
+        return COMMANDS[argv[0]](argv[1:])
     settings = _settings(argv)
     settings.check_reach()
     settings.check_tls()

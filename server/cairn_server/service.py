@@ -4,6 +4,7 @@ Acknowledge only what is durable and fully validated; fold afterwards, in groups
 called from many threads.
 """
 
+import threading
 import time
 from itertools import chain
 
@@ -29,9 +30,11 @@ from cairn_map.messages import (
 from cairn_map.version_vector import VersionVector
 from cairn_server.auth import Caller, Role, new_token, token_hash
 from cairn_server.branch_list import branch_infos
+from cairn_server.cells_at_rest import sound_cell
 from cairn_server.commit_checks import CommitChecks
 from cairn_server.fold_health import FoldHealth
 from cairn_server.folder import Folder
+from cairn_server.healing import heal_cell, keep_healed
 from cairn_server.live import Hub
 from cairn_server.missing import asker_from_request, header_of, reply_frames
 from cairn_server.push_policy import check_claims
@@ -68,6 +71,7 @@ class Service:
         self._meter = Meter(store, settings.quotas)
         self._stable = StableVectors(settings.stable_after_s)
         self._reads = ReadCache()
+        self._healing = threading.Lock()
         self.operator = new_incarnation()
         """Of the retracts made here. A new one with every start: a restored server must not number over lost ones."""
 
@@ -157,6 +161,7 @@ class Service:
             stable = self._stable.of(row, snapshot)
             frames = reply_frames(snapshot, asker, row.geometry, self._reads, stable=stable)
             parts += [encode_frame(f) for f in self.figures.counted(frames)]
+        keep_healed(self.store, row, asker.healed)
         self.store.seen(row, branch, asker.cursor)
         self.live.robot_heard(row, branch, **({"cursor": str(asker.cursor)} if asker.cursor else {}))
         return b"".join(parts)
@@ -220,9 +225,23 @@ class Service:
         )
 
     def cell(self, row: MapRow, key: CellKey) -> tuple[CellRow | None, Head]:
-        """One cell (None: never seen) and the state that it was read from."""
+        """One cell (None: never seen) and the state that it was read from.
+
+        Raises:
+            DamagedDataError: kind `damaged_store`: it is damaged, and nothing here says what it was.
+        """
+        healed: list[CellRow] = []
         with self.store.snapshot(row) as snapshot:
-            return snapshot.cell(key), snapshot.head
+            found, head = sound_cell(snapshot, key, row.geometry, healed), snapshot.head
+        keep_healed(self.store, row, healed)
+        return found, head
+
+    def heal_cell(self, row: MapRow, key: CellKey, data: bytes) -> bool:
+        """Put a damaged cell right with bytes that somebody still has; False if it is sound."""
+        with self._healing:
+            is_healed = heal_cell(self.store, row, key, data)
+        self._folder.wake()
+        return is_healed
 
     def vector_at(self, row: MapRow, cursor: Cursor) -> VersionVector:
         """The ids folded at or before a cursor of late."""

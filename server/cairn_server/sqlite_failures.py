@@ -1,6 +1,8 @@
 """What a failure of SQLite means to whoever asked: a full disk, damaged pages, or a store that cannot work now."""
 
 import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import apsw
 
@@ -30,3 +32,16 @@ def read_failure(exc: apsw.Error) -> CairnError:
     if isinstance(exc, apsw.CorruptError | apsw.NotADBError):
         return DamagedDataError("damaged_store", f"the store's file is damaged: {exc}; see `cairn serve check`")
     return UnreachableError("store_failed", f"the store could not read: {exc}", retry_after_s=RETRY_S)
+
+
+@contextmanager
+def damaged_pages() -> Iterator[None]:
+    """Reading one thing whose pages may be damaged, without giving up what can be read beside it.
+
+    Raises:
+        DamagedDataError: kind `damaged_store`.
+    """
+    try:
+        yield
+    except (apsw.CorruptError, apsw.NotADBError) as exc:
+        raise read_failure(exc) from exc

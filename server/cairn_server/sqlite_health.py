@@ -11,6 +11,7 @@ from cairn_server.sqlite_failures import disk_full
 from cairn_server.sqlite_readers import Readers
 from cairn_server.sqlite_writer import Writer, rows
 from cairn_server.store_health import Backlog, StoreFigures
+from cairn_server.store_rows import CellRow, MapRow
 
 PROBE_S = 5.0
 """A writer that does not get to the probe in this time does not keep up."""
@@ -59,6 +60,20 @@ class SqliteHealth:
                 f"{free_bytes} bytes are free on the server's disk, it keeps {free_bytes_min}; make room, or lower "
                 "--disk-free-min"
             )
+
+    def heal(self, row: MapRow, cell: CellRow) -> bool:
+        """Put sound bytes in the place of a damaged cell; False if it changed meanwhile."""
+        values = (cell.digest, cell.fingerprint.to_bytes(), cell.voxels, cell.size_bytes, cell.body)
+
+        def job(connection: apsw.Connection) -> bool:
+            connection.execute(
+                "UPDATE cell SET digest = ?, fingerprint = ?, voxels = ?, size_bytes = ?, body = ?"
+                " WHERE map = ? AND cell = ? AND lm = ?",
+                (*values, row.number, cell.key, cell.lm),
+            )
+            return connection.changes() > 0
+
+        return self._writer.run(job)
 
     def probe(self) -> None:
         """Write something that changes nothing, as durably as a commit."""

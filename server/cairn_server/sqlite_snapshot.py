@@ -12,6 +12,7 @@ from cairn_map.grid import CellKey, cell_of_key
 from cairn_map.ids import Author, CommitId, commit_id_from_text
 from cairn_map.messages import LogEntry
 from cairn_map.version_vector import EMPTY, VersionVector, version_vector_from_json
+from cairn_server.sqlite_failures import damaged_pages
 from cairn_server.sqlite_writer import first, rows
 from cairn_server.store_rows import CellRow, Contribution, Head, Selection, Totals
 
@@ -55,11 +56,12 @@ class SqliteSnapshot:
 
     def cell(self, key: CellKey) -> CellRow | None:
         """One cell with its body."""
-        row = first(
-            self._connection,
-            f"SELECT {CELL_COLUMNS}, body, stamps FROM cell WHERE map = ? AND cell = ?",  # noqa: S608 - constant columns
-            (self._map, key),
-        )
+        with damaged_pages():
+            row = first(
+                self._connection,
+                f"SELECT {CELL_COLUMNS}, body, stamps FROM cell WHERE map = ? AND cell = ?",  # noqa: S608 - constant columns
+                (self._map, key),
+            )
         return cell_row(row) if row else None
 
     def cells(self, *, after_seq: int = -1) -> Iterator[CellRow]:
@@ -87,7 +89,8 @@ class SqliteSnapshot:
 
     def diff(self, number: int) -> bytes | None:
         """The bytes of a contribution; None if they are not kept any more."""
-        body: bytes | None = first(self._connection, "SELECT body FROM diff WHERE number = ?", (number,))
+        with damaged_pages():
+            body: bytes | None = first(self._connection, "SELECT body FROM diff WHERE number = ?", (number,))
         return body
 
     def tip(self, author: Author) -> tuple[int, bytes] | None:

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Protocol
 
+from cairn_server.store_rows import CellRow, MapRow
+
 
 @dataclass(frozen=True, slots=True)
 class Backlog:
@@ -51,6 +53,10 @@ class StoreHealth(Protocol):
         Raises:
             UnreachableError: kind `disk_full`.
         """
+        ...
+
+    def heal(self, row: MapRow, cell: CellRow) -> bool:
+        """Put sound bytes in the place of a damaged cell; False if it changed meanwhile. Durable on return."""
         ...
 
     def probe(self) -> None:

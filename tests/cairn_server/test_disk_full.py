@@ -15,8 +15,9 @@ from tests.cairn_server.tiny_disk import TinyDisk, tiny_disk
 
 from cairn_client.api import MapApi
 from cairn_map.commit import Commit
-from cairn_map.errors import UnreachableError
+from cairn_map.errors import BadInputError, UnreachableError
 from cairn_map.grid import cell_of_key
+from cairn_server.serve_command import main
 
 
 @pytest.fixture
@@ -24,6 +25,13 @@ def disk(tmp_path: Path) -> Iterator[TinyDisk]:
     """Room for a store, and not for much more."""
     with tiny_disk(tmp_path / "disk", size_mb=6) as found:
         yield found
+
+
+@pytest.mark.parametrize("option", ["--disk-free-min=-1", "--disk-free-min=nan", "--fold-lag-max=0"])
+def test_a_bound_that_is_none_is_refused(option: str, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=option.split("=")[0]) as refused:
+        main(["--data", str(tmp_path), option])
+    assert refused.value.kind == "bad_setting"
 
 
 def push(http: httpx.Client, commit: Commit) -> httpx.Response:
@@ -91,13 +99,13 @@ def ready_reasons(http: httpx.Client) -> str:
 
 
 def test_space_is_kept_free_in_which_what_was_acknowledged_is_folded(disk: TinyDisk) -> None:
-    process = Process(disk.folder / "data", "--disk-free-min", "3")
+    process = Process(disk.folder / "data", "--disk-free-min", "4.5")
     with client(process) as http:
         make_map(http)
         assert http.get("/readyz").json() == {"status": "ready"}
         acked, refusal = push_until_full(http, 0)
         assert_refusal(refusal)
-        assert "keeps 3145728" in refusal.json()["detail"]
+        assert "keeps 4718592" in refusal.json()["detail"]
         assert ready_reasons(http).startswith("disk_full: ")
         assert_map_is(http, acked)
     process.send(signal.SIGTERM)

@@ -149,6 +149,7 @@ def test_a_damaged_cell_is_an_error_of_the_server_when_read(live: Live) -> None:
     store = live.service.store
     assert isinstance(store, SqliteStore)
     damage(store, "UPDATE cell SET body = ? WHERE map = ?", b"x", row.number)
+    damage(store, "UPDATE diff SET body = ? WHERE commit_number = (SELECT max(number) FROM commits)", b"x")
     answer = live.http.get(f"/maps/{row.name}/main/cells/{cell_of_key(next(iter(commit.cells)))}.npz")
     assert (answer.status_code, answer.json()["kind"]) == (500, "damaged_store")
 

@@ -1,5 +1,6 @@
 """`GET /metrics`: what is counted, and that it is the format that Prometheus reads."""
 
+import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,7 +9,7 @@ import pytest
 from tests.cairn_server.live import Live
 from tests.cairn_server.prometheus_text import families_of, value
 from tests.cairn_server.pushes import MOLE, pushed
-from tests.cairn_server.test_protocol_document import DOCUMENT
+from tests.cairn_server.test_protocol_document import DOCUMENT, ROOT
 
 from cairn_server import folder, metrics
 from cairn_server.metrics import Counter, Histogram
@@ -34,6 +35,11 @@ def test_the_names_in_the_document_are_those_of_the_page(live: Live) -> None:
     named = [part.strip("` ") for line in section.splitlines() if "_" in line for part in line.split("|")[1:2]]
     names = {name for text in named for name in text.replace("`", "").split(", ") if name.startswith(("cairn", "proc"))}
     assert names == set(families_of(text_of(live)))
+
+
+def test_the_alarms_in_the_handbook_are_about_figures_that_there_are(live: Live) -> None:
+    names = set(re.findall(r"cairn_[a-z_]+", (ROOT / "docs" / "operations.md").read_text()))
+    assert names - {"cairn_server"} <= set(families_of(text_of(live)))
 
 
 def test_pushes_are_counted_by_outcome_with_their_bytes(fresh: Live) -> None:

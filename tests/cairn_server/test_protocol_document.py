@@ -92,7 +92,7 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
 @pytest.mark.parametrize(
     ("row", "number"),
     [
-        ("body of a push", COMMIT_BYTES_MAX),
+        ("body of a push, or of a cell", COMMIT_BYTES_MAX),
         ("body of `missing`", body_limit.MISSING_BYTES_MAX),
         ("body of a status", body_limit.STATUS_BYTES_MAX),
         ("body of a view", body_limit.VIEW_BYTES_MAX),
