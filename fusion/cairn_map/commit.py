@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError, model_validator
 
 from cairn_map.cell_code import DecodedCell, Profile, decode_canonical_cell, decode_cell, encode_cells
 from cairn_map.cell_head import CellHead, decode_head
@@ -67,12 +67,14 @@ class CommitMeta(BaseModel):
     """Cursor of the server's state that the author had when it made this."""
     captured_s: tuple[Finite, Finite] | None = None
     """First and last scan, UTC seconds since 1970."""
-    scans: Annotated[tuple[ScanPose, ...], Field(max_length=4096)] = ()
-    sensors: Annotated[tuple[Annotated[str, Field(max_length=64)], ...], Field(max_length=64)] = ()
+    scans: Annotated[tuple[ScanPose, ...], Field(max_length=4096), FailFast()] = ()
+    sensors: Annotated[tuple[Annotated[str, Field(max_length=64)], ...], Field(max_length=64), FailFast()] = ()
     rig: Hex32 | None = None
     integrator: Annotated[str, Field(max_length=256)] = ""
     """Name, version and parameters of what turned images into evidence."""
-    retracts: Annotated[tuple[Annotated[str, Field(max_length=96)], ...], Field(max_length=RETRACTS_MAX)] = ()
+    retracts: Annotated[
+        tuple[Annotated[str, Field(max_length=96)], ...], Field(max_length=RETRACTS_MAX), FailFast()
+    ] = ()
     note: Annotated[str, Field(max_length=1024)] = ""
     kind: Literal["commit"] = "commit"
 

@@ -5,7 +5,7 @@ Fields that hold cursors, fingerprints or version vectors carry their text forms
 
 from typing import Annotated, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field, ValidationError, model_validator
 
 from cairn_map.cursor import Cursor, cursor_from_text
 from cairn_map.errors import DamagedDataError, first_error
@@ -32,8 +32,29 @@ CURSORS_MAX = 100_000
 SELECTING_PARTS = ("robot", "rig", "pushed_after_s", "pushed_before_s", "captured_after_s", "captured_before_s")
 
 
+FIELDS_MAX = 64
+"""Of one object; more than any message here has."""
+
+
 class _Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+def _tuple_of(value: object) -> object:
+    """A JSON array as it must be where what was read is looked at before it is checked."""
+    return tuple(value) if isinstance(value, list) else value
+
+
+class _LongRequest(_Model):
+    """A request of which a server reads megabytes."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_few_fields(cls, value: object) -> object:
+        # Each unknown field is an error of its own: a million of them would take minutes and gigabytes.
+        if isinstance(value, dict) and len(value) > FIELDS_MAX:
+            raise ValueError(f"{len(value)} fields, at most {FIELDS_MAX} can be known")
+        return value
 
 
 class CreateMap(_Model):
@@ -103,14 +124,14 @@ class Pushed(_Model):
     state: Literal["new", "known"]
 
 
-class CellCursor(_Model):
+class CellCursor(_LongRequest):
     """One cell whose cursor differs from the request's default; None: hold nothing of it."""
 
-    cell: tuple[int, int, int]
+    cell: Annotated[tuple[int, int, int], BeforeValidator(_tuple_of)]
     cursor: CursorText | None
 
 
-class MissingRequest(_Model):
+class MissingRequest(_LongRequest):
     """Body of `POST /maps/{map}/branches/{branch}/missing`: what the asker holds."""
 
     author: Annotated[str, Field(max_length=80)] | None = None

@@ -226,9 +226,11 @@ class SqliteStore:
         """Finish what was accepted and close."""
         with suppress(UnreachableError):  # closed before
             self.tokens.write_used()
-        self._writer.close()
-        self._readers.close()
-        self._lock.close()
+        try:
+            self._writer.close()
+            self._readers.close()
+        finally:
+            self._lock.close()
 
     def _map_rows(self, clause: str, values: Values) -> list[MapRow]:
         query = f"SELECT number, name, geometry, sensor_model, seal_key FROM map {clause}"  # noqa: S608 - our own clause

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -112,10 +113,12 @@ class Process:
     """`cairn serve` as a process of its own; `url` is None if it did not start."""
 
     def __init__(self, folder: Path, *arguments: str) -> None:
+        # Not into a pipe: nobody reads it meanwhile, and a server that complains much would wait for ever.
+        self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - `end` closes it
         self._process = subprocess.Popen(
             [sys.executable, "-m", "cairn_client.main", "serve", "--data", str(folder), "--port", "0", *arguments],
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stderr=self._errors,
             text=True,
             env={name: value for name, value in os.environ.items() if not name.startswith("CAIRN_")},
         )
@@ -132,7 +135,15 @@ class Process:
         """A signal."""
         self._process.send_signal(number)
 
+    def peak_mb(self) -> int:
+        """Its largest resident memory so far."""
+        found = re.search(r"VmHWM:\s*(\d+) kB", Path(f"/proc/{self._process.pid}/status").read_text())
+        assert found
+        return int(found[1]) >> 10
+
     def end(self) -> tuple[int, str]:
         """Exit code and what it complained of, once it ended."""
-        _, errors = self._process.communicate(timeout=DEADLINE_S)
-        return self._process.returncode, errors
+        self._process.communicate(timeout=DEADLINE_S)
+        with self._errors:
+            self._errors.seek(0)
+            return self._process.returncode, self._errors.read()

@@ -1,13 +1,14 @@
 """What every store must do, beside a model of a few dictionaries.
 
-Inherit `StoreContract` in a module that has a fixture `store` of module scope; every test makes a map of its own.
+Inherit `StoreContract`, and those of `commit_contract` and `branch_contract`, in a module that has a fixture `store` of
+module scope; every test makes a map of its own.
 """
 
 import itertools
 from dataclasses import dataclass, field
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tests.cairn_map.made import SMALL
 from tests.cairn_server.pushes import MOLE, WREN, Cells, pushed, read, sum_of
@@ -78,7 +79,8 @@ class StoreContract:
     def new_map(self, store: Store) -> MapRow:
         return store.create_map(next(NAMES), SMALL, SensorModel())[0]
 
-    @settings(max_examples=12)
+    # Each store has this test, so that it has several executors.
+    @settings(max_examples=12, suppress_health_check=[HealthCheck.too_slow, HealthCheck.differing_executors])
     @given(steps=st.lists(st.sampled_from([*COMMITS, *RETRACTS, 1, 2, 64]), max_size=16))
     def test_a_store_does_what_dictionaries_do(self, store: Store, steps: list[Commit | int]) -> None:
         row, model = self.new_map(store), Model()

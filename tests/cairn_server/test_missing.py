@@ -1,5 +1,7 @@
 """Fetch-missing: SYNC.md's rules, the server's half, each against an asker made of dictionaries."""
 
+from pathlib import Path
+
 import httpx
 import pytest
 from hypothesis import given, settings
@@ -70,6 +72,44 @@ def test_a_small_change_of_a_large_cell_comes_as_delta_and_the_first_fetch_whole
     frames = cell_frames(fetch(live, row, asker))
     assert set(asker.kinds) == {FrameKind.DELTA}
     assert frames.keys() == pushed(12, 1).cells.keys()
+
+
+def test_a_delta_that_is_larger_than_the_cell_gives_way_to_the_cell(live: Live) -> None:
+    row = live.new_map()
+    asker = NaiveAsker(MOLE)
+    live.push(row, pushed(0, 1, WREN))
+    fetch(live, row, asker)
+    asker.kinds.clear()
+    live.retract(row, pushed(0, 1, WREN))
+    fetch(live, row, asker)
+    assert set(asker.kinds) == {FrameKind.FULL}
+    assert asker.map() == {}
+
+
+def test_what_was_taken_out_is_subtracted_in_a_delta_even_alone(live: Live) -> None:
+    row = live.new_map()
+    asker = NaiveAsker(MOLE)
+    commits = [pushed(n, n, WREN) for n in range(12)]
+    for commit in commits:
+        live.push(row, commit)
+    fetch(live, row, asker)
+    asker.kinds.clear()
+    live.retract(row, commits[0])
+    fetch(live, row, asker)
+    assert set(asker.kinds) == {FrameKind.DELTA}
+    assert asker.map() == sum_of(commits[1:])
+
+
+def test_what_is_pending_is_not_stable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Live(tmp_path, stable_after_s=0) as own:
+        row = own.new_map()
+        own.push(row, pushed(0, 0))
+        own.folded(row)
+        monkeypatch.setattr(own.service._folder, "wake", lambda: None)
+        own.push(row, pushed(1, 1))
+        header = frames_of(ask(own, row, NaiveAsker(MOLE).request()).content)[0]
+        assert isinstance(header, ReplyHeader)
+        assert header.stable == {str(MOLE): [[0, 0]]}
 
 
 def test_own_commits_are_left_out_of_a_delta_but_not_their_retract(live: Live) -> None:

@@ -1,0 +1,91 @@
+"""What every store must do with branches and their tokens."""
+
+import time
+
+import pytest
+from tests.cairn_server.commit_contract import folded_map, new_map
+from tests.cairn_server.pushes import pushed
+
+from cairn_map.errors import NotFoundError
+from cairn_server.store import Store
+from cairn_server.store_rows import Branch, MapRow
+
+
+def branch(name: str, *, mode: str = "high-end", sensors: tuple[str, ...] = ()) -> Branch:
+    """A branch as it is registered."""
+    return Branch(name, mode, sensors, None, 5.0)
+
+
+def token(row: MapRow, text: str) -> bytes:
+    """What stands for a token of that map."""
+    return f"{row.name} {text}".encode()
+
+
+class BranchContract:
+    """Tests of a `Store`."""
+
+    def after_notes(self, store: Store) -> None:
+        """Return when notes are written that were made before."""
+        new_map(store)
+
+    def test_branches_come_by_name_and_belong_to_one_map(self, store: Store) -> None:
+        row, other = new_map(store), new_map(store)
+        for name in ("wren", "mole", "newt"):
+            store.register(row, branch(name, sensors=("tof", "camera")), token(row, name))
+        store.register(other, branch("mole", mode="viewer"), token(other, "mole"))
+        assert [found.name for found in store.branches(row)] == ["mole", "newt", "wren"]
+        assert {found.sensors for found in store.branches(row)} == {("tof", "camera")}
+        assert [(found.name, found.mode) for found in store.branches(other)] == [("mole", "viewer")]
+        store.deregister(row, "mole")
+        assert [found.name for found in store.branches(other)] == ["mole"]
+        with store.snapshot(row) as snapshot:
+            assert snapshot.totals().branches == 2
+
+    def test_a_token_is_known_on_its_map_until_it_is_replaced_or_the_branch_is_gone(self, store: Store) -> None:
+        row, other = new_map(store), new_map(store)
+        store.register(row, branch("mole"), token(row, "old"))
+        store.register(row, branch("wren"), token(row, "wren"))
+        store.register(row, branch("mole"), token(row, "new"))
+        known = [store.branch_of_token(row, token(row, text)) for text in ("old", "new", "wren", "none")]
+        assert known == [None, "mole", "wren", None]
+        assert store.branch_of_token(other, token(row, "new")) is None
+        store.deregister(row, "mole")
+        assert store.branch_of_token(row, token(row, "new")) is None
+        assert store.branch_of_token(row, token(row, "wren")) == "wren"
+
+    def test_a_branch_that_registers_again_keeps_its_cursor(self, store: Store) -> None:
+        row = folded_map(store, pushed(0, 0))
+        store.register(row, branch("mole"), token(row, "1"))
+        with store.snapshot(row) as snapshot:
+            cursor = snapshot.head.cursor
+        store.seen(row, "mole", cursor)
+        store.register(row, branch("mole", mode="low-end", sensors=("tof",)), token(row, "2"))
+        [found] = store.branches(row)
+        assert (found.mode, found.sensors, found.cursor, found.last_seen_s) == ("low-end", ("tof",), cursor, 5.0)
+
+    def test_a_branch_that_was_seen_has_the_time_and_the_newest_cursor(self, store: Store) -> None:
+        row = folded_map(store, pushed(0, 0))
+        store.register(row, branch("mole"), token(row, "1"))
+        start_s = time.time()
+        with store.snapshot(row) as snapshot:
+            cursor = snapshot.head.cursor
+        store.seen(row, "mole", None)
+        self.after_notes(store)
+        [found] = store.branches(row)
+        assert found.cursor is None
+        assert start_s <= found.last_seen_s <= time.time()
+        store.seen(row, "mole", cursor)
+        store.seen(row, "mole", None)
+        self.after_notes(store)
+        assert [found.cursor for found in store.branches(row)] == [cursor]
+
+    def test_who_was_deregistered_is_not_seen_any_more(self, store: Store) -> None:
+        row = new_map(store)
+        store.register(row, branch("mole"), token(row, "1"))
+        store.deregister(row, "mole")
+        store.seen(row, "mole", None)
+        self.after_notes(store)
+        assert store.branches(row) == []
+        with pytest.raises(NotFoundError) as refused:
+            store.deregister(row, "mole")
+        assert refused.value.kind == "no_branch"
