@@ -28,9 +28,12 @@ PICTURES = ("image/jpeg", "image/png")
 BODIES: dict[Route, tuple[str, ...]] = {
     ("put", f"{MAP}/commits/{{commit}}"): (COMMIT_MEDIA_TYPE,),
     ("put", VIEW): PICTURES,
+    ("put", CELL): (CELL_MEDIA_TYPE,),
 }
 ANSWERS: dict[Route, dict[int, tuple[str, ...]]] = {
     ("post", f"{MAP}/branches/{{branch}}/missing"): {200: (REPLY_MEDIA_TYPE,)},
+    ("get", f"{MAP}/commits/{{commit}}"): {200: (COMMIT_MEDIA_TYPE,)},
+    ("get", "/metrics"): {200: ("text/plain",)},
     ("get", CELL): {200: CELL_TYPES, 206: CELL_TYPES, 304: ()},
     ("head", CELL): {200: CELL_TYPES, 304: ()},
     ("get", f"{MAP}/main/vector"): {200: ("application/json",)},
@@ -43,7 +46,11 @@ ALSO: dict[Route, int] = {("put", MAP): 200, ("put", f"{MAP}/commits/{{commit}}"
 """A second status of success with the same body: what was there already, or is new."""
 PROBLEMS: dict[Route, tuple[int, ...]] = {
     ("put", MAP): (409,),
-    ("put", f"{MAP}/commits/{{commit}}"): (409,),
+    ("put", f"{MAP}/commits/{{commit}}"): (409, 429, 507),
+    ("get", f"{MAP}/commits/{{commit}}"): (409,),
+    ("post", f"{MAP}/retracts"): (409,),
+    ("put", "/tokens/{token}"): (409,),
+    ("put", CELL): (409,),
     ("post", f"{MAP}/branches/{{branch}}/missing"): (410,),
     ("get", f"{MAP}/main/vector"): (410,),
     ("get", CELL): (416,),
@@ -56,6 +63,7 @@ HEADERS: dict[Route, tuple[str, ...]] = {
     ("get", CELL): CELL_HEADERS,
     ("head", CELL): CELL_HEADERS,
     ("get", VIEW): ("ETag", "Last-Modified"),
+    ("get", f"{MAP}/commits/{{commit}}"): ("ETag", "Cairn-Seal"),
 }
 BYTES: Json = {"schema": {"type": "string", "format": "binary"}}
 TEXT: Json = {"schema": {"type": "string"}}
@@ -106,7 +114,7 @@ def _correct(route: Route, operation: Json) -> None:
 
 
 def _answer(route: Route, status: int, media_types: tuple[str, ...]) -> Json:
-    kinds = {"application/json": JSON, "text/event-stream": TEXT}
+    kinds = {"application/json": JSON, "text/event-stream": TEXT, "text/plain": TEXT}
     words = {101: "Switching to the WebSocket", 206: "Part", 304: "Still the same"}
     answer: Json = {"description": words.get(status, "Done")}
     if media_types:

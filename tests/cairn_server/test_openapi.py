@@ -59,7 +59,7 @@ def test_every_error_is_a_problem(document: dict[str, Any]) -> None:
             if status == "default" or int(status) >= 400:
                 assert list(answer["content"]) == [PROBLEM], (method, path, status)
         assert {"500", "default"} <= operation["responses"].keys()
-        is_open = path in ("/", "/healthz", "/docs")
+        is_open = path in ("/", "/healthz", "/readyz", "/docs")
         assert ("401" in operation["responses"]) != is_open
         assert bool(operation.get("security")) != is_open
     assert document["components"]["schemas"]["Problem"]["properties"]["kind"]
@@ -100,6 +100,10 @@ def test_answers_of_bytes_are_what_the_document_says(live: Live, row: MapRow, do
         answer = live.push(row, pushed(number, seed))
         assert answer.status_code == status
         check(document, "PUT", commit, answer)
+    for number in (1, 9):
+        check(document, "GET", commit, live.http.get(f"/maps/{row.name}/commits/{pushed(number, 1).id}"))
+    check(document, "PUT", cell, live.http.put(cells, content=live.http.get(cells).content))
+    check(document, "GET", "/metrics", live.http.get("/metrics"))
     view = "/maps/{name}/branches/{branch}/view"
     for picture in (JPEG, PNG, b"neither"):
         check(document, "PUT", view, live.http.put(view.format(name=row.name, branch="mole"), content=picture))
