@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from tests.bench.fetching import fetching_rows
 from tests.bench.pushing import BOMB_BYTES, Bodies, Diff, Robot, bomb, meta_of, served
 
 from cairn_fusion.integrate import Integrator, integrate_scans
@@ -50,7 +51,7 @@ def server_rows(smoke: bool) -> Iterator[Row]:
             yield from _store_rows(name, diffs, geometry, commits=200 if smoke else 10_000)
     yield from _visible_rows(diffs, geometry, pushes=10 if smoke else 200)
     yield from _bomb_rows(diffs[0], geometry)
-    yield "bytes of all but cells, per commit of 10 000 with retention 0", "not measured", "B"
+    yield from fetching_rows(diffs, geometry, smoke)
 
 
 def _diffs(robot: str, geometry: Geometry, *, scale: float, scans: int) -> list[Diff]:
