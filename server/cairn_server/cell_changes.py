@@ -74,11 +74,7 @@ def change_since(
 def _delta(snapshot: Snapshot, row: CellRow, start: Cursor, asker: Author | None, geometry: Geometry) -> bytes | None:
     """Sum of what others did to a cell since `start`; None if that cannot be said or is not worth it."""
     entries = snapshot.contributions(row.key, after_seq=start.seq, limit=DELTA_ENTRIES_MAX + 1)
-    if (
-        start.seq < row.gone_seq
-        or len(entries) > DELTA_ENTRIES_MAX
-        or any(entry.size_bytes is None for entry in entries)
-    ):
+    if start.seq < row.gone_seq or len(entries) > DELTA_ENTRIES_MAX:
         return None
     # What takes an own commit out again is not own: the asker must hear of it (SYNC.md rule 11).
     foreign = [entry for entry in entries if entry.kind != ENTRY_FOLD or entry.author != asker]

@@ -5,6 +5,8 @@ A switch replaces one piece of a source file by another that leaves the rule out
 
 from dataclasses import dataclass
 
+CELLS_CHANGED, RETENTION = "server/cairn_server/cell_changes.py", "server/cairn_server/sqlite_retention.py"
+RETRACTING = "server/cairn_server/retracting.py"
 MISSING, FOLDING = "server/cairn_server/missing.py", "server/cairn_server/folding.py"
 CHANGES, SNAPSHOT = "server/cairn_server/sqlite_changes.py", "server/cairn_server/sqlite_snapshot.py"
 READERS, CELLS = "server/cairn_server/sqlite_readers.py", "server/cairn_server/cell_routes.py"
@@ -73,8 +75,8 @@ SWITCHES = (
         2,
         "a cell's lm is the entry that last changed it",
         FOLDING,
-        "self.start.seq + len(self.entries)))",
-        "self.start.seq + 1))",
+        "seq = self.start.seq + len(self.entries)",
+        "seq = self.start.seq + 1",
         "cairn_server/test_sqlite_store.py::TestSqliteStore::test_a_store_does_what_dictionaries_do",
     ),
     Switch(
@@ -136,7 +138,7 @@ SWITCHES = (
     Switch(
         4,
         "a delta leaves the asker's own commits out",
-        MISSING,
+        CELLS_CHANGED,
         "if entry.kind != ENTRY_FOLD or entry.author != asker]",
         "]",
         "cairn_server/test_missing.py::test_own_commits_are_left_out_of_a_delta_but_not_their_retract",
@@ -144,7 +146,7 @@ SWITCHES = (
     Switch(
         4,
         "own means this incarnation, not this robot",
-        MISSING,
+        CELLS_CHANGED,
         "entry.author != asker]",
         "entry.author.robot != (asker.robot if asker else None)]",
         "cairn_server/test_missing.py::test_the_same_robot_in_another_incarnation_gets_its_old_evidence_back",
@@ -152,31 +154,31 @@ SWITCHES = (
     Switch(
         4,
         "a delta says whether it left own commits out",
-        MISSING,
-        "own_excluded=asker.author is not None,",
-        "own_excluded=True,",
+        CELLS_CHANGED,
+        "own_excluded=kind is FrameKind.DELTA and asker is not None,",
+        "own_excluded=kind is FrameKind.DELTA,",
         "cairn_server/test_missing.py::test_an_asker_without_an_author_is_not_told_that_anything_was_left_out",
     ),
     Switch(
         4,
         "the smaller kind of frame wins",
-        MISSING,
-        "if payload is not None and len(payload) < row.size_bytes:",
-        "if payload is not None:",
+        CELLS_CHANGED,
+        "if state is None and (delta is None or len(delta) >= row.size_bytes):",
+        "if state is None and delta is None:",
         "cairn_server/test_missing.py::test_a_delta_that_is_larger_than_the_cell_gives_way_to_the_cell",
     ),
     Switch(
         4,
         "only who can use a delta gets one",
-        MISSING,
-        "if start is not None and asker.wants_delta:",
-        "if start is not None:",
+        CELLS_CHANGED,
+        'if "delta" in kinds else None',
+        "if True else None",
         "cairn_server/test_missing.py::test_who_cannot_use_a_delta_gets_the_cell_whole",
     ),
     Switch(
         4,
         "what was taken out is subtracted in a delta",
-        MISSING,
+        CELLS_CHANGED,
         "if len(foreign) == 1 and foreign[0].kind == ENTRY_FOLD:",
         "if len(foreign) == 1:",
         "cairn_server/test_missing.py::test_what_was_taken_out_is_subtracted_in_a_delta_even_alone",
@@ -456,7 +458,7 @@ SWITCHES = (
     Switch(
         11,
         "taking out is in every delta, the author's own too",
-        MISSING,
+        CELLS_CHANGED,
         "if entry.kind != ENTRY_FOLD or entry.author != asker]",
         "if entry.author != asker]",
         "cairn_server/test_missing.py::test_own_commits_are_left_out_of_a_delta_but_not_their_retract",
@@ -464,10 +466,10 @@ SWITCHES = (
     Switch(
         11,
         "a retract is not retracted",
-        SERVICE,
+        RETRACTING,
         "if any(target.author.robot == OPERATOR for target in targets):",
         "if False:",
-        "cairn_server/test_retract.py",
+        "cairn_server/test_retract.py::test_nothing_and_retracts_cannot_be_retracted",
     ),
     Switch(
         11,
@@ -577,7 +579,7 @@ SWITCHES = (
         13,
         "commits whose ids are taken are renamed",
         SYNC,
-        'if exc.kind != "id_taken":',
+        'if exc.kind != "id_taken" or seal is not None:',
         "if True:",
         "cairn_client/test_rules.py::test_commits_whose_ids_are_taken_are_renamed_and_pushed_and_the_others_keep_theirs",
     ),
@@ -652,5 +654,69 @@ SWITCHES = (
         "if fingerprint(base, key) == cell.fingerprint:",
         "if True:",
         "cairn_client/test_rules.py::test_a_cell_that_was_damaged_at_rest_is_asked_for_anew",
+    ),
+    Switch(
+        2,
+        "each block has a stamp of its own",
+        FOLDING,
+        "self.cache.stamp(key, changed, seq, self._load)",
+        "self.cache.stamp(key, changed[:1], seq, self._load)",
+        "cairn_server/test_stamps.py::test_a_state_frame_names_the_changed_blocks_and_no_others",
+    ),
+    Switch(
+        4,
+        "a delta is made only while all of its evidence is kept",
+        CELLS_CHANGED,
+        "if start.seq < row.gone_seq or len(entries) > DELTA_ENTRIES_MAX:",
+        "if len(entries) > DELTA_ENTRIES_MAX:",
+        "cairn_server/test_retention.py::test_no_delta_is_made_of_what_is_left_when_a_part_is_gone",
+    ),
+    Switch(
+        4,
+        "a state frame has the changed blocks and no others",
+        CELLS_CHANGED,
+        "payload = encode_cell(row.key, of_blocks(evidence, blocks), geometry).data",
+        "payload = encode_cell(row.key, evidence, geometry).data",
+        "cairn_server/test_stamps.py::test_a_state_frame_names_the_changed_blocks_and_no_others",
+    ),
+    Switch(
+        10,
+        "blocks that were emptied keep their stamp",
+        "server/cairn_server/cell_cache.py",
+        "            stamps=encode_stamps(stamps),",
+        "            stamps=encode_stamps(stamps * np.isin(np.arange(len(stamps)), blocks_of(evidence))),",
+        "cairn_server/test_stamps.py::test_voxels_that_were_taken_out_again_leave_the_asker_too",
+    ),
+    Switch(
+        11,
+        "evidence that a waiting retract names is kept",
+        RETENTION,
+        "gone = [(number, *seqs) for number, *seqs, commit in found if commit not in pinned]",
+        "gone = [(number, *seqs) for number, *seqs, commit in found]",
+        "cairn_server/test_retention.py::test_evidence_that_a_waiting_commit_takes_out_is_kept",
+    ),
+    Switch(
+        11,
+        "what is gone is not retracted before its bytes came again",
+        RETENTION,
+        "    if gone:\n        names",
+        "    if False:\n        names",
+        "cairn_server/test_retention.py::test_what_is_gone_is_retracted_once_its_bytes_are_pushed_again",
+    ),
+    Switch(
+        11,
+        "robots keep operators' retracts and push them back",
+        SYNC,
+        "            keep_retracts(replica, api, map_name)\n            return report",
+        "            return report",
+        "cairn_client/test_laws.py::test_an_operator_s_retract_survives_the_restore_of_a_backup_from_before_it",
+    ),
+    Switch(
+        11,
+        "an operator's retract is taken back by its seal alone",
+        SERVICE,
+        "speaks_for = Caller(Role.ADMIN) if is_sealed(row, data, seal) else caller",
+        "speaks_for = Caller(Role.ADMIN)",
+        "cairn_server/test_retract.py::test_a_retract_may_be_pushed_back_by_anybody_with_this_map_s_seal_on_it_and_by_nobody_without",
     ),
 )
