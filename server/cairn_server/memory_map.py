@@ -1,31 +1,53 @@
-"""One map as dictionaries: the rows of `memory_store`, their changes, and a snapshot of them."""
+"""One map as dictionaries: the rows of `memory_store`, and their changes."""
 
 import secrets
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
-from cairn_map.cursor import Cursor, first_chain
+from cairn_map.cursor import ENTRY_FOLD, Cursor, first_chain
 from cairn_map.errors import BadInputError, ConflictError
 from cairn_map.evidence import COUNT_MAX, SUM_MAX
-from cairn_map.grid import CellKey, Geometry, cell_of_key
-from cairn_map.ids import Author, CommitId, new_incarnation
-from cairn_map.messages import LogEntry
+from cairn_map.grid import CellKey, Geometry
+from cairn_map.ids import Author, CommitId
 from cairn_map.sensor_model import SensorModel
-from cairn_map.version_vector import EMPTY, VersionVector
-from cairn_server.push_policy import Numbering, check_number
-from cairn_server.store_rows import (
-    Branch,
-    CellRow,
-    Contribution,
-    Entry,
-    Fold,
-    Head,
-    MapRow,
-    NewCommit,
-    StoredCommit,
-    Totals,
-)
+from cairn_server.push_policy import Numbering, check_number, evidence_gone
+from cairn_server.store_rows import Branch, CellRow, Entry, Fold, Head, MapRow, NewCommit, StoredCommit
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Kept:
+    """A commit and what became of it."""
+
+    number: int
+    new: NewCommit
+    """Without its meta and its diff once they are gone."""
+    cells: int
+    """That it touched, gone or not."""
+    received_s: float
+    folded_s: float = 0.0
+    folded_seq: int | None = None
+    unfolded_seq: int = 0
+    """Log entry that took it out again; 0 if none did."""
+    is_damaged: bool = False
+    is_gone: bool = False
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether it is to be folded."""
+        return self.folded_seq is None and not self.is_damaged
+
+    def stored(self) -> StoredCommit:
+        """As the folder reads it."""
+        return StoredCommit(
+            number=self.number,
+            id=self.new.id,
+            sha=self.new.sha,
+            text=self.new.text,
+            retracts=self.new.retracts,
+            diff=dict(sorted(self.new.diff.items())),
+            gone=self.is_gone,
+        )
 
 
 @dataclass(slots=True)
@@ -37,26 +59,23 @@ class MemoryMap:
     tops: tuple[int, ...]
     is_shared: bool = False
     """A snapshot has these dictionaries: copy them before they are changed."""
-    commits: dict[CommitId, NewCommit] = field(default_factory=dict)
+    commits: dict[CommitId, Kept] = field(default_factory=dict)
     """In order of arrival."""
-    numbers: dict[CommitId, int] = field(default_factory=dict)
     ids: list[CommitId] = field(default_factory=list)
     """By number."""
-    diffs: list[tuple[CommitId, CellKey]] = field(default_factory=list)
-    """By the number of the diff."""
+    diffs: dict[int, tuple[CommitId, CellKey]] = field(default_factory=dict)
+    """Of what is kept, by the number of the diff."""
     diff_numbers: dict[tuple[CommitId, CellKey], int] = field(default_factory=dict)
+    diffs_made: int = 0
     authors: dict[Author, tuple[int, int]] = field(default_factory=dict)
     """Highest number, and intervals of the numbers."""
-    folded: dict[CommitId, float] = field(default_factory=dict)
-    """When each was."""
-    damaged: set[CommitId] = field(default_factory=set)
     entries: list[Entry] = field(default_factory=list)
     touched: dict[CellKey, tuple[int, ...]] = field(default_factory=dict)
     """Log entries that concern a cell."""
     retracted: set[CommitId] = field(default_factory=set)
     cells: dict[CellKey, CellRow] = field(default_factory=dict)
     branches: dict[str, Branch] = field(default_factory=dict)
-    tokens: dict[str, bytes] = field(default_factory=dict)
+    statuses: dict[str, str] = field(default_factory=dict)
 
     def copied(self) -> "MemoryMap":
         """The same in other dictionaries."""
@@ -68,26 +87,18 @@ class MemoryMap:
         return other
 
     def append(self, commit: NewCommit) -> bool:
-        """Keep a commit; False if the same one is kept already."""
+        """Keep a commit; False if the same one is known already."""
         known = self.commits.get(commit.id)
         if known is not None:
-            if known.sha != commit.sha:
-                raise ConflictError("id_taken", f"commit {commit.id} is already here with other bytes")
-            if commit.id not in self.damaged:
-                return False
-            self.damaged.remove(commit.id)
-        else:
-            intervals = self._checked_intervals(commit.id)
-            self.tops = self._checked_tops(commit.tops)
-            top, _ = self.authors.get(commit.id.author, (0, 0))
-            self.authors[commit.id.author] = max(top, commit.id.n), intervals
-            self.numbers[commit.id] = len(self.ids)
-            self.ids.append(commit.id)
-        self.commits[commit.id] = commit
-        for key in commit.diff:
-            if (commit.id, key) not in self.diff_numbers:
-                self.diff_numbers[commit.id, key] = len(self.diffs)
-                self.diffs.append((commit.id, key))
+            return self._append_again(known, commit)
+        self._check_kept(commit.retracts)
+        intervals = self._checked_intervals(commit.id)
+        self.tops = self._checked_tops(commit.tops)
+        top, _ = self.authors.get(commit.id.author, (0, 0))
+        self.authors[commit.id.author] = max(top, commit.id.n), intervals
+        self.commits[commit.id] = Kept(number=len(self.ids), new=commit, cells=len(commit.diff), received_s=time.time())
+        self.ids.append(commit.id)
+        self._number_diff(commit)
         return True
 
     def next_number(self, author: Author) -> int:
@@ -101,31 +112,90 @@ class MemoryMap:
         self.head = Head(cursor=fold.head, vector=fold.vector)
         now_s = time.time()
         for entry in fold.entries:
-            commit = self.commits[self.ids[entry.commit]]
             self.entries.append(entry)
-            self.folded.setdefault(commit.id, now_s)
-            for key in commit.diff:
-                self.touched[key] = (*self.touched.get(key, ()), len(self.entries))
+            self._note_entry(entry, len(self.entries), now_s)
         self.retracted.update(fold.retracted)
-        self.damaged.update(self.ids[number] for number, _ in fold.damaged)
-        self.cells.update((cell.key, cell) for cell in fold.cells)
+        for number, _ in fold.damaged:
+            aside = self.ids[number]
+            self.commits[aside] = replace(self.commits[aside], is_damaged=True)
+        for cell in fold.cells:
+            before = self.cells.get(cell.key)
+            self.cells[cell.key] = replace(cell, gone_seq=before.gone_seq if before else 0)
         return True
 
-    def waiting(self) -> Iterator[NewCommit]:
-        """Commits to be folded, in order of arrival."""
-        return (c for i, c in self.commits.items() if i not in self.folded and i not in self.damaged)
+    def forget_evidence(self, *, before_s: float, limit: int) -> int:
+        """Drop the evidence and the meta of commits folded, and last pushed, before a time; how many.
 
-    def stored(self, commit: CommitId) -> StoredCommit:
-        """A commit as the folder reads it."""
+        What is left of a commit is its row in the log; see `sqlite_retention`.
+        """
+        pinned = {target for kept in self.commits.values() if kept.folded_seq is None for target in kept.new.retracts}
+        old = [
+            kept
+            for commit, kept in self.commits.items()
+            if kept.folded_seq is not None
+            and kept.cells
+            and not kept.is_gone
+            and max(kept.folded_s, kept.received_s) < before_s
+            and commit not in pinned
+        ]
+        old.sort(key=lambda kept: kept.folded_s)
+        for kept in old[:limit]:
+            self._forget(kept)
+        return len(old[:limit])
+
+    def waiting(self) -> Iterator[Kept]:
+        """Commits to be folded, in order of arrival."""
+        return (kept for kept in self.commits.values() if kept.is_waiting)
+
+    def heal(self, cell: CellRow) -> bool:
+        """Other bytes for a cell, if it is still of the same entry; its stamps stay."""
+        known = self.cells.get(cell.key)
+        if known is None or known.lm != cell.lm:
+            return False
+        self.cells[cell.key] = replace(cell, stamps=known.stamps, gone_seq=known.gone_seq)
+        return True
+
+    def _append_again(self, known: Kept, commit: NewCommit) -> bool:
+        if known.new.sha != commit.sha:
+            raise ConflictError("id_taken", f"commit {commit.id} is already here with other bytes")
+        if known.is_damaged:
+            self.commits[commit.id] = replace(known, new=commit, is_damaged=False)
+        elif known.is_gone and commit.id not in self.retracted:
+            self.commits[commit.id] = replace(known, new=commit, is_gone=False, received_s=time.time())
+            self._number_diff(commit)
+        return known.is_damaged
+
+    def _note_entry(self, entry: Entry, seq: int, now_s: float) -> None:
+        commit = self.ids[entry.commit]
         kept = self.commits[commit]
-        return StoredCommit(
-            number=self.numbers[commit],
-            id=commit,
-            sha=kept.sha,
-            text=kept.text,
-            retracts=kept.retracts,
-            diff=dict(sorted(kept.diff.items())),
-        )
+        for key in kept.new.diff:
+            self.touched[key] = (*self.touched.get(key, ()), seq)
+        if entry.kind != ENTRY_FOLD:
+            self.commits[commit] = replace(kept, unfolded_seq=seq)
+        elif kept.folded_seq is None:
+            self.commits[commit] = replace(kept, folded_seq=seq, folded_s=now_s)
+
+    def _forget(self, kept: Kept) -> None:
+        seqs = (kept.folded_seq or 0, kept.unfolded_seq)
+        for key in kept.new.diff:
+            if key in self.cells:
+                cell = self.cells[key]
+                self.cells[key] = replace(cell, gone_seq=max(cell.gone_seq, *seqs))
+            self.touched[key] = tuple(seq for seq in self.touched.get(key, ()) if seq not in seqs)
+            del self.diffs[self.diff_numbers.pop((kept.new.id, key))]
+        self.commits[kept.new.id] = replace(kept, new=replace(kept.new, text=b"", diff={}), is_gone=True)
+
+    def _number_diff(self, commit: NewCommit) -> None:
+        for key in commit.diff:
+            self.diffs[self.diffs_made] = (commit.id, key)
+            self.diff_numbers[commit.id, key] = self.diffs_made
+            self.diffs_made += 1
+
+    def _check_kept(self, targets: tuple[CommitId, ...]) -> None:
+        """Refuse to retract what cannot be subtracted any more."""
+        known = [t for t in targets if t in self.commits and t not in self.retracted]
+        if gone := [target for target in known if self.commits[target].is_gone]:
+            raise evidence_gone(gone)
 
     def _checked_intervals(self, commit: CommitId) -> int:
         """Intervals of the author's numbers with this one, if `push_policy` lets it in."""
@@ -152,107 +222,9 @@ class MemoryMap:
 
 def new_memory_map(number: int, name: str, geometry: Geometry, sensor_model: SensorModel) -> MemoryMap:
     """A map without anything in it."""
-    row = MapRow(number=number, name=name, geometry=geometry, sensor_model=sensor_model, operator=new_incarnation())
+    row = MapRow(
+        number=number, name=name, geometry=geometry, sensor_model=sensor_model, seal_key=secrets.token_bytes(32)
+    )
     log_id = secrets.token_bytes(16)
     head = Head(cursor=Cursor(log_id, 0, first_chain(log_id, geometry.digest())))
     return MemoryMap(row, head, tops=(0,) * (2 + geometry.plane_count))
-
-
-class MemorySnapshot:
-    """`store.Snapshot` of dictionaries that nobody changes any more."""
-
-    def __init__(self, state: MemoryMap) -> None:
-        self._state = state
-
-    @property
-    def head(self) -> Head:
-        """The state."""
-        return self._state.head
-
-    def chain_at(self, seq: int) -> bytes | None:
-        """The chain after entry `seq` (0: of the empty log); None if there is no such entry."""
-        if seq == 0:
-            return first_chain(self.head.cursor.log_id, self._state.row.geometry.digest())
-        return self._state.entries[seq - 1].chain if 0 < seq <= len(self._state.entries) else None
-
-    def cell(self, key: CellKey) -> CellRow | None:
-        """One cell with its body."""
-        return self._state.cells.get(key)
-
-    def cells(self, *, after_seq: int = -1) -> Iterator[CellRow]:
-        """All cells changed after a log entry, without bodies, rising in number."""
-        for _, cell in sorted(self._state.cells.items()):
-            if cell.lm > after_seq:
-                yield replace(cell, body=b"")
-
-    def contributions(self, key: CellKey, *, after_seq: int, limit: int | None = None) -> list[Contribution]:
-        """Entries after `after_seq` that touch a cell, oldest first, at most `limit`."""
-        seqs = [seq for seq in self._state.touched.get(key, ()) if seq > after_seq]
-        return [self._contribution(key, self._state.entries[seq - 1]) for seq in seqs[:limit]]
-
-    def diff(self, number: int) -> bytes | None:
-        """The bytes of a contribution."""
-        commit, key = self._state.diffs[number]
-        return self._state.commits[commit].diff[key]
-
-    def tip(self, author: Author) -> tuple[int, bytes] | None:
-        """Highest folded number of an author and its SHA-256."""
-        mine = [commit.n for commit in self._state.folded if commit.author == author]
-        return (max(mine), self._state.commits[CommitId(author, max(mine))].sha) if mine else None
-
-    def commits_of(self, robot: str) -> list[CommitId]:
-        """Every commit with evidence of a robot, all incarnations, that is not retracted."""
-        return [
-            commit.id
-            for commit in self._state.commits.values()
-            if commit.id.author.robot == robot and commit.diff and commit.id not in self._state.retracted
-        ]
-
-    def pending(self) -> VersionVector:
-        """Commits that are kept but not folded, without those that are set aside as damaged."""
-        return EMPTY.with_commits(commit.id for commit in self._state.waiting())
-
-    def folded_before(self, time_s: float) -> VersionVector:
-        """Commits folded before a time."""
-        return EMPTY.with_commits(commit for commit, when_s in self._state.folded.items() if when_s < time_s)
-
-    def retracting(self) -> list[CommitId]:
-        """Commits that retract others."""
-        return [c.id for c in self._state.commits.values() if c.retracts and c.id in self._state.folded]
-
-    def log(self, *, after_seq: int, limit: int) -> list[LogEntry]:
-        """Log entries, oldest first."""
-        found = list(enumerate(self._state.entries, start=1))[after_seq : after_seq + limit]
-        return [self._log_entry(seq, entry) for seq, entry in found]
-
-    def totals(self) -> Totals:
-        """Sizes."""
-        cells = [cell for cell in self._state.cells.values() if cell.voxels]
-        axes = list(zip(*(cell_of_key(cell.key) for cell in cells), strict=True))
-        return Totals(
-            cells=len(cells),
-            size_bytes=sum(cell.size_bytes for cell in cells),
-            commits=len(self._state.commits),
-            branches=len(self._state.branches),
-            corner_cells=((min(axes[0]), min(axes[1]), min(axes[2])), (max(axes[0]), max(axes[1]), max(axes[2])))
-            if cells
-            else None,
-        )
-
-    def _contribution(self, key: CellKey, entry: Entry) -> Contribution:
-        commit = self._state.ids[entry.commit]
-        size_bytes = len(self._state.commits[commit].diff[key])
-        return Contribution(entry.kind, commit.author, self._state.diff_numbers[commit, key], size_bytes)
-
-    def _log_entry(self, seq: int, entry: Entry) -> LogEntry:
-        commit = self._state.commits[self._state.ids[entry.commit]]
-        return LogEntry(
-            seq=seq,
-            kind="+" if entry.kind == b"+" else "-",
-            id=str(commit.id),
-            sha=commit.sha.hex(),
-            size_bytes=commit.size_bytes,
-            cells=len(commit.diff),
-            captured_s=commit.captured_s,
-            retracts=[str(target) for target in commit.retracts],
-        )

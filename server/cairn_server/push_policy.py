@@ -4,13 +4,13 @@ Evidence is refused before it can spoil a map: counts that no scan could give wo
 and use up the range of the sums for everybody; ids full of gaps would grow every version vector without bound.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from cairn_map.cell_code import DecodedCell
 from cairn_map.channels import SAMPLE_MAX
 from cairn_map.commit import CommitMeta
-from cairn_map.errors import BadInputError, DamagedDataError, DeniedError
+from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, DeniedError
 from cairn_map.evidence import Evidence
 from cairn_map.evidence_kernels import bounds_of_counts
 from cairn_map.grid import CellKey, Geometry, cell_of_key
@@ -28,6 +28,8 @@ AHEAD_MAX = 10_000
 server does not keep its oldest commits."""
 INCARNATIONS_MAX = 256
 """Of one robot: disks lost or rolled back."""
+NAMED_MAX = 5
+"""Ids that a complaint names."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,3 +129,13 @@ def _excess(evidence: Evidence, geometry: Geometry, scans: int) -> str | None:
         if any((sums[:, p] > weights * top).any() for p, top in enumerate(tops)):
             return f"samples of {channel.name} above {SAMPLE_MAX} steps"
     return None
+
+
+def evidence_gone(commits: Sequence[CommitId]) -> ConflictError:
+    """What a store says to a retract of commits whose evidence it does not keep any more."""
+    names = ", ".join(map(str, commits[:NAMED_MAX])) + (" ..." if len(commits) > NAMED_MAX else "")
+    return ConflictError(
+        "evidence_gone",
+        f"the evidence of {len(commits)} of these commits is not kept any more ({names}); push each again, from "
+        "whoever has its bytes, and then retract it",
+    )

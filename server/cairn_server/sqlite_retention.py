@@ -8,13 +8,10 @@ import time
 
 import apsw
 
-from cairn_map.errors import ConflictError
 from cairn_map.ids import CommitId
+from cairn_server.push_policy import evidence_gone
 from cairn_server.sqlite_writer import first, rows
 from cairn_server.store_rows import MapRow, NewCommit
-
-NAMED_MAX = 5
-"""Ids that a complaint names."""
 
 
 def forget_evidence(connection: apsw.Connection, row: MapRow, before_s: float, limit: int) -> int:
@@ -65,12 +62,7 @@ def check_kept(connection: apsw.Connection, row: MapRow, targets: tuple[CommitId
         and not is_retracted(connection, row, target)
     ]
     if gone:
-        names = ", ".join(map(str, gone[:NAMED_MAX])) + (" ..." if len(gone) > NAMED_MAX else "")
-        raise ConflictError(
-            "evidence_gone",
-            f"the evidence of {len(gone)} of these commits is not kept any more ({names}); push each again, from "
-            "whoever has its bytes, and then retract it",
-        )
+        raise evidence_gone(gone)
 
 
 def is_retracted(connection: apsw.Connection, row: MapRow, commit: CommitId) -> bool:

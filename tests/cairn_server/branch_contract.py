@@ -41,17 +41,21 @@ class BranchContract:
         with store.snapshot(row) as snapshot:
             assert snapshot.totals().branches == 2
 
-    def test_a_token_is_known_on_its_map_until_it_is_replaced_or_the_branch_is_gone(self, store: Store) -> None:
+    def test_a_registration_s_token_is_known_until_it_is_replaced_or_the_branch_is_gone(self, store: Store) -> None:
         row, other = new_map(store), new_map(store)
         store.register(row, branch("mole"), token(row, "old"))
         store.register(row, branch("wren"), token(row, "wren"))
+        store.register(other, branch("mole"), token(other, "mole"))
         store.register(row, branch("mole"), token(row, "new"))
-        known = [store.branch_of_token(row, token(row, text)) for text in ("old", "new", "wren", "none")]
-        assert known == [None, "mole", "wren", None]
-        assert store.branch_of_token(other, token(row, "new")) is None
+
+        def robots() -> list[tuple[str, str | None] | None]:
+            hashes = [*(token(row, text) for text in ("old", "new", "wren", "none")), token(other, "mole")]
+            found = [store.tokens.of_hash(secret_hash) for secret_hash in hashes]
+            return [(t.map_name or "", t.robot) if t else None for t in found]
+
+        assert robots() == [None, (row.name, "mole"), (row.name, "wren"), None, (other.name, "mole")]
         store.deregister(row, "mole")
-        assert store.branch_of_token(row, token(row, "new")) is None
-        assert store.branch_of_token(row, token(row, "wren")) == "wren"
+        assert robots() == [None, None, (row.name, "wren"), None, (other.name, "mole")]
 
     def test_a_branch_that_registers_again_keeps_its_cursor(self, store: Store) -> None:
         row = folded_map(store, pushed(0, 0))

@@ -272,7 +272,7 @@ class CommitContract:
         for row in rows:
             with store.snapshot(row) as snapshot:
                 logs.add(snapshot.head.cursor.log_id)
-        assert len(logs) == len({row.operator for row in rows}) == len(rows)
+        assert len(logs) == len({row.seal_key for row in rows}) == len(rows)
         names = [row.name for row in store.maps()]
         assert names == sorted(names)
 
