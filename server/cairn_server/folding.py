@@ -48,6 +48,10 @@ def fold_pending(store: Store, row: MapRow, cache: CellCache, *, limit: int) -> 
         return 0
     with store.snapshot(row) as snapshot:
         head = snapshot.head
+    # Another folder may have taken some between these two looks: its head is our base, so nothing else would tell.
+    commits = [commit for commit in commits if commit.id not in head.vector]
+    if not commits:
+        return 0
     cache.begin(head.cursor)
     written = False
     try:

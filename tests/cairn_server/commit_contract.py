@@ -22,7 +22,7 @@ from cairn_server.cell_cache import CellCache
 from cairn_server.folding import fold_pending
 from cairn_server.service import _new_commit
 from cairn_server.store import Store
-from cairn_server.store_rows import Entry, Fold, MapRow, NewCommit, Totals
+from cairn_server.store_rows import Entry, Fold, MapRow, NewCommit, StoredCommit, Totals
 
 
 def new_map(store: Store, *commits: Commit) -> MapRow:
@@ -168,6 +168,24 @@ class CommitContract:
             assert len(snapshot.log(after_seq=0, limit=9)) == 1
             assert waiting.id in snapshot.pending()
         assert not store.is_retracted(row, waiting.id)
+
+    def test_what_another_folder_folded_meanwhile_is_not_folded_twice(
+        self, store: Store, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        commits = [pushed(n, 1) for n in range(3)]
+        row, look = new_map(store, *commits), store.pending
+
+        def overtaken(row: MapRow, *, limit: int, size_bytes_max: int) -> list[StoredCommit]:
+            found = look(row, limit=limit, size_bytes_max=size_bytes_max)
+            monkeypatch.undo()
+            assert fold_pending(store, row, CellCache(SMALL), limit=2) == 2
+            return found
+
+        monkeypatch.setattr(store, "pending", overtaken)
+        assert fold_pending(store, row, CellCache(SMALL), limit=9) == 1
+        assert read(bodies(store, row)) == sum_of(commits)
+        with store.snapshot(row) as snapshot:
+            assert snapshot.head.cursor.seq == 3
 
     def test_a_retract_is_remembered_before_its_target_comes(self, store: Store) -> None:
         row = folded_map(store, pushed(1, 0, cells={}, retracts=[pushed(0, 0)]))
