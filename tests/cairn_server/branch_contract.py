@@ -1,12 +1,14 @@
 """What every store must do with branches and their tokens."""
 
 import time
+from dataclasses import replace
 
 import pytest
 from tests.cairn_server.commit_contract import folded_map, new_map
-from tests.cairn_server.pushes import pushed
+from tests.cairn_server.pushes import WREN, pushed
 
 from cairn_map.errors import NotFoundError
+from cairn_server.branch_notes import EntrySize
 from cairn_server.store import Store
 from cairn_server.store_rows import Branch, MapRow
 
@@ -93,3 +95,39 @@ class BranchContract:
         with pytest.raises(NotFoundError) as refused:
             store.deregister(row, "mole")
         assert refused.value.kind == "no_branch"
+
+    def test_a_new_incarnation_stands_nowhere(self, store: Store) -> None:
+        row = folded_map(store, pushed(0, 0))
+        with store.snapshot(row) as snapshot:
+            cursor = snapshot.head.cursor
+        cursors = []
+        for turn, incarnation in enumerate(("a", "a", "b")):
+            store.register(row, replace(branch("mole"), incarnation=incarnation), token(row, str(turn)))
+            cursors += [found.cursor for found in store.branches(row)]
+            store.seen(row, "mole", cursor)
+            self.after_notes(store)
+        assert cursors == [None, cursor, None]
+        assert [found.incarnation for found in store.branches(row)] == ["b"]
+
+    def test_a_branch_s_last_status_is_kept_as_long_as_the_branch(self, store: Store) -> None:
+        row, other = new_map(store), new_map(store)
+        for name in ("mole", "wren"):
+            store.register(row, branch(name), token(row, name))
+        for name, status in (("mole", "1"), ("wren", "2"), ("mole", "3"), ("nobody", "4")):
+            store.notes.put_status(row, name, status)
+        self.after_notes(store)
+        assert (store.notes.statuses(row), store.notes.statuses(other)) == ({"mole": "3", "wren": "2"}, {})
+        store.register(row, branch("mole"), token(row, "new"))
+        assert store.notes.statuses(row) == {"mole": "3", "wren": "2"}
+        store.deregister(row, "mole")
+        store.register(row, branch("mole"), token(row, "newer"))
+        assert store.notes.statuses(row) == {"wren": "2"}
+
+    def test_what_the_log_weighs_comes_in_pages(self, store: Store) -> None:
+        commits = [pushed(0, 0), pushed(0, 1, WREN), pushed(1, 0, cells={}, retracts=[pushed(0, 0)])]
+        row = folded_map(store, *commits)
+        sizes = [EntrySize(n, c.id.author, len(c.data)) for n, c in enumerate(commits, start=1)]
+        sizes.append(EntrySize(4, None, len(commits[0].data)))
+        assert store.notes.entry_sizes(row, after_seq=0, limit=9) == sizes
+        assert store.notes.entry_sizes(row, after_seq=1, limit=2) == sizes[1:3]
+        assert store.notes.entry_sizes(row, after_seq=4, limit=9) == []

@@ -4,8 +4,10 @@ from collections.abc import Iterator
 
 import pytest
 from tests.cairn_map.made import SMALL
+from tests.cairn_server.access_contract import AccessContract
 from tests.cairn_server.branch_contract import BranchContract
 from tests.cairn_server.commit_contract import CommitContract
+from tests.cairn_server.evidence_contract import EvidenceContract
 from tests.cairn_server.store_contract import StoreContract
 
 from cairn_map.errors import UnreachableError
@@ -21,7 +23,7 @@ def store() -> Iterator[MemoryStore]:
     made.close()
 
 
-class TestMemoryStore(StoreContract, CommitContract, BranchContract):
+class TestMemoryStore(StoreContract, CommitContract, EvidenceContract, BranchContract, AccessContract):
     """All of the contract."""
 
 

@@ -8,8 +8,10 @@ from pathlib import Path
 import apsw
 import pytest
 from tests.cairn_map.made import SMALL
+from tests.cairn_server.access_contract import AccessContract
 from tests.cairn_server.branch_contract import BranchContract
 from tests.cairn_server.commit_contract import CommitContract
+from tests.cairn_server.evidence_contract import EvidenceContract
 from tests.cairn_server.pushes import pushed
 from tests.cairn_server.store_contract import StoreContract, new_of
 
@@ -36,7 +38,7 @@ def fresh(tmp_path: Path) -> Iterator[SqliteStore]:
     made.close()
 
 
-class TestSqliteStore(StoreContract, CommitContract, BranchContract):
+class TestSqliteStore(StoreContract, CommitContract, EvidenceContract, BranchContract, AccessContract):
     """All of the contract."""
 
 
