@@ -16,6 +16,7 @@ from cairn_server.memory_map import new_memory_map
 from cairn_server.memory_maps import MemoryMaps
 from cairn_server.memory_snapshot import MemorySnapshot
 from cairn_server.memory_tokens import MemoryAuditLog, MemoryTokens
+from cairn_server.store import Store
 from cairn_server.store_rows import Branch, Fold, MapRow, NewCommit, StoredCommit
 
 log = logging.getLogger(__name__)
@@ -145,3 +146,7 @@ class MemoryStore:
     def close(self) -> None:
         """Answer nothing any more."""
         self._maps.close()
+
+
+_IS_A_STORE: type[Store] = MemoryStore
+"""Refused by the type checker if it is none."""

@@ -25,6 +25,7 @@ from cairn_server.serve_command import config_of, listen
 from cairn_server.service import Service
 from cairn_server.settings import Settings
 from cairn_server.sqlite_store import SqliteStore
+from cairn_server.store import Store
 from cairn_server.store_rows import MapRow
 
 DEADLINE_S = 60.0
@@ -42,8 +43,8 @@ def until(condition: Callable[[], bool], what: str) -> None:
 class Live:
     """A server in this process, reached through its socket."""
 
-    def __init__(self, folder: Path, **settings: Any) -> None:
-        self.service = Service(SqliteStore(folder), Settings(folder=folder, **settings))
+    def __init__(self, folder: Path, *, store: Store | None = None, **settings: Any) -> None:
+        self.service = Service(store or SqliteStore(folder), Settings(folder=folder, **settings))
         self.app = make_app(self.service)
         listener = listen("127.0.0.1", 0)
         self.port: int = listener.getsockname()[1]
