@@ -1,7 +1,7 @@
 """What every store must do, beside a model of a few dictionaries.
 
-Inherit `StoreContract`, and those of `commit_contract` and `branch_contract`, in a module that has a fixture `store` of
-module scope; every test makes a map of its own.
+Inherit `StoreContract`, and those of `commit_contract`, `crowd_contract`, `evidence_contract`, `branch_contract` and
+`access_contract`, in a module that has a fixture `store` of module scope; every test makes a map of its own.
 """
 
 import itertools

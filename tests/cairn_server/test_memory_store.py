@@ -9,6 +9,7 @@ from tests.cairn_map.made import SMALL
 from tests.cairn_server.access_contract import AccessContract
 from tests.cairn_server.branch_contract import BranchContract
 from tests.cairn_server.commit_contract import CommitContract
+from tests.cairn_server.crowd_contract import CrowdContract
 from tests.cairn_server.evidence_contract import EvidenceContract
 from tests.cairn_server.live import Live
 from tests.cairn_server.naive_asker import NaiveAsker
@@ -34,7 +35,7 @@ def store() -> Iterator[MemoryStore]:
     made.close()
 
 
-class TestMemoryStore(StoreContract, CommitContract, EvidenceContract, BranchContract, AccessContract):
+class TestMemoryStore(StoreContract, CommitContract, CrowdContract, EvidenceContract, BranchContract, AccessContract):
     """All of the contract."""
 
 

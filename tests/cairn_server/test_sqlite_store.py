@@ -11,6 +11,7 @@ from tests.cairn_map.made import SMALL
 from tests.cairn_server.access_contract import AccessContract
 from tests.cairn_server.branch_contract import BranchContract
 from tests.cairn_server.commit_contract import CommitContract
+from tests.cairn_server.crowd_contract import CrowdContract
 from tests.cairn_server.evidence_contract import EvidenceContract
 from tests.cairn_server.pushes import pushed
 from tests.cairn_server.store_contract import StoreContract, new_of
@@ -38,7 +39,7 @@ def fresh(tmp_path: Path) -> Iterator[SqliteStore]:
     made.close()
 
 
-class TestSqliteStore(StoreContract, CommitContract, EvidenceContract, BranchContract, AccessContract):
+class TestSqliteStore(StoreContract, CommitContract, CrowdContract, EvidenceContract, BranchContract, AccessContract):
     """All of the contract."""
 
 
