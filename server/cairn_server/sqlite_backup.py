@@ -13,7 +13,6 @@ from pathlib import Path
 import apsw
 
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, NotFoundError
-from cairn_map.ids import new_incarnation
 from cairn_server.folder_lock import LOCK_NAME, lock_folder
 from cairn_server.sqlite_schema import STEPS, ensure_schema
 from cairn_server.sqlite_store import FILE_NAME
@@ -48,9 +47,6 @@ def back_up(folder: Path, target: Path, report: Report) -> int:
 def restore(source: Path, folder: Path, report: Report, verify: Callable[[Path], None]) -> None:
     """Make a folder's store out of a backup; `verify` raises if the copy is not sound, and then nothing is left of it.
 
-    Each map takes a new incarnation for the retracts that its operator will make: those made after the backup are
-    kept by robots, who push them back, and their numbers must not be given out twice.
-
     Raises:
         NotFoundError: kind `no_store`: the file is not there.
         ConflictError: kind `store_in_use` or `not_empty`: a server works on the folder, or something is in it.
@@ -68,7 +64,7 @@ def restore(source: Path, folder: Path, report: Report, verify: Callable[[Path],
             raise ConflictError("not_empty", f"{folder} is not empty, it has {found[0]}; restore into a new folder")
         with _partial(folder / FILE_NAME) as partial:
             _copy(source, partial, report)
-            _renew_operators(partial)
+            _migrate(partial)
             verify(partial)
             _settle(partial)
 
@@ -126,12 +122,10 @@ def _settle(path: Path) -> None:
         connection.close()
 
 
-def _renew_operators(path: Path) -> None:
+def _migrate(path: Path) -> None:
     connection = apsw.Connection(str(path))
     try:
         ensure_schema(connection)
-        for (number,) in connection.execute("SELECT number FROM map").fetchall():
-            connection.execute("UPDATE map SET operator = ? WHERE number = ?", (new_incarnation(), number))
     finally:
         connection.close()
 

@@ -16,15 +16,15 @@ from cairn_server.store_rows import MapRow, NewCommit
 
 def forget_evidence(connection: apsw.Connection, row: MapRow, before_s: float, limit: int) -> int:
     """Drop the evidence of commits folded, and last pushed, before a time; how many."""
+    pinned = _pinned(connection, row)
     found = rows(
         connection,
         "SELECT number, folded_seq, unfolded_seq, robot || '.' || incarnation || '.' || n FROM commits"
         " WHERE map = ? AND gone = 0 AND cells > 0 AND folded_seq IS NOT NULL AND folded_s < ? AND received_s < ?"
         " ORDER BY folded_s LIMIT ?",
-        (row.number, before_s, before_s, limit),
+        (row.number, before_s, before_s, limit + len(pinned)),
     )
-    pinned = _pinned(connection, row) if found else set()
-    gone = [(number, *seqs) for number, *seqs, commit in found if commit not in pinned]
+    gone = [(number, *seqs) for number, *seqs, commit in found if commit not in pinned][:limit]
     for number, folded_seq, unfolded_seq in gone:
         newest = max(folded_seq, unfolded_seq or 0)
         cells = "cell IN (SELECT cell FROM diff WHERE commit_number = ?)"
