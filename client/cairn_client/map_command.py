@@ -99,17 +99,14 @@ def _log(args: argparse.Namespace) -> None:
     if args.json:
         say(json.dumps([entry.model_dump(mode="json") for entry in entries]))
         return
-    if args.graph:
-        for line in log_graph(entries):
-            say(line)
-        if len(entries) == args.limit:
-            say(f"(perhaps more: --after {entries[-1].seq})")
-        return
     taken_out = {entry.id: entry.seq for entry in entries if entry.kind == "-"}
-    for entry in entries:
-        say(_log_line(entry, taken_out.get(entry.id)))
+    listed = (_log_line(entry, taken_out.get(entry.id)) for entry in entries)
+    for line in log_graph(entries) if args.graph else listed:
+        say(line)
     if not entries:
         say("(nothing yet)")
+    if len(entries) == args.limit:
+        say(f"(perhaps more: --after {entries[-1].seq})")
 
 
 def _branches(args: argparse.Namespace) -> None:
