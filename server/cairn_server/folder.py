@@ -99,6 +99,7 @@ class Folder:
         try:
             counts = [self._forget_group(row) for row in maps]
         except Exception:
+            # A full disk, or anything: dropping is no haste, and this thread must live.
             log.exception("old evidence cannot be dropped")
             return True
         if max(counts, default=0) < GROUP_MAX:

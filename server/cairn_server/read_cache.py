@@ -3,8 +3,9 @@
 import threading
 from collections import OrderedDict
 
+from cairn_map.errors import DamagedDataError
 from cairn_map.evidence import Evidence
-from cairn_map.grid import Geometry
+from cairn_map.grid import Geometry, cell_of_key
 from cairn_server.cells_at_rest import stored_evidence, stored_stamps
 from cairn_server.stamps import Stamps
 from cairn_server.store import Snapshot
@@ -37,7 +38,8 @@ class ReadCache:
                 self._cells.move_to_end(name)
                 return self._cells[name]
         stored = snapshot.cell(listed.key)
-        assert stored is not None  # noqa: S101 - listed in the same snapshot
+        if stored is None:
+            raise DamagedDataError("damaged_store", f"cell {cell_of_key(listed.key)} is listed, but is not there")
         found = stored_evidence(stored), stored_stamps(stored, geometry)
         with self._lock:
             if name not in self._cells:

@@ -1,6 +1,5 @@
 """What branches of any age cost: finding what they miss, the answer, the space of stamps, and of commits that went."""
 
-import statistics
 import tempfile
 import time
 from collections.abc import Iterator
@@ -8,6 +7,7 @@ from pathlib import Path
 
 import apsw
 from tests.bench.pushing import Bodies, Diff
+from tests.bench.timing import cpu_s
 
 from cairn_map.blocks import of_blocks
 from cairn_map.cursor import Cursor
@@ -66,8 +66,10 @@ def _folded(store: SqliteStore, row: MapRow, bodies: Bodies, first: int, more: i
 
 def _age_rows(service: Service, row: MapRow, cursor: Cursor, age: int, last_bytes: int) -> Iterator[Row]:
     request = MissingRequest(cursor=str(cursor), kinds=["delta", "state", "full"])
-    cold_s, answer = _timed(lambda: service.missing(row, "wren", request), 1)
-    warm_s, _ = _timed(lambda: service.missing(row, "wren", request), 3)
+    start_s = time.process_time()
+    answer = service.missing(row, "wren", request)
+    cold_s = time.process_time() - start_s
+    warm_s = cpu_s(lambda: service.missing(row, "wren", request), 3)
     frames = [frame for frame in frames_of(answer) if isinstance(frame, CellFrame)]
     kinds = {frame.kind.name.lower(): 0 for frame in frames}
     for frame in frames:
@@ -87,20 +89,12 @@ def _age_rows(service: Service, row: MapRow, cursor: Cursor, age: int, last_byte
                 found += len(of_blocks(evidence, blocks_after(stamps, cursor.seq)))
             return found
 
-        first_s, _ = _timed(find, 1)
-        found_s, found = _timed(find, 5)
+        start_s = time.process_time()
+        found = find()
+        first_s = time.process_time() - start_s
+        found_s = cpu_s(find, 5)
     how = f"ms, {found} of them ({1e3 * first_s:.0f} ms with cells from disk)"
     yield "    finding the changed voxels", f"{1e3 * found_s:.1f}", how
-
-
-def _timed(work: object, repeats: int) -> tuple[float, object]:
-    """Median processor time of this process, and what came of it."""
-    seconds, result = [], None
-    for _ in range(repeats):
-        start_s = time.process_time()
-        result = work()  # type: ignore[operator]
-        seconds.append(time.process_time() - start_s)
-    return statistics.median(seconds), result
 
 
 def _growth_rows(bodies: Bodies, geometry: Geometry, *, commits: int) -> Iterator[Row]:
