@@ -18,6 +18,9 @@ from cairn_map.octree_kernels import expand_content_into, leaves_of_rows
 from cairn_map.streams import column_planes, encode_column, required
 
 CHILD_MASKS, LEAF_MASKS, HITS, MISSES = 1, 2, 3, 4
+LARGE_PAGES_FROM_BYTES = 1 << 22
+WORTH_BYTES = 1 << 20
+"""Evidence smaller than this would hold more memory than it needs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,13 +53,23 @@ def evidence_of(content: CellContent) -> Evidence:
     """
     octree, counts, sampled = content.octree, content.counts, content.sampled
     V = int(octree.sizes.sum())
-    evidence = Evidence(
-        np.empty(V, np.uint32), np.empty((V, 2), np.int32), np.empty(len(sampled), np.uint32), content.samples
-    )
+    # In one block, counts first, so that two of them can be read as one number of 64 bits.
+    block = _large_empty(3 * V + len(sampled))
+    pairs, voxels, rows_of_samples = block[: 2 * V], block[2 * V : 3 * V], block[3 * V :]
+    evidence = Evidence(voxels, pairs.view(np.int32).reshape(V, 2), rows_of_samples, content.samples)
     rows = (evidence.voxels, evidence.counts, evidence.sampled)
     if not expand_content_into(octree.starts, octree.sizes, counts, sampled, *rows):
         raise DamagedDataError("bad_cell", "a leaf says nothing, or a collapsed one holds samples")
     return evidence
+
+
+def _large_empty(count: int) -> npt.NDArray[np.uint32]:
+    """(count,) fresh memory, in large pages where it is large: else first touching it takes longer than writing it.
+
+    numpy asks for large pages from 4 MB on. What is left of such a block is never touched, and so costs nothing.
+    """
+    whole = max(count, LARGE_PAGES_FROM_BYTES // 4) if 4 * count >= WORTH_BYTES else count
+    return np.empty(whole, np.uint32)[:count]
 
 
 def topology_streams(octree: Octree) -> dict[int, bytes]:
