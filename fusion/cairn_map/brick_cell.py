@@ -9,6 +9,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from cairn_map.brick_counts import BrickCounts
+from cairn_map.errors import BadInputError
 from cairn_map.evidence import Evidence, check_fits
 from cairn_map.grid import Geometry
 from cairn_map.sample_rows import SampleRows
@@ -58,10 +59,12 @@ class BrickCell:
         diff = _in_rows(diff)
         # Negative sums are legal on the way (a delta may come before what it takes away); the caller that holds a
         # finished state checks it by fingerprint.
-        bounds = self._samples.bounds_after(diff, sign)  # first, so that the counts are still in the cache when added
-        bound = self._counts.bound_after(diff.voxels, diff.counts, sign)
-        self._counts.add(diff.voxels, diff.counts, sign, bound=bound)
-        self._samples.add(diff, sign, bounds=bounds)
+        self._samples.add(diff, sign)
+        try:
+            self._counts.add(diff.voxels, diff.counts, sign)
+        except BadInputError:
+            self._samples.add(diff, -sign)
+            raise
 
 
 def brick_cell(geometry: Geometry, diffs: Iterable[Evidence] = ()) -> BrickCell:

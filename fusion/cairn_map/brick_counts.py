@@ -2,8 +2,8 @@
 
     brick_of [Morton number of a brick] -> b or -1      pool [b, 512, 2] hits, misses of all its voxels
 
-The pool has 16 bits a count until it may need 32. When that is, a bound of the magnitudes tells: each diff's largest
-count raises it, and only when it passes the limit are the counts themselves looked at.
+The pool has 16 bits a count until it may need 32. When that is, a bound of the magnitudes tells: each diff's counts
+raise it while they are added, and only when it passes the limit are they taken back, and the sums looked at.
 """
 
 import numpy as np
@@ -28,31 +28,24 @@ class BrickCounts:
         self._pool: npt.NDArray[np.int16] | npt.NDArray[np.int32] = np.zeros((0, 512, 2), np.int16)
         self._bound = 0
 
-    def bound_after(self, voxels: Voxels, counts: Counts, sign: int) -> int:
-        """No magnitude will be larger than this after adding sign * counts, for which there are bits enough now.
+    def add(self, voxels: Voxels, counts: Counts, sign: int) -> None:
+        """Add sign * counts.
 
         Raises:
-            BadInputError: kind `evidence_overflow`: a sum would leave its range.
+            BadInputError: kind `evidence_overflow`: a sum would leave its range; nothing was changed.
         """
-        largest = kernels.largest_count(counts)
-        bound = self._bound + largest
-        if bound <= self._limit:
-            return bound
-        bound = kernels.largest_count(self._pool) + largest
-        if bound > COUNT_MAX and not kernels.counts_fit(voxels, counts, sign, self._brick_of, self._pool, COUNT_MAX):
-            raise BadInputError("evidence_overflow", f"counts are at most {COUNT_MAX}; a sum would be more")
-        if bound > self._limit // 2:  # rather too early than to look again at each diff from now on
-            self._pool = self._pool.astype(np.int32, copy=False)
-        return min(bound, COUNT_MAX)
-
-    def add(self, voxels: Voxels, counts: Counts, sign: int, *, bound: int) -> None:
-        """Add sign * counts, after which no magnitude is larger than the bound."""
-        self._bound = bound
         new = kernels.count_new_bricks(voxels, self._brick_of)
         if new:
             used = len(self._pool)
             self._pool.resize((used + new, 512, 2), refcheck=False)  # in place where it can; nobody else has a view
             kernels.number_bricks_into(voxels, self._brick_of, used)
+        said = kernels.add_counts_into(voxels, counts, sign, self._brick_of, self._pool)
+        if said >= 0 and self._bound + said <= self._limit:
+            self._bound += said
+            return
+        # A sum may have wrapped around. Taking the counts out again brings back what was, and then we look first.
+        kernels.add_counts_into(voxels, counts, -sign, self._brick_of, self._pool)
+        self._bound = self._bound_after(voxels, counts, sign)
         kernels.add_counts_into(voxels, counts, sign, self._brick_of, self._pool)
 
     def packed(self, sampled: Voxels) -> tuple[Voxels, Counts, Voxels]:
@@ -70,3 +63,20 @@ class BrickCounts:
     @property
     def _limit(self) -> int:
         return int(np.iinfo(self._pool.dtype).max)
+
+    def _bound_after(self, voxels: Voxels, counts: Counts, sign: int) -> int:
+        """No magnitude will be larger than this after adding sign * counts, for which there are bits enough now.
+
+        Raises:
+            BadInputError: kind `evidence_overflow`: a sum would leave its range.
+        """
+        largest = kernels.largest_count(counts)
+        bound = self._bound + largest
+        if bound <= self._limit:
+            return bound
+        bound = kernels.largest_count(self._pool) + largest
+        if bound > COUNT_MAX and not kernels.counts_fit(voxels, counts, sign, self._brick_of, self._pool, COUNT_MAX):
+            raise BadInputError("evidence_overflow", f"counts are at most {COUNT_MAX}; a sum would be more")
+        if bound > self._limit // 2:  # rather too early than to look again at each diff from now on
+            self._pool = self._pool.astype(np.int32, copy=False)
+        return min(bound, COUNT_MAX)

@@ -17,7 +17,13 @@ from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence import SUM_MAX
 from cairn_map.grid import Geometry
 from cairn_map.streams import column_planes, encode_column, required, words_of_planes
-from cairn_map.sum_kernels import predict_sums, restore_squares_into, restore_sums_into, square_guesses
+from cairn_map.sum_kernels import (
+    place_sums_into,
+    predict_sums,
+    restore_squares_into,
+    restore_sums_into,
+    square_guesses,
+)
 
 Ints = npt.NDArray[np.int64]
 Words = npt.NDArray[np.uint64]
@@ -70,11 +76,9 @@ def join_samples(
     samples = np.zeros((len(sampled), geometry.plane_count), np.int64)
     low = -SUM_MAX if signed else 0
     for channel, rows in zip(geometry.channels, channels, strict=True):
-        sums = rows.sums
-        if sums.size and (sums.min() < low or sums.max() > SUM_MAX or not _says_something(sums).all()):
+        own = samples[:, geometry.planes_of(channel.name)]
+        if not place_sums_into(rows.leaves, rows.sums, sampled, own, low, SUM_MAX):
             raise DamagedDataError("bad_stream", f"channel {channel.name} holds a sum that is zero or out of range")
-        at = slice(None) if len(rows.leaves) == len(sampled) else np.searchsorted(sampled, rows.leaves)
-        samples[at, geometry.planes_of(channel.name)] = sums
     return sampled, samples
 
 

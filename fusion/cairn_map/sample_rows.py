@@ -6,8 +6,8 @@
 The list, and not the rows, is kept in order: a few new voxels move 8 bytes of each that follows, not 50.
 
 A plane has 32 bits a sum until it may need 64; its column in `narrow` goes on as their low half. When that is, a bound
-of its magnitudes tells: each diff's largest sum raises it, and only when it passes the limit are the sums themselves
-looked at.
+of its magnitudes tells: each diff's samples raise it while they are added, and only when it passes the limit are they
+taken back, and the sums looked at.
 """
 
 import numpy as np
@@ -20,6 +20,7 @@ from cairn_map.evidence import SUM_MAX, Evidence
 Voxels = npt.NDArray[np.uint32]
 Sums = npt.NDArray[np.int64]
 Magnitudes = npt.NDArray[np.uint64]
+Places = npt.NDArray[np.int32]
 
 NARROW_MAX = (1 << 31) - 1
 
@@ -38,35 +39,27 @@ class SampleRows:
         self._bounds: Magnitudes = np.zeros(plane_count, np.uint64)
         self._limits: Magnitudes = np.full(plane_count, NARROW_MAX, np.uint64)
 
-    def bounds_after(self, diff: Evidence, sign: int) -> Magnitudes:
-        """(P,) no magnitude of a plane will be larger after adding sign * samples, for which there are bits enough now.
+    def add(self, diff: Evidence, sign: int) -> None:
+        """Add sign * samples.
 
         Raises:
-            BadInputError: kind `evidence_overflow`: a sum would leave its range.
+            BadInputError: kind `evidence_overflow`: a sum would leave its range; nothing was changed.
         """
-        largest = _largest(diff.samples)
-        bounds = self._bounds + largest
-        if (bounds <= self._limits).all():
-            return bounds
-        bounds = _largest(self._narrow)
-        bounds[self._wide_planes] = _largest(self._wide)
-        bounds += largest
-        if (bounds > SUM_MAX).any() and not ((largest <= SUM_MAX).all() and self._fit(diff, sign)):
-            raise BadInputError("evidence_overflow", f"sums are at most {SUM_MAX}; one would be more")
-        # Rather too early than to look again at each diff from now on.
-        self._widen(np.nonzero((bounds > NARROW_MAX // 2) & (self._limits == NARROW_MAX))[0])
-        return np.minimum(bounds, SUM_MAX, dtype=np.uint64)
-
-    def add(self, diff: Evidence, sign: int, *, bounds: Magnitudes) -> None:
-        """Add sign * samples, after which no magnitude of a plane is larger than its bound."""
-        self._bounds = bounds
         places, new = self._find(diff)
         if new:
             rows = len(self._known) + new
             for array in (self._narrow, self._wide, self._row_of, self._known):
                 array.resize((rows, *array.shape[1:]), refcheck=False)
             kernels.insert_samples_into(diff.voxels, diff.sampled, places, new, self._known, self._row_of)
-        kernels.add_samples_into(diff.samples, sign, places, self._row_of, self._narrow, self._wide_planes, self._wide)
+        said = self._add(diff, sign, places)
+        bounds = self._bounds + said.astype(np.uint64)
+        if (said >= 0).all() and (bounds <= self._limits).all():
+            self._bounds = bounds
+            return
+        # A sum may have wrapped around. Taking the samples out again brings back what was, and then we look first.
+        self._add(diff, -sign, places)
+        self._bounds = self._bounds_after(diff, sign, places)
+        self._add(diff, sign, places)
 
     def packed(self) -> tuple[Voxels, Sums]:
         """The voxels whose sums are not all zero, rising, and their sums."""
@@ -80,15 +73,39 @@ class SampleRows:
         """Memory held by the arrays."""
         return sum(array.nbytes for array in (self._known, self._row_of, self._narrow, self._wide))
 
-    def _find(self, diff: Evidence) -> tuple[npt.NDArray[np.int32], int]:
+    def _find(self, diff: Evidence) -> tuple[Places, int]:
         places = np.empty(len(diff.sampled), np.int32)
         return places, kernels.find_samples_into(diff.voxels, diff.sampled, self._known, places)
 
-    def _fit(self, diff: Evidence, sign: int) -> bool:
-        places, _ = self._find(diff)
-        return kernels.samples_fit(
-            diff.samples, sign, places, self._row_of, self._narrow, self._wide_planes, self._wide, SUM_MAX
-        )
+    def _add(self, diff: Evidence, sign: int, places: Places) -> Sums:
+        """Add sign * samples; (P,) the samples or'ed by plane: negative if one is, else no less than the largest."""
+        said = np.zeros((8, diff.samples.shape[1]), np.int64)
+        rows = (self._row_of, self._narrow, self._wide_planes, self._wide)
+        kernels.add_samples_into(diff.samples, sign, places, *rows, said.reshape(-1))
+        together: Sums = np.bitwise_or.reduce(said, axis=0)
+        return together
+
+    def _bounds_after(self, diff: Evidence, sign: int, places: Places) -> Magnitudes:
+        """(P,) no magnitude of a plane will be larger after adding sign * samples, for which there are bits enough now.
+
+        Raises:
+            BadInputError: kind `evidence_overflow`: a sum would leave its range.
+        """
+        largest = _largest(diff.samples)
+        bounds = self._bounds + largest
+        if (bounds <= self._limits).all():
+            return bounds
+        bounds = _largest(self._narrow)
+        bounds[self._wide_planes] = _largest(self._wide)
+        bounds += largest
+        rows = (self._row_of, self._narrow, self._wide_planes, self._wide)
+        if (bounds > SUM_MAX).any() and not (
+            (largest <= SUM_MAX).all() and kernels.samples_fit(diff.samples, sign, places, *rows, SUM_MAX)
+        ):
+            raise BadInputError("evidence_overflow", f"sums are at most {SUM_MAX}; one would be more")
+        # Rather too early than to look again at each diff from now on.
+        self._widen(np.nonzero((bounds > NARROW_MAX // 2) & (self._limits == NARROW_MAX))[0])
+        return np.minimum(bounds, SUM_MAX, dtype=np.uint64)
 
     def _widen(self, planes: npt.NDArray[np.int64]) -> None:
         wide = np.empty((len(self._known), len(self._wide_planes) + len(planes)), np.int64)

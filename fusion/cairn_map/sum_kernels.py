@@ -47,6 +47,27 @@ def restore_squares_into(sums: Ints, planes: Planes) -> None:
         sums[n, 1] = np.int64(guess + unzigzag(_word(planes, n)))
 
 
+@nb.njit(cache=True, nogil=True)
+def place_sums_into(leaves: Ints, sums: Ints, sampled: Ints, samples: Ints, low: int, high: int) -> bool:
+    """Write the (N, P) sums of leaves that rise into (S, P) samples, at their places among the leaves `sampled`.
+
+    Returns False where a row is all zeros, or a sum not in [low, high]; `sampled` rises and has them all.
+    """
+    row = np.uint64(0)
+    sound = True
+    for n in range(np.uint64(leaves.shape[0])):
+        while sampled[row] != leaves[n]:
+            row += np.uint64(1)
+        said = np.int64(0)
+        for p in range(np.uint64(sums.shape[1])):
+            value = sums[n, p]
+            sound &= low <= value <= high
+            said |= value
+            samples[row, p] = value
+        sound &= said != 0
+    return sound
+
+
 @nb.njit(forceinline=True)
 def _word(planes: Planes, n: int) -> np.uint64:
     """The number that the planes of `streams.column_planes` spell."""
