@@ -28,9 +28,9 @@ from cairn_map.fingerprint import fingerprint_from_hex
 from cairn_map.frames import Frame, FrameReader
 from cairn_map.grid import Cell
 from cairn_map.ids import Author, CommitId
+from cairn_map.index_messages import CellIndex
 from cairn_map.messages import (
     BranchInfo,
-    CellIndex,
     CreateMap,
     LogEntry,
     MapInfo,
@@ -196,6 +196,11 @@ class MapApi:
         except (KeyError, ValidationError) as exc:
             raise DamagedDataError("bad_message", f"the answer for cell {cell} lacks its headers: {exc}") from exc
 
+    def put_cell(self, name: str, cell: Cell, data: bytes) -> None:
+        """Put a damaged cell right; a sound one stays as it is, and of other bytes nothing is taken."""
+        headers = {"Content-Type": "application/vnd.cairn.cell"}
+        self._ask("PUT", f"/maps/{name}/main/cells/{cell}", content=data, headers=headers)
+
     def missing(self, name: str, branch: str, request: MissingRequest) -> Iterator[Frame]:
         """Frames as they arrive.
 
@@ -252,7 +257,8 @@ class MapApi:
         if self.token:
             sent["Authorization"] = f"Bearer {self.token}"
         if content:
-            sent["Content-Type"] = "application/json" if content.startswith(b"{") else "application/vnd.cairn.commit"
+            is_json = content.startswith(b"{")
+            sent.setdefault("Content-Type", "application/json" if is_json else "application/vnd.cairn.commit")
         try:
             with self._client.stream(method, path, headers=sent, content=content, params=params) as response:
                 self.traffic.up_bytes += len(content)

@@ -9,6 +9,7 @@
     $ cairn map log http://127.0.0.1:8750/maps/lab --graph
     $ cairn map branches http://127.0.0.1:8750/maps/lab
     $ cairn map retract http://127.0.0.1:8750/maps/lab --robot mole --pushed-after 14:05 --dry-run
+    $ cairn map heal http://127.0.0.1:8750/maps/lab lab/
 
 A map's URL is http://HOST:PORT/maps/NAME. A retract takes exactly the evidence of the named commits out again, on
 the server and on every robot; everything else stays as it is. Results go to standard output, progress to standard
@@ -26,6 +27,7 @@ from cairn_client import map_export
 from cairn_client.api import MapApi
 from cairn_client.arguments import add_token, allow_negative_lists, api_of, parser, say, shown_bytes, shown_length
 from cairn_client.branch_table import branch_table
+from cairn_client.heal_command import add_heal_arguments, heal
 from cairn_client.log_graph import log_graph
 from cairn_client.prior_data import push_prior_data
 from cairn_client.retract_command import add_retract_arguments, retract
@@ -208,5 +210,6 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--npz", type=Path, metavar="FILE", help="all known voxels as NumPy arrays")
     export.add_argument("--picture", type=Path, metavar="FILE", help="PNG: colour, temperature, probability")
     export.add_argument("--ceiling", type=float, metavar="METRES", help="picture: leave out what is higher")
+    add_heal_arguments(command("heal", "send cells that the server's disk damaged", heal, "map"))
     add_retract_arguments(command("retract", "take commits out of a map again, exactly", retract, "map"))
     return top

@@ -43,8 +43,9 @@ def export_map(args: argparse.Namespace) -> None:
         raise BadInputError("nothing_asked", "say what to write: --cells DIR, --ply FILE, --npz FILE or --picture FILE")
     _check_outputs(args.ply, args.npz, args.picture)
     api, name = api_of(args.map, args.token)
-    info = api.map_info(name)
-    cells = list(fetch_map(api, name))
+    with api:
+        info = api.map_info(name)
+        cells = list(fetch_map(api, name))
     if args.cells:
         write_head(args.cells, FolderHead(geometry=info.geometry, sensor_model=info.sensor_model))
         for body, cell in cells:

@@ -54,6 +54,8 @@ class Replica:
         self.default_cursor: Cursor | None = cursor_from_text(cursor) if cursor else None
         """Cursor of every cell that is not held."""
         self.cells: dict[CellKey, BaseCell] = store.cells()
+        self.refused_cells: set[tuple[CellKey, str]] = set()
+        """Cells, with their fingerprints, by which the server would not be healed: not sent again."""
         self._load()
 
     @property

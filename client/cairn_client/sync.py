@@ -6,7 +6,7 @@ viewer     fetch as high-end does, push nothing
 """
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from cairn_client.api import MapApi
 from cairn_client.applying import Box, Exchange, is_within
+from cairn_client.heal import heal_damaged
 from cairn_client.replica import Replica
 from cairn_client.replica_store import BaseCell
 from cairn_map.cell_code import decode_cell
@@ -27,7 +28,7 @@ from cairn_map.errors import (
     UnreachableError,
 )
 from cairn_map.fingerprint import ZERO, fingerprint
-from cairn_map.grid import Cell, cell_key, cell_of_key
+from cairn_map.grid import Cell, CellKey, cell_key, cell_of_key
 from cairn_map.ids import CommitId
 
 log = logging.getLogger(__name__)
@@ -49,6 +50,8 @@ class RoundReport:
     """Commits that the server will not take; they stay in the outbox, and the log says why."""
     frames: int = 0
     cells_fetched: int = 0
+    healed: int = 0
+    """Cells that the server had damaged and has from here again."""
 
 
 def push_commits(
@@ -150,9 +153,8 @@ def fetch_missing(replica: Replica, api: MapApi, map_name: str, branch: str, *, 
             log.warning("another server answers for map %s; starting without its old state", map_name)
             replica.forget_server()
             continue
-        if exchange.damaged:
-            names = ", ".join(str(cell_of_key(key)) for key in exchange.damaged)
-            raise DamagedDataError("fingerprint_mismatch", f"the server's cells {names} are damaged; all others came")
+        report.healed += heal_damaged(replica, api, map_name)
+        _complain(exchange.damaged)
         compare = exchange.must_compare
         if exchange.is_done and not _has_unproven(replica, box):
             keep_retracts(replica, api, map_name)
@@ -167,6 +169,7 @@ def fetch_cells(replica: Replica, api: MapApi, map_name: str, *, wanted: Wanted 
 
     Raises:
         UnreachableError: the link broke; the cells before it are kept.
+        DamagedDataError: some cells are damaged; all others came.
     """
     report = RoundReport()
     author = replica.author
@@ -182,11 +185,18 @@ def fetch_cells(replica: Replica, api: MapApi, map_name: str, *, wanted: Wanted 
         replica.move(same, to=to, coverage=coverage)
         for key in replica.cells.keys() - digests.keys():  # a server that was restored forgot them
             replica.hold_nothing(key, BaseCell(to, coverage, ZERO))
+    report.healed = heal_damaged(replica, api, map_name)
+    damaged = []
     for key in sorted(digests.keys() - set(same)):
         if wanted is None or wanted(cell_of_key(key)):
-            report.cells_fetched += fetch_cell(replica, api, map_name, cell_of_key(key))
+            try:
+                report.cells_fetched += fetch_cell(replica, api, map_name, cell_of_key(key))
+            except DamagedDataError as exc:
+                log.error("cell %s: %s", cell_of_key(key), exc.message)
+                damaged.append(key)
     replica.forget_stable_commits(wanted=wanted)
     keep_retracts(replica, api, map_name)
+    _complain(damaged)
     return report
 
 
@@ -222,6 +232,13 @@ def within(position_m: npt.ArrayLike, *, radius_m: float, cell_edge_m: float) ->
         return bool(np.linalg.norm(nearest - centre) <= radius_m)
 
     return is_near
+
+
+def _complain(damaged: Sequence[CellKey]) -> None:
+    """Raises: DamagedDataError: for cells that came whole but not sound, or could not come; if there are any."""
+    if damaged:
+        names = ", ".join(str(cell_of_key(key)) for key in damaged)
+        raise DamagedDataError("fingerprint_mismatch", f"the server's cells {names} are damaged; all others came")
 
 
 def _has_unproven(replica: Replica, box: Box | None) -> bool:

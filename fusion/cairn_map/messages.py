@@ -29,6 +29,8 @@ VectorJson = Annotated[dict[str, Annotated[list[Interval], FailFast()]], Field(m
 Time = Annotated[float, Field(allow_inf_nan=False)]
 
 CURSORS_MAX = 100_000
+DAMAGED_MAX = 256
+"""Damaged cells named in one header; the others are named when these are healed."""
 SELECTING_PARTS = ("robot", "rig", "pushed_after_s", "pushed_before_s", "captured_after_s", "captured_before_s")
 
 
@@ -163,6 +165,8 @@ class ReplyHeader(_Model):
     """Highest folded number of the asker's own incarnation, and its SHA-256."""
     retracts: list[IdText] = []
     """Retracting commits that are not yet stable."""
+    damaged: Annotated[list[tuple[tuple[int, int, int], FingerprintText]], Field(max_length=DAMAGED_MAX)] = []
+    """Cells that the server cannot read any more, and what they were: whoever has one as it was may send it."""
 
     @property
     def to_cursor(self) -> Cursor:
@@ -207,25 +211,6 @@ class More(_Model):
     """Last frame of a reply that reached its size limit: ask again for the rest."""
 
     to: CursorText
-
-
-class CellEntry(_Model):
-    """One row of the cell index."""
-
-    cell: tuple[int, int, int]
-    size_bytes: int
-    digest: ShaText
-    lm: int
-    """Log entry that last changed the cell."""
-    fingerprint: FingerprintText
-    voxels: int
-
-
-class CellIndex(_Model):
-    """Answer to `GET /maps/{map}/main/cells`, taken from one state of the map."""
-
-    header: ReplyHeader
-    cells: list[CellEntry]
 
 
 class Retract(_Model):

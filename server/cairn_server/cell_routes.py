@@ -9,7 +9,7 @@ from cairn_map.cursor import cursor_from_text
 from cairn_map.errors import BadInputError, NotFoundError
 from cairn_map.grid import CellKey, cell_from_text, cell_key
 from cairn_map.ids import author_from_text
-from cairn_map.messages import CellIndex
+from cairn_map.index_messages import CellIndex
 from cairn_map.version_vector import vector_digest, vector_text
 from cairn_map.view import ViewStyle
 from cairn_map.view_code import encode_view

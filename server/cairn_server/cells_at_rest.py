@@ -24,6 +24,14 @@ SOUND_MAX = 50_000
 """Cells remembered as sound, some 300 bytes each."""
 
 
+class DamagedCellError(DamagedDataError):
+    """A cell of the map is damaged, and nothing here says any more what it was."""
+
+    def __init__(self, key: CellKey, message: str) -> None:
+        super().__init__("damaged_store", message)
+        self.key = key
+
+
 def stored_evidence(stored: CellRow) -> Evidence:
     """The evidence of a cell at rest.
 
@@ -45,9 +53,9 @@ def sound_cell(snapshot: Snapshot, key: CellKey, geometry: Geometry, healed: lis
     is added to `healed`, for the caller to write once nothing is read any more.
 
     Raises:
-        DamagedDataError: kind `damaged_store`: it is damaged, and the log does not tell any more what it was.
+        DamagedCellError: it is damaged, and the log does not tell any more what it was.
     """
-    stored = snapshot.cell(key)
+    stored = _row(snapshot, key)
     if stored is None or _SOUND.knows(stored):
         return stored
     try:
@@ -131,9 +139,9 @@ def cell_to_change(snapshot: Snapshot, key: CellKey, geometry: Geometry) -> tupl
     """A cell of the map, to be changed; a damaged one is summed up anew from all that the log says about it.
 
     Raises:
-        DamagedDataError: kind `damaged_store`: it is damaged, and so is what it was made from.
+        DamagedCellError: it is damaged, and so is what it was made from.
     """
-    stored = snapshot.cell(key)
+    stored = _row(snapshot, key)
     cell = BrickCell(geometry)
     if stored is None:
         return cell, no_stamps(geometry.depth)
@@ -146,18 +154,25 @@ def cell_to_change(snapshot: Snapshot, key: CellKey, geometry: Geometry) -> tupl
     return cell, stamps
 
 
+def _row(snapshot: Snapshot, key: CellKey) -> CellRow | None:
+    try:
+        return snapshot.cell(key)
+    except DamagedDataError as exc:
+        raise DamagedCellError(key, exc.message) from exc
+
+
 def _proven_anew(snapshot: Snapshot, stored: CellRow, geometry: Geometry, why: DamagedDataError) -> CellRow:
     """A damaged cell made anew, if its digest or its fingerprint says that the log still tells all of it."""
     try:
         anew = rebuilt_cell(snapshot, stored, geometry)
     except DamagedDataError as exc:
-        raise DamagedDataError(
-            "damaged_store",
+        raise DamagedCellError(
+            stored.key,
             f"{why.message}, and cannot be made anew: {exc.message}; send the cell as it was, or restore a backup",
         ) from exc
     if anew.digest != stored.digest and anew.fingerprint != stored.fingerprint:
-        raise DamagedDataError(
-            "damaged_store",
+        raise DamagedCellError(
+            stored.key,
             f"{why.message}, and its commits do not add up to it; send the cell as it was, or restore a backup",
         )
     return anew

@@ -3,14 +3,17 @@
 import threading
 
 from cairn_map.errors import CairnError, DamagedDataError
+from cairn_server.cells_at_rest import DamagedCellError
+from cairn_server.damaged_cells import DamagedCells
 from cairn_server.server_figures import ServerFigures
 
 
 class FoldHealth:
     """Which maps could not be folded the last time, and why; thread-safe."""
 
-    def __init__(self, figures: ServerFigures) -> None:
+    def __init__(self, figures: ServerFigures, damaged: DamagedCells) -> None:
         self._figures = figures
+        self._damaged = damaged
         self._lock = threading.Lock()
         self._failing: dict[str, BaseException] = {}
 
@@ -26,6 +29,8 @@ class FoldHealth:
         """A map could not be folded."""
         with self._lock:
             self._failing[name] = error
+        if isinstance(error, DamagedCellError):
+            self._damaged.note(name, [error.key])
         self._figures.fold_failures.add(1, name)
 
     def damaged(self) -> frozenset[str]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from cairn_map.cell_code import encode_cell
 from cairn_map.cursor import Cursor, cursor_from_text
-from cairn_map.errors import BadInputError, ConflictError, DamagedDataError
+from cairn_map.errors import BadInputError, ConflictError
 from cairn_map.evidence import empty_evidence
 from cairn_map.fingerprint import ZERO, Fingerprint
 from cairn_map.frames import CELL_HEAD, CellFrame, Frame, FrameKind
@@ -19,7 +19,8 @@ from cairn_map.ids import Author, author_from_text
 from cairn_map.messages import Done, MissingRequest, More, ReplyHeader
 from cairn_map.version_vector import VersionVector
 from cairn_server.cell_changes import change_since
-from cairn_server.cells_at_rest import sound_cell
+from cairn_server.cells_at_rest import DamagedCellError, sound_cell
+from cairn_server.damaged_cells import as_named
 from cairn_server.read_cache import ReadCache
 from cairn_server.store import Snapshot
 from cairn_server.store_rows import CellRow
@@ -44,6 +45,8 @@ class Asker:
     unproven: set[Cursor] = field(default_factory=set)
     healed: list[CellRow] = field(default_factory=list)
     """Damaged cells that were made anew for it."""
+    damaged: set[CellKey] = field(default_factory=set)
+    """Cells that could not be."""
 
     def wants(self, key: CellKey) -> bool:
         """Whether a cell lies in the box that is asked for."""
@@ -81,11 +84,17 @@ def asker_from_request(request: MissingRequest, snapshot: Snapshot) -> Asker:
 
 
 def reply_frames(
-    snapshot: Snapshot, asker: Asker, geometry: Geometry, cache: ReadCache, *, stable: VersionVector
+    snapshot: Snapshot,
+    asker: Asker,
+    geometry: Geometry,
+    cache: ReadCache,
+    *,
+    stable: VersionVector,
+    damaged: frozenset[CellKey] = frozenset(),
 ) -> Iterator[Frame]:
     """Header, frames of the cells that the asker misses, and the end; all from one snapshot."""
     head = snapshot.head
-    yield header_of(snapshot, asker.author, stable=stable)
+    yield header_of(snapshot, asker.author, stable=stable, damaged=damaged)
     rest = ZERO
     sent_bytes = 0
     listed = dict(asker.cells)
@@ -107,7 +116,9 @@ def reply_frames(
     yield Done(to=str(head.cursor), rest=rest.hex())
 
 
-def header_of(snapshot: Snapshot, author: Author | None, *, stable: VersionVector) -> ReplyHeader:
+def header_of(
+    snapshot: Snapshot, author: Author | None, *, stable: VersionVector, damaged: frozenset[CellKey] = frozenset()
+) -> ReplyHeader:
     """The state of a snapshot, as the author of some of its commits needs to know it."""
     head = snapshot.head
     tip = snapshot.tip(author) if author else None
@@ -118,6 +129,7 @@ def header_of(snapshot: Snapshot, author: Author | None, *, stable: VersionVecto
         pending=snapshot.pending().to_json(),
         tip=(tip[0], tip[1].hex()) if tip else None,
         retracts=[str(commit) for commit in snapshot.retracting() if commit not in stable],
+        damaged=as_named(snapshot, damaged),
     )
 
 
@@ -132,15 +144,16 @@ def _frame_for(
         change = change_since(snapshot, row, start, geometry, cache, asker=asker.author, kinds=asker.kinds)
         if change is not None:
             return change
-    body = _body(snapshot, row.key, geometry, asker.healed)
+    body = _body(snapshot, row.key, geometry, asker)
     return _frame(FrameKind.FULL, row.key, start, snapshot.head.cursor, row.fingerprint, body)
 
 
-def _body(snapshot: Snapshot, key: CellKey, geometry: Geometry, healed: list[CellRow]) -> bytes:
+def _body(snapshot: Snapshot, key: CellKey, geometry: Geometry, asker: Asker) -> bytes:
     """A cell's bytes; none if they are damaged for good, which its asker reports, while all other cells come."""
     try:
-        stored = sound_cell(snapshot, key, geometry, healed)
-    except DamagedDataError as exc:
+        stored = sound_cell(snapshot, key, geometry, asker.healed)
+    except DamagedCellError as exc:
+        asker.damaged.add(key)
         log.error("cell %s is sent without its bytes: %s", cell_of_key(key), exc.message)
         return b""
     return stored.body if stored else b""

@@ -14,11 +14,10 @@ from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_map.frames import encode_frame, start_of_reply
 from cairn_map.grid import CellKey, cell_of_key
 from cairn_map.ids import INITIAL, OPERATOR, Author, RobotName, commit_id_from_text, new_incarnation, robot_name
+from cairn_map.index_messages import CellEntry, CellIndex
 from cairn_map.live_events import RobotSign
 from cairn_map.messages import (
     BranchInfo,
-    CellEntry,
-    CellIndex,
     CreateMap,
     MapInfo,
     MissingRequest,
@@ -30,8 +29,9 @@ from cairn_map.messages import (
 from cairn_map.version_vector import VersionVector
 from cairn_server.auth import Caller, Role, new_token, token_hash
 from cairn_server.branch_list import branch_infos
-from cairn_server.cells_at_rest import sound_cell
+from cairn_server.cells_at_rest import DamagedCellError, sound_cell
 from cairn_server.commit_checks import CommitChecks
+from cairn_server.damaged_cells import DamagedCells
 from cairn_server.fold_health import FoldHealth
 from cairn_server.folder import Folder
 from cairn_server.healing import heal_cell, keep_healed
@@ -61,7 +61,8 @@ class Service:
         self.store = store
         self.settings = settings
         self.figures = ServerFigures()
-        self.folds = FoldHealth(self.figures)
+        self.damaged = DamagedCells()
+        self.folds = FoldHealth(self.figures, self.damaged)
         self.live = Hub(store)
         self.reports = RobotReports(store, self.live)
         self._folder = Folder(store, self.folds, keep_evidence_s=settings.keep_evidence_s, on_fold=self.live.folded)
@@ -158,10 +159,11 @@ class Service:
         with self.store.snapshot(row) as snapshot:
             asker = asker_from_request(request, snapshot)
             parts = [start_of_reply()]
-            stable = self._stable.of(row, snapshot)
-            frames = reply_frames(snapshot, asker, row.geometry, self._reads, stable=stable)
+            stable, damaged = self._stable.of(row, snapshot), self.damaged.of(row.name)
+            frames = reply_frames(snapshot, asker, row.geometry, self._reads, stable=stable, damaged=damaged)
             parts += [encode_frame(f) for f in self.figures.counted(frames)]
         keep_healed(self.store, row, asker.healed)
+        self.damaged.note(row.name, asker.damaged)
         self.store.seen(row, branch, asker.cursor)
         self.live.robot_heard(row, branch, **({"cursor": str(asker.cursor)} if asker.cursor else {}))
         return b"".join(parts)
@@ -208,7 +210,8 @@ class Service:
         """All cells that were ever touched, emptied ones included, from one state."""
         with self.store.snapshot(row) as snapshot:
             cells = list(snapshot.cells())
-            header = header_of(snapshot, author, stable=self._stable.of(row, snapshot))
+            stable, damaged = self._stable.of(row, snapshot), self.damaged.of(row.name)
+            header = header_of(snapshot, author, stable=stable, damaged=damaged)
         return CellIndex(
             header=header,
             cells=[
@@ -228,11 +231,15 @@ class Service:
         """One cell (None: never seen) and the state that it was read from.
 
         Raises:
-            DamagedDataError: kind `damaged_store`: it is damaged, and nothing here says what it was.
+            DamagedCellError: kind `damaged_store`: it is damaged, and nothing here says what it was.
         """
         healed: list[CellRow] = []
-        with self.store.snapshot(row) as snapshot:
-            found, head = sound_cell(snapshot, key, row.geometry, healed), snapshot.head
+        try:
+            with self.store.snapshot(row) as snapshot:
+                found, head = sound_cell(snapshot, key, row.geometry, healed), snapshot.head
+        except DamagedCellError:
+            self.damaged.note(row.name, [key])
+            raise
         keep_healed(self.store, row, healed)
         return found, head
 
@@ -240,6 +247,7 @@ class Service:
         """Put a damaged cell right with bytes that somebody still has; False if it is sound."""
         with self._healing:
             is_healed = heal_cell(self.store, row, key, data)
+        self.damaged.forget(row.name, key)
         self._folder.wake()
         return is_healed
 

@@ -34,7 +34,8 @@ from cairn_map.fingerprint import fingerprint
 from cairn_map.frames import FrameKind
 from cairn_map.grid import cell_of_key
 from cairn_map.ids import CommitId
-from cairn_map.messages import CellEntry, CellIndex, MissingRequest
+from cairn_map.index_messages import CellEntry, CellIndex
+from cairn_map.messages import MissingRequest
 from cairn_map.version_vector import EMPTY, VersionVector
 
 C1, C2, C3 = cursor(1), cursor(2), cursor(3)

@@ -30,7 +30,8 @@ from cairn_map.fingerprint import ZERO, fingerprint
 from cairn_map.frames import Frame, FrameReader
 from cairn_map.grid import Cell, CellKey, cell_key
 from cairn_map.ids import OPERATOR, Author, CommitId, RobotName, commit_id_from_text
-from cairn_map.messages import CellIndex, CreateMap, MissingRequest, Pushed, Retract
+from cairn_map.index_messages import CellIndex
+from cairn_map.messages import CreateMap, MissingRequest, Pushed, Retract
 from cairn_map.version_vector import EMPTY, VersionVector
 from cairn_server import service as service_module
 from cairn_server import sqlite_store, sqlite_writer

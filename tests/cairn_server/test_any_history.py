@@ -20,7 +20,8 @@ from cairn_map.commit import Commit
 from cairn_map.frames import frames_of
 from cairn_map.grid import CellKey, cell_of_key
 from cairn_map.ids import Author, CommitId, Incarnation
-from cairn_map.messages import CellIndex, CreateMap, MapInfo, Register, Retract
+from cairn_map.index_messages import CellIndex
+from cairn_map.messages import CreateMap, MapInfo, Register, Retract
 from cairn_map.version_vector import EMPTY
 from cairn_server.service import OPERATOR
 from cairn_server.store_rows import MapRow

@@ -17,7 +17,7 @@ from cairn_map.commit import make_commit
 from cairn_map.cursor import cursor_from_text
 from cairn_map.fingerprint import fingerprint
 from cairn_map.grid import cell_of_key
-from cairn_map.messages import CellIndex
+from cairn_map.index_messages import CellIndex
 from cairn_map.version_vector import version_vector_from_json
 from cairn_server.store_rows import MapRow
 

@@ -30,10 +30,9 @@ from cairn_map.cell_folder import FolderHead
 from cairn_map.evidence import Evidence, empty_evidence
 from cairn_map.fingerprint import fingerprint
 from cairn_map.frames import encode_frame, start_of_reply
+from cairn_map.index_messages import CellEntry, CellIndex
 from cairn_map.messages import (
     CellCursor,
-    CellEntry,
-    CellIndex,
     CreateMap,
     Done,
     LogEntry,

@@ -1,0 +1,28 @@
+"""The cell index as JSON: what a map's cells are, without their bytes."""
+
+from pydantic import BaseModel, ConfigDict
+
+from cairn_map.messages import FingerprintText, ReplyHeader, ShaText
+
+
+class CellEntry(BaseModel):
+    """One row of the cell index."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    cell: tuple[int, int, int]
+    size_bytes: int
+    digest: ShaText
+    lm: int
+    """Log entry that last changed the cell."""
+    fingerprint: FingerprintText
+    voxels: int
+
+
+class CellIndex(BaseModel):
+    """Answer to `GET /maps/{map}/main/cells`, taken from one state of the map."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    header: ReplyHeader
+    cells: list[CellEntry]
