@@ -169,9 +169,11 @@ class MapApi:
         """Log entries after a sequence number, oldest first."""
         return list_of(LogEntry, self._ask("GET", f"/maps/{name}/log", params={"after": after, "limit": limit}))
 
-    def cell_index(self, name: str, author: Author | None = None) -> CellIndex:
-        """All cells of a map, without their bytes."""
+    def cell_index(self, name: str, author: Author | None = None, *, box: tuple[Cell, Cell] | None = None) -> CellIndex:
+        """The cells of a map, all or those in a box (lowest and highest cell), without their bytes."""
         params = {"author": str(author)} if author else {}
+        if box:
+            params["box"] = f"{box[0]},{box[1]}"
         index = message_from_json(CellIndex, self._ask("GET", f"/maps/{name}/main/cells", params=params))
         self._vector = index.header.coverage
         return index

@@ -36,8 +36,10 @@ def is_within(key: CellKey, box: Box | None) -> bool:
 class Exchange:
     """One request for what is missing, and the frames of its answer."""
 
-    def __init__(self, replica: Replica, *, compare: bool = False, box: Box | None = None) -> None:
-        """Args: box: lowest and highest cell (inclusive) to ask for; None: all."""
+    def __init__(
+        self, replica: Replica, *, compare: bool = False, box: Box | None = None, reply_bytes_max: int | None = None
+    ) -> None:
+        """Ask for all cells, or for those in a box; at most so many bytes of cells, or as many as the server likes."""
         self._replica = replica
         with replica.lock:
             self._author = replica.author
@@ -45,6 +47,7 @@ class Exchange:
             self._asked = {key: cell.cursor for key, cell in replica.cells.items() if is_within(key, box)}
         self._compare = compare
         self._box = box
+        self._reply_bytes_max = reply_bytes_max
         self._header: ReplyHeader | None = None
         self._coverage = EMPTY
         self._framed: set[CellKey] = set()
@@ -52,6 +55,8 @@ class Exchange:
         self.damaged: list[CellKey] = []
         """Cells that came whole, but not sound: they are asked for again, and the others are not held up."""
         self.is_done = False
+        self.has_more = False
+        """The reply ended before its cells did: the next request asks for the rest."""
         self.must_compare = False
 
     def request(self) -> MissingRequest:
@@ -64,6 +69,7 @@ class Exchange:
             compare=self._compare,
             kinds=["delta", "state", "full"],
             box=self._box,
+            size_bytes_max=self._reply_bytes_max,
         )
 
     def take(self, frame: Frame) -> None:
@@ -80,7 +86,7 @@ class Exchange:
             elif self._header is None:
                 raise DamagedDataError("bad_frame", "a reply must begin with its header")
             elif isinstance(frame, More):
-                pass  # what came is kept; the next request asks for the rest
+                self.has_more = bool(self._framed)
             elif frame.to_cursor != self._header.to_cursor:
                 raise DamagedDataError("bad_frame", "a frame leads to another state than its header")
             elif isinstance(frame, CellFrame):

@@ -25,7 +25,8 @@ from cairn_client.outbox import UNNUMBERED
 from cairn_client.own_status import OwnStatus
 from cairn_client.replica import Replica
 from cairn_client.replica_store import ReplicaStore
-from cairn_client.sync import RoundReport, Wanted, fetch_cells, fetch_missing, push_commits
+from cairn_client.scope import EVERYTHING, Scope, fetch
+from cairn_client.sync import RoundReport, push_commits
 from cairn_client.sync_thread import SyncThread
 from cairn_fusion.integrate import Integrator
 from cairn_fusion.measurement import Measurement
@@ -59,7 +60,7 @@ class Robot:
         mode: Mode = "high-end",
         geometry: Geometry | None = None,
         integrator: Integrator | None = None,
-        wanted: Wanted | None = None,
+        scope: Scope = EVERYTHING,
     ) -> None:
         """Open or make the robot's directory; no network unless the map's geometry is not known yet.
 
@@ -73,7 +74,7 @@ class Robot:
                 nothing.
             geometry: of the map, to start without a link; else the server is asked once.
             integrator: range limits.
-            wanted: low-end: which cells to fetch; default all.
+            scope: which cells to fetch, and how much in one reply.
 
         Raises:
             BadInputError: bad URL or name, or the directory belongs to another robot or map.
@@ -86,7 +87,7 @@ class Robot:
         self.mode: Mode = mode
         self._rig = rig
         self._enrolment_token = token
-        self._wanted = wanted
+        self._scope = scope
         self._api = MapApi(server_url, token=token)
         try:
             self._replica = self._open(Path(directory), geometry)
@@ -219,10 +220,8 @@ class Robot:
         pushes = RoundReport()
         if self.mode != "viewer":
             pushes = push_commits(self._replica, self._api, self._map_name, on_push=on_push)
-        if self.mode == "low-end":
-            report = fetch_cells(self._replica, self._api, self._map_name, wanted=self._wanted)
-        else:
-            report = fetch_missing(self._replica, self._api, self._map_name, self.name)
+        is_low_end = self.mode == "low-end"
+        report = fetch(self._replica, self._api, self._map_name, self.name, is_low_end=is_low_end, scope=self._scope)
         report.pushed, report.refused = pushes.pushed, pushes.refused
         self.status.tell(self._replica, self._api, self._map_name, branch=self.name, mode=self.mode)
         return report

@@ -13,11 +13,16 @@ can share a recording: --share 1/2 takes every second measurement from the first
 
 `pull` fetches what the state folder's robot misses and pushes what waits there. With --mode low-end it fetches whole
 cells instead of differences, on request only those around a place (--near X,Y,Z --radius METRES).
+
+Both can fetch a part of the map: --box X0,Y0,Z0,X1,Y1,Z1 (metres in the map's frame) only the cells that share more
+than a face with this box; and in small helpings: with --reply-bytes 100000 each reply ends after 100 kB of cells, or
+one cell, so that a link that breaks often loses no more than that.
 """
 
 import argparse
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +41,7 @@ from cairn_client.arguments import (
 from cairn_client.frame_arguments import add_frame_arguments, frame_options
 from cairn_client.replica_store import ReplicaStore
 from cairn_client.robot import Mode, Robot
+from cairn_client.scope import Scope
 from cairn_client.sync import Wanted, within
 from cairn_fusion.importers import open_source
 from cairn_fusion.integrate import Integrator
@@ -83,6 +89,7 @@ def _replay(args: argparse.Namespace) -> int:
         mode=args.mode,
         geometry=geometry,
         integrator=integrator,
+        scope=_scope(args),
     ) as robot:
         last_sync_s = start_s
         for stop in with_progress(stops, source.name, total=len(stops)):
@@ -127,8 +134,8 @@ def _pull(args: argparse.Namespace) -> int:
     known = _robot_of(args.state)
     name = args.name or known or "viewer"
     mode: Mode = args.mode or ("high-end" if known and known != "viewer" else "viewer")
-    wanted = _wanted(args, api, map_name)
-    with Robot(None, args.map, directory=args.state, name=name, token=args.token, mode=mode, wanted=wanted) as robot:
+    scope = replace(_scope(args), wanted=_wanted(args, api, map_name))
+    with Robot(None, args.map, directory=args.state, name=name, token=args.token, mode=mode, scope=scope) as robot:
         report = robot.sync()
         robot.sync()  # tells the server where this robot stands now
         cells = robot.map.packed()
@@ -206,6 +213,12 @@ def _wanted(args: argparse.Namespace, api: MapApi, map_name: str) -> Wanted | No
     return within(args.near, radius_m=args.radius, cell_edge_m=api.map_info(map_name).geometry.cell_edge_m)
 
 
+def _scope(args: argparse.Namespace) -> Scope:
+    if args.reply_bytes is not None and args.mode == "low-end":
+        raise BadInputError("bad_option", "--reply-bytes bounds the answers with differences; low-end fetches cells")
+    return Scope(box_m=(args.box[:3], args.box[3:]) if args.box else None, reply_bytes_max=args.reply_bytes)
+
+
 def _share(text: str) -> tuple[int, int]:
     part, slash, parts = text.partition("/")
     if not slash or not part.isdigit() or not parts.isdigit() or not 1 <= int(part) <= int(parts):
@@ -219,6 +232,13 @@ def _place(text: str) -> tuple[float, float, float]:
     except ValueError:
         raise argparse.ArgumentTypeError(f"expected X,Y,Z in metres, got {text!r}") from None
     return x, y, z
+
+
+def _box(text: str) -> tuple[float, ...]:
+    parts = text.split(",")
+    if len(parts) != 6:
+        raise argparse.ArgumentTypeError(f"expected X0,Y0,Z0,X1,Y1,Z1 in metres, got {text!r}")
+    return (*_place(",".join(parts[:3])), *_place(",".join(parts[3:])))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -260,5 +280,9 @@ def _parser() -> argparse.ArgumentParser:
         allow_negative_lists(command)
         command.add_argument("--map", required=True, metavar="URL", help="http://HOST:PORT/maps/NAME")
         command.add_argument("--name", help="the robot's name on the map")
+        command.add_argument("--box", type=_box, metavar="X0,Y0,Z0,X1,Y1,Z1", help="fetch only cells in it, metres")
+        command.add_argument(
+            "--reply-bytes", type=int, metavar="BYTES", help="of cells in one reply; the rest comes in the next ones"
+        )
         add_token(command)
     return top

@@ -34,7 +34,9 @@ from cairn_map.ids import CommitId
 log = logging.getLogger(__name__)
 
 ROUNDS_MAX = 64
-"""Requests in one fetch: a reply may ask to come back for the rest, or to compare; it may not go on for ever."""
+"""Requests in one fetch: a reply may ask to come back, or to compare; it may not go on for ever."""
+REPLIES_MAX = 4096
+"""The same with those that end before their cells do, by the asker's or the server's limit of bytes."""
 
 
 Wanted = Callable[[Cell], bool]
@@ -132,8 +134,18 @@ def keep_retracts(replica: Replica, api: MapApi, map_name: str) -> None:
             replica.keep_sealed(commit, seal)
 
 
-def fetch_missing(replica: Replica, api: MapApi, map_name: str, branch: str, *, box: Box | None = None) -> RoundReport:
+def fetch_missing(
+    replica: Replica,
+    api: MapApi,
+    map_name: str,
+    branch: str,
+    *,
+    box: Box | None = None,
+    reply_bytes_max: int | None = None,
+) -> RoundReport:
     """Bring every held cell to the server's head, or those in a box; what arrives before a cut is kept.
+
+    With `reply_bytes_max` a reply ends after so many bytes of cells, and the rest is asked for by the next request.
 
     Raises:
         UnreachableError: the link broke, or the server keeps asking to come back.
@@ -141,8 +153,10 @@ def fetch_missing(replica: Replica, api: MapApi, map_name: str, branch: str, *, 
     """
     report = RoundReport()
     compare = False
-    for _ in range(ROUNDS_MAX):
-        exchange = Exchange(replica, compare=compare, box=box)
+    rounds = replies = 0
+    while rounds < ROUNDS_MAX and replies < REPLIES_MAX:
+        replies += 1
+        exchange = Exchange(replica, compare=compare, box=box, reply_bytes_max=reply_bytes_max)
         try:
             for frame in api.missing(map_name, branch, exchange.request()):
                 exchange.take(frame)
@@ -152,18 +166,22 @@ def fetch_missing(replica: Replica, api: MapApi, map_name: str, branch: str, *, 
                 raise
             log.warning("another server answers for map %s; starting without its old state", map_name)
             replica.forget_server()
+            rounds += 1
             continue
         report.healed += heal_damaged(replica, api, map_name)
         _complain(exchange.damaged)
         compare = exchange.must_compare
+        rounds += not exchange.has_more
         if exchange.is_done and not _has_unproven(replica, box):
             keep_retracts(replica, api, map_name)
             return report
-    raise UnreachableError("no_end", f"no end of the answer after {ROUNDS_MAX} requests", retry_after_s=30.0)
+    raise UnreachableError("no_end", f"no end of the answer after {replies} requests", retry_after_s=30.0)
 
 
-def fetch_cells(replica: Replica, api: MapApi, map_name: str, *, wanted: Wanted | None = None) -> RoundReport:
-    """Low-end: whole cells that changed since they were fetched last, all or the wanted ones.
+def fetch_cells(
+    replica: Replica, api: MapApi, map_name: str, *, wanted: Wanted | None = None, box: Box | None = None
+) -> RoundReport:
+    """Low-end: whole cells that changed since they were fetched last; all, or those in a box, or the wanted ones of it.
 
     The index tells which did, so that cells that are still the same cost no request.
 
@@ -173,7 +191,7 @@ def fetch_cells(replica: Replica, api: MapApi, map_name: str, *, wanted: Wanted 
     """
     report = RoundReport()
     author = replica.author
-    index = api.cell_index(map_name, author)
+    index = api.cell_index(map_name, author, box=box)
     to, coverage = index.header.to_cursor, index.header.coverage
     digests = {cell_key(entry.cell): entry.digest for entry in index.cells}
     with replica.lock:
@@ -184,7 +202,8 @@ def fetch_cells(replica: Replica, api: MapApi, map_name: str, *, wanted: Wanted 
         same = [key for key, held in replica.cells.items() if held.etag == f'"{digests.get(key)}"']
         replica.move(same, to=to, coverage=coverage)
         for key in replica.cells.keys() - digests.keys():  # a server that was restored forgot them
-            replica.hold_nothing(key, BaseCell(to, coverage, ZERO))
+            if is_within(key, box):
+                replica.hold_nothing(key, BaseCell(to, coverage, ZERO))
     report.healed = heal_damaged(replica, api, map_name)
     damaged = []
     for key in sorted(digests.keys() - set(same)):

@@ -120,7 +120,7 @@ class DirectApi:
         request = MissingRequest.model_validate_json(request.model_dump_json())
         yield from FrameReader().feed(service.missing(service.store.map(name), branch, request))
 
-    def cell_index(self, name: str, author: Author) -> CellIndex:
+    def cell_index(self, name: str, author: Author, *, box: object = None) -> CellIndex:
         service = self._world.service
         index = service.cell_index(service.store.map(name), author)
         return CellIndex.model_validate_json(index.model_dump_json())
@@ -158,7 +158,7 @@ class FaultyApi:
                 raise UnreachableError("cut_off", "cut")
             yield frame
 
-    def cell_index(self, name: str, author: Author) -> CellIndex:
+    def cell_index(self, name: str, author: Author, *, box: object = None) -> CellIndex:
         index: CellIndex = self._call(self._api.cell_index, name, author)
         return index
 

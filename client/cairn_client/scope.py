@@ -1,0 +1,80 @@
+"""What of a map a robot fetches, and in what helpings."""
+
+import math
+from dataclasses import dataclass
+
+from cairn_client.api import MapApi
+from cairn_client.applying import Box, is_within
+from cairn_client.replica import Replica
+from cairn_client.sync import RoundReport, Wanted, fetch_cells, fetch_missing
+from cairn_map.errors import BadInputError
+from cairn_map.grid import CELL_LIMIT, Cell, cell_key
+
+BoxMetres = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Lowest and highest corner in the map's frame, metres."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scope:
+    """All of it, unless something is said."""
+
+    box_m: BoxMetres | None = None
+    """Only cells that share more than a face with this box."""
+    wanted: Wanted | None = None
+    """Low-end: only these cells, of those in the box."""
+    reply_bytes_max: int | None = None
+    """High-end and viewer: after so many bytes of cells a reply ends, and the rest is asked for by another request."""
+
+    def __post_init__(self) -> None:
+        """Raises: BadInputError: the box is none, or there is no room for a cell in a reply."""
+        if self.box_m is not None:
+            low, high = self.box_m
+            if not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(low, high, strict=True)):
+                raise BadInputError(
+                    "bad_box", f"a box is its lowest and its highest corner in metres, got {self.box_m}"
+                )
+        if self.reply_bytes_max is not None and self.reply_bytes_max < 1:
+            raise BadInputError("bad_option", f"a reply has at least 1 byte, got {self.reply_bytes_max}")
+
+    def box(self, cell_edge_m: float) -> Box | None:
+        """The box as cells, lowest and highest, both included."""
+        if self.box_m is None:
+            return None
+        low, high = self.box_m
+        first = Cell(*(_number(math.floor(_cells(value, cell_edge_m))) for value in low))
+        last = Cell(*(_number(math.ceil(_cells(value, cell_edge_m)) - 1) for value in high))
+        return first, last
+
+
+EVERYTHING = Scope()
+
+
+def fetch(replica: Replica, api: MapApi, map_name: str, branch: str, *, is_low_end: bool, scope: Scope) -> RoundReport:
+    """Bring what is in the scope to the server's head: whole cells for a low-end robot, else what is missing.
+
+    Raises:
+        UnreachableError: the link broke; what came is kept.
+        DamagedDataError: the server's answer is not sound.
+    """
+    box = scope.box(replica.geometry.cell_edge_m)
+    wanted = scope.wanted
+
+    def is_in_scope(cell: Cell) -> bool:
+        return is_within(cell_key(cell), box) and (wanted is None or wanted(cell))
+
+    if is_low_end:
+        return fetch_cells(replica, api, map_name, wanted=is_in_scope if box or wanted else None, box=box)
+    report = fetch_missing(replica, api, map_name, branch, box=box, reply_bytes_max=scope.reply_bytes_max)
+    if box is not None:  # what is outside never comes, so own commits must not wait for it
+        replica.forget_stable_commits(wanted=is_in_scope)
+    return report
+
+
+def _cells(metres: float, cell_edge_m: float) -> float:
+    """A length in cells; three edges are three, and not a little more as floats have it."""
+    return round(metres / cell_edge_m, 9)
+
+
+def _number(value: int) -> int:
+    """A cell's number on one axis, or the outermost one of the grid."""
+    return max(-CELL_LIMIT, min(CELL_LIMIT - 1, value))
