@@ -5,7 +5,7 @@ again later, is `UnreachableError`. Every call is idempotent, so whoever calls m
 """
 
 import ssl
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -203,7 +203,7 @@ class MapApi:
         headers = {"Content-Type": "application/vnd.cairn.cell"}
         self._ask("PUT", f"/maps/{name}/main/cells/{cell}", content=data, headers=headers)
 
-    def missing(self, name: str, branch: str, request: MissingRequest) -> Iterator[Frame]:
+    def missing(self, name: str, branch: str, request: MissingRequest) -> Generator[Frame, None, None]:
         """Frames as they arrive.
 
         Raises:

@@ -8,6 +8,7 @@ import logging
 
 import numpy as np
 
+from cairn_client.asks import Box
 from cairn_client.replica import UNPROVEN, Replica
 from cairn_client.replica_store import BaseCell
 from cairn_map.blocks import without_blocks
@@ -17,15 +18,11 @@ from cairn_map.errors import DamagedDataError
 from cairn_map.evidence import Evidence, empty_evidence
 from cairn_map.fingerprint import ZERO, fingerprint
 from cairn_map.frames import CellFrame, Frame, FrameKind
-from cairn_map.grid import Cell, CellKey, cell_of_key
+from cairn_map.grid import CellKey, cell_of_key
 from cairn_map.messages import CellCursor, Done, MissingRequest, More, ReplyHeader
 from cairn_map.version_vector import EMPTY
 
 log = logging.getLogger(__name__)
-
-
-Box = tuple[Cell, Cell]
-"""Lowest and highest cell, inclusive."""
 
 
 def is_within(key: CellKey, box: Box | None) -> bool:

@@ -6,7 +6,7 @@ server takes it for its SHA-256 alone, so nobody has to be trusted, and whoever 
 
 import logging
 
-from cairn_client.api import MapApi
+from cairn_client.asks import Conversation, PutCell
 from cairn_client.replica import Replica
 from cairn_map.cell_code import encode_cell
 from cairn_map.errors import CairnError, DeniedError, UnreachableError
@@ -16,7 +16,7 @@ from cairn_map.grid import Cell, CellKey, cell_key
 log = logging.getLogger(__name__)
 
 
-def heal_damaged(replica: Replica, api: MapApi, map_name: str) -> int:
+def heal_damaged(replica: Replica) -> Conversation[int]:
     """Send what the newest header calls damaged and this robot holds as it was; how many cells were.
 
     Raises:
@@ -30,7 +30,7 @@ def heal_damaged(replica: Replica, api: MapApi, map_name: str) -> int:
         if body is None:
             continue
         try:
-            api.put_cell(map_name, Cell(*cell), body)
+            yield from PutCell(Cell(*cell), body)
         except (UnreachableError, DeniedError):
             raise
         except CairnError as exc:

@@ -20,6 +20,7 @@ from pydantic import ValidationError
 from cairn_calib.rig import Rig
 from cairn_client.answers import Traffic
 from cairn_client.api import MapApi
+from cairn_client.link import Link
 from cairn_client.map_url import split_map_url
 from cairn_client.outbox import UNNUMBERED
 from cairn_client.own_status import OwnStatus
@@ -89,6 +90,7 @@ class Robot:
         self._enrolment_token = token
         self._scope = scope
         self._api = MapApi(server_url, token=token)
+        self._link = Link(self._api, self._map_name, branch=self.name)
         try:
             self._replica = self._open(Path(directory), geometry)
         except BaseException:
@@ -212,16 +214,16 @@ class Robot:
         if self.mode == "viewer" or not self.waiting:
             return
         try:
-            self._as_registered(lambda: push_commits(self._replica, self._api, self._map_name))
+            self._as_registered(lambda: self._link.hold(push_commits(self._replica)))
         except CairnError as exc:
             log.warning("%d commits wait in the directory: %s", self.waiting, exc.message)
 
     def _sync_once(self, on_push: Callable[[CommitId], None] | None) -> RoundReport:
         pushes = RoundReport()
         if self.mode != "viewer":
-            pushes = push_commits(self._replica, self._api, self._map_name, on_push=on_push)
+            pushes = self._link.hold(push_commits(self._replica, on_push=on_push))
         is_low_end = self.mode == "low-end"
-        report = fetch(self._replica, self._api, self._map_name, self.name, is_low_end=is_low_end, scope=self._scope)
+        report = self._link.hold(fetch(self._replica, is_low_end=is_low_end, scope=self._scope))
         report.pushed, report.refused = pushes.pushed, pushes.refused
         self.status.tell(self._replica, self._api, self._map_name, branch=self.name, mode=self.mode)
         return report

@@ -3,8 +3,8 @@
 import math
 from dataclasses import dataclass
 
-from cairn_client.api import MapApi
-from cairn_client.applying import Box, is_within
+from cairn_client.applying import is_within
+from cairn_client.asks import Box, Conversation
 from cairn_client.replica import Replica
 from cairn_client.sync import RoundReport, Wanted, fetch_cells, fetch_missing
 from cairn_map.errors import BadInputError
@@ -49,7 +49,7 @@ class Scope:
 EVERYTHING = Scope()
 
 
-def fetch(replica: Replica, api: MapApi, map_name: str, branch: str, *, is_low_end: bool, scope: Scope) -> RoundReport:
+def fetch(replica: Replica, *, is_low_end: bool, scope: Scope) -> Conversation[RoundReport]:
     """Bring what is in the scope to the server's head: whole cells for a low-end robot, else what is missing.
 
     Raises:
@@ -63,8 +63,8 @@ def fetch(replica: Replica, api: MapApi, map_name: str, branch: str, *, is_low_e
         return is_within(cell_key(cell), box) and (wanted is None or wanted(cell))
 
     if is_low_end:
-        return fetch_cells(replica, api, map_name, wanted=is_in_scope if box or wanted else None, box=box)
-    report = fetch_missing(replica, api, map_name, branch, box=box, reply_bytes_max=scope.reply_bytes_max)
+        return (yield from fetch_cells(replica, wanted=is_in_scope if box or wanted else None, box=box))
+    report = yield from fetch_missing(replica, box=box, reply_bytes_max=scope.reply_bytes_max)
     if box is not None:  # what is outside never comes, so own commits must not wait for it
         replica.forget_stable_commits(wanted=is_in_scope)
     return report

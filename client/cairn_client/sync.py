@@ -1,5 +1,7 @@
 """One round with the server: push what it may lack, fetch what is missing. Repeating a round changes nothing.
 
+These are conversations (`asks`): what to ask next, given what was answered. There is no I/O but the replica's own.
+
 high-end   push commits; frames that bring every held cell to the server's head
 low-end    push commits; the index of cells; whole cells that changed, all or those near a place
 viewer     fetch as high-end does, push nothing
@@ -12,8 +14,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from cairn_client.api import MapApi
-from cairn_client.applying import Box, Exchange, is_within
+from cairn_client.applying import Exchange, is_within
+from cairn_client.asks import Box, Conversation, GetCell, GetCommit, GetIndex, GetMissing, NextFrame, Push
 from cairn_client.heal import heal_damaged
 from cairn_client.replica import Replica
 from cairn_client.replica_store import BaseCell
@@ -56,9 +58,7 @@ class RoundReport:
     """Cells that the server had damaged and has from here again."""
 
 
-def push_commits(
-    replica: Replica, api: MapApi, map_name: str, *, on_push: Callable[[CommitId], None] | None = None
-) -> RoundReport:
+def push_commits(replica: Replica, *, on_push: Callable[[CommitId], None] | None = None) -> Conversation[RoundReport]:
     """Push every commit that the server may lack, oldest first.
 
     Raises:
@@ -68,7 +68,7 @@ def push_commits(
     report = RoundReport()
     for commit_id in replica.push_set():
         try:
-            pushed = _push(replica, api, map_name, commit_id)
+            pushed = yield from _push(replica, commit_id)
         except ConflictError as exc:
             log.error("the server will not take commit %s: %s: %s", commit_id, exc.kind, exc.message)
             report.refused.append(commit_id)
@@ -90,32 +90,32 @@ def push_commits(
     return report
 
 
-def _push(replica: Replica, api: MapApi, map_name: str, commit_id: CommitId) -> CommitId:
+def _push(replica: Replica, commit_id: CommitId) -> Conversation[CommitId]:
     """Push one commit; its id, which is a new one if the server has other bytes under the old (rule 13)."""
     commit = replica.kept_commit(commit_id)
     if commit is None:
         raise BadInputError("no_bytes", f"the bytes of {commit_id} are not kept any more")
     seal = replica.seal(commit_id)
     try:
-        api.push(map_name, commit, seal=seal)
+        yield from Push(commit, seal)
     except ConflictError as exc:
         if exc.kind == "evidence_gone":
             # The server forgot what this commit takes out: it takes it from whoever still has it (rule 11).
             for target in commit.meta.retracted_ids:
                 if (kept := replica.kept_commit(target)) is not None:
-                    api.push(map_name, kept)
-            api.push(map_name, commit)
+                    yield from Push(kept)
+            yield from Push(commit)
             return commit_id
         if exc.kind != "id_taken" or seal is not None:
             raise
         renamed = replica.kept_commit(replica.rename(commit_id))
         assert renamed is not None  # noqa: S101 - it was just kept
-        api.push(map_name, renamed)
+        yield from Push(renamed)
         return renamed.id
     return commit_id
 
 
-def keep_retracts(replica: Replica, api: MapApi, map_name: str) -> None:
+def keep_retracts(replica: Replica) -> Conversation[None]:
     """Fetch and keep the operator's retracts until no restore of the server can lose them (SYNC.md rule 11).
 
     Raises:
@@ -123,7 +123,7 @@ def keep_retracts(replica: Replica, api: MapApi, map_name: str) -> None:
     """
     for commit_id in replica.lacking_retracts():
         try:
-            data, seal = api.commit(map_name, commit_id)
+            data, seal = yield from GetCommit(commit_id)
             commit, _ = open_commit(data)
         except CairnError as exc:
             if isinstance(exc, UnreachableError | DeniedError):
@@ -135,14 +135,8 @@ def keep_retracts(replica: Replica, api: MapApi, map_name: str) -> None:
 
 
 def fetch_missing(
-    replica: Replica,
-    api: MapApi,
-    map_name: str,
-    branch: str,
-    *,
-    box: Box | None = None,
-    reply_bytes_max: int | None = None,
-) -> RoundReport:
+    replica: Replica, *, box: Box | None = None, reply_bytes_max: int | None = None
+) -> Conversation[RoundReport]:
     """Bring every held cell to the server's head, or those in a box; what arrives before a cut is kept.
 
     With `reply_bytes_max` a reply ends after so many bytes of cells, and the rest is asked for by the next request.
@@ -158,29 +152,29 @@ def fetch_missing(
         replies += 1
         exchange = Exchange(replica, compare=compare, box=box, reply_bytes_max=reply_bytes_max)
         try:
-            for frame in api.missing(map_name, branch, exchange.request()):
+            frame = yield from GetMissing(exchange.request())
+            while frame is not None:
                 exchange.take(frame)
                 report.frames += 1
+                frame = yield from NextFrame()
         except ConflictError as exc:
             if exc.kind != "other_log":
                 raise
-            log.warning("another server answers for map %s; starting without its old state", map_name)
+            log.warning("another server answers for this map; starting without its old state")
             replica.forget_server()
             rounds += 1
             continue
-        report.healed += heal_damaged(replica, api, map_name)
+        report.healed += yield from heal_damaged(replica)
         _complain(exchange.damaged)
         compare = exchange.must_compare
         rounds += not exchange.has_more
         if exchange.is_done and not _has_unproven(replica, box):
-            keep_retracts(replica, api, map_name)
+            yield from keep_retracts(replica)
             return report
     raise UnreachableError("no_end", f"no end of the answer after {replies} requests", retry_after_s=30.0)
 
 
-def fetch_cells(
-    replica: Replica, api: MapApi, map_name: str, *, wanted: Wanted | None = None, box: Box | None = None
-) -> RoundReport:
+def fetch_cells(replica: Replica, *, wanted: Wanted | None = None, box: Box | None = None) -> Conversation[RoundReport]:
     """Low-end: whole cells that changed since they were fetched last; all, or those in a box, or the wanted ones of it.
 
     The index tells which did, so that cells that are still the same cost no request.
@@ -191,12 +185,12 @@ def fetch_cells(
     """
     report = RoundReport()
     author = replica.author
-    index = api.cell_index(map_name, author, box=box)
+    index = yield from GetIndex(author, box)
     to, coverage = index.header.to_cursor, index.header.coverage
     digests = {cell_key(entry.cell): entry.digest for entry in index.cells}
     with replica.lock:
         if replica.header and replica.header.to_cursor.log_id != to.log_id:
-            log.warning("another server answers for map %s; starting without its old state", map_name)
+            log.warning("another server answers for this map; starting without its old state")
             replica.forget_server()
         replica.take_header(index.header, asked_by=author)
         same = [key for key, held in replica.cells.items() if held.etag == f'"{digests.get(key)}"']
@@ -204,22 +198,22 @@ def fetch_cells(
         for key in replica.cells.keys() - digests.keys():  # a server that was restored forgot them
             if is_within(key, box):
                 replica.hold_nothing(key, BaseCell(to, coverage, ZERO))
-    report.healed = heal_damaged(replica, api, map_name)
+    report.healed = yield from heal_damaged(replica)
     damaged = []
     for key in sorted(digests.keys() - set(same)):
         if wanted is None or wanted(cell_of_key(key)):
             try:
-                report.cells_fetched += fetch_cell(replica, api, map_name, cell_of_key(key))
+                report.cells_fetched += yield from fetch_cell(replica, cell_of_key(key))
             except DamagedDataError as exc:
                 log.error("cell %s: %s", cell_of_key(key), exc.message)
                 damaged.append(key)
     replica.forget_stable_commits(wanted=wanted)
-    keep_retracts(replica, api, map_name)
+    yield from keep_retracts(replica)
     _complain(damaged)
     return report
 
 
-def fetch_cell(replica: Replica, api: MapApi, map_name: str, cell: Cell) -> bool:
+def fetch_cell(replica: Replica, cell: Cell) -> Conversation[bool]:
     """Low-end: one cell, if it changed; True if bytes came.
 
     Raises:
@@ -227,7 +221,7 @@ def fetch_cell(replica: Replica, api: MapApi, map_name: str, cell: Cell) -> bool
     """
     key = cell_key(cell)
     held = replica.cells.get(key)
-    fetched = api.cell(map_name, cell, etag=held.etag if held else None)
+    fetched = yield from GetCell(cell, held.etag if held else None)
     with replica.lock:
         if fetched.body is None and held is not None:
             replica.move([key], to=fetched.cursor, coverage=fetched.coverage)

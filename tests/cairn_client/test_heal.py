@@ -14,7 +14,6 @@ from tests.cairn_client.test_sync import Team
 from cairn_client import map_command
 from cairn_client.api import MapApi
 from cairn_client.robot import Mode
-from cairn_client.sync import fetch_cells
 from cairn_map.cell_code import encode_cell
 from cairn_map.cell_folder import write_cell
 from cairn_map.errors import CairnError, DamagedDataError
@@ -99,7 +98,7 @@ def test_who_fetches_a_damaged_cell_gets_all_others_and_whoever_has_it_is_told(
     team.fetch("mole")
     damage(server, FIRST)
     with pytest.raises(DamagedDataError, match="all others came"):
-        fetch_cells(team["fox"], team.robots["fox"][1], MAP) if newcomer == "low-end" else team.fetch("fox")
+        team.fetch_cells("fox") if newcomer == "low-end" else team.fetch("fox")
     assert team["fox"].view.evidence(LAST) == X
     team.fetch("mole")
     assert not is_damaged(server, FIRST)

@@ -24,6 +24,7 @@ from tests.cairn_client.made import (
 
 from cairn_client.answers import FetchedCell
 from cairn_client.applying import Exchange
+from cairn_client.link import Link
 from cairn_client.replica import Replica
 from cairn_client.sync import fetch_cells, fetch_missing, push_commits
 from cairn_map.cell_code import encode_cell
@@ -54,6 +55,11 @@ def at(replica: Replica, to: Cursor, evidence: Evidence, coverage: VersionVector
     start = replica.default_cursor
     frame = cell_frame(FrameKind.FULL, to, evidence, start=start)
     assert exchanged(replica, header(to, coverage), frame, done(to)).is_done
+
+
+def linked(server: object) -> Link:
+    """A link to what has some of the methods of `MapApi`."""
+    return Link(server, "lab", branch="mole")  # type: ignore[arg-type]
 
 
 # Rule 3: a header, frames that lead to its state, an end
@@ -346,9 +352,9 @@ def test_another_log_takes_the_base_away_and_offers_every_commit_anew(mole: Repl
     at(mole, C1, added(X, Y), covering(commit.id))
     assert mole.push_set() == []
     server = OtherServer(covering(commit.id))  # perhaps with other bytes, so that it must be asked
-    fetch_missing(mole, server, "lab", "mole")  # type: ignore[arg-type]
+    linked(server).hold(fetch_missing(mole))
     assert mole.view.evidence(A) == Y
-    push_commits(mole, server, "lab")  # type: ignore[arg-type]
+    linked(server).hold(push_commits(mole))
     assert server.pushed == [commit.id]
 
 
@@ -455,7 +461,7 @@ def test_commits_whose_ids_are_taken_are_renamed_and_pushed_and_the_others_keep_
     commits = [committed(mole, evidence) for evidence in (X, Y, Z)]
     old = mole.author
     server = TakenIds({commits[0].id, commits[1].id})
-    assert push_commits(mole, server, "lab").pushed == len(commits)  # type: ignore[arg-type]
+    assert linked(server).hold(push_commits(mole)).pushed == len(commits)
     assert server.pushed == [CommitId(mole.author, 0), CommitId(mole.author, 1), CommitId(old, 2)]
     assert mole.view.evidence(A) == added(X, Y, Z)
     assert mole.push_set() == []
@@ -498,7 +504,7 @@ class Cells:
 
 
 def fetch(mole: Replica, server: Cells) -> int:
-    return fetch_cells(mole, server, "lab").cells_fetched  # type: ignore[arg-type]
+    return linked(server).hold(fetch_cells(mole)).cells_fetched
 
 
 def test_a_cell_that_did_not_change_is_not_asked_for_again(mole: Replica) -> None:

@@ -13,8 +13,9 @@ from tests.cairn_client.conftest import LiveServer
 from tests.cairn_client.made import GEOMETRY, MAP, A, B, added, cells_of, cursor, header, opened, random_diff, seen
 
 from cairn_client.api import MapApi
+from cairn_client.link import Link
 from cairn_client.replica import Replica
-from cairn_client.sync import fetch_cells, fetch_missing, push_commits, within
+from cairn_client.sync import Wanted, fetch_cells, fetch_missing, push_commits, within
 from cairn_map.cell_code import decode_cell
 from cairn_map.commit import make_commit
 from cairn_map.errors import (
@@ -49,18 +50,23 @@ class Team:
         return self.robots[name][0]
 
     def push(self, name: str) -> None:
-        replica, api = self.robots[name]
-        push_commits(replica, api, MAP)
+        self._link(name).hold(push_commits(self[name]))
         self.server.wait_for_fold()
 
     def fetch(self, name: str) -> int:
-        self[name]
-        return fetch_missing(*self.robots[name], MAP, name).frames
+        return self._link(name).hold(fetch_missing(self[name])).frames
+
+    def fetch_cells(self, name: str, *, wanted: Wanted | None = None) -> int:
+        return self._link(name).hold(fetch_cells(self[name], wanted=wanted)).cells_fetched
 
     def register_anew(self) -> None:
         for name, (replica, api) in self.robots.items():
             api.token = None
             api.register(MAP, Register(robot=name, incarnation=replica.author.incarnation))
+
+    def _link(self, name: str) -> Link:
+        self[name]
+        return Link(self.robots[name][1], MAP, branch=name)
 
     def close(self) -> None:
         for replica, api in self.robots.values():
@@ -164,10 +170,10 @@ def test_a_low_end_robot_fetches_the_cells_around_it_and_only_once(team: Team) -
     team.push("mole")
     team["bat"]
     near_b = within((-0.1, 0.1, 0.9), radius_m=0.2, cell_edge_m=GEOMETRY.cell_edge_m)
-    assert fetch_cells(*team.robots["bat"], MAP, wanted=near_b).cells_fetched == 1
+    assert team.fetch_cells("bat", wanted=near_b) == 1
     assert list(team["bat"].cells) == [B]
-    assert fetch_cells(*team.robots["bat"], MAP).cells_fetched == 1
-    assert fetch_cells(*team.robots["bat"], MAP).cells_fetched == 0
+    assert team.fetch_cells("bat") == 1
+    assert team.fetch_cells("bat") == 0
     assert cells_of(team["bat"].view) == cells_of(team["mole"].view)
 
 

@@ -18,6 +18,7 @@ from tests.cairn_client.made import GEOMETRY, MAP, cells_of, random_diff
 from cairn_client import replica_store
 from cairn_client.answers import FetchedCell
 from cairn_client.applying import is_within
+from cairn_client.link import Link
 from cairn_client.outbox import UNNUMBERED
 from cairn_client.replica import Replica
 from cairn_client.replica_store import ReplicaStore
@@ -270,7 +271,7 @@ class World:
         if self._modes[robot] != "low-end":
             box = (Cell(-9, -9, -9), Cell(-1, 9, 9)) if side else (Cell(0, -9, -9), Cell(9, 9, 9))
             api: Any = DirectApi(self, f"r{robot}")
-            fetch_missing(self.robots[robot], api, MAP, f"r{robot}", box=box)
+            Link(api, MAP, branch=f"r{robot}").hold(fetch_missing(self.robots[robot], box=box))
             inside = [key for key in self.robots[robot].cells if is_within(key, box)]
             with self.service.store.snapshot(self._row) as snapshot:
                 rows = {row.key: row for row in snapshot.cells() if is_within(row.key, box)}
@@ -379,13 +380,13 @@ class World:
         assert cells_of(replica.view) == cells_of(expected)
 
     def _round(self, robot: int, api: Any) -> None:
-        replica = self.robots[robot]
+        replica, link = self.robots[robot], Link(api, MAP, branch=f"r{robot}")
         if robot in PUSHES:
-            assert not push_commits(replica, api, MAP).refused
+            assert not link.hold(push_commits(replica)).refused
         if self._modes[robot] == "low-end":
-            fetch_cells(replica, api, MAP)
+            link.hold(fetch_cells(replica))
         else:
-            fetch_missing(replica, api, MAP, f"r{robot}")
+            link.hold(fetch_missing(replica))
 
     def _open(self, robot: int) -> Replica:
         store = ReplicaStore(self._folder / f"r{robot}")

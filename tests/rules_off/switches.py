@@ -707,7 +707,7 @@ SWITCHES = (
         11,
         "robots keep operators' retracts and push them back",
         SYNC,
-        "            keep_retracts(replica, api, map_name)\n            return report",
+        "            yield from keep_retracts(replica)\n            return report",
         "            return report",
         "cairn_client/test_laws.py::test_an_operator_s_retract_survives_the_restore_of_a_backup_from_before_it",
     ),
