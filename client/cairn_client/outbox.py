@@ -43,6 +43,8 @@ class Outbox:
         self._commits: dict[CommitId, KeptCommit] = {}
         self._touching: dict[CellKey, dict[CommitId, None]] = {}
         self._acked_since_header: set[CommitId] = set()
+        self._retracts: dict[CommitId, tuple[CommitId, ...]] = {}
+        """What the kept commits take out, of those that somebody asked for."""
         for kept in store.commits():
             self._note(kept)
 
@@ -89,6 +91,7 @@ class Outbox:
             self._store.add_commit(commit)
             self._set_next(n + 1, commit)
         self._note(_kept(commit))
+        self._retracts[commit.id] = commit.meta.retracted_ids
         return commit
 
     def keep_sealed(self, commit: Commit, seal: str) -> None:
@@ -190,6 +193,10 @@ class Outbox:
         if n >= self._next_n() or (known is not None and known.sha.hex() != sha):
             self.new_incarnation(f"the server has commit {n} of it with bytes that are not here")
 
+    def named(self) -> set[CommitId]:
+        """What the kept commits take out: whoever holds an amend keeps what it names (rule 11)."""
+        return {target for kept in self for target in self._retracts_of(kept.id)}
+
     def forget(self, gone: Iterable[CommitId]) -> None:
         """Drop the bytes of commits; their SHA stays."""
         commits = list(gone)
@@ -198,6 +205,7 @@ class Outbox:
                 self._store.forget_data(commits)
         for commit in commits:
             self._commits[commit] = replace(self._commits[commit], has_data=False)
+            self._retracts.pop(commit, None)
 
     def reread(self) -> None:
         """Take over what the store was changed to: whether commits are acknowledged."""
@@ -226,9 +234,16 @@ class Outbox:
         return decode_cell(split_commit(self._store.commit_data(commit) or b"")[1][key]).evidence
 
     def _note(self, kept: KeptCommit) -> None:
+        self._retracts.pop(kept.id, None)
         self._commits[kept.id] = kept
         for key in kept.cells:
             self._touching.setdefault(key, {})[kept.id] = None
+
+    def _retracts_of(self, commit: CommitId) -> tuple[CommitId, ...]:
+        if commit not in self._retracts:
+            data = self._store.commit_data(commit)
+            self._retracts[commit] = split_commit(data)[0].retracted_ids if data else ()
+        return self._retracts[commit]
 
     def _next_n(self) -> int:
         return int(self._store.get("next_n") or 0)

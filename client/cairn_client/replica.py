@@ -215,6 +215,7 @@ class Replica:
     def forget_stable_commits(self, *, wanted: Callable[[Cell], bool] | None = None) -> int:
         """Drop the bytes of commits that are stable and covered in every cell they touch (rule 12); how many.
 
+        Not of what another kept commit takes out: the server may have forgotten its evidence, and asks for it again.
         Only of acknowledged ones: after a roll-back of this robot's disk, the stable and covered commit may be another
         one under the same id.
 
@@ -226,6 +227,8 @@ class Replica:
             gone = [
                 kept.id for kept in self.outbox if kept.acked and kept.id in stable and self._is_covered(kept, wanted)
             ]
+            named = self.outbox.named() if gone else set()
+            gone = [commit for commit in gone if commit not in named]
             self.outbox.forget(gone)
             return len(gone)
 

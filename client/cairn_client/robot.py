@@ -219,9 +219,8 @@ class Robot:
             log.warning("%d commits wait in the directory: %s", self.waiting, exc.message)
 
     def _sync_once(self, on_push: Callable[[CommitId], None] | None) -> RoundReport:
-        pushes = RoundReport()
-        if self.mode != "viewer":
-            pushes = self._link.hold(push_commits(self._replica, on_push=on_push))
+        sealed_only = self.mode == "viewer"
+        pushes = self._link.hold(push_commits(self._replica, sealed_only=sealed_only, on_push=on_push))
         is_low_end = self.mode == "low-end"
         report = self._link.hold(fetch(self._replica, is_low_end=is_low_end, scope=self._scope))
         report.pushed, report.refused = pushes.pushed, pushes.refused

@@ -4,7 +4,7 @@ These are conversations (`asks`): what to ask next, given what was answered. The
 
 high-end   push commits; frames that bring every held cell to the server's head
 low-end    push commits; the index of cells; whole cells that changed, all or those near a place
-viewer     fetch as high-end does, push nothing
+viewer     fetch as high-end does; push nothing but the operator's retracts that a restored server lost
 """
 
 import logging
@@ -58,8 +58,10 @@ class RoundReport:
     """Cells that the server had damaged and has from here again."""
 
 
-def push_commits(replica: Replica, *, on_push: Callable[[CommitId], None] | None = None) -> Conversation[RoundReport]:
-    """Push every commit that the server may lack, oldest first.
+def push_commits(
+    replica: Replica, *, sealed_only: bool = False, on_push: Callable[[CommitId], None] | None = None
+) -> Conversation[RoundReport]:
+    """Push every commit that the server may lack, oldest first; or of them only the server's own retracts.
 
     Raises:
         UnreachableError: the link broke; what was acknowledged before stays so.
@@ -67,6 +69,8 @@ def push_commits(replica: Replica, *, on_push: Callable[[CommitId], None] | None
     """
     report = RoundReport()
     for commit_id in replica.push_set():
+        if sealed_only and replica.seal(commit_id) is None:
+            continue
         try:
             pushed = yield from _push(replica, commit_id)
         except ConflictError as exc:
@@ -104,7 +108,7 @@ def _push(replica: Replica, commit_id: CommitId) -> Conversation[CommitId]:
             for target in commit.meta.retracted_ids:
                 if (kept := replica.kept_commit(target)) is not None:
                     yield from Push(kept)
-            yield from Push(commit)
+            yield from Push(commit, seal)
             return commit_id
         if exc.kind != "id_taken" or seal is not None:
             raise

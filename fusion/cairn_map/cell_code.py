@@ -96,6 +96,8 @@ def encode_cells(
         BadInputError: as `encode_cell`.
     """
     keys = sorted(diff)
+    if len(keys) == 1:
+        return {keys[0]: encode_cell(keys[0], diff[keys[0]], geometry, profile=profile)}
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
         encoded = pool.map(lambda key: encode_cell(key, diff[key], geometry, profile=profile), keys)
         return dict(zip(keys, encoded, strict=True))

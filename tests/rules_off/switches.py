@@ -719,4 +719,20 @@ SWITCHES = (
         "speaks_for = Caller(Role.ADMIN)",
         "cairn_server/test_retract.py::test_a_retract_may_be_pushed_back_by_anybody_with_this_map_s_seal_on_it_and_by_nobody_without",
     ),
+    Switch(
+        11,
+        "what a kept amend names is kept",
+        REPLICA,
+        "named = self.outbox.named() if gone else set()",
+        "named: set[CommitId] = set()",
+        "cairn_client/test_conversations.py::test_what_a_kept_amend_names_is_kept_though_it_is_stable_and_covered",
+    ),
+    Switch(
+        11,
+        "a retract is pushed back with its seal",
+        SYNC,
+        "            yield from Push(commit, seal)\n            return commit_id",
+        "            yield from Push(commit)\n            return commit_id",
+        "cairn_client/test_conversations.py::test_an_operator_s_retract_is_pushed_back_with_its_seal_after_what_it_names",
+    ),
 )

@@ -1,0 +1,192 @@
+"""The map server of a simulation: the real service on a store in memory, folding on request."""
+
+from typing import Any
+
+from tests.cairn_client.made import GEOMETRY, MAP
+
+from cairn_client.answers import FetchedCell
+from cairn_client.asks import Ask, GetCell, GetCommit, GetIndex, GetMissing, Push, PutCell
+from cairn_map.cell_code import decode_cell
+from cairn_map.commit import CommitMeta
+from cairn_map.cursor import Cursor
+from cairn_map.errors import BadInputError, ConflictError, NotFoundError
+from cairn_map.evidence_map import EvidenceMap
+from cairn_map.grid import CellKey, cell_key
+from cairn_map.ids import OPERATOR, CommitId
+from cairn_map.index_messages import CellIndex
+from cairn_map.messages import CreateMap, MissingRequest, Retract
+from cairn_map.version_vector import EMPTY, VersionVector
+from cairn_server.auth import Caller, Role
+from cairn_server.cell_cache import CellCache
+from cairn_server.folding import fold_pending
+from cairn_server.memory_map import MemoryMap
+from cairn_server.memory_store import MemoryStore
+from cairn_server.service import Service
+from cairn_server.settings import Settings
+from cairn_server.store_rows import MapRow
+
+Fingerprints = dict[CellKey, str]
+
+
+class FoldOnRequest:
+    """In the place of the folding thread."""
+
+    def __init__(self, *parts: object, **settings: object) -> None:
+        pass
+
+    def is_alive(self) -> bool:
+        return True
+
+    def wake(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+class StableBackup:
+    """In the place of a setting of time: what the oldest backup holds."""
+
+    def __init__(self) -> None:
+        self.vector: VersionVector = EMPTY
+
+    def of(self, row: object, snapshot: object) -> VersionVector:
+        return self.vector
+
+
+class SimServer:
+    """A server that can be restored and replaced."""
+
+    def __init__(self) -> None:
+        self._stable = StableBackup()
+        self._backup: MemoryMap | None = None
+        self._evidence: dict[CommitId, tuple[str, dict[CellKey, bytes]]] = {}
+        """Note and diff of every commit that was ever here: a server may forget them, a test may not."""
+        self.states: dict[Cursor, Fingerprints] = {}
+        """What each state that ever was held, by its cursor."""
+        self.replace()
+
+    def replace(self) -> None:
+        """Another server, with nothing on it, under the same name."""
+        self._backup, self._stable.vector = None, EMPTY
+        self._start(MemoryStore())
+        self.service.create_map(MAP, CreateMap(geometry=GEOMETRY))
+        self._note_state()
+
+    def restart(self) -> None:
+        """Stop and start on the same store."""
+        self._start(self._store)
+
+    def back_up(self) -> None:
+        """Make a backup, and throw older ones away: what it holds is stable."""
+        state = self._store._maps.shared(self.row)
+        self._backup, self._stable.vector = state, state.head.vector
+
+    def restore(self) -> None:
+        """Put the backup in the place of the store."""
+        if self._backup is not None:
+            with self._store._maps.locked() as maps:
+                maps[MAP] = self._backup.copied()
+            self._start(self._store)
+
+    def answer(self, robot: str, ask: Ask[Any]) -> Any:
+        """What the service says to a request; of `GetMissing` the reply's bytes.
+
+        Raises:
+            CairnError: as the service does.
+        """
+        service, row = self.service, self.row
+        match ask:
+            case Push(commit, seal):
+                service.push(row, Caller(Role.ROBOT, robot), str(commit.id), commit.data, seal=seal)
+                self._evidence[commit.id] = commit.meta.note, commit.cells
+                return None
+            case GetCommit(commit_id):
+                data, _, found = service.commit(row, str(commit_id))
+                return data, found
+            case GetMissing(request):
+                return service.missing(row, robot, MissingRequest.model_validate_json(request.model_dump_json()))
+            case GetIndex(author):
+                return CellIndex.model_validate_json(service.cell_index(row, author).model_dump_json())
+            case GetCell(cell, etag):
+                stored, head = service.cell(row, cell_key(cell))
+                if stored is None:
+                    raise NotFoundError("no_cell", f"cell {cell} was never seen")
+                found_etag = f'"{stored.digest.hex()}"'
+                body = None if etag == found_etag else stored.body
+                return FetchedCell(body, found_etag, head.cursor, head.vector, stored.fingerprint)
+            case PutCell(cell, body):
+                return service.heal_cell(row, cell_key(cell), body)
+        raise TypeError(ask)
+
+    def fold(self, limit: int) -> None:
+        """Fold some of what waits."""
+        fold_pending(self._store, self.row, self._cache, limit=limit)
+        self._note_state()
+
+    def retract(self, target: CommitId) -> None:
+        """An operator takes out a commit that may or may not have come."""
+        try:
+            self.service.retract(self.row, Retract(commits=[str(target)]), by=Caller(Role.ADMIN))
+        except ConflictError as exc:
+            assert exc.kind == "evidence_gone"
+        except BadInputError as exc:
+            assert exc.kind == "not_retractable"
+
+    def forget_evidence(self) -> None:
+        """Drop the evidence of all that was folded."""
+        self._store.forget_evidence(self.row, before_s=float("inf"), limit=1000)
+
+    def commits(self) -> dict[CommitId, str]:
+        """Every commit of robots that is here, and its note."""
+        with self._store._maps.reading(self.row) as state:
+            here = [commit for commit in state.commits if commit.author.robot != OPERATOR]
+        return {commit: self._evidence[commit][0] for commit in here}
+
+    def is_retracted(self, commit: CommitId) -> bool:
+        """Whether it is taken out, or will be when it comes."""
+        return self._store.is_retracted(self.row, commit)
+
+    def sum_of_commits(self) -> EvidenceMap:
+        """The map as its definition says: all commits that are not retracted."""
+        total = EvidenceMap(GEOMETRY)
+        for commit in self.commits():
+            if not self.is_retracted(commit):
+                cells = self._evidence[commit][1]
+                total.merge({key: decode_cell(body).evidence for key, body in cells.items()})
+        return total
+
+    def cells(self) -> dict[CellKey, tuple[bytes, str]]:
+        """Digest and fingerprint of each cell that holds evidence."""
+        with self._store.snapshot(self.row) as snapshot:
+            return {row.key: (row.digest, row.fingerprint.hex()) for row in snapshot.cells() if row.voxels}
+
+    def close(self) -> None:
+        """End its threads."""
+        self.service.close()
+
+    @property
+    def cursor(self) -> Cursor:
+        """Where its log ends."""
+        with self._store.snapshot(self.row) as snapshot:
+            return snapshot.head.cursor
+
+    @property
+    def row(self) -> MapRow:
+        """The map."""
+        return self._store.map(MAP)
+
+    def _start(self, store: MemoryStore) -> None:
+        self._store = store
+        self.service = Service(store, Settings())
+        self.service._stable = self._stable  # type: ignore[assignment]
+        self._cache = CellCache(GEOMETRY)
+
+    def _note_state(self) -> None:
+        with self._store.snapshot(self.row) as snapshot:
+            self.states[snapshot.head.cursor] = {row.key: row.fingerprint.hex() for row in snapshot.cells()}
+
+
+def meta_of(commit: CommitId, *, note: str, retracts: tuple[str, ...]) -> CommitMeta:
+    """What a simulated robot says of its commit."""
+    return CommitMeta(id=str(commit), geometry=GEOMETRY.digest().hex(), retracts=retracts, note=note)
