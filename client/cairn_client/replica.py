@@ -124,7 +124,8 @@ class Replica:
     def keep_sealed(self, commit: Commit, seal: str) -> None:
         """Keep a server's own retract, to push it back if the server loses it."""
         with self.lock:
-            self.outbox.keep_sealed(commit, seal)
+            if not self.outbox.knows(commit.id):
+                self.outbox.keep_sealed(commit, seal)
 
     def seal(self, commit: CommitId) -> str | None:
         """The seal that a kept commit bears."""

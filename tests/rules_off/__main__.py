@@ -1,8 +1,13 @@
 """Switch each rule off in a copy of the tree, and see its test fail.
 
-$ python -m tests.rules_off 5 9     # these rules; default: all
+$ python -m tests.rules_off 5 9                    # these rules; default: all
+$ python -m tests.rules_off --simulated 300 5 9    # see a seed of `tests.sync_sim` go wrong instead
+
+Ends with 1 where a test notices nothing; simulated, where no switch of a rule is noticed by any of so many seeds (some
+switches are of code that a simulation does not run, such as SQLite's).
 """
 
+import argparse
 import os
 import shutil
 import subprocess
@@ -19,29 +24,37 @@ LIMIT_S = 300
 
 def main() -> int:
     """Print one line for each switch; 1 if one was not noticed."""
-    rules = {int(text) for text in sys.argv[1:]}
-    unnoticed = 0
+    parser = argparse.ArgumentParser("python -m tests.rules_off", description=__doc__)
+    parser.add_argument("rules", nargs="*", type=int, metavar="RULE", help="of SYNC.md (all)")
+    parser.add_argument("--simulated", type=int, metavar="SEEDS", help="simulate so many seeds instead")
+    given = parser.parse_args()
+    noticed_by: dict[int, list[bool]] = {}
     with tempfile.TemporaryDirectory() as name:
         tree = Path(name)
         for folder in (*FOLDERS, "tests"):
             shutil.copytree(ROOT / folder, tree / folder)
         shutil.copy2(ROOT / "pyproject.toml", tree)
         for switch in SWITCHES:
-            if not rules or switch.rule in rules:
-                noticed = is_noticed(tree, switch)
-                unnoticed += not noticed
+            if not given.rules or switch.rule in given.rules:
+                noticed = is_noticed(tree, switch, seeds=given.simulated)
+                noticed_by.setdefault(switch.rule, []).append(noticed)
                 sys.stdout.write(f"{switch.rule:>3}  {'noticed' if noticed else 'UNNOTICED':<10}{switch.without}\n")
                 sys.stdout.flush()
-    return min(1, unnoticed)
+    enough = any if given.simulated else all
+    return int(not all(enough(noticed) for noticed in noticed_by.values()))
 
 
-def is_noticed(tree: Path, switch: Switch) -> bool:
-    """Whether its test fails in the tree while it is off."""
+def is_noticed(tree: Path, switch: Switch, *, seeds: int | None) -> bool:
+    """Whether its test fails in the tree while it is off; or one of so many seeds."""
     path = tree / switch.path
     source = path.read_text()
     path.write_text(source.replace(switch.old, switch.new))
     try:
-        command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", f"tests/{switch.caught_by}"]
+        command = [sys.executable, "-m"]
+        if seeds:
+            command += ["tests.sync_sim", "--seeds", f"{seeds}", "--jobs", "1", "--until-wrong"]
+        else:
+            command += ["pytest", "-q", "-x", "-p", "no:cacheprovider", f"tests/{switch.caught_by}"]
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(str(tree / folder) for folder in FOLDERS)}
         done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, timeout=LIMIT_S, check=False)
     except subprocess.TimeoutExpired:

@@ -26,15 +26,16 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="the first of them (0)")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="seeds at a time (all processors)")
     parser.add_argument("--seed", type=int, help="only this one, telling what happens")
+    parser.add_argument("--until-wrong", action="store_true", help="stop soon after a seed went wrong")
     given = parser.parse_args()
     if given.seed is not None:
         logging.basicConfig(level=logging.INFO, format="          %(message)s", stream=sys.stdout)
         run_seed(given.seed, log=lambda text: print(text, flush=True))  # noqa: T201
         return 0
-    return _many(range(given.first, given.first + given.seeds), given.jobs)
+    return _many(range(given.first, given.first + given.seeds), given.jobs, until_wrong=given.until_wrong)
 
 
-def _many(seeds: range, jobs: int) -> int:
+def _many(seeds: range, jobs: int, *, until_wrong: bool) -> int:
     start_s, done, wrong = time.monotonic(), 0, 0
     chunks = [seeds[n : n + CHUNK] for n in range(0, len(seeds), CHUNK)]
     context = multiprocessing.get_context("spawn")
@@ -46,6 +47,9 @@ def _many(seeds: range, jobs: int) -> int:
                 sys.stdout.write(f"\rseed {seed} went wrong: {why}\n")
             rate = done / (time.monotonic() - start_s)
             left_s = (len(seeds) - done) / rate
+            if wrong and until_wrong:
+                pool.shutdown(cancel_futures=True)
+                break
             sys.stderr.write(f"\r{done} of {len(seeds)} seeds, {rate:.0f} a second, {left_s / 60:.0f} min left ")
     sys.stderr.write("\n")
     sys.stdout.write(f"{done} seeds, {wrong} went wrong\n")

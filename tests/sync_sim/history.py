@@ -1,5 +1,6 @@
 """One seed's history, and what must hold during and after it."""
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from random import Random
@@ -37,6 +38,7 @@ SELDOM = (
     "roll_back_disk",
     "lose_disk",
     "forget_evidence",
+    "clock",
 )
 
 Log = Callable[[str], None]
@@ -49,12 +51,19 @@ class History:
         self._random = Random(seed)
         self._log = log
         self._notes = 0
+        self.clock_s = 1.7e9
+        """What clocks are ahead of virtual time."""
         self._events = Events()
         self._server = SimServer()
         self._network = Network(self._events, self._server, self._random)
         count = self._random.randint(2, len(MODES))
         self._robots = [SimRobot(f"r{n}", MODES[n], self._network.ask) for n in range(count)]
         self._mappers = [robot for robot in self._robots if robot.mode != "viewer"]
+        self._weather()
+
+    def time_s(self) -> float:
+        """What clocks say."""
+        return self.clock_s + self._events.now_s
 
     def run(self) -> None:
         """Let it happen, and check.
@@ -92,7 +101,10 @@ class History:
             robot.commit(self._random.randrange(60), note=self._note(), retracts=taken_back)
 
     def _sync(self) -> None:
-        self._random.choice(self._robots).start_round()
+        robot = self._random.choice(self._robots)
+        robot.start_round()
+        if self._random.random() < 0.3:
+            self._events.after(self._random.random() * self._network.weather.delay_s, robot.start_round)
 
     def _fold(self) -> None:
         self._server.fold(self._random.randint(1, 5))
@@ -142,6 +154,10 @@ class History:
 
     def _forget_evidence(self) -> None:
         self._server.forget_evidence()
+
+    def _clock(self) -> None:
+        """Somebody sets all clocks to another time."""
+        self.clock_s += self._random.uniform(-1e7, 1e7)
 
     # What must hold
 
@@ -213,9 +229,10 @@ def run_seed(seed: int, log: Log = lambda text: None) -> None:
         AssertionError: something does not hold.
     """
     history = None
-    with _seeded(seed):
+    with _seeded(seed) as patch:
         try:
             history = History(seed, log)
+            patch.setattr(time, "time", history.time_s)
             history.run()
         finally:
             if history is not None:
@@ -234,11 +251,11 @@ def failures(seeds: range) -> list[tuple[int, str]]:
 
 
 @contextmanager
-def _seeded(seed: int) -> Iterator[None]:
+def _seeded(seed: int) -> Iterator[pytest.MonkeyPatch]:
     """Random numbers of the program itself from the seed, and no folding thread."""
     random = Random(~seed)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ids.secrets, "token_hex", lambda size: random.randbytes(size).hex())
         patch.setattr(memory_map.secrets, "token_bytes", random.randbytes)
         patch.setattr(service_module, "Folder", FoldOnRequest)
-        yield
+        yield patch

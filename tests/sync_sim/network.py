@@ -36,26 +36,26 @@ class Network:
         self._events = events
         self._server = server
         self._random = random
-        self._replies: dict[str, Iterator[Frame | CairnError]] = {}
+        self._replies: dict[tuple[str, int], Iterator[Frame | CairnError]] = {}
+        """Of rounds, the reply that is coming in."""
 
-    def ask(self, robot: SimRobot, ask: Ask[Any]) -> None:
-        """Send a request; the robot hears of it in a while, one way or the other."""
+    def ask(self, robot: SimRobot, number: int, ask: Ask[Any]) -> None:
+        """Send a request of a round; the robot hears of it in a while, one way or the other."""
         if isinstance(ask, NextFrame):
-            self._hand_over(robot)
+            self._hand_over(robot, number)
             return
-        self._replies.pop(robot.name, None)
-        number = robot.round
+        self._replies.pop((robot.name, number), None)
         answered = [False]
 
         def give_up() -> None:
-            if not answered[0] and robot.round == number and robot.is_busy:
+            if not answered[0] and robot.is_in(number):
                 answered[0] = True
-                robot.failed(UnreachableError("no_link", "no answer in time"))
+                robot.failed(number, UnreachableError("no_link", "no answer in time"))
 
         def hear(answer: Any) -> None:
-            if not answered[0] and robot.round == number and robot.is_busy:
+            if not answered[0] and robot.is_in(number):
                 answered[0] = True
-                self._hear(robot, ask, answer)
+                self._hear(robot, number, ask, answer)
 
         self._events.after(TIMEOUT_S, give_up)
         for _ in range(1 + self._is(self.weather.doubled)):
@@ -71,27 +71,26 @@ class Network:
         if not self._is_gone(robot):
             self._later(lambda: hear(answer))
 
-    def _hear(self, robot: SimRobot, ask: Ask[Any], answer: Any) -> None:
+    def _hear(self, robot: SimRobot, number: int, ask: Ask[Any], answer: Any) -> None:
         if isinstance(answer, CairnError):
-            robot.failed(answer)
+            robot.failed(number, answer)
         elif isinstance(ask, GetMissing):
-            self._replies[robot.name] = self._frames(answer)
-            self._hand_over(robot)
+            self._replies[robot.name, number] = self._frames(answer)
+            self._hand_over(robot, number)
         else:
-            robot.answered(answer)
+            robot.answered(number, answer)
 
-    def _hand_over(self, robot: SimRobot) -> None:
+    def _hand_over(self, robot: SimRobot, number: int) -> None:
         """The next frame of a reply, some time later."""
-        number = robot.round
-        reply = self._replies[robot.name]
+        reply = self._replies[robot.name, number]
 
         def hand_over() -> None:
-            if robot.round == number and robot.is_busy:
+            if robot.is_in(number):
                 frame = next(reply, None)
                 if isinstance(frame, CairnError):
-                    robot.failed(frame)
+                    robot.failed(number, frame)
                 else:
-                    robot.answered(frame)
+                    robot.answered(number, frame)
 
         self._later(hand_over)
 

@@ -1,6 +1,10 @@
-"""A robot of a simulation: a real replica on a disk in memory, and at most one round with the server under way."""
+"""A robot of a simulation: a real replica on a disk in memory, and rounds with the server that are under way.
+
+Two at once, which a real robot does not have, so that answers of one come when the other has moved cells.
+"""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import apsw
@@ -16,11 +20,14 @@ from cairn_map.commit import split_commit
 from cairn_map.errors import CairnError
 from cairn_map.ids import CommitId, RobotName
 
+ROUNDS_AT_ONCE = 2
+
 
 class MemoryDisk(ReplicaStore):
     """A replica's file in memory."""
 
     def __init__(self, image: bytes = b"") -> None:
+        self._folder = Path("in-memory")
         self._connection = apsw.Connection(":memory:")
         if image:
             self._connection.deserialize("main", image)
@@ -32,22 +39,26 @@ class MemoryDisk(ReplicaStore):
 
 
 class SimRobot:
-    """One robot; `ask` sends a request on its way, and `answered` or `failed` is called some time later."""
+    """One robot; `ask` sends a round's request on its way, and `answered` or `failed` is called some time later."""
 
-    def __init__(self, name: str, mode: str, ask: Callable[["SimRobot", Ask[Any]], None]) -> None:
+    def __init__(self, name: str, mode: str, ask: Callable[["SimRobot", int, Ask[Any]], None]) -> None:
         self.name = name
         self.mode = mode
-        self.round = 0
-        """Number of the round under way, or of the last one: an answer to an older one comes too late."""
         self._ask = ask
-        self._conversation: Conversation[None] | None = None
+        self._rounds_begun = 0
+        self._conversations: dict[int, Conversation[None]] = {}
+        """Those under way, by the number of their round."""
         self._saved: bytes | None = None
         self._open(MemoryDisk())
 
     @property
     def is_busy(self) -> bool:
         """Whether a round is under way."""
-        return self._conversation is not None
+        return bool(self._conversations)
+
+    def is_in(self, number: int) -> bool:
+        """Whether this round is under way: to any other, an answer comes too late."""
+        return number in self._conversations
 
     def commit(self, seed: int, *, note: str, retracts: tuple[str, ...] = ()) -> None:
         """Map something."""
@@ -64,28 +75,25 @@ class SimRobot:
         return found
 
     def start_round(self) -> None:
-        """Begin to sync, unless it does already."""
-        if not self.is_busy:
-            self.round += 1
-            self._conversation = self._rounds()
-            self.answered(None)
+        """Begin to sync, unless there is enough under way."""
+        if len(self._conversations) < ROUNDS_AT_ONCE:
+            self._rounds_begun += 1
+            self._conversations[self._rounds_begun] = self._round()
+            self.answered(self._rounds_begun, None)
 
-    def answered(self, answer: Any) -> None:
+    def answered(self, number: int, answer: Any) -> None:
         """Go on with an answer."""
-        conversation = self._conversation
-        assert conversation is not None
-        self._advance(lambda: conversation.send(answer))
+        conversation = self._conversations[number]
+        self._advance(number, lambda: conversation.send(answer))
 
-    def failed(self, error: CairnError) -> None:
+    def failed(self, number: int, error: CairnError) -> None:
         """Go on with an error of the server or the link."""
-        conversation = self._conversation
-        assert conversation is not None
-        self._advance(lambda: conversation.throw(error))
+        conversation = self._conversations[number]
+        self._advance(number, lambda: conversation.throw(error))
 
     def stop(self) -> None:
         """The program ends without a word."""
-        self.round += 1
-        self._conversation = None
+        self._conversations.clear()
 
     def restart(self) -> None:
         """It starts again."""
@@ -109,7 +117,7 @@ class SimRobot:
         self.replica.close()
         self._open(MemoryDisk())
 
-    def _rounds(self) -> Conversation[None]:
+    def _round(self) -> Conversation[None]:
         report = yield from push_commits(self.replica, sealed_only=self.mode == "viewer")
         # A retract of a server that was replaced is not taken by the other one, of which this robot will hear next.
         assert all(self.replica.seal(commit) is not None for commit in report.refused)
@@ -118,13 +126,13 @@ class SimRobot:
         else:
             yield from fetch_missing(self.replica)
 
-    def _advance(self, step: Callable[[], Ask[Any]]) -> None:
+    def _advance(self, number: int, step: Callable[[], Ask[Any]]) -> None:
         try:
             ask = step()
         except (StopIteration, CairnError):
-            self._conversation = None
+            del self._conversations[number]
         else:
-            self._ask(self, ask)
+            self._ask(self, number, ask)
 
     def _open(self, disk: MemoryDisk) -> None:
         self.disk = disk
