@@ -40,10 +40,10 @@ class MemorySnapshot:
             if cell.lm > after_seq:
                 yield replace(cell, body=b"", stamps=b"")
 
-    def contributions(self, key: CellKey, *, after_seq: int, limit: int | None = None) -> list[Contribution]:
-        """Entries after `after_seq` that touch a cell, oldest first, at most `limit`."""
+    def contributions(self, key: CellKey, *, after_seq: int, newest: int | None = None) -> list[Contribution]:
+        """Entries after `after_seq` that touch a cell, oldest first, at most so many of the newest."""
         seqs = [seq for seq in self._state.touched.get(key, ()) if seq > after_seq]
-        return [self._contribution(key, self._state.entries[seq - 1]) for seq in seqs[:limit]]
+        return [self._contribution(key, seq) for seq in seqs[-(newest or len(seqs)) :]]
 
     def diff(self, number: int) -> bytes | None:
         """The bytes of a contribution; None if they are not kept any more."""
@@ -97,10 +97,11 @@ class MemorySnapshot:
     def _folded(self) -> Iterator[Kept]:
         return (kept for kept in self._state.commits.values() if kept.folded_seq is not None)
 
-    def _contribution(self, key: CellKey, entry: Entry) -> Contribution:
+    def _contribution(self, key: CellKey, seq: int) -> Contribution:
+        entry = self._state.entries[seq - 1]
         commit = self._state.ids[entry.commit]
         size_bytes = len(self._state.commits[commit].new.diff[key])
-        return Contribution(entry.kind, commit.author, self._state.diff_numbers[commit, key], size_bytes)
+        return Contribution(seq, entry.kind, commit.author, self._state.diff_numbers[commit, key], size_bytes)
 
     def _log_entry(self, seq: int, entry: Entry) -> LogEntry:
         kept = self._state.commits[self._state.ids[entry.commit]]

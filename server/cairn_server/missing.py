@@ -122,7 +122,8 @@ def header_of(
     """The state of a snapshot, as the author of some of its commits needs to know it."""
     head = snapshot.head
     tip = snapshot.tip(author) if author else None
-    return ReplyHeader(
+    # Not checked once more: of hundreds of authors that takes longer than all else in a reply.
+    return ReplyHeader.model_construct(
         to=str(head.cursor),
         vector=head.vector.to_json(),
         stable=stable.to_json(),

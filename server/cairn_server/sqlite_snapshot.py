@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import Any
 
 import apsw
@@ -38,7 +39,7 @@ class SqliteSnapshot:
         log_id, seq, chain, vector = first(
             connection, "SELECT log_id, seq, chain, vector FROM map WHERE number = ?", (map_number,)
         )
-        self._head = Head(cursor=Cursor(log_id, seq, chain), vector=version_vector_from_json(json.loads(vector)))
+        self._head = Head(cursor=Cursor(log_id, seq, chain), vector=_vector_of_text(vector))
 
     @property
     def head(self) -> Head:
@@ -74,18 +75,21 @@ class SqliteSnapshot:
         for row in found:
             yield cell_row(row)
 
-    def contributions(self, key: CellKey, *, after_seq: int, limit: int | None = None) -> list[Contribution]:
-        """Entries after `after_seq` that touch a cell, oldest first, at most `limit`."""
+    def contributions(self, key: CellKey, *, after_seq: int, newest: int | None = None) -> list[Contribution]:
+        """Entries after `after_seq` that touch a cell, oldest first, at most so many of the newest."""
         found = rows(
             self._connection,
-            "SELECT log.kind, robot, incarnation, diff.number, length(diff.body) FROM touched"
+            "SELECT touched.seq, log.kind, robot, incarnation, diff.number, length(diff.body) FROM touched"
             " JOIN log ON log.map = touched.map AND log.seq = touched.seq"
             " JOIN commits ON commits.number = log.commit_number"
             " JOIN diff ON diff.commit_number = commits.number AND diff.cell = touched.cell"
-            " WHERE touched.map = ? AND touched.cell = ? AND touched.seq > ? ORDER BY touched.seq LIMIT ?",
-            (self._map, key, after_seq, -1 if limit is None else limit),
+            " WHERE touched.map = ? AND touched.cell = ? AND touched.seq > ? ORDER BY touched.seq DESC LIMIT ?",
+            (self._map, key, after_seq, -1 if newest is None else newest),
         )
-        return [Contribution(kind, Author(robot, inc), number, size) for kind, robot, inc, number, size in found]
+        return [
+            Contribution(seq, kind, Author(robot, incarnation), number, size_bytes)
+            for seq, kind, robot, incarnation, number, size_bytes in reversed(found)
+        ]
 
     def diff(self, number: int) -> bytes | None:
         """The bytes of a contribution; None if they are not kept any more."""
@@ -189,6 +193,12 @@ def cell_row(columns: tuple[Any, ...]) -> CellRow:
         gone_seq=gone_seq,
         size_bytes=size_bytes,
     )
+
+
+@lru_cache(maxsize=4)
+def _vector_of_text(text: str) -> VersionVector:
+    """The head's vector: many ask between two folds, and of hundreds of authors it takes longer than the rest."""
+    return version_vector_from_json(json.loads(text))
 
 
 def _vector(found: list[tuple[Any, ...]]) -> VersionVector:

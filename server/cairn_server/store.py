@@ -54,8 +54,8 @@ class Snapshot(Protocol):
         """All cells changed after a log entry, without bodies, rising in number."""
         ...
 
-    def contributions(self, key: CellKey, *, after_seq: int, limit: int | None = None) -> list[Contribution]:
-        """Entries after `after_seq` that touch a cell, oldest first, at most `limit`.
+    def contributions(self, key: CellKey, *, after_seq: int, newest: int | None = None) -> list[Contribution]:
+        """Entries after `after_seq` that touch a cell, oldest first, at most so many of the newest.
 
         Those up to the cell's `gone_seq` may be missing.
         """

@@ -61,6 +61,7 @@ class StoredCommit:
 class Contribution:
     """What one log entry did to one cell."""
 
+    seq: int
     kind: bytes
     author: Author
     diff: int

@@ -85,8 +85,8 @@ def _age_rows(service: Service, row: MapRow, cursor: Cursor, age: int, last_byte
         def find() -> int:
             found = 0
             for cell in listed:
-                evidence, stamps = cache.read(snapshot, cell, row.geometry)
-                found += len(of_blocks(evidence, blocks_after(stamps, cursor.seq)))
+                stamps = cache.stamps(snapshot, cell, row.geometry)
+                found += len(of_blocks(cache.evidence(snapshot, cell), blocks_after(stamps, cursor.seq)))
             return found
 
         start_s = time.process_time()

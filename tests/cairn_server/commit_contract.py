@@ -87,7 +87,8 @@ class CommitContract:
             for key in commits[0].cells:
                 found = snapshot.contributions(key, after_seq=0)
                 assert [snapshot.diff(entry.diff) for entry in found] == [commit.cells[key] for commit in commits]
-                assert snapshot.contributions(key, after_seq=0, limit=2) == found[:2]
+                assert [entry.seq for entry in found] == [1, 2, 3]
+                assert snapshot.contributions(key, after_seq=0, newest=2) == found[1:]
                 assert snapshot.contributions(key, after_seq=2) == found[2:]
 
     def test_only_cells_that_changed_later_are_listed(self, store: Store) -> None:

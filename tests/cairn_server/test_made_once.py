@@ -1,0 +1,64 @@
+"""What many ask for at a time is made once, and kept within a bound."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from cairn_server.made_once import MadeOnce
+
+ASKERS = 8
+
+
+def kept(limit_bytes: int = 100) -> MadeOnce[str, bytes]:
+    return MadeOnce(limit_bytes=limit_bytes, size_of=len)
+
+
+def refuse() -> bytes:
+    raise AssertionError("made again")
+
+
+def test_all_who_ask_meanwhile_get_what_the_first_one_makes() -> None:
+    values, made, go = kept(), [0], threading.Event()
+
+    def make() -> bytes:
+        made[0] += 1
+        assert go.wait(60.0)
+        return b"value"
+
+    with ThreadPoolExecutor(ASKERS) as pool:
+        asked = [pool.submit(values.get, "name", make) for _ in range(ASKERS)]
+        assert values.get("other", lambda: b"x") == b"x"  # nobody waits for what it did not ask for
+        go.set()
+        assert [future.result() for future in asked] == [b"value"] * ASKERS
+    assert made == [1]
+    assert values.get("name", refuse) == b"value"
+
+
+def test_a_failure_goes_to_all_who_wait_and_is_not_kept() -> None:
+    values, go = kept(), threading.Event()
+
+    def fail() -> bytes:
+        assert go.wait(60.0)
+        raise ZeroDivisionError
+
+    with ThreadPoolExecutor(ASKERS) as pool:
+        asked = [pool.submit(values.get, "name", fail) for _ in range(ASKERS)]
+        go.set()
+        assert all(isinstance(future.exception(), ZeroDivisionError) for future in asked)
+    assert values.get("name", lambda: b"value") == b"value"
+
+
+def test_what_nobody_asked_for_longest_is_forgotten_first() -> None:
+    values = kept(limit_bytes=2)
+    for name in ("a", "b", "a", "c"):
+        values.get(name, name.encode)
+    assert [values.get(name, refuse) for name in ("a", "c")] == [b"a", b"c"]
+    with pytest.raises(AssertionError, match="made again"):
+        values.get("b", refuse)
+
+
+def test_what_is_larger_than_the_bound_is_handed_out_but_not_kept() -> None:
+    values = kept(limit_bytes=2)
+    assert values.get("a", lambda: b"long") == b"long"
+    assert values.get("a", lambda: b"else") == b"else"
