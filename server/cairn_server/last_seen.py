@@ -1,32 +1,58 @@
-"""When each branch was last written as seen: a robot pushes many commits a second, its row changes every few."""
+"""When each branch was last heard of, and where it stood: gathered, so that a crowd's signs of life are one write."""
 
 import threading
 import time
+from dataclasses import dataclass
 
 KEEP_S = 10.0
+"""A branch that only gives signs of life is written so often."""
+WRITE_EVERY_S = 1.0
+"""All that is news is written so often."""
 ENTRIES_MAX = 10_000
+Key = tuple[int, str]
+"""Number of the map, and name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sign:
+    """The last of one branch."""
+
+    time_s: float
+    cursor: str | None
 
 
 class LastSeen:
-    """Remembers what was written about each branch; thread-safe."""
+    """Remembers what is to be written about each branch, and what was; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._written: dict[tuple[int, str], tuple[float, str | None]] = {}
+        self._written: dict[Key, tuple[float, str | None]] = {}
+        self._unwritten: dict[Key, Sign] = {}
+        self._written_s = float("-inf")
 
-    def is_news(self, map_number: int, name: str, cursor: str | None) -> bool:
-        """Whether this is worth writing: a cursor that moved, or the first sign of life for a while."""
+    def note(self, map_number: int, name: str, cursor: str | None) -> bool:
+        """Whether it is time to write what is `taken`: there is news, and the last time was a while ago."""
+        now_s, key = time.monotonic(), (map_number, name)
+        with self._lock:
+            written_s, known = self._written.get(key, (float("-inf"), None))
+            if now_s - written_s >= KEEP_S or cursor not in (None, known):
+                before = self._unwritten.get(key)
+                self._unwritten[key] = Sign(time.time(), cursor or (before.cursor if before else None))
+            return bool(self._unwritten) and now_s - self._written_s >= WRITE_EVERY_S
+
+    def taken(self) -> dict[Key, Sign]:
+        """What is to be written now; it counts as written."""
         now_s = time.monotonic()
         with self._lock:
-            written_s, known = self._written.get((map_number, name), (float("-inf"), None))
-            if now_s - written_s < KEEP_S and cursor in (None, known):
-                return False
-            if len(self._written) >= ENTRIES_MAX:
+            signs, self._unwritten = self._unwritten, {}
+            if len(self._written) + len(signs) > ENTRIES_MAX:
                 self._written.clear()
-            self._written[map_number, name] = (now_s, cursor or known)
-            return True
+            for key, sign in signs.items():
+                self._written[key] = now_s, sign.cursor or self._written.get(key, (0.0, None))[1]
+            self._written_s = now_s
+            return signs
 
     def forget(self, map_number: int, name: str) -> None:
-        """The branch's row was made anew, or is gone."""
+        """The branch's row is made anew, or is gone; what is to be written is `taken` before."""
         with self._lock:
             self._written.pop((map_number, name), None)

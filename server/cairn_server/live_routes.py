@@ -24,7 +24,7 @@ from starlette.types import Receive, Scope, Send
 from cairn_map.errors import BadInputError, CairnError, DeniedError
 from cairn_map.live_events import Beat, LiveEvent, Seen, seen_from_text
 from cairn_server.auth import require
-from cairn_server.http_access import READERS, READING, Credentials, Map, Operations, caller_on_map, map_of
+from cairn_server.http_access import READERS, READING, Credentials, Map, Operations, caller_now, map_now
 from cairn_server.live import Listener
 from cairn_server.problems import answer_to
 from cairn_server.service import Service
@@ -91,7 +91,7 @@ class _Stream:
     def _may_listen(self) -> bool:
         """Whether the token is still good."""
         try:
-            require(caller_on_map(self._service, self._row, self._credentials), *READING)
+            require(caller_now(self._service, self._row, self._credentials), *READING)
         except DeniedError:
             return False
         except CairnError as exc:  # not to know is not to be refused
@@ -99,6 +99,8 @@ class _Stream:
         return True
 
     def _wake(self) -> None:
+        if self._woken.is_set():  # `pump` clears it before it takes what there is
+            return
         with suppress(RuntimeError):  # the loop is closed: nobody is left to be woken
             self._loop.call_soon_threadsafe(self._woken.set)
 
@@ -192,8 +194,8 @@ async def _until_left(socket: WebSocket) -> None:
 
 
 def _admitted(service: Service, name: str, credentials: HTTPAuthorizationCredentials | None) -> MapRow:
-    row = map_of(name, service, credentials)
-    require(caller_on_map(service, row, credentials), *READING)
+    row = map_now(name, service, credentials)
+    require(caller_now(service, row, credentials), *READING)
     return row
 
 

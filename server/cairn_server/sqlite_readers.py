@@ -14,8 +14,9 @@ from cairn_map.errors import UnreachableError
 from cairn_server.sqlite_failures import read_failure
 from cairn_server.sqlite_writer import connect
 
-IDLE_MAX = 16
-"""Connections that are kept open while nobody reads."""
+IDLE_MAX = 48
+"""Connections that are kept open while nobody reads: one for each thread of the web server, and a few. To open one
+takes longer than most of what is read through it."""
 
 
 class Readers:

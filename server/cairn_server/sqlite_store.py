@@ -3,8 +3,8 @@
 import json
 import logging
 import secrets
-import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -163,6 +163,7 @@ class SqliteStore:
 
     def register(self, row: MapRow, branch: Branch, token_hash: bytes) -> None:
         """Make a branch, or give an existing one a new token."""
+        self._write_seen()  # before the row is made anew, in the order of the writer's jobs
         self._seen.forget(row.number, branch.name)
         sensors = json.dumps(branch.sensors)
         values = (row.number, branch.name, branch.mode, sensors, branch.last_seen_s, branch.incarnation)
@@ -183,16 +184,19 @@ class SqliteStore:
 
     def seen(self, row: MapRow, name: str, cursor: Cursor | None) -> None:
         """Note that a branch was heard of, and where it stands; may be written later."""
-        text = str(cursor) if cursor else None
-        if not self._seen.is_news(row.number, name, text):
-            return
-        values = (time.time(), text, row.number, name)
-        with suppress(UnreachableError):  # it is only a note, and what it is about was done
-            self._writer.submit(
-                lambda connection: connection.execute(
-                    "UPDATE branch SET last_seen_s = ?, cursor = coalesce(?, cursor) WHERE map = ? AND name = ?", values
-                ).fetchall()
-            )
+        if self._seen.note(row.number, name, str(cursor) if cursor else None):
+            with suppress(UnreachableError):  # it is only a note, and what it is about was done
+                self._write_seen()
+
+    def _write_seen(self) -> Future[None]:
+        """Write what was heard of branches."""
+        values = [(sign.time_s, sign.cursor, *key) for key, sign in self._seen.taken().items()]
+        query = "UPDATE branch SET last_seen_s = ?, cursor = coalesce(?, cursor) WHERE map = ? AND name = ?"
+
+        def job(connection: apsw.Connection) -> None:
+            connection.executemany(query, values).fetchall()
+
+        return self._writer.submit(job)
 
     def deregister(self, row: MapRow, name: str) -> None:
         """Remove a branch and its token."""
@@ -208,6 +212,8 @@ class SqliteStore:
 
     def branches(self, row: MapRow) -> list[Branch]:
         """All branches, by name."""
+        with suppress(UnreachableError):  # a full disk is no reason not to tell what is known
+            self._write_seen().result()
         query = "SELECT name, mode, sensors, cursor, last_seen_s, incarnation FROM branch WHERE map = ? ORDER BY name"
         with self._readers.reading() as reader:
             found = rows(reader, query, (row.number,))
@@ -225,6 +231,7 @@ class SqliteStore:
     def close(self) -> None:
         """Finish what was accepted and close."""
         with suppress(UnreachableError):  # closed before
+            self._write_seen()
             self.tokens.write_used()
         try:
             self._writer.close()

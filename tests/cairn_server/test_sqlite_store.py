@@ -9,7 +9,7 @@ import apsw
 import pytest
 from tests.cairn_map.made import SMALL
 from tests.cairn_server.access_contract import AccessContract
-from tests.cairn_server.branch_contract import BranchContract
+from tests.cairn_server.branch_contract import BranchContract, branch, token
 from tests.cairn_server.commit_contract import CommitContract
 from tests.cairn_server.crowd_contract import CrowdContract
 from tests.cairn_server.evidence_contract import EvidenceContract
@@ -41,6 +41,28 @@ def fresh(tmp_path: Path) -> Iterator[SqliteStore]:
 
 class TestSqliteStore(StoreContract, CommitContract, CrowdContract, EvidenceContract, BranchContract, AccessContract):
     """All of the contract."""
+
+
+CROWD = sqlite_readers.IDLE_MAX + 10
+
+
+def test_signs_of_life_of_a_crowd_are_few_writes_and_none_is_lost(tmp_path: Path) -> None:
+    store = SqliteStore(tmp_path)
+    row, _ = store.create_map("lab", SMALL, SensorModel())
+    names = [f"robot{n}" for n in range(20)]
+    for name in names:
+        store.register(row, branch(name), token(row, name))
+    with store.snapshot(row) as snapshot:
+        cursor = snapshot.head.cursor
+    written = store.health.figures().written
+    for name in names:
+        store.seen(row, name, cursor)
+        store.seen(row, name, None)
+    store.close()
+    again = SqliteStore(tmp_path)
+    assert [found.cursor for found in again.branches(row)] == [cursor] * len(names)
+    again.close()
+    assert store._writer.written - written <= 3
 
 
 def test_a_second_store_on_the_same_folder_is_refused_until_the_first_is_closed(tmp_path: Path) -> None:
@@ -77,7 +99,7 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
 def test_threads_that_come_and_go_leave_no_connections_behind(fresh: SqliteStore) -> None:
     row, _ = fresh.create_map("lab", SMALL, SensorModel())
     for _ in range(3):
-        threads = [threading.Thread(target=lambda: fresh.branches(row)) for _ in range(30)]
+        threads = [threading.Thread(target=lambda: fresh.branches(row)) for _ in range(CROWD)]
         for thread in threads:
             thread.start()
         for thread in threads:
