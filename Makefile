@@ -29,8 +29,9 @@ demo: .venv/run.stamp .venv/kernels.stamp  ## three robots, one server, one map 
 test: .venv/dev.stamp .venv/kernels.stamp | system  ## all tests (PYTEST_ARGS="...")
 	$(BIN)/python -m pytest $(WORKERS) $(PYTEST_ARGS)
 
-soak: .venv/dev.stamp  ## crash stores and servers, simulate sync, fuzz every decoder (SOAK_SECONDS=600 of each, SOAK_ARGS="cell")
+soak: .venv/dev.stamp .venv/kernels.stamp  ## crash, crowd, simulate sync, fuzz (SOAK_SECONDS=600 of each, SOAK_ARGS="cell")
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.crash --trials 1000 --kills 200)
+	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.crowd --robots 200 --seconds $(SOAK_SECONDS))
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.sync_sim --seeds 100000)
 	$(BIN)/python -m tests.fuzz --seconds $(SOAK_SECONDS) $(SOAK_ARGS)
 

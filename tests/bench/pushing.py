@@ -34,19 +34,22 @@ BOMB_BYTES = 1 << 30
 class Bodies:
     """Commits of the same diffs under ever new ids; only the meta is made anew."""
 
-    def __init__(self, diffs: list[Diff], geometry: Geometry) -> None:
+    def __init__(self, diffs: list[Diff], geometry: Geometry, *, scans: int = 1) -> None:
+        """Each diff is what so many scans saw."""
         self.geometry = geometry
-        self._made = [make_commit(meta_of("mole", 0, geometry), diff, geometry) for diff in diffs]
+        self._scans = scans
+        self._made = [make_commit(meta_of("mole", 0, geometry, scans), diff, geometry) for diff in diffs]
         self._digests = [[cell_digest(key, diff[key], geometry) for key in sorted(diff)] for diff in diffs]
 
-    def body(self, robot: str, n: int) -> bytes:
-        """The n-th commit of a robot."""
-        return self._with_text(self._made[n % len(self._made)], _text(robot, n, self.geometry))
+    def body(self, robot: str, n: int, *, diff: int | None = None) -> bytes:
+        """The n-th commit of a robot, of the n-th diff or of this one."""
+        made = self._made[(n if diff is None else diff) % len(self._made)]
+        return self._with_text(made, _text(robot, n, self.geometry, self._scans))
 
     def commit(self, robot: str, n: int) -> NewCommit:
         """The same as the store takes it."""
-        made, text = self._made[n % len(self._made)], _text(robot, n, self.geometry)
-        meta = meta_of(robot, n, self.geometry)
+        made, text = self._made[n % len(self._made)], _text(robot, n, self.geometry, self._scans)
+        meta = meta_of(robot, n, self.geometry, self._scans)
         return NewCommit(
             id=meta.commit_id,
             sha=commit_sha(text, self._digests[n % len(self._made)]),
@@ -63,14 +66,14 @@ class Bodies:
         return HEAD.pack(*HEAD.unpack_from(made.data)[:2], len(text)) + text + rest
 
 
-def meta_of(robot: str, n: int, geometry: Geometry) -> CommitMeta:
+def meta_of(robot: str, n: int, geometry: Geometry, scans: int = 1) -> CommitMeta:
     """What the n-th commit of a robot says of itself."""
     pose = ScanPose(time_s=1.7e9 + n, t_map_rig=(1.0, 2.0, 0.4), q_map_rig=(0.0, 0.0, 0.0, 1.0))
-    return CommitMeta(id=f"{robot}.{'0' * 16}.{n}", geometry=geometry.digest().hex(), scans=(pose,))
+    return CommitMeta(id=f"{robot}.{'0' * 16}.{n}", geometry=geometry.digest().hex(), scans=(pose,) * scans)
 
 
-def _text(robot: str, n: int, geometry: Geometry) -> bytes:
-    return meta_of(robot, n, geometry).model_dump_json(exclude_defaults=True).encode()
+def _text(robot: str, n: int, geometry: Geometry, scans: int) -> bytes:
+    return meta_of(robot, n, geometry, scans).model_dump_json(exclude_defaults=True).encode()
 
 
 class Robot:

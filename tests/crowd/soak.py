@@ -1,0 +1,168 @@
+"""One soak: a server of its own, a map of the building, the crowd on it, and what came of it."""
+
+import asyncio
+import multiprocessing
+import secrets
+import signal
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from tests.cairn_server.live import Process
+from tests.crowd.building import Survey
+from tests.crowd.crowd import Crowd, CrowdRobot, fetch_all, listen, live_together
+from tests.crowd.figures import Seen
+from tests.crowd.watch import Sample, Watch
+from tests.crowd.whole_robots import WholeReport, live_whole
+
+from cairn_client.api import MapApi
+from cairn_map.messages import CreateMap, MapInfo
+
+MAP = "building"
+FOLDED_S = 120.0
+"""So long after the last push everything must be in the map."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """All that was measured."""
+
+    crowd: Crowd
+    seen: Seen
+    samples: list[Sample]
+    start_s: float
+    """When the first robot came, on the samples' clock."""
+    whole: WholeReport
+    info: MapInfo
+    """Of the map in the end."""
+    at_head: int
+    """Robots that stood at the head in the end."""
+    exit_code: int
+    complaints: str
+    """What the server wrote to standard error."""
+
+
+Progress = Callable[[float, Seen, list[Sample]], None]
+
+
+def soak(
+    crowd: Crowd, seen_by: Survey, folder: Path, *, whole_robots: int, every_s: float, progress: Progress
+) -> Outcome:
+    """Let a crowd live on a server.
+
+    Args:
+        crowd: how many robots, for how long.
+        seen_by: what they push.
+        folder: of the server's store; it exists.
+        whole_robots: how many more there are that keep the map.
+        every_s: between two calls of `progress`.
+        progress: told the seconds so far, and what was seen.
+    """
+    token = secrets.token_urlsafe(32)
+    secret = folder / "admin"
+    secret.write_text(token)
+    server = Process(folder / "store", "--admin-token-file", str(secret))
+    try:
+        assert server.url is not None, "the server did not start"
+        with MapApi(server.url, token=token) as api:
+            api.create_map(MAP, CreateMap(geometry=seen_by.geometry))
+            asyncio.run(_lay_out(server.url, token, seen_by))
+            seen, watch = Seen(), Watch(server.pid, every_s=min(5.0, crowd.seconds / 20))
+            with watch, _whole_robots(server.url, token, whole_robots, seen_by, crowd) as pipe:
+                start_s = time.perf_counter()
+                tell = (lambda: progress(time.perf_counter() - start_s, seen, watch.samples), every_s)
+                at_head = asyncio.run(_live(crowd, seen_by, seen, api, _port(server.url), pipe, tell))
+                whole: WholeReport = pipe.recv()
+            info = api.map_info(MAP)
+    finally:
+        server.send(signal.SIGTERM)
+        exit_code, complaints = server.end()
+    return Outcome(crowd, seen, watch.samples, start_s, whole, info, at_head, exit_code, complaints)
+
+
+async def _lay_out(url: str, token: str, seen_by: Survey) -> None:
+    """The map as it is when the crowd comes: one commit of each stop."""
+    bodies, seen = seen_by.stop_bodies(), Seen()
+    surveyor = CrowdRobot(_port(url), token, MAP, 0, bodies, seen)
+    surveyor.name = "surveyor"
+    await surveyor.join()
+    for _ in seen_by.stops:
+        await surveyor.push()
+    surveyor.link.close()
+
+
+async def _live(
+    crowd: Crowd,
+    seen_by: Survey,
+    seen: Seen,
+    api: MapApi,
+    port: int,
+    pipe: Connection,
+    tell: tuple[Callable[[], None], float],
+) -> int:
+    """The crowd's life, and its last fetch; how many robots stand at the head then."""
+    token = str(api.token)
+    bodies = seen_by.scan_bodies()
+    robots = [CrowdRobot(port, token, MAP, n, bodies, seen) for n in range(crowd.robots)]
+    around = [asyncio.create_task(listen(port, MAP, token, seen)) for _ in range(crowd.listeners)]
+    around.append(asyncio.create_task(_every(*tell)))
+    await live_together(crowd, robots, seen, start_s=time.perf_counter())
+    with ThreadPoolExecutor(1) as aside:
+        loop = asyncio.get_running_loop()
+        await loop.run_in_executor(aside, _quiet, pipe, api)
+        head = api.map_info(MAP).cursor
+        at_head = await fetch_all(robots, seen, head)
+        await asyncio.sleep(0.5)
+    for task in around:
+        task.cancel()
+    await asyncio.gather(*around, return_exceptions=True)
+    for robot in robots:
+        seen.sent_bytes += robot.link.sent_bytes
+        seen.received_bytes += robot.link.received_bytes
+        robot.link.close()
+    pipe.send("compare")
+    return at_head
+
+
+def _quiet(pipe: Connection, api: MapApi) -> None:
+    """Return when nobody pushes any more, and everything is folded."""
+    pipe.send("stop")
+    pipe.recv()
+    end_s = time.perf_counter() + FOLDED_S
+    while api.cell_index(MAP).header.pending:
+        assert time.perf_counter() < end_s, f"not folded {FOLDED_S:g} s after the last push"
+        time.sleep(0.1)
+
+
+async def _every(work: Callable[[], None], seconds: float) -> None:
+    while True:
+        await asyncio.sleep(seconds)
+        work()
+
+
+@contextmanager
+def _whole_robots(url: str, token: str, count: int, seen_by: Survey, crowd: Crowd) -> Iterator[Connection]:
+    """Some robots in a process of their own; the pipe to it."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    names = [f"whole{n}" for n in range(count)]
+    told = (f"{url}/maps/{MAP}", token, names, seen_by.scans[:: max(1, len(seen_by.scans) // 32)], seen_by.geometry)
+    process = context.Process(target=live_whole, args=(theirs, *told, [crowd.sync_s, crowd.push_s]))
+    process.start()
+    theirs.close()
+    try:
+        yield ours
+    finally:
+        ours.close()
+        with suppress(OSError):
+            process.join(60.0)
+            process.kill()
+
+
+def _port(url: str) -> int:
+    return int(urlsplit(url).port or 0)

@@ -1,0 +1,47 @@
+"""A few seconds of `make soak`'s crowd: everybody is answered, and what they are sent is the server's map."""
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from tests.crowd.building import survey
+from tests.crowd.crowd import Crowd
+from tests.crowd.figures import rise_of
+from tests.crowd.link import BadAnswerError, Told
+from tests.crowd.soak import soak
+from tests.crowd.verdict import findings, summary
+
+from cairn_map.cursor import Cursor
+from cairn_map.fingerprint import ZERO
+from cairn_map.frames import FrameKind, encode_frame, start_of_reply
+from cairn_map.messages import Done, ReplyHeader
+
+CURSOR = str(Cursor(bytes(16), 7, bytes(16)))
+HEADER = encode_frame(ReplyHeader(to=CURSOR, vector={}, stable={}))
+DONE = encode_frame(Done(to=CURSOR, rest=ZERO.hex()))
+
+
+def test_a_small_crowd_is_served_without_an_error_and_ends_with_the_servers_map(tmp_path: Path) -> None:
+    crowd = Crowd(robots=6, listeners=2, seconds=3.0, sync_s=0.5, push_s=1.0)
+    seen_by = survey(robot="tof", voxel_m=0.08, stops=2)
+    outcome = soak(crowd, seen_by, tmp_path, whole_robots=1, every_s=60.0, progress=lambda *_: None)
+    assert [line for line in findings(outcome) if "p99" not in line and "skipped" not in line] == []
+    assert outcome.seen.events["head"] and outcome.seen.frames[FrameKind.DELTA]
+    assert len(outcome.seen.pushes) + outcome.whole.pushed + len(seen_by.stops) == outcome.info.commits
+    assert any("compared byte for byte, 0 different" in line for line in summary(outcome))
+
+
+def test_a_reply_is_read_as_far_as_its_cursor_and_its_end() -> None:
+    told = Told.by(start_of_reply() + HEADER + DONE)
+    assert (told.cursor, told.kinds) == (CURSOR, Counter([FrameKind.HEADER, FrameKind.DONE]))
+
+
+@pytest.mark.parametrize("reply", [b"", DONE, HEADER, HEADER + DONE[:-1], HEADER + DONE + b"x"])
+def test_a_reply_that_is_not_whole_is_an_error(reply: bytes) -> None:
+    with pytest.raises(BadAnswerError):
+        Told.by(start_of_reply() + reply)
+
+
+def test_the_rise_of_a_line_is_told_from_what_lies_beside_it() -> None:
+    rise, beside = rise_of([0.0, 1.0, 2.0, 3.0], [10.0, 12.0, 12.0, 14.0])
+    assert rise == pytest.approx(3.6) and beside == pytest.approx(0.447, abs=1e-3)

@@ -1,0 +1,71 @@
+"""A server's process from outside: memory and processor time, its children's included."""
+
+import os
+import re
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One look."""
+
+    time_s: float
+    resident_bytes: int
+    cpu_s: float
+
+
+class Watch:
+    """Looks every so often, in a thread."""
+
+    def __init__(self, pid: int, *, every_s: float) -> None:
+        self.samples = [sample_of(pid)]
+        self._pid = pid
+        self._every_s = every_s
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ending.set()
+        self._thread.join()
+        self.samples.append(sample_of(self._pid))
+
+    def _run(self) -> None:
+        while not self._ending.wait(self._every_s):
+            self.samples.append(sample_of(self._pid))
+
+
+def sample_of(pid: int) -> Sample:
+    """What a process and its children hold and took now."""
+    now_s, found = time.perf_counter(), [_of_process(number) for number in (pid, *_children(pid))]
+    return Sample(now_s, sum(resident for resident, _ in found), sum(cpu_s for _, cpu_s in found))
+
+
+def _of_process(pid: int) -> tuple[int, float]:
+    folder = Path(f"/proc/{pid}")
+    try:
+        resident = re.search(r"VmRSS:\s+(\d+)", (folder / "status").read_text())
+        fields = (folder / "stat").read_text().rpartition(")")[2].split()
+    except OSError:  # it ended meanwhile
+        return 0, 0.0
+    return int(resident[1]) * 1024 if resident else 0, (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _children(pid: int) -> list[int]:
+    found: list[int] = []
+    for path in Path(f"/proc/{pid}/task").glob("*/children"):
+        try:
+            found += map(int, path.read_text().split())
+        except OSError:  # a thread that ended meanwhile
+            continue
+    return found + [grandchild for child in found for grandchild in _children(child)]
