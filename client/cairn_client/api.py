@@ -16,6 +16,7 @@ import httpx
 from pydantic import TypeAdapter, ValidationError
 
 from cairn_client.answers import FetchedCell, Traffic, error_of, list_of
+from cairn_client.asks import Box
 from cairn_map.access_messages import CreateToken, NewSecret, TokenInfo
 from cairn_map.commit import Commit
 from cairn_map.cursor import cursor_from_text
@@ -28,7 +29,7 @@ from cairn_map.fingerprint import fingerprint_from_hex
 from cairn_map.frames import Frame, FrameReader
 from cairn_map.grid import Cell
 from cairn_map.ids import Author, CommitId
-from cairn_map.index_messages import CellIndex
+from cairn_map.index_messages import INDEX_PAGE, CellIndex
 from cairn_map.messages import (
     BranchInfo,
     CreateMap,
@@ -169,11 +170,12 @@ class MapApi:
         """Log entries after a sequence number, oldest first."""
         return list_of(LogEntry, self._ask("GET", f"/maps/{name}/log", params={"after": after, "limit": limit}))
 
-    def cell_index(self, name: str, author: Author | None = None, *, box: tuple[Cell, Cell] | None = None) -> CellIndex:
-        """The cells of a map, all or those in a box (lowest and highest cell), without their bytes."""
-        params = {"author": str(author)} if author else {}
-        if box:
-            params["box"] = f"{box[0]},{box[1]}"
+    def cell_index(
+        self, name: str, author: Author | None = None, *, box: Box | None = None, after: Cell | None = None
+    ) -> CellIndex:
+        """A page of the cells of a map, or of a box (lowest and highest cell); all: `cell_index.whole_index`."""
+        asked = {"author": author, "box": f"{box[0]},{box[1]}" if box else None, "after": after}
+        params = {"limit": str(INDEX_PAGE)} | {key: str(value) for key, value in asked.items() if value is not None}
         index = message_from_json(CellIndex, self._ask("GET", f"/maps/{name}/main/cells", params=params))
         self._vector = index.header.coverage
         return index

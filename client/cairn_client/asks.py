@@ -72,10 +72,12 @@ class NextFrame(Ask[Frame | None]):
 
 @dataclass(frozen=True, slots=True)
 class GetIndex(Ask[CellIndex]):
-    """All cells, or those in a box, without their bytes."""
+    """A page of all cells, or of those in a box, without their bytes."""
 
-    author: Author
+    author: Author | None
     box: Box | None = None
+    after: Cell | None = None
+    """The last cell of the page before."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from cairn_client.api import MapApi
 from cairn_client.arguments import api_of, say, with_progress
+from cairn_client.link import index_of
 from cairn_map.cell_code import encode_cell
 from cairn_map.cell_folder import read_cells, read_head
 from cairn_map.errors import DamagedDataError
@@ -22,7 +23,7 @@ def heal(args: argparse.Namespace) -> None:
     api, name = api_of(args.map, args.token)
     left: list[Cell] = []
     with api:
-        entries = api.cell_index(name).cells
+        entries = index_of(api, name).cells
         for entry in with_progress(entries, "cells", total=len(entries)):
             number, here = Cell(*entry.cell), cells.get(cell_key(entry.cell))
             if _is_sound(api, name, number, entry.digest):

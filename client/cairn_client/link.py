@@ -15,8 +15,10 @@ from cairn_client.asks import (
     Push,
     PutCell,
 )
+from cairn_client.cell_index import whole_index
 from cairn_map.errors import CairnError
 from cairn_map.frames import Frame
+from cairn_map.index_messages import CellIndex
 
 T = TypeVar("T")
 
@@ -65,8 +67,8 @@ class Link:
                 return next(self._frames, None)
             case NextFrame():
                 return next(self._frames, None) if self._frames else None
-            case GetIndex(author, box):
-                return api.cell_index(name, author, box=box)
+            case GetIndex(author, box, after):
+                return api.cell_index(name, author, box=box, after=after)
             case GetCell(cell, etag):
                 return api.cell(name, cell, etag=etag)
             case PutCell(cell, body):
@@ -79,3 +81,8 @@ class Link:
         if self._frames is not None:
             self._frames.close()
             self._frames = None
+
+
+def index_of(api: MapApi, map_name: str) -> CellIndex:
+    """All cells of a map, without their bytes, for who is no robot."""
+    return Link(api, map_name, branch="").hold(whole_index())

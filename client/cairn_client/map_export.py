@@ -7,6 +7,7 @@ from pathlib import Path
 
 from cairn_client.api import MapApi
 from cairn_client.arguments import api_of, say, shown_bytes, with_progress
+from cairn_client.link import index_of
 from cairn_map.cell_code import DecodedCell, decode_cell
 from cairn_map.cell_files import cell_file, npz_file, ply_file
 from cairn_map.cell_folder import FolderHead, write_cell, write_head
@@ -71,7 +72,7 @@ def export_map(args: argparse.Namespace) -> None:
 
 def fetch_map(api: MapApi, name: str) -> Iterator[tuple[bytes, DecodedCell]]:
     """All cells that hold evidence, each with its bytes, in order of their numbers."""
-    entries = [entry for entry in api.cell_index(name).cells if entry.voxels]
+    entries = [entry for entry in index_of(api, name).cells if entry.voxels]
     entries.sort(key=lambda entry: cell_key(entry.cell))
     for entry in with_progress(entries, "cells", total=len(entries)):
         yield fetch_cell(api, name, Cell(*entry.cell))

@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_client.applying import Exchange, is_within
-from cairn_client.asks import Box, Conversation, GetCell, GetCommit, GetIndex, GetMissing, NextFrame, Push
+from cairn_client.asks import Box, Conversation, GetCell, GetCommit, GetMissing, NextFrame, Push
+from cairn_client.cell_index import whole_index
 from cairn_client.heal import heal_damaged
 from cairn_client.replica import Replica
 from cairn_client.replica_store import BaseCell
@@ -189,15 +190,17 @@ def fetch_cells(replica: Replica, *, wanted: Wanted | None = None, box: Box | No
     """
     report = RoundReport()
     author = replica.author
-    index = yield from GetIndex(author, box)
+    index = yield from whole_index(author, box=box)
     to, coverage = index.header.to_cursor, index.header.coverage
     digests = {cell_key(entry.cell): entry.digest for entry in index.cells}
+    later = {cell_key(entry.cell) for entry in index.cells if entry.lm > to.seq}
     with replica.lock:
         if replica.header and replica.header.to_cursor.log_id != to.log_id:
             log.warning("another server answers for this map; starting without its old state")
             replica.forget_server()
         replica.take_header(index.header, asked_by=author)
-        same = [key for key, held in replica.cells.items() if held.etag == f'"{digests.get(key)}"']
+        held = [key for key, cell in replica.cells.items() if cell.etag == f'"{digests.get(key)}"']
+        same = [key for key in held if key not in later]
         replica.move(same, to=to, coverage=coverage)
         for key in replica.cells.keys() - digests.keys():  # a server that was restored forgot them
             if is_within(key, box):

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from cairn_client.api import MapApi
+from cairn_client.link import index_of
 from cairn_client.robot import Robot
 from cairn_map.cell_code import cell_digest, decode_cell
 from cairn_map.commit import split_commit
@@ -38,7 +39,7 @@ def bring_level(robots: Sequence[Robot], api: MapApi, map_name: str) -> None:
 
 def server_identity(api: MapApi, map_name: str) -> dict[CellKey, Identity]:
     """Each of the server's cells that holds evidence."""
-    cells = api.cell_index(map_name).cells
+    cells = index_of(api, map_name).cells
     return {cell_key(entry.cell): (entry.digest, entry.fingerprint) for entry in cells if entry.voxels}
 
 

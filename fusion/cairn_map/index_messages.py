@@ -4,6 +4,10 @@ from pydantic import BaseModel, ConfigDict
 
 from cairn_map.messages import FingerprintText, ReplyHeader, ShaText
 
+INDEX_PAGE = 1000
+"""Entries of a page of which the asker says nothing."""
+INDEX_PAGE_MAX = 10_000
+
 
 class CellEntry(BaseModel):
     """One row of the cell index."""
@@ -20,7 +24,7 @@ class CellEntry(BaseModel):
 
 
 class CellIndex(BaseModel):
-    """Answer to `GET /maps/{map}/main/cells`, taken from one state of the map."""
+    """Answer to `GET /maps/{map}/main/cells`: a page of the index, taken from one state of the map."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -9,10 +9,11 @@ from cairn_map.cursor import cursor_from_text
 from cairn_map.errors import BadInputError, NotFoundError
 from cairn_map.grid import CellKey, cell_from_text, cell_key
 from cairn_map.ids import author_from_text
-from cairn_map.index_messages import CellIndex
+from cairn_map.index_messages import INDEX_PAGE, INDEX_PAGE_MAX, CellIndex
 from cairn_map.version_vector import vector_digest, vector_text
 from cairn_map.view import ViewStyle
 from cairn_map.view_code import encode_view
+from cairn_server.cell_index import IndexPage
 from cairn_server.cells_at_rest import stored_evidence
 from cairn_server.http_access import READERS, Map, Operations, body_of
 from cairn_server.http_ranges import is_same, part_of
@@ -32,13 +33,16 @@ def cell_index(
     row: Map,
     author: Annotated[str | None, Query(max_length=80)] = None,
     box: Annotated[str | None, Query(max_length=80, description="i0,j0,k0,i1,j1,k1: only these, ends included")] = None,
+    after: Annotated[str | None, Query(max_length=32, description="i,j,k: the last cell of the page before")] = None,
+    limit: Annotated[int, Query(ge=1, le=INDEX_PAGE_MAX)] = INDEX_PAGE,
 ) -> CellIndex:
-    """All cells that were ever touched, or those in a box, from one state."""
-    index = service.cell_index(row, author_from_text(author) if author else None)
-    if box is None:
-        return index
-    inside = box_from_text(box)
-    return index.model_copy(update={"cells": [entry for entry in index.cells if inside(entry.cell)]})
+    """Cells that were ever touched, all or those in a box, a page at a time."""
+    page = IndexPage(
+        after=cell_key(cell_from_text(after)) if after is not None else None,
+        limit=limit,
+        inside=box_from_text(box) if box is not None else None,
+    )
+    return service.cell_index(row, author_from_text(author) if author else None, page)
 
 
 @router.get("/maps/{name}/main/vector", dependencies=READERS)

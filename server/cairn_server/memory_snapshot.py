@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 
 from cairn_map.cursor import ENTRY_FOLD, first_chain
 from cairn_map.grid import CellKey, cell_of_key
@@ -34,11 +35,11 @@ class MemorySnapshot:
         """One cell with its body."""
         return self._state.cells.get(key)
 
-    def cells(self, *, after_seq: int = -1) -> Iterator[CellRow]:
-        """All cells changed after a log entry, without bodies, rising in number."""
-        for _, cell in sorted(self._state.cells.items()):
-            if cell.lm > after_seq:
-                yield replace(cell, body=b"", stamps=b"")
+    def cells(self, *, after_seq: int = -1, after_key: int = -1, limit: int | None = None) -> Iterator[CellRow]:
+        """Cells changed after a log entry, of numbers above `after_key`, at most `limit`; without bodies, rising."""
+        found = (cell for key, cell in sorted(self._state.cells.items()) if key > after_key and cell.lm > after_seq)
+        for cell in islice(found, limit):
+            yield replace(cell, body=b"", stamps=b"")
 
     def contributions(self, key: CellKey, *, after_seq: int, newest: int | None = None) -> list[Contribution]:
         """Entries after `after_seq` that touch a cell, oldest first, at most so many of the newest."""

@@ -12,9 +12,9 @@ from cairn_map.commit import Commit, commit_bytes, split_commit
 from cairn_map.cursor import Cursor
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_map.frames import encode_frame, start_of_reply
-from cairn_map.grid import CellKey, cell_of_key
+from cairn_map.grid import CellKey
 from cairn_map.ids import INITIAL, OPERATOR, Author, RobotName, commit_id_from_text, new_incarnation, robot_name
-from cairn_map.index_messages import CellEntry, CellIndex
+from cairn_map.index_messages import CellIndex
 from cairn_map.live_events import RobotSign
 from cairn_map.messages import (
     BranchInfo,
@@ -29,6 +29,7 @@ from cairn_map.messages import (
 from cairn_map.version_vector import VersionVector
 from cairn_server.auth import Caller, Role, new_token, token_hash
 from cairn_server.branch_list import branch_infos
+from cairn_server.cell_index import FIRST_PAGE, IndexPage, entries_of
 from cairn_server.cells_at_rest import DamagedCellError, sound_cell
 from cairn_server.commit_checks import CommitChecks
 from cairn_server.damaged_cells import DamagedCells
@@ -206,26 +207,12 @@ class Service:
         seal = seal_of(row, found.sha) if found.id.author.robot == OPERATOR else None
         return commit_bytes(found.text, dict(sorted(found.diff.items()))), found.sha, seal
 
-    def cell_index(self, row: MapRow, author: Author | None) -> CellIndex:
-        """All cells that were ever touched, emptied ones included, from one state."""
+    def cell_index(self, row: MapRow, author: Author | None, page: IndexPage = FIRST_PAGE) -> CellIndex:
+        """Some of the cells that were ever touched, and the state that they were read from."""
         with self.store.snapshot(row) as snapshot:
-            cells = list(snapshot.cells())
             stable, damaged = self._stable.of(row, snapshot), self.damaged.of(row.name)
             header = header_of(snapshot, author, stable=stable, damaged=damaged)
-        return CellIndex(
-            header=header,
-            cells=[
-                CellEntry(
-                    cell=cell_of_key(cell.key),
-                    size_bytes=cell.size_bytes,
-                    digest=cell.digest.hex(),
-                    lm=cell.lm,
-                    fingerprint=cell.fingerprint.hex(),
-                    voxels=cell.voxels,
-                )
-                for cell in cells
-            ],
-        )
+            return CellIndex(header=header, cells=entries_of(snapshot, page))
 
     def cell(self, row: MapRow, key: CellKey) -> tuple[CellRow | None, Head]:
         """One cell (None: never seen) and the state that it was read from.

@@ -65,12 +65,12 @@ class SqliteSnapshot:
             )
         return cell_row(row) if row else None
 
-    def cells(self, *, after_seq: int = -1) -> Iterator[CellRow]:
-        """All cells changed after a log entry, without bodies, rising in number."""
+    def cells(self, *, after_seq: int = -1, after_key: int = -1, limit: int | None = None) -> Iterator[CellRow]:
+        """Cells changed after a log entry, of numbers above `after_key`, at most `limit`; without bodies, rising."""
         found = rows(
             self._connection,
-            f"SELECT {CELL_COLUMNS} FROM cell WHERE map = ? AND lm > ? ORDER BY cell",  # noqa: S608 - constant columns
-            (self._map, after_seq),
+            f"SELECT {CELL_COLUMNS} FROM cell WHERE map = ? AND lm > ? AND cell > ? ORDER BY cell LIMIT ?",  # noqa: S608 - constant columns
+            (self._map, after_seq, after_key, -1 if limit is None else limit),
         )
         for row in found:
             yield cell_row(row)

@@ -50,8 +50,8 @@ class Snapshot(Protocol):
         """One cell with its body."""
         ...
 
-    def cells(self, *, after_seq: int = -1) -> Iterator[CellRow]:
-        """All cells changed after a log entry, without bodies, rising in number."""
+    def cells(self, *, after_seq: int = -1, after_key: int = -1, limit: int | None = None) -> Iterator[CellRow]:
+        """Cells changed after a log entry, of numbers above `after_key`, at most `limit`; without bodies, rising."""
         ...
 
     def contributions(self, key: CellKey, *, after_seq: int, newest: int | None = None) -> list[Contribution]:

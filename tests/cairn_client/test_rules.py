@@ -485,7 +485,7 @@ class Cells:
         self.index_digest = self.digest
         self.asked = 0
 
-    def cell_index(self, name: str, author: object, *, box: object = None) -> CellIndex:
+    def cell_index(self, name: str, author: object = None, *, box: object = None, after: object = None) -> CellIndex:
         entry = CellEntry(
             cell=cell_of_key(A),
             size_bytes=1,

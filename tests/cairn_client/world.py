@@ -121,7 +121,9 @@ class DirectApi:
         request = MissingRequest.model_validate_json(request.model_dump_json())
         yield from FrameReader().feed(service.missing(service.store.map(name), branch, request))
 
-    def cell_index(self, name: str, author: Author, *, box: object = None) -> CellIndex:
+    def cell_index(
+        self, name: str, author: Author | None = None, *, box: object = None, after: object = None
+    ) -> CellIndex:
         service = self._world.service
         index = service.cell_index(service.store.map(name), author)
         return CellIndex.model_validate_json(index.model_dump_json())
@@ -159,7 +161,9 @@ class FaultyApi:
                 raise UnreachableError("cut_off", "cut")
             yield frame
 
-    def cell_index(self, name: str, author: Author, *, box: object = None) -> CellIndex:
+    def cell_index(
+        self, name: str, author: Author | None = None, *, box: object = None, after: object = None
+    ) -> CellIndex:
         index: CellIndex = self._call(self._api.cell_index, name, author)
         return index
 

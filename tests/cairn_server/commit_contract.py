@@ -99,6 +99,10 @@ class CommitContract:
             assert {cell.key for cell in snapshot.cells(after_seq=1)} == set(pushed(1, 1).cells)
             assert [cell.key for cell in snapshot.cells(after_seq=2)] == []
             assert {cell.body for cell in snapshot.cells()} == {b""}
+            listed = [cell.key for cell in snapshot.cells()]
+            assert listed == sorted(listed)
+            assert [cell.key for cell in snapshot.cells(after_key=listed[0])] == listed[1:]
+            assert [cell.key for cell in snapshot.cells(after_key=listed[0], limit=1)] == listed[1:2]
 
     def test_what_was_folded_before_a_time(self, store: Store) -> None:
         before_s = time.time()

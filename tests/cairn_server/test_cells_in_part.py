@@ -19,7 +19,7 @@ from cairn_map.cell_code import decode_cell
 from cairn_map.cell_files import CELL_MEDIA_TYPE, MEDIA_TYPES
 from cairn_map.cursor import Cursor, cursor_from_text
 from cairn_map.errors import BadInputError, DamagedDataError
-from cairn_map.grid import cell_of_key
+from cairn_map.grid import cell_key, cell_of_key
 from cairn_map.ids import Author, Incarnation, RobotName
 from cairn_map.version_vector import VersionVector, version_vector_from_json
 from cairn_map.view import ViewStyle
@@ -170,6 +170,38 @@ def test_a_box_that_cannot_be_is_refused(live: Live, row: MapRow, box: str) -> N
     answer = live.http.get(f"/maps/{row.name}/main/cells", params={"box": box})
     assert answer.status_code == 400
     assert kind_of(answer) in ("bad_box", "bad_cell", "cell_range")
+
+
+@pytest.mark.parametrize("box", [None, "-1,0,0,0,0,2"])
+def test_pages_of_the_index_are_the_index_in_pieces(live: Live, row: MapRow, box: str | None) -> None:
+    url, params = f"/maps/{row.name}/main/cells", {"box": box} if box else {}
+    whole = live.http.get(url, params=params).json()["cells"]
+    keys = [cell_key(tuple(entry["cell"])) for entry in whole]
+    assert keys == sorted(keys)
+    found: list[object] = []
+    page, after = [], {}
+    for _ in range(len(whole) + 1):
+        page = live.http.get(url, params={**params, "limit": 1, **after}).json()["cells"]
+        assert len(page) == (len(found) < len(whole))
+        found += page
+        if page:
+            after = {"after": ",".join(map(str, page[0]["cell"]))}
+    assert found == whole
+
+
+def test_a_page_that_is_full_and_one_that_is_not(live: Live, row: MapRow) -> None:
+    url = f"/maps/{row.name}/main/cells"
+    sizes = {limit: len(live.http.get(url, params={"limit": limit}).json()["cells"]) for limit in (1, 2, 3, 10_000)}
+    assert sizes == {1: 1, 2: 2, 3: 3, 10_000: 3}
+
+
+@pytest.mark.parametrize(
+    ("params", "status"),
+    [({"limit": 0}, 422), ({"limit": 10_001}, 422), ({"after": "0,0"}, 400), ({"after": "9999999,0,0"}, 400)],
+)
+def test_a_page_that_cannot_be_is_refused(live: Live, row: MapRow, params: dict[str, str | int], status: int) -> None:
+    answer = live.http.get(f"/maps/{row.name}/main/cells", params=params)
+    assert (answer.status_code, kind_of(answer) in ("bad_message", "bad_cell", "cell_range")) == (status, True)
 
 
 def vector_url(row: MapRow) -> str:

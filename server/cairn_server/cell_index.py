@@ -1,0 +1,47 @@
+"""The cell index, a page at a time."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from cairn_map.grid import CellKey, cell_of_key
+from cairn_map.index_messages import INDEX_PAGE, CellEntry
+from cairn_server.store import Snapshot
+from cairn_server.store_rows import CellRow
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IndexPage:
+    """Which entries are asked for."""
+
+    after: CellKey | None = None
+    """Those of a higher number; None: from the first on."""
+    limit: int = INDEX_PAGE
+    inside: Callable[[tuple[int, int, int]], bool] | None = None
+    """Only cells of which it says yes."""
+
+
+FIRST_PAGE = IndexPage()
+
+
+def entries_of(snapshot: Snapshot, page: IndexPage) -> list[CellEntry]:
+    """Every cell that was ever touched, emptied ones included, rising in number; no more than the page takes."""
+    found: list[CellEntry] = []
+    after = -1 if page.after is None else page.after
+    while len(found) < page.limit:
+        rows = list(snapshot.cells(after_key=after, limit=page.limit))
+        found += [_entry(row) for row in rows if page.inside is None or page.inside(cell_of_key(row.key))]
+        if len(rows) < page.limit:
+            break
+        after = rows[-1].key
+    return found[: page.limit]
+
+
+def _entry(row: CellRow) -> CellEntry:
+    return CellEntry(
+        cell=cell_of_key(row.key),
+        size_bytes=row.size_bytes,
+        digest=row.digest.hex(),
+        lm=row.lm,
+        fingerprint=row.fingerprint.hex(),
+        voxels=row.voxels,
+    )
