@@ -164,7 +164,11 @@ CREATE TABLE branch_status (
 ) WITHOUT ROWID;
 """
 
-STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS)
+RECEIVED = """
+CREATE INDEX commits_received ON commits (received_s);  -- a clock may be set back: numbers do not rise with it
+"""
+
+STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS, RECEIVED)
 
 
 def ensure_schema(connection: apsw.Connection) -> None:

@@ -14,12 +14,12 @@ class SqliteUses:
         self._readers = readers
 
     def since(self, time_s: float) -> Mapping[Robot, Use]:
-        """What each robot's commits took that came after a time; reads from the newest back, and no further."""
+        """What each robot's commits took that came at or after a time."""
         found: defaultdict[Robot, Use] = defaultdict(Use)
-        query = "SELECT received_s, map, robot, size_bytes, cells FROM commits ORDER BY number DESC"
+        # Not from the newest back to the first older one: a clock may be set back, and so the order of the numbers
+        # says nothing. Nor summed up by SQL, which would go through all commits to have them in groups.
+        query = "SELECT map, robot, size_bytes, cells FROM commits WHERE received_s >= ?"
         with self._readers.reading() as reader:
-            for received_s, number, robot, size_bytes, cells in reader.execute(query):
-                if received_s < time_s:
-                    break
+            for number, robot, size_bytes, cells in reader.execute(query, (time_s,)):
                 found[number, robot] += Use(size_bytes, cells)
         return found

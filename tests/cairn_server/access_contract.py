@@ -153,6 +153,19 @@ class AccessContract:
         }
         assert since(time.time() + 1) == {}
 
+    def test_what_was_pushed_since_a_time_counts_although_the_clock_was_set_back_after_it(
+        self, store: Store, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        row, now_s = new_map(store), time.time()
+        for n, shift_s in enumerate((-10.0, 0.0, 20.0, -30.0, -1e9)):
+            monkeypatch.setattr(time, "time", lambda shift_s=shift_s: now_s + shift_s)
+            store.append(row, new_of(pushed(n, 0)))
+        monkeypatch.undo()
+        sizes = [len(pushed(n, 0).data) for n in range(3)]
+        for since_s, counted in ((-15.0, sizes), (-5.0, sizes[1:]), (20.0, sizes[2:]), (21.0, [])):
+            used = store.uses.since(now_s + since_s).get((row.number, "mole"), Use())
+            assert used == Use(sum(counted), 2 * len(counted))
+
     def test_what_is_not_folded_is_counted_for_each_map(self, store: Store) -> None:
         start_s = time.time()
         row, empty = new_map(store, pushed(0, 0), pushed(1, 1)), new_map(store)
