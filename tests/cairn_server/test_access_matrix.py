@@ -3,6 +3,7 @@
 A route that is added to the app must be in the table (`test_protocol_document`), and so it is asked for here.
 """
 
+import base64
 import time
 from collections import defaultdict
 from collections.abc import Iterator
@@ -12,13 +13,18 @@ from typing import Literal
 
 import httpx
 import pytest
-from tests.cairn_server.live import Live
+from starlette.routing import WebSocketRoute
+from tests.cairn_server.live import DEADLINE_S, Live
 from tests.cairn_server.pushes import MOLE, WREN, pushed
 from tests.cairn_server.test_protocol_document import DOCUMENT, ROUTE
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from cairn_map.access_messages import RoleText
 from cairn_map.messages import Register
 from cairn_server.auth import new_token, token_hash
+from cairn_server.live_routes import PROTOCOL, TOKEN_PREFIX
+from cairn_server.routes import ROUTERS
 from cairn_server.store_rows import MapRow
 from cairn_server.token_store import Token
 
@@ -170,6 +176,57 @@ def test_each_token_may_do_what_the_document_says_and_no_more(holders: Holders, 
                     assert answer.headers["WWW-Authenticate"] == "Bearer"
                     refusals.add(answer.content)
         assert len(refusals) <= 1, f"{holder} learns from refusals which names there are"
+    assert wrong == []
+
+
+def shake_hands(holders: Holders, path: str, holder: Holder, place: str, *, offers: bool) -> tuple[int, bytes]:
+    """Status and body of a WebSocket's handshake, the token in its header or, as browsers do it, in a subprotocol."""
+    row = holders.rows[place].name if place in holders.rows else place  # type: ignore[index]
+    headers = holders.headers_of(holder)
+    token = headers.get("Authorization", "").removeprefix("Bearer ")
+    offered = [
+        PROTOCOL,
+        *([TOKEN_PREFIX + base64.urlsafe_b64encode(token.encode()).decode().rstrip("=")] * bool(token)),
+    ]
+    try:
+        with connect(
+            f"ws://127.0.0.1:{holders.live.port}{path.format(name=row)}",
+            additional_headers={} if offers else headers,
+            subprotocols=offered if offers else None,  # type: ignore[arg-type]
+            open_timeout=DEADLINE_S,
+        ):
+            return 101, b""
+    except InvalidStatus as exc:
+        assert exc.response.status_code != 101
+        if exc.response.status_code == 401:
+            assert exc.response.headers["WWW-Authenticate"] == "Bearer"
+        return exc.response.status_code, bytes(exc.response.body or b"")
+
+
+def sockets() -> list[str]:
+    """The app's WebSockets, each of which the document has as a GET."""
+    found = [part.path for router in ROUTERS for part in router.routes if isinstance(part, WebSocketRoute)]
+    assert all(("GET", path) in TABLE for path in found)
+    return found
+
+
+@pytest.mark.parametrize("offers", [False, True], ids=["header", "subprotocol"])
+def test_each_token_opens_the_websockets_that_the_document_lets_it_read(holders: Holders, offers: bool) -> None:
+    paths = sockets()
+    assert paths == ["/maps/{name}/live"]
+    holders.renew()
+    wrong = []
+    for path in paths:
+        for holder in HOLDERS:
+            refusals = set()
+            for place in ("here", "there", "nowhere"):
+                status, body = shake_hands(holders, path, holder, place, offers=offers)
+                expected = statuses(("GET", path), holder, place, "mole") or {101}
+                if status not in expected:
+                    wrong.append(f"{holder} on map {place}: {status}, not {expected}")
+                if status == 401:
+                    refusals.add(body)
+            assert len(refusals) <= 1, f"{holder} learns from refusals which maps there are"
     assert wrong == []
 
 
