@@ -2,6 +2,7 @@
 
     $ python -m tests.bench            # `make bench`
     $ python -m tests.bench --smoke    # a few repeats only, to see that it still runs
+    $ python -m tests.bench --smoke server    # that part alone, about 10 s
 
 Times are medians of process CPU time for kernels, of wall time for what crosses a socket. The scene is the
 simulated room at 4 cm; where CAIRN_TEST_DATA is set, real recordings are replayed too.
@@ -53,20 +54,20 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser("python -m tests.bench", description=__doc__)
     parser.add_argument("--smoke", action="store_true", help="few repeats")
-    smoke = parser.parse_args().smoke
-    scans = _room_scans(stop_count=2 if smoke else 8, yaws=4 if smoke else 12)
-    rows = [*_kernel_rows(scans, repeats=3 if smoke else 15), *_server_rows(scans, pushes=20 if smoke else 300)]
-    rows += coding_rows(smoke)
-    rows += integration_rows(smoke)
-    rows += peer_rows(smoke)
-    rows += server_rows(smoke)
-    rows += simulation_rows(smoke)
-    rows += start_rows(smoke)
-    rows += _recording_rows(smoke)
-    rows += _size_rows()
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}; all without any")
+    args = parser.parse_args()
+    if unknown := set(args.parts) - PARTS.keys():
+        parser.error(f"there is no part {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}")
+    rows = [row for name in args.parts or PARTS for row in PARTS[name](args.smoke)]
     width = max(len(name) for name, _, _ in rows)
     for name, value, unit in rows:
         sys.stdout.write(f"{name:<{width}}  {value:>12}  {unit}\n")
+
+
+def _room_rows(smoke: bool) -> Iterator[Row]:
+    scans = _room_scans(stop_count=2 if smoke else 8, yaws=4 if smoke else 12)
+    yield from _kernel_rows(scans, repeats=3 if smoke else 15)
+    yield from _server_rows(scans, pushes=20 if smoke else 300)
 
 
 def _room_scans(*, stop_count: int, yaws: int) -> list[list[Scan]]:
@@ -191,7 +192,7 @@ def _recording_rows(smoke: bool) -> Iterator[Row]:
                 yield "  bytes pushed per measurement (1 image)", f"{robot.traffic.up_bytes / count:.0f}", "B"
 
 
-def _size_rows() -> Iterator[Row]:
+def _size_rows(smoke: bool) -> Iterator[Row]:
     root = Path(__file__).parents[2]
     for folder in sorted(root.glob("*/cairn_*")):
         count = sum(len(path.read_text().splitlines()) for path in folder.glob("*.py"))
@@ -219,6 +220,20 @@ def _cpu_s(work: Callable[[], object]) -> float:
     start = time.process_time()
     work()
     return time.process_time() - start
+
+
+PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
+    "room": _room_rows,
+    "coding": coding_rows,
+    "integration": integration_rows,
+    "peers": peer_rows,
+    "server": server_rows,
+    "simulation": simulation_rows,
+    "start": start_rows,
+    "recordings": _recording_rows,
+    "sizes": _size_rows,
+}
+"""Each gives its lines, few repeats if told so."""
 
 
 if __name__ == "__main__":
