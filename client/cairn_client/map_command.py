@@ -89,8 +89,8 @@ def _info(args: argparse.Namespace) -> None:
         low, high = ("  ".join(f"{value:.2f}" for value in corner) for corner in info.box_m)
         say(f"cells span ({low}) m to ({high}) m")
     for branch in branches:
-        lag = "held nothing" if branch.behind is None else f"{branch.behind} entries behind"
-        lag = "fetches whole cells" if branch.mode == "low-end" else f"{lag} when it last asked"
+        lag = "has not fetched all yet" if branch.behind is None else f"{branch.behind} log entries since it last asked"
+        lag = "fetches whole cells" if branch.mode == "low-end" else lag
         seen_s, sensors = time.time() - branch.last_seen_s, ", ".join(branch.sensors)
         say(f"  {branch.branch:<16} {branch.mode:<9} {lag}, seen {seen_s:.0f} s ago, {sensors}")
 

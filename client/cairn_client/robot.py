@@ -70,7 +70,7 @@ class Robot:
             map_url: `http://HOST:PORT/maps/NAME`.
             directory: of this robot alone; everything durable is in it.
             name: the robot's name on the map.
-            token: enrolment (or admin) token; not needed where the server trusts this machine.
+            token: enrolment (or admin) token, or the robot's own; not needed where the server trusts this machine.
             mode: high-end keeps the whole map and fetches differences; low-end fetches whole cells; a viewer pushes
                 nothing.
             geometry: of the map, to start without a link; else the server is asked once.
@@ -89,6 +89,7 @@ class Robot:
         self._rig = rig
         self._enrolment_token = token
         self._scope = scope
+        self._is_known_by_token = False
         self._api = MapApi(server_url, token=token)
         self._link = Link(self._api, self._map_name, branch=self.name)
         try:
@@ -229,7 +230,7 @@ class Robot:
 
     def _as_registered(self, action: Callable[[], T]) -> T:
         """Do it as a robot that the server knows: register first if need be, and anew if the token is not good."""
-        if self._replica.token() is None:
+        if self._replica.token() is None and not self._is_known_by_token:
             self._register()
         try:
             return action()
@@ -237,6 +238,7 @@ class Robot:
             if exc.kind != "bad_token":
                 raise
             self._replica.set_token(None)  # the server was replaced, or somebody registered under this name
+            self._is_known_by_token = False
             self._register()
             return action()
 
@@ -248,7 +250,13 @@ class Robot:
             incarnation=self._replica.author.incarnation,
             sensors=list(self._rig.cameras) if self._rig else [],
         )
-        registered = self._api.register(self._map_name, request)
+        try:
+            registered = self._api.register(self._map_name, request)
+        except DeniedError as exc:
+            if exc.kind != "not_allowed":
+                raise
+            self._is_known_by_token = True  # perhaps an admin gave the robot a token of its own; else the next ask says
+            return
         if registered.map.geometry != self._replica.geometry:
             raise BadInputError("other_geometry", f"map {self._map_name} has another grid than this robot's directory")
         self._replica.set_token(registered.token)

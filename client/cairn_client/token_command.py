@@ -64,7 +64,7 @@ def _list(api: MapApi, args: argparse.Namespace) -> None:
 def _line(info: TokenInfo) -> str:
     scope = info.map or "all maps"
     where = f"{scope}, {info.robot}" if info.robot else scope
-    until, used = _shown_time(info.expires_s, "revoked"), _shown_time(info.last_used_s, "never")
+    until, used = _shown_time(info.expires_s, "no end"), _shown_time(info.last_used_s, "never")
     return f"{info.name:<24} {info.role:<8} {where:<22} {until:<17} {used}"
 
 

@@ -57,7 +57,7 @@ def restore(source: Path, folder: Path, report: Report, verify: Callable[[Path],
         raise NotFoundError("no_store", f"there is no file {source}")
     if not is_store(source):
         raise BadInputError("bad_backup", f"{source} is no backup of a cairn server")
-    folder.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(0o700, parents=True, exist_ok=True)
     with lock_folder(folder):
         found = sorted(path.name for path in folder.iterdir() if path.name != LOCK_NAME)
         if found:
@@ -135,6 +135,7 @@ def _partial(target: Path) -> Iterator[Path]:
     """A file that takes the name of the target at the end, wholly on the disk; gone if anything fails."""
     partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
     try:
+        partial.touch(0o600)
         yield partial
         _sync(partial)
         partial.replace(target)

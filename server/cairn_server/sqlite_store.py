@@ -46,7 +46,7 @@ class SqliteStore:
         """
         path = folder / FILE_NAME
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            folder.mkdir(0o700, parents=True, exist_ok=True)  # what is in it is as secret as the maps
             self._lock = lock_folder(folder)
         except OSError as exc:
             raise BadInputError("bad_store", f"cannot keep a store in {folder}: {exc.strerror}") from exc

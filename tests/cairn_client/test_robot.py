@@ -20,6 +20,7 @@ from cairn_client.backoff import RETRY_AFTER_MAX_S, Backoff
 from cairn_client.map_url import split_map_url
 from cairn_client.robot import Robot
 from cairn_fusion.integrate import integrate_scan
+from cairn_map.access_messages import CreateToken
 from cairn_map.cell_code import Profile
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, DeniedError, UnreachableError
 from cairn_map.evidence_map import EvidenceMap
@@ -245,6 +246,24 @@ def test_a_robot_registers_with_an_enrolment_token(guarded: LiveServer, tmp_path
         assert robot.sync().pushed == 1
     with robot_in(tmp_path, guarded.map_url) as robot:  # its own token is in the folder
         robot.sync()
+
+
+def test_a_robot_works_with_a_token_of_its_own_that_an_admin_gave_it(guarded: LiveServer, tmp_path: Path) -> None:
+    with MapApi(guarded.url, token=ADMIN) as admin:
+        own, other = (
+            admin.create_token(name, CreateToken(role="robot", map=MAP, robot=name)).token for name in ("mole", "bat")
+        )
+    with robot_in(tmp_path, guarded.map_url, token=other) as robot, pytest.raises(DeniedError, match="admin rights"):
+        robot.sync()
+    with robot_in(tmp_path, guarded.map_url, token=own) as robot:
+        map_commit(robot, 1)
+        assert robot.sync().pushed == 1
+        guarded.wait_for_fold()
+        robot.sync()
+        assert cells_of(robot.map) == cells_of(evidence_of(1))
+    with robot_in(tmp_path, guarded.map_url, token=TOKEN) as robot:  # and may be enrolled all the same
+        robot.sync()
+        assert robot.replica.token() not in (None, own)
 
 
 def test_a_robot_whose_token_was_replaced_registers_anew_though_the_link_fails_between(

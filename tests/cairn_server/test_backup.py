@@ -53,6 +53,8 @@ def test_a_backup_restored_is_the_map_as_it_was(
     assert f"{folder}: restored and checked: 1 maps, 4 commits, 3 cells" in said
     assert "push again what is newer" in said
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "nightly.cairn", "restored"]
+    modes = {path.name: path.stat().st_mode & 0o777 for path in tmp_path.iterdir()}
+    assert modes == {"data": 0o700, "nightly.cairn": 0o600, "restored": 0o700}  # as secret as the maps
     with Live(folder) as other:
         assert other.http.get(f"/maps/{row.name}").json() == before
         assert read(other.cells(other.service.store.map(row.name))) == sum_of(COMMITS)
