@@ -12,7 +12,7 @@ the server. The exit code is 0 if all is sound and 6 if not.
 
 With --repair, which needs the server stopped, damaged cells are made anew where the log still has all of their commits.
 Others stay set aside: the server answers 500 damaged_store for such a cell alone and goes on with all others; commits
-to its map wait. What heals it: the next robot that syncs and still has the cell as it was, by itself; an export that
+that touch it wait. What heals it: the next robot that syncs and still has the cell as it was, by itself; an export that
 has it (`cairn map heal`); or a backup from before the damage, after which robots push again what is newer.
 """
 

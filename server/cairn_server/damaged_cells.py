@@ -21,6 +21,7 @@ class DamagedCells:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._found: dict[str, set[CellKey]] = {}
+        self._healed: dict[str, int] = {}
 
     def note(self, map_name: str, keys: Iterable[CellKey]) -> None:
         """These cells could not be read, nor made anew."""
@@ -31,6 +32,12 @@ class DamagedCells:
         """The cell is sound."""
         with self._lock:
             self._found.get(map_name, set()).discard(key)
+            self._healed[map_name] = self._healed.get(map_name, 0) + 1
+
+    def healed(self, map_name: str) -> int:
+        """How often a cell of a map was said to be sound: if it is more than before, look again."""
+        with self._lock:
+            return self._healed.get(map_name, 0)
 
     def of(self, map_name: str) -> frozenset[CellKey]:
         """The damaged cells of a map, as far as anybody asked for them."""

@@ -3,17 +3,14 @@
 import threading
 
 from cairn_map.errors import CairnError, DamagedDataError
-from cairn_server.cells_at_rest import DamagedCellError
-from cairn_server.damaged_cells import DamagedCells
 from cairn_server.server_figures import ServerFigures
 
 
 class FoldHealth:
     """Which maps could not be folded the last time, and why; thread-safe."""
 
-    def __init__(self, figures: ServerFigures, damaged: DamagedCells) -> None:
+    def __init__(self, figures: ServerFigures) -> None:
         self._figures = figures
-        self._damaged = damaged
         self._lock = threading.Lock()
         self._failing: dict[str, BaseException] = {}
 
@@ -29,12 +26,10 @@ class FoldHealth:
         """A map could not be folded."""
         with self._lock:
             self._failing[name] = error
-        if isinstance(error, DamagedCellError):
-            self._damaged.note(name, [error.key])
         self._figures.fold_failures.add(1, name)
 
     def damaged(self) -> frozenset[str]:
-        """Maps that wait for a damaged cell to be healed: their own trouble, not the server's."""
+        """Maps of which something waits for a damaged cell to be healed: their own trouble, not the server's."""
         with self._lock:
             return frozenset(name for name, error in self._failing.items() if isinstance(error, DamagedDataError))
 

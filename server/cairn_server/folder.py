@@ -7,8 +7,9 @@ from collections.abc import Callable
 
 from cairn_map.errors import CairnError
 from cairn_server.cell_cache import CACHE_BYTES, CellCache
+from cairn_server.damaged_cells import DamagedCells
+from cairn_server.fold_around import Waiting, fold_around
 from cairn_server.fold_health import FoldHealth
-from cairn_server.folding import fold_pending
 from cairn_server.store import Store
 from cairn_server.store_rows import MapRow
 
@@ -19,7 +20,7 @@ GROUP_MAX = 64
 FORGET_EVERY_S = 60.0
 """How often it is looked for evidence that need not be kept any more."""
 RETRY_S = 5.0
-"""A fold that failed (a full disk, a damaged cell) is tried again after this at the latest, the first time soon."""
+"""A fold that failed (a full disk) is tried again after this at the latest, the first time soon."""
 FIRST_RETRY_S = 0.2
 
 
@@ -27,16 +28,24 @@ class Folder:
     """Folds all maps of a store until closed."""
 
     def __init__(
-        self, store: Store, health: FoldHealth, *, keep_evidence_s: float, on_fold: Callable[[MapRow], None]
+        self,
+        store: Store,
+        health: FoldHealth,
+        damaged: DamagedCells,
+        *,
+        keep_evidence_s: float,
+        on_fold: Callable[[MapRow], None],
     ) -> None:
         self._store = store
         self._health = health
+        self._damaged = damaged
         self._on_fold = on_fold
         self._keep_evidence_s = keep_evidence_s
         self._forget_next_s = 0.0
         self._wake = threading.Event()
         self._closing = threading.Event()
         self._caches: dict[str, CellCache] = {}
+        self._waiting: dict[str, Waiting] = {}
         self._wake.set()
         self._thread = threading.Thread(target=self._run, name="cairn-folder", daemon=True)
         self._thread.start()
@@ -116,8 +125,11 @@ class Folder:
         cache = self._caches.setdefault(row.name, CellCache(row.geometry))
         cache.limit_bytes = CACHE_BYTES // maps
         start_s = time.monotonic()
-        count = fold_pending(self._store, row, cache, limit=GROUP_MAX)
+        waiting = self._waiting.setdefault(row.name, Waiting())
+        count = fold_around(self._store, row, cache, waiting, self._damaged, limit=GROUP_MAX)
         self._health.folded(row.name, count, time.monotonic() - start_s)
+        if waiting.why is not None:
+            self._health.failed(row.name, waiting.why)
         if count:
             self._on_fold(row)
             log.info("map %s: folded %d commits in %.0f ms", row.name, count, (time.monotonic() - start_s) * 1e3)

@@ -43,7 +43,15 @@ def fold_pending(store: Store, row: MapRow, cache: CellCache, *, limit: int) -> 
     Raises:
         DamagedDataError: a cell at rest is not sound, and cannot be made anew.
     """
-    commits = store.pending(row, limit=limit, size_bytes_max=GROUP_BYTES_MAX)
+    return fold_commits(store, row, cache, store.pending(row, limit=limit, size_bytes_max=GROUP_BYTES_MAX))
+
+
+def fold_commits(store: Store, row: MapRow, cache: CellCache, commits: Sequence[StoredCommit]) -> int:
+    """Fold these pending commits; returns how many were.
+
+    Raises:
+        DamagedCellError: a cell at rest is not sound, and cannot be made anew; nothing was folded.
+    """
     if not commits:
         return 0
     with store.snapshot(row) as snapshot:

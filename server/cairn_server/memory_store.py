@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 
@@ -64,12 +64,14 @@ class MemoryStore:
             changed.append(commit)
             return commit
 
-    def pending(self, row: MapRow, *, limit: int, size_bytes_max: int) -> list[StoredCommit]:
+    def pending(
+        self, row: MapRow, *, limit: int, size_bytes_max: int, skip: Collection[int] = ()
+    ) -> list[StoredCommit]:
         """Commits to be folded, in order of arrival, with their diffs: at most `limit`, and one or within the size."""
         found: list[StoredCommit] = []
         total_bytes = 0
         with self._maps.reading(row) as state:
-            for kept in state.waiting():
+            for kept in (kept for kept in state.waiting() if kept.number not in skip):
                 total_bytes += kept.new.size_bytes
                 if len(found) >= limit or (found and total_bytes > size_bytes_max):
                     break

@@ -63,10 +63,12 @@ class Service:
         self.settings = settings
         self.figures = ServerFigures()
         self.damaged = DamagedCells()
-        self.folds = FoldHealth(self.figures, self.damaged)
+        self.folds = FoldHealth(self.figures)
         self.live = Hub(store)
         self.reports = RobotReports(store, self.live)
-        self._folder = Folder(store, self.folds, keep_evidence_s=settings.keep_evidence_s, on_fold=self.live.folded)
+        self._folder = Folder(
+            store, self.folds, self.damaged, keep_evidence_s=settings.keep_evidence_s, on_fold=self.live.folded
+        )
         self.readiness = Readiness(store.health, self.folds, settings, self._folder.is_alive)
         self._checks = CommitChecks(settings)
         self._refusals = Refusals()

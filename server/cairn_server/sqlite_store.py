@@ -3,7 +3,7 @@
 import json
 import logging
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -123,10 +123,14 @@ class SqliteStore:
 
         return self._writer.run(job)
 
-    def pending(self, row: MapRow, *, limit: int, size_bytes_max: int) -> list[StoredCommit]:
+    def pending(
+        self, row: MapRow, *, limit: int, size_bytes_max: int, skip: Collection[int] = ()
+    ) -> list[StoredCommit]:
         """Commits to be folded, in order of arrival, with their diffs: at most `limit`, and one or within the size."""
-        clause = "map = ? AND folded_seq IS NULL AND damaged IS NULL ORDER BY number LIMIT ?"
-        return self._commits(clause, (row.number, limit), size_bytes_max=size_bytes_max)
+        skipped = " AND number NOT IN (SELECT value FROM json_each(?))" if skip else ""
+        clause = f"map = ? AND folded_seq IS NULL AND damaged IS NULL{skipped} ORDER BY number LIMIT ?"
+        values = (row.number, json.dumps(sorted(skip)), limit) if skip else (row.number, limit)
+        return self._commits(clause, values, size_bytes_max=size_bytes_max)
 
     def commit(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
         """A commit with its diff, folded or not; None if there is none."""

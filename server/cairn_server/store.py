@@ -6,7 +6,7 @@ fold      cells, log entries and the new head, all or nothing, only on top of th
 snapshot  a view of one state of the map: header and frames of a reply come from one of these
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager
 from typing import Protocol
 
@@ -159,8 +159,13 @@ class Store(Protocol):
         """Keep a commit that `build(n)` makes for the author's next number n."""
         ...
 
-    def pending(self, row: MapRow, *, limit: int, size_bytes_max: int) -> list[StoredCommit]:
-        """Commits to be folded, in order of arrival, with their diffs: at most `limit`, and one or within the size."""
+    def pending(
+        self, row: MapRow, *, limit: int, size_bytes_max: int, skip: Collection[int] = ()
+    ) -> list[StoredCommit]:
+        """Commits to be folded, in order of arrival, with their diffs: at most `limit`, and one or within the size.
+
+        None whose number is in `skip`.
+        """
         ...
 
     def commit(self, row: MapRow, commit: CommitId) -> StoredCommit | None:

@@ -168,6 +168,9 @@ class StoreContract:
             store.append(row, new_of(commit))
         assert len(store.pending(row, limit=2, size_bytes_max=1 << 30)) == 2
         assert len(store.pending(row, limit=9, size_bytes_max=1)) == 1
+        first, second, *_ = [commit.number for commit in store.pending(row, limit=9, size_bytes_max=1 << 30)]
+        left = store.pending(row, limit=1, size_bytes_max=1 << 30, skip={first})
+        assert [commit.number for commit in left] == [second]
         two = len(COMMITS[0].data) + len(COMMITS[1].data)
         assert len(store.pending(row, limit=9, size_bytes_max=two)) == 2
 

@@ -159,12 +159,12 @@ def test_a_map_that_cannot_be_folded_holds_up_no_other_and_is_tried_again(
 ) -> None:
     broken: list[str] = ["map0"]
 
-    def fold(store: SqliteStore, row: MapRow, cache: CellCache, *, limit: int) -> int:
+    def fold(store: SqliteStore, row: MapRow, cache: CellCache, *rest: object, limit: int) -> int:
         if row.name in broken:
             raise MemoryError
         return fold_pending(store, row, cache, limit=limit)
 
-    monkeypatch.setattr(folder, "fold_pending", fold)
+    monkeypatch.setattr(folder, "fold_around", fold)
     monkeypatch.setattr(folder, "RETRY_S", 0.01)
     with Live(tmp_path) as live:
         first, second = live.new_map(), live.new_map()

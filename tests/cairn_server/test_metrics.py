@@ -76,7 +76,7 @@ def test_what_waits_to_be_folded_shows_until_it_is(fresh: Live, monkeypatch: pyt
     row = fresh.new_map()
     monkeypatch.setattr(folder, "RETRY_S", 0.01)
     with monkeypatch.context() as broken:
-        broken.setattr(folder, "fold_pending", _no_memory)
+        broken.setattr(folder, "fold_around", _no_memory)
         fresh.push(row, pushed(0, 0))
         begin_s = time.monotonic()
         while not value(text := text_of(fresh), "cairn_fold_failures_total", map=row.name):
