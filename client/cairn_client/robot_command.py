@@ -20,6 +20,7 @@ one cell, so that a link that breaks often loses no more than that.
 """
 
 import argparse
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -48,9 +49,11 @@ from cairn_fusion.integrate import Integrator
 from cairn_fusion.recording import Recording
 from cairn_map.cell_code import Profile
 from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel
-from cairn_map.errors import BadInputError, NotFoundError, UnreachableError
+from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError, UnreachableError
 from cairn_map.grid import Geometry, geometry_for
 from cairn_map.messages import CreateMap
+
+log = logging.getLogger(__name__)
 
 REPLAYED_FILE = "replayed.txt"
 SYNC_EVERY_S = 2.0
@@ -164,6 +167,8 @@ def _try_sync(robot: Robot) -> bool:
         robot.sync()
     except UnreachableError:
         return False
+    except DamagedDataError as exc:
+        log.error("%s", exc.message)  # mapping goes on: what is sound came, and own commits are pushed
     return True
 
 

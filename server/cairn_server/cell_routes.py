@@ -13,9 +13,10 @@ from cairn_map.index_messages import INDEX_PAGE, INDEX_PAGE_MAX, CellIndex
 from cairn_map.version_vector import vector_digest, vector_text
 from cairn_map.view import ViewStyle
 from cairn_map.view_code import encode_view
+from cairn_server.auth import Caller
 from cairn_server.cell_index import IndexPage
 from cairn_server.cells_at_rest import stored_evidence
-from cairn_server.http_access import READERS, Map, Operations, body_of
+from cairn_server.http_access import READERS, Map, Operations, body_of, reader
 from cairn_server.http_ranges import is_same, part_of
 from cairn_server.problems import answer_to
 from cairn_server.store_rows import CellRow, Head, MapRow
@@ -130,7 +131,13 @@ def _coverage(head: Head) -> dict[str, str]:
     return {"Cairn-Coverage-Digest": vector_digest(head.vector)}
 
 
-@router.put("/maps/{name}/main/cells/{cell}", status_code=204, dependencies=READERS)
-def heal_cell(cell: str, service: Operations, row: Map, data: Annotated[bytes, Depends(body_of)]) -> None:
+@router.put("/maps/{name}/main/cells/{cell}", status_code=204)
+def heal_cell(
+    cell: str,
+    service: Operations,
+    row: Map,
+    caller: Annotated[Caller, Depends(reader)],
+    data: Annotated[bytes, Depends(body_of)],
+) -> None:
     """Put right a cell that the server's disk damaged: only the very bytes that it had are taken."""
-    service.heal_cell(row, cell_key(cell_from_text(cell)), data)
+    service.heal_cell(row, cell_key(cell_from_text(cell)), data, by=caller)

@@ -30,7 +30,7 @@ def keep_healed(store: Store, row: MapRow, cells: Iterable[CellRow]) -> None:
             log.error("cell %s could not be written anew: %s", cell_of_key(cell.key), exc.message)
 
 
-def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes) -> bool:
+def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes, *, by: str) -> bool:
     """Put these bytes in the place of a damaged cell; False if the cell is sound, and nothing is to be done.
 
     Raises:
@@ -69,7 +69,7 @@ def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes) -> bool:
     )
     if not store.health.heal(row, sound):
         return False
-    store.audit("healed_cell", f"map {row.name}: {cell_of_key(key)} from {len(data)} bytes that were sent")
+    store.audit_log.add(by, "healed_cell", f"map {row.name}: {cell_of_key(key)} from {len(data)} bytes that were sent")
     return True
 
 

@@ -232,10 +232,10 @@ class Service:
         keep_healed(self.store, row, healed)
         return found, head
 
-    def heal_cell(self, row: MapRow, key: CellKey, data: bytes) -> bool:
+    def heal_cell(self, row: MapRow, key: CellKey, data: bytes, *, by: Caller) -> bool:
         """Put a damaged cell right with bytes that somebody still has; False if it is sound."""
         with self._healing:
-            is_healed = heal_cell(self.store, row, key, data)
+            is_healed = heal_cell(self.store, row, key, data, by=by.name)
         self.damaged.forget(row.name, key)
         self._folder.wake()
         return is_healed

@@ -11,7 +11,7 @@ from tests.cairn_client.test_damage import flip_a_bit
 from tests.cairn_client.test_robot import evidence_of, map_commit, robot_in
 from tests.cairn_client.test_sync import Team
 
-from cairn_client import map_command
+from cairn_client import map_command, robot_command
 from cairn_client.api import MapApi
 from cairn_client.robot import Mode
 from cairn_map.cell_code import encode_cell
@@ -166,6 +166,21 @@ def test_a_cell_that_the_server_refuses_is_sent_once(team: Team, server: LiveSer
         team.fetch("mole")
         sent_bytes.append(traffic.up_bytes - before_bytes)
     assert sent_bytes[0] - sent_bytes[1] >= size_bytes
+
+
+def test_a_replay_goes_on_though_a_cell_of_the_server_is_damaged(
+    server: LiveServer, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with robot_in(tmp_path, server.map_url) as mole:
+        map_commit(mole, 1)
+        mole.sync()
+    server.wait_for_fold()
+    damage(server, min(evidence_of(1).packed()))
+    with robot_in(tmp_path, server.map_url, name="owl") as owl:
+        map_commit(owl, 2)
+        assert robot_command._try_sync(owl)
+        assert owl.waiting == 0
+    assert "all others came" in caplog.text
 
 
 def test_an_export_heals_a_server(

@@ -96,6 +96,8 @@ def test_whoever_still_has_a_damaged_cell_heals_it_and_folding_goes_on(live: Liv
     assert live.http.put(url(row, BROKEN), content=b"no cell").status_code == 400
     assert live.http.get(url(row, BROKEN)).status_code == 500
     assert live.http.put(url(row, BROKEN), content=body_of(BROKEN)).status_code == 204
+    lines = live.http.get("/audit", params={"limit": 1000}).json()
+    assert ("local", "healed_cell") in {(line["who"], line["what"]) for line in lines}
     live.folded(row)
     assert read(live.cells(row)) == sum_of([pushed(0, 0), pushed(1, 0)])
 
