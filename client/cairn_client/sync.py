@@ -21,7 +21,7 @@ from cairn_client.heal import heal_damaged
 from cairn_client.replica import Replica
 from cairn_client.replica_store import BaseCell
 from cairn_map.cell_code import decode_cell
-from cairn_map.commit import open_commit
+from cairn_map.commit import Commit, open_commit
 from cairn_map.errors import (
     BadInputError,
     CairnError,
@@ -70,10 +70,11 @@ def push_commits(
     """
     report = RoundReport()
     for commit_id in replica.push_set():
-        if sealed_only and replica.seal(commit_id) is None:
+        commit, seal = replica.kept_commit(commit_id), replica.seal(commit_id)
+        if commit is None or (sealed_only and seal is None):
             continue
         try:
-            pushed = yield from _push(replica, commit_id)
+            pushed = yield from _push(replica, commit, seal)
         except ConflictError as exc:
             log.error("the server will not take commit %s: %s: %s", commit_id, exc.kind, exc.message)
             report.refused.append(commit_id)
@@ -95,12 +96,8 @@ def push_commits(
     return report
 
 
-def _push(replica: Replica, commit_id: CommitId) -> Conversation[CommitId]:
+def _push(replica: Replica, commit: Commit, seal: str | None) -> Conversation[CommitId]:
     """Push one commit; its id, which is a new one if the server has other bytes under the old (rule 13)."""
-    commit = replica.kept_commit(commit_id)
-    if commit is None:
-        raise BadInputError("no_bytes", f"the bytes of {commit_id} are not kept any more")
-    seal = replica.seal(commit_id)
     try:
         yield from Push(commit, seal)
     except ConflictError as exc:
@@ -110,14 +107,14 @@ def _push(replica: Replica, commit_id: CommitId) -> Conversation[CommitId]:
                 if (kept := replica.kept_commit(target)) is not None:
                     yield from Push(kept)
             yield from Push(commit, seal)
-            return commit_id
+            return commit.id
         if exc.kind != "id_taken" or seal is not None:
             raise
-        renamed = replica.kept_commit(replica.rename(commit_id))
+        renamed = replica.kept_commit(replica.rename(commit.id))
         assert renamed is not None  # noqa: S101 - it was just kept
         yield from Push(renamed)
         return renamed.id
-    return commit_id
+    return commit.id
 
 
 def keep_retracts(replica: Replica) -> Conversation[None]:

@@ -1,6 +1,7 @@
 """A robot of a simulation: a real replica on a disk in memory, and rounds with the server that are under way.
 
-Two at once, which a real robot does not have, so that answers of one come when the other has moved cells.
+Two at once, which a real robot does not have, so that answers of one come when the other has moved cells; the second
+one does not push.
 """
 
 from collections.abc import Callable
@@ -78,7 +79,7 @@ class SimRobot:
         """Begin to sync, unless there is enough under way."""
         if len(self._conversations) < ROUNDS_AT_ONCE:
             self._rounds_begun += 1
-            self._conversations[self._rounds_begun] = self._round()
+            self._conversations[self._rounds_begun] = self._round(pushes=not self.is_busy)
             self.answered(self._rounds_begun, None)
 
     def answered(self, number: int, answer: Any) -> None:
@@ -117,10 +118,11 @@ class SimRobot:
         self.replica.close()
         self._open(MemoryDisk())
 
-    def _round(self) -> Conversation[None]:
-        report = yield from push_commits(self.replica, sealed_only=self.mode == "viewer")
-        # A retract of a server that was replaced is not taken by the other one, of which this robot will hear next.
-        assert all(self.replica.seal(commit) is not None for commit in report.refused)
+    def _round(self, *, pushes: bool) -> Conversation[None]:
+        if pushes:
+            report = yield from push_commits(self.replica, sealed_only=self.mode == "viewer")
+            # A retract of a server that was replaced is not taken by the other one, of which this robot will hear next.
+            assert all(self.replica.seal(commit) is not None for commit in report.refused)
         if self.mode == "low-end":
             yield from fetch_cells(self.replica)
         else:
