@@ -21,7 +21,8 @@ from cairn_client.heal import heal_damaged
 from cairn_client.replica import Replica
 from cairn_client.replica_store import BaseCell
 from cairn_map.cell_code import decode_cell
-from cairn_map.commit import Commit, open_commit
+from cairn_map.commit import Commit
+from cairn_map.commit_reading import open_commit
 from cairn_map.errors import (
     BadInputError,
     CairnError,

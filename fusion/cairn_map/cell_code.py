@@ -8,7 +8,6 @@ the SHA-256 over them is the cell's identity; so bytes at rest may be compressed
 
 import hashlib
 import os
-import struct
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -23,13 +22,14 @@ from cairn_map.cell_content import (
     LEAF_MASKS,
     MISSES,
     CellContent,
+    canonical_bytes,
     content_of,
     count_streams,
     evidence_of,
     topology_streams,
 )
 from cairn_map.cell_head import CellHead, encode_head
-from cairn_map.cell_reading import EVIDENCE_BYTES_MAX, cell_reader
+from cairn_map.cell_reading import EVIDENCE_BYTES_MAX, CellReader, cell_reader
 from cairn_map.channel_streams import ChannelRows, stream_of_channel
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence import Evidence, check_fits
@@ -52,6 +52,21 @@ class EncodedCell:
 
     data: bytes
     digest: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class CanonicalCell:
+    """What canonical bytes say, by leaf."""
+
+    key: CellKey
+    geometry: Geometry
+    content: CellContent
+    digest: bytes
+
+    @property
+    def evidence(self) -> Evidence:
+        """The same by voxel, made anew each time."""
+        return evidence_of(self.content)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +99,7 @@ def encode_cell(
                 for number in group:
                     body = data if number == first else b""
                     stored[number] = StoredStream(number, MODELLED, len(streams[number]), body)
-    return EncodedCell(head + join_streams(list(stored.values())), _digest(head, streams))
+    return EncodedCell(head + join_streams(list(stored.values())), _digest(canonical_bytes(head, streams)))
 
 
 def encode_cells(
@@ -109,7 +124,7 @@ def cell_digest(key: CellKey, evidence: Evidence, geometry: Geometry) -> bytes:
     Raises:
         BadInputError: kind `bad_evidence`: it is not of this geometry.
     """
-    return _digest(*_encoded(key, evidence, geometry))
+    return _digest(canonical_bytes(*_encoded(key, evidence, geometry)))
 
 
 def decode_cell(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) -> DecodedCell:
@@ -123,7 +138,9 @@ def decode_cell(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) ->
         DamagedDataError: cut off, contradictory or out of range.
         BadInputError: a version or kind of cell that this reader does not know, or too large.
     """
-    return _decoded(data, evidence_bytes_max)[0]
+    reader = cell_reader(data, evidence_bytes_max=evidence_bytes_max)
+    evidence = evidence_of(reader.content())
+    return DecodedCell(reader.head.key, reader.head.geometry, evidence, _digest(reader.canonical_bytes()))
 
 
 def decode_canonical_cell(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) -> DecodedCell:
@@ -133,10 +150,23 @@ def decode_canonical_cell(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYT
         DamagedDataError: kind `not_canonical`, or as `decode_cell`.
         BadInputError: as `decode_cell`.
     """
-    cell, head, streams = _decoded(data, evidence_bytes_max)
-    if _encoded(cell.key, cell.evidence, cell.geometry) != (head, streams):
-        raise DamagedDataError("not_canonical", f"cell {cell_of_key(cell.key)} is not in canonical form")
-    return cell
+    cell = read_canonical_cell(cell_reader(data, evidence_bytes_max=evidence_bytes_max))
+    return DecodedCell(cell.key, cell.geometry, cell.evidence, cell.digest)
+
+
+def read_canonical_cell(reader: CellReader) -> CanonicalCell:
+    """What a reader's bytes say, by leaf, if they are the canonical coding of it.
+
+    Raises:
+        DamagedDataError, BadInputError: as `decode_canonical_cell`.
+    """
+    head, content = reader.head, reader.content()
+    is_canonical, data = reader.is_canonical(content), reader.canonical_bytes()
+    if is_canonical is None:
+        is_canonical = canonical_bytes(*_encoded(head.key, evidence_of(content), head.geometry)) == data
+    if not is_canonical:
+        raise DamagedDataError("not_canonical", f"cell {cell_of_key(head.key)} is not in canonical form")
+    return CanonicalCell(head.key, head.geometry, content, _digest(data))
 
 
 def recompressed_cell(data: bytes, *, profile: Profile) -> bytes:
@@ -147,16 +177,6 @@ def recompressed_cell(data: bytes, *, profile: Profile) -> bytes:
     """
     cell = decode_canonical_cell(data)
     return encode_cell(cell.key, cell.evidence, cell.geometry, profile=profile).data
-
-
-def _decoded(data: bytes, evidence_bytes_max: int) -> tuple[DecodedCell, bytes, dict[int, bytes]]:
-    """What a cell's bytes say, its head's bytes and its raw streams."""
-    reader = cell_reader(data, evidence_bytes_max=evidence_bytes_max)
-    evidence = evidence_of(reader.content())
-    # In the order in which streams stand, which is that of their numbers.
-    streams = {number: reader.raw[number] for number in reader.stored}
-    digest = _digest(reader.head_bytes, streams)
-    return DecodedCell(reader.head.key, reader.head.geometry, evidence, digest), reader.head_bytes, streams
 
 
 def _encoded(key: CellKey, evidence: Evidence, geometry: Geometry) -> tuple[bytes, dict[int, bytes]]:
@@ -199,9 +219,5 @@ def _group(number: int) -> int:
     return {CHILD_MASKS: CHILD_MASKS, LEAF_MASKS: CHILD_MASKS, HITS: HITS, MISSES: HITS}.get(number, number & ~7)
 
 
-def _digest(head: bytes, streams: dict[int, bytes]) -> bytes:
-    sha = hashlib.sha256(head)
-    for number, raw in streams.items():
-        sha.update(struct.pack("<BI", number, len(raw)))
-        sha.update(raw)
-    return sha.digest()
+def _digest(data: bytes) -> bytes:
+    return hashlib.sha256(data).digest()

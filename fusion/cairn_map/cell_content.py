@@ -4,6 +4,8 @@ evidence  <->  content  <->  raw streams, which are canonical          `channel_
                         <->  modelled streams, which are small         `small_code`
 """
 
+import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +16,12 @@ from cairn_map.errors import DamagedDataError
 from cairn_map.evidence import COUNT_MAX, Evidence
 from cairn_map.grid import Geometry
 from cairn_map.octree import Octree, build_octree
-from cairn_map.octree_kernels import expand_content_into, leaves_of_rows
+from cairn_map.octree_kernels import check_leaves, expand_content_into, leaves_of_rows
 from cairn_map.streams import column_planes, encode_column, required
 
 CHILD_MASKS, LEAF_MASKS, HITS, MISSES = 1, 2, 3, 4
+BAD_LEAF = "bad_cell", "a leaf says nothing, or a collapsed one holds samples"
+STREAM_HEAD = struct.Struct("<BI")
 LARGE_PAGES_FROM_BYTES = 1 << 22
 WORTH_BYTES = 1 << 20
 """Evidence smaller than this would hold more memory than it needs."""
@@ -34,6 +38,23 @@ class CellContent:
     """(S,) leaves that have samples, rising."""
     samples: npt.NDArray[np.int64]
     """(S, P) sums."""
+
+    @property
+    def evidence_bytes(self) -> int:
+        """Memory that `evidence_of` it would hold."""
+        return 12 * int(self.octree.sizes.sum()) + 4 * len(self.sampled) + self.samples.nbytes
+
+    def is_collapsed(self, geometry: Geometry) -> bool:
+        """Whether all leaves are collapsed that can be.
+
+        Raises:
+            DamagedDataError: a leaf says nothing, or one of several voxels has samples.
+        """
+        octree = self.octree
+        sound, collapsed = check_leaves(octree.starts, octree.sizes, self.counts, self.sampled, 8**geometry.depth)
+        if not sound:
+            raise DamagedDataError(*BAD_LEAF)
+        return collapsed
 
 
 def content_of(evidence: Evidence, geometry: Geometry) -> CellContent:
@@ -59,7 +80,7 @@ def evidence_of(content: CellContent) -> Evidence:
     evidence = Evidence(voxels, pairs.view(np.int32).reshape(V, 2), rows_of_samples, content.samples)
     rows = (evidence.voxels, evidence.counts, evidence.sampled)
     if not expand_content_into(octree.starts, octree.sizes, counts, sampled, *rows):
-        raise DamagedDataError("bad_cell", "a leaf says nothing, or a collapsed one holds samples")
+        raise DamagedDataError(*BAD_LEAF)
     return evidence
 
 
@@ -70,6 +91,14 @@ def _large_empty(count: int) -> npt.NDArray[np.uint32]:
     """
     whole = max(count, LARGE_PAGES_FROM_BYTES // 4) if 4 * count >= WORTH_BYTES else count
     return np.empty(whole, np.uint32)[:count]
+
+
+def canonical_bytes(head: bytes, streams: Mapping[int, bytes]) -> bytes:
+    """What a cell's digest is taken of: its head and its raw streams, each behind its number and length."""
+    parts = [head]
+    for number, raw in streams.items():
+        parts += [STREAM_HEAD.pack(number, len(raw)), raw]
+    return b"".join(parts)
 
 
 def topology_streams(octree: Octree) -> dict[int, bytes]:

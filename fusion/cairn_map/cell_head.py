@@ -62,7 +62,12 @@ def encode_head(head: CellHead) -> bytes:
         len(head.geometry.channels),
         head.streams,
     )
-    for channel in head.geometry.channels:
+    return data + _channel_bytes(head.geometry)
+
+
+def _channel_bytes(geometry: Geometry) -> bytes:
+    data = b""
+    for channel in geometry.channels:
         name, unit = channel.name.encode(), channel.unit.encode()
         data += CHANNEL_SIZES.pack(CODE_OF_KIND[channel.kind], len(name), len(unit)) + name + unit
         data += CHANNEL_SCALE.pack(channel.step, channel.zero)
@@ -104,6 +109,17 @@ def decode_head(data: bytes) -> tuple[CellHead, bytes]:
         signed=bool(flags & FLAG_SIGNED),
     )
     return head, data[:at]
+
+
+def is_canonical_head(head: CellHead, data: bytes) -> bool:
+    """Whether a head's own bytes, as `decode_head` gave them, are those that `encode_head` makes of it."""
+    return _is_canonical(head.geometry, data[FIXED_PART.size :])
+
+
+@lru_cache(maxsize=16)
+def _is_canonical(geometry: Geometry, data: bytes) -> bool:
+    """All numbers before the channels are read as they stand."""
+    return _channel_bytes(geometry) == data
 
 
 @lru_cache(maxsize=16)

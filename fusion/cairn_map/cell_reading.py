@@ -17,16 +17,18 @@ from cairn_map.cell_content import (
     LEAF_MASKS,
     MISSES,
     CellContent,
+    canonical_bytes,
     count_streams,
     counts_of_streams,
     topology_streams,
 )
-from cairn_map.cell_head import CellHead, decode_head
+from cairn_map.cell_head import CellHead, decode_head, is_canonical_head
+from cairn_map.cell_limits import check_efforts, sampled_max_of
 from cairn_map.channel_streams import ChannelRows
 from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.grid import BRICK_DEPTH
-from cairn_map.modelled import check_effort
 from cairn_map.octree import Octree, parse_octree
+from cairn_map.plain_content import PlainCell, is_plain, plain_content
 from cairn_map.small_code import Ground
 from cairn_map.streams import MODELLED, RAW_BYTES_MAX, STORED, ZSTD, StoredStream, split_streams, zstd_prefix
 
@@ -34,8 +36,6 @@ CELL_BYTES_MAX = 1 << 28
 """Bytes of one encoded cell that a reader accepts."""
 EVIDENCE_BYTES_MAX = 1 << 31
 """Bytes of one cell's packed evidence: the largest cell, full, with the standard channels in every voxel, has 1.4e9."""
-VOXEL_BYTES = 12
-"""Of packed evidence: a voxel's number and two counts."""
 
 
 @dataclass(slots=True, eq=False)
@@ -52,6 +52,7 @@ class CellReader:
     _ground: Ground | None = None
     _counts: npt.NDArray[np.int32] | None = None
     _channels: dict[int, ChannelRows] = field(default_factory=dict)
+    _plain: PlainCell | None = None
 
     def octree(self) -> Octree:
         """The whole octree.
@@ -167,6 +168,10 @@ class CellReader:
             BadInputError: kind `too_large`.
         """
         head, channels = self.head, range(len(self.head.geometry.channels))
+        if is_plain(self.head, self.stored):
+            self._read(list(self.stored))
+            self._plain = plain_content(head, self.head_bytes, self.raw, sampled_max=self.sampled_max)
+            return self._plain.content
         octree, counts = self.octree(), self.counts()
         parts = [self.channel(c) for c in channels]
         if len(self.raw) != len(self.stored):
@@ -175,6 +180,26 @@ class CellReader:
             parts, head.geometry, leaves=head.leaves, signed=head.signed, sampled_max=self.sampled_max
         )
         return CellContent(octree, counts, sampled, samples)
+
+    def is_canonical(self, content: CellContent) -> bool | None:
+        """Whether these are the canonical form of what `content` gave; None if only coding it anew can tell."""
+        if self._plain is None:
+            return None
+        is_fewest = self._plain.is_fewest and content.is_collapsed(self.head.geometry)
+        return is_fewest and is_canonical_head(self.head, self.head_bytes)
+
+    def canonical_bytes(self) -> bytes:
+        """What the digest is taken of, once all of it was read."""
+        if self._plain is not None:
+            return self._plain.canonical
+        # In the order in which streams stand, which is that of their numbers.
+        return canonical_bytes(self.head_bytes, {number: self.raw[number] for number in self.stored})
+
+    def forget(self) -> None:
+        """Drop all that was read so far."""
+        self.raw.clear()
+        self._channels.clear()
+        self._octree = self._ground = self._counts = self._plain = None
 
     def _channel_before(self, c: int, stop: int) -> ChannelRows:
         """The samples of the leaves before one, or of all."""
@@ -252,23 +277,12 @@ def cell_reader(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) ->
     if len(data) > CELL_BYTES_MAX:
         raise BadInputError("too_large", f"a cell has at most {CELL_BYTES_MAX} bytes, got {len(data)}")
     head, head_bytes = decode_head(data)
-    sampled_max = (evidence_bytes_max - VOXEL_BYTES * head.voxels) // (4 + 8 * head.geometry.plane_count)
-    if sampled_max < 0:
-        raise BadInputError("too_large", f"{head.voxels} voxels are more than {evidence_bytes_max} bytes of evidence")
+    sampled_max = sampled_max_of(head, evidence_bytes_max)
     stored = split_streams(
         data[len(head_bytes) :], count=head.streams, raw_bytes_max=min(RAW_BYTES_MAX, head.raw_bytes_max)
     )
-    _check_effort(head, stored)
+    check_efforts(head, stored)
     return CellReader(head, head_bytes, stored, sampled_max)
-
-
-def _check_effort(head: CellHead, stored: dict[int, StoredStream]) -> None:
-    """Refuse modelled groups of too few bytes on the head's word, before a leaf is looked for."""
-    masks = sum(stored[number].raw_bytes for number in (CHILD_MASKS, LEAF_MASKS) if number in stored)
-    firsts = [HITS, *(channel_streams.stream_of_channel(c) for c in range(len(head.geometry.channels)))]
-    for first, numbers in {CHILD_MASKS: masks, **dict.fromkeys(firsts, head.leaves)}.items():
-        if first in stored and stored[first].coding == MODELLED:
-            check_effort(numbers, stored[first].body)
 
 
 def _between(rows: ChannelRows, first: int, stop: int) -> ChannelRows:

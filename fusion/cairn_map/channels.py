@@ -11,6 +11,7 @@ A sample is `integer = round((value - zero) / step)`, never negative; each scan 
 """
 
 from enum import StrEnum
+from functools import lru_cache
 from typing import Annotated, Self
 
 import numpy as np
@@ -96,3 +97,14 @@ TEMPERATURE = Channel(kind=ChannelKind.TEMPERATURE, name="temperature", unit="K"
 """0.05 K is the resolution of the paper's thermal cameras."""
 
 STANDARD_CHANNELS = (COLOUR, INTENSITY, TEMPERATURE)
+
+
+def planes_and_squares(channels: tuple[Channel, ...]) -> npt.NDArray[np.int64]:
+    """(channels, 2) planes of each channel, and how many of them are sums of squares, as kernels want to know it."""
+    return _planes_and_squares(tuple(channel.kind for channel in channels))
+
+
+@lru_cache(maxsize=16)
+def _planes_and_squares(kinds: tuple[ChannelKind, ...]) -> npt.NDArray[np.int64]:
+    rows = [(len(PLANES[kind]), PLANES[kind].count("square_sum")) for kind in kinds]
+    return np.array(rows, np.int64).reshape(-1, 2)

@@ -9,15 +9,16 @@ A retract is a commit without cells that names others; an amend is one with both
 import hashlib
 import json
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal, Self
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError, model_validator
 
-from cairn_map.cell_code import DecodedCell, Profile, decode_canonical_cell, decode_cell, encode_cells
-from cairn_map.cell_head import CellHead, decode_head
-from cairn_map.cell_reading import VOXEL_BYTES
+from cairn_map.cell_code import Profile, decode_cell, encode_cells
+from cairn_map.cell_head import decode_head
 from cairn_map.errors import BadInputError, DamagedDataError, first_error
 from cairn_map.evidence import Evidence, every_sum_has_weight
 from cairn_map.grid import CellKey, Geometry
@@ -135,15 +136,17 @@ def make_commit(
         raise BadInputError("other_geometry", "the commit's meta names another geometry than its evidence has")
     held = {key: evidence for key, evidence in diff.items() if len(evidence)}
     for evidence in held.values():
-        _check_evidence(evidence, geometry)
+        if evidence.is_signed:
+            raise negative_evidence()
+        check_samples(evidence.samples, geometry)
     encoded = encode_cells(held, geometry, profile=profile)
     cells = {key: cell.data for key, cell in encoded.items()}
     digests = [cell.digest for cell in encoded.values()]
     text = meta.model_dump_json(exclude_defaults=True).encode()
     data = commit_bytes(text, cells)
     _check_size(len(data), len(cells), len(text))
-    _check_evidence_size(sum(evidence.size_bytes for evidence in diff.values()), EVIDENCE_BYTES_MAX)
-    _check_bricks(diff.values())
+    check_evidence_size(sum(evidence.size_bytes for evidence in diff.values()), EVIDENCE_BYTES_MAX)
+    check_bricks(sum(evidence.brick_count for evidence in diff.values()))
     return Commit(meta, cells, commit_sha(text, digests), data)
 
 
@@ -154,7 +157,7 @@ def sha_without_evidence(data: bytes) -> bytes | None:
         DamagedDataError: cut off or contradictory.
         BadInputError: an unknown version, or larger than allowed.
     """
-    _, text, bodies = _split(data)
+    _, text, bodies = split_bytes(data)
     return None if bodies else commit_sha(text, [])
 
 
@@ -177,58 +180,31 @@ def split_commit(data: bytes) -> tuple[CommitMeta, dict[CellKey, bytes]]:
         DamagedDataError: cut off or contradictory.
         BadInputError: an unknown version, or larger than allowed.
     """
-    meta, _, bodies = _split(data)
+    meta, _, bodies = split_bytes(data)
     return meta, {decode_head(body)[0].key: body for body in bodies}
 
 
-def open_commit(
-    data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX
-) -> tuple[Commit, dict[CellKey, DecodedCell]]:
-    """The commit in bytes and all its evidence, validated completely: canonical cells, rising, of one geometry.
+def negative_evidence() -> BadInputError:
+    """What whoever reads a commit that takes away says."""
+    return BadInputError("negative_evidence", "a commit only adds evidence; to undo, name a commit in a retract")
 
-    Needs up to about twice `evidence_bytes_max` of memory, whatever the bytes say.
+
+def check_samples(samples: npt.NDArray[np.int64], geometry: Geometry) -> None:
+    """Refuse sums without weight.
 
     Raises:
-        DamagedDataError: cut off, contradictory, not canonical.
-        BadInputError: an unknown version, too large, negative evidence, or sums without weight.
+        BadInputError: kind `bad_evidence`.
     """
-    meta, text, bodies = _split(data)
-    _check_heads([decode_head(body)[0] for body in bodies], meta, evidence_bytes_max)
-    cells: dict[CellKey, bytes] = {}
-    decoded: dict[CellKey, DecodedCell] = {}
-    left = evidence_bytes_max
-    for body in bodies:
-        cell = decode_canonical_cell(body, evidence_bytes_max=left)
-        _check_evidence(cell.evidence, cell.geometry)
-        left -= cell.evidence.size_bytes
-        cells[cell.key], decoded[cell.key] = body, cell
-    _check_bricks(cell.evidence for cell in decoded.values())
-    sha = commit_sha(text, [cell.digest for cell in decoded.values()])
-    return Commit(meta, cells, sha, data), decoded
-
-
-def _check_heads(heads: list[CellHead], meta: CommitMeta, evidence_bytes_max: int) -> None:
-    """Refuse by the heads alone what need not be decoded to be refused."""
-    last = -1
-    for head in heads:
-        if head.key <= last or not head.voxels:
-            raise DamagedDataError("bad_commit", "cells must have evidence and rise in number")
-        if head.signed:
-            raise BadInputError("negative_evidence", "a commit only adds evidence; to undo, name a commit in a retract")
-        if head.geometry.digest().hex() != meta.geometry:
-            raise BadInputError("other_geometry", "a cell of the commit has another geometry than its meta names")
-        last = head.key
-    _check_evidence_size(VOXEL_BYTES * sum(head.voxels for head in heads), evidence_bytes_max)
-
-
-def _check_evidence(evidence: Evidence, geometry: Geometry) -> None:
-    if evidence.is_signed:
-        raise BadInputError("negative_evidence", "a commit only adds evidence; to undo, name a commit in a retract")
-    if not every_sum_has_weight(evidence, geometry):
+    if not every_sum_has_weight(samples, geometry):
         raise BadInputError("bad_evidence", "a channel has sums without weight")
 
 
-def _check_evidence_size(size_bytes: int, limit_bytes: int) -> None:
+def check_evidence_size(size_bytes: int, limit_bytes: int) -> None:
+    """Refuse what would take more memory than a reader has for a commit.
+
+    Raises:
+        BadInputError: kind `too_large`.
+    """
     if size_bytes > limit_bytes:
         raise BadInputError(
             "too_large", f"a commit has at most {limit_bytes} bytes of evidence, got {size_bytes}; make two of it"
@@ -243,13 +219,23 @@ def commit_bytes(text: bytes, cells: Mapping[CellKey, bytes]) -> bytes:
     return b"".join(parts)
 
 
-def _check_bricks(evidences: Iterable[Evidence]) -> None:
-    bricks = sum(evidence.brick_count for evidence in evidences)
+def check_bricks(bricks: int) -> None:
+    """Refuse a commit that touches too many.
+
+    Raises:
+        BadInputError: kind `too_large`.
+    """
     if bricks > BRICKS_MAX:
         raise BadInputError("too_large", f"a commit touches at most {BRICKS_MAX} bricks, got {bricks}; make two of it")
 
 
-def _split(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
+def split_bytes(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
+    """A commit's meta, the meta as it stands in the bytes, and its cells' bytes.
+
+    Raises:
+        DamagedDataError: cut off or contradictory.
+        BadInputError: an unknown version, or larger than allowed.
+    """
     if len(data) < HEAD.size or data[:4] != MAGIC:
         raise DamagedDataError("bad_commit", "not a cairn commit: it must begin with CRCM and a whole head")
     _, version, meta_bytes = HEAD.unpack_from(data)

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.channels import planes_and_squares
 from cairn_map.errors import BadInputError
-from cairn_map.evidence_kernels import bounds_of_counts, sums_without_weight
+from cairn_map.evidence_kernels import bounds_of_counts, largest_into, sums_without_weight
 from cairn_map.grid import BRICK_DEPTH, Geometry
 
 COUNT_MAX = (1 << 31) - 1
@@ -122,13 +123,11 @@ def packed_evidence(
     )
 
 
-def largest(evidence: Evidence, geometry: Geometry) -> npt.NDArray[np.int64]:
-    """(2 + P,) largest number of each plane, of counts at least 0; the server adds these up against overflow."""
-    tops = np.zeros(2 + geometry.plane_count, np.int64)
-    if len(evidence.voxels):
-        tops[:2] = bounds_of_counts(evidence.counts)[1:3]
-    if len(evidence.sampled):
-        tops[2:] = evidence.samples.max(axis=0)
+def largest(counts: npt.NDArray[np.int32], samples: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """(2 + P,) largest number of each plane, of numbers at least 0; the server adds these up against overflow."""
+    tops = np.zeros(2 + samples.shape[1], np.int64)
+    tops[:2] = bounds_of_counts(counts)[1:3]
+    largest_into(samples, tops[2:])
     return tops
 
 
@@ -156,10 +155,6 @@ def _rise(numbers: npt.NDArray[np.uint32]) -> bool:
     return bool((numbers[1:] > numbers[:-1]).all())
 
 
-def every_sum_has_weight(evidence: Evidence, geometry: Geometry) -> bool:
+def every_sum_has_weight(samples: npt.NDArray[np.int64], geometry: Geometry) -> bool:
     """Whether each channel's sums come with a weight, as every real sample does: means divide by it."""
-    for channel in geometry.channels:
-        planes = geometry.planes_of(channel.name)
-        if sums_without_weight(evidence.samples, planes.start, planes.stop - 1):
-            return False
-    return True
+    return not sums_without_weight(samples, planes_and_squares(geometry.channels))

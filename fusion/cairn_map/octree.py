@@ -28,6 +28,11 @@ class Octree:
     starts: npt.NDArray[np.uint32]
     sizes: npt.NDArray[np.int64]
 
+    @property
+    def brick_count(self) -> int:
+        """Bricks of 8^3 voxels that its leaves touch."""
+        return int(kernels.bricks_of_leaves(self.starts, self.sizes))
+
 
 def build_octree(evidence: Evidence, *, depth: int) -> tuple[Octree, npt.NDArray[np.int64]]:
     """The octree of packed evidence, and the row of `evidence` at which each leaf starts."""
@@ -73,6 +78,6 @@ def parse_octree(child_masks: Bytes, leaf_masks: Bytes, *, depth: int, stop: int
         # What is inner at the depth where reading stops is listed, too.
         last = slice(firsts[stop - 1], masks)
         leaves += int(np.unpackbits(child_masks[last] & ~leaf_masks[last]).sum())
-    starts, sizes = np.empty(leaves, np.uint32), np.empty(leaves, np.int64)
+    starts, sizes = np.empty(leaves + 1, np.uint32), np.empty(leaves + 1, np.int64)
     kernels.list_leaves_into(child_masks, leaf_masks, firsts, stop, starts, sizes)
-    return Octree(child_masks[:masks], leaf_masks[:leaf_count], starts, sizes)
+    return Octree(child_masks[:masks], leaf_masks[:leaf_count], starts[:leaves], sizes[:leaves])

@@ -108,6 +108,14 @@ def _add_child(
         leaves[d] |= np.uint8(1 << c)
 
 
+@nb.njit(nogil=True, forceinline=True)
+def ones(byte: np.uint8) -> int:
+    """Bits of a byte that are 1."""
+    pairs = byte - ((byte >> 1) & 0x55)
+    fours = (pairs & 0x33) + ((pairs >> 2) & 0x33)
+    return np.int64((fours + (fours >> 4)) & 15)  # type: ignore[return-value]
+
+
 @nb.njit(cache=True, nogil=True)
 def measure_masks(child_masks: Bytes, leaf_masks: Bytes, firsts: Ints, stop: int) -> tuple[int, int, int]:
     """Numbers of child masks, leaf masks and leaves above depth `stop`, or -1 three times if the masks are not sound.
@@ -127,9 +135,8 @@ def measure_masks(child_masks: Bytes, leaf_masks: Bytes, firsts: Ints, stop: int
             leaf = mask if d == depth - 1 else leaf_masks[leaf_at + n]
             if mask == 0 or leaf & ~mask != 0:
                 return -1, -1, -1
-            for c in range(8):
-                leaves += (leaf >> c) & 1
-                below += ((mask & ~leaf) >> c) & 1
+            leaves += ones(leaf)
+            below += ones(mask & ~leaf)
         at += nodes
         if d < depth - 1:
             leaf_at += nodes
@@ -144,7 +151,8 @@ def list_leaves_into(
 ) -> None:
     """First voxel and size of each leaf, in Morton order; inner nodes at depth `stop` count as leaves there.
 
-    The masks are sound (`measure_masks`), and there is room for all.
+    The masks are sound (`measure_masks`), and there is room for all and one more: a voxel is written before it is known
+    to be there, because what branches on each bit of a mask is guessed wrong half the time.
     """
     depth = firsts.shape[0] - 1
     places = firsts.copy()
@@ -179,10 +187,9 @@ def list_leaves_into(
             # Most nodes are here, and all of their children are voxels.
             mask = child_masks[at]
             for c in range(8):
-                if (mask >> c) & 1:
-                    starts[count] = np.uint32(8 * key + c)
-                    sizes[count] = 1
-                    count += 1
+                starts[count] = np.uint32(8 * key + c)
+                sizes[count] = 1
+                count += (mask >> c) & 1
             d -= 1
             continue
         keys[d] = key
@@ -229,6 +236,41 @@ def expand_content_into(
             out[V + V + np.uint64(1)] = misses
             V += np.uint64(1)
     return True
+
+
+@nb.njit(cache=True, nogil=True)
+def check_leaves(starts: Words, sizes: Ints, counts: Counts, sampled: Ints, whole: int) -> tuple[bool, bool]:
+    """Whether each leaf says something, none of several voxels has samples, and all that can be are collapsed.
+
+    The second is told apart from the first two. The cell has `whole` voxels.
+    """
+    collapsed = True
+    s = alike = 0
+    size_before, parent_before, hits_before, misses_before = np.int64(0), np.int64(0), np.int32(0), np.int32(0)
+    for n in range(starts.shape[0]):
+        size, hits, misses = sizes[n], counts[n, 0], counts[n, 1]
+        parent = np.int64(starts[n]) & -(8 * size)
+        has_samples = s < sampled.shape[0] and sampled[s] == n
+        s += has_samples
+        if (has_samples and size != 1) or (not has_samples and hits | misses == 0):
+            return False, False
+        different = (size ^ size_before) | (parent ^ parent_before) | (hits ^ hits_before) | (misses ^ misses_before)
+        alike = 0 if has_samples else 1 if different != 0 else alike + 1
+        collapsed &= alike < 8 or 8 * size >= whole
+        size_before, parent_before, hits_before, misses_before = size, parent, hits, misses
+    return True, collapsed
+
+
+@nb.njit(cache=True, nogil=True)
+def bricks_of_leaves(starts: Words, sizes: Ints) -> int:
+    """Bricks of 8^3 voxels that leaves, rising, touch."""
+    bricks = 0
+    after = np.int64(0)
+    for n in range(starts.shape[0]):
+        first, stop = np.int64(starts[n]) >> 9, (np.int64(starts[n]) + sizes[n] + 511) >> 9
+        bricks += stop - max(first, after)
+        after = stop
+    return bricks
 
 
 @nb.njit(cache=True, nogil=True)

@@ -10,6 +10,7 @@ import numpy as np
 
 from cairn_map.brick_cell import brick_cell
 from cairn_map.cell_code import Profile, decode_canonical_cell, encode_cell
+from cairn_map.channels import planes_and_squares
 from cairn_map.errors import BadInputError
 from cairn_map.evidence import (
     COUNT_MAX,
@@ -19,6 +20,7 @@ from cairn_map.evidence import (
     largest,
     packed_evidence,
 )
+from cairn_map.evidence_kernels import channel_above
 from cairn_map.fingerprint import fingerprint
 from cairn_map.grid import BRICK_DEPTH, Geometry, cell_key, voxels_in_cell
 from cairn_map.sensor_model import SensorModel
@@ -41,8 +43,9 @@ def warm_up() -> None:
                     change(evidence)
             cell.packed()
         fingerprint(evidence, key)
-        largest(evidence, geometry)
-        every_sum_has_weight(evidence, geometry)
+        largest(evidence.counts, evidence.samples)
+        every_sum_has_weight(evidence.samples, geometry)
+        channel_above(evidence.samples, planes_and_squares(geometry.channels), 1)
         voxels_in_cell(evidence.voxels, key, geometry)
     decode_view(encode_view(key, modelled, geometry, SensorModel()))
 

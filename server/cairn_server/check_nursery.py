@@ -21,6 +21,7 @@ import struct
 import sys
 from pathlib import Path
 
+from cairn_map.commit_reading import commit_reader
 from cairn_map.errors import CairnError
 from cairn_map.warm_up import warm_up
 from cairn_server.checking import check_commit
@@ -70,7 +71,7 @@ def _be_worker(fd: int, memory_bytes: int) -> None:
 def answer_to(data: bytes) -> dict[str, object]:
     """What a check found, as JSON."""
     try:
-        checked = check_commit(data)
+        checked = check_commit(commit_reader(data))
     except CairnError as exc:
         return {"family": type(exc).__name__, "kind": exc.kind, "message": exc.message}
     except MemoryError:

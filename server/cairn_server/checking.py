@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cairn_map.commit import open_commit
+from cairn_map.commit_reading import CommitReader
 from cairn_map.evidence import largest
 from cairn_server.push_policy import check_evidence
 
@@ -22,13 +22,13 @@ class Checked:
     """Largest number of each plane; none for a commit without cells."""
 
 
-def check_commit(data: bytes) -> Checked:
+def check_commit(reader: CommitReader) -> Checked:
     """Decode a commit, and find it sound.
 
     Raises:
-        DamagedDataError, BadInputError: as `open_commit` and `push_policy.check_evidence`.
+        DamagedDataError, BadInputError: as `CommitReader.read` and `push_policy.check_evidence`.
     """
-    commit, decoded = open_commit(data)
-    check_evidence(commit.meta, decoded)
-    tops = [largest(cell.evidence, cell.geometry) for cell in decoded.values()]
-    return Checked(commit.sha, tuple(np.max(tops, axis=0).tolist()) if tops else ())
+    commit, cells = reader.read()
+    tops = {key: largest(cell.content.counts, cell.content.samples) for key, cell in cells.items()}
+    check_evidence(commit.meta, cells, tops)
+    return Checked(commit.sha, tuple(np.max(list(tops.values()), axis=0).tolist()) if tops else ())

@@ -5,9 +5,8 @@ process busy for longer than a blink, or makes it grow.
 """
 
 import threading
-from collections.abc import Mapping
 
-from cairn_map.grid import CellKey
+from cairn_map.commit_reading import CommitReader
 from cairn_server.check_pool import CheckPool
 from cairn_server.checking import Checked, check_commit
 from cairn_server.commit_cost import check_cost, cost_of
@@ -29,20 +28,20 @@ class CommitChecks:
             workers=settings.check_workers, limit_s=settings.check_cpu_s, memory_bytes=settings.check_memory_bytes
         )
 
-    def check(self, data: bytes, cells: Mapping[CellKey, bytes]) -> Checked:
-        """What a whole commit holds; its cells are what `split_commit` gave.
+    def check(self, commit: CommitReader) -> Checked:
+        """What a whole commit holds.
 
         Raises:
             BadInputError: kind `too_costly`; or as `check_commit`.
             DamagedDataError: as `check_commit`.
             UnreachableError: kind `busy`, `check_failed` or `shutting_down`: later.
         """
-        cost = cost_of(cells.values())
-        check_cost(cost, size_bytes=len(data))
+        cost = cost_of(commit.readers)
+        check_cost(cost, size_bytes=len(commit.data))
         if cost.seconds > self.ordinary_s:
-            return self._pool.check(data)
+            return self._pool.check(commit.data)
         with self._threads:
-            return check_commit(data)
+            return check_commit(commit)
 
     def close(self) -> None:
         """End the workers."""

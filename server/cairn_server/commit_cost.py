@@ -10,9 +10,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from cairn_map.cell_content import CHILD_MASKS, HITS, LEAF_MASKS
-from cairn_map.cell_reading import CellReader, cell_reader
+from cairn_map.cell_reading import CellReader
 from cairn_map.channel_streams import stream_of_channel
-from cairn_map.commit import EVIDENCE_BYTES_MAX
 from cairn_map.errors import BadInputError
 from cairn_map.streams import MODELLED
 
@@ -47,15 +46,10 @@ class CommitCost:
         return self.cells * CELL_S + self.voxels * VOXEL_S + self.raw_bytes * RAW_BYTE_S + self.numbers * NUMBER_S
 
 
-def cost_of(bodies: Iterable[bytes]) -> CommitCost:
-    """The cost of a commit's cells.
-
-    Raises:
-        DamagedDataError, BadInputError: a head or its streams' sizes contradict each other, or are beyond FORMAT.md 11.
-    """
+def cost_of(readers: Iterable[CellReader]) -> CommitCost:
+    """The cost of a commit's cells."""
     cells = voxels = raw_bytes = numbers = 0
-    for body in bodies:
-        reader = cell_reader(body, evidence_bytes_max=EVIDENCE_BYTES_MAX)
+    for reader in readers:
         cells += 1
         voxels += reader.head.voxels
         raw_bytes += sum(stream.raw_bytes for stream in reader.stored.values())

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from cairn_map.cell_code import decode_canonical_cell
-from cairn_map.cell_reading import VOXEL_BYTES
+from cairn_map.cell_limits import VOXEL_BYTES
 from cairn_map.errors import BadInputError, CairnError, ConflictError, DamagedDataError, NotFoundError
 from cairn_map.fingerprint import fingerprint
 from cairn_map.grid import CellKey, cell_of_key

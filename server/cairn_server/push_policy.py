@@ -7,12 +7,15 @@ and use up the range of the sums for everybody; ids full of gaps would grow ever
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from cairn_map.cell_code import DecodedCell
-from cairn_map.channels import SAMPLE_MAX
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.cell_code import CanonicalCell
+from cairn_map.cell_content import CellContent
+from cairn_map.channels import SAMPLE_MAX, planes_and_squares
 from cairn_map.commit import CommitMeta
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, DeniedError
-from cairn_map.evidence import Evidence
-from cairn_map.evidence_kernels import bounds_of_counts
+from cairn_map.evidence_kernels import bounds_of_counts, channel_above
 from cairn_map.grid import CellKey, Geometry, cell_of_key
 from cairn_map.ids import INITIAL, OPERATOR, CommitId
 from cairn_map.version_vector import AUTHORS_MAX, INTERVALS_MAX
@@ -67,8 +70,12 @@ def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *,
         raise DamagedDataError("empty_commit", "a commit must hold evidence or name commits to retract")
 
 
-def check_evidence(meta: CommitMeta, cells: Mapping[CellKey, DecodedCell]) -> None:
+def check_evidence(
+    meta: CommitMeta, cells: Mapping[CellKey, CanonicalCell], tops: Mapping[CellKey, npt.NDArray[np.int64]]
+) -> None:
     """Refuse more evidence than the commit's scans can have given; prior data (author `initial`) had other scans.
+
+    The largest number of each plane of each cell is known.
 
     Raises:
         BadInputError: kind `too_much_evidence`.
@@ -77,7 +84,7 @@ def check_evidence(meta: CommitMeta, cells: Mapping[CellKey, DecodedCell]) -> No
         return
     scans = max(1, len(meta.scans))
     for key, cell in cells.items():
-        complaint = _excess(cell.evidence, cell.geometry, scans)
+        complaint = _excess(cell.content, cell.geometry, tops[key], scans)
         if complaint:
             raise BadInputError("too_much_evidence", f"cell {cell_of_key(key)}: {complaint} from {scans} scans")
 
@@ -114,21 +121,18 @@ def check_number(commit: CommitId, numbering: Numbering) -> None:
         )
 
 
-def _excess(evidence: Evidence, geometry: Geometry, scans: int) -> str | None:
+def _excess(content: CellContent, geometry: Geometry, tops: npt.NDArray[np.int64], scans: int) -> str | None:
     """What is too much, or None."""
-    counts = bounds_of_counts(evidence.counts)[3]
+    counts = bounds_of_counts(content.counts)[3]
     if counts > scans:
         return f"{counts} counts in one voxel"
     for channel in geometry.channels:
-        sums = evidence.samples[:, geometry.planes_of(channel.name)]
-        weights = sums[:, -1]
-        if int(weights.max(initial=0)) > WEIGHT_MAX * scans:
-            return f"weight {int(weights.max())} of {channel.name} in one voxel (at most {WEIGHT_MAX} a scan)"
-        # Weights are below 2^22 here and a square below 2^40, so that the products fit.
-        tops = [SAMPLE_MAX**2 if plane == "square_sum" else SAMPLE_MAX for plane in channel.planes[:-1]]
-        if any((sums[:, p] > weights * top).any() for p, top in enumerate(tops)):
-            return f"samples of {channel.name} above {SAMPLE_MAX} steps"
-    return None
+        weight = int(tops[1 + geometry.planes_of(channel.name).stop])
+        if weight > WEIGHT_MAX * scans:
+            return f"weight {weight} of {channel.name} in one voxel (at most {WEIGHT_MAX} a scan)"
+    # Weights are below 2^22 here and a square below 2^40, so that the products fit.
+    above = channel_above(content.samples, planes_and_squares(geometry.channels), SAMPLE_MAX)
+    return None if above < 0 else f"samples of {geometry.channels[above].name} above {SAMPLE_MAX} steps"
 
 
 def evidence_gone(commits: Sequence[CommitId]) -> ConflictError:

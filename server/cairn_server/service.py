@@ -8,7 +8,8 @@ import threading
 import time
 from itertools import chain
 
-from cairn_map.commit import Commit, commit_bytes, split_commit
+from cairn_map.commit import Commit, commit_bytes
+from cairn_map.commit_reading import commit_reader
 from cairn_map.cursor import Cursor
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_map.frames import encode_frame, start_of_reply
@@ -135,11 +136,12 @@ class Service:
             ConflictError: kind `id_taken`: the id is known with other bytes.
         """
         self.store.health.check_space(self.settings.disk_free_min_bytes)
-        meta, cells = split_commit(data)
+        pushed = commit_reader(data)
+        meta, cells = pushed.meta, pushed.cells
         speaks_for = Caller(Role.ADMIN) if is_sealed(row, data, seal) else caller
         check_claims(row, speaks_for, id_text, meta, cells=len(cells))
         with self._meter.spending(row, caller, size_bytes=len(data), cells=cells) as keep:
-            checked = self._checks.check(data, cells)
+            checked = self._checks.check(pushed)
             tops = checked.tops or (0,) * (2 + row.geometry.plane_count)
             new = _new_commit(Commit(meta, cells, checked.sha, data), tops)
             try:

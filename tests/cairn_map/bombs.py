@@ -16,7 +16,7 @@ from cairn_map.cell_code import decode_cell, encode_cell
 from cairn_map.cell_head import CellHead, encode_head
 from cairn_map.channels import Channel, ChannelKind
 from cairn_map.commit import HEAD as COMMIT_HEAD
-from cairn_map.commit import open_commit
+from cairn_map.commit_reading import open_commit
 from cairn_map.errors import CairnError
 from cairn_map.evidence import empty_evidence, packed_evidence
 from cairn_map.frames import frames_of, start_of_reply

@@ -23,7 +23,8 @@ from tests.cairn_map.stored import recoded
 
 from cairn_map.brick_cell import difference
 from cairn_map.cell_code import encode_cell
-from cairn_map.commit import CELLS_MAX, HEAD, META_BYTES_MAX, Commit, CommitMeta, make_commit, open_commit
+from cairn_map.commit import CELLS_MAX, HEAD, META_BYTES_MAX, Commit, CommitMeta, make_commit
+from cairn_map.commit_reading import open_commit
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError
 from cairn_map.evidence import Evidence, empty_evidence
 from cairn_map.grid import cell_key

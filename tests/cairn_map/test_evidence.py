@@ -16,7 +16,7 @@ from cairn_map.evidence import (
     largest,
     packed_evidence,
 )
-from cairn_map.evidence_kernels import bounds_of_counts, sums_without_weight
+from cairn_map.evidence_kernels import bounds_of_counts, channel_above, sums_without_weight
 
 I64_MIN = -(1 << 63)
 
@@ -88,14 +88,15 @@ def test_equal_evidence_has_equal_hashes() -> None:
 
 def test_largest_is_the_largest_of_each_plane() -> None:
     evidence = packed([1, 2], [[5, 1], [2, 9]], [[7, 1], [3, 8]])
-    assert largest(evidence, SMALL).tolist() == [5, 9, 7, 8] + [0] * (SMALL.plane_count - 2)
-    assert not largest(empty_evidence(SMALL), SMALL).any()
+    assert largest(evidence.counts, evidence.samples).tolist() == [5, 9, 7, 8] + [0] * (SMALL.plane_count - 2)
+    nothing = empty_evidence(SMALL)
+    assert not largest(nothing.counts, nothing.samples).any()
 
 
 def test_a_sum_without_weight_is_noticed() -> None:
-    assert every_sum_has_weight(random_evidence(1, SMALL), SMALL)
-    assert every_sum_has_weight(packed([0], [[0, 0]], [[9, 9, 9, 1]]), SMALL)
-    assert not every_sum_has_weight(packed([0], [[0, 0]], [[9, 9, 9, 0]]), SMALL)
+    assert every_sum_has_weight(random_evidence(1, SMALL).samples, SMALL)
+    assert every_sum_has_weight(packed([0], [[0, 0]], [[9, 9, 9, 1]]).samples, SMALL)
+    assert not every_sum_has_weight(packed([0], [[0, 0]], [[9, 9, 9, 0]]).samples, SMALL)
 
 
 def test_size_is_that_of_the_arrays() -> None:
@@ -124,8 +125,26 @@ def test_bounds_of_counts_are_those_of_every_row(seed: int, rows: int) -> None:
     )
 
 
+SPEC = np.array([[2, 0], [3, 1]])
+"""Two channels: a sum and a weight; a sum, a square sum and a weight."""
+
+
 @given(st.integers(0, 2**32 - 1), st.integers(0, 4))
 def test_a_sum_without_weight_is_found_in_any_row(seed: int, rows: int) -> None:
-    samples = np.random.default_rng(seed).choice([0, 0, 1, -1, 1 << 62], (rows, 5))
-    expected = any(row[3] == 0 and any(row[p] for p in (1, 2)) for row in samples.tolist())
-    assert sums_without_weight(samples, 1, 3) == expected
+    samples = np.random.default_rng(seed).choice([0, 0, 1, -1, 1 << 62], (rows, 5), p=[0.4, 0.3, 0.1, 0.1, 0.1])
+    expected = any((w == 0 and s != 0) or (v == 0 and (t or q)) for s, w, t, q, v in samples.tolist())
+    assert sums_without_weight(samples, SPEC) == expected
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 4))
+def test_largest_of_samples_is_that_of_every_row(seed: int, rows: int) -> None:
+    samples = np.random.default_rng(seed).choice([0, 1, 7, 1 << 62], (rows, 5))
+    assert largest(np.zeros((0, 2), np.int32), samples).tolist() == [0, 0, *samples.max(axis=0, initial=0).tolist()]
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 4))
+def test_a_mean_beyond_the_limit_is_found_in_any_row(seed: int, rows: int) -> None:
+    samples = np.random.default_rng(seed).choice([0, 1, 10, 11, 100, 101], (rows, 5), p=[0.1, 0.5, 0.1, 0.1, 0.1, 0.1])
+    above = [[s > 10 * w, t > 10 * v or q > 100 * v] for s, w, t, q, v in samples.tolist()]
+    expected = next((c for c in range(2) if any(row[c] for row in above)), -1)
+    assert channel_above(samples, SPEC, 10) == expected

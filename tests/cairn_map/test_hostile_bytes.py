@@ -30,7 +30,7 @@ from tests.cairn_map.stored import GROUPS, bodies_of, recoded, with_streams
 
 from cairn_map.brick_cell import brick_cell
 from cairn_map.cell_code import Profile, decode_cell, encode_cell
-from cairn_map.commit import open_commit
+from cairn_map.commit_reading import open_commit
 from cairn_map.errors import CairnError
 from cairn_map.evidence import Evidence
 from cairn_map.fingerprint import fingerprint

@@ -136,7 +136,7 @@ def test_evidence_for_another_grid_is_refused_before_it_is_decoded(live: Live, m
     def not_now(*_: object, **__: object) -> None:
         raise AssertionError("decoded")
 
-    monkeypatch.setattr("cairn_server.checking.open_commit", not_now)
+    monkeypatch.setattr("cairn_map.commit_reading.read_canonical_cell", not_now)
     row = live.new_map(SMALL)
     assert kind_of(live.push(row, pushed(0, 1, geometry=MIDDLE))) == "other_geometry"
     assert kind_of(live.http.put(f"/maps/{row.name}/commits/{MOLE}.7", content=pushed(0, 1).data)) == "other_id"

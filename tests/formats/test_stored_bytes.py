@@ -9,7 +9,7 @@ from tests.formats.make_formats import GEOMETRY, KEY, evidence, wall
 
 from cairn_map.cell_code import decode_canonical_cell, decode_cell, encode_cell
 from cairn_map.cell_reading import cell_reader
-from cairn_map.commit import open_commit
+from cairn_map.commit_reading import open_commit
 from cairn_map.fingerprint import fingerprint
 from cairn_map.frames import CellFrame, frames_of
 from cairn_map.streams import MODELLED

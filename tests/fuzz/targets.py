@@ -29,7 +29,8 @@ from cairn_map.brick_cell import brick_cell
 from cairn_map.cell_code import Profile, decode_canonical_cell, decode_cell, encode_cell
 from cairn_map.cell_folder import read_head
 from cairn_map.cell_reading import cell_reader
-from cairn_map.commit import commit_sha, open_commit, renamed_commit, split_commit
+from cairn_map.commit import commit_sha, renamed_commit, split_commit
+from cairn_map.commit_reading import open_commit
 from cairn_map.cursor import cursor_from_text
 from cairn_map.errors import BadInputError, CairnError
 from cairn_map.evidence import Evidence
