@@ -8,9 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cairn_map.commit import Commit
 from cairn_map.commit_reading import CommitReader
 from cairn_map.evidence import largest
 from cairn_server.push_policy import check_evidence
+from cairn_server.store_rows import NewCommit
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,3 +34,18 @@ def check_commit(reader: CommitReader) -> Checked:
     tops = {key: largest(cell.content.counts, cell.content.samples) for key, cell in cells.items()}
     check_evidence(commit.meta, cells, tops)
     return Checked(commit.sha, tuple(np.max(list(tops.values()), axis=0).tolist()) if tops else ())
+
+
+def new_commit(commit: Commit, tops: tuple[int, ...]) -> NewCommit:
+    """A commit that was found sound, as a store keeps it."""
+    return NewCommit(
+        id=commit.id,
+        sha=commit.sha,
+        size_bytes=len(commit.data),
+        text=commit.text,
+        captured_s=commit.meta.captured_s,
+        retracts=commit.meta.retracted_ids,
+        diff=commit.cells,
+        tops=tops,
+        rig=bytes.fromhex(commit.meta.rig) if commit.meta.rig else None,
+    )

@@ -16,6 +16,8 @@ ORDINARY_S = 0.05
 """Commits that may cost no more are checked in threads."""
 THREADS_MAX = 4
 """Of them at once."""
+QUICK_S = 0.01
+"""Commits that may cost no more, as nearly all of one scan do, are checked on the spot: another thread costs more."""
 
 
 class CommitChecks:
@@ -40,8 +42,14 @@ class CommitChecks:
         check_cost(cost, size_bytes=len(commit.data))
         if cost.seconds > self.ordinary_s:
             return self._pool.check(commit.data)
+        if cost.seconds <= QUICK_S:
+            return check_commit(commit)
         with self._threads:
             return check_commit(commit)
+
+    def is_quick(self, commit: CommitReader) -> bool:
+        """Whether `check` will be done in a moment, and wait for nobody."""
+        return cost_of(commit.readers).seconds <= min(QUICK_S, self.ordinary_s)
 
     def close(self) -> None:
         """End the workers."""

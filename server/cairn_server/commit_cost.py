@@ -1,6 +1,7 @@
 """What checking a commit will cost, by what the heads of its cells claim: nothing is decoded yet.
 
-    cell:  100 us  +  50 ns a voxel  +  30 ns a raw byte  +  800 ns a modelled number
+    cell:  100 us  +  50 ns a leaf  +  30 ns a raw byte  +  800 ns a modelled number
+                   +  50 ns a voxel, of a cell that only coding anew shows to be canonical (modelled, or large)
 
 Whatever the bytes turn out to be, a reader does no more than the heads claim, so this is a bound and not a guess. Each
 rate is twice what was measured (docs/decisions/007-where-commits-are-checked.md).
@@ -13,10 +14,11 @@ from cairn_map.cell_content import CHILD_MASKS, HITS, LEAF_MASKS
 from cairn_map.cell_reading import CellReader
 from cairn_map.channel_streams import stream_of_channel
 from cairn_map.errors import BadInputError
+from cairn_map.plain_content import is_plain
 from cairn_map.streams import MODELLED
 
 CELL_S = 1e-4
-VOXEL_S = 5e-8
+LEAF_S = VOXEL_S = 5e-8
 RAW_BYTE_S = 3e-8
 NUMBER_S = 8e-7
 
@@ -35,7 +37,9 @@ class CommitCost:
     """Sums over a commit's cells."""
 
     cells: int = 0
+    leaves: int = 0
     voxels: int = 0
+    """Of cells that are coded anew."""
     raw_bytes: int = 0
     numbers: int = 0
     """Modelled ones, each of which a mixture of opinions has to be asked for."""
@@ -43,18 +47,20 @@ class CommitCost:
     @property
     def seconds(self) -> float:
         """Most processor time that checking takes."""
-        return self.cells * CELL_S + self.voxels * VOXEL_S + self.raw_bytes * RAW_BYTE_S + self.numbers * NUMBER_S
+        sizes = self.leaves * LEAF_S + self.voxels * VOXEL_S + self.raw_bytes * RAW_BYTE_S
+        return self.cells * CELL_S + sizes + self.numbers * NUMBER_S
 
 
 def cost_of(readers: Iterable[CellReader]) -> CommitCost:
     """The cost of a commit's cells."""
-    cells = voxels = raw_bytes = numbers = 0
+    cells = leaves = voxels = raw_bytes = numbers = 0
     for reader in readers:
         cells += 1
-        voxels += reader.head.voxels
+        leaves += reader.head.leaves
+        voxels += 0 if is_plain(reader.head, reader.stored) else reader.head.voxels
         raw_bytes += sum(stream.raw_bytes for stream in reader.stored.values())
         numbers += _modelled_numbers(reader)
-    return CommitCost(cells=cells, voxels=voxels, raw_bytes=raw_bytes, numbers=numbers)
+    return CommitCost(cells=cells, leaves=leaves, voxels=voxels, raw_bytes=raw_bytes, numbers=numbers)
 
 
 def check_cost(cost: CommitCost, *, size_bytes: int) -> None:

@@ -11,7 +11,7 @@ What the server itself delays (it reads no faster than it works) does not count 
 
 import asyncio
 import logging
-from typing import Literal
+from typing import Any, Literal
 
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 
@@ -21,7 +21,47 @@ log = logging.getLogger(__name__)
 
 TICK_S = 1.0
 """How often a connection is looked at."""
+JOINED_BYTES_MAX = 1 << 14
 Stage = Literal["head", "body", "answer"]
+
+
+class _Joined:
+    """A transport that sends at once what is written in one turn of the event loop: an answer's head and its body.
+
+    A system call less, and the other side is woken once; for a small answer that is a tenth of its cost.
+    """
+
+    def __init__(self, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop) -> None:
+        self._transport = transport
+        self._loop = loop
+        self._parts: list[bytes] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._transport, name)
+
+    def write(self, data: bytes) -> None:
+        """Send it soon, or at once if it is so large that copying it would cost more."""
+        if len(data) > JOINED_BYTES_MAX:
+            self._flush()
+            self._transport.write(data)
+        elif data:
+            if not self._parts:
+                self._loop.call_soon(self._flush)
+            self._parts.append(data)
+
+    def get_write_buffer_size(self) -> int:
+        """Bytes that wait."""
+        return self._transport.get_write_buffer_size() + sum(map(len, self._parts))
+
+    def close(self) -> None:
+        """Send what was written, and close."""
+        self._flush()
+        self._transport.close()
+
+    def _flush(self) -> None:
+        parts, self._parts = self._parts, []
+        if parts and not self._transport.is_closing():
+            self._transport.write(b"".join(parts))
 
 
 class PunctualProtocol(H11Protocol):
@@ -31,7 +71,7 @@ class PunctualProtocol(H11Protocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """The other side connected; there are only so many places to wait in."""
-        super().connection_made(transport)
+        super().connection_made(_Joined(transport, self.loop))  # type: ignore[arg-type]
         self._stage: tuple[Stage, RequestResponseCycle | None] = ("head", None)
         self._since_s = self._seen_s = self.loop.time()
         self._got_bytes = 0

@@ -3,11 +3,12 @@
 import logging
 import time
 from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 
 from cairn_map.cursor import Cursor
-from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
+from cairn_map.errors import CairnError, ConflictError, NotFoundError, UnreachableError
 from cairn_map.grid import Geometry
 from cairn_map.ids import Author, CommitId
 from cairn_map.sensor_model import SensorModel
@@ -56,6 +57,15 @@ class MemoryStore:
         """Keep a commit; True if it is new, False if the same one is known already."""
         with self._maps.changing(row) as changed:
             return changed.append(commit)
+
+    def submit(self, row: MapRow, commit: NewCommit) -> Future[bool]:
+        """Keep a commit, at once."""
+        done: Future[bool] = Future()
+        try:
+            done.set_result(self.append(row, commit))
+        except CairnError as exc:
+            done.set_exception(exc)
+        return done
 
     def append_built(self, row: MapRow, author: Author, build: Callable[[int], NewCommit]) -> NewCommit:
         """Keep a commit that `build(n)` makes for the author's next number n."""

@@ -6,10 +6,13 @@ called from many threads.
 
 import threading
 import time
+from collections.abc import Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
 from itertools import chain
 
 from cairn_map.commit import Commit, commit_bytes
-from cairn_map.commit_reading import commit_reader
+from cairn_map.commit_reading import CommitReader, commit_reader
 from cairn_map.cursor import Cursor
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_map.frames import encode_frame, start_of_reply
@@ -32,6 +35,7 @@ from cairn_server.auth import Caller, Role, new_token, token_hash
 from cairn_server.branch_list import branch_infos
 from cairn_server.cell_index import FIRST_PAGE, IndexPage, entries_of
 from cairn_server.cells_at_rest import DamagedCellError, sound_cell
+from cairn_server.checking import new_commit
 from cairn_server.commit_checks import CommitChecks
 from cairn_server.damaged_cells import DamagedCells
 from cairn_server.fold_health import FoldHealth
@@ -50,7 +54,7 @@ from cairn_server.server_figures import ServerFigures, process_lines, store_line
 from cairn_server.settings import Settings
 from cairn_server.stable import StableVectors
 from cairn_server.store import Store
-from cairn_server.store_rows import Branch, CellRow, Head, MapRow, NewCommit
+from cairn_server.store_rows import Branch, CellRow, Head, MapRow
 from cairn_server.vectors import vector_at
 
 RESERVED_NAMES = frozenset({OPERATOR, INITIAL, RobotName("main")})
@@ -71,7 +75,7 @@ class Service:
             store, self.folds, self.damaged, keep_evidence_s=settings.keep_evidence_s, on_fold=self.live.folded
         )
         self.readiness = Readiness(store.health, self.folds, settings, self._folder.is_alive)
-        self._checks = CommitChecks(settings)
+        self.checks = CommitChecks(settings)
         self._refusals = Refusals()
         self._meter = Meter(store, settings.quotas)
         self._stable = StableVectors(settings.stable_after_s)
@@ -128,6 +132,18 @@ class Service:
     def push(self, row: MapRow, caller: Caller, id_text: str, data: bytes, *, seal: str | None = None) -> bool:
         """Keep a commit; True if it is new. When this returns, no power cut can lose it.
 
+        Raises:
+            As `pushing`.
+        """
+        with self.pushing(row, caller, id_text, commit_reader(data), seal=seal) as kept:
+            return kept.result()
+
+    @contextmanager
+    def pushing(
+        self, row: MapRow, caller: Caller, id_text: str, pushed: CommitReader, *, seal: str | None = None
+    ) -> Iterator["Future[bool]"]:
+        """Keep a commit; what it gives says, some milliseconds later, that it is durable, and True if it is new.
+
         Anybody may push back a retract that bears this server's own seal.
 
         Raises:
@@ -136,16 +152,16 @@ class Service:
             ConflictError: kind `id_taken`: the id is known with other bytes.
         """
         self.store.health.check_space(self.settings.disk_free_min_bytes)
-        pushed = commit_reader(data)
-        meta, cells = pushed.meta, pushed.cells
-        speaks_for = Caller(Role.ADMIN) if is_sealed(row, data, seal) else caller
-        check_claims(row, speaks_for, id_text, meta, cells=len(cells))
-        with self._meter.spending(row, caller, size_bytes=len(data), cells=cells) as keep:
-            checked = self._checks.check(pushed)
-            tops = checked.tops or (0,) * (2 + row.geometry.plane_count)
-            new = _new_commit(Commit(meta, cells, checked.sha, data), tops)
+        speaks_for = Caller(Role.ADMIN) if is_sealed(row, pushed.data, seal) else caller
+        cells = pushed.cells
+        check_claims(row, speaks_for, id_text, pushed.meta, cells=len(cells))
+        with self._meter.spending(row, caller, size_bytes=len(pushed.data), cells=cells) as keep:
+            checked = self.checks.check(pushed)
+            commit = Commit(pushed.meta, cells, checked.sha, pushed.data)
+            kept = self.store.submit(row, new_commit(commit, checked.tops or (0,) * (2 + row.geometry.plane_count)))
             try:
-                is_new = self.store.append(row, new)
+                yield kept
+                is_new = kept.result()
             except ConflictError as exc:
                 if self._refusals.is_worth_a_line(caller.name):
                     self.store.audit_log.add(caller.name, exc.kind, f"map {row.name}: {exc.message}")
@@ -157,7 +173,6 @@ class Service:
         if caller.robot:
             self.store.seen(row, caller.robot, None)
             self.live.robot_heard(row, caller.robot)
-        return is_new
 
     def missing(self, row: MapRow, branch: str, request: MissingRequest) -> bytes:
         """The frames that bring the asker to the head; one snapshot, wholly in memory before it is sent."""
@@ -270,21 +285,7 @@ class Service:
         """Stop folding and close the store; what was acknowledged is folded after the next start."""
         self.readiness.is_closing = True
         self.live.close()
-        self._checks.close()
+        self.checks.close()
         self._folder.close()
         self.reports.close()
         self.store.close()
-
-
-def _new_commit(commit: Commit, tops: tuple[int, ...]) -> NewCommit:
-    return NewCommit(
-        id=commit.id,
-        sha=commit.sha,
-        size_bytes=len(commit.data),
-        text=commit.text,
-        captured_s=commit.meta.captured_s,
-        retracts=commit.meta.retracted_ids,
-        diff=commit.cells,
-        tops=tops,
-        rig=bytes.fromhex(commit.meta.rig) if commit.meta.rig else None,
-    )

@@ -111,7 +111,11 @@ class SqliteStore:
 
     def append(self, row: MapRow, commit: NewCommit) -> bool:
         """Keep a commit; True if it is new, False if the same one is kept already. Durable on return."""
-        return self._writer.run(lambda connection: append_commit(connection, row, commit))
+        return self.submit(row, commit).result()
+
+    def submit(self, row: MapRow, commit: NewCommit) -> Future[bool]:
+        """Keep a commit, as `append` does; durable once the answer is there."""
+        return self._writer.submit(lambda connection: append_commit(connection, row, commit))
 
     def append_built(self, row: MapRow, author: Author, build: Callable[[int], NewCommit]) -> NewCommit:
         """Keep a commit that `build(n)` makes for the author's next number n."""

@@ -7,6 +7,7 @@ snapshot  a view of one state of the map: header and frames of a reply come from
 """
 
 from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from typing import Protocol
 
@@ -143,7 +144,11 @@ class Store(Protocol):
         ...
 
     def append(self, row: MapRow, commit: NewCommit) -> bool:
-        """Keep a commit; True if it is new, False if the same one is known already. Durable on return.
+        """`submit`, and wait."""
+        ...
+
+    def submit(self, row: MapRow, commit: NewCommit) -> Future[bool]:
+        """Keep a commit; True if it is new, False if the same one is known already. Durable once that is known.
 
         One that was set aside as damaged is new again. Of a known one the evidence is kept again if it was gone.
 

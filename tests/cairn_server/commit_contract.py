@@ -16,8 +16,8 @@ from cairn_map.sensor_model import SensorModel
 from cairn_map.version_vector import EMPTY
 from cairn_server import push_policy
 from cairn_server.cell_cache import CellCache
+from cairn_server.checking import new_commit
 from cairn_server.folding import fold_pending
-from cairn_server.service import _new_commit
 from cairn_server.store import Store
 from cairn_server.store_rows import Entry, Fold, MapRow, NewCommit, StoredCommit, Totals
 
@@ -239,7 +239,7 @@ class CommitContract:
         def heavy(n: int, top: int) -> NewCommit:
             tops = [0] * (2 + SMALL.plane_count)
             tops[plane] = top
-            return _new_commit(pushed(n, 1), tuple(tops))
+            return new_commit(pushed(n, 1), tuple(tops))
 
         row = new_map(store)
         assert store.append(row, heavy(0, most - 1))

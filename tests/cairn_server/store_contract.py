@@ -20,8 +20,8 @@ from cairn_map.ids import CommitId
 from cairn_map.sensor_model import SensorModel
 from cairn_map.version_vector import EMPTY, VersionVector
 from cairn_server.cell_cache import CellCache
+from cairn_server.checking import new_commit
 from cairn_server.folding import fold_pending
-from cairn_server.service import _new_commit
 from cairn_server.store import Store
 from cairn_server.store_rows import Branch, Fold, Head, MapRow, NewCommit, Selection
 
@@ -36,7 +36,7 @@ RETRACTS = [
 
 def new_of(commit: Commit) -> NewCommit:
     """As the service hands it to a store."""
-    return _new_commit(commit, (0,) * (2 + SMALL.plane_count))
+    return new_commit(commit, (0,) * (2 + SMALL.plane_count))
 
 
 @dataclass
@@ -214,7 +214,7 @@ class StoreContract:
         store.append(row, new_of(pushed(0, 1)))
         with pytest.raises(BadInputError):
             store.append(row, new_of(pushed(20_000, 1)))
-        heavy = _new_commit(pushed(2, 1), (1 << 31, *[0] * (1 + SMALL.plane_count)))
+        heavy = new_commit(pushed(2, 1), (1 << 31, *[0] * (1 + SMALL.plane_count)))
         with pytest.raises(BadInputError):
             store.append(row, heavy)
         with store.snapshot(row) as snapshot:

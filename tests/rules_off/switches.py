@@ -715,7 +715,7 @@ SWITCHES = (
         11,
         "an operator's retract is taken back by its seal alone",
         SERVICE,
-        "speaks_for = Caller(Role.ADMIN) if is_sealed(row, data, seal) else caller",
+        "speaks_for = Caller(Role.ADMIN) if is_sealed(row, pushed.data, seal) else caller",
         "speaks_for = Caller(Role.ADMIN)",
         "cairn_server/test_retract.py::test_a_retract_may_be_pushed_back_by_anybody_with_this_map_s_seal_on_it_and_by_nobody_without",
     ),
