@@ -16,7 +16,9 @@ BLOCK_BITS = 6
 def blocks_of(evidence: Evidence) -> Blocks:
     """The blocks that hold a voxel."""
     blocks = evidence.voxels >> np.uint32(BLOCK_BITS)
-    return np.asarray(blocks[np.diff(blocks, prepend=np.uint32(0xFFFFFFFF)) != 0])
+    is_first = np.ones(len(blocks), np.bool_)
+    np.not_equal(blocks[1:], blocks[:-1], out=is_first[1:])  # np.diff takes four times as long
+    return np.asarray(blocks[is_first])
 
 
 def of_blocks(evidence: Evidence, blocks: Blocks) -> Evidence:

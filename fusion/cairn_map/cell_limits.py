@@ -29,6 +29,8 @@ def check_efforts(head: CellHead, stored: dict[int, StoredStream]) -> None:
     Raises:
         BadInputError: kind `too_large`.
     """
+    if all(stream.coding != MODELLED for stream in stored.values()):
+        return
     masks = sum(stored[number].raw_bytes for number in (CHILD_MASKS, LEAF_MASKS) if number in stored)
     firsts = [HITS, *(stream_of_channel(c) for c in range(len(head.geometry.channels)))]
     for first, numbers in {CHILD_MASKS: masks, **dict.fromkeys(firsts, head.leaves)}.items():

@@ -46,6 +46,8 @@ class CellReader:
     head_bytes: bytes
     stored: dict[int, StoredStream]
     sampled_max: int
+    is_plain: bool = False
+    """Whether all of it can be read at once (`plain_content`)."""
     raw: dict[int, bytes] = field(default_factory=dict)
     """Raw streams of what was read so far."""
     _octree: Octree | None = None
@@ -168,7 +170,7 @@ class CellReader:
             BadInputError: kind `too_large`.
         """
         head, channels = self.head, range(len(self.head.geometry.channels))
-        if is_plain(self.head, self.stored):
+        if self.is_plain:
             self._read(list(self.stored))
             self._plain = plain_content(head, self.head_bytes, self.raw, sampled_max=self.sampled_max)
             return self._plain.content
@@ -282,7 +284,7 @@ def cell_reader(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) ->
         data[len(head_bytes) :], count=head.streams, raw_bytes_max=min(RAW_BYTES_MAX, head.raw_bytes_max)
     )
     check_efforts(head, stored)
-    return CellReader(head, head_bytes, stored, sampled_max)
+    return CellReader(head, head_bytes, stored, sampled_max, is_plain(head, stored))
 
 
 def _between(rows: ChannelRows, first: int, stop: int) -> ChannelRows:

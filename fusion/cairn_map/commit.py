@@ -249,7 +249,7 @@ def split_bytes(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
     try:
         meta = CommitMeta.model_validate_json(text, strict=True)
         # Readers differ in which of two equal keys they take, and the SHA-256 is the same for all of them.
-        json.loads(text.decode(), object_pairs_hook=_object, parse_int=float)
+        _UNIQUE.decode(text.decode())
     except ValidationError as exc:
         raise DamagedDataError("bad_commit", f"commit meta: {first_error(exc)}") from None
     (count,) = struct.unpack_from("<I", data, at - 4)
@@ -267,6 +267,10 @@ def split_bytes(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
 def _object(pairs: list[tuple[str, object]]) -> None:
     if len({key for key, _ in pairs}) != len(pairs):
         raise DamagedDataError("bad_commit", "commit meta: a key is there twice")
+
+
+_UNIQUE = json.JSONDecoder(object_pairs_hook=_object, parse_int=float)
+"""Refuses keys that are there twice. `json.loads` would make it anew each time."""
 
 
 def _check_size(size_bytes: int, cells: int, meta_bytes: int) -> None:

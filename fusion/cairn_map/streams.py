@@ -10,7 +10,7 @@ the k-th; k is the least that holds the largest value, so a column has one form 
 import struct
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -28,8 +28,7 @@ RAW_BYTES_MAX = 1 << 28
 """Of all streams of a cell together: sixteen bytes for each voxel of the largest cell."""
 
 
-@dataclass(frozen=True, slots=True)
-class StoredStream:
+class StoredStream(NamedTuple):
     """A stream as it stands in a cell's bytes: nothing of it is decoded, and `raw_bytes` is only claimed."""
 
     number: int

@@ -57,9 +57,11 @@ class CellCache:
 
     def stamp(self, key: CellKey, blocks: Blocks, seq: int, load: Load) -> None:
         """Note that a log entry changed these blocks of a cell."""
+        is_here = key in self._cells and key in self._changed
         cell, stamps = self._taken(key, load)
         stamps[blocks] = seq
-        self._keep(key, cell, stamps)
+        if not is_here:
+            self._keep(key, cell, stamps)
 
     def rows(self, last_change: Mapping[CellKey, int]) -> tuple[CellRow, ...]:
         """The changed cells encoded, rising in number, each with the log entry that last changed it."""

@@ -14,7 +14,6 @@ from cairn_map.cell_content import CHILD_MASKS, HITS, LEAF_MASKS
 from cairn_map.cell_reading import CellReader
 from cairn_map.channel_streams import stream_of_channel
 from cairn_map.errors import BadInputError
-from cairn_map.plain_content import is_plain
 from cairn_map.streams import MODELLED
 
 CELL_S = 1e-4
@@ -57,9 +56,9 @@ def cost_of(readers: Iterable[CellReader]) -> CommitCost:
     for reader in readers:
         cells += 1
         leaves += reader.head.leaves
-        voxels += 0 if is_plain(reader.head, reader.stored) else reader.head.voxels
+        voxels += 0 if reader.is_plain else reader.head.voxels
         raw_bytes += sum(stream.raw_bytes for stream in reader.stored.values())
-        numbers += _modelled_numbers(reader)
+        numbers += 0 if reader.is_plain else _modelled_numbers(reader)
     return CommitCost(cells=cells, leaves=leaves, voxels=voxels, raw_bytes=raw_bytes, numbers=numbers)
 
 

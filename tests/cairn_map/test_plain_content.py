@@ -25,9 +25,7 @@ KINDS = {"bad_octree", "bad_cell", "bad_stream", "too_large", "not_canonical"}
 
 def slowly(reader: CellReader) -> CellContent:
     """Read stream by stream."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("cairn_map.cell_reading.is_plain", lambda *_: False)
-        return CellReader(reader.head, reader.head_bytes, reader.stored, reader.sampled_max).content()
+    return CellReader(reader.head, reader.head_bytes, reader.stored, reader.sampled_max, is_plain=False).content()
 
 
 def arrays_of(content: CellContent) -> Arrays:
