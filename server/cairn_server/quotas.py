@@ -60,6 +60,11 @@ class Meter:
         self._minutes: dict[Robot, _Minute] = {}
         self._boxes: dict[int, tuple[Box | None, float]] = {}
 
+    def is_ready(self, row: MapRow) -> bool:
+        """Whether `spending` has no need to read from the store what was pushed today, or where the map is."""
+        knows_box = self._quotas.map_extent_m is None or row.number in self._boxes
+        return knows_box and self._day == int(self._wall_s() // DAY_S)
+
     @contextmanager
     def spending(
         self, row: MapRow, caller: Caller, *, size_bytes: int, cells: Collection[CellKey]

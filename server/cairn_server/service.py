@@ -159,13 +159,8 @@ class Service:
             checked = self.checks.check(pushed)
             commit = Commit(pushed.meta, cells, checked.sha, pushed.data)
             kept = self.store.submit(row, new_commit(commit, checked.tops or (0,) * (2 + row.geometry.plane_count)))
-            try:
-                yield kept
-                is_new = kept.result()
-            except ConflictError as exc:
-                if self._refusals.is_worth_a_line(caller.name):
-                    self.store.audit_log.add(caller.name, exc.kind, f"map {row.name}: {exc.message}")
-                raise
+            yield kept
+            is_new = kept.result()
             if is_new:
                 keep()
         if is_new:
@@ -173,6 +168,15 @@ class Service:
         if caller.robot:
             self.store.seen(row, caller.robot, None)
             self.live.robot_heard(row, caller.robot)
+
+    def is_quick(self, row: MapRow, caller: Caller, pushed: CommitReader) -> bool:
+        """Whether `pushing` will be done in a moment, and wait for nobody."""
+        return self.checks.is_quick(pushed) and (caller.robot is None or self._meter.is_ready(row))
+
+    def note_conflict(self, row: MapRow, caller: Caller, conflict: ConflictError) -> None:
+        """A line in the audit log, now and then, for somebody who pushes what cannot be."""
+        if self._refusals.is_worth_a_line(caller.name):
+            self.store.audit_log.add(caller.name, conflict.kind, f"map {row.name}: {conflict.message}")
 
     def missing(self, row: MapRow, branch: str, request: MissingRequest) -> bytes:
         """The frames that bring the asker to the head; one snapshot, wholly in memory before it is sent."""

@@ -72,12 +72,13 @@ class Writer:
         self._thread.start()
 
     def submit(self, job: Callable[[apsw.Connection], T]) -> "Future[T]":
-        """Run a job inside a transaction; the future resolves when it is durable.
+        """Run a job inside a transaction; the future resolves when it is durable, and cannot be cancelled.
 
         Raises:
             UnreachableError: the server is shutting down, or its disk does not keep up.
         """
         future: Future[T] = Future()
+        future.set_running_or_notify_cancel()  # whoever waits may be gone at a shutdown, and this thread must live
         with self._lock:
             if self._closed:
                 raise UnreachableError("shutting_down", "the server is shutting down", retry_after_s=5.0)

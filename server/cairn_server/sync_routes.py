@@ -11,6 +11,7 @@ from fastapi import APIRouter, Depends, Header, Response
 from starlette.concurrency import run_in_threadpool
 
 from cairn_map.commit_reading import commit_reader
+from cairn_map.errors import ConflictError
 from cairn_map.messages import MissingRequest, Pushed
 from cairn_server.auth import Role
 from cairn_server.http_access import OWNERS, READERS, Door, Map, Operations, body_of, door_of
@@ -36,11 +37,15 @@ async def push(
     """Push a commit: 201 new, 200 seen before, 409 other bytes under this id."""
     service, (row, caller) = door.service, door.opened(Role.ROBOT)
     pushed = commit_reader(data) if len(data) <= AT_ONCE_BYTES else None
-    if pushed is None or not service.checks.is_quick(pushed):
-        is_new = await run_in_threadpool(service.push, row, caller, commit, data, seal=cairn_seal)
-    else:
-        with service.pushing(row, caller, commit, pushed, seal=cairn_seal) as kept:
-            is_new = await asyncio.wrap_future(kept)
+    try:
+        if pushed is None or not service.is_quick(row, caller, pushed):
+            is_new = await run_in_threadpool(service.push, row, caller, commit, data, seal=cairn_seal)
+        else:
+            with service.pushing(row, caller, commit, pushed, seal=cairn_seal) as kept:
+                is_new = await asyncio.wrap_future(kept)
+    except ConflictError as exc:
+        await run_in_threadpool(service.note_conflict, row, caller, exc)
+        raise
     response.status_code = 201 if is_new else 200
     return Pushed(id=commit, state="new" if is_new else "known")
 
