@@ -6,13 +6,9 @@ called from many threads.
 
 import threading
 import time
-from collections.abc import Iterator
-from concurrent.futures import Future
-from contextlib import contextmanager
 from itertools import chain
 
-from cairn_map.commit import Commit, commit_bytes
-from cairn_map.commit_reading import CommitReader, commit_reader
+from cairn_map.commit import commit_bytes
 from cairn_map.cursor import Cursor
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_map.frames import encode_frame, start_of_reply
@@ -31,24 +27,20 @@ from cairn_map.messages import (
     Retracted,
 )
 from cairn_map.version_vector import VersionVector
-from cairn_server.auth import Caller, Role, new_token, token_hash
+from cairn_server.auth import Caller, new_token, token_hash
 from cairn_server.branch_list import branch_infos
 from cairn_server.cell_index import FIRST_PAGE, IndexPage, entries_of
 from cairn_server.cells_at_rest import DamagedCellError, sound_cell
-from cairn_server.checking import new_commit
-from cairn_server.commit_checks import CommitChecks
 from cairn_server.damaged_cells import DamagedCells
 from cairn_server.fold_health import FoldHealth
 from cairn_server.folder import Folder
 from cairn_server.healing import heal_cell, keep_healed
 from cairn_server.live import Hub
 from cairn_server.missing import asker_from_request, header_of, reply_frames
-from cairn_server.push_policy import check_claims
-from cairn_server.quotas import Meter
+from cairn_server.pushes import Pushes
 from cairn_server.read_cache import ReadCache
 from cairn_server.readiness import Readiness
-from cairn_server.refusals import Refusals
-from cairn_server.retracting import is_sealed, retract_builders, seal_of, targets_of
+from cairn_server.retracting import retract_builders, seal_of, targets_of
 from cairn_server.robot_reports import RobotReports
 from cairn_server.server_figures import ServerFigures, process_lines, store_lines
 from cairn_server.settings import Settings
@@ -75,9 +67,7 @@ class Service:
             store, self.folds, self.damaged, keep_evidence_s=settings.keep_evidence_s, on_fold=self.live.folded
         )
         self.readiness = Readiness(store.health, self.folds, settings, self._folder.is_alive)
-        self.checks = CommitChecks(settings)
-        self._refusals = Refusals()
-        self._meter = Meter(store, settings.quotas)
+        self.pushes = Pushes(store, settings, self.live, on_new=self._folder.wake)
         self._stable = StableVectors(settings.stable_after_s)
         self._reads = ReadCache()
         self._healing = threading.Lock()
@@ -130,53 +120,8 @@ class Service:
         return Registered(branch=request.robot, token=token, map=self.map_info(row))
 
     def push(self, row: MapRow, caller: Caller, id_text: str, data: bytes, *, seal: str | None = None) -> bool:
-        """Keep a commit; True if it is new. When this returns, no power cut can lose it.
-
-        Raises:
-            As `pushing`.
-        """
-        with self.pushing(row, caller, id_text, commit_reader(data), seal=seal) as kept:
-            return kept.result()
-
-    @contextmanager
-    def pushing(
-        self, row: MapRow, caller: Caller, id_text: str, pushed: CommitReader, *, seal: str | None = None
-    ) -> Iterator["Future[bool]"]:
-        """Keep a commit; what it gives says, some milliseconds later, that it is durable, and True if it is new.
-
-        Anybody may push back a retract that bears this server's own seal.
-
-        Raises:
-            BadInputError: not a commit for this map, not by this caller, or against `push_policy` or `quotas`.
-            UnreachableError: kind `quota`: more than the robot may push now; or `disk_full`.
-            ConflictError: kind `id_taken`: the id is known with other bytes.
-        """
-        self.store.health.check_space(self.settings.disk_free_min_bytes)
-        speaks_for = Caller(Role.ADMIN) if is_sealed(row, pushed.data, seal) else caller
-        cells = pushed.cells
-        check_claims(row, speaks_for, id_text, pushed.meta, cells=len(cells))
-        with self._meter.spending(row, caller, size_bytes=len(pushed.data), cells=cells) as keep:
-            checked = self.checks.check(pushed)
-            commit = Commit(pushed.meta, cells, checked.sha, pushed.data)
-            kept = self.store.submit(row, new_commit(commit, checked.tops or (0,) * (2 + row.geometry.plane_count)))
-            yield kept
-            is_new = kept.result()
-            if is_new:
-                keep()
-        if is_new:
-            self._folder.wake()
-        if caller.robot:
-            self.store.seen(row, caller.robot, None)
-            self.live.robot_heard(row, caller.robot)
-
-    def is_quick(self, row: MapRow, caller: Caller, pushed: CommitReader) -> bool:
-        """Whether `pushing` will be done in a moment, and wait for nobody."""
-        return self.checks.is_quick(pushed) and (caller.robot is None or self._meter.is_ready(row))
-
-    def note_conflict(self, row: MapRow, caller: Caller, conflict: ConflictError) -> None:
-        """A line in the audit log, now and then, for somebody who pushes what cannot be."""
-        if self._refusals.is_worth_a_line(caller.name):
-            self.store.audit_log.add(caller.name, conflict.kind, f"map {row.name}: {conflict.message}")
+        """`Pushes.keep`."""
+        return self.pushes.keep(row, caller, id_text, data, seal=seal)
 
     def missing(self, row: MapRow, branch: str, request: MissingRequest) -> bytes:
         """The frames that bring the asker to the head; one snapshot, wholly in memory before it is sent."""
@@ -289,7 +234,7 @@ class Service:
         """Stop folding and close the store; what was acknowledged is folded after the next start."""
         self.readiness.is_closing = True
         self.live.close()
-        self.checks.close()
+        self.pushes.close()
         self._folder.close()
         self.reports.close()
         self.store.close()

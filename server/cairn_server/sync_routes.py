@@ -35,16 +35,16 @@ async def push(
     cairn_seal: Annotated[str | None, Header(max_length=64)] = None,
 ) -> Pushed:
     """Push a commit: 201 new, 200 seen before, 409 other bytes under this id."""
-    service, (row, caller) = door.service, door.opened(Role.ROBOT)
+    pushes, (row, caller) = door.service.pushes, door.opened(Role.ROBOT)
     pushed = commit_reader(data) if len(data) <= AT_ONCE_BYTES else None
     try:
-        if pushed is None or not service.is_quick(row, caller, pushed):
-            is_new = await run_in_threadpool(service.push, row, caller, commit, data, seal=cairn_seal)
+        if pushed is None or not pushes.is_quick(row, caller, pushed):
+            is_new = await run_in_threadpool(pushes.keep, row, caller, commit, data, seal=cairn_seal)
         else:
-            with service.pushing(row, caller, commit, pushed, seal=cairn_seal) as kept:
+            with pushes.keeping(row, caller, commit, pushed, seal=cairn_seal) as kept:
                 is_new = await asyncio.wrap_future(kept)
     except ConflictError as exc:
-        await run_in_threadpool(service.note_conflict, row, caller, exc)
+        await run_in_threadpool(pushes.note_conflict, row, caller, exc)
         raise
     response.status_code = 201 if is_new else 200
     return Pushed(id=commit, state="new" if is_new else "known")

@@ -24,13 +24,13 @@ from cairn_server.sqlite_writer import Writer, connect
 def checked_on(live: Live, monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     """For each check whether it was on the event loop."""
     found: list[bool] = []
-    check = live.service.checks.check
+    check = live.service.pushes.checks.check
 
     def noted(commit: CommitReader) -> Checked:
         found.append(threading.current_thread() is live._thread)
         return check(commit)
 
-    monkeypatch.setattr(live.service.checks, "check", noted)
+    monkeypatch.setattr(live.service.pushes.checks, "check", noted)
     return found
 
 
@@ -66,13 +66,13 @@ def test_a_server_that_has_just_started_reads_quotas_in_a_thread(
 ) -> None:
     on_loop: list[bool] = []
     with guarded(tmp_path) as live:
-        spending = live.service._meter.spending
+        spending = live.service.pushes.meter.spending
 
         def noted(*args: object, **kwargs: object) -> object:
             on_loop.append(threading.current_thread() is live._thread)
             return spending(*args, **kwargs)  # type: ignore[arg-type]
 
-        monkeypatch.setattr(live.service._meter, "spending", noted)
+        monkeypatch.setattr(live.service.pushes.meter, "spending", noted)
         row = live.new_map(SMALL)
         mole = bearer(robot_token(live, row, MOLE.robot or ""))
         assert [live.push(row, pushed(n, n), headers=mole).status_code for n in range(2)] == [201, 201]

@@ -160,7 +160,7 @@ def test_what_was_refused_or_known_costs_nothing(tmp_path: Path) -> None:
 def test_a_quota_is_looked_at_before_evidence_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with guarded(tmp_path, cells_per_commit=1) as live:
         row = live.new_map()
-        monkeypatch.setattr(live.service.checks, "check", lambda commit: pytest.fail("decoded"))
+        monkeypatch.setattr(live.service.pushes.checks, "check", lambda commit: pytest.fail("decoded"))
         answer = live.push(row, pushed(0, 0), headers=bearer(robot_token(live, row, "mole")))
         assert (answer.status_code, kind_of(answer)) == (400, "beyond_quota")
         assert "Retry-After" not in answer.headers

@@ -11,6 +11,7 @@ MISSING, FOLDING = "server/cairn_server/missing.py", "server/cairn_server/foldin
 CHANGES, SNAPSHOT = "server/cairn_server/sqlite_changes.py", "server/cairn_server/sqlite_snapshot.py"
 READERS, CELLS = "server/cairn_server/sqlite_readers.py", "server/cairn_server/cell_routes.py"
 SERVICE, STABLE = "server/cairn_server/service.py", "server/cairn_server/stable.py"
+PUSHES = "server/cairn_server/pushes.py"
 APPLYING, OUTBOX = "client/cairn_client/applying.py", "client/cairn_client/outbox.py"
 REPLICA, SYNC = "client/cairn_client/replica.py", "client/cairn_client/sync.py"
 
@@ -714,7 +715,7 @@ SWITCHES = (
     Switch(
         11,
         "an operator's retract is taken back by its seal alone",
-        SERVICE,
+        PUSHES,
         "speaks_for = Caller(Role.ADMIN) if is_sealed(row, pushed.data, seal) else caller",
         "speaks_for = Caller(Role.ADMIN)",
         "cairn_server/test_retract.py::test_a_retract_may_be_pushed_back_by_anybody_with_this_map_s_seal_on_it_and_by_nobody_without",
