@@ -1,7 +1,6 @@
 """Streams of a cell as they stand in its bytes, taken out, changed and put back."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import zstandard
 
@@ -28,7 +27,7 @@ def with_streams(data: bytes, *changed: StoredStream) -> bytes:
 def garbled(data: bytes, keep: Callable[[int], bool]) -> bytes:
     """The cell with other bytes, as many, in all streams but those to keep."""
     others = [stream for number, stream in bodies_of(data).items() if not keep(number)]
-    return with_streams(data, *(replace(stream, body=bytes(b ^ 0x5A for b in stream.body)) for stream in others))
+    return with_streams(data, *(stream._replace(body=bytes(b ^ 0x5A for b in stream.body)) for stream in others))
 
 
 def recoded(data: bytes, *, level: int | None) -> bytes:

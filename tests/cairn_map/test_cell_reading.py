@@ -1,7 +1,5 @@
 """Cells read in part, and groups of streams that do not fit each other."""
 
-from dataclasses import replace
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -45,7 +43,7 @@ def test_masks_behind_the_depth_asked_for_are_not_looked_at(geometry: Geometry) 
         sound = cell_reader(data).topology(depth)
         child, leaf = len(sound.child_masks), len(sound.leaf_masks)
         masks = [
-            replace(stream, body=stream.body[:kept] + bytes(len(stream.body) - kept))
+            stream._replace(body=stream.body[:kept] + bytes(len(stream.body) - kept))
             for stream, kept in ((bodies_of(data)[1], child), (bodies_of(data)[2], leaf))
         ]
         cut = with_streams(data, *masks)
@@ -167,7 +165,7 @@ def test_samples_behind_the_bricks_asked_for_are_not_looked_at() -> None:
     # The highest byte of every plane of counts and sums belongs to the last leaf.
     bodies = {number: stream for number, stream in bodies_of(data).items() if number in (3, 4) and stream.body[0] == 1}
     assert bodies
-    damaged = with_streams(data, *(replace(s, body=s.body[:-1] + b"\xff") for s in bodies.values()))
+    damaged = with_streams(data, *(s._replace(body=s.body[:-1] + b"\xff") for s in bodies.values()))
     sound = evidence_of(cell_reader(data).bricks(0, 20))
     assert head.voxels > len(sound) > 0
     assert evidence_of(cell_reader(damaged).bricks(0, 20)) == sound
