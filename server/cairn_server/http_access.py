@@ -6,7 +6,6 @@ token is looked up by its key, which takes some 40 us and waits for no writer.
 """
 
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
 from typing import Annotated
 
 from fastapi import Depends, Request
@@ -89,29 +88,6 @@ def reader_somewhere(caller: Annotated[Caller, Depends(anybody)]) -> Caller:
     """The caller, if it may read some map or all."""
     require(caller, *READING)
     return caller
-
-
-@dataclass(frozen=True, slots=True)
-class Door:
-    """A request to a map before it is known who makes it. For routes asked so often that a thread for each look at the
-    store is too much: they look themselves, in the one that they have.
-    """
-
-    service: Service
-    name: str
-    credentials: HTTPAuthorizationCredentials | None
-
-    def opened(self, *roles: Role) -> tuple[MapRow, Caller]:
-        """The map, and the caller on it, if it is an admin or has one of these roles."""
-        row = map_of(self.name, self.service, self.credentials)
-        caller = caller_on_map(self.service, row, self.credentials)
-        require(caller, *roles)
-        return row, caller
-
-
-async def door_of(name: str, service: Operations, credentials: Credentials) -> Door:
-    """The request's door."""
-    return Door(service, name, credentials)
 
 
 async def own_branch(branch: str, caller: OnMap) -> Caller:

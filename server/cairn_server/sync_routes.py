@@ -13,8 +13,8 @@ from starlette.concurrency import run_in_threadpool
 from cairn_map.commit_reading import commit_reader
 from cairn_map.errors import ConflictError
 from cairn_map.messages import MissingRequest, Pushed
-from cairn_server.auth import Role
-from cairn_server.http_access import OWNERS, READERS, Door, Map, Operations, body_of, door_of
+from cairn_server.auth import Caller, Role
+from cairn_server.http_access import OWNERS, READERS, Map, Operations, allowed, body_of
 
 COMMIT_MEDIA_TYPE = "application/vnd.cairn.commit"
 REPLY_MEDIA_TYPE = "application/vnd.cairn.reply"
@@ -29,13 +29,15 @@ AT_ONCE_BYTES = 1 << 16
 @router.put("/maps/{name}/commits/{commit}")
 async def push(
     commit: str,
-    door: Annotated[Door, Depends(door_of)],
+    service: Operations,
+    row: Map,
+    caller: Annotated[Caller, Depends(allowed(Role.ROBOT))],
     response: Response,
     data: Annotated[bytes, Depends(body_of)],
     cairn_seal: Annotated[str | None, Header(max_length=64)] = None,
 ) -> Pushed:
     """Push a commit: 201 new, 200 seen before, 409 other bytes under this id."""
-    pushes, (row, caller) = door.service.pushes, door.opened(Role.ROBOT)
+    pushes = service.pushes
     pushed = commit_reader(data) if len(data) <= AT_ONCE_BYTES else None
     try:
         if pushed is None or not pushes.is_quick(row, caller, pushed):
