@@ -111,18 +111,20 @@ class Outbox:
     def push_set(self, header: ReplyHeader | None) -> list[CommitId]:
         """Commits that the server may lack, oldest first.
 
-        All minus what the newest header covers, minus what is on the server's desk or was acknowledged since. A
+        All minus what the newest header covers, unless it wants it again, minus what is on the server's desk or was
+        acknowledged since. A
         commit that was never acknowledged is pushed even if its id is covered: after a roll-back of this robot's disk
         another commit may have that id (rule 13).
         """
         covered = header.coverage if header else EMPTY
         pending = header.pending_vector if header else EMPTY
+        wanted = set(header.wanted) if header else set()
         return [
             kept.id
             for kept in self._commits.values()
             if kept.has_data
             and kept.id not in self._acked_since_header
-            and not (kept.acked and (kept.id in covered or kept.id in pending))
+            and not (kept.acked and (kept.id in covered or kept.id in pending) and str(kept.id) not in wanted)
         ]
 
     def whole(self, commit: CommitId) -> Commit | None:

@@ -29,6 +29,8 @@ VectorJson = Annotated[dict[str, Annotated[list[Interval], FailFast()]], Field(m
 Time = Annotated[float, Field(allow_inf_nan=False)]
 
 CURSORS_MAX = 100_000
+WANTED_MAX = 256
+"""Commits that a header wants again."""
 DAMAGED_MAX = 256
 """Damaged cells named in one header; the others are named when these are healed."""
 SELECTING_PARTS = ("robot", "rig", "pushed_after_s", "pushed_before_s", "captured_after_s", "captured_before_s")
@@ -167,6 +169,8 @@ class ReplyHeader(_Model):
     """Retracting commits that are not yet stable."""
     damaged: Annotated[list[tuple[tuple[int, int, int], FingerprintText]], Field(max_length=DAMAGED_MAX)] = []
     """Cells that the server cannot read any more, and what they were: whoever has one as it was may send it."""
+    wanted: Annotated[list[IdText], Field(max_length=WANTED_MAX)] = []
+    """Commits whose evidence a retract needs and the server forgot: whoever has one pushes it again."""
 
     @property
     def to_cursor(self) -> Cursor:

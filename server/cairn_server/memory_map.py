@@ -11,7 +11,7 @@ from cairn_map.evidence import COUNT_MAX, SUM_MAX
 from cairn_map.grid import CellKey, Geometry
 from cairn_map.ids import Author, CommitId
 from cairn_map.sensor_model import SensorModel
-from cairn_server.push_policy import Numbering, check_number, evidence_gone
+from cairn_server.push_policy import AGAIN_KEPT_S, EvidenceGoneError, Numbering, check_number
 from cairn_server.store_rows import Branch, CellRow, Entry, Fold, Head, MapRow, NewCommit, StoredCommit
 
 
@@ -129,13 +129,15 @@ class MemoryMap:
         What is left of a commit is its row in the log; see `sqlite_retention`.
         """
         pinned = {target for kept in self.commits.values() if kept.folded_seq is None for target in kept.new.retracts}
+        again_s = min(before_s, time.time() - AGAIN_KEPT_S)
         old = [
             kept
             for commit, kept in self.commits.items()
             if kept.folded_seq is not None
             and kept.cells
             and not kept.is_gone
-            and max(kept.folded_s, kept.received_s) < before_s
+            and kept.folded_s < before_s
+            and kept.received_s < (again_s if kept.received_s > kept.folded_s and not kept.unfolded_seq else before_s)
             and commit not in pinned
         ]
         old.sort(key=lambda kept: kept.folded_s)
@@ -195,7 +197,7 @@ class MemoryMap:
         """Refuse to retract what cannot be subtracted any more."""
         known = [t for t in targets if t in self.commits and t not in self.retracted]
         if gone := [target for target in known if self.commits[target].is_gone]:
-            raise evidence_gone(gone)
+            raise EvidenceGoneError(gone)
 
     def _checked_intervals(self, commit: CommitId) -> int:
         """Intervals of the author's numbers with this one, if `push_policy` lets it in."""

@@ -15,7 +15,7 @@ from cairn_map.evidence import empty_evidence
 from cairn_map.fingerprint import ZERO, Fingerprint
 from cairn_map.frames import CELL_HEAD, CellFrame, Frame, FrameKind
 from cairn_map.grid import Cell, CellKey, Geometry, cell_key, cell_of_key
-from cairn_map.ids import Author, author_from_text
+from cairn_map.ids import Author, CommitId, author_from_text
 from cairn_map.messages import Done, MissingRequest, More, ReplyHeader
 from cairn_map.version_vector import VersionVector
 from cairn_server.cell_changes import change_since
@@ -29,6 +29,15 @@ log = logging.getLogger(__name__)
 
 REPLY_BYTES_MAX = 64 << 20
 """A longer reply ends with `more`, and the asker comes back for the rest."""
+
+
+@dataclass(frozen=True, slots=True)
+class Besides:
+    """What a header says beside a snapshot's own state."""
+
+    stable: VersionVector
+    damaged: frozenset[CellKey] = frozenset()
+    wanted: tuple[CommitId, ...] = ()
 
 
 @dataclass(slots=True)
@@ -88,13 +97,11 @@ def reply_frames(
     asker: Asker,
     geometry: Geometry,
     cache: ReadCache,
-    *,
-    stable: VersionVector,
-    damaged: frozenset[CellKey] = frozenset(),
+    besides: Besides,
 ) -> Iterator[Frame]:
     """Header, frames of the cells that the asker misses, and the end; all from one snapshot."""
     head = snapshot.head
-    yield header_of(snapshot, asker.author, stable=stable, damaged=damaged)
+    yield header_of(snapshot, asker.author, besides)
     rest = ZERO
     sent_bytes = 0
     listed = dict(asker.cells)
@@ -116,9 +123,7 @@ def reply_frames(
     yield Done(to=str(head.cursor), rest=rest.hex())
 
 
-def header_of(
-    snapshot: Snapshot, author: Author | None, *, stable: VersionVector, damaged: frozenset[CellKey] = frozenset()
-) -> ReplyHeader:
+def header_of(snapshot: Snapshot, author: Author | None, besides: Besides) -> ReplyHeader:
     """The state of a snapshot, as the author of some of its commits needs to know it."""
     head = snapshot.head
     tip = snapshot.tip(author) if author else None
@@ -126,11 +131,12 @@ def header_of(
     return ReplyHeader.model_construct(
         to=str(head.cursor),
         vector=head.vector.to_json(),
-        stable=stable.to_json(),
+        stable=besides.stable.to_json(),
         pending=snapshot.pending().to_json(),
         tip=(tip[0], tip[1].hex()) if tip else None,
-        retracts=[str(commit) for commit in snapshot.retracting() if commit not in stable],
-        damaged=as_named(snapshot, damaged),
+        retracts=[str(commit) for commit in snapshot.retracting() if commit not in besides.stable],
+        damaged=as_named(snapshot, besides.damaged),
+        wanted=[str(commit) for commit in besides.wanted],
     )
 
 

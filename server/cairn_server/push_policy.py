@@ -135,11 +135,18 @@ def _excess(content: CellContent, geometry: Geometry, tops: npt.NDArray[np.int64
     return None if above < 0 else f"samples of {geometry.channels[above].name} above {SAMPLE_MAX} steps"
 
 
-def evidence_gone(commits: Sequence[CommitId]) -> ConflictError:
+AGAIN_KEPT_S = 3600.0
+"""Evidence that was pushed again because a retract needs it is kept for this long, whatever the setting."""
+
+
+class EvidenceGoneError(ConflictError):
     """What a store says to a retract of commits whose evidence it does not keep any more."""
-    names = ", ".join(map(str, commits[:NAMED_MAX])) + (" ..." if len(commits) > NAMED_MAX else "")
-    return ConflictError(
-        "evidence_gone",
-        f"the evidence of {len(commits)} of these commits is not kept any more ({names}); push each again, from "
-        "whoever has its bytes, and then retract it",
-    )
+
+    def __init__(self, commits: Sequence[CommitId]) -> None:
+        names = ", ".join(map(str, commits[:NAMED_MAX])) + (" ..." if len(commits) > NAMED_MAX else "")
+        super().__init__(
+            "evidence_gone",
+            f"the evidence of {len(commits)} of these commits is not kept any more ({names}); robots that have their "
+            "bytes push them again when they sync, and then they can be retracted",
+        )
+        self.commits = tuple(commits)

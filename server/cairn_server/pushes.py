@@ -15,24 +15,28 @@ from cairn_server.auth import Caller, Role
 from cairn_server.checking import new_commit
 from cairn_server.commit_checks import CommitChecks
 from cairn_server.live import Hub
-from cairn_server.push_policy import check_claims
+from cairn_server.push_policy import EvidenceGoneError, check_claims
 from cairn_server.quotas import Meter
 from cairn_server.refusals import Refusals
 from cairn_server.retracting import is_sealed
 from cairn_server.settings import Settings
 from cairn_server.store import Store
 from cairn_server.store_rows import MapRow
+from cairn_server.wanted_commits import WantedCommits
 
 
 class Pushes:
     """What becomes of pushed bytes; called from many threads."""
 
-    def __init__(self, store: Store, settings: Settings, live: Hub, *, on_new: Callable[[], None]) -> None:
+    def __init__(
+        self, store: Store, settings: Settings, live: Hub, wanted: WantedCommits, *, on_new: Callable[[], None]
+    ) -> None:
         self.checks = CommitChecks(settings)
         self.meter = Meter(store, settings.quotas)
         self._store = store
         self._settings = settings
         self._live = live
+        self._wanted = wanted
         self._on_new = on_new
         self._refusals = Refusals()
 
@@ -56,7 +60,8 @@ class Pushes:
         Raises:
             BadInputError: not a commit for this map, not by this caller, or against `push_policy` or `quotas`.
             UnreachableError: kind `quota`: more than the robot may push now; or `disk_full`.
-            ConflictError: kind `id_taken`: the id is known with other bytes.
+            ConflictError: kind `id_taken`: the id is known with other bytes; or `evidence_gone`: of what it retracts,
+                which is wanted from now on.
         """
         self._store.health.check_space(self._settings.disk_free_min_bytes)
         speaks_for = Caller(Role.ADMIN) if is_sealed(row, pushed.data, seal) else caller
@@ -66,10 +71,15 @@ class Pushes:
             checked = self.checks.check(pushed)
             commit = Commit(pushed.meta, cells, checked.sha, pushed.data)
             kept = self._store.submit(row, new_commit(commit, checked.tops or (0,) * (2 + row.geometry.plane_count)))
-            yield kept
-            is_new = kept.result()
+            try:
+                yield kept
+                is_new = kept.result()
+            except EvidenceGoneError as exc:
+                self._wanted.note(row.name, exc.commits)
+                raise
             if is_new:
                 keep()
+        self._wanted.forget(row.name, commit.id)
         if is_new:
             self._on_new()
         if caller.robot:

@@ -36,7 +36,8 @@ from cairn_server.fold_health import FoldHealth
 from cairn_server.folder import Folder
 from cairn_server.healing import heal_cell, keep_healed
 from cairn_server.live import Hub
-from cairn_server.missing import asker_from_request, header_of, reply_frames
+from cairn_server.missing import Besides, asker_from_request, header_of, reply_frames
+from cairn_server.push_policy import EvidenceGoneError
 from cairn_server.pushes import Pushes
 from cairn_server.read_cache import ReadCache
 from cairn_server.readiness import Readiness
@@ -45,9 +46,10 @@ from cairn_server.robot_reports import RobotReports
 from cairn_server.server_figures import ServerFigures, process_lines, store_lines
 from cairn_server.settings import Settings
 from cairn_server.stable import StableVectors
-from cairn_server.store import Store
+from cairn_server.store import Snapshot, Store
 from cairn_server.store_rows import Branch, CellRow, Head, MapRow
 from cairn_server.vectors import vector_at
+from cairn_server.wanted_commits import WantedCommits
 
 RESERVED_NAMES = frozenset({OPERATOR, INITIAL, RobotName("main")})
 
@@ -67,7 +69,8 @@ class Service:
             store, self.folds, self.damaged, keep_evidence_s=settings.keep_evidence_s, on_fold=self.live.folded
         )
         self.readiness = Readiness(store.health, self.folds, settings, self._folder.is_alive)
-        self.pushes = Pushes(store, settings, self.live, on_new=self._folder.wake)
+        self._wanted = WantedCommits()
+        self.pushes = Pushes(store, settings, self.live, self._wanted, on_new=self._folder.wake)
         self._stable = StableVectors(settings.stable_after_s)
         self._reads = ReadCache()
         self._healing = threading.Lock()
@@ -128,8 +131,7 @@ class Service:
         with self.store.snapshot(row) as snapshot:
             asker = asker_from_request(request, snapshot)
             parts = [start_of_reply()]
-            stable, damaged = self._stable.of(row, snapshot), self.damaged.of(row.name)
-            frames = reply_frames(snapshot, asker, row.geometry, self._reads, stable=stable, damaged=damaged)
+            frames = reply_frames(snapshot, asker, row.geometry, self._reads, self._besides(row, snapshot))
             parts += [encode_frame(f) for f in self.figures.counted(frames)]
         keep_healed(self.store, row, asker.healed)
         self.damaged.note(row.name, asker.damaged)
@@ -145,7 +147,8 @@ class Service:
         Raises:
             NotFoundError: kind `nothing_to_retract`: none is named, or none fits.
             BadInputError: kind `not_retractable`: a retract is not retracted.
-            ConflictError: kind `evidence_gone`: push a commit's bytes again first.
+            ConflictError: kind `evidence_gone`: robots that have a commit's bytes must push them again first, and are
+                asked to from now on.
         """
         with self.store.snapshot(row) as snapshot:
             targets = targets_of(request, snapshot)
@@ -154,7 +157,11 @@ class Service:
             return Retracted(id=None, commits=names)
         author = Author(OPERATOR, self.operator)
         builders = retract_builders(row, author, targets, request.note)
-        ids = [str(self.store.append_built(row, author, build).id) for build in builders]
+        try:
+            ids = [str(self.store.append_built(row, author, build).id) for build in builders]
+        except EvidenceGoneError as exc:
+            self._wanted.note(row.name, exc.commits)
+            raise
         detail = f"map {row.name}: {ids[-1]} takes out {len(names)} commits: {request.note}"
         self.store.audit_log.add(by.name, "retract", detail)
         self._folder.wake()
@@ -178,8 +185,7 @@ class Service:
     def cell_index(self, row: MapRow, author: Author | None, page: IndexPage = FIRST_PAGE) -> CellIndex:
         """Some of the cells that were ever touched, and the state that they were read from."""
         with self.store.snapshot(row) as snapshot:
-            stable, damaged = self._stable.of(row, snapshot), self.damaged.of(row.name)
-            header = header_of(snapshot, author, stable=stable, damaged=damaged)
+            header = header_of(snapshot, author, self._besides(row, snapshot))
             return CellIndex(header=header, cells=entries_of(snapshot, page))
 
     def cell(self, row: MapRow, key: CellKey) -> tuple[CellRow | None, Head]:
@@ -224,6 +230,9 @@ class Service:
         self.store.deregister(row, branch)
         self.reports.forget(row, branch)
         self.live.robot_left(row, branch)
+
+    def _besides(self, row: MapRow, snapshot: Snapshot) -> Besides:
+        return Besides(self._stable.of(row, snapshot), self.damaged.of(row.name), self._wanted.of(row.name))
 
     def metrics_text(self) -> str:
         """All figures for Prometheus."""

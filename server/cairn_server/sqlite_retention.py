@@ -9,20 +9,24 @@ import time
 import apsw
 
 from cairn_map.ids import CommitId
-from cairn_server.push_policy import evidence_gone
+from cairn_server.push_policy import AGAIN_KEPT_S, EvidenceGoneError
 from cairn_server.sqlite_writer import first, rows
 from cairn_server.store_rows import MapRow, NewCommit
 
 
 def forget_evidence(connection: apsw.Connection, row: MapRow, before_s: float, limit: int) -> int:
-    """Drop the evidence of commits folded, and last pushed, before a time; how many."""
+    """Drop the evidence of commits folded, and last pushed, before a time; how many.
+
+    What was pushed again and is not taken out stays for `AGAIN_KEPT_S` at least: a retract may need it.
+    """
     pinned = _pinned(connection, row)
     found = rows(
         connection,
         "SELECT number, folded_seq, unfolded_seq, robot || '.' || incarnation || '.' || n FROM commits"
-        " WHERE map = ? AND gone = 0 AND cells > 0 AND folded_seq IS NOT NULL AND folded_s < ? AND received_s < ?"
+        " WHERE map = ? AND gone = 0 AND cells > 0 AND folded_seq IS NOT NULL AND folded_s < ?"
+        " AND received_s < CASE WHEN received_s > folded_s AND coalesce(unfolded_seq, 0) = 0 THEN ? ELSE ? END"
         " ORDER BY folded_s LIMIT ?",
-        (row.number, before_s, before_s, limit + len(pinned)),
+        (row.number, before_s, min(before_s, time.time() - AGAIN_KEPT_S), before_s, limit + len(pinned)),
     )
     gone = [(number, *seqs) for number, *seqs, commit in found if commit not in pinned][:limit]
     for number, folded_seq, unfolded_seq in gone:
@@ -62,7 +66,7 @@ def check_kept(connection: apsw.Connection, row: MapRow, targets: tuple[CommitId
         and not is_retracted(connection, row, target)
     ]
     if gone:
-        raise evidence_gone(gone)
+        raise EvidenceGoneError(gone)
 
 
 def is_retracted(connection: apsw.Connection, row: MapRow, commit: CommitId) -> bool:

@@ -79,6 +79,19 @@ def test_an_operator_s_retract_is_pushed_back_with_its_seal_after_what_it_names(
     assert conversation.send(None) == Push(retract, "the seal")
 
 
+def test_what_a_header_wants_again_is_pushed_once_though_it_is_covered(mole: Replica) -> None:
+    commits = [committed(mole, evidence) for evidence in (X, Y)]
+    for commit in commits:
+        mole.acknowledge(commit.id)
+    told = header(cursor(1), covering(*(commit.id for commit in commits)))
+    exchanged(mole, told)
+    assert mole.push_set() == []
+    exchanged(mole, told.model_copy(update={"wanted": [str(commits[1].id)]}))
+    assert mole.push_set() == [commits[1].id]
+    mole.acknowledge(commits[1].id)
+    assert mole.push_set() == []
+
+
 def test_a_viewer_pushes_nothing_but_operators_retracts(mole: Replica) -> None:
     committed(mole, X)
     retract = retract_of(CommitId(mole.author, 0))

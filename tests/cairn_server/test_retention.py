@@ -103,6 +103,28 @@ def test_what_is_gone_is_retracted_once_its_bytes_are_pushed_again(live: Live) -
     assert live.retract(row, commits[1]).status_code == 201, "what is out already needs no evidence"
 
 
+def wanted(live: Live, row: MapRow) -> list[str]:
+    told: list[str] = live.http.get(f"/maps/{row.name}/main/cells").json()["header"]["wanted"]
+    return told
+
+
+def test_evidence_that_a_refused_retract_needs_is_wanted_until_it_comes(live: Live) -> None:
+    row, commits = live.new_map(), [pushed(n, 3) for n in range(3)]
+    for commit in commits:
+        live.push(row, commit)
+    forget(live, row)
+    assert wanted(live, row) == []
+    amend = pushed(3, 1, retracts=[commits[1]])
+    assert kind_of(live.push(row, amend)) == "evidence_gone"
+    assert wanted(live, row) == [str(commits[1].id)]
+    assert kind_of(live.retract(row, commits[2])) == "evidence_gone"
+    assert wanted(live, row) == [str(commits[1].id), str(commits[2].id)]
+    live.push(row, commits[1])
+    assert wanted(live, row) == [str(commits[2].id)]
+    assert forget(live, row) == 0, "whoever needs it comes soon"
+    assert live.push(row, amend).status_code == 201
+
+
 def test_bytes_that_come_again_count_as_new_and_those_of_a_retracted_commit_change_nothing(live: Live) -> None:
     row, commit, gone = live.new_map(), pushed(0, 1), pushed(1, 2)
     for each in (commit, gone):
@@ -122,7 +144,7 @@ def test_evidence_that_a_waiting_commit_takes_out_is_kept(live: Live, monkeypatc
     row, commit = live.new_map(), pushed(0, 1)
     live.push(row, commit)
     live.folded(row)
-    monkeypatch.setattr(live.service._folder, "wake", lambda: None)
+    monkeypatch.setattr(live.service.pushes, "_on_new", lambda: None)
     live.push(row, pushed(1, 2, retracts=[commit]))
     assert live.service.store.forget_evidence(row, before_s=NOW, limit=100) == 0
     monkeypatch.undo()

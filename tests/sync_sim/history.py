@@ -21,7 +21,7 @@ from cairn_server import service as service_module
 MODES = ("high-end", "high-end", "low-end", "viewer", "high-end")
 LENGTH_S = 120.0
 STEPS_MAX = 50
-FINAL_ROUNDS = 5
+FINAL_ROUNDS = 6
 
 OFTEN = ("commit", "commit", "commit", "sync", "sync", "sync", "sync", "fold", "fold")
 SELDOM = (
