@@ -1,4 +1,7 @@
-"""A server's process from outside: memory and processor time, its children's included."""
+"""A server's process from outside: memory and processor time, its children's included.
+
+Of memory that processes share, each one's share is counted (PSS): children are forks of one another.
+"""
 
 import os
 import re
@@ -54,7 +57,7 @@ def sample_of(pid: int) -> Sample:
 def _of_process(pid: int) -> tuple[int, float]:
     folder = Path(f"/proc/{pid}")
     try:
-        resident = re.search(r"VmRSS:\s+(\d+)", (folder / "status").read_text())
+        resident = re.search(r"Pss:\s+(\d+)", (folder / "smaps_rollup").read_text())
         fields = (folder / "stat").read_text().rpartition(")")[2].split()
     except OSError:  # it ended meanwhile
         return 0, 0.0
