@@ -24,7 +24,9 @@ from cairn_map.evidence_map import EvidenceMap
 from cairn_map.fingerprint import ZERO, fingerprint
 from cairn_map.grid import Cell, CellKey, Geometry, cell_of_key
 from cairn_map.ids import OPERATOR, Author, CommitId, RobotName, commit_id_from_text
+from cairn_map.map_snapshot import STANDARD_MODEL, MapSnapshot, snapshot_of
 from cairn_map.messages import ReplyHeader, message_from_json
+from cairn_map.sensor_model import SensorModel
 from cairn_map.version_vector import EMPTY, VersionVector
 
 log = logging.getLogger(__name__)
@@ -46,6 +48,7 @@ class Replica:
         self.store = store
         self.geometry = geometry
         self.view = EvidenceMap(geometry)
+        self._snapshot: MapSnapshot | None = None
         self._identify({"robot": robot, "map": map_name, "geometry": geometry.model_dump_json()})
         self.outbox = Outbox(store, robot, geometry)
         header = store.get("header")
@@ -238,6 +241,15 @@ class Replica:
         own = [evidence for commit in self._uncovered(key) if (evidence := self._sound(commit, key)) is not None]
         shown = self.base_evidence(key) if base is None else base
         self.view.replace(key, sum_evidence([shown, *own], self.geometry) if own else shown)
+
+    def snapshot(self, model: SensorModel = STANDARD_MODEL) -> MapSnapshot:
+        """The view as it is now, unmoved by what comes later; what did not change since the last one is kept."""
+        with self.lock:
+            if self._snapshot is not None and self._snapshot.model == model:
+                self._snapshot = self._snapshot.refreshed(self.view)
+            else:
+                self._snapshot = snapshot_of(self.view, model)
+            return self._snapshot
 
     def close(self) -> None:
         """Close the file."""

@@ -101,6 +101,8 @@ class Robot:
         self._integrator = integrator or Integrator()
         self._measurement = self._new_measurement()
         self.status = OwnStatus()
+        self.snapshot = self._replica.snapshot
+        """`robot.snapshot()`: the map as it is now, to ask (`map_snapshot.MapSnapshot`); by any thread."""
         self._round = threading.Lock()
         self._thread: SyncThread | None = None
         self._is_closed = False

@@ -2,6 +2,8 @@
 
 `merge` and `unmerge` are exact inverses, in any order, because all of it is integer addition. Both ask first and
 change nothing when a sum would leave its range. `packed` gives the canonical form back.
+
+A `copy` costs nothing until one of the two is changed: they share their arrays, and who adds takes new ones first.
 """
 
 from collections.abc import Iterable
@@ -18,12 +20,13 @@ from cairn_map.sample_rows import SampleRows
 class BrickCell:
     """Sums of evidence over one cell; not thread-safe."""
 
-    __slots__ = ("_counts", "_geometry", "_samples")
+    __slots__ = ("_counts", "_geometry", "_is_shared", "_samples")
 
     def __init__(self, geometry: Geometry) -> None:
         self._geometry = geometry
         self._counts = BrickCounts(geometry.depth)
         self._samples = SampleRows(geometry.plane_count)
+        self._is_shared = False
 
     def merge(self, diff: Evidence) -> None:
         """Add a diff.
@@ -43,11 +46,28 @@ class BrickCell:
         """
         self._add(diff, -1)
 
+    def copy(self) -> "BrickCell":
+        """The same sums; what either cell adds from here on goes into arrays of its own."""
+        copied = BrickCell.__new__(BrickCell)
+        copied._geometry, copied._counts, copied._samples = self._geometry, self._counts, self._samples
+        self._is_shared = copied._is_shared = True
+        return copied
+
     def packed(self) -> Evidence:
         """The canonical packed evidence: rising Morton order, no zeros."""
         sampled_voxels, samples = self._samples.packed()
         voxels, counts, sampled = self._counts.packed(sampled_voxels)
         return Evidence(voxels, counts, sampled, samples)
+
+    @property
+    def counts(self) -> BrickCounts:
+        """Hits and misses, to be read."""
+        return self._counts
+
+    @property
+    def samples(self) -> SampleRows:
+        """Sums of samples, to be read."""
+        return self._samples
 
     @property
     def size_bytes(self) -> int:
@@ -57,6 +77,8 @@ class BrickCell:
     def _add(self, diff: Evidence, sign: int) -> None:
         check_fits(diff, self._geometry)
         diff = _in_rows(diff)
+        if self._is_shared:
+            self._counts, self._samples, self._is_shared = self._counts.copy(), self._samples.copy(), False
         # Negative sums are legal on the way (a delta may come before what it takes away); the caller that holds a
         # finished state checks it by fingerprint.
         self._samples.add(diff, sign)

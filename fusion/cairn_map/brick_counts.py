@@ -16,6 +16,8 @@ from cairn_map.grid import BRICK_DEPTH
 
 Voxels = npt.NDArray[np.uint32]
 Counts = npt.NDArray[np.int32]
+BrickNumbers = npt.NDArray[np.int16]
+Pool = npt.NDArray[np.int16] | npt.NDArray[np.int32]
 
 
 class BrickCounts:
@@ -24,8 +26,8 @@ class BrickCounts:
     __slots__ = ("_bound", "_brick_of", "_pool")
 
     def __init__(self, depth: int) -> None:
-        self._brick_of = np.full(8 ** (depth - BRICK_DEPTH), -1, np.int16)
-        self._pool: npt.NDArray[np.int16] | npt.NDArray[np.int32] = np.zeros((0, 512, 2), np.int16)
+        self._brick_of: BrickNumbers = np.full(8 ** (depth - BRICK_DEPTH), -1, np.int16)
+        self._pool: Pool = np.zeros((0, 512, 2), np.int16)
         self._bound = 0
 
     def add(self, voxels: Voxels, counts: Counts, sign: int) -> None:
@@ -54,6 +56,22 @@ class BrickCounts:
         out = np.empty(V, np.uint32), np.empty((V, 2), np.int32), np.empty(len(sampled), np.uint32)
         kernels.pack_into(self._brick_of, self._pool, sampled, *out)
         return out
+
+    def copy(self) -> "BrickCounts":
+        """The same sums in arrays of its own."""
+        copied = BrickCounts.__new__(BrickCounts)
+        copied._brick_of, copied._pool, copied._bound = self._brick_of.copy(), self._pool.copy(), self._bound
+        return copied
+
+    @property
+    def brick_of(self) -> BrickNumbers:
+        """(8^(depth - 3),) row of `pool` by a brick's Morton number, -1 where there is none; to be read only."""
+        return self._brick_of
+
+    @property
+    def pool(self) -> Pool:
+        """(B, 512, 2) hits and misses of each brick's voxels in Morton order; to be read only."""
+        return self._pool
 
     @property
     def size_bytes(self) -> int:

@@ -1,6 +1,7 @@
 """A map in memory: cells by number, each a sum of evidence. What a robot sees, and what a server folds.
 
 map.merge(diff)      add a measurement         map.unmerge(diff)      take it out again, exactly
+map.copy()           what it holds now, at the price of a list of its cells
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -51,6 +52,16 @@ class EvidenceMap:
         cell = BrickCell(self.geometry)
         cell.merge(evidence)
         self._cells[key] = cell
+
+    def copy(self) -> "EvidenceMap":
+        """The same sums, unmoved by what is merged from here on; cells share their arrays until one is changed."""
+        copied = EvidenceMap(self.geometry)
+        copied._cells = {key: cell.copy() for key, cell in self._cells.items()}
+        return copied
+
+    def cell(self, key: CellKey) -> BrickCell | None:
+        """One cell's sums, to be read; None if there is none."""
+        return self._cells.get(key)
 
     def evidence(self, key: CellKey) -> Evidence:
         """Packed evidence of one cell; empty if nothing is known of it."""

@@ -21,6 +21,7 @@ Voxels = npt.NDArray[np.uint32]
 Sums = npt.NDArray[np.int64]
 Magnitudes = npt.NDArray[np.uint64]
 Places = npt.NDArray[np.int32]
+Rows = tuple[Voxels, Places, npt.NDArray[np.int32], npt.NDArray[np.int64], Sums]
 
 NARROW_MAX = (1 << 31) - 1
 
@@ -67,6 +68,18 @@ class SampleRows:
         out = np.empty(S, np.uint32), np.empty((S, self._narrow.shape[1]), np.int64)
         kernels.pack_rows_into(self._known, self._row_of, self._narrow, self._wide_planes, self._wide, *out)
         return out
+
+    def copy(self) -> "SampleRows":
+        """The same sums in arrays of its own."""
+        copied = SampleRows.__new__(SampleRows)
+        for name in self.__slots__:
+            setattr(copied, name, getattr(self, name).copy())
+        return copied
+
+    @property
+    def rows(self) -> Rows:
+        """`known`, `row_of`, `narrow`, the planes that are in `wide`, and `wide`; to be read only."""
+        return self._known, self._row_of, self._narrow, self._wide_planes, self._wide
 
     @property
     def size_bytes(self) -> int:

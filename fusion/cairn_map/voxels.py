@@ -26,6 +26,11 @@ class Reading:
     spread: Floats | None = None
     """(N,) standard deviation of the samples, temperature only."""
 
+    def rows(self, rows: npt.NDArray[np.int64]) -> "Reading":
+        """Of these voxels alone, in this order."""
+        spread = None if self.spread is None else self.spread[rows]
+        return Reading(self.channel, self.mean[rows], self.weight[rows], spread)
+
 
 @dataclass(frozen=True, slots=True)
 class Voxels:
@@ -39,6 +44,11 @@ class Voxels:
 
     def __len__(self) -> int:
         return len(self.numbers)
+
+    def rows(self, rows: npt.NDArray[np.int64]) -> "Voxels":
+        """These voxels alone, in this order."""
+        readings = {name: reading.rows(rows) for name, reading in self.readings.items()}
+        return Voxels(self.numbers[rows], self.centres_m[rows], self.counts[rows], self.probability[rows], readings)
 
     def of_kind(self, kind: ChannelKind) -> Reading | None:
         """The first reading of a kind, or None if the map has no such channel."""
@@ -55,7 +65,7 @@ def voxels_of_evidence(
     numbers = voxels_in_cell(evidence.voxels[keep], key, geometry)
     counts = evidence.counts[keep]
     readings = {
-        channel.name: _reading(channel, samples[keep][:, geometry.planes_of(channel.name)])
+        channel.name: reading_of_sums(channel, samples[keep][:, geometry.planes_of(channel.name)])
         for channel in geometry.channels
     }
     return Voxels(numbers, centres_of_voxels(numbers, geometry), counts, model.probability(counts), readings)
@@ -79,7 +89,8 @@ def joined_voxels(parts: list[Voxels]) -> Voxels:
     )
 
 
-def _reading(channel: Channel, sums: npt.NDArray[np.int64]) -> Reading:
+def reading_of_sums(channel: Channel, sums: npt.NDArray[np.int64]) -> Reading:
+    """What (N, planes) sums of one channel mean."""
     weight = sums[:, -1]
     divisor = np.where(weight > 0, weight, np.nan)
     values = sums[:, : channel.value_count] / divisor[:, None]

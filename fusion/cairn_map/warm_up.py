@@ -21,8 +21,10 @@ from cairn_map.evidence import (
     packed_evidence,
 )
 from cairn_map.evidence_kernels import channel_above
+from cairn_map.evidence_map import EvidenceMap
 from cairn_map.fingerprint import fingerprint
 from cairn_map.grid import BRICK_DEPTH, Geometry, cell_key, voxels_in_cell
+from cairn_map.map_snapshot import snapshot_of
 from cairn_map.sensor_model import SensorModel
 from cairn_map.view_code import decode_view, encode_view
 
@@ -48,6 +50,26 @@ def warm_up() -> None:
         channel_above(evidence.samples, planes_and_squares(geometry.channels), 1)
         voxels_in_cell(evidence.voxels, key, geometry)
     decode_view(encode_view(key, modelled, geometry, SensorModel()))
+    for evidence in (small, large):
+        _ask(evidence, geometry)
+
+
+def _ask(evidence: Evidence, geometry: Geometry) -> None:
+    """Every query of a map of one cell."""
+    whole = EvidenceMap(geometry)
+    whole.replace(cell_key((0, 0, 0)), evidence)
+    snapshot = snapshot_of(whole)
+    points = np.full((1, 3), geometry.voxel_edge_m / 2)
+    snapshot.state_at(points)
+    snapshot.counts_at(points)
+    snapshot.log_odds_at(points)
+    snapshot.colour_at(points)
+    snapshot.cast_rays(points, np.ones((1, 3)), max_range_m=1)
+    snapshot.check_sphere(points, radius_m=0.1)
+    snapshot.nearest_occupied(points, radius_m=1)
+    snapshot.nearest_unknown(points, radius_m=1)
+    snapshot.frontier()
+    snapshot.height_map()
 
 
 def _many_voxels(geometry: Geometry) -> Evidence:

@@ -5,7 +5,9 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +27,8 @@ from cairn_map.cell_code import Profile
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, DeniedError, UnreachableError
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.messages import Register
+from cairn_map.sensor_model import SensorModel
+from cairn_map.state_grid import State
 
 Until = Callable[[Callable[[], bool]], None]
 NOWHERE = "http://127.0.0.1:9/maps/lab"
@@ -63,6 +67,53 @@ def test_without_a_server_a_robot_maps_on_and_forgets_nothing(tmp_path: Path) ->
     with robot_in(tmp_path) as robot:
         assert cells_of(robot.map) == cells_of(evidence_of(1, 2, 3))
         assert robot.waiting == 2
+
+
+def test_a_robot_asks_its_map_without_a_server_and_its_snapshot_stays(tmp_path: Path) -> None:
+    with robot_in(tmp_path) as robot:
+        assert len(robot.snapshot().voxels_in()) == 0
+        map_commit(robot, 1)
+        first = robot.snapshot()
+        occupied = first.occupied_in()
+        assert len(occupied) > 0
+        assert (first.state_at(occupied.centres_m) == State.OCCUPIED).all()
+        assert first.nearest_occupied(occupied.centres_m, radius_m=1).distance_m.tolist() == [0] * len(occupied)
+        counts = first.counts_at(occupied.centres_m).tolist()
+        map_commit(robot, 1)
+        assert first.counts_at(occupied.centres_m).tolist() == counts
+        assert robot.snapshot().counts_at(occupied.centres_m).tolist() == (2 * np.array(counts)).tolist()
+        wary = SensorModel(p_occupied=0.9)
+        assert robot.snapshot(wary).model == wary
+        assert len(robot.snapshot(wary).occupied_in()) < len(robot.snapshot().occupied_in())
+
+
+def test_a_snapshot_is_taken_and_asked_while_another_thread_syncs(server: LiveServer, tmp_path: Path) -> None:
+    with (
+        robot_in(tmp_path, server.map_url) as mole,
+        robot_in(tmp_path, server.map_url, name="bat") as bat,
+        ThreadPoolExecutor(1) as asking,
+    ):
+        mole.start_sync(every_s=0.01)
+        done = threading.Event()
+
+        def ask() -> int:
+            asked = 0
+            while not done.is_set():
+                snapshot = mole.snapshot()
+                voxels = snapshot.voxels_in()
+                assert snapshot.counts_at(voxels.centres_m).tolist() == voxels.counts.tolist()
+                asked += 1
+            return asked
+
+        asked = asking.submit(ask)
+        try:
+            for seed in range(1, 7):
+                map_commit(bat, seed)
+                bat.sync()
+                map_commit(mole, seed)
+        finally:
+            done.set()
+        assert asked.result() > 0
 
 
 def test_two_robots_share_a_map(server: LiveServer, tmp_path: Path) -> None:

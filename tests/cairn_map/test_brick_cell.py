@@ -1,5 +1,7 @@
 """The law: merging is integer addition, in any order, and nothing else."""
 
+from contextlib import suppress
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -49,6 +51,29 @@ def edge_evidence(draw: st.DrawFn) -> Evidence:
     samples = np.zeros((len(voxels), geometry.plane_count), np.int64)
     samples[draw(st.integers(0, 1))] = [draw(sums) for _ in range(geometry.plane_count)]
     return packed_evidence(np.array(list(voxels), np.uint32), np.array(list(voxels.values())), samples, geometry)
+
+
+@given(st.lists(edge_evidence(), max_size=2), edge_evidence(), st.booleans())
+def test_a_copy_and_its_cell_do_not_see_what_the_other_merges(
+    before: list[Evidence], diff: Evidence, into_copy: bool
+) -> None:
+    cell = BrickCell(TWO_CHANNELS)
+    with suppress(BadInputError):
+        for evidence in before:
+            cell.merge(evidence)
+    copied, held = cell.copy(), cell.packed()
+    assert copied.packed() == held
+    changed, other = (copied, cell) if into_copy else (cell, copied)
+    alone = brick_cell(TWO_CHANNELS, [held])
+    with suppress(BadInputError):
+        changed.merge(diff)
+    with suppress(BadInputError):
+        alone.merge(diff)
+    assert other.packed() == held
+    assert changed.packed() == alone.packed()
+    with suppress(BadInputError):
+        other.merge(diff)
+    assert other.packed() == alone.packed()
 
 
 @given(st.lists(st.tuples(edge_evidence(), st.sampled_from([1, -1])), min_size=1, max_size=6))
