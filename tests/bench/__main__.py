@@ -24,6 +24,7 @@ from pathlib import Path
 from tests.bench.coding import coding_rows
 from tests.bench.integration import integration_rows
 from tests.bench.peers import peer_rows
+from tests.bench.queries import query_rows
 from tests.bench.server import server_rows
 from tests.bench.simulation import simulation_rows
 from tests.bench.start import start_rows
@@ -227,6 +228,7 @@ PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "coding": coding_rows,
     "integration": integration_rows,
     "peers": peer_rows,
+    "queries": query_rows,
     "server": server_rows,
     "simulation": simulation_rows,
     "start": start_rows,

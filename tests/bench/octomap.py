@@ -14,7 +14,9 @@ from cairn_calib.rig import Rig
 from cairn_fusion.scan import Scan
 from cairn_fusion.transfer import points_from_range
 
-SOURCE = Path(__file__).with_name("octomap_driver.cpp")
+DRIVER = "octomap_driver"
+QUERIES = "octomap_queries"
+"""Names of the programs, and of their sources in this folder."""
 HEADER = Path("/usr/include/octomap/octomap.h")
 RANGE_MAX_M = 10.0
 
@@ -27,6 +29,17 @@ class OctomapRun:
     leaves: int
 
 
+@dataclass(frozen=True, slots=True)
+class OctomapAnswers:
+    """The fewest CPU seconds that points and rays took, and what they found."""
+
+    points_s: float
+    known: int
+    occupied: int
+    rays_s: float
+    hits: int
+
+
 def missing() -> str:
     """Why OctoMap cannot be measured here; empty if it can."""
     if shutil.which("g++") is None:
@@ -34,11 +47,11 @@ def missing() -> str:
     return "" if HEADER.exists() else "no OctoMap (apt-get install liboctomap-dev)"
 
 
-def compiled_driver(folder: Path) -> Path:
-    """The driver, compiled for this machine."""
-    driver = folder / "octomap_driver"
+def compiled_driver(folder: Path, name: str = DRIVER) -> Path:
+    """One of the programs, compiled for this machine."""
+    driver, source = folder / name, Path(__file__).with_name(f"{name}.cpp")
     options = ["-O3", "-march=native", "-DNDEBUG", "-o", str(driver)]
-    subprocess.run(["g++", *options, str(SOURCE), "-loctomap", "-loctomath"], check=True)
+    subprocess.run(["g++", *options, str(source), "-loctomap", "-loctomath"], check=True)
     return driver
 
 
@@ -73,6 +86,26 @@ def insert_scans(driver: Path, scans: Path, *, voxel_edge_m: float) -> OctomapRu
 def colour_tree(driver: Path, scans: Path, colours: Path, out: Path, *, voxel_edge_m: float) -> OctomapRun:
     """The same as a `ColorOcTree` with these colours, written to `out` (.ot)."""
     return _run([str(driver), str(scans), str(voxel_edge_m), str(RANGE_MAX_M), str(colours), str(out)])
+
+
+def write_queries(
+    folder: Path,
+    centres_m: npt.NDArray[np.float64],
+    log_odds: npt.NDArray[np.float64],
+    points_m: npt.NDArray[np.float64],
+    rays: npt.NDArray[np.float64],
+) -> None:
+    """A map's known voxels, points and (N, 6) rays, as `ask` reads them."""
+    for name, rows in (("voxels", np.column_stack([centres_m, log_odds])), ("points", points_m), ("rays", rays)):
+        (folder / name).write_bytes(rows.astype("<f4").tobytes())
+
+
+def ask(queries: Path, folder: Path, *, voxel_edge_m: float, range_max_m: float, repeats: int) -> OctomapAnswers:
+    """OctoMap's answers to what `write_queries` left in a folder, on that very map."""
+    voxels, points, rays = (str(folder / name) for name in ("voxels", "points", "rays"))
+    command = [str(queries), voxels, str(voxel_edge_m), points, rays, str(range_max_m), str(repeats)]
+    said = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+    return OctomapAnswers(float(said[0]), int(said[1]), int(said[2]), float(said[3]), int(said[4]))
 
 
 def _run(command: list[str]) -> OctomapRun:
