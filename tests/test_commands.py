@@ -181,7 +181,7 @@ def test_after_a_replay_the_server_knows_that_the_robot_is_level(
     url = f"{server}/maps/level"
     cairn("robot", "replay", room_recording, "--map", url, "--voxel", VOXEL_M, folder=tmp_path)
     cairn("robot", "pull", "--map", url, "--state", "cairn-room", folder=tmp_path)
-    assert "0 entries behind" in cairn("map", "info", url, folder=tmp_path)
+    assert "0 log entries since it last asked" in cairn("map", "info", url, folder=tmp_path)
 
 
 def test_files_that_cannot_be_written_and_cells_with_negative_numbers(

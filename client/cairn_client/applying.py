@@ -150,9 +150,11 @@ class Exchange:
         """Rule 8: cells without a frame move to `to`, only if they are where they were and their sum agrees."""
         if self._has_dropped:
             return
-        rest = {key: self._replica.cells[key] for key in self._asked.keys() - self._framed}
+        unframed = self._asked.keys() - self._framed
+        rest = {key: cell for key in unframed if (cell := self._replica.cells.get(key)) is not None}
         total = sum((cell.fingerprint for cell in rest.values()), ZERO)
-        if any(cell.cursor != self._asked[key] for key, cell in rest.items()) or total != done.rest_fingerprint:
+        stands = {key: cell.cursor for key, cell in rest.items()}
+        if stands != {key: self._asked[key] for key in unframed} or total != done.rest_fingerprint:
             log.warning("cells without a frame do not add up to the server's; comparing all fingerprints")
             self.must_compare = True
             return

@@ -10,6 +10,7 @@ import numpy as np
 
 from cairn_map.brick_cell import brick_cell
 from cairn_map.cell_code import Profile, decode_canonical_cell, encode_cell
+from cairn_map.cell_reading import cell_reader
 from cairn_map.channels import planes_and_squares
 from cairn_map.errors import BadInputError
 from cairn_map.evidence import (
@@ -50,6 +51,12 @@ def warm_up() -> None:
         channel_above(evidence.samples, planes_and_squares(geometry.channels), 1)
         voxels_in_cell(evidence.voxels, key, geometry)
     decode_view(encode_view(key, modelled, geometry, SensorModel()))
+    for evidence in made:
+        reader = cell_reader(encode_cell(key, evidence, geometry).data)
+        _ = reader.octree().brick_count
+        for c in range(len(geometry.channels)):
+            reader.channel(c)
+        reader.bricks(0, 1)
     for evidence in (small, large):
         _ask(evidence, geometry)
 

@@ -19,10 +19,10 @@ def test_a_fold_is_followed_by_a_rest_only_if_commits_came_meanwhile() -> None:
 def test_what_comes_while_the_folder_rests_is_folded_together(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     """The rest lasts until all is there; then one fold takes it."""
     all_there, row, groups = threading.Event(), live.new_map(), []
-    fold_pending = folder.fold_pending
+    fold_around = folder.fold_around
 
     def noted(*args: object, **kwargs: object) -> int:
-        count: int = fold_pending(*args, **kwargs)  # type: ignore[arg-type]
+        count: int = fold_around(*args, **kwargs)  # type: ignore[arg-type]
         if count:
             groups.append(count)
             if len(groups) == 1:  # commits come while it folds
@@ -35,7 +35,7 @@ def test_what_comes_while_the_folder_rests_is_folded_together(live: Live, monkey
             all_there.set()
         return 0.0
 
-    monkeypatch.setattr(folder, "fold_pending", noted)
+    monkeypatch.setattr(folder, "fold_around", noted)
     monkeypatch.setattr(folder, "rest_s", rest)
     live.push(row, pushed(0, 0))
     assert all_there.wait(20)
