@@ -1,4 +1,7 @@
-"""What a robot tells of itself with every sync: where it is, what waits, how it is doing. Losing one costs nothing."""
+"""What a robot tells of itself as it syncs: where it is, what waits, how it is doing. Losing one costs nothing.
+
+A robot that stands still says so once a minute, and not with every sync: each is a request more.
+"""
 
 import logging
 import time
@@ -14,10 +17,13 @@ from cairn_map.robot_status import Mode, RobotStatus
 
 log = logging.getLogger(__name__)
 
+TELL_AGAIN_S = 60.0
+"""A status that did not change is told again after this."""
+
 
 @dataclass(slots=True)
 class OwnStatus:
-    """Set its fields at any time; the next sync tells them."""
+    """Set its fields at any time; the next sync tells them if they are others than the last ones."""
 
     pose: ScanPose | None = None
     """Of the last scan, unless something better is known."""
@@ -25,9 +31,10 @@ class OwnStatus:
     """Charge, 0 to 1."""
     note: str = ""
     """Anything else for people, to 256 characters."""
+    _told: RobotStatus | None = None
 
     def tell(self, replica: Replica, api: MapApi, map_name: str, *, branch: str, mode: Mode) -> None:
-        """Send it; a failure is logged and is no failure of the sync."""
+        """Send it, unless it was told of late; a failure is logged and is no failure of the sync."""
         try:
             with replica.lock:
                 waiting = replica.push_set()
@@ -41,8 +48,16 @@ class OwnStatus:
                 battery=self.battery,
                 note=self.note,
             )
-            api.put_status(map_name, branch, status)
+            if self._told is None or _says_more(status, self._told):
+                api.put_status(map_name, branch, status)
+                self._told = status
         except ValidationError as exc:
             log.warning("this robot's status cannot be told: %s", first_error(exc))
         except CairnError as exc:
             log.info("this robot's status was not taken: %s: %s", exc.kind, exc.message)
+
+
+def _says_more(status: RobotStatus, told: RobotStatus) -> bool:
+    """Whether it is old, or says anything else than the one before."""
+    is_old = not 0 <= status.time_s - told.time_s < TELL_AGAIN_S
+    return is_old or status.model_copy(update={"time_s": told.time_s}) != told

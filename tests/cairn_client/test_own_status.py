@@ -2,11 +2,13 @@
 
 from pathlib import Path
 
+import pytest
 from tests.cairn_client.conftest import LiveServer
 from tests.cairn_client.made import MAP
 from tests.cairn_client.robot_program import scan_of
 from tests.cairn_client.test_robot import map_commit, robot_in
 
+from cairn_client import own_status
 from cairn_client.api import MapApi
 from cairn_client.branch_table import branch_table, shown_age
 from cairn_map.commit import ScanPose
@@ -41,6 +43,31 @@ def test_a_robot_tells_its_status_with_every_sync(server: LiveServer, tmp_path: 
         with MapApi(server.url) as api:
             api.put_view(MAP, "mole", b"\xff\xd8\xff picture")
             assert api.view(MAP, "mole") == b"\xff\xd8\xff picture"
+
+
+def test_a_status_is_told_when_it_says_something_new_or_is_a_minute_old(
+    server: LiveServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with robot_in(tmp_path, server.map_url) as mole:
+        map_commit(mole, 1)
+        told: list[RobotStatus] = []
+        put_status = mole._api.put_status
+
+        def noted(name: str, branch: str, status: RobotStatus) -> None:
+            put_status(name, branch, status)
+            told.append(status)
+
+        monkeypatch.setattr(mole._api, "put_status", noted)
+        for _ in range(3):
+            mole.sync()
+        assert len(told) == 1
+        mole.status.note = "at the stairs"
+        mole.sync()
+        assert [status.note for status in told] == ["", "at the stairs"]
+        for later_s, count in ((59.0, 2), (61.0, 3), (-5.0, 4)):  # the clock may be set back, too
+            monkeypatch.setattr(own_status.time, "time", lambda later_s=later_s: told[1].time_s + later_s)
+            mole.sync()
+            assert len(told) == count
 
 
 def test_a_status_that_is_not_taken_does_not_stop_the_sync(server: LiveServer, tmp_path: Path) -> None:

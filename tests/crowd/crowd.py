@@ -1,6 +1,6 @@
 """Robots that only speak the protocol: each with a connection that stays open, in rounds as `cairn_client` has them.
 
-    every so often    (push one scan, once a minute)   missing from the own cursor   status
+    every so often    missing from the own cursor; once a minute one scan before it, and a status after it
 
 Rounds of all robots are spread evenly over the time between two, and so are their pushes over the minute. A robot
 that was late does not catch up: it skips rounds, which are counted.
@@ -75,10 +75,12 @@ class CrowdRobot:
         while due_s < end_s:
             await asyncio.sleep(due_s - time.perf_counter())
             try:
-                if number % crowd.pushes_each == offset:
+                has_moved = number % crowd.pushes_each == offset
+                if has_moved:
                     await self.push()
                 await self.fetch(self._seen.fetches)
-                await self.report()
+                if has_moved:
+                    await self.report()
             except (BadAnswerError, OSError) as exc:
                 self._seen.errors[_named(exc)] += 1
                 await self._again()
