@@ -14,6 +14,7 @@ from typing import Any, Self
 
 import pytest
 from tests.cairn_client.made import GEOMETRY, MAP, cells_of, random_diff
+from tests.sync_sim.server import FoldOnRequest, StableBackup
 
 from cairn_client import replica_store
 from cairn_client.answers import FetchedCell
@@ -33,7 +34,7 @@ from cairn_map.grid import Cell, CellKey, cell_key
 from cairn_map.ids import OPERATOR, Author, CommitId, RobotName, commit_id_from_text
 from cairn_map.index_messages import CellIndex
 from cairn_map.messages import CreateMap, MissingRequest, Pushed, Retract
-from cairn_map.version_vector import EMPTY, VersionVector
+from cairn_map.version_vector import EMPTY
 from cairn_server import service as service_module
 from cairn_server import sqlite_store, sqlite_writer
 from cairn_server.auth import Caller, Role
@@ -55,32 +56,6 @@ class Fault:
     call: int
     kind: str
     frames: int = 0
-
-
-class FoldOnRequest:
-    """In the place of the folding thread."""
-
-    def __init__(self, *parts: object, **settings: object) -> None:
-        pass
-
-    def is_alive(self) -> bool:
-        return True
-
-    def wake(self) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
-
-
-class StableBackup:
-    """In the place of a setting of time: what the last backup holds."""
-
-    def __init__(self, vector: VersionVector) -> None:
-        self._vector = vector
-
-    def of(self, row: object, snapshot: object) -> VersionVector:
-        return self._vector
 
 
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,8 +47,8 @@ class FoldOnRequest:
 class StableBackup:
     """In the place of a setting of time: what the oldest backup holds."""
 
-    def __init__(self) -> None:
-        self.vector: VersionVector = EMPTY
+    def __init__(self, vector: VersionVector = EMPTY) -> None:
+        self.vector = vector
 
     def of(self, row: object, snapshot: object) -> VersionVector:
         return self.vector
