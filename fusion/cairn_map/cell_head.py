@@ -113,7 +113,7 @@ def decode_head(data: bytes) -> tuple[CellHead, bytes]:
 
 def is_canonical_head(head: CellHead, data: bytes) -> bool:
     """Whether a head's own bytes, as `decode_head` gave them, are those that `encode_head` makes of it."""
-    return _is_canonical(head.geometry, data[FIXED_PART.size :])
+    return _is_canonical(head.geometry, data[FIXED_PART.size :])  # pyright: ignore[reportArgumentType]
 
 
 @lru_cache(maxsize=16)

@@ -158,7 +158,7 @@ def _channel_into(
     values = planes - 1 - squares
     rows = 0
     for n in range(size[0]):
-        rows += ones(data[at[0] + n])
+        rows += ones(data[at[0] + n])  # pyright: ignore[reportArgumentType]
     row, before, weight_before = 0, 0, np.uint64(0)
     for s in range(sampled.shape[0]):
         leaf = sampled[s]
@@ -204,4 +204,4 @@ def _any_presence(data: Bytes, at: Ints, spec: Ints, n: int) -> np.uint8:
     for c in range(spec.shape[0]):
         bits |= data[at[s] + n]
         s += 1 + spec[c, 0]
-    return bits
+    return bits  # pyright: ignore[reportReturnType]

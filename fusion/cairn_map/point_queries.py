@@ -46,7 +46,8 @@ def log_odds_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> Floats:
     for part, cell, rows, places in _located(frozen, points):
         bricks, pool = cell.counts.brick_of, cell.counts.pool
         if pool.dtype == np.int16:
-            kernels.log_odds_into(rows, places, bricks, pool, *odds_of_counts(model), *clamps, odds[part])
+            tables = odds_of_counts(model)  # pyright: ignore[reportArgumentType]
+            kernels.log_odds_into(rows, places, bricks, pool, *tables, *clamps, odds[part])
         else:
             counts = pool[bricks[places[rows] >> 9], places[rows] & 511].astype(np.int32)
             odds[part][rows] = np.where(known(counts), model.log_odds(counts), np.nan)

@@ -44,7 +44,8 @@ def states_of_counts(counts: BrickCounts, model: SensorModel) -> CellStates:
     pool = counts.pool
     words = np.empty((len(pool), 8, 2), np.uint64)
     if pool.dtype == np.int16:
-        kernels.states_of_counts_into(pool, *odds_of_counts(model), log_odds(model.p_occupied), words)
+        tables = odds_of_counts(model)  # pyright: ignore[reportArgumentType]
+        kernels.states_of_counts_into(pool, *tables, log_odds(model.p_occupied), words)
     else:
         rows = pool.reshape(-1, 2)
         for n, bits in ((kernels.OCCUPIED_BITS, model.occupied(rows)), (kernels.KNOWN_BITS, known(rows))):

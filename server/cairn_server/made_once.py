@@ -26,15 +26,14 @@ class MadeOnce(Generic[K, V]):
 
     def get(self, name: K, make: Callable[[], V]) -> V:
         """The value of a name; what `make` raises is raised to all who wait for it, and not kept."""
+        mine: Future[V] = Future()
         with self._lock:
             if name in self._kept:
                 self._kept.move_to_end(name)
                 return self._kept[name]
-            others = self._making.get(name)
-            if others is None:
-                mine = self._making[name] = Future()
-        if others is not None:
-            return others.result()
+            maker = self._making.setdefault(name, mine)
+        if maker is not mine:
+            return maker.result()
         try:
             value = make()
         except BaseException as exc:
