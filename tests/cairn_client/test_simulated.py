@@ -6,7 +6,7 @@
 import pytest
 from tests.sync_sim.history import failures, run_seed
 
-SEEDS, PART = 2000, 100
+SEEDS, PART = 800, 50
 
 
 @pytest.mark.parametrize("first", range(0, SEEDS, PART))
