@@ -36,7 +36,6 @@ from pydantic import ValidationError
 
 from cairn_map.errors import BadInputError
 from cairn_server import backup_command, check_command, restore_command
-from cairn_server.heap import keep_few_arenas
 from cairn_server.http_deadlines import protocol_of
 from cairn_server.log_format import LogForm, start_logging
 from cairn_server.routes import make_app
@@ -90,7 +89,6 @@ def main(argv: list[str]) -> int:
     settings.check_tls()
     signal.signal(signal.SIGTERM, _stop)
     sys.setswitchinterval(SWITCH_S)
-    keep_few_arenas()
     with listen(settings.host, settings.port) as listener:
         try:
             with closing(Service(SqliteStore(settings.folder), settings)) as service:
