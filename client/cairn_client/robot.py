@@ -13,7 +13,7 @@ import logging
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal, Self, TypeVar
+from typing import Self
 
 from pydantic import ValidationError
 
@@ -22,6 +22,7 @@ from cairn_client.answers import Traffic
 from cairn_client.api import MapApi
 from cairn_client.link import Link
 from cairn_client.map_url import split_map_url
+from cairn_client.membership import Membership
 from cairn_client.outbox import UNNUMBERED
 from cairn_client.own_status import OwnStatus
 from cairn_client.replica import Replica
@@ -35,16 +36,13 @@ from cairn_fusion.scan import Scan
 from cairn_map.cell_code import Profile
 from cairn_map.commit import Commit, CommitMeta
 from cairn_map.compile_progress import show_compiling
-from cairn_map.errors import BadInputError, CairnError, DeniedError, first_error
+from cairn_map.errors import BadInputError, CairnError, first_error
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.grid import Geometry
 from cairn_map.ids import CommitId, robot_name
-from cairn_map.messages import Register
+from cairn_map.robot_status import Mode
 
 log = logging.getLogger(__name__)
-
-Mode = Literal["high-end", "low-end", "viewer"]
-T = TypeVar("T")
 
 
 class Robot:
@@ -87,9 +85,7 @@ class Robot:
         self.name = robot_name(name)
         self.mode: Mode = mode
         self._rig = rig
-        self._enrolment_token = token
         self._scope = scope
-        self._is_known_by_token = False
         self._api = MapApi(server_url, token=token)
         self._link = Link(self._api, self._map_name, branch=self.name)
         try:
@@ -97,7 +93,10 @@ class Robot:
         except BaseException:
             self._api.close()
             raise
-        self._api.token = self._replica.token() or token
+        sensors = list(rig.cameras) if rig else []
+        self._membership = Membership(
+            self._api, self._replica, map_name=self._map_name, mode=mode, sensors=sensors, enrolment_token=token
+        )
         self._integrator = integrator or Integrator()
         self._measurement = self._new_measurement()
         self.status = OwnStatus()
@@ -181,7 +180,7 @@ class Robot:
             CairnError: the server refuses this robot, or its data is damaged.
         """
         with self._round:
-            return self._as_registered(lambda: self._sync_once(on_push))
+            return self._membership.as_member(lambda: self._sync_once(on_push))
 
     def start_sync(self, *, every_s: float = 5.0) -> None:
         """Sync in the background: after each commit, and at least every so many seconds while there is a link."""
@@ -210,14 +209,13 @@ class Robot:
         if self._thread is not None:
             self._thread.stop()
             self._thread = None
-        self._api.deregister(self._map_name, self.name)
-        self._replica.set_token(None)
+        self._membership.leave()
 
     def _flush(self) -> None:
         if self.mode == "viewer" or not self.waiting:
             return
         try:
-            self._as_registered(lambda: self._link.hold(push_commits(self._replica)))
+            self._membership.as_member(lambda: self._link.hold(push_commits(self._replica)))
         except CairnError as exc:
             log.warning("%d commits wait in the directory: %s", self.waiting, exc.message)
 
@@ -229,39 +227,6 @@ class Robot:
         report.pushed, report.refused = pushes.pushed, pushes.refused
         self.status.tell(self._replica, self._api, self._map_name, branch=self.name, mode=self.mode)
         return report
-
-    def _as_registered(self, action: Callable[[], T]) -> T:
-        """Do it as a robot that the server knows: register first if need be, and anew if the token is not good."""
-        if self._replica.token() is None and not self._is_known_by_token:
-            self._register()
-        try:
-            return action()
-        except DeniedError as exc:
-            if exc.kind != "bad_token":
-                raise
-            self._replica.set_token(None)  # the server was replaced, or somebody registered under this name
-            self._is_known_by_token = False
-            self._register()
-            return action()
-
-    def _register(self) -> None:
-        self._api.token = self._enrolment_token
-        request = Register(
-            robot=self.name,
-            mode=self.mode,
-            incarnation=self._replica.author.incarnation,
-            sensors=list(self._rig.cameras) if self._rig else [],
-        )
-        try:
-            registered = self._api.register(self._map_name, request)
-        except DeniedError as exc:
-            if exc.kind != "not_allowed":
-                raise
-            self._is_known_by_token = True  # perhaps an admin gave the robot a token of its own; else the next ask says
-            return
-        if registered.map.geometry != self._replica.geometry:
-            raise BadInputError("other_geometry", f"map {self._map_name} has another grid than this robot's directory")
-        self._replica.set_token(registered.token)
 
     def _open(self, directory: Path, geometry: Geometry | None) -> Replica:
         """The durable state; its grid is the given one, the remembered one, or the server's."""

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from cairn_calib.poses import Transform
 from cairn_calib.rig import Rig
-from cairn_client.robot import Mode, Robot
+from cairn_client.robot import Robot
 from cairn_map.errors import CairnError, UnreachableError
+from cairn_map.robot_status import Mode
 from cairn_sim.heads import RANGE_CAMERA
 from cairn_sim.kinematics import Manipulator, measurement_joints
 from cairn_sim.record import CLOCK_START_S, SCAN_S

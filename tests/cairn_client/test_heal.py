@@ -11,13 +11,13 @@ from tests.cairn_client.test_damage import flip_a_bit
 from tests.cairn_client.test_robot import evidence_of, map_commit, robot_in
 from tests.cairn_client.test_sync import Team
 
-from cairn_client import map_command, robot_command
+from cairn_client import map_command, replay_command
 from cairn_client.api import MapApi
-from cairn_client.robot import Mode
 from cairn_map.cell_code import encode_cell
 from cairn_map.cell_folder import write_cell
 from cairn_map.errors import CairnError, DamagedDataError
 from cairn_map.grid import CellKey, cell_of_key
+from cairn_map.robot_status import Mode
 
 MAP = "lab"
 X, Y = seen(1, 2, kelvin_steps=7), seen(2, 100)
@@ -178,7 +178,7 @@ def test_a_replay_goes_on_though_a_cell_of_the_server_is_damaged(
     damage(server, min(evidence_of(1).packed()))
     with robot_in(tmp_path, server.map_url, name="owl") as owl:
         map_commit(owl, 2)
-        assert robot_command._try_sync(owl)
+        assert replay_command._try_sync(owl)
         assert owl.waiting == 0
     assert "all others came" in caplog.text
 

@@ -11,7 +11,6 @@ from tests.cairn_client.test_sync import Team
 
 from cairn_client import robot_command
 from cairn_client.api import MapApi
-from cairn_client.robot import Mode
 from cairn_client.scope import BoxMetres, Scope
 from cairn_client.sync import ROUNDS_MAX
 from cairn_map.errors import BadInputError
@@ -19,6 +18,7 @@ from cairn_map.frames import CELL_HEAD, CellFrame
 from cairn_map.grid import Cell, cell_key, cell_of_key
 from cairn_map.ids import commit_id_from_text
 from cairn_map.messages import MissingRequest, More
+from cairn_map.robot_status import Mode
 
 EDGE_M = GEOMETRY.cell_edge_m
 EVERY_CELL = {Cell(i, j, 0) for i in range(-5, 5) for j in range(7)}

@@ -1,0 +1,42 @@
+"""Arguments that the robot's commands share."""
+
+import argparse
+
+from cairn_client.arguments import add_token, allow_negative_lists
+from cairn_client.scope import Scope
+from cairn_map.errors import BadInputError
+
+
+def add_map(command: argparse.ArgumentParser) -> None:
+    """Which map, as whom, and how much of it."""
+    allow_negative_lists(command)
+    command.add_argument("--map", required=True, metavar="URL", help="http://HOST:PORT/maps/NAME")
+    command.add_argument("--name", help="the robot's name on the map")
+    command.add_argument("--box", type=_box, metavar="X0,Y0,Z0,X1,Y1,Z1", help="fetch only cells in it, metres")
+    command.add_argument(
+        "--reply-bytes", type=int, metavar="BYTES", help="of cells in one reply; the rest comes in the next ones"
+    )
+    add_token(command)
+
+
+def scope_of(args: argparse.Namespace) -> Scope:
+    """What of the map to fetch."""
+    if args.reply_bytes is not None and args.mode == "low-end":
+        raise BadInputError("bad_option", "--reply-bytes bounds the answers with differences; low-end fetches cells")
+    return Scope(box_m=(args.box[:3], args.box[3:]) if args.box else None, reply_bytes_max=args.reply_bytes)
+
+
+def place(text: str) -> tuple[float, float, float]:
+    """X,Y,Z in metres."""
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected X,Y,Z in metres, got {text!r}") from None
+    return x, y, z
+
+
+def _box(text: str) -> tuple[float, ...]:
+    parts = text.split(",")
+    if len(parts) != 6:
+        raise argparse.ArgumentTypeError(f"expected X0,Y0,Z0,X1,Y1,Z1 in metres, got {text!r}")
+    return (*place(",".join(parts[:3])), *place(",".join(parts[3:])))
