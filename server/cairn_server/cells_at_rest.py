@@ -31,6 +31,9 @@ class DamagedCellError(DamagedDataError):
         super().__init__("damaged_store", message)
         self.key = key
 
+    def __reduce__(self) -> tuple[type["DamagedCellError"], tuple[CellKey, str]]:  # type: ignore[override]
+        return type(self), (self.key, self.message)
+
 
 def stored_evidence(stored: CellRow) -> Evidence:
     """The evidence of a cell at rest.

@@ -22,12 +22,13 @@ import sys
 from pathlib import Path
 
 from cairn_map.commit_reading import commit_reader
-from cairn_map.errors import CairnError
+from cairn_map.errors import BadInputError, CairnError, DamagedDataError
 from cairn_map.warm_up import warm_up
-from cairn_server.checking import check_commit
+from cairn_server.checking import Checked, check_commit
 
 LENGTH = struct.Struct("<Q")
 PR_SET_PDEATHSIG = 1
+FAMILIES: dict[str, type[CairnError]] = {family.__name__: family for family in (BadInputError, DamagedDataError)}
 RETIRED_SHARE = 4
 """A worker that ever held more than this part of its memory is replaced after its answer, so that memory goes back."""
 
@@ -50,7 +51,7 @@ def main(control_fd: int, memory_bytes: int) -> None:
 
 def _be_worker(fd: int, memory_bytes: int) -> None:
     try:
-        _die_with_parent()
+        die_with_parent()
         limit, start_bytes = _address_space_bytes() + memory_bytes, _peak_bytes()
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -79,6 +80,18 @@ def answer_to(data: bytes) -> dict[str, object]:
     return {"sha": checked.sha.hex(), "tops": checked.tops}
 
 
+def checked_from(answer: dict[str, object]) -> Checked:
+    """What `answer_to` found, but for a lack of memory.
+
+    Raises:
+        BadInputError, DamagedDataError: what it found wrong.
+    """
+    if "family" in answer:
+        raise FAMILIES[str(answer["family"])](str(answer["kind"]), str(answer["message"]))
+    tops = answer["tops"]
+    return Checked(bytes.fromhex(str(answer["sha"])), tuple(tops) if isinstance(tops, list) else ())
+
+
 def send(channel: socket.socket, data: bytes) -> None:
     """A length, and as many bytes."""
     channel.sendall(LENGTH.pack(len(data)))
@@ -102,7 +115,8 @@ def _exactly(channel: socket.socket, size_bytes: int) -> bytes | None:
     return bytes(data)
 
 
-def _die_with_parent() -> None:
+def die_with_parent() -> None:
+    """End this process as soon as the one that forked it ends, however that does."""
     parent = os.getppid()
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:

@@ -17,8 +17,8 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from cairn_map.errors import BadInputError, CairnError, DamagedDataError, UnreachableError
-from cairn_server.check_nursery import LENGTH, received, send
+from cairn_map.errors import BadInputError, UnreachableError
+from cairn_server.check_nursery import LENGTH, checked_from, received, send
 from cairn_server.checking import Checked
 
 log = logging.getLogger(__name__)
@@ -33,7 +33,6 @@ LOOK_S = 0.05
 """How often a worker's processor time is looked at."""
 STALL_FACTOR = 20.0
 """A worker that got so little of the processor is given up after this many times its limit, by the clock."""
-FAMILIES: dict[str, type[CairnError]] = {family.__name__: family for family in (BadInputError, DamagedDataError)}
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
@@ -184,10 +183,7 @@ class CheckPool:
     def _read(self, answer: dict[str, object]) -> Checked:
         if "memory" in answer:
             raise _too_costly(f"more than {self._memory_bytes} bytes of memory")
-        if "family" in answer:
-            raise FAMILIES[str(answer["family"])](str(answer["kind"]), str(answer["message"]))
-        tops = answer["tops"]
-        return Checked(bytes.fromhex(str(answer["sha"])), tuple(tops) if isinstance(tops, list) else ())
+        return checked_from(answer)
 
     def _new_worker(self) -> _Worker:
         ours, theirs = socket.socketpair()

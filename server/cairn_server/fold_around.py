@@ -12,9 +12,8 @@ from dataclasses import dataclass, field
 from cairn_map.grid import CellKey, cell_of_key
 from cairn_server.cell_cache import CellCache
 from cairn_server.cells_at_rest import DamagedCellError, cell_to_change
-from cairn_server.damaged_cells import DamagedCells
+from cairn_server.fold_store import Damage, FoldStore
 from cairn_server.folding import GROUP_BYTES_MAX, fold_commits
-from cairn_server.store import Store
 from cairn_server.store_rows import MapRow, StoredCommit
 
 log = logging.getLogger(__name__)
@@ -44,7 +43,7 @@ class Waiting:
 
 
 def fold_around(
-    store: Store, row: MapRow, cache: CellCache, waiting: Waiting, damaged: DamagedCells, *, limit: int
+    store: FoldStore, row: MapRow, cache: CellCache, waiting: Waiting, damaged: Damage, *, limit: int
 ) -> int:
     """Fold up to `limit` pending commits that touch no damaged cell; returns how many were.
 
@@ -82,7 +81,7 @@ def fold_around(
     return 0
 
 
-def _touches(store: Store, row: MapRow, commit: StoredCommit, cells: set[CellKey]) -> bool:
+def _touches(store: FoldStore, row: MapRow, commit: StoredCommit, cells: set[CellKey]) -> bool:
     """Whether to fold a commit, or to take out what it retracts, changes one of these cells."""
     if not cells:
         return False
@@ -92,7 +91,7 @@ def _touches(store: Store, row: MapRow, commit: StoredCommit, cells: set[CellKey
     return any(target is not None and not cells.isdisjoint(target.diff) for target in targets)
 
 
-def _can_be_read(store: Store, row: MapRow, key: CellKey) -> bool:
+def _can_be_read(store: FoldStore, row: MapRow, key: CellKey) -> bool:
     try:
         with store.snapshot(row) as snapshot:
             cell_to_change(snapshot, key, row.geometry)

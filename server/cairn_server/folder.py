@@ -6,17 +6,15 @@ import time
 from collections.abc import Callable
 
 from cairn_map.errors import CairnError
-from cairn_server.cell_cache import CACHE_BYTES, CellCache
 from cairn_server.damaged_cells import DamagedCells
-from cairn_server.fold_around import Waiting, fold_around
 from cairn_server.fold_health import FoldHealth
+from cairn_server.fold_here import Folded, FoldHere
+from cairn_server.fold_process import FoldProcess, LostProcessError
 from cairn_server.store import Store
 from cairn_server.store_rows import MapRow
 
 log = logging.getLogger(__name__)
 
-GROUP_MAX = 256
-"""Commits folded at once."""
 REST_SHARE, REST_MAX_S = 3.0, 0.5
 """While robots push, a fold is followed by a rest of so many times its length, at the longest this. What comes in it is
 folded together, each cell encoded once: 15 cells take 30 ms, for one scan or 200 of them; merging a scan takes 1 ms."""
@@ -40,6 +38,7 @@ class Folder:
         *,
         keep_evidence_s: float,
         on_fold: Callable[[MapRow], None],
+        process: FoldProcess | None = None,
     ) -> None:
         self._store = store
         self._health = health
@@ -49,8 +48,8 @@ class Folder:
         self._forget_next_s = 0.0
         self._wake = threading.Event()
         self._closing = threading.Event()
-        self._caches: dict[str, CellCache] = {}
-        self._waiting: dict[str, Waiting] = {}
+        self._process = process
+        self._here = FoldHere(store, damaged)
         self._wake.set()
         self._thread = threading.Thread(target=self._run, name="cairn-folder", daemon=True)
         self._thread.start()
@@ -68,6 +67,9 @@ class Folder:
         self._closing.set()
         self._wake.set()
         self._thread.join()
+        if self._process is not None:
+            self._process.close()
+            self._process = None
 
     def _run(self) -> None:
         retry_s = FIRST_RETRY_S
@@ -131,19 +133,27 @@ class Folder:
         return self._store.forget_evidence(row, before_s=before_s, limit=FORGET_MAX)
 
     def _fold_group(self, row: MapRow, maps: int) -> int:
-        cache = self._caches.setdefault(row.name, CellCache(row.geometry))
-        cache.limit_bytes = CACHE_BYTES // maps
         start_s = time.monotonic()
-        waiting = self._waiting.setdefault(row.name, Waiting())
-        count = fold_around(self._store, row, cache, waiting, self._damaged, limit=GROUP_MAX)
-        self._health.folded(row.name, count, time.monotonic() - start_s)
-        if waiting.why is not None:
-            self._health.failed(row.name, waiting.why)
-        if count:
+        folded = self._folded(row, maps)
+        self._health.folded(row.name, folded.commits, time.monotonic() - start_s)
+        if folded.waits_for is not None:
+            self._health.failed(row.name, folded.waits_for)
+        if folded.commits:
             self._on_fold(row)
-            log.info("map %s: folded %d commits in %.0f ms", row.name, count, (time.monotonic() - start_s) * 1e3)
-        cache.trim()
-        return count
+            log.info(
+                "map %s: folded %d commits in %.0f ms", row.name, folded.commits, 1e3 * (time.monotonic() - start_s)
+            )
+        return folded.commits
+
+    def _folded(self, row: MapRow, maps: int) -> Folded:
+        if self._process is not None:
+            try:
+                return self._process.fold(row, self._store, self._damaged, maps=maps)
+            except LostProcessError:
+                log.error("the process that folds was killed; folding in the server's own until the next start")
+                self._process.close()
+                self._process = None
+        return self._here.fold(row, maps=maps)
 
 
 def rest_s(took_s: float, *, is_pushed: bool) -> float:

@@ -23,8 +23,8 @@ from cairn_map.grid import CellKey
 from cairn_map.ids import CommitId
 from cairn_server.cell_cache import CellCache, Step
 from cairn_server.cells_at_rest import cell_to_change, decode_stored
+from cairn_server.fold_store import FoldStore
 from cairn_server.stamps import Stamps
-from cairn_server.store import Store
 from cairn_server.store_rows import Entry, Fold, Head, MapRow, StoredCommit
 
 log = logging.getLogger(__name__)
@@ -37,7 +37,7 @@ class DamagedCommitError(DamagedDataError):
     """A commit at rest is not what was pushed."""
 
 
-def fold_pending(store: Store, row: MapRow, cache: CellCache, *, limit: int) -> int:
+def fold_pending(store: FoldStore, row: MapRow, cache: CellCache, *, limit: int) -> int:
     """Fold up to `limit` pending commits; returns how many were.
 
     Raises:
@@ -46,7 +46,7 @@ def fold_pending(store: Store, row: MapRow, cache: CellCache, *, limit: int) -> 
     return fold_commits(store, row, cache, store.pending(row, limit=limit, size_bytes_max=GROUP_BYTES_MAX))
 
 
-def fold_commits(store: Store, row: MapRow, cache: CellCache, commits: Sequence[StoredCommit]) -> int:
+def fold_commits(store: FoldStore, row: MapRow, cache: CellCache, commits: Sequence[StoredCommit]) -> int:
     """Fold these pending commits; returns how many were.
 
     Raises:
@@ -74,7 +74,7 @@ def fold_commits(store: Store, row: MapRow, cache: CellCache, commits: Sequence[
     return len(commits) if written else 0
 
 
-def plan_fold(store: Store, row: MapRow, head: Head, commits: Sequence[StoredCommit], cache: CellCache) -> Fold:
+def plan_fold(store: FoldStore, row: MapRow, head: Head, commits: Sequence[StoredCommit], cache: CellCache) -> Fold:
     """What folding these commits on top of `head` changes; `cache` stands at `head`."""
     plan = _Plan(store, row, cache, head.cursor)
     for commit in commits:
@@ -92,7 +92,7 @@ def plan_fold(store: Store, row: MapRow, head: Head, commits: Sequence[StoredCom
 
 @dataclass(slots=True)
 class _Plan:
-    store: Store
+    store: FoldStore
     row: MapRow
     cache: CellCache
     start: Cursor

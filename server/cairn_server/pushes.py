@@ -1,18 +1,21 @@
 """A commit from its bytes to the answer that it is kept: claims, quotas, check, store.
 
-Acknowledge only what is durable and fully validated. Nobody needs to wait while the store writes: there is a future of
-its answer.
+Acknowledge only what is durable and fully validated. Small ones are kept by the event loop, which does other things
+while another process checks and while the store writes.
 """
 
-from collections.abc import Callable, Iterator
+import asyncio
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager
 
 from cairn_map.commit import Commit
 from cairn_map.commit_reading import CommitReader, commit_reader
 from cairn_map.errors import ConflictError
+from cairn_map.grid import CellKey
 from cairn_server.auth import Caller, Role
-from cairn_server.checking import new_commit
+from cairn_server.check_process import CheckProcess
+from cairn_server.checking import Checked, new_commit
 from cairn_server.commit_checks import CommitChecks
 from cairn_server.live import Hub
 from cairn_server.push_policy import EvidenceGoneError, check_claims
@@ -29,9 +32,16 @@ class Pushes:
     """What becomes of pushed bytes; called from many threads."""
 
     def __init__(
-        self, store: Store, settings: Settings, live: Hub, wanted: WantedCommits, *, on_new: Callable[[], None]
+        self,
+        store: Store,
+        settings: Settings,
+        live: Hub,
+        wanted: WantedCommits,
+        *,
+        on_new: Callable[[], None],
+        process: CheckProcess | None = None,
     ) -> None:
-        self.checks = CommitChecks(settings)
+        self.checks = CommitChecks(settings, process)
         self.meter = Meter(store, settings.quotas)
         self._store = store
         self._settings = settings
@@ -44,16 +54,28 @@ class Pushes:
         """Keep a commit; True if it is new. When this returns, no power cut can lose it.
 
         Raises:
-            As `keeping`.
+            As `admitted`.
         """
-        with self.keeping(row, caller, id_text, commit_reader(data), seal=seal) as kept:
-            return kept.result()
+        reader = commit_reader(data)
+        with self.admitted(row, caller, id_text, reader, seal=seal) as admitted:
+            return admitted.keep(self.checks.check(reader)).result()
+
+    async def keep_soon(
+        self, row: MapRow, caller: Caller, id_text: str, pushed: CommitReader, *, seal: str | None = None
+    ) -> bool:
+        """`keep` for a quick one, while the event loop does other things.
+
+        Raises:
+            As `keep`.
+        """
+        with self.admitted(row, caller, id_text, pushed, seal=seal) as admitted:
+            return await asyncio.wrap_future(admitted.keep(await self.checks.check_soon(pushed)))
 
     @contextmanager
-    def keeping(
-        self, row: MapRow, caller: Caller, id_text: str, pushed: CommitReader, *, seal: str | None = None
-    ) -> Iterator[Future[bool]]:
-        """Keep a commit; what it gives says, some milliseconds later, that it is durable, and True if it is new.
+    def admitted(
+        self, row: MapRow, caller: Caller, id_text: str, pushed: CommitReader, *, seal: str | None
+    ) -> Iterator["_Admitted"]:
+        """A commit that may be kept once it is checked; its room is taken for the length of the `with`.
 
         Anybody may push back a retract that bears this server's own seal.
 
@@ -67,27 +89,24 @@ class Pushes:
         speaks_for = Caller(Role.ADMIN) if is_sealed(row, pushed.data, seal) else caller
         cells = pushed.cells
         check_claims(row, speaks_for, id_text, pushed.meta, cells=len(cells))
-        with self.meter.spending(row, caller, size_bytes=len(pushed.data), cells=cells) as keep:
-            checked = self.checks.check(pushed)
-            commit = Commit(pushed.meta, cells, checked.sha, pushed.data)
-            kept = self._store.submit(row, new_commit(commit, checked.tops or (0,) * (2 + row.geometry.plane_count)))
+        with self.meter.spending(row, caller, size_bytes=len(pushed.data), cells=cells) as take:
+            admitted = _Admitted(self._store, row, pushed, cells)
             try:
-                yield kept
-                is_new = kept.result()
+                yield admitted
             except EvidenceGoneError as exc:
                 self._wanted.note(row.name, exc.commits)
                 raise
-            if is_new:
-                keep()
-        self._wanted.forget(row.name, commit.id)
-        if is_new:
+            if admitted.is_new():
+                take()
+        self._wanted.forget(row.name, pushed.meta.commit_id)
+        if admitted.is_new():
             self._on_new()
         if caller.robot:
             self._store.seen(row, caller.robot, None)
             self._live.robot_heard(row, caller.robot)
 
     def is_quick(self, row: MapRow, caller: Caller, pushed: CommitReader) -> bool:
-        """Whether `keeping` will be done in a moment, and wait for nobody."""
+        """Whether `keep_soon` may keep it: its check is done in a moment, and nothing else waits for anybody."""
         return self.checks.is_quick(pushed) and (caller.robot is None or self.meter.is_ready(row))
 
     def note_conflict(self, row: MapRow, caller: Caller, conflict: ConflictError) -> None:
@@ -98,3 +117,25 @@ class Pushes:
     def close(self) -> None:
         """End the workers that check."""
         self.checks.close()
+
+
+class _Admitted:
+    """A commit that nothing but its evidence can be refused for."""
+
+    def __init__(self, store: Store, row: MapRow, pushed: CommitReader, cells: Mapping[CellKey, bytes]) -> None:
+        self._store = store
+        self._row = row
+        self._pushed = pushed
+        self._cells = cells
+        self._kept: Future[bool] | None = None
+
+    def keep(self, checked: Checked) -> Future[bool]:
+        """Keep it; some milliseconds later it is durable, and it is known whether it is new."""
+        commit = Commit(self._pushed.meta, self._cells, checked.sha, self._pushed.data)
+        tops = checked.tops or (0,) * (2 + self._row.geometry.plane_count)
+        self._kept = self._store.submit(self._row, new_commit(commit, tops))
+        return self._kept
+
+    def is_new(self) -> bool:
+        """Whether it was, once it is durable."""
+        return self._kept is not None and self._kept.result()

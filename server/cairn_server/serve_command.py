@@ -36,12 +36,14 @@ from pydantic import ValidationError
 
 from cairn_map.errors import BadInputError
 from cairn_server import backup_command, check_command, restore_command
+from cairn_server.check_process import fork_checking
+from cairn_server.fold_process import fork_folding
 from cairn_server.http_deadlines import protocol_of
 from cairn_server.log_format import LogForm, start_logging
 from cairn_server.routes import make_app
 from cairn_server.service import Service
 from cairn_server.settings import LOOPBACK, Quotas, Settings
-from cairn_server.sqlite_store import SqliteStore
+from cairn_server.sqlite_store import FILE_NAME, SqliteStore
 
 log = logging.getLogger(__name__)
 
@@ -89,9 +91,11 @@ def main(argv: list[str]) -> int:
     settings.check_tls()
     signal.signal(signal.SIGTERM, _stop)
     sys.setswitchinterval(SWITCH_S)
+    folding, checking = fork_folding(settings.folder / FILE_NAME), fork_checking()  # before there are threads
     with listen(settings.host, settings.port) as listener:
         try:
-            with closing(Service(SqliteStore(settings.folder), settings)) as service:
+            store = SqliteStore(settings.folder)
+            with closing(Service(store, settings, fold_process=folding, check_process=checking)) as service:
                 _serve(service, listener)
         except KeyboardInterrupt:
             pass

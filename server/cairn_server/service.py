@@ -31,8 +31,10 @@ from cairn_server.auth import Caller, new_token, token_hash
 from cairn_server.branch_list import branch_infos
 from cairn_server.cell_index import FIRST_PAGE, IndexPage, entries_of
 from cairn_server.cells_at_rest import DamagedCellError, sound_cell
+from cairn_server.check_process import CheckProcess
 from cairn_server.damaged_cells import DamagedCells
 from cairn_server.fold_health import FoldHealth
+from cairn_server.fold_process import FoldProcess
 from cairn_server.folder import Folder
 from cairn_server.healing import heal_cell, keep_healed
 from cairn_server.live import Hub
@@ -57,7 +59,15 @@ RESERVED_NAMES = frozenset({OPERATOR, INITIAL, RobotName("main")})
 class Service:
     """The map server's operations on one store."""
 
-    def __init__(self, store: Store, settings: Settings) -> None:
+    def __init__(
+        self,
+        store: Store,
+        settings: Settings,
+        *,
+        fold_process: FoldProcess | None = None,
+        check_process: CheckProcess | None = None,
+    ) -> None:
+        """Use the processes given; without them the same is done here."""
         self.store = store
         self.settings = settings
         self.figures = ServerFigures()
@@ -66,11 +76,16 @@ class Service:
         self.live = Hub(store)
         self.reports = RobotReports(store, self.live)
         self._folder = Folder(
-            store, self.folds, self.damaged, keep_evidence_s=settings.keep_evidence_s, on_fold=self.live.folded
+            store,
+            self.folds,
+            self.damaged,
+            keep_evidence_s=settings.keep_evidence_s,
+            on_fold=self.live.folded,
+            process=fold_process,
         )
         self.readiness = Readiness(store.health, self.folds, settings, self._folder.is_alive)
         self._wanted = WantedCommits()
-        self.pushes = Pushes(store, settings, self.live, self._wanted, on_new=self._folder.wake)
+        self.pushes = Pushes(store, settings, self.live, self._wanted, on_new=self._folder.wake, process=check_process)
         self._stable = StableVectors(settings.stable_after_s)
         self._reads = ReadCache()
         self._healing = threading.Lock()

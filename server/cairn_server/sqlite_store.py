@@ -3,17 +3,17 @@
 import json
 import logging
 import secrets
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import apsw
 
 from cairn_map.cursor import Cursor, cursor_from_text, first_chain
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError, UnreachableError
-from cairn_map.grid import CellKey, Geometry
-from cairn_map.ids import Author, CommitId, new_incarnation
+from cairn_map.grid import Geometry
+from cairn_map.ids import Author, new_incarnation
 from cairn_map.sensor_model import SensorModel
 from cairn_server.folder_lock import lock_folder
 from cairn_server.last_seen import LastSeen
@@ -21,20 +21,20 @@ from cairn_server.sqlite_branch_notes import SqliteBranchNotes
 from cairn_server.sqlite_changes import append_commit, next_number, write_fold
 from cairn_server.sqlite_health import SqliteHealth
 from cairn_server.sqlite_readers import Readers
+from cairn_server.sqlite_reads import SqliteReads
 from cairn_server.sqlite_retention import forget_evidence
 from cairn_server.sqlite_schema import ensure_schema
-from cairn_server.sqlite_snapshot import SqliteSnapshot, ids_from_text
 from cairn_server.sqlite_tokens import SqliteAuditLog, SqliteTokens, put_registration, remove_tokens_of, write_audit
 from cairn_server.sqlite_uses import SqliteUses
-from cairn_server.sqlite_writer import Values, Writer, connect, first, rows
-from cairn_server.store_rows import Branch, Fold, MapRow, NewCommit, StoredCommit
+from cairn_server.sqlite_writer import Writer, connect, first, rows
+from cairn_server.store_rows import Branch, Fold, MapRow, NewCommit
 
 log = logging.getLogger(__name__)
 
 FILE_NAME = "cairn.sqlite"
 
 
-class SqliteStore:
+class SqliteStore(SqliteReads):
     """`store.Store` in a folder."""
 
     def __init__(self, folder: Path) -> None:
@@ -56,7 +56,7 @@ class SqliteStore:
         except BaseException:
             self._lock.close()
             raise
-        self._readers = Readers(path)
+        super().__init__(Readers(path))
         self._seen = LastSeen()
         self.tokens = SqliteTokens(self._writer, self._readers)
         self.uses = SqliteUses(self._readers)
@@ -99,15 +99,11 @@ class SqliteStore:
         kept = self._maps.get(name)
         if kept is not None:
             return kept
-        found = self._map_rows("WHERE name = ?", (name,))
+        found = self.map_rows("WHERE name = ?", (name,))
         if found:
             self._maps[name] = found[0]
             return found[0]
         raise NotFoundError("no_map", f"there is no map {name!r}; `cairn map ls` lists them")
-
-    def maps(self) -> list[MapRow]:
-        """All maps, by name."""
-        return self._map_rows("ORDER BY name", ())
 
     def append(self, row: MapRow, commit: NewCommit) -> bool:
         """Keep a commit; True if it is new, False if the same one is kept already. Durable on return."""
@@ -127,47 +123,13 @@ class SqliteStore:
 
         return self._writer.run(job)
 
-    def pending(
-        self, row: MapRow, *, limit: int, size_bytes_max: int, skip: Collection[int] = ()
-    ) -> list[StoredCommit]:
-        """Commits to be folded, in order of arrival, with their diffs: at most `limit`, and one or within the size."""
-        skipped = " AND number NOT IN (SELECT value FROM json_each(?))" if skip else ""
-        clause = f"map = ? AND folded_seq IS NULL AND damaged IS NULL{skipped} ORDER BY number LIMIT ?"
-        values = (row.number, json.dumps(sorted(skip)), limit) if skip else (row.number, limit)
-        return self._commits(clause, values, size_bytes_max=size_bytes_max)
-
-    def commit(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
-        """A commit with its diff, folded or not; None if there is none."""
-        return self._commit("map = ? AND robot = ? AND incarnation = ? AND n = ?", row, commit)
-
-    def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
-        """A folded commit with its diff, or None."""
-        clause = "map = ? AND robot = ? AND incarnation = ? AND n = ? AND folded_seq IS NOT NULL"
-        return self._commit(clause, row, commit)
-
     def forget_evidence(self, row: MapRow, *, before_s: float, limit: int) -> int:
         """Drop the evidence and the meta of up to `limit` commits folded, and last pushed, before a time; how many."""
         return self._writer.run(lambda connection: forget_evidence(connection, row, before_s, limit))
 
-    def _commit(self, clause: str, row: MapRow, commit: CommitId) -> StoredCommit | None:
-        found = self._commits(clause, (row.number, *commit.author, commit.n), size_bytes_max=0)
-        return found[0] if found else None
-
-    def is_retracted(self, row: MapRow, commit: CommitId) -> bool:
-        """Whether a retract of this id has taken effect, or waits for it to come."""
-        query = "SELECT 1 FROM retracted WHERE map = ? AND id = ?"
-        with self._readers.reading() as reader:
-            return first(reader, query, (row.number, str(commit))) is not None
-
     def fold(self, row: MapRow, fold: Fold) -> bool:
         """Write a fold if the head is still its base; False (and nothing written) otherwise."""
         return self._writer.run(lambda connection: write_fold(connection, row, fold))
-
-    @contextmanager
-    def snapshot(self, row: MapRow) -> Iterator[SqliteSnapshot]:
-        """One state of the map."""
-        with self._readers.transaction() as connection:
-            yield SqliteSnapshot(connection, row.number, row.geometry.digest())
 
     def register(self, row: MapRow, branch: Branch, token_hash: bytes) -> None:
         """Make a branch, or give an existing one a new token."""
@@ -189,6 +151,7 @@ class SqliteStore:
             put_registration(connection, row, branch.name, token_hash)
 
         self._writer.run(job)
+        self.tokens.forget_known()
 
     def seen(self, row: MapRow, name: str, cursor: Cursor | None) -> None:
         """Note that a branch was heard of, and where it stands; may be written later."""
@@ -216,6 +179,7 @@ class SqliteStore:
             remove_tokens_of(connection, row, name)
 
         self._writer.run(job)
+        self.tokens.forget_known()
         self._seen.forget(row.number, name)
 
     def branches(self, row: MapRow) -> list[Branch]:
@@ -246,46 +210,6 @@ class SqliteStore:
             self._readers.close()
         finally:
             self._lock.close()
-
-    def _map_rows(self, clause: str, values: Values) -> list[MapRow]:
-        query = f"SELECT number, name, geometry, sensor_model, seal_key FROM map {clause}"  # noqa: S608 - our own clause
-        with self._readers.reading() as reader:
-            found = rows(reader, query, values)
-        return [
-            MapRow(
-                number=number,
-                name=name,
-                geometry=Geometry.model_validate_json(geometry),
-                sensor_model=SensorModel.model_validate_json(sensor_model),
-                seal_key=seal_key,
-            )
-            for number, name, geometry, sensor_model, seal_key in found
-        ]
-
-    def _commits(self, clause: str, values: Values, *, size_bytes_max: int) -> list[StoredCommit]:
-        """Commits in the order asked for, as long as their bytes stay within the size; the first in any case."""
-        columns = "number, robot, incarnation, n, sha, meta, retracts, gone, size_bytes"
-        found: list[StoredCommit] = []
-        total_bytes = 0
-        with self._readers.transaction() as reader:
-            query = f"SELECT {columns} FROM commits WHERE {clause}"  # noqa: S608 - our own clause
-            for number, robot, incarnation, n, sha, text, retracts, gone, size_bytes in reader.execute(query, values):
-                total_bytes += size_bytes
-                if found and total_bytes > size_bytes_max:
-                    break
-                diff = rows(reader, "SELECT cell, body FROM diff WHERE commit_number = ? ORDER BY cell", (number,))
-                found.append(
-                    StoredCommit(
-                        number=number,
-                        id=CommitId(Author(robot, incarnation), n),
-                        sha=sha,
-                        text=text,
-                        retracts=ids_from_text(retracts),
-                        diff={CellKey(cell): body or b"" for cell, body in diff},
-                        gone=bool(gone),
-                    )
-                )
-        return found
 
 
 def _prepare(path: Path) -> None:

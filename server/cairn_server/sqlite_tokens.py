@@ -19,6 +19,8 @@ log = logging.getLogger(__name__)
 
 USED_EVERY_S = 10.0
 """How often the times of last use are written, all together."""
+KNOWN_S, KNOWN_MAX = 1.0, 4096
+"""How long a token that was found is known without another look, and how many; a robot shows it with each push."""
 AUDIT_ROWS_MAX = 100_000
 _SELECT = (
     "SELECT t.name, t.role, t.map, m.name, t.robot, t.created_s, t.expires_s, t.last_used_s"
@@ -35,6 +37,11 @@ class SqliteTokens:
         self._lock = threading.Lock()
         self._used: dict[str, float] = {}
         self._written_s = float("-inf")
+        self._known: dict[bytes, tuple[Token, float]] = {}
+
+    def forget_known(self) -> None:
+        """Look at all tokens anew; called once a change is durable, before anybody is told of it."""
+        self._known = {}
 
     def add(self, token: Token, secret_hash: bytes) -> None:
         """Keep a new token."""
@@ -65,7 +72,9 @@ class SqliteTokens:
             _check_changed(connection, name)
             return _token(connection.execute(f"{_SELECT} WHERE t.name = ?", (name,)).fetchall()[0])
 
-        return self._writer.run(job)
+        token = self._writer.run(job)
+        self.forget_known()
+        return token
 
     def remove(self, name: str) -> None:
         """Forget a token."""
@@ -75,6 +84,7 @@ class SqliteTokens:
             _check_changed(connection, name)
 
         self._writer.run(job)
+        self.forget_known()
 
     def all(self) -> list[Token]:
         """All tokens, by name."""
@@ -83,10 +93,20 @@ class SqliteTokens:
             return [_token(row) for row in rows(reader, f"{_SELECT} ORDER BY t.name")]
 
     def of_hash(self, secret_hash: bytes) -> Token | None:
-        """The token of a secret."""
+        """The token of a secret, as it was at most a second ago, and not before it was changed."""
+        known = self._known  # what is read before a change must not become known after it
+        token, until_s = known.get(secret_hash, (None, 0.0))
+        if token is not None and time.monotonic() < until_s:
+            return token
         with self._readers.reading() as reader:
             found = rows(reader, f"{_SELECT} WHERE t.hash = ?", (secret_hash,))
-        return _token(found[0]) if found else None
+        if not found:
+            return None
+        token = _token(found[0])
+        if len(known) >= KNOWN_MAX:
+            known.clear()
+        known[secret_hash] = token, time.monotonic() + KNOWN_S
+        return token
 
     def used(self, name: str) -> None:
         """Note that a token was shown just now; written some seconds later."""

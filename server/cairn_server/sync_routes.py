@@ -4,17 +4,15 @@ A small one on the event loop: its check takes less time than to change to a thr
 waits for the disk on its behalf. Whatever may take longer has a thread of its own.
 """
 
-import asyncio
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header, Response
+from fastapi import APIRouter, Depends, Header, Request, Response
 from starlette.concurrency import run_in_threadpool
 
 from cairn_map.commit_reading import commit_reader
 from cairn_map.errors import ConflictError
 from cairn_map.messages import MissingRequest, Pushed
-from cairn_server.auth import Caller, Role
-from cairn_server.http_access import OWNERS, READERS, Map, Operations, allowed, body_of
+from cairn_server.http_access import READERS, Map, Operations, Visit, visiting_owner, visiting_robot
 
 COMMIT_MEDIA_TYPE = "application/vnd.cairn.commit"
 REPLY_MEDIA_TYPE = "application/vnd.cairn.reply"
@@ -29,22 +27,20 @@ AT_ONCE_BYTES = 1 << 16
 @router.put("/maps/{name}/commits/{commit}")
 async def push(
     commit: str,
-    service: Operations,
-    row: Map,
-    caller: Annotated[Caller, Depends(allowed(Role.ROBOT))],
+    visit: Annotated[Visit, Depends(visiting_robot)],
+    request: Request,
     response: Response,
-    data: Annotated[bytes, Depends(body_of)],
     cairn_seal: Annotated[str | None, Header(max_length=64)] = None,
 ) -> Pushed:
     """Push a commit: 201 new, 200 seen before, 409 other bytes under this id."""
-    pushes = service.pushes
+    pushes, row, caller = visit.service.pushes, visit.row, visit.caller
+    data = await request.body()
     pushed = commit_reader(data) if len(data) <= AT_ONCE_BYTES else None
     try:
         if pushed is None or not pushes.is_quick(row, caller, pushed):
             is_new = await run_in_threadpool(pushes.keep, row, caller, commit, data, seal=cairn_seal)
         else:
-            with pushes.keeping(row, caller, commit, pushed, seal=cairn_seal) as kept:
-                is_new = await asyncio.wrap_future(kept)
+            is_new = await pushes.keep_soon(row, caller, commit, pushed, seal=cairn_seal)
     except ConflictError as exc:
         await run_in_threadpool(pushes.note_conflict, row, caller, exc)
         raise
@@ -60,7 +56,7 @@ def get_commit(commit: str, service: Operations, row: Map) -> Response:
     return Response(data, media_type=COMMIT_MEDIA_TYPE, headers=headers)
 
 
-@router.post("/maps/{name}/branches/{branch}/missing", dependencies=OWNERS)
-def missing(branch: str, body: MissingRequest, service: Operations, row: Map) -> Response:
+@router.post("/maps/{name}/branches/{branch}/missing")
+def missing(branch: str, body: MissingRequest, visit: Annotated[Visit, Depends(visiting_owner)]) -> Response:
     """The frames that bring the asker to the head."""
-    return Response(service.missing(row, branch, body), media_type=REPLY_MEDIA_TYPE)
+    return Response(visit.service.missing(visit.row, branch, body), media_type=REPLY_MEDIA_TYPE)

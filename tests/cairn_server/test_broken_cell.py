@@ -68,7 +68,7 @@ def test_an_answer_to_missing_brings_all_other_cells_and_names_the_damaged_one(l
 
 def test_other_maps_are_served_and_folded(live: Live) -> None:
     row, other = new_map(live, keep_diffs=False), live.new_map()
-    live.service._folder._caches.clear()  # the folder still knows the cell, and would write it anew
+    live.service._folder._here._caches.clear()  # the folder still knows the cell, and would write it anew
     assert live.push(row, pushed(1, 0)).status_code == 201
     live.push(other, pushed(0, 0))
     live.folded(other)
@@ -86,7 +86,7 @@ def body_of(key: CellKey) -> bytes:
 
 def test_whoever_still_has_a_damaged_cell_heals_it_and_folding_goes_on(live: Live) -> None:
     row = new_map(live, keep_diffs=False)
-    live.service._folder._caches.clear()
+    live.service._folder._here._caches.clear()
     live.push(row, pushed(1, 0))
     until(lambda: live.service.folds.damaged() >= {row.name}, "the fold of the damaged map failed")
     wrong = live.http.put(url(row, BROKEN), content=pushed(0, 0, scans=7).cells[SOUND])

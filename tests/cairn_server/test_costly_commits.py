@@ -225,12 +225,13 @@ def test_workers_end_with_a_server_that_was_killed(tmp_path: Path) -> None:
         http.put("/maps/lab", content=body, headers={"Content-Type": "application/json"}).raise_for_status()
         commit = of_cells(4, profile=Profile.SMALL)
         assert http.put(f"/maps/lab/commits/{commit.id}", content=commit.data).status_code == 201
-    (nursery,) = children_of(process.pid)
+    children = children_of(process.pid)
+    (nursery,) = (pid for pid in children if b"check_nursery" in Path(f"/proc/{pid}/cmdline").read_bytes())
     workers = children_of(nursery)
     assert len(workers) == 1
     process.send(signal.SIGKILL)
     process.end()
-    until(lambda: not any(map(is_alive, [nursery, *workers])), "all ended")
+    until(lambda: not any(map(is_alive, [*children, *workers])), "all ended")
 
 
 def pool_of(live: Live) -> check_pool.CheckPool:

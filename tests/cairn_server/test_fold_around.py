@@ -35,7 +35,7 @@ def broken_map(live: Live) -> tuple[MapRow, bytes]:
         BROKEN,
         row.number,
     )
-    live.service._folder._caches.clear()  # the folder still knows the cell, and would write it anew
+    live.service._folder._here._caches.clear()  # the folder still knows the cell, and would write it anew
     return row, whole
 
 

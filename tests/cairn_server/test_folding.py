@@ -16,7 +16,7 @@ from tests.cairn_server.store_contract import NAMES, new_of
 from cairn_map.commit import Commit
 from cairn_map.grid import cell_of_key
 from cairn_map.sensor_model import SensorModel
-from cairn_server import folder
+from cairn_server import fold_here, folder
 from cairn_server.cell_cache import CellCache
 from cairn_server.folding import fold_pending
 from cairn_server.sqlite_store import SqliteStore
@@ -164,7 +164,7 @@ def test_a_map_that_cannot_be_folded_holds_up_no_other_and_is_tried_again(
             raise MemoryError
         return fold_pending(store, row, cache, limit=limit)
 
-    monkeypatch.setattr(folder, "fold_around", fold)
+    monkeypatch.setattr(fold_here, "fold_around", fold)
     monkeypatch.setattr(folder, "RETRY_S", 0.01)
     with Live(tmp_path) as live:
         first, second = live.new_map(), live.new_map()

@@ -11,7 +11,7 @@ from tests.cairn_server.prometheus_text import families_of, value
 from tests.cairn_server.pushes import MOLE, pushed
 from tests.cairn_server.test_protocol_document import DOCUMENT, ROOT
 
-from cairn_server import folder, metrics
+from cairn_server import fold_here, folder, metrics
 from cairn_server.metrics import Counter, Histogram
 
 PUSH = "/maps/{name}/commits/{commit}"
@@ -76,7 +76,7 @@ def test_what_waits_to_be_folded_shows_until_it_is(fresh: Live, monkeypatch: pyt
     row = fresh.new_map()
     monkeypatch.setattr(folder, "RETRY_S", 0.01)
     with monkeypatch.context() as broken:
-        broken.setattr(folder, "fold_around", _no_memory)
+        broken.setattr(fold_here, "fold_around", _no_memory)
         fresh.push(row, pushed(0, 0))
         begin_s = time.monotonic()
         while not value(text := text_of(fresh), "cairn_fold_failures_total", map=row.name):
