@@ -43,15 +43,16 @@ def main(control_fd: int, memory_bytes: int) -> None:
             message, fds, _, _ = socket.recv_fds(control, 1, 1)
             if not message:
                 return
+            nursery = os.getpid()
             if os.fork() == 0:
                 control.close()
-                _be_worker(fds[0], memory_bytes)
+                _be_worker(fds[0], memory_bytes, nursery)
             os.close(fds[0])
 
 
-def _be_worker(fd: int, memory_bytes: int) -> None:
+def _be_worker(fd: int, memory_bytes: int, nursery: int) -> None:
     try:
-        die_with_parent()
+        die_with_parent(nursery)
         limit, start_bytes = _address_space_bytes() + memory_bytes, _peak_bytes()
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -115,13 +116,12 @@ def _exactly(channel: socket.socket, size_bytes: int) -> bytes | None:
     return bytes(data)
 
 
-def die_with_parent() -> None:
-    """End this process as soon as the one that forked it ends, however that does."""
-    parent = os.getppid()
+def die_with_parent(parent: int) -> None:
+    """End this process as soon as the one that forked it, and has this number, ends, however that does."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
         raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
-    if os.getppid() != parent or parent == 1:
+    if os.getppid() != parent:
         os._exit(0)  # it died meanwhile
 
 

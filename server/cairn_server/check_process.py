@@ -77,10 +77,12 @@ class CheckProcess:
 def fork_checking() -> CheckProcess:
     """A process that checks. Only before there are threads."""
     ours, theirs = socket.socketpair()
+    server = os.getpid()
     pid = os.fork()
     if pid == 0:
         ours.close()
         try:
+            die_with_parent(server)
             _be_checker(theirs)
         finally:
             os._exit(0)
@@ -90,7 +92,6 @@ def fork_checking() -> CheckProcess:
 
 def _be_checker(jobs: socket.socket) -> None:
     """Answer until the server is gone."""
-    die_with_parent()
     for number in (signal.SIGINT, signal.SIGTERM):  # of a whole group: the server first finishes what it does
         signal.signal(number, signal.SIG_IGN)
     while (data := received(jobs)) is not None:

@@ -141,10 +141,12 @@ class FoldProcess:
 def fork_folding(store_file: Path) -> FoldProcess:
     """A process for the store in this file, which need not be there yet. Only before there are threads."""
     ours, theirs = socket.socketpair()
+    server = os.getpid()
     pid = os.fork()
     if pid == 0:
         ours.close()
         try:
+            die_with_parent(server)
             _be_folder(Connection(theirs.detach()), store_file)
         finally:
             os._exit(0)
@@ -154,7 +156,6 @@ def fork_folding(store_file: Path) -> FoldProcess:
 
 def _be_folder(link: Connection, store_file: Path) -> None:
     """What the process does."""
-    die_with_parent()
     for number in (signal.SIGINT, signal.SIGTERM):  # of a whole group: the server first finishes what it does
         signal.signal(number, signal.SIG_IGN)
     logging.getLogger().handlers = [_FarLog(link)]

@@ -113,11 +113,23 @@ class Live:
 class Process:
     """`cairn serve` as a process of its own; `url` is None if it did not start."""
 
-    def __init__(self, folder: Path, *arguments: str) -> None:
+    def __init__(self, folder: Path, *arguments: str, under: tuple[str, ...] = ()) -> None:
+        """Start it, perhaps under another program."""
         # Not into a pipe: nobody reads it meanwhile, and a server that complains much would wait for ever.
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - `end` closes it
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "cairn_client.main", "serve", "--data", str(folder), "--port", "0", *arguments],
+            [
+                *under,
+                sys.executable,
+                "-m",
+                "cairn_client.main",
+                "serve",
+                "--data",
+                str(folder),
+                "--port",
+                "0",
+                *arguments,
+            ],
             stdout=subprocess.PIPE,
             stderr=self._errors,
             text=True,

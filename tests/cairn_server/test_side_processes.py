@@ -1,7 +1,9 @@
 """The processes beside the server: what they do is what it does without them, and it can be without them."""
 
 import os
+import shutil
 import signal
+import subprocess
 import threading
 from collections.abc import Iterator
 from multiprocessing import Pipe
@@ -88,6 +90,21 @@ def test_a_server_whose_processes_were_killed_goes_on(process: Process, live: Li
     cut = COMMITS[0].data[:-1]
     assert httpx.put(f"{process.url}/maps/lab/commits/{COMMITS[0].id}", content=cut).status_code == 400
     assert httpx.get(f"{process.url}/readyz").status_code == 200
+
+
+def test_they_work_for_the_first_process_of_a_container(tmp_path: Path) -> None:
+    alone = ("unshare", "--pid", "--fork", "--kill-child")
+    if shutil.which("unshare") is None or subprocess.run([*alone, "true"], check=False).returncode:
+        pytest.skip("this machine makes no namespace of processes for us")
+    made = Process(tmp_path, under=alone)
+    (server,) = children_of(made.pid)
+    assert len(children_of(server)) == 2
+    httpx.put(f"{made.url}/maps/lab", content=CreateMap(geometry=SMALL).model_dump_json().encode(), headers=JSON)
+    push(made, *COMMITS)
+    cells_when_folded(made, len(COMMITS))
+    assert len(children_of(server)) == 2
+    os.kill(server, signal.SIGTERM)
+    assert "killed" not in made.end()[1]
 
 
 def test_what_the_process_refuses_is_refused_in_the_same_words(process: Process, live: Live) -> None:
