@@ -36,6 +36,7 @@ from pydantic import ValidationError
 
 from cairn_map.errors import BadInputError
 from cairn_server import backup_command, check_command, restore_command
+from cairn_server.allocator import keep_memory_small
 from cairn_server.check_process import fork_checking
 from cairn_server.fold_process import fork_folding
 from cairn_server.http_deadlines import protocol_of
@@ -92,6 +93,7 @@ def main(argv: list[str]) -> int:
     signal.signal(signal.SIGTERM, _stop)
     sys.setswitchinterval(SWITCH_S)
     folding, checking = fork_folding(settings.folder / FILE_NAME), fork_checking()  # before there are threads
+    keep_memory_small()
     with listen(settings.host, settings.port) as listener:
         try:
             store = SqliteStore(settings.folder)
