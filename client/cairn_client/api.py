@@ -17,6 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from cairn_client.answers import FetchedCell, Traffic, error_of, list_of
 from cairn_client.asks import Box
+from cairn_client.open_sockets import OpenSockets
 from cairn_map.access_messages import CreateToken, NewSecret, TokenInfo
 from cairn_map.commit import Commit
 from cairn_map.cursor import cursor_from_text
@@ -72,12 +73,14 @@ class MapApi:
 
     def __init__(self, server_url: str, *, token: str | None = None, ca_file: Path | None = None) -> None:
         self.traffic = Traffic()
+        self.sockets = OpenSockets()
         self._vector = EMPTY
         """The last one that came whole: many cells come with the same."""
         if not server_url.startswith(("http://", "https://")) or "/maps/" in server_url:
             raise BadInputError("bad_url", f"a server's URL is http://HOST:PORT, got {server_url!r}")
         try:
-            self._client = httpx.Client(base_url=server_url.rstrip("/"), timeout=TIMEOUT, verify=_verified(ca_file))
+            options: Any = {"timeout": TIMEOUT, "event_hooks": {"request": [self.sockets.watch]}}
+            self._client = httpx.Client(base_url=server_url.rstrip("/"), verify=_verified(ca_file), **options)
         except httpx.InvalidURL as exc:
             raise BadInputError("bad_url", f"{server_url!r} is not a URL: {exc}") from exc
         self.token = token

@@ -11,6 +11,9 @@ from cairn_map.robot_status import Mode
 
 T = TypeVar("T")
 
+DOOR_KEY, OPEN = "door", "open"
+"""Remembered of a robot that registered without any token: it can do so again."""
+
 
 class Membership:
     """One robot's place on one map."""
@@ -54,6 +57,18 @@ class Membership:
         self._api.deregister(self._map_name, self._replica.author.robot)
         self._replica.set_token(None)
 
+    def leave_if_welcome_back(self) -> bool:
+        """Deregister, unless the robot never registered or could not do it again; whether it left.
+
+        One that an admin gave its token stays, and so does one that has nothing but the token in its folder.
+        """
+        with self._replica.lock:
+            may_return = self._enrolment_token is not None or self._replica.store.get(DOOR_KEY) == OPEN
+        if self._replica.token() is None or not may_return:
+            return False
+        self.leave()
+        return True
+
     def _register(self) -> None:
         self._api.token = self._enrolment_token
         author = self._replica.author
@@ -68,3 +83,5 @@ class Membership:
         if registered.map.geometry != self._replica.geometry:
             raise BadInputError("other_geometry", f"map {self._map_name} has another grid than this robot's directory")
         self._replica.set_token(registered.token)
+        with self._replica.lock, self._replica.store.transaction():
+            self._replica.store.put(DOOR_KEY, OPEN if self._enrolment_token is None else None)

@@ -24,7 +24,9 @@ def _pull(args: argparse.Namespace) -> int:
     name = args.name or known or "viewer"
     mode: Mode = args.mode or ("high-end" if known and known != "viewer" else "viewer")
     scope = replace(scope_of(args), wanted=_wanted(args, api, map_name))
-    with Robot(None, args.map, directory=args.state, name=name, token=args.token, mode=mode, scope=scope) as robot:
+    with Robot(
+        None, args.map, directory=args.state, name=name, token=args.token, mode=mode, scope=scope, stay=True
+    ) as robot:
         report = robot.sync()
         robot.sync()  # tells the server where this robot stands now
         cells = robot.map.packed()

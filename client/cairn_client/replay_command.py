@@ -59,6 +59,7 @@ def _replay(args: argparse.Namespace) -> int:
         geometry=geometry,
         integrator=integrator,
         scope=scope_of(args),
+        stay=True,
     ) as robot:
         last_sync_s = start_s
         for stop in with_progress(stops, source.name, total=len(stops)):

@@ -10,7 +10,6 @@ It maps on without a link: commits wait in the directory, and power may be cut a
 """
 
 import logging
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Self
@@ -20,29 +19,32 @@ from pydantic import ValidationError
 from cairn_calib.rig import Rig
 from cairn_client.answers import Traffic
 from cairn_client.api import MapApi
-from cairn_client.link import Link
 from cairn_client.map_url import split_map_url
 from cairn_client.membership import Membership
 from cairn_client.outbox import UNNUMBERED
 from cairn_client.own_status import OwnStatus
 from cairn_client.replica import Replica
 from cairn_client.replica_store import ReplicaStore
-from cairn_client.scope import EVERYTHING, Scope, fetch
-from cairn_client.sync import RoundReport, push_commits
-from cairn_client.sync_thread import SyncThread
+from cairn_client.robot_events import SIZE, Committed, Events, EventStream
+from cairn_client.rounds import Rounds
+from cairn_client.scope import EVERYTHING, Scope
+from cairn_client.sync import RoundReport
 from cairn_fusion.integrate import Integrator
 from cairn_fusion.measurement import Measurement
 from cairn_fusion.scan import Scan
 from cairn_map.cell_code import Profile
 from cairn_map.commit import Commit, CommitMeta
 from cairn_map.compile_progress import show_compiling
-from cairn_map.errors import BadInputError, CairnError, first_error
+from cairn_map.errors import BadInputError, first_error
 from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import Geometry
+from cairn_map.grid import Geometry, cell_of_key
 from cairn_map.ids import CommitId, robot_name
 from cairn_map.robot_status import Mode
 
 log = logging.getLogger(__name__)
+
+FLUSH_S = 60.0
+"""How long `close` may push before it leaves the rest for the next time."""
 
 
 class Robot:
@@ -60,6 +62,7 @@ class Robot:
         geometry: Geometry | None = None,
         integrator: Integrator | None = None,
         scope: Scope = EVERYTHING,
+        stay: bool = False,
     ) -> None:
         """Open or make the robot's directory; no network unless the map's geometry is not known yet.
 
@@ -74,6 +77,7 @@ class Robot:
             geometry: of the map, to start without a link; else the server is asked once.
             integrator: range limits.
             scope: which cells to fetch, and how much in one reply.
+            stay: a robot that only pauses: `close` does not deregister it.
 
         Raises:
             BadInputError: bad URL or name, or the directory belongs to another robot or map.
@@ -85,25 +89,30 @@ class Robot:
         self.name = robot_name(name)
         self.mode: Mode = mode
         self._rig = rig
-        self._scope = scope
         self._api = MapApi(server_url, token=token)
-        self._link = Link(self._api, self._map_name, branch=self.name)
         try:
             self._replica = self._open(Path(directory), geometry)
         except BaseException:
             self._api.close()
             raise
         sensors = list(rig.cameras) if rig else []
-        self._membership = Membership(
+        membership = Membership(
             self._api, self._replica, map_name=self._map_name, mode=mode, sensors=sensors, enrolment_token=token
         )
+        self.status = OwnStatus()
+        self._events = Events()
+        self._rounds = Rounds(
+            *(self._api, self._replica, membership, self._events),
+            map_name=self._map_name,
+            mode=mode,
+            scope=scope,
+            status=self.status,
+        )
+        self._stay = stay
         self._integrator = integrator or Integrator()
         self._measurement = self._new_measurement()
-        self.status = OwnStatus()
         self.snapshot = self._replica.snapshot
         """`robot.snapshot()`: the map as it is now, to ask (`map_snapshot.MapSnapshot`); by any thread."""
-        self._round = threading.Lock()
-        self._thread: SyncThread | None = None
         self._is_closed = False
 
     def __enter__(self) -> Self:
@@ -134,6 +143,10 @@ class Robot:
     def waiting(self) -> int:
         """Commits that the server has not yet acknowledged."""
         return len(self._replica.push_set())
+
+    def events(self, *, size: int = SIZE) -> EventStream:
+        """What happens from here on (`robot_events`), for one reader; who is too slow loses the oldest of `size`."""
+        return self._events.open(size)
 
     def observe(self, scan: Scan) -> None:
         """Add a scan to the open measurement.
@@ -168,8 +181,9 @@ class Robot:
             return None
         commit = self._replica.commit(diff, self._meta(note, retracts), profile=profile)
         self._measurement = self._new_measurement()
-        if self._thread is not None:
-            self._thread.wake()
+        cells = tuple(cell_of_key(key) for key in sorted(commit.cells))
+        self._events.tell(Committed(commit=commit.id, cells=cells, size_bytes=len(commit.data)))
+        self._rounds.wake()
         return commit
 
     def sync(self, *, on_push: Callable[[CommitId], None] | None = None) -> RoundReport:
@@ -179,54 +193,36 @@ class Robot:
             UnreachableError: no link; try again later, nothing is lost.
             CairnError: the server refuses this robot, or its data is damaged.
         """
-        with self._round:
-            return self._membership.as_member(lambda: self._sync_once(on_push))
+        return self._rounds.sync(on_push)
 
     def start_sync(self, *, every_s: float = 5.0) -> None:
         """Sync in the background: after each commit, and at least every so many seconds while there is a link."""
-        if self._thread is None:
-            self._thread = SyncThread(self.sync, every_s=every_s)
+        self._rounds.start(every_s=every_s)
 
-    def close(self) -> None:
-        """Commit what is open, push what waits if there is a link, and close; what could not be pushed stays.
+    def close(self, *, stay: bool = False, flush_s: float = FLUSH_S) -> None:
+        """Commit what is open, push what waits if there is a link, deregister if nothing is left, and close.
 
-        May be called twice.
+        What could not be pushed stays here, and the robot on the map. May be called twice.
+
+        Args:
+            stay: only pause: do not deregister.
+            flush_s: how long to push at most, seconds; a round in the background is cut after two.
         """
         if self._is_closed:
             return
         self._is_closed = True
-        if self._thread is not None:
-            self._thread.stop()
         try:
+            self._rounds.stop()
             self.commit()
-            self._flush()
+            self._rounds.finish(is_leaving=not (stay or self._stay), within_s=flush_s)
         finally:
             self._api.close()
             self._replica.close()
+            self._events.close()
 
     def deregister(self) -> None:
         """Leave the map; the evidence stays there, and this directory keeps its own. Ends the background sync."""
-        if self._thread is not None:
-            self._thread.stop()
-            self._thread = None
-        self._membership.leave()
-
-    def _flush(self) -> None:
-        if self.mode == "viewer" or not self.waiting:
-            return
-        try:
-            self._membership.as_member(lambda: self._link.hold(push_commits(self._replica)))
-        except CairnError as exc:
-            log.warning("%d commits wait in the directory: %s", self.waiting, exc.message)
-
-    def _sync_once(self, on_push: Callable[[CommitId], None] | None) -> RoundReport:
-        sealed_only = self.mode == "viewer"
-        pushes = self._link.hold(push_commits(self._replica, sealed_only=sealed_only, on_push=on_push))
-        is_low_end = self.mode == "low-end"
-        report = self._link.hold(fetch(self._replica, is_low_end=is_low_end, scope=self._scope))
-        report.pushed, report.refused = pushes.pushed, pushes.refused
-        self.status.tell(self._replica, self._api, self._map_name, branch=self.name, mode=self.mode)
-        return report
+        self._rounds.leave()
 
     def _open(self, directory: Path, geometry: Geometry | None) -> Replica:
         """The durable state; its grid is the given one, the remembered one, or the server's."""

@@ -52,8 +52,8 @@ class RoundReport:
     """What one round did."""
 
     pushed: int = 0
-    refused: list[CommitId] = field(default_factory=list)
-    """Commits that the server will not take; they stay in the outbox, and the log says why."""
+    refused: dict[CommitId, CairnError] = field(default_factory=dict)
+    """Commits that the server will not take, and why; they stay in the outbox."""
     frames: int = 0
     cells_fetched: int = 0
     healed: int = 0
@@ -78,17 +78,17 @@ def push_commits(
             pushed = yield from _push(replica, commit, seal)
         except ConflictError as exc:
             log.error("the server will not take commit %s: %s: %s", commit_id, exc.kind, exc.message)
-            report.refused.append(commit_id)
+            report.refused[commit_id] = exc
             continue
         except DeniedError as exc:
             if exc.kind != "not_allowed":  # the token is not good: that is no fault of the commit
                 raise
             log.error("the server refuses commit %s: %s", commit_id, exc.message)
-            report.refused.append(commit_id)
+            report.refused[commit_id] = exc
             continue
         except (BadInputError, DamagedDataError) as exc:  # it must not hold up all that come after it
             log.error("the server refuses commit %s: %s: %s", commit_id, exc.kind, exc.message)
-            report.refused.append(commit_id)
+            report.refused[commit_id] = exc
             continue
         replica.acknowledge(pushed)
         report.pushed += 1

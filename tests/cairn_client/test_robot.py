@@ -292,7 +292,7 @@ def guarded(server: LiveServer) -> Iterator[LiveServer]:
 def test_a_robot_registers_with_an_enrolment_token(guarded: LiveServer, tmp_path: Path) -> None:
     with robot_in(tmp_path, guarded.map_url, token="not-the-enrolment-token") as robot, pytest.raises(DeniedError):
         robot.sync()
-    with robot_in(tmp_path, guarded.map_url, token=TOKEN) as robot:
+    with robot_in(tmp_path, guarded.map_url, token=TOKEN, stay=True) as robot:
         map_commit(robot, 1)
         assert robot.sync().pushed == 1
     with robot_in(tmp_path, guarded.map_url) as robot:  # its own token is in the folder

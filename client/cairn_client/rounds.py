@@ -1,0 +1,117 @@
+"""One robot's rounds with its server: called for, in the background, and the last one before the robot goes."""
+
+import logging
+import threading
+from collections.abc import Callable
+
+from cairn_client.api import MapApi
+from cairn_client.link import Link
+from cairn_client.membership import Membership
+from cairn_client.own_status import OwnStatus
+from cairn_client.replica import Replica
+from cairn_client.robot_events import Events
+from cairn_client.round_watch import RoundWatch
+from cairn_client.scope import Scope, fetch
+from cairn_client.sync import RoundReport, push_commits
+from cairn_client.sync_thread import SyncThread
+from cairn_map.errors import CairnError
+from cairn_map.ids import CommitId
+from cairn_map.robot_status import Mode
+
+log = logging.getLogger(__name__)
+
+OnPush = Callable[[CommitId], None]
+
+
+class Rounds:
+    """Push, then fetch; one round at a time, by whichever thread."""
+
+    def __init__(
+        self,
+        api: MapApi,
+        replica: Replica,
+        membership: Membership,
+        events: Events,
+        *,
+        map_name: str,
+        mode: Mode,
+        scope: Scope,
+        status: OwnStatus,
+    ) -> None:
+        """Nothing is sent before `sync` or `start`."""
+        self._api = api
+        self._replica = replica
+        self._membership = membership
+        self._map_name = map_name
+        self._mode: Mode = mode
+        self._scope = scope
+        self._status = status
+        self._branch = replica.author.robot
+        self._link = Link(api, map_name, branch=self._branch)
+        self._watch = RoundWatch(replica, events)
+        self._lock = threading.Lock()
+        self._thread: SyncThread | None = None
+
+    def sync(self, on_push: OnPush | None = None) -> RoundReport:
+        """One round; raises what `Robot.sync` does."""
+        try:
+            return self._round(on_push)
+        except CairnError as exc:
+            self._watch.failed(exc)
+            raise
+
+    def start(self, *, every_s: float) -> None:
+        """Rounds in the background, if there are none yet."""
+        if self._thread is None:
+            self._thread = SyncThread(self._round, every_s=every_s, on_failure=self._watch.failed)
+
+    def wake(self) -> None:
+        """There is something to push."""
+        if self._thread is not None:
+            self._thread.wake()
+
+    def stop(self) -> None:
+        """No more rounds in the background; one under way has two seconds to end."""
+        if self._thread is not None:
+            self._thread.stop(self._api.sockets.cut)
+            self._thread = None
+            self._api.sockets.mend()
+
+    def leave(self) -> None:
+        """Deregister."""
+        self.stop()
+        self._membership.leave()
+
+    def finish(self, *, is_leaving: bool, within_s: float) -> None:
+        """Push what waits, and deregister if nothing is left; without a link all stays as it is."""
+        limit = threading.Timer(within_s, self._api.sockets.cut)
+        limit.start()
+        try:
+            if self._mode != "viewer" and self._replica.push_set():
+                self._membership.as_member(lambda: self._push(None))
+            if is_leaving and not self._replica.push_set():
+                self._membership.leave_if_welcome_back()
+        except CairnError as exc:
+            waiting = len(self._replica.push_set())
+            log.warning("still on the map, and %d commits wait in the directory: %s", waiting, exc.message)
+        finally:
+            limit.cancel()
+
+    def _round(self, on_push: OnPush | None = None) -> RoundReport:
+        with self._lock:
+            return self._watch.round(lambda: self._membership.as_member(lambda: self._push_and_fetch(on_push)))
+
+    def _push_and_fetch(self, on_push: OnPush | None) -> RoundReport:
+        pushes = self._push(on_push)
+        report = self._link.hold(fetch(self._replica, is_low_end=self._mode == "low-end", scope=self._scope))
+        report.pushed, report.refused = pushes.pushed, pushes.refused
+        self._status.tell(self._replica, self._api, self._map_name, branch=self._branch, mode=self._mode)
+        return report
+
+    def _push(self, on_push: OnPush | None) -> RoundReport:
+        def pushed(commit: CommitId) -> None:
+            self._watch.pushed(commit)
+            if on_push:
+                on_push(commit)
+
+        return self._link.hold(push_commits(self._replica, sealed_only=self._mode == "viewer", on_push=pushed))
