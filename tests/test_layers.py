@@ -55,7 +55,7 @@ MAY_NAME = {
     ],
     "uvicorn": ["cairn_server/serve_command.py", "cairn_server/http_*.py"],
     "httpx": ["cairn_client/api.py"],
-    "apsw": ["cairn_server/sqlite_*.py", "cairn_client/replica_store.py"],
+    "apsw": ["cairn_server/sqlite_*.py", "cairn_client/sqlite_*.py", "cairn_client/replica_store.py"],
     "psycopg": [],
     "numba": [
         "cairn_map/*_kernels.py",

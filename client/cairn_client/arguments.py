@@ -5,21 +5,30 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Iterator
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from cairn_client.api import MapApi
 from cairn_client.map_url import split_map_url
+from cairn_map.exit_codes import EXIT_CODES
 
 Item = TypeVar("Item")
 TOKEN_VARIABLE = "CAIRN_TOKEN"  # noqa: S105 - the variable's name
 
 
+class CommandParser(argparse.ArgumentParser):
+    """A parser whose help, and that of its subcommands, is shown as written, and ends with the exit codes."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        shown: dict[str, Any] = {"epilog": EXIT_CODES, "formatter_class": argparse.RawDescriptionHelpFormatter}
+        super().__init__(*args, **(shown | options))
+
+
 def parser(program: str, text: str | None) -> argparse.ArgumentParser:
     """A parser whose help is a docstring."""
-    return argparse.ArgumentParser(program, description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    return CommandParser(program, description=text)
 
 
 def add_token(parser: argparse.ArgumentParser) -> None:

@@ -1,7 +1,6 @@
 """One live map, built by a team of robots.
 
-Run `cairn COMMAND --help` for what a command does. Exit codes: 0 done, 1 failed, 2 wrong usage, 3 not found,
-4 conflict, 5 no link, 6 damaged data.
+Run `cairn COMMAND --help` for what a command does. Results go to standard output, everything else to standard error.
 """
 
 import ast
@@ -12,18 +11,10 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from cairn_map.compile_progress import show_compiling
-from cairn_map.errors import (
-    CairnError,
-    ConflictError,
-    DamagedDataError,
-    NotFoundError,
-    UnreachableError,
-)
+from cairn_map.errors import CairnError
+from cairn_map.exit_codes import DONE, EXIT_CODES, FAILED, INTERRUPTED, USAGE, exit_code_of
 
 GROUP = "cairn.commands"
-FAILED, USAGE = 1, 2
-EXIT_CODES = ((NotFoundError, 3), (ConflictError, 4), (UnreachableError, 5), (DamagedDataError, 6))
-INTERRUPTED = 130
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -32,7 +23,7 @@ def main(argv: list[str] | None = None) -> int:
     commands = {point.name: point for point in entry_points(group=GROUP)}
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         sys.stdout.write(_help(commands))
-        return 0 if arguments else USAGE
+        return DONE if arguments else USAGE
     if arguments[0] == "--version":
         sys.stdout.write(f"cairn {version('cairn-robotics')}\n")
         return 0
@@ -44,7 +35,7 @@ def main(argv: list[str] | None = None) -> int:
         return _run(commands[name], rest)
     except CairnError as exc:
         sys.stderr.write(f"cairn {name}: {exc.message} [{exc.kind}]\n")
-        return next((code for family, code in EXIT_CODES if isinstance(exc, family)), FAILED)
+        return exit_code_of(exc)
     except KeyboardInterrupt:
         sys.stderr.write("\n")
         return INTERRUPTED
@@ -72,7 +63,7 @@ def _run(point: EntryPoint, arguments: list[str]) -> int:
 def _help(commands: dict[str, EntryPoint]) -> str:
     lines = [f"usage: cairn COMMAND ...\n\n{__doc__}\n"]
     lines += [f"  {name:<10} {_first_line(point.module)}" for name, point in sorted(commands.items())]
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, "", EXIT_CODES]) + "\n"
 
 
 def _first_line(module: str) -> str:

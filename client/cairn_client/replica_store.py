@@ -1,7 +1,7 @@
 """What a robot must not forget, in one SQLite file: its name and number, its commits, the server's cells it holds.
 
-Every change is one transaction with `synchronous=FULL`, so that power may be cut between any two steps. One process
-at a time has the file open. All methods are called under the replica's lock.
+Every change is one transaction with `synchronous=FULL`, so that power may be cut between any two steps. One robot
+at a time has the file open; others may look at it (`sqlite_glance`). All methods are called under the replica's lock.
 """
 
 import json
@@ -9,10 +9,11 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import apsw
 
+from cairn_client.folder_lock import lock_folder
 from cairn_map.commit import Commit
 from cairn_map.cursor import Cursor, cursor_from_text
 from cairn_map.errors import BadInputError, CairnError, ConflictError, DamagedDataError, UnreachableError
@@ -26,8 +27,6 @@ VERSION = 2
 BUSY_MS = 1000
 """How long a folder may still be held by a robot that is just closing."""
 PRAGMAS = (
-    # One process at a time: two would give two commits the same number.
-    "locking_mode = EXCLUSIVE",
     "page_size = 16384",
     "journal_mode = WAL",
     "synchronous = FULL",
@@ -89,6 +88,8 @@ class KeptCommit:
 class ReplicaStore:
     """The file behind a replica."""
 
+    _lock: BinaryIO | None = None
+
     def __init__(self, folder: Path) -> None:
         """Open or make the file.
 
@@ -105,9 +106,10 @@ class ReplicaStore:
         with self._translated():
             self._connection = apsw.Connection(str(folder / FILE_NAME))
         try:
+            self._lock = lock_folder(folder, wait_s=BUSY_MS / 1000)
             self._prepare()
         except BaseException:
-            self._connection.close()
+            self.close()
             raise
 
     def _prepare(self) -> None:
@@ -258,6 +260,8 @@ class ReplicaStore:
     def close(self) -> None:
         """Close the file; may be called twice."""
         self._connection.close()
+        if self._lock is not None:
+            self._lock.close()
 
     def _coverage(self, coverage: VersionVector) -> int:
         """Name under which a coverage is kept: one row for all cells that share it."""

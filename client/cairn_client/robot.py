@@ -19,6 +19,7 @@ from pydantic import ValidationError
 from cairn_calib.rig import Rig
 from cairn_client.answers import Traffic
 from cairn_client.api import MapApi
+from cairn_client.folder_status import MODE_KEY, URL_KEY
 from cairn_client.map_url import split_map_url
 from cairn_client.membership import Membership
 from cairn_client.outbox import UNNUMBERED
@@ -92,6 +93,9 @@ class Robot:
         self._api = MapApi(server_url, token=token)
         try:
             self._replica = self._open(Path(directory), geometry)
+            with self._replica.store.transaction():
+                self._replica.store.put(URL_KEY, map_url)
+                self._replica.store.put(MODE_KEY, mode)
         except BaseException:
             self._api.close()
             raise

@@ -9,9 +9,14 @@ from cairn_map.errors import BadInputError
 
 def add_map(command: argparse.ArgumentParser) -> None:
     """Which map, as whom, and how much of it."""
-    allow_negative_lists(command)
     command.add_argument("--map", required=True, metavar="URL", help="http://HOST:PORT/maps/NAME")
     command.add_argument("--name", help="the robot's name on the map")
+    add_amount(command)
+
+
+def add_amount(command: argparse.ArgumentParser) -> None:
+    """How much of the map, and the token."""
+    allow_negative_lists(command)
     command.add_argument("--box", type=_box, metavar="X0,Y0,Z0,X1,Y1,Z1", help="fetch only cells in it, metres")
     command.add_argument(
         "--reply-bytes", type=int, metavar="BYTES", help="of cells in one reply; the rest comes in the next ones"

@@ -1,9 +1,12 @@
-"""Be a robot: replay a recording into a map, or keep a local copy of one.
+"""Be a robot: replay a recording into a map, or keep a local copy of one; look after a robot's folder.
 
     $ cairn robot replay shelf/ --map http://127.0.0.1:8750/maps/shelf --voxel 0.01
     shelf: 15 scans; the first has 26% of its pixels, median range 0.57 m
     replayed 15 scans as 15 commits in 1.9 s (7.9 scans/s), 302.0 kB up, 62.8 kB down, 0 commits wait
     $ cairn robot pull --map http://127.0.0.1:8750/maps/shelf --state copy/
+    $ cairn robot status cairn-shelf/
+    $ cairn robot queue cairn-shelf/
+    $ cairn robot sync cairn-shelf/
 
 `replay` reads a recording folder (RECORDING.md), a known layout as it was published (apc_shelf_rgbd, mm5_rgbdt), or
 any folder of frames that options describe (--depth, --pose, --intrinsics, ...: `cairn robot replay --help`). It maps
@@ -17,12 +20,14 @@ cells instead of differences, on request only those around a place (--near X,Y,Z
 Both can fetch a part of the map: --box X0,Y0,Z0,X1,Y1,Z1 (metres in the map's frame) only the cells that share more
 than a face with this box; and in small helpings: with --reply-bytes 100000 each reply ends after 100 kB of cells, or
 one cell, so that a link that breaks often loses no more than that.
+
+`status` and `queue` look into a robot's folder, also while the robot is at work; `sync` pushes and fetches for it.
 """
 
 import argparse
 from collections.abc import Callable
 
-from cairn_client import pull_command, replay_command
+from cairn_client import pull_command, queue_command, replay_command, status_command, sync_command
 from cairn_client.arguments import parser
 
 
@@ -38,4 +43,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(required=True, metavar="COMMAND")
     replay_command.add_parser(commands)
     pull_command.add_parser(commands)
+    status_command.add_parser(commands)
+    queue_command.add_parser(commands)
+    sync_command.add_parser(commands)
     return top

@@ -13,6 +13,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from cairn_map.exit_codes import EXIT_CODES
 from cairn_server.progress import Progress
 from cairn_server.settings import Settings
 from cairn_server.sqlite_backup import back_up
@@ -21,7 +22,7 @@ from cairn_server.sqlite_backup import back_up
 def main(argv: list[str]) -> int:
     """Make a backup."""
     parser = argparse.ArgumentParser(
-        "cairn serve backup", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+        "cairn serve backup", description=__doc__, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help="folder of the store")
     parser.add_argument("file", type=Path, metavar="FILE", help="the backup; an older one of that name is replaced")

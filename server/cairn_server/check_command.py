@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cairn_map.errors import DamagedDataError
+from cairn_map.exit_codes import EXIT_CODES
 from cairn_server.progress import Progress
 from cairn_server.settings import Settings
 from cairn_server.sqlite_archive import SqliteArchive
@@ -35,7 +36,7 @@ from cairn_server.store_rows import MapRow
 def main(argv: list[str]) -> int:
     """Check, and repair if asked."""
     parser = argparse.ArgumentParser(
-        "cairn serve check", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+        "cairn serve check", description=__doc__, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help="folder of the store")
     parser.add_argument("--repair", action="store_true", help="make damaged cells anew; the server must be stopped")

@@ -17,6 +17,7 @@ import sys
 from pathlib import Path
 
 from cairn_map.errors import DamagedDataError
+from cairn_map.exit_codes import EXIT_CODES
 from cairn_server.check_command import check_all
 from cairn_server.progress import Progress
 from cairn_server.settings import Settings
@@ -31,7 +32,7 @@ fetch what differs, and push again what is newer than the backup. Those register
 def main(argv: list[str]) -> int:
     """Restore a backup."""
     parser = argparse.ArgumentParser(
-        "cairn serve restore", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+        "cairn serve restore", description=__doc__, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("file", type=Path, metavar="FILE", help="a file that `cairn serve backup` made")
     parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help="a new or empty folder")

@@ -35,6 +35,7 @@ from fastapi import FastAPI
 from pydantic import ValidationError
 
 from cairn_map.errors import BadInputError
+from cairn_map.exit_codes import EXIT_CODES
 from cairn_server import backup_command, check_command, restore_command
 from cairn_server.allocator import keep_memory_small
 from cairn_server.check_process import fork_checking
@@ -185,7 +186,9 @@ def listen(host: str, port: int) -> socket.socket:
 
 def _settings(argv: list[str]) -> Settings:
     defaults = Settings()
-    parser = argparse.ArgumentParser("cairn serve", description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        "cairn serve", description=__doc__, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("--data", type=Path, default=defaults.folder, metavar="DIR", help="folder of the store")
     parser.add_argument("--host", default=defaults.host, help=f"address to listen on ({defaults.host})")
     parser.add_argument("--port", type=int, default=defaults.port, help=f"port, 0 for any free one ({defaults.port})")

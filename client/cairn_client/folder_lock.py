@@ -1,0 +1,54 @@
+"""One robot for one folder: an advisory lock that the operating system lets go when the process ends.
+
+Two would give two commits the same number. Who only looks (`sqlite_glance`) needs no lock.
+"""
+
+import fcntl
+import time
+from pathlib import Path
+from typing import BinaryIO
+
+from cairn_map.errors import BadInputError, ConflictError
+
+LOCK_NAME = "robot.lock"
+LOOK_AGAIN_S = 0.02
+
+
+def lock_folder(folder: Path, *, wait_s: float) -> BinaryIO:
+    """The lock on a folder, held until it is closed; waits so long for a robot that is just closing.
+
+    Raises:
+        ConflictError: kind `folder_in_use`: another robot works in this folder.
+        BadInputError: kind `bad_folder`: nothing can be written there.
+    """
+    try:
+        lock = (folder / LOCK_NAME).open("ab")
+    except OSError as exc:
+        raise BadInputError("bad_folder", f"cannot write in the folder {folder}: {exc.strerror}") from exc
+    end_s = time.monotonic() + wait_s
+    while True:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as exc:
+            if time.monotonic() > end_s:
+                lock.close()
+                raise ConflictError(
+                    "folder_in_use", f"another robot has {folder} open; stop it, or choose another folder"
+                ) from exc
+            time.sleep(LOOK_AGAIN_S)
+        else:
+            return lock
+
+
+def is_locked(folder: Path) -> bool:
+    """Whether a robot works in a folder now."""
+    try:
+        lock = (folder / LOCK_NAME).open("rb")
+    except OSError:
+        return False
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        return False
