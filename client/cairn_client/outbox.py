@@ -45,6 +45,8 @@ class Outbox:
         self._acked_since_header: set[CommitId] = set()
         self._retracts: dict[CommitId, tuple[CommitId, ...]] = {}
         """What the kept commits take out, of those that somebody asked for."""
+        self.beside: Mapping[str, str] = {}
+        """Texts to remember in the transaction of the next commit, and of no other."""
         for kept in store.commits():
             self._note(kept)
 
@@ -90,6 +92,9 @@ class Outbox:
         with self._store.transaction():
             self._store.add_commit(commit)
             self._set_next(n + 1, commit)
+            for key, text in self.beside.items():
+                self._store.put(key, text)
+        self.beside = {}
         self._note(_kept(commit))
         self._retracts[commit.id] = commit.meta.retracted_ids
         return commit

@@ -38,8 +38,8 @@ def _replay(args: argparse.Namespace) -> int:
     options, size = frame_options(args), args.scans_per_measurement
     source = open_source(args.recording, options=options, frames=args.frames, scans_per_measurement=size)
     _say_range(source)
-    geometry = _ensure_map(args, source)
-    name = args.name or _default_name(source.name)
+    geometry = ensure_map(args, source)
+    name = args.name or default_name(source.name)
     state = args.state or Path(f"cairn-{name}")
     part = f"{args.recording.resolve()} {args.share[0]}/{args.share[1]}"
     if not args.again and part in _replayed(state):
@@ -109,7 +109,7 @@ def _try_sync(robot: Robot) -> bool:
     return True
 
 
-def _ensure_map(args: argparse.Namespace, source: Recording) -> Geometry | None:
+def ensure_map(args: argparse.Namespace, source: Recording) -> Geometry | None:
     """The map's geometry; makes the map if there is none. None: no link, and perhaps the state folder knows it."""
     api, name = api_of(args.map, args.token)
     wished = geometry_for(voxel_edge_m=args.voxel) if args.voxel is not None else None
@@ -142,7 +142,8 @@ def _channels(source: Recording) -> tuple[Channel, ...]:
     return tuple(channel for channel, found in has if found)
 
 
-def _default_name(text: str) -> str:
+def default_name(text: str) -> str:
+    """A robot's name made of any text."""
     name = "".join(letter if letter.isascii() and letter.isalnum() else "-" for letter in text.lower()).strip("-")
     return name[:32] or "robot"
 

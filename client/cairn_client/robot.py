@@ -163,6 +163,21 @@ class Robot:
         self._measurement.add(scan)
         self.status.pose = self._measurement.poses[-1]
 
+    def mount(self, rig: Rig) -> None:
+        """Take another head, whose scans come from here on.
+
+        Raises:
+            BadInputError: kind `open_measurement`: there are scans of the old one.
+        """
+        if self._measurement is not None and len(self._measurement):
+            raise BadInputError("open_measurement", "commit or discard the scans of the old head first")
+        self._rig = rig
+        self._measurement = self._new_measurement()
+
+    def discard(self) -> None:
+        """Forget the scans since the last commit."""
+        self._measurement = self._new_measurement()
+
     def commit(
         self, *, note: str = "", retracts: tuple[CommitId, ...] = (), profile: Profile = Profile.FAST
     ) -> Commit | None:

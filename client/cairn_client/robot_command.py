@@ -1,9 +1,10 @@
-"""Be a robot: replay a recording into a map, or keep a local copy of one; look after a robot's folder.
+"""Be a robot: map recordings as they come or afterwards, keep a copy of a map, look after a robot's folder.
 
     $ cairn robot replay shelf/ --map http://127.0.0.1:8750/maps/shelf --voxel 0.01
     shelf: 15 scans; the first has 26% of its pixels, median range 0.57 m
     replayed 15 scans as 15 commits in 1.9 s (7.9 scans/s), 302.0 kB up, 62.8 kB down, 0 commits wait
     $ cairn robot pull --map http://127.0.0.1:8750/maps/shelf --state copy/
+    $ cairn robot run spool/ --map http://127.0.0.1:8750/maps/shelf --name mole
     $ cairn robot status cairn-shelf/
     $ cairn robot queue cairn-shelf/
     $ cairn robot sync cairn-shelf/
@@ -21,13 +22,14 @@ Both can fetch a part of the map: --box X0,Y0,Z0,X1,Y1,Z1 (metres in the map's f
 than a face with this box; and in small helpings: with --reply-bytes 100000 each reply ends after 100 kB of cells, or
 one cell, so that a link that breaks often loses no more than that.
 
+`run` is a robot that lives: it maps the recordings that a driver puts into a folder, and syncs, until a signal ends it.
 `status` and `queue` look into a robot's folder, also while the robot is at work; `sync` pushes and fetches for it.
 """
 
 import argparse
 from collections.abc import Callable
 
-from cairn_client import pull_command, queue_command, replay_command, status_command, sync_command
+from cairn_client import pull_command, queue_command, replay_command, run_command, status_command, sync_command
 from cairn_client.arguments import parser
 
 
@@ -43,6 +45,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(required=True, metavar="COMMAND")
     replay_command.add_parser(commands)
     pull_command.add_parser(commands)
+    run_command.add_parser(commands)
     status_command.add_parser(commands)
     queue_command.add_parser(commands)
     sync_command.add_parser(commands)

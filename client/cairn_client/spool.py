@@ -1,0 +1,135 @@
+"""A folder into which a driver puts recordings, and how far a robot is with each of them.
+
+    spool/
+      0001/  rig.json trajectory.txt tof.txt images/... recording.json     whole: recording.json is written last
+      0002/  rig.json trajectory.txt ...                                   still being written
+
+They are mapped in the order of their names; names with a dot in front are not looked at. What is done is remembered in
+the same transaction as the commit, so that a measurement counts once, whenever the power is cut.
+"""
+
+import logging
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict
+
+from cairn_client.replica import Replica
+from cairn_fusion.importers import open_source
+from cairn_fusion.recording import Recording
+from cairn_fusion.recording_format import HEADER_FILE
+from cairn_map.errors import BadInputError, DamagedDataError
+
+log = logging.getLogger(__name__)
+
+
+class Mark(BaseModel):
+    """How far a recording is mapped."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    first_s: float
+    """Time of its first scan, UTC: another recording may come under an old name."""
+    stops: int
+    """Measurements that are commits, or gave no evidence."""
+    is_done: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """One measurement that is to be mapped."""
+
+    folder: Path
+    source: Recording
+    number: int
+    """Of the recording's measurements, from 0."""
+
+    @property
+    def scans(self) -> range:
+        """Indices in the recording."""
+        return self.source.measurements()[self.number]
+
+    def mark(self) -> Mapping[str, str]:
+        """What is to be remembered when it is done."""
+        done = self.number + 1
+        is_done = done == len(self.source.measurements())
+        mark = Mark(first_s=self.source.files[0].time_s, stops=done, is_done=is_done)
+        return {_key(self.folder): mark.model_dump_json()}
+
+
+class Spool:
+    """A spool, without the robot that maps it."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises: BadInputError: kind `no_spool`: there is no such folder, or it is a recording itself."""
+        if not folder.is_dir():
+            raise BadInputError("no_spool", f"there is no folder {folder} for recordings to come into; make it")
+        if (folder / HEADER_FILE).exists():
+            raise BadInputError(
+                "no_spool", f"{folder} is a recording, and a spool holds recordings; `cairn robot replay` maps one"
+            )
+        self._folder = folder
+        self._settled: set[Path] = set()
+        """Recordings that are done, or no recordings."""
+
+    def next_recording(self) -> Recording | None:
+        """The first recording that is whole; None if there is none yet."""
+        return next((source for path in self._whole() if (source := self._opened(path)) is not None), None)
+
+    def stops(self, replica: Replica) -> Iterator[Stop]:
+        """Measurements that are not mapped yet, of the recordings that are whole now."""
+        for path in self._whole():
+            source = self._opened(path)
+            mark = _mark(replica, path)
+            if source is None:
+                continue
+            if mark is None or mark.first_s != source.files[0].time_s:
+                mark = Mark(first_s=source.files[0].time_s, stops=0, is_done=False)
+            if not mark.is_done:
+                for number in range(mark.stops, len(source.measurements())):
+                    yield Stop(path, source, number)
+            self._settled.add(path)
+
+    def delete_done(self, replica: Replica) -> None:
+        """Delete the recordings that are mapped to their end, and forget them."""
+        for path in sorted(self._folder.iterdir()):
+            mark = _mark(replica, path)
+            if mark is not None and mark.is_done and path.is_dir():
+                shutil.rmtree(path)
+                remember(replica, {_key(path): None})
+                self._settled.discard(path)
+
+    def _whole(self) -> list[Path]:
+        found = (path for path in self._folder.iterdir() if not path.name.startswith("."))
+        return sorted(path for path in found if path not in self._settled and (path / HEADER_FILE).is_file())
+
+    def _opened(self, path: Path) -> Recording | None:
+        try:
+            source = open_source(path)
+        except (BadInputError, DamagedDataError) as exc:
+            log.error("%s is left out: %s", path, exc.message)
+            self._settled.add(path)
+            return None
+        if not len(source):
+            self._settled.add(path)
+            return None
+        return source
+
+
+def remember(replica: Replica, texts: Mapping[str, str | None]) -> None:
+    """Durably, at once."""
+    with replica.lock, replica.store.transaction():
+        for key, text in texts.items():
+            replica.store.put(key, text)
+
+
+def _mark(replica: Replica, folder: Path) -> Mark | None:
+    with replica.lock:
+        text = replica.store.get(_key(folder))
+    return Mark.model_validate_json(text) if text else None
+
+
+def _key(folder: Path) -> str:
+    return f"spool/{folder.name}"
