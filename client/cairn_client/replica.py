@@ -13,12 +13,13 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 
 from cairn_client.outbox import Outbox
+from cairn_client.replica_identity import identify
 from cairn_client.replica_store import BaseCell, KeptCommit, ReplicaStore
 from cairn_map.brick_cell import sum_evidence
 from cairn_map.cell_code import Profile, decode_cell, encode_cell
 from cairn_map.commit import Commit, CommitMeta
 from cairn_map.cursor import Cursor, cursor_from_text
-from cairn_map.errors import BadInputError, CairnError, DamagedDataError
+from cairn_map.errors import CairnError, DamagedDataError
 from cairn_map.evidence import Evidence, empty_evidence
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.fingerprint import ZERO, fingerprint
@@ -49,7 +50,7 @@ class Replica:
         self.geometry = geometry
         self.view = EvidenceMap(geometry)
         self._snapshot: MapSnapshot | None = None
-        self._identify({"robot": robot, "map": map_name, "geometry": geometry.model_dump_json()})
+        identify(store, {"robot": robot, "map": map_name, "geometry": geometry.model_dump_json()})
         self.outbox = Outbox(store, robot, geometry)
         header = store.get("header")
         self.header: ReplyHeader | None = message_from_json(ReplyHeader, header) if header else None
@@ -284,15 +285,3 @@ class Replica:
                 self.hold_nothing(key, UNPROVEN)
         for key in self.outbox.cells - self.cells.keys():
             self.refresh_view(key)
-
-    def _identify(self, identity: Mapping[str, str]) -> None:
-        """Make the folder this robot's, or see that it is."""
-        with self.store.transaction():
-            for key, value in identity.items():
-                known = self.store.get(key)
-                if known is not None and known != value:
-                    raise BadInputError(
-                        "other_replica",
-                        f"the robot's folder belongs to another {key}: {known[:120]}; choose another (--state)",
-                    )
-                self.store.put(key, value)

@@ -14,9 +14,10 @@ from typing import Any, BinaryIO
 import apsw
 
 from cairn_client.folder_lock import lock_folder
+from cairn_client.sqlite_failures import failure_of
 from cairn_map.commit import Commit
 from cairn_map.cursor import Cursor, cursor_from_text
-from cairn_map.errors import BadInputError, CairnError, ConflictError, DamagedDataError, UnreachableError
+from cairn_map.errors import BadInputError
 from cairn_map.fingerprint import Fingerprint, fingerprint_from_bytes
 from cairn_map.grid import CellKey
 from cairn_map.ids import Author, CommitId
@@ -284,15 +285,7 @@ class ReplicaStore:
         try:
             yield
         except apsw.Error as exc:
-            raise _failure(exc, self._folder) from exc
-
-
-def _failure(exc: apsw.Error, folder: Path) -> CairnError:
-    if isinstance(exc, apsw.BusyError):
-        return ConflictError("folder_in_use", f"another robot has {folder} open; stop it, or choose another folder")
-    if isinstance(exc, apsw.CorruptError | apsw.NotADBError):
-        return DamagedDataError("damaged_store", f"{folder / FILE_NAME} is damaged: {exc}; move it away to start anew")
-    return UnreachableError("store_failed", f"cannot use {folder / FILE_NAME}: {exc}")
+            raise failure_of(exc, self._folder / FILE_NAME) from exc
 
 
 def _values(commit: CommitId) -> tuple[str, str, int]:

@@ -11,7 +11,8 @@ from typing import Any
 import apsw
 
 from cairn_client.replica_store import BUSY_MS, FILE_NAME
-from cairn_map.errors import CairnError, ConflictError, DamagedDataError, NotFoundError, UnreachableError
+from cairn_client.sqlite_failures import failure_of
+from cairn_map.errors import NotFoundError
 from cairn_map.ids import Author, CommitId, Incarnation, RobotName
 
 
@@ -90,7 +91,7 @@ class _Reader:
         except apsw.CantOpenError:  # nothing may be written beside it, so no robot that could change it is at work
             self._connection = self._opened("immutable=1")
         except apsw.Error as exc:
-            raise self._failure(exc) from exc
+            raise failure_of(exc, self._path) from exc
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -101,7 +102,7 @@ class _Reader:
         try:
             return self._connection.execute(query, values).fetchall()
         except apsw.Error as exc:
-            raise self._failure(exc) from exc
+            raise failure_of(exc, self._path) from exc
 
     def _opened(self, how: str) -> apsw.Connection:
         flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
@@ -114,10 +115,3 @@ class _Reader:
             connection.close()
             raise
         return connection
-
-    def _failure(self, exc: apsw.Error) -> CairnError:
-        if isinstance(exc, apsw.BusyError):
-            return ConflictError("folder_in_use", f"{self._path} is open in a robot of an older version; ask it later")
-        if isinstance(exc, apsw.CorruptError | apsw.NotADBError | apsw.SQLError):
-            return DamagedDataError("damaged_store", f"{self._path} is no robot's file, or a broken one: {exc}")
-        return UnreachableError("store_failed", f"cannot read {self._path}: {exc}")

@@ -1,0 +1,23 @@
+"""Whose a robot's folder is."""
+
+from collections.abc import Mapping
+
+from cairn_client.replica_store import ReplicaStore
+from cairn_map.errors import BadInputError
+
+
+def identify(store: ReplicaStore, identity: Mapping[str, str]) -> None:
+    """Make the folder this robot's, or see that it is.
+
+    Raises:
+        BadInputError: kind `other_replica`: it is of another robot, map or grid.
+    """
+    with store.transaction():
+        for key, value in identity.items():
+            known = store.get(key)
+            if known is not None and known != value:
+                raise BadInputError(
+                    "other_replica",
+                    f"the robot's folder belongs to another {key}: {known[:120]}; choose another (--state)",
+                )
+            store.put(key, value)
