@@ -14,6 +14,14 @@ LOCK_NAME = "robot.lock"
 LOOK_AGAIN_S = 0.02
 
 
+def make_folder(folder: Path) -> None:
+    """Raises: BadInputError: kind `bad_folder`: it is not there and cannot be made."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as exc:
+        raise BadInputError("bad_folder", f"cannot make the folder {folder}: {exc.strerror}") from exc
+
+
 def lock_folder(folder: Path, *, wait_s: float) -> BinaryIO:
     """The lock on a folder, held until it is closed; waits so long for a robot that is just closing.
 

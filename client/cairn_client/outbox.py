@@ -8,7 +8,7 @@ All methods are called under the replica's lock.
 """
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 
 from cairn_client.replica_store import KeptCommit, ReplicaStore
@@ -45,6 +45,8 @@ class Outbox:
         self._acked_since_header: set[CommitId] = set()
         self._retracts: dict[CommitId, tuple[CommitId, ...]] = {}
         """What the kept commits take out, of those that somebody asked for."""
+        self.make_room: Callable[[int], None] = lambda size_bytes: None
+        """Called before a commit of so many bytes is kept; raises if there is no room (`room`)."""
         self.beside: Mapping[str, str] = {}
         """Texts to remember in the transaction of the next commit, and of no other."""
         for kept in store.commits():
@@ -89,6 +91,7 @@ class Outbox:
         }
         meta = CommitMeta.model_validate({**dict(meta or ()), **known})
         commit = make_commit(meta, diff, self._geometry, profile=profile)
+        self.make_room(len(commit.data))
         with self._store.transaction():
             self._store.add_commit(commit)
             self._set_next(n + 1, commit)

@@ -33,6 +33,10 @@ class OwnStatus:
     """Anything else for people, to 256 characters."""
     _told: RobotStatus | None = None
 
+    def place(self) -> tuple[float, float, float] | None:
+        """Where the robot is, metres, map frame; None if it did not say."""
+        return self.pose.t_map_rig if self.pose else None
+
     def tell(self, replica: Replica, api: MapApi, map_name: str, *, branch: str, mode: Mode) -> None:
         """Send it, unless it was told of late; a failure is logged and is no failure of the sync."""
         try:

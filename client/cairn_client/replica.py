@@ -60,6 +60,8 @@ class Replica:
         self.cells: dict[CellKey, BaseCell] = store.cells()
         self.refused_cells: set[tuple[CellKey, str]] = set()
         """Cells, with their fingerprints, by which the server would not be healed: not sent again."""
+        self.admit: Callable[[CellKey, int], None] = lambda key, size_bytes: None
+        """Asked before a cell of so many bytes is held; raises if there is no room (`room`)."""
         self._load()
 
     @property
@@ -173,8 +175,11 @@ class Replica:
 
     def hold(self, key: CellKey, cell: BaseCell, evidence: Evidence, *, body: bytes | None = None) -> None:
         """Make a cell's base this evidence, with its cursor and coverage, in one transaction, and show it."""
+        data = body or encode_cell(key, evidence, self.geometry).data
+        if len(evidence):
+            self.admit(key, len(data))
         with self.store.transaction():
-            self.store.put_cell(key, cell, body=body or encode_cell(key, evidence, self.geometry).data)
+            self.store.put_cell(key, cell, body=data)
         self.cells[key] = cell
         self.refresh_view(key, base=evidence)
 

@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 
 import apsw
 
-from cairn_client.folder_lock import lock_folder
+from cairn_client.folder_lock import lock_folder, make_folder
 from cairn_client.sqlite_failures import failure_of
 from cairn_map.commit import Commit
 from cairn_map.cursor import Cursor, cursor_from_text
@@ -100,10 +100,7 @@ class ReplicaStore:
             BadInputError: it is of another version, or the folder cannot be made.
         """
         self._folder = folder
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as exc:
-            raise BadInputError("bad_folder", f"cannot make the folder {folder}: {exc.strerror}") from exc
+        make_folder(folder)
         with self._translated():
             self._connection = apsw.Connection(str(folder / FILE_NAME))
         try:
@@ -232,6 +229,15 @@ class ReplicaStore:
         """Bytes of a cell held."""
         body: bytes | None = self._first("SELECT body FROM cell WHERE cell = ?", (key,))
         return body
+
+    def cell_bytes(self) -> dict[CellKey, int]:
+        """Sizes of the cells held, as they are at rest."""
+        return {CellKey(cell): size for cell, size in self._run("SELECT cell, length(body) FROM cell")}
+
+    def used_bytes(self) -> int:
+        """Size of the file, without its free pages."""
+        pages, free, size = (self._first(f"PRAGMA {n}", ()) for n in ("page_count", "freelist_count", "page_size"))
+        return int(pages - free) * int(size)
 
     def put_cell(self, key: CellKey, cell: BaseCell, *, body: bytes) -> None:
         """Hold a cell; its cursor, coverage and bytes change together."""

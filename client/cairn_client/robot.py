@@ -20,6 +20,7 @@ from cairn_calib.rig import Rig
 from cairn_client.answers import Traffic
 from cairn_client.api import MapApi
 from cairn_client.folder_status import MODE_KEY, URL_KEY
+from cairn_client.limits import NO_LIMITS, Limits
 from cairn_client.map_url import split_map_url
 from cairn_client.membership import Membership
 from cairn_client.outbox import UNNUMBERED
@@ -63,6 +64,7 @@ class Robot:
         geometry: Geometry | None = None,
         integrator: Integrator | None = None,
         scope: Scope = EVERYTHING,
+        limits: Limits = NO_LIMITS,
         stay: bool = False,
     ) -> None:
         """Open or make the robot's directory; no network unless the map's geometry is not known yet.
@@ -78,6 +80,7 @@ class Robot:
             geometry: of the map, to start without a link; else the server is asked once.
             integrator: range limits.
             scope: which cells to fetch, and how much in one reply.
+            limits: how much to keep on the disk and in memory, and what goes when that is full.
             stay: a robot that only pauses: `close` does not deregister it.
 
         Raises:
@@ -110,6 +113,7 @@ class Robot:
             map_name=self._map_name,
             mode=mode,
             scope=scope,
+            limits=limits,
             status=self.status,
         )
         self._stay = stay
@@ -190,7 +194,8 @@ class Robot:
 
         Raises:
             BadInputError: the commit would be too large, its note too long, or it retracts what is not this robot's.
-            UnreachableError: kind `store_failed`: the disk is full or broken. The measurement stays open in any case.
+            UnreachableError: kind `store_failed`: the disk is full or broken; `outbox_full`: the limits are reached,
+                and nothing is left to drop. The measurement stays open in any case.
         """
         diff = self._measurement.diff() if self._measurement else {}
         if not diff and not retracts:

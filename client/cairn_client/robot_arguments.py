@@ -3,6 +3,7 @@
 import argparse
 
 from cairn_client.arguments import add_token, allow_negative_lists
+from cairn_client.limits import Limits
 from cairn_client.scope import Scope
 from cairn_map.errors import BadInputError
 
@@ -29,6 +30,25 @@ def scope_of(args: argparse.Namespace) -> Scope:
     if args.reply_bytes is not None and args.mode == "low-end":
         raise BadInputError("bad_option", "--reply-bytes bounds the answers with differences; low-end fetches cells")
     return Scope(box_m=(args.box[:3], args.box[3:]) if args.box else None, reply_bytes_max=args.reply_bytes)
+
+
+def add_limits(command: argparse.ArgumentParser) -> None:
+    """How much the robot may keep, megabytes (10^6)."""
+    for name, what in (
+        ("disk", "of the robot's file: then the server's farthest cells go"),
+        ("memory", "of the map in memory: likewise"),
+        ("outbox", "of commits that the server does not have for good: then no more are taken"),
+    ):
+        command.add_argument(f"--{name}-max", type=float, metavar="MB", help=f"{what} (no limit)")
+
+
+def limits_of(args: argparse.Namespace) -> Limits:
+    """The limits that were given."""
+    disk, memory, outbox = (
+        None if megabytes is None else round(megabytes * 1e6)
+        for megabytes in (args.disk_max, args.memory_max, args.outbox_max)
+    )
+    return Limits(disk_bytes_max=disk, memory_bytes_max=memory, outbox_bytes_max=outbox)
 
 
 def place(text: str) -> tuple[float, float, float]:

@@ -5,16 +5,18 @@ import threading
 from collections.abc import Callable
 
 from cairn_client.api import MapApi
+from cairn_client.limits import Limits
 from cairn_client.link import Link
 from cairn_client.membership import Membership
 from cairn_client.own_status import OwnStatus
 from cairn_client.replica import Replica
 from cairn_client.robot_events import Events
+from cairn_client.room import NO_ROOM, Room
 from cairn_client.round_watch import RoundWatch
 from cairn_client.scope import Scope, fetch
 from cairn_client.sync import RoundReport, push_commits
 from cairn_client.sync_thread import SyncThread
-from cairn_map.errors import CairnError
+from cairn_map.errors import BadInputError, CairnError, UnreachableError
 from cairn_map.ids import CommitId
 from cairn_map.robot_status import Mode
 
@@ -36,6 +38,7 @@ class Rounds:
         map_name: str,
         mode: Mode,
         scope: Scope,
+        limits: Limits,
         status: OwnStatus,
     ) -> None:
         """Nothing is sent before `sync` or `start`."""
@@ -48,6 +51,9 @@ class Rounds:
         self._status = status
         self._branch = replica.author.robot
         self._link = Link(api, map_name, branch=self._branch)
+        self._room = Room(
+            *(replica, limits, events), place=status.place, scope_box=scope.box(replica.geometry.cell_edge_m)
+        )
         self._watch = RoundWatch(replica, events)
         self._lock = threading.Lock()
         self._thread: SyncThread | None = None
@@ -103,10 +109,24 @@ class Rounds:
 
     def _push_and_fetch(self, on_push: OnPush | None) -> RoundReport:
         pushes = self._push(on_push)
-        report = self._link.hold(fetch(self._replica, is_low_end=self._mode == "low-end", scope=self._scope))
+        report = self._fetch()
         report.pushed, report.refused = pushes.pushed, pushes.refused
         self._status.tell(self._replica, self._api, self._map_name, branch=self._branch, mode=self._mode)
         return report
+
+    def _fetch(self) -> RoundReport:
+        """What fits: again with a smaller box when there is no room for it."""
+        is_low_end = self._mode == "low-end"
+        self._link.hold(self._room.keep_up())
+        while True:
+            box = self._room.box()
+            try:
+                return self._link.hold(fetch(self._replica, is_low_end=is_low_end, scope=self._scope, room=box))
+            except UnreachableError as exc:
+                if exc.kind != NO_ROOM:
+                    raise
+                if not self._link.hold(self._room.tighten()):
+                    raise BadInputError(NO_ROOM, f"not even the cell around the robot fits: {exc.message}") from exc
 
     def _push(self, on_push: OnPush | None) -> RoundReport:
         def pushed(commit: CommitId) -> None:

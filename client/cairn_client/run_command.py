@@ -25,7 +25,7 @@ from cairn_client.event_lines import lines_on_stderr, until_signal
 from cairn_client.replay_command import default_name, ensure_map
 from cairn_client.replica_store import FILE_NAME
 from cairn_client.robot import Robot
-from cairn_client.robot_arguments import add_map, scope_of
+from cairn_client.robot_arguments import add_limits, add_map, limits_of, scope_of
 from cairn_client.spool import Spool, Stop, remember
 from cairn_fusion.integrate import Integrator
 from cairn_map.cell_code import Profile
@@ -67,6 +67,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "--profile", choices=list(Profile), default=Profile.FAST, help="small: fewer bytes, more work (fast)"
     )
     run.add_argument("--every", type=float, default=5.0, metavar="SECONDS", help="sync at least so often (5)")
+    add_limits(run)
     run.add_argument("--delete", action="store_true", help="delete recordings that are mapped")
     run.add_argument("--stay", action="store_true", help="stay on the map at the end")
     run.set_defaults(run=_run)
@@ -75,6 +76,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 def _run(args: argparse.Namespace) -> int:
     if args.every <= 0:
         raise BadInputError("bad_option", f"--every takes seconds above 0, got {args.every:g}")
+    limits_of(args)  # before it waits for the first recording
     spool, tally = Spool(args.spool), _Tally()
     with until_signal() as stopping:
         robot = _robot(args, spool, stopping)
@@ -116,6 +118,7 @@ def _robot(args: argparse.Namespace, spool: Spool, stopping: threading.Event) ->
         geometry=ensure_map(args, source) if source else None,
         integrator=Integrator(min_range_m=args.min_range, max_range_m=args.max_range),
         scope=scope_of(args),
+        limits=limits_of(args),
         stay=args.stay,
     )
 

@@ -49,14 +49,16 @@ class Scope:
 EVERYTHING = Scope()
 
 
-def fetch(replica: Replica, *, is_low_end: bool, scope: Scope) -> Conversation[RoundReport]:
+def fetch(replica: Replica, *, is_low_end: bool, scope: Scope, room: Box | None = None) -> Conversation[RoundReport]:
     """Bring what is in the scope to the server's head: whole cells for a low-end robot, else what is missing.
+
+    Of the scope only what is in `room`, if that is given.
 
     Raises:
         UnreachableError: the link broke; what came is kept.
         DamagedDataError: the server's answer is not sound.
     """
-    box = scope.box(replica.geometry.cell_edge_m)
+    box = room or scope.box(replica.geometry.cell_edge_m)
     wanted = scope.wanted
 
     def is_in_scope(cell: Cell) -> bool:

@@ -48,7 +48,10 @@ class EvidenceMap:
         self._apply(diff, BrickCell.unmerge, BrickCell.merge)
 
     def replace(self, key: CellKey, evidence: Evidence) -> None:
-        """Make one cell hold exactly this evidence."""
+        """Make one cell hold exactly this evidence; one that holds none takes no memory."""
+        if not len(evidence):
+            self._cells.pop(key, None)
+            return
         cell = BrickCell(self.geometry)
         cell.merge(evidence)
         self._cells[key] = cell

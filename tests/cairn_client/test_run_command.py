@@ -96,7 +96,7 @@ def test_kills_lose_nothing_and_count_nothing_twice(
     for n in range(12):
         record(spool, f"{n:04}", [4 * n, 4 * n + 1], [4 * n + 2], [4 * n + 3])
     moments = random.Random(5)
-    for _ in range(3):
+    for _ in range(2):
         with process(spool, server.map_url) as running:
             assert running.stderr is not None
             for _ in range(moments.randrange(1, 10)):
@@ -118,7 +118,7 @@ def test_mapped_recordings_are_deleted_if_one_wants_that(
     (spool / "0000").mkdir()
     (spool / "0000" / "rig.json").write_text("{}")  # not whole yet
     record(spool, "0001", [1])
-    with process(spool, server.map_url, "--delete", "--stay") as running:
+    with process(spool, server.map_url, "--delete", "--stay", "--disk-max", "50", "--outbox-max", "20") as running:
         until(lambda: not (spool / "0001").exists())
         record(spool, "0001", [2])  # the name is free again
         until(lambda: not (spool / "0001").exists())
@@ -201,3 +201,4 @@ def test_a_folder_that_is_no_spool_is_refused(spool: Path) -> None:
     assert cairn.main(["robot", "run", str(spool / "none"), "--map", url]) == 1
     assert cairn.main(["robot", "run", str(record(spool, "a", [1])), "--map", url]) == 1
     assert cairn.main(["robot", "run", str(spool), "--map", url, "--every", "0"]) == 1
+    assert cairn.main(["robot", "run", str(spool), "--map", url, "--disk-max", "0.001"]) == 1

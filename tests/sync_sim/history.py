@@ -12,6 +12,7 @@ from tests.sync_sim.network import Network, Weather
 from tests.sync_sim.robot import SimRobot
 from tests.sync_sim.server import FoldOnRequest, SimServer
 
+from cairn_client.room import drop_cells
 from cairn_map import ids
 from cairn_map.fingerprint import ZERO, fingerprint
 from cairn_map.ids import OPERATOR, CommitId
@@ -38,6 +39,7 @@ SELDOM = (
     "roll_back_disk",
     "lose_disk",
     "forget_evidence",
+    "drop_cells",
     "clock",
 )
 
@@ -154,6 +156,11 @@ class History:
 
     def _forget_evidence(self) -> None:
         self._server.forget_evidence()
+
+    def _drop_cells(self) -> None:
+        """A robot has no room for some cells of the server any more."""
+        replica = self._random.choice(self._robots).replica
+        drop_cells(replica, [key for key in replica.cells if self._random.random() < 0.5])
 
     def _clock(self) -> None:
         """Somebody sets all clocks to another time."""
