@@ -308,7 +308,7 @@ SWITCHES = (
         6,
         "the base on disk changes with its cursor",
         REPLICA,
-        "self.store.put_cell(key, cell, body=body or encode_cell(key, evidence, self.geometry).data)",
+        "self.store.put_cell(key, cell, body=data)",
         "self.store.put_cell(key, cell, body=self.store.body(key) or b'')",
         "cairn_client/test_rules.py::test_a_frame_that_comes_twice_counts_once",
     ),
