@@ -1,5 +1,6 @@
 """What a server's answers become: lists, cells, errors."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from pydantic import TypeAdapter, ValidationError
@@ -26,6 +27,12 @@ class Traffic:
 
     up_bytes: int = 0
     down_bytes: int = 0
+
+    def counted(self, parts: Iterable[bytes]) -> Iterator[bytes]:
+        """The parts of an answer, counted as they come."""
+        for part in parts:
+            self.down_bytes += len(part)
+            yield part
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,6 @@ Errors come out as the same `CairnError` that the server raised. What could not 
 again later, is `UnreachableError`. Every call is idempotent, so whoever calls may simply call again.
 """
 
-import ssl
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,18 +15,16 @@ import httpx
 from pydantic import TypeAdapter, ValidationError
 
 from cairn_client.answers import FetchedCell, Traffic, error_of, list_of
-from cairn_client.asks import Box
+from cairn_client.asks import Box, GetUpload, PutPart
+from cairn_client.certificates import certificates
 from cairn_client.open_sockets import OpenSockets
 from cairn_map.access_messages import CreateToken, NewSecret, TokenInfo
+from cairn_map.begun_frames import Replies
 from cairn_map.commit import Commit
 from cairn_map.cursor import cursor_from_text
-from cairn_map.errors import (
-    BadInputError,
-    DamagedDataError,
-    UnreachableError,
-)
+from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
 from cairn_map.fingerprint import fingerprint_from_hex
-from cairn_map.frames import Frame, FrameReader
+from cairn_map.frames import Frame
 from cairn_map.grid import Cell
 from cairn_map.ids import Author, CommitId
 from cairn_map.index_messages import INDEX_PAGE, CellIndex
@@ -46,6 +43,7 @@ from cairn_map.messages import (
     message_from_json,
 )
 from cairn_map.robot_status import RobotStatus
+from cairn_map.upload_messages import Upload
 from cairn_map.version_vector import EMPTY, VersionVector, vector_digest, version_vector_from_json
 
 PROTOCOL_VERSION = "1"
@@ -80,9 +78,10 @@ class MapApi:
             raise BadInputError("bad_url", f"a server's URL is http://HOST:PORT, got {server_url!r}")
         try:
             options: Any = {"timeout": TIMEOUT, "event_hooks": {"request": [self.sockets.watch]}}
-            self._client = httpx.Client(base_url=server_url.rstrip("/"), verify=_verified(ca_file), **options)
+            self._client = httpx.Client(base_url=server_url.rstrip("/"), verify=certificates(ca_file), **options)
         except httpx.InvalidURL as exc:
             raise BadInputError("bad_url", f"{server_url!r} is not a URL: {exc}") from exc
+        self._client.headers.clear()  # a robot that asks whether anything is new pays for each of them
         self.token = token
 
     def __enter__(self) -> Self:
@@ -141,6 +140,14 @@ class MapApi:
         headers = {"Cairn-Seal": seal} if seal else {}
         path = f"/maps/{name}/commits/{commit.id}"
         return message_from_json(Pushed, self._ask("PUT", path, content=commit.data, headers=headers))
+
+    def upload(self, name: str, ask: GetUpload | PutPart) -> Upload:
+        """How much of a commit's bytes came in parts, after this one if it is one; with the last it is pushed."""
+        path, params = f"/maps/{name}/commits/{ask.id}/upload", {"digest": ask.digest}
+        if isinstance(ask, GetUpload):
+            return message_from_json(Upload, self._ask("GET", path, params=params))
+        params |= {"total": f"{ask.total_bytes}", "offset": f"{ask.offset_bytes}"}
+        return message_from_json(Upload, self._ask("PATCH", path, content=ask.data, params=params))
 
     def commit(self, name: str, commit: CommitId) -> tuple[bytes, str | None]:
         """A commit's bytes as they were pushed, and the seal on a retract that is the server's."""
@@ -208,21 +215,20 @@ class MapApi:
         headers = {"Content-Type": "application/vnd.cairn.cell"}
         self._ask("PUT", f"/maps/{name}/main/cells/{cell}", content=data, headers=headers)
 
-    def missing(self, name: str, branch: str, request: MissingRequest) -> Generator[Frame, None, None]:
-        """Frames as they arrive.
+    def missing(
+        self, name: str, branch: str, request: MissingRequest, *, replies: Replies | None = None
+    ) -> Generator[Frame, None, None]:
+        """Frames as they arrive; with `replies`, nothing that came with an earlier reply comes again.
 
         Raises:
             UnreachableError: the link broke; the frames before it were whole and may be kept.
             DamagedDataError: the bytes are not frames.
         """
-        reader = FrameReader()
-        body = request.model_dump_json(exclude_defaults=True).encode()
+        reply = (replies or Replies()).reply_to(request)
+        body = reply.request.model_dump_json(exclude_defaults=True).encode()
         with self._open("POST", f"/maps/{name}/branches/{branch}/missing", content=body) as response:
-            for part in response.iter_bytes(1 << 16):
-                self.traffic.down_bytes += len(part)
-                yield from reader.feed(part)
-        if not reader.is_empty:
-            raise UnreachableError("cut_off", "the reply was cut off")
+            known = response.status_code == httpx.codes.NO_CONTENT
+            yield from reply.again() if known else reply.frames(self.traffic.counted(response.iter_bytes()))
 
     def _coverage(self, name: str, headers: httpx.Headers) -> VersionVector:
         """The version vector that a cell came with: as it is, or by a digest, of the one known last or asked for."""
@@ -264,7 +270,7 @@ class MapApi:
         if self.token:
             sent["Authorization"] = f"Bearer {self.token}"
         if content:
-            is_json = content.startswith(b"{")
+            is_json = content.startswith(b"{") and method != "PATCH"
             sent.setdefault("Content-Type", "application/json" if is_json else "application/vnd.cairn.commit")
         try:
             with self._client.stream(method, path, headers=sent, content=content, params=params) as response:
@@ -289,10 +295,3 @@ def _unreachable(exc: httpx.TransportError) -> UnreachableError:
             "no_link", f"{where} shows a certificate of nobody we know; name its issuer's file in SSL_CERT_FILE"
         )
     return UnreachableError("no_link", f"cannot reach {where} ({exc or type(exc).__name__}); is `cairn serve` running?")
-
-
-def _verified(ca_file: Path | None) -> ssl.SSLContext | bool:
-    try:
-        return ssl.create_default_context(cafile=ca_file) if ca_file else True
-    except OSError as exc:  # ssl.SSLError is one
-        raise BadInputError("bad_setting", f"{ca_file} is no file of certificates: {exc}") from exc

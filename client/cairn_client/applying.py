@@ -18,8 +18,8 @@ from cairn_map.errors import DamagedDataError
 from cairn_map.evidence import Evidence, empty_evidence
 from cairn_map.fingerprint import ZERO, fingerprint
 from cairn_map.frames import CellFrame, Frame, FrameKind
-from cairn_map.grid import CellKey, cell_of_key
-from cairn_map.messages import CellCursor, Done, MissingRequest, More, ReplyHeader
+from cairn_map.grid import Cell, CellKey, cell_of_key
+from cairn_map.messages import Done, MissingRequest, More, ReplyHeader
 from cairn_map.version_vector import EMPTY
 
 log = logging.getLogger(__name__)
@@ -34,9 +34,18 @@ class Exchange:
     """One request for what is missing, and the frames of its answer."""
 
     def __init__(
-        self, replica: Replica, *, compare: bool = False, box: Box | None = None, reply_bytes_max: int | None = None
+        self,
+        replica: Replica,
+        *,
+        compare: bool = False,
+        box: Box | None = None,
+        reply_bytes_max: int | None = None,
+        near: Cell | None = None,
     ) -> None:
-        """Ask for all cells, or for those in a box; at most so many bytes of cells, or as many as the server likes."""
+        """Ask for all cells, or for those in a box; at most so many bytes of cells, or as many as the server likes.
+
+        The cells next to `near` come first.
+        """
         self._replica = replica
         with replica.lock:
             self._author = replica.author
@@ -45,6 +54,7 @@ class Exchange:
         self._compare = compare
         self._box = box
         self._reply_bytes_max = reply_bytes_max
+        self._near = near
         self._header: ReplyHeader | None = None
         self._coverage = EMPTY
         self._framed: set[CellKey] = set()
@@ -58,15 +68,19 @@ class Exchange:
 
     def request(self) -> MissingRequest:
         """What this replica holds: the default cursor, and every cell that stands elsewhere."""
-        listed = [(key, cursor) for key, cursor in self._asked.items() if self._compare or cursor != self._default]
+        groups: dict[str | None, list[CellKey]] = {}
+        for key, cursor in sorted(self._asked.items()):
+            if self._compare or cursor != self._default:
+                groups.setdefault(str(cursor) if cursor else None, []).append(key)
         return MissingRequest(
             author=str(self._author),
             cursor=str(self._default) if self._default else None,
-            cells=[CellCursor(cell=cell_of_key(k), cursor=str(c) if c else None) for k, c in sorted(listed)],
+            groups=[(cursor, [cell_of_key(key) for key in keys]) for cursor, keys in groups.items()],
             compare=self._compare,
             kinds=["delta", "state", "full"],
             box=self._box,
             size_bytes_max=self._reply_bytes_max,
+            near=self._near,
         )
 
     def take(self, frame: Frame) -> None:

@@ -19,6 +19,7 @@ from cairn_map.grid import Cell
 from cairn_map.ids import Author, CommitId
 from cairn_map.index_messages import CellIndex
 from cairn_map.messages import MissingRequest
+from cairn_map.upload_messages import Upload
 
 A = TypeVar("A")
 T = TypeVar("T")
@@ -49,6 +50,25 @@ class Push(Ask[None]):
     commit: Commit
     seal: str | None = None
     """On a retract that is the server's own."""
+
+
+@dataclass(frozen=True, slots=True)
+class GetUpload(Ask[Upload]):
+    """How much of a commit's bytes (their SHA-256) came with earlier parts."""
+
+    id: CommitId
+    digest: str
+
+
+@dataclass(frozen=True, slots=True)
+class PutPart(Ask[Upload]):
+    """Take these bytes of a commit; with the last of them, take the commit."""
+
+    id: CommitId
+    digest: str
+    total_bytes: int
+    offset_bytes: int
+    data: bytes
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,11 +11,14 @@ from cairn_client.asks import (
     GetCommit,
     GetIndex,
     GetMissing,
+    GetUpload,
     NextFrame,
     Push,
     PutCell,
+    PutPart,
 )
 from cairn_client.cell_index import whole_index
+from cairn_map.begun_frames import Replies
 from cairn_map.errors import CairnError
 from cairn_map.frames import Frame
 from cairn_map.index_messages import CellIndex
@@ -31,6 +34,7 @@ class Link:
         self._map_name = map_name
         self._branch = branch
         self._frames: Generator[Frame, None, None] | None = None
+        self._replies = Replies()
 
     def hold(self, conversation: Conversation[T]) -> T:
         """The result of a conversation with the server.
@@ -59,11 +63,13 @@ class Link:
             case Push(commit, seal):
                 api.push(name, commit, seal=seal)
                 return None
+            case GetUpload() | PutPart():
+                return api.upload(name, ask)
             case GetCommit(commit_id):
                 return api.commit(name, commit_id)
             case GetMissing(request):
                 self._stop_reading()
-                self._frames = api.missing(name, self._branch, request)
+                self._frames = api.missing(name, self._branch, request, replies=self._replies)
                 return next(self._frames, None)
             case NextFrame():
                 return next(self._frames, None) if self._frames else None

@@ -31,6 +31,8 @@ class OwnStatus:
     """Charge, 0 to 1."""
     note: str = ""
     """Anything else for people, to 256 characters."""
+    every_s: float = 0.0
+    """Not told more often than this, whatever is new."""
     _told: RobotStatus | None = None
 
     def place(self) -> tuple[float, float, float] | None:
@@ -52,7 +54,7 @@ class OwnStatus:
                 battery=self.battery,
                 note=self.note,
             )
-            if self._told is None or _says_more(status, self._told):
+            if self._told is None or _says_more(status, self._told, every_s=self.every_s):
                 api.put_status(map_name, branch, status)
                 self._told = status
         except ValidationError as exc:
@@ -61,7 +63,10 @@ class OwnStatus:
             log.info("this robot's status was not taken: %s: %s", exc.kind, exc.message)
 
 
-def _says_more(status: RobotStatus, told: RobotStatus) -> bool:
-    """Whether it is old, or says anything else than the one before."""
-    is_old = not 0 <= status.time_s - told.time_s < TELL_AGAIN_S
+def _says_more(status: RobotStatus, told: RobotStatus, *, every_s: float) -> bool:
+    """Whether it is old, or says anything else than the one before, if it may already."""
+    age_s = status.time_s - told.time_s
+    if 0 <= age_s < every_s:
+        return False
+    is_old = not 0 <= age_s < TELL_AGAIN_S
     return is_old or status.model_copy(update={"time_s": told.time_s}) != told

@@ -10,10 +10,10 @@ from cairn_client.arguments import (
     say,
     shown_bytes,
 )
+from cairn_client.nearness import Wanted, within
 from cairn_client.replica_store import ReplicaStore
 from cairn_client.robot import Robot
 from cairn_client.robot_arguments import add_map, place, scope_of
-from cairn_client.sync import Wanted, within
 from cairn_map.errors import BadInputError
 from cairn_map.robot_status import Mode
 
@@ -25,9 +25,18 @@ def _pull(args: argparse.Namespace) -> int:
     mode: Mode = args.mode or ("high-end" if known and known != "viewer" else "viewer")
     scope = replace(scope_of(args), wanted=_wanted(args, api, map_name))
     with Robot(
-        None, args.map, directory=args.state, name=name, token=args.token, mode=mode, scope=scope, stay=True
+        *(None, args.map),
+        directory=args.state,
+        name=name,
+        token=args.token,
+        mode=mode,
+        scope=scope,
+        link=args.link,
+        stay=True,
     ) as robot:
         report = robot.sync()
+        while report.has_more:
+            report.has_more = robot.sync().has_more
         robot.sync()  # tells the server where this robot stands now
         cells = robot.map.packed()
         voxels = sum(len(evidence) for evidence in cells.values())

@@ -59,6 +59,7 @@ def _replay(args: argparse.Namespace) -> int:
         geometry=geometry,
         integrator=integrator,
         scope=scope_of(args),
+        link=args.link,
         stay=True,
     ) as robot:
         last_sync_s = start_s
@@ -66,7 +67,7 @@ def _replay(args: argparse.Namespace) -> int:
             for index in stop:
                 robot.observe(source.scan(index))
                 scans += 1
-            commits += robot.commit(profile=Profile(args.profile)) is not None
+            commits += robot.commit(profile=Profile(args.profile) if args.profile else None) is not None
             if time.monotonic() - last_sync_s > SYNC_EVERY_S:
                 _try_sync(robot)
                 last_sync_s = time.monotonic()
@@ -172,8 +173,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     replay.add_argument(
         "--profile",
         choices=list(Profile),
-        default=Profile.FAST,
-        help="small: four tenths fewer bytes, more work (fast)",
+        help="small: four tenths fewer bytes, more work (as --link wants it)",
     )
     add_frame_arguments(replay)
     replay.set_defaults(run=_replay)

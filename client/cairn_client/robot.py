@@ -21,6 +21,7 @@ from cairn_client.answers import Traffic
 from cairn_client.api import MapApi
 from cairn_client.folder_status import MODE_KEY, URL_KEY
 from cairn_client.limits import NO_LIMITS, Limits
+from cairn_client.link_profile import LINKS, LinkName
 from cairn_client.map_url import split_map_url
 from cairn_client.membership import Membership
 from cairn_client.outbox import UNNUMBERED
@@ -65,6 +66,7 @@ class Robot:
         integrator: Integrator | None = None,
         scope: Scope = EVERYTHING,
         limits: Limits = NO_LIMITS,
+        link: LinkName = "good",
         stay: bool = False,
     ) -> None:
         """Open or make the robot's directory; no network unless the map's geometry is not known yet.
@@ -81,6 +83,7 @@ class Robot:
             integrator: range limits.
             scope: which cells to fetch, and how much in one reply.
             limits: how much to keep on the disk and in memory, and what goes when that is full.
+            link: small for a link of some ten to some hundred kbit/s (`link_profile`).
             stay: a robot that only pauses: `close` does not deregister it.
 
         Raises:
@@ -93,6 +96,7 @@ class Robot:
         self.name = robot_name(name)
         self.mode: Mode = mode
         self._rig = rig
+        self._profile = LINKS[link]
         self._api = MapApi(server_url, token=token)
         try:
             self._replica = self._open(Path(directory), geometry)
@@ -106,13 +110,14 @@ class Robot:
         membership = Membership(
             self._api, self._replica, map_name=self._map_name, mode=mode, sensors=sensors, enrolment_token=token
         )
-        self.status = OwnStatus()
+        self.status = OwnStatus(every_s=self._profile.tell_every_s)
         self._events = Events()
         self._rounds = Rounds(
             *(self._api, self._replica, membership, self._events),
             map_name=self._map_name,
             mode=mode,
             scope=scope,
+            profile=self._profile,
             limits=limits,
             status=self.status,
         )
@@ -183,14 +188,14 @@ class Robot:
         self._measurement = self._new_measurement()
 
     def commit(
-        self, *, note: str = "", retracts: tuple[CommitId, ...] = (), profile: Profile = Profile.FAST
+        self, *, note: str = "", retracts: tuple[CommitId, ...] = (), profile: Profile | None = None
     ) -> Commit | None:
         """Close the open measurement and keep it durably; None if there is nothing in it.
 
         Args:
             note: up to 1024 characters for the map's log.
             retracts: own commits that it takes back and stands for, on this robot too once the server has folded it.
-            profile: small spends more work, up to a second, on four tenths fewer bytes.
+            profile: small spends more work, up to a second, on four tenths fewer bytes; None: as the link wants it.
 
         Raises:
             BadInputError: the commit would be too large, its note too long, or it retracts what is not this robot's.
@@ -203,7 +208,7 @@ class Robot:
                 log.warning("%d scans gave no evidence; nothing is committed", len(self._measurement))
                 self._measurement = self._new_measurement()
             return None
-        commit = self._replica.commit(diff, self._meta(note, retracts), profile=profile)
+        commit = self._replica.commit(diff, self._meta(note, retracts), profile=profile or self._profile.commits)
         self._measurement = self._new_measurement()
         cells = tuple(cell_of_key(key) for key in sorted(commit.cells))
         self._events.tell(Committed(commit=commit.id, cells=cells, size_bytes=len(commit.data)))

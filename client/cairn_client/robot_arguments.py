@@ -4,6 +4,7 @@ import argparse
 
 from cairn_client.arguments import add_token, allow_negative_lists
 from cairn_client.limits import Limits
+from cairn_client.link_profile import LINKS
 from cairn_client.scope import Scope
 from cairn_map.errors import BadInputError
 
@@ -21,6 +22,12 @@ def add_amount(command: argparse.ArgumentParser) -> None:
     command.add_argument("--box", type=_box, metavar="X0,Y0,Z0,X1,Y1,Z1", help="fetch only cells in it, metres")
     command.add_argument(
         "--reply-bytes", type=int, metavar="BYTES", help="of cells in one reply; the rest comes in the next ones"
+    )
+    command.add_argument(
+        "--link",
+        choices=list(LINKS),
+        default="good",
+        help="small: some ten to some hundred kbit/s: commits in few bytes and parts, short replies (good)",
     )
     add_token(command)
 

@@ -7,7 +7,9 @@ from collections.abc import Callable
 from cairn_client.api import MapApi
 from cairn_client.limits import Limits
 from cairn_client.link import Link
+from cairn_client.link_profile import LinkProfile
 from cairn_client.membership import Membership
+from cairn_client.nearness import cell_at
 from cairn_client.own_status import OwnStatus
 from cairn_client.replica import Replica
 from cairn_client.robot_events import Events
@@ -38,6 +40,7 @@ class Rounds:
         map_name: str,
         mode: Mode,
         scope: Scope,
+        profile: LinkProfile,
         limits: Limits,
         status: OwnStatus,
     ) -> None:
@@ -47,7 +50,8 @@ class Rounds:
         self._membership = membership
         self._map_name = map_name
         self._mode: Mode = mode
-        self._scope = scope
+        self._scope = profile.scope_of(scope)
+        self._parts = profile.parts
         self._status = status
         self._branch = replica.author.robot
         self._link = Link(api, map_name, branch=self._branch)
@@ -111,17 +115,21 @@ class Rounds:
         pushes = self._push(on_push)
         report = self._fetch()
         report.pushed, report.refused = pushes.pushed, pushes.refused
+        if report.has_more:
+            self.wake()
         self._status.tell(self._replica, self._api, self._map_name, branch=self._branch, mode=self._mode)
         return report
 
     def _fetch(self) -> RoundReport:
         """What fits: again with a smaller box when there is no room for it."""
-        is_low_end = self._mode == "low-end"
+        is_low_end, place = self._mode == "low-end", self._status.place()
+        near = cell_at(place, self._replica.geometry.cell_edge_m) if place is not None else None
         self._link.hold(self._room.keep_up())
         while True:
             box = self._room.box()
             try:
-                return self._link.hold(fetch(self._replica, is_low_end=is_low_end, scope=self._scope, room=box))
+                fetching = fetch(self._replica, is_low_end=is_low_end, scope=self._scope, room=box, near=near)
+                return self._link.hold(fetching)
             except UnreachableError as exc:
                 if exc.kind != NO_ROOM:
                     raise
@@ -134,4 +142,10 @@ class Rounds:
             if on_push:
                 on_push(commit)
 
-        return self._link.hold(push_commits(self._replica, sealed_only=self._mode == "viewer", on_push=pushed))
+        sealed_only = self._mode == "viewer"
+        pushing = push_commits(self._replica, sealed_only=sealed_only, on_push=pushed, parts=self._parts)
+        try:
+            return self._link.hold(pushing)
+        except UnreachableError:
+            self._parts = self._parts.after_a_cut()
+            raise

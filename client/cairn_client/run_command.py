@@ -119,6 +119,7 @@ def _robot(args: argparse.Namespace, spool: Spool, stopping: threading.Event) ->
         integrator=Integrator(min_range_m=args.min_range, max_range_m=args.max_range),
         scope=scope_of(args),
         limits=limits_of(args),
+        link=args.link,
         stay=args.stay,
     )
 

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 from cairn_client.applying import is_within
 from cairn_client.asks import Box, Conversation
+from cairn_client.nearness import Wanted
 from cairn_client.replica import Replica
-from cairn_client.sync import RoundReport, Wanted, fetch_cells, fetch_missing
+from cairn_client.sync import RoundReport, fetch_cells, fetch_missing
 from cairn_map.errors import BadInputError
 from cairn_map.grid import CELL_LIMIT, Cell, cell_key
 
@@ -24,6 +25,8 @@ class Scope:
     """Low-end: only these cells, of those in the box."""
     reply_bytes_max: int | None = None
     """High-end and viewer: after so many bytes of cells a reply ends, and the rest is asked for by another request."""
+    round_bytes_max: int | None = None
+    """After so many bytes of cells a round ends, and the next one goes on: a commit does not wait for the whole map."""
 
     def __post_init__(self) -> None:
         """Raises: BadInputError: the box is none, or there is no room for a cell in a reply."""
@@ -33,8 +36,9 @@ class Scope:
                 raise BadInputError(
                     "bad_box", f"a box is its lowest and its highest corner in metres, got {self.box_m}"
                 )
-        if self.reply_bytes_max is not None and self.reply_bytes_max < 1:
-            raise BadInputError("bad_option", f"a reply has at least 1 byte, got {self.reply_bytes_max}")
+        for size_bytes in (self.reply_bytes_max, self.round_bytes_max):
+            if size_bytes is not None and size_bytes < 1:
+                raise BadInputError("bad_option", f"a reply and a round have at least 1 byte, got {size_bytes}")
 
     def box(self, cell_edge_m: float) -> Box | None:
         """The box as cells, lowest and highest, both included."""
@@ -49,10 +53,12 @@ class Scope:
 EVERYTHING = Scope()
 
 
-def fetch(replica: Replica, *, is_low_end: bool, scope: Scope, room: Box | None = None) -> Conversation[RoundReport]:
+def fetch(
+    replica: Replica, *, is_low_end: bool, scope: Scope, room: Box | None = None, near: Cell | None = None
+) -> Conversation[RoundReport]:
     """Bring what is in the scope to the server's head: whole cells for a low-end robot, else what is missing.
 
-    Of the scope only what is in `room`, if that is given.
+    Of the scope only what is in `room`, if that is given. The cells next to `near` come first.
 
     Raises:
         UnreachableError: the link broke; what came is kept.
@@ -65,8 +71,16 @@ def fetch(replica: Replica, *, is_low_end: bool, scope: Scope, room: Box | None 
         return is_within(cell_key(cell), box) and (wanted is None or wanted(cell))
 
     if is_low_end:
-        return (yield from fetch_cells(replica, wanted=is_in_scope if box or wanted else None, box=box))
-    report = yield from fetch_missing(replica, box=box, reply_bytes_max=scope.reply_bytes_max)
+        needed = is_in_scope if box or wanted else None
+        most = scope.round_bytes_max
+        return (yield from fetch_cells(replica, wanted=needed, box=box, round_bytes_max=most, near=near))
+    report = yield from fetch_missing(
+        replica,
+        box=box,
+        reply_bytes_max=scope.reply_bytes_max,
+        round_bytes_max=scope.round_bytes_max,
+        near=near,
+    )
     if box is not None:  # what is outside never comes, so own commits must not wait for it
         replica.forget_stable_commits(wanted=is_in_scope)
     return report

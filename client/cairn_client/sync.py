@@ -11,15 +11,14 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-import numpy.typing as npt
-
 from cairn_client.applying import Exchange, is_within
-from cairn_client.asks import Box, Conversation, GetCell, GetCommit, GetMissing, NextFrame, Push
+from cairn_client.asks import Box, Conversation, GetCell, GetCommit, GetMissing, NextFrame
 from cairn_client.cell_index import whole_index
 from cairn_client.heal import heal_damaged
+from cairn_client.nearness import Wanted, rings_between
 from cairn_client.replica import Replica
 from cairn_client.replica_store import BaseCell
+from cairn_client.uploads import PARTS, Parts, push_whole_or_in_parts
 from cairn_map.cell_code import decode_cell
 from cairn_map.commit import Commit
 from cairn_map.commit_reading import open_commit
@@ -32,6 +31,7 @@ from cairn_map.errors import (
     UnreachableError,
 )
 from cairn_map.fingerprint import ZERO, fingerprint
+from cairn_map.frames import CellFrame
 from cairn_map.grid import Cell, CellKey, cell_key, cell_of_key
 from cairn_map.ids import CommitId
 
@@ -43,10 +43,6 @@ REPLIES_MAX = 4096
 """The same with those that end before their cells do, by the asker's or the server's limit of bytes."""
 
 
-Wanted = Callable[[Cell], bool]
-"""Which cells a low-end robot keeps."""
-
-
 @dataclass(slots=True)
 class RoundReport:
     """What one round did."""
@@ -56,12 +52,20 @@ class RoundReport:
     """Commits that the server will not take, and why; they stay in the outbox."""
     frames: int = 0
     cells_fetched: int = 0
+    size_bytes: int = 0
+    """Of cells that came."""
+    has_more: bool = False
+    """The round ended at its limit of bytes: the next one goes on."""
     healed: int = 0
     """Cells that the server had damaged and has from here again."""
 
 
 def push_commits(
-    replica: Replica, *, sealed_only: bool = False, on_push: Callable[[CommitId], None] | None = None
+    replica: Replica,
+    *,
+    sealed_only: bool = False,
+    on_push: Callable[[CommitId], None] | None = None,
+    parts: Parts = PARTS,
 ) -> Conversation[RoundReport]:
     """Push every commit that the server may lack, oldest first; or of them only the server's own retracts.
 
@@ -75,7 +79,7 @@ def push_commits(
         if commit is None or (sealed_only and seal is None):
             continue
         try:
-            pushed = yield from _push(replica, commit, seal)
+            pushed = yield from _push(replica, commit, seal, parts)
         except ConflictError as exc:
             log.error("the server will not take commit %s: %s: %s", commit_id, exc.kind, exc.message)
             report.refused[commit_id] = exc
@@ -97,23 +101,23 @@ def push_commits(
     return report
 
 
-def _push(replica: Replica, commit: Commit, seal: str | None) -> Conversation[CommitId]:
+def _push(replica: Replica, commit: Commit, seal: str | None, parts: Parts) -> Conversation[CommitId]:
     """Push one commit; its id, which is a new one if the server has other bytes under the old (rule 13)."""
     try:
-        yield from Push(commit, seal)
+        yield from push_whole_or_in_parts(commit, seal, parts)
     except ConflictError as exc:
         if exc.kind == "evidence_gone":
             # The server forgot what this commit takes out: it takes it from whoever still has it (rule 11).
             for target in commit.meta.retracted_ids:
                 if (kept := replica.kept_commit(target)) is not None:
-                    yield from Push(kept)
-            yield from Push(commit, seal)
+                    yield from push_whole_or_in_parts(kept, None, parts)
+            yield from push_whole_or_in_parts(commit, seal, parts)
             return commit.id
         if exc.kind != "id_taken" or seal is not None:
             raise
         renamed = replica.kept_commit(replica.rename(commit.id))
         assert renamed is not None  # noqa: S101 - it was just kept
-        yield from Push(renamed)
+        yield from push_whole_or_in_parts(renamed, None, parts)
         return renamed.id
     return commit.id
 
@@ -138,11 +142,18 @@ def keep_retracts(replica: Replica) -> Conversation[None]:
 
 
 def fetch_missing(
-    replica: Replica, *, box: Box | None = None, reply_bytes_max: int | None = None
+    replica: Replica,
+    *,
+    box: Box | None = None,
+    reply_bytes_max: int | None = None,
+    round_bytes_max: int | None = None,
+    near: Cell | None = None,
 ) -> Conversation[RoundReport]:
     """Bring every held cell to the server's head, or those in a box; what arrives before a cut is kept.
 
-    With `reply_bytes_max` a reply ends after so many bytes of cells, and the rest is asked for by the next request.
+    With `reply_bytes_max` a reply ends after so many bytes of cells, and the rest is asked for by the next request;
+    with `round_bytes_max` that is left to the next round, so that commits need not wait. The cells next to `near`
+    come first.
 
     Raises:
         UnreachableError: the link broke, or the server keeps asking to come back.
@@ -153,12 +164,13 @@ def fetch_missing(
     rounds = replies = 0
     while rounds < ROUNDS_MAX and replies < REPLIES_MAX:
         replies += 1
-        exchange = Exchange(replica, compare=compare, box=box, reply_bytes_max=reply_bytes_max)
+        exchange = Exchange(replica, compare=compare, box=box, reply_bytes_max=reply_bytes_max, near=near)
         try:
             frame = yield from GetMissing(exchange.request())
             while frame is not None:
                 exchange.take(frame)
                 report.frames += 1
+                report.size_bytes += len(frame.payload) if isinstance(frame, CellFrame) else 0
                 frame = yield from NextFrame()
         except ConflictError as exc:
             if exc.kind != "other_log":
@@ -174,13 +186,24 @@ def fetch_missing(
         if exchange.is_done and not _has_unproven(replica, box):
             yield from keep_retracts(replica)
             return report
+        if exchange.has_more and round_bytes_max is not None and report.size_bytes >= round_bytes_max:
+            report.has_more = True
+            return report
     raise UnreachableError("no_end", f"no end of the answer after {replies} requests", retry_after_s=30.0)
 
 
-def fetch_cells(replica: Replica, *, wanted: Wanted | None = None, box: Box | None = None) -> Conversation[RoundReport]:
+def fetch_cells(
+    replica: Replica,
+    *,
+    wanted: Wanted | None = None,
+    box: Box | None = None,
+    round_bytes_max: int | None = None,
+    near: Cell | None = None,
+) -> Conversation[RoundReport]:
     """Low-end: whole cells that changed since they were fetched last; all, or those in a box, or the wanted ones of it.
 
-    The index tells which did, so that cells that are still the same cost no request.
+    The index tells which did, so that cells that are still the same cost no request. Those next to `near` come first,
+    and of equally far ones what changed last.
 
     Raises:
         UnreachableError: the link broke; the cells before it are kept.
@@ -198,28 +221,36 @@ def fetch_cells(replica: Replica, *, wanted: Wanted | None = None, box: Box | No
             replica.forget_server()
         replica.take_header(index.header, asked_by=author)
         held = [key for key, cell in replica.cells.items() if cell.etag == f'"{digests.get(key)}"']
-        same = [key for key in held if key not in later]
+        same = {key for key in held if key not in later}
         replica.move(same, to=to, coverage=coverage)
         for key in replica.cells.keys() - digests.keys():  # a server that was restored forgot them
             if is_within(key, box):
                 replica.hold_nothing(key, BaseCell(to, coverage, ZERO))
     report.healed = yield from heal_damaged(replica)
     damaged = []
-    for key in sorted(digests.keys() - set(same)):
+    stale = [entry for entry in index.cells if cell_key(entry.cell) not in same]
+    for entry in sorted(stale, key=lambda entry: (rings_between(entry.cell, near), -entry.lm)):
+        report.has_more = round_bytes_max is not None and report.size_bytes >= round_bytes_max
+        if report.has_more:
+            break
+        key = cell_key(entry.cell)
         if wanted is None or wanted(cell_of_key(key)):
             try:
-                report.cells_fetched += yield from fetch_cell(replica, cell_of_key(key))
+                size_bytes = yield from fetch_cell(replica, cell_of_key(key))
+                report.cells_fetched += size_bytes > 0
+                report.size_bytes += size_bytes
             except DamagedDataError as exc:
                 log.error("cell %s: %s", cell_of_key(key), exc.message)
                 damaged.append(key)
-    replica.forget_stable_commits(wanted=wanted)
-    yield from keep_retracts(replica)
+    if not report.has_more:
+        replica.forget_stable_commits(wanted=wanted)
+        yield from keep_retracts(replica)
     _complain(damaged)
     return report
 
 
-def fetch_cell(replica: Replica, cell: Cell) -> Conversation[bool]:
-    """Low-end: one cell, if it changed; True if bytes came.
+def fetch_cell(replica: Replica, cell: Cell) -> Conversation[int]:
+    """Low-end: one cell, if it changed; the bytes that came.
 
     Raises:
         DamagedDataError: the cell does not have the fingerprint that the server states.
@@ -230,26 +261,14 @@ def fetch_cell(replica: Replica, cell: Cell) -> Conversation[bool]:
     with replica.lock:
         if fetched.body is None and held is not None:
             replica.move([key], to=fetched.cursor, coverage=fetched.coverage)
-            return False
+            return 0
         decoded = decode_cell(fetched.body or b"")
         is_ours = decoded.key == key and decoded.geometry == replica.geometry
         if not is_ours or fingerprint(decoded.evidence, key) != fetched.fingerprint:
             raise DamagedDataError("fingerprint_mismatch", f"cell {cell} is not what the server says it is")
         base = BaseCell(fetched.cursor, fetched.coverage, fetched.fingerprint, fetched.etag)
         replica.hold(key, base, decoded.evidence, body=fetched.body)
-        return True
-
-
-def within(position_m: npt.ArrayLike, *, radius_m: float, cell_edge_m: float) -> Wanted:
-    """Cells of which some point lies within a radius of a position."""
-    centre = np.asarray(position_m, dtype=np.float64)
-
-    def is_near(cell: Cell) -> bool:
-        low = np.array(cell) * cell_edge_m
-        nearest = np.clip(centre, low, low + cell_edge_m)
-        return bool(np.linalg.norm(nearest - centre) <= radius_m)
-
-    return is_near
+        return len(fetched.body or b"")
 
 
 def _complain(damaged: Sequence[CellKey]) -> None:

@@ -68,6 +68,7 @@ def _sync(args: argparse.Namespace) -> int:
             token=args.token,
             mode=args.mode,
             scope=scope_of(args),
+            link=args.link,
             stay=True,
         ) as robot,
     ):

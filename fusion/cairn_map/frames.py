@@ -39,6 +39,7 @@ JSON_BYTES_MAX = 1 << 22
 BLOCK_LIMIT = 8 ** (DEPTH_MAX - 2)
 """Block numbers are below it, in the deepest cell."""
 FLAG_OWN_EXCLUDED = 1
+FLAG_CONTINUES = 2
 NO_CURSOR = -1
 
 
@@ -70,6 +71,8 @@ class CellFrame:
     own_excluded: bool = False
     blocks: npt.NDArray[np.uint32] | None = None
     """Of a `state` frame: (B,) rising Morton numbers of the 4^3 blocks that it replaces."""
+    continues: bool = False
+    """The payload is only the rest of it: the asker said that it has the beginning."""
     payload: bytes = b""
     """A cell's bytes; empty for `reset`."""
 
@@ -122,6 +125,20 @@ class FrameReader:
         """Whether a reply began and nothing is left over: false at the end means the reply was cut."""
         return self._started and not self._buffer
 
+    @property
+    def begun(self) -> tuple[CellKey, bool, bytes] | None:
+        """Of the frame that is not whole: cell, whether it continues, what came of its payload; nothing is checked."""
+        if not self._started or len(self._buffer) <= PREFIX.size + CELL_HEAD.size + 4:
+            return None
+        size, kind = PREFIX.unpack_from(self._buffer)
+        key, flags = struct.unpack_from("<QB", self._buffer, PREFIX.size)
+        at = PREFIX.size + CELL_HEAD.size
+        if kind == FrameKind.STATE:
+            at += 4 + 4 * int.from_bytes(self._buffer[at : at + 4], "little")
+        payload = bytes(self._buffer[at : PREFIX.size + size])
+        is_cell = kind in CELL_KINDS and key < 1 << 63
+        return (CellKey(key), bool(flags & FLAG_CONTINUES), payload) if is_cell and payload else None
+
     def _next(self) -> Frame | None:
         if len(self._buffer) < PREFIX.size:
             return None
@@ -166,7 +183,7 @@ def _cell_body(frame: CellFrame) -> bytes:
     to = frame.to_cursor
     head = CELL_HEAD.pack(
         frame.cell,
-        FLAG_OWN_EXCLUDED if frame.own_excluded else 0,
+        FLAG_OWN_EXCLUDED * frame.own_excluded | FLAG_CONTINUES * frame.continues,
         start.log_id if start else bytes(16),
         start.seq if start else NO_CURSOR,
         start.chain if start else bytes(CHAIN_BYTES),
@@ -207,7 +224,7 @@ def _parsed_cell(kind: FrameKind, body: bytes) -> CellFrame:
         if (blocks[1:] <= blocks[:-1]).any() or (blocks >= BLOCK_LIMIT).any():
             raise DamagedDataError("bad_frame", "a state frame's blocks must rise and lie in the cell")
         at += 4 * count
-    if key >= 1 << 63 or flags & ~FLAG_OWN_EXCLUDED or (kind is FrameKind.RESET and at != len(body)):
+    if key >= 1 << 63 or flags & ~(FLAG_OWN_EXCLUDED | FLAG_CONTINUES) or (kind is FrameKind.RESET and at != len(body)):
         raise DamagedDataError("bad_frame", "a cell frame has an impossible cell number, flag or payload")
     try:
         start = None if from_seq == NO_CURSOR else Cursor(from_log, from_seq, from_chain)
@@ -221,6 +238,7 @@ def _parsed_cell(kind: FrameKind, body: bytes) -> CellFrame:
         to_cursor=to,
         fingerprint=fingerprint_from_bytes(sums),
         own_excluded=bool(flags & FLAG_OWN_EXCLUDED),
+        continues=bool(flags & FLAG_CONTINUES),
         blocks=blocks,
         payload=body[at:],
     )

@@ -29,6 +29,8 @@ VectorJson = Annotated[dict[str, Annotated[list[Interval], FailFast()]], Field(m
 Time = Annotated[float, Field(allow_inf_nan=False)]
 
 CURSORS_MAX = 100_000
+CellNumbers = Annotated[list[tuple[int, int, int]], Field(max_length=CURSORS_MAX), FailFast()]
+CursorGroup = tuple[CursorText | None, CellNumbers]
 WANTED_MAX = 256
 """Commits that a header wants again."""
 DAMAGED_MAX = 256
@@ -143,6 +145,8 @@ class MissingRequest(_LongRequest):
     cursor: CursorText | None = None
     """Cursor of every cell not listed; None: holds nothing."""
     cells: Annotated[list[CellCursor], Field(max_length=CURSORS_MAX), FailFast()] = []
+    groups: Annotated[list[CursorGroup], Field(max_length=CURSORS_MAX), FailFast()] = []
+    """The same by cursor: those of a reply that was cut have the same one, and it is longer than a cell's number."""
     compare: bool = False
     """Answer every listed cell with a `reset` frame: only its fingerprint."""
     box: tuple[tuple[int, int, int], tuple[int, int, int]] | None = None
@@ -151,6 +155,12 @@ class MissingRequest(_LongRequest):
     """After so many bytes of cell frames the reply ends with `more`; None: the server's own limit."""
     kinds: Annotated[list[Literal["delta", "state", "full"]], Field(max_length=3), FailFast()] = ["delta", "full"]
     """Kinds of frame that the asker can use now; `full` is always understood to be."""
+    near: tuple[int, int, int] | None = None
+    """Frames of the cells next to this one come first, then those farther away; None: the newest everywhere."""
+    begun: tuple[tuple[int, int, int], Annotated[int, Field(ge=1)], ShaText] | None = None
+    """Cell, bytes of its frame's payload that came before a cut, SHA-256 of them: only the rest is sent."""
+    known: Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")] | None = None
+    """First digits of the SHA-256 of the last reply: if this one would be the same, 204 says so."""
 
 
 class ReplyHeader(_Model):

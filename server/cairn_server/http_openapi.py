@@ -20,6 +20,7 @@ Json = dict[str, Any]
 Route = tuple[str, str]
 
 MAP = "/maps/{name}"
+UPLOAD = f"{MAP}/commits/{{commit}}/upload"
 CELL = f"{MAP}/main/cells/{{cell}}"
 VIEW = f"{MAP}/branches/{{branch}}/view"
 COMMIT_MEDIA_TYPE = "application/vnd.cairn.commit"
@@ -27,11 +28,12 @@ CELL_TYPES = (CELL_MEDIA_TYPE, *MEDIA_TYPES.values())
 PICTURES = ("image/jpeg", "image/png")
 BODIES: dict[Route, tuple[str, ...]] = {
     ("put", f"{MAP}/commits/{{commit}}"): (COMMIT_MEDIA_TYPE,),
+    ("patch", UPLOAD): ("application/octet-stream",),
     ("put", VIEW): PICTURES,
     ("put", CELL): (CELL_MEDIA_TYPE,),
 }
 ANSWERS: dict[Route, dict[int, tuple[str, ...]]] = {
-    ("post", f"{MAP}/branches/{{branch}}/missing"): {200: (REPLY_MEDIA_TYPE,)},
+    ("post", f"{MAP}/branches/{{branch}}/missing"): {200: (REPLY_MEDIA_TYPE,), 204: ()},
     ("get", f"{MAP}/commits/{{commit}}"): {200: (COMMIT_MEDIA_TYPE,)},
     ("get", "/metrics"): {200: ("text/plain",)},
     ("get", CELL): {200: CELL_TYPES, 206: CELL_TYPES, 304: ()},
@@ -42,11 +44,12 @@ ANSWERS: dict[Route, dict[int, tuple[str, ...]]] = {
     ("get", f"{MAP}/live"): {101: ()},
 }
 """Media types by status, of answers that the framework takes for JSON; () for none."""
-ALSO: dict[Route, int] = {("put", MAP): 200, ("put", f"{MAP}/commits/{{commit}}"): 201}
+ALSO: dict[Route, int] = {("put", MAP): 200, ("put", f"{MAP}/commits/{{commit}}"): 201, ("patch", UPLOAD): 201}
 """A second status of success with the same body: what was there already, or is new."""
 PROBLEMS: dict[Route, tuple[int, ...]] = {
     ("put", MAP): (409,),
     ("put", f"{MAP}/commits/{{commit}}"): (409, 429, 507),
+    ("patch", UPLOAD): (409, 429, 507),
     ("get", f"{MAP}/commits/{{commit}}"): (409,),
     ("post", f"{MAP}/retracts"): (409,),
     ("put", "/tokens/{token}"): (409,),

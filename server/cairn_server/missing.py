@@ -16,11 +16,12 @@ from cairn_map.fingerprint import ZERO, Fingerprint
 from cairn_map.frames import CELL_HEAD, CellFrame, Frame, FrameKind
 from cairn_map.grid import Cell, CellKey, Geometry, cell_key, cell_of_key
 from cairn_map.ids import Author, CommitId, author_from_text
-from cairn_map.messages import Done, MissingRequest, More, ReplyHeader
+from cairn_map.messages import CURSORS_MAX, Done, MissingRequest, More, ReplyHeader
 from cairn_map.version_vector import VersionVector
 from cairn_server.cell_changes import change_since
 from cairn_server.cells_at_rest import DamagedCellError, sound_cell
 from cairn_server.damaged_cells import as_named
+from cairn_server.frame_order import in_order
 from cairn_server.read_cache import ReadCache
 from cairn_server.store import Snapshot
 from cairn_server.store_rows import CellRow
@@ -51,6 +52,7 @@ class Asker:
     compare: bool
     box: tuple[Cell, Cell] | None = None
     size_bytes_max: int = REPLY_BYTES_MAX
+    near: Cell | None = None
     unproven: set[Cursor] = field(default_factory=set)
     healed: list[CellRow] = field(default_factory=list)
     """Damaged cells that were made anew for it."""
@@ -75,14 +77,13 @@ def asker_from_request(request: MissingRequest, snapshot: Snapshot) -> Asker:
     asker = Asker(
         author=author_from_text(request.author) if request.author else None,
         cursor=_cursor(request.cursor),
-        cells={cell_key(entry.cell): _cursor(entry.cursor) for entry in request.cells},
+        cells=_listed(request),
         kinds=frozenset(request.kinds),
         box=(Cell(*request.box[0]), Cell(*request.box[1])) if request.box else None,
         size_bytes_max=min(request.size_bytes_max or REPLY_BYTES_MAX, REPLY_BYTES_MAX),
+        near=cell_of_key(cell_key(request.near)) if request.near else None,
         compare=request.compare,
     )
-    if len(asker.cells) != len(request.cells):
-        raise BadInputError("bad_message", "a cell is named twice in the request")
     head = snapshot.head.cursor
     for cursor in {cursor for cursor in (asker.cursor, *asker.cells.values()) if cursor is not None}:
         if cursor.log_id != head.log_id:
@@ -105,7 +106,7 @@ def reply_frames(
     rest = ZERO
     sent_bytes = 0
     listed = dict(asker.cells)
-    for row in [row for row in snapshot.cells() if asker.wants(row.key)]:
+    for row in in_order([row for row in snapshot.cells() if asker.wants(row.key)], asker.near):
         start = listed.pop(row.key, asker.cursor)
         frame = _frame_for(snapshot, asker, row, start, geometry, cache)
         if frame is None:
@@ -179,6 +180,20 @@ def _frame(
     kind: FrameKind, key: CellKey, start: Cursor | None, to: Cursor, fingerprint: Fingerprint, payload: bytes = b""
 ) -> CellFrame:
     return CellFrame(kind=kind, cell=key, from_cursor=start, to_cursor=to, fingerprint=fingerprint, payload=payload)
+
+
+def _listed(request: MissingRequest) -> dict[CellKey, Cursor | None]:
+    """The cells that a request lists, one by one or by cursor."""
+    groups = [*request.groups, *((entry.cursor, [entry.cell]) for entry in request.cells)]
+    count = sum(len(cells) for _, cells in groups)
+    if count > CURSORS_MAX:
+        raise BadInputError("bad_message", f"{count} cells are listed, at most {CURSORS_MAX} may be")
+    listed: dict[CellKey, Cursor | None] = {}
+    for text, cells in groups:
+        listed |= dict.fromkeys(map(cell_key, cells), _cursor(text))
+    if len(listed) != count:
+        raise BadInputError("bad_message", "a cell is named twice in the request")
+    return listed
 
 
 def _cursor(text: str | None) -> Cursor | None:

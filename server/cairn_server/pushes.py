@@ -105,6 +105,16 @@ class Pushes:
             self._store.seen(row, caller.robot, None)
             self._live.robot_heard(row, caller.robot)
 
+    def check_room(self, row: MapRow, caller: Caller, *, size_bytes: int) -> None:
+        """Refuse what `admitted` would refuse for its size alone, before it comes.
+
+        Raises:
+            UnreachableError: kind `quota` or `disk_full`.
+        """
+        self._store.health.check_space(self._settings.disk_free_min_bytes)
+        with self.meter.spending(row, caller, size_bytes=size_bytes, cells=()):
+            pass  # not kept: it counts when all of it is here
+
     def is_quick(self, row: MapRow, caller: Caller, pushed: CommitReader) -> bool:
         """Whether `keep_soon` may keep it: its check is done in a moment, and nothing else waits for anybody."""
         return self.checks.is_quick(pushed) and (caller.robot is None or self.meter.is_ready(row))

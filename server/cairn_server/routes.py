@@ -11,6 +11,7 @@ from cairn_server import (
     operations_routes,
     robot_routes,
     sync_routes,
+    upload_routes,
 )
 from cairn_server.body_limit import BodyLimit
 from cairn_server.docs_page import docs_page
@@ -36,6 +37,7 @@ ROUTERS = (
     operations_routes.router,
     live_routes.router,
     robot_routes.router,
+    upload_routes.router,
 )
 
 

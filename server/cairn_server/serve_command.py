@@ -143,6 +143,7 @@ def config_of(app: FastAPI, settings: Settings, *, log_level: str = "warning") -
         log_config=None,
         log_level=log_level,
         access_log=False,
+        server_header=False,
         timeout_graceful_shutdown=GRACE_S,
         lifespan="off",
         limit_concurrency=settings.limit_concurrency,

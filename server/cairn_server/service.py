@@ -8,6 +8,7 @@ import threading
 import time
 from itertools import chain
 
+from cairn_map.begun_frames import reply_digest, without_begun
 from cairn_map.commit import commit_bytes
 from cairn_map.cursor import Cursor
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
@@ -50,6 +51,7 @@ from cairn_server.settings import Settings
 from cairn_server.stable import StableVectors
 from cairn_server.store import Snapshot, Store
 from cairn_server.store_rows import Branch, CellRow, Head, MapRow
+from cairn_server.uploads import Uploads
 from cairn_server.vectors import vector_at
 from cairn_server.wanted_commits import WantedCommits
 
@@ -86,6 +88,7 @@ class Service:
         self.readiness = Readiness(store.health, self.folds, settings, self._folder.is_alive)
         self._wanted = WantedCommits()
         self.pushes = Pushes(store, settings, self.live, self._wanted, on_new=self._folder.wake, process=check_process)
+        self.uploads = Uploads(store, self.pushes)
         self._stable = StableVectors(settings.stable_after_s)
         self._reads = ReadCache()
         self._healing = threading.Lock()
@@ -142,17 +145,21 @@ class Service:
         return self.pushes.keep(row, caller, id_text, data, seal=seal)
 
     def missing(self, row: MapRow, branch: str, request: MissingRequest) -> bytes:
-        """The frames that bring the asker to the head; one snapshot, wholly in memory before it is sent."""
+        """The frames that bring the asker to the head; one snapshot, wholly in memory before it is sent.
+
+        Nothing, if the asker knows this reply.
+        """
         with self.store.snapshot(row) as snapshot:
             asker = asker_from_request(request, snapshot)
             parts = [start_of_reply()]
             frames = reply_frames(snapshot, asker, row.geometry, self._reads, self._besides(row, snapshot))
-            parts += [encode_frame(f) for f in self.figures.counted(frames)]
+            parts += [encode_frame(f) for f in self.figures.counted(without_begun(frames, request.begun))]
         keep_healed(self.store, row, asker.healed)
         self.damaged.note(row.name, asker.damaged)
         self.store.seen(row, branch, asker.cursor)
         self.live.robot_heard(row, branch, **({"cursor": str(asker.cursor)} if asker.cursor else {}))
-        return b"".join(parts)
+        reply = b"".join(parts)
+        return b"" if request.known is not None and request.known == reply_digest(reply) else reply
 
     def retract(self, row: MapRow, request: Retract, *, by: Caller) -> Retracted:
         """Undo commits exactly. Durable on return.

@@ -58,5 +58,6 @@ def get_commit(commit: str, service: Operations, row: Map) -> Response:
 
 @router.post("/maps/{name}/branches/{branch}/missing")
 def missing(branch: str, body: MissingRequest, visit: Annotated[Visit, Depends(visiting_owner)]) -> Response:
-    """The frames that bring the asker to the head."""
-    return Response(visit.service.missing(visit.row, branch, body), media_type=REPLY_MEDIA_TYPE)
+    """The frames that bring the asker to the head; 204 if they are those of the last reply."""
+    reply = visit.service.missing(visit.row, branch, body)
+    return Response(reply, media_type=REPLY_MEDIA_TYPE) if reply else Response(status_code=204)

@@ -23,6 +23,7 @@ from pathlib import Path
 
 from tests.bench.coding import coding_rows
 from tests.bench.integration import integration_rows
+from tests.bench.links import link_rows
 from tests.bench.peers import peer_rows
 from tests.bench.queries import query_rows
 from tests.bench.server import server_rows
@@ -227,6 +228,7 @@ PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "room": _room_rows,
     "coding": coding_rows,
     "integration": integration_rows,
+    "links": link_rows,
     "peers": peer_rows,
     "queries": query_rows,
     "server": server_rows,

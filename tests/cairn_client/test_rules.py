@@ -199,7 +199,7 @@ def test_a_delta_without_the_bytes_of_an_own_commit_asks_for_the_whole_cell(mole
     exchanged(mole, header(C2, covering(commit.id)), frame)
     assert mole.cells[A].cursor is None
     assert mole.base_evidence(A) == X
-    assert [entry.cursor for entry in Exchange(mole).request().cells] == [None]
+    assert [cursor for cursor, _ in Exchange(mole).request().groups] == [None]
 
 
 @pytest.mark.parametrize("kind", [FrameKind.DELTA, FrameKind.STATE])
@@ -273,14 +273,14 @@ def test_a_cut_reply_keeps_its_frames_and_no_more(mole: Replica) -> None:
     exchange = exchanged(mole, header(C2), cell_frame(FrameKind.FULL, C2, Y, key=B, start=C1))
     assert not exchange.is_done
     assert (mole.cells[A].cursor, mole.cells[B].cursor, mole.default_cursor) == (C1, C2, C1)
-    assert [entry.cell for entry in Exchange(mole).request().cells] == [cell_of_key(B)]
+    assert Exchange(mole).request().groups == [(str(C2), [cell_of_key(B)])]
 
 
 def test_comparing_names_every_cell(mole: Replica) -> None:
     at(mole, C1, X)
     request = Exchange(mole, compare=True).request()
     assert request.compare
-    assert [entry.cursor for entry in request.cells] == [str(C1)]
+    assert [cursor for cursor, _ in request.groups] == [str(C1)]
 
 
 # Rule 9: reset
@@ -338,8 +338,8 @@ class OtherServer:
     def push(self, name: str, commit: object, *, seal: str | None = None) -> None:
         self.pushed.append(commit.id)  # type: ignore[attr-defined]
 
-    def missing(self, name: str, branch: str, request: MissingRequest) -> Iterator[object]:
-        if request.cursor or any(entry.cursor for entry in request.cells):
+    def missing(self, name: str, branch: str, request: MissingRequest, *, replies: object) -> Iterator[object]:
+        if request.cursor or any(cursor for cursor, _ in request.groups):
             raise ConflictError("other_log", "the cursor belongs to another server's log")
         to = Cursor(bytes(16), 0, bytes(16))
         yield header(to, self.coverage)

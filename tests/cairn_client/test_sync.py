@@ -14,8 +14,9 @@ from tests.cairn_client.made import GEOMETRY, MAP, A, B, added, cells_of, cursor
 
 from cairn_client.api import MapApi
 from cairn_client.link import Link
+from cairn_client.nearness import Wanted, within
 from cairn_client.replica import Replica
-from cairn_client.sync import Wanted, fetch_cells, fetch_missing, push_commits, within
+from cairn_client.sync import fetch_cells, fetch_missing, push_commits
 from cairn_map.cell_code import decode_cell
 from cairn_map.commit import make_commit
 from cairn_map.errors import (

@@ -24,12 +24,13 @@ from cairn_client.outbox import UNNUMBERED
 from cairn_client.replica import Replica
 from cairn_client.replica_store import ReplicaStore
 from cairn_client.sync import fetch_cells, fetch_missing, push_commits
+from cairn_map.begun_frames import Replies
 from cairn_map.cell_code import decode_cell
 from cairn_map.commit import Commit, CommitMeta, split_commit
 from cairn_map.errors import ConflictError, UnreachableError
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.fingerprint import ZERO, fingerprint
-from cairn_map.frames import Frame, FrameReader
+from cairn_map.frames import Frame
 from cairn_map.grid import Cell, CellKey, cell_key
 from cairn_map.ids import OPERATOR, Author, CommitId, RobotName, commit_id_from_text
 from cairn_map.index_messages import CellIndex
@@ -91,10 +92,14 @@ class DirectApi:
         is_new = service.push(service.store.map(name), self._caller, str(commit.id), commit.data, seal=seal)
         return Pushed(id=str(commit.id), state="new" if is_new else "known")
 
-    def missing(self, name: str, branch: str, request: MissingRequest) -> Iterator[Frame]:
+    def missing(
+        self, name: str, branch: str, request: MissingRequest, *, replies: Replies | None = None
+    ) -> Iterator[Frame]:
         service = self._world.service
-        request = MissingRequest.model_validate_json(request.model_dump_json())
-        yield from FrameReader().feed(service.missing(service.store.map(name), branch, request))
+        reply = (replies or Replies()).reply_to(request)
+        sent = MissingRequest.model_validate_json(reply.request.model_dump_json())
+        data = service.missing(service.store.map(name), branch, sent)
+        yield from reply.frames([data]) if data else reply.again()
 
     def cell_index(
         self, name: str, author: Author | None = None, *, box: object = None, after: object = None
@@ -128,10 +133,12 @@ class FaultyApi:
         pushed: Pushed = self._call(self._api.push, name, commit, seal=seal)
         return pushed
 
-    def missing(self, name: str, branch: str, request: MissingRequest) -> Iterator[Frame]:
+    def missing(
+        self, name: str, branch: str, request: MissingRequest, *, replies: Replies | None = None
+    ) -> Iterator[Frame]:
         fault = self._next()
         self._lose(fault, "before")
-        for n, frame in enumerate(list(self._api.missing(name, branch, request))):
+        for n, frame in enumerate(list(self._api.missing(name, branch, request, replies=replies))):
             if fault and fault.kind in ("cut", "after") and n == fault.frames:
                 raise UnreachableError("cut_off", "cut")
             yield frame

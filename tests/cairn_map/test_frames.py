@@ -148,7 +148,7 @@ def test_cell_frames_cut_inside_a_sound_checksum_are_refused_or_shorter(kind: in
 
 @pytest.mark.parametrize(
     ("at", "data"),
-    [(0, struct.pack("<Q", 1 << 63)), (8, b"\x02"), (25, struct.pack("<q", -2)), (65, struct.pack("<q", -1))],
+    [(0, struct.pack("<Q", 1 << 63)), (8, b"\x04"), (25, struct.pack("<q", -2)), (65, struct.pack("<q", -1))],
     ids=["cell number", "flag", "from", "to"],
 )
 def test_impossible_cell_heads_are_refused(at: int, data: bytes) -> None:

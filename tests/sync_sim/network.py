@@ -10,8 +10,9 @@ from tests.sync_sim.robot import SimRobot
 from tests.sync_sim.server import SimServer
 
 from cairn_client.asks import Ask, GetMissing, NextFrame
+from cairn_map.begun_frames import Replies, Reply
 from cairn_map.errors import CairnError, UnreachableError
-from cairn_map.frames import Frame, FrameReader
+from cairn_map.frames import Frame
 
 TIMEOUT_S = 8.0
 
@@ -38,6 +39,8 @@ class Network:
         self._random = random
         self._replies: dict[tuple[str, int], Iterator[Frame | CairnError]] = {}
         """Of rounds, the reply that is coming in."""
+        self._memories: dict[str, Replies] = {}
+        """What each robot remembers of its replies."""
 
     def ask(self, robot: SimRobot, number: int, ask: Ask[Any]) -> None:
         """Send a request of a round; the robot hears of it in a while, one way or the other."""
@@ -46,6 +49,10 @@ class Network:
             return
         self._replies.pop((robot.name, number), None)
         answered = [False]
+        reply: Reply | None = None
+        if isinstance(ask, GetMissing):
+            reply = self._memories.setdefault(robot.name, Replies()).reply_to(ask.request)
+            ask = GetMissing(reply.request)
 
         def give_up() -> None:
             if not answered[0] and robot.is_in(number):
@@ -55,7 +62,7 @@ class Network:
         def hear(answer: Any) -> None:
             if not answered[0] and robot.is_in(number):
                 answered[0] = True
-                self._hear(robot, number, ask, answer)
+                self._hear(robot, number, reply, answer)
 
         self._events.after(TIMEOUT_S, give_up)
         for _ in range(1 + self._is(self.weather.doubled)):
@@ -71,11 +78,11 @@ class Network:
         if not self._is_gone(robot):
             self._later(lambda: hear(answer))
 
-    def _hear(self, robot: SimRobot, number: int, ask: Ask[Any], answer: Any) -> None:
+    def _hear(self, robot: SimRobot, number: int, reply: Reply | None, answer: Any) -> None:
         if isinstance(answer, CairnError):
             robot.failed(number, answer)
-        elif isinstance(ask, GetMissing):
-            self._replies[robot.name, number] = self._frames(answer)
+        elif reply is not None:
+            self._replies[robot.name, number] = self._frames(reply, answer)
             self._hand_over(robot, number)
         else:
             robot.answered(number, answer)
@@ -94,20 +101,20 @@ class Network:
 
         self._later(hand_over)
 
-    def _frames(self, data: bytes) -> Iterator[Frame | CairnError]:
+    def _frames(self, reply: Reply, data: bytes) -> Iterator[Frame | CairnError]:
         """What is read of a reply until it ends: whole, or cut at any byte, or damaged at any."""
+        if not data:
+            yield from reply.again()
+            return
         if self._is(self.weather.damaged):
             at = self._random.randrange(len(data))
             data = data[:at] + bytes([data[at] ^ (1 << self._random.randrange(8))]) + data[at + 1 :]
         if self._is(self.weather.cut):
             data = data[: self._random.randrange(len(data))]
-        reader = FrameReader()
         try:
-            yield from reader.feed(data)
+            yield from reply.frames([data])
         except CairnError as exc:
             yield exc
-        if not reader.is_empty:
-            yield UnreachableError("cut_off", "the reply was cut off")
 
     def _later(self, event: Any) -> None:
         self._events.after(self._random.random() * self.weather.delay_s, event)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import apsw
-from tests.cairn_client.made import GEOMETRY, MAP, random_diff
+from tests.cairn_client.made import GEOMETRY, MAP, B, random_diff
 from tests.sync_sim.server import meta_of
 
 from cairn_client.asks import Ask, Conversation
@@ -17,11 +17,20 @@ from cairn_client.outbox import UNNUMBERED
 from cairn_client.replica import Replica
 from cairn_client.replica_store import ReplicaStore
 from cairn_client.sync import fetch_cells, fetch_missing, push_commits
+from cairn_client.uploads import PARTS, Parts
 from cairn_map.commit import split_commit
 from cairn_map.errors import CairnError
+from cairn_map.grid import cell_of_key
 from cairn_map.ids import CommitId, RobotName
 
 ROUNDS_AT_ONCE = 2
+IN_PARTS = ("r1", "r2")
+"""Robots that push in parts."""
+HELPINGS: dict[str, dict[str, Any]] = {
+    "r1": {"reply_bytes_max": 100, "near": cell_of_key(B)},
+    "r4": {"reply_bytes_max": 100, "round_bytes_max": 100},
+}
+"""Robots that fetch little at a time."""
 
 
 class MemoryDisk(ReplicaStore):
@@ -50,6 +59,8 @@ class SimRobot:
         self._conversations: dict[int, Conversation[None]] = {}
         """Those under way, by the number of their round."""
         self._saved: bytes | None = None
+        # Commits have some 500 bytes here, most of it meta.
+        self._parts = Parts(above_bytes=100, part_bytes=250) if name in IN_PARTS else PARTS
         self._open(MemoryDisk())
 
     @property
@@ -120,13 +131,13 @@ class SimRobot:
 
     def _round(self, *, pushes: bool) -> Conversation[None]:
         if pushes:
-            report = yield from push_commits(self.replica, sealed_only=self.mode == "viewer")
+            report = yield from push_commits(self.replica, sealed_only=self.mode == "viewer", parts=self._parts)
             # A retract of a server that was replaced is not taken by the other one, of which this robot will hear next.
             assert all(self.replica.seal(commit) is not None for commit in report.refused)
         if self.mode == "low-end":
             yield from fetch_cells(self.replica)
         else:
-            yield from fetch_missing(self.replica)
+            yield from fetch_missing(self.replica, **HELPINGS.get(self.name, {}))
 
     def _advance(self, number: int, step: Callable[[], Ask[Any]]) -> None:
         try:

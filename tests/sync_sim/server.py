@@ -5,9 +5,9 @@ from typing import Any
 from tests.cairn_client.made import GEOMETRY, MAP
 
 from cairn_client.answers import FetchedCell
-from cairn_client.asks import Ask, GetCell, GetCommit, GetIndex, GetMissing, Push, PutCell
+from cairn_client.asks import Ask, GetCell, GetCommit, GetIndex, GetMissing, GetUpload, Push, PutCell, PutPart
 from cairn_map.cell_code import decode_cell
-from cairn_map.commit import CommitMeta
+from cairn_map.commit import CommitMeta, split_commit
 from cairn_map.cursor import Cursor
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_map.evidence_map import EvidenceMap
@@ -24,6 +24,7 @@ from cairn_server.memory_store import MemoryStore
 from cairn_server.service import Service
 from cairn_server.settings import Settings
 from cairn_server.store_rows import MapRow
+from cairn_server.uploads import Part
 
 Fingerprints = dict[CellKey, str]
 
@@ -101,6 +102,15 @@ class SimServer:
                 service.push(row, Caller(Role.ROBOT, robot), str(commit.id), commit.data, seal=seal)
                 self._evidence[commit.id] = commit.meta.note, commit.cells
                 return None
+            case GetUpload(commit_id, digest):
+                return service.uploads.state(row, Caller(Role.ROBOT, robot), str(commit_id), digest)
+            case PutPart(commit_id, digest, total, offset, data):
+                part = Part(digest, total, offset, data)
+                found, _ = service.uploads.add(row, Caller(Role.ROBOT, robot), str(commit_id), part)
+                if found.sha is not None:  # perhaps under an id that was another server's
+                    meta, cells = split_commit(service.commit(row, str(commit_id))[0])
+                    self._evidence[commit_id] = meta.note, cells
+                return found
             case GetCommit(commit_id):
                 data, _, found = service.commit(row, str(commit_id))
                 return data, found
