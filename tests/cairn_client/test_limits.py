@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.cairn_client.conftest import LiveServer
-from tests.cairn_client.made import GEOMETRY, cells_of
+from tests.cairn_client.made import GEOMETRY, MAP, cells_of
 from tests.cairn_client.robot_program import scan_of
 from tests.cairn_client.test_robot import evidence_of, map_commit, robot_in
 
@@ -215,6 +215,21 @@ def _sum(*maps: EvidenceMap) -> EvidenceMap:
     for each in maps:
         total.merge(each.packed())
     return total
+
+
+def test_commits_that_are_stable_go_first(server: LiveServer, tmp_path: Path) -> None:
+    with robot_in(tmp_path, server.map_url, limits=Limits(outbox_bytes_max=1 << 16)) as robot:
+        far = {cell_key((50, i, 0)): full_cell(i) for i in range(25)}
+        robot.replica.commit(far)
+        robot.sync()
+        server.wait_for_fold()
+        # The robot hears that it is stable, and goes on without its cells, before it fetches again.
+        robot.replica.take_header(robot._api.cell_index(MAP).header, asked_by=robot.replica.author)
+        robot._rounds._room.kept = Kept(centre=(0, 0, 0), radius=1)
+        robot.replica.commit(far)
+        assert len(robot.replica.commits) == 1
+        with pytest.raises(UnreachableError, match="1 of them unpushed"):
+            robot.replica.commit(far)
 
 
 def test_acknowledged_commits_that_a_restore_could_lose_stay(server: LiveServer, tmp_path: Path) -> None:

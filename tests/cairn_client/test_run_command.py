@@ -174,6 +174,7 @@ def test_a_mark_is_kept_with_its_commit_or_not_at_all(
         monkeypatch.setattr(mole.replica.store, "add_commit", full)
         monkeypatch.setattr("cairn_client.run_command.COMMIT_AGAIN_S", 0.0)
         assert not _commit(mole, stop, Profile.FAST, _Tally(), stopping)
+        assert mole.replica.outbox.beside == {}
         monkeypatch.undo()
     with robot_in(tmp_path) as mole:  # neither was kept, nor when the robot was closed
         assert mole.waiting == 0
@@ -181,8 +182,10 @@ def test_a_mark_is_kept_with_its_commit_or_not_at_all(
         mole.observe(stop.source.scan(0))
         assert _commit(mole, stop, Profile.FAST, _Tally(), threading.Event())
         assert list(Spool(spool).stops(mole.replica)) == []
+        remember(mole.replica, dict.fromkeys(stop.mark()))
         mole.observe(scan_of(7))
         assert mole.commit() is not None
+        assert len(list(Spool(spool).stops(mole.replica))) == 1  # the next commit says nothing of it
         assert mole.waiting == 2
 
 
