@@ -86,7 +86,7 @@ def test_a_round_that_somebody_calls_tells_its_failure_too(tmp_path: Path) -> No
 def test_an_answer_that_is_not_sound_is_no_lost_link(server: LiveServer, tmp_path: Path) -> None:
     with robot_in(tmp_path, server.map_url) as mole, mole.events() as stream:
 
-        def damaged(*_: object) -> object:
+        def damaged(*_: object, **__: object) -> object:
             raise DamagedDataError("bad_frame", "no")
 
         mole._api.missing = damaged  # type: ignore[assignment, method-assign]
