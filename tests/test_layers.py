@@ -57,6 +57,7 @@ MAY_NAME = {
     "httpx": ["cairn_client/api.py"],
     "apsw": ["cairn_server/sqlite_*.py", "cairn_client/sqlite_*.py", "cairn_client/replica_store.py"],
     "psycopg": [],
+    "cryptography": ["cairn_map/signature.py"],
     "numba": [
         "cairn_map/*_kernels.py",
         "cairn_map/compile_progress.py",

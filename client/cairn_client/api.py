@@ -135,9 +135,9 @@ class MapApi:
         """Deregister a robot."""
         self._ask("DELETE", f"/maps/{name}/branches/{branch}")
 
-    def push(self, name: str, commit: Commit, *, seal: str | None = None) -> Pushed:
+    def push(self, name: str, commit: Commit, *, seal: str | None = None, signatures: str | None = None) -> Pushed:
         """Push a commit; when this returns, the server has it for good. `seal`: of a retract that is the server's."""
-        headers = {"Cairn-Seal": seal} if seal else {}
+        headers = {key: text for key, text in (("Cairn-Seal", seal), ("Cairn-Signature", signatures)) if text}
         path = f"/maps/{name}/commits/{commit.id}"
         return message_from_json(Pushed, self._ask("PUT", path, content=commit.data, headers=headers))
 
@@ -147,7 +147,8 @@ class MapApi:
         if isinstance(ask, GetUpload):
             return message_from_json(Upload, self._ask("GET", path, params=params))
         params |= {"total": f"{ask.total_bytes}", "offset": f"{ask.offset_bytes}"}
-        return message_from_json(Upload, self._ask("PATCH", path, content=ask.data, params=params))
+        headers = {"Cairn-Signature": ask.signatures} if ask.signatures else {}
+        return message_from_json(Upload, self._ask("PATCH", path, content=ask.data, params=params, headers=headers))
 
     def commit(self, name: str, commit: CommitId) -> tuple[bytes, str | None]:
         """A commit's bytes as they were pushed, and the seal on a retract that is the server's."""

@@ -50,6 +50,8 @@ class Push(Ask[None]):
     commit: Commit
     seal: str | None = None
     """On a retract that is the server's own."""
+    signatures: str | None = None
+    """Of those for whom it speaks, as in `Cairn-Signature`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +71,8 @@ class PutPart(Ask[Upload]):
     total_bytes: int
     offset_bytes: int
     data: bytes
+    signatures: str | None = None
+    """On the commit, as in `Cairn-Signature`."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,10 +14,16 @@ LOCK_NAME = "robot.lock"
 LOOK_AGAIN_S = 0.02
 
 
-def make_folder(folder: Path) -> None:
-    """Raises: BadInputError: kind `bad_folder`: it is not there and cannot be made."""
+def make_folder(folder: Path, *, secret_file: str) -> None:
+    """A folder with a file that only its user reads: the robot's token and keys are in it.
+
+    Raises:
+        BadInputError: kind `bad_folder`: it is not there and cannot be made.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        (folder / secret_file).touch()
+        (folder / secret_file).chmod(0o600)
     except OSError as exc:
         raise BadInputError("bad_folder", f"cannot make the folder {folder}: {exc.strerror}") from exc
 

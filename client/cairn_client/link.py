@@ -60,8 +60,8 @@ class Link:
     def _answer(self, ask: Ask[Any]) -> Any:
         api, name = self._api, self._map_name
         match ask:
-            case Push(commit, seal):
-                api.push(name, commit, seal=seal)
+            case Push(commit, seal, signatures):
+                api.push(name, commit, seal=seal, signatures=signatures)
                 return None
             case GetUpload() | PutPart():
                 return api.upload(name, ask)

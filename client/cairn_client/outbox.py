@@ -12,12 +12,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 
 from cairn_client.replica_store import KeptCommit, ReplicaStore
+from cairn_client.robot_keys import RobotKeys
 from cairn_map.cell_code import Profile, decode_cell
 from cairn_map.commit import Commit, CommitMeta, make_commit, renamed_commit, split_commit
 from cairn_map.errors import BadInputError
 from cairn_map.evidence import Evidence
 from cairn_map.grid import CellKey, Geometry
-from cairn_map.ids import NUMBER_LIMIT, Author, CommitId, Incarnation, RobotName, new_incarnation
+from cairn_map.ids import NUMBER_LIMIT, Author, CommitId, Incarnation, RobotName
 from cairn_map.messages import ReplyHeader
 from cairn_map.version_vector import EMPTY, VersionVector
 
@@ -34,11 +35,13 @@ class Outbox:
         self._store = store
         self._robot = robot
         self._geometry = geometry
+        self._keys = RobotKeys(store, robot)
         known = store.get("incarnation")
-        if known is None:
-            known = new_incarnation()
+        if known is None or not self._keys.has(Incarnation(known)):  # a folder from before commits were signed
             with store.transaction():
+                known = self._keys.draw()
                 store.put("incarnation", known)
+                self._set_next(0, None)
         self._incarnation = Incarnation(known)
         self._commits: dict[CommitId, KeptCommit] = {}
         self._touching: dict[CellKey, dict[CommitId, None]] = {}
@@ -116,6 +119,10 @@ class Outbox:
         """The seal that a kept commit bears."""
         return self._commits[commit].seal
 
+    def signatures(self, commit: Commit) -> str | None:
+        """Of this robot on a commit of its own, as `Cairn-Signature` has them; None for a server's retract."""
+        return self._keys.signatures(commit)
+
     def push_set(self, header: ReplyHeader | None) -> list[CommitId]:
         """Commits that the server may lack, oldest first.
 
@@ -187,8 +194,8 @@ class Outbox:
     def new_incarnation(self, reason: str) -> None:
         """Number commits anew under a fresh incarnation: this robot's disk was rolled back or lost."""
         log.warning("robot %s takes a new incarnation: %s", self._robot, reason)
-        fresh = new_incarnation()
         with self._store.transaction():
+            fresh = self._keys.draw()
             self._store.put("incarnation", fresh)
             self._set_next(0, None)
         self._incarnation = fresh

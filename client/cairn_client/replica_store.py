@@ -100,7 +100,7 @@ class ReplicaStore:
             BadInputError: it is of another version, or the folder cannot be made.
         """
         self._folder = folder
-        make_folder(folder)
+        make_folder(folder, secret_file=FILE_NAME)
         with self._translated():
             self._connection = apsw.Connection(str(folder / FILE_NAME))
         try:

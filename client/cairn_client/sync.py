@@ -104,22 +104,27 @@ def push_commits(
 def _push(replica: Replica, commit: Commit, seal: str | None, parts: Parts) -> Conversation[CommitId]:
     """Push one commit; its id, which is a new one if the server has other bytes under the old (rule 13)."""
     try:
-        yield from push_whole_or_in_parts(commit, seal, parts)
+        yield from push_whole_or_in_parts(_signed(replica, commit, seal), parts)
     except ConflictError as exc:
         if exc.kind == "evidence_gone":
             # The server forgot what this commit takes out: it takes it from whoever still has it (rule 11).
             for target in commit.meta.retracted_ids:
                 if (kept := replica.kept_commit(target)) is not None:
-                    yield from push_whole_or_in_parts(kept, None, parts)
-            yield from push_whole_or_in_parts(commit, seal, parts)
+                    yield from push_whole_or_in_parts(_signed(replica, kept), parts)
+            yield from push_whole_or_in_parts(_signed(replica, commit, seal), parts)
             return commit.id
         if exc.kind != "id_taken" or seal is not None:
             raise
         renamed = replica.kept_commit(replica.rename(commit.id))
         assert renamed is not None  # noqa: S101 - it was just kept
-        yield from push_whole_or_in_parts(renamed, None, parts)
+        yield from push_whole_or_in_parts(_signed(replica, renamed), parts)
         return renamed.id
     return commit.id
+
+
+def _signed(replica: Replica, commit: Commit, seal: str | None = None) -> Push:
+    with replica.lock:
+        return Push(commit, seal, replica.outbox.signatures(commit))
 
 
 def keep_retracts(replica: Replica) -> Conversation[None]:

@@ -7,7 +7,6 @@ import hashlib
 from dataclasses import dataclass, replace
 
 from cairn_client.asks import Conversation, GetUpload, Push, PutPart
-from cairn_map.commit import Commit
 from cairn_map.errors import ConflictError, UnreachableError
 
 
@@ -28,14 +27,15 @@ class Parts:
 PARTS = Parts()
 
 
-def push_whole_or_in_parts(commit: Commit, seal: str | None, parts: Parts) -> Conversation[None]:
+def push_whole_or_in_parts(push: Push, parts: Parts) -> Conversation[None]:
     """Push a commit; when this ends the server has it for good.
 
     Raises:
         CairnError: as `Push`; what came of a part stays there for the next try.
     """
-    if seal is not None or len(commit.data) <= parts.above_bytes:
-        yield from Push(commit, seal)
+    commit = push.commit
+    if push.seal is not None or len(commit.data) <= parts.above_bytes:
+        yield from push
         return
     digest = hashlib.sha256(commit.data).hexdigest()
     found = yield from GetUpload(commit.id, digest)
@@ -45,6 +45,6 @@ def push_whole_or_in_parts(commit: Commit, seal: str | None, parts: Parts) -> Co
             raise UnreachableError("no_end", f"commit {commit.id} does not come to its end, part by part", 30.0)
         tries -= 1
         part = commit.data[found.size_bytes : found.size_bytes + parts.part_bytes]
-        found = yield from PutPart(commit.id, digest, len(commit.data), found.size_bytes, part)
+        found = yield from PutPart(commit.id, digest, len(commit.data), found.size_bytes, part, push.signatures)
     if found.sha != commit.sha.hex():
         raise ConflictError("id_taken", f"the server has other bytes under the id {commit.id}")

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cairn_map.messages import NameText
 
-RoleText = Literal["admin", "operator", "robot", "reader", "enroller"]
+RoleText = Literal["admin", "operator", "robot", "reader", "enroller", "relay"]
 LIFETIME_MAX_S = 20 * 366 * 86_400.0
 
 
@@ -23,7 +23,7 @@ class CreateToken(_Model):
     map: NameText | None = None
     """The one map that it counts on; None: all maps, those to come included."""
     robot: NameText | None = None
-    """Whose token it is; of role robot only."""
+    """Whose token it is; of role robot, or of a relay that is a robot, too."""
     lifetime_s: Annotated[float, Field(gt=0, le=LIFETIME_MAX_S)] | None = None
     """None: until it is revoked."""
 
@@ -31,7 +31,9 @@ class CreateToken(_Model):
     def _check_robot(self) -> Self:
         if self.role == "robot" and not (self.map and self.robot):
             raise ValueError("a robot's token names its map and its robot")
-        if self.role != "robot" and self.robot:
+        if self.role == "relay" and self.robot and not self.map:
+            raise ValueError("a relay that is a robot names its map, too")
+        if self.role not in ("robot", "relay") and self.robot:
             raise ValueError(f"a token of role {self.role} names no robot")
         return self
 

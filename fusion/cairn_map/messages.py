@@ -84,6 +84,8 @@ class MapInfo(_Model):
     branches: int
     box_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None
     """Lowest and highest corner of the cells that hold evidence; None while the map is empty."""
+    server_key: ShaText | None = None
+    """Public key by which the server signs what it says itself, in hex: what `--trust-server` takes."""
 
 
 class Register(_Model):
@@ -273,6 +275,8 @@ class LogEntry(_Model):
     """SHA-256 of the author's commit before it."""
     seen: CursorText | None = None
     """State of the server that the author had when it made it."""
+    via: str | None = None
+    """Name of the token of the relay that handed it over; None: its robot did, or the server made it."""
 
 
 class Problem(BaseModel):

@@ -4,6 +4,7 @@ admin     everything                           `admin_token`, or anybody while t
 operator  read, retract
 robot     read, push its own commits, fetch    given at registration; of one map and one robot
 reader    read
+relay     read, hand over what robots signed   a robot's, too, if it names one
 enroller  register robots                      `enrolment_token`
 
 Whoever may read may do it with any of the first four. Tokens are kept as SHA-256 only (`token_store`); the two secrets
@@ -32,6 +33,7 @@ class Role(StrEnum):
     ROBOT = "robot"
     READER = "reader"
     ENROLLER = "enroller"
+    RELAY = "relay"
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from cairn_server.service import Service
 from cairn_server.store_rows import MapRow
 
 bearer = HTTPBearer(auto_error=False)
-READING = (Role.READER, Role.ROBOT, Role.OPERATOR)
+READING = (Role.READER, Role.ROBOT, Role.OPERATOR, Role.RELAY)
 """Who may read a map."""
 
 
@@ -99,7 +99,7 @@ async def own_branch(branch: str, caller: OnMap) -> Caller:
 
 def require_owner(caller: Caller, branch: str) -> None:
     """Refuse who is neither an admin nor the robot of a branch."""
-    require(caller, *([Role.ROBOT] if caller.robot == branch else []))
+    require(caller, *([Role.ROBOT, Role.RELAY] if caller.robot == branch else []))
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,9 +115,9 @@ class Visit:
 
 
 async def visiting_robot(name: str, request: Request, credentials: Credentials) -> Visit:
-    """A robot or an admin on the map in the path."""
+    """A robot, a relay or an admin on the map in the path."""
     visit = _visit(name, request, credentials)
-    require(visit.caller, Role.ROBOT)
+    require(visit.caller, Role.ROBOT, Role.RELAY)
     return visit
 
 

@@ -47,6 +47,7 @@ class Kept:
             retracts=self.new.retracts,
             diff=dict(sorted(self.new.diff.items())),
             gone=self.is_gone,
+            signatures=self.new.signatures,
         )
 
 

@@ -118,6 +118,7 @@ class MemorySnapshot:
             retracts=[str(target) for target in kept.new.retracts],
             parent=meta.get("parent"),
             seen=meta.get("seen"),
+            via=kept.new.via,
         )
 
 

@@ -8,15 +8,18 @@ import asyncio
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager
+from dataclasses import replace
 
 from cairn_map.commit import Commit
 from cairn_map.commit_reading import CommitReader, commit_reader
 from cairn_map.errors import ConflictError
 from cairn_map.grid import CellKey
+from cairn_map.signature import Signature, check_signatures, signatures_from_text, signatures_to_text
 from cairn_server.auth import Caller, Role
 from cairn_server.check_process import CheckProcess
 from cairn_server.checking import Checked, new_commit
 from cairn_server.commit_checks import CommitChecks
+from cairn_server.handing_over import speaker_of
 from cairn_server.live import Hub
 from cairn_server.push_policy import EvidenceGoneError, check_claims
 from cairn_server.quotas import Meter
@@ -50,34 +53,57 @@ class Pushes:
         self._on_new = on_new
         self._refusals = Refusals()
 
-    def keep(self, row: MapRow, caller: Caller, id_text: str, data: bytes, *, seal: str | None = None) -> bool:
+    def keep(
+        self,
+        row: MapRow,
+        caller: Caller,
+        id_text: str,
+        data: bytes,
+        *,
+        seal: str | None = None,
+        signatures: str | None = None,
+    ) -> bool:
         """Keep a commit; True if it is new. When this returns, no power cut can lose it.
 
         Raises:
             As `admitted`.
         """
         reader = commit_reader(data)
-        with self.admitted(row, caller, id_text, reader, seal=seal) as admitted:
+        with self.admitted(row, caller, id_text, reader, seal=seal, signatures=signatures) as admitted:
             return admitted.keep(self.checks.check(reader)).result()
 
     async def keep_soon(
-        self, row: MapRow, caller: Caller, id_text: str, pushed: CommitReader, *, seal: str | None = None
+        self,
+        row: MapRow,
+        caller: Caller,
+        id_text: str,
+        pushed: CommitReader,
+        *,
+        seal: str | None = None,
+        signatures: str | None = None,
     ) -> bool:
         """`keep` for a quick one, while the event loop does other things.
 
         Raises:
             As `keep`.
         """
-        with self.admitted(row, caller, id_text, pushed, seal=seal) as admitted:
+        with self.admitted(row, caller, id_text, pushed, seal=seal, signatures=signatures) as admitted:
             return await asyncio.wrap_future(admitted.keep(await self.checks.check_soon(pushed)))
 
     @contextmanager
     def admitted(
-        self, row: MapRow, caller: Caller, id_text: str, pushed: CommitReader, *, seal: str | None
+        self,
+        row: MapRow,
+        caller: Caller,
+        id_text: str,
+        pushed: CommitReader,
+        *,
+        seal: str | None,
+        signatures: str | None,
     ) -> Iterator["_Admitted"]:
         """A commit that may be kept once it is checked; its room is taken for the length of the `with`.
 
-        Anybody may push back a retract that bears this server's own seal.
+        Anybody may push back a retract that bears this server's own seal; a relay, what robots signed.
 
         Raises:
             BadInputError: not a commit for this map, not by this caller, or against `push_policy` or `quotas`.
@@ -86,11 +112,15 @@ class Pushes:
                 which is wanted from now on.
         """
         self._store.health.check_space(self._settings.disk_free_min_bytes)
+        signed = signatures_from_text(signatures) if signatures else ()
         speaks_for = Caller(Role.ADMIN) if is_sealed(row, pushed.data, seal) else caller
+        if speaks_for is caller:
+            speaks_for = speaker_of(row, caller, pushed.meta, signed, self._settings.trusted_servers)
         cells = pushed.cells
         check_claims(row, speaks_for, id_text, pushed.meta, cells=len(cells))
         with self.meter.spending(row, caller, size_bytes=len(pushed.data), cells=cells) as take:
-            admitted = _Admitted(self._store, row, pushed, cells)
+            via = caller.name if speaks_for is not caller and caller.role is Role.RELAY else None
+            admitted = _Admitted(self._store, row, pushed, cells, signed, via)
             try:
                 yield admitted
             except EvidenceGoneError as exc:
@@ -132,18 +162,35 @@ class Pushes:
 class _Admitted:
     """A commit that nothing but its evidence can be refused for."""
 
-    def __init__(self, store: Store, row: MapRow, pushed: CommitReader, cells: Mapping[CellKey, bytes]) -> None:
+    def __init__(
+        self,
+        store: Store,
+        row: MapRow,
+        pushed: CommitReader,
+        cells: Mapping[CellKey, bytes],
+        signed: tuple[Signature, ...],
+        via: str | None,
+    ) -> None:
         self._store = store
         self._row = row
         self._pushed = pushed
         self._cells = cells
+        self._signed = signed
+        self._via = via
         self._kept: Future[bool] | None = None
 
     def keep(self, checked: Checked) -> Future[bool]:
-        """Keep it; some milliseconds later it is durable, and it is known whether it is new."""
+        """Keep it; some milliseconds later it is durable, and it is known whether it is new.
+
+        Raises:
+            BadInputError: kind `bad_signature`.
+        """
+        check_signatures(self._signed, self._row.name, checked.sha)
         commit = Commit(self._pushed.meta, self._cells, checked.sha, self._pushed.data)
         tops = checked.tops or (0,) * (2 + self._row.geometry.plane_count)
-        self._kept = self._store.submit(self._row, new_commit(commit, tops))
+        signatures = signatures_to_text(self._signed) or None
+        new = replace(new_commit(commit, tops), signatures=signatures, via=self._via)
+        self._kept = self._store.submit(self._row, new)
         return self._kept
 
     def is_new(self) -> bool:

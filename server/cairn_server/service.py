@@ -9,12 +9,11 @@ import time
 from itertools import chain
 
 from cairn_map.begun_frames import reply_digest, without_begun
-from cairn_map.commit import commit_bytes
 from cairn_map.cursor import Cursor
-from cairn_map.errors import BadInputError, ConflictError, NotFoundError
+from cairn_map.errors import BadInputError
 from cairn_map.frames import encode_frame, start_of_reply
 from cairn_map.grid import CellKey
-from cairn_map.ids import INITIAL, OPERATOR, Author, RobotName, commit_id_from_text, new_incarnation, robot_name
+from cairn_map.ids import INITIAL, OPERATOR, Author, RobotName, new_incarnation, robot_name
 from cairn_map.index_messages import CellIndex
 from cairn_map.live_events import RobotSign
 from cairn_map.messages import (
@@ -37,6 +36,7 @@ from cairn_server.damaged_cells import DamagedCells
 from cairn_server.fold_health import FoldHealth
 from cairn_server.fold_process import FoldProcess
 from cairn_server.folder import Folder
+from cairn_server.handing_over import found_commit, server_key
 from cairn_server.healing import heal_cell, keep_healed
 from cairn_server.live import Hub
 from cairn_server.missing import Besides, asker_from_request, header_of, reply_frames
@@ -44,7 +44,7 @@ from cairn_server.push_policy import EvidenceGoneError
 from cairn_server.pushes import Pushes
 from cairn_server.read_cache import ReadCache
 from cairn_server.readiness import Readiness
-from cairn_server.retracting import retract_builders, seal_of, targets_of
+from cairn_server.retracting import retract_builders, targets_of
 from cairn_server.robot_reports import RobotReports
 from cairn_server.server_figures import ServerFigures, process_lines, store_lines
 from cairn_server.settings import Settings
@@ -122,6 +122,7 @@ class Service:
             commits=totals.commits,
             branches=totals.branches,
             box_m=box_m,
+            server_key=server_key(row).public_key.hex(),
         )
 
     def register(self, row: MapRow, request: Register) -> Registered:
@@ -140,9 +141,9 @@ class Service:
         self.live.robot_came(row, RobotSign(branch=branch.name, mode=branch.mode, time_s=branch.last_seen_s))
         return Registered(branch=request.robot, token=token, map=self.map_info(row))
 
-    def push(self, row: MapRow, caller: Caller, id_text: str, data: bytes, *, seal: str | None = None) -> bool:
+    def push(self, row: MapRow, caller: Caller, id_text: str, data: bytes, **beside: str | None) -> bool:
         """`Pushes.keep`."""
-        return self.pushes.keep(row, caller, id_text, data, seal=seal)
+        return self.pushes.keep(row, caller, id_text, data, **beside)
 
     def missing(self, row: MapRow, branch: str, request: MissingRequest) -> bytes:
         """The frames that bring the asker to the head; one snapshot, wholly in memory before it is sent.
@@ -196,13 +197,8 @@ class Service:
             NotFoundError: kind `no_commit`.
             ConflictError: kind `evidence_gone`.
         """
-        found = self.store.commit(row, commit_id_from_text(id_text))
-        if found is None:
-            raise NotFoundError("no_commit", f"nobody pushed {id_text[:96]} to map {row.name}")
-        if found.gone:
-            raise ConflictError("evidence_gone", f"the bytes of {found.id} are not kept any more")
-        seal = seal_of(row, found.sha) if found.id.author.robot == OPERATOR else None
-        return commit_bytes(found.text, dict(sorted(found.diff.items()))), found.sha, seal
+        found = found_commit(self.store, row, id_text)
+        return found.data, found.sha, found.seal
 
     def cell_index(self, row: MapRow, author: Author | None, page: IndexPage = FIRST_PAGE) -> CellIndex:
         """Some of the cells that were ever touched, and the state that they were read from."""

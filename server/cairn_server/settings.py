@@ -79,6 +79,8 @@ class Settings(BaseModel):
     """While a commit waits longer to be folded, the server is not ready."""
     metrics_open: bool = False
     """Whether anybody may read `/metrics`, which names the maps; else an admin only."""
+    trusted_servers: Annotated[str, Field(pattern=r"^([0-9a-f]{64}( [0-9a-f]{64})*)?$")] = ""
+    """Public keys of servers whose operators' retracts and prior data count here, in hex, separated by spaces."""
     check_workers: Annotated[int, Field(ge=1)] = 2
     """Processes that check dear commits, made when the first one comes."""
     check_cpu_s: Annotated[float, Field(gt=0)] = 60.0

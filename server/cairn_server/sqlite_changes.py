@@ -35,7 +35,8 @@ def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit) -
     _note_tops(connection, row, commit.tops)
     connection.execute(
         "INSERT INTO commits (map, robot, incarnation, n, sha, size_bytes, cells, meta, captured_first_s,"
-        " captured_last_s, retracts, received_s, rig) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        " captured_last_s, retracts, received_s, rig, signatures, via)"
+        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         (
             *key,
             commit.sha,
@@ -46,6 +47,8 @@ def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit) -
             " ".join(map(str, commit.retracts)),
             time.time(),
             commit.rig,
+            commit.signatures,
+            commit.via,
         ),
     )
     _insert_diff(connection, connection.last_insert_rowid(), commit)

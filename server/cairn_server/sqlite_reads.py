@@ -75,12 +75,12 @@ class SqliteReads:
 
     def _commits(self, clause: str, values: Values, *, size_bytes_max: int) -> list[StoredCommit]:
         """Commits in the order asked for, as long as their bytes stay within the size; the first in any case."""
-        columns = "number, robot, incarnation, n, sha, meta, retracts, gone, size_bytes"
+        columns = "number, robot, incarnation, n, sha, meta, retracts, gone, size_bytes, signatures"
         found: list[StoredCommit] = []
         total_bytes = 0
         with self._readers.transaction() as reader:
             query = f"SELECT {columns} FROM commits WHERE {clause}"  # noqa: S608 - our own clause
-            for number, robot, incarnation, n, sha, text, retracts, gone, size_bytes in reader.execute(query, values):
+            for number, *author, n, sha, text, retracts, gone, size_bytes, signed in reader.execute(query, values):
                 total_bytes += size_bytes
                 if found and total_bytes > size_bytes_max:
                     break
@@ -88,12 +88,13 @@ class SqliteReads:
                 found.append(
                     StoredCommit(
                         number=number,
-                        id=CommitId(Author(robot, incarnation), n),
+                        id=CommitId(Author(*author), n),
                         sha=sha,
                         text=text,
                         retracts=ids_from_text(retracts),
                         diff={CellKey(cell): body or b"" for cell, body in diff},
                         gone=bool(gone),
+                        signatures=signed,
                     )
                 )
         return found

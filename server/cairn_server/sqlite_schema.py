@@ -168,7 +168,12 @@ RECEIVED = """
 CREATE INDEX commits_received ON commits (received_s);  -- a clock may be set back: numbers do not rise with it
 """
 
-STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS, RECEIVED)
+SIGNED = """
+ALTER TABLE commits ADD COLUMN signatures TEXT;     -- of whom it speaks for, as pushed; NULL: it cannot travel
+ALTER TABLE commits ADD COLUMN via TEXT;            -- name of the token of the relay that handed it over
+"""
+
+STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS, RECEIVED, SIGNED)
 
 
 def ensure_schema(connection: apsw.Connection) -> None:

@@ -25,7 +25,7 @@ PARENT, SEEN = (
 """Of a commit's meta; NULL, too, if that is damaged."""
 LOG_COLUMNS = (
     "seq, kind, robot, incarnation, n, sha, size_bytes, cells, captured_first_s, captured_last_s, retracts,"
-    f" {PARENT}, {SEEN}"
+    f" {PARENT}, {SEEN}, via"
 )
 
 
@@ -224,6 +224,7 @@ def _log_entry(
     retracts: str,
     parent: str | None,
     seen: str | None,
+    via: str | None,
 ) -> LogEntry:
     return LogEntry.model_validate(
         {
@@ -237,5 +238,6 @@ def _log_entry(
             "retracts": retracts.split(),
             "parent": parent,
             "seen": seen,
+            "via": via,
         }
     )

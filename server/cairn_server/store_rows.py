@@ -40,6 +40,10 @@ class NewCommit:
     """Largest number of each plane; their sums over all commits bound every sum in the map."""
     rig: bytes | None = None
     """SHA-256 of the rig that its sensors were described by."""
+    signatures: str | None = None
+    """Of whom it speaks for, checked; as in `Cairn-Signature`."""
+    via: str | None = None
+    """Name of the token of the relay that handed it over."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,6 +59,7 @@ class StoredCommit:
     """Empty if it is gone, too."""
     gone: bool = False
     """Its evidence and its meta are not kept any more."""
+    signatures: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,8 @@ from starlette.concurrency import run_in_threadpool
 from cairn_map.commit_reading import commit_reader
 from cairn_map.errors import ConflictError
 from cairn_map.messages import MissingRequest, Pushed
+from cairn_map.signature import TEXT_MAX
+from cairn_server.handing_over import found_commit
 from cairn_server.http_access import READERS, Map, Operations, Visit, visiting_owner, visiting_robot
 
 COMMIT_MEDIA_TYPE = "application/vnd.cairn.commit"
@@ -31,16 +33,18 @@ async def push(
     request: Request,
     response: Response,
     cairn_seal: Annotated[str | None, Header(max_length=64)] = None,
+    cairn_signature: Annotated[str | None, Header(max_length=TEXT_MAX)] = None,
 ) -> Pushed:
     """Push a commit: 201 new, 200 seen before, 409 other bytes under this id."""
     pushes, row, caller = visit.service.pushes, visit.row, visit.caller
+    beside = {"seal": cairn_seal, "signatures": cairn_signature}
     data = await request.body()
     pushed = commit_reader(data) if len(data) <= AT_ONCE_BYTES else None
     try:
         if pushed is None or not pushes.is_quick(row, caller, pushed):
-            is_new = await run_in_threadpool(pushes.keep, row, caller, commit, data, seal=cairn_seal)
+            is_new = await run_in_threadpool(pushes.keep, row, caller, commit, data, **beside)
         else:
-            is_new = await pushes.keep_soon(row, caller, commit, pushed, seal=cairn_seal)
+            is_new = await pushes.keep_soon(row, caller, commit, pushed, **beside)
     except ConflictError as exc:
         await run_in_threadpool(pushes.note_conflict, row, caller, exc)
         raise
@@ -51,9 +55,11 @@ async def push(
 @router.get("/maps/{name}/commits/{commit}", dependencies=READERS)
 def get_commit(commit: str, service: Operations, row: Map) -> Response:
     """A commit's bytes as they were pushed, while its evidence is kept."""
-    data, sha, seal = service.commit(row, commit)
-    headers = {"ETag": f'"{sha.hex()}"', "Cache-Control": "no-cache"} | ({"Cairn-Seal": seal} if seal else {})
-    return Response(data, media_type=COMMIT_MEDIA_TYPE, headers=headers)
+    found = found_commit(service.store, row, commit)
+    headers = {"ETag": f'"{found.sha.hex()}"', "Cache-Control": "no-cache"}
+    headers |= {"Cairn-Seal": found.seal} if found.seal else {}
+    headers |= {"Cairn-Signature": found.signatures} if found.signatures else {}
+    return Response(found.data, media_type=COMMIT_MEDIA_TYPE, headers=headers)
 
 
 @router.post("/maps/{name}/branches/{branch}/missing")

@@ -2,10 +2,11 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Query, Response
+from fastapi import APIRouter, Depends, Header, Query, Response
 from starlette.concurrency import run_in_threadpool
 
 from cairn_map.errors import ConflictError
+from cairn_map.signature import TEXT_MAX
 from cairn_map.upload_messages import Upload
 from cairn_server.auth import Caller, Role
 from cairn_server.http_access import Map, Operations, allowed, body_of
@@ -18,7 +19,7 @@ Count = Annotated[int, Query(ge=0, lt=1 << 53)]
 router = APIRouter()
 
 
-async def author(commit: str, caller: Annotated[Caller, Depends(allowed(Role.ROBOT))]) -> Caller:
+async def author(commit: str, caller: Annotated[Caller, Depends(allowed(Role.ROBOT, Role.RELAY))]) -> Caller:
     """The caller, if it may push this commit."""
     uploaded_by(caller, commit)
     return caller
@@ -50,9 +51,10 @@ async def add_part(
     digest: Digest,
     total: Count,
     offset: Count,
+    cairn_signature: Annotated[str | None, Header(max_length=TEXT_MAX)] = None,
 ) -> Upload:
     """Add a part of a commit's bytes; with the last one it is pushed."""
-    part = Part(digest, total, offset, data)
+    part = Part(digest, total, offset, data, cairn_signature)
     try:
         found, is_new = await run_in_threadpool(service.uploads.add, row, caller, commit, part)
     except ConflictError as exc:

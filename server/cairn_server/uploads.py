@@ -38,6 +38,8 @@ class Part:
     total_bytes: int
     offset_bytes: int
     data: bytes
+    signatures: str | None = None
+    """As in `Cairn-Signature`; those that come with the last part count."""
 
 
 @dataclass(slots=True)
@@ -114,7 +116,7 @@ class Uploads:
             self._drop(place, commit)
             return Upload(size_bytes=0), False
         try:
-            is_new = self._pushes.keep(row, caller, id_text, whole)
+            is_new = self._pushes.keep(row, caller, id_text, whole, signatures=part.signatures)
         except UnreachableError:
             raise
         except CairnError:

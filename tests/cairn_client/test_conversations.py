@@ -39,12 +39,16 @@ def amending(replica: Replica, target: CommitId) -> Commit:
     return replica.commit({A: Z}, meta)
 
 
+def signed(replica: Replica, commit: Commit) -> Push:
+    return Push(commit, signatures=replica.outbox.signatures(commit))
+
+
 def test_commits_are_pushed_oldest_first_and_each_is_acknowledged_by_its_answer(mole: Replica) -> None:
     first, second = committed(mole, X), committed(mole, Y)
     conversation = push_commits(mole)
-    assert next(conversation) == Push(first)
+    assert next(conversation) == signed(mole, first)
     assert mole.push_set() == [first.id, second.id]
-    assert conversation.send(None) == Push(second)
+    assert conversation.send(None) == signed(mole, second)
     assert mole.push_set() == [second.id]
     with pytest.raises(StopIteration) as end:
         conversation.send(None)
@@ -75,7 +79,7 @@ def test_an_operator_s_retract_is_pushed_back_with_its_seal_after_what_it_names(
     conversation = push_commits(mole)
     assert next(conversation) == Push(retract, "the seal")
     evidence_gone = ConflictError("evidence_gone", "push it again")
-    assert conversation.throw(evidence_gone) == Push(commit)
+    assert conversation.throw(evidence_gone) == signed(mole, commit)
     assert conversation.send(None) == Push(retract, "the seal")
 
 

@@ -335,7 +335,7 @@ class OtherServer:
         self.coverage = coverage
         self.pushed: list[CommitId] = []
 
-    def push(self, name: str, commit: object, *, seal: str | None = None) -> None:
+    def push(self, name: str, commit: object, **beside: str | None) -> None:
         self.pushed.append(commit.id)  # type: ignore[attr-defined]
 
     def missing(self, name: str, branch: str, request: MissingRequest, *, replies: object) -> Iterator[object]:
@@ -450,7 +450,7 @@ class TakenIds:
         self.taken = taken
         self.pushed: list[CommitId] = []
 
-    def push(self, name: str, commit: object, *, seal: str | None = None) -> None:
+    def push(self, name: str, commit: object, **beside: str | None) -> None:
         commit_id: CommitId = commit.id  # type: ignore[attr-defined]
         if commit_id in self.taken:
             raise ConflictError("id_taken", "other bytes")

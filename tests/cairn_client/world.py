@@ -87,9 +87,10 @@ class DirectApi:
         data, _, seal = service.commit(service.store.map(name), str(commit))
         return data, seal
 
-    def push(self, name: str, commit: Commit, *, seal: str | None = None) -> Pushed:
+    def push(self, name: str, commit: Commit, *, seal: str | None = None, signatures: str | None = None) -> Pushed:
         service = self._world.service
-        is_new = service.push(service.store.map(name), self._caller, str(commit.id), commit.data, seal=seal)
+        beside = {"seal": seal, "signatures": signatures}
+        is_new = service.push(service.store.map(name), self._caller, str(commit.id), commit.data, **beside)
         return Pushed(id=str(commit.id), state="new" if is_new else "known")
 
     def missing(
@@ -129,8 +130,8 @@ class FaultyApi:
         found: tuple[bytes, str | None] = self._call(self._api.commit, name, commit)
         return found
 
-    def push(self, name: str, commit: Commit, *, seal: str | None = None) -> Pushed:
-        pushed: Pushed = self._call(self._api.push, name, commit, seal=seal)
+    def push(self, name: str, commit: Commit, *, seal: str | None = None, signatures: str | None = None) -> Pushed:
+        pushed: Pushed = self._call(self._api.push, name, commit, seal=seal, signatures=signatures)
         return pushed
 
     def missing(

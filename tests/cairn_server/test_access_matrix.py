@@ -29,7 +29,7 @@ from cairn_server.store_rows import MapRow
 from cairn_server.token_store import Token
 
 TABLE = {(found[1], found[2]): found[3].split(", ") for found in ROUTE.finditer(DOCUMENT)}
-READING = {"reader", "robot", "operator"}
+READING = {"reader", "robot", "operator", "relay"}
 ADMIN, ENROLLER = "a" * 20, "e" * 20
 AUTHORS = {"mole": MOLE, "wren": WREN}
 CREATION = ("PUT", "/maps/{name}")
@@ -54,7 +54,7 @@ class Holder:
         return " ".join(part for part in parts if part)
 
 
-ROLES: tuple[RoleText, ...] = ("admin", "operator", "reader", "enroller")
+ROLES: tuple[RoleText, ...] = ("admin", "operator", "reader", "enroller", "relay")
 PLACES: tuple[Place, ...] = ("here", "there")
 HOLDERS = [
     Holder(None, worth="none"),
@@ -65,6 +65,7 @@ HOLDERS = [
     Holder("enroller", file=ENROLLER),
     *(Holder(role, place) for role in ROLES for place in (None, *PLACES)),
     *(Holder("robot", place, robot) for place in PLACES for robot in ("mole", "wren")),
+    *(Holder("relay", place, "mole") for place in PLACES),
 ]
 
 

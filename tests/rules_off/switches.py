@@ -732,8 +732,8 @@ SWITCHES = (
         11,
         "a retract is pushed back with its seal",
         SYNC,
-        "            yield from push_whole_or_in_parts(commit, seal, parts)\n            return commit.id",
-        "            yield from push_whole_or_in_parts(commit, None, parts)\n            return commit.id",
+        "            yield from push_whole_or_in_parts(_signed(replica, commit, seal), parts)\n            return commit.id",
+        "            yield from push_whole_or_in_parts(_signed(replica, commit), parts)\n            return commit.id",
         "cairn_client/test_conversations.py::test_an_operator_s_retract_is_pushed_back_with_its_seal_after_what_it_names",
     ),
     Switch(

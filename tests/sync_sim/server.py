@@ -98,14 +98,15 @@ class SimServer:
         """
         service, row = self.service, self.row
         match ask:
-            case Push(commit, seal):
-                service.push(row, Caller(Role.ROBOT, robot), str(commit.id), commit.data, seal=seal)
+            case Push(commit, seal, signatures):
+                beside = {"seal": seal, "signatures": signatures}
+                service.push(row, Caller(Role.ROBOT, robot), str(commit.id), commit.data, **beside)
                 self._evidence[commit.id] = commit.meta.note, commit.cells
                 return None
             case GetUpload(commit_id, digest):
                 return service.uploads.state(row, Caller(Role.ROBOT, robot), str(commit_id), digest)
-            case PutPart(commit_id, digest, total, offset, data):
-                part = Part(digest, total, offset, data)
+            case PutPart(commit_id, digest, total, offset, data, signatures):
+                part = Part(digest, total, offset, data, signatures)
                 found, _ = service.uploads.add(row, Caller(Role.ROBOT, robot), str(commit_id), part)
                 if found.sha is not None:  # perhaps under an id that was another server's
                     meta, cells = split_commit(service.commit(row, str(commit_id))[0])
