@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from cairn_client.applying import Exchange, is_within
-from cairn_client.asks import Box, Conversation, GetCell, GetCommit, GetMissing, NextFrame
+from cairn_client.asks import Box, Conversation, GetCell, GetCommit, GetMissing, NextFrame, Push
 from cairn_client.cell_index import whole_index
 from cairn_client.heal import heal_damaged
 from cairn_client.nearness import Wanted, rings_between

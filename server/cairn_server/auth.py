@@ -57,7 +57,9 @@ class Caller:
 
 
 ADMIN_FILE, ENROLLER_FILE, LOCAL = Caller(Role.ADMIN, name="admin"), Caller(Role.ENROLLER, name="enroller"), "local"
-RESERVED_TOKEN_NAMES = frozenset({ADMIN_FILE.name, ENROLLER_FILE.name, LOCAL, "server"})
+UPSTREAM = Caller(Role.RELAY, name="upstream")
+"""This server's own relay, with what the upstream server has."""
+RESERVED_TOKEN_NAMES = frozenset({ADMIN_FILE.name, ENROLLER_FILE.name, LOCAL, UPSTREAM.name, "server"})
 
 
 def new_token() -> str:

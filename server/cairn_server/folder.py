@@ -38,12 +38,14 @@ class Folder:
         *,
         keep_evidence_s: float,
         on_fold: Callable[[MapRow], None],
+        may_forget_s: Callable[[str], float],
         process: FoldProcess | None = None,
     ) -> None:
         self._store = store
         self._health = health
         self._damaged = damaged
         self._on_fold = on_fold
+        self._may_forget_s = may_forget_s
         self._keep_evidence_s = keep_evidence_s
         self._forget_next_s = 0.0
         self._wake = threading.Event()
@@ -129,7 +131,7 @@ class Folder:
         return False
 
     def _forget_group(self, row: MapRow) -> int:
-        before_s = time.time() - self._keep_evidence_s
+        before_s = min(time.time() - self._keep_evidence_s, self._may_forget_s(row.name))
         return self._store.forget_evidence(row, before_s=before_s, limit=FORGET_MAX)
 
     def _fold_group(self, row: MapRow, maps: int) -> int:

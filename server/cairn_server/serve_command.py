@@ -11,6 +11,10 @@ put a secret of at least 16 characters into a file and name it with --admin-toke
 --enrolment-token-file's secret. CAIRN_ADMIN_TOKEN and CAIRN_ENROLMENT_TOKEN do the same from the environment.
 `cairn token` gives tokens for less than everything. Beyond a network that you trust, use --tls-cert and --tls-key.
 
+A field server is joined to a base with --upstream http://BASE:PORT and a token of role relay of the base's, in
+--upstream-token-file or CAIRN_UPSTREAM_TOKEN: from then on both have every robot's commits. So that a retract by an
+operator of one counts on the other, each is told the other's key: --trust-server KEY (`cairn map ls --json` shows it).
+
 Three more commands look after the folder (docs/operations.md); each explains itself with --help:
 
     cairn serve backup --data DIR FILE      copy the store into one file, while the server runs
@@ -46,6 +50,7 @@ from cairn_server.routes import make_app
 from cairn_server.service import Service
 from cairn_server.settings import LOOPBACK, Quotas, Settings
 from cairn_server.sqlite_store import FILE_NAME, SqliteStore
+from cairn_server.upstream import UPSTREAM_VARIABLE, add_upstream_arguments, joined
 
 log = logging.getLogger(__name__)
 
@@ -74,6 +79,7 @@ FLAG_OF_SETTING = {
     "body_bytes_per_s": "--min-rate",
     "disk_free_min_bytes": "--disk-free-min",
     "fold_lag_max_s": "--fold-lag-max",
+    "trusted_servers": "--trust-server",
 }
 QUOTA_FLAGS = {
     "commits_per_minute": ("--quota-commits", "N", "commits that a robot may push in a minute"),
@@ -98,7 +104,8 @@ def main(argv: list[str]) -> int:
     with listen(settings.host, settings.port) as listener:
         try:
             store = SqliteStore(settings.folder)
-            with closing(Service(store, settings, fold_process=folding, check_process=checking)) as service:
+            service = Service(store, settings, fold_process=folding, check_process=checking)
+            with closing(service), joined(service):
                 _serve(service, listener)
         except KeyboardInterrupt:
             pass
@@ -246,6 +253,7 @@ def _settings(argv: list[str]) -> Settings:
         help="while a commit waits longer to be folded, the server is not ready (600)",
     )
     parser.add_argument("--metrics-open", action="store_true", help="anybody may read /metrics, not only an admin")
+    add_upstream_arguments(parser)
     forms = [str(form) for form in LogForm]
     parser.add_argument("--log-format", choices=forms, default=forms[0], help=f"how log lines look ({forms[0]})")
     parser.add_argument("-v", "--verbose", action="store_true", help="log every request and fold")
@@ -275,6 +283,9 @@ def _settings(argv: list[str]) -> Settings:
             disk_free_min_bytes=_bytes_of(args.disk_free_min),
             fold_lag_max_s=args.fold_lag_max,
             metrics_open=args.metrics_open,
+            upstream=args.upstream,
+            upstream_token=_secret(args.upstream_token_file, UPSTREAM_VARIABLE),
+            trusted_servers=" ".join(args.trust_server),
         )
     except ValidationError as exc:
         first = exc.errors()[0]

@@ -38,6 +38,8 @@ from cairn_server.fold_process import FoldProcess
 from cairn_server.folder import Folder
 from cairn_server.handing_over import found_commit, server_key
 from cairn_server.healing import heal_cell, keep_healed
+from cairn_server.held_commits import HeldCommits
+from cairn_server.joining import Joining
 from cairn_server.live import Hub
 from cairn_server.missing import Besides, asker_from_request, header_of, reply_frames
 from cairn_server.push_policy import EvidenceGoneError
@@ -77,17 +79,20 @@ class Service:
         self.folds = FoldHealth(self.figures)
         self.live = Hub(store)
         self.reports = RobotReports(store, self.live)
+        self.joining = Joining(is_joined=settings.upstream is not None)
         self._folder = Folder(
             store,
             self.folds,
             self.damaged,
             keep_evidence_s=settings.keep_evidence_s,
             on_fold=self.live.folded,
+            may_forget_s=self.joining.may_forget_s,
             process=fold_process,
         )
         self.readiness = Readiness(store.health, self.folds, settings, self._folder.is_alive)
         self._wanted = WantedCommits()
-        self.pushes = Pushes(store, settings, self.live, self._wanted, on_new=self._folder.wake, process=check_process)
+        self.held = HeldCommits(store, self._wanted.of)
+        self.pushes = Pushes(store, settings, self.live, self._wanted, on_new=self._came, process=check_process)
         self.uploads = Uploads(store, self.pushes)
         self._stable = StableVectors(settings.stable_after_s)
         self._reads = ReadCache()
@@ -187,7 +192,7 @@ class Service:
             raise
         detail = f"map {row.name}: {ids[-1]} takes out {len(names)} commits: {request.note}"
         self.store.audit_log.add(by.name, "retract", detail)
-        self._folder.wake()
+        self._came()
         return Retracted(id=ids[-1], commits=names)
 
     def commit(self, row: MapRow, id_text: str) -> tuple[bytes, bytes, str | None]:
@@ -248,6 +253,10 @@ class Service:
         self.store.deregister(row, branch)
         self.reports.forget(row, branch)
         self.live.robot_left(row, branch)
+
+    def _came(self) -> None:
+        self._folder.wake()
+        self.joining.wake()
 
     def _besides(self, row: MapRow, snapshot: Snapshot) -> Besides:
         return Besides(self._stable.of(row, snapshot), self.damaged.of(row.name), self._wanted.of(row.name))

@@ -79,6 +79,10 @@ class Settings(BaseModel):
     """While a commit waits longer to be folded, the server is not ready."""
     metrics_open: bool = False
     """Whether anybody may read `/metrics`, which names the maps; else an admin only."""
+    upstream: str | None = None
+    """URL of the server that this one is joined to: both then hold the same commits."""
+    upstream_token: str | None = None
+    """Of role relay, given by that server."""
     trusted_servers: Annotated[str, Field(pattern=r"^([0-9a-f]{64}( [0-9a-f]{64})*)?$")] = ""
     """Public keys of servers whose operators' retracts and prior data count here, in hex, separated by spaces."""
     check_workers: Annotated[int, Field(ge=1)] = 2

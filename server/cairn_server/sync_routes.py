@@ -12,6 +12,7 @@ from starlette.concurrency import run_in_threadpool
 from cairn_map.commit_reading import commit_reader
 from cairn_map.errors import ConflictError
 from cairn_map.messages import MissingRequest, Pushed
+from cairn_map.relay_messages import CommitList, commit_list
 from cairn_map.signature import TEXT_MAX
 from cairn_server.handing_over import found_commit
 from cairn_server.http_access import READERS, Map, Operations, Visit, visiting_owner, visiting_robot
@@ -60,6 +61,12 @@ def get_commit(commit: str, service: Operations, row: Map) -> Response:
     headers |= {"Cairn-Seal": found.seal} if found.seal else {}
     headers |= {"Cairn-Signature": found.signatures} if found.signatures else {}
     return Response(found.data, media_type=COMMIT_MEDIA_TYPE, headers=headers)
+
+
+@router.get("/maps/{name}/commits", dependencies=READERS)
+def list_commits(service: Operations, row: Map) -> CommitList:
+    """Which commits are here, for relays."""
+    return commit_list(service.held.of(row))
 
 
 @router.post("/maps/{name}/branches/{branch}/missing")

@@ -1,0 +1,205 @@
+"""Field servers, a base, and robots that carry: whatever way a commit takes, all maps end equal, byte for byte."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tests.cairn_client.joined import Server, settled
+from tests.cairn_client.made import GEOMETRY, MAP, cells_of, random_diff
+from tests.cairn_server.live import until
+
+from cairn_client.robot import Robot
+from cairn_map.ids import OPERATOR
+from cairn_map.messages import Retract
+
+
+@pytest.fixture
+def base(tmp_path: Path) -> Iterator[Server]:
+    with Server(tmp_path / "base") as server:
+        server.create_map()
+        yield server
+
+
+@pytest.fixture
+def fields(tmp_path: Path, base: Server) -> Iterator[list[Server]]:
+    """Two field servers, joined to the base."""
+    with (
+        Server(tmp_path / "field0", trusted_servers=base.key) as one,
+        Server(tmp_path / "field1", trusted_servers=base.key) as two,
+    ):
+        for server in (one, two):
+            server.join(base)
+            until(lambda server=server: server.service.store.maps() != [], "the map is made")  # type: ignore[misc]
+        yield [one, two]
+
+
+def opened(server: Server, folder: Path, name: str) -> Robot:
+    token = server.token(name, role="robot", map=MAP, robot=name)
+    return Robot(None, f"{server.url}/maps/{MAP}", directory=folder, name=name, token=token, geometry=GEOMETRY)
+
+
+def mapped(server: Server, folder: Path, name: str, *seeds: int) -> Robot:
+    """A robot that maps something at a server and goes away."""
+    with opened(server, folder, name) as robot:
+        for seed in seeds:
+            robot.replica.commit(random_diff(seed))
+        robot.sync()
+    return robot
+
+
+def test_what_robots_map_at_one_server_is_on_all(base: Server, fields: list[Server], tmp_path: Path) -> None:
+    for n, server in enumerate((*fields, base)):
+        mapped(server, tmp_path / f"robot{n}", f"robot{n}", n, n + 10)
+    settled(base, *fields)
+    assert len(base.ids()) == 6
+    vias = base.vias()
+    assert vias["robot2"] is None
+    assert vias["robot0"] and vias["robot1"] and vias["robot0"] != vias["robot1"]
+    assert fields[0].vias() == {"robot0": None, "robot1": "upstream", "robot2": "upstream"}
+
+
+def test_a_robot_of_a_field_server_gets_what_others_mapped_at_the_base(
+    base: Server, fields: list[Server], tmp_path: Path
+) -> None:
+    mapped(base, tmp_path / "far", "far", 1)
+    settled(base, *fields)
+    with opened(fields[0], tmp_path / "near", "near") as near:
+        near.sync()
+        assert cells_of(near.map).keys() == base.digests().keys()
+        assert near.map.packed()
+
+
+def test_a_server_without_its_upstream_goes_on_and_catches_up(
+    base: Server, fields: list[Server], tmp_path: Path
+) -> None:
+    for server in fields:
+        server.leave()
+    for n, server in enumerate((*fields, base)):
+        mapped(server, tmp_path / f"robot{n}", f"robot{n}", n)
+    assert [len(server.ids()) for server in (base, *fields)] == [1, 1, 1]
+    for server in fields:
+        server.join(base)
+    settled(base, *fields)
+    assert len(base.ids()) == 3
+
+
+def test_circles_are_harmless(base: Server, fields: list[Server], tmp_path: Path) -> None:
+    base.join(fields[0])
+    fields[0].join(fields[1])
+    fields[1].join(fields[0])
+    for n, server in enumerate(fields):
+        mapped(server, tmp_path / f"robot{n}", f"robot{n}", n, n + 1)
+    settled(base, *fields)
+    assert [len(server.ids()) for server in (base, *fields)] == [4, 4, 4]
+
+
+@pytest.mark.parametrize("at", [0, 1])
+def test_an_operator_s_retract_at_base_or_field_reaches_all_that_trust_the_server(
+    tmp_path: Path, base: Server, fields: list[Server], at: int
+) -> None:
+    mapped(fields[1], tmp_path / "robot", "robot", 1, 2)
+    settled(base, *fields)
+    base.service.settings = base.service.settings.model_copy(
+        update={"trusted_servers": " ".join(server.key for server in fields)}
+    )
+    base.service.pushes._settings = base.service.settings
+    [target, kept] = sorted(base.ids())
+    (base, fields[0])[at].retract(target)
+    settled(base, *fields)
+    assert {commit.author.robot for commit in fields[1].ids()} == {"robot", OPERATOR}
+    with fields[1].service.store.snapshot(fields[1].row) as snapshot:
+        assert [entry.id for entry in snapshot.log(after_seq=0, limit=9) if entry.kind == "-"] == [str(target)]
+    assert fields[1].digests().keys() == set(random_diff(2))
+    assert kept in fields[1].ids()
+
+
+def test_a_retract_of_a_server_that_is_not_trusted_stays_there_and_the_log_says_how_to_trust_it(
+    tmp_path: Path, base: Server, fields: list[Server], caplog: pytest.LogCaptureFixture
+) -> None:
+    mapped(fields[0], tmp_path / "robot", "robot", 1)
+    settled(base, *fields)
+    [target] = base.ids()
+    fields[0].retract(target)
+    until(lambda: f"--trust-server {fields[0].key}" in caplog.text, "the relay says what to do")
+    assert base.digests()
+    assert not fields[0].digests()
+
+
+def test_a_robot_takes_back_what_an_older_incarnation_of_it_said_on_every_server(
+    base: Server, fields: list[Server], tmp_path: Path
+) -> None:
+    with opened(fields[0], tmp_path / "robot", "robot") as robot:
+        first = robot.replica.commit(random_diff(1))
+        robot.sync()
+        robot.replica.outbox.new_incarnation("its disk was rolled back")
+        robot.commit(retracts=(first.id,))
+        robot.sync()
+    settled(base, *fields)
+    assert base.digests() == {}
+    assert len(base.ids()) == 2
+
+
+def test_a_field_server_forgets_nothing_that_its_upstream_has_not_got(base: Server, tmp_path: Path) -> None:
+    settings = {"keep_evidence_s": 0.0, "upstream": base.url}
+    with Server(tmp_path / "field", **settings) as field:
+        field.create_map()
+        mapped(field, tmp_path / "robot", "robot", 1)
+        field.folded(field.row)
+        [commit] = field.ids()
+
+        def is_gone() -> bool:
+            field.service._folder._forget_next_s = 0.0
+            assert not field.service._folder._forget_old([field.row])
+            found = field.service.store.commit(field.row, commit)
+            return found is not None and found.gone
+
+        assert not is_gone()
+        field.join(base)
+        until(is_gone, "the evidence is forgotten")
+        until(lambda: commit in base.ids(), "the base has it")
+
+
+def test_what_the_base_does_not_keep_any_more_is_missed_aloud(
+    base: Server, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    mapped(base, tmp_path / "robot", "robot", 1)
+    base.folded(base.row)
+    base.service.store.forget_evidence(base.row, before_s=float("inf"), limit=9)
+    mapped(base, tmp_path / "other", "other", 2)
+    with Server(tmp_path / "late") as late:
+        late.join(base)
+        until(lambda: late.service.store.maps() != [] and len(late.ids()) == 1, "what is kept came")
+        until(lambda: "cairn serve backup" in caplog.text, "the relay says what to do")
+        assert set(late.ids()) < set(base.ids())
+
+
+def test_two_servers_with_other_bytes_under_one_id_are_told_apart_and_a_retract_makes_them_equal(
+    base: Server, fields: list[Server], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    fields[0].leave()
+    with opened(fields[0], tmp_path / "robot", "robot") as robot:
+        seed = robot.replica.store.get(f"signing_key.{robot.replica.author.incarnation}")
+        commit = robot.replica.commit(random_diff(1))
+        robot.sync()
+    with opened(base, tmp_path / "copy", "robot") as copy:
+        with copy.replica.store.transaction():
+            copy.replica.store.put("incarnation", commit.id.author.incarnation)
+            copy.replica.store.put(f"signing_key.{commit.id.author.incarnation}", seed)
+        copy.replica.outbox._incarnation = commit.id.author.incarnation
+        other = copy.replica.commit(random_diff(5))
+        copy.sync()
+    assert other.id == commit.id
+    fields[0].join(base)
+    until(lambda: "other commits under the same ids" in caplog.text, "the relay notices")
+    assert base.digests() != fields[0].digests()
+    base.retract(commit.id)
+    settled(base, *fields)
+
+
+def test_the_api_retracts_for_an_operator_through_http_too(base: Server, fields: list[Server], tmp_path: Path) -> None:
+    mapped(fields[0], tmp_path / "robot", "robot", 1)
+    settled(base, *fields)
+    with base.api() as api:
+        api.retract(MAP, Retract(robot="robot"))
+    settled(base, *fields)
+    assert fields[0].digests() == {}
