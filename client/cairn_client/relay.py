@@ -14,7 +14,7 @@ from itertools import islice
 
 from cairn_client.asks import Ask, Conversation
 from cairn_map.commit import split_commit
-from cairn_map.errors import CairnError, ConflictError, DeniedError, NotFoundError, UnreachableError
+from cairn_map.errors import CairnError, ConflictError, DamagedDataError, DeniedError, NotFoundError, UnreachableError
 from cairn_map.ids import Author, CommitId
 from cairn_map.relay_end import Held, SignedCommit
 
@@ -114,7 +114,7 @@ def _hand_over(
     for commit_id in islice(lacking, AT_ONCE):
         try:
             commit = yield from TakeCommit(source, commit_id)
-        except (ConflictError, NotFoundError):
+        except (ConflictError, NotFoundError, DamagedDataError):
             report.gone.append(commit_id)
             resting.add(target, commit_id)
             continue

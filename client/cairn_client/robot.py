@@ -18,7 +18,7 @@ from pydantic import ValidationError
 
 from cairn_calib.rig import Rig
 from cairn_client.answers import Traffic
-from cairn_client.api import MapApi
+from cairn_client.carrying import carrier_in
 from cairn_client.folder_status import MODE_KEY, URL_KEY
 from cairn_client.limits import NO_LIMITS, Limits
 from cairn_client.link_profile import LINKS, LinkName
@@ -26,6 +26,7 @@ from cairn_client.map_url import split_map_url
 from cairn_client.membership import Membership
 from cairn_client.outbox import UNNUMBERED
 from cairn_client.own_status import OwnStatus
+from cairn_client.relay_link import RelayApi
 from cairn_client.replica import Replica
 from cairn_client.replica_store import ReplicaStore
 from cairn_client.robot_events import SIZE, Committed, Events, EventStream
@@ -68,6 +69,7 @@ class Robot:
         limits: Limits = NO_LIMITS,
         link: LinkName = "good",
         stay: bool = False,
+        carry_bytes_max: int = 0,
     ) -> None:
         """Open or make the robot's directory; no network unless the map's geometry is not known yet.
 
@@ -85,6 +87,8 @@ class Robot:
             limits: how much to keep on the disk and in memory, and what goes when that is full.
             link: small for a link of some ten to some hundred kbit/s (`link_profile`).
             stay: a robot that only pauses: `close` does not deregister it.
+            carry_bytes_max: room on the disk for others' signed commits, taken along from server to server; it needs
+                a token of role relay that names this robot. 0: none are.
 
         Raises:
             BadInputError: bad URL or name, or the directory belongs to another robot or map.
@@ -97,7 +101,7 @@ class Robot:
         self.mode: Mode = mode
         self._rig = rig
         self._profile = LINKS[link]
-        self._api = MapApi(server_url, token=token)
+        self._api = RelayApi(server_url, token=token)
         try:
             self._replica = self._open(Path(directory), geometry)
             with self._replica.store.transaction():
@@ -120,6 +124,7 @@ class Robot:
             profile=self._profile,
             limits=limits,
             status=self.status,
+            carrier=carrier_in(Path(directory), self._api, self._map_name, size_bytes_max=carry_bytes_max),
         )
         self._stay = stay
         self._integrator = integrator or Integrator()

@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable
 
 from cairn_client.api import MapApi
+from cairn_client.carrying import Carrier
 from cairn_client.limits import Limits
 from cairn_client.link import Link
 from cairn_client.link_profile import LinkProfile
@@ -43,6 +44,7 @@ class Rounds:
         profile: LinkProfile,
         limits: Limits,
         status: OwnStatus,
+        carrier: Carrier | None = None,
     ) -> None:
         """Nothing is sent before `sync` or `start`."""
         self._api = api
@@ -53,6 +55,7 @@ class Rounds:
         self._scope = profile.scope_of(scope)
         self._parts = profile.parts
         self._status = status
+        self._carrier = carrier
         self._branch = replica.author.robot
         self._link = Link(api, map_name, branch=self._branch)
         self._room = Room(
@@ -115,6 +118,8 @@ class Rounds:
         pushes = self._push(on_push)
         report = self._fetch()
         report.pushed, report.refused = pushes.pushed, pushes.refused
+        if self._carrier is not None:
+            self._carrier.exchange()
         if report.has_more:
             self.wake()
         self._status.tell(self._replica, self._api, self._map_name, branch=self._branch, mode=self._mode)

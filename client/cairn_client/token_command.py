@@ -11,7 +11,8 @@
 It asks the server, as an admin of all maps (--token), instead of opening the store's folder: so it works from anywhere,
 on any store, while the server runs, and the audit log says who did it. The secret goes to standard output, once;
 nobody keeps it. Roles: admin everything; operator reads and retracts; reader reads; robot (with --map and --robot) as
-if registered; enroller registers robots. Without --map a token counts on all maps.
+if registered; enroller registers robots; relay hands over what robots signed (`cairn serve --upstream`, `cairn relay`),
+and with --map and --robot is that robot, too. Without --map a token counts on all maps.
 """
 
 import argparse
@@ -101,7 +102,7 @@ def _parser() -> argparse.ArgumentParser:
     create = command("create", "give a token and print its secret", _create)
     create.add_argument("--role", required=True, choices=get_args(RoleText))
     create.add_argument("--map", metavar="NAME", help="the one map that it counts on (all)")
-    create.add_argument("--robot", metavar="NAME", help="whose token it is, with --role robot")
+    create.add_argument("--robot", metavar="NAME", help="whose token it is, with --role robot or relay")
     create.add_argument("--days", type=float, metavar="DAYS", help="how long it counts (until revoked)")
     command("list", "all tokens, when they end and were used last", _list).add_argument(
         "--json", action="store_true", help="print JSON"

@@ -8,7 +8,9 @@ from tests.cairn_client.joined import Server, settled
 from tests.cairn_client.made import GEOMETRY, MAP, cells_of, random_diff
 from tests.cairn_server.live import until
 
+from cairn_client import relay_command
 from cairn_client.robot import Robot
+from cairn_map.errors import BadInputError
 from cairn_map.ids import OPERATOR
 from cairn_map.messages import Retract
 
@@ -203,3 +205,76 @@ def test_the_api_retracts_for_an_operator_through_http_too(base: Server, fields:
         api.retract(MAP, Retract(robot="robot"))
     settled(base, *fields)
     assert fields[0].digests() == {}
+
+
+def test_a_robot_carries_what_others_mapped_between_servers_that_do_not_reach_each_other(tmp_path: Path) -> None:
+    with Server(tmp_path / "a") as a, Server(tmp_path / "b") as b:
+        for server in (a, b):
+            server.create_map()
+        mapped(a, tmp_path / "x", "x", 1, 2)
+        mapped(b, tmp_path / "y", "y", 3)
+        for server in (a, b, a):
+            token = server.token(f"mule{len(server.vias())}", role="relay", map=MAP, robot="mule")
+            with Robot(
+                None,
+                f"{server.url}/maps/{MAP}",
+                directory=tmp_path / "mule",
+                name="mule",
+                token=token,
+                geometry=GEOMETRY,
+                carry_bytes_max=1 << 20,
+            ) as mule:
+                if server is a and len(a.ids()) == 2:
+                    mule.replica.commit(random_diff(4))
+                mule.sync()
+                server.folded(server.row)
+                mule.sync()
+        settled(a, b)
+        assert {commit.author.robot for commit in b.ids()} == {"x", "y", "mule"}
+        assert b.vias()["x"] == "mule1"
+
+
+def test_a_robot_without_the_right_carries_nothing_to_a_server_and_syncs_all_the_same(
+    base: Server, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with Server(tmp_path / "a") as a:
+        a.create_map()
+        mapped(a, tmp_path / "x", "x", 1)
+        for server in (a, base):
+            token = server.token("mule", role="robot", map=MAP, robot="mule")
+            with Robot(
+                None,
+                f"{server.url}/maps/{MAP}",
+                directory=tmp_path / "mule",
+                name="mule",
+                token=token,
+                geometry=GEOMETRY,
+                carry_bytes_max=1 << 20,
+            ) as mule:
+                mule.sync()
+        assert "1 commits refused" in caplog.text
+        assert base.ids() == set()
+
+
+def test_a_folder_is_a_place_between_two_servers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], base: Server
+) -> None:
+    with Server(tmp_path / "field") as field:
+        field.create_map()
+        mapped(field, tmp_path / "x", "x", 1, 2)
+        folder, there = str(tmp_path / "on-the-way"), f"{base.url}/maps/{MAP}"
+        take = [f"{field.url}/maps/{MAP}", folder, "--token", field.token("taker", role="reader")]
+        give = [folder, there, "--token-there", base.token("giver", role="relay")]
+        assert [relay_command.main(arguments) for arguments in (take, take, give, give)] == [0] * 4
+        assert capsys.readouterr().out.splitlines() == [
+            f"map {MAP}: 2 commits to {folder}, 0 from there",
+            f"map {MAP}: 0 commits to {folder}, 0 from there",
+            f"map {MAP}: 2 commits to {there}, 0 from there",
+            f"map {MAP}: 0 commits to {there}, 0 from there",
+        ]
+        settled(base, field)
+
+
+def test_a_relay_between_two_folders_has_no_map(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="map's URL"):
+        relay_command.main([str(tmp_path / "a"), str(tmp_path / "b")])
