@@ -24,7 +24,6 @@ Three more commands look after the folder (docs/operations.md); each explains it
 
 import argparse
 import logging
-import os
 import signal
 import socket
 import sys
@@ -47,6 +46,7 @@ from cairn_server.fold_process import fork_folding
 from cairn_server.http_deadlines import protocol_of
 from cairn_server.log_format import LogForm, start_logging
 from cairn_server.routes import make_app
+from cairn_server.secret_file import secret_of
 from cairn_server.service import Service
 from cairn_server.settings import LOOPBACK, Quotas, Settings
 from cairn_server.sqlite_store import FILE_NAME, SqliteStore
@@ -270,8 +270,8 @@ def _settings(argv: list[str]) -> Settings:
             folder=args.data,
             host=args.host,
             port=args.port,
-            admin_token=_secret(args.admin_token_file, "CAIRN_ADMIN_TOKEN"),
-            enrolment_token=_secret(args.enrolment_token_file, "CAIRN_ENROLMENT_TOKEN"),
+            admin_token=secret_of(args.admin_token_file, "CAIRN_ADMIN_TOKEN"),
+            enrolment_token=secret_of(args.enrolment_token_file, "CAIRN_ENROLMENT_TOKEN"),
             stable_after_s=args.stable_after,
             keep_evidence_s=args.keep_evidence,
             branch_expiry_s=args.branch_expiry,
@@ -284,7 +284,7 @@ def _settings(argv: list[str]) -> Settings:
             fold_lag_max_s=args.fold_lag_max,
             metrics_open=args.metrics_open,
             upstream=args.upstream,
-            upstream_token=_secret(args.upstream_token_file, UPSTREAM_VARIABLE),
+            upstream_token=secret_of(args.upstream_token_file, UPSTREAM_VARIABLE),
             trusted_servers=" ".join(args.trust_server),
         )
     except ValidationError as exc:
@@ -298,12 +298,3 @@ def _bytes_of(megabytes: float) -> int:
     if not 0 <= megabytes < 1 << 30:
         raise BadInputError("bad_setting", f"--disk-free-min is in megabytes, 0 or more, got {megabytes}")
     return int(megabytes * MEGABYTE)
-
-
-def _secret(path: Path | None, variable: str) -> str | None:
-    if path is None:
-        return os.environ.get(variable) or None
-    try:
-        return path.read_text().strip()
-    except (OSError, UnicodeDecodeError) as exc:
-        raise BadInputError("bad_setting", f"cannot read {path}: {exc}") from exc
