@@ -115,7 +115,8 @@ def _hand_over(
         try:
             commit = yield from TakeCommit(source, commit_id)
         except (ConflictError, NotFoundError, DamagedDataError):
-            report.gone.append(commit_id)
+            if commit_id not in held[target].vector:  # else it is only wanted again, and not lacking
+                report.gone.append(commit_id)
             resting.add(target, commit_id)
             continue
         if commit.signatures is None:

@@ -4,10 +4,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from tests.cairn_client.made import GEOMETRY, MAP
+from tests.cairn_client.made import GEOMETRY, MAP, random_diff
 from tests.cairn_server.live import Live, until
 
 from cairn_client.api import MapApi
+from cairn_client.robot import Robot
 from cairn_client.upstream import Upstream
 from cairn_map.access_messages import CreateToken
 from cairn_map.ids import CommitId
@@ -108,3 +109,18 @@ def settled(*servers: Server) -> None:
         for server in servers:
             server.folded(server.row)
     assert len({frozenset(server.digests().items()) for server in servers}) == 1
+
+
+def opened(server: Server, folder: Path, name: str) -> Robot:
+    """A robot of a server, with a token of its own."""
+    token = server.token(name, role="robot", map=MAP, robot=name)
+    return Robot(None, f"{server.url}/maps/{MAP}", directory=folder, name=name, token=token, geometry=GEOMETRY)
+
+
+def mapped(server: Server, folder: Path, name: str, *seeds: int) -> Robot:
+    """A robot that maps something at a server and goes away."""
+    with opened(server, folder, name) as robot:
+        for seed in seeds:
+            robot.replica.commit(random_diff(seed))
+        robot.sync()
+    return robot

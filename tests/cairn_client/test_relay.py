@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.cairn_client.joined import Server, settled
+from tests.cairn_client.joined import Server, mapped, opened, settled
 from tests.cairn_client.made import GEOMETRY, MAP, cells_of, random_diff
 from tests.cairn_server.live import until
 
@@ -33,20 +33,6 @@ def fields(tmp_path: Path, base: Server) -> Iterator[list[Server]]:
             server.join(base)
             until(lambda server=server: server.service.store.maps() != [], "the map is made")  # type: ignore[misc]
         yield [one, two]
-
-
-def opened(server: Server, folder: Path, name: str) -> Robot:
-    token = server.token(name, role="robot", map=MAP, robot=name)
-    return Robot(None, f"{server.url}/maps/{MAP}", directory=folder, name=name, token=token, geometry=GEOMETRY)
-
-
-def mapped(server: Server, folder: Path, name: str, *seeds: int) -> Robot:
-    """A robot that maps something at a server and goes away."""
-    with opened(server, folder, name) as robot:
-        for seed in seeds:
-            robot.replica.commit(random_diff(seed))
-        robot.sync()
-    return robot
 
 
 def test_what_robots_map_at_one_server_is_on_all(base: Server, fields: list[Server], tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from random import Random
 import pytest
 from tests.cairn_client.made import cells_of
 from tests.sync_sim.events import Events
+from tests.sync_sim.joined import JoinedHistory
 from tests.sync_sim.network import Network, Weather
 from tests.sync_sim.robot import SimRobot
 from tests.sync_sim.server import FoldOnRequest, SimServer
@@ -23,6 +24,8 @@ MODES = ("high-end", "high-end", "low-end", "viewer", "high-end")
 LENGTH_S = 120.0
 STEPS_MAX = 50
 FINAL_ROUNDS = 6
+JOINED_EVERY = 4
+"""Every so many seeds there are several servers, relays between them, and robots that come from one to another."""
 
 OFTEN = ("commit", "commit", "commit", "sync", "sync", "sync", "sync", "fold", "fold")
 SELDOM = (
@@ -235,10 +238,10 @@ def run_seed(seed: int, log: Log = lambda text: None) -> None:
     Raises:
         AssertionError: something does not hold.
     """
-    history = None
+    history: History | JoinedHistory | None = None
     with _seeded(seed) as patch:
         try:
-            history = History(seed, log)
+            history = JoinedHistory(seed, log) if seed % JOINED_EVERY == JOINED_EVERY - 1 else History(seed, log)
             patch.setattr(time, "time", history.time_s)
             history.run()
         finally:

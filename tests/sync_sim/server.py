@@ -15,6 +15,7 @@ from cairn_map.grid import CellKey, cell_key
 from cairn_map.ids import OPERATOR, CommitId
 from cairn_map.index_messages import CellIndex
 from cairn_map.messages import CreateMap, MissingRequest, Retract
+from cairn_map.relay_end import SignedCommit
 from cairn_map.version_vector import EMPTY, VersionVector
 from cairn_server.auth import Caller, Role
 from cairn_server.cell_cache import CellCache
@@ -59,6 +60,7 @@ class SimServer:
     """A server that can be restored and replaced."""
 
     def __init__(self) -> None:
+        self.settings = Settings()
         self._stable = StableBackup()
         self._backup: MemoryMap | None = None
         self._evidence: dict[CommitId, tuple[str, dict[CellKey, bytes]]] = {}
@@ -89,6 +91,31 @@ class SimServer:
             with self._store._maps.locked() as maps:
                 maps[MAP] = self._backup.copied()
             self._start(self._store)
+
+    def trust(self, keys: str) -> None:
+        """Obey the operators of servers with these keys."""
+        self.settings = self.service.settings.model_copy(update={"trusted_servers": keys})
+        self.service.settings = self.service.pushes._settings = self.settings
+
+    def copy_of(self, other: "SimServer") -> None:
+        """Another server in this one's place, that starts from a backup of a third."""
+        self._backup, self._stable.vector = None, EMPTY
+        state = other._store._maps.shared(other.row)
+        self._start(MemoryStore())
+        with self._store._maps.locked() as maps:
+            maps[MAP] = state.copied()
+        self._evidence |= other._evidence
+
+    def hand_over(self, commit: SignedCommit, *, by: Caller) -> None:
+        """A relay brings a commit."""
+        self.service.push(self.row, by, str(commit.id), commit.data, signatures=commit.signatures)
+        meta, cells = split_commit(commit.data)
+        self._evidence[commit.id] = meta.note, cells
+
+    @property
+    def backed_up(self) -> VersionVector:
+        """What its oldest backup holds."""
+        return self._stable.vector
 
     def answer(self, robot: str, ask: Ask[Any]) -> Any:
         """What the service says to a request; of `GetMissing` the reply's bytes.
@@ -154,6 +181,17 @@ class SimServer:
             here = [commit for commit in state.commits if commit.author.robot != OPERATOR]
         return {commit: self._evidence[commit][0] for commit in here}
 
+    def shas(self) -> dict[CommitId, str]:
+        """Every commit that is here, and its SHA-256."""
+        with self._store._maps.reading(self.row) as state:
+            return {commit: kept.new.sha.hex() for commit, kept in state.commits.items()}
+
+    def retracted(self) -> set[CommitId]:
+        """What operators took out, once it was folded."""
+        with self._store._maps.reading(self.row) as state:
+            kept = [kept for commit, kept in state.commits.items() if commit.author.robot == OPERATOR]
+            return {target for commit in kept for target in commit.new.retracts}
+
     def is_retracted(self, commit: CommitId) -> bool:
         """Whether it is taken out, or will be when it comes."""
         return self._store.is_retracted(self.row, commit)
@@ -189,7 +227,7 @@ class SimServer:
 
     def _start(self, store: MemoryStore) -> None:
         self._store = store
-        self.service = Service(store, Settings())
+        self.service = Service(store, self.settings)
         self.service._stable = self._stable  # type: ignore[assignment]
         self._cache = CellCache(GEOMETRY)
 
