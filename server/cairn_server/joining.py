@@ -1,7 +1,10 @@
 """What a server knows of the one that it is joined to: what it may forget, and whom to tell that something came."""
 
 import math
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+
+from cairn_server.metrics import gauge_lines
 
 
 def _nobody() -> None:
@@ -20,6 +23,14 @@ class Joining:
     def handed_over(self, map_name: str, begun_s: float) -> None:
         """All that was in a map at this time (UTC seconds since 1970) was given to the upstream, if it can travel."""
         self._handed_over_s[map_name] = begun_s
+
+    def lines(self) -> Iterator[str]:
+        """How long ago that was, as text for Prometheus."""
+        now_s = time.time()
+        ages_s = {name: max(0.0, now_s - begun_s) for name, begun_s in list(self._handed_over_s.items())}
+        yield from gauge_lines(
+            "cairn_upstream_age_seconds", "Since all of a map was handed to the upstream server.", ages_s, label="map"
+        )
 
     def may_forget_s(self, map_name: str) -> float:
         """Evidence that was folded before this time is on the upstream, too; infinite without one."""

@@ -264,7 +264,7 @@ class Service:
     def metrics_text(self) -> str:
         """All figures for Prometheus."""
         parts = [self.figures.lines(), store_lines(self.store.health.figures(), self.store.health.backlogs())]
-        return "\n".join([*chain(*parts, process_lines()), ""])
+        return "\n".join([*chain(*parts, self.joining.lines(), process_lines()), ""])
 
     def close(self) -> None:
         """Stop folding and close the store; what was acknowledged is folded after the next start."""

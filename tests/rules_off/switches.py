@@ -12,6 +12,7 @@ CHANGES, SNAPSHOT = "server/cairn_server/sqlite_changes.py", "server/cairn_serve
 READERS, CELLS = "server/cairn_server/sqlite_readers.py", "server/cairn_server/cell_routes.py"
 SERVICE, STABLE = "server/cairn_server/service.py", "server/cairn_server/stable.py"
 PUSHES = "server/cairn_server/pushes.py"
+HANDING_OVER = "server/cairn_server/handing_over.py"
 APPLYING, OUTBOX = "client/cairn_client/applying.py", "client/cairn_client/outbox.py"
 REPLICA, SYNC = "client/cairn_client/replica.py", "client/cairn_client/sync.py"
 
@@ -751,5 +752,69 @@ SWITCHES = (
         "self._wanted.note(row.name, exc.commits)",
         "pass",
         "cairn_server/test_retention.py::test_evidence_that_a_refused_retract_needs_is_wanted_until_it_comes",
+    ),
+    Switch(
+        16,
+        "a relay hands over only what those signed for whom it speaks",
+        HANDING_OVER,
+        "if not speaks_for(signed, spoken_for):",
+        "if False:",
+        "cairn_server/test_handing_over.py::test_a_retract_is_signed_by_everybody_from_whom_it_takes_something",
+    ),
+    Switch(
+        16,
+        "a relay hands over nothing unsigned",
+        HANDING_OVER,
+        "if caller.role is not Role.RELAY or not signed or caller.robot == author.robot:",
+        "if caller.role is not Role.RELAY or caller.robot == author.robot:",
+        "cairn_server/test_handing_over.py::test_an_unsigned_commit_is_not_a_relay_s_to_give",
+    ),
+    Switch(
+        16,
+        "signatures are checked",
+        PUSHES,
+        "check_signatures(self._signed, self._row.name, checked.sha)",
+        "pass",
+        "cairn_server/test_handing_over.py::test_no_byte_can_be_changed_on_the_way",
+    ),
+    Switch(
+        16,
+        "a signature is of one map",
+        "fusion/cairn_map/signature.py",
+        'return b"cairn-signed-commit-1\\0" + map_name.encode() + b"\\0" + sha',
+        'return b"cairn-signed-commit-1\\0" + sha',
+        "cairn_server/test_handing_over.py::test_a_commit_is_not_replayed_under_another_id_or_on_another_map",
+    ),
+    Switch(
+        16,
+        "what a server says itself is taken from trusted servers alone",
+        HANDING_OVER,
+        "if server_key(row).public_key.hex() not in keys and not set(keys) & set(trusted.split()):",
+        "if False:",
+        "cairn_server/test_handing_over.py::test_what_a_server_says_itself_is_taken_from_servers_that_are_trusted",
+    ),
+    Switch(
+        16,
+        "a robot signs by the keys of all its incarnations from which it takes something",
+        "client/cairn_client/robot_keys.py",
+        "dict.fromkeys([commit.id.author, *(target.author for target in commit.meta.retracted_ids)])",
+        "dict.fromkeys([commit.id.author])",
+        "cairn_client/test_relay.py::test_a_robot_takes_back_what_an_older_incarnation_of_it_said_on_every_server",
+    ),
+    Switch(
+        16,
+        "evidence that the upstream lacks is not forgotten",
+        "server/cairn_server/folder.py",
+        "before_s = min(time.time() - self._keep_evidence_s, self._may_forget_s(row.name))",
+        "before_s = time.time() - self._keep_evidence_s",
+        "cairn_client/test_relay.py::test_a_field_server_forgets_nothing_that_its_upstream_has_not_got",
+    ),
+    Switch(
+        16,
+        "a relay notices other bytes under one id",
+        "client/cairn_client/relay.py",
+        "report.split = _split(held[Side.HERE], held[Side.THERE])",
+        "pass",
+        "cairn_client/test_relay.py::test_two_servers_with_other_bytes_under_one_id_are_told_apart_and_a_retract_makes_them_equal",
     ),
 )
