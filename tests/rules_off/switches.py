@@ -763,14 +763,6 @@ SWITCHES = (
     ),
     Switch(
         16,
-        "a relay hands over nothing unsigned",
-        HANDING_OVER,
-        "if caller.role is not Role.RELAY or not signed or caller.robot == author.robot:",
-        "if caller.role is not Role.RELAY or caller.robot == author.robot:",
-        "cairn_server/test_handing_over.py::test_an_unsigned_commit_is_not_a_relay_s_to_give",
-    ),
-    Switch(
-        16,
         "signatures are checked",
         PUSHES,
         "check_signatures(self._signed, self._row.name, checked.sha)",
