@@ -32,6 +32,7 @@ class Upstream:
         Raises:
             BadInputError: the URL is none of a server.
         """
+        logging.getLogger("httpx").setLevel(logging.WARNING)  # a line for each request is no help in a server's log
         self._api = RelayApi(url, token=token)
         self._url = url
         self._server = server
