@@ -25,7 +25,6 @@ IdText = Annotated[str, Field(max_length=96)]
 # Fail fast, else a few megabytes of wrong intervals become gigabytes of error messages.
 Interval = Annotated[list[int], Field(min_length=2, max_length=2), FailFast()]
 VectorJson = Annotated[dict[str, Annotated[list[Interval], FailFast()]], Field(max_length=AUTHORS_MAX)]
-
 Time = Annotated[float, Field(allow_inf_nan=False)]
 
 CURSORS_MAX = 100_000
@@ -36,8 +35,6 @@ WANTED_MAX = 256
 DAMAGED_MAX = 256
 """Damaged cells named in one header; the others are named when these are healed."""
 SELECTING_PARTS = ("robot", "rig", "pushed_after_s", "pushed_before_s", "captured_after_s", "captured_before_s")
-
-
 FIELDS_MAX = 64
 """Of one object; more than any message here has."""
 
