@@ -134,11 +134,12 @@ class SimServer:
                 return service.uploads.state(row, Caller(Role.ROBOT, robot), str(commit_id), digest)
             case PutPart(commit_id, digest, total, offset, data, signatures):
                 part = Part(digest, total, offset, data, signatures)
-                found, _ = service.uploads.add(row, Caller(Role.ROBOT, robot), str(commit_id), part)
-                if found.sha is not None:  # perhaps under an id that was another server's
+                upload, _ = service.uploads.add(row, Caller(Role.ROBOT, robot), str(commit_id), part)
+                kept = service.store.commit(row, commit_id)
+                if kept is not None and not kept.gone:  # perhaps under an id that was another server's
                     meta, cells = split_commit(service.commit(row, str(commit_id))[0])
                     self._evidence[commit_id] = meta.note, cells
-                return found
+                return upload
             case GetCommit(commit_id):
                 data, _, found = service.commit(row, str(commit_id))
                 return data, found
