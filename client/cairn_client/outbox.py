@@ -13,6 +13,7 @@ from dataclasses import replace
 
 from cairn_client.replica_store import KeptCommit, ReplicaStore
 from cairn_client.robot_keys import RobotKeys
+from cairn_client.successors import Successors
 from cairn_map.cell_code import Profile, decode_cell
 from cairn_map.commit import Commit, CommitMeta, make_commit, renamed_commit, split_commit
 from cairn_map.errors import BadInputError
@@ -52,6 +53,9 @@ class Outbox:
         """Called before a commit of so many bytes is kept; raises if there is no room (`room`)."""
         self.beside: Mapping[str, str] = {}
         """Texts to remember in the transaction of the next commit, and of no other."""
+        self.successors = Successors(store)
+        self.amendable: Callable[[], Iterable[CommitId]] = tuple
+        """Commits that may still be amended: their bytes are kept, to subtract them at once."""
         for kept in store.commits():
             self._note(kept)
 
@@ -100,8 +104,10 @@ class Outbox:
             self._set_next(n + 1, commit)
             for key, text in self.beside.items():
                 self._store.put(key, text)
+            self._put_successor(commit)
         self.beside = {}
         self._note(_kept(commit))
+        self._read_successors(commit.meta.retracted_ids)
         self._retracts[commit.id] = commit.meta.retracted_ids
         return commit
 
@@ -109,7 +115,9 @@ class Outbox:
         """Keep a server's own retract, to push it back if the server is restored to a time before it (rule 11)."""
         with self._store.transaction():
             self._store.add_commit(commit, seal=seal)
+            self._put_successor(commit)
         self._note(replace(_kept(commit), acked=True, seal=seal))
+        self._read_successors(commit.meta.retracted_ids)
 
     def knows(self, commit: CommitId) -> bool:
         """Whether it is here, or was."""
@@ -173,10 +181,12 @@ class Outbox:
             self._set_next(n + 1, renamed)
             for amend in amends:
                 self._store.replace_commit(amend)
+            self.successors.rename(commit, renamed.id, takes_out=renamed.meta.retracted_ids)
         for key in self._commits.pop(commit).cells:
             del self._touching[key][commit]
         for changed in (renamed, *amends):
             self._note(_kept(changed))
+        self._read_successors(renamed.meta.retracted_ids)
         return renamed
 
     def _naming(self, old: CommitId, new: CommitId) -> Iterator[Commit]:
@@ -211,8 +221,9 @@ class Outbox:
             self.new_incarnation(f"the server has commit {n} of it with bytes that are not here")
 
     def named(self) -> set[CommitId]:
-        """What the kept commits take out: whoever holds an amend keeps what it names (rule 11)."""
-        return {target for kept in self for target in self._retracts_of(kept.id)}
+        """What the kept commits take out, for whoever holds an amend keeps what it names (rule 11); or may yet."""
+        amendable = {self.successors.latest(commit) for commit in self.amendable()}
+        return amendable | {target for kept in self for target in self._retracts_of(kept.id)}
 
     def forget(self, gone: Iterable[CommitId]) -> None:
         """Drop the bytes of commits; their SHA stays."""
@@ -230,10 +241,14 @@ class Outbox:
         for kept in self._store.commits():
             self._note(kept)
 
-    def uncovered(self, key: CellKey, coverage: VersionVector) -> list[CommitId]:
-        """Commits with bytes that touch a cell and are not in its coverage, oldest first."""
-        touching = self._touching.get(key, ())
-        return [commit for commit in touching if self._commits[commit].has_data and commit not in coverage]
+    def touching(self, key: CellKey) -> list[KeptCommit]:
+        """Commits with bytes that touch a cell, oldest first."""
+        return [kept for commit in self._touching.get(key, ()) if (kept := self._commits[commit]).has_data]
+
+    def kept(self, commit: CommitId) -> KeptCommit | None:
+        """A commit, if its bytes are kept."""
+        kept = self._commits.get(commit)
+        return kept if kept is not None and kept.has_data else None
 
     def own_evidence(self, key: CellKey, news: VersionVector, author: Author) -> list[Evidence] | None:
         """What an author's commits among `news` say about a cell; None if the bytes of one are not kept any more."""
@@ -255,6 +270,15 @@ class Outbox:
         self._commits[kept.id] = kept
         for key in kept.cells:
             self._touching.setdefault(key, {})[kept.id] = None
+        self.successors.read(kept.id)
+
+    def _put_successor(self, commit: Commit) -> None:
+        for target in commit.meta.retracted_ids:
+            self.successors.put(target, commit.id)
+
+    def _read_successors(self, commits: Iterable[CommitId]) -> None:
+        for commit in commits:
+            self.successors.read(commit)
 
     def _retracts_of(self, commit: CommitId) -> tuple[CommitId, ...]:
         if commit not in self._retracts:

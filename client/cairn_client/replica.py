@@ -2,7 +2,7 @@
 
     outbox   own commits, until no restore can lose them              (SYNC.md rule 12)
     base     per cell the server's state at a cursor, and its coverage: the ids in it
-    view     base + the commits in the outbox that the cell's coverage lacks     (rule 7)
+    view     base + the commits in the outbox that the cell's coverage lacks, without what they take out  (rule 7)
 
 Everything durable changes in one local transaction; everything is called under one lock.
 """
@@ -15,11 +15,11 @@ from dataclasses import replace
 from cairn_client.outbox import Outbox
 from cairn_client.replica_identity import identify
 from cairn_client.replica_store import BaseCell, KeptCommit, ReplicaStore
-from cairn_map.brick_cell import sum_evidence
+from cairn_client.shown import changes, is_to_be_taken, shown_evidence, taken_back
 from cairn_map.cell_code import Profile, decode_cell, encode_cell
 from cairn_map.commit import Commit, CommitMeta
 from cairn_map.cursor import Cursor, cursor_from_text
-from cairn_map.errors import CairnError, DamagedDataError
+from cairn_map.errors import CairnError
 from cairn_map.evidence import Evidence, empty_evidence
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.fingerprint import ZERO, fingerprint
@@ -99,6 +99,8 @@ class Replica:
             seen = str(self.default_cursor) if self.default_cursor else None
             commit = self.outbox.add(diff, meta, seen=seen, profile=profile)
             self.view.merge({key: diff[key] for key in commit.cells})
+            for gone in taken_back(self.outbox, commit, self.geometry, coverage_of=self._coverage):
+                self.view.unmerge(gone)
             return commit
 
     def push_set(self) -> list[CommitId]:
@@ -120,6 +122,8 @@ class Replica:
         """The server has this commit for good."""
         with self.lock:
             self.outbox.acknowledge(commit)
+            if is_to_be_taken(self.outbox, commit, coverage_of=self._coverage):
+                self._refresh_views([commit])
 
     def lacking_retracts(self) -> list[CommitId]:
         """The operator's retracts that a restore could still lose, and that are not kept here yet."""
@@ -132,6 +136,7 @@ class Replica:
         with self.lock:
             if not self.outbox.knows(commit.id):
                 self.outbox.keep_sealed(commit, seal)
+                self._refresh_views(commit.meta.retracted_ids)
 
     def seal(self, commit: CommitId) -> str | None:
         """The seal that a kept commit bears."""
@@ -190,13 +195,13 @@ class Replica:
     def move(self, keys: Iterable[CellKey], *, to: Cursor | None, coverage: VersionVector | None) -> None:
         """Give held cells another cursor, and coverage unless None; their evidence stays."""
         moved = list(keys)
-        shown = {key: self._uncovered(key) for key in moved}
+        shown = {key: changes(self.outbox, key, self._coverage(key)) for key in moved}
         with self.store.transaction():
             self.store.move_cells(moved, to=to, coverage=coverage)
         for key in moved:
             cell = self.cells[key]
             self.cells[key] = replace(cell, cursor=to, coverage=cell.coverage if coverage is None else coverage)
-            if self._uncovered(key) != shown[key]:
+            if changes(self.outbox, key, self._coverage(key)) != shown[key]:
                 self.refresh_view(key)
 
     def set_default_cursor(self, cursor: Cursor) -> None:
@@ -214,12 +219,12 @@ class Replica:
                 self.store.put("header", None)
                 self.store.put("default_cursor", None)
             self.header = self.default_cursor = None
-            held = list(self.cells)
+            shown = {*self.cells, *self.outbox.cells}
             self.cells.clear()
             self.outbox.reread()
             # Another server does not know the first one's seal.
             self.outbox.forget([kept.id for kept in self.outbox if kept.seal is not None])
-            for key in held:
+            for key in shown:
                 self.refresh_view(key)
 
     def forget_stable_commits(self, *, wanted: Callable[[Cell], bool] | None = None) -> int:
@@ -243,10 +248,10 @@ class Replica:
             return len(gone)
 
     def refresh_view(self, key: CellKey, *, base: Evidence | None = None) -> None:
-        """Make the view of a cell its base plus the commits that the base lacks."""
-        own = [evidence for commit in self._uncovered(key) if (evidence := self._sound(commit, key)) is not None]
-        shown = self.base_evidence(key) if base is None else base
-        self.view.replace(key, sum_evidence([shown, *own], self.geometry) if own else shown)
+        """Make the view of a cell its base, changed by the commits that are kept (rule 7)."""
+        base = self.base_evidence(key) if base is None else base
+        shown = shown_evidence(self.outbox, key, base, self.geometry, coverage=self._coverage(key))
+        self.view.replace(key, shown)
 
     def snapshot(self, model: SensorModel = STANDARD_MODEL) -> MapSnapshot:
         """The view as it is now, unmoved by what comes later; what did not change since the last one is kept."""
@@ -262,17 +267,13 @@ class Replica:
         with self.lock:
             self.store.close()
 
-    def _sound(self, commit: CommitId, key: CellKey) -> Evidence | None:
-        """What a kept commit says about a cell; None, and a complaint, if the disk damaged it."""
-        try:
-            return self.outbox.evidence(commit, key)
-        except DamagedDataError as exc:
-            log.error("commit %s at rest is damaged and left out of the map: %s", commit, exc.message)
-            return None
+    def _refresh_views(self, commits: Iterable[CommitId]) -> None:
+        """Show the cells of some commits anew."""
+        for key in {key for commit in commits if (kept := self.outbox.kept(commit)) for key in kept.cells}:
+            self.refresh_view(key)
 
-    def _uncovered(self, key: CellKey) -> list[CommitId]:
-        cell = self.cells.get(key)
-        return self.outbox.uncovered(key, cell.coverage if cell else EMPTY)
+    def _coverage(self, key: CellKey) -> VersionVector:
+        return self.cells[key].coverage if key in self.cells else EMPTY
 
     def _is_covered(self, kept: KeptCommit, wanted: Callable[[Cell], bool] | None) -> bool:
         needed = [key for key in kept.cells if wanted is None or wanted(cell_of_key(key))]

@@ -349,7 +349,7 @@ class World:
         self.robots[robot].commit(random_diff(seed), meta)
 
     def _check_level(self, robot: int) -> None:
-        """After a whole round a robot shows the server's map, and what of its own is not in it."""
+        """After a whole round a robot shows the server's map, and what its own commits change of it."""
         replica = self.robots[robot]
         expected = EvidenceMap(GEOMETRY)
         with self.service.store.snapshot(self._row) as snapshot:
@@ -358,12 +358,14 @@ class World:
                 assert row is not None
                 expected.merge({row.key: decode_cell(row.body).evidence})
             folded = snapshot.head.vector
-        for commit in replica.commits:
-            if commit not in folded:
-                data = replica.commit_data(commit)
-                assert data is not None
-                cells = split_commit(data)[1]
-                expected.merge({key: decode_cell(body).evidence for key, body in cells.items()})
+        kept = {commit: split_commit(replica.commit_data(commit) or b"") for commit in replica.commits}
+        named = {target: commit for commit, (meta, _) in reversed(kept.items()) for target in meta.retracted_ids}
+        for commit, (_, cells) in kept.items():
+            diff = {key: decode_cell(body).evidence for key, body in cells.items()}
+            if commit not in folded and commit not in named:
+                expected.merge(diff)
+            elif commit in folded and commit in named and named[commit] not in folded:
+                expected.unmerge(diff)
         assert cells_of(replica.view) == cells_of(expected)
 
     def _round(self, robot: int, api: Any) -> None:

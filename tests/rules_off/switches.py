@@ -15,6 +15,7 @@ PUSHES = "server/cairn_server/pushes.py"
 HANDING_OVER = "server/cairn_server/handing_over.py"
 APPLYING, OUTBOX = "client/cairn_client/applying.py", "client/cairn_client/outbox.py"
 REPLICA, SYNC = "client/cairn_client/replica.py", "client/cairn_client/sync.py"
+SHOWN = "client/cairn_client/shown.py"
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,8 +286,8 @@ SWITCHES = (
         6,
         "coverage is kept for each cell",
         REPLICA,
-        "return self.outbox.uncovered(key, cell.coverage if cell else EMPTY)",
-        "return self.outbox.uncovered(key, self.header.coverage if self.header else EMPTY)",
+        "return self.cells[key].coverage if key in self.cells else EMPTY",
+        "return self.header.coverage if self.header else EMPTY",
         "cairn_client/test_rules.py::test_a_reset_to_the_same_fingerprint_takes_the_cursor_and_replaces_coverage",
     ),
     Switch(
@@ -316,17 +317,41 @@ SWITCHES = (
     Switch(
         7,
         "the view shows own commits that the base lacks",
-        REPLICA,
-        "sum_evidence([shown, *own], self.geometry) if own else shown",
-        "shown",
+        SHOWN,
+        "    for commit in found.added:\n",
+        "    for commit in ():\n",
         "cairn_client/test_rules.py::test_the_view_is_the_base_and_the_commits_it_lacks",
     ),
     Switch(
         7,
+        "the view shows no commit that a kept one takes out",
+        SHOWN,
+        "if not _is_taken_out(outbox, kept, coverage)",
+        "",
+        "cairn_client/test_shown.py::test_what_an_amend_names_is_not_shown_where_the_server_lacks_both",
+    ),
+    Switch(
+        7,
+        "the view lacks what the base has and a kept commit takes out",
+        SHOWN,
+        "    for commit in found.taken:\n",
+        "    for commit in ():\n",
+        "cairn_client/test_shown.py::test_what_an_amend_names_is_subtracted_where_the_server_has_it",
+    ),
+    Switch(
+        7,
+        "a commit is taken out once",
+        SHOWN,
+        "by not in coverage and outbox.kept(by) is not None",
+        "outbox.kept(by) is not None",
+        "cairn_client/test_shown.py::test_what_the_server_took_out_is_not_taken_out_again",
+    ),
+    Switch(
+        7,
         "the view shows no commit that the base has",
-        OUTBOX,
-        "if self._commits[commit].has_data and commit not in coverage]",
-        "if self._commits[commit].has_data]",
+        SHOWN,
+        "outbox.touching(key) if kept.id not in coverage]",
+        "outbox.touching(key)]",
         "cairn_client/test_rules.py::test_a_commit_in_the_coverage_of_its_cell_is_not_added_again",
     ),
     Switch(
@@ -516,9 +541,9 @@ SWITCHES = (
     Switch(
         12,
         "an acknowledgement is no coverage",
-        OUTBOX,
-        "if self._commits[commit].has_data and commit not in coverage]",
-        "if self._commits[commit].has_data and commit not in coverage and not self._commits[commit].acked]",
+        SHOWN,
+        "outbox.touching(key) if kept.id not in coverage]",
+        "outbox.touching(key) if kept.id not in coverage and not kept.acked]",
         "cairn_client/test_rules.py::test_an_acknowledged_commit_is_still_shown_and_still_kept",
     ),
     Switch(
