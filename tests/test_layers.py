@@ -58,6 +58,7 @@ MAY_NAME = {
     "apsw": ["cairn_server/sqlite_*.py", "cairn_client/sqlite_*.py", "cairn_client/replica_store.py"],
     "psycopg": [],
     "cryptography": ["cairn_map/signature.py"],
+    "small_gicp": ["cairn_client/alignment.py"],
     "numba": [
         "cairn_map/*_kernels.py",
         "cairn_map/compile_progress.py",

@@ -17,6 +17,7 @@ from typing import Self
 from pydantic import ValidationError
 
 from cairn_calib.rig import Rig
+from cairn_client.alignment import Aligning
 from cairn_client.amending import Amending
 from cairn_client.answers import Traffic
 from cairn_client.carrying import carrier_in
@@ -145,6 +146,8 @@ class Robot:
             meta_of=self._meta,
             on_commit=self._made,
         )
+        self.align = Aligning(self.snapshot, rig, self._integrator).align
+        """Where this robot's own frame lies in the map (`alignment.Aligning`)."""
         self.amend, self.amend_all = amending.amend, amending.amend_all
         """Past measurements from corrected poses (`amending.Amending`); needs `keep_scans_bytes`."""
         self._is_closed = False
