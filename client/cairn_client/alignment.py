@@ -53,8 +53,10 @@ NEIGHBOURS = 20
 class Aligning:
     """Alignments of one robot; its method is the robot's."""
 
-    def __init__(self, snapshot: Callable[[], MapSnapshot], rig: Rig | None, integrator: Integrator) -> None:
-        """Args: snapshot: the map as it is now. integrator: range limits."""
+    def __init__(
+        self, snapshot: Callable[[], MapSnapshot], rig: Callable[[], Rig | None], integrator: Integrator
+    ) -> None:
+        """Args: snapshot: the map as it is now. rig: the head as it is now. integrator: range limits."""
         self._snapshot = snapshot
         self._rig = rig
         self._integrator = integrator
@@ -81,7 +83,7 @@ class Aligning:
             BadInputError: a scan does not fit the rig, the guess is no rigid transform, the reach asks for too many
                 starts, there is no rig, or small_gicp is not installed.
         """
-        rig, limits = self._rig, self._integrator
+        rig, limits = self._rig(), self._integrator
         if rig is None:
             raise BadInputError("no_rig", "this robot was opened without a rig, so it cannot read scans")
         seen = (

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from cairn_client.api import MapApi
+from cairn_client.map_model import store_model
 from cairn_client.replica import Replica
 from cairn_map.errors import BadInputError, DeniedError
 from cairn_map.messages import Register
@@ -82,6 +83,8 @@ class Membership:
             return
         if registered.map.geometry != self._replica.geometry:
             raise BadInputError("other_geometry", f"map {self._map_name} has another grid than this robot's directory")
+        with self._replica.lock:
+            store_model(self._replica.store, registered.map.sensor_model)
         self._replica.set_token(registered.token)
         with self._replica.lock, self._replica.store.transaction():
             self._replica.store.put(DOOR_KEY, OPEN if self._enrolment_token is None else None)

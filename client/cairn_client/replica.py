@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 
+from cairn_client.map_model import stored_model
 from cairn_client.outbox import Outbox
 from cairn_client.replica_identity import identify
 from cairn_client.replica_store import BaseCell, KeptCommit, ReplicaStore
@@ -25,7 +26,7 @@ from cairn_map.evidence_map import EvidenceMap
 from cairn_map.fingerprint import ZERO, fingerprint
 from cairn_map.grid import Cell, CellKey, Geometry, cell_of_key
 from cairn_map.ids import OPERATOR, Author, CommitId, RobotName, commit_id_from_text
-from cairn_map.map_snapshot import STANDARD_MODEL, MapSnapshot, snapshot_of
+from cairn_map.map_snapshot import MapSnapshot, snapshot_of
 from cairn_map.messages import ReplyHeader, message_from_json
 from cairn_map.sensor_model import SensorModel
 from cairn_map.version_vector import EMPTY, VersionVector
@@ -250,12 +251,12 @@ class Replica:
     def refresh_view(self, key: CellKey, *, base: Evidence | None = None) -> None:
         """Make the view of a cell its base, changed by the commits that are kept (rule 7)."""
         base = self.base_evidence(key) if base is None else base
-        shown = shown_evidence(self.outbox, key, base, self.geometry, coverage=self._coverage(key))
-        self.view.replace(key, shown)
+        self.view.replace(key, shown_evidence(self.outbox, key, base, self.geometry, coverage=self._coverage(key)))
 
-    def snapshot(self, model: SensorModel = STANDARD_MODEL) -> MapSnapshot:
-        """The view as it is now, unmoved by what comes later; what did not change since the last one is kept."""
+    def snapshot(self, model: SensorModel | None = None) -> MapSnapshot:
+        """The view as it is now, unmoved by what comes later, under the map's own sensor model or another one."""
         with self.lock:
+            model = stored_model(self.store) if model is None else model
             if self._snapshot is not None and self._snapshot.model == model:
                 self._snapshot = self._snapshot.refreshed(self.view)
             else:

@@ -14,8 +14,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Self
 
-from pydantic import ValidationError
-
 from cairn_calib.rig import Rig
 from cairn_client.alignment import Aligning
 from cairn_client.amending import Amending
@@ -25,9 +23,10 @@ from cairn_client.folder_status import MODE_KEY, URL_KEY
 from cairn_client.kept_scans import KeptScans
 from cairn_client.limits import NO_LIMITS, Limits
 from cairn_client.link_profile import LINKS, LinkName
+from cairn_client.map_model import store_model
 from cairn_client.map_url import split_map_url
 from cairn_client.membership import Membership
-from cairn_client.outbox import UNNUMBERED
+from cairn_client.own_meta import own_meta
 from cairn_client.own_status import OwnStatus
 from cairn_client.relay_link import RelayApi
 from cairn_client.replica import Replica
@@ -42,7 +41,7 @@ from cairn_fusion.scan import Scan
 from cairn_map.cell_code import Profile
 from cairn_map.commit import Commit, CommitMeta
 from cairn_map.compile_progress import show_compiling
-from cairn_map.errors import BadInputError, first_error
+from cairn_map.errors import BadInputError
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.grid import Geometry, cell_of_key
 from cairn_map.ids import CommitId, robot_name
@@ -137,7 +136,7 @@ class Robot:
         self._integrator = integrator or Integrator()
         self._measurement = self._new_measurement()
         self.snapshot = self._replica.snapshot
-        """`robot.snapshot()`: the map as it is now, to ask (`map_snapshot.MapSnapshot`); by any thread."""
+        """`robot.snapshot()`: the map as it is now, under its own sensor model (`map_snapshot`); by any thread."""
         if limits == NO_LIMITS:  # else commits that the server has for good go first
             self._replica.outbox.amendable = lambda: self._kept_scans.commits
         amending = Amending(
@@ -146,7 +145,7 @@ class Robot:
             meta_of=self._meta,
             on_commit=self._made,
         )
-        self.align = Aligning(self.snapshot, rig, self._integrator).align
+        self.align = Aligning(self.snapshot, lambda: self._rig, self._integrator).align
         """Where this robot's own frame lies in the map (`alignment.Aligning`)."""
         self.amend, self.amend_all = amending.amend, amending.amend_all
         """Past measurements from corrected poses (`amending.Amending`); needs `keep_scans_bytes`."""
@@ -288,7 +287,9 @@ class Robot:
             if geometry is None and remembered is not None:
                 geometry = Geometry.model_validate_json(remembered)
             if geometry is None:
-                geometry = self._api.map_info(self._map_name).geometry
+                info = self._api.map_info(self._map_name)
+                geometry = info.geometry
+                store_model(store, info.sensor_model)
             return Replica(store, robot=self.name, map_name=self._map_name, geometry=geometry)
         except BaseException:
             store.close()
@@ -303,18 +304,4 @@ class Robot:
         self._rounds.wake()
 
     def _meta(self, measurement: Measurement | None, note: str, retracts: tuple[CommitId, ...]) -> CommitMeta:
-        """What the commit of a measurement says; the replica gives the number."""
-        try:
-            return CommitMeta(
-                id=str(CommitId(self._replica.author, UNNUMBERED)),
-                geometry=self._replica.geometry.digest().hex(),
-                captured_s=measurement.captured_s if measurement else None,
-                scans=tuple(measurement.poses) if measurement else (),
-                sensors=tuple(self._rig.cameras) if self._rig else (),
-                rig=self._rig.digest() if self._rig else None,
-                integrator=str(self._integrator),
-                retracts=tuple(str(target) for target in retracts),
-                note=note,
-            )
-        except ValidationError as exc:
-            raise BadInputError("bad_meta", f"the commit cannot say this of itself: {first_error(exc)}") from exc
+        return own_meta(self._replica, measurement, self._rig, self._integrator, note=note, retracts=retracts)

@@ -3,7 +3,7 @@
     snapshot = robot.snapshot()
     snapshot.probability_at([[1.0, 2.0, 0.4]])                         # NaN where unknown
     snapshot.cast_rays(origins_m, directions, max_range_m=10).hit
-    snapshot.check_box(T_map_body, [[-0.4, -0.3, 0.0], [0.4, 0.3, 0.6]]).first_occupied
+    snapshot.sweep_box(T_map_body, [[-0.4, -0.3, 0.0], [0.4, 0.3, 0.6]]).first_occupied
 
 A snapshot never changes, whatever the robot merges meanwhile: any number of threads may ask it, without a lock. Taking
 the next one costs the cells that changed since, and sharing costs the map a copy of each cell that changes.
@@ -25,6 +25,7 @@ from cairn_map import (
     body_queries,
     layer_queries,
     nearest_queries,
+    path_queries,
     point_queries,
     ray_queries,
     voxel_queries,
@@ -123,7 +124,7 @@ class MapSnapshot:
         )
 
     def check_box(self, T_map_body: npt.ArrayLike, box_m: npt.ArrayLike) -> PathStates:
-        """What a box meets at each pose of a path; between the poses nothing is looked at.
+        """What a box meets at each pose of a path; between the poses `sweep_box` looks.
 
         It meets the voxels that it overlaps; touching, to a millionth of a voxel, is not meeting.
 
@@ -136,6 +137,25 @@ class MapSnapshot:
     def check_sphere(self, centres_m: npt.ArrayLike, *, radius_m: float) -> PathStates:
         """What a sphere meets at each of (N, 3) centres, as `check_box`."""
         return body_queries.check_sphere(self._frozen, centres_m, radius_m=radius_m)
+
+    def sweep_box(self, T_map_body: npt.ArrayLike, box_m: npt.ArrayLike) -> PathStates:
+        """What a box meets on its way to each pose of a path, the pose included: straight, turning the shortest way.
+
+        Looked at wherever a point of the box has moved by half a voxel. What it reports is met; what it misses is
+        overlapped by less than a quarter of a voxel's edge: with a box larger by that to all sides nothing is missed.
+
+        Args:
+            T_map_body: (N, 4, 4) rigid transforms.
+            box_m: as for `check_box`.
+
+        Raises:
+            BadInputError: as `check_box`; kind `too_large`: more than a million steps.
+        """
+        return path_queries.sweep_box(self._frozen, T_map_body, box_m)
+
+    def sweep_sphere(self, centres_m: npt.ArrayLike, *, radius_m: float) -> PathStates:
+        """What a sphere meets on its straight ways to each of (N, 3) centres, as `sweep_box`."""
+        return path_queries.sweep_sphere(self._frozen, centres_m, radius_m=radius_m)
 
     def nearest_occupied(self, points_m: npt.ArrayLike, *, radius_m: float) -> Nearest:
         """The nearest occupied voxel of each point, within a finite radius."""

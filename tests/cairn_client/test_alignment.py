@@ -115,7 +115,7 @@ def test_scans_of_another_place_are_not_found_on_the_map(building: EvidenceMap) 
         render_scan(scene, rig, T_map_rig=T, range_camera=RANGE_CAMERA, time_s=0.0, noise=Noise(seed=1), number=n)
         for n, T in enumerate(robot.head_poses(T_true)[::3])
     ]
-    aligning = Aligning(lambda: snapshot_of(building), rig, Integrator())
+    aligning = Aligning(lambda: snapshot_of(building), lambda: rig, Integrator())
     guess = stops(load_scene("building"), "labs")[2]
     found = aligning.align(in_own_frame(scans, T_true), T_map_robot=guess)
     assert found.verdict is not Verdict.ACCEPTED, found.reason
@@ -124,7 +124,7 @@ def test_scans_of_another_place_are_not_found_on_the_map(building: EvidenceMap) 
     assert "0 occupied voxels" in far.reason
     assert np.isinf(np.diag(far.covariance)).all()
     with pytest.raises(BadInputError):
-        Aligning(lambda: snapshot_of(building), None, Integrator()).align(scans, T_map_robot=guess)
+        Aligning(lambda: snapshot_of(building), lambda: None, Integrator()).align(scans, T_map_robot=guess)
 
 
 # In rooms and corridors of planes

@@ -26,7 +26,7 @@ from cairn_map.access_messages import CreateToken
 from cairn_map.cell_code import Profile
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, DeniedError, UnreachableError
 from cairn_map.evidence_map import EvidenceMap
-from cairn_map.messages import Register
+from cairn_map.messages import CreateMap, Register
 from cairn_map.sensor_model import SensorModel
 from cairn_map.state_grid import State
 
@@ -478,3 +478,24 @@ def test_a_killed_robot_loses_nothing_that_it_committed_and_counts_nothing_twice
         seeds = [int(seed) for note, _ in stored.values() for seed in note.split()]
         assert len(set(seeds)) == len(seeds)
         assert cells_of(robot.map) == cells_of(evidence_of(*seeds))
+
+
+# The map's own sensor model
+
+
+def test_a_snapshot_is_read_under_the_model_that_the_map_was_made_with(server: LiveServer, tmp_path: Path) -> None:
+    wary = SensorModel(p_occupied=0.9, p_max=0.99)
+    with MapApi(server.url) as api:
+        api.create_map("wary", CreateMap(geometry=GEOMETRY, sensor_model=wary))
+    url = f"{server.url}/maps/wary"
+    with robot_in(tmp_path, url) as robot:  # the grid is given: it hears of the model when it registers
+        assert robot.snapshot().model == SensorModel()
+        robot.sync()
+        assert robot.snapshot().model == wary
+    with robot_in(tmp_path, url, name="fox", geometry=None) as robot:  # it asks for the grid
+        assert robot.snapshot().model == wary
+        map_commit(robot, 1)
+        assert robot.snapshot(SensorModel()).model == SensorModel()
+    server.stop()
+    with robot_in(tmp_path, url) as robot:
+        assert robot.snapshot().model == wary
