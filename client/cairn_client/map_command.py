@@ -9,6 +9,7 @@
     $ cairn map log http://127.0.0.1:8750/maps/lab --graph
     $ cairn map branches http://127.0.0.1:8750/maps/lab
     $ cairn map retract http://127.0.0.1:8750/maps/lab --robot mole --pushed-after 14:05 --dry-run
+    $ cairn map query lab/ ray 1,2,0.4 0,1,0
     $ cairn map heal http://127.0.0.1:8750/maps/lab lab/
 
 A map's URL is http://HOST:PORT/maps/NAME. A retract takes exactly the evidence of the named commits out again, on
@@ -30,6 +31,7 @@ from cairn_client.branch_table import branch_table
 from cairn_client.heal_command import add_heal_arguments, heal
 from cairn_client.log_graph import log_graph
 from cairn_client.prior_data import push_prior_data
+from cairn_client.query_command import add_query_arguments
 from cairn_client.retract_command import add_retract_arguments, retract
 from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
 from cairn_map.errors import BadInputError
@@ -210,6 +212,7 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--npz", type=Path, metavar="FILE", help="all known voxels as NumPy arrays")
     export.add_argument("--picture", type=Path, metavar="FILE", help="PNG: colour, temperature, probability")
     export.add_argument("--ceiling", type=float, metavar="METRES", help="picture: leave out what is higher")
+    add_query_arguments(commands.add_parser("query", help="ask a map that lies in a folder, without a server"))
     add_heal_arguments(command("heal", "send cells that the server's disk damaged", heal, "map"))
     add_retract_arguments(command("retract", "take commits out of a map again, exactly", retract, "map"))
     return top

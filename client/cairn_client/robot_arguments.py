@@ -19,7 +19,7 @@ def add_map(command: argparse.ArgumentParser) -> None:
 def add_amount(command: argparse.ArgumentParser) -> None:
     """How much of the map, and the token."""
     allow_negative_lists(command)
-    command.add_argument("--box", type=_box, metavar="X0,Y0,Z0,X1,Y1,Z1", help="fetch only cells in it, metres")
+    command.add_argument("--box", type=box, metavar="X0,Y0,Z0,X1,Y1,Z1", help="fetch only cells in it, metres")
     command.add_argument(
         "--reply-bytes", type=int, metavar="BYTES", help="of cells in one reply; the rest comes in the next ones"
     )
@@ -67,7 +67,8 @@ def place(text: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _box(text: str) -> tuple[float, ...]:
+def box(text: str) -> tuple[float, ...]:
+    """X0,Y0,Z0,X1,Y1,Z1 in metres."""
     parts = text.split(",")
     if len(parts) != 6:
         raise argparse.ArgumentTypeError(f"expected X0,Y0,Z0,X1,Y1,Z1 in metres, got {text!r}")
