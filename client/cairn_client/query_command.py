@@ -10,7 +10,6 @@
     $ cairn map query lab/ hottest --count 5                  # where it is hot
     $ cairn map query lab/ slice 0.5                          # a horizontal layer: # occupied, . free
     $ cairn map query lab/ height --box=-5,-5,0,5,5,2         # the highest surface of each column, metres
-    $ cairn map query lab/ box                                # how many voxels of which state
 
 The folder is what `cairn map export --cells` wrote, or the state folder of a robot that is not running. All lengths are
 metres in the map's frame, temperatures degrees Celsius here and kelvin in JSON; what is unknown is `-`, in JSON null.
@@ -74,8 +73,7 @@ def add_query_arguments(query: argparse.ArgumentParser) -> None:
     layer.add_argument("z", type=float, metavar="Z", help="metres, map frame")
     layer.add_argument("--what", default="state", help="state, probability, log_odds or a channel's name (state)")
     height = question("height", "the highest occupied surface of each column", _height)
-    state = question("box", "how many voxels there are of each state", _box)
-    for limited in (hottest, layer, height, state):
+    for limited in (hottest, layer, height):
         limited.add_argument("--box", type=box, metavar="X0,Y0,Z0,X1,Y1,Z1", help="only in this box, metres")
 
 
@@ -144,13 +142,6 @@ def _slice(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[s
 def _height(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
     image = snapshot.height_map(box_m=_corners(args))
     return _image_json(image), [_image_head(image), *_span(image.values, "height in m")]
-
-
-def _box(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
-    voxels, occupied = snapshot.voxels_in(_corners(args)), snapshot.occupied_in(_corners(args))
-    litres = (snapshot.geometry.voxel_edge_m * 10) ** 3
-    counts = {"occupied": len(occupied), "free": int((voxels.counts != 0).any(axis=1).sum()) - len(occupied)}
-    return counts, [f"{name:<9}{count:>12} voxels, {count * litres / 1000:.3f} m3" for name, count in counts.items()]
 
 
 def _corners(args: argparse.Namespace) -> npt.NDArray[np.float64] | None:

@@ -117,11 +117,6 @@ def test_a_height_map_tells_the_highest_surfaces(folder: Path, capsys: pytest.Ca
     assert "height in m: 0.1 to 0.1 (2 of 64 values known" in asked(capsys, folder, "height")
 
 
-def test_how_much_is_known(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert answered(capsys, folder, "box") == {"occupied": 2, "free": 1}
-    assert "2 voxels, 0.000 m3" in asked(capsys, folder, "box")
-
-
 def test_a_robot_s_state_is_read_under_the_map_s_own_sensor_model(tmp_path: Path) -> None:
     replica = opened(tmp_path)
     replica.commit({A: evidence()})
@@ -135,14 +130,16 @@ def test_a_robot_s_state_is_read_under_the_map_s_own_sensor_model(tmp_path: Path
 
 def test_what_is_no_map_is_refused_and_named(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="cairn map export"):
-        main(["query", str(tmp_path), "box"])
+        main(["query", str(tmp_path), "height"])
     write_head(tmp_path, FolderHead(geometry=GEOMETRY))
     (tmp_path / "0_0_0.cell").write_bytes(b"no cell")
     with pytest.raises(DamagedDataError, match=r"0_0_0\.cell"):
-        main(["query", str(tmp_path), "box"])
+        main(["query", str(tmp_path), "height"])
 
 
-@pytest.mark.parametrize("words", [["points", "1,2"], ["ray", "0,0,0"], [], ["slice", "high"], ["box", "--box", "1,2"]])
+@pytest.mark.parametrize(
+    "words", [["points", "1,2"], ["ray", "0,0,0"], [], ["slice", "high"], ["height", "--box", "1,2"]]
+)
 def test_a_question_that_is_none_is_a_wrong_usage(tmp_path: Path, words: list[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["query", str(tmp_path), *words])
