@@ -5,9 +5,11 @@
 
 A file is a row of scans (`scan_bytes`), each behind its length. It is written once, from its beginning to its end, and
 never flushed by force: that would wear the flash of a robot for what only helps. A power cut may cost the scans of the
-last half minute, which is noticed by their checksums, and never any evidence; so may a full disk. One scan of five
-cameras (10 MB) costs 6 MB and 35 ms, one of a 176 x 144 time-of-flight camera 0.12 MB and 1 ms; amends write none anew.
-The commits of the measurements that are kept stay in the outbox, so that an amend is seen at once.
+last half minute, which is noticed by their checksums, and never any evidence; so may a full disk. The commits of the
+measurements that are kept stay in the outbox, so that an amend is seen at once.
+
+Cost of `KeptScans.add` on one core: five cameras of full size (10 MB) 6.3 MB and 30 ms a scan, of a quarter of it 0.5
+MB and 1.1 ms, a time-of-flight camera of 176 x 144 pixels alone 0.14 MB and 0.2 ms. Amends write no scans.
 """
 
 import logging
