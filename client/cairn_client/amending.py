@@ -109,7 +109,8 @@ class Amending:
         diff = measurement.diff()
         with self._replica.lock:  # the sync may give the commit another id, but not meanwhile
             latest = self._replica.outbox.successors.latest(found)
-            commit = self._replica.commit(diff, self._meta_of(measurement, note, (latest,)), profile=profile or self._usual)
+            meta = self._meta_of(measurement, note, (latest,))
+            commit = self._replica.commit(diff, meta, profile=profile or self._usual)
         self._kept.rename(found, commit.id)
         self._on_commit(commit)
         return commit

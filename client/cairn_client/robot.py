@@ -92,8 +92,7 @@ class Robot:
             stay: a robot that only pauses: `close` does not deregister it.
             carry_bytes_max: room on the disk for others' signed commits, taken along from server to server; it needs
                 a token of role relay that names this robot. 0: none are.
-            keep_scans_bytes: of the newest scans, kept in `directory/scans` for `amend`: 6 MB and 30 ms for a scan of
-                five large cameras, 0.14 MB and 0.2 ms for one small range camera (`kept_scans`).
+            keep_scans_bytes: of the newest scans, kept in `directory/scans` for `amend`; what they cost: `kept_scans`.
 
         Raises:
             BadInputError: bad URL or name, or the directory belongs to another robot or map.
@@ -146,9 +145,8 @@ class Robot:
             on_commit=self._made,
         )
         self.align = Aligning(self.snapshot, lambda: self._rig, self._integrator).align
-        """Where this robot's own frame lies in the map (`alignment.Aligning`)."""
+        """Where this robot's own frame lies in the map (`alignment.Aligning`); below: past measurements, moved."""
         self.amend, self.amend_all = amending.amend, amending.amend_all
-        """Past measurements from corrected poses (`amending.Amending`); needs `keep_scans_bytes`."""
         self._is_closed = False
 
     def __enter__(self) -> Self:
