@@ -5,6 +5,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict
 
 from cairn_client.folder_lock import is_locked
+from cairn_client.replica_store import ReplicaStore
 from cairn_client.round_watch import CONTACT_KEY, Contact
 from cairn_client.sqlite_glance import Glance, KeptBytes, commit_bytes, glance
 from cairn_map.commit import split_commit
@@ -76,6 +77,13 @@ class FolderQueue(BaseModel):
     map: str
     commits: list[QueuedCommit]
     """Oldest first."""
+
+
+def note_use(store: ReplicaStore, *, url: str, mode: Mode) -> None:
+    """Remember on which map, and how, a robot works."""
+    with store.transaction():
+        store.put(URL_KEY, url)
+        store.put(MODE_KEY, mode)
 
 
 def folder_status(folder: Path) -> FolderStatus:

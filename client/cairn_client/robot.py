@@ -19,7 +19,7 @@ from cairn_client.alignment import Aligning
 from cairn_client.amending import Amending
 from cairn_client.answers import Traffic
 from cairn_client.carrying import carrier_in
-from cairn_client.folder_status import MODE_KEY, URL_KEY
+from cairn_client.folder_status import note_use
 from cairn_client.kept_scans import KeptScans
 from cairn_client.limits import NO_LIMITS, Limits
 from cairn_client.link_profile import LINKS, LinkName
@@ -109,9 +109,7 @@ class Robot:
         try:
             self._kept_scans = KeptScans(Path(directory) / "scans", bytes_max=keep_scans_bytes)
             self._replica = self._open(Path(directory), geometry)
-            with self._replica.store.transaction():
-                self._replica.store.put(URL_KEY, map_url)
-                self._replica.store.put(MODE_KEY, mode)
+            note_use(self._replica.store, url=map_url, mode=mode)
         except BaseException:
             self._api.close()
             raise
@@ -131,6 +129,8 @@ class Robot:
             status=self.status,
             carrier=carrier_in(Path(directory), self._api, self._map_name, size_bytes_max=carry_bytes_max),
         )
+        self.deregister = self._rounds.leave
+        """Leave the map; the evidence stays there, and this directory keeps its own. Ends the background sync."""
         self._stay = stay
         self._integrator = integrator or Integrator()
         self._measurement = self._new_measurement()
@@ -272,10 +272,6 @@ class Robot:
             self._replica.close()
             self._events.close()
             self._kept_scans.drop_measurement()
-
-    def deregister(self) -> None:
-        """Leave the map; the evidence stays there, and this directory keeps its own. Ends the background sync."""
-        self._rounds.leave()
 
     def _open(self, directory: Path, geometry: Geometry | None) -> Replica:
         """The durable state; its grid is the given one, the remembered one, or the server's."""
