@@ -131,7 +131,7 @@ class Robot:
         )
         self.deregister = self._rounds.leave
         """Leave the map; the evidence stays there, and this directory keeps its own. Ends the background sync."""
-        self._stay = stay
+        self._stay, self._is_closed = stay, False
         self._integrator = integrator or Integrator()
         self._measurement = self._new_measurement()
         self.snapshot = self._replica.snapshot
@@ -147,7 +147,6 @@ class Robot:
         self.align = Aligning(self.snapshot, lambda: self._rig, self._integrator).align
         """Where this robot's own frame lies in the map (`alignment.Aligning`); below: past measurements, moved."""
         self.amend, self.amend_all = amending.amend, amending.amend_all
-        self._is_closed = False
 
     def __enter__(self) -> Self:
         return self
