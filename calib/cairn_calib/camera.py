@@ -4,66 +4,45 @@
     pixel (x, y)  --unproject-->  ray                             the inverse, by Newton's method (brown.py)
 
 Camera frame: x right, y down, z forward. The centre of the top-left pixel is (0, 0). Units: pixels
-for `focal_px` and `centre_px`; the distortion coefficients have none. CONVENTIONS.md says it once for all.
+for `focal_px` and `centre_px`; the distortion coefficients have none. CONVENTIONS.md says it once for all; what
+cameras with lenses share, derivatives above all, is in `lens.py`.
 """
-
-from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field
 
-from cairn_calib.brown import Coefficients, distorted, jacobian, undistorted
-from cairn_calib.raster import Raster
+from cairn_calib.brown import Coefficients, coefficient_gradients, distorted, jacobian, undistorted
+from cairn_calib.lens import Lens
 
 Floats = npt.NDArray[np.float64]
 
+NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
-class Camera(Raster):
-    """Pinhole camera with Brown's distortion (k1, k2, p1, p2, k3, in OpenCV's order)."""
 
-    focal_px: tuple[
-        Annotated[float, Field(gt=0, allow_inf_nan=False)], Annotated[float, Field(gt=0, allow_inf_nan=False)]
-    ]
-    centre_px: tuple[Annotated[float, Field(allow_inf_nan=False)], Annotated[float, Field(allow_inf_nan=False)]]
+class Camera(Lens):
+    """Pinhole camera with Brown's distortion: k1, k2, p1, p2, k3[, k4, k5, k6], in OpenCV's order."""
+
     distortion: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)
 
-    def project(self, points: npt.NDArray[np.floating]) -> Floats:
-        """Pixels at which points of the camera frame appear.
+    @property
+    def coefficient_names(self) -> tuple[str, ...]:
+        """Five names, or eight of a rational lens."""
+        return NAMES[: len(self.distortion)]
 
-        Eq. 6 of Kocmanova et al., then distortion, then the shift to the principal point.
+    def plane(self, points: Floats) -> Floats:
+        """(..., 2) of (..., 3) points; NaN at or behind the camera's plane, and beyond the fold."""
+        z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
+        return distorted(points[..., :2] / z[..., None], self.distortion)
 
-        Args:
-            points: (..., 3), metres (any scale), camera frame.
-
-        Returns:
-            (..., 2) float64 pixels (x, y); NaN for points at or behind the camera's plane, and for those so far
-            off the axis that the distortion would fold them back into the image.
-        """
-        p = np.asarray(points, dtype=np.float64)
-        z = np.where(p[..., 2] > 0, p[..., 2], np.nan)
-        plane = p[..., :2] / z[..., None]
-        pixels: Floats = distorted(plane, self.distortion) * np.array(self.focal_px) + np.array(self.centre_px)
-        return pixels
-
-    def pixel_gradients(self, points: npt.NDArray[np.floating]) -> Floats:
-        """How pixels move with points: the derivatives of `project`.
-
-        Args:
-            points: (..., 3), metres, camera frame.
-
-        Returns:
-            (..., 2, 3) float64, pixels a metre; NaN where `project` gives NaN because of z.
-        """
-        p = np.asarray(points, dtype=np.float64)
-        z = np.where(p[..., 2] > 0, p[..., 2], np.nan)
-        x, y = p[..., 0] / z, p[..., 1] / z
+    def plane_gradients(self, points: Floats) -> tuple[Floats, Floats]:
+        """(..., 2, 3) by the point and (..., 2, 5 or 8) by the coefficients; NaN at or behind the camera's plane."""
+        z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
+        x, y = points[..., 0] / z, points[..., 1] / z
         xx, xy, yy, _ = jacobian(x, y, self.distortion)
         lens = np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-2)
         one, none = 1 / z, np.zeros_like(z)
         plane = np.stack([np.stack([one, none, -x / z], axis=-1), np.stack([none, one, -y / z], axis=-1)], axis=-2)
-        gradients: Floats = np.array(self.focal_px)[:, None] * (lens @ plane)
-        return gradients
+        return lens @ plane, coefficient_gradients(x, y, self.distortion)
 
     def unproject(self, pixels: npt.NDArray[np.floating]) -> Floats:
         """Unit rays through pixels; the mirror of `project`.

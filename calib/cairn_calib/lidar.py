@@ -18,6 +18,7 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from cairn_calib.camera import Camera
+from cairn_calib.fisheye import FisheyeCamera
 from cairn_calib.raster import MAX_SIDE_PX, Raster
 
 Floats = npt.NDArray[np.float64]
@@ -100,5 +101,5 @@ class SpinningLidar(Raster):
         return elevations_rad
 
 
-AnyCamera = Camera | SpinningLidar
-"""What a rig carries. Both are rasters; a pinhole also has z-depth and colours."""
+AnyCamera = Camera | FisheyeCamera | SpinningLidar
+"""What a rig carries. All are rasters; those with a lens have derivatives too."""

@@ -5,8 +5,9 @@
 
 `T_rig_camera` maps points from the camera's frame to the rig's, in metres. Which camera sees which
 spectrum is part of the rig, so an image's meaning never depends on its file name. A camera without `model` is a
-pinhole; a spinning lidar says `"model": "spinning"`. What is optional and not said is not in the document either:
-`sensing` of a range camera, `calibration_sigma_px` of a camera, the robot's `body`.
+pinhole; a fisheye says `"model": "kb4"`, a spinning lidar `"model": "spinning"`. What is optional and not said is not
+in the document either: `sensing` of a range camera, `calibration_sigma_px` of a camera, the robot's `body`, and how
+the numbers came about and how certain they are (`calibration`).
 """
 
 import hashlib
@@ -17,16 +18,20 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, field_validator, model_validator
 
 from cairn_calib.body import Body
+from cairn_calib.calibration import Calibration
 from cairn_calib.camera import Camera
-from cairn_calib.lidar import AnyCamera, SpinningLidar
+from cairn_calib.fisheye import FisheyeCamera
+from cairn_calib.lidar import SpinningLidar
 from cairn_calib.poses import Transform, checked_transform
+from cairn_calib.raster import Raster
 from cairn_calib.sensing import LIDAR, TIME_OF_FLIGHT, RangeSensing
 from cairn_map.errors import BadInputError, first_error
 
 RIG_BYTES_MAX = 1 << 20
+VERSION = 1
 Row = tuple[float, float, float, float]
 
 
@@ -43,11 +48,11 @@ class Spectrum(StrEnum):
 
 def _model_of(camera: object) -> str | None:
     """Which model a camera in a document has; None: one that there is not."""
-    if isinstance(camera, SpinningLidar):
-        return "spinning"
-    if not isinstance(camera, dict) or "model" not in camera:
+    if not isinstance(camera, dict):
+        return str(getattr(camera, "model", "pinhole"))
+    if "model" not in camera:
         return "pinhole"
-    return "spinning" if camera["model"] == "spinning" else None
+    return str(camera["model"]) if camera["model"] in ("kb4", "spinning") else None
 
 
 class MountedCamera(BaseModel):
@@ -58,11 +63,13 @@ class MountedCamera(BaseModel):
     spectrum: Spectrum
     # One model is tried, not both: the message of a refusal is about what was meant.
     camera: Annotated[
-        Annotated[Camera, Tag("pinhole")] | Annotated[SpinningLidar, Tag("spinning")],
+        Annotated[Camera, Tag("pinhole")]
+        | Annotated[FisheyeCamera, Tag("kb4")]
+        | Annotated[SpinningLidar, Tag("spinning")],
         Discriminator(
             _model_of,
             custom_error_type="camera_model",
-            custom_error_message="model must be 'spinning' (a lidar), or absent (a pinhole)",
+            custom_error_message="model must be 'kb4' (a fisheye), 'spinning' (a lidar), or absent (a pinhole)",
         ),
     ]
     T_rig_camera: tuple[Row, Row, Row, Row]
@@ -126,6 +133,24 @@ class Rig(BaseModel):
     cameras: Annotated[dict[str, MountedCamera], Field(min_length=1, max_length=32)]
     body: Body | None = None
     """Of the robot that carries it."""
+    calibration: Calibration | None = None
+    """How the numbers came about, and how certain they are."""
+
+    @field_validator("version", mode="before")
+    @classmethod
+    def _known_version(cls, value: object) -> object:
+        if value != VERSION:
+            raise ValueError(f"this cairn reads version {VERSION}, the file is of {value!r}: a newer cairn wrote it")
+        return value
+
+    @model_validator(mode="after")
+    def _calibration_is_of_its_cameras(self) -> Self:
+        if self.calibration is not None:
+            self.calibration.check_cameras({name: each.camera for name, each in self.cameras.items()})
+            gauge = self.calibration.gauge
+            if not np.array_equal(self.cameras[gauge].transform, np.eye(4)):
+                raise ValueError(f"calibration.gauge is {gauge}: its T_rig_camera must be the identity")
+        return self
 
     def __getitem__(self, name: str) -> MountedCamera:
         try:
@@ -148,7 +173,7 @@ class Rig(BaseModel):
         return hashlib.sha256(self.to_json()).hexdigest()
 
 
-def mounted(spectrum: Spectrum, camera: AnyCamera, T_rig_camera: Transform) -> MountedCamera:
+def mounted(spectrum: Spectrum, camera: Raster, T_rig_camera: Transform) -> MountedCamera:
     """A camera at a place given as an array."""
     rows = [tuple(float(v) for v in row) for row in np.asarray(T_rig_camera)]
     return MountedCamera.model_validate({"spectrum": spectrum, "camera": camera, "T_rig_camera": rows})

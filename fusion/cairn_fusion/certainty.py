@@ -14,7 +14,8 @@ of S spans at the point's depth.
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.camera import Camera
+from cairn_calib.fisheye import FisheyeCamera
+from cairn_calib.lens import Lens
 from cairn_calib.poses import inverse, transform_points
 from cairn_calib.rig import Rig
 from cairn_map.errors import BadInputError
@@ -40,8 +41,8 @@ def pixel_covariance(points_src: Floats, sigma_m: Floats, rig: Rig, *, src: str,
         BadInputError: `dst` is a lidar.
     """
     camera = rig[dst].camera
-    if not isinstance(camera, Camera):
-        raise BadInputError("bad_camera", f"{dst} must be a pinhole, it is a {type(camera).__name__}")
+    if not isinstance(camera, Lens):
+        raise BadInputError("bad_camera", f"{dst} must have a lens, it is a {type(camera).__name__}")
     T_dst_src = inverse(rig[dst].transform) @ rig[src].transform
     gradients = camera.pixel_gradients(transform_points(T_dst_src, points_src))
     moved = gradients @ T_dst_src[:3, 3] * (sigma_m / np.linalg.norm(points_src, axis=1))[:, None]
@@ -59,8 +60,11 @@ def spread_m(points_src: Floats, sigma_m: Floats, rig: Rig, *, src: str, dst: st
     """(N,) how uncertain the place of each sample is across the line of sight, metres: arguments as above."""
     covariance = pixel_covariance(points_src, sigma_m, rig, src=src, dst=dst)
     T_dst_src = inverse(rig[dst].transform) @ rig[src].transform
-    depth_m = transform_points(T_dst_src, points_src)[:, 2]
-    return np.asarray(spread_px(covariance) * depth_m / min(rig[dst].camera.focal_px))
+    points_dst = transform_points(T_dst_src, points_src)
+    # A pinhole's focal length is pixels a tangent, of depth; a fisheye's pixels a radian, of range.
+    is_fisheye = isinstance(rig[dst].camera, FisheyeCamera)
+    away_m = np.linalg.norm(points_dst, axis=1) if is_fisheye else points_dst[:, 2]
+    return np.asarray(spread_px(covariance) * away_m / min(rig[dst].camera.focal_px))
 
 
 def is_certain(range_m: Floats, sigma_m: Floats, rig: Rig, *, src: str, dst: str, limit_m: float) -> Flags:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from cairn_calib.fisheye import FisheyeCamera
 from cairn_calib.lidar import AnyCamera, SpinningLidar
 from cairn_calib.rig import Rig, Spectrum
 from cairn_fusion.adapters import kelvin_from_counts, range_from_radial, range_from_z_depth
@@ -139,7 +140,7 @@ def check_cameras(header: RecordingHeader, rig: Rig) -> None:
                     "bad_recording", f"{HEADER_FILE} lists {name} as {spectrum}, the rig as {rig[name].spectrum}"
                 )
     for name, encoding in header.range.items():
-        if encoding.convention is Convention.Z and isinstance(rig[name].camera, SpinningLidar):
+        if encoding.convention is Convention.Z and isinstance(rig[name].camera, SpinningLidar | FisheyeCamera):
             raise BadInputError(
                 "bad_recording",
                 f"{HEADER_FILE}: {name} looks all around, so its distances must be along the beam, not z",

@@ -30,6 +30,8 @@ DEPTH_TOLERANCE = 0.05
 DEPTH_TOLERANCE_M = 0.03
 """A point is hidden if it lies deeper than the nearest of its bin by more than 5 %, 3 cm and what its surface's slant
 makes of the bin's width."""
+KERNEL_COEFFICIENTS = 5
+"""Of the pinholes that the kernel knows; rational ones and other lenses take the longer way."""
 
 
 class Label(IntEnum):
@@ -107,7 +109,7 @@ def transfer_points(points_src: Floats, rig: Rig, *, src: str, dst: str, steps_m
     T_dst_src, seen_by = inverse(rig[dst].transform) @ rig[src].transform, rig[dst].camera
     N = len(points_src)
     pixels, depth_m, labels = np.empty((N, 2), np.int64), np.empty(N), np.empty(N, np.uint8)
-    if isinstance(seen_by, Camera):
+    if isinstance(seen_by, Camera) and len(seen_by.distortion) == KERNEL_COEFFICIENTS:
         lens = np.array([*seen_by.focal_px, *seen_by.centre_px])
         coefficients, limit = np.array(seen_by.distortion), radius_limit(seen_by.distortion)
         points, size = np.ascontiguousarray(points_src, dtype=np.float64), (seen_by.width, seen_by.height)
@@ -117,7 +119,7 @@ def transfer_points(points_src: Floats, rig: Rig, *, src: str, dst: str, steps_m
         exact = seen_by.project(points)
         seen = seen_by.contains(exact)
         labels[:] = np.where(np.isnan(points[:, 2]), Label.NO_RANGE, np.where(seen, Label.OK, Label.OUT_OF_VIEW))
-        pixels[:], depth_m[:] = np.rint(np.where(seen[:, None], exact, 0)), points[:, 2]
+        pixels[:], depth_m[:] = np.rint(np.where(seen[:, None], exact, 0)), np.linalg.norm(points, axis=1)
     if not _same_centre(T_dst_src):
         ratio = seen_by.focal_px[0] / rig[src].camera.focal_px[0]
         bin_px = int(np.ceil(BIN_MARGIN * max(ratio, 1)))

@@ -79,7 +79,7 @@ def test_the_spread_is_the_longer_axis() -> None:
 def test_a_lidar_has_no_pixel_covariance() -> None:
     lidar = mounted(Spectrum.RANGE, SpinningLidar(width=8, height=1, elevations_deg=(0.0,)), np.eye(4))
     rig = Rig(name="two", cameras={"tof": HEAD["tof"], "lidar": lidar})
-    with pytest.raises(BadInputError, match="pinhole"):
+    with pytest.raises(BadInputError, match="must have a lens"):
         pixel_covariance(points(), np.ones(200), rig, src="tof", dst="lidar")
 
 

@@ -5,6 +5,8 @@ import numpy.typing as npt
 import pytest
 
 from cairn_calib.camera import Camera, camera_from_field_of_view
+from cairn_calib.fisheye import FisheyeCamera
+from cairn_calib.lens import Lens
 from cairn_calib.poses import look_at
 from cairn_calib.rig import Rig, Spectrum, mounted
 from cairn_fusion.transfer import Label, depth_steps, points_from_range, transfer_points
@@ -167,9 +169,23 @@ def test_a_slanted_plane_hides_nothing_of_itself(tilt_deg: float, camera: Camera
     assert transfer.ok.sum() > 300
 
 
-@pytest.mark.parametrize("distortion", [(0.0,) * 5, (-0.3, 0.1, 0.002, -0.003, -0.02), (-0.6, 0.0, 0.0, 0.0, 0.0)])
-def test_points_appear_where_the_camera_says(distortion: tuple[float, float, float, float, float]) -> None:
-    camera = Camera(width=64, height=48, focal_px=(50.0, 52.0), centre_px=(31.0, 24.5), distortion=distortion)
+SIZE = {"width": 64, "height": 48, "focal_px": (50.0, 52.0), "centre_px": (31.0, 24.5)}
+LENSES: list[Lens] = [
+    *(
+        Camera.model_validate(SIZE | {"distortion": distortion})
+        for distortion in (
+            (0.0,) * 5,
+            (-0.3, 0.1, 0.002, -0.003, -0.02),
+            (-0.6, 0.0, 0.0, 0.0, 0.0),
+            (0.4, 0.2, 1e-3, -5e-4, 0.05, 0.7, 0.15, 0.02),
+        )
+    ),
+    FisheyeCamera.model_validate(SIZE | {"focal_px": (16.0, 16.0), "distortion": (0.02, -5e-3, 1e-3, -1e-4)}),
+]
+
+
+@pytest.mark.parametrize("camera", LENSES)
+def test_points_appear_where_the_camera_says(camera: Lens) -> None:
     beside = np.eye(4)
     beside[0, 3] = 0.1
     tof = Camera(width=8, height=6, focal_px=(6.0, 6.0), centre_px=(3.5, 2.5))
@@ -181,7 +197,7 @@ def test_points_appear_where_the_camera_says(distortion: tuple[float, float, flo
     exact = camera.project(points - beside[:3, 3])
     inside = camera.contains(exact)
     in_view = np.isin(transfer.labels, [Label.OK, Label.OCCLUDED])
-    assert 50 < inside.sum() < 2000
+    assert 50 < inside.sum() < 3000
     np.testing.assert_array_equal(in_view, inside)
     np.testing.assert_array_equal(transfer.pixels[inside], np.rint(exact[inside]).astype(np.int64))
     assert (transfer.labels[:50] == Label.NO_RANGE).all()
