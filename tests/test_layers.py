@@ -59,6 +59,7 @@ MAY_NAME = {
     "psycopg": [],
     "cryptography": ["cairn_map/signature.py"],
     "small_gicp": ["cairn_client/alignment.py"],
+    "yaml": ["cairn_calib/yaml_text.py"],
     "numba": [
         "cairn_map/*_kernels.py",
         "cairn_map/compile_progress.py",
