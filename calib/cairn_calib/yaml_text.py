@@ -22,7 +22,11 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc] # without stubs it is Any
     """Plain data and OpenCV's matrices, which are mappings `rows`, `cols`, `dt`, `data`."""
 
 
-_Loader.add_constructor(MATRIX_TAG, lambda loader, node: loader.construct_mapping(node, deep=True))
+def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> object:
+    return loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else None
+
+
+_Loader.add_constructor(MATRIX_TAG, _matrix)
 
 
 def read_yaml(text: str, *, name: str) -> dict[str, object]:

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
+import yaml
 
 from cairn_calib.calib_command import main
 from cairn_calib.camera import Camera
@@ -68,6 +69,13 @@ def test_a_camchain_keeps_names_order_and_places() -> None:
     for found, each in zip(back.cameras, given, strict=True):
         assert_same(found, each.name, BROWN5, each.T_rig_camera)
     assert back.left_out == ()
+
+
+@pytest.mark.parametrize("name", ["kalibr", "ros"])
+def test_a_small_number_is_a_number_to_every_yaml_reader(name: str) -> None:
+    document = yaml.safe_load(FORMATS[name].write([PlacedCamera("left", BROWN5, None)]))
+    found = document["cam0"]["intrinsics"][2] if name == "kalibr" else document["camera_matrix"]["data"][2]
+    assert (type(found), found) == (float, 1e-05)
 
 
 def test_opencv_reads_what_is_written_for_it_to_the_last_bit(tmp_path: Path) -> None:
@@ -160,6 +168,12 @@ def test_files_as_others_write_them_are_read() -> None:
         ("ros", ROS.replace("[500, 0, 320", "[500, 3, 320"), "camera_matrix .* no skew, got 3"),
         ("ros", ROS.replace("0.1, 0, 0, 0, 0", "0.1, 0, 0"), "distortion_coefficients: .*1 x 5 numbers, got 3"),
         ("ros", ROS.replace("500", ".nan"), "focal_px"),
+        (
+            "ros",
+            ROS.replace("cols: 5", "cols: 12").replace("0.1, 0, 0", "0.1, 0, 0, 0, 0, 0, 0, 0, 0, 1e-3"),
+            "thin prism",
+        ),
+        ("ros", ROS.replace("mono", "../up"), "a camera's name must be letters.*up"),
         ("ros", "a: [" * 5000, "nested too deep|no YAML"),
         ("ros", "- 1", "mapping"),
         ("ros", "a: !!python/object/apply:os.system [ls]", "no YAML"),
@@ -170,6 +184,13 @@ def test_files_as_others_write_them_are_read() -> None:
             "mrcal",
             "{'lensmodel': 'LENSMODEL_CAHVOR', 'intrinsics': [1]*4, 'extrinsics': [0]*6, 'imagersize': [1, 1]}",
             "not a Python dictionary",
+        ),
+        (
+            "mrcal",
+            str(
+                {"lensmodel": "LENSMODEL_OPENCV12", "intrinsics": [1] * 16, "extrinsics": [0] * 6, "imagersize": [1, 1]}
+            ),
+            "thin prism",
         ),
         (
             "mrcal",

@@ -8,6 +8,7 @@ import numpy.typing as npt
 import pytest
 
 from cairn_calib.camera import Camera
+from cairn_calib.fisheye import FisheyeCamera
 from cairn_calib.lidar import SpinningLidar
 from cairn_calib.poses import inverse, look_at, transform_points
 from cairn_calib.rig import Rig, Spectrum, mounted
@@ -74,6 +75,17 @@ def test_the_spread_is_the_longer_axis() -> None:
     turn = np.array([[0.6, -0.8], [0.8, 0.6]])
     covariance = turn @ np.diag([9.0, 1.0]) @ turn.T
     np.testing.assert_allclose(spread_px(covariance[None]), 3.0)
+
+
+def test_beside_a_fisheye_a_point_is_as_uncertain_as_its_angle_and_range_say() -> None:
+    fisheye = FisheyeCamera(width=640, height=480, focal_px=(200.0, 200.0), centre_px=(320.0, 240.0))
+    ahead = np.eye(4)
+    ahead[:3, 3] = (0.0, 0.0, 0.1)  # across a line of sight along x
+    seen = mounted(Spectrum.COLOUR, fisheye, ahead)
+    rig = Rig(name="two", cameras={"tof": mounted(Spectrum.RANGE, fisheye, np.eye(4)), "colour": seen})
+    found = spread_m(np.array([[2.0, 0.0, 0.1]]), np.array([0.5]), rig, src="tof", dst="colour")
+    # 0.5 m along a line that is 0.05 rad off the other camera's.
+    np.testing.assert_allclose(found, 0.5 * 0.05, rtol=0.01)
 
 
 def test_a_lidar_has_no_pixel_covariance() -> None:

@@ -5,6 +5,7 @@ import numpy.typing as npt
 import pytest
 
 from cairn_calib.camera import camera_from_field_of_view
+from cairn_calib.fisheye import FisheyeCamera
 from cairn_calib.lidar import SpinningLidar
 from cairn_calib.poses import look_at
 from cairn_calib.rig import Rig, Spectrum, mounted
@@ -100,6 +101,11 @@ def test_a_sweep_is_recorded_as_other_range_images_are() -> None:
 
 
 def test_depth_along_an_axis_that_a_lidar_does_not_have_is_refused() -> None:
+    fisheye = FisheyeCamera(width=8, height=6, focal_px=(3.0, 3.0), centre_px=(3.5, 2.5))
+    rig = Rig(name="wide", cameras={"tof": mounted(Spectrum.RANGE, fisheye, np.eye(4))})
+    header = RecordingHeader(name="wide", range={"tof": RangeEncoding(convention=Convention.Z)})
+    with pytest.raises(BadInputError, match="must be along the beam"):
+        check_cameras(header, rig)
     header = RecordingHeader(name="sweep", range={"lidar": RangeEncoding(convention=Convention.Z)})
     with pytest.raises(BadInputError, match="must be along the beam"):
         check_cameras(header, RIG)
