@@ -98,11 +98,10 @@ def cameras_of_rig(rig: Rig, *, format_name: str, drop: Sequence[str] = ()) -> F
                 KIND, f"cameras.{name}.camera: {format_name} has no spinning lidar; choose others with --camera"
             )
         said += [f"cameras.{name}.{field}" for field in ("sensing", "calibration_sigma_px") if getattr(each, field)]
-        T_rig_camera = None if "T_rig_camera" in drop else np.array(each.T_rig_camera)
-        if not held and T_rig_camera is not None:
-            said += [] if np.array_equal(T_rig_camera, np.eye(4)) else [f"cameras.{name}.T_rig_camera"]
-            T_rig_camera = None
-        placed.append(PlacedCamera(name, each.camera, T_rig_camera))
+        is_said = held and "T_rig_camera" not in drop
+        if not is_said and not np.array_equal(each.transform, np.eye(4)):
+            said.append(f"cameras.{name}.T_rig_camera")
+        placed.append(PlacedCamera(name, each.camera, each.transform if is_said else None))
     said += [field for field in ("body", "calibration") if getattr(rig, field)]
     refused = [field for field in said if field.rpartition(".")[2] not in drop]
     if refused:
