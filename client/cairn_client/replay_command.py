@@ -17,9 +17,10 @@ from cairn_client.arguments import (
 from cairn_client.frame_arguments import add_frame_arguments, frame_options
 from cairn_client.robot import Robot
 from cairn_client.robot_arguments import add_map, scope_of
+from cairn_fusion.bag_mapping import mapping_of
 from cairn_fusion.importers import open_source
 from cairn_fusion.integrate import Integrator
-from cairn_fusion.recording import Recording
+from cairn_fusion.recording import ScanSource
 from cairn_map.cell_code import Profile
 from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel
 from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError, UnreachableError
@@ -36,7 +37,10 @@ SYNC_EVERY_S = 2.0
 def _replay(args: argparse.Namespace) -> int:
     integrator = Integrator(min_range_m=args.min_range, max_range_m=args.max_range)
     options, size = frame_options(args), args.scans_per_measurement
-    source = open_source(args.recording, options=options, frames=args.frames, scans_per_measurement=size)
+    mapping = mapping_of(args.topics) if args.topics else None
+    source = open_source(
+        args.recording, options=options, mapping=mapping, frames=args.frames, scans_per_measurement=size
+    )
     _say_range(source)
     geometry = ensure_map(args, source)
     name = args.name or default_name(source.name)
@@ -86,7 +90,7 @@ def _replay(args: argparse.Namespace) -> int:
     return 0
 
 
-def _say_range(source: Recording) -> None:
+def _say_range(source: ScanSource) -> None:
     """Ranges of the first scan: who sees 5 m for a shelf at arm's length has given the wrong depth units."""
     range_m = source.scan(0).range_m
     seen = range_m[np.isfinite(range_m)]
@@ -110,7 +114,7 @@ def _try_sync(robot: Robot) -> bool:
     return True
 
 
-def ensure_map(args: argparse.Namespace, source: Recording) -> Geometry | None:
+def ensure_map(args: argparse.Namespace, source: ScanSource) -> Geometry | None:
     """The map's geometry; makes the map if there is none. None: no link, and perhaps the state folder knows it."""
     api, name = api_of(args.map, args.token)
     wished = geometry_for(voxel_edge_m=args.voxel) if args.voxel is not None else None
@@ -136,7 +140,7 @@ def ensure_map(args: argparse.Namespace, source: Recording) -> Geometry | None:
     return geometry
 
 
-def _channels(source: Recording) -> tuple[Channel, ...]:
+def _channels(source: ScanSource) -> tuple[Channel, ...]:
     """What the recording's first scan can fill."""
     scan = source.scan(0)
     has = ((COLOUR, bool(scan.colour)), (INTENSITY, scan.amplitude is not None), (TEMPERATURE, bool(scan.thermal)))
@@ -153,7 +157,8 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     """Add the subcommand."""
     replay = commands.add_parser("replay", help="map a recording", description="map a recording")
     add_map(replay)
-    replay.add_argument("recording", type=Path, help="recording folder, or one of the known published layouts")
+    replay.add_argument("recording", type=Path, help="recording folder, known published layout, or bag of ROS")
+    replay.add_argument("--topics", type=Path, metavar="YAML", help="which topics of a bag are what; see inspect")
     replay.add_argument("--voxel", type=float, metavar="METRES", help="make the map with this voxel edge if needed")
     replay.add_argument("--again", action="store_true", help="replay what this robot has replayed before once more")
     replay.add_argument("--share", type=_share, default=(1, 1), metavar="I/N", help="every N-th measurement from I on")

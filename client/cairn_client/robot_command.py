@@ -9,9 +9,10 @@
     $ cairn robot queue cairn-shelf/
     $ cairn robot sync cairn-shelf/
 
-`replay` reads a recording folder (RECORDING.md), a known layout as it was published (apc_shelf_rgbd, mm5_rgbdt), or
-any folder of frames that options describe (--depth, --pose, --intrinsics, ...: `cairn robot replay --help`). It maps
-as a live robot would: each measurement becomes a commit, first kept in the state folder, then pushed.
+`replay` reads a recording folder (RECORDING.md), a bag of ROS 1 or ROS 2 (.bag, .mcap, .db3; `cairn robot inspect`
+says what is in it and proposes --topics), a known layout as it was published (apc_shelf_rgbd, mm5_rgbdt), or any
+folder of frames that options describe (--depth, --pose, --intrinsics, ...: `cairn robot replay --help`). It maps as a
+live robot would: each measurement becomes a commit, first kept in the state folder, then pushed.
 Without a link it goes on, and the next `replay` or `pull` with the same state folder pushes what waits. Two robots
 can share a recording: --share 1/2 takes every second measurement from the first on, --share 2/2 the others.
 
@@ -31,7 +32,15 @@ every link the cells around the robot come first.
 import argparse
 from collections.abc import Callable
 
-from cairn_client import pull_command, queue_command, replay_command, run_command, status_command, sync_command
+from cairn_client import (
+    inspect_command,
+    pull_command,
+    queue_command,
+    replay_command,
+    run_command,
+    status_command,
+    sync_command,
+)
 from cairn_client.arguments import parser
 
 
@@ -46,6 +55,7 @@ def _parser() -> argparse.ArgumentParser:
     top = parser("cairn robot", __doc__)
     commands = top.add_subparsers(required=True, metavar="COMMAND")
     replay_command.add_parser(commands)
+    inspect_command.add_parser(commands)
     pull_command.add_parser(commands)
     run_command.add_parser(commands)
     status_command.add_parser(commands)

@@ -11,6 +11,7 @@ from pathlib import Path
 from cairn_calib.poses import Transform
 from cairn_calib.rig import Rig
 from cairn_fusion.importers import open_source
+from cairn_fusion.recording import Recording
 from cairn_fusion.scan import Scan
 from cairn_fusion.trajectory import read_trajectory
 from cairn_map.errors import BadInputError
@@ -94,6 +95,8 @@ def recorded_robot(folder: Path, *, stops: int | None) -> ExperimentRobot:
         BadInputError: no recording, or its name or its truth is not sound.
     """
     source = open_source(folder)
+    if not isinstance(source, Recording):
+        raise BadInputError("bad_recording", f"{folder} is a bag; experiments are made with recordings (RECORDING.md)")
     at = source.measurements()[:stops]
     if not at:
         raise BadInputError("no_stops", f"{folder} holds no scans")

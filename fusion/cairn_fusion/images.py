@@ -68,7 +68,11 @@ def read_colour(path: Path, size: Size | None = None) -> Colour:
         BadInputError: as `image_header`, another size than expected, or OpenCV is not installed.
         DamagedDataError: the file cannot be decoded.
     """
-    data = _read_bounded(path)
+    return colour_of_bytes(_read_bounded(path), path, size)
+
+
+def colour_of_bytes(data: bytes, path: Path | str, size: Size | None = None) -> Colour:
+    """The picture in the bytes of a PNG or JPEG file, as `read_colour`; `path` names them in errors."""
     _check_size(_header(data, path), size, path)
     cv2 = _opencv()
     bgr = _decode(cv2, data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, path)
@@ -83,7 +87,11 @@ def read_grey16(path: Path, size: Size | None = None) -> Grey16:
     Raises:
         BadInputError: also when the file holds 8 bits or colour, which is a picture *of* depth and not depth.
     """
-    data = _read_bounded(path)
+    return grey16_of_bytes(_read_bounded(path), path, size)
+
+
+def grey16_of_bytes(data: bytes, path: Path | str, size: Size | None = None) -> Grey16:
+    """The counts in the bytes of a 16-bit grey PNG file, as `read_grey16`; `path` names them in errors."""
     header = _header(data, path)
     if not header.grey16:
         raise BadInputError("image_type", f"{path} must be a PNG with one channel of 16 bits, and is not")
@@ -119,7 +127,7 @@ def _opencv() -> ModuleType:
     return cv2
 
 
-def _decode(cv2: ModuleType, data: bytes, flags: int, path: Path) -> npt.NDArray[np.generic]:
+def _decode(cv2: ModuleType, data: bytes, flags: int, path: Path | str) -> npt.NDArray[np.generic]:
     try:
         image: npt.NDArray[np.generic] | None = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     except cv2.error as exc:
@@ -149,7 +157,7 @@ def _read_bounded(path: Path) -> bytes:
     return data
 
 
-def _header(data: bytes, path: Path) -> ImageHeader:
+def _header(data: bytes, path: Path | str) -> ImageHeader:
     try:
         if data.startswith(PNG_SIGNATURE):
             header = _png_header(data)
@@ -214,7 +222,7 @@ def _jpeg_header(data: bytes) -> ImageHeader:
     return header
 
 
-def _check_size(header: ImageHeader, size: Size | None, path: Path) -> None:
+def _check_size(header: ImageHeader, size: Size | None, path: Path | str) -> None:
     if size is not None and (header.width, header.height) != size:
         raise BadInputError(
             "image_size", f"{path} must be {size[0]} x {size[1]} pixels, got {header.width} x {header.height}"

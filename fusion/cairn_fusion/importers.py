@@ -1,16 +1,19 @@
 """The layouts that are known by their files, and the one door to all of them.
 
-    open_source(folder)  ->  detect_layout  ->  recording | apc_shelf | mm5
+    open_source(path)  ->  detect_layout  ->  recording | apc_shelf | mm5 | bag
 
-The real layouts are presets of the generic folder of frames (`frame_folder.py`).
+A bag is one of ROS, its topics named by a `BagMapping` or, where there is no doubt, by themselves. The other layouts
+are presets of the generic folder of frames (`frame_folder.py`).
 """
 
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 
+from cairn_fusion.bag_file import SUFFIXES, is_bag
+from cairn_fusion.bag_mapping import BagMapping
 from cairn_fusion.frame_folder import FrameFolderOptions, import_frames
-from cairn_fusion.recording import Recording, open_recording
+from cairn_fusion.recording import Recording, ScanSource, open_recording
 from cairn_fusion.recording_format import HEADER_FILE, RIG_FILE
 from cairn_map.errors import BadInputError
 
@@ -53,6 +56,7 @@ class Layout(StrEnum):
     RECORDING = "recording"
     APC_SHELF = "apc_shelf"
     MM5 = "mm5"
+    BAG = "bag"
 
 
 LAYOUT_FILES: dict[Layout, tuple[str, ...]] = {
@@ -74,9 +78,12 @@ def detect_layout(folder: str | Path) -> Layout:
             return layout
     if (root / RIG_FILE).exists():  # an unfinished recording; opening it says so
         return Layout.RECORDING
+    if is_bag(root):
+        return Layout.BAG
     looked_for = "; ".join(f"{layout}: {' and '.join(names)}" for layout, names in LAYOUT_FILES.items())
+    looked_for += f"; bag: {', '.join(SUFFIXES)}"
     if not root.is_dir():
-        raise BadInputError("unknown_layout", f"there is no folder {root}")
+        raise BadInputError("unknown_layout", f"there is no folder {root}, and no bag ({', '.join(SUFFIXES)})")
     raise BadInputError(
         "unknown_layout",
         f"{root} has none of the known layouts; looked for {looked_for}; or describe its frames with "
@@ -88,18 +95,27 @@ def open_source(
     folder: str | Path,
     *,
     options: FrameFolderOptions | None = None,
+    mapping: BagMapping | None = None,
     frames: Sequence[str] | None = None,
     scans_per_measurement: int | None = None,
-) -> Recording:
-    """A folder of any layout: by `options` where they are given, else by what `detect_layout` finds.
+) -> ScanSource:
+    """A recording of any layout: by `options` or `mapping` where they are given, else by what `detect_layout` finds.
 
     Raises:
-        BadInputError: unknown layout, `frames` of a recording (its lists say which), or as the importer that fits.
+        BadInputError: unknown layout, `frames` of a recording (its lists say which), `mapping` of what is no bag, or as
+            the importer that fits.
     """
-    preset = options or {Layout.APC_SHELF: APC_SHELF, Layout.MM5: MM5}.get(detect_layout(folder))
+    layout = None if options else detect_layout(folder)
+    if mapping is not None and layout is not Layout.BAG:
+        raise BadInputError("bad_mapping", f"{folder} is no bag, so topics cannot be named")
+    preset = options or {Layout.APC_SHELF: APC_SHELF, Layout.MM5: MM5}.get(layout or Layout.RECORDING)
     if preset is not None:
         group = 1 if scans_per_measurement is None else scans_per_measurement
         return import_frames(folder, preset, frames=frames, scans_per_measurement=group)
     if frames is not None:
-        raise BadInputError("unknown_frame", "a recording has no frame ids to choose by")
+        raise BadInputError("unknown_frame", f"a {layout} has no frame ids to choose by")
+    if layout is Layout.BAG:
+        from cairn_fusion.bag_survey import open_any_bag
+
+        return open_any_bag(Path(folder), mapping, scans_per_measurement=scans_per_measurement)
     return open_recording(folder, scans_per_measurement=scans_per_measurement)

@@ -24,7 +24,8 @@ SLERP_MIN_RAD = 1e-6
 class Trajectory:
     """Poses at strictly increasing times."""
 
-    path: Path
+    path: Path | str
+    """The file, or what else the poses are from; errors name it."""
     poses: TimedList[Transform]
 
     def pose_at(self, time_s: float, *, max_gap_s: float) -> Transform:
