@@ -1,12 +1,12 @@
 """Bags of every kind, written from a recording by the libraries that ROS users have; all that is in one is in all."""
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Writer1
@@ -244,8 +244,7 @@ def mapping_text(source: Recording, **changes: object) -> str:
         "time_tolerance_s": 0.0,
         "cameras": cameras,
     }
-    text: str = yaml.safe_dump(mapping | changes, sort_keys=False)
-    return text
+    return json.dumps(mapping | changes)  # JSON is YAML
 
 
 def png(pixels: np.ndarray[Any, Any]) -> bytes:

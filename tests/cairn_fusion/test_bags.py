@@ -1,3 +1,4 @@
+import json
 import struct
 from collections.abc import Iterator
 from contextlib import suppress
@@ -8,7 +9,6 @@ from typing import Any
 import lz4.frame
 import numpy as np
 import pytest
-import yaml
 import zstandard
 from mcap.writer import Writer as McapWriter
 from tests.cairn_fusion.bags import (
@@ -133,11 +133,11 @@ def test_a_bag_that_leaves_something_open_says_what(bag_path: Path) -> None:
 
 def test_cameras_are_placed_by_static_transforms(bag_path: Path, source: Recording) -> None:
     text = mapping_text(source)
-    content = yaml.safe_load(text)
+    content = json.loads(text)
     for name, camera in content["cameras"].items():
         del camera["T_base_camera"]
         camera["frame"] = optical(name)
-    bag = open_source(bag_path, mapping=mapping_from_yaml(yaml.safe_dump(content), "bag.yaml"))
+    bag = open_source(bag_path, mapping=mapping_from_yaml(json.dumps(content), "bag.yaml"))
     for name in bag.rig.cameras:
         np.testing.assert_allclose(bag.rig[name].transform, source.rig[name].transform, atol=1e-12)
 
@@ -201,18 +201,18 @@ def test_a_moving_joint_between_base_and_camera_is_refused_with_the_frame_to_nam
             yield t, topic, make.tf(*message.transforms, make.transform(t, "base_link", "head", pan))
 
     path = write_bag(tmp_path / "b", "db3", messages)
-    content = yaml.safe_load(mapping_text(source))
+    content = json.loads(mapping_text(source))
     del content["cameras"]["tof"]["T_base_camera"]
     content["cameras"]["tof"]["frame"] = "head"
-    error = refused(path, yaml.safe_dump(content))
+    error = refused(path, json.dumps(content))
     assert error.kind == "bad_frames"
     assert "head moves on base_link" in error.message
 
 
 def camera_changed(source: Recording, **changes: object) -> str:
-    content = yaml.safe_load(mapping_text(source))
+    content = json.loads(mapping_text(source))
     content["cameras"]["tof"] |= changes
-    return yaml.safe_dump(content)
+    return json.dumps(content)
 
 
 @pytest.mark.parametrize(
