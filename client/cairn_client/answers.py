@@ -1,7 +1,8 @@
 """What a server's answers become: lists, cells, errors."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -33,6 +34,16 @@ class Traffic:
         for part in parts:
             self.down_bytes += len(part)
             yield part
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A whole answer that is no error."""
+
+    status: int
+    headers: Mapping[str, str]
+    """Names without regard to capitals."""
+    body: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,3 +88,16 @@ def error_of(status: int, retry_after: str, body: bytes) -> CairnError:
     }
     family = families.get(status, BadInputError if status < 500 else DamagedDataError)
     return family(problem.kind, problem.detail)
+
+
+def unreachable(exc: Any) -> UnreachableError:
+    """What a request failed by (httpx's `TransportError`), as ours."""
+    try:
+        where = str(exc.request.url.copy_with(path="/", query=None))
+    except RuntimeError:
+        where = "the server"
+    if "CERTIFICATE_VERIFY_FAILED" in str(exc):
+        return UnreachableError(
+            "no_link", f"{where} shows a certificate of nobody we know; name its issuer's file in SSL_CERT_FILE"
+        )
+    return UnreachableError("no_link", f"cannot reach {where} ({exc or type(exc).__name__}); is `cairn serve` running?")

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
@@ -90,3 +91,10 @@ def known_kernels() -> "Iterator[Dispatcher]":
     for value in values.values():
         if isinstance(value, Dispatcher) and value.stats.cache_path is not None:
             yield value
+
+
+def is_compiled(kernel: "Dispatcher") -> bool:
+    """Whether a kernel is on disk for this Python: as an index file `FILE.NAME-LINE.pyVERSION.nbi` in Numba's cache."""
+    code, version = kernel.py_func.__code__, f"py{sys.version_info.major}{sys.version_info.minor}"
+    name = f"{Path(code.co_filename).stem}.{kernel.py_func.__qualname__}-{code.co_firstlineno}.{version}.nbi"
+    return (Path(kernel.stats.cache_path or "") / name).is_file()

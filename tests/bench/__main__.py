@@ -22,6 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tests.bench.coding import coding_rows
+from tests.bench.imports import import_rows
 from tests.bench.integration import integration_rows
 from tests.bench.links import link_rows
 from tests.bench.peers import peer_rows
@@ -227,6 +228,7 @@ def _cpu_s(work: Callable[[], object]) -> float:
 PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "room": _room_rows,
     "coding": coding_rows,
+    "imports": import_rows,
     "integration": integration_rows,
     "links": link_rows,
     "peers": peer_rows,

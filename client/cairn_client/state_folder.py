@@ -1,0 +1,61 @@
+"""A robot's folder, or a copy's, looked at from outside: whose it is, and the map as it stands in it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from cairn_client.replica import Replica
+from cairn_client.replica_store import FILE_NAME, ReplicaStore
+from cairn_map.errors import BadInputError
+from cairn_map.grid import Geometry
+from cairn_map.ids import robot_name
+
+URL_KEY = "map_url"
+"""Where a copy is from, in its store."""
+
+
+def is_state_folder(folder: Path) -> bool:
+    """Whether a robot or a copy keeps its map there."""
+    return (folder / FILE_NAME).is_file()
+
+
+@contextmanager
+def opened_replica(folder: Path) -> Iterator[Replica]:
+    """The map in a folder that exists, under the name that it has.
+
+    Raises:
+        BadInputError: kind `no_state_folder`: nobody's.
+        ConflictError: a robot has it open.
+        DamagedDataError: it is broken.
+    """
+    if not is_state_folder(folder):
+        raise BadInputError("no_state_folder", f"{folder} is no robot's folder and no copy: there is no {FILE_NAME}")
+    store = ReplicaStore(folder)
+    try:
+        robot, map_name, geometry = (store.get(key) for key in ("robot", "map", "geometry"))
+        if robot is None or map_name is None or geometry is None:
+            raise BadInputError("no_state_folder", f"{folder} was never used; begin with `cairn clone URL {folder}`")
+        yield Replica(
+            store,
+            robot=robot_name(robot),
+            map_name=map_name,
+            geometry=Geometry.model_validate_json(geometry),
+        )
+    finally:
+        store.close()
+
+
+def url_of(folder: Path) -> str:
+    """The URL of the map that a folder is a copy of.
+
+    Raises:
+        BadInputError: no state folder, or a robot's, which knows its map by name only.
+    """
+    with opened_replica(folder) as replica:
+        url = replica.store.get(URL_KEY)
+    if url is None:
+        raise BadInputError(
+            "no_copy",
+            f"{folder} is a robot's folder; `cairn robot pull --map URL --state {folder}` brings it up to date",
+        )
+    return url
