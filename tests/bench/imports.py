@@ -1,7 +1,7 @@
 """How long it takes to import what a robot needs, and to be told what `cairn` can do: each in a process of its own.
 
-Medians of the wall time of whole processes, beside `python -c pass` and `import numpy` on the same machine; no kernel is
-compiled. Byte code is kept, in a folder of its own: that of the environment may be switched off.
+Medians of the wall time of whole processes, beside `python -c pass` and `import numpy` on the same machine. No kernel
+is compiled. Byte code is kept, in a folder of its own: that of the environment may be switched off.
 """
 
 import os
