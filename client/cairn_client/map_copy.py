@@ -28,7 +28,7 @@ class Pulled:
 
     def as_json(self) -> dict[str, object]:
         """Its fields, for JSON."""
-        return asdict(self) | {"folder": str(self.folder)}
+        return {**asdict(self), "folder": str(self.folder)}
 
 
 def clone(map_url: str, folder: Path, *, token: str | None, name: str | None = None) -> Pulled:
