@@ -19,6 +19,7 @@ from cairn_fusion.ros_messages import (
     COMPRESSED,
     IMAGE,
     ODOMETRY,
+    POINTS,
     POSES,
     STAMPED,
     TRANSFORMS,
@@ -31,6 +32,7 @@ from cairn_fusion.ros_messages import (
     read_pose,
     read_transforms,
 )
+from cairn_fusion.ros_points import elevations_of, read_points
 from cairn_map.errors import BadInputError, DamagedDataError
 
 MESSAGES_MAX = 20_000_000
@@ -57,6 +59,10 @@ class TopicIndex:
     image_size: tuple[int, int] | None = None
     """Width and height of the first image or camera info."""
     info: RosCameraInfo | None = None
+    elevations_deg: tuple[float, ...] | None = None
+    """Of the beams in the first point cloud, the highest first."""
+    columns: int = 0
+    """Points of a beam in it, at most."""
 
     def __len__(self) -> int:
         return len(self.log_ns)
@@ -167,6 +173,11 @@ def _look_closer(entry: TopicIndex, message: BagMessage, wire: Wire) -> None:
     elif entry.topic.type == CAMERA_INFO:
         entry.info = read_camera_info(message.data, wire)
         entry.image_size = (entry.info.width, entry.info.height)
+    elif entry.topic.type == POINTS:
+        points = read_points(message.data, wire)
+        entry.elevations_deg, entry.image_size = elevations_of(points), (points.width, points.height)
+        beams = len(entry.elevations_deg or ()) or 1
+        entry.columns = -(-points.width * points.height // beams)
 
 
 def _add_poses(index: BagIndex, message: BagMessage, topic: Topic, wire: Wire) -> None:

@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from cairn_calib.brown import Coefficients
 from cairn_calib.camera import Camera
+from cairn_calib.lidar import SpinningLidar
 from cairn_calib.raster import Side
 from cairn_calib.rig import Row, Spectrum
 from cairn_fusion.recording_format import (
@@ -75,6 +76,25 @@ class Intrinsics(Model):
     """k1, k2, p1, p2, k3: ROS's plumb_bob."""
 
 
+class MappedLidar(Model):
+    """The raster that a spinning lidar's points are sorted into; its frame is ROS's: x forward, y left, z up."""
+
+    columns: Side
+    """In one turn."""
+    elevations_deg: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=1024)]
+    """Of each beam, the highest first."""
+
+    @model_validator(mode="after")
+    def _is_lidar(self) -> Self:
+        self.lidar()
+        return self
+
+    def lidar(self) -> SpinningLidar:
+        """As a camera."""
+        beams = self.elevations_deg
+        return SpinningLidar(width=self.columns, height=len(beams), elevations_deg=beams)
+
+
 class MappedCamera(Model):
     """One camera: its topics, its place, and how its pixels are coded."""
 
@@ -86,6 +106,8 @@ class MappedCamera(Model):
     """CameraInfo; its first message counts."""
     intrinsics: Intrinsics | None = None
     """Instead of `info`."""
+    lidar: MappedLidar | None = None
+    """Instead of both: the topic holds the point clouds of a spinning lidar."""
     is_rectified: bool = Field(default=False, alias="rectified")
     """The images are rectified: of `info` then P counts, and no distortion."""
     frame: Frame | None = None
@@ -110,8 +132,10 @@ class MappedCamera(Model):
 
     @model_validator(mode="after")
     def _is_whole(self) -> Self:
-        if (self.info is None) == (self.intrinsics is None):
-            raise ValueError("give either info, a CameraInfo topic, or intrinsics")
+        if sum(given is not None for given in (self.info, self.intrinsics, self.lidar)) != 1:
+            raise ValueError("give either info, a CameraInfo topic, or intrinsics; or lidar, of point clouds")
+        if self.lidar is not None and (self.spectrum is not Spectrum.RANGE or self.amplitude is not None):
+            raise ValueError("a lidar's spectrum is range, and it has no amplitude")
         if self.amplitude is not None and self.spectrum is not Spectrum.RANGE:
             raise ValueError("amplitude is of range cameras")
         return self

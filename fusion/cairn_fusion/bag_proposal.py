@@ -19,11 +19,13 @@ from cairn_calib.rig import Spectrum
 from cairn_fusion.bag_index import BASE, BagIndex, TopicIndex
 from cairn_fusion.ros_frames import FrameTree
 from cairn_fusion.ros_images import COLOURS
-from cairn_fusion.ros_messages import CAMERA_INFO, COMPRESSED, IMAGE, TRANSFORMS
+from cairn_fusion.ros_messages import CAMERA_INFO, COMPRESSED, IMAGE, POINTS, TRANSFORMS
 
 AMPLITUDE_WORDS = re.compile(r"infra|amplitude|intensity|(^|[_/])(ir|nir)\d*([_/]|$)")
 THERMAL_WORDS = re.compile(r"therm|lwir|flir|boson|lepton|tau2|optris|seek")
 IGNORED_WORDS = re.compile(r"confidence|theora|ffmpeg|aligned_.*_mask|segmentation|label")
+CAMERA_WORDS = re.compile(r"depth|camera|stereo|rgb|color")
+"""In names of clouds that a depth camera's driver makes of its images."""
 TOLERANCE_S = (0.005, 0.05)
 GAP_S = (0.1, 5.0)
 GAPS = 3
@@ -102,6 +104,7 @@ def _cameras(index: BagIndex, questions: list[str]) -> list[Guess]:
             if info is None:
                 questions.append(f"camera {name}: no CameraInfo beside {entry.topic.name}; write its intrinsics")
     ranges = [guess for guess in guesses if guess.spectrum is Spectrum.RANGE]
+    guesses += _lidars(index, questions)
     if len(ranges) > 1:
         names = ", ".join(guess.entry.topic.name for guess in ranges)
         questions.append(f"{names} may be one sensor seen twice (aligned to another camera): keep one of such")
@@ -113,6 +116,16 @@ def _cameras(index: BagIndex, questions: list[str]) -> list[Guess]:
         if guess.spectrum is Spectrum.THERMAL
     ]
     return guesses
+
+
+def _lidars(index: BagIndex, questions: list[str]) -> list[Guess]:
+    """Every topic of point clouds that a lidar can have made."""
+    clouds = [e for e in index.topics.values() if e.topic.type == POINTS and len(e) and e.topic.wire is not None]
+    found = [e for e in clouds if not CAMERA_WORDS.search(_word(e))]
+    for n, entry in enumerate(found):
+        if entry.elevations_deg is None:
+            questions.append(f"lidar{n or ''}: which beams {entry.topic.name} has; neither rows nor rings tell them")
+    return [Guess(f"lidar{n or ''}", Spectrum.RANGE, entry, None) for n, entry in enumerate(found)]
 
 
 def _role(entry: TopicIndex) -> str:
@@ -202,6 +215,11 @@ def _camera_lines(camera: Guess, index: BagIndex) -> Iterator[str]:
     yield f"  {camera.name}:"
     yield f"    spectrum: {camera.spectrum.value}"
     yield f"    topic: {_quoted(camera.entry.topic.name)}  # {camera.entry.encoding}, {camera.entry.rate_hz:.3g} Hz"
+    if camera.entry.topic.type == POINTS:
+        elevations = list(camera.entry.elevations_deg or (15.0, 0.0, -15.0))
+        yield f"    lidar: {{columns: {min(camera.entry.columns, 4096)}, elevations_deg: {elevations}}}"
+        yield f"    frame: {_quoted(camera.entry.frame)}  # x forward, y left, z up"
+        return
     if camera.info:
         yield f"    info: {_quoted(camera.info)}"
     else:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.camera import Camera
-from cairn_calib.lidar import AnyCamera
+from cairn_calib.lidar import AnyCamera, SpinningLidar
 from cairn_calib.rig import Rig, Spectrum, mounted
 from cairn_fusion.adapters import range_from_radial, range_from_z_depth
 from cairn_fusion.bag_file import Bag, BagMessage, Wire, open_bag
@@ -24,7 +24,8 @@ from cairn_fusion.bag_scans import BagScan, scans_of
 from cairn_fusion.recording import measurements_of
 from cairn_fusion.recording_format import Convention, decode_kelvin, decode_range
 from cairn_fusion.ros_images import AnyImage, Pixels, amplitude_of, colour_of, depth_of, thermal_counts_of
-from cairn_fusion.ros_messages import COMPRESSED, IMAGE, TRANSFORMS, read_compressed_image, read_image
+from cairn_fusion.ros_messages import COMPRESSED, IMAGE, POINTS, TRANSFORMS, read_compressed_image, read_image
+from cairn_fusion.ros_points import T_LIDAR_CAMERA, read_points, sweep_image
 from cairn_fusion.scan import Scan, check_scan
 from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError
 
@@ -73,7 +74,7 @@ class BagRecording:
         """
         self._mapping = mapping
         self._bag = bag
-        self._topics = {name: _images_of(index, name, what) for name, what in _image_topics(mapping)}
+        self._topics = {topic: _images_of(index, topic, name, types) for topic, name, types in _image_topics(mapping)}
         self._readers = {name: TopicReader(bag, entry) for name, entry in self._topics.items()}
         self.name = mapping.name
         self.rig = _rig_of(index, mapping, self._topics)
@@ -109,7 +110,7 @@ class BagRecording:
             time_s=found.time_s,
             T_map_rig=found.T_map_rig,
             range_camera=found.camera,
-            range_m=_range_of(self._pixels(own.topic, found, depth_of), self.rig[found.camera].camera, own),
+            range_m=self._sweep(own, found) if own.lidar else self._range(own, found),
             amplitude=self._amplitude(own, found),
             colour={
                 name: self._pixels(camera.topic, found, colour_of)
@@ -124,6 +125,19 @@ class BagRecording:
         )
         check_scan(scan, self.rig)
         return scan
+
+    def _range(self, camera: MappedCamera, found: BagScan) -> npt.NDArray[np.float32]:
+        """(H, W) metres along the beam."""
+        return _range_of(self._pixels(camera.topic, found, depth_of), self.rig[found.camera].camera, camera)
+
+    def _sweep(self, camera: MappedCamera, found: BagScan) -> npt.NDArray[np.float32]:
+        """The same of a lidar's cloud."""
+        lidar = self.rig[found.camera].camera
+        message = self._readers[camera.topic].message(found.images[camera.topic])
+        with message_told(self._bag, message):
+            points = read_points(message.data, wire_of(self._topics[camera.topic].topic))
+            assert isinstance(lidar, SpinningLidar)  # noqa: S101 - `_camera_of` made it so
+            return sweep_image(points.xyz(), lidar)
 
     def _amplitude(self, camera: MappedCamera, found: BagScan) -> npt.NDArray[np.uint16] | None:
         has_one = camera.amplitude is not None and camera.amplitude in found.images
@@ -169,17 +183,20 @@ def open_bag_recording(
         raise
 
 
-def _image_topics(mapping: BagMapping) -> Iterator[tuple[str, str]]:
+def _image_topics(mapping: BagMapping) -> Iterator[tuple[str, str, tuple[str, ...]]]:
+    """Each topic of pixels, whose it is, and which types it may have."""
     for name, camera in mapping.cameras.items():
-        yield camera.topic, name
+        yield camera.topic, name, (POINTS,) if camera.lidar else (IMAGE, COMPRESSED)
         if camera.amplitude is not None:
-            yield camera.amplitude, name
+            yield camera.amplitude, name, (IMAGE, COMPRESSED)
 
 
-def _images_of(index: BagIndex, topic: str, camera: str) -> TopicIndex:
+def _images_of(index: BagIndex, topic: str, camera: str, types: tuple[str, ...]) -> TopicIndex:
     entry = index.topics[topic]
-    if entry.topic.type not in (IMAGE, COMPRESSED):
-        raise BadInputError("wrong_topic", f"camera {camera}: {topic} holds {entry.topic.type}, images are expected")
+    if entry.topic.type not in types:
+        raise BadInputError(
+            "wrong_topic", f"camera {camera}: {topic} holds {entry.topic.type}, {' or '.join(types)} is expected"
+        )
     wire_of(entry.topic)
     if not len(entry):
         raise BadInputError("no_messages", f"camera {camera}: {topic} has no messages")
@@ -195,11 +212,15 @@ def _rig_of(index: BagIndex, mapping: BagMapping, topics: Mapping[str, TopicInde
         else:
             frame = camera.frame or topics[camera.topic].frame
             T_base_camera = index.tree.fixed_pose(mapping.frames.base, frame)
+        if camera.lidar is not None:
+            T_base_camera = T_base_camera @ T_LIDAR_CAMERA
         cameras[name] = mounted(camera.spectrum, _camera_of(index, name, camera), T_base_camera)
     return Rig(name=mapping.name, cameras=cameras)
 
 
-def _camera_of(index: BagIndex, name: str, camera: MappedCamera) -> Camera:
+def _camera_of(index: BagIndex, name: str, camera: MappedCamera) -> AnyCamera:
+    if camera.lidar is not None:
+        return camera.lidar.lidar()
     if camera.intrinsics is not None:
         return Camera.model_validate(camera.intrinsics.model_dump())
     info = index.topics[camera.info or ""].info

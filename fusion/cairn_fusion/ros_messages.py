@@ -95,13 +95,13 @@ def plain_type(name: str) -> str:
 
 def read_header(data: bytes | memoryview, wire: Wire) -> RosHeader:
     """The header that a message of a `STAMPED` type begins with. Here and below ValueError: the bytes are not that."""
-    return _header(WireReader(data, wire), wire)
+    return header_of(WireReader(data, wire), wire)
 
 
 def read_image(data: bytes | memoryview, wire: Wire) -> RosImage:
     """A `sensor_msgs/Image`; its pixels stay where they are."""
     fields = WireReader(data, wire)
-    header = _header(fields, wire)
+    header = header_of(fields, wire)
     height, width, encoding = fields.integer("I"), fields.integer("I"), fields.text()
     return RosImage(header, width, height, encoding, bool(fields.integer("B")), fields.integer("I"), fields.octets())
 
@@ -109,13 +109,13 @@ def read_image(data: bytes | memoryview, wire: Wire) -> RosImage:
 def read_compressed_image(data: bytes | memoryview, wire: Wire) -> RosCompressedImage:
     """A `sensor_msgs/CompressedImage`, not yet unpacked."""
     fields = WireReader(data, wire)
-    return RosCompressedImage(_header(fields, wire), fields.text(), fields.octets())
+    return RosCompressedImage(header_of(fields, wire), fields.text(), fields.octets())
 
 
 def read_camera_info(data: bytes | memoryview, wire: Wire) -> RosCameraInfo:
     """A `sensor_msgs/CameraInfo`."""
     fields = WireReader(data, wire)
-    header = _header(fields, wire)
+    header = header_of(fields, wire)
     height, width, model = fields.integer("I"), fields.integer("I"), fields.text()
     distortion = tuple(fields.floats(fields.length(8)).tolist())
     K, _, P = fields.floats(9), fields.floats(9), fields.floats(12)
@@ -127,7 +127,7 @@ def read_transforms(data: bytes | memoryview, wire: Wire) -> list[RosTransform]:
     fields = WireReader(data, wire)
     edges = []
     for _ in range(fields.length(TRANSFORM_BYTES_MIN)):
-        header = _header(fields, wire)
+        header = header_of(fields, wire)
         edges.append(RosTransform(header.time_s, _frame(header.frame), _frame(fields.text()), fields.floats(7)))
     return edges
 
@@ -135,12 +135,13 @@ def read_transforms(data: bytes | memoryview, wire: Wire) -> list[RosTransform]:
 def read_pose(data: bytes | memoryview, wire: Wire, *, type_name: str) -> RosTransform:
     """The pose in a `nav_msgs/Odometry`, or in one of the `POSES`, whose child has no name."""
     fields = WireReader(data, wire)
-    header = _header(fields, wire)
+    header = header_of(fields, wire)
     child = fields.text() if type_name == ODOMETRY else ""
     return RosTransform(header.time_s, _frame(header.frame), _frame(child), fields.floats(7))
 
 
-def _header(fields: WireReader, wire: Wire) -> RosHeader:
+def header_of(fields: WireReader, wire: Wire) -> RosHeader:
+    """The header at the place that a reader is at."""
     if wire is Wire.ROS1:
         fields.integer("I")  # seq
     seconds, nanoseconds = fields.integer("I" if wire is Wire.ROS1 else "i"), fields.integer("I")

@@ -36,7 +36,7 @@ class Messages:
         self.store = store
         self.is_ros1 = store is ROS1
 
-    def make(self, name: str, **fields: object) -> Any:
+    def make(self, name: str, /, **fields: object) -> Any:
         package, _, kind = name.partition("/")
         return self.store.types[f"{package}/msg/{kind}"](**fields)
 

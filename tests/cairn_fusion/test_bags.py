@@ -219,7 +219,7 @@ def camera_changed(source: Recording, **changes: object) -> str:
     ("changes", "kind", "said"),
     [
         ({"topic": "/nothing"}, "no_topic", "it has /colour_left/camera_info"),
-        ({"topic": "/tf"}, "wrong_topic", "holds tf2_msgs/TFMessage, images are expected"),
+        ({"topic": "/tf"}, "wrong_topic", "holds tf2_msgs/TFMessage, sensor_msgs/Image or"),
         ({"topic": "/colour_left/image_raw"}, "unknown_encoding", "/colour_left/image_raw at 1760000000"),
         ({"info": "/tf"}, "no_messages", "give intrinsics instead of info"),
         ({"info": "/colour_left/camera_info"}, "image_size", "must be 128 x 96 pixels, got 176 x 144"),
