@@ -30,7 +30,7 @@ class Lost:
 
 def listen(
     api: MapApi, map_name: str, *, sleep: Callable[[float], None] = time.sleep, backoff: Backoff | None = None
-) -> Iterator[LiveEvent | Lost]:
+) -> Generator[LiveEvent | Lost, None, None]:
     """Events of a map, without an end; after a cut from where it was cut.
 
     Args:

@@ -61,7 +61,7 @@ def test_listening_goes_on_after_a_cut_from_where_it_was(server: LiveServer, tmp
         commit(server, tmp_path / "mole")
         while not isinstance(found[-1], LogGrew):
             found.append(next(stream))
-        stream.close()  # type: ignore[attr-defined]
+        stream.close()
     first, lost, *rest = found
     assert isinstance(first, Hello)
     assert isinstance(lost, Lost)

@@ -36,7 +36,7 @@ class Messages:
         self.store = store
         self.is_ros1 = store is ROS1
 
-    def make(self, name: str, /, **fields: object) -> Any:
+    def make(self, name: str, /, **fields: Any) -> Any:
         package, _, kind = name.partition("/")
         return self.store.types[f"{package}/msg/{kind}"](**fields)
 
@@ -214,7 +214,7 @@ def _write_mcap1(path: Path, timed: list[Timed]) -> Path:
             ns = round(time_s * 1e9)
             data = bytes(ROS1.serialize_ros1(message, name))
             writer.add_message(channels[topic], log_time=ns, publish_time=ns, data=data)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
     return path
 
 

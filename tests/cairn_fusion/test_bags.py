@@ -1,9 +1,11 @@
 import json
+import sqlite3
 import struct
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import lz4.frame
@@ -25,7 +27,8 @@ from tests.cairn_fusion.bags import (
     write_bag,
 )
 
-from cairn_fusion.bag_file import Wire, open_bag
+from cairn_fusion import bag_index, ros_frames
+from cairn_fusion.bag_file import BoundedFile, Wire, open_bag
 from cairn_fusion.bag_mapping import camera_of_info, mapping_from_yaml
 from cairn_fusion.bag_mcap import unpacked
 from cairn_fusion.bag_survey import survey
@@ -38,7 +41,7 @@ from cairn_fusion.ros_messages import RosCameraInfo, RosCompressedImage, RosHead
 from cairn_fusion.trajectory import interpolated
 from cairn_map.cell_code import encode_cell
 from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE
-from cairn_map.errors import BadInputError, CairnError, DamagedDataError
+from cairn_map.errors import BadInputError, CairnError, DamagedDataError, NotFoundError
 from cairn_map.grid import Geometry, geometry_for
 from cairn_sim.record import Plan, scans_of, shots_of
 from cairn_sim.robots import ROBOTS
@@ -340,7 +343,7 @@ def test_depth_of_other_encodings() -> None:
     counts = np.where(np.isnan(metres), 0, np.rint(a / np.nan_to_num(metres, nan=1.0) + b)).astype(np.uint16)
     file = struct.pack("<iff", 0, a, b) + png(counts)
     image = RosCompressedImage(RosHeader(1.0, "eye"), "32FC1; compressedDepth png", memoryview(file))
-    np.testing.assert_allclose(depth_of(image, "it"), metres, rtol=0.02)
+    np.testing.assert_allclose(depth_of(image, "it").astype(np.float32), metres, rtol=0.02)
     rvl = replace(image, format="16UC1; compressedDepth rvl", data=memoryview(bytes(40)))
     with pytest.raises(BadInputError, match="only PNG"):
         depth_of(rvl, "it")
@@ -348,7 +351,8 @@ def test_depth_of_other_encodings() -> None:
 
 def test_an_image_that_claims_more_than_it_has_is_damaged() -> None:
     image = raw(np.ones((2, 3), np.uint16), "16UC1")
-    for changes in ({"height": 3}, {"width": 4}, {"step": 5}, {"width": 1 << 31}, {"height": 0}):
+    wrong: list[dict[str, Any]] = [{"height": 3}, {"width": 4}, {"step": 5}, {"width": 1 << 31}, {"height": 0}]
+    for changes in wrong:
         with pytest.raises(DamagedDataError):
             depth_of(replace(image, **changes), "it")
 
@@ -375,10 +379,56 @@ def test_messages_out_of_order_in_overlapping_chunks_come_in_order(tmp_path: Pat
         times = np.random.default_rng(3).permutation(200)
         for n in times.tolist():
             writer.add_message(channel, log_time=n, publish_time=n, data=n.to_bytes(4, "little"))
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
     bag = open_bag(path)
     assert [message.log_ns for message in bag.messages(["/a"])] == list(range(200))
     assert [bytes(message.data) for message in bag.messages(["/a"], start_ns=198)] == [
         n.to_bytes(4, "little") for n in (198, 199)
     ]
     bag.close()
+
+
+def test_scans_may_be_read_in_any_order(bag_path: Path, source: Recording) -> None:
+    bag = opened(bag_path, source)
+    forward = [scan.range_m for scan in bag]
+    for n in (3, 0, 2, 2, 1, 3):
+        np.testing.assert_array_equal(bag.scan(n).range_m, forward[n])
+    with pytest.raises(NotFoundError):
+        bag.scan(4)
+
+
+def test_a_file_is_not_asked_for_more_than_it_has(tmp_path: Path) -> None:
+    (tmp_path / "short").write_bytes(b"four")
+    with BoundedFile(tmp_path / "short") as file, pytest.raises(EOFError, match="the file has 4"):
+        file.read(1 << 62)
+
+
+@pytest.mark.parametrize(
+    ("module", "limit", "kind"),
+    [(ros_frames, "POSES_MAX", "too_many_poses"), (bag_index, "MESSAGES_MAX", "bag_too_large")],
+)
+def test_what_does_not_fit_into_memory_is_refused(
+    module: ModuleType, limit: str, kind: str, bag_path: Path, source: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, limit, 5)
+    with pytest.raises(BadInputError) as caught:
+        opened(bag_path, source)
+    assert caught.value.kind == kind
+
+
+def test_a_folder_that_is_packed_as_a_whole_is_refused_with_how_to_unpack_it(tmp_path: Path) -> None:
+    (tmp_path / "lab").mkdir()
+    (tmp_path / "lab" / "lab_0.db3").write_bytes(b"")
+    (tmp_path / "lab" / "lab_1.db3.zstd").write_bytes(b"")
+    with pytest.raises(BadInputError, match="zstd -d"):
+        open_bag(tmp_path / "lab")
+
+
+def test_messages_packed_one_by_one_are_unpacked(source: Recording, tmp_path: Path) -> None:
+    """As `ros2 bag record --compression-mode message --compression-format zstd` leaves them."""
+    path = write_bag(tmp_path / "lab", "db3", lambda make: recorded(source, make))
+    file = next(path.glob("*.db3"))
+    with closing(sqlite3.connect(file)) as database, database:
+        for row, data in database.execute("SELECT id, data FROM messages").fetchall():
+            database.execute("UPDATE messages SET data = ? WHERE id = ?", (zstandard.compress(data), row))
+    assert map_bytes(opened(path, source)) == map_bytes(source)
