@@ -66,7 +66,7 @@ def test_listening_goes_on_after_a_cut_from_where_it_was(server: LiveServer, tmp
     assert isinstance(first, Hello)
     assert isinstance(lost, Lost)
     assert any(isinstance(event, Hello) and event.resumed for event in rest)
-    assert [entry.cells for entry in found[-1].entries] == [1]  # type: ignore[union-attr]
+    assert [entry.cells for entry in found[-1].entries] == [1]
     shown = [line for event in found for line in lines_of(event)]
     assert shown[0] == "lab is at 0, robots: none"
     assert any(line.startswith("folded  mole.") and "1 cells" in line for line in shown)
