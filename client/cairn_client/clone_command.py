@@ -7,7 +7,6 @@
 
 The copy is a viewer: it pushes nothing, holds the whole map, and programs can ask it (`cairn_client.robot.Robot` with
 mode "viewer"). Cut off by a lost link, it is finished by `cairn pull`. A map's URL is http://HOST:PORT/maps/NAME.
-Exit codes: 0 done, 1 refused, 3 no such map, 4 the folder is in use, 5 no link, 6 damaged data.
 """
 
 import json

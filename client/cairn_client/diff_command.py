@@ -11,7 +11,7 @@
 
 A and B are a map's URL, a folder of `cairn clone`, a robot's state folder (commits that wait are part of its map), or a
 folder of `cairn map export --cells`. Cells are compared by their fingerprints: none is downloaded.
-Exit codes, as of diff: 0 equal, 1 different (or it cannot be told), 2 wrong usage, 5 no link.
+As diff, it ends with 0 if they are equal and with 1 if they are not, or if it cannot be told.
 """
 
 import argparse

@@ -16,7 +16,7 @@
 
 Without an argument, the installation alone; with a server's or a map's URL, the way there as well; with a state folder
 (of a robot, or of `cairn clone`), what is in it, and of a copy the way to its server. Lines that are not `ok` have the
-next step below them. Exit codes: 0 nothing failed (warnings may be there), 1 something failed, 2 wrong usage.
+next step below them. It ends with 0 if nothing failed (warnings may be there), else with 1.
 """
 
 import json
@@ -26,8 +26,9 @@ from pathlib import Path
 from cairn_client.arguments import add_token, parser, say
 from cairn_client.doctor_checks import Check, Verdict, disk_check, installation_checks
 from cairn_client.doctor_link import folder_checks, server_checks
+from cairn_client.folder_status import URL_KEY
 from cairn_client.map_url import split_map_url
-from cairn_client.state_folder import URL_KEY, opened_replica
+from cairn_client.state_folder import opened_replica
 from cairn_map.errors import CairnError
 
 SOUND, ILL = 0, 1

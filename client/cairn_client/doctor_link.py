@@ -10,7 +10,7 @@ from cairn_client.api import PROTOCOL_VERSION, MapApi
 from cairn_client.arguments import shown_bytes
 from cairn_client.doctor_checks import Check, Verdict, disk_check
 from cairn_client.link import index_of
-from cairn_client.state_folder import URL_KEY, opened_replica
+from cairn_client.state_folder import is_copy, opened_replica
 from cairn_map.errors import CairnError, ConflictError, DeniedError, NotFoundError, UnreachableError
 from cairn_map.grid import Cell
 
@@ -32,9 +32,8 @@ def folder_checks(folder: Path) -> Iterator[Check]:
         with opened_replica(folder) as replica:
             waiting = replica.push_set()
             size = shown_bytes(replica.store.data_bytes(waiting))
-            is_copy = replica.store.get(URL_KEY) is not None
             whose = f"{replica.author.robot} on map {replica.store.get('map')}, {len(replica.cells)} cells, sound"
-            yield Check("folder", Verdict.OK, f"{'copy' if is_copy else 'robot'} {whose}")
+            yield Check("folder", Verdict.OK, f"{'copy' if is_copy(replica) else 'robot'} {whose}")
     except ConflictError as exc:
         yield Check("folder", Verdict.WARN, exc.message, "stop the robot to have its folder checked")
         return

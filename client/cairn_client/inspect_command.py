@@ -24,7 +24,7 @@ that says which of them are depth, colour, thermal images and poses. It needs no
     $ cairn robot replay lab.bag --topics lab.yaml --map URL --voxel 0.04
 
 What the file cannot know stands in its head as `DECIDE`; `replay` without --topics works where nothing is left to
-decide. Exit codes: 0 done, 1 no bag, 6 damaged."""
+decide."""
 
 
 def _inspect(args: argparse.Namespace) -> int:
@@ -120,7 +120,6 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "inspect",
         help="what is in a bag of ROS, and what to map of it",
         description=TEXT,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     inspect.add_argument("bag", type=Path, help="FILE.bag, FILE.mcap, FILE.db3, or a folder of rosbag2")
     inspect.add_argument("-o", "--output", type=Path, metavar="YAML", help="write the proposed file there")

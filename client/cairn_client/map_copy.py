@@ -5,8 +5,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from cairn_client.robot import Robot
-from cairn_client.state_folder import URL_KEY, is_state_folder, opened_replica, url_of
-from cairn_map.errors import ConflictError
+from cairn_client.state_folder import is_copy, is_state_folder, opened_replica, url_of
+from cairn_map.errors import BadInputError, ConflictError
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,17 +59,18 @@ def pull(folder: Path, *, token: str | None = None) -> Pulled:
     """
     map_url = url_of(folder)
     with opened_replica(folder) as replica:
-        name = replica.author.robot
+        name, is_robot = replica.author.robot, not is_copy(replica)
+    if is_robot:
+        raise BadInputError(
+            "no_copy", f"{folder} is robot {name}'s folder; `cairn robot sync {folder}` brings it up to date"
+        )
     return _pull(map_url, folder, token=token, name=name)
 
 
 def _pull(map_url: str, folder: Path, *, token: str | None, name: str) -> Pulled:
-    with Robot(None, map_url, directory=folder, name=name, token=token, mode="viewer") as robot:
+    with Robot(None, map_url, directory=folder, name=name, token=token, mode="viewer", stay=True) as robot:
         replica = robot.replica
         with replica.lock:
-            if replica.store.get(URL_KEY) is None:
-                with replica.store.transaction():
-                    replica.store.put(URL_KEY, map_url)
             before = {key: cell.fingerprint for key, cell in replica.cells.items()}
             commits = len(replica.header.coverage) if replica.header else 0
         robot.sync()

@@ -5,8 +5,7 @@
     $ cairn pull lab
     lab: up to date
 
-DIR is what `cairn clone` made. Of a robot's own folder, `cairn robot pull` pushes what waits there, too.
-Exit codes: 0 done, 1 no copy, 4 in use by another process, 5 no link, 6 damaged data.
+DIR is what `cairn clone` made. A robot's own folder is brought up to date by `cairn robot sync`, which pushes, too.
 """
 
 import json

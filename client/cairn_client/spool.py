@@ -17,8 +17,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict
 
 from cairn_client.replica import Replica
-from cairn_fusion.importers import open_source
-from cairn_fusion.recording import Recording
+from cairn_fusion.recording import Recording, open_recording
 from cairn_fusion.recording_format import HEADER_FILE
 from cairn_map.errors import BadInputError, DamagedDataError
 
@@ -107,7 +106,7 @@ class Spool:
 
     def _opened(self, path: Path) -> Recording | None:
         try:
-            source = open_source(path)
+            source = open_recording(path)
         except (BadInputError, DamagedDataError) as exc:
             log.error("%s is left out: %s", path, exc.message)
             self._settled.add(path)

@@ -4,14 +4,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from cairn_client.folder_status import MODE_KEY, URL_KEY
 from cairn_client.replica import Replica
 from cairn_client.replica_store import FILE_NAME, ReplicaStore
 from cairn_map.errors import BadInputError
 from cairn_map.grid import Geometry
 from cairn_map.ids import robot_name
-
-URL_KEY = "map_url"
-"""Where a copy is from, in its store."""
 
 
 def is_state_folder(folder: Path) -> bool:
@@ -46,16 +44,18 @@ def opened_replica(folder: Path) -> Iterator[Replica]:
 
 
 def url_of(folder: Path) -> str:
-    """The URL of the map that a folder is a copy of.
+    """The URL of the map that a folder is from.
 
     Raises:
-        BadInputError: no state folder, or a robot's, which knows its map by name only.
+        BadInputError: no state folder, or one that was never opened since it remembers.
     """
     with opened_replica(folder) as replica:
         url = replica.store.get(URL_KEY)
     if url is None:
-        raise BadInputError(
-            "no_copy",
-            f"{folder} is a robot's folder; `cairn robot pull --map URL --state {folder}` brings it up to date",
-        )
+        raise BadInputError("no_url", f"{folder} does not say which server its map is on; name its URL")
     return url
+
+
+def is_copy(replica: Replica) -> bool:
+    """Whether it is nobody's but a viewer's: it makes no commits."""
+    return replica.store.get(MODE_KEY) == "viewer"

@@ -10,7 +10,7 @@
 
 It goes on until Ctrl-C, and connects again when the link breaks, from where it was (what was missed meanwhile is told
 then). --json prints each event as a line, as PROTOCOL.md 4.6 has it; `lost` is our own, for a broken link. --events N
-ends after N of them. Exit codes: 0 done, 1 refused, 3 no such map, 130 interrupted.
+ends after N of them.
 """
 
 import json

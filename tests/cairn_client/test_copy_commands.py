@@ -109,7 +109,7 @@ def test_a_copy_is_not_made_over_something_else(server: LiveServer, tmp_path: Pa
     with pytest.raises(ConflictError, match="cairn pull"):
         clone(server.map_url, copy, token=None)
     push(server, tmp_path / "mole", {A: seen(1)})
-    with pytest.raises(BadInputError, match="cairn robot pull --map URL"):
+    with pytest.raises(BadInputError, match="cairn robot sync"):
         pull(tmp_path / "mole")
     with pytest.raises(BadInputError) as caught:
         pull(tmp_path / "nobody")
@@ -123,8 +123,6 @@ def test_a_clone_that_lost_its_link_is_finished_by_a_pull(server: LiveServer, tm
     copy = tmp_path / "copy"
     with Robot(None, server.map_url, directory=copy, name="copy-1", mode="viewer"):
         pass  # the folder of a clone of which nothing came yet, but for its URL
-    with opened_replica(copy) as replica, replica.store.transaction():
-        replica.store.put("map_url", server.map_url)
     server.stop()
     with pytest.raises(UnreachableError):
         pull(copy)
