@@ -20,6 +20,7 @@ PROGRAMS: Mapping[str, tuple[str, ...]] = {
     "  import numpy": ("-c", "import numpy"),
     "  import numba": ("-c", "import numba"),
     "  import cairn_client.robot": ("-c", "import cairn_client.robot"),
+    "  the same, and httpx": ("-c", "import cairn_client.robot, httpx"),
     "  cairn --help": ("-c", "import sys; from cairn_client.main import main; sys.exit(main(['--help']))"),
 }
 
