@@ -36,6 +36,10 @@ MAY_IMPORT = {
 
 MAY_NAME = {
     "cv2": [
+        "cairn_calib/circle_grid.py",
+        "cairn_calib/corner_detection.py",
+        "cairn_calib/corner_pictures.py",
+        "cairn_calib/saddle_points.py",
         "cairn_fusion/images.py",
         "cairn_fusion/picture.py",
         "cairn_sim/contact_sheet.py",

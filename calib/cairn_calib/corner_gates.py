@@ -1,0 +1,252 @@
+"""What a grid of corners must pass to be believed: windows, tiles and brick walls have lattices too.
+
+Each gate returns why it refuses, or None. They look at the fitted corners and at the image as recorded, so whichever
+detector proposed the grid, it is judged alike.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.board import Board
+from cairn_calib.corner_refinement import FittedCorners, fit_corners
+from cairn_calib.homography import fit_homography, mapped, steps_between
+
+Floats = npt.NDArray[np.float64]
+Image = npt.NDArray[np.float32]
+
+CELL_MIN_PX = 3.5
+"""Shortest step from corner to corner. Below, the fit has fewer pixels than it needs."""
+SEEN_MIN = 0.6
+MISFIT_MAX = 0.45
+"""Residuals of one corner, share of its contrast: noise of a tenth of the step from dark to bright is 0.2."""
+MISFIT_RATIO, MISFIT_SPARE = 3.0, 0.05
+"""Of the board's usual misfit, and beside it: something that hides a corner in part pulls it by a third of a pixel."""
+MISFIT_USUAL_MAX = 0.3
+MOVED_MAX = 0.4
+"""Cells between a proposed corner and the fitted one."""
+CONTRAST_RATIO = 4.0
+"""Between a corner's contrast and the board's usual one."""
+FLAT_RMS_PX = 0.5
+FLAT_RMS_CELLS = 0.01
+"""A lens with more than one radial term still bends a large board a little."""
+ALTERNATING_MIN = 0.9
+CELL_MIDDLE = 0.25
+"""Half width of the middle of a cell, cells."""
+BEYOND_MAX = 0.6
+"""Share of a rim's places that may look like corners too."""
+BEYOND_CONTRAST = 0.6
+BEYOND_MOVED = 0.15
+"""Cells between where the next corner of a pattern that goes on must lie and where one is. Where a board's outer cells
+are cut, their ends do look like corners, elsewhere."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A grid and what was found about it; arrays in the board's order."""
+
+    image: Image
+    board: Board
+    fitted: FittedCorners
+    homography: Floats
+
+    @property
+    def kept(self) -> npt.NDArray[np.bool_]:
+        """(N,) which corners are there."""
+        return np.isfinite(self.fitted.pixels[:, 0])
+
+    @property
+    def steps(self) -> Floats:
+        """(N, 2, 2) pixels to the next column and row."""
+        return steps_between(self.homography, self.board.lattice())
+
+
+Gate = Callable[[Judged], str | None]
+
+
+def sound_corners(fitted: FittedCorners, signs: Floats) -> npt.NDArray[np.bool_]:
+    """(N,) which fitted corners look like the corners of one chessboard.
+
+    Args:
+        fitted: the corners.
+        signs: (N,) 1 or -1, the checker's sign at each; either all agree with the contrasts or all disagree.
+    """
+    there = np.isfinite(fitted.pixels[:, 0])
+    signed = np.where(there, fitted.contrast, 0) * signs
+    if not there.any():
+        return there
+    way = 1.0 if np.median(signed[there]) > 0 else -1.0
+    signed = signed * way
+    usual = float(np.median(signed[there]))
+    alike = (signed > usual / CONTRAST_RATIO) & (signed < usual * CONTRAST_RATIO)
+    misfit = np.nan_to_num(fitted.misfit, nan=9.0)
+    crisp = misfit < min(MISFIT_MAX, MISFIT_RATIO * float(np.median(misfit[there])) + MISFIT_SPARE)
+    return np.asarray(there & alike & crisp & (np.nan_to_num(fitted.moved, nan=9.0) < MOVED_MAX))
+
+
+def checker_signs(board: Board) -> Floats:
+    """(N,) 1 where the cell towards the next column and row has the colour of the first cell, else -1."""
+    return np.where(board.lattice().sum(axis=1) % 2 == 0, 1.0, -1.0)
+
+
+def refusal(judged: Judged) -> tuple[str, str] | None:
+    """The first gate that refuses, and why; None where all let it pass."""
+    for name, gate in GATES:
+        reason = gate(judged)
+        if reason is not None:
+            return name, reason
+    return None
+
+
+def _seen(judged: Judged) -> str | None:
+    count = int(judged.kept.sum())
+    if count < SEEN_MIN * judged.board.count:
+        total = judged.board.count
+        return f"{count} of {total} corners are crossings of two sharp edges, at least {SEEN_MIN:.0%} are needed"
+    return None
+
+
+def _cell_size(judged: Judged) -> str | None:
+    shortest = float(np.linalg.norm(judged.steps[judged.kept], axis=2).min())
+    if shortest < CELL_MIN_PX:
+        return f"cells are {shortest:.1f} px small, at least {CELL_MIN_PX} px are needed: come nearer or tilt less"
+    return None
+
+
+def _distinct(judged: Judged) -> str | None:
+    pixels = judged.fitted.pixels[judged.kept]
+    apart = np.linalg.norm(pixels[:, None] - pixels[None], axis=2)
+    apart[np.diag_indices(len(pixels))] = np.inf
+    shortest = np.linalg.norm(judged.steps[judged.kept], axis=2).min()
+    return None if apart.min() > 0.5 * shortest else f"two corners lie {apart.min():.1f} px from each other"
+
+
+def _not_mirrored(judged: Judged) -> str | None:
+    return None if np.linalg.det(judged.steps[judged.kept]).min() > 0 else "the grid is mirrored or folded"
+
+
+def _flat(judged: Judged) -> str | None:
+    rms = flat_rms_px(judged.board.lattice()[judged.kept], judged.fitted.pixels[judged.kept], judged.image.shape)
+    cell = float(np.linalg.norm(judged.steps[judged.kept], axis=2).mean())
+    limit = FLAT_RMS_PX + FLAT_RMS_CELLS * cell
+    return None if rms < limit else f"the corners lie {rms:.2f} px (rms) off a plane behind a lens, at most {limit:.2f}"
+
+
+def _crisp(judged: Judged) -> str | None:
+    usual = float(np.median(judged.fitted.misfit[judged.kept]))
+    if usual > MISFIT_USUAL_MAX:
+        return f"what is no chessboard or noise is {usual:.2f} of the contrast, at most {MISFIT_USUAL_MAX}"
+    return None
+
+
+def _alternating(judged: Judged) -> str | None:
+    """Means of the middles of cells whose four corners are there, each against its neighbours."""
+    board = judged.board
+    kept = judged.kept.reshape(board.rows, board.columns)
+    whole = kept[1:, 1:] & kept[1:, :-1] & kept[:-1, 1:] & kept[:-1, :-1]
+    middles = _cell_means(judged).reshape(board.rows - 1, board.columns - 1)
+    row, column = np.nonzero(whole)
+    signs = np.where((np.arange(board.rows - 1)[:, None] + np.arange(board.columns - 1)) % 2 == 0, 1.0, -1.0)
+    way = 1.0 if np.nansum(judged.fitted.contrast * checker_signs(board)) > 0 else -1.0
+    signed = middles * signs * way
+    right = total = 0
+    for down, across in ((0, 1), (1, 0)):
+        ends = (row + down < board.rows - 1) & (column + across < board.columns - 1)
+        r, c = row[ends], column[ends]
+        both = whole[r + down, c + across]
+        r, c = r[both], c[both]
+        right += int((signed[r, c] + signed[r + down, c + across] > 0).sum())
+        total += len(r)
+    if total == 0 or right < ALTERNATING_MIN * total:
+        return (
+            f"{right} of {total} pairs of cells alternate between dark and bright, at least {ALTERNATING_MIN:.0%} must"
+        )
+    return None
+
+
+def _ends(judged: Judged) -> str | None:
+    """Whether the pattern goes on: then these corners may be any part of it."""
+    board = judged.board
+    lattice = judged.board.lattice()
+    columns, rows = np.arange(board.columns, dtype=float), np.arange(board.rows, dtype=float)
+    rims = {
+        "left": np.column_stack([np.full(board.rows, -1.0), rows]),
+        "right": np.column_stack([np.full(board.rows, float(board.columns)), rows]),
+        "top": np.column_stack([columns, np.full(board.columns, -1.0)]),
+        "bottom": np.column_stack([columns, np.full(board.columns, float(board.rows))]),
+    }
+    usual = float(np.median(np.abs(judged.fitted.contrast[judged.kept])))
+    way = 1.0 if np.nansum(judged.fitted.contrast * checker_signs(board)) > 0 else -1.0
+    misfit = float(np.median(judged.fitted.misfit[judged.kept]))
+    for name, rim in rims.items():
+        guesses = _extrapolated(judged, rim, lattice)
+        fitted = fit_corners(judged.image, guesses, steps_between(judged.homography, rim))
+        signs = np.where(rim.sum(axis=1) % 2 == 0, way, -way)
+        with np.errstate(invalid="ignore"):
+            strong, crisp = fitted.contrast * signs > BEYOND_CONTRAST * usual, fitted.misfit < 1.5 * misfit + 0.03
+            alike = strong & crisp & (fitted.moved < BEYOND_MOVED)
+        if alike.mean() > BEYOND_MAX:
+            return f"the pattern goes on {name} of the board: {int(alike.sum())} of {len(rim)} places there are corners"
+    return None
+
+
+def _extrapolated(judged: Judged, rim: Floats, lattice: Floats) -> Floats:
+    """(M, 2) pixels of places just outside: the homography, corrected by what it misses at the nearest corners."""
+    off = judged.fitted.pixels - mapped(judged.homography, lattice)
+    off = np.where(judged.kept[:, None], off, 0)
+    nearest = np.argmin(np.linalg.norm(rim[:, None] - lattice[None], axis=2), axis=1)
+    return np.asarray(mapped(judged.homography, rim) + off[nearest])
+
+
+def _cell_means(judged: Judged) -> Floats:
+    """((rows - 1) * (columns - 1),) mean brightness of the middle of each cell, bilinear."""
+    board, image = judged.board, judged.image
+    grid = np.where(judged.kept[:, None], judged.fitted.pixels, mapped(judged.homography, board.lattice()))
+    grid = grid.reshape(board.rows, board.columns, 2)
+    samples = []
+    for v in (0.5 - CELL_MIDDLE, 0.5, 0.5 + CELL_MIDDLE):
+        for u in (0.5 - CELL_MIDDLE, 0.5, 0.5 + CELL_MIDDLE):
+            at = (1 - v) * ((1 - u) * grid[:-1, :-1] + u * grid[:-1, 1:]) + v * (
+                (1 - u) * grid[1:, :-1] + u * grid[1:, 1:]
+            )
+            x, y = np.clip(at[..., 0], 0, image.shape[1] - 1.001), np.clip(at[..., 1], 0, image.shape[0] - 1.001)
+            left, top = x.astype(np.intp), y.astype(np.intp)
+            s, t = x - left, y - top
+            upper = (1 - s) * image[top, left] + s * image[top, left + 1]
+            samples.append((1 - t) * upper + t * ((1 - s) * image[top + 1, left] + s * image[top + 1, left + 1]))
+    return np.asarray(np.mean(samples, axis=0).ravel())
+
+
+def flat_rms_px(lattice: Floats, pixels: Floats, shape: tuple[int, ...]) -> float:
+    """Root mean square distance, pixels, of (N, 2) corners from a plane seen through a lens with one radial term."""
+    centre = np.array([shape[1] - 1, shape[0] - 1]) / 2
+    scale = float(np.hypot(*centre))
+    plane = (pixels - centre) / scale
+    square = (plane**2).sum(axis=1, keepdims=True)
+
+    def off(k: float) -> Floats:
+        straight = plane * (1 + k * square)
+        homography = fit_homography(lattice, straight)
+        missed = np.full_like(plane, np.nan) if homography is None else straight - mapped(homography, lattice)
+        return np.asarray(missed.ravel() * scale)
+
+    k = 0.0
+    for _ in range(3):
+        here, slope = off(k), (off(k + 1e-3) - off(k)) / 1e-3
+        k = float(np.clip(k - (slope @ here) / max(float(slope @ slope), 1e-12), -0.4, 0.8))
+    return float(np.sqrt((off(k) ** 2).sum() / len(pixels)))
+
+
+GATES: tuple[tuple[str, Gate], ...] = (
+    ("corners", _seen),
+    ("orientation", _not_mirrored),
+    ("cell size", _cell_size),
+    ("distinct", _distinct),
+    ("flatness", _flat),
+    ("crispness", _crisp),
+    ("alternation", _alternating),
+    ("border", _ends),
+)
+"""In the order in which they are asked: cheap ones first."""

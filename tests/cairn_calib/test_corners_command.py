@@ -1,0 +1,60 @@
+"""`cairn calib corners`: documents and pictures for every image, found or not."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tests.cairn_calib.board_images import BOARD, TOF, picture, pose, truth
+
+from cairn_calib.corner_file import read_corner_file
+from cairn_calib.corners_command import main
+from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError
+
+
+def test_each_image_gets_a_document_and_a_picture_and_failures_name_their_stage(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(4)
+    T_camera_board = pose(rng, TOF)
+    at = truth(TOF, T_camera_board)
+    good, empty = tmp_path / "good.png", tmp_path / "empty.png"
+    cv2.imwrite(str(good), picture(TOF, T_camera_board, rng))
+    cv2.imwrite(str(empty), rng.integers(0, 60000, (144, 176)).astype(np.uint16))
+    options = ["--board", "9x6", "--square", "0.05", "--output", str(tmp_path / "out")]
+    assert main([str(good), str(empty), *options]) == 0
+    told = capsys.readouterr().err
+    assert "good.png: 54 of 54 corners" in told
+    assert "found in 1 of 2 images; the others: empty.png" in told
+    document = read_corner_file(tmp_path / "out" / "good.json")
+    assert (document.width, document.height, document.board) == (176, 144, BOARD)
+    corners = document.to_corners()
+    assert corners is not None
+    assert np.abs(corners.pixels - at).max() < 0.3
+    nothing = read_corner_file(tmp_path / "out" / "empty.json")
+    assert nothing.to_corners() is None
+    assert all(attempt.stage != "found" and attempt.reason for attempt in nothing.attempts)
+    assert np.asarray(cv2.imread(str(tmp_path / "out" / "good.png"))).shape[1] >= 1000
+    with pytest.raises(NotFoundError, match="no board in any image"):
+        main([str(empty), *options])
+
+
+def test_corners_pointed_at_by_hand_are_taken_from_the_file(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    T_camera_board = pose(rng, TOF)
+    at = truth(TOF, T_camera_board)
+    cv2.imwrite(str(tmp_path / "one.png"), picture(TOF, T_camera_board, rng))
+    pointed = {"format": "cairn-outer-corners", "version": 1, "images": {"one.png": at[[0, 8, 53, 45]].tolist()}}
+    (tmp_path / "by-hand.json").write_text(json.dumps(pointed))
+    options = ["--board", "9x6", "--square", "0.05", "--output", str(tmp_path), "--outer-corners"]
+    assert main([str(tmp_path / "one.png"), *options, str(tmp_path / "by-hand.json")]) == 0
+    document = read_corner_file(tmp_path / "one.json")
+    assert document.attempts[-1].method == "by hand"
+    pointed["images"] = {"one.png": [[1, 2]] * 5}
+    (tmp_path / "by-hand.json").write_text(json.dumps(pointed))
+    with pytest.raises(BadInputError, match="4 corners or all 54"):
+        main([str(tmp_path / "one.png"), *options, str(tmp_path / "by-hand.json")])
+    (tmp_path / "one.json").write_text("{}")
+    with pytest.raises(DamagedDataError, match="no file of corners"):
+        read_corner_file(tmp_path / "one.json")
