@@ -224,11 +224,10 @@ def _shading(pixels: Floats, mean: Floats) -> Floats:
     x, y = ((pixels - centre) / scale).T
     one, none = np.ones_like(x), np.zeros_like(x)
     terms = np.stack([one, x, y, x * x, x * y, y * y], axis=-1)
-    keep = sound.copy()
-    for _ in range(2):
-        factors = np.linalg.lstsq(terms[keep], mean[keep], rcond=None)[0]
-        off = np.abs(mean - terms @ factors)
-        keep = sound & (off <= 4 * np.median(off[sound]) + 1e-9)
+    factors = np.linalg.lstsq(terms[sound], mean[sound], rcond=None)[0]
+    off = np.abs(mean - terms @ factors)
+    keep = sound & (off <= 4 * np.median(off[sound]) + 1e-9)
+    factors = np.linalg.lstsq(terms[keep], mean[keep], rcond=None)[0]
     by_x = np.stack([none, one, none, 2 * x, y, none], axis=-1) @ factors / scale
     by_y = np.stack([none, none, one, none, x, 2 * y], axis=-1) @ factors / scale
     return np.asarray(np.nan_to_num(np.stack([by_x, by_y], axis=-1)))
