@@ -9,7 +9,11 @@ from tests.cairn_client.made import GEOMETRY, MAP, cells_of, random_diff
 from tests.cairn_server.live import until
 
 from cairn_client import relay_command
+from cairn_client.api import MapApi
+from cairn_client.link import Link
 from cairn_client.robot import Robot
+from cairn_client.sync import push_commits
+from cairn_client.uploads import Parts
 from cairn_map.errors import BadInputError
 from cairn_map.ids import OPERATOR
 from cairn_map.messages import Retract
@@ -264,3 +268,13 @@ def test_a_folder_is_a_place_between_two_servers(
 def test_a_relay_between_two_folders_has_no_map(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="map's URL"):
         relay_command.main([str(tmp_path / "a"), str(tmp_path / "b")])
+
+
+def test_a_commit_that_comes_in_parts_is_signed_as_well(base: Server, fields: list[Server], tmp_path: Path) -> None:
+    with opened(fields[0], tmp_path / "robot", "robot") as robot:
+        commit = robot.replica.commit(random_diff(1))
+        with MapApi(fields[0].url, token=robot.replica.token() or robot._api.token) as api:
+            small = Parts(above_bytes=1, part_bytes=len(commit.data) // 2)
+            Link(api, MAP, branch="robot").hold(push_commits(robot.replica, parts=small))
+    settled(base, *fields)
+    assert base.ids() == {commit.id}

@@ -149,7 +149,7 @@ def test_after_a_quota_the_same_part_comes_again(tmp_path: Path) -> None:
 def test_where_the_push_must_wait_an_empty_part_tries_again(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     row = live.new_map()
 
-    def busy(*arguments: object) -> bool:
+    def busy(*arguments: object, **beside: object) -> bool:
         raise UnreachableError("busy", "later", 1.0)
 
     with monkeypatch.context() as patch:
