@@ -19,7 +19,7 @@ from cairn_calib.saddle_points import SaddlePoints
 Floats = npt.NDArray[np.float64]
 Lattice = dict[tuple[int, int], int]
 
-ANGLE_COS = np.cos(np.radians(25.0))
+ANGLE_COS = np.cos(np.radians(22.0))
 """How far a neighbour may lie off an edge's direction: a lens bends it, noise turns it."""
 SWAP_COS = 0.6
 """How well a neighbour's bright quarters are the mirror image of the corner's own."""
@@ -30,8 +30,8 @@ SEEN_MIN = 0.6
 STRAY = 0.34
 """Of an outer row: with fewer corners than this share it is no part of the board."""
 GROW_MIN = 9
-LONGER = 2.5
-"""Longest step over the shortest at one corner: a board tilted by 60 degrees has 2."""
+LONGER = 2.1
+"""Longest step over the shortest at one corner: a board tilted by 60 degrees has 2, a step past a corner 2.2."""
 ALIKE = 3.0
 """Ratio of strengths that neighbours may have; noise beside a board is much weaker."""
 MORE = 4

@@ -65,7 +65,9 @@ def saddle_points(image: Image) -> SaddlePoints:
     strong = strength > WEAK * strength.max(initial=0.0)
     y, x, strength = y[strong], x[strong], strength[strong]
     hessian = np.stack([np.stack([xx[y, x], xy[y, x]], -1), np.stack([xy[y, x], yy[y, x]], -1)], -1).astype(np.float64)
-    values, vectors = np.linalg.eigh(hessian)
+    # The directions of edges want more smoothing than the places of corners do.
+    wide = [np.asarray(cv2.blur(part, (3, 3)))[y, x].astype(np.float64) for part in (xx, xy, yy)]
+    values, vectors = np.linalg.eigh(np.stack(wide, axis=-1)[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
     bright, dark = vectors[..., 1], vectors[..., 0]
     # Along an edge the brightness does not bend: cos^2 of the positive and sin^2 of the negative curvature cancel.
     angle = np.arctan2(np.sqrt(np.maximum(values[:, 1], 1e-12)), np.sqrt(np.maximum(-values[:, 0], 1e-12)))
