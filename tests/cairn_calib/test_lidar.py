@@ -42,10 +42,10 @@ def test_project_undoes_unproject_beside_the_middle_of_a_pixel(lidar: SpinningLi
     again = lidar.project(lidar.unproject(pixels))
     # The left and the right edge of the image are one direction.
     turned = (again[:, 0] - pixels[:, 0] + lidar.width / 2) % lidar.width - lidar.width / 2
-    np.testing.assert_allclose(turned, 0, atol=1e-9)
     inside = ~np.isnan(again[:, 1])
+    np.testing.assert_allclose(turned[inside], 0, atol=1e-9)
     np.testing.assert_allclose(again[inside, 1], pixels[inside, 1], atol=1e-9)
-    assert inside.all() or dy == -0.5
+    assert inside.all() or dy < -0.5 + 1e-9  # rounding may lift the top edge out of the image
 
 
 @pytest.mark.parametrize(
