@@ -110,7 +110,7 @@ def served(image: Image, tmp_path_factory: pytest.TempPathFactory) -> Iterator[S
         url = f"http://127.0.0.1:{found[1]}"
         key, evidence = pushed_cell(url, folder / "robot")
         yield Served(container, url, key, evidence, kernels_built)
-        os.kill(innermost(process.pid), signal.SIGTERM)
+        os.kill(server_below(process.pid), signal.SIGTERM)
         assert process.wait(STOP_S) == 0, (folder / "stderr").read_text()
     finally:
         process.kill()
@@ -268,11 +268,11 @@ def kernel_count(container: str) -> int:
     return sum(1 for _ in (root / "var/cache/cairn").rglob("*.nbc"))
 
 
-def innermost(pid: int) -> int:
-    """The last of a chain of processes that start one another: buildah, its helpers, the server."""
-    for tasks in Path(f"/proc/{pid}/task").glob("*/children"):
-        for child in tasks.read_text().split():
-            return innermost(int(child))
+def server_below(pid: int) -> int:
+    """The first Python in a chain of processes that start one another: buildah, its helpers, the server."""
+    while not Path(f"/proc/{pid}/exe").resolve().name.startswith("python"):
+        (tasks,) = (text.split() for path in Path(f"/proc/{pid}/task").glob("*/children") if (text := path.read_text()))
+        pid = int(tasks[0])
     return pid
 
 

@@ -7,17 +7,24 @@ is forked before the server has threads, and costs no start of its own. If it is
 
 import asyncio
 import json
+import logging
 import os
 import signal
 import socket
+import traceback
 from collections import deque
 
 from cairn_server.check_nursery import LENGTH, answer_to, checked_from, die_with_parent, received, send
 from cairn_server.checking import Checked
 
+log = logging.getLogger(__name__)
+
+ANSWER_S = 60.0
+"""A process that takes longer for milliseconds of work is not coming back."""
+
 
 class LostCheckError(Exception):
-    """The process ended, or has no memory."""
+    """The process ended, has no memory, or met an error of its own."""
 
 
 class CheckProcess:
@@ -26,10 +33,12 @@ class CheckProcess:
     def __init__(self, pid: int, jobs: socket.socket) -> None:
         self.pid = pid
         self._jobs = jobs
+        self._opening = asyncio.Lock()
         self._writer: asyncio.StreamWriter | None = None
         self._reading: asyncio.Task[None] | None = None
         self._asked: deque[asyncio.Future[bytes]] = deque()
-        self._is_lost = False
+        self.is_lost = False
+        """Whether it will not answer any more; else a failure is of one commit."""
 
     async def check(self, data: bytes) -> Checked:
         """What it finds of a commit.
@@ -38,16 +47,23 @@ class CheckProcess:
             DamagedDataError, BadInputError: what it found wrong.
             LostCheckError: it cannot answer.
         """
-        if self._is_lost:
+        if self.is_lost:
             raise LostCheckError
-        if self._writer is None:
-            reader, self._writer = await asyncio.open_unix_connection(sock=self._jobs)
-            self._reading = asyncio.get_running_loop().create_task(self._read(reader))
+        async with self._opening:
+            if self._writer is None:
+                reader, self._writer = await asyncio.open_unix_connection(sock=self._jobs)
+                self._reading = asyncio.get_running_loop().create_task(self._read(reader))
         answer: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
         self._asked.append(answer)
         self._writer.write(LENGTH.pack(len(data)) + data)
-        found = json.loads(await answer)
-        if "memory" in found:
+        try:
+            found = json.loads(await asyncio.wait_for(answer, ANSWER_S))
+        except TimeoutError:
+            self.is_lost = True
+            raise LostCheckError from None
+        if "broken" in found:
+            log.error("the process that checks small commits met an error of its own: %s", found["broken"])
+        if "memory" in found or "broken" in found:
             raise LostCheckError
         return checked_from(found)
 
@@ -67,7 +83,7 @@ class CheckProcess:
                 if not answer.done():  # whoever asked may be gone
                     answer.set_result(data)
         except (asyncio.IncompleteReadError, OSError):
-            self._is_lost = True
+            self.is_lost = True
             for answer in self._asked:
                 if not answer.done():
                     answer.set_exception(LostCheckError())
@@ -91,8 +107,17 @@ def fork_checking() -> CheckProcess:
 
 
 def _be_checker(jobs: socket.socket) -> None:
-    """Answer until the server is gone."""
+    """What the process does."""
     for number in (signal.SIGINT, signal.SIGTERM):  # of a whole group: the server first finishes what it does
         signal.signal(number, signal.SIG_IGN)
+    answer_checks(jobs)
+
+
+def answer_checks(jobs: socket.socket) -> None:
+    """Check what the other end asks for, until it is gone."""
     while (data := received(jobs)) is not None:
-        send(jobs, json.dumps(answer_to(data)).encode())
+        try:
+            answer = answer_to(data)
+        except Exception:  # noqa: BLE001 - told to the server, which logs it
+            answer = {"broken": traceback.format_exc()}
+        send(jobs, json.dumps(answer).encode())

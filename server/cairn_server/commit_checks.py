@@ -64,7 +64,7 @@ class CommitChecks:
             try:
                 return await self._process.check(commit.data)
             except LostCheckError:
-                self._give_up_process()
+                self._give_up_process()  # if it is gone
         return self.check(commit)
 
     def is_quick(self, commit: CommitReader) -> bool:
@@ -78,7 +78,8 @@ class CommitChecks:
             self._process.close()
 
     def _give_up_process(self) -> None:
-        process, self._process = self._process, None
-        if process is not None:  # the first of those that waited for it
+        process = self._process
+        if process is not None and process.is_lost:  # the first of those that waited for it
+            self._process = None
             log.error("the process that checks small commits was killed; checking in the server's own from now on")
             process.close()

@@ -1,6 +1,7 @@
 """What many ask for at the same time is made once: the first one makes it, the others wait. What was made is kept."""
 
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future
@@ -9,18 +10,24 @@ from typing import Generic, TypeVar
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 
+IDLE_S = 60.0
+"""What nobody asked for so long goes with the next value that is made: a state of a cell that is another's past now."""
+
 
 class MadeOnce(Generic[K, V]):
-    """Values by name within a bound of memory, those that nobody asked for longest forgotten; thread-safe.
+    """Values by name within bounds of memory and of idle time, what nobody asked for longest forgotten; thread-safe.
 
     Nobody changes what it hands out. Whoever makes a value must not ask for another one here.
     """
 
-    def __init__(self, *, limit_bytes: int, size_of: Callable[[V], int]) -> None:
+    def __init__(
+        self, *, limit_bytes: int, size_of: Callable[[V], int], steady_s: Callable[[], float] = time.monotonic
+    ) -> None:
         self._limit_bytes = limit_bytes
         self._size_of = size_of
+        self._steady_s = steady_s
         self._lock = threading.Lock()
-        self._kept: OrderedDict[K, V] = OrderedDict()
+        self._kept: OrderedDict[K, tuple[V, float]] = OrderedDict()
         self._making: dict[K, Future[V]] = {}
         self._size_bytes = 0
 
@@ -29,8 +36,9 @@ class MadeOnce(Generic[K, V]):
         mine: Future[V] = Future()
         with self._lock:
             if name in self._kept:
-                self._kept.move_to_end(name)
-                return self._kept[name]
+                value, _ = self._kept.pop(name)
+                self._kept[name] = value, self._steady_s()
+                return value
             maker = self._making.setdefault(name, mine)
         if maker is not mine:
             return maker.result()
@@ -43,9 +51,17 @@ class MadeOnce(Generic[K, V]):
             raise
         with self._lock:
             del self._making[name]
-            self._kept[name] = value
-            self._size_bytes += self._size_of(value)
-            while self._size_bytes > self._limit_bytes:
-                self._size_bytes -= self._size_of(self._kept.popitem(last=False)[1])
+            self._keep(name, value)
         mine.set_result(value)
         return value
+
+    def _keep(self, name: K, value: V) -> None:
+        now_s = self._steady_s()
+        self._kept[name] = value, now_s
+        self._size_bytes += self._size_of(value)
+        while self._kept:
+            oldest, (least, used_s) = next(iter(self._kept.items()))
+            if self._size_bytes <= self._limit_bytes and now_s - used_s <= IDLE_S:
+                return
+            del self._kept[oldest]
+            self._size_bytes -= self._size_of(least)

@@ -36,7 +36,7 @@ from cairn_server.damaged_cells import DamagedCells
 from cairn_server.fold_health import FoldHealth
 from cairn_server.fold_process import FoldProcess
 from cairn_server.folder import Folder
-from cairn_server.handing_over import found_commit, server_key
+from cairn_server.handing_over import server_key
 from cairn_server.healing import heal_cell, keep_healed
 from cairn_server.held_commits import HeldCommits
 from cairn_server.joining import Joining
@@ -194,16 +194,6 @@ class Service:
         self.store.audit_log.add(by.name, "retract", detail)
         self._came()
         return Retracted(id=ids[-1], commits=names)
-
-    def commit(self, row: MapRow, id_text: str) -> tuple[bytes, bytes, str | None]:
-        """A commit's bytes as they were pushed, its SHA-256, and the seal on a retract that this server made.
-
-        Raises:
-            NotFoundError: kind `no_commit`.
-            ConflictError: kind `evidence_gone`.
-        """
-        found = found_commit(self.store, row, id_text)
-        return found.data, found.sha, found.seal
 
     def cell_index(self, row: MapRow, author: Author | None, page: IndexPage = FIRST_PAGE) -> CellIndex:
         """Some of the cells that were ever touched, and the state that they were read from."""

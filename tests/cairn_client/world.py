@@ -41,6 +41,7 @@ from cairn_server import sqlite_store, sqlite_writer
 from cairn_server.auth import Caller, Role
 from cairn_server.cell_cache import CellCache
 from cairn_server.folding import fold_pending
+from cairn_server.handing_over import found_commit
 from cairn_server.service import Service
 from cairn_server.settings import Settings
 from cairn_server.sqlite_store import SqliteStore
@@ -84,8 +85,8 @@ class DirectApi:
 
     def commit(self, name: str, commit: CommitId) -> tuple[bytes, str | None]:
         service = self._world.service
-        data, _, seal = service.commit(service.store.map(name), str(commit))
-        return data, seal
+        found = found_commit(service.store, service.store.map(name), str(commit))
+        return found.data, found.seal
 
     def push(self, name: str, commit: Commit, *, seal: str | None = None, signatures: str | None = None) -> Pushed:
         service = self._world.service

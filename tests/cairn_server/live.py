@@ -154,6 +154,12 @@ class Process:
         assert found
         return int(found[1]) >> 10
 
+    def said(self) -> str:
+        """What it complained of so far."""
+        self._errors.flush()
+        self._errors.seek(0)
+        return self._errors.read()
+
     def end(self) -> tuple[int, str]:
         """Exit code and what it complained of, once it ended."""
         self._process.communicate(timeout=DEADLINE_S)

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from cairn_server.made_once import MadeOnce
+from cairn_server.made_once import IDLE_S, MadeOnce
 
 ASKERS = 8
 
@@ -62,3 +62,17 @@ def test_what_is_larger_than_the_bound_is_handed_out_but_not_kept() -> None:
     values = kept(limit_bytes=2)
     assert values.get("a", lambda: b"long") == b"long"
     assert values.get("a", lambda: b"else") == b"else"
+
+
+def test_what_nobody_asked_for_of_late_goes_when_something_else_is_made() -> None:
+    now_s = [0.0]
+    values: MadeOnce[str, bytes] = MadeOnce(limit_bytes=100, size_of=len, steady_s=lambda: now_s[0])
+    for name in ("old", "asked for"):
+        values.get(name, lambda: b"value")
+    now_s[0] = IDLE_S * 0.9
+    values.get("asked for", refuse)
+    now_s[0] = IDLE_S * 1.1
+    values.get("new", lambda: b"value")
+    assert values.get("asked for", refuse) == b"value"
+    assert values.get("old", lambda: b"again") == b"again"
+    assert values._size_bytes == 3 * len(b"value")

@@ -1,11 +1,14 @@
 """The processes beside the server: what they do is what it does without them, and it can be without them."""
 
+import asyncio
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import Pipe
 from pathlib import Path
 
@@ -23,6 +26,8 @@ from cairn_map.errors import UnreachableError
 from cairn_map.grid import cell_of_key
 from cairn_map.messages import CreateMap, MapInfo
 from cairn_map.sensor_model import SensorModel
+from cairn_server import check_process
+from cairn_server.check_process import CheckProcess, LostCheckError
 from cairn_server.damaged_cells import DamagedCells
 from cairn_server.fold_process import FoldProcess, LostProcessError, answer_folds
 from cairn_server.sqlite_store import SqliteStore
@@ -187,3 +192,37 @@ def test_damage_is_noted_and_folded_around_from_afar(
         process.fold(row, store, damaged, maps=1)
         noted = lambda: [entry.what for entry in store.audit_log.page(after=0, limit=100)]  # noqa: E731
         until(lambda: "damaged_commit" in noted(), "the audit log says so")
+
+
+def test_robots_that_come_at_the_same_moment_do_not_end_the_process(process: Process) -> None:
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda commit: push(process, commit), COMMITS[:8]))
+    before = children_of(process.pid)
+    push(process, *COMMITS[8:])
+    assert len(before) == len(children_of(process.pid)) == 2
+    assert "killed" not in process.said()
+
+
+def test_an_error_that_nobody_expected_is_of_one_commit_and_told(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(check_process, "answer_to", raising(RuntimeError("by chance")))
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        thread = threading.Thread(target=check_process.answer_checks, args=(theirs,))
+        thread.start()
+        asking = CheckProcess(0, ours)
+
+        async def ask() -> None:
+            for _ in range(2):
+                with pytest.raises(LostCheckError):
+                    await asking.check(COMMITS[0].data)
+            assert not asking.is_lost
+            assert asking._writer is not None
+            assert asking._reading is not None
+            asking._writer.close()
+            await asking._reading
+
+        asyncio.run(ask())
+        assert "RuntimeError: by chance" in caplog.text
+        thread.join()

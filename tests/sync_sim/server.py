@@ -20,6 +20,7 @@ from cairn_map.version_vector import EMPTY, VersionVector
 from cairn_server.auth import Caller, Role
 from cairn_server.cell_cache import CellCache
 from cairn_server.folding import fold_pending
+from cairn_server.handing_over import found_commit
 from cairn_server.memory_map import MemoryMap
 from cairn_server.memory_store import MemoryStore
 from cairn_server.service import Service
@@ -137,12 +138,12 @@ class SimServer:
                 upload, _ = service.uploads.add(row, Caller(Role.ROBOT, robot), str(commit_id), part)
                 kept = service.store.commit(row, commit_id)
                 if kept is not None and not kept.gone:  # perhaps under an id that was another server's
-                    meta, cells = split_commit(service.commit(row, str(commit_id))[0])
+                    meta, cells = split_commit(found_commit(service.store, row, str(commit_id)).data)
                     self._evidence[commit_id] = meta.note, cells
                 return upload
             case GetCommit(commit_id):
-                data, _, found = service.commit(row, str(commit_id))
-                return data, found
+                found = found_commit(service.store, row, str(commit_id))
+                return found.data, found.seal
             case GetMissing(request):
                 return service.missing(row, robot, MissingRequest.model_validate_json(request.model_dump_json()))
             case GetIndex(author):
