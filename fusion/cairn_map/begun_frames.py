@@ -12,6 +12,7 @@ import hashlib
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
+from cairn_map.cell_reading import CELL_BYTES_MAX
 from cairn_map.errors import DamagedDataError, UnreachableError
 from cairn_map.frames import CellFrame, Frame, FrameReader
 from cairn_map.grid import CellKey, cell_of_key
@@ -111,9 +112,12 @@ class Reply:
             self._memory.begun = None
         if not frame.continues:
             return frame
+        name = cell_of_key(frame.cell)
         if self._begun is None or self._begun[0] != frame.cell:
-            name = cell_of_key(frame.cell)
             raise DamagedDataError("bad_frame", f"the frame of cell {name} goes on from what is not here")
+        size_bytes = len(self._begun[1]) + len(frame.payload)
+        if size_bytes > CELL_BYTES_MAX:
+            raise DamagedDataError("bad_frame", f"cell {name} has at most {CELL_BYTES_MAX} bytes, got {size_bytes}")
         return replace(frame, continues=False, payload=self._begun[1] + frame.payload)
 
     def _note(self, reader: FrameReader) -> None:
@@ -123,6 +127,9 @@ class Reply:
         key, continues, payload = reader.begun
         if continues:
             if self._begun is None or self._begun[0] != key:
+                return
+            if len(self._begun[1]) + len(payload) > CELL_BYTES_MAX:  # no cell; who always goes on must not fill us
+                self._memory.begun = None
                 return
             payload = self._begun[1] + payload
         if len(payload) >= BEGUN_BYTES_MIN:

@@ -7,6 +7,7 @@ from random import Random
 import pytest
 from tests.cairn_map.made import KEY, made_frames
 
+from cairn_map import begun_frames
 from cairn_map.begun_frames import BEGUN_BYTES_MIN, Replies, reply_digest, without_begun
 from cairn_map.errors import DamagedDataError, UnreachableError
 from cairn_map.frames import CellFrame, Frame, encode_frame, start_of_reply
@@ -76,6 +77,26 @@ def test_a_frame_that_goes_on_from_what_is_not_here_is_refused() -> None:
     data = start_of_reply() + encode_frame(HEADER) + encode_frame(replace(cell(0, 900), continues=True))
     with pytest.raises(DamagedDataError, match="goes on"):
         list(Replies().reply_to(MissingRequest()).frames([data]))
+
+
+def going_on(replies: Replies, size: int, *, cut: int = 0) -> list[Frame]:
+    """What comes of a reply that goes on with so many bytes, whatever was here."""
+    data = start_of_reply() + encode_frame(replace(cell(0, size), continues=True))
+    return list(replies.reply_to(MissingRequest()).frames([data[: len(data) - cut]]))
+
+
+def test_a_cell_that_goes_on_beyond_its_limit_is_no_cell(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(begun_frames, "CELL_BYTES_MAX", 10_000)
+    replies = Replies()
+    fetched(replies, [cell(0, 9000)], cut_at=5000)
+    for _ in range(20):
+        with pytest.raises((UnreachableError, DamagedDataError)):
+            going_on(replies, 1500, cut=100)
+        assert replies.begun is None or len(replies.begun[1]) <= 10_000
+    fetched(replies, [cell(0, 9000)], cut_at=5000)
+    with pytest.raises(DamagedDataError, match="at most 10000 bytes"):
+        going_on(replies, 6000)
+    assert fetched(replies, [cell(0, 9000)])[0] == [cell(0, 9000)]
 
 
 def test_a_digest_that_is_not_that_of_the_beginning_gets_the_whole_frame() -> None:
