@@ -1,8 +1,9 @@
 """Bodies of commits that come in parts, so that a link that breaks goes on where it stopped.
 
-In memory, and of no weight: losing them costs bytes, never evidence. A robot has one upload at a time, as it pushes its
-commits one after the other, so a hostile one holds no more here than a push would; who comes next takes the place of
-whoever was quiet longest. Only the whole body is checked and acknowledged, and by the very steps of a push.
+In memory, and of no weight: losing them costs bytes, never evidence. A robot pushes its commits one after the other, so
+it has one upload here, and a second one while an amend waits for what it takes out; who comes next takes the room of
+whoever was quiet longest. Room is what came: announcing much takes none. Only the whole body is checked and
+acknowledged, and by the very steps of a push.
 """
 
 import hashlib
@@ -16,17 +17,20 @@ from cairn_map.errors import BadInputError, CairnError, DeniedError, Unreachable
 from cairn_map.ids import CommitId, commit_id_from_text
 from cairn_map.upload_messages import Upload
 from cairn_server.auth import Caller
+from cairn_server.push_policy import EvidenceGoneError
 from cairn_server.pushes import Pushes
 from cairn_server.store import Store
 from cairn_server.store_rows import MapRow
 
 STAGED_BYTES_MAX = 1 << 27
-"""Of all robots together, whole bodies counted though only their beginnings are here."""
+"""Of all robots together."""
+BODIES_MAX = 2
+"""Of one robot on one map."""
 KEPT_S = 86_400.0
 """Bytes that nobody added to for so long go."""
 
-Place = tuple[int, str]
-"""Map and robot."""
+Place = tuple[int, str, CommitId]
+"""Map, robot, and which of its commits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +50,6 @@ class Part:
 class _Staged:
     """The beginning of a body."""
 
-    commit: CommitId
     digest: str
     total_bytes: int
     used_s: float
@@ -85,7 +88,7 @@ class Uploads:
         commit, robot = uploaded_by(caller, id_text)
         kept = self._store.commit(row, commit)
         with self._lock:
-            found = self._at((row.number, robot), commit, digest)
+            found = self._at((row.number, robot, commit), digest)
             return Upload(
                 size_bytes=len(found.data) if found else 0, sha=kept.sha.hex() if kept and not kept.gone else None
             )
@@ -97,10 +100,11 @@ class Uploads:
 
         Raises:
             BadInputError: kind `too_large`; or, with the last part, as a push.
-            CairnError: as a push; after `UnreachableError` the bytes stay, and an empty part tries again.
+            CairnError: as a push; after `UnreachableError` and `EvidenceGoneError` the bytes stay, and an empty part
+                tries again.
         """
         commit, robot = uploaded_by(caller, id_text)
-        place = (row.number, robot)
+        place = (row.number, robot, commit)
         if part.total_bytes > COMMIT_BYTES_MAX or part.offset_bytes + len(part.data) > part.total_bytes:
             raise BadInputError(
                 "too_large",
@@ -109,20 +113,20 @@ class Uploads:
             )
         # What a push would refuse in any case need not come first, and nobody makes the server digest it for nothing.
         self._pushes.check_room(row, caller, size_bytes=part.total_bytes)
-        whole = self._take(place, commit, part)
+        whole = self._take(place, part)
         if whole is None:
-            return Upload(size_bytes=self._size(place, commit, part.digest)), False
+            return Upload(size_bytes=self._size(place, part.digest)), False
         if hashlib.sha256(whole).hexdigest() != part.digest:
-            self._drop(place, commit)
+            self._drop(place)
             return Upload(size_bytes=0), False
         try:
             is_new = self._pushes.keep(row, caller, id_text, whole, signatures=part.signatures)
-        except UnreachableError:
+        except (UnreachableError, EvidenceGoneError):
             raise
         except CairnError:
-            self._drop(place, commit)
+            self._drop(place)
             raise
-        self._drop(place, commit)
+        self._drop(place)
         kept = self._store.commit(row, commit)
         return Upload(size_bytes=len(whole), sha=kept.sha.hex() if kept else None), is_new
 
@@ -131,40 +135,42 @@ class Uploads:
         with self._lock:
             return sum(len(found.data) for found in self._staged.values())
 
-    def _take(self, place: Place, commit: CommitId, part: Part) -> bytes | None:
+    def _take(self, place: Place, part: Part) -> bytes | None:
         """The whole body, if this part was its last one."""
         with self._lock:
-            found = self._at(place, commit, part.digest)
+            found = self._at(place, part.digest)
             if found is None or found.total_bytes != part.total_bytes:
-                found = _Staged(commit, part.digest, part.total_bytes, self._steady_s())
+                found = _Staged(part.digest, part.total_bytes, self._steady_s())
             if part.offset_bytes == len(found.data):
                 found.data += part.data
             found.used_s = self._steady_s()
             if found.data:
                 self._staged.pop(place, None)
-                self._make_room(found.total_bytes)
+                self._make_room(place, len(found.data))
                 self._staged[place] = found  # the one used last stands last
             return bytes(found.data) if len(found.data) == found.total_bytes else None
 
-    def _make_room(self, size_bytes: int) -> None:
-        """Forget what is too old, and of the rest those that were quiet longest."""
+    def _make_room(self, place: Place, size_bytes: int) -> None:
+        """Forget the robot's own beyond its two, what is too old, and of the rest those that were quiet longest."""
         now_s = self._steady_s()
-        held_bytes = sum(found.total_bytes for found in self._staged.values())
-        for place, found in list(self._staged.items()):
+        own = [other for other in self._staged if other[:2] == place[:2]]
+        for other in own[: 1 - BODIES_MAX]:
+            del self._staged[other]
+        held_bytes = sum(len(found.data) for found in self._staged.values())
+        for other, found in list(self._staged.items()):
             if held_bytes + size_bytes > STAGED_BYTES_MAX or now_s - found.used_s > KEPT_S:
-                held_bytes -= found.total_bytes
-                del self._staged[place]
+                held_bytes -= len(found.data)
+                del self._staged[other]
 
-    def _size(self, place: Place, commit: CommitId, digest: str) -> int:
+    def _size(self, place: Place, digest: str) -> int:
         with self._lock:
-            found = self._at(place, commit, digest)
+            found = self._at(place, digest)
             return len(found.data) if found else 0
 
-    def _at(self, place: Place, commit: CommitId, digest: str) -> _Staged | None:
+    def _at(self, place: Place, digest: str) -> _Staged | None:
         found = self._staged.get(place)
-        return found if found and (found.commit, found.digest) == (commit, digest) else None
+        return found if found and found.digest == digest else None
 
-    def _drop(self, place: Place, commit: CommitId) -> None:
+    def _drop(self, place: Place) -> None:
         with self._lock:
-            if place in self._staged and self._staged[place].commit == commit:
-                del self._staged[place]
+            self._staged.pop(place, None)

@@ -98,7 +98,7 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("body of a status", body_limit.STATUS_BYTES_MAX),
         ("body of a view", body_limit.VIEW_BYTES_MAX),
         ("any other body", body_limit.JSON_BYTES_MAX),
-        ("bodies that come in parts, of all robots, announced lengths added up", uploads.STAGED_BYTES_MAX),
+        ("bytes that are here of bodies that come in parts, of all robots", uploads.STAGED_BYTES_MAX),
         ("cells listed in `missing`", CURSORS_MAX),
         ("commits named in one retract request", RETRACTS_MAX),
         ("reply to `missing`", missing.REPLY_BYTES_MAX),

@@ -173,11 +173,32 @@ class Staging:
         return self.uploads.add(self.row, caller, f"{robot}.{MOLE.incarnation}.{n}", part)[0].size_bytes
 
 
-def test_a_hostile_robot_holds_one_body_at_a_time(live: Live) -> None:
+def test_an_amend_stays_while_what_it_names_comes_in_parts(live: Live) -> None:
+    row, target = live.new_map(), pushed(0, 3)
+    live.push(row, target)
+    live.folded(row)
+    live.service.store.forget_evidence(row, before_s=float("inf"), limit=100)
+    amend = pushed(1, 1, retracts=[target])
+    assert kind_of(add(live, row, amend.data, 0, commit=amend)) == "evidence_gone"
+    half = len(target.data) // 2
+    for data, offset in ((target.data[:half], 0), (target.data[half:], half)):
+        assert add(live, row, data, offset, commit=target).status_code == 200
+    assert state(live, row, amend)["size_bytes"] == len(amend.data)
+    assert add(live, row, b"", len(amend.data), commit=amend).status_code == 201
+
+
+def test_a_hostile_robot_holds_two_bodies_at_a_time(live: Live) -> None:
     staging = Staging(live)
     for n in range(50):
         assert staging.add("mole", 1000, n=n) == 1000
-        assert staging.uploads.staged_bytes() == 1000
+        assert staging.uploads.staged_bytes() == 1000 * min(n + 1, 2)
+
+
+def test_who_announces_much_takes_no_room_from_others(live: Live) -> None:
+    staging = Staging(live)
+    for robot in "abcdef":
+        staging.add(robot, 1)
+    assert [staging.add(robot, 1, offset=1) for robot in "abcdef"] == [2] * 6
 
 
 def test_all_robots_together_hold_no_more_than_the_limit(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -191,14 +212,14 @@ def test_all_robots_together_hold_no_more_than_the_limit(live: Live, monkeypatch
 
 
 def test_who_was_quiet_longest_goes_first_and_what_is_old_goes(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(uploads, "STAGED_BYTES_MAX", 10_000)
+    monkeypatch.setattr(uploads, "STAGED_BYTES_MAX", 500)
     staging = Staging(live)
     for robot in ("a", "b"):
-        staging.add(robot, 100, total=4000)
-    staging.add("a", 100, total=4000, offset=100)
-    staging.add("c", 100, total=4000)
-    assert staging.add("b", 1, total=4000, offset=100) == 0
-    assert staging.add("a", 1, total=4000, offset=200) == 201
+        staging.add(robot, 150)
+    staging.add("a", 100, offset=150)
+    staging.add("c", 150)
+    assert staging.add("b", 1, offset=150) == 0
+    assert staging.add("a", 1, offset=250) == 251
     staging.now_s = uploads.KEPT_S + 1
     staging.add("d", 10, total=1000)
     assert staging.uploads.staged_bytes() == 10
