@@ -16,6 +16,7 @@ from cairn_client.map_model import stored_model
 from cairn_client.outbox import Outbox
 from cairn_client.replica_identity import identify
 from cairn_client.replica_store import BaseCell, KeptCommit, ReplicaStore
+from cairn_client.resting import Resting
 from cairn_client.shown import changes, is_to_be_taken, shown_evidence, taken_back
 from cairn_map.cell_code import Profile, decode_cell, encode_cell
 from cairn_map.commit import Commit, CommitMeta
@@ -61,6 +62,8 @@ class Replica:
         self.cells: dict[CellKey, BaseCell] = store.cells()
         self.refused_cells: set[tuple[CellKey, str]] = set()
         """Cells, with their fingerprints, by which the server would not be healed: not sent again."""
+        self.resting = Resting()
+        """Commits that the server refused for their bytes: not sent again for a while."""
         self.admit: Callable[[CellKey, int], None] = lambda key, size_bytes: None
         """Asked before a cell of so many bytes is held; raises if there is no room (`room`)."""
         self._load()
@@ -223,6 +226,7 @@ class Replica:
             shown = {*self.cells, *self.outbox.cells}
             self.cells.clear()
             self.outbox.reread()
+            self.resting.end()
             # Another server does not know the first one's seal.
             self.outbox.forget([kept.id for kept in self.outbox if kept.seal is not None])
             for key in shown:

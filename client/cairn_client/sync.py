@@ -75,6 +75,9 @@ def push_commits(
     """
     report = RoundReport()
     for commit_id in replica.push_set():
+        if (refusal := replica.resting.refusal(commit_id)) is not None:
+            report.refused[commit_id] = refusal
+            continue
         commit, seal = replica.kept_commit(commit_id), replica.seal(commit_id)
         if commit is None or (sealed_only and seal is None):
             continue
@@ -93,6 +96,7 @@ def push_commits(
         except (BadInputError, DamagedDataError) as exc:  # it must not hold up all that come after it
             log.error("the server refuses commit %s: %s: %s", commit_id, exc.kind, exc.message)
             report.refused[commit_id] = exc
+            replica.resting.note(commit_id, exc)
             continue
         replica.acknowledge(pushed)
         report.pushed += 1

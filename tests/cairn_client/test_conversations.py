@@ -9,9 +9,10 @@ from tests.cairn_client.made import GEOMETRY, A, committed, covering, cursor, ex
 from cairn_client.asks import GetMissing, NextFrame, Push
 from cairn_client.replica import Replica
 from cairn_client.replica_store import BaseCell
+from cairn_client.resting import REST_S, Resting
 from cairn_client.sync import fetch_missing, push_commits
 from cairn_map.commit import Commit, CommitMeta, make_commit
-from cairn_map.errors import ConflictError, UnreachableError
+from cairn_map.errors import BadInputError, CairnError, ConflictError, DamagedDataError, UnreachableError
 from cairn_map.fingerprint import ZERO
 from cairn_map.ids import OPERATOR, Author, CommitId, Incarnation
 
@@ -62,6 +63,41 @@ def test_a_link_that_breaks_ends_the_round_and_keeps_what_was_not_answered(mole:
     with pytest.raises(UnreachableError):
         conversation.throw(UnreachableError("no_link", "cut"))
     assert mole.push_set() == [commit.id]
+
+
+def refused(replica: Replica, *answers: CairnError | None) -> dict[CommitId, CairnError]:
+    """What a round reports as refused, in which the server answers so to as many pushes."""
+    conversation = push_commits(replica)
+    with pytest.raises(StopIteration) as end:
+        next(conversation)
+        for answer in answers:
+            conversation.throw(answer) if answer else conversation.send(None)
+    found: dict[CommitId, CairnError] = end.value.value.refused
+    return found
+
+
+def test_a_commit_that_is_refused_for_its_bytes_rests_for_an_hour(mole: Replica) -> None:
+    now_s = 0.0
+    mole.resting = Resting(steady_s=lambda: now_s)
+    first, no = committed(mole, X), BadInputError("too_much_evidence", "no")
+    assert refused(mole, no) == {first.id: no}
+    second = committed(mole, Y)
+    assert refused(mole, None) == {first.id: no}, "only the second one was sent"
+    assert mole.push_set() == [first.id] and mole.kept_commit(second.id) is not None
+    now_s = REST_S
+    assert refused(mole, no) == {first.id: no}
+    assert refused(mole) == {first.id: no}
+    mole.forget_server()
+    assert refused(mole, None, None) == {}
+
+
+@pytest.mark.parametrize(
+    "answer", [BadInputError("http", "307"), ConflictError("id_gone", "no"), DamagedDataError("internal", "500")]
+)
+def test_a_refusal_that_tells_nothing_of_the_bytes_is_tried_again(mole: Replica, answer: CairnError) -> None:
+    commit = committed(mole, X)
+    for _ in range(2):
+        assert refused(mole, answer) == {commit.id: answer}
 
 
 def test_frames_are_asked_for_one_by_one(mole: Replica) -> None:
