@@ -1,5 +1,6 @@
 """A thin link with losses: what is near comes first, nothing breaks, and nothing is paid twice. Real transfers."""
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from random import Random
@@ -190,11 +191,16 @@ def test_who_joins_late_pays_for_the_map_and_hardly_more(city: LiveServer, tmp_p
         assert link.size_bytes < at_rest_bytes + 160 * frames + 4000  # frames of real cells have some 150 kB
 
 
-def test_a_copy_comes_whole_over_a_small_link(city: LiveServer, tmp_path: Path) -> None:
+def test_a_copy_comes_whole_over_a_small_link(
+    city: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with MapApi(city.url) as api:
         cells = api.map_info(MAP).cells
     state = str(tmp_path / "copy")
-    assert robot_command.main(["pull", "--map", city.map_url, "--state", state, "--link", "small"]) == 0
+    assert robot_command.main(["pull", "--map", city.map_url, "--state", state, "--link", "small", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["cells"], report["pushed"], report["refused"], report["waiting"]) == (cells, 0, {}, 0)
+    assert report["voxels"] > 0 and report["down_bytes"] > 0
     copy = opened(tmp_path / "copy", "viewer")
     assert len(copy.view.packed()) == cells == SIZE * SIZE
     copy.close()
