@@ -10,12 +10,15 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from cairn_map.commit_reading import open_commit
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, NotFoundError, UnreachableError
-from cairn_map.ids import CommitId, commit_id_from_text
+from cairn_map.ids import INITIAL, OPERATOR, CommitId, commit_id_from_text
 from cairn_map.relay_end import Held, SignedCommit
-from cairn_map.signature import TEXT_MAX
+from cairn_map.signature import TEXT_MAX, check_signatures, signatures_from_text, speaks_for
 from cairn_map.version_vector import EMPTY
 
+SERVERS_OWN = (OPERATOR, INITIAL)
+"""Authors in whose name servers speak, by keys that only a server knows whether to trust."""
 COMING = ".coming"
 """Ends the name of a file that is not whole."""
 
@@ -23,13 +26,14 @@ COMING = ".coming"
 class CarriedCommits:
     """`relay_end.MapEnd` in a folder; of one program at a time."""
 
-    def __init__(self, folder: Path, *, size_bytes_max: int) -> None:
-        """Open or make the folder.
+    def __init__(self, folder: Path, map_name: str, *, size_bytes_max: int) -> None:
+        """Open or make the folder; for commits of this map.
 
         Raises:
             BadInputError: kind `bad_folder`.
         """
         self._folder = folder
+        self._map_name = map_name
         self._size_bytes_max = size_bytes_max
         try:
             folder.mkdir(0o700, parents=True, exist_ok=True)
@@ -53,7 +57,13 @@ class CarriedCommits:
         return SignedCommit(commit, data, signatures.decode())
 
     def push(self, commit: SignedCommit) -> None:
-        """Carry a commit; durable on return."""
+        """Carry a commit; durable on return.
+
+        Raises:
+            BadInputError: not what its author signed: kept, it would keep the true one out; or larger than all room.
+            DamagedDataError: no sound commit.
+        """
+        self._check(commit)
         content = (commit.signatures or "").encode() + b"\n" + commit.data
         path = self._folder / str(commit.id)
         coming = path.with_name(path.name + COMING)
@@ -67,6 +77,20 @@ class CarriedCommits:
             _sync_folder(self._folder)
         except OSError as exc:
             raise UnreachableError("store_failed", f"cannot write to {self._folder}: {exc.strerror}") from exc
+
+    def _check(self, commit: SignedCommit) -> None:
+        size_bytes = len(commit.signatures or "") + 1 + len(commit.data)
+        if size_bytes > self._size_bytes_max:
+            raise BadInputError(
+                "too_large", f"{commit.id} takes {size_bytes} bytes, and {self._folder} has {self._size_bytes_max}"
+            )
+        found, _ = open_commit(commit.data)
+        if found.id != commit.id:
+            raise BadInputError("other_id", f"came as {commit.id}, and is {found.id}")
+        signed = signatures_from_text(commit.signatures or "")
+        check_signatures(signed, self._map_name, found.sha)
+        if commit.id.author.robot not in SERVERS_OWN and not speaks_for(signed, commit.id.author):
+            raise BadInputError("bad_signature", f"{commit.id} is not signed by its author")
 
     def _make_room(self, size_bytes: int) -> None:
         """Let the oldest give way."""

@@ -14,7 +14,7 @@ class Carrier:
     """What a robot carries in its directory, beside its own state."""
 
     def __init__(self, directory: Path, api: RelayApi, map_name: str, *, size_bytes_max: int) -> None:
-        self._here = CarriedCommits(directory / FOLDER, size_bytes_max=size_bytes_max)
+        self._here = CarriedCommits(directory / FOLDER, map_name, size_bytes_max=size_bytes_max)
         self._there = ServerEnd(api, map_name)
         self._map_name = map_name
         self._resting = Resting()

@@ -46,7 +46,7 @@ def main(argv: list[str]) -> int:
     name = Path((args.here if "://" in args.here else args.there).rstrip("/")).name
     with ExitStack() as stack:
         here, there = (
-            stack.enter_context(_place(text, token, size_bytes_max=int(args.folder_mb * MEGABYTE)))
+            stack.enter_context(_place(text, token, name, size_bytes_max=int(args.folder_mb * MEGABYTE)))
             for text, token in ((args.here, args.token), (args.there, args.token_there))
         )
         resting = Resting()
@@ -81,9 +81,9 @@ def _once(here: MapEnd, there: MapEnd, resting: Resting, *, map_name: str, where
 
 
 @contextmanager
-def _place(text: str, token: str | None, *, size_bytes_max: int) -> Iterator[MapEnd]:
+def _place(text: str, token: str | None, map_name: str, *, size_bytes_max: int) -> Iterator[MapEnd]:
     if "://" not in text:
-        yield CarriedCommits(Path(text), size_bytes_max=size_bytes_max)
+        yield CarriedCommits(Path(text), map_name, size_bytes_max=size_bytes_max)
         return
     server_url, map_name = split_map_url(text)
     with RelayApi(server_url, token=token) as api:
