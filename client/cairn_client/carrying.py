@@ -27,6 +27,8 @@ class Carrier:
         """
         report = hold_between(relay_round(self._resting), self._here, self._there)
         tell(report, self._map_name, there="the server")
+        if report.cut:
+            raise report.cut
         return report
 
 

@@ -7,6 +7,7 @@ signatures are checked by who takes it.
 """
 
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import Enum
@@ -14,15 +15,17 @@ from itertools import islice
 
 from cairn_client.asks import Ask, Conversation
 from cairn_map.commit import split_commit
-from cairn_map.errors import CairnError, ConflictError, DamagedDataError, DeniedError, NotFoundError, UnreachableError
+from cairn_map.errors import CairnError, ConflictError, DeniedError, NotFoundError, UnreachableError
 from cairn_map.ids import Author, CommitId
 from cairn_map.relay_end import Held, SignedCommit
+from cairn_map.version_vector import EMPTY, VersionVector
 
 AT_ONCE = 1000
 """Commits handed over, in each direction, before both places are asked anew."""
 REST_S = 600.0
-"""A commit that could not be handed over is tried again after this."""
-RESTING_MAX = 100_000
+"""So often what could not be handed over is tried again, once all else was."""
+NOT_ITS_FAULT = ("quota", "disk_full")
+"""Why a server takes nothing for now, whatever it is."""
 
 
 class Side(Enum):
@@ -55,23 +58,77 @@ class GiveCommit(Ask[None]):
     commit: SignedCommit
 
 
+class Why(Enum):
+    """Why a commit was not handed over."""
+
+    GONE = "gone"
+    """Not kept any more where it was to come from."""
+    UNSIGNED = "unsigned"
+    REFUSED = "refused"
+    BROKEN = "broken"
+    """Twice the link broke at it, or the server could not take it, though both places had just answered."""
+
+
+FOR_GOOD = (Why.GONE, Why.UNSIGNED)
+"""Not asked for again while the place that it was to come from still names it."""
+
+
 @dataclass(slots=True)
 class Resting:
-    """What could not be handed over, and is left alone for a while; only saves traffic."""
+    """What could not be handed over, and is left alone for a while; a few intervals for each author, however many.
+
+    It saves traffic, and lets what comes after it go by.
+    """
 
     rest_s: float = REST_S
     clock_s: Callable[[], float] = time.monotonic
-    _until_s: dict[tuple[Side, CommitId], float] = field(default_factory=dict)
+    _found: defaultdict[tuple[Side, Why], VersionVector] = field(default_factory=lambda: defaultdict(lambda: EMPTY))
+    _broke_at: dict[Side, CommitId] = field(default_factory=dict)
+    _pauses_until_s: dict[Side, float] = field(default_factory=dict)
+    _until_s: dict[Side, float] = field(default_factory=dict)
 
-    def add(self, to: Side, commit: CommitId) -> None:
+    def add(self, to: Side, why: Why, commit: CommitId) -> None:
         """It could not be handed over to this side."""
-        if len(self._until_s) >= RESTING_MAX:
-            self._until_s.clear()
-        self._until_s[to, commit] = self.clock_s() + self.rest_s
+        self._found[to, why] = self._found[to, why].with_commits([commit])
 
-    def has(self, to: Side, commit: CommitId) -> bool:
-        """Whether it is too early to try again."""
-        return self._until_s.get((to, commit), float("-inf")) > self.clock_s()
+    def broke(self, to: Side, commit: CommitId, error: UnreachableError) -> None:
+        """The link broke at it, or the server said when it may be able to take more."""
+        if self._broke_at.get(to) == commit and error.kind not in NOT_ITS_FAULT:
+            self.add(to, Why.BROKEN, commit)
+        self._broke_at[to] = commit
+        if error.retry_after_s:
+            self._pauses_until_s[to] = self.clock_s() + min(error.retry_after_s, self.rest_s)
+
+    def pauses(self, to: Side) -> bool:
+        """Whether this side wants no more for now."""
+        return self._pauses_until_s.get(to, float("-inf")) > self.clock_s()
+
+    def may_come_later(self, to: Side) -> bool:
+        """Whether this side lacks what it might have once the link or the server is better."""
+        return self.pauses(to) or bool(self._found[to, Why.BROKEN].intervals)
+
+    def lacking(self, source: Held, target: Held, to: Side) -> Iterator[CommitId]:
+        """What the source could give and is worth a try, each author's oldest first."""
+        lacking = source.vector.minus(target.vector)
+        for why in FOR_GOOD:  # of these, what the source still names: if it was replaced, it may have them again
+            self._found[to, why] = known = lacking.minus(lacking.minus(self._found[to, why]))
+            lacking = lacking.minus(known)
+        tried = [self._found[to, why] for why in (Why.REFUSED, Why.BROKEN)]
+        for known in tried:
+            lacking = lacking.minus(known)
+        yield from lacking
+        for commit in target.wanted:
+            if commit in source.vector and not any(commit in known for known in tried):
+                yield commit
+
+    def all_tried(self, to: Side, report: "RelayReport") -> None:
+        """Nothing is left to hand over to this side; every `rest_s` say all that it lacks, and begin again."""
+        if self._until_s.setdefault(to, self.clock_s() + self.rest_s) > self.clock_s():
+            return
+        del self._until_s[to]
+        report.has_more |= self.may_come_later(to)
+        self._found[to, Why.REFUSED] = self._found[to, Why.BROKEN] = EMPTY
+        report.kept_back |= {(to, why): self._found[to, why] for why in FOR_GOOD if self._found[to, why].intervals}
 
 
 @dataclass(slots=True)
@@ -80,21 +137,30 @@ class RelayReport:
 
     moved: dict[Side, int] = field(default_factory=lambda: dict.fromkeys(Side, 0))
     """Commits handed over, by the side that they came to."""
-    gone: list[CommitId] = field(default_factory=list)
-    """Not kept any more where they were to come from: the other map lacks them."""
-    unsigned: list[CommitId] = field(default_factory=list)
+    kept_back: dict[tuple[Side, Why], VersionVector] = field(default_factory=dict)
+    """What a side lacks for good: gone, or unsigned. Only what is new, and now and then all."""
     refused: list[tuple[CommitId, CairnError]] = field(default_factory=list)
     split: list[Author] = field(default_factory=list)
     """Authors of whom the two sides have other bytes under the same ids."""
+    later: UnreachableError | None = None
+    """A server takes no more for now, and says when."""
+    cut: UnreachableError | None = None
+    """A link broke in the middle; whoever holds the rounds waits a little."""
     has_more: bool = False
     """There was too much for one round."""
+    is_all_there: bool = False
+    """All that can travel from here came there."""
+
+    def keep_back(self, to: Side, why: Why, commit: CommitId) -> None:
+        """A side lacks it."""
+        self.kept_back[to, why] = self.kept_back.get((to, why), EMPTY).with_commits([commit])
 
 
 def relay_round(resting: Resting) -> Conversation[RelayReport]:
-    """Hand over what either side lacks and the other has.
+    """Hand over what either side lacks and the other has; where one direction breaks off, the other has its turn.
 
     Raises:
-        UnreachableError: a link broke; what was handed over stays so.
+        UnreachableError: a place does not say what it holds.
         DeniedError: a server does not know this relay.
     """
     report = RelayReport()
@@ -103,6 +169,7 @@ def relay_round(resting: Resting) -> Conversation[RelayReport]:
         held[side] = yield from AskHeld(side)
     report.split = _split(held[Side.HERE], held[Side.THERE])
     yield from _hand_over(Side.HERE, Side.THERE, held, resting, report)
+    report.is_all_there = not (report.has_more or report.cut or resting.may_come_later(Side.THERE))
     yield from _hand_over(Side.THERE, Side.HERE, held, resting, report)
     return report
 
@@ -110,31 +177,50 @@ def relay_round(resting: Resting) -> Conversation[RelayReport]:
 def _hand_over(
     source: Side, target: Side, held: dict[Side, Held], resting: Resting, report: RelayReport
 ) -> Conversation[None]:
-    lacking = (commit for commit in _lacking(held[source], held[target]) if not resting.has(target, commit))
+    if resting.pauses(target):
+        return
+    lacking = resting.lacking(held[source], held[target], target)
     for commit_id in islice(lacking, AT_ONCE):
         try:
-            commit = yield from TakeCommit(source, commit_id)
-        except (ConflictError, NotFoundError, DamagedDataError):
-            if commit_id not in held[target].vector:  # else it is only wanted again, and not lacking
-                report.gone.append(commit_id)
-            resting.add(target, commit_id)
-            continue
-        if commit.signatures is None:
-            report.unsigned.append(commit_id)
-            resting.add(target, commit_id)
-            continue
-        try:
-            yield from _give(source, target, commit)
-        except UnreachableError:
-            raise
+            why = yield from _move(source, target, commit_id)
+        except UnreachableError as exc:
+            resting.broke(target, commit_id, exc)
+            if exc.retry_after_s:
+                report.later = exc
+            else:
+                report.cut = exc
+            return
         except CairnError as exc:
             if isinstance(exc, DeniedError) and exc.kind != "not_allowed":
                 raise
             report.refused.append((commit_id, exc))
-            resting.add(target, commit_id)
-        else:
+            why = Why.REFUSED
+        if why is None:
             report.moved[target] += 1
-    report.has_more |= next(lacking, None) is not None
+        elif commit_id in held[target].vector:  # only wanted again, and not lacking
+            resting.add(target, Why.REFUSED, commit_id)
+        else:
+            resting.add(target, why, commit_id)
+            if why in FOR_GOOD:
+                report.keep_back(target, why, commit_id)
+    if next(lacking, None) is None:
+        resting.all_tried(target, report)
+    else:
+        report.has_more = True
+
+
+def _move(source: Side, target: Side, commit_id: CommitId) -> Conversation[Why | None]:
+    """Hand over one commit; or why it cannot be."""
+    try:
+        commit = yield from TakeCommit(source, commit_id)
+    except ConflictError as exc:
+        if exc.kind != "evidence_gone":
+            raise
+        return Why.GONE
+    if commit.signatures is None:
+        return Why.UNSIGNED
+    yield from _give(source, target, commit)
+    return None
 
 
 def _give(source: Side, target: Side, commit: SignedCommit) -> Conversation[None]:
@@ -150,12 +236,6 @@ def _give(source: Side, target: Side, commit: SignedCommit) -> Conversation[None
             except (ConflictError, NotFoundError):
                 continue
         yield from GiveCommit(target, commit)
-
-
-def _lacking(source: Held, target: Held) -> Iterator[CommitId]:
-    """What the source could give, each author's oldest first."""
-    yield from source.vector.minus(target.vector)
-    yield from (commit for commit in target.wanted if commit in source.vector)
 
 
 def _split(here: Held, there: Held) -> list[Author]:

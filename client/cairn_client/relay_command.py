@@ -24,7 +24,7 @@ from cairn_client.arguments import parser, say
 from cairn_client.backoff import Backoff
 from cairn_client.carried import CarriedCommits
 from cairn_client.map_url import split_map_url
-from cairn_client.relay import RelayReport, Resting, Side, relay_round
+from cairn_client.relay import REST_S, RelayReport, Resting, Side, relay_round
 from cairn_client.relay_link import RelayApi, ServerEnd, hold_between
 from cairn_client.relay_log import tell
 from cairn_map.errors import BadInputError, UnreachableError
@@ -33,6 +33,10 @@ from cairn_map.relay_end import MapEnd
 log = logging.getLogger(__name__)
 
 TOKENS = ("CAIRN_TOKEN", "CAIRN_TOKEN_THERE")
+CUTS_MAX = 6
+"""Rounds that break, one after the other, without a commit that moved."""
+WAIT_MAX_S = 60.0
+"""Who should come back later than this is told so."""
 FOLDER_MB = 10_000.0
 MEGABYTE = 1e6
 
@@ -58,24 +62,30 @@ def main(argv: list[str]) -> int:
                 report = _once(here, there, resting, map_name=name, where=args.there)
                 backoff.reset()
             except UnreachableError as exc:
-                wait_s = backoff.next_s(exc.retry_after_s)
+                wait_s = backoff.next_s(min(exc.retry_after_s or 0.0, REST_S))
                 log.warning("no link (%s); trying again in %.1f s", exc.message, wait_s)
                 time.sleep(wait_s)
-    return int(bool(report.gone or report.unsigned or report.refused or report.split))
+    return int(bool(report.kept_back or report.refused or report.split or any(map(resting.may_come_later, Side))))
 
 
 def _once(here: MapEnd, there: MapEnd, resting: Resting, *, map_name: str, where: str) -> RelayReport:
     """Rounds until there is nothing more to hand over; what all of them did."""
-    total = RelayReport(has_more=True)
+    total, backoff, cuts = RelayReport(has_more=True), Backoff(), 0
     while total.has_more:
         report = hold_between(relay_round(resting), here, there)
         tell(report, map_name, there=where)
         total.has_more, total.split = report.has_more, report.split
         for side in Side:
             total.moved[side] += report.moved[side]
-        total.gone += report.gone
-        total.unsigned += report.unsigned
+        total.kept_back |= report.kept_back
         total.refused += report.refused
+        error = report.cut or report.later
+        if error:  # a commit at which this comes twice rests, so that what follows it has its turn
+            cuts = 1 if any(report.moved.values()) else cuts + 1
+            if cuts == CUTS_MAX or (error.retry_after_s or 0.0) > WAIT_MAX_S:
+                raise error
+            time.sleep(backoff.next_s(error.retry_after_s))
+            total.has_more = True
     say(f"map {map_name}: {total.moved[Side.THERE]} commits to {where}, {total.moved[Side.HERE]} from there")
     return total
 

@@ -81,7 +81,7 @@ class Upstream:
         found = self._api.maps()
         for name in sorted(set(self._server.map_names()) - {info.name for info in found}):
             self._say(logging.WARNING, f"upstream {self._url} has no map {name} for this token; create it there")
-        has_more = False
+        has_more, cut = False, None
         for info in found:
             if self._stopping.is_set():
                 return False
@@ -94,10 +94,11 @@ class Upstream:
             resting = self._resting.setdefault(info.name, Resting())
             report = hold_between(relay_round(resting), here, ServerEnd(self._api, info.name))
             tell(report, info.name, there=self._url)
-            if report.has_more:
-                has_more = True
-            else:
+            has_more, cut = has_more or report.has_more, cut or report.cut
+            if report.is_all_there:
                 self._server.handed_over(info.name, begun_s)
+        if cut:
+            raise cut
         return has_more
 
     def _say(self, level: int, text: str) -> None:

@@ -268,7 +268,7 @@ class JoinedHistory:
         reports = [relay.report for relay in self._relays if relay.report is not None]
         assert len(reports) == len(self._relays)
         for report in reports:
-            assert not (report.unsigned or report.refused or report.gone or any(report.moved.values()))
+            assert not (report.refused or report.kept_back or report.cut or any(report.moved.values()))
 
     def _level(self) -> None:
         """Every relay once with good links, everything folded."""
