@@ -9,7 +9,7 @@ from cairn_map.errors import UnreachableError
 from cairn_server.branch_notes import EntrySize
 from cairn_server.memory_map import MemoryMap
 from cairn_server.memory_maps import MemoryMaps
-from cairn_server.quota_store import Robot, Use
+from cairn_server.quota_store import Robot, Use, relay_of
 from cairn_server.store_health import Backlog, StoreFigures
 from cairn_server.store_rows import CellRow, MapRow
 
@@ -60,13 +60,14 @@ class MemoryUses:
         self._maps = maps
 
     def since(self, time_s: float) -> Mapping[Robot, Use]:
-        """What each robot's commits took that came after a time."""
+        """What each robot's commits took that came after a time, and what each relay handed over."""
         found: defaultdict[Robot, Use] = defaultdict(Use)
         with self._maps.locked() as maps:
             for state in maps.values():
                 for commit, kept in state.commits.items():
                     if kept.received_s >= time_s:
-                        found[state.row.number, commit.author.robot] += Use(kept.new.size_bytes, kept.cells)
+                        who = relay_of(kept.new.via) if kept.new.via else commit.author.robot
+                        found[state.row.number, who] += Use(kept.new.size_bytes, kept.cells)
         return found
 
 

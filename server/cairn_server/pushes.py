@@ -118,8 +118,8 @@ class Pushes:
             speaks_for = speaker_of(row, caller, pushed.meta, signed, self._settings.trusted_servers)
         cells = pushed.cells
         check_claims(row, speaks_for, id_text, pushed.meta, cells=len(cells))
-        with self.meter.spending(row, caller, size_bytes=len(pushed.data), cells=cells) as take:
-            via = caller.name if speaks_for is not caller and caller.role is Role.RELAY else None
+        via = caller.name if speaks_for is not caller and caller.role is Role.RELAY else None
+        with self.meter.spending(row, caller, size_bytes=len(pushed.data), cells=cells, via=via) as take:
             admitted = _Admitted(self._store, row, pushed, cells, signed, via)
             try:
                 yield admitted
@@ -147,7 +147,7 @@ class Pushes:
 
     def is_quick(self, row: MapRow, caller: Caller, pushed: CommitReader) -> bool:
         """Whether `keep_soon` may keep it: its check is done in a moment, and nothing else waits for anybody."""
-        return self.checks.is_quick(pushed) and (caller.robot is None or self.meter.is_ready(row))
+        return self.checks.is_quick(pushed) and (caller.role is Role.ADMIN or self.meter.is_ready(row))
 
     def note_conflict(self, row: MapRow, caller: Caller, conflict: ConflictError) -> None:
         """A line in the audit log, now and then, for somebody who pushes what cannot be."""

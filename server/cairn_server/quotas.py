@@ -17,8 +17,8 @@ import numpy as np
 from cairn_map.errors import BadInputError, UnreachableError
 from cairn_map.grid import CELL_LIMIT, CellKey
 from cairn_map.morton_kernels import deinterleave
-from cairn_server.auth import Caller
-from cairn_server.quota_store import Robot, Use
+from cairn_server.auth import UPSTREAM, Caller, Role
+from cairn_server.quota_store import Robot, Use, relay_of
 from cairn_server.settings import Quotas
 from cairn_server.store import Store
 from cairn_server.store_rows import MapRow
@@ -67,21 +67,26 @@ class Meter:
 
     @contextmanager
     def spending(
-        self, row: MapRow, caller: Caller, *, size_bytes: int, cells: Collection[CellKey]
+        self, row: MapRow, caller: Caller, *, size_bytes: int, cells: Collection[CellKey], via: str | None = None
     ) -> Iterator[Callable[[], None]]:
         """Take a commit off its robot's quotas for the length of a `with`; call what it gives to keep it taken.
+
+        What a relay hands over (`via`: by this token) is taken off the relay's. What this server fetches itself from
+        its upstream is held to what one commit may be only: it may be all of a map that grew for years.
 
         Raises:
             UnreachableError: kind `quota`: too much for now, with the seconds until it is not.
             BadInputError: kind `beyond_quota`: too much at any time.
         """
-        if caller.robot is None:  # an admin
+        if caller.role is Role.ADMIN:
             yield lambda: None
             return
-        robot, use, box = (row.number, caller.robot), Use(size_bytes, len(cells)), _box_of(cells)
+        robot = row.number, relay_of(via) if via else caller.robot or caller.name
+        use, box, is_metered = Use(size_bytes, len(cells)), _box_of(cells), caller != UPSTREAM
         self._check_commit(row, use, box)
         with self._lock:
-            self._take(robot, use)
+            if is_metered:
+                self._take(robot, use)
             day = self._day
         is_kept = False
 
@@ -95,7 +100,7 @@ class Meter:
             with self._lock:
                 if is_kept and self._quotas.map_extent_m is not None:
                     self._boxes[row.number] = self._widened(row, box), self._boxes[row.number][1]
-                if not is_kept:
+                if is_metered and not is_kept:
                     self._give_back(robot, use, day)
 
     def _check_commit(self, row: MapRow, use: Use, box: Box | None) -> None:

@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Mapping
 
-from cairn_server.quota_store import Robot, Use
+from cairn_server.quota_store import Robot, Use, relay_of
 from cairn_server.sqlite_readers import Readers
 
 
@@ -14,12 +14,12 @@ class SqliteUses:
         self._readers = readers
 
     def since(self, time_s: float) -> Mapping[Robot, Use]:
-        """What each robot's commits took that came at or after a time."""
+        """What each robot's commits took that came at or after a time, and what each relay handed over."""
         found: defaultdict[Robot, Use] = defaultdict(Use)
         # Not from the newest back to the first older one: a clock may be set back, and so the order of the numbers
         # says nothing. Nor summed up by SQL, which would go through all commits to have them in groups.
-        query = "SELECT map, robot, size_bytes, cells FROM commits WHERE received_s >= ?"
+        query = "SELECT map, robot, via, size_bytes, cells FROM commits WHERE received_s >= ?"
         with self._readers.reading() as reader:
-            for number, robot, size_bytes, cells in reader.execute(query, (time_s,)):
-                found[number, robot] += Use(size_bytes, cells)
+            for number, robot, via, size_bytes, cells in reader.execute(query, (time_s,)):
+                found[number, relay_of(via) if via else robot] += Use(size_bytes, cells)
         return found

@@ -2,6 +2,7 @@
 
 import hashlib
 import time
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -152,6 +153,13 @@ class AccessContract:
             (other.number, "mole"): use["other"],
         }
         assert since(time.time() + 1) == {}
+
+    def test_what_a_relay_brought_counts_for_its_token_and_for_no_robot(self, store: Store) -> None:
+        row = new_map(store, pushed(0, 0))
+        brought = pushed(1, 1)
+        store.append(row, replace(new_of(brought), via="field"))
+        used = {robot: use.size_bytes for robot, use in store.uses.since(0.0).items() if robot[0] == row.number}
+        assert used == {(row.number, "mole"): len(pushed(0, 0).data), (row.number, "relay field"): len(brought.data)}
 
     def test_what_was_pushed_since_a_time_counts_although_the_clock_was_set_back_after_it(
         self, store: Store, monkeypatch: pytest.MonkeyPatch

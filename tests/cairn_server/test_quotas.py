@@ -1,29 +1,32 @@
 """What a robot may push, and that what was refused, known or an administrator's costs nothing."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import httpx
 import pytest
 from tests.cairn_map.made import SMALL, random_evidence
+from tests.cairn_server import test_handing_over as handing_over
 from tests.cairn_server.live import Live
 from tests.cairn_server.pushes import KEYS, WREN, pushed
 from tests.cairn_server.test_auth import ADMIN, ENROLLER, bearer, robot_token
 from tests.cairn_server.test_push import kind_of
 
 from cairn_client.api import MapApi
+from cairn_map.access_messages import CreateToken
 from cairn_map.commit import Commit
 from cairn_map.errors import BadInputError, UnreachableError
 from cairn_map.grid import cell_key
 from cairn_map.sensor_model import SensorModel
 from cairn_server import quotas
-from cairn_server.auth import Caller, Role
+from cairn_server.auth import ADMIN_FILE, UPSTREAM, Caller, Role
 from cairn_server.quotas import DAY_S, Meter
 from cairn_server.serve_command import main
 from cairn_server.settings import Quotas
 from cairn_server.sqlite_store import SqliteStore
 from cairn_server.store_rows import MapRow
+from cairn_server.tokens import create_token
 
 OFF = dict.fromkeys(Quotas.model_fields)
 MOLE = Caller(Role.ROBOT, "mole")
@@ -175,6 +178,52 @@ def test_a_days_quota_survives_a_new_start(tmp_path: Path) -> None:
             if not start:
                 assert live.push(row, pushed(0, 0), headers=mole).status_code == 201
             assert_waits(live.push(row, pushed(1, 0), headers=mole), 1, DAY_S)
+
+
+def test_a_relay_has_quotas_of_its_own_by_its_token_after_a_new_start_too(tmp_path: Path) -> None:
+    commits = [
+        pushed(n, n, author) for n, author in enumerate((handing_over.MOLE, handing_over.WREN, handing_over.MOLE))
+    ]
+    for start in range(2):
+        with guarded(tmp_path, bytes_per_day=SIZE * 3 // 2) as live:
+            if not start:
+                row = live.new_map()
+                names = ("field", "other")
+                made = [create_token(live.service.store, n, CreateToken(role="relay"), by=ADMIN_FILE) for n in names]
+                mole = bearer(robot_token(live, row, "mole"))
+            field, other = (bearer(token.token) for token in made)
+            signed = [handing_over.signed(row, commit) for commit in commits]
+            if not start:
+                assert live.push(row, commits[0], headers=signed[0] | field).status_code == 201
+                assert live.push(row, pushed(0, 0), headers=mole).status_code == 201, "nothing of the robot's"
+            assert_waits(live.push(row, commits[1], headers=signed[1] | field), 1, DAY_S)
+    with guarded(tmp_path, bytes_per_day=SIZE * 3 // 2) as live:
+        assert live.push(row, commits[2], headers=signed[2] | other).status_code == 201
+
+
+def test_what_a_relay_brings_is_not_larger_or_farther_than_what_a_robot_may(tmp_path: Path) -> None:
+    with guarded(tmp_path, cells_per_commit=1, map_extent_m=10 * SMALL.cell_edge_m) as live:
+        row = live.new_map()
+        relay = bearer(create_token(live.service.store, "field", CreateToken(role="relay"), by=ADMIN_FILE).token)
+        near = {cell_key((0, 0, 0)): random_evidence(1, SMALL, voxels=3, air=1)}
+        far_away = {cell_key((900, 0, 0)): random_evidence(1, SMALL, voxels=3, air=1)}
+        answers = []
+        for n, cells in enumerate((near, far_away, None)):
+            commit = pushed(n, n, handing_over.MOLE, cells=cells)
+            signed = handing_over.signed(row, commit)
+            answers.append(live.push(row, commit, headers=signed | relay))
+            with pytest.raises(BadInputError) if n else nullcontext():
+                live.service.push(row, UPSTREAM, str(commit.id), commit.data, signatures=signed["Cairn-Signature"])
+        assert answers[0].status_code == 201
+        assert [kind_of(answer) for answer in answers[1:]] == ["beyond_quota"] * 2
+
+
+def test_a_server_s_own_upstream_may_bring_all_of_an_old_map_at_once(tmp_path: Path) -> None:
+    with metered(tmp_path, Clock(), commits_per_minute=1, bytes_per_day=1, cells_per_day=1) as (meter, row):
+        for keep in (True, False, True):
+            with meter.spending(row, UPSTREAM, size_bytes=9, cells=KEYS, via=UPSTREAM.name) as kept:
+                if keep:
+                    kept()
 
 
 def test_a_map_grows_to_its_extent_and_a_retract_makes_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
