@@ -20,14 +20,14 @@ class HeldCommits:
     def __init__(self, store: Store, wanted_of: Callable[[str], Collection[CommitId]]) -> None:
         self._store = store
         self._wanted_of = wanted_of
-        self._lock = threading.Lock()
+        self._locks: dict[int, threading.Lock] = {}
         self._sums: dict[int, tuple[Cursor, dict[Author, bytes]]] = {}
 
     def of(self, row: MapRow) -> Held:
         """What a map has now."""
         with self._store.snapshot(row) as snapshot:
             pending = snapshot.pending()
-            with self._lock:
+            with self._locks.setdefault(row.number, threading.Lock()):  # one log may take long to read
                 sums = self._sums_in(row, snapshot)
             return Held(
                 vector=snapshot.head.vector.with_commits(pending),
