@@ -7,9 +7,10 @@
 
 Each place gets what it lacks and the other has, and a repetition changes nothing. A place is a map's URL or a folder;
 two URLs join two servers, with --every SECONDS until stopped. Servers take commits from a token of role relay (`cairn
-token create URL NAME --role relay --map MAP`), and only as they were signed: whoever carries them can neither change
-nor add one. `cairn serve --upstream` does the same for all maps of a server. Ends with 1 if something could not be
-handed over; the log says what, and why.
+token create URL NAME --role relay --map MAP`), and only as they were signed: whoever carries them can change none
+and add none in the name of a robot whose key it has not; of robots that it invents, `cairn map log --json` says by
+whom they came (`via`). `cairn serve --upstream` does the same for all maps of a server. Ends with 1 if something could
+not be handed over; the log says what, and why.
 """
 
 import argparse
