@@ -23,14 +23,13 @@ from cairn_client.folder_status import note_use
 from cairn_client.kept_scans import KeptScans
 from cairn_client.limits import NO_LIMITS, Limits
 from cairn_client.link_profile import LINKS, LinkName
-from cairn_client.map_model import store_model
 from cairn_client.map_url import split_map_url
 from cairn_client.membership import Membership
+from cairn_client.opening import open_replica
 from cairn_client.own_meta import own_meta
 from cairn_client.own_status import OwnStatus
 from cairn_client.relay_link import RelayApi
 from cairn_client.replica import Replica
-from cairn_client.replica_store import ReplicaStore
 from cairn_client.robot_events import SIZE, Committed, Events, EventStream
 from cairn_client.rounds import Rounds
 from cairn_client.scope import EVERYTHING, Scope
@@ -108,7 +107,9 @@ class Robot:
         self._api = RelayApi(server_url, token=token)
         try:
             self._kept_scans = KeptScans(Path(directory) / "scans", bytes_max=keep_scans_bytes)
-            self._replica = self._open(Path(directory), geometry)
+            self._replica = open_replica(
+                Path(directory), self._api, robot=self.name, map_name=self._map_name, geometry=geometry
+            )
             note_use(self._replica.store, url=map_url, mode=mode)
         except BaseException:
             self._api.close()
@@ -271,22 +272,6 @@ class Robot:
             self._replica.close()
             self._events.close()
             self._kept_scans.drop_measurement()
-
-    def _open(self, directory: Path, geometry: Geometry | None) -> Replica:
-        """The durable state; its grid is the given one, the remembered one, or the server's."""
-        store = ReplicaStore(directory)
-        try:
-            remembered = store.get("geometry")
-            if geometry is None and remembered is not None:
-                geometry = Geometry.model_validate_json(remembered)
-            if geometry is None:
-                info = self._api.map_info(self._map_name)
-                geometry = info.geometry
-                store_model(store, info.sensor_model)
-            return Replica(store, robot=self.name, map_name=self._map_name, geometry=geometry)
-        except BaseException:
-            store.close()
-            raise
 
     def _new_measurement(self) -> Measurement | None:
         return Measurement(self._rig, self._replica.geometry, self._integrator) if self._rig else None
