@@ -5,7 +5,8 @@
       0002/  rig.json trajectory.txt ...                                   still being written
 
 They are mapped in the order of their names; names with a dot in front are not looked at. What is done is remembered in
-the same transaction as the commit, so that a measurement counts once, whenever the power is cut.
+the same transaction as the commit, so that a measurement counts once, whenever the power is cut. A name may come again
+with another recording, whose first scan has another time.
 """
 
 import logging
@@ -22,6 +23,11 @@ from cairn_fusion.recording_format import HEADER_FILE
 from cairn_map.errors import BadInputError, DamagedDataError
 
 log = logging.getLogger(__name__)
+
+GOING = ".going"
+"""Ends the name, behind a dot, of a recording that is being deleted: whole or not, it is looked at no more."""
+Stamp = tuple[int, int]
+"""Which header file a recording has: its inode, and when it was written, ns."""
 
 
 class Mark(BaseModel):
@@ -70,17 +76,18 @@ class Spool:
                 "no_spool", f"{folder} is a recording, and a spool holds recordings; `cairn robot replay` maps one"
             )
         self._folder = folder
-        self._settled: set[Path] = set()
-        """Recordings that are done, or no recordings."""
+        self._settled: dict[Path, tuple[Stamp, float | None]] = {}
+        """What was in a folder when it was done, with the time of its first scan; None: no recording."""
 
     def next_recording(self) -> Recording | None:
         """The first recording that is whole; None if there is none yet."""
-        return next((source for path in self._whole() if (source := self._opened(path)) is not None), None)
+        found = (self._opened(path, stamp) for path, stamp in self._whole())
+        return next((source for source in found if source is not None), None)
 
     def stops(self, replica: Replica) -> Iterator[Stop]:
         """Measurements that are not mapped yet, of the recordings that are whole now."""
-        for path in self._whole():
-            source = self._opened(path)
+        for path, stamp in self._whole():
+            source = self._opened(path, stamp)
             mark = _mark(replica, path)
             if source is None:
                 continue
@@ -89,30 +96,37 @@ class Spool:
             if not mark.is_done:
                 for number in range(mark.stops, len(source.measurements())):
                     yield Stop(path, source, number)
-            self._settled.add(path)
+            self._settled[path] = stamp, source.files[0].time_s
 
     def delete_done(self, replica: Replica) -> None:
-        """Delete the recordings that are mapped to their end, and forget them."""
-        for path in sorted(self._folder.iterdir()):
+        """Delete the recordings that `stops` found mapped to their end, and forget them."""
+        for path in self._folder.glob(f".*{GOING}"):  # the power was cut
+            shutil.rmtree(path)
+        for path, (stamp, first_s) in sorted(self._settled.items()):
             mark = _mark(replica, path)
-            if mark is not None and mark.is_done and path.is_dir():
-                shutil.rmtree(path)
-                remember(replica, {_key(path): None})
-                self._settled.discard(path)
+            if mark is None or not mark.is_done or mark.first_s != first_s or _stamp(path) != stamp:
+                continue
+            going = path.with_name(f".{path.name}{GOING}")
+            path.rename(going)  # the driver may use the name again at once
+            shutil.rmtree(going)
+            remember(replica, {_key(path): None})
+            del self._settled[path]
 
-    def _whole(self) -> list[Path]:
-        found = (path for path in self._folder.iterdir() if not path.name.startswith("."))
-        return sorted(path for path in found if path not in self._settled and (path / HEADER_FILE).is_file())
+    def _whole(self) -> list[tuple[Path, Stamp]]:
+        """Recordings that are not settled, in order."""
+        found = (path for path in sorted(self._folder.iterdir()) if not path.name.startswith("."))
+        stamped = [(path, stamp) for path in found if (stamp := _stamp(path)) is not None]
+        return [(path, stamp) for path, stamp in stamped if self._settled.get(path, (None, None))[0] != stamp]
 
-    def _opened(self, path: Path) -> Recording | None:
+    def _opened(self, path: Path, stamp: Stamp) -> Recording | None:
         try:
             source = open_recording(path)
         except (BadInputError, DamagedDataError) as exc:
             log.error("%s is left out: %s", path, exc.message)
-            self._settled.add(path)
+            self._settled[path] = stamp, None
             return None
         if not len(source):
-            self._settled.add(path)
+            self._settled[path] = stamp, None
             return None
         return source
 
@@ -122,6 +136,15 @@ def remember(replica: Replica, texts: Mapping[str, str | None]) -> None:
     with replica.lock, replica.store.transaction():
         for key, text in texts.items():
             replica.store.put(key, text)
+
+
+def _stamp(folder: Path) -> Stamp | None:
+    """None: it is no recording, or not whole."""
+    try:
+        found = (folder / HEADER_FILE).stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    return found.st_ino, found.st_mtime_ns
 
 
 def _mark(replica: Replica, folder: Path) -> Mark | None:

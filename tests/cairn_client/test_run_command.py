@@ -156,6 +156,25 @@ def test_another_recording_under_an_old_name_is_mapped(spool: Path, tmp_path: Pa
         assert len(list(Spool(spool).stops(mole.replica))) == 1
 
 
+def test_a_recording_under_an_old_name_is_not_deleted_before_it_is_mapped(spool: Path, tmp_path: Path) -> None:
+    with robot_in(tmp_path) as mole:
+        watched = Spool(spool)
+        record(spool, "a", [1])
+        (stop,) = watched.stops(mole.replica)
+        remember(mole.replica, stop.mark())
+        (spool / "a").rename(tmp_path / "moved")  # by the driver, which begins to count anew
+        record(spool, "a", [2])
+        watched.delete_done(mole.replica)
+        Spool(spool).delete_done(mole.replica)  # after a restart
+        (stop,) = watched.stops(mole.replica)
+        assert stop.source.files[0].time_s == scan_of(2).time_s
+        remember(mole.replica, stop.mark())
+        assert list(watched.stops(mole.replica)) == []
+        (spool / ".0.going").mkdir()  # the power was cut
+        watched.delete_done(mole.replica)
+        assert list(spool.iterdir()) == []
+
+
 def test_a_mark_is_kept_with_its_commit_or_not_at_all(
     spool: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
