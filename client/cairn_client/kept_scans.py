@@ -160,10 +160,13 @@ class KeptScans:
             self._files = {commit: file for commit, file in self._files.items() if file is not oldest}
 
     def _forget_open(self, *, is_given_up: bool) -> None:
-        if self._open is not None:
-            self._open.close()
-            (self._folder / OPEN).unlink(missing_ok=True)
-        self._open, self._open_bytes, self._is_given_up = None, 0, is_given_up
+        opened, self._open = self._open, None
+        self._open_bytes, self._is_given_up = 0, is_given_up
+        if opened is not None:
+            with suppress(OSError):  # on a full disk closing fails, too: it writes what is buffered
+                opened.close()
+            with suppress(OSError):
+                (self._folder / OPEN).unlink(missing_ok=True)
 
 
 def _files_in(folder: Path) -> dict[CommitId, ScanFile]:

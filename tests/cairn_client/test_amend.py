@@ -12,6 +12,7 @@ from tests.cairn_client.robot_program import INTEGRATOR, RIG, scan_of
 from tests.cairn_client.world import stored_commits
 
 from cairn_calib.poses import Transform, look_at
+from cairn_client.kept_scans import OPEN
 from cairn_client.robot import Robot
 from cairn_fusion.integrate import integrate_scan
 from cairn_fusion.scan import Scan
@@ -221,6 +222,16 @@ def test_a_disk_that_takes_no_scans_costs_no_evidence(tmp_path: Path) -> None:
         (tmp_path / "mole/scans").write_text("a file")
         refused_amend(robot, measured(robot, 1, 2), "no_scans")
         assert cells_of(robot.map) == cells_of(sum_of([scan_of(1), scan_of(2)]))
+
+
+def test_a_disk_that_gets_full_costs_no_evidence(tmp_path: Path) -> None:
+    with robot_in(tmp_path) as robot:
+        (tmp_path / "mole/scans").mkdir()
+        (tmp_path / "mole/scans" / OPEN).symlink_to("/dev/full")
+        seeds = range(1, 151)  # more than is buffered
+        refused_amend(robot, measured(robot, *seeds), "no_scans")
+        assert cells_of(robot.map) == cells_of(sum_of([scan_of(seed) for seed in seeds]))
+        robot.amend(measured(robot, 200), poses_of(corrected(200)))  # there is room again
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped"])
