@@ -11,6 +11,7 @@ It maps on without a link: commits wait in the directory, and power may be cut a
 
 import logging
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Self
 
@@ -40,7 +41,7 @@ from cairn_fusion.scan import Scan
 from cairn_map.cell_code import Profile
 from cairn_map.commit import Commit, CommitMeta
 from cairn_map.compile_progress import show_compiling
-from cairn_map.errors import BadInputError
+from cairn_map.errors import BadInputError, CairnError
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.grid import Geometry, cell_of_key
 from cairn_map.ids import CommitId, robot_name
@@ -105,49 +106,49 @@ class Robot:
         self._rig = rig
         self._profile = LINKS[link]
         self._api = RelayApi(server_url, token=token)
-        try:
+        with ExitStack() as opened:
+            opened.callback(self._api.close)
             self._kept_scans = KeptScans(Path(directory) / "scans", bytes_max=keep_scans_bytes)
             self._replica = open_replica(
                 Path(directory), self._api, robot=self.name, map_name=self._map_name, geometry=geometry
             )
+            opened.callback(self._replica.close)
             note_use(self._replica.store, url=map_url, mode=mode)
-        except BaseException:
-            self._api.close()
-            raise
-        sensors = list(rig.cameras) if rig else []
-        membership = Membership(
-            self._api, self._replica, map_name=self._map_name, mode=mode, sensors=sensors, enrolment_token=token
-        )
-        self.status = OwnStatus(every_s=self._profile.tell_every_s)
-        self._events = Events()
-        self._rounds = Rounds(
-            *(self._api, self._replica, membership, self._events),
-            map_name=self._map_name,
-            mode=mode,
-            scope=scope,
-            profile=self._profile,
-            limits=limits,
-            status=self.status,
-            carrier=carrier_in(Path(directory), self._api, self._map_name, size_bytes_max=carry_bytes_max),
-        )
-        self.deregister = self._rounds.leave
-        """Leave the map; the evidence stays there, and this directory keeps its own. Ends the background sync."""
-        self._stay, self._is_closed = stay, False
-        self._integrator = integrator or Integrator()
-        self._measurement = self._new_measurement()
-        self.snapshot = self._replica.snapshot
-        """`robot.snapshot()`: the map as it is now, under its own sensor model (`map_snapshot`); by any thread."""
-        if limits == NO_LIMITS:  # else commits that the server has for good go first
-            self._replica.outbox.amendable = lambda: self._kept_scans.commits
-        amending = Amending(
-            *(self._replica, self._kept_scans, self._profile.commits),
-            fresh=self._new_measurement,
-            meta_of=self._meta,
-            on_commit=self._made,
-        )
-        self.align = Aligning(self.snapshot, lambda: self._rig, self._integrator).align
-        """Where this robot's own frame lies in the map (`alignment.Aligning`); below: past measurements, moved."""
-        self.amend, self.amend_all = amending.amend, amending.amend_all
+            sensors = list(rig.cameras) if rig else []
+            membership = Membership(
+                self._api, self._replica, map_name=self._map_name, mode=mode, sensors=sensors, enrolment_token=token
+            )
+            self.status = OwnStatus(every_s=self._profile.tell_every_s)
+            self._events = Events()
+            self._rounds = Rounds(
+                *(self._api, self._replica, membership, self._events),
+                map_name=self._map_name,
+                mode=mode,
+                scope=scope,
+                profile=self._profile,
+                limits=limits,
+                status=self.status,
+                carrier=carrier_in(Path(directory), self._api, self._map_name, size_bytes_max=carry_bytes_max),
+            )
+            self.deregister = self._rounds.leave
+            """Leave the map; the evidence stays there, and this directory keeps its own. Ends the background sync."""
+            self._stay, self._is_closed = stay, False
+            self._integrator = integrator or Integrator()
+            self._measurement = self._new_measurement()
+            self.snapshot = self._replica.snapshot
+            """`robot.snapshot()`: the map as it is now, under its own sensor model (`map_snapshot`); by any thread."""
+            if limits == NO_LIMITS:  # else commits that the server has for good go first
+                self._replica.outbox.amendable = lambda: self._kept_scans.commits
+            amending = Amending(
+                *(self._replica, self._kept_scans, self._profile.commits),
+                fresh=self._new_measurement,
+                meta_of=self._meta,
+                on_commit=self._made,
+            )
+            self.align = Aligning(self.snapshot, lambda: self._rig, self._integrator).align
+            """Where this robot's own frame lies in the map (`alignment.Aligning`); below: past measurements, moved."""
+            self.amend, self.amend_all = amending.amend, amending.amend_all
+            opened.pop_all()  # for `close`
 
     def __enter__(self) -> Self:
         return self
@@ -254,7 +255,8 @@ class Robot:
     def close(self, *, stay: bool = False, flush_s: float = FLUSH_S) -> None:
         """Commit what is open, push what waits if there is a link, deregister if nothing is left, and close.
 
-        What could not be pushed stays here, and the robot on the map. May be called twice.
+        What could not be pushed stays here, and the robot on the map. May be called twice. Where `commit` refuses,
+        the open measurement is lost; what waited is pushed all the same, and then its error is raised.
 
         Args:
             stay: only pause: do not deregister.
@@ -265,7 +267,11 @@ class Robot:
         self._is_closed = True
         try:
             self._rounds.stop()
-            self.commit()
+            try:
+                self.commit()
+            except CairnError:
+                self._rounds.finish(is_leaving=False, within_s=flush_s)
+                raise
             self._rounds.finish(is_leaving=not (stay or self._stay), within_s=flush_s)
         finally:
             self._api.close()

@@ -9,13 +9,14 @@ from pathlib import Path
 import pytest
 from tests.cairn_client.conftest import LiveServer
 from tests.cairn_client.made import MAP
+from tests.cairn_client.robot_program import scan_of
 from tests.cairn_client.test_robot import ADMIN, NOWHERE, TOKEN, map_commit, robot_in
 from tests.cairn_client.world import stored_commits
 
 from cairn_client.api import MapApi
 from cairn_client.backoff import Backoff
 from cairn_map.access_messages import CreateToken
-from cairn_map.errors import DeniedError, UnreachableError
+from cairn_map.errors import BadInputError, DeniedError, UnreachableError
 
 Until = Callable[[Callable[[], bool]], None]
 SOON_S = 8.0
@@ -98,6 +99,31 @@ def test_a_robot_leaves_only_if_it_could_register_again(guarded: LiveServer, tmp
     assert robots_on(guarded, ADMIN) == []
     with robot_in(tmp_path, guarded.map_url) as robot, pytest.raises(DeniedError):
         robot.sync()
+
+
+def test_where_the_last_commit_is_refused_those_before_it_are_pushed(server: LiveServer, tmp_path: Path) -> None:
+    robot = robot_in(tmp_path, server.map_url)
+    map_commit(robot, 1)
+    robot.observe(scan_of(2))
+
+    def full(size_bytes: int) -> None:
+        raise UnreachableError("outbox_full", "no room")
+
+    robot.replica.outbox.make_room = full
+    with pytest.raises(UnreachableError, match="no room"):
+        robot.close()
+    assert len(stored_commits(tmp_path / "server")) == 1
+    assert robots_on(server) == ["mole"]
+    robot.close()
+
+
+def test_a_robot_that_cannot_be_opened_leaves_its_folder_to_the_next(tmp_path: Path) -> None:
+    (tmp_path / "mole").mkdir()
+    (tmp_path / "mole" / "carried").write_text("a file")
+    with pytest.raises(BadInputError, match="carried"):
+        robot_in(tmp_path, carry_bytes_max=1000)
+    with robot_in(tmp_path) as robot:
+        assert robot.waiting == 0
 
 
 # In time
