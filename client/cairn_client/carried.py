@@ -41,8 +41,15 @@ class CarriedCommits:
             raise BadInputError("bad_folder", f"cannot make the folder {folder}: {exc.strerror}") from exc
 
     def held(self) -> Held:
-        """What is or was carried."""
-        return Held(vector=EMPTY.with_commits(commit for commit, _ in self._files()))
+        """What is or was carried.
+
+        Raises:
+            UnreachableError: kind `store_failed`: the folder cannot be read.
+        """
+        try:
+            return Held(vector=EMPTY.with_commits(commit for commit, _ in self._files()))
+        except OSError as exc:
+            raise UnreachableError("store_failed", f"cannot read {self._folder}: {exc.strerror}") from exc
 
     def commit(self, commit: CommitId) -> SignedCommit:
         """A commit that is carried."""
@@ -50,6 +57,9 @@ class CarriedCommits:
             signatures, _, data = (self._folder / str(commit)).read_bytes().partition(b"\n")
         except FileNotFoundError as exc:
             raise NotFoundError("no_commit", f"{commit} is not carried") from exc
+        except OSError as exc:
+            path = self._folder / str(commit)
+            raise DamagedDataError("damaged_store", f"cannot read {path}: {exc.strerror}; remove it") from exc
         if not signatures:
             raise ConflictError("evidence_gone", f"there was no room to carry {commit} on")
         if len(signatures) > TEXT_MAX or not signatures.isascii():

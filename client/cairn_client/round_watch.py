@@ -97,7 +97,7 @@ class RoundWatch:
         try:
             with self._replica.lock, self._replica.store.transaction():
                 self._replica.store.put(CONTACT_KEY, contact.model_dump_json())
-        except UnreachableError as exc:  # the disk is full: that is no failure of the round
+        except CairnError as exc:  # the disk is full or broken: that is no failure of the round
             log.warning("the last contact cannot be remembered: %s", exc.message)
 
     def _fingerprints(self) -> dict[CellKey, object]:

@@ -61,6 +61,10 @@ class SyncThread:
                 wait_s = backoff.next_s(None)
                 log.error("sync failed: %s: %s; trying again in %.1f s", exc.kind, exc.message, wait_s)
                 self._wait(exc, wait_s)
+            except Exception as exc:  # a fault of ours; without it the robot would never sync again, and say nothing
+                wait_s = backoff.next_s(None)
+                log.exception("sync failed in a way that was not expected; trying again in %.1f s", wait_s)
+                self._wait(CairnError("internal", f"{type(exc).__name__}: {exc}; the log says more"), wait_s)
             else:
                 backoff.reset()
                 if not self._stopping.is_set():

@@ -8,7 +8,7 @@ from tests.cairn_client.made import MAP
 from tests.cairn_server.pushes import pushed
 
 from cairn_client.carried import COMING, CarriedCommits
-from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, NotFoundError
+from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, NotFoundError, UnreachableError
 from cairn_map.ids import Author, CommitId, RobotName
 from cairn_map.relay_end import SignedCommit
 from cairn_map.signature import TEXT_MAX, SigningKey, signatures_to_text
@@ -65,6 +65,15 @@ def test_a_file_that_is_not_whole_is_none(carried: CarriedCommits, tmp_path: Pat
     (tmp_path / "carried" / str(id_of(0))).write_bytes(b"x" * (TEXT_MAX + 1))
     with pytest.raises(DamagedDataError):
         carried.commit(id_of(0))
+
+
+def test_what_cannot_be_read_is_named(carried: CarriedCommits, tmp_path: Path) -> None:
+    (tmp_path / "carried" / str(id_of(0))).mkdir()
+    with pytest.raises(DamagedDataError, match=str(id_of(0))):
+        carried.commit(id_of(0))
+    (tmp_path / "carried").rename(tmp_path / "gone")
+    with pytest.raises(UnreachableError, match="carried"):
+        carried.held()
 
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:

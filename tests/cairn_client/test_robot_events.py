@@ -96,6 +96,26 @@ def test_an_answer_that_is_not_sound_is_no_lost_link(server: LiveServer, tmp_pat
         assert isinstance(failed, SyncFailed) and (failed.kind, failed.tries) == ("bad_frame", 1)
 
 
+def test_a_fault_of_ours_is_told_and_ends_no_background_sync(
+    server: LiveServer, tmp_path: Path, until: Until, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Backoff, "next_s", lambda self, wish: 0.01)
+    with robot_in(tmp_path, server.map_url) as mole, mole.events() as stream:
+        sound, faults = mole._api.missing, [OSError(5, "Input/output error")]
+
+        def faulty(*args: object, **options: object) -> object:
+            if faults:
+                raise faults.pop()
+            return sound(*args, **options)  # type: ignore[arg-type]
+
+        mole._api.missing = faulty  # type: ignore[assignment, method-assign]
+        mole.start_sync(every_s=0.01)
+        seen: list[Event] = []
+        until(lambda: bool(seen.extend(stream.take()) or "LinkBack" in kinds(seen)))
+        failed = next(event for event in seen if isinstance(event, SyncFailed))
+        assert failed.kind == "internal" and "Input/output error" in failed.reason
+
+
 def test_a_refusal_is_told_once_with_its_reason(server: LiveServer, tmp_path: Path) -> None:
     with robot_in(tmp_path, server.map_url) as mole:
         map_commit(mole, 1)
