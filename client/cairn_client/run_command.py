@@ -7,7 +7,8 @@
 
 SPOOL holds recordings (RECORDING.md), a folder each, in the order of their names; one counts from when it has its
 recording.json, which is written last. So a driver writes each stop as a recording of its own. Each measurement is
-mapped once, whatever happens: what is done stands in the robot's folder. --delete removes recordings that are mapped.
+mapped once, whatever happens: what is done stands in the robot's folder. --delete removes recordings that are mapped
+whole. What no commit can be made of is left out; the log says why.
 
 What happens is told on standard error. Without a link it maps on. ^C or SIGTERM: what waits is pushed for some seconds,
 and the robot leaves the map, if nothing is left and unless --stay; a measurement under way is mapped at the next start.
@@ -137,10 +138,25 @@ def _map_what_came(
                 tally.scans += 1
             except (BadInputError, DamagedDataError) as exc:
                 log.error("scan %d of %s is left out: %s", index, stop.folder, exc.message)
-        if not _commit(robot, stop, Profile(args.profile), tally, stopping):
-            return
+        try:
+            if not _commit(robot, stop, Profile(args.profile), tally, stopping):
+                return
+        except BadInputError as exc:  # it would be refused at every start
+            _leave_out(robot, stop, exc)
     if args.delete:
         spool.delete_done(robot.replica)
+
+
+def _leave_out(robot: Robot, stop: Stop, exc: BadInputError) -> None:
+    """Nothing can be made of a measurement: go on without it."""
+    log.error(
+        "measurement %d of %s is left out: %s; put its scans into the spool again, under a new name and in smaller "
+        "measurements",
+        *(stop.number, stop.folder, exc.message),
+    )
+    robot.replica.outbox.beside = {}
+    robot.discard()
+    remember(robot.replica, stop.mark_left_out())
 
 
 def _commit(robot: Robot, stop: Stop, profile: Profile, tally: _Tally, stopping: threading.Event) -> bool:

@@ -40,6 +40,8 @@ class Mark(BaseModel):
     stops: int
     """Measurements that are commits, or gave no evidence."""
     is_done: bool
+    left_out: int = 0
+    """Of these measurements, those that no commit can be made of; a recording with one is not deleted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +52,8 @@ class Stop:
     source: Recording
     number: int
     """Of the recording's measurements, from 0."""
+    left_out: int
+    """Measurements before it that were left out."""
 
     @property
     def scans(self) -> range:
@@ -58,9 +62,16 @@ class Stop:
 
     def mark(self) -> Mapping[str, str]:
         """What is to be remembered when it is done."""
+        return self._mark(left_out=self.left_out)
+
+    def mark_left_out(self) -> Mapping[str, str]:
+        """What is to be remembered when nothing can be made of it."""
+        return self._mark(left_out=self.left_out + 1)
+
+    def _mark(self, *, left_out: int) -> Mapping[str, str]:
         done = self.number + 1
         is_done = done == len(self.source.measurements())
-        mark = Mark(first_s=self.source.files[0].time_s, stops=done, is_done=is_done)
+        mark = Mark(first_s=self.source.files[0].time_s, stops=done, is_done=is_done, left_out=left_out)
         return {_key(self.folder): mark.model_dump_json()}
 
 
@@ -88,23 +99,22 @@ class Spool:
         """Measurements that are not mapped yet, of the recordings that are whole now."""
         for path, stamp in self._whole():
             source = self._opened(path, stamp)
-            mark = _mark(replica, path)
             if source is None:
                 continue
-            if mark is None or mark.first_s != source.files[0].time_s:
-                mark = Mark(first_s=source.files[0].time_s, stops=0, is_done=False)
+            first_s = source.files[0].time_s
+            mark = _mark(replica, path, first_s)
             if not mark.is_done:
                 for number in range(mark.stops, len(source.measurements())):
-                    yield Stop(path, source, number)
-            self._settled[path] = stamp, source.files[0].time_s
+                    yield Stop(path, source, number, _mark(replica, path, first_s).left_out)
+            self._settled[path] = stamp, first_s
 
     def delete_done(self, replica: Replica) -> None:
         """Delete the recordings that `stops` found mapped to their end, and forget them."""
         for path in self._folder.glob(f".*{GOING}"):  # the power was cut
             shutil.rmtree(path)
         for path, (stamp, first_s) in sorted(self._settled.items()):
-            mark = _mark(replica, path)
-            if mark is None or not mark.is_done or mark.first_s != first_s or _stamp(path) != stamp:
+            mark = _mark(replica, path, first_s) if first_s is not None else None
+            if mark is None or not mark.is_done or mark.left_out or _stamp(path) != stamp:
                 continue
             going = path.with_name(f".{path.name}{GOING}")
             path.rename(going)  # the driver may use the name again at once
@@ -147,10 +157,12 @@ def _stamp(folder: Path) -> Stamp | None:
     return found.st_ino, found.st_mtime_ns
 
 
-def _mark(replica: Replica, folder: Path) -> Mark | None:
+def _mark(replica: Replica, folder: Path, first_s: float) -> Mark:
+    """Of the recording that begins at this time; what was in the folder before it does not count."""
     with replica.lock:
         text = replica.store.get(_key(folder))
-    return Mark.model_validate_json(text) if text else None
+    mark = Mark.model_validate_json(text) if text else None
+    return mark if mark is not None and mark.first_s == first_s else Mark(first_s=first_s, stops=0, is_done=False)
 
 
 def _key(folder: Path) -> str:

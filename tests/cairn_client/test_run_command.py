@@ -1,5 +1,6 @@
 """`cairn robot run`: what a driver puts into a spool is mapped, each measurement once, through signals and kills."""
 
+import argparse
 import os
 import random
 import signal
@@ -8,6 +9,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tests.cairn_client.conftest import LiveServer
@@ -17,7 +19,7 @@ from tests.cairn_client.test_robot import robot_in
 from tests.cairn_client.world import stored_commits
 
 from cairn_client import main as cairn
-from cairn_client.run_command import _commit, _Tally
+from cairn_client.run_command import _commit, _map_what_came, _Tally
 from cairn_client.spool import Spool, remember
 from cairn_fusion.integrate import integrate_scan
 from cairn_fusion.recording import open_recording
@@ -206,6 +208,28 @@ def test_a_mark_is_kept_with_its_commit_or_not_at_all(
         assert mole.commit() is not None
         assert len(list(Spool(spool).stops(mole.replica))) == 1  # the next commit says nothing of it
         assert mole.waiting == 2
+
+
+def test_a_measurement_that_no_commit_can_be_made_of_stops_nothing(
+    spool: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    record(spool, "a", [1], [2])
+    record(spool, "b", [3])
+    with robot_in(tmp_path) as mole:
+        commit = mole.commit
+
+        def picky(**options: Any) -> Commit | None:
+            if mole._measurement and mole._measurement.poses[0].time_s == scan_of(1).time_s:
+                raise BadInputError("too_large", "256 MiB at most")
+            return commit(**options)
+
+        monkeypatch.setattr(mole, "commit", picky)
+        args, tally = argparse.Namespace(profile="fast", delete=True), _Tally()
+        _map_what_came(mole, Spool(spool), args, tally, threading.Event())
+        assert (tally.commits, mole.waiting) == (2, 2)
+        assert "measurement 0 of" in caplog.text and "256 MiB at most" in caplog.text
+        assert [path.name for path in spool.iterdir()] == ["a"]  # it is not deleted: not all of it is mapped
+        assert list(Spool(spool).stops(mole.replica)) == []  # after a restart
 
 
 def test_a_robot_takes_another_head_between_its_measurements(tmp_path: Path) -> None:
