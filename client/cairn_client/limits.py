@@ -6,13 +6,18 @@
 
 What the server does not have for good is never dropped, nor is it left out of the robot's map. A dropped cell is one
 that is not held: the robot asks for it whole when it comes near, and until then shows of it only what it made itself.
+
+The robot's folder remembers the limits that were given last, for whatever opens it without a word of them.
 """
 
-from dataclasses import dataclass
+import json
+from dataclasses import asdict, dataclass
 
+from cairn_client.replica_store import ReplicaStore
 from cairn_map.errors import BadInputError
 
 LEAST_BYTES = 1 << 16
+LIMITS_KEY = "limits"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,3 +41,13 @@ class Limits:
 
 
 NO_LIMITS = Limits()
+
+
+def limits_in(store: ReplicaStore, given: Limits | None) -> Limits:
+    """The given limits, which are remembered from here on, or those that are."""
+    if given is None:
+        remembered = store.get(LIMITS_KEY)
+        return Limits(**json.loads(remembered)) if remembered else NO_LIMITS
+    with store.transaction():
+        store.put(LIMITS_KEY, json.dumps(asdict(given)))
+    return given

@@ -23,6 +23,7 @@ from cairn_fusion.integrate import Integrator
 from cairn_fusion.recording import ScanSource
 from cairn_map.cell_code import Profile
 from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel
+from cairn_map.commit import Commit
 from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError, UnreachableError
 from cairn_map.grid import Geometry, geometry_for
 from cairn_map.messages import CreateMap
@@ -71,7 +72,7 @@ def _replay(args: argparse.Namespace) -> int:
             for index in stop:
                 robot.observe(source.scan(index))
                 scans += 1
-            commits += robot.commit(profile=Profile(args.profile) if args.profile else None) is not None
+            commits += _commit(robot, Profile(args.profile) if args.profile else None) is not None
             if time.monotonic() - last_sync_s > SYNC_EVERY_S:
                 _try_sync(robot)
                 last_sync_s = time.monotonic()
@@ -102,6 +103,16 @@ def _replayed(state: Path) -> set[str]:
     """Recordings, with the share, that a robot's folder has replayed."""
     path = state / REPLAYED_FILE
     return set(path.read_text().splitlines()) if path.exists() else set()
+
+
+def _commit(robot: Robot, profile: Profile | None) -> Commit | None:
+    """If the folder's limits are reached, after a sync: it may make room."""
+    try:
+        return robot.commit(profile=profile)
+    except UnreachableError as exc:
+        if exc.kind != "outbox_full" or not (_try_sync(robot) and _try_sync(robot)):
+            raise
+        return robot.commit(profile=profile)
 
 
 def _try_sync(robot: Robot) -> bool:

@@ -22,7 +22,7 @@ from cairn_client.answers import Traffic
 from cairn_client.carrying import carrier_in
 from cairn_client.folder_status import note_use
 from cairn_client.kept_scans import KeptScans
-from cairn_client.limits import NO_LIMITS, Limits
+from cairn_client.limits import NO_LIMITS, Limits, limits_in
 from cairn_client.link_profile import LINKS, LinkName
 from cairn_client.map_url import split_map_url
 from cairn_client.membership import Membership
@@ -68,7 +68,7 @@ class Robot:
         geometry: Geometry | None = None,
         integrator: Integrator | None = None,
         scope: Scope = EVERYTHING,
-        limits: Limits = NO_LIMITS,
+        limits: Limits | None = None,
         link: LinkName = "good",
         stay: bool = False,
         carry_bytes_max: int = 0,
@@ -87,7 +87,7 @@ class Robot:
             geometry: of the map, to start without a link; else the server is asked once.
             integrator: range limits.
             scope: which cells to fetch, and how much in one reply.
-            limits: how much to keep on the disk and in memory, and what goes when that is full.
+            limits: how much to keep on the disk and in memory, and what goes when that is full; None: as before.
             link: small for a link of some ten to some hundred kbit/s (`link_profile`).
             stay: a robot that only pauses: `close` does not deregister it.
             carry_bytes_max: room on the disk for others' signed commits, taken along from server to server; it needs
@@ -114,6 +114,7 @@ class Robot:
             )
             opened.callback(self._replica.close)
             note_use(self._replica.store, url=map_url, mode=mode)
+            limits = limits_in(self._replica.store, limits)
             sensors = list(rig.cameras) if rig else []
             membership = Membership(
                 self._api, self._replica, map_name=self._map_name, mode=mode, sensors=sensors, enrolment_token=token

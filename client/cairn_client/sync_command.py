@@ -4,8 +4,9 @@
     pushed 2 commits, 4 cells have news; 81.3 kB up, 40.2 kB down; 0 commits wait
     $ cairn robot sync state/ --every 60
 
-The folder remembers its robot, server and mode. A robot that is at work syncs by itself, and has its folder for itself.
-With --every it goes on through lost links until ^C or SIGTERM, and tells what happens on standard error.
+The folder remembers its robot, server, mode, and the limits of `cairn robot run`. A robot that is at work syncs by
+itself, and has its folder for itself. With --every it goes on through lost links until ^C or SIGTERM, and tells what
+happens on standard error.
 """
 
 import argparse

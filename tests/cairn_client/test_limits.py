@@ -11,7 +11,7 @@ from tests.cairn_client.robot_program import scan_of
 from tests.cairn_client.test_robot import evidence_of, map_commit, robot_in
 
 from cairn_client import replica_store
-from cairn_client.limits import Limits
+from cairn_client.limits import NO_LIMITS, Limits
 from cairn_client.robot import Robot
 from cairn_client.robot_events import CellsDropped, OutboxNearlyFull
 from cairn_client.room import Kept
@@ -101,7 +101,11 @@ def test_a_full_disk_holds_the_cells_around_the_robot_and_they_go_with_it(
         assert held(robot) == kept  # it is remembered, and so is where it was
         robot.sync()
         assert set(held(robot)) >= set(range(SIDE - 4, SIDE + 1))
-    with robot_in(tmp_path, row_server.map_url, mode=mode) as robot:  # without limits the rest comes
+    with robot_in(tmp_path, row_server.map_url, mode=mode, stay=True) as robot:  # and so are the limits
+        at(robot, SIDE)
+        robot.sync()
+        assert used(robot) <= 66_000
+    with robot_in(tmp_path, row_server.map_url, limits=NO_LIMITS, mode=mode) as robot:  # without them the rest comes
         robot.sync()
         assert held(robot) == list(range(-SIDE, SIDE + 1))
         whole = EvidenceMap(GEOMETRY)
