@@ -105,7 +105,7 @@ def test_what_is_pending_is_not_stable(tmp_path: Path, monkeypatch: pytest.Monke
         row = own.new_map()
         own.push(row, pushed(0, 0))
         own.folded(row)
-        monkeypatch.setattr(own.service.pushes, "_on_new", lambda: None)
+        monkeypatch.setattr(own.service._folder, "_fold_group", lambda *arguments: 0)
         own.push(row, pushed(1, 1))
         header = frames_of(ask(own, row, NaiveAsker(MOLE).request()).content)[0]
         assert isinstance(header, ReplyHeader)
@@ -275,7 +275,7 @@ def test_the_header_tells_what_a_robot_may_conclude(live: Live, monkeypatch: pyt
     assert header.tip == (1, commits[1].sha.hex())
     assert header.stable == {}
     assert header.retracts == [f"operator.{live.service.operator}.0"]
-    monkeypatch.setattr(live.service.pushes, "_on_new", lambda: None)
+    monkeypatch.setattr(live.service._folder, "_fold_group", lambda *arguments: 0)
     live.push(row, pushed(2, 2))
     header = frames_of(ask(live, row, NaiveAsker(MOLE).request()).content)[0]
     assert isinstance(header, ReplyHeader)

@@ -144,7 +144,7 @@ def test_evidence_that_a_waiting_commit_takes_out_is_kept(live: Live, monkeypatc
     row, commit = live.new_map(), pushed(0, 1)
     live.push(row, commit)
     live.folded(row)
-    monkeypatch.setattr(live.service.pushes, "_on_new", lambda: None)
+    monkeypatch.setattr(live.service._folder, "_fold_group", lambda *arguments: 0)
     live.push(row, pushed(1, 2, retracts=[commit]))
     assert live.service.store.forget_evidence(row, before_s=NOW, limit=100) == 0
     monkeypatch.undo()

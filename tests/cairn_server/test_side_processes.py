@@ -143,7 +143,7 @@ def test_a_fold_that_cannot_be_written_is_told_as_it_is_and_tried_again(
 ) -> None:
     store, process = far
     with Live(tmp_path, store=store) as served:
-        monkeypatch.setattr(served.service.pushes, "_on_new", lambda: None)
+        monkeypatch.setattr(served.service._folder, "_fold_group", lambda *arguments: 0)
         row = served.new_map()
         for commit in COMMITS:
             served.push(row, commit)
@@ -173,7 +173,7 @@ def test_damage_is_noted_and_folded_around_from_afar(
         row, damaged = served.new_map(), DamagedCells()
         served.push(row, COMMITS[0])
         served.folded(row)
-        monkeypatch.setattr(served.service.pushes, "_on_new", lambda: None)
+        monkeypatch.setattr(served.service._folder, "_fold_group", lambda *arguments: 0)
         for commit in COMMITS[1:]:
             served.push(row, commit)
         damage(served, "UPDATE cell SET body = x'00' WHERE map = ? AND cell = ?", row.number, BROKEN)
