@@ -63,8 +63,8 @@ RESERVED_TOKEN_NAMES = frozenset({ADMIN_FILE.name, ENROLLER_FILE.name, LOCAL, UP
 
 
 def new_token() -> str:
-    """A random token of 256 bits."""
-    return secrets.token_urlsafe(32)
+    """A random token of 256 bits, in digits that no command line takes for an option."""
+    return secrets.token_hex(32)
 
 
 def token_hash(token: str) -> bytes:
