@@ -24,6 +24,8 @@ from cairn_map.version_vector import EMPTY
 
 log = logging.getLogger(__name__)
 
+MISFIT = "the frame does not lead to the server's fingerprint"
+
 
 def is_within(key: CellKey, box: Box | None) -> bool:
     """Whether a cell lies in a box; None is everywhere."""
@@ -193,7 +195,7 @@ class Exchange:
         if fingerprint(evidence, frame.cell) == frame.fingerprint:
             self._replica.hold(frame.cell, self._at_head(frame), evidence)
         else:
-            self._ask_whole(frame.cell, "the frame does not lead to the server's fingerprint")
+            self._ask_whole(frame.cell, MISFIT)
 
     def _ask_whole(self, key: CellKey, why: str) -> None:
         """The next request asks for the cell without a cursor; what is held of it is shown until then."""

@@ -13,9 +13,11 @@ from tests.sync_sim.network import Network, Weather
 from tests.sync_sim.robot import SimRobot
 from tests.sync_sim.server import FoldOnRequest, SimServer
 
+from cairn_client.applying import MISFIT, Exchange
 from cairn_client.room import drop_cells
 from cairn_map import ids
 from cairn_map.fingerprint import ZERO, fingerprint
+from cairn_map.grid import CellKey
 from cairn_map.ids import OPERATOR, CommitId
 from cairn_server import memory_map
 from cairn_server import service as service_module
@@ -64,6 +66,8 @@ class History:
         count = self._random.randint(2, len(MODES))
         self._robots = [SimRobot(f"r{n}", MODES[n], self._network.ask) for n in range(count)]
         self._mappers = [robot for robot in self._robots if robot.mode != "viewer"]
+        self.may_misfit = False
+        """Bytes were damaged on their way, so that fingerprints may be the first to notice something."""
         self._weather()
 
     def time_s(self) -> float:
@@ -129,6 +133,7 @@ class History:
             damaged=share * self._random.random(),
             delay_s=self._random.choice((0.1, 2.0, 7.0)),
         )
+        self.may_misfit |= self._network.weather.damaged > 0
 
     def _partition(self) -> None:
         self._network.offline = {robot.name for robot in self._robots if self._random.random() < 0.3}
@@ -240,10 +245,13 @@ def run_seed(seed: int, log: Log = lambda text: None) -> None:
     """
     history: History | JoinedHistory | None = None
     with _seeded(seed) as patch:
+        misfits = _misfits(patch)
         try:
             history = JoinedHistory(seed, log) if seed % JOINED_EVERY == JOINED_EVERY - 1 else History(seed, log)
             patch.setattr(time, "time", history.time_s)
             history.run()
+            if isinstance(history, History):
+                assert history.may_misfit or not misfits, "only fingerprints kept a frame from the wrong cell"
         finally:
             if history is not None:
                 history.close()
@@ -257,6 +265,20 @@ def failures(seeds: range) -> list[tuple[int, str]]:
             run_seed(seed)
         except Exception as exc:  # noqa: BLE001 - whatever it is, the seed is wanted
             found.append((seed, f"{type(exc).__name__}: {str(exc).splitlines()[0] if str(exc) else ''}"))
+    return found
+
+
+def _misfits(patch: pytest.MonkeyPatch) -> list[CellKey]:
+    """The cells, as time goes on, whose frames only the fingerprint keeps from being applied."""
+    found: list[CellKey] = []
+    ask_whole = Exchange._ask_whole
+
+    def heard(exchange: Exchange, key: CellKey, why: str) -> None:
+        if why == MISFIT:
+            found.append(key)
+        ask_whole(exchange, key, why)
+
+    patch.setattr(Exchange, "_ask_whole", heard)
     return found
 
 
