@@ -183,7 +183,9 @@ class MapApi:
     ) -> CellIndex:
         """A page of the cells of a map, or of a box (lowest and highest cell); all: `cell_index.whole_index`."""
         asked = {"author": author, "box": f"{box[0]},{box[1]}" if box else None, "after": after}
-        params = {"limit": str(INDEX_PAGE)} | {key: str(value) for key, value in asked.items() if value is not None}
+        params = {"limit": str(INDEX_PAGE), "hottest": "true"} | {
+            key: str(value) for key, value in asked.items() if value is not None
+        }
         index = message_from_json(CellIndex, self._ask("GET", f"/maps/{name}/main/cells", params=params))
         self._vector = index.header.coverage
         return index

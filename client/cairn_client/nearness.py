@@ -6,7 +6,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.cell_order import first_to_last
 from cairn_map.grid import CELL_LIMIT, Cell
+from cairn_map.index_messages import CellEntry
 
 Wanted = Callable[[Cell], bool]
 """Which cells a low-end robot keeps."""
@@ -29,6 +31,12 @@ def cell_at(position_m: Sequence[float], cell_edge_m: float) -> Cell:
     return Cell(*(max(-CELL_LIMIT, min(CELL_LIMIT - 1, math.floor(value / cell_edge_m))) for value in position_m))
 
 
-def rings_between(cell: tuple[int, int, int], near: Cell | None) -> int:
-    """How far a cell is from one, in cells along the farthest axis; 0 where there is none."""
-    return max(abs(a - b) for a, b in zip(cell, near, strict=True)) if near is not None else 0
+def in_order(entries: Sequence[CellEntry], near: Cell | None) -> list[CellEntry]:
+    """The cells around a cell first, and hot ones before others (`cell_order`)."""
+    order = first_to_last(
+        np.array([entry.cell for entry in entries], np.int64).reshape(-1, 3),
+        near=near,
+        changed=np.array([entry.lm for entry in entries], np.int64),
+        hottest_k=np.array([entry.hottest_k for entry in entries], np.float64),
+    )
+    return [entries[n] for n in order]

@@ -15,7 +15,7 @@ from cairn_client.applying import Exchange, is_within
 from cairn_client.asks import Box, Conversation, GetCell, GetCommit, GetMissing, NextFrame, Push
 from cairn_client.cell_index import whole_index
 from cairn_client.heal import heal_damaged
-from cairn_client.nearness import Wanted, rings_between
+from cairn_client.nearness import Wanted, in_order
 from cairn_client.replica import Replica
 from cairn_client.replica_store import BaseCell
 from cairn_client.uploads import PARTS, Parts, push_whole_or_in_parts
@@ -212,7 +212,7 @@ def fetch_cells(
     """Low-end: whole cells that changed since they were fetched last; all, or those in a box, or the wanted ones of it.
 
     The index tells which did, so that cells that are still the same cost no request. Those next to `near` come first,
-    and of equally far ones what changed last.
+    and hot ones before others (`cell_order`).
 
     Raises:
         UnreachableError: the link broke; the cells before it are kept.
@@ -237,12 +237,13 @@ def fetch_cells(
                 replica.hold_nothing(key, BaseCell(to, coverage, ZERO))
     report.healed = yield from heal_damaged(replica)
     damaged = []
-    stale = [entry for entry in index.cells if cell_key(entry.cell) not in same]
-    for entry in sorted(stale, key=lambda entry: (rings_between(entry.cell, near), -entry.lm)):
+    for entry in in_order(index.cells, near):
+        key = cell_key(entry.cell)
+        if key in same:
+            continue
         report.has_more = round_bytes_max is not None and report.size_bytes >= round_bytes_max
         if report.has_more:
             break
-        key = cell_key(entry.cell)
         if wanted is None or wanted(cell_of_key(key)):
             try:
                 size_bytes = yield from fetch_cell(replica, cell_of_key(key))

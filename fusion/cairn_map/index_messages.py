@@ -21,6 +21,9 @@ class CellEntry(BaseModel):
     """Log entry that last changed the cell."""
     fingerprint: FingerprintText
     voxels: int
+    hottest_k: float | None = None
+    """Mean temperature of its hottest voxel, kelvin; None: it has none, or the server does not know it, or was not
+    asked for it: robots of old refuse what they do not know."""
 
 
 class CellIndex(BaseModel):

@@ -11,6 +11,7 @@ from dataclasses import replace
 from cairn_map.blocks import Blocks
 from cairn_map.brick_cell import BrickCell
 from cairn_map.cell_code import encode_cell
+from cairn_map.cell_order import hottest_k
 from cairn_map.cursor import Cursor
 from cairn_map.evidence import Evidence
 from cairn_map.fingerprint import fingerprint
@@ -122,4 +123,5 @@ class CellCache:
             body=encoded.data,
             size_bytes=len(encoded.data),
             stamps=encode_stamps(stamps),
+            hottest_k=hottest_k(evidence, self._geometry),
         )

@@ -18,6 +18,8 @@ class IndexPage:
     limit: int = INDEX_PAGE
     inside: Callable[[tuple[int, int, int]], bool] | None = None
     """Only cells of which it says yes."""
+    is_hottest_asked: bool = False
+    """Whether each entry says how hot its cell is."""
 
 
 FIRST_PAGE = IndexPage()
@@ -29,7 +31,8 @@ def entries_of(snapshot: Snapshot, page: IndexPage) -> list[CellEntry]:
     after = -1 if page.after is None else page.after
     while len(found) < page.limit:
         rows = list(snapshot.cells(after_key=after, limit=page.limit))
-        found += [_entry(row) for row in rows if page.inside is None or page.inside(cell_of_key(row.key))]
+        inside = (row for row in rows if page.inside is None or page.inside(cell_of_key(row.key)))
+        found += map(_entry_with_hottest if page.is_hottest_asked else _entry, inside)
         if len(rows) < page.limit:
             break
         after = rows[-1].key
@@ -45,3 +48,7 @@ def _entry(row: CellRow) -> CellEntry:
         fingerprint=row.fingerprint.hex(),
         voxels=row.voxels,
     )
+
+
+def _entry_with_hottest(row: CellRow) -> CellEntry:
+    return _entry(row).model_copy(update={"hottest_k": row.hottest_k})

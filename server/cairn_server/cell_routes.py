@@ -28,7 +28,7 @@ COVERAGE_BYTES_MAX = 4096
 router = APIRouter()
 
 
-@router.get("/maps/{name}/main/cells", dependencies=READERS)
+@router.get("/maps/{name}/main/cells", dependencies=READERS, response_model_exclude_unset=True)
 def cell_index(
     service: Operations,
     row: Map,
@@ -36,12 +36,14 @@ def cell_index(
     box: Annotated[str | None, Query(max_length=80, description="i0,j0,k0,i1,j1,k1: only these, ends included")] = None,
     after: Annotated[str | None, Query(max_length=32, description="i,j,k: the last cell of the page before")] = None,
     limit: Annotated[int, Query(ge=1, le=INDEX_PAGE_MAX)] = INDEX_PAGE,
+    hottest: Annotated[bool, Query(description="each entry has hottest_k, too")] = False,
 ) -> CellIndex:
     """Cells that were ever touched, all or those in a box, a page at a time."""
     page = IndexPage(
         after=cell_key(cell_from_text(after)) if after is not None else None,
         limit=limit,
         inside=box_from_text(box) if box is not None else None,
+        is_hottest_asked=hottest,
     )
     return service.cell_index(row, author_from_text(author) if author else None, page)
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 from cairn_map.brick_cell import BrickCell
 from cairn_map.cell_code import DecodedCell, decode_cell, encode_cell
+from cairn_map.cell_order import hottest_k
 from cairn_map.cursor import ENTRY_FOLD
 from cairn_map.errors import CairnError, DamagedDataError
 from cairn_map.evidence import Evidence
@@ -90,6 +91,7 @@ def rebuilt_cell(snapshot: Snapshot, stored: CellRow, geometry: Geometry) -> Cel
         voxels=len(evidence),
         body=encoded.data,
         size_bytes=len(encoded.data),
+        hottest_k=hottest_k(evidence, geometry),
     )
 
 

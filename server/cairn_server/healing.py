@@ -10,6 +10,7 @@ from dataclasses import replace
 
 from cairn_map.cell_code import decode_canonical_cell
 from cairn_map.cell_limits import VOXEL_BYTES
+from cairn_map.cell_order import hottest_k
 from cairn_map.errors import BadInputError, CairnError, ConflictError, DamagedDataError, NotFoundError
 from cairn_map.fingerprint import fingerprint
 from cairn_map.grid import CellKey, cell_of_key
@@ -66,6 +67,7 @@ def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes, *, by: str) 
         voxels=len(decoded.evidence),
         body=data,
         size_bytes=len(data),
+        hottest_k=hottest_k(decoded.evidence, row.geometry),
     )
     if not store.health.heal(row, sound):
         return False

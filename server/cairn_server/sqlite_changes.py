@@ -98,13 +98,16 @@ def write_fold(connection: apsw.Connection, row: MapRow, fold: Fold) -> bool:
 
 def _write_cells(connection: apsw.Connection, row: MapRow, fold: Fold) -> None:
     connection.executemany(
-        "INSERT INTO cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, body, stamps)"
-        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
+        "INSERT INTO cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, hottest_k, body, stamps)"
+        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
         " ON CONFLICT (map, cell) DO UPDATE SET lm = excluded.lm, digest = excluded.digest,"
         " fingerprint = excluded.fingerprint, voxels = excluded.voxels, size_bytes = excluded.size_bytes,"
-        " body = excluded.body, stamps = excluded.stamps",
+        " hottest_k = excluded.hottest_k, body = excluded.body, stamps = excluded.stamps",
         [
-            (row.number, c.key, c.lm, c.digest, c.fingerprint.to_bytes(), c.voxels, c.size_bytes, c.body, c.stamps)
+            (
+                *(row.number, c.key, c.lm, c.digest, c.fingerprint.to_bytes(), c.voxels),
+                *(c.size_bytes, c.hottest_k, c.body, c.stamps),
+            )
             for c in fold.cells
         ],
     )

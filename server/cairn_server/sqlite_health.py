@@ -63,11 +63,11 @@ class SqliteHealth:
 
     def heal(self, row: MapRow, cell: CellRow) -> bool:
         """Put sound bytes in the place of a damaged cell; False if it changed meanwhile."""
-        values = (cell.digest, cell.fingerprint.to_bytes(), cell.voxels, cell.size_bytes, cell.body)
+        values = (cell.digest, cell.fingerprint.to_bytes(), cell.voxels, cell.size_bytes, cell.body, cell.hottest_k)
 
         def job(connection: apsw.Connection) -> bool:
             connection.execute(
-                "UPDATE cell SET digest = ?, fingerprint = ?, voxels = ?, size_bytes = ?, body = ?"
+                "UPDATE cell SET digest = ?, fingerprint = ?, voxels = ?, size_bytes = ?, body = ?, hottest_k = ?"
                 " WHERE map = ? AND cell = ? AND lm = ?",
                 (*values, row.number, cell.key, cell.lm),
             )

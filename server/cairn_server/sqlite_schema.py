@@ -173,7 +173,14 @@ ALTER TABLE commits ADD COLUMN signatures TEXT;     -- of whom it speaks for, as
 ALTER TABLE commits ADD COLUMN via TEXT;            -- name of the token of the relay that handed it over
 """
 
-STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS, RECEIVED, SIGNED)
+HOTTEST = """
+ALTER TABLE cell ADD COLUMN hottest_k REAL;         -- mean of its hottest voxel; NULL: none, or not known yet
+-- A column behind a cell's bytes is found by reading through all of them: a list of cells never looks at the rows.
+CREATE INDEX cell_listed ON cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k);
+DROP INDEX cell_changed;
+"""
+
+STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS, RECEIVED, SIGNED, HOTTEST)
 
 
 def ensure_schema(connection: apsw.Connection) -> None:

@@ -17,7 +17,7 @@ from cairn_server.sqlite_failures import damaged_pages
 from cairn_server.sqlite_writer import first, rows
 from cairn_server.store_rows import CellRow, Contribution, Head, Selection, Totals
 
-CELL_COLUMNS = "cell, lm, digest, fingerprint, voxels, size_bytes, gone_seq"
+CELL_COLUMNS = "cell, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k"
 PARENT, SEEN = (
     f"CASE WHEN json_valid(CAST(meta AS TEXT)) THEN json_extract(CAST(meta AS TEXT), '$.{name}') END"
     for name in ("parent", "seen")
@@ -181,7 +181,7 @@ class SqliteSnapshot:
 
 def cell_row(columns: tuple[Any, ...]) -> CellRow:
     """A cell from its columns, body and stamps last or left out."""
-    key, lm, digest, fingerprint, voxels, size_bytes, gone_seq, *rest = columns
+    key, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k, *rest = columns
     return CellRow(
         key=CellKey(key),
         lm=lm,
@@ -192,6 +192,7 @@ def cell_row(columns: tuple[Any, ...]) -> CellRow:
         stamps=rest[1] if rest else b"",
         gone_seq=gone_seq,
         size_bytes=size_bytes,
+        hottest_k=hottest_k,
     )
 
 

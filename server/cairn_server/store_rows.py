@@ -91,6 +91,8 @@ class CellRow:
     """Of `stamps`; empty where a listing did not ask for them."""
     gone_seq: int = 0
     """The newest log entry of which the evidence is not kept any more; a fold does not change it."""
+    hottest_k: float | None = None
+    """`cell_order.hottest_k`; None, too, of a cell that did not change since it is stored."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

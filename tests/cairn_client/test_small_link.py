@@ -1,7 +1,7 @@
 """A thin link with losses: what is near comes first, nothing breaks, and nothing is paid twice. Real transfers."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
@@ -17,7 +17,7 @@ from cairn_client import own_status, robot_command
 from cairn_client.api import MapApi
 from cairn_client.link import Link
 from cairn_client.link_profile import LINKS
-from cairn_client.nearness import cell_at, rings_between
+from cairn_client.nearness import cell_at
 from cairn_client.robot import Robot
 from cairn_client.scope import Scope
 from cairn_client.sync import push_commits
@@ -34,17 +34,38 @@ BYTES_PER_S = 8000.0
 """64 kbit/s."""
 
 
+FIRE = Cell(5, 5, 0)
+
+
+def rings_between(cell: Cell, near: Cell) -> int:
+    """How far a cell is from one, in cells along the farthest axis."""
+    return max(abs(a - b) for a, b in zip(cell, near, strict=True))
+
+
 @pytest.fixture
-def city(server: LiveServer, tmp_path: Path) -> Iterator[LiveServer]:
+def city(server: LiveServer, tmp_path: Path) -> LiveServer:
     """A map of many cells, each of them a few hundred bytes that do not compress."""
-    owl = opened(tmp_path / "owl", "owl")
+    return built(server, tmp_path / "owl", kelvin=lambda _: 0)
+
+
+@pytest.fixture
+def burning(server: LiveServer, tmp_path: Path) -> LiveServer:
+    """The same with temperatures, and a fire in one corner."""
+    return built(server, tmp_path / "owl", kelvin=lambda cell: 900 if cell == FIRE else 290 + cell.i)
+
+
+def built(server: LiveServer, folder: Path, *, kelvin: Callable[[Cell], int]) -> LiveServer:
+    """A city; a temperature of 0 is none."""
+    owl = opened(folder, "owl")
     rng = np.random.default_rng(1)
     cells = {}
     for i in range(SIZE):
         for j in range(SIZE):
             voxels = np.sort(rng.choice(512, 200, replace=False)).astype(np.uint32)
             counts = rng.integers(1, 30, (200, 2))
-            cells[cell_key((i, j, 0))] = packed_evidence(voxels, counts, np.zeros((200, 3), int), GEOMETRY)
+            steps = 20 * kelvin(Cell(i, j, 0))
+            samples = np.tile([steps, steps**2, int(steps > 0)], (200, 1))
+            cells[cell_key((i, j, 0))] = packed_evidence(voxels, counts, samples, GEOMETRY)
     pose = ScanPose(time_s=1.5e9, t_map_rig=(0.0, 0.0, 0.4), q_map_rig=(0.0, 0.0, 0.0, 1.0))
     meta = CommitMeta(id=f"owl.{'0' * 16}.0", geometry=GEOMETRY.digest().hex(), scans=(pose,) * 64)
     with MapApi(server.url) as api:
@@ -52,8 +73,8 @@ def city(server: LiveServer, tmp_path: Path) -> Iterator[LiveServer]:
         owl.commit(cells, meta)
         assert Link(api, MAP, branch="owl").hold(push_commits(owl)).pushed == 1
     server.wait_for_fold()
-    yield server
     owl.close()
+    return server
 
 
 def robot_at(folder: Path, link: FaultProxy, place: Cell, *, name: str = "fox", scope: Scope | None = None) -> Robot:
@@ -92,6 +113,24 @@ def test_at_64_kbit_and_5_percent_loss_the_cells_around_the_robot_come_first(
         assert rounds > 3
     rings = [rings_between(cell, place) for cell in order]
     assert rings == sorted(rings)
+
+
+@pytest.mark.parametrize("mode", ["high-end", "low-end"])
+def test_a_far_fire_comes_right_after_the_robots_surroundings(burning: LiveServer, tmp_path: Path, mode: str) -> None:
+    place = Cell(1, 1, 0)
+    with (
+        FaultProxy(burning.port) as link,
+        robot_at(tmp_path, link, place, scope=Scope(reply_bytes_max=1, round_bytes_max=1)) as robot,
+    ):
+        robot.mode = mode  # type: ignore[assignment]
+        order: list[Cell] = []
+        while len(order) < 12:
+            before = set(robot.replica.cells)
+            assert robot.sync().has_more
+            order += [cell_of_key(key) for key in robot.replica.cells if key not in before]
+    assert {rings_between(cell, place) for cell in order[:9]} == {0, 1}
+    assert order[9] == FIRE
+    assert {rings_between(cell, place) for cell in order[10:]} == {2}
 
 
 def test_a_robot_that_moves_gets_what_is_around_its_new_place(city: LiveServer, tmp_path: Path) -> None:

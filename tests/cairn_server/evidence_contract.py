@@ -12,6 +12,7 @@ from tests.cairn_server.store_contract import new_of
 
 from cairn_map.blocks import blocks_of
 from cairn_map.cell_code import decode_cell
+from cairn_map.cell_order import hottest_k
 from cairn_map.commit import Commit, make_commit
 from cairn_map.cursor import ENTRY_UNFOLD
 from cairn_map.errors import ConflictError
@@ -63,6 +64,7 @@ class EvidenceContract:
                     expected[blocks_of(decode_cell(commit.cells[key]).evidence)] = seq
             assert decode_stamps(cell.stamps, depth=SMALL.depth, lm=cell.lm).tolist() == expected.tolist()
             assert (cell.lm, cell.gone_seq) == (expected.max(), 0)
+            assert cell.hottest_k == hottest_k(decode_cell(cell.body).evidence, SMALL) is not None
         with store.snapshot(row) as snapshot:
             assert {(cell.stamps, cell.body) for cell in snapshot.cells()} == {(b"", b"")}
 
@@ -70,7 +72,8 @@ class EvidenceContract:
         row = folded_map(store, pushed(0, 0))
         store.forget_evidence(row, before_s=SOON, limit=9)
         key, cell = next(iter(cells_of(store, row).items()))
-        other = replace(cell, body=b"sound", size_bytes=5, digest=bytes(32), voxels=1, stamps=b"", gone_seq=0)
+        other = replace(cell, body=b"sound", size_bytes=5, digest=bytes(32), voxels=1, stamps=b"")
+        other = replace(other, gone_seq=0, hottest_k=5.5)
         assert not store.health.heal(row, replace(other, lm=cell.lm + 1))
         assert cells_of(store, row)[key] == cell
         assert store.health.heal(row, other)

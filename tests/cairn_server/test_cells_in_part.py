@@ -195,6 +195,14 @@ def test_a_page_that_is_full_and_one_that_is_not(live: Live, row: MapRow) -> Non
     assert sizes == {1: 1, 2: 2, 3: 3, 10_000: 3}
 
 
+def test_entries_say_how_hot_cells_are_only_to_who_asks(live: Live, row: MapRow) -> None:
+    url = f"/maps/{row.name}/main/cells"
+    plain, asked = (live.http.get(url, params=params).json()["cells"] for params in ({}, {"hottest": "true"}))
+    with live.service.store.snapshot(row) as snapshot:
+        assert [entry.pop("hottest_k") for entry in asked] == [cell.hottest_k for cell in snapshot.cells()]
+    assert asked == plain
+
+
 @pytest.mark.parametrize(
     ("params", "status"),
     [({"limit": 0}, 422), ({"limit": 10_001}, 422), ({"after": "0,0"}, 400), ({"after": "9999999,0,0"}, 400)],

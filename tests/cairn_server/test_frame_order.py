@@ -9,6 +9,7 @@ from tests.cairn_server.test_missing import ask, fetch
 from tests.cairn_server.test_push import kind_of
 
 from cairn_map.begun_frames import reply_digest
+from cairn_map.evidence import packed_evidence
 from cairn_map.frames import CellFrame, frames_of
 from cairn_map.grid import cell_key, cell_of_key
 from cairn_map.messages import MissingRequest
@@ -44,6 +45,20 @@ def test_the_cells_next_to_the_asker_come_first_and_of_equally_far_ones_the_newe
         assert rings == sorted(rings)
         newest = [PLACES.index(place) for place in found]
         assert all(a > b for a, b, p, q in zip(newest, newest[1:], rings, rings[1:], strict=False) if p == q)
+
+
+def test_a_hot_cell_comes_before_cold_ones_that_are_as_far_or_a_little_nearer(live: Live) -> None:
+    row = live.new_map()
+    for n, (i, kelvin) in enumerate([(0, 293), (1, 295), (40, 650), (4, 299), (5, 288), (9, 290), (8, 650)]):
+        samples = np.zeros((1, SMALL.plane_count), np.int64)
+        samples[:, SMALL.planes_of("temperature")] = 20 * kelvin, (20 * kelvin) ** 2, 1
+        evidence = packed_evidence(np.zeros(1, np.uint32), np.ones((1, 2), np.int32), samples, SMALL)
+        live.push(row, pushed(n, 0, WREN, cells={cell_key((i, 0, 0)): evidence}, scans=SCANS))
+        live.folded(row)
+    whole = [i for i, _, _ in order(live, row, MissingRequest(near=(0, 0, 0)))]
+    assert whole == [0, 1, 8, 4, 5, 9, 40]
+    cut = [i for i, _, _ in order(live, row, MissingRequest(near=(0, 0, 0), size_bytes_max=1000))]
+    assert cut == whole[: len(cut)] and 8 in cut and 40 not in cut
 
 
 def test_a_small_reply_has_the_nearest_cell(live: Live) -> None:

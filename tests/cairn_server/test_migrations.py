@@ -11,6 +11,7 @@ from tests.cairn_server.pushes import MOLE, WREN, pushed, read, sum_of
 from cairn_map.errors import BadInputError
 from cairn_server.sqlite_schema import STEPS, ensure_schema
 from cairn_server.sqlite_store import FILE_NAME, SqliteStore
+from cairn_server.store_rows import CellRow
 
 FORMATS = Path(__file__).parents[1] / "formats"
 HEADS = {"v1.sqlite.zst": "4243ca94aa4e5ac2bca4157d97a5ba33.10.0c13ae5711ebe0d9d9c007e2badf0262"}
@@ -27,6 +28,11 @@ def unpacked(name: str, folder: Path) -> Path:
     return path
 
 
+def rows_of(live: Live) -> list[CellRow]:
+    with live.service.store.snapshot(live.service.store.map("lab")) as snapshot:
+        return list(snapshot.cells())
+
+
 @pytest.mark.parametrize("name", sorted(path.name for path in FORMATS.glob("*.sqlite.zst")))
 def test_an_older_store_opens_with_all_that_it_held_and_goes_on(name: str, tmp_path: Path) -> None:
     unpacked(name, tmp_path)
@@ -35,10 +41,15 @@ def test_an_older_store_opens_with_all_that_it_held_and_goes_on(name: str, tmp_p
         row = live.service.store.map("lab")
         with live.service.store.snapshot(row) as snapshot:
             assert str(snapshot.head.cursor) == HEADS[name]
+            seq = snapshot.head.cursor.seq
         assert read(live.cells(row)) == sum_of([*COMMITS, *RETRACTS])
+        assert {cell.hottest_k for cell in rows_of(live)} == {None}  # nobody wrote down how hot they are
         assert [branch.name for branch in live.service.store.branches(row)] == ["mole"]
         assert live.push(row, COMMITS[2]).status_code == 200
         assert live.push(row, more).status_code == 201
+        live.folded(row)
+        told = [cell.key for cell in rows_of(live) if cell.hottest_k is not None]
+        assert told == [cell.key for cell in rows_of(live) if cell.lm > seq] != []
         assert read(live.cells(row)) == sum_of([*COMMITS, *RETRACTS, more])
     with Live(tmp_path) as live:  # and once more, now as a store of this version
         assert read(live.cells(live.service.store.map("lab"))) == sum_of([*COMMITS, *RETRACTS, more])

@@ -20,6 +20,8 @@ from cairn_map.errors import BadInputError, ConflictError, UnreachableError
 from cairn_map.sensor_model import SensorModel
 from cairn_server import sqlite_readers, sqlite_tokens
 from cairn_server.sqlite_changes import append_commit
+from cairn_server.sqlite_schema import ensure_schema
+from cairn_server.sqlite_snapshot import CELL_COLUMNS
 from cairn_server.sqlite_store import FILE_NAME, SqliteStore
 
 
@@ -169,3 +171,11 @@ def test_the_audit_log_keeps_its_newest_lines(fresh: SqliteStore, monkeypatch: p
         fresh.audit("test", str(n))
     found = fresh._writer.run(lambda connection: connection.execute("SELECT detail FROM audit").fetchall())
     assert found == [("6",), ("7",), ("8",)]
+
+
+def test_a_list_of_cells_reads_none_of_their_bytes(tmp_path: Path) -> None:
+    connection = apsw.Connection(str(tmp_path / FILE_NAME))
+    ensure_schema(connection)
+    query = f"SELECT {CELL_COLUMNS} FROM cell WHERE map = 1 AND lm > 5 AND cell > 7 ORDER BY cell LIMIT 9"
+    [(*_, plan)] = connection.execute(f"EXPLAIN QUERY PLAN {query}")
+    assert "COVERING INDEX cell_listed" in str(plan)
