@@ -68,11 +68,10 @@ MAY_NAME = {
     "psycopg": [],
     "cryptography": ["cairn_map/signature.py"],
     "small_gicp": ["cairn_client/alignment.py"],
-    "yaml": ["cairn_calib/yaml_text.py"],
     "mcap": ["cairn_fusion/bag_mcap.py"],
     "rosbags": ["cairn_fusion/bag_rosbags.py"],
     "lz4": ["cairn_fusion/bag_mcap.py", "cairn_fusion/bag_rosbags.py"],
-    "ruamel": ["cairn_fusion/bag_mapping.py"],
+    "ruamel": ["cairn_calib/yaml_text.py"],
     "numba": [
         "cairn_map/*_kernels.py",
         "cairn_map/compile_progress.py",

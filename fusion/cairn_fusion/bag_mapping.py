@@ -21,6 +21,7 @@ from cairn_calib.camera import Camera
 from cairn_calib.lidar import SpinningLidar
 from cairn_calib.raster import Side
 from cairn_calib.rig import Row, Spectrum
+from cairn_calib.yaml_text import document_of_yaml
 from cairn_fusion.recording_format import (
     Convention,
     Name,
@@ -186,13 +187,10 @@ def mapping_of(path: Path) -> BagMapping:
 
 def mapping_from_yaml(text: str, path: Path | str) -> BagMapping:
     """The mapping in a YAML text; errors as `mapping_of`."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
     try:
-        content = YAML(typ="safe", pure=True).load(text)
-    except (YAMLError, ValueError, RecursionError) as exc:
-        raise BadInputError("bad_mapping", f"{path} is no YAML: {' '.join(str(exc).split())[:400]}") from exc
+        content = document_of_yaml(text)
+    except ValueError as exc:
+        raise BadInputError("bad_mapping", f"{path} is no YAML: {exc}") from exc
     try:
         return BagMapping.model_validate(content)
     except ValidationError as exc:

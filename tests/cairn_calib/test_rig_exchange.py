@@ -178,6 +178,10 @@ def test_files_as_others_write_them_are_read() -> None:
         ("ros", "- 1", "mapping"),
         ("ros", "a: !!python/object/apply:os.system [ls]", "no YAML"),
         ("opencv", "%YAML:1.0\nM1: 3\n", "image_width"),
+        ("kalibr", "%YAML 1.0\n---\ncam0: 3\n", "cam0"),
+        ("ros", "image_width: !!float\n", "is no YAML"),
+        ("ros", "image_width: !!int x\n", "is no YAML"),
+        ("ros", "image_width: 3\nimage_width: 4\n", "duplicate key"),
         ("mrcal", "{'lensmodel': 'LENSMODEL_SPLINED_STEREOGRAPHIC_order=3'", "not a Python dictionary"),
         ("mrcal", "[" * 10_000, "not a Python dictionary"),
         (
@@ -202,6 +206,14 @@ def test_files_as_others_write_them_are_read() -> None:
 def test_what_cannot_be_read_is_named(name: str, text: str, named: str) -> None:
     with pytest.raises(BadInputError, match=named):
         FORMATS[name].read(text, name="x.yaml")
+
+
+@pytest.mark.parametrize("head", ["", "%YAML 1.0\n---\n", "%YAML 1.1\n---\n", "%YAML:1.0\n---\n", "%YAML 1.2\n---\n"])
+def test_a_small_number_without_a_point_is_read_as_one(head: str) -> None:
+    given = FORMATS["ros"].write([PlacedCamera("left", BROWN5, None)])
+    text = head + given.removeprefix("%YAML 1.1\n---\n").replace("1.0e-05", "1e-05")
+    assert "1e-05" in text
+    assert FORMATS["ros"].read(text, name="left.yaml").cameras[0].camera == BROWN5
 
 
 def test_what_cannot_be_written_is_named() -> None:
