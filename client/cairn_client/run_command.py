@@ -69,6 +69,20 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     )
     run.add_argument("--every", type=float, default=5.0, metavar="SECONDS", help="sync at least so often (5)")
     add_limits(run)
+    run.add_argument(
+        "--keep-scans",
+        type=float,
+        default=0.0,
+        metavar="MB",
+        help="keep so much of the newest scans in the robot's folder, so that a program can correct their poses (0)",
+    )
+    run.add_argument(
+        "--carry",
+        type=float,
+        default=0.0,
+        metavar="MB",
+        help="room for what other robots mapped, taken along to the next server; needs a token of role relay (0)",
+    )
     run.add_argument("--delete", action="store_true", help="delete recordings that are mapped")
     run.add_argument("--stay", action="store_true", help="stay on the map at the end")
     run.set_defaults(run=_run)
@@ -77,6 +91,8 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 def _run(args: argparse.Namespace) -> int:
     if args.every <= 0:
         raise BadInputError("bad_option", f"--every takes seconds above 0, got {args.every:g}")
+    if args.carry < 0 or args.keep_scans < 0:
+        raise BadInputError("bad_option", "--carry and --keep-scans take megabytes of 0 or more")
     limits_of(args)  # before it waits for the first recording
     spool, tally = Spool(args.spool), _Tally()
     with until_signal() as stopping:
@@ -122,6 +138,8 @@ def _robot(args: argparse.Namespace, spool: Spool, stopping: threading.Event) ->
         limits=limits_of(args),
         link=args.link,
         stay=args.stay,
+        keep_scans_bytes=round(args.keep_scans * 1e6),
+        carry_bytes_max=round(args.carry * 1e6),
     )
 
 

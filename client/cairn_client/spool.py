@@ -89,11 +89,16 @@ class Spool:
         self._folder = folder
         self._settled: dict[Path, tuple[Stamp, float | None]] = {}
         """What was in a folder when it was done, with the time of its first scan; None: no recording."""
+        self._begin_badly: dict[Path, Stamp] = {}
+        """Recordings whose first scan is damaged, which was told."""
 
     def next_recording(self) -> Recording | None:
-        """The first recording that is whole; None if there is none yet."""
-        found = (self._opened(path, stamp) for path, stamp in self._whole())
-        return next((source for source in found if source is not None), None)
+        """The first recording that is whole and begins with a sound scan; None if there is none yet."""
+        for path, stamp in self._whole():
+            source = self._opened(path, stamp)
+            if source is not None and self._begins_well(path, stamp, source):
+                return source
+        return None
 
     def stops(self, replica: Replica) -> Iterator[Stop]:
         """Measurements that are not mapped yet, of the recordings that are whole now."""
@@ -127,6 +132,18 @@ class Spool:
         found = (path for path in sorted(self._folder.iterdir()) if not path.name.startswith("."))
         stamped = [(path, stamp) for path in found if (stamp := _stamp(path)) is not None]
         return [(path, stamp) for path, stamp in stamped if self._settled.get(path, (None, None))[0] != stamp]
+
+    def _begins_well(self, path: Path, stamp: Stamp, source: Recording) -> bool:
+        """Whether its first scan, which says what there is to map, can be read; what follows may be sound all the same."""
+        if self._begin_badly.get(path) == stamp:
+            return False
+        try:
+            source.scan(0)
+        except (BadInputError, DamagedDataError) as exc:
+            log.error("%s cannot be the first recording of a map: %s", path, exc.message)
+            self._begin_badly[path] = stamp
+            return False
+        return True
 
     def _opened(self, path: Path, stamp: Stamp) -> Recording | None:
         try:

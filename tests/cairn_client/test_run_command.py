@@ -114,6 +114,33 @@ def test_kills_lose_nothing_and_count_nothing_twice(
         assert cells_of(bat.map) == cells_of(evidence_in(spool))
 
 
+def test_a_recording_that_begins_with_a_damaged_scan_does_not_say_what_there_is_to_map(
+    server: LiveServer, spool: Path, tmp_path: Path, until: Until
+) -> None:
+    image = sorted(record(spool, "0001", [1, 2]).rglob("*.png"))[0]
+    image.write_bytes(image.read_bytes()[:40])
+    with process(spool, f"{server.url}/maps/new", "--voxel", "0.05") as running:
+        assert running.stderr is not None
+        assert "0001 cannot be the first recording of a map" in running.stderr.readline()
+        record(spool, "0002", [3])
+        until(lambda: len(stored_commits(tmp_path / "server")) == 2)
+        assert "mapped 2 scans as 2 commits" in ended(running)
+
+
+def test_scans_are_kept_and_others_commits_are_carried_if_one_wants_that(
+    server: LiveServer, spool: Path, tmp_path: Path, until: Until
+) -> None:
+    with robot_in(tmp_path, server.map_url, name="bat") as bat:
+        bat.observe(scan_of(9))
+        bat.commit()
+        bat.sync()
+    record(spool, "0001", [1])
+    state = tmp_path / "mole"
+    with process(spool, server.map_url, "--keep-scans", "1", "--carry", "1") as running:
+        until(lambda: len(list(state.glob("scans/*.scans"))) == 1 and len(list(state.glob("carried/bat.*"))) == 1)
+        ended(running)
+
+
 def test_mapped_recordings_are_deleted_if_one_wants_that(
     server: LiveServer, spool: Path, tmp_path: Path, until: Until
 ) -> None:
@@ -247,4 +274,5 @@ def test_a_folder_that_is_no_spool_is_refused(spool: Path) -> None:
     assert cairn.main(["robot", "run", str(spool / "none"), "--map", url]) == 1
     assert cairn.main(["robot", "run", str(record(spool, "a", [1])), "--map", url]) == 1
     assert cairn.main(["robot", "run", str(spool), "--map", url, "--every", "0"]) == 1
+    assert cairn.main(["robot", "run", str(spool), "--map", url, "--carry", "-1"]) == 1
     assert cairn.main(["robot", "run", str(spool), "--map", url, "--disk-max", "0.001"]) == 1
