@@ -1,0 +1,129 @@
+"""By how much corners miss, and how that changes with every number: one camera's share of the normal equations.
+
+    board --scale, warp--> (x, y, z) --T_rig_board--> rig --T_rig_camera^-1--> camera --lens--> pixel
+    residual = W (pixel - corner) / s       W^T W: the inverse of the corner's covariance; s: the sensor's own scale
+
+A board's point moves with its pose by dt + dr x (R p); the rig's camera moves the other way. So one matrix, pixels by
+a point of the rig, makes all columns.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.board_views import BoardView
+from cairn_calib.normal_equations import Block, Indices, Loss
+from cairn_calib.rig_state import Layout, RigState
+
+Floats = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class CornerData:
+    """All corners of one camera, V views of N points; what is hidden has whitening 0."""
+
+    camera: int
+    frames: Indices
+    """(V,)"""
+    pixels: Floats
+    """(V, N, 2)"""
+    whitening: Floats
+    """(V, N, 2, 2)"""
+    seen: Flags
+    """(V, N)"""
+    sigma_px: float
+    """Root mean square of the stated standard deviations, one axis."""
+
+
+def corner_data(camera: int, views: Sequence[BoardView], frames: Sequence[str]) -> CornerData:
+    """The corners of a camera's views as arrays."""
+    seen = np.stack([view.corners.seen for view in views])
+    covariance = np.stack([view.corners.covariance_px2 for view in views])
+    seen &= np.isfinite(covariance).all(axis=(2, 3))
+    safe = np.where(seen[..., None, None], covariance, np.eye(2))
+    # cov = L L^T, so W = L^-1 gives W^T W = cov^-1.
+    whitening = np.asarray(np.linalg.inv(np.linalg.cholesky(safe)), np.float64) * seen[..., None, None]
+    variance = np.trace(covariance[seen], axis1=1, axis2=2).mean() / 2
+    return CornerData(
+        camera,
+        np.array([frames.index(view.frame) for view in views], np.intp),
+        np.where(seen[..., None], np.stack([view.corners.pixels for view in views]), 0.0),
+        whitening,
+        seen,
+        float(np.sqrt(variance)),
+    )
+
+
+def board_points(state: RigState, lattice: Floats, shape: Floats) -> Floats:
+    """(N, 3) points of the board as it is, of (N, 3) as it should be and its (N, 2) warp shape."""
+    points = state.scale * lattice
+    points[:, 2] += shape @ state.warp_m
+    return points
+
+
+def corner_misses(data: CornerData, state: RigState, lattice: Floats, shape: Floats) -> Floats:
+    """(V, N, 2) predicted minus found, pixels; 0 where hidden; NaN where the model cannot see a point."""
+    T_rig_board, T_rig_camera = state.T_rig_board[data.frames], state.T_rig_camera[data.camera]
+    p_rig = (
+        board_points(state, lattice, shape) @ np.swapaxes(T_rig_board[:, :3, :3], 1, 2) + T_rig_board[:, None, :3, 3]
+    )
+    p_camera = (p_rig - T_rig_camera[:3, 3]) @ T_rig_camera[:3, :3]
+    return np.where(data.seen[..., None], state.lenses[data.camera].project(p_camera) - data.pixels, 0.0)
+
+
+def corner_derivatives(
+    data: CornerData, state: RigState, layout: Layout, lattice: Floats, shape: Floats
+) -> tuple[Floats, Floats, Indices]:
+    """Misses (V, N, 2) as above, their derivatives (V, N, 2, K + 6), and (K,) where the shared columns stand."""
+    c = data.camera
+    T_rig_board, T_rig_camera = state.T_rig_board[data.frames], state.T_rig_camera[c]
+    R_rig_board, R_rig_camera = T_rig_board[:, :3, :3], T_rig_camera[:3, :3]
+    turned = board_points(state, lattice, shape) @ np.swapaxes(R_rig_board, 1, 2)
+    q = turned + T_rig_board[:, None, :3, 3] - T_rig_camera[:3, 3]
+    there = state.lenses[c].projection(q @ R_rig_camera)
+    G = there.by_point @ R_rig_camera.T
+    columns = [there.by_intrinsics[..., layout.intrinsic_columns[c]]]
+    at = [layout.intrinsic_at[c]]
+    if len(layout.pose_at[c]):
+        # A turned camera: dp = q x dr, as seen by it.
+        columns += [_crossed(G, q), -G]
+        at.append(layout.pose_at[c])
+    if len(layout.warp_at):
+        columns.append((G @ R_rig_board[:, None, :, 2:]) * shape[:, None, :])
+        at.append(layout.warp_at)
+    if len(layout.scale_at):
+        columns.append(G @ (lattice @ np.swapaxes(R_rig_board, 1, 2))[..., None])
+        at.append(layout.scale_at)
+    columns += [-_crossed(G, turned), G]
+    misses = np.where(data.seen[..., None], there.pixels - data.pixels, 0.0)
+    return misses, np.concatenate(columns, axis=-1), np.concatenate(at)
+
+
+def corner_block(
+    data: CornerData,
+    state: RigState,
+    layout: Layout,
+    board: tuple[Floats, Floats],
+    loss: Loss,
+) -> Block:
+    """The camera's share: `board` is lattice and warp shape."""
+    misses, derivatives, at = corner_derivatives(data, state, layout, *board)
+    whitening = data.whitening / loss.scale * loss.kept[..., None, None]
+    residuals = np.einsum("vnij,vnj->vni", whitening, np.where(loss.kept[..., None], misses, 0.0))
+    weights, cost = loss(np.sum(residuals**2, axis=-1))
+    views, points = data.seen.shape
+    root = np.sqrt(weights)[..., None]
+    r = (root * residuals).reshape(views, 2 * points, 1)
+    J = ((root[..., None] * whitening) @ derivatives).reshape(views, 2 * points, -1)
+    J_t = np.swapaxes(J, 1, 2)
+    return Block(at, data.frames, J_t @ J, -(J_t @ r)[..., 0], residuals, cost)
+
+
+def _crossed(G: Floats, points: Floats) -> Floats:
+    """(V, N, 2, 3) rows g x p of (V, N, 2, 3) rows and (V, N, 3) points: g . (p x dr) = dr . (g x p)."""
+    gx, gy, gz = np.moveaxis(G, -1, 0)
+    px, py, pz = np.moveaxis(points[..., None, :], -1, 0)
+    return np.stack([gy * pz - gz * py, gz * px - gx * pz, gx * py - gy * px], axis=-1)

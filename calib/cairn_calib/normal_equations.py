@@ -1,0 +1,179 @@
+r"""Normal equations of a calibration, and how to solve them: a Schur complement on the boards' poses.
+
+    | A    B |  | shared |     | a |       A (P, P) all that is shared: cameras, warp, scale, range bias
+    |        |  |        |  =  |   |       C (F, 6, 6) one block for each board, for boards do not meet each other
+    | B^T  C |  | boards |     | b |       B (F, P, 6)
+
+    (A - sum_f B C^-1 B^T) shared = a - sum_f B C^-1 b        P unknowns, however many boards
+
+Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 6.1.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """What a sensor's residuals cost."""
+
+    scale: float
+    """Noise of the sensor over the stated one."""
+    kept: npt.NDArray[np.bool_]
+    """(V, N) points that count."""
+    huber_sigmas: float
+    """Beyond it the cost grows linearly (Huber 1964)."""
+
+    def __call__(self, squares: Floats) -> tuple[Floats, float]:
+        """(...) weights of squared lengths of residuals, and the sum of their costs; infinite if one is NaN."""
+        if np.isnan(squares).any():
+            return np.ones_like(squares), np.inf
+        lengths = np.sqrt(squares)
+        beyond = lengths > self.huber_sigmas
+        if not beyond.any():
+            return np.ones_like(squares), float(squares.sum())
+        k = self.huber_sigmas
+        weights = np.where(beyond, k / np.maximum(lengths, 1e-300), 1.0)
+        return weights, float(np.where(beyond, 2 * k * lengths - k * k, squares).sum())
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """What one camera's views say: the squares of their whitened derivatives.
+
+    V views, each of one frame; K columns of shared parameters, then 6 of the frame's board.
+    """
+
+    at: Indices
+    """(K,) where the shared columns stand."""
+    frames: Indices
+    """(V,) of each view, all different."""
+    square: Floats
+    """(V, K + 6, K + 6) J^T J."""
+    pull: Floats
+    """(V, K + 6) -J^T r."""
+    residuals: Floats
+    """(V, M, D) whitened, D a corner's or a pixel's axes; 0 where there is nothing or it is left out."""
+    cost: float
+    """Sum of what the loss makes of the residuals' squares."""
+
+
+@dataclass(frozen=True, slots=True)
+class NormalEquations:
+    """The sum of all blocks."""
+
+    A: Floats
+    B: Floats
+    C: Floats
+    a: Floats
+    b: Floats
+    cost: float
+
+    def reduced(self, damping: float = 0.0) -> tuple[Floats, Floats, Floats, Floats]:
+        """S (P, P) and s (P,) of the Schur complement, and C^-1 B^T (F, 6, P), C^-1 b (F, 6).
+
+        With `damping`, diagonals are that much larger, relatively (Marquardt).
+
+        Raises:
+            numpy.linalg.LinAlgError: a board's place is not determined.
+        """
+        A = self.A + damping * np.diag(np.diag(self.A))
+        C = self.C * (1 + damping * np.eye(6))
+        right = np.concatenate([np.swapaxes(self.B, 1, 2), self.b[..., None]], axis=2)
+        solved = np.linalg.solve(C, right)
+        inner = np.einsum("fpk,fkq->pq", self.B, solved, optimize=True)
+        return A - inner[:, :-1], self.a - inner[:, -1], solved[..., :-1], solved[..., -1]
+
+    def step(self, damping: float) -> tuple[Floats, Floats, float]:
+        """(P,) shared, (F, 6) boards, and by how much the cost should fall, of a damped Gauss-Newton step.
+
+        Raises:
+            numpy.linalg.LinAlgError: it is singular.
+        """
+        S, s, by_shared, alone = self.reduced(damping)
+        shared = solved_scaled(S, s)
+        boards = alone - by_shared @ shared
+        # Of the undamped model: 2 g.d - d.H.d.
+        slope = float(self.a @ shared + np.sum(self.b * boards))
+        bend = float(
+            shared @ self.A @ shared
+            + 2 * np.einsum("p,fpk,fk->", shared, self.B, boards, optimize=True)
+            + np.einsum("fk,fkl,fl->", boards, self.C, boards, optimize=True)
+        )
+        return shared, boards, 2 * slope - bend
+
+
+def gathered(blocks: list[Block], size: int, frame_count: int) -> NormalEquations:
+    """The sum of blocks, for P = `size` shared parameters and F = `frame_count` boards."""
+    A, a = np.zeros((size, size)), np.zeros(size)
+    B, C, b = np.zeros((frame_count, size, 6)), np.zeros((frame_count, 6, 6)), np.zeros((frame_count, 6))
+    for block in blocks:
+        k = len(block.at)
+        A[np.ix_(block.at, block.at)] += block.square[:, :k, :k].sum(axis=0)
+        a[block.at] += block.pull[:, :k].sum(axis=0)
+        B[np.ix_(block.frames, block.at)] += block.square[:, :k, k:]
+        C[block.frames] += block.square[:, k:, k:]
+        b[block.frames] += block.pull[:, k:]
+    return NormalEquations(A, B, C, a, b, sum(block.cost for block in blocks))
+
+
+def solved_scaled(S: Floats, right: Floats) -> Floats:
+    """S^-1 right, with S scaled to a diagonal of 1: pixels, metres and coefficients differ by a million.
+
+    Raises:
+        numpy.linalg.LinAlgError: S is not positive definite.
+    """
+    diagonal = np.diag(S)
+    if not np.all(diagonal > 0):
+        raise np.linalg.LinAlgError("a parameter has no effect")
+    scale = 1 / np.sqrt(diagonal)
+    lower = np.linalg.cholesky(S * scale[:, None] * scale)
+    side = scale if right.ndim == 1 else scale[:, None]
+    solved = np.linalg.solve(lower.T, np.linalg.solve(lower, side * right))
+    return np.asarray(side * solved)
+
+
+@dataclass(frozen=True, slots=True)
+class Uncertainty:
+    """Covariances at a solution, from its normal equations."""
+
+    shared: Floats
+    """(P, P)"""
+    by_shared: Floats
+    """(F, 6, P) C^-1 B^T: by a change of the shared parameters each board moves by minus that."""
+    own: Floats
+    """(F, 6, 6) C^-1: of each board if the shared parameters were known."""
+
+    def of_board(self, frame: int) -> Floats:
+        """(6, 6) covariance of one board's pose."""
+        moves = self.by_shared[frame]
+        return np.asarray(self.own[frame] + moves @ self.shared @ moves.T)
+
+    def of_block(self, at: Indices, frames: Indices) -> Floats:
+        """(V, K + 6, K + 6) covariance of some shared parameters with each frame's board."""
+        k = len(at)
+        result = np.empty((len(frames), k + 6, k + 6))
+        moves = -self.by_shared[frames]
+        cross = moves @ self.shared
+        result[:, :k, :k] = self.shared[np.ix_(at, at)]
+        result[:, k:, :k] = cross[:, :, at]
+        result[:, :k, k:] = np.swapaxes(result[:, k:, :k], 1, 2)
+        result[:, k:, k:] = self.own[frames] + cross @ np.swapaxes(moves, 1, 2)
+        return result
+
+
+def uncertainty(normal: NormalEquations) -> Uncertainty:
+    """The covariances at a minimum.
+
+    Raises:
+        numpy.linalg.LinAlgError: something is not determined.
+    """
+    S, _, by_shared, _ = normal.reduced()
+    shared = solved_scaled(S, np.eye(len(S)))
+    own = np.asarray(np.linalg.inv(normal.C), np.float64)
+    return Uncertainty((shared + shared.T) / 2, by_shared, own)

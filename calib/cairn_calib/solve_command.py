@@ -1,0 +1,160 @@
+"""Solve a rig of cameras from the corners that `cairn calib corners` found: rig.json with its uncertainty.
+
+    $ cairn calib corners tof/*.png   --board 7x6 --square 0.1 --output corners/tof
+    $ cairn calib corners left/*.png  --board 7x6 --square 0.1 --output corners/left
+    $ cairn calib solve corners/tof corners/left --spectrum tof=range,left=colour --output rig.json
+    tof   12 images  504 points   2 outliers  noise 0.10 px  rms 0.09 px
+    left  12 images  504 points   0 outliers  noise 0.08 px  rms 0.07 px
+    rig.json: tof, left; chi2 1987 of 1930
+
+A camera's name is its folder's. Images of one place of the board have the same last number in their names
+(tof03.png, left03.png). The first range camera is the rig's frame, else the first camera (--gauge).
+
+First each camera is solved alone, then all of them with all places of the board. Corners count by their covariance
+and by each camera's own noise, which is estimated; what is off by more than 4 sigma is left out and counted. The
+board may be bent (--flat: it is not), its pitch wrong by 0.02 % (--pitch-sigma). Free coefficients of a lens follow
+from the spectrum: colour k1,k2,p1,p2,k3, thermal k1,k2,k3, range k1,k2; --distortion says otherwise, --fisheye names
+cameras with Kannala and Brandt's model. With --range DIR the range camera's images of the same boards (16 bit, radial,
+--range-units-per-m) show its bias.
+
+Images that cannot tell a number are refused or warned about, with what to shoot instead.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cairn_calib.board_views import BoardViews, RangeView, frame_of, read_board_views
+from cairn_calib.calibration import Statistics
+from cairn_calib.corner_pictures import read_grey
+from cairn_calib.rig import Spectrum
+from cairn_calib.solve import solve_rig
+from cairn_calib.solve_plan import PITCH_SIGMA, CameraPlan, SolvePlan, usual_plan
+from cairn_calib.solved_rig import solved_rig
+from cairn_map.errors import BadInputError
+
+if TYPE_CHECKING:
+    from argparse import _SubParsersAction
+
+
+def add_parser(commands: "_SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add `solve` to `cairn calib`."""
+    added = commands.add_parser(
+        "solve",
+        help="cameras and their places from corners: rig.json with its uncertainty",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    added.add_argument("folders", nargs="+", type=Path, metavar="DIR", help="of corner documents, one for each camera")
+    added.add_argument(
+        "--spectrum", required=True, metavar="[NAME=]SPECTRUM,...", help="range, colour or thermal, of all or by camera"
+    )
+    added.add_argument("--output", type=Path, required=True, metavar="RIG.JSON")
+    added.add_argument("--gauge", metavar="NAME", help="the camera whose frame is the rig's")
+    added.add_argument("--name", default="rig", help="of the rig (rig)")
+    added.add_argument(
+        "--distortion", action="append", default=[], metavar="NAME=k1,k2,...", help="free coefficients; NAME=: none"
+    )
+    added.add_argument("--fisheye", default="", metavar="NAME,...", help="cameras with the KB4 model")
+    added.add_argument("--flat", action="store_true", help="the board is not bent at all")
+    added.add_argument(
+        "--pitch-sigma",
+        type=float,
+        default=PITCH_SIGMA,
+        metavar="SHARE",
+        help=f"of the board's pitch ({PITCH_SIGMA:g})",
+    )
+    added.add_argument("--range", type=Path, metavar="DIR", help="range images of the range camera, 16 bit")
+    added.add_argument("--range-units-per-m", type=float, default=1000.0, metavar="N", help="of those images (1000)")
+    added.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Solve, and write what was asked for."""
+    plan = _plan(args)
+    folders = dict(zip(plan.cameras, args.folders, strict=True))
+    views = read_board_views(folders)
+    if args.range is not None:
+        views = _with_ranges(views, plan, args.range, args.range_units_per_m)
+    rig = solved_rig(solve_rig(views, plan), made_s=time.time())
+    args.output.write_bytes(rig.to_json())
+    if rig.calibration is not None and rig.calibration.statistics is not None:
+        sys.stdout.write(told(rig.calibration.statistics))
+        fit = rig.calibration.statistics
+        sys.stdout.write(f"{args.output}: {', '.join(rig.cameras)}; chi2 {fit.chi2:.0f} of {fit.degrees_of_freedom}\n")
+
+
+def told(statistics: Statistics) -> str:
+    """A line for each camera."""
+    width = max(len(name) for name in statistics.cameras)
+    return "".join(
+        f"{name:<{width}}  {each.images} images  {each.points} points  {each.outliers} outliers  "
+        f"noise {each.sigma_px:.3f} px  rms {each.rms_px:.3f} px\n"
+        for name, each in statistics.cameras.items()
+    )
+
+
+def _plan(args: argparse.Namespace) -> SolvePlan:
+    names = [folder.resolve().name for folder in args.folders]
+    if len(set(names)) < len(names):
+        raise BadInputError("bad_arguments", f"folders must have names of their own, got {', '.join(names)}")
+    spectra = _spectra(args.spectrum, names)
+    usual = usual_plan(spectra, rig_name=args.name, gauge=args.gauge)
+    free = dict(_distortion(text, names) for text in args.distortion)
+    fisheyes = [name for name in args.fisheye.split(",") if name]
+    if strange := [name for name in fisheyes if name not in names]:
+        raise BadInputError(
+            "unknown_camera", f"--fisheye: there is no camera {strange[0]!r}; there are {', '.join(names)}"
+        )
+    cameras = {
+        name: CameraPlan(spectrum=spectra[name], model="kb4" if name in fisheyes else "pinhole", free=free.get(name))
+        for name in names
+    }
+    if not 0 <= args.pitch_sigma < 0.1:
+        raise BadInputError("bad_arguments", f"--pitch-sigma is a share, 0 to 0.1, got {args.pitch_sigma:g}")
+    return SolvePlan(
+        cameras=cameras, gauge=usual.gauge, rig_name=args.name, warp=not args.flat, pitch_sigma=args.pitch_sigma
+    )
+
+
+def _spectra(text: str, names: list[str]) -> dict[str, Spectrum]:
+    spectra: dict[str, Spectrum] = {}
+    for part in filter(None, text.split(",")):
+        name, _, value = part.rpartition("=")
+        if value not in list(Spectrum):
+            raise BadInputError("bad_arguments", f"a spectrum is {', '.join(Spectrum)}, got {value[:80]!r}")
+        if name and name not in names:
+            raise BadInputError(
+                "unknown_camera", f"--spectrum: there is no camera {name!r}; there are {', '.join(names)}"
+            )
+        spectra.update(dict.fromkeys([name] if name else names, Spectrum(value)))
+    if lost := [name for name in names if name not in spectra]:
+        raise BadInputError("bad_arguments", f"--spectrum does not say what {', '.join(lost)} sees")
+    return {name: spectra[name] for name in names}
+
+
+def _distortion(text: str, names: list[str]) -> tuple[str, tuple[str, ...]]:
+    name, equals, values = text.partition("=")
+    if not equals or name not in names:
+        raise BadInputError(
+            "bad_arguments", f"--distortion is NAME=k1,k2,... with one of {', '.join(names)}, got {text[:80]!r}"
+        )
+    return name, tuple(value for value in values.split(",") if value)
+
+
+def _with_ranges(views: BoardViews, plan: SolvePlan, folder: Path, units_per_m: float) -> BoardViews:
+    owner = next((name for name, camera in plan.cameras.items() if camera.spectrum is Spectrum.RANGE), None)
+    if owner is None or not units_per_m > 0:
+        raise BadInputError("bad_arguments", "--range needs a camera of spectrum range, and units per metre above 0")
+    ranges = []
+    for path in sorted(folder.glob("*.png")):
+        counts, _ = read_grey(path)
+        range_m = np.where(counts > 0, counts / units_per_m, np.nan)
+        ranges.append(RangeView(owner, frame_of(path.stem), range_m))
+    if not ranges:
+        raise BadInputError("bad_arguments", f"{folder} holds no range images (*.png)")
+    return BoardViews(views.board, views.sizes_px, views.views, tuple(ranges), views.inputs, views.polarities)

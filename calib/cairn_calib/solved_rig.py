@@ -1,0 +1,68 @@
+"""The `rig.json` of a solution: cameras, places, covariance, statistics, and what it came from."""
+
+import importlib.metadata
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.calibration import Calibration, CameraStatistics, Statistics, covariance_from_matrix
+from cairn_calib.corner_residuals import CornerData, corner_misses
+from cairn_calib.rig import Rig, mounted
+from cairn_calib.rig_state import warp_shape
+from cairn_calib.solve import Solution
+
+Floats = npt.NDArray[np.float64]
+
+
+def solved_rig(solution: Solution, *, made_s: float) -> Rig:
+    """The rig of a solution, `made_s` seconds since 1970; the covariance is of its cameras, all else eliminated."""
+    plan, state = solution.plan, solution.state
+    cameras = {
+        name: mounted(camera.spectrum, lens, T)
+        for (name, camera), lens, T in zip(plan.cameras.items(), state.lenses, state.T_rig_camera, strict=True)
+    }
+    rows = [n for n, (owner, name) in enumerate(solution.layout.names) if owner in cameras and _is_of_camera(name)]
+    names = [solution.layout.names[n] for n in rows]
+    calibration = Calibration(
+        software=f"cairn {_version()}",
+        made_s=made_s,
+        gauge=plan.gauge,
+        covariance=covariance_from_matrix(names, solution.covariance[np.ix_(rows, rows)]),
+        statistics=statistics_of(solution),
+        inputs=solution.views.inputs[:1000],
+    )
+    return Rig(name=plan.rig_name, cameras=cameras, calibration=calibration)
+
+
+def statistics_of(solution: Solution) -> Statistics:
+    """How well everything was met."""
+    cameras = {}
+    board = (solution.views.board.points(), warp_shape(solution.views.board))
+    names = list(solution.plan.cameras)
+    count = 0
+    for sensor in solution.adjusted.problem.sensors:
+        count += int(sensor.kept.sum()) * sensor.axes
+        if isinstance(sensor.data, CornerData):
+            misses = corner_misses(sensor.data, solution.state, *board)[sensor.kept]
+            cameras[names[sensor.data.camera]] = CameraStatistics(
+                images=len(sensor.data.frames),
+                points=int(sensor.there.sum()),
+                outliers=int(sensor.there.sum() - sensor.kept.sum()),
+                rms_px=float(np.sqrt(np.mean(misses**2))) if misses.size else 0.0,
+                sigma_px=float(sensor.scale * sensor.data.sigma_px),
+            )
+    unknown = solution.layout.size + 6 * len(solution.state.T_rig_board)
+    freedom = count + len(solution.adjusted.problem.priors) - unknown
+    return Statistics(chi2=solution.adjusted.normal.cost, degrees_of_freedom=max(freedom, 0), cameras=cameras)
+
+
+def _is_of_camera(name: str) -> bool:
+    """Whether `rig.json` knows the parameter: a range bias has no place in it yet."""
+    return name not in ("offset_m", "scale", "radial_m")
+
+
+def _version() -> str:
+    try:
+        return importlib.metadata.version("cairn-robotics")
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"
