@@ -21,6 +21,10 @@ from cairn_map.errors import BadInputError
 Floats = npt.NDArray[np.float64]
 
 
+Moves = dict[tuple[str, str], Floats]
+"""(..., 2) pixels a unit of a parameter, by camera and name."""
+
+
 @dataclass(frozen=True, slots=True)
 class CertainPixels:
     """Where points appear, and how certain that is."""
@@ -56,9 +60,8 @@ def project_certain(rig: Rig, camera: str, points_rig: npt.NDArray[np.floating])
     Raises:
         BadInputError: no such camera, no lens, or the rig has no covariance.
     """
-    points = np.asarray(points_rig, np.float64)
-    pixels, _, columns = _seen(rig, camera, points)
-    return CertainPixels(pixels, _carried(rig, {camera: columns}))
+    pixels, _, moves = _seen(rig, camera, np.asarray(points_rig, np.float64))
+    return CertainPixels(pixels, _carried(rig, moves))
 
 
 def transfer_certain(
@@ -85,56 +88,84 @@ def transfer_certain(
     Raises:
         BadInputError: no such camera, no lens, or the rig has no covariance.
     """
-    lens, T_rig_source = _lens(rig, source), rig[source].transform
-    seen = lens.unprojection(pixels)
-    R = T_rig_source[:3, :3]
-    q = np.asarray(range_m, np.float64)[..., None] * seen.rays @ R.T
-    found, by_point, columns = _seen(rig, target, q + T_rig_source[:3, 3])
-    by_pixel = by_point @ R @ seen.by_pixel * np.asarray(range_m)[..., None, None]
-    by_range = by_point @ (seen.rays @ R.T)[..., None]
-    own = {"": by_point @ R @ seen.by_intrinsics * np.asarray(range_m)[..., None, None]}
-    intrinsics = dict(zip(lens.intrinsic_names, np.moveaxis(own[""], -1, 0), strict=True))
-    # The source's camera turns and shifts its points: dp = dr x q + dt.
-    pose = np.concatenate([-by_point @ cross_matrix(q), by_point], axis=-1)
-    places = dict(zip(POSE_UNITS, np.moveaxis(pose, -1, 0), strict=True))
+    found, by_pixel, by_range, moves = _transferred(rig, source, target, pixels, range_m)
     return CertainTransfer(
         found,
-        _carried(rig, {source: {**intrinsics, **places}, target: columns}),
+        _carried(rig, moves),
         pixel_sigma_px**2 * by_pixel @ np.swapaxes(by_pixel, -1, -2),
         range_sigma_m**2 * by_range @ np.swapaxes(by_range, -1, -2),
     )
 
 
-def _seen(rig: Rig, camera: str, points: Floats) -> tuple[Floats, Floats, dict[str, Floats]]:
-    """Pixels, (..., 2, 3) by the point in the rig's frame, and (..., 2) by each number of the camera."""
-    lens, T_rig_camera = _lens(rig, camera), rig[camera].transform
+def transfer_moves(
+    rig: Rig, source: str, target: str, pixels: npt.NDArray[np.floating], range_m: npt.NDArray[np.floating]
+) -> tuple[Floats, Moves]:
+    """Pixels of `target` as above, and how they move with every parameter of both cameras."""
+    found, _, _, moves = _transferred(rig, source, target, pixels, range_m)
+    return found, moves
+
+
+def projection_moves(rig: Rig, camera: str, points_rig: Floats) -> tuple[Floats, Floats, Moves]:
+    """Pixels of (..., 3) points, rig frame; (..., 2, 3) by the point; and how they move by parameter."""
+    return _seen(rig, camera, points_rig)
+
+
+def _transferred(
+    rig: Rig, source: str, target: str, pixels: npt.NDArray[np.floating], range_m: npt.NDArray[np.floating]
+) -> tuple[Floats, Floats, Floats, Moves]:
+    """Pixels, (..., 2, 2) by the pixel, (..., 2, 1) by the range, and by each parameter."""
+    lens, T_rig_source = mounted_lens(rig, source), rig[source].transform
+    seen = lens.unprojection(pixels)
+    R, far = T_rig_source[:3, :3], np.asarray(range_m, np.float64)[..., None]
+    q = far * (seen.rays @ R.T)
+    found, by_point, moves = _seen(rig, target, q + T_rig_source[:3, 3])
+    by_ray = far[..., None] * (by_point @ R)
+    # The source's camera turns and shifts its points: dp = dr x q + dt.
+    own = _by_name(source, lens, by_ray @ seen.by_intrinsics, -by_point @ cross_matrix(q), by_point)
+    for parameter, move in own.items():
+        # Of a camera to itself both come together.
+        moves[parameter] = moves.get(parameter, 0.0) + move
+    return found, by_ray @ seen.by_pixel, by_point @ (seen.rays @ R.T)[..., None], moves
+
+
+def _seen(rig: Rig, camera: str, points: Floats) -> tuple[Floats, Floats, Moves]:
+    """Pixels, (..., 2, 3) by the point in the rig's frame, and by each parameter of the camera."""
+    lens, T_rig_camera = mounted_lens(rig, camera), rig[camera].transform
     R = T_rig_camera[:3, :3]
     q = points - T_rig_camera[:3, 3]
     there = lens.projection(q @ R)
     by_point = there.by_point @ R.T
     # p_camera = R^T exp(-dr) (p - t - dt): as seen from the camera points move by -dt - dr x q.
-    pose = np.concatenate([by_point @ cross_matrix(q), -by_point], axis=-1)
-    columns = dict(zip(lens.intrinsic_names, np.moveaxis(there.by_intrinsics, -1, 0), strict=True))
-    return there.pixels, by_point, {**columns, **dict(zip(POSE_UNITS, np.moveaxis(pose, -1, 0), strict=True))}
+    moves = _by_name(camera, lens, there.by_intrinsics, by_point @ cross_matrix(q), -by_point)
+    return there.pixels, by_point, moves
 
 
-def _carried(rig: Rig, columns: dict[str, dict[str, Floats]]) -> Floats:
+def _by_name(camera: str, lens: Lens, by_intrinsics: Floats, by_rotation: Floats, by_translation: Floats) -> Moves:
+    names = (*lens.intrinsic_names, *POSE_UNITS)
+    columns = np.moveaxis(np.concatenate([by_intrinsics, by_rotation, by_translation], axis=-1), -1, 0)
+    return {(camera, name): column for name, column in zip(names, columns, strict=True)}
+
+
+def _carried(rig: Rig, moves: Moves) -> Floats:
     calibration = rig.calibration
     if calibration is None or calibration.covariance is None:
         raise BadInputError(
             "no_covariance", f"rig {rig.name} does not say how certain it is: solve it with cairn calib solve"
         )
-    parameters = calibration.covariance.parameters
-    used = [n for n, each in enumerate(parameters) if each.name in columns.get(each.camera, {})]
+    parameters = [(each.camera, each.name) for each in calibration.covariance.parameters]
+    used = [n for n, parameter in enumerate(parameters) if parameter in moves]
     covariance = calibration.covariance.matrix[np.ix_(used, used)]
-    J = np.stack([columns[parameters[n].camera][parameters[n].name] for n in used], axis=-1)
+    J = np.stack([moves[parameters[n]] for n in used], axis=-1)
     return np.asarray(J @ covariance @ np.swapaxes(J, -1, -2))
 
 
-def _lens(rig: Rig, camera: str) -> Lens:
+def mounted_lens(rig: Rig, camera: str) -> Lens:
+    """A camera's lens.
+
+    Raises:
+        BadInputError: no such camera, or a lidar.
+    """
     lens = rig[camera].camera
     if not isinstance(lens, Lens):
-        raise BadInputError(
-            "no_lens", f"{camera} of rig {rig.name} is a lidar: it has no lens whose pixels could be carried"
-        )
+        raise BadInputError("no_lens", f"{camera} of rig {rig.name} is a lidar: it has no lens to carry pixels by")
     return lens

@@ -1,7 +1,7 @@
 """By how much ranges miss the board's plane: what the range camera's images add to the normal equations.
 
     true range = (n . (o - c) + w) / (n . v)      n, o: the board's normal and origin, w: its warp there; v: the pixel's
-    residual   = (measured - bias - true) / s     ray, c: the camera; all in the rig's frame, metres
+    residual   = (true + bias - measured) / s     ray, c: the camera; all in the rig's frame, metres
 
 Every pixel that looks at the inside of the board measures its plane, whatever is printed on it. The warp is taken from
 where the ray meets the plane.
@@ -16,7 +16,7 @@ import numpy.typing as npt
 from cairn_calib.board import Board
 from cairn_calib.board_views import RangeView
 from cairn_calib.normal_equations import Block, Indices, Loss
-from cairn_calib.range_bias import bias_shapes
+from cairn_calib.range_bias import SCALE_AT, bias_shapes
 from cairn_calib.rig_state import Layout, RigState, warp_at_places
 
 Floats = npt.NDArray[np.float64]
@@ -40,8 +40,6 @@ class RangeData:
     """(V, M, 2)"""
     range_m: Floats
     """(V, M)"""
-    shapes: Floats
-    """(V, M, B) of the bias."""
     measured: Flags
     """(V, M)"""
     sigma_m: float
@@ -70,8 +68,7 @@ def range_data(
         pixels_px[n, : len(pixels)], range_m[n, : len(pixels)] = pixels, ranges
         measured[n, : len(pixels)] = True
     indices = np.array([frame for frame, _, _ in chosen], np.intp)
-    shapes = bias_shapes(lens, pixels_px, range_m)
-    return RangeData(camera, indices, pixels_px, range_m, shapes, measured, sigma_m)
+    return RangeData(camera, indices, pixels_px, range_m, measured, sigma_m)
 
 
 def plane_ranges(data: RangeData, state: RigState, board: Board) -> Floats:
@@ -85,6 +82,7 @@ def range_block(data: RangeData, state: RigState, layout: Layout, board: Board, 
     seen = state.lenses[c].unprojection(data.pixels)
     met = _met(data, state, board, seen.rays)
     R_rig_camera = state.T_rig_camera[c, :3, :3]
+    shapes = bias_shapes(state.lenses[c], data.pixels, met.range_m)
     n, v, d, slant = met.normals[:, None, :], met.rays, met.range_m, met.slant
     by_ray = -(d / slant)[..., None] * n
     columns = [
@@ -97,11 +95,13 @@ def range_block(data: RangeData, state: RigState, layout: Layout, board: Board, 
     if len(layout.warp_at):
         columns.append(met.warp_shape / slant[..., None])
         at.append(layout.warp_at)
-    columns.append(data.shapes)
-    at.append(layout.bias_at)
     columns += [np.cross(n, met.off_board) / slant[..., None], np.broadcast_to(n, v.shape) / slant[..., None]]
+    # All so far move the true range, of which the bias scales.
+    columns = [(1 + state.bias[SCALE_AT]) * column for column in columns]
+    columns.insert(-2, shapes)
+    at.append(layout.bias_at)
     whitening = loss.kept / (loss.scale * data.sigma_m)
-    residuals = np.where(loss.kept, whitening * (d + data.shapes @ state.bias - data.range_m), 0.0)
+    residuals = np.where(loss.kept, whitening * (d + shapes @ state.bias - data.range_m), 0.0)
     weights, cost = loss(residuals**2)
     root = np.sqrt(weights)
     J = np.nan_to_num(np.concatenate(columns, axis=-1) * (root * whitening)[..., None])
