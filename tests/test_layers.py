@@ -39,6 +39,7 @@ MAY_NAME = {
         "cairn_calib/circle_grid.py",
         "cairn_calib/corner_detection.py",
         "cairn_calib/corner_pictures.py",
+        "cairn_calib/flir_file.py",
         "cairn_calib/saddle_points.py",
         "cairn_fusion/images.py",
         "cairn_fusion/picture.py",

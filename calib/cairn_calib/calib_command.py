@@ -9,9 +9,9 @@
 import argparse
 from collections.abc import Callable
 
-from cairn_calib import convert_command, corners_command, solve_command
+from cairn_calib import convert_command, corners_command, solve_command, thermal_command
 
-SUBCOMMANDS = (convert_command, corners_command, solve_command)
+SUBCOMMANDS = (convert_command, corners_command, solve_command, thermal_command)
 
 
 def main(argv: list[str]) -> int:

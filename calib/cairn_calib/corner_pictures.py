@@ -76,6 +76,11 @@ def write_picture(path: Path, picture: Picture) -> None:
     path.write_bytes(bytes(cv2.imencode(".png", picture)[1]))
 
 
+def write_grey16(path: Path, counts: npt.NDArray[np.uint16]) -> None:
+    """A 16-bit PNG file of (H, W) counts."""
+    path.write_bytes(bytes(cv2.imencode(".png", counts)[1]))
+
+
 def _draw(picture: Picture, corners: Corners, scale: int) -> None:
     seen = corners.seen
     at = (corners.pixels + 0.5) * scale - 0.5

@@ -26,6 +26,7 @@ from cairn_calib.camera import Camera
 from cairn_calib.fisheye import FisheyeCamera
 from cairn_calib.lidar import SpinningLidar
 from cairn_calib.poses import Transform, checked_transform
+from cairn_calib.radiometry import Radiometry
 from cairn_calib.raster import Raster
 from cairn_calib.sensing import LIDAR, TIME_OF_FLIGHT, RangeSensing
 from cairn_map.errors import BadInputError, first_error
@@ -77,6 +78,8 @@ class MountedCamera(BaseModel):
     """Of a range camera."""
     calibration_sigma_px: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
     """How far off, in its own pixels, points of the range camera are expected in it: one axis, standard deviation."""
+    radiometry: Radiometry | None = None
+    """Of a thermal camera: what its counts mean."""
 
     @model_validator(mode="after")
     def _rigid(self) -> Self:
@@ -96,6 +99,12 @@ class MountedCamera(BaseModel):
     def _range_is_sensed_by_range_cameras(self) -> Self:
         if self.sensing is not None and self.spectrum is not Spectrum.RANGE:
             raise ValueError(f"sensing is of range cameras, not of {self.spectrum}")
+        return self
+
+    @model_validator(mode="after")
+    def _temperatures_are_of_thermal_cameras(self) -> Self:
+        if self.radiometry is not None and self.spectrum is not Spectrum.THERMAL:
+            raise ValueError(f"radiometry is of thermal cameras, not of {self.spectrum}")
         return self
 
     @property

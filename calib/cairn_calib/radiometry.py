@@ -1,0 +1,199 @@
+"""What a thermal camera's counts mean: its response to a black body, both ways, and how certain it is.
+
+    kelvin  --counts_of-->  counts          "radiometry" of a thermal camera in rig.json (CONVENTIONS.md)
+    kelvin  <--kelvin_of--  counts          how it is found: response_fit.py, flir_file.py, flat_field.py
+
+Two laws. `planck`: U = R / (exp(B / T) - F) + O, FLIR's form of Planck's law over the camera's band, for counts that
+are proportional to the light received. `polynomial`: T = c0 + c1 U + c2 U^2, for cameras that compute a temperature
+themselves. Both are refused where they do not rise all over their range; beyond it there is no temperature, for there
+nobody looked.
+"""
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from cairn_map.errors import BadInputError, first_error
+
+Floats = npt.NDArray[np.float64]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Above0 = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+AtLeast0 = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Kelvin = Annotated[float, Field(ge=50, le=5000, allow_inf_nan=False)]
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+ZERO_C_K = 273.15
+
+
+class PlanckResponse(BaseModel):
+    """U = r / (exp(b_k / T) - f) + o, of a black body at T kelvin; r is FLIR's R1 / R2, o its O with the other sign."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    law: Literal["planck"] = "planck"
+    r: Above0
+    b_k: Above0
+    f: Finite = 1.0
+    o: Finite = 0.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the numbers that a covariance is of."""
+        return ("r", "b_k", "o")
+
+    def counts_of(self, kelvin: npt.ArrayLike) -> Floats:
+        """(...) counts, not rounded, of a black body; NaN at and below 0 K."""
+        T = _positive(kelvin)
+        return np.asarray(self.r * self._light(T) + self.o)
+
+    def kelvin_of(self, counts: npt.ArrayLike) -> Floats:
+        """The mirror of `counts_of`; NaN where no temperature gives the counts."""
+        light = _positive(np.asarray(counts, np.float64) - self.o)
+        return np.asarray(self.b_k / _positive(np.log(_positive(self.r / light + self.f))))
+
+    def slope(self, kelvin: npt.ArrayLike) -> Floats:
+        """(...) counts a kelvin."""
+        T = _positive(kelvin)
+        light = self._light(T)
+        # (exp(x) without its overflow: exp(x) = 1 / light + f.)
+        return np.asarray(self.r * light * light * (1 / light + self.f) * self.b_k / T**2)
+
+    def by_parameters(self, kelvin: npt.ArrayLike) -> Floats:
+        """(..., 3) counts a unit of each of `names`."""
+        T = _positive(kelvin)
+        light = self._light(T)
+        return np.stack([light, -self.slope(T) * T / self.b_k, np.ones_like(light)], axis=-1)
+
+    def _light(self, T: Floats) -> Floats:
+        tail = np.exp(-self.b_k / T)
+        return np.asarray(tail / (1 - self.f * tail))
+
+
+class PolynomialResponse(BaseModel):
+    """T = c0 + c1 v + c2 v^2 kelvin, v = (U - at_counts) / per_counts: counts of nearly even steps of temperature."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    law: Literal["polynomial"] = "polynomial"
+    c0: Finite
+    c1: Above0
+    c2: Finite = 0.0
+    at_counts: Finite
+    """About the middle of the references, so that the coefficients stay of one size."""
+    per_counts: Above0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the numbers that a covariance is of."""
+        return ("c0", "c1", "c2")
+
+    def kelvin_of(self, counts: npt.ArrayLike) -> Floats:
+        """(...) kelvin of a black body that gives the counts; NaN beyond the turning point."""
+        v = (np.asarray(counts, np.float64) - self.at_counts) / self.per_counts
+        return np.asarray(np.where(self.c1 + 2 * self.c2 * v > 0, self.c0 + v * (self.c1 + v * self.c2), np.nan))
+
+    def counts_of(self, kelvin: npt.ArrayLike) -> Floats:
+        """The mirror of `kelvin_of`; NaN where no counts give the temperature."""
+        up = np.asarray(kelvin, np.float64) - self.c0
+        root = np.sqrt(_positive(self.c1**2 + 4 * self.c2 * up))
+        return np.asarray(self.at_counts + self.per_counts * 2 * up / (self.c1 + root))
+
+    def slope(self, kelvin: npt.ArrayLike) -> Floats:
+        """(...) counts a kelvin."""
+        up = np.asarray(kelvin, np.float64) - self.c0
+        return np.asarray(self.per_counts / np.sqrt(_positive(self.c1**2 + 4 * self.c2 * up)))
+
+    def by_parameters(self, kelvin: npt.ArrayLike) -> Floats:
+        """(..., 3) counts a unit of each of `names`."""
+        T = np.asarray(kelvin, np.float64)
+        v = (self.counts_of(T) - self.at_counts) / self.per_counts
+        return np.asarray(-self.slope(T)[..., None] * np.stack([np.ones_like(v), v, v * v], axis=-1))
+
+
+Response = Annotated[PlanckResponse | PolynomialResponse, Field(discriminator="law")]
+
+
+class MapsFile(BaseModel):
+    """The file beside rig.json that says how each pixel differs from the mean one (`flat_field.py`)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
+    sha256: Sha256
+
+
+class Radiometry(BaseModel):
+    """The response of one camera, its range, how certain it is; `radiometry` in rig.json, or a file of its own."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    format: Literal["cairn-radiometry"] = "cairn-radiometry"
+    version: Literal[1] = 1
+    response: Response
+    range_k: tuple[Kelvin, Kelvin]
+    """Black bodies between these were looked at; what is colder or hotter has no temperature."""
+    covariance_lower: tuple[tuple[Finite, ...], ...] | None = None
+    """Of the response's numbers, lower triangle row by row; absent where nobody said (a maker's own numbers)."""
+    accuracy_k: AtLeast0 = 0.0
+    """What a maker states, standard deviation, the same at all pixels; on top of the covariance."""
+    noise_counts: AtLeast0 = 0.0
+    """Of a pixel from image to image, standard deviation."""
+    pattern_counts: AtLeast0 = 0.0
+    """What is left of the pixels' own offsets after the maps, standard deviation."""
+    source: Annotated[str, Field(min_length=1, max_length=400)]
+    """Where the numbers come from, for people."""
+    maps: MapsFile | None = None
+
+    @model_validator(mode="after")
+    def _rises(self) -> Self:
+        low_k, high_k = self.range_k
+        if not low_k < high_k:
+            raise ValueError(f"range_k must rise, got {low_k:g} to {high_k:g}")
+        with np.errstate(all="ignore"):
+            counts = self.response.counts_of(np.linspace(low_k, high_k, 101))
+        if not (np.isfinite(counts).all() and (np.diff(counts) > 0).all()):
+            raise ValueError(f"the response does not rise all the way from {low_k:g} to {high_k:g} K")
+        return self
+
+    @model_validator(mode="after")
+    def _is_a_covariance(self) -> Self:
+        if self.covariance_lower is not None:
+            if [len(row) for row in self.covariance_lower] != [1, 2, 3]:
+                raise ValueError("covariance_lower must have rows of 1, 2 and 3 numbers")
+            sigma = np.sqrt(np.maximum(np.diag(self.covariance), 0))
+            safe = np.where(sigma > 0, sigma, 1)
+            if np.linalg.eigvalsh(self.covariance / safe[:, None] / safe)[0] < -1e-6:
+                raise ValueError("covariance_lower has a negative eigenvalue")
+        return self
+
+    @property
+    def covariance(self) -> Floats:
+        """(3, 3) of the response's `names`; zeros where it is not known."""
+        matrix = np.zeros((3, 3))
+        for n, row in enumerate(self.covariance_lower or ()):
+            matrix[n, : n + 1] = row
+            matrix[: n + 1, n] = row
+        return matrix
+
+    def to_json(self) -> bytes:
+        """The bytes of a file of its own; the mirror of `radiometry_from_json`."""
+        return self.model_dump_json(indent=1, exclude_none=True).encode() + b"\n"
+
+
+def radiometry_from_json(data: bytes) -> Radiometry:
+    """The radiometry in a file's bytes.
+
+    Raises:
+        BadInputError: not JSON, another format or version, or numbers that cannot be; the message names the field.
+    """
+    try:
+        return Radiometry.model_validate_json(data)
+    except ValidationError as exc:
+        raise BadInputError("bad_radiometry", f"radiometry: {first_error(exc)}") from exc
+
+
+def _positive(values: npt.ArrayLike) -> Floats:
+    """Values above 0; NaN for all others."""
+    v = np.asarray(values, np.float64)
+    return np.where(v > 0, v, np.nan)
