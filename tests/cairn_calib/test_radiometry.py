@@ -132,6 +132,21 @@ def test_stated_sigma_is_that_of_monte_carlo(response: Response) -> None:
     np.testing.assert_allclose(stated.sigma_k**2 - stated.common_sigma_k**2, each[None] ** 2, rtol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("name", "sigma"),
+    [("emissivity", 0.02), ("reflected_k", 2.0), ("transmission", 0.01), ("air_k", 3.0)],
+)
+def test_each_share_of_the_sigma_is_what_the_temperature_moves_by(name: str, sigma: float) -> None:
+    known, sure = radiometry(PLANCK), Viewing(emissivity=0.7, reflected_k=320.0, transmission=0.8, air_k=280.0)
+    counts = seen_counts(np.array([300.0, 350.0]), known, sure)
+    field = f"{name.removesuffix('_k')}_sigma{'_k' if name.endswith('_k') else ''}"
+    stated = read(counts, known, replace(sure, **{field: sigma})).sigma_k[0]
+    up, down = (
+        read(counts, known, replace(sure, **{name: getattr(sure, name) + s * sigma})).kelvin[0] for s in (1, -1)
+    )
+    np.testing.assert_allclose(stated, np.abs(up - down) / 2, rtol=0.02)
+
+
 def drawn_viewing(rng: np.random.Generator) -> Viewing:
     e, r, t, a = rng.standard_normal(4)
     return replace(
