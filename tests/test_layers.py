@@ -39,8 +39,10 @@ MAY_NAME = {
         "cairn_calib/circle_grid.py",
         "cairn_calib/corner_detection.py",
         "cairn_calib/corner_pictures.py",
+        "cairn_calib/disc_images.py",
         "cairn_calib/flir_file.py",
         "cairn_calib/saddle_points.py",
+        "cairn_calib/target_pictures.py",
         "cairn_fusion/images.py",
         "cairn_fusion/picture.py",
         "cairn_sim/contact_sheet.py",
@@ -184,5 +186,5 @@ def test_every_entry_point_resolves() -> None:
     for group, points in groups.items():
         for name, value in points.items():
             found = EntryPoint(name, value, group).load()
-            door = found.main if group == "cairn.commands" else found
+            door = found.main if group in ("cairn.commands", "cairn.calib") else found
             assert callable(door), f"{group}: {name}"
