@@ -44,6 +44,7 @@ MAY_NAME = {
         "cairn_calib/saddle_points.py",
         "cairn_calib/target_pictures.py",
         "cairn_fusion/images.py",
+        "cairn_fusion/overlay_blur.py",
         "cairn_fusion/picture.py",
         "cairn_sim/contact_sheet.py",
         "cairn_sim/render.py",

@@ -10,6 +10,7 @@
     $ cairn map branches http://127.0.0.1:8750/maps/lab
     $ cairn map retract http://127.0.0.1:8750/maps/lab --robot mole --pushed-after 14:05 --dry-run
     $ cairn map query lab/ ray 1,2,0.4 0,1,0
+    $ cairn map render lab/ --from 1,2,1.4 --to 4,2,1 -o view.png
     $ cairn map heal http://127.0.0.1:8750/maps/lab lab/
 
 A map's URL is http://HOST:PORT/maps/NAME. A retract takes exactly the evidence of the named commits out again, on
@@ -32,6 +33,7 @@ from cairn_client.heal_command import add_heal_arguments, heal
 from cairn_client.log_graph import log_graph
 from cairn_client.prior_data import push_prior_data
 from cairn_client.query_command import add_query_arguments
+from cairn_client.render_command import add_render_arguments
 from cairn_client.retract_command import add_retract_arguments, retract
 from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
 from cairn_map.errors import BadInputError
@@ -213,6 +215,7 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--picture", type=Path, metavar="FILE", help="PNG: colour, temperature, probability")
     export.add_argument("--ceiling", type=float, metavar="METRES", help="picture: leave out what is higher")
     add_query_arguments(commands.add_parser("query", help="ask a map that lies in a folder, without a server"))
+    add_render_arguments(commands.add_parser("render", help="draw a map from a pose, or over a camera's image"))
     add_heal_arguments(command("heal", "send cells that the server's disk damaged", heal, "map"))
     add_retract_arguments(command("retract", "take commits out of a map again, exactly", retract, "map"))
     return top

@@ -58,6 +58,11 @@ class MapSnapshot:
         return type(self)(freeze(whole, self._frozen.model, earlier=self._frozen))
 
     @property
+    def frozen(self) -> FrozenMap:
+        """What queries in other modules read, such as `map_render`."""
+        return self._frozen
+
+    @property
     def geometry(self) -> Geometry:
         """Voxel edge, cells and channels."""
         return self._frozen.geometry

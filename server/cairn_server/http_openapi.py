@@ -22,6 +22,7 @@ Route = tuple[str, str]
 MAP = "/maps/{name}"
 UPLOAD = f"{MAP}/commits/{{commit}}/upload"
 CELL = f"{MAP}/main/cells/{{cell}}"
+RENDER = f"{MAP}/main/render"
 VIEW = f"{MAP}/branches/{{branch}}/view"
 COMMIT_MEDIA_TYPE = "application/vnd.cairn.commit"
 CELL_TYPES = (CELL_MEDIA_TYPE, *MEDIA_TYPES.values())
@@ -40,6 +41,7 @@ ANSWERS: dict[Route, dict[int, tuple[str, ...]]] = {
     ("head", CELL): {200: CELL_TYPES, 304: ()},
     ("get", f"{MAP}/main/vector"): {200: ("application/json",)},
     ("get", VIEW): {200: PICTURES, 304: ()},
+    ("get", RENDER): {200: ("image/png", "application/x-npz"), 304: ()},
     ("get", f"{MAP}/events"): {200: ("text/event-stream",)},
     ("get", f"{MAP}/live"): {101: ()},
 }
@@ -57,6 +59,7 @@ PROBLEMS: dict[Route, tuple[int, ...]] = {
     ("post", f"{MAP}/branches/{{branch}}/missing"): (410,),
     ("get", f"{MAP}/main/vector"): (410,),
     ("get", CELL): (416,),
+    ("get", RENDER): (413,),
     ("get", f"{MAP}/events"): (429,),
     ("get", f"{MAP}/live"): (426,),
 }
@@ -66,6 +69,7 @@ HEADERS: dict[Route, tuple[str, ...]] = {
     ("get", CELL): CELL_HEADERS,
     ("head", CELL): CELL_HEADERS,
     ("get", VIEW): ("ETag", "Last-Modified"),
+    ("get", RENDER): ("ETag", "Cairn-Cursor"),
     ("get", f"{MAP}/commits/{{commit}}"): ("ETag", "Cairn-Seal"),
 }
 BYTES: Json = {"schema": {"type": "string", "format": "binary"}}

@@ -31,6 +31,16 @@ class MadeOnce(Generic[K, V]):
         self._making: dict[K, Future[V]] = {}
         self._size_bytes = 0
 
+    def here(self, name: K) -> V | None:
+        """The value of a name if it was made and kept; nobody makes one for this."""
+        with self._lock:
+            kept = self._kept.get(name)
+            if kept is None:
+                return None
+            self._kept.move_to_end(name)
+            self._kept[name] = kept[0], self._steady_s()
+            return kept[0]
+
     def get(self, name: K, make: Callable[[], V]) -> V:
         """The value of a name; what `make` raises is raised to all who wait for it, and not kept."""
         mine: Future[V] = Future()

@@ -9,6 +9,7 @@ from cairn_server import (
     live_routes,
     map_routes,
     operations_routes,
+    render_routes,
     robot_routes,
     sync_routes,
     upload_routes,
@@ -38,6 +39,7 @@ ROUTERS = (
     live_routes.router,
     robot_routes.router,
     upload_routes.router,
+    render_routes.router,
 )
 
 

@@ -41,6 +41,7 @@ from cairn_server.healing import heal_cell, keep_healed
 from cairn_server.held_commits import HeldCommits
 from cairn_server.joining import Joining
 from cairn_server.live import Hub
+from cairn_server.map_views import MapViews
 from cairn_server.missing import Besides, asker_from_request, header_of, reply_frames
 from cairn_server.push_policy import EvidenceGoneError
 from cairn_server.pushes import Pushes
@@ -96,6 +97,7 @@ class Service:
         self.uploads = Uploads(store, self.pushes)
         self._stable = StableVectors(settings.stable_after_s)
         self._reads = ReadCache()
+        self.views = MapViews(store, self.damaged)
         self._healing = threading.Lock()
         self.operator = new_incarnation()
         """Of the retracts made here. A new one with every start: a restored server must not number over lost ones."""

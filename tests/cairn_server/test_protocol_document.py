@@ -9,7 +9,7 @@ from fastapi.routing import APIRoute
 from starlette.routing import Route, WebSocketRoute
 from tests.cairn_server.live import Live
 
-from cairn_map import live_events
+from cairn_map import live_events, render_request
 from cairn_map.commit import COMMIT_BYTES_MAX, RETRACTS_MAX
 from cairn_map.messages import CURSORS_MAX
 from cairn_server import (
@@ -20,6 +20,7 @@ from cairn_server import (
     commit_checks,
     commit_cost,
     live,
+    map_views,
     missing,
     problems,
     push_policy,
@@ -109,6 +110,12 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("dear commits that wait for a worker", check_pool.WAITING_MAX),
         ("live streams of one token", live.LISTENERS_OF_TOKEN_MAX),
         ("live streams", live.LISTENERS_MAX),
+        ("pixels of a rendered picture", render_request.REQUEST_PIXELS_MAX),
+        ("range of a rendered picture", render_request.RANGE_MAX_M),
+        ("cells in its sight", map_views.CELLS_IN_VIEW_MAX),
+        ("voxels of the cells that it takes", map_views.VOXELS_READ_MAX),
+        ("making it", map_views.RENDER_S),
+        ("pictures made at once", map_views.RENDERS_AT_ONCE),
         ("header `Cairn-Coverage`", cell_routes.COVERAGE_BYTES_MAX),
         ("cells in one live event", live_events.CELLS_MAX),
         ("problem's `detail`", problems.DETAIL_CHARACTERS_MAX),

@@ -1,0 +1,231 @@
+"""The team's map over a robot's live image: what others measured, where this robot looks now.
+
+    visible       the map agrees with the live depth: painted solid
+    see-through   behind the live surface, beyond the next free space: in stripes, fainter the farther and older it is
+    map only      no live depth says what is there: in dots
+
+    overlay = draw_overlay(renderer, snapshot, live, OverlayStyle(layer=Layer.TEMPERATURE))
+    overlay.picture                      (H, W, 3), with `legend()` below
+
+A map surface in front of the live depth is gone now, and is not drawn. What the map has no value for is grey, never
+cold. Where the pose is uncertain the ink spreads as far as it may be off; where it is too uncertain, nothing is drawn,
+and the picture says why.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_fusion import overlay_kernels as kernels
+from cairn_fusion.overlay_blur import PoseSpread, spread_ink
+from cairn_map.errors import BadInputError
+from cairn_map.map_picture import Ages, layer_values
+from cairn_map.map_render import MapRenderer, Seen
+from cairn_map.map_snapshot import MapSnapshot
+from cairn_map.paint_kernels import blend_into
+from cairn_map.render_picture import LEGEND_PX, NOTHING, SCALES, TEXT, Layer, Scale, painted, with_legend
+from cairn_map.sight import Sight
+from cairn_map.small_text import write_text_into
+
+Rgb = npt.NDArray[np.uint8]
+Values = npt.NDArray[np.float32]
+Flags = npt.NDArray[np.bool_]
+
+TOLERANCE_VOXELS = 2.0
+GREY_COVER = 0.4
+"""Of what has no value, beside what has."""
+THROUGH_COVER = 0.9
+THROUGH_COVER_MIN = 0.2
+MEANINGS = "solid: visible   stripes: behind what is seen   dots: known from the map alone"
+EXACT = PoseSpread()
+WARNING = (255, 210, 60)
+
+
+class Mode(IntEnum):
+    """What a pixel of an overlay shows of the map in front."""
+
+    NOTHING = kernels.NOTHING
+    VISIBLE = kernels.VISIBLE
+    SEE_THROUGH = kernels.SEE_THROUGH
+    MAP_ONLY = kernels.MAP_ONLY
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Live:
+    """A live image, and where it was taken."""
+
+    rgb: Rgb
+    """(H, W, 3) sRGB."""
+    range_m: Values
+    """(H, W) metres along each pixel's ray; NaN where there is none."""
+    sight: Sight
+    T_map_camera: npt.NDArray[np.float64]
+    spread: PoseSpread = EXACT
+
+    def __post_init__(self) -> None:
+        size = (self.sight.height, self.sight.width)
+        if self.rgb.shape != (*size, 3) or self.rgb.dtype != np.uint8 or self.range_m.shape != size:
+            raise BadInputError(
+                "image_size",
+                f"the camera has {size[1]} x {size[0]} pixels, so rgb must be {(*size, 3)} uint8 and range_m {size}; "
+                f"got {self.rgb.shape} {self.rgb.dtype} and {self.range_m.shape}",
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OverlayStyle:
+    """What is drawn, and how."""
+
+    layer: Layer = Layer.TEMPERATURE
+    scale: Scale | None = None
+    """None: the layer's usual one."""
+    tolerance_m: float | None = None
+    """By how much the map and the live depth may differ and still agree; None: two voxels."""
+    range_max_m: float = 20.0
+    fade_m: float = 8.0
+    """Behind the live surface by this, stripes have faded to 1/e; and"""
+    fade_s: float = 3600.0
+    """likewise at this age, where the age is known."""
+    blur_max_px: float = 16.0
+    """Nothing is drawn when half of it may be off by more (standard deviation)."""
+    step_px: int = 2
+    """What is behind is looked up once for so many pixels along both axes: stripes do not show more."""
+
+    @property
+    def colours(self) -> Scale:
+        """The scale."""
+        return self.scale or SCALES[self.layer]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Overlay:
+    """What was drawn."""
+
+    picture: Rgb
+    """(H, W, 3)"""
+    front: Seen
+    """What the map has where the live surface is; without live depth, the nearest."""
+    values: npt.NDArray[np.floating]
+    """Of the layer, in front; (H, W), of colours (H, W, 3)."""
+    front_modes: npt.NDArray[np.uint8]
+    """(H, W) VISIBLE, MAP_ONLY or NOTHING."""
+    behind: Seen
+    """What lies beyond, for each `step_px`-th row and column."""
+    values_behind: npt.NDArray[np.floating]
+    step_px: int
+    withheld: str | None = None
+    """Why nothing was drawn."""
+
+    @property
+    def through(self) -> Flags:
+        """(H, W) whether something lies behind the live surface."""
+        H, W = self.front_modes.shape
+        return self.behind.hit.repeat(self.step_px, axis=0).repeat(self.step_px, axis=1)[:H, :W]
+
+    @property
+    def modes(self) -> npt.NDArray[np.uint8]:
+        """(H, W) `Mode` of each pixel; SEE_THROUGH where nothing is in front, but something is behind."""
+        is_behind = (self.front_modes == Mode.NOTHING) & self.through
+        return np.where(is_behind, np.uint8(Mode.SEE_THROUGH), self.front_modes)
+
+
+def draw_overlay(
+    renderer: MapRenderer, snapshot: MapSnapshot, live: Live, style: OverlayStyle, ages: Ages | None = None
+) -> Overlay:
+    """The map over a live image.
+
+    Args:
+        renderer: keeps what it worked out between images.
+        snapshot: the map.
+        live: the image, its depth and its camera.
+        style: which layer, and how.
+        ages: when the map changed; without it nothing fades with age.
+
+    Raises:
+        BadInputError: the map has no such layer, or the pose is no rigid transform.
+    """
+    tolerance_m = np.float32(style.tolerance_m or TOLERANCE_VOXELS * snapshot.geometry.voxel_edge_m)
+    range_m = np.asarray(live.range_m, np.float32)
+    is_live = ~np.isnan(range_m)
+    between = np.where(is_live, range_m - tolerance_m, 0), np.where(is_live, range_m + tolerance_m, np.inf)
+    reach = {"range_max_m": style.range_max_m}
+    front = renderer.nearest(snapshot, live.sight, live.T_map_camera, between_m=between, **reach)
+    modes = np.where(is_live, np.uint8(Mode.VISIBLE), np.uint8(Mode.MAP_ONLY))
+    modes[~front.hit] = Mode.NOTHING
+    coarse_m = range_m[:: style.step_px, :: style.step_px]
+    behind = renderer.beyond(
+        snapshot,
+        live.sight.every(style.step_px),
+        live.T_map_camera,
+        between_m=(coarse_m + tolerance_m, np.full_like(coarse_m, style.range_max_m)),
+        **reach,
+    )
+    values = layer_values(renderer, snapshot, front, style.layer, ages)
+    values_behind = layer_values(renderer, snapshot, behind, style.layer, ages)
+    sigma_px = live.spread.at(front.range_m, pixel_rad=live.sight.pixel_rad)
+    why = _too_uncertain(sigma_px[modes != Mode.NOTHING], style)
+    if why is not None:
+        picture = live.rgb.copy()
+        write_text_into(picture, f"map withheld: {why}", (8, 8), WARNING)
+    else:
+        covers = _covers(renderer, snapshot, behind, coarse_m, style, ages)
+        covers[_unknown(values_behind)] *= GREY_COVER
+        front_covers = np.where(_unknown(values), np.float32(GREY_COVER), np.float32(1))
+        ink = np.empty((*modes.shape, 4), np.uint8)
+        kernels.ink_into(
+            painted(values, style.colours),
+            modes,
+            front_covers,
+            painted(values_behind, style.colours),
+            covers,
+            style.step_px,
+            ink,
+        )
+        if live.spread != EXACT:
+            ink = spread_ink(ink, sigma_px)
+        picture = np.empty_like(live.rgb)
+        blend_into(np.ascontiguousarray(live.rgb).reshape(-1, 3), ink.reshape(-1, 4), picture.reshape(-1, 3))
+    return Overlay(
+        picture=picture,
+        front=front,
+        values=values,
+        front_modes=modes,
+        behind=behind,
+        values_behind=values_behind,
+        step_px=style.step_px,
+        withheld=why,
+    )
+
+
+def with_overlay_legend(picture: Rgb, scale: Scale) -> Rgb:
+    """The picture with two strips below: the scale, and what solid, stripes and dots mean."""
+    legend = with_legend(picture, scale)
+    strip = np.full((LEGEND_PX // 2, picture.shape[1], 3), NOTHING, np.uint8)
+    write_text_into(strip, MEANINGS, (8, 2), TEXT)
+    return np.concatenate([legend, strip])
+
+
+def _covers(
+    renderer: MapRenderer, snapshot: MapSnapshot, behind: Seen, live_m: Values, style: OverlayStyle, ages: Ages | None
+) -> Values:
+    """(h, w) of what lies behind: less the farther behind it is, and the older."""
+    fade = (behind.range_m - live_m) / np.float32(style.fade_m)
+    if ages is not None:
+        age = (ages.now - renderer.changed(snapshot, behind, ages.changes)).astype(np.float32)
+        fade += np.nan_to_num(np.maximum(age, 0)) / np.float32(style.fade_s)
+    covers: Values = np.maximum(THROUGH_COVER * np.exp(-fade), THROUGH_COVER_MIN).astype(np.float32)
+    return np.where(behind.hit, covers, np.float32(0))
+
+
+def _too_uncertain(sigma_px: Values, style: OverlayStyle) -> str | None:
+    """Why half of what would be drawn may be too far off; None if it may not."""
+    middle = float(np.median(sigma_px)) if sigma_px.size else 0.0
+    if middle <= style.blur_max_px:
+        return None
+    return f"the pose is uncertain by {middle:.0f} px, more than {style.blur_max_px:g}"
+
+
+def _unknown(values: npt.NDArray[np.floating]) -> Flags:
+    return np.asarray(np.isnan(values if values.ndim == 2 else values[..., 0]))

@@ -1,0 +1,144 @@
+"""Where a camera looks: one ray for each pixel, and how fine the pixels are. Any lens: who has the rays has a camera.
+
+    Sight(rig["colour"].camera.rays())                     a calibrated camera, distortion and all
+    pinhole(640, 480, focal_px=500)                        an ideal one, to look from anywhere
+    look_at((1, 2, 1.2), (4, 2, 1.0))                      T_map_camera of an eye and what it looks at
+
+Camera frame: x right, y down, z forward; the centre of the top-left pixel is (0, 0).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.errors import BadInputError
+
+Floats = npt.NDArray[np.float64]
+
+PIXELS_MAX = 1 << 24
+UNIT_TOLERANCE = 1e-6
+RIGID_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """The rays of a camera's pixels."""
+
+    rays: Floats
+    """(H, W, 3) unit vectors, camera frame; NaN for pixels that look nowhere."""
+    pixel_rad: float = field(init=False)
+    """The least angle between neighbouring pixels: what is smaller is smaller than any pixel."""
+
+    def __post_init__(self) -> None:
+        rays = np.ascontiguousarray(self.rays, dtype=np.float64)
+        if rays.ndim != 3 or rays.shape[2] != 3 or not 4 <= rays[..., 0].size <= PIXELS_MAX or min(rays.shape[:2]) < 2:
+            raise BadInputError(
+                "bad_camera", f"rays must be (H, W, 3), 2 x 2 to {PIXELS_MAX} pixels, got {self.rays.shape}"
+            )
+        length = np.linalg.norm(rays, axis=2)
+        if not (np.abs(length[~np.isnan(length)] - 1) < UNIT_TOLERANCE).all():
+            raise BadInputError("bad_camera", "a camera's rays must be unit vectors, or NaN")
+        object.__setattr__(self, "rays", rays)
+        gaps = [np.linalg.norm(rays[1:] - rays[:-1], axis=2), np.linalg.norm(rays[:, 1:] - rays[:, :-1], axis=2)]
+        known = [gap[gap > 0] for gap in gaps]  # NaN is not
+        object.__setattr__(self, "pixel_rad", min((float(gap.min()) for gap in known if gap.size), default=1.0))
+
+    def every(self, step: int) -> "Sight":
+        """The camera with only each `step`-th row and column."""
+        return Sight(self.rays[::step, ::step])
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return int(self.rays.shape[0])
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+        return int(self.rays.shape[1])
+
+
+def pinhole(width: int, height: int, *, focal_px: float, centre_px: tuple[float, float] | None = None) -> Sight:
+    """An ideal camera, with the principal point in the middle or at `centre_px` (x, y).
+
+    Raises:
+        BadInputError: kind `bad_camera`: a size or focal length that cannot be.
+    """
+    if not (0 < focal_px < np.inf and width * height <= PIXELS_MAX and min(width, height) >= 2):
+        raise BadInputError("bad_camera", f"no camera has {width} x {height} pixels and a focal length of {focal_px}")
+    centre_x, centre_y = ((width - 1) / 2, (height - 1) / 2) if centre_px is None else centre_px
+    x, y = np.meshgrid((np.arange(width) - centre_x) / focal_px, (np.arange(height) - centre_y) / focal_px)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+    if not np.isfinite(rays).all():
+        raise BadInputError("bad_camera", f"the principal point must be finite, got {centre_px}")
+    rays /= np.sqrt((rays * rays).sum(axis=2, keepdims=True))
+    return Sight(rays)
+
+
+def look_at(eye_m: Sequence[float], target_m: Sequence[float]) -> Floats:
+    """`T_map_camera` (4, 4) of a camera at `eye_m` that has `target_m` in its middle, and the map's z axis upwards.
+
+    Looking straight up or down, the map's x axis is to the right.
+
+    Raises:
+        BadInputError: kind `bad_pose`: both are the same place, or not finite.
+    """
+    eye, target = (np.asarray(place, np.float64).reshape(-1) for place in (eye_m, target_m))
+    if eye.shape != (3,) or target.shape != (3,):
+        raise BadInputError("bad_pose", f"a place is three numbers, metres; got {eye_m} and {target_m}")
+    forward = target - eye
+    distance = float(np.linalg.norm(forward))
+    if not 1e-9 < distance < np.inf:
+        raise BadInputError("bad_pose", f"the eye and what it looks at must be two places, got {eye_m} and {target_m}")
+    forward /= distance
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right = np.array([1.0, 0.0, 0.0]) if np.linalg.norm(right) < 1e-9 else right / np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, 0], T[:3, 1], T[:3, 2], T[:3, 3] = right, np.cross(forward, right), forward, eye
+    return T
+
+
+def checked_pose(T_map_camera: npt.ArrayLike, *, reach_m: float) -> Floats:
+    """(4, 4) float64 of a rigid transform within the numbered space.
+
+    Raises:
+        BadInputError: kind `bad_pose`.
+    """
+    T = np.require(T_map_camera, np.float64, ["C", "A", "W"])
+    is_rigid = (
+        T.shape == (4, 4)
+        and bool(np.isfinite(T).all())
+        and np.array_equal(T[3], [0, 0, 0, 1])
+        and bool(np.abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max() < RIGID_TOLERANCE)
+        and float(np.linalg.det(T[:3, :3])) > 0
+        and float(np.abs(T[:3, 3]).max()) < reach_m
+    )
+    if not is_rigid:
+        raise BadInputError(
+            "bad_pose", f"T_map_camera must be a (4, 4) rigid transform, its place within {reach_m:.0f} m of the origin"
+        )
+    return T
+
+
+def cells_in_sight(
+    cells: npt.NDArray[np.int64], sight: Sight, T_map_camera: Floats, *, edge_m: float, range_max_m: float
+) -> npt.NDArray[np.bool_]:
+    """(C,) which of (C, 3) cells, of an edge, may be seen: those outside of what all rays span certainly are not."""
+    half_m = edge_m * np.sqrt(3) / 2  # of the sphere around a cell
+    centres = ((cells + 0.5) * edge_m - T_map_camera[:3, 3]) @ T_map_camera[:3, :3]
+    away_m = np.linalg.norm(centres, axis=1)
+    rays = sight.rays.reshape(-1, 3)
+    rays = rays[~np.isnan(rays[:, 0])]
+    middle = rays.mean(axis=0) if len(rays) else np.zeros(3)
+    length = float(np.linalg.norm(middle))
+    near = away_m - half_m <= range_max_m
+    if length < 1e-6:  # all around
+        return np.asarray(near & bool(len(rays)))
+    middle /= length
+    widest = float(np.arccos(np.clip((rays @ middle).min(), -1, 1)))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        off = np.arccos(np.clip(centres @ middle / away_m, -1, 1))
+        spread = np.arcsin(np.clip(half_m / away_m, 0, 1))
+    return np.asarray(near & ((away_m <= half_m) | (off <= widest + spread)))
