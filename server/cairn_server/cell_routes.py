@@ -87,7 +87,11 @@ def get_cell(
     }
     if is_same(etag, if_none_match):
         return Response(status_code=304, headers=headers)
-    data, media_type = _file(suffix, depth, key, stored, row)
+    if depth is None:
+        data, media_type = _file(suffix, key, stored, row)
+    else:
+        data = service.cell_views.view(f"{row.name}/{etag}", lambda: _view(depth, key, stored, row))
+        media_type = MEDIA_TYPES["view"]
     if suffix:
         headers["Content-Disposition"] = f'attachment; filename="{row.name}_{number}.{suffix}"'
     try:
@@ -116,13 +120,15 @@ def _form(dot: str, suffix: str, depth: int | None, row: MapRow) -> str:
     return f".view.{depth}"
 
 
-def _file(suffix: str, depth: int | None, key: CellKey, stored: CellRow, row: MapRow) -> tuple[bytes, str]:
-    if depth is not None:
-        evidence, style = stored_evidence(stored), ViewStyle(depth=depth)
-        return encode_view(key, evidence, row.geometry, row.sensor_model, style=style), MEDIA_TYPES["view"]
+def _file(suffix: str, key: CellKey, stored: CellRow, row: MapRow) -> tuple[bytes, str]:
     if not suffix:
         return stored.body, CELL_MEDIA_TYPE
     return cell_file(suffix, key, stored_evidence(stored), row.geometry, row.sensor_model)
+
+
+def _view(depth: int, key: CellKey, stored: CellRow, row: MapRow) -> bytes:
+    style = ViewStyle(depth=depth)
+    return encode_view(key, stored_evidence(stored), row.geometry, row.sensor_model, style=style)
 
 
 def _coverage(head: Head) -> dict[str, str]:

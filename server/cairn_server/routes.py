@@ -6,6 +6,7 @@ from fastapi.responses import HTMLResponse
 from cairn_server import (
     access_routes,
     cell_routes,
+    console_routes,
     live_routes,
     map_routes,
     operations_routes,
@@ -24,10 +25,6 @@ from cairn_server.protocol_version import ProtocolVersion
 from cairn_server.request_trail import RequestTrail
 from cairn_server.service import Service
 
-PAGE = """<!doctype html><title>cairn</title><h1>cairn map server</h1>
-<p>It runs. <a href="maps">Maps</a>, <a href="docs">routes</a>;
-<code>cairn map ls</code> lists the maps in a terminal.</p>"""
-
 router = APIRouter()
 ROUTERS = (
     router,
@@ -40,6 +37,7 @@ ROUTERS = (
     robot_routes.router,
     upload_routes.router,
     render_routes.router,
+    console_routes.router,
 )
 
 
@@ -47,12 +45,6 @@ ROUTERS = (
 def healthz() -> dict[str, str]:
     """The process answers."""
     return {"status": "ok"}
-
-
-@router.get("/", response_class=HTMLResponse)
-def page() -> str:
-    """A page for whoever opens the server in a browser."""
-    return PAGE
 
 
 @router.get("/docs", response_class=HTMLResponse)

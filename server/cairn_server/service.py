@@ -56,6 +56,7 @@ from cairn_server.store import Snapshot, Store
 from cairn_server.store_rows import Branch, CellRow, Head, MapRow
 from cairn_server.uploads import Uploads
 from cairn_server.vectors import vector_at
+from cairn_server.view_cache import ViewCache
 from cairn_server.wanted_commits import WantedCommits
 
 RESERVED_NAMES = frozenset({OPERATOR, INITIAL, RobotName("main")})
@@ -98,6 +99,7 @@ class Service:
         self._stable = StableVectors(settings.stable_after_s)
         self._reads = ReadCache()
         self.views = MapViews(store, self.damaged)
+        self.cell_views = ViewCache()
         self._healing = threading.Lock()
         self.operator = new_incarnation()
         """Of the retracts made here. A new one with every start: a restored server must not number over lost ones."""

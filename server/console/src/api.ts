@@ -1,0 +1,91 @@
+/** Requests to the one server that this page came from, with the token that the operator gave. */
+
+import type { CellEntry, CellIndex } from "./messages.ts";
+
+const TOKEN_KEY = "cairn.token";
+const INDEX_PAGE = 10_000;
+
+/** What the server refused, in its own words; `kind` is the code of PROTOCOL.md section 5. */
+export class ApiError extends Error {
+  readonly status: number;
+  readonly kind: string;
+
+  constructor(status: number, kind: string, message: string) {
+    super(message);
+    this.status = status;
+    this.kind = kind;
+  }
+
+  get wantsToken(): boolean {
+    return this.status === 401;
+  }
+}
+
+export interface CellAnswer {
+  /** null: as it was. */
+  readonly data: Uint8Array | null;
+  readonly etag: string;
+}
+
+export class Api {
+  token: string | null = sessionStorage.getItem(TOKEN_KEY) ?? localStorage.getItem(TOKEN_KEY);
+  /** Bytes of answers' bodies, for the figures at the foot of the page. */
+  received = 0;
+
+  /** Keep the token for this tab, or on this computer. */
+  logIn(token: string, stays: boolean): void {
+    this.token = token;
+    (stays ? localStorage : sessionStorage).setItem(TOKEN_KEY, token);
+  }
+
+  logOut(): void {
+    this.token = null;
+    sessionStorage.removeItem(TOKEN_KEY);
+    localStorage.removeItem(TOKEN_KEY);
+  }
+
+  async json<T>(path: string): Promise<T> {
+    return (await this.ask(path)).json() as Promise<T>;
+  }
+
+  async post<T>(path: string, body: unknown): Promise<T> {
+    const headers = { "Content-Type": "application/json" };
+    return (await this.ask(path, { method: "POST", body: JSON.stringify(body), headers })).json() as Promise<T>;
+  }
+
+  /** All cells that were ever touched, and the state that the first page is of. */
+  async cells(map: string): Promise<{ cursor: string; entries: CellEntry[] }> {
+    const entries: CellEntry[] = [];
+    let cursor: string | null = null;
+    for (let after = ""; ; ) {
+      const page = await this.json<CellIndex>(`maps/${map}/main/cells?limit=${INDEX_PAGE}${after}`);
+      cursor ??= page.header.to;
+      entries.push(...page.cells);
+      if (page.cells.length < INDEX_PAGE) return { cursor, entries };
+      after = `&after=${page.cells[page.cells.length - 1].cell.join(",")}`;
+    }
+  }
+
+  /** What one cell looks like at an octree depth, if it is not what `etag` names. */
+  async view(map: string, cell: string, depth: number, etag: string | null): Promise<CellAnswer> {
+    const headers: Record<string, string> = etag ? { "If-None-Match": etag } : {};
+    const answer = await this.ask(`maps/${map}/main/cells/${cell}.view?depth=${depth}`, { headers, cache: "no-store" });
+    const data = answer.status === 304 ? null : new Uint8Array(await answer.arrayBuffer());
+    this.received += data?.length ?? 0;
+    return { data, etag: answer.headers.get("ETag") ?? "" };
+  }
+
+  async ask(path: string, options: RequestInit = {}): Promise<Response> {
+    const headers = new Headers(options.headers);
+    if (this.token) headers.set("Authorization", `Bearer ${this.token}`);
+    let answer: Response;
+    try {
+      answer = await fetch(path, { ...options, headers });
+    } catch {
+      throw new ApiError(0, "unreachable", "The server does not answer. The page goes on by itself when it does.");
+    }
+    if (answer.ok || answer.status === 304) return answer;
+    const problem = (await answer.json().catch(() => ({}))) as { kind?: string; detail?: string };
+    throw new ApiError(answer.status, problem.kind ?? "unknown", problem.detail ?? answer.statusText);
+  }
+}

@@ -1,0 +1,88 @@
+/** How the map is looked at: kept in the address, so that a link shows another person the same. */
+
+import type { Triple } from "./messages.ts";
+import type { Palette } from "./palettes.ts";
+
+export type Field = "colour" | "temperature" | "probability" | "height" | "age";
+
+export const FIELDS: { field: Field; label: string; palette: Palette | null; unit: string }[] = [
+  { field: "colour", label: "Colour", palette: null, unit: "" },
+  { field: "temperature", label: "Temperature", palette: "inferno", unit: "°C" },
+  { field: "probability", label: "Probability", palette: "cividis", unit: "" },
+  { field: "height", label: "Height", palette: "viridis", unit: "m" },
+  { field: "age", label: "Age", palette: "cividis", unit: "entries" },
+];
+
+export interface Look {
+  field: Field;
+  /** Ends of the legend that the operator locked, by field, in its unit; else they follow what is shown. */
+  ranges: Partial<Record<Field, [number, number]>>;
+  /** What lies below or above is cut off; m in the map; null: nothing is. */
+  floorM: number | null;
+  ceilingM: number | null;
+  /** Lowest and highest corner of a box outside of which nothing is shown; m. */
+  clip: [Triple, Triple] | null;
+  /** Least probability shown. */
+  minP: number;
+  /** Only these temperatures stand out; °C. */
+  band: [number, number] | null;
+  cells: boolean;
+  boxes: boolean | null;
+}
+
+export interface CameraView {
+  eye: Triple;
+  target: Triple;
+}
+
+export function defaultLook(): Look {
+  return {
+    field: "colour", ranges: {}, floorM: null, ceilingM: null, clip: null, minP: 0, band: null, cells: true, boxes: null,
+  };
+}
+
+/** The part of an address behind #. */
+export function toHash(map: string, look: Look, camera: CameraView | null): string {
+  const parts: [string, string][] = [["map", map]];
+  const add = (name: string, value: string | null) => value !== null && parts.push([name, value]);
+  const numbers = (values: number[], digits = 2) => values.map((value) => +value.toFixed(digits)).join(",");
+  if (look.field !== "colour") add("by", look.field);
+  for (const [field, range] of Object.entries(look.ranges)) add(`range.${field}`, numbers(range));
+  add("floor", look.floorM === null ? null : numbers([look.floorM]));
+  add("ceiling", look.ceilingM === null ? null : numbers([look.ceilingM]));
+  add("clip", look.clip && numbers(look.clip.flat()));
+  add("p", look.minP > 0 ? numbers([look.minP]) : null);
+  add("band", look.band && numbers(look.band));
+  add("cells", look.cells ? null : "0");
+  add("boxes", look.boxes === null ? null : look.boxes ? "1" : "0");
+  add("eye", camera && numbers(camera.eye));
+  add("target", camera && numbers(camera.target));
+  return "#" + parts.map(([name, value]) => `${name}=${value}`).join("&");
+}
+
+export function fromHash(hash: string): { map: string | null; look: Look; camera: CameraView | null } {
+  const given = new Map(hash.replace(/^#/, "").split("&").map((part) => part.split("=", 2) as [string, string]));
+  const look = defaultLook();
+  const numbers = (name: string, count: number): number[] | null => {
+    const found = (given.get(name) ?? "").split(",").map(Number);
+    return given.has(name) && found.length === count && found.every(Number.isFinite) ? found : null;
+  };
+  const one = (name: string) => numbers(name, 1)?.[0] ?? null;
+  look.field = FIELDS.find(({ field }) => field === given.get("by"))?.field ?? "colour";
+  for (const { field } of FIELDS) {
+    const range = numbers(`range.${field}`, 2);
+    if (range) look.ranges[field] = range as [number, number];
+  }
+  look.floorM = one("floor");
+  look.ceilingM = one("ceiling");
+  const clip = numbers("clip", 6);
+  if (clip) look.clip = [clip.slice(0, 3) as Triple, clip.slice(3) as Triple];
+  look.minP = one("p") ?? 0;
+  look.band = numbers("band", 2) as [number, number] | null;
+  look.cells = given.get("cells") !== "0";
+  look.boxes = given.has("boxes") ? given.get("boxes") === "1" : null;
+  const eye = numbers("eye", 3) as Triple | null;
+  const target = numbers("target", 3) as Triple | null;
+  const map = given.get("map") ?? null;
+  return { map: map && /^[a-z0-9][a-z0-9_-]{0,31}$/.test(map) ? map : null, look, camera: eye && target && { eye, target } };
+}

@@ -1,0 +1,164 @@
+/** Voxels as points: one vertex a voxel, 12 bytes; how they look is uniforms, so nothing is sent or made again.
+ *
+ * Three materials share one vertex shader: squares (cheapest), boxes (the ray of each pixel is cut with the voxel's
+ * cube, so edges, faces and depth are exact), and boxes that say which voxel they are instead of a colour. */
+
+import { DataTexture, DoubleSide, GLSL3, ShaderMaterial, Vector2, Vector3, Vector4, type IUniform } from "three";
+import { HEAT_STEP_K, HEAT_ZERO_K } from "../decode/pack.ts";
+import { textureOf } from "../palettes.ts";
+
+export const FIELD_CODES = { colour: 0, temperature: 1, probability: 2, height: 3, age: 4 } as const;
+/** A box spreads over at most this much of its edge in a picture: the diagonal, and some for perspective. */
+const SPREAD = 1.9;
+
+export const uniforms = {
+  uField: { value: 0 },
+  uRange: { value: new Vector2(0, 1) },
+  uPalette: { value: textureOf("inferno") as DataTexture },
+  uLow: { value: new Vector3(-1e9, -1e9, -1e9) },
+  uHigh: { value: new Vector3(1e9, 1e9, 1e9) },
+  uMinP: { value: 0 },
+  /** Kelvin; low above high: no band. */
+  uBand: { value: new Vector2(1, 0) },
+  uViewport: { value: new Vector4(0, 0, 1, 1) },
+  uNearFar: { value: new Vector2(0.05, 1000) },
+  uPointMax: { value: 64 },
+  uBare: { value: new Vector3(0.45, 0.47, 0.5) },
+  /** Of the object that is drawn: its age from 0 to 1, how freshly it changed, its number. */
+  uAge: { value: 0 },
+  uFresh: { value: 0 },
+  uObject: { value: 0 },
+} satisfies Record<string, IUniform>;
+
+const VERTEX = `
+in vec4 place;    // x, y, z in nodes, probability in 1/255
+in vec4 colour;   // red, green, blue; flags in 1/255
+in vec4 heat;     // mean and hottest, in steps, two bytes each
+uniform int uField;
+uniform vec2 uRange, uBand;
+uniform vec3 uLow, uHigh, uBare;
+uniform float uMinP, uPointMax, uAge, uFresh;
+uniform vec4 uViewport;
+uniform sampler2D uPalette;
+flat out vec3 vColour;
+flat out float vBare;
+flat out vec3 vCentre;   // from the eye, along the map's axes
+flat out float vHalf;
+flat out vec4 vLens;
+flat out uint vVertex;
+flat out float vLight;
+const float GROWN = __GROWN__;
+
+vec3 shade(float x) { return texture(uPalette, vec2((clamp(x, 0.0, 1.0) * 255.0 + 0.5) / 256.0, 0.5)).rgb; }
+
+void main() {
+  vec4 world = modelMatrix * vec4(place.xyz + 0.5, 1.0);
+  float edge = modelMatrix[0].x;
+  float p = place.w / 255.0;
+  int flags = int(colour.a * 255.0 + 0.5);
+  bool coloured = (flags & 1) != 0;
+  bool warm = (flags & 2) != 0;
+  vec4 seen = viewMatrix * world;
+  gl_Position = projectionMatrix * seen;
+  bool hidden = p < uMinP || any(lessThan(world.xyz, uLow)) || any(greaterThan(world.xyz, uHigh)) || seen.z > -edge * 0.5;
+  if (hidden) gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
+  vLens = vec4(projectionMatrix[0][0], projectionMatrix[1][1], projectionMatrix[2][0], projectionMatrix[2][1]);
+  gl_PointSize = min(edge * GROWN * vLens.y * uViewport.w * 0.5 / max(-seen.z, edge * 0.6) + 1.0, uPointMax);
+  vCentre = world.xyz - cameraPosition;
+  vHalf = edge * 0.5;
+  vVertex = uint(gl_VertexID);
+  // Lit by those of its open faces that the eye can see, the more the straighter; by all others if there is none.
+  vec3 eye = normalize(-vCentre);
+  vec3 low = vec3(flags & 4, (flags >> 2) & 4, (flags >> 4) & 4) * 0.25 * max(-eye, 0.0);
+  vec3 high = vec3(flags & 8, (flags >> 2) & 8, (flags >> 4) & 8) * 0.125 * max(eye, 0.0);
+  vec3 open = low + high;
+  float sum = open.x + open.y + open.z;
+  vec3 lit = vec3(0.88, 0.74, 0.0) * open;
+  vLight = sum < 0.02 ? 0.8 : (lit.x + lit.y + high.z * 1.04 + low.z * 0.62) / sum;
+  float kelvin = (heat.x + 256.0 * heat.y) * ${HEAT_STEP_K.toFixed(3)} + ${HEAT_ZERO_K.toFixed(1)};
+  float hottest = (heat.z + 256.0 * heat.w) * ${HEAT_STEP_K.toFixed(3)} + ${HEAT_ZERO_K.toFixed(1)};
+  vBare = 0.0;
+  float span = max(uRange.y - uRange.x, 1e-6);
+  if (uField == 0) {
+    vColour = coloured ? colour.rgb : uBare;
+    vBare = coloured ? 0.0 : 1.0;
+  } else if (uField == 1) {
+    vColour = warm ? shade((hottest - uRange.x) / span) : uBare;
+    vBare = warm ? 0.0 : 1.0;
+  } else if (uField == 2) vColour = shade((p - uRange.x) / span);
+  else if (uField == 3) vColour = shade((world.z - uRange.x) / span);
+  else vColour = shade(1.0 - (uAge - uRange.x) / span);
+  if (uBand.x <= uBand.y && !(warm && hottest >= uBand.x && kelvin <= uBand.y)) {
+    vColour = mix(uBare * 0.45, vColour, 0.12);
+    vBare = 0.0;
+  }
+  vColour = mix(vColour, vec3(1.0, 1.0, 0.85), uFresh);
+}`;
+
+const FRAGMENT_HEAD = `
+precision highp float;
+precision highp int;
+flat in vec3 vColour;
+flat in float vBare;
+flat in vec3 vCentre;
+flat in float vHalf;
+flat in vec4 vLens;
+flat in uint vVertex;
+flat in float vLight;
+uniform vec4 uViewport;
+uniform vec2 uNearFar;
+uniform uint uObject;
+`;
+
+const HATCH = `
+  if (vBare > 0.5 && mod(floor((gl_FragCoord.x + gl_FragCoord.y) / 3.0), 2.0) < 0.5) shown *= 0.72;
+`;
+
+const SQUARE = `${FRAGMENT_HEAD}
+out vec4 outColour;
+void main() {
+  vec3 shown = vColour * vLight;
+  ${HATCH}
+  outColour = vec4(shown, 1.0);
+}`;
+
+/** Where the pixel's ray meets the cube; `t` is the depth along the view's axis. */
+const CUT = `
+  vec2 at = (gl_FragCoord.xy - uViewport.xy) / uViewport.zw * 2.0 - 1.0;
+  vec3 ray = transpose(mat3(viewMatrix)) * vec3((at + vLens.zw) / vLens.xy, -1.0);
+  vec3 a = (vCentre - vHalf) / ray, b = (vCentre + vHalf) / ray;
+  vec3 enter = min(a, b), leave = max(a, b);
+  float t = max(max(enter.x, enter.y), enter.z);
+  if (t > min(min(leave.x, leave.y), leave.z) || t <= 0.0) discard;
+  float far = uNearFar.y, near = uNearFar.x;
+  gl_FragDepth = clamp(0.5 + 0.5 * ((far + near) - 2.0 * far * near / t) / (far - near), 0.0, 1.0);
+`;
+
+const BOX = `${FRAGMENT_HEAD}
+out vec4 outColour;
+void main() {
+  ${CUT}
+  vec3 lit = vec3(t == enter.x, t == enter.y, t == enter.z);
+  float light = dot(lit, vec3(0.88, 0.74, ray.z < 0.0 ? 1.04 : 0.62)) / max(lit.x + lit.y + lit.z, 1.0);
+  vec3 shown = vColour * light;
+  ${HATCH}
+  outColour = vec4(shown, 1.0);
+}`;
+
+const NUMBER = `${FRAGMENT_HEAD}
+out uvec4 outNumber;
+void main() {
+  ${CUT}
+  outNumber = uvec4(uObject + 1u, vVertex, floatBitsToUint(t), 1u);
+}`;
+
+function material(fragmentShader: string, grown: number): ShaderMaterial {
+  const vertexShader = VERTEX.replace("__GROWN__", grown.toFixed(2));
+  const made = new ShaderMaterial({ uniforms, vertexShader, fragmentShader, glslVersion: GLSL3, side: DoubleSide });
+  made.toneMapped = false;
+  return made;
+}
+
+export const squares = material(SQUARE, 1.25);
+export const boxes = material(BOX, SPREAD);
+export const numbers = material(NUMBER, SPREAD);

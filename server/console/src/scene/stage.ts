@@ -1,0 +1,173 @@
+/** Canvas, camera and light hand: draws when something changed, and never otherwise. */
+
+import { Box3, Color, Frustum, Matrix4, PerspectiveCamera, Scene, Spherical, Vector3, WebGLRenderer, type Object3D } from "three";
+import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+import type { CameraView } from "../look.ts";
+import type { Triple } from "../messages.ts";
+import { uniforms } from "./materials.ts";
+
+const FLIGHT_MS = 450;
+const STEP_RAD = Math.PI / 30;
+
+export class Stage {
+  readonly renderer: WebGLRenderer;
+  readonly camera = new PerspectiveCamera(55, 1, 0.05, 1000);
+  readonly controls: OrbitControls;
+  readonly scene = new Scene();
+  readonly isSoftware: boolean;
+  readonly gpu: string;
+  /** Called before a frame; whether another one follows. */
+  onFrame: () => boolean = () => false;
+  onMove: () => void = () => {};
+  frames = 0;
+  private asked = false;
+  private ready = false;
+  private flight: { from: CameraView; to: CameraView; startMs: number } | null = null;
+
+  constructor(host: HTMLElement) {
+    this.renderer = new WebGLRenderer({ antialias: false, powerPreference: "high-performance" });
+    // To ask whether a shader is sound waits for its compiler: seconds, without a graphics card.
+    this.renderer.debug.checkShaderErrors = false;
+    const { canvas } = this;
+    canvas.tabIndex = 0;
+    canvas.setAttribute("role", "img");
+    canvas.setAttribute("aria-label", "The map in three dimensions. Arrow keys move, plus and minus zoom; see the key list with ?");
+    host.append(canvas);
+    const gl = this.renderer.getContext();
+    const names = gl.getExtension("WEBGL_debug_renderer_info");
+    this.gpu = String(gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+    this.isSoftware = /swiftshader|llvmpipe|software/i.test(this.gpu);
+    uniforms.uPointMax.value = (gl.getParameter(gl.ALIASED_POINT_SIZE_RANGE) as Float32Array)[1];
+    this.camera.up.set(0, 0, 1);
+    this.camera.position.set(-10, -10, 10);
+    this.controls = new OrbitControls(this.camera, canvas);
+    this.controls.zoomToCursor = true;
+    this.controls.screenSpacePanning = true;
+    this.controls.maxDistance = 500;
+    this.controls.minDistance = 0.2;
+    this.controls.addEventListener("change", () => {
+      this.onMove();
+      this.draw();
+    });
+    this.controls.addEventListener("start", () => (this.flight = null));
+    new ResizeObserver(() => this.resize(host)).observe(host);
+    this.resize(host);
+  }
+
+  get canvas(): HTMLCanvasElement {
+    return this.renderer.domElement;
+  }
+
+  add(...objects: Object3D[]): void {
+    this.scene.add(...objects);
+  }
+
+  /** Have the shaders of what will be drawn compiled beside the page's own work; then draw. */
+  async prepare(): Promise<void> {
+    await this.renderer.compileAsync(this.scene, this.camera);
+    this.ready = true;
+    this.draw();
+  }
+
+  /** Ask for a frame; many askings make one. */
+  draw(): void {
+    if (this.asked || !this.ready) return;
+    this.asked = true;
+    requestAnimationFrame(() => this.frame());
+  }
+
+  get heightPx(): number {
+    return this.canvas.height;
+  }
+
+  get frustum(): Frustum {
+    this.camera.updateMatrixWorld();
+    const matrix = new Matrix4().multiplyMatrices(this.camera.projectionMatrix, this.camera.matrixWorldInverse);
+    return new Frustum().setFromProjectionMatrix(matrix);
+  }
+
+  get view(): CameraView {
+    return { eye: this.camera.position.toArray() as Triple, target: this.controls.target.toArray() as Triple };
+  }
+
+  /** Put the eye somewhere, at once. */
+  place({ eye, target }: CameraView): void {
+    this.camera.position.set(...eye);
+    this.controls.target.set(...target);
+    this.controls.update();
+    this.onMove();
+    this.draw();
+  }
+
+  /** Bring the eye somewhere, so that people see how they got there. */
+  fly(to: CameraView): void {
+    if (matchMedia("(prefers-reduced-motion: reduce)").matches || this.isSoftware) return this.place(to);
+    this.flight = { from: this.view, to, startMs: performance.now() };
+    this.draw();
+  }
+
+  /** Look at a box from a side: `direction` from the box to the eye. */
+  lookAt(box: Box3, direction: Vector3): CameraView {
+    const centre = box.getCenter(new Vector3());
+    const size = box.getSize(new Vector3());
+    const radius = Math.max(size.length() / 2, 0.5);
+    const half = Math.min(this.camera.fov / 2, (this.camera.fov / 2) * this.camera.aspect) * (Math.PI / 180);
+    const eye = centre.clone().addScaledVector(direction.clone().normalize(), (radius / Math.sin(half)) * 0.82);
+    return { eye: eye.toArray() as Triple, target: centre.toArray() as Triple };
+  }
+
+  /** Go round what is looked at, in steps of 6 degrees. */
+  turn(right: number, down: number): void {
+    const around = this.camera.position.clone().sub(this.controls.target);
+    const sphere = new Spherical().setFromCartesianCoords(around.x, around.z, -around.y);
+    sphere.theta += right * STEP_RAD;
+    sphere.phi = Math.min(Math.max(sphere.phi + down * STEP_RAD, 0.01), Math.PI - 0.01);
+    const turned = new Vector3().setFromSpherical(sphere);
+    const eye = this.controls.target.clone().add(new Vector3(turned.x, -turned.z, turned.y));
+    this.place({ eye: eye.toArray() as Triple, target: this.view.target });
+  }
+
+  nearer(factor: number): void {
+    const eye = this.camera.position.clone().sub(this.controls.target).multiplyScalar(factor).add(this.controls.target);
+    this.place({ eye: eye.toArray() as Triple, target: this.view.target });
+  }
+
+  setBackground(colour: string): void {
+    this.renderer.setClearColor(new Color(colour));
+    this.draw();
+  }
+
+  private frame(): void {
+    this.asked = false;
+    this.stepFlight();
+    const again = this.onFrame();
+    const { width, height } = this.canvas;
+    uniforms.uViewport.value.set(0, 0, width, height);
+    uniforms.uNearFar.value.set(this.camera.near, this.camera.far);
+    this.renderer.render(this.scene, this.camera);
+    this.frames++;
+    if (again || this.flight) this.draw();
+  }
+
+  private stepFlight(): void {
+    if (!this.flight) return;
+    const { from, to, startMs } = this.flight;
+    const x = Math.min((performance.now() - startMs) / FLIGHT_MS, 1);
+    const ease = x * x * (3 - 2 * x);
+    const between = (a: Triple, b: Triple) => a.map((value, n) => value + (b[n] - value) * ease) as Triple;
+    if (x >= 1) this.flight = null;
+    this.place({ eye: between(from.eye, to.eye), target: between(from.target, to.target) });
+  }
+
+  private resize(host: HTMLElement): void {
+    const { clientWidth, clientHeight } = host;
+    if (!clientWidth || !clientHeight) return;
+    // More pixels than points take time without telling more.
+    this.renderer.setPixelRatio(this.isSoftware ? 1 : Math.min(devicePixelRatio, 2));
+    this.renderer.setSize(clientWidth, clientHeight);
+    this.camera.aspect = clientWidth / clientHeight;
+    this.camera.updateProjectionMatrix();
+    this.onMove();
+    this.draw();
+  }
+}

@@ -1,0 +1,144 @@
+/** Robots: in the picture, in their panel, and the one that the camera follows. */
+
+import { Group, Vector3 } from "three";
+import type { Api } from "./api.ts";
+import { h } from "./dom.ts";
+import type { Branch, RobotSign, Triple } from "./messages.ts";
+import { robotColour } from "./palettes.ts";
+import { RobotMark } from "./scene/lines.ts";
+import type { Stage } from "./scene/stage.ts";
+import { isOffline, TeamPanel } from "./ui/team_panel.ts";
+
+const REFRESH_MS = 10_000;
+const SOON_MS = 1000;
+const OFFLINE_COLOUR = "#8b949e";
+
+export class Team {
+  readonly panel = new TeamPanel();
+  readonly group = new Group();
+  onFollow: () => void = () => {};
+  private branches: Branch[] = [];
+  private readonly signs = new Map<string, RobotSign>();
+  private readonly marks = new Map<string, RobotMark>();
+  private readonly labels = new Map<string, HTMLElement>();
+  private readonly host: HTMLElement;
+  private readonly api: Api;
+  private readonly map: string;
+  private readonly stage: Stage;
+  private followed: string | null = null;
+  private askAtMs = 0;
+  private wasOffline = new Map<string, boolean>();
+
+  constructor(api: Api, map: string, host: HTMLElement, stage: Stage) {
+    this.api = api;
+    this.map = map;
+    this.host = host;
+    this.stage = stage;
+    this.panel.onFollow = (robot) => this.follow(this.followed === robot ? null : robot);
+  }
+
+  get names(): string[] {
+    return [...new Set([...this.branches.map(({ branch }) => branch), ...this.signs.keys()])].sort();
+  }
+
+  greet(robots: readonly RobotSign[]): void {
+    for (const robot of robots) this.hear(robot);
+    this.refresh();
+  }
+
+  hear(sign: RobotSign): void {
+    if (sign.gone) this.signs.delete(sign.branch);
+    else this.signs.set(sign.branch, sign);
+    this.mark(sign);
+    this.refresh();
+    this.panel.show(this.branches, this.signs, this.names, this.followed);
+    this.stage.draw();
+  }
+
+  /** Ask for lags soon; many askings make one. */
+  refresh(): void {
+    this.askAtMs = Math.min(this.askAtMs, performance.now() + SOON_MS);
+  }
+
+  follow(robot: string | null): void {
+    this.followed = robot;
+    const mark = robot === null ? null : this.marks.get(robot);
+    if (mark?.position) {
+      const ahead = mark.ahead.setZ(0);
+      const eye = mark.position.clone().addScaledVector(ahead.lengthSq() > 0.01 ? ahead.normalize() : new Vector3(0, 1, 0), -3);
+      eye.z += 2.2;
+      this.stage.fly({ eye: eye.toArray() as Triple, target: mark.position.toArray() as Triple });
+    }
+    this.panel.show(this.branches, this.signs, this.names, this.followed);
+    this.onFollow();
+  }
+
+  /** Where the robot next to a place stands; null: no robot told. */
+  nearest(place: Vector3): Vector3 | null {
+    const places = [...this.marks.values()].flatMap(({ position }) => (position ? [position] : []));
+    places.sort((a, b) => a.distanceTo(place) - b.distanceTo(place));
+    return places[0]?.clone() ?? null;
+  }
+
+  tick(): void {
+    if (performance.now() >= this.askAtMs) {
+      this.askAtMs = performance.now() + REFRESH_MS;
+      void this.ask();
+    }
+    for (const [name, sign] of this.signs) {
+      const offline = isOffline(sign.time_s);
+      if (this.wasOffline.get(name) !== offline) {
+        this.wasOffline.set(name, offline);
+        this.mark(sign);
+        this.stage.draw();
+      }
+    }
+    this.panel.show(this.branches, this.signs, this.names, this.followed);
+  }
+
+  /** Labels beside the robots, where these are in the picture now. */
+  place(): void {
+    const { clientWidth, clientHeight } = this.stage.canvas;
+    for (const [name, mark] of this.marks) {
+      const label = this.labels.get(name)!;
+      const at = mark.position?.clone().project(this.stage.camera);
+      label.hidden = !at || at.z > 1 || Math.abs(at.x) > 1 || Math.abs(at.y) > 1;
+      if (!at || label.hidden) continue;
+      label.style.transform = `translate(${((at.x + 1) / 2) * clientWidth}px, ${((1 - at.y) / 2) * clientHeight}px)`;
+    }
+  }
+
+  private async ask(): Promise<void> {
+    try {
+      this.branches = await this.api.json<Branch[]>(`maps/${this.map}/branches`);
+    } catch {
+      return; // the bar says that there is no link
+    }
+    this.panel.show(this.branches, this.signs, this.names, this.followed);
+    for (const sign of this.signs.values()) this.mark(sign);
+    this.stage.draw();
+  }
+
+  private mark(sign: RobotSign): void {
+    const offline = isOffline(sign.time_s);
+    const colour = offline ? OFFLINE_COLOUR : robotColour(sign.branch, this.names);
+    let mark = this.marks.get(sign.branch);
+    if (!mark) {
+      mark = new RobotMark(colour);
+      this.marks.set(sign.branch, mark);
+      this.group.add(mark.group);
+      const label = h("span", { class: "label" }, sign.branch);
+      this.labels.set(sign.branch, label);
+      this.host.append(label);
+    }
+    const before = mark.position?.clone();
+    mark.update(sign, colour);
+    this.labels.get(sign.branch)!.classList.toggle("offline", offline);
+    if (this.followed === sign.branch && before && mark.position) {
+      const step = mark.position.clone().sub(before);
+      const { eye, target } = this.stage.view;
+      const moved = (point: Triple) => new Vector3(...point).add(step).toArray() as Triple;
+      if (step.length() > 0.01) this.stage.place({ eye: moved(eye), target: moved(target) });
+    }
+  }
+}

@@ -1,0 +1,71 @@
+/** Which map, coloured by what, and whether it is live. */
+
+import { fill, h } from "../dom.ts";
+import type { LinkState } from "../live.ts";
+import { FIELDS, type Field } from "../look.ts";
+import type { MapInfo } from "../messages.ts";
+import { ago } from "../units.ts";
+
+const THEME_KEY = "cairn.theme";
+
+export class TopBar {
+  readonly element: HTMLElement;
+  onField: (field: Field) => void = () => {};
+  onTheme: () => void = () => {};
+  private readonly fields: HTMLElement;
+  private readonly link = h("span", { class: "link", role: "status" });
+
+  constructor(maps: readonly MapInfo[], map: string, loggedIn: boolean, on: { map: (name: string) => void; keys: () => void; share: () => void; logOut: () => void }) {
+    const choice = h("select", { "aria-label": "Map" }, ...maps.map(({ name }) => h("option", { value: name, selected: name === map }, name)));
+    choice.addEventListener("change", () => on.map(choice.value));
+    this.fields = h(
+      "div", { class: "segments", role: "group", "aria-label": "Colour by" },
+      ...FIELDS.map(({ field, label }) =>
+        h("button", { type: "button", "data-field": field, onclick: () => this.onField(field) }, label),
+      ),
+    );
+    const button = (label: string, title: string, run: () => void) => h("button", { type: "button", title, onclick: run }, label);
+    this.element = h(
+      "header", { class: "bar" },
+      h("strong", { class: "brand" }, "cairn"), choice, this.fields, h("span", { class: "space" }), this.link,
+      button("Share", "A link that shows another person the same", on.share),
+      button("Theme", "Dark or light", () => {
+        toggleTheme();
+        this.onTheme();
+      }),
+      button("?", "Keys", on.keys),
+      loggedIn ? button("Log out", "Forget the token", on.logOut) : null,
+    );
+  }
+
+  showField(field: Field): void {
+    for (const button of this.fields.querySelectorAll("button")) {
+      button.setAttribute("aria-pressed", String(button.dataset.field === field));
+    }
+  }
+
+  showLink({ live, heardMs }: LinkState, waiting: number, error: string | null): void {
+    const age = heardMs === null ? null : (Date.now() - heardMs) / 1000;
+    const [state, said] =
+      error !== null && live ? ["late", `Trouble: ${error}`]
+      : live ? (waiting > 0 ? ["busy", `Live, loading ${waiting} cells`] : ["live", "Live"])
+      : age === null ? ["lost", "Connecting …"]
+      : ["lost", `No link: the map is as it was ${ago(age)}`];
+    if (this.link.dataset.state === state && this.link.textContent === said) return;
+    this.link.dataset.state = state;
+    fill(this.link, said);
+  }
+}
+
+/** Dark or light: as the system says, or as was chosen here. */
+export function applyTheme(): "dark" | "light" {
+  const system = matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark";
+  const theme = (localStorage.getItem(THEME_KEY) ?? system) as "dark" | "light";
+  document.documentElement.dataset.theme = theme;
+  return theme;
+}
+
+function toggleTheme(): void {
+  localStorage.setItem(THEME_KEY, applyTheme() === "dark" ? "light" : "dark");
+  applyTheme();
+}

@@ -1,0 +1,117 @@
+/** What was clicked: first what the picture knows, then the server's own numbers. */
+
+import type { Api } from "../api.ts";
+import { facts, fill, h } from "../dom.ts";
+import type { Channel, Triple } from "../messages.ts";
+import { readingOf, type Picked } from "../scene/picking.ts";
+import { ago, celsius, clock, metres } from "../units.ts";
+
+export interface ChannelReading {
+  name: string;
+  kind: Channel["kind"];
+  unit: string;
+  weight: number;
+  mean: number[];
+  sigma: number | null;
+}
+
+/** Answer to GET .../main/voxels/{voxel}. */
+export interface VoxelAnswer {
+  voxel: Triple;
+  cell: Triple;
+  centre_m: Triple;
+  hits: number;
+  misses: number;
+  probability: number | null;
+  channels: ChannelReading[];
+  lm: number | null;
+  cursor: string;
+  commits: { id: string; hits: number; misses: number; captured_s: [number, number] | null }[];
+  unread: number;
+  gone: boolean;
+}
+
+export class VoxelPanel {
+  readonly element = h("section", { "aria-label": "Voxel", "aria-live": "polite" });
+  private readonly api: Api;
+  private readonly map: string;
+  private asked = 0;
+
+  constructor(api: Api, map: string) {
+    this.api = api;
+    this.map = map;
+    this.clear();
+  }
+
+  clear(): void {
+    this.asked++;
+    fill(this.element, h("h2", {}, "Voxel"), h("p", { class: "hint" }, "Click the map to ask what is there."));
+  }
+
+  async show(picked: Picked, depthMax: number): Promise<void> {
+    const mine = ++this.asked;
+    if (!picked.isVoxel) {
+      fill(this.element, h("h2", {}, "Voxel"), coarse(picked), h("p", { class: "hint" }, "Go closer to ask of a voxel."));
+      return;
+    }
+    const side = 2 ** depthMax;
+    const voxel = picked.node.map((place, axis) => place + picked.cell.cell[axis] * side) as Triple;
+    fill(this.element, h("h2", {}, "Voxel"), coarse(picked), h("p", { class: "hint" }, "Asking the server …"));
+    try {
+      const answer = await this.api.json<VoxelAnswer>(`maps/${this.map}/main/voxels/${voxel.join(",")}`);
+      if (mine === this.asked) fill(this.element, h("h2", {}, "Voxel"), exact(answer), whence(answer));
+    } catch (error) {
+      if (mine === this.asked) fill(this.element, h("h2", {}, "Voxel"), coarse(picked), h("p", { class: "error" }, (error as Error).message));
+    }
+  }
+}
+
+function swatch(rgb: number[]): HTMLElement {
+  const found = h("span", { class: "swatch", "aria-hidden": "true" });
+  found.style.background = `rgb(${rgb.map(Math.round).join(" ")})`;
+  return found;
+}
+
+function coarse({ cell, row, centre, edgeM, node, depth }: Picked): HTMLElement {
+  const { probability, rgb, meanK, hottestK } = readingOf(cell, row);
+  return facts([
+    ["cell", cell.key],
+    ["node", `${node.join(",")} at depth ${depth}, ${metres(edgeM)} wide`],
+    ["centre", centre.toArray().map((value) => value.toFixed(2)).join(", ") + " m"],
+    ["probability", `${probability.toFixed(2)} (its highest voxel)`],
+    ["colour", rgb ? h("span", {}, swatch(rgb), ` ${rgb.join(", ")}`) : "none measured"],
+    ["temperature", meanK === null ? "none measured" : `${celsius(meanK)} mean, ${celsius(hottestK!)} hottest`],
+  ]);
+}
+
+function exact(answer: VoxelAnswer): HTMLElement {
+  const seen = answer.hits + answer.misses;
+  return facts([
+    ["voxel", answer.voxel.join(",")],
+    ["cell", answer.cell.join(",")],
+    ["centre", answer.centre_m.map((value) => value.toFixed(3)).join(", ") + " m"],
+    ["probability", answer.probability === null ? "unknown" : answer.probability.toFixed(4)],
+    ["seen", `${answer.hits} of ${seen} scans hit it`],
+    ...answer.channels.map(({ name, kind, unit, mean, sigma, weight }): [string, Node | string] => {
+      if (!weight) return [name, "none measured"];
+      if (kind === "colour") return [name, h("span", {}, swatch(mean), ` ${mean.map((value) => value.toFixed(1)).join(", ")} (${weight} samples)`)];
+      const spread = sigma === null ? "" : ` ± ${sigma.toFixed(2)} ${unit === "K" ? "°C" : unit}`;
+      const value = unit === "K" ? celsius(mean[0], 2) : `${mean[0].toFixed(2)} ${unit}`;
+      return [name, `${value}${spread} (${weight} samples)`];
+    }),
+  ]);
+}
+
+function whence(answer: VoxelAnswer): HTMLElement {
+  const rows = answer.commits.map(({ id, hits, misses, captured_s }) => {
+    const when = captured_s ? `${clock(captured_s[1])} (${ago(Date.now() / 1000 - captured_s[1])})` : "at an unknown time";
+    return h("li", {}, h("strong", {}, id.split(".")[0]), ` ${hits} hits, ${misses} misses; ${when}`, h("code", {}, id));
+  });
+  const left = [
+    answer.gone ? "Older commits are not kept any more: of them only the sum is known." : "",
+    answer.unread ? `${answer.unread} older commits of this cell were not looked at.` : "",
+  ].filter(Boolean);
+  return h(
+    "div", { class: "whence" }, h("h3", {}, "Who saw it"), h("ul", {}, ...rows), ...left.map((line) => h("p", { class: "hint" }, line)),
+  );
+}
