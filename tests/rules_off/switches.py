@@ -124,6 +124,14 @@ SWITCHES = (
     ),
     Switch(
         3,
+        "the header names all commits of its state",
+        MISSING,
+        "vector=head.vector.to_json(),",
+        "vector=besides.stable.to_json(),",
+        "cairn_server/test_missing.py::test_the_header_tells_what_a_robot_may_conclude",
+    ),
+    Switch(
+        3,
         "the header names the tip of the asker's incarnation",
         MISSING,
         "tip = snapshot.tip(author) if author else None",
