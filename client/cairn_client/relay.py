@@ -14,6 +14,7 @@ from enum import Enum
 from itertools import islice
 
 from cairn_client.asks import Ask, Conversation
+from cairn_client.uploads import CAME_IN_PART
 from cairn_map.commit import split_commit
 from cairn_map.errors import CairnError, ConflictError, DeniedError, NotFoundError, UnreachableError
 from cairn_map.ids import Author, CommitId
@@ -66,7 +67,8 @@ class Why(Enum):
     UNSIGNED = "unsigned"
     REFUSED = "refused"
     BROKEN = "broken"
-    """Twice the link broke at it, or the server could not take it, though both places had just answered."""
+    """Twice the link broke at it before any part of it came, or the server could not take it, though both places had
+    just answered."""
 
 
 FOR_GOOD = (Why.GONE, Why.UNSIGNED)
@@ -93,9 +95,12 @@ class Resting:
 
     def broke(self, to: Side, commit: CommitId, error: UnreachableError) -> None:
         """The link broke at it, or the server said when it may be able to take more."""
-        if self._broke_at.get(to) == commit and error.kind not in NOT_ITS_FAULT:
-            self.add(to, Why.BROKEN, commit)
-        self._broke_at[to] = commit
+        if error.kind == CAME_IN_PART:
+            self._broke_at.pop(to, None)
+        else:
+            if self._broke_at.get(to) == commit and error.kind not in NOT_ITS_FAULT:
+                self.add(to, Why.BROKEN, commit)
+            self._broke_at[to] = commit
         if error.retry_after_s:
             self._pauses_until_s[to] = self.clock_s() + min(error.retry_after_s, self.rest_s)
 

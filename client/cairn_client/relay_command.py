@@ -28,6 +28,7 @@ from cairn_client.map_url import split_map_url
 from cairn_client.relay import REST_S, RelayReport, Resting, Side, relay_round
 from cairn_client.relay_link import RelayApi, ServerEnd, hold_between
 from cairn_client.relay_log import tell
+from cairn_client.uploads import CAME_IN_PART
 from cairn_map.errors import BadInputError, UnreachableError
 from cairn_map.relay_end import MapEnd
 
@@ -35,7 +36,7 @@ log = logging.getLogger(__name__)
 
 TOKENS = ("CAIRN_TOKEN", "CAIRN_TOKEN_THERE")
 CUTS_MAX = 6
-"""Rounds that break, one after the other, without a commit that moved."""
+"""Rounds that break, one after the other, without a commit, or a part of one, that moved."""
 WAIT_MAX_S = 60.0
 """Who should come back later than this is told so."""
 FOLDER_MB = 10_000.0
@@ -82,7 +83,7 @@ def _once(here: MapEnd, there: MapEnd, resting: Resting, *, map_name: str, where
         total.refused += report.refused
         error = report.cut or report.later
         if error:  # a commit at which this comes twice rests, so that what follows it has its turn
-            cuts = 1 if any(report.moved.values()) else cuts + 1
+            cuts = 1 if any(report.moved.values()) or error.kind == CAME_IN_PART else cuts + 1
             if cuts == CUTS_MAX or (error.retry_after_s or 0.0) > WAIT_MAX_S:
                 raise error
             time.sleep(backoff.next_s(error.retry_after_s))

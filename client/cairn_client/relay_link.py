@@ -4,8 +4,11 @@ from collections.abc import Mapping
 from typing import Any, TypeVar
 
 from cairn_client.api import MapApi
-from cairn_client.asks import Ask, Conversation
+from cairn_client.asks import Ask, Conversation, GetUpload
+from cairn_client.link import Link
 from cairn_client.relay import AskHeld, GiveCommit, Side, TakeCommit
+from cairn_client.uploads import PARTS as LARGER_PARTS
+from cairn_client.uploads import Body, push_rest
 from cairn_map.errors import CairnError
 from cairn_map.ids import CommitId
 from cairn_map.messages import message_from_json
@@ -13,6 +16,8 @@ from cairn_map.relay_end import Held, MapEnd, SignedCommit
 from cairn_map.relay_messages import CommitList, held_from_list
 
 T = TypeVar("T")
+PARTS = LARGER_PARTS.after_a_cut()
+"""Links between servers are those that break, or there would be one server."""
 
 
 class RelayApi(MapApi):
@@ -49,8 +54,14 @@ class ServerEnd:
         return self._api.signed_commit(self._map_name, commit)
 
     def push(self, commit: SignedCommit) -> None:
-        """Keep a commit; durable on return."""
-        self._api.hand_over(self._map_name, commit)
+        """Keep a commit; durable on return. A large one goes in parts, and on from what came before a cut."""
+        if len(commit.data) > PARTS.above_bytes:
+            body = Body(commit.id, commit.data, commit.signatures)
+            found = self._api.upload(self._map_name, GetUpload(commit.id, body.digest))
+            if found.sha is None:
+                Link(self._api, self._map_name, branch="").hold(push_rest(body, found.size_bytes, PARTS))
+                return
+        self._api.hand_over(self._map_name, commit)  # what is there already is compared
 
 
 def hold_between(conversation: Conversation[T], here: MapEnd, there: MapEnd) -> T:

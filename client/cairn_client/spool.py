@@ -134,7 +134,7 @@ class Spool:
         return [(path, stamp) for path, stamp in stamped if self._settled.get(path, (None, None))[0] != stamp]
 
     def _begins_well(self, path: Path, stamp: Stamp, source: Recording) -> bool:
-        """Whether its first scan, which says what there is to map, can be read; what follows may be sound all the same."""
+        """Whether its first scan, which says what there is to map, can be read; the others may be sound anyway."""
         if self._begin_badly.get(path) == stamp:
             return False
         try:

@@ -16,7 +16,7 @@ from cairn_map.commit import COMMIT_BYTES_MAX
 from cairn_map.errors import BadInputError, CairnError, DeniedError, UnreachableError
 from cairn_map.ids import CommitId, commit_id_from_text
 from cairn_map.upload_messages import Upload
-from cairn_server.auth import Caller
+from cairn_server.auth import Caller, Role
 from cairn_server.push_policy import EvidenceGoneError
 from cairn_server.pushes import Pushes
 from cairn_server.store import Store
@@ -30,7 +30,7 @@ KEPT_S = 86_400.0
 """Bytes that nobody added to for so long go."""
 
 Place = tuple[int, str, CommitId]
-"""Map, robot, and which of its commits."""
+"""Map, robot or relay, and which commit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,13 +57,15 @@ class _Staged:
 
 
 def uploaded_by(caller: Caller, id_text: str) -> tuple[CommitId, str]:
-    """The commit, and the robot that its bytes are held for.
+    """The commit, and for whom its bytes are held: its robot, or the relay that brings it, which is no robot's name.
 
     Raises:
         DeniedError: kind `not_allowed`: it is another robot's.
         BadInputError: kind `bad_id`.
     """
     commit = commit_id_from_text(id_text)
+    if caller.role is Role.RELAY:
+        return commit, f"{caller.name}/"
     if not caller.may_author(commit.author.robot):
         raise DeniedError("not_allowed", f"this token stands for {caller.robot}, not for {commit.author.robot}")
     return commit, caller.robot or commit.author.robot

@@ -2,21 +2,29 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from random import Random
 
 import pytest
-from tests.cairn_client.joined import Server, mapped, opened, settled
+from tests.cairn_client.joined import ADMIN, Server, mapped, opened, settled
 from tests.cairn_client.made import GEOMETRY, MAP, cells_of, random_diff
+from tests.cairn_client.test_uploads import HEAD_BYTES, large_commit
 from tests.cairn_server.live import until
+from tests.links.proxy import Cut, Fault, FaultProxy
 
-from cairn_client import relay_command
+from cairn_client import relay_command, relay_link
 from cairn_client.api import MapApi
 from cairn_client.link import Link
+from cairn_client.relay import Resting, Side, relay_round
+from cairn_client.relay_link import RelayApi, ServerEnd, hold_between
 from cairn_client.robot import Robot
 from cairn_client.sync import push_commits
 from cairn_client.uploads import Parts
-from cairn_map.errors import BadInputError
+from cairn_map.commit import renamed_commit
+from cairn_map.errors import BadInputError, CairnError
 from cairn_map.ids import OPERATOR
 from cairn_map.messages import Retract
+from cairn_map.relay_end import SignedCommit
+from cairn_map.signature import SigningKey
 
 
 @pytest.fixture
@@ -278,3 +286,52 @@ def test_a_commit_that_comes_in_parts_is_signed_as_well(base: Server, fields: li
             Link(api, MAP, branch="robot").hold(push_commits(robot.replica, parts=small))
     settled(base, *fields)
     assert base.ids() == {commit.id}
+
+
+@pytest.mark.parametrize("cut", ["close", "half", "reset"])
+def test_a_commit_that_no_connection_carries_whole_goes_from_server_to_server_in_parts(
+    base: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cut: Cut
+) -> None:
+    monkeypatch.setattr(relay_link, "PARTS", Parts(above_bytes=1000, part_bytes=1000))
+    random, resting, broken = Random(2), Resting(), 0
+    with Server(tmp_path / "field") as field:
+        field.create_map()
+        with opened(field, tmp_path / "robot", "robot") as robot:
+            commit = large_commit(robot.replica)
+            robot.sync()
+        field.folded(field.row)
+        with (
+            FaultProxy(base.port, fault=lambda: Fault(up_bytes=random.randint(3500, 7000), cut=cut)) as link,
+            RelayApi(field.url, token=ADMIN) as here,
+            RelayApi(f"http://127.0.0.1:{link.port}", token=base.token("field", role="relay")) as there,
+        ):
+            for _ in range(100):
+                report = hold_between(relay_round(resting), ServerEnd(here, MAP), ServerEnd(there, MAP))
+                broken += report.cut is not None
+                assert not report.refused
+                if report.moved[Side.THERE]:
+                    break
+            paid = link.up.size_bytes
+        assert broken >= 3
+        assert report.moved[Side.THERE] == 1
+        assert not resting.may_come_later(Side.THERE)
+        heads = len(link.requests) * HEAD_BYTES
+        assert paid <= len(commit.data) + broken * (1000 + HEAD_BYTES) + heads
+        settled(base, field)
+
+
+def test_what_is_there_under_other_bytes_is_refused_though_it_would_go_in_parts(
+    base: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(relay_link, "PARTS", Parts(above_bytes=1, part_bytes=1000))
+    mapped(base, tmp_path / "x", "x", 1)
+    [commit] = base.ids()
+    with RelayApi(base.url, token=base.token("field", role="relay")) as api:
+        kept = api.signed_commit(MAP, commit)
+        end = ServerEnd(api, MAP)
+        end.push(kept)
+        other = renamed_commit(kept.data, commit=commit, parent="ab" * 32, retracts=())
+        key = SigningKey.drawn()
+        with pytest.raises(CairnError) as caught:
+            end.push(SignedCommit(commit, other.data, str(key.sign(MAP, other.sha))))
+        assert caught.value.kind in ("id_taken", "not_allowed")

@@ -9,6 +9,7 @@ from tests.cairn_server.live import Live
 from tests.cairn_server.pushes import pushed, read, sum_of
 from tests.cairn_server.test_auth import ADMIN, bearer
 from tests.cairn_server.test_push import kind_of
+from tests.cairn_server.test_uploads import add, state
 
 from cairn_map.access_messages import CreateToken
 from cairn_map.commit import Commit, renamed_commit
@@ -148,6 +149,24 @@ def test_a_server_hands_its_operators_retracts_on_under_its_own_key(live: Live, 
     assert found.headers["Cairn-Signature"].startswith(f"{key}.")
     path, headers = f"/maps/{row.name}/commits/{done}", {"Cairn-Signature": found.headers["Cairn-Signature"]}
     assert live.http.put(path, content=found.content, headers=headers).status_code == 200
+
+
+def test_a_signed_commit_may_come_in_parts_and_only_whole_and_signed_it_counts(live: Live, row: MapRow) -> None:
+    commit = pushed(0, 1, MOLE)
+    half = len(commit.data) // 2
+    assert add(live, row, commit.data[:half], 0, commit=commit).status_code == 200
+    unsigned = add(live, row, commit.data[half:], half, commit=commit)
+    assert (unsigned.status_code, kind_of(unsigned)) == (403, "not_allowed")
+    assert state(live, row, commit) == {"size_bytes": 0, "sha": None}
+    headers = signed(row, commit)
+    add(live, row, commit.data[:half], 0, commit=commit, headers=headers)
+    assert state(live, row, commit)["size_bytes"] == half
+    as_robot = {"headers": bearer(ADMIN)}  # who pushes it itself has its own bytes there
+    assert state(live, row, commit, **as_robot)["size_bytes"] == 0
+    add(live, row, commit.data[:9], 0, commit=commit, total=len(commit.data) + 1, **as_robot)
+    answer = add(live, row, commit.data[half:], half, commit=commit, headers=headers)
+    assert (answer.status_code, answer.json()["sha"]) == (201, commit.sha.hex())
+    assert [(entry["id"], entry["via"]) for entry in entries(live, row)] == [(str(commit.id), "field")]
 
 
 def test_a_server_s_key_is_of_its_map(live: Live) -> None:
