@@ -5,13 +5,11 @@ robot's own state.
 from pathlib import Path
 
 from cairn_client.map_model import stored_model
-from cairn_client.replica import Replica
-from cairn_client.replica_store import FILE_NAME, ReplicaStore
+from cairn_client.replica_store import FILE_NAME
+from cairn_client.state_folder import is_state_folder, opened_replica
 from cairn_map.cell_folder import MAP_FILE, read_cells, read_head
 from cairn_map.errors import BadInputError
 from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import Geometry
-from cairn_map.ids import robot_name
 from cairn_map.map_snapshot import MapSnapshot, snapshot_of
 
 
@@ -23,8 +21,9 @@ def snapshot_of_folder(folder: Path) -> MapSnapshot:
         ConflictError: a robot has its state open.
         DamagedDataError: a cell or the state is not sound.
     """
-    if (folder / FILE_NAME).is_file():
-        return _snapshot_of_robot(folder)
+    if is_state_folder(folder):
+        with opened_replica(folder) as replica:
+            return replica.snapshot(stored_model(replica.store))
     if (folder / MAP_FILE).is_file():
         head = read_head(folder)
         whole = EvidenceMap(head.geometry)
@@ -36,17 +35,3 @@ def snapshot_of_folder(folder: Path) -> MapSnapshot:
         f"{folder} holds no map: neither {MAP_FILE} and cells (`cairn map export URL --cells DIR`) nor a robot's "
         f"{FILE_NAME} (`cairn robot pull --map URL --state DIR`)",
     )
-
-
-def _snapshot_of_robot(folder: Path) -> MapSnapshot:
-    store = ReplicaStore(folder)
-    try:
-        known = [store.get(key) for key in ("robot", "map", "geometry")]
-        if None in known:
-            raise BadInputError("no_map_folder", f"the robot in {folder} has not learnt of a map yet")
-        robot, map_name, geometry = (str(text) for text in known)
-        grid = Geometry.model_validate_json(geometry)
-        replica = Replica(store, robot=robot_name(robot), map_name=map_name, geometry=grid)
-        return replica.snapshot(stored_model(store))
-    finally:
-        store.close()
