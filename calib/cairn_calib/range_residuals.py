@@ -3,8 +3,7 @@
     true range = (n . (o - c) + w) / (n . v)      n, o: the board's normal and origin, w: its warp there; v: the pixel's
     residual   = (true + bias - measured) / s     ray, c: the camera; all in the rig's frame, metres
 
-Every pixel that looks at the inside of the board measures its plane, whatever is printed on it. The warp is taken from
-where the ray meets the plane.
+Every pixel that looks at the inside of the board measures its plane, whatever is printed on it.
 """
 
 from collections.abc import Sequence
@@ -25,6 +24,8 @@ Flags = npt.NDArray[np.bool_]
 PIXELS_MAX = 400
 """Of one image, evenly spread: more would only say the same again."""
 PIXELS_MIN = 12
+WARP_ROUNDS = 3
+"""Of finding where a ray meets the bent board; each is a thousand times nearer."""
 INSIDE = 0.0
 """How far inside the outermost corners a pixel's middle must be, in pitches: half a cell of board is around them."""
 
@@ -83,19 +84,19 @@ def range_block(data: RangeData, state: RigState, layout: Layout, board: Board, 
     met = _met(data, state, board, seen.rays)
     R_rig_camera = state.T_rig_camera[c, :3, :3]
     shapes = bias_shapes(state.lenses[c], data.pixels, met.range_m)
-    n, v, d, slant = met.normals[:, None, :], met.rays, met.range_m, met.slant
+    n, v, d, slant = met.normals, met.rays, met.range_m, met.slant
     by_ray = -(d / slant)[..., None] * n
     columns = [
         np.squeeze((by_ray @ R_rig_camera)[..., None, :] @ seen.by_intrinsics, -2)[..., layout.intrinsic_columns[c]]
     ]
     at = [layout.intrinsic_at[c]]
     if len(layout.pose_at[c]):
-        columns += [np.cross(v, by_ray), np.broadcast_to(-n, v.shape) / slant[..., None]]
+        columns += [np.cross(v, by_ray), -n / slant[..., None]]
         at.append(layout.pose_at[c])
     if len(layout.warp_at):
         columns.append(met.warp_shape / slant[..., None])
         at.append(layout.warp_at)
-    columns += [np.cross(n, met.off_board) / slant[..., None], np.broadcast_to(n, v.shape) / slant[..., None]]
+    columns += [np.cross(n, met.off_board) / slant[..., None], n / slant[..., None]]
     # All so far move the true range, of which the bias scales.
     columns = [(1 + state.bias[SCALE_AT]) * column for column in columns]
     columns.insert(-2, shapes)
@@ -115,7 +116,7 @@ class _Met:
     """Where rays meet the board, in the rig's frame."""
 
     normals: Floats
-    """(V, 3)"""
+    """(V, M, 3) of the bent board, there; 1 long but for the bend."""
     rays: Floats
     """(V, M, 3)"""
     slant: Floats
@@ -136,10 +137,16 @@ def _met(data: RangeData, state: RigState, board: Board, rays_camera: Floats) ->
     slant = np.einsum("vi,vmi->vm", n, v)
     offset = T_rig_board[:, :3, 3] - T_rig_camera[:3, 3]
     flat_m = np.einsum("vi,vi->v", n, offset)[:, None] / slant
-    places = (flat_m[..., None] * v - offset[:, None]) @ R_rig_board
-    shape = warp_at_places(board, places[..., :2])
-    range_m = flat_m + (shape @ state.warp_m) / slant
-    return _Met(n, v, slant, range_m, offset[:, None] - range_m[..., None] * v, shape)
+    range_m = flat_m
+    for _ in range(WARP_ROUNDS):
+        places = (range_m[..., None] * v - offset[:, None]) @ R_rig_board
+        shape = warp_at_places(board, places[..., :2])
+        range_m = flat_m + (shape @ state.warp_m) / slant
+    last = board.points()[:, :2].max(axis=0)
+    slopes = -4 / last * (2 * places[..., :2] / last - 1) * state.warp_m
+    local = np.concatenate([-slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1) @ np.swapaxes(R_rig_board, 1, 2)
+    slant = np.einsum("vmi,vmi->vm", local, v)
+    return _Met(local, v, slant, range_m, offset[:, None] - range_m[..., None] * v, shape)
 
 
 def _inside(

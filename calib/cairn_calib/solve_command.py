@@ -2,10 +2,13 @@
 
     $ cairn calib corners tof/*.png   --board 7x6 --square 0.1 --output corners/tof
     $ cairn calib corners left/*.png  --board 7x6 --square 0.1 --output corners/left
-    $ cairn calib solve corners/tof corners/left --spectrum tof=range,left=colour --output rig.json
-    tof   12 images  504 points   2 outliers  noise 0.10 px  rms 0.09 px
-    left  12 images  504 points   0 outliers  noise 0.08 px  rms 0.07 px
-    rig.json: tof, left; chi2 1987 of 1930
+    $ cairn calib solve corners/tof corners/left --spectrum tof=range,left=colour --output rig.json --report report.html
+    warning: tof: no corner lies near the image's corners, ... [tof_edge: 0.59 of the half diagonal, threshold 0.8 ...]
+    next: the board's middle at pixel (29, 72) of tof, 1.55 m away, its right edge turned away by 35 degrees
+    tof   20 images  840 points  8 outliers  noise 0.106 px  rms 0.105 px
+    left  20 images  830 points  0 outliers  noise 0.154 px  rms 0.152 px
+    rig.json: tof, left
+    report.html: 1 warnings; the same as report.json
 
 A camera's name is its folder's. Images of one place of the board have the same last number in their names
 (tof03.png, left03.png). The first range camera is the rig's frame, else the first camera (--gauge).
@@ -17,7 +20,11 @@ from the spectrum: colour k1,k2,p1,p2,k3, thermal k1,k2,k3, range k1,k2; --disto
 cameras with Kannala and Brandt's model. With --range DIR the range camera's images of the same boards (16 bit, radial,
 --range-units-per-m) show its bias.
 
-Images that cannot tell a number are refused or warned about, with what to shoot instead.
+What the images cannot tell is warned about, with the threshold and what was measured: tilt, distances, the image's
+edge, numbers that come from assumptions, halves of the images that contradict each other, single frames that much hangs
+on; and which image would help most. Images that leave a camera open (one view, parallel boards, cameras that never saw
+a board together) are refused. The report has it all, with residuals, coverage, and how certain each pixel is at 1, 2
+and 5 m.
 """
 
 import argparse
@@ -31,10 +38,13 @@ import numpy as np
 from cairn_calib.board_views import BoardViews, RangeView, frame_of, read_board_views
 from cairn_calib.calibration import Statistics
 from cairn_calib.corner_pictures import read_grey
+from cairn_calib.examination import examined
 from cairn_calib.rig import Spectrum
 from cairn_calib.solve import solve_rig
+from cairn_calib.solve_json import examination_json
 from cairn_calib.solve_plan import PITCH_SIGMA, CameraPlan, SolvePlan, usual_plan
-from cairn_calib.solved_rig import solved_rig
+from cairn_calib.solve_report import report_page
+from cairn_calib.solved_rig import solved_rig, statistics_of
 from cairn_map.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -54,6 +64,7 @@ def add_parser(commands: "_SubParsersAction[argparse.ArgumentParser]") -> None:
         "--spectrum", required=True, metavar="[NAME=]SPECTRUM,...", help="range, colour or thermal, of all or by camera"
     )
     added.add_argument("--output", type=Path, required=True, metavar="RIG.JSON")
+    added.add_argument("--report", type=Path, metavar="REPORT.HTML", help="for people; beside it the same as .json")
     added.add_argument("--gauge", metavar="NAME", help="the camera whose frame is the rig's")
     added.add_argument("--name", default="rig", help="of the rig (rig)")
     added.add_argument(
@@ -80,12 +91,27 @@ def run(args: argparse.Namespace) -> None:
     views = read_board_views(folders)
     if args.range is not None:
         views = _with_ranges(views, plan, args.range, args.range_units_per_m)
-    rig = solved_rig(solve_rig(views, plan), made_s=time.time())
-    args.output.write_bytes(rig.to_json())
-    if rig.calibration is not None and rig.calibration.statistics is not None:
-        sys.stdout.write(told(rig.calibration.statistics))
-        fit = rig.calibration.statistics
-        sys.stdout.write(f"{args.output}: {', '.join(rig.cameras)}; chi2 {fit.chi2:.0f} of {fit.degrees_of_freedom}\n")
+    solution = solve_rig(views, plan)
+    rig = solved_rig(solution, made_s=time.time())
+    seen = examined(solution, rig)
+    _write(args.output, rig.to_json())
+    sys.stdout.write(told(statistics_of(solution)))
+    for each in seen.warnings:
+        sys.stderr.write(f"warning: {each}\n")
+    if seen.next_images and seen.warnings:
+        sys.stderr.write(f"next: {seen.next_images[0]}\n")
+    sys.stdout.write(f"{args.output}: {', '.join(rig.cameras)}\n")
+    if args.report is not None:
+        _write(args.report, report_page(seen).encode())
+        _write(args.report.with_suffix(".json"), examination_json(seen))
+        sys.stdout.write(f"{args.report}: {len(seen.warnings)} warnings; the same as {args.report.stem}.json\n")
+
+
+def _write(path: Path, data: bytes) -> None:
+    try:
+        path.write_bytes(data)
+    except OSError as exc:
+        raise BadInputError("cannot_write", f"cannot write {path}: {exc.strerror}") from exc
 
 
 def told(statistics: Statistics) -> str:

@@ -128,7 +128,9 @@ def _of_priors(solution: Solution) -> Iterator[Warned]:
 def _of_coefficients(solution: Solution) -> Iterator[Warned]:
     values, sigmas = solution.values(), solution.sigmas()
     for name, camera in solution.plan.cameras.items():
-        lost = {each: sigmas[name, each] / max(abs(values[name, each]), 1e-12) for each in camera.coefficients}
+        # A tangential part of 0 is what a good lens has.
+        radial = [each for each in camera.coefficients if each.startswith("k")]
+        lost = {each: sigmas[name, each] / max(abs(values[name, each]), 1e-12) for each in radial}
         unknown = [each for each, share in lost.items() if share > 1]
         if unknown:
             told = ", ".join(f"{each} = {values[name, each]:.2g} +- {sigmas[name, each]:.2g}" for each in unknown)
@@ -142,9 +144,7 @@ def _of_noise(solution: Solution) -> Iterator[Warned]:
             continue
         name = solution.views.cameras[sensor.data.camera]
         if sensor.scale > NOISE_SCALE:
-            text = (
-                "corners miss by far more than they are uncertain: a lens model that does not fit, a bent board, motion"
-            )
+            text = "corners miss by far more than they may: a lens model that does not fit, a bent board, motion"
             yield Warned("noise", name, sensor.scale, NOISE_SCALE, "times the stated noise", text)
         lost = (sensor.there & ~sensor.kept).sum(axis=1) / np.maximum(sensor.there.sum(axis=1), 1)
         share = 1 - sensor.kept.sum() / max(sensor.there.sum(), 1)

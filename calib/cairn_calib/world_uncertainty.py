@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.pose_vectors import cross_matrix
+from cairn_calib.poses import inverse, transform_points
 from cairn_calib.probe_points import image_grid
-from cairn_calib.projection_uncertainty import mounted_lens, projection_moves
+from cairn_calib.projection_uncertainty import mounted_lens, projection_moves, transfer_certain
 from cairn_calib.rig import Rig
 from cairn_calib.solve import Solution
 
@@ -73,4 +74,23 @@ def sigma_map(solution: Solution, rig: Rig, camera: str, range_m: float, *, colu
     grid = image_grid(lens.width, lens.height, columns, rows)
     covariance = pixel_covariance(solution, rig, world_covariance(solution), camera, grid, range_m)
     sigmas: Floats = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
+    return sigmas.reshape(rows, columns)
+
+
+def transfer_map(rig: Rig, source: str, target: str, range_m: float, *, columns: int = 24) -> Floats:
+    """(rows, columns) over the image of `target`: how certain it is where a pixel of `source` appears there.
+
+    Pixels of one axis; NaN where `source` does not look. The range is from `target`.
+    """
+    lens, other = mounted_lens(rig, target), mounted_lens(rig, source)
+    rows = max(1, round(columns * lens.height / lens.width))
+    T_source_target = inverse(rig[source].transform) @ rig[target].transform
+    grid = image_grid(lens.width, lens.height, columns, rows)
+    points = transform_points(T_source_target, range_m * lens.unproject(grid))
+    pixels = other.project(points)
+    seen = other.contains(pixels)
+    sigmas = np.full(len(grid), np.nan)
+    if seen.any():
+        certain = transfer_certain(rig, source, target, pixels[seen], np.linalg.norm(points[seen], axis=1))
+        sigmas[seen] = np.sqrt(np.trace(certain.calibration_px2, axis1=1, axis2=2) / 2)
     return sigmas.reshape(rows, columns)

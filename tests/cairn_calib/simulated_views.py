@@ -7,12 +7,14 @@ import numpy.typing as npt
 
 from cairn_calib.board import Board
 from cairn_calib.board_views import BoardView, BoardViews, RangeView
+from cairn_calib.calibration import POSE_UNITS
 from cairn_calib.camera import Camera
 from cairn_calib.corners import Corners
-from cairn_calib.pose_vectors import transform_from_vector
-from cairn_calib.range_bias import bias_shapes
+from cairn_calib.pose_vectors import transform_from_vector, vector_from_transform
+from cairn_calib.range_bias import BIAS_NAMES, bias_shapes
 from cairn_calib.rig import Spectrum
 from cairn_calib.rig_state import warp_at_places, warp_shape
+from cairn_calib.solve import Solution
 
 Floats = npt.NDArray[np.float64]
 
@@ -137,3 +139,27 @@ def ranges_of(truth: World, name: str, *, seed: int, sigma_m: float) -> tuple[Ra
         measured = true_m + shapes @ np.array(truth.bias) + rng.normal(size=true_m.shape) * sigma_m
         result.append(RangeView(name, f"{frame:03d}", np.where(on_board, measured, np.nan)))
     return tuple(result)
+
+
+def errors_of(solution: Solution, truth: World) -> dict[tuple[str, str], float]:
+    """Estimate minus truth of every shared parameter; of poses, the error that `rig.json` speaks of, negated."""
+    errors = {}
+    board = {"warp_x": truth.warp_m[0], "warp_y": truth.warp_m[1], "scale": truth.scale}
+    bias = dict(zip(BIAS_NAMES, truth.bias, strict=True))
+    for (owner, name), value in solution.values().items():
+        if owner == "":
+            errors[owner, name] = value - board[name]
+        elif name in bias:
+            errors[owner, name] = value - bias[name]
+        elif name in truth.lenses[owner].intrinsic_names:
+            lens = truth.lenses[owner]
+            errors[owner, name] = value - float(lens.intrinsics[lens.intrinsic_names.index(name)])
+    for name, T in zip(solution.plan.cameras, solution.state.T_rig_camera, strict=True):
+        if name == solution.plan.gauge:
+            continue
+        true_T = truth.T_rig_camera(name)
+        turn = np.eye(4)
+        turn[:3, :3] = T[:3, :3] @ true_T[:3, :3].T
+        wrong = np.concatenate([vector_from_transform(turn)[:3], T[:3, 3] - true_T[:3, 3]])
+        errors |= {(name, each): float(value) for each, value in zip(POSE_UNITS, wrong, strict=True)}
+    return errors
