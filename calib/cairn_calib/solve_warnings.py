@@ -33,6 +33,7 @@ NOISE_SCALE = 3.0
 OUTLIER_SHARE = 0.05
 IMAGE_OUTLIER_SHARE = 0.2
 HALVES_RATIO = 3.0
+HALVES_CHI2_SIGMAS = 5.0
 INFLUENCE_SIGMAS = 3.0
 MODE_PX = 1.0
 FOCAL_SHARE_MAX = 0.2
@@ -192,3 +193,11 @@ def _of_halves(halves: Halves | None) -> Iterator[Warned]:
                 "expected: model error (lens model, moved board, images not of one moment)"
             )
             yield Warned("model_error", each.camera, each.ratio, HALVES_RATIO, "times the expected", text)
+    threshold = 1 + HALVES_CHI2_SIGMAS * float(np.sqrt(2 / halves.parameters))
+    share = halves.chi2 / halves.parameters
+    if share > threshold:
+        text = (
+            "two halves of the images differ by far more than their covariances allow: model error (lens model, moved "
+            "board or camera, images not of one moment)"
+        )
+        yield Warned("model_error", "", share, threshold, "chi2 a parameter", text)
