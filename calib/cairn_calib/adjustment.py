@@ -24,10 +24,15 @@ Floats = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 STEPS_MAX = 100
-DAMPING = (1e-4, 1e-12, 1e10)
-"""At first, at least, at most."""
+DAMPING, DAMPING_MIN, DAMPING_MAX = 1e-4, 1e-12, 1e10
+WARM = 1e-8
+"""Damping near a minimum, where it would only slow down what is weakly determined."""
+ROUNDING = 1e-12
+"""Relative rise of the cost that is none."""
 SETTLED = 1e-10
 """Expected fall of the cost, in squared sigmas, below which a step is not worth it: 1e-5 sigma."""
+COARSE = 1e-2
+"""The same where outliers and noise are still to be found: a tenth of a sigma."""
 SCALE_SETTLED = 1e-3
 """Relative change of a sensor's noise."""
 MEDIAN_SQUARE = {1: 0.4549, 2: 1.3863}
@@ -116,53 +121,53 @@ def adjust(problem: Problem, state: RigState, noise: Noise) -> Adjusted:
     Raises:
         numpy.linalg.LinAlgError: the data do not determine all parameters.
     """
-    if not np.isfinite(noise.huber_sigmas) and noise.rounds == 0:
-        return descend(problem, state)
-    first = _median_scaled(problem, state) if noise.rounds else problem
-    result = descend(first, state, huber_sigmas=noise.huber_sigmas)
-    if noise.rounds:
-        result = descend(_median_scaled(first, result.state), result.state, huber_sigmas=noise.huber_sigmas)
     if noise.rounds == 0:
-        return result
+        return descend(problem, state, huber_sigmas=noise.huber_sigmas)
+    result = descend(_median_scaled(problem, state), state, huber_sigmas=noise.huber_sigmas, settled=COARSE)
+    result = replace(result, problem=_median_scaled(result.problem, result.state))
     for _ in range(noise.rounds):
         before = result.problem.sensors
-        kept = tuple(
-            _culled(sensor, each, noise.cull_sigmas) for sensor, each in zip(before, _all_blocks(result), strict=True)
-        )
-        result = descend(replace(result.problem, sensors=kept), result.state)
+        blocks = result.problem.blocks(result.state)
+        kept = tuple(_culled(sensor, each, noise.cull_sigmas) for sensor, each in zip(before, blocks, strict=True))
+        result = descend(replace(result.problem, sensors=kept), result.state, settled=COARSE, damping=WARM)
         scaled = _scaled(result)
-        settled = all(
+        result = replace(result, problem=replace(result.problem, sensors=scaled))
+        if all(
             np.array_equal(a.kept, b.kept) and abs(a.scale / c.scale - 1) < SCALE_SETTLED
             for a, b, c in zip(before, kept, scaled, strict=True)
-        )
-        result = replace(result, problem=replace(result.problem, sensors=scaled))
-        if settled:
+        ):
             break
-    return descend(result.problem, result.state)
+    return descend(result.problem, result.state, damping=WARM)
 
 
-def descend(problem: Problem, state: RigState, *, huber_sigmas: float = np.inf) -> Adjusted:
-    """The minimum for known noise and outliers.
+def descend(
+    problem: Problem,
+    state: RigState,
+    *,
+    huber_sigmas: float = np.inf,
+    settled: float = SETTLED,
+    damping: float = DAMPING,
+) -> Adjusted:
+    """The minimum for known noise and outliers, to a fall of the cost of `settled`.
 
     Raises:
         numpy.linalg.LinAlgError: the data do not determine all parameters.
     """
-    damping, least, most = DAMPING
     blocks = problem.blocks(state, huber_sigmas=huber_sigmas)
     normal = problem.normal(state, blocks)
     if not np.isfinite(normal.cost):
         raise np.linalg.LinAlgError("the start puts corners where the lens sees nothing")
     for step in range(STEPS_MAX):
         shared, boards, expected = normal.step(damping)
-        if expected < SETTLED:
+        if expected < settled:
             return Adjusted(problem, state, blocks, normal, step)
         trial = moved(state, problem.layout, shared, boards)
         trial_blocks = problem.blocks(trial, huber_sigmas=huber_sigmas)
         trial_normal = problem.normal(trial, trial_blocks)
         if trial_normal.cost < normal.cost:
             state, blocks, normal = trial, trial_blocks, trial_normal
-            damping = max(damping / 10, least)
-        elif damping >= most or trial_normal.cost - normal.cost < 1e-12 * normal.cost:
+            damping = max(damping / 10, DAMPING_MIN)
+        elif damping >= DAMPING_MAX or trial_normal.cost - normal.cost < ROUNDING * normal.cost:
             # Rounding is all that is left to gain.
             return Adjusted(problem, state, blocks, normal, step)
         else:
@@ -178,12 +183,6 @@ def redundancies(blocks: list[Block], known: Uncertainty, sensors: tuple[Sensor,
     ]
 
 
-def _all_blocks(result: Adjusted) -> list[Block]:
-    """Blocks with outliers in them, to see whether they still are."""
-    everything = tuple(replace(sensor, kept=sensor.there) for sensor in result.problem.sensors)
-    return replace(result.problem, sensors=everything).blocks(result.state)
-
-
 def _culled(sensor: Sensor, block: Block, sigmas: float) -> Sensor:
     squares = np.sum(block.residuals**2, axis=-1)
     return replace(sensor, kept=sensor.there & (squares <= sigmas**2))
@@ -195,7 +194,7 @@ def _scaled(result: Adjusted) -> tuple[Sensor, ...]:
     free = redundancies(result.blocks, uncertainty(result.normal), sensors)
     scaled = []
     for sensor, block, count in zip(sensors, result.blocks, free, strict=True):
-        variance = float(np.sum(block.residuals**2)) / count if count > 1 else 1.0
+        variance = float(np.sum(block.residuals[sensor.kept] ** 2)) / count if count > 1 else 1.0
         scaled.append(replace(sensor, scale=sensor.scale * np.sqrt(variance) if variance > 0 else sensor.scale))
     return tuple(scaled)
 

@@ -84,22 +84,23 @@ def corner_derivatives(
     turned = board_points(state, lattice, shape) @ np.swapaxes(R_rig_board, 1, 2)
     q = turned + T_rig_board[:, None, :3, 3] - T_rig_camera[:3, 3]
     there = state.lenses[c].projection(q @ R_rig_camera)
-    G = there.by_point @ R_rig_camera.T
-    columns = [there.by_intrinsics[..., layout.intrinsic_columns[c]]]
-    at = [layout.intrinsic_at[c]]
+    G = (there.by_point.reshape(-1, 3) @ R_rig_camera.T).reshape(there.by_point.shape)
+    at = [layout.intrinsic_at[c], layout.pose_at[c], layout.warp_at, layout.scale_at]
+    ends = np.cumsum([len(each) for each in at]).tolist()
+    J = np.empty((*there.pixels.shape, ends[-1] + 6))
+    J[..., : ends[0]] = there.by_intrinsics[..., layout.intrinsic_columns[c]]
     if len(layout.pose_at[c]):
         # A turned camera: dp = q x dr, as seen by it.
-        columns += [_crossed(G, q), -G]
-        at.append(layout.pose_at[c])
+        _crossed_into(J[..., ends[0] : ends[0] + 3], G, q)
+        J[..., ends[0] + 3 : ends[1]] = -G
     if len(layout.warp_at):
-        columns.append((G @ R_rig_board[:, None, :, 2:]) * shape[:, None, :])
-        at.append(layout.warp_at)
+        J[..., ends[1] : ends[2]] = (G @ R_rig_board[:, None, :, 2:]) * shape[:, None, :]
     if len(layout.scale_at):
-        columns.append(G @ (lattice @ np.swapaxes(R_rig_board, 1, 2))[..., None])
-        at.append(layout.scale_at)
-    columns += [-_crossed(G, turned), G]
+        J[..., ends[2]] = np.einsum("vnij,vnj->vni", G, lattice @ np.swapaxes(R_rig_board, 1, 2))
+    _crossed_into(J[..., ends[3] : ends[3] + 3], G, -turned)
+    J[..., ends[3] + 3 :] = G
     misses = np.where(data.seen[..., None], there.pixels - data.pixels, 0.0)
-    return misses, np.concatenate(columns, axis=-1), np.concatenate(at)
+    return misses, J, np.concatenate(at)
 
 
 def corner_block(
@@ -110,20 +111,30 @@ def corner_block(
     loss: Loss,
 ) -> Block:
     """The camera's share: `board` is lattice and warp shape."""
-    misses, derivatives, at = corner_derivatives(data, state, layout, *board)
-    whitening = data.whitening / loss.scale * loss.kept[..., None, None]
-    residuals = np.einsum("vnij,vnj->vni", whitening, np.where(loss.kept[..., None], misses, 0.0))
+    misses, J, at = corner_derivatives(data, state, layout, *board)
+    whitening = data.whitening / loss.scale
+    residuals = _whitened(whitening, misses[..., None])[..., 0]
     weights, cost = loss(np.sum(residuals**2, axis=-1))
-    views, points = data.seen.shape
     root = np.sqrt(weights)[..., None]
+    views, points = data.seen.shape
     r = (root * residuals).reshape(views, 2 * points, 1)
-    J = ((root[..., None] * whitening) @ derivatives).reshape(views, 2 * points, -1)
+    J = _whitened(root[..., None] * whitening, J).reshape(views, 2 * points, -1)
     J_t = np.swapaxes(J, 1, 2)
     return Block(at, data.frames, J_t @ J, -(J_t @ r)[..., 0], residuals, cost)
 
 
-def _crossed(G: Floats, points: Floats) -> Floats:
-    """(V, N, 2, 3) rows g x p of (V, N, 2, 3) rows and (V, N, 3) points: g . (p x dr) = dr . (g x p)."""
-    gx, gy, gz = np.moveaxis(G, -1, 0)
-    px, py, pz = np.moveaxis(points[..., None, :], -1, 0)
-    return np.stack([gy * pz - gz * py, gz * px - gx * pz, gx * py - gy * px], axis=-1)
+def _whitened(whitening: Floats, J: Floats) -> Floats:
+    """(V, N, 2, K) lower triangular (V, N, 2, 2) times (V, N, 2, K): twice as fast as a product of little matrices."""
+    result = np.empty_like(J)
+    np.multiply(whitening[..., 0, 0, None], J[..., 0, :], out=result[..., 0, :])
+    np.multiply(whitening[..., 1, 1, None], J[..., 1, :], out=result[..., 1, :])
+    result[..., 1, :] += whitening[..., 1, 0, None] * J[..., 0, :]
+    return result
+
+
+def _crossed_into(out: Floats, G: Floats, points: Floats) -> None:
+    """(V, N, 2, 3) rows g x p of (V, N, 2, 3) rows and (V, N, 3) points into `out`: g . (p x dr) = dr . (g x p)."""
+    px, py, pz = (points[..., None, axis] for axis in range(3))
+    out[..., 0] = G[..., 1] * pz - G[..., 2] * py
+    out[..., 1] = G[..., 2] * px - G[..., 0] * pz
+    out[..., 2] = G[..., 0] * py - G[..., 1] * px

@@ -30,15 +30,18 @@ class Loss:
     """Beyond it the cost grows linearly (Huber 1964)."""
 
     def __call__(self, squares: Floats) -> tuple[Floats, float]:
-        """(...) weights of squared lengths of residuals, and the sum of their costs; infinite if one is NaN."""
+        """(V, N) weights of squared lengths of residuals, and the sum of their costs; infinite if one is NaN.
+
+        What does not count has no weight and no cost.
+        """
+        squares = np.where(self.kept, squares, 0.0)
         if np.isnan(squares).any():
             return np.ones_like(squares), np.inf
-        lengths = np.sqrt(squares)
-        beyond = lengths > self.huber_sigmas
+        lengths, k = np.sqrt(squares), self.huber_sigmas
+        beyond = lengths > k
         if not beyond.any():
-            return np.ones_like(squares), float(squares.sum())
-        k = self.huber_sigmas
-        weights = np.where(beyond, k / np.maximum(lengths, 1e-300), 1.0)
+            return self.kept.astype(np.float64), float(squares.sum())
+        weights = self.kept * np.where(beyond, k / np.maximum(lengths, 1e-300), 1.0)
         return weights, float(np.where(beyond, 2 * k * lengths - k * k, squares).sum())
 
 
@@ -58,7 +61,7 @@ class Block:
     pull: Floats
     """(V, K + 6) -J^T r."""
     residuals: Floats
-    """(V, M, D) whitened, D a corner's or a pixel's axes; 0 where there is nothing or it is left out."""
+    """(V, M, D) whitened, D a corner's or a pixel's axes; of outliers, too; 0 where there is nothing."""
     cost: float
     """Sum of what the loss makes of the residuals' squares."""
 
@@ -86,7 +89,8 @@ class NormalEquations:
         C = self.C * (1 + damping * np.eye(6))
         right = np.concatenate([np.swapaxes(self.B, 1, 2), self.b[..., None]], axis=2)
         solved = np.linalg.solve(C, right)
-        inner = np.einsum("fpk,fkq->pq", self.B, solved, optimize=True)
+        # F small products: a single large one makes BLAS start threads, 30 times slower where processors are busy.
+        inner = (self.B @ solved).sum(axis=0)
         return A - inner[:, :-1], self.a - inner[:, -1], solved[..., :-1], solved[..., -1]
 
     def step(self, damping: float) -> tuple[Floats, Floats, float]:
@@ -98,14 +102,10 @@ class NormalEquations:
         S, s, by_shared, alone = self.reduced(damping)
         shared = solved_scaled(S, s)
         boards = alone - by_shared @ shared
-        # Of the undamped model: 2 g.d - d.H.d.
-        slope = float(self.a @ shared + np.sum(self.b * boards))
-        bend = float(
-            shared @ self.A @ shared
-            + 2 * np.einsum("p,fpk,fk->", shared, self.B, boards, optimize=True)
-            + np.einsum("fk,fkl,fl->", boards, self.C, boards, optimize=True)
-        )
-        return shared, boards, 2 * slope - bend
+        # 2 g.d - d.H.d with (H + damping D) d = g.
+        held = shared @ (np.diag(self.A) * shared) + np.sum(np.einsum("fkk->fk", self.C) * boards**2)
+        expected = float(self.a @ shared + np.sum(self.b * boards) + damping * held)
+        return shared, boards, expected
 
 
 def gathered(blocks: list[Block], size: int, frame_count: int) -> NormalEquations:

@@ -101,11 +101,11 @@ def range_block(data: RangeData, state: RigState, layout: Layout, board: Board, 
     columns = [(1 + state.bias[SCALE_AT]) * column for column in columns]
     columns.insert(-2, shapes)
     at.append(layout.bias_at)
-    whitening = loss.kept / (loss.scale * data.sigma_m)
-    residuals = np.where(loss.kept, whitening * (d + shapes @ state.bias - data.range_m), 0.0)
+    noise_m = loss.scale * data.sigma_m
+    residuals = np.where(data.measured, (d + shapes @ state.bias - data.range_m) / noise_m, 0.0)
     weights, cost = loss(residuals**2)
     root = np.sqrt(weights)
-    J = np.nan_to_num(np.concatenate(columns, axis=-1) * (root * whitening)[..., None])
+    J = np.nan_to_num(np.concatenate(columns, axis=-1) * (root / noise_m)[..., None])
     J_t = np.swapaxes(J, 1, 2)
     pull = -(J_t @ (root * residuals)[..., None])[..., 0]
     return Block(np.concatenate(at), data.frames, J_t @ J, pull, residuals[..., None], cost)

@@ -55,6 +55,12 @@ def rig_start(
         BadInputError: some cameras never saw a board together with the others, or all of a camera's corners are named
             from the wrong end.
     """
+    middle = board.points().mean(axis=0)
+    # Each as it is, then mirrored.
+    readings = {
+        name: {frame: np.stack([T, mirrored_pose(T, middle)]) for frame, T in frames.items()}
+        for name, frames in poses.items()
+    }
     edges = []
     names = list(poses)
     for n, one in enumerate(names):
@@ -62,11 +68,8 @@ def rig_start(
             common = sorted(set(poses[one]) & set(poses[other]))
             if common:
                 weight = sum(min(weights[one, frame], weights[other, frame]) for frame in common)
-                edges.append(
-                    _edge(
-                        one, other, [(frame, poses[one][frame], poses[other][frame]) for frame in common], board, weight
-                    )
-                )
+                pairs = [np.stack([readings[name][frame] for frame in common]) for name in (one, other)]
+                edges.append(_edge((one, other), common, pairs[0], pairs[1], half_turn(board), weight))
     T_rig_camera: dict[str, Transform] = {gauge: np.eye(4)}
     turned: dict[str, list[_Edge]] = {name: [] for name in names}
     while len(T_rig_camera) < len(names):
@@ -99,36 +102,32 @@ def half_turn(board: Board) -> Transform:
 
 
 def _edge(
-    one: str, other: str, pairs: Sequence[tuple[str, Transform, Transform]], board: Board, weight: float
+    names: tuple[str, str], frames: Sequence[str], one: Floats, other: Floats, turn: Transform, weight: float
 ) -> _Edge:
-    middle = board.points().mean(axis=0)
-    readings, owners, kinds = [], [], []
-    for n, (_, T_one_board, T_other_board) in enumerate(pairs):
-        for turn, way in enumerate((np.eye(4), half_turn(board))):
-            for a in (T_one_board, mirrored_pose(T_one_board, middle)):
-                for b in (T_other_board, mirrored_pose(T_other_board, middle)):
-                    readings.append(a @ way @ inverse(b))
-                    owners.append(n)
-                    kinds.append(turn)
-    T = np.stack(readings)
-    distance = np.median([np.linalg.norm(a[:3, 3]) + np.linalg.norm(b[:3, 3]) for _, a, b in pairs]) / 2
-    apart = _apart(T, distance).reshape(len(T), len(pairs), -1).min(axis=2)
-    # As they are stand before turned, and unmirrored before mirrored: of equals the first wins.
-    best = int(np.argmin(np.minimum(apart, AGREE_RAD).sum(axis=1).round(6)))
-    to_best = _apart(T, distance)[best].reshape(len(pairs), -1)
-    nearest = to_best.argmin(axis=1) + np.arange(len(pairs)) * to_best.shape[1]
-    agrees = to_best.min(axis=1) < AGREE_RAD
-    chosen = T[nearest[agrees]]
+    """The relative pose that most of F frames agree on, of (F, 2, 4, 4) readings of each camera's."""
+    ways = np.stack([np.eye(4), turn])
+    # (F, way, reading of one, reading of the other): as they are stand before turned and mirrored.
+    T = one[:, None, :, None] @ ways[:, None, None] @ np.linalg.inv(other)[:, None, None]
+    count = len(frames)
+    T = T.reshape(count * 8, 4, 4)
+    distance = float(np.median(np.linalg.norm(np.concatenate([one[:, 0], other[:, 0]])[:, :3, 3], axis=1)))
+    apart = _apart(T, distance).reshape(len(T), count, 8)
+    # Of equals the first wins.
+    best = int(np.argmin(np.minimum(apart.min(axis=2), AGREE_RAD).sum(axis=1).round(6)))
+    nearest = apart[best].argmin(axis=1)
+    agrees = apart[best].min(axis=1) < AGREE_RAD
+    chosen = T[np.flatnonzero(agrees) * 8 + nearest[agrees]]
     mean = np.eye(4)
     mean[:3, :3], mean[:3, 3] = chordal_mean(chosen[:, :3, :3]), np.median(chosen[:, :3, 3], axis=0)
-    turned = tuple(frame for n, (frame, _, _) in enumerate(pairs) if agrees[n] and kinds[nearest[n]] == 1)
-    return _Edge(one, other, mean, weight * max(agrees.mean(), 0.01), turned)
+    turned = tuple(frame for n, frame in enumerate(frames) if agrees[n] and nearest[n] >= 4)
+    return _Edge(*names, mean, weight * max(float(agrees.mean()), 0.01), turned)
 
 
 def _apart(T: Floats, distance_m: float) -> Floats:
     """(N, N) rotation between each two transforms, radians, plus translation over a distance."""
-    cosine = (np.einsum("aij,bij->ab", T[:, :3, :3], T[:, :3, :3]) - 1) / 2
-    shift = np.linalg.norm(T[:, None, :3, 3] - T[None, :, :3, 3], axis=2)
+    R, t = T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]
+    cosine = (R @ R.T - 1) / 2
+    shift = np.sqrt(np.sum((t[:, None] - t[None]) ** 2, axis=2))
     return np.asarray(np.arccos(np.clip(cosine, -1, 1)) + shift / distance_m)
 
 

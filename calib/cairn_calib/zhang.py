@@ -2,8 +2,8 @@
 
 Each view's homography H = K [r1 r2 t] makes two equations in the image of the absolute conic, B = K^-T K^-1, for r1
 and r2 are perpendicular and equally long. Lens distortion is not known yet and bends all of it, so several guesses are
-made: Zhang's own, one with the principal point in the middle, and fixed fields of view; the one is taken that meets
-the corners best.
+made: Zhang's own, one with the principal point in the middle, and where both are impossible fixed fields of view; the
+one is taken that meets the corners best.
 """
 
 from collections.abc import Iterator, Sequence
@@ -81,13 +81,16 @@ def mirrored_pose(T_camera_board: Transform, middle: Floats) -> Transform:
 def _guesses(homographies: Sequence[Floats], size_px: tuple[int, int]) -> Iterator[Floats]:
     width, height = size_px
     middle = np.array([width - 1, height - 1]) / 2
+    found = False
     full = _zhang(homographies, middle, width)
     if full is not None and np.all(np.abs(full[:2, 2] - middle) < OFF_CENTRE * np.array(size_px)):
+        found = True
         yield full
     centred = _centred(homographies, middle)
     if centred is not None and SANE[0] < centred[0, 0] / width < SANE[1]:
+        found = True
         yield centred
-    for share in FOCAL_SHARES:
+    for share in () if found else FOCAL_SHARES:
         yield _matrix(share * width, share * width, *middle)
 
 

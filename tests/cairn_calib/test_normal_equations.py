@@ -108,15 +108,15 @@ def test_a_minimum_has_no_slope(solution: Solution) -> None:
 
 
 def test_hubers_loss_grows_linearly_and_weights_are_its_slope() -> None:
-    loss = Loss(1.0, np.ones(3, bool), 1.5)
     squares = np.array([1.0, 4.0, 100.0])
-    weights, cost = loss(squares)
+    weights, cost = Loss(1.0, np.ones(3, bool), 1.5)(squares)
     np.testing.assert_allclose(weights, [1.0, 0.75, 0.15])
     assert cost == pytest.approx(1 + (2 * 1.5 * 2 - 1.5**2) + (2 * 1.5 * 10 - 1.5**2))
-    h = 1e-6
+    loss, h = Loss(1.0, np.ones(1, bool), 1.5), 1e-6
     slopes = [(loss(np.array([s + h]))[1] - loss(np.array([s - h]))[1]) / (2 * h) for s in squares]
     np.testing.assert_allclose(slopes, weights, rtol=1e-6)
-    assert loss(np.array([1.0, np.nan]))[1] == np.inf
+    assert Loss(1.0, np.array([True, True]), 1.5)(np.array([1.0, np.nan]))[1] == np.inf
+    assert Loss(1.0, np.array([True, False]), 1.5)(np.array([1.0, np.nan]))[1] == 1
 
 
 def test_corners_weigh_by_their_covariance(solution: Solution) -> None:

@@ -180,7 +180,7 @@ def test_one_image_named_from_the_other_end_is_left_out_and_told() -> None:
     solution = solve_rig(wrong, pair_plan())
     assert solution.turned == (("left", odd.frame),)
     right = solve_rig(views.without([("left", odd.frame)]), pair_plan())
-    assert solution.state.T_rig_camera == pytest.approx(right.state.T_rig_camera, abs=1e-9)
+    assert solution.state.T_rig_camera == pytest.approx(right.state.T_rig_camera, abs=1e-7)
 
 
 def test_half_a_turn_names_points_from_the_other_end() -> None:
