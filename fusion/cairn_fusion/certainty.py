@@ -4,50 +4,57 @@ Eq. 1-4 put a point at P = d u along the unit ray u of its pixel, Eq. 5 at Q = R
 the pixel p(Q). Range noise moves the point along its beam, and the pixel along the beam's image:
 
     dp/dd = J R u = J (Q - t) / d = -J t / d        J = dp/dQ, and J Q = 0: along its own ray a point keeps its pixel
-    S     = sigma_d^2 (J t / d) (J t / d)^T + sigma_c^2 I
+    S     = C + sigma_d^2 (J t / d) (J t / d)^T + sigma_u^2 D D^T
 
-so without a baseline t range noise does nothing. sigma_c is the rig's `calibration_sigma_px`: what calibration left, as
-much in both axes. The place on the surface that a pixel is taken from is uncertain by as many metres as the longer axis
-of S spans at the point's depth.
+so without a baseline t range noise does nothing. C is what calibration left (`calibration_certainty`), sigma_u how
+uncertain the pixel itself is, where it is one that was found by an algorithm, D how the other moves with it. The
+place on the surface that a pixel is taken from is uncertain by as many metres as the longer axis of S spans at the
+point's depth.
 """
 
 import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.fisheye import FisheyeCamera
-from cairn_calib.lens import Lens
 from cairn_calib.poses import inverse, transform_points
 from cairn_calib.rig import Rig
-from cairn_map.errors import BadInputError
+from cairn_fusion.calibration_certainty import calibration_covariance, lens_of, pixel_gradients
+from cairn_fusion.place_covariance import calibration_bound_px
 
 Floats = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
+REACH_MAX_PX = 16
+"""A bound on the work of looking around."""
 STRETCH_MAX = 8.0
 """By how much a lens may stretch what it shows, for `is_certain`."""
 
 
-def pixel_covariance(points_src: Floats, sigma_m: Floats, rig: Rig, *, src: str, dst: str) -> Floats:
+def pixel_covariance(
+    points_src: Floats, sigma_m: Floats, rig: Rig, *, src: str, dst: str, pixel_sigma_px: float = 0.0
+) -> Floats:
     """(N, 2, 2) covariance, px^2, of where points of one camera's frame appear in another's image.
 
     Args:
-        points_src: (N, 3) metres, frame of the range camera `src`.
-        sigma_m: (N,) standard deviation of their range.
+        points_src: (N, 3) metres, frame of the camera `src`.
+        sigma_m: (N,) standard deviation of their range along its rays.
         rig: with both cameras.
-        src: the range camera.
+        src: the camera whose pixels are carried: the range camera, or any other through range.
         dst: the camera to look from.
+        pixel_sigma_px: of where in `src` they are, both axes; 0 for the centres of pixels.
 
     Raises:
         BadInputError: `dst` is a lidar.
     """
-    camera = rig[dst].camera
-    if not isinstance(camera, Lens):
-        raise BadInputError("bad_camera", f"{dst} must have a lens, it is a {type(camera).__name__}")
+    camera = lens_of(rig, dst)
     T_dst_src = inverse(rig[dst].transform) @ rig[src].transform
     gradients = camera.pixel_gradients(transform_points(T_dst_src, points_src))
     moved = gradients @ T_dst_src[:3, 3] * (sigma_m / np.linalg.norm(points_src, axis=1))[:, None]
-    calibration_px = rig[dst].calibration_sigma_px or 0.0
-    return np.asarray(moved[:, :, None] * moved[:, None, :] + calibration_px**2 * np.eye(2))
+    covariance = moved[:, :, None] * moved[:, None, :] + calibration_covariance(points_src, rig, src=src, dst=dst)
+    if pixel_sigma_px:
+        by_pixel = pixel_gradients(points_src, rig, src=src, dst=dst)
+        covariance += pixel_sigma_px**2 * by_pixel @ np.swapaxes(by_pixel, -1, -2)
+    return np.asarray(covariance)
 
 
 def spread_px(covariance: Floats) -> Floats:
@@ -75,6 +82,19 @@ def is_certain(range_m: Floats, sigma_m: Floats, rig: Rig, *, src: str, dst: str
     """
     T_dst_src = inverse(rig[dst].transform) @ rig[src].transform
     baseline_m = float(np.linalg.norm(T_dst_src[:3, 3]))
-    calibration = (rig[dst].calibration_sigma_px or 0.0) / min(rig[dst].camera.focal_px)
+    calibration = calibration_bound_px(rig, src=src, dst=dst) / min(rig[dst].camera.focal_px)
     bound_m = STRETCH_MAX * (baseline_m * (sigma_m / range_m) + calibration * (range_m + baseline_m))
     return np.asarray(bound_m <= limit_m)
+
+
+def reach_px_of(range_m: Floats, sigma_m: Floats, rig: Rig, *, src: str, dst: str) -> npt.NDArray[np.int32]:
+    """(N,) how many pixels of `dst`, to each side, a pixel of the range camera may cover there.
+
+    Half a range pixel, one standard deviation of calibration, and one of the range's noise, which moves it along the
+    baseline's image by f t sigma / d^2.
+    """
+    focal_px, T_dst_src = max(rig[dst].camera.focal_px), inverse(rig[dst].transform) @ rig[src].transform
+    half_px = 0.5 * focal_px / max(rig[src].camera.focal_px)
+    fixed_px = min(half_px + calibration_bound_px(rig, src=src, dst=dst), float(REACH_MAX_PX))
+    moved_px = focal_px * float(np.linalg.norm(T_dst_src[:3, 3])) * sigma_m / np.square(range_m)
+    return np.asarray(np.minimum(np.ceil(fixed_px + moved_px), REACH_MAX_PX), dtype=np.int32)

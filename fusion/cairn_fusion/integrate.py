@@ -31,6 +31,7 @@ from cairn_fusion.samples import sample_sums
 from cairn_fusion.scan import Scan
 from cairn_fusion.tallies import Tallies
 from cairn_fusion.tally import Each
+from cairn_fusion.transfer import DEPTH_TOLERANCE_M
 from cairn_map.channels import ChannelKind
 from cairn_map.errors import BadInputError
 from cairn_map.evidence import Evidence, packed_evidence
@@ -65,6 +66,12 @@ class Integrator:
     than one voxel."""
     sample_spread_voxels: float = 1.0
     """How uncertain, in voxels, the place of a colour or temperature may be (`certainty`); beyond it there is none."""
+    temperature_step_k: float = 4.0
+    """How much the thermal image may differ within what a range pixel covers; beyond it there is no temperature, for it
+    could be that of the background, or a hot thing's on the background. Infinite: whatever the pixel says."""
+
+    hidden_behind_m: float = DEPTH_TOLERANCE_M
+    """How much deeper than what hides it from a camera a point must be (`transfer`). Infinite: nothing hides."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_range_m < self.max_range_m < float("inf"):
@@ -77,11 +84,16 @@ class Integrator:
             raise BadInputError("bad_range", f"noise_sigmas must be finite, from 0, got {self.noise_sigmas}")
         if not self.sample_spread_voxels > 0:
             raise BadInputError("bad_range", f"sample_spread_voxels must be above 0, got {self.sample_spread_voxels}")
+        for name in ("temperature_step_k", "hidden_behind_m"):
+            if not getattr(self, name) > 0:
+                raise BadInputError("bad_range", f"{name} must be above 0, got {getattr(self, name)}")
 
     def __str__(self) -> str:
         limits = f"min_range_m={self.min_range_m:g} max_range_m={self.max_range_m:g}"
         surfaces = f"flying_step_m={self.flying_step_m:g} noise_sigmas={self.noise_sigmas:g}"
-        return f"cairn-{self.method} 3 {limits} {surfaces} sample_spread_voxels={self.sample_spread_voxels:g}"
+        samples = f"sample_spread_voxels={self.sample_spread_voxels:g} temperature_step_k={self.temperature_step_k:g}"
+        samples += f" hidden_behind_m={self.hidden_behind_m:g}"
+        return f"cairn-{self.method} 4 {limits} {surfaces} {samples}"
 
 
 class Integration:
@@ -191,7 +203,12 @@ class Integration:
 
     def _sample_sums(self, scan: Scan, returns: Returns, voxel_of: npt.NDArray[np.integer], count: int) -> Ints:
         limit_m = self._integrator.sample_spread_voxels * self._geometry.voxel_edge_m
-        return sample_sums(scan, self._rig, self._geometry, returns, voxel_of, count, spread_max_m=limit_m)
+        return sample_sums(
+            *(scan, self._rig, self._geometry, returns, voxel_of, count),
+            spread_max_m=limit_m,
+            step_max_k=self._integrator.temperature_step_k,
+            hidden_behind_m=self._integrator.hidden_behind_m,
+        )
 
     def _clear_ends(self, origin_m: Floats, points_map: Floats, sigma_m: Floats) -> Floats:
         edge_m, sigmas = self._geometry.voxel_edge_m, self._integrator.noise_sigmas

@@ -60,7 +60,7 @@ def returns_of(
     check_scan(scan, rig)
     mounted = rig[scan.range_camera]
     T_map_tof = scan.T_map_rig @ mounted.transform
-    full = _full_pixels(scan, mounted)
+    full = full_pixels(scan, mounted)
     within = (scan.range_m >= min_range_m) & (scan.range_m <= max_range_m) & ~full
     shield_m = np.where(within, scan.range_m, np.float32(np.nan))
     if flying_step_m < math.inf:
@@ -79,7 +79,7 @@ def returns_of(
     return Returns(T_map_tof, range_m, shield_m, silent, silent_m, pixels, points_map)
 
 
-def _full_pixels(scan: Scan, mounted: MountedCamera) -> Flags:
+def full_pixels(scan: Scan, mounted: MountedCamera) -> Flags:
     """(H, W) where too much light returned for a range."""
     limit = mounted.known_sensing.saturated_amplitude
     if limit is None or scan.amplitude is None:

@@ -4,12 +4,44 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from cairn_fusion.transfer_kernels import OK
+from cairn_fusion.transfer_kernels import OK, UNCERTAIN
 from cairn_map.channels import SAMPLE_MAX
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Index = npt.NDArray[np.int32]
+
+
+@nb.njit(cache=True, nogil=True)
+def doubt_edges_into(
+    labels: npt.NDArray[np.uint8],
+    pixels: Ints,
+    reach_px: Index,
+    image: npt.NDArray[np.float32],
+    step_max: float,
+) -> None:
+    """Label points UNCERTAIN around whose pixel the image differs by more than a step.
+
+    Args:
+        labels: (N,) only what is OK is looked at.
+        pixels: (N, 2) x, y, where the label is OK.
+        reach_px: (N,) how many pixels to each side the point may be from there.
+        image: (H, W); what is not a number is not looked at.
+        step_max: between the least and the most.
+    """
+    height, width = image.shape
+    for n in range(labels.shape[0]):
+        if labels[n] != OK:
+            continue
+        x, y, reach = pixels[n, 0], pixels[n, 1], np.int64(reach_px[n])
+        least, most = np.float32(np.inf), np.float32(-np.inf)
+        for j in range(max(y - reach, 0), min(y + reach + 1, height)):
+            for i in range(max(x - reach, 0), min(x + reach + 1, width)):
+                value = image[j, i]
+                least = value if value < least else least
+                most = value if value > most else most
+        if most - least > step_max:
+            labels[n] = UNCERTAIN
 
 
 @nb.njit(cache=True, nogil=True)

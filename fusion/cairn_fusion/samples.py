@@ -16,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.rig import Rig
-from cairn_fusion.certainty import is_certain, spread_m
+from cairn_fusion.certainty import is_certain, reach_px_of, spread_m
 from cairn_fusion.returns import Returns
-from cairn_fusion.sample_kernels import add_pixels_into, write_means_into
+from cairn_fusion.sample_kernels import add_pixels_into, doubt_edges_into, write_means_into
 from cairn_fusion.scan import Scan
-from cairn_fusion.transfer import Label, Transfer, depth_steps, points_from_range, transfer_points
+from cairn_fusion.transfer import DEPTH_TOLERANCE_M, Label, Transfer, depth_steps, points_from_range, transfer_points
 from cairn_map.channels import Channel, ChannelKind
 from cairn_map.grid import Geometry
 
@@ -39,13 +39,19 @@ def sample_sums(
     count: int,
     *,
     spread_max_m: float = math.inf,
+    step_max_k: float = math.inf,
+    hidden_behind_m: float = DEPTH_TOLERANCE_M,
 ) -> Ints:
     """(count, P) sums of the scan's voxels: one sample of weight 1 for each channel that a camera saw there.
 
-    Colours and temperatures whose place is uncertain by more than `spread_max_m` are left out (`certainty`).
+    Colours and temperatures whose place is uncertain by more than `spread_max_m` are left out (`certainty`); and
+    temperatures at whose place the thermal image differs by more than `step_max_k`, within what a range pixel covers:
+    of an edge of something hot nobody knows which side the range is of. `hidden_behind_m` is that of
+    `transfer_points`.
     """
     sums = np.zeros((count, geometry.plane_count), np.int64)
-    sight, numbers = Sight(scan, rig, returns, spread_max_m), voxel_of.astype(np.int32, copy=False)
+    limits = SightLimits(spread_max_m, step_max_k, hidden_behind_m)
+    sight, numbers = Sight(scan, rig, returns, limits), voxel_of.astype(np.int32, copy=False)
     for channel in geometry.channels:
         taken = np.zeros(len(returns.pixels), np.bool_)
         # The first camera speaks for what it sees; the next ones only fill what was hidden from those before.
@@ -69,14 +75,23 @@ class _Points:
     """(N,) of their ranges."""
 
 
+@dataclass(frozen=True, slots=True)
+class SightLimits:
+    """What is taken for seen; arguments of `sample_sums`."""
+
+    spread_max_m: float
+    step_max_k: float
+    hidden_behind_m: float
+
+
 class Sight:
     """Where the points of a scan appear in its images, each found when it is asked for."""
 
-    def __init__(self, scan: Scan, rig: Rig, returns: Returns, spread_max_m: float) -> None:
+    def __init__(self, scan: Scan, rig: Rig, returns: Returns, limits: SightLimits) -> None:
         self._scan = scan
         self._rig = rig
         self._returns = returns
-        self._spread_max_m = spread_max_m
+        self._limits = limits
         self._points: _Points | None = None
 
     def images_of(self, kind: ChannelKind) -> Iterator[tuple[npt.NDArray[np.generic], Ints, Labels]]:
@@ -96,15 +111,25 @@ class Sight:
             yield image, transfer.pixels, transfer.labels
 
     def _transfer(self, name: str) -> Transfer:
-        """Where all points appear in a camera's image; those whose place there is too uncertain as out of view."""
-        src = self._scan.range_camera
+        """Where all points appear in a camera's image; those whose place there is too uncertain are so labelled."""
+        src, limits = self._scan.range_camera, self._limits
         points = self._seen_points()
-        transfer = transfer_points(points.tof, self._rig, src=src, dst=name, steps_m=points.steps_m)
-        certain = is_certain(points.range_m, points.sigma_m, self._rig, src=src, dst=name, limit_m=self._spread_max_m)
+        transfer = transfer_points(
+            *(points.tof, self._rig),
+            src=src,
+            dst=name,
+            steps_m=points.steps_m,
+            hidden_behind_m=limits.hidden_behind_m,
+        )
+        certain = is_certain(points.range_m, points.sigma_m, self._rig, src=src, dst=name, limit_m=limits.spread_max_m)
         doubtful = np.nonzero(transfer.ok & ~certain)[0]
         if len(doubtful):
             spread = spread_m(points.tof[doubtful], points.sigma_m[doubtful], self._rig, src=src, dst=name)
-            transfer.labels[doubtful[~(spread <= self._spread_max_m)]] = Label.OUT_OF_VIEW
+            transfer.labels[doubtful[~(spread <= limits.spread_max_m)]] = Label.UNCERTAIN
+        if name in self._scan.thermal and limits.step_max_k < math.inf:
+            reach_px = reach_px_of(points.range_m, points.sigma_m, self._rig, src=src, dst=name)
+            image = np.ascontiguousarray(self._scan.thermal[name])
+            doubt_edges_into(transfer.labels, transfer.pixels, reach_px, image, limits.step_max_k)
         return transfer
 
     def _seen_points(self) -> "_Points":

@@ -43,6 +43,9 @@ class Scan:
         object.__setattr__(self, "T_map_rig", checked_transform(self.T_map_rig, name="T_map_rig"))
         if self.T_map_body is not None:
             object.__setattr__(self, "T_map_body", checked_transform(self.T_map_body, name="T_map_body"))
+        if not isinstance(self.range_m, np.ndarray):
+            # Above all no `EyeDepth`: what was filled in for the eye is no measurement.
+            raise BadInputError("bad_scan", f"range_m must be an array of ranges, got {type(self.range_m).__name__}")
         if not np.isfinite(self.time_s):
             raise BadInputError("bad_scan", f"time_s must be finite seconds, got {self.time_s}")
 

@@ -41,6 +41,14 @@ class Label(IntEnum):
     OCCLUDED = 1
     OUT_OF_VIEW = 2
     NO_RANGE = 3
+    SATURATED = 4
+    """Too much light returned to the range camera."""
+    FLYING = 5
+    """A mixture of two surfaces."""
+    NO_READING = 6
+    """The camera sees it, and has no value there."""
+    UNCERTAIN = 7
+    """What the camera has there may be of another place (`certainty`, `samples`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +104,15 @@ def depth_steps(points: Floats) -> Floats:
     return steps_of(np.ascontiguousarray(points[..., 2]))
 
 
-def transfer_points(points_src: Floats, rig: Rig, *, src: str, dst: str, steps_m: Floats | None = None) -> Transfer:
+def transfer_points(
+    points_src: Floats,
+    rig: Rig,
+    *,
+    src: str,
+    dst: str,
+    steps_m: Floats | None = None,
+    hidden_behind_m: float = DEPTH_TOLERANCE_M,
+) -> Transfer:
     """Where points of one camera's frame appear in another's image.
 
     Args:
@@ -105,6 +121,7 @@ def transfer_points(points_src: Floats, rig: Rig, *, src: str, dst: str, steps_m
         src: the range camera.
         dst: the camera to look from.
         steps_m: (N,) `depth_steps` of the points; None: surfaces that face the camera.
+        hidden_behind_m: how much deeper than what hides it a point must be, besides 5 % and slant; infinite: none is.
     """
     T_dst_src, seen_by = inverse(rig[dst].transform) @ rig[src].transform, rig[dst].camera
     N = len(points_src)
@@ -125,7 +142,7 @@ def transfer_points(points_src: Floats, rig: Rig, *, src: str, dst: str, steps_m
         bin_px = int(np.ceil(BIN_MARGIN * max(ratio, 1)))
         slant_m = np.zeros(N) if steps_m is None else steps_m * (bin_px / ratio)
         bins = (-(-seen_by.width // bin_px), -(-seen_by.height // bin_px))
-        hide_into(labels, pixels, depth_m, slant_m, bin_px, *bins, DEPTH_TOLERANCE, DEPTH_TOLERANCE_M)
+        hide_into(labels, pixels, depth_m, slant_m, bin_px, *bins, DEPTH_TOLERANCE, hidden_behind_m)
     return Transfer(pixels, labels)
 
 

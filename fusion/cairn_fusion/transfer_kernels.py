@@ -13,6 +13,7 @@ Pixels = npt.NDArray[np.int64]
 Labels = npt.NDArray[np.uint8]
 
 OK, OCCLUDED, OUT_OF_VIEW, NO_RANGE = 0, 1, 2, 3
+UNCERTAIN = 7
 """`transfer.Label`."""
 
 

@@ -1,0 +1,143 @@
+"""See heat on colour: a recording's cameras fused into one picture, a folder of pictures, or a live stream.
+
+    $ cairn telepresence lab-1 --output view.png                        # scan 0, temperatures over colour
+    $ cairn telepresence lab-1 --scan 12 --mode side-by-side --output view.png
+    $ cairn telepresence lab-1 --hotter 40 --scale 15:60 --output pictures/    # all scans; only what is hot
+    $ cairn telepresence lab-1 --band 34:38 --mode stereo --serve 8760  # for a browser: http://127.0.0.1:8760/
+    $ cairn telepresence lab-1 --mode colour-on-thermal --output view.png
+
+Range carries each temperature to the colour pixel of the same place; what the thermal camera does not see from where
+it stands is taken from the second one. Where no temperature is known the picture is hatched: it is never shown as
+cold. The temperature scale is that of the first picture, or what --scale says, and stays. Temperatures are apparent,
+in deg C.
+"""
+
+import argparse
+import math
+import time
+from pathlib import Path
+
+from cairn_client.arguments import allow_negative_lists, parser, say, with_progress
+from cairn_client.frame_arguments import add_frame_arguments, frame_options
+from cairn_fusion.images import write_colour
+from cairn_fusion.importers import open_source
+from cairn_fusion.recording import ScanSource
+from cairn_fusion.view.mjpeg import Latest, streaming
+from cairn_fusion.view.painting import Emphasis
+from cairn_fusion.view.telepresence import Mode, Telepresence, ViewOptions
+from cairn_fusion.view.temperature_scale import ZERO_CELSIUS_K, TemperatureScale
+from cairn_map.errors import BadInputError
+
+RATE_HZ = 5.0
+
+
+def main(argv: list[str]) -> int:
+    """Write pictures, or serve them."""
+    args = _parser().parse_args(argv)
+    source = open_source(args.recording, options=frame_options(args), frames=args.frames)
+    telepresence = Telepresence(source.rig, _options(args))
+    if args.serve is not None:
+        _serve(source, telepresence, args)
+    elif args.output.suffix.lower() == ".png":
+        _write(telepresence, source, args.scan or 0, args.output)
+        say(f"wrote {args.output}: {args.mode}, scan {args.scan or 0} of {len(source)} of {source.name}")
+    else:
+        _write_all(source, telepresence, args)
+    return 0
+
+
+def _write_all(source: ScanSource, telepresence: Telepresence, args: argparse.Namespace) -> None:
+    """One PNG a scan."""
+    try:
+        args.output.mkdir(parents=True, exist_ok=True)
+    except OSError as exc:
+        raise BadInputError("bad_output", f"cannot make the folder {args.output}: {exc.strerror}") from exc
+    numbers = range(len(source)) if args.scan is None else [args.scan]
+    for number in with_progress(numbers, "pictures", total=len(numbers)):
+        _write(telepresence, source, number, args.output / f"{number:06d}.png")
+    say(f"wrote {len(numbers)} pictures into {args.output}: {args.mode} of {source.name}")
+
+
+def _write(telepresence: Telepresence, source: ScanSource, number: int, path: Path) -> None:
+    picture = telepresence.view(source.scan(number))
+    try:
+        write_colour(path, picture)
+    except OSError as exc:
+        raise BadInputError("bad_output", f"cannot write {path}: {exc.strerror}") from exc
+
+
+def _serve(source: ScanSource, telepresence: Telepresence, args: argparse.Namespace) -> None:
+    """Show the scans one after the other, again and again, or one for good, until interrupted."""
+    host, port = args.serve
+    latest = Latest()
+    numbers = range(len(source)) if args.scan is None else [args.scan]
+    latest.show(telepresence.view(source.scan(numbers[0])))
+    with streaming(latest, host=host, port=port) as url:
+        say(f"{args.mode} of {source.name} at {url} ; end with Ctrl-C")
+        while True:
+            for number in numbers:
+                due_s = time.monotonic() + 1 / args.rate
+                latest.show(telepresence.view(source.scan(number)))
+                time.sleep(max(0.0, due_s - time.monotonic()))
+
+
+def _options(args: argparse.Namespace) -> ViewOptions:
+    from_c, to_c = args.band or (args.hotter if args.hotter is not None else -math.inf, math.inf)
+    emphasis = Emphasis(alpha=args.alpha, from_k=from_c + ZERO_CELSIUS_K, to_k=to_c + ZERO_CELSIUS_K)
+    scale = None
+    if args.scale is not None:
+        scale = TemperatureScale(args.scale[0] + ZERO_CELSIUS_K, args.scale[1] + ZERO_CELSIUS_K)
+    mode = Mode(args.mode)
+    return ViewOptions(mode=mode, camera=args.camera, emphasis=emphasis, scale=scale, marks_hottest=not args.no_marker)
+
+
+def _celsius(text: str) -> tuple[float, float]:
+    """Two temperatures, LOW:HIGH."""
+    low, colon, high = text.partition(":")
+    try:
+        return float(low), float(high) if colon else math.nan
+    except ValueError as exc:
+        raise argparse.ArgumentTypeError(f"two temperatures in deg C are LOW:HIGH, got {text!r}") from exc
+
+
+def _address(text: str) -> tuple[str, int]:
+    """PORT on loopback, or HOST:PORT."""
+    host, _, port = text.rpartition(":")
+    if not port.isdecimal() or int(port) > 65535:
+        raise argparse.ArgumentTypeError(f"an address is PORT or HOST:PORT, got {text!r}")
+    return host or "127.0.0.1", int(port)
+
+
+def _rate(text: str) -> float:
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = math.nan
+    if not 0 < rate <= 1000:
+        raise argparse.ArgumentTypeError(f"pictures a second are above 0, at most 1000, got {text!r}")
+    return rate
+
+
+def _parser() -> argparse.ArgumentParser:
+    options = parser("cairn telepresence", __doc__)
+    options.add_argument("recording", type=Path, help="a recording, a bag, or a folder of frames")
+    where = options.add_mutually_exclusive_group(required=True)
+    where.add_argument("--output", type=Path, metavar="PNG|FOLDER", help="one picture, or a folder with one a scan")
+    where.add_argument(
+        "--serve", type=_address, metavar="[HOST:]PORT", help="stream to browsers (host 127.0.0.1: this machine alone)"
+    )
+    options.add_argument("--scan", type=int, metavar="N", help="only this scan, from 0")
+    options.add_argument("--mode", choices=[mode.value for mode in Mode], default=Mode.THERMAL_ON_COLOUR.value)
+    options.add_argument("--camera", help="of the rig, to look through (the first that fits)")
+    options.add_argument("--alpha", type=float, default=0.5, help="of temperatures over colour, 0 to 1 (0.5)")
+    painted = options.add_mutually_exclusive_group()
+    painted.add_argument("--hotter", type=float, metavar="C", help="paint only what is hotter, deg C")
+    painted.add_argument("--band", type=_celsius, metavar="LOW:HIGH", help="paint only what is between, deg C")
+    options.add_argument(
+        "--scale", type=_celsius, metavar="LOW:HIGH", help="ends of the palette, deg C (first picture)"
+    )
+    options.add_argument("--no-marker", action="store_true", help="do not mark the hottest place")
+    options.add_argument("--rate", type=_rate, default=RATE_HZ, metavar="HZ", help=f"pictures a second ({RATE_HZ:g})")
+    add_frame_arguments(options)
+    allow_negative_lists(options)
+    return options

@@ -1,0 +1,25 @@
+"""Work on an image's rows by all cores: kernels let go of the interpreter's lock, and bands of rows share nothing."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+BANDS_PER_CORE = 2
+"""Some bands are harder than others."""
+
+
+def in_bands(work: Callable[[int, int], None], rows: int) -> None:
+    """Call `work(first, last)` for bands that make up all rows, at once; what it raises is raised."""
+    cores = os.cpu_count() or 1
+    count = max(1, min(BANDS_PER_CORE * cores, rows)) if cores > 1 else 1
+    edges = [rows * n // count for n in range(count + 1)]
+    if count == 1:
+        work(0, rows)
+        return
+    list(_pool(cores).map(work, edges[:-1], edges[1:]))
+
+
+@cache
+def _pool(cores: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(cores, thread_name_prefix="bands")

@@ -1,0 +1,89 @@
+"""Temperatures painted over a picture, and the hottest found: the loops of `painting`."""
+
+import math
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+Singles = npt.NDArray[np.float32]
+Bytes = npt.NDArray[np.uint8]
+
+OK = 0
+"""`cairn_fusion.transfer.Label`."""
+HATCH_PERIOD, HATCH_WIDTH = 16, 3
+HATCH_GREY = 150
+HATCH_MIX = 128
+"""Of 256: how much of a hatched line is grey."""
+
+
+@nb.njit(cache=True, nogil=True)
+def paint_into(
+    out: Bytes,
+    base: Bytes,
+    kelvin: Singles,
+    labels: Bytes,
+    palette: Bytes,
+    low_k: float,
+    high_k: float,
+    from_k: float,
+    to_k: float,
+    alpha: float,
+    first_row: int,
+) -> None:
+    """Blend temperatures into a picture; where there is none, hatch it.
+
+    Args:
+        out: (H, W, 3) takes the picture.
+        base: (H, W, 3) what is beneath.
+        kelvin: (H, W)
+        labels: (H, W) temperatures count where it is OK, and they are numbers.
+        palette: (256, 3) from `low_k` to `high_k`; what is outside has the colour of the nearer end.
+        low_k: kelvin.
+        high_k: kelvin.
+        from_k: colder is not painted.
+        to_k: hotter is not painted.
+        alpha: 0 nothing to 1 nothing else of the palette is seen.
+        first_row: of the whole picture, in which the hatching goes on.
+    """
+    f = np.float32
+    height, width = labels.shape
+    scale, low, start, stop = f(255.0 / (high_k - low_k)), f(low_k), f(from_k), f(to_k)
+    mix = np.int32(round(256 * alpha))
+    rest = np.int32(256) - mix
+    for y in range(height):
+        for x in range(width):
+            t = kelvin[y, x]
+            if labels[y, x] != OK or math.isnan(t):
+                grey = (x + y + first_row) % HATCH_PERIOD < HATCH_WIDTH
+                for c in range(3):
+                    value = np.int32(base[y, x, c])
+                    hatched = (value * (256 - HATCH_MIX) + HATCH_GREY * HATCH_MIX) >> 8
+                    out[y, x, c] = hatched if grey else value
+                continue
+            if t < start or t > stop:
+                for c in range(3):
+                    out[y, x, c] = base[y, x, c]
+                continue
+            level = np.int32(min(max((t - low) * scale + f(0.5), f(0.0)), f(255.0)))
+            for c in range(3):
+                out[y, x, c] = (np.int32(base[y, x, c]) * rest + np.int32(palette[level, c]) * mix) >> 8
+
+
+@nb.njit(cache=True, nogil=True)
+def hottest_square(kelvin: Singles, labels: Bytes) -> tuple[int, int, float]:
+    """x, y and mean of the hottest 3 x 3 pixels that all are OK and numbers; -1, -1, NaN for none."""
+    height, width = labels.shape
+    best, best_x, best_y = -np.inf, -1, -1
+    for y in range(1, height - 1):
+        for x in range(1, width - 1):
+            # The hottest square's middle may be a little colder than its mean; another of its squares is then found.
+            if labels[y, x] != OK or not kelvin[y, x] > best:
+                continue
+            total = 0.0
+            for j in range(y - 1, y + 2):
+                for i in range(x - 1, x + 2):
+                    total += np.float64(kelvin[j, i]) if labels[j, i] == OK else np.nan
+            if total / 9.0 > best:
+                best, best_x, best_y = total / 9.0, x, y
+    return best_x, best_y, best if best_x >= 0 else np.nan

@@ -1,0 +1,131 @@
+"""Pictures from fused images: temperatures blended over colour, hatching where there is none, the legend, the hottest.
+
+Every picture is (H, W, 3) uint8, R, G, B.
+"""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from cairn_fusion.bands import in_bands
+from cairn_fusion.view.paint_kernels import hottest_square, paint_into
+from cairn_fusion.view.temperature_scale import PALETTE, ZERO_CELSIUS_K, TemperatureScale
+from cairn_map.errors import BadInputError
+
+Rgb = npt.NDArray[np.uint8]
+Labels = npt.NDArray[np.uint8]
+Singles = npt.NDArray[np.float32]
+
+TEXT = (240, 240, 240)
+SHADOW = (0, 0, 0)
+BAR_PX = 14
+BAR_SHARE = 0.4
+"""Of the picture's height."""
+MARGIN_PX = 12
+CROSS_PX = 9
+
+
+@dataclass(frozen=True, slots=True)
+class Emphasis:
+    """Which temperatures are painted, and how strongly."""
+
+    alpha: float = 0.5
+    """0: nothing of the palette is seen, 1: nothing else."""
+    from_k: float = -math.inf
+    """Colder is left as it is: with `to_k` endless, hot things only."""
+    to_k: float = math.inf
+    """Hotter is left as it is: an isotherm band."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.alpha <= 1:
+            raise BadInputError("bad_emphasis", f"alpha must be 0 to 1, got {self.alpha:g}")
+        if not self.from_k < self.to_k:
+            low, high = self.from_k - ZERO_CELSIUS_K, self.to_k - ZERO_CELSIUS_K
+            raise BadInputError(
+                "bad_emphasis", f"a band goes from a lower to a higher temperature, got {low:g}:{high:g}"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Hottest:
+    """The hottest place in a picture: pixel x, y, and its temperature."""
+
+    x: int
+    y: int
+    kelvin: float
+
+
+def painted(base: Rgb, kelvin: Singles, labels: Labels, scale: TemperatureScale, emphasis: Emphasis) -> Rgb:
+    """A picture with temperatures blended over it; hatched where the label is not OK or there is no temperature.
+
+    Args:
+        base: (H, W, 3) what is beneath.
+        kelvin: (H, W)
+        labels: (H, W) `Label`.
+        scale: of the palette.
+        emphasis: what is painted.
+    """
+    out = np.empty_like(base)
+    limits = (scale.low_k, scale.high_k, emphasis.from_k, emphasis.to_k, emphasis.alpha)
+
+    def paint(first: int, last: int) -> None:
+        rows = slice(first, last)
+        paint_into(out[rows], base[rows], kelvin[rows], labels[rows], PALETTE, *limits, first)
+
+    in_bands(paint, len(base))
+    return out
+
+
+def painted_alone(kelvin: Singles, labels: Labels, scale: TemperatureScale) -> Rgb:
+    """Temperatures by the palette alone; hatched on dark grey where there is none."""
+    return painted(np.full((*kelvin.shape, 3), 40, np.uint8), kelvin, labels, scale, Emphasis(alpha=1.0))
+
+
+def hottest(kelvin: Singles, labels: Labels) -> Hottest | None:
+    """The hottest square of 3 x 3 pixels, by its mean: one noisy pixel is none; None where no square is known."""
+    x, y, kelvin_there = hottest_square(kelvin, labels)
+    return Hottest(x, y, kelvin_there) if x >= 0 else None
+
+
+def mark_hottest_into(picture: Rgb, place: Hottest) -> None:
+    """Draw a cross at the hottest place, and its temperature beside it."""
+    at, size = (place.x, place.y), _text_size(picture)
+    for ink, width in ((SHADOW, 3), (TEXT, 1)):
+        cv2.drawMarker(picture, at, ink, cv2.MARKER_CROSS, 2 * CROSS_PX, width)
+    text = f"{place.kelvin - ZERO_CELSIUS_K:.1f} deg C"
+    (width_px, height_px), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
+    right, below = place.x + CROSS_PX + 2, place.y + CROSS_PX + height_px
+    x = right if right + width_px < picture.shape[1] else place.x - CROSS_PX - width_px
+    y = below if below < picture.shape[0] else place.y - CROSS_PX
+    write_into(picture, text, (max(x, 0), max(y, height_px)))
+
+
+def draw_legend_into(picture: Rgb, scale: TemperatureScale) -> None:
+    """Draw the palette's bar at the left edge, with its ends and how they came about."""
+    height, size = picture.shape[0], _text_size(picture)
+    top, length = 2 * MARGIN_PX + round(30 * size), max(8, round(BAR_SHARE * height))
+    bar = PALETTE[np.linspace(255, 0, length).astype(np.uint8)]
+    bottom = min(top + length, height)
+    picture[top:bottom, MARGIN_PX : MARGIN_PX + BAR_PX] = bar[: bottom - top, None]
+    cv2.rectangle(picture, (MARGIN_PX, top), (MARGIN_PX + BAR_PX, bottom - 1), SHADOW, 1)
+    celsius = [limit - ZERO_CELSIUS_K for limit in (scale.high_k, (scale.low_k + scale.high_k) / 2, scale.low_k)]
+    step = round(8 * size)
+    for value, y in zip(celsius, (top + step, (top + bottom) // 2 + step // 2, bottom - 2), strict=True):
+        write_into(picture, f"{value:g}", (MARGIN_PX + BAR_PX + 6, y))
+    write_into(picture, f"deg C, {scale.note}", (MARGIN_PX, top - MARGIN_PX))
+
+
+def write_into(picture: Rgb, text: str, at: tuple[int, int]) -> None:
+    """Write light text on a darkened ground, readable on anything."""
+    size, (x, y) = _text_size(picture), at
+    (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
+    ground = picture[max(y - height - 2, 0) : y + below, max(x - 2, 0) : x + width + 2]
+    ground >>= 1
+    cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, TEXT, 1, cv2.LINE_AA)
+
+
+def _text_size(picture: Rgb) -> float:
+    return float(min(max(picture.shape[0] / 1000, 0.4), 1.0))

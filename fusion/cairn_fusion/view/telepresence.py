@@ -1,0 +1,169 @@
+"""Telepresence: what an operator sees of a robot's cameras, scan by scan.
+
+scan --surface--> drawn in each camera --the picture as guide--> depth of every pixel --across--> fused --> picture
+
+thermal-on-colour    colour, with temperatures blended over it
+colour-on-thermal    the thermal camera's view, with colour in it
+side-by-side         colour, and beside it the temperatures of the same pixels
+stereo               thermal-on-colour for both eyes, from the left and the right colour camera
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig import Rig, Spectrum
+from cairn_fusion.across import Across, across
+from cairn_fusion.eye_depth import eye_depth
+from cairn_fusion.scan import Scan, check_scan
+from cairn_fusion.surface import drawn_surface, surface_of
+from cairn_fusion.transfer import Label
+from cairn_fusion.view.painting import (
+    Emphasis,
+    Hottest,
+    draw_legend_into,
+    hottest,
+    mark_hottest_into,
+    painted,
+    painted_alone,
+    write_into,
+)
+from cairn_fusion.view.temperature_scale import TemperatureScale, locked_scale
+from cairn_map.errors import BadInputError
+
+Rgb = npt.NDArray[np.uint8]
+Image = npt.NDArray[np.generic]
+
+
+class Mode(StrEnum):
+    """What a picture shows."""
+
+    THERMAL_ON_COLOUR = "thermal-on-colour"
+    COLOUR_ON_THERMAL = "colour-on-thermal"
+    SIDE_BY_SIDE = "side-by-side"
+    STEREO = "stereo"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewOptions:
+    """What an operator chooses."""
+
+    mode: Mode = Mode.THERMAL_ON_COLOUR
+    camera: str | None = None
+    """To look through; None: the first that fits the mode."""
+    emphasis: Emphasis = field(default_factory=Emphasis)
+    scale: TemperatureScale | None = None
+    """None: that of the first picture, from then on."""
+    marks_hottest: bool = True
+
+
+class Telepresence:
+    """Pictures of one rig; the temperature scale is kept from one to the next."""
+
+    def __init__(self, rig: Rig, options: ViewOptions) -> None:
+        """Raises: BadInputError: the rig lacks a camera that the mode needs."""
+        self._rig, self._options, self._scale = rig, options, options.scale
+        self._eyes = _eyes(rig, options)
+
+    @property
+    def scale(self) -> TemperatureScale | None:
+        """That all pictures have; None before the first that shows a temperature."""
+        return self._scale
+
+    def view(self, scan: Scan) -> Rgb:
+        """(H, W, 3) sRGB: the picture of a scan; two side by side are twice as wide.
+
+        Raises:
+            BadInputError: an image does not fit its camera, or that of the camera to look through is missing.
+        """
+        fused = [fuse(scan, self._rig, camera) for camera in self._eyes]
+        if self._options.mode is Mode.COLOUR_ON_THERMAL:
+            return self._colour_on_thermal(scan, fused[0])
+        pictures = []
+        for each in fused:
+            base, kelvin = scan.colour[each.camera], each.values[..., 0]
+            scale = self._locked(np.where(each.ok, kelvin, np.float32(np.nan))[::4, ::4])
+            if self._options.mode is Mode.SIDE_BY_SIDE:
+                pictures += [
+                    base,
+                    self._finished(painted_alone(kelvin, each.labels, scale), hottest(kelvin, each.labels)),
+                ]
+            else:
+                picture = painted(base, kelvin, each.labels, scale, self._options.emphasis)
+                pictures.append(self._finished(picture, hottest(kelvin, each.labels)))
+            if not each.sources:
+                write_into(pictures[-1], "no thermal image", (12, base.shape[0] - 12))
+        return pictures[0] if len(pictures) == 1 else np.hstack(pictures)
+
+    def _colour_on_thermal(self, scan: Scan, fused: Across) -> Rgb:
+        kelvin = scan.thermal[fused.camera]
+        scale, known = self._locked(kelvin[::4, ::4]), np.where(np.isfinite(kelvin), Label.OK, Label.NO_READING)
+        labels, alone = known.astype(np.uint8), Emphasis(alpha=1.0)
+        warm = painted(np.full((*kelvin.shape, 3), 40, np.uint8), kelvin, labels, scale, alone)
+        # Where no colour is known the palette is left alone: the temperature is.
+        base = np.where(fused.ok[..., None], np.nan_to_num(fused.values).clip(0, 255).astype(np.uint8), warm)
+        picture = painted(base, kelvin, labels, scale, self._options.emphasis)
+        return self._finished(picture, hottest(kelvin, labels))
+
+    def _locked(self, kelvin: npt.NDArray[np.float32]) -> TemperatureScale:
+        if self._scale is None and np.isfinite(kelvin).any():
+            self._scale = locked_scale(kelvin)
+        return self._scale or TemperatureScale(273.15, 323.15, "no temperature yet")
+
+    def _finished(self, picture: Rgb, place: Hottest | None) -> Rgb:
+        """With legend and marker."""
+        draw_legend_into(picture, self._scale or self._locked(np.empty(0, np.float32)))
+        if place is not None and self._options.marks_hottest:
+            mark_hottest_into(picture, place)
+        return picture
+
+
+def fuse(scan: Scan, rig: Rig, camera: str) -> Across:
+    """What the cameras of the other spectrum see at each pixel of a colour or thermal camera, with its depth.
+
+    Several cameras of that spectrum are asked in the rig's order, the nearest first.
+
+    Args:
+        scan: with the camera's image; of images of the other spectrum what there is.
+        rig: of the scan.
+        camera: whose pixels.
+
+    Raises:
+        BadInputError: an image does not fit its camera, the camera's own is missing, or it has none.
+    """
+    check_scan(scan, rig)
+    own: Mapping[str, Image] = {**scan.colour, **scan.thermal}
+    if camera not in own:
+        there = ", ".join(own) or "none"
+        raise BadInputError("missing_image", f"the scan has no image of {camera!r}; it has {there}")
+    others: dict[str, Image] = dict(scan.thermal if camera in scan.colour else scan.colour)
+    place_m = rig[camera].transform[:3, 3]
+    order = sorted(others, key=lambda name: float(np.linalg.norm(rig[name].transform[:3, 3] - place_m)))
+    surface = surface_of(scan, rig)
+    drawn = {name: drawn_surface(surface, rig, name) for name in (camera, *order)}
+    depth = eye_depth(drawn[camera], rig, camera, own[camera], range_camera=scan.range_camera)
+    return across(depth, rig, {name: others[name] for name in order}, drawn=drawn, range_camera=scan.range_camera)
+
+
+def _eyes(rig: Rig, options: ViewOptions) -> list[str]:
+    """The cameras to look through."""
+    wanted = Spectrum.THERMAL if options.mode is Mode.COLOUR_ON_THERMAL else Spectrum.COLOUR
+    names, count = rig.of_spectrum(wanted), 2 if options.mode is Mode.STEREO else 1
+    if len(names) < count:
+        raise BadInputError(
+            "missing_camera", f"{options.mode} needs {count} {wanted} camera(s), {rig.name} has {len(names)}"
+        )
+    if count == 2:
+        # The left eye is the one farther left in the first one's own view.
+        x = [float(rig[names[0]].transform[:3, 0] @ rig[name].transform[:3, 3]) for name in names[:2]]
+        return names[:2] if x[0] < x[1] else names[1::-1]
+    if options.camera is None:
+        return names[:1]
+    if rig[options.camera].spectrum is not wanted:
+        raise BadInputError(
+            "missing_camera", f"{options.mode} looks through one of {', '.join(names)}, got {options.camera}"
+        )
+    return [options.camera]
