@@ -111,7 +111,7 @@ def fusion_scores(fused: Across, truth: FusionTruth, *, unit: str) -> FusionScor
         unit: of the values, one of `LARGE`.
     """
     ok, clear = fused.ok, ~truth.beyond
-    error = np.abs(fused.values - truth.values).mean(axis=-1, dtype=np.float32)
+    error = np.abs(fused.values - truth.values).mean(axis=-1, dtype=np.float32)  # NaN where nothing is painted
     seen = np.zeros(ok.shape, np.bool_)
     for name in fused.sources:
         seen |= truth.sees[name]

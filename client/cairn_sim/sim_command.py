@@ -3,6 +3,7 @@
     $ cairn sim scene                                  # the scenes, robots and paths that come with cairn
     $ cairn sim show building --path labs --stop 3     # what a head sees there, as pictures
     $ cairn sim record building lab-1 --path experiment --robot tof
+    $ cairn sim evaluate-fusion pictures/              # fused images against the truth, and the paper's Fig. 24
     $ cairn robot replay lab-1 --map http://127.0.0.1:8750/maps/lab
 
 A recording is like a real robot's; the truth behind every image lies beside it, in its folder truth/. The path
@@ -20,6 +21,7 @@ from cairn_client.arguments import parser, say, with_progress
 from cairn_fusion.images import write_colour
 from cairn_map.errors import BadInputError
 from cairn_sim.contact_sheet import contact_sheet, view_from_above
+from cairn_sim.evaluate_command import add_evaluate_arguments, evaluate
 from cairn_sim.heads import RANGE_CAMERA
 from cairn_sim.record import Plan, places_of, record, shots_of
 from cairn_sim.render import render_scan
@@ -38,7 +40,7 @@ TRUTH_FACTORS = {"none": 0.95, "range": 1.0, "all": 2.1}
 def main(argv: list[str]) -> int:
     """Run one subcommand."""
     args = _parser().parse_args(argv)
-    actions = {"scene": _scene, "record": _record, "show": _show}
+    actions = {"scene": _scene, "record": _record, "show": _show, "evaluate-fusion": evaluate}
     return actions[args.action](args)
 
 
@@ -181,6 +183,7 @@ def _parser() -> argparse.ArgumentParser:
     scene.add_argument("--write", type=Path, metavar="FILE", help="write the scene's text there, to change it")
     recording = actions.add_parser("record", help="write what a robot records along a path, and the truth")
     show = actions.add_parser("show", help="write what a robot sees at one stop as PNG, and the scene from above")
+    add_evaluate_arguments(actions.add_parser("evaluate-fusion", help="measure fusion against the truth; Fig. 24"))
     for one in (recording, show):
         one.add_argument("scene", help=f"{', '.join([*SHIPPED, *TARGET_SCENES])}, or a scene file")
     recording.add_argument("output", type=Path, metavar="FOLDER", help="new or empty")

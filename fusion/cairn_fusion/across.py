@@ -38,7 +38,7 @@ class Across:
     sources: tuple[str, ...]
     """Whose values, in the order in which they were asked."""
     values: Singles
-    """(H, W, C), valid where the label is OK."""
+    """(H, W, C); NaN where the label is not OK."""
     labels: Labels
     """(H, W) `Label`; where no source has a value, why the first has none."""
     source: Labels
@@ -72,7 +72,9 @@ def across(
     names, known, rays = tuple(images), _known(depth), beams(rig[depth.camera].camera)
     if not names:
         labels = np.where(known == Label.OK, np.uint8(Label.NO_READING), known)
-        return Across(depth.camera, (), np.zeros((*known.shape, 1), np.float32), labels, np.zeros_like(known), depth)
+        return Across(
+            depth.camera, (), np.full((*known.shape, 1), np.nan, np.float32), labels, np.zeros_like(known), depth
+        )
     values, labels = seen.by(names[0], images[names[0]], depth.shown_m, rays, known)
     source = np.zeros(labels.shape, np.uint8)
     for number, name in enumerate(names[1:], 1):
@@ -100,7 +102,7 @@ class _Seen:
         src, dst = self.rig[self.camera], self.rig[name]
         u, v, q = places(range_m, rays, dst.camera, inverse(dst.transform) @ src.transform)
         smooth = _smoothed(image, dst.camera.focal_px[0] / src.camera.focal_px[0])
-        labels, values = known.copy(), np.empty((*known.shape, smooth.shape[2]), np.float32)
+        labels, values = known.copy(), np.full((*known.shape, smooth.shape[2]), np.nan, np.float32)
         # Without parallax nothing can hide anything.
         apart = float(np.linalg.norm(src.transform[:3, 3] - dst.transform[:3, 3])) > 1e-9
         hiding, slack, step = np.zeros((1, 1), np.float32), np.zeros((1, 1), np.float32), 1 << 20

@@ -1,16 +1,20 @@
 """Every kernel of this package, run once on a tiny scan, so that Numba compiles it ahead and keeps it."""
 
+from dataclasses import replace
+from importlib.util import find_spec
+
 import numpy as np
 
 from cairn_calib.camera import camera_from_field_of_view
 from cairn_calib.rig import Rig, Spectrum, mounted
 from cairn_fusion.integrate import Integrator, Method, integrate_scan, integrate_scans
+from cairn_fusion.place_covariance import PlaceCovariance
 from cairn_fusion.scan import Scan
 from cairn_map.grid import Geometry
 
 
 def warm_up() -> None:
-    """Integrate a scan of three images of two by two pixels, from images to evidence."""
+    """Integrate a scan of three images of two by two pixels, from images to evidence, and look at it."""
     camera = camera_from_field_of_view(2, 2, horizontal_deg=60.0)
     beside = np.eye(4)
     beside[0, 3] = 0.01
@@ -29,3 +33,15 @@ def warm_up() -> None:
     )
     integrate_scans([scan, scan], rig, Geometry(), integrator=Integrator(), threads=2)
     integrate_scan(scan, rig, Geometry(), integrator=Integrator(method=Method.CAST))
+    covariance = PlaceCovariance.of(rig, src="tof", dst="colour")
+    covariance.at(np.zeros((1, 2)), np.ones(1, np.float32), np.ones(1, np.float32))
+    if find_spec("cv2") is not None:
+        _look(rig, scan)
+
+
+def _look(rig: Rig, scan: Scan) -> None:
+    """Fuse the scan, with a second thermal camera, into a picture; views need OpenCV, which maps do without."""
+    from cairn_fusion.view.telepresence import Telepresence, ViewOptions
+
+    both = Rig(name="warm-up", cameras={**rig.cameras, "second": rig["thermal"]})
+    Telepresence(both, ViewOptions()).view(replace(scan, thermal={**scan.thermal, "second": scan.thermal["thermal"]}))

@@ -106,7 +106,7 @@ def mark_hottest_into(picture: Rgb, place: Hottest) -> None:
 def draw_legend_into(picture: Rgb, scale: TemperatureScale) -> None:
     """Draw the palette's bar at the left edge, with its ends and how they came about."""
     height, size = picture.shape[0], _text_size(picture)
-    top, length = 2 * MARGIN_PX + round(30 * size), max(8, round(BAR_SHARE * height))
+    top, length = 2 * MARGIN_PX + round(36 * size), max(8, round(BAR_SHARE * height))
     bar = PALETTE[np.linspace(255, 0, length).astype(np.uint8)]
     bottom = min(top + length, height)
     picture[top:bottom, MARGIN_PX : MARGIN_PX + BAR_PX] = bar[: bottom - top, None]
@@ -115,7 +115,7 @@ def draw_legend_into(picture: Rgb, scale: TemperatureScale) -> None:
     step = round(8 * size)
     for value, y in zip(celsius, (top + step, (top + bottom) // 2 + step // 2, bottom - 2), strict=True):
         write_into(picture, f"{value:g}", (MARGIN_PX + BAR_PX + 6, y))
-    write_into(picture, f"deg C, {scale.note}", (MARGIN_PX, top - MARGIN_PX))
+    write_into(picture, f"deg C, {scale.note}", (MARGIN_PX, top - MARGIN_PX - step))
 
 
 def write_into(picture: Rgb, text: str, at: tuple[int, int]) -> None:

@@ -17,9 +17,9 @@ import numpy.typing as npt
 
 from cairn_calib.rig import Rig, Spectrum
 from cairn_fusion.across import Across, across
-from cairn_fusion.eye_depth import eye_depth
+from cairn_fusion.eye_depth import EyeDepth, eye_depth
 from cairn_fusion.scan import Scan, check_scan
-from cairn_fusion.surface import drawn_surface, surface_of
+from cairn_fusion.surface import Drawn, drawn_surface, surface_of
 from cairn_fusion.transfer import Label
 from cairn_fusion.view.painting import (
     Emphasis,
@@ -124,7 +124,7 @@ class Telepresence:
 def fuse(scan: Scan, rig: Rig, camera: str) -> Across:
     """What the cameras of the other spectrum see at each pixel of a colour or thermal camera, with its depth.
 
-    Several cameras of that spectrum are asked in the rig's order, the nearest first.
+    Several cameras of that spectrum are asked, the nearest first.
 
     Args:
         scan: with the camera's image; of images of the other spectrum what there is.
@@ -135,17 +135,32 @@ def fuse(scan: Scan, rig: Rig, camera: str) -> Across:
         BadInputError: an image does not fit its camera, the camera's own is missing, or it has none.
     """
     check_scan(scan, rig)
+    images = source_order(scan, rig, camera)
+    surface = surface_of(scan, rig)
+    drawn = {name: drawn_surface(surface, rig, name) for name in (camera, *images)}
+    depth = view_depth(scan, rig, camera, drawn[camera])
+    return across(depth, rig, images, drawn=drawn, range_camera=scan.range_camera)
+
+
+def source_order(scan: Scan, rig: Rig, camera: str) -> dict[str, Image]:
+    """The images of the other spectrum than a camera's, that of the camera nearest to it first."""
+    images: dict[str, Image] = dict(scan.thermal if camera in scan.colour else scan.colour)
+    place_m = rig[camera].transform[:3, 3]
+    order = sorted(images, key=lambda name: float(np.linalg.norm(rig[name].transform[:3, 3] - place_m)))
+    return {name: images[name] for name in order}
+
+
+def view_depth(scan: Scan, rig: Rig, camera: str, drawn: Drawn) -> EyeDepth:
+    """The depth of a colour or thermal camera's pixels, its own image as guide.
+
+    Raises:
+        BadInputError: the scan has no image of it.
+    """
     own: Mapping[str, Image] = {**scan.colour, **scan.thermal}
     if camera not in own:
         there = ", ".join(own) or "none"
         raise BadInputError("missing_image", f"the scan has no image of {camera!r}; it has {there}")
-    others: dict[str, Image] = dict(scan.thermal if camera in scan.colour else scan.colour)
-    place_m = rig[camera].transform[:3, 3]
-    order = sorted(others, key=lambda name: float(np.linalg.norm(rig[name].transform[:3, 3] - place_m)))
-    surface = surface_of(scan, rig)
-    drawn = {name: drawn_surface(surface, rig, name) for name in (camera, *order)}
-    depth = eye_depth(drawn[camera], rig, camera, own[camera], range_camera=scan.range_camera)
-    return across(depth, rig, {name: others[name] for name in order}, drawn=drawn, range_camera=scan.range_camera)
+    return eye_depth(drawn, rig, camera, own[camera], range_camera=scan.range_camera)
 
 
 def _eyes(rig: Rig, options: ViewOptions) -> list[str]:

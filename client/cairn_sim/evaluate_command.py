@@ -1,0 +1,140 @@
+"""Measure fusion against the simulator's truth, and draw the paper's Fig. 24; `cairn sim evaluate-fusion`.
+
+The table's columns: pixels painted; error, median and 95 %; share of errors above 2 K or 20 of 255; 95 % of pixels
+farther than a range pixel from any edge, and of those whose depth was filled in; median behind glass and in mirrors;
+pixels painted although hidden; precision and recall of the label OCCLUDED. With --map also the temperatures of a map
+of whole stops, and with --mm5 hot cups of real frames against hand labels.
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from cairn_calib.rig import Spectrum
+from cairn_client.arguments import say, with_progress
+from cairn_fusion.images import write_colour
+from cairn_fusion.view.telepresence import Mode, Telepresence, ViewOptions
+from cairn_fusion.view.temperature_scale import locked_scale
+from cairn_map.errors import BadInputError
+from cairn_sim.fusion_evaluation import WAYS, mapped_scores, plan_scans, scored_view
+from cairn_sim.fusion_pictures import error_picture, figure_24
+from cairn_sim.fusion_scores import COLUMNS, FusionScores
+from cairn_sim.labelled_frames import labelled_frames
+from cairn_sim.record import Plan, scans_of, shots_of
+from cairn_sim.robots import SimRobot, robot_named
+from cairn_sim.scene_file import load_scene
+from cairn_sim.sensors import ColourSensor
+from cairn_sim.trajectories import EXPERIMENT
+
+SCANS_OF_STOP = 36
+FIGURE = (20, 22)
+"""Stop and scan of the pictures: a person, hot things before a wall, glass, and a floor too dark for a range."""
+STOPS = (3, 20, 40)
+"""Of the experiment: a laboratory with hot pipes, one with people and hot things, the corridor."""
+
+
+def add_evaluate_arguments(options: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    options.add_argument("output", type=Path, metavar="FOLDER", help="for the pictures; made if it is not there")
+    options.add_argument("--scans", type=int, default=12, metavar="N", help="to score, of 3 stops (12)")
+    options.add_argument("--seed", type=int, default=1, help="of all noise (1)")
+    options.add_argument("--perfect", action="store_true", help="sensors without noise")
+    options.add_argument("--map", type=int, default=0, metavar="N", help="also map N whole stops, some 20 s each (0)")
+    options.add_argument("--voxel", type=float, default=0.04, metavar="M", help="of the map (0.04)")
+    options.add_argument("--mm5", type=Path, metavar="FOLDER", help="also score hot cups of the MM5 frames there")
+
+
+def evaluate(args: argparse.Namespace) -> int:
+    """Print the tables and write the pictures."""
+    try:
+        args.output.mkdir(parents=True, exist_ok=True)
+    except OSError as exc:
+        raise BadInputError("bad_output", f"cannot make the folder {args.output}: {exc.strerror}") from exc
+    if args.scans < 1 or args.map < 0:
+        raise BadInputError("bad_option", f"--scans must be above 0 and --map from 0, got {args.scans}, {args.map}")
+    _images(args)
+    if args.map:
+        _maps(args)
+    if args.mm5 is not None:
+        _frames(args)
+    return 0
+
+
+def _images(args: argparse.Namespace) -> None:
+    """The table of fused images, Fig. 24, and a picture of errors."""
+    scene, robot = load_scene("building"), _robot()
+    rig, per_stop = robot.rig_of(1.0), -(-args.scans // len(STOPS))
+    plans = [_plan(args, stop) for stop in STOPS]
+    step = max(1, SCANS_OF_STOP // per_stop)
+    scans = [scan for plan in plans for scan in list(plan_scans(plan, rig, step=step))[:per_stop]][: args.scans]
+    cameras = rig.of_spectrum(Spectrum.COLOUR)[0], rig.of_spectrum(Spectrum.THERMAL)[0]
+    totals: dict[tuple[str, str], FusionScores] = {}
+    for scan in with_progress(scans, "scoring", total=len(scans)):
+        for camera in cameras:
+            view = scored_view(scene, rig, scan, camera)
+            for way, scores in view.scores.items():
+                totals[camera, way] = totals[camera, way] + scores if (camera, way) in totals else scores
+    for camera, what in zip(cameras, ("temperature, K, on", "colour, of 255, on"), strict=True):
+        say(f"{what + ' ' + camera:<34}" + "".join(f"{column:>12}" for column in COLUMNS))
+        for way in WAYS:
+            say(f"  {way:<32}" + "".join(f"{cell:>12}" for cell in totals[camera, way].row()))
+    stop, number = FIGURE
+    shots = [shot for shot in shots_of(_plan(args, stop)) if shot.scan == number]
+    scan = next(scan for _, scan, _ in scans_of(_plan(args, stop), shots, rig))
+    view = scored_view(scene, rig, scan, cameras[0])
+    scale = locked_scale(view.truth.values)
+    write_colour(args.output / "fig24.png", figure_24(scan, rig, cameras[0], scale))
+    write_colour(args.output / "errors.png", error_picture(scan, view.fused, view.truth, scale))
+    say(f"wrote {args.output / 'fig24.png'} and {args.output / 'errors.png'}")
+
+
+def _maps(args: argparse.Namespace) -> None:
+    """The table of a map's temperatures."""
+    scene, robot = load_scene("building"), _robot()
+    rig = robot.rig_of(1.0)
+    # Colour is not looked at.
+    rig = rig.model_copy(
+        update={"cameras": {n: m for n, m in rig.cameras.items() if m.spectrum is not Spectrum.COLOUR}}
+    )
+    chosen = [(2 * n + 1) * 54 // (2 * args.map) for n in range(args.map)]
+    stops = [
+        [scan for _, scan, _ in scans_of(_plan(args, stop), shots_of(_plan(args, stop)), rig)]
+        for stop in with_progress(chosen, "rendering stops", total=len(chosen))
+    ]
+    head = f"map of {len(stops)} stops, {args.voxel * 100:g} cm"
+    say(f"{head:<34}" + "".join(f"{column:>12}" for column in ("voxels", "known %", "median K", "95 % K")))
+    for name, scores in mapped_scores(scene, rig, stops, voxel_edge_m=args.voxel).items():
+        for what, each in scores.items():
+            count = f"{len(each.errors_k) + each.without:>12}{100 * each.known:>12.1f}"
+            say(f"  {name + ', ' + what:<32}{count}{each.median_k:>12.2f}{each.p95_k:>12.2f}")
+
+
+def _frames(args: argparse.Namespace) -> None:
+    """The table of hot cups, and a picture of the first."""
+    say(f"{'hot cups, IoU with hand labels':<34}{'label px':>12}{'the set':>12}{'fused':>12}")
+    for number, frame in enumerate(labelled_frames(args.mm5)):
+        say(f"  {frame.frame:<32}{int(frame.label.sum()):>12}{frame.given_iou:>12.3f}{frame.fused_iou:>12.3f}")
+        if number == 0:
+            picture = Telepresence(frame.rig, ViewOptions(mode=Mode.SIDE_BY_SIDE)).view(frame.scan)
+            write_colour(args.output / "mm5.png", picture)
+            say(f"  wrote {args.output / 'mm5.png'}")
+
+
+def _robot() -> SimRobot:
+    """Orpheus, its colour cameras corrected for vignetting: that is no error of fusion."""
+    robot = robot_named("orpheus")
+    even = ColourSensor(vignetting=0.0)
+    return replace(robot, sensors=dict.fromkeys(robot.rig_of(1.0).of_spectrum(Spectrum.COLOUR), even))
+
+
+def _plan(args: argparse.Namespace, stop: int) -> Plan:
+    return Plan(
+        scene=load_scene("building"),
+        robot=_robot(),
+        path=EXPERIMENT,
+        seed=args.seed,
+        perfect=args.perfect,
+        truth="none",
+        first_stop=stop,
+        last_stop=stop + 1,
+    )

@@ -1,0 +1,131 @@
+"""How true a map's temperatures are: voxels of bodies and pipes against what their surfaces really send.
+
+    truth     what a thermal camera reads of the surfaces in a voxel: from the coldest to the warmest of them
+    error     how far the voxel's mean is from that
+
+A voxel is 'on' a solid whose surface is nearest to its centre, and passes through it. Edges are among them.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.channels import ChannelKind
+from cairn_map.evidence_map import Diff
+from cairn_map.grid import Geometry, voxels_in_cell
+from cairn_map.sensor_model import SensorModel
+from cairn_sim.scene import Scene
+from cairn_sim.sensors import ThermalSensor
+from cairn_sim.solid_kernels import second_at
+
+Floats = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+Ints = npt.NDArray[np.int32]
+
+BODIES = ("person", "technician", "operator", "chemist", "casualty", "fire fighter")
+PIPES = ("pipe", "riser")
+SAMPLES = 5
+"""Places along a voxel's edge at which its surfaces are looked for."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TemperatureScores:
+    """Of the mapped voxels on some solids."""
+
+    errors_k: Floats
+    """(N,) of those with a temperature."""
+    without: int
+    """Occupied, and without a temperature."""
+
+    @property
+    def median_k(self) -> float:
+        """NaN for none."""
+        return float(np.median(self.errors_k)) if len(self.errors_k) else math.nan
+
+    @property
+    def p95_k(self) -> float:
+        """Of 20 voxels 19 are better; NaN for none."""
+        return float(np.quantile(self.errors_k, 0.95)) if len(self.errors_k) else math.nan
+
+    @property
+    def known(self) -> float:
+        """Share of the voxels that have a temperature."""
+        total = len(self.errors_k) + self.without
+        return len(self.errors_k) / total if total else math.nan
+
+
+def is_body(name: str) -> bool:
+    """Whether a solid of that name is a person's."""
+    return name.split("/")[0].startswith(BODIES) or "person" in name.split("/")[0]
+
+
+def is_pipe(name: str) -> bool:
+    """Whether a solid of that name is a pipe."""
+    return any(word in name for word in PIPES)
+
+
+def temperature_scores(
+    scene: Scene, diff: Diff, geometry: Geometry, *, chosen: Callable[[str], bool]
+) -> TemperatureScores:
+    """The scores of all occupied voxels on solids of chosen names.
+
+    Args:
+        scene: that was mapped.
+        diff: the map's evidence by cell, `EvidenceMap.packed()`.
+        geometry: of the map; it has a temperature channel.
+        chosen: by the name of a solid.
+    """
+    solids = np.array([chosen(solid.name) for solid in scene.solids])
+    centres, kelvin = _occupied(diff, geometry)
+    on = solids[scene.nearest_solid(centres)]
+    centres, kelvin = centres[on], kelvin[on]
+    low, high = _surface_temperatures(scene, centres, geometry.voxel_edge_m, solids)
+    through = np.isfinite(low)
+    known = through & np.isfinite(kelvin)
+    error = np.maximum(np.maximum(low[known] - kelvin[known], kelvin[known] - high[known]), 0.0)
+    return TemperatureScores(errors_k=error, without=int((through & ~known).sum()))
+
+
+def apparent_k(scene: Scene, points: Floats, solids: Ints) -> Floats:
+    """(N,) what a thermal camera reads of solids' surfaces at (N, 3) points: their own, and what they mirror."""
+    sensor, surfaces = ThermalSensor(), scene.surfaces
+    second = second_at(np.ascontiguousarray(points), solids, scene.shapes)
+    emissivity = surfaces.emissivity[solids, second].astype(np.float64)
+    own = sensor.counts_of(surfaces.temperature_k[solids, second].astype(np.float64))
+    return sensor.kelvin_of(emissivity * own + (1 - emissivity) * sensor.counts_of(np.array(scene.ambient_k)))
+
+
+def _occupied(diff: Diff, geometry: Geometry) -> tuple[Floats, Floats]:
+    """(N, 3) centres of occupied voxels, metres, and (N,) their temperatures, kelvin; NaN for none."""
+    channel = next(each for each in geometry.channels if each.kind is ChannelKind.TEMPERATURE)
+    planes = geometry.planes_of(channel.name)
+    centres, kelvin = [np.empty((0, 3))], [np.empty(0)]
+    for key, evidence in diff.items():
+        occupied = SensorModel().log_odds(evidence.counts) > 0
+        sums = np.zeros((len(evidence), 2))
+        sums[evidence.sampled] = evidence.samples[:, [planes.start, planes.stop - 1]]
+        with np.errstate(invalid="ignore"):
+            mean = sums[:, 0] / sums[:, 1] * channel.step + channel.zero
+        voxels = voxels_in_cell(evidence.voxels[occupied], key, geometry)
+        centres.append((voxels + 0.5) * geometry.voxel_edge_m)
+        kelvin.append(mean[occupied])
+    return np.concatenate(centres), np.concatenate(kelvin)
+
+
+def _surface_temperatures(scene: Scene, centres: Floats, edge_m: float, solids: Flags) -> tuple[Floats, Floats]:
+    """(N,) coldest and (N,) warmest of the surfaces in voxels; infinite where none is of a chosen solid."""
+    low, high, touched = np.full(len(centres), np.inf), np.full(len(centres), -np.inf), np.zeros(len(centres), bool)
+    places_m = ((np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5) * edge_m
+    reach_m = edge_m / SAMPLES * math.sqrt(3) / 2
+    for offset_m in product(places_m, repeat=3):
+        points = centres + np.array(offset_m)
+        nearest = scene.nearest_solid(points)
+        here = np.abs(scene.distance_m(points)) <= reach_m
+        kelvin = apparent_k(scene, points, nearest)
+        low, high = np.where(here, np.minimum(low, kelvin), low), np.where(here, np.maximum(high, kelvin), high)
+        touched |= here & solids[nearest]
+    return np.where(touched, low, np.inf), np.where(touched, high, -np.inf)
