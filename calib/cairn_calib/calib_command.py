@@ -2,9 +2,7 @@
 
     $ cairn calib convert rig.json camchain.yaml --format kalibr
 
-`cairn calib COMMAND --help` for each. Frames, pixels and units: calib/CONVENTIONS.md. A subcommand is a module with
-`add_parser(commands)`, which sets `run`, a function of the parsed arguments; or, where it needs recordings or the
-simulator, one with `main(argv)` behind an entry point of the group `cairn.calib`.
+`cairn calib COMMAND --help` for each. Frames, pixels and units: calib/CONVENTIONS.md.
 """
 
 import argparse
@@ -14,9 +12,9 @@ from importlib.metadata import entry_points
 
 from cairn_calib import convert_command, corners_command, solve_command, thermal_command
 
+# A subcommand is a module with `add_parser(commands)`, which sets `run`, a function of the parsed arguments; or, where
+# it needs recordings or the simulator, one with `main(argv)` behind an entry point of GROUP.
 SUBCOMMANDS = (convert_command, corners_command, solve_command, thermal_command)
-
-
 GROUP = "cairn.calib"
 ELSEWHERE = {
     "verify": "how well a rig carries circle targets between its cameras",
