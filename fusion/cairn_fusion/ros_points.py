@@ -72,6 +72,10 @@ def read_points(data: bytes | memoryview, wire: Wire) -> RosPoints:
     order = ">" if reader.integer("B") else "<"
     point_step, row_step, octets = reader.integer("I"), reader.integer("I"), reader.octets()
     fields = {name: (offset, order + TYPES[kind]) for name, offset, kind, _ in found if kind in TYPES}
+    if not (width and height):
+        width = height = 0  # no rows of nothing: 2^32 of them would take no bytes
+    elif not point_step:
+        raise ValueError("points of 0 bytes are announced")
     if any(offset + np.dtype(letter).itemsize > point_step for offset, letter in fields.values()):
         raise ValueError(f"a field lies outside its point of {point_step} bytes")
     if width * point_step > row_step or row_step * height > len(octets):

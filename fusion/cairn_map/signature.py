@@ -116,6 +116,8 @@ def signatures_from_text(text: str) -> tuple[Signature, ...]:
         found = tuple(Signature(bytes.fromhex(key), bytes.fromhex(mark)) for key, mark in parts)
         if len(text) > TEXT_MAX or any((len(key), len(mark)) != (KEY_BYTES, MARK_BYTES) for key, mark in found):
             raise ValueError("too long, or not of 32 and 64 bytes")
+        if signatures_to_text(found) != text:
+            raise ValueError("not in lower-case hex")
     except ValueError as exc:
         raise BadInputError(
             "bad_signature", f"signatures are written KEY.MARK in hex, separated by commas (at most {SIGNATURES_MAX})"

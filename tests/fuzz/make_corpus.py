@@ -9,14 +9,16 @@ finding: each is read again by an ordinary test.
 import json
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from pydantic import BaseModel
-from tests.cairn_map.made import GEOMETRIES, KEY, PLAIN, ROBOT, SMALL, made_commit, made_cursor, made_frames
+from tests.cairn_map.made import GEOMETRIES, KEY, MIDDLE, PLAIN, ROBOT, SMALL, made_commit, made_cursor, made_frames
 from tests.cairn_map.made import random_evidence as made_evidence
 from tests.cairn_map.stored import recoded
+from tests.fuzz.foreign_corpus import foreign_seeds
 from tests.fuzz.sections import joined
 
 from cairn_calib.camera import camera_from_field_of_view
@@ -28,8 +30,8 @@ from cairn_fusion.trajectory import trajectory_line
 from cairn_map.cell_code import Profile, encode_cell
 from cairn_map.cell_folder import FolderHead
 from cairn_map.evidence import Evidence, empty_evidence
-from cairn_map.fingerprint import fingerprint
-from cairn_map.frames import encode_frame, start_of_reply
+from cairn_map.fingerprint import ZERO, fingerprint
+from cairn_map.frames import CellFrame, FrameKind, encode_frame, start_of_reply
 from cairn_map.index_messages import CellEntry, CellIndex
 from cairn_map.messages import (
     CellCursor,
@@ -46,6 +48,7 @@ from cairn_map.messages import (
     Retract,
 )
 from cairn_map.sensor_model import SensorModel
+from cairn_map.signature import Signature, signatures_to_text
 from cairn_map.view import Chance, Extent, ViewStyle
 from cairn_map.view_code import encode_view
 
@@ -120,6 +123,8 @@ def seeds() -> Iterator[tuple[str, str, bytes]]:
     yield "recording", "two-scans", _recording()
     yield from _images()
     yield "frame-folder", "one-frame", _frame_folder()
+    yield from _begun()
+    yield from foreign_seeds()
 
 
 def _cells() -> Iterator[tuple[str, str, bytes]]:
@@ -177,6 +182,7 @@ def _texts() -> Iterator[tuple[str, str, bytes]]:
         "cell": "0,-12,3",
         "fingerprint": "0f" * 16,
         "url": "http://base:8750/maps/lab",
+        "signatures": signatures_to_text([Signature(bytes(range(32)), bytes(64))] * 2),
     }
     for kind, text in texts.items():
         yield "text", kind, f"{kind} {text}".encode()
@@ -210,6 +216,20 @@ def _recording() -> bytes:
                     data = data.replace(other.relative_to(folder).as_posix().encode(), short[other].encode())
             lists[path] = data
         return joined([(short[path], data) for path, data in lists.items()])
+
+
+def _begun() -> Iterator[tuple[str, str, bytes]]:
+    """A cell of some kilobytes, cut after a few hundred bytes of it."""
+    body = encode_cell(KEY, made_evidence(1, MIDDLE, voxels=2000, air=0), MIDDLE).data
+    cell = CellFrame(
+        kind=FrameKind.FULL, cell=KEY, from_cursor=None, to_cursor=made_cursor(), fingerprint=ZERO, payload=body
+    )
+    others = [frame for frame in made_frames() if not isinstance(frame, CellFrame)]
+    whole = start_of_reply() + b"".join(encode_frame(frame) for frame in (*others[:1], cell, *others[-1:]))
+    yield "begun", "same-again", joined([("first", whole[:2000]), ("then", whole)])
+    yield "begun", "nothing-new", joined([("first", start_of_reply()), ("then", whole)])
+    rest = encode_frame(replace(cell, continues=True, payload=body[700:]))
+    yield "begun", "goes-on", joined([("first", whole[:2000]), ("then", start_of_reply() + rest)])
 
 
 def _images() -> Iterator[tuple[str, str, bytes]]:

@@ -10,9 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import BaseModel
+from tests.fuzz.begun_target import mutated_begun, read_begun
 from tests.fuzz.cell_mutator import mutated_cell
+from tests.fuzz.foreign_targets import mutated_message, read_bag, read_camera_file, read_ros_message
 from tests.fuzz.json_mutator import mutated_json
+from tests.fuzz.message_target import check_properties, read_message
 from tests.fuzz.png_mutator import mutated_png
 from tests.fuzz.sections import in_folder, mutated_sections, sections_of
 from tests.fuzz.wrapping_mutator import mutated_commit, mutated_reply
@@ -24,7 +26,6 @@ from cairn_fusion.images import image_header, read_colour, read_grey16
 from cairn_fusion.importers import detect_layout
 from cairn_fusion.recording import open_recording
 from cairn_fusion.trajectory import interpolated, read_trajectory, trajectory_line
-from cairn_map import messages
 from cairn_map.brick_cell import brick_cell
 from cairn_map.cell_code import Profile, decode_canonical_cell, decode_cell, encode_cell
 from cairn_map.cell_folder import read_head
@@ -32,12 +33,13 @@ from cairn_map.cell_reading import cell_reader
 from cairn_map.commit import commit_sha, renamed_commit, split_commit
 from cairn_map.commit_reading import open_commit
 from cairn_map.cursor import cursor_from_text
-from cairn_map.errors import BadInputError, CairnError
+from cairn_map.errors import CairnError
 from cairn_map.evidence import Evidence
 from cairn_map.fingerprint import fingerprint, fingerprint_from_hex
 from cairn_map.frames import FrameReader, encode_frame, frames_of, start_of_reply
 from cairn_map.grid import DEPTH_MAX, CellKey, Geometry, cell_from_text
 from cairn_map.ids import author_from_text, commit_id_from_text, robot_name
+from cairn_map.signature import signatures_from_text, signatures_to_text
 from cairn_map.version_vector import version_vector_from_json
 from cairn_map.view_code import decode_view
 from cairn_sim.scene_file import load_scene
@@ -56,11 +58,6 @@ FRAMES = FrameFolderOptions(
     pose="frames/{id}.pose.txt",
     intrinsics_file="K.txt",
 )
-MODELS: dict[str, type[BaseModel]] = {
-    name: model
-    for name, model in vars(messages).items()
-    if isinstance(model, type) and issubclass(model, BaseModel) and model.__module__ == messages.__name__
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,26 +151,6 @@ def read_reply(data: bytes) -> None:
         check_properties(frame)
 
 
-def read_message(data: bytes) -> None:
-    """`=== Model`, then its JSON: every message that client and server exchange."""
-    for name, text in sections_of(data):
-        if name in MODELS:
-            message = messages.message_from_json(MODELS[name], text)
-            again = messages.message_from_json(MODELS[name], message.model_dump_json())
-            assert again.model_dump_json() == message.model_dump_json()
-            check_properties(message)
-
-
-def check_properties(message: object) -> None:
-    """Every parsed form of a message's texts; each may refuse what it holds."""
-    for name, value in vars(type(message)).items():
-        if isinstance(value, property):
-            try:
-                getattr(message, name)
-            except BadInputError:
-                continue
-
-
 def read_version_vector(data: bytes) -> None:
     """A version vector in JSON, and its algebra."""
     try:
@@ -202,6 +179,8 @@ def read_text(data: bytes) -> None:
         "robot": robot_name,
         "cell": cell_from_text,
     }
+    if kind == "signatures":
+        assert signatures_to_text(signatures_from_text(rest)) == rest
     if kind in parsers:
         assert str(parsers[kind](rest)) == rest
     elif kind == "fingerprint":
@@ -291,4 +270,8 @@ TARGETS: dict[str, Target] = {
     "trajectory": Target(read_trajectory_text),
     "image": Target(read_image, mutated_png),
     "scene": Target(read_scene),
+    "begun": Target(read_begun, mutated_begun),
+    "bag": Target(read_bag, mutated_sections),
+    "ros-message": Target(read_ros_message, mutated_message),
+    "camera-file": Target(read_camera_file, mutated_sections),
 }
