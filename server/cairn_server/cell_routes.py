@@ -13,6 +13,8 @@ from cairn_map.index_messages import INDEX_PAGE, INDEX_PAGE_MAX, CellIndex
 from cairn_map.version_vector import vector_digest, vector_text
 from cairn_map.view import ViewStyle
 from cairn_map.view_code import encode_view
+from cairn_map.voxel_messages import VoxelAnswer
+from cairn_server.asked_voxel import asked_voxel
 from cairn_server.auth import Caller
 from cairn_server.cell_index import IndexPage
 from cairn_server.cells_at_rest import stored_evidence
@@ -53,6 +55,12 @@ def vector(service: Operations, row: Map, at: Annotated[str, Query(max_length=12
     """The version vector at a cursor: what `Cairn-Coverage` says where it is short enough."""
     found = service.vector_at(row, cursor_from_text(at))
     return Response(vector_text(found), media_type="application/json", headers={"ETag": f'"{vector_digest(found)}"'})
+
+
+@router.get("/maps/{name}/main/voxels/{voxel}", dependencies=READERS)
+def voxel(voxel: str, service: Operations, row: Map) -> VoxelAnswer:
+    """One voxel of the lattice: its exact numbers, and the commits that saw it."""
+    return asked_voxel(service, row, voxel)
 
 
 @router.head("/maps/{name}/main/cells/{cell}", dependencies=READERS)

@@ -26,6 +26,7 @@ RENDER = f"{MAP}/main/render"
 VIEW = f"{MAP}/branches/{{branch}}/view"
 COMMIT_MEDIA_TYPE = "application/vnd.cairn.commit"
 CELL_TYPES = (CELL_MEDIA_TYPE, *MEDIA_TYPES.values())
+CONSOLE_TYPES = ("text/javascript", "text/css", "image/svg+xml")
 PICTURES = ("image/jpeg", "image/png")
 BODIES: dict[Route, tuple[str, ...]] = {
     ("put", f"{MAP}/commits/{{commit}}"): (COMMIT_MEDIA_TYPE,),
@@ -36,6 +37,8 @@ BODIES: dict[Route, tuple[str, ...]] = {
 ANSWERS: dict[Route, dict[int, tuple[str, ...]]] = {
     ("post", f"{MAP}/branches/{{branch}}/missing"): {200: (REPLY_MEDIA_TYPE,), 204: ()},
     ("get", f"{MAP}/commits/{{commit}}"): {200: (COMMIT_MEDIA_TYPE,)},
+    ("get", "/"): {200: ("text/html",), 304: ()},
+    ("get", "/assets/{file}"): {200: CONSOLE_TYPES, 304: ()},
     ("get", "/metrics"): {200: ("text/plain",)},
     ("get", CELL): {200: CELL_TYPES, 206: CELL_TYPES, 304: ()},
     ("head", CELL): {200: CELL_TYPES, 304: ()},

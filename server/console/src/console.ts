@@ -138,15 +138,15 @@ export class Console {
     this.stage.fly(this.stage.lookAt(this.cells.tightBounds, new Vector3(0, -0.001, 1)));
   }
 
-  /** Stand inside, eyes at the height of a person's, where the eye looks now. */
+  /** Stand inside, eyes at the height of a person's, where a robot is, and look towards the middle of the map. */
   walk(): void {
     this.team.follow(null);
-    const { eye, target } = this.stage.view;
+    const { target } = this.stage.view;
     const box = this.cells.tightBounds;
-    const ahead = new Vector3(...target).sub(new Vector3(...eye)).setZ(0);
+    const robot = this.team.nearest(new Vector3(...target));
+    const ahead = box.getCenter(new Vector3()).sub(robot ?? box.min).setZ(0);
     if (ahead.lengthSq() < 1e-6) ahead.set(0, 1, 0);
     ahead.normalize();
-    const robot = this.team.nearest(new Vector3(...target));
     const z = robot ? robot.z + 0.6 : box.min.z + 1.6;
     const stand = robot ?? box.clampPoint(new Vector3(...target), new Vector3());
     const from = new Vector3(stand.x, stand.y, z);

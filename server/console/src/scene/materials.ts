@@ -111,7 +111,7 @@ uniform uint uObject;
 `;
 
 const HATCH = `
-  if (vBare > 0.5 && mod(floor((gl_FragCoord.x + gl_FragCoord.y) / 3.0), 2.0) < 0.5) shown *= 0.72;
+  if (vBare > 0.5 && mod(floor((gl_FragCoord.x + gl_FragCoord.y) / 3.0), 2.0) < 0.5) shown *= 0.82;
 `;
 
 const SQUARE = `${FRAGMENT_HEAD}

@@ -24,10 +24,10 @@ export interface VoxelAnswer {
   misses: number;
   probability: number | null;
   channels: ChannelReading[];
-  lm: number | null;
+  lm: number;
   cursor: string;
   commits: { id: string; hits: number; misses: number; captured_s: [number, number] | null }[];
-  unread: number;
+  more: boolean;
   gone: boolean;
 }
 
@@ -109,7 +109,7 @@ function whence(answer: VoxelAnswer): HTMLElement {
   });
   const left = [
     answer.gone ? "Older commits are not kept any more: of them only the sum is known." : "",
-    answer.unread ? `${answer.unread} older commits of this cell were not looked at.` : "",
+    answer.more ? "Only the newest 32 commits of this cell were looked at." : "",
   ].filter(Boolean);
   return h(
     "div", { class: "whence" }, h("h3", {}, "Who saw it"), h("ul", {}, ...rows), ...left.map((line) => h("p", { class: "hint" }, line)),

@@ -1,0 +1,76 @@
+"""The console in a browser, and what its test door (`?test=1`) tells of it."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
+from tests.console.conftest import ADMIN_TOKEN, CHROMIUM, FLAGS, Room
+
+DEADLINE_S = 60.0
+VIEW = {"width": 1280, "height": 720}
+
+
+class Console:
+    """One tab."""
+
+    def __init__(self, page: Page, room: Room) -> None:
+        self.page = page
+        page.set_default_timeout(1000 * DEADLINE_S)
+        self.room = room
+        self.errors: list[str] = []
+        self.requests: list[str] = []
+        page.on("pageerror", lambda error: self.errors.append(str(error)))
+        page.on("console", lambda said: self.errors.append(said.text) if said.type == "error" else None)
+        page.on("request", lambda request: self.requests.append(request.url))
+
+    def open(self, look: str = "") -> None:
+        self.page.goto(f"{self.room.url}/?test=1{look}")
+
+    def log_in(self, token: str = ADMIN_TOKEN) -> None:
+        self.page.get_by_label("Token").fill(token)
+        self.page.get_by_role("button", name="Log in").click()
+
+    def tell(self, expression: str, *arguments: Any) -> Any:
+        """What the page's own objects say: `c` is the console, `a` the arguments."""
+        return self.page.evaluate(
+            f"(a) => {{ const c = window.cairn?.console; return {expression}; }}", list(arguments)
+        )
+
+    def until(self, expression: str, what: str) -> float:
+        """Look again until it is so; seconds that took."""
+        start_s = time.monotonic()
+        while not self.tell(expression):
+            assert time.monotonic() < start_s + DEADLINE_S, f"not in {DEADLINE_S} s: {what}; {self.errors}"
+            self.page.wait_for_timeout(20)
+        return time.monotonic() - start_s
+
+    def settled(self) -> None:
+        """Return when all that is wanted is there, and drawn."""
+        self.until("c && c.cells.all.size > 0 && c.cells.waiting === 0 && !c.cells.needsPlan", "everything is drawn")
+        frames = self.tell("(c.stage.draw(), c.stage.frames)")
+        self.until(f"c.stage.frames > {frames}", "a frame follows")
+
+    def picture(self) -> npt.NDArray[np.uint8]:
+        """(H, W, 3) what the canvas shows."""
+        data = np.frombuffer(self.page.locator(".host canvas").screenshot(), np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        assert image is not None
+        return image[..., ::-1].astype(np.uint8)
+
+
+@contextmanager
+def browser() -> Iterator[Browser]:
+    """Debian's chromium with a profile of its own."""
+    with sync_playwright() as playwright:
+        made = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield made
+        made.close()
+
+
+def tab(context: BrowserContext, room: Room) -> Console:
+    return Console(context.new_page(), room)

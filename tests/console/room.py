@@ -1,0 +1,56 @@
+"""A room that two simulated robots mapped: colour, temperature and bare surfaces, in a few cells."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from cairn_client.robot import Robot
+from cairn_fusion.scan import Scan
+from cairn_map.grid import Geometry
+from cairn_sim.heads import RANGE_CAMERA, full_head, thermal_and_tof_head
+from cairn_sim.kinematics import Manipulator, measurement_joints
+from cairn_sim.render import render_scan
+from cairn_sim.scene import Scene
+from cairn_sim.scene_file import load_scene
+from cairn_sim.sensors import Noise
+from cairn_sim.trajectories import path_names, stops
+
+MAP = "room"
+GEOMETRY = Geometry(voxel_edge_um=80_000, depth=5)
+SCALE = 0.1
+HEADS = {"scout": full_head(scale=SCALE), "mole": thermal_and_tof_head(scale=SCALE)}
+CLOCK_S = 1_760_000_000.0
+
+
+def scans_of(scene: Scene, robot: str, stop: int) -> Iterator[Scan]:
+    """What a robot's head sees from one stop, turned all round."""
+    (path, *_) = path_names("small-room")
+    T_map_robot = stops(scene, path)[stop]
+    for number, joint in enumerate(measurement_joints(6, 2)):
+        yield render_scan(
+            scene,
+            HEADS[robot],
+            T_map_rig=T_map_robot @ Manipulator().T_robot_rig(joint),
+            range_camera=RANGE_CAMERA,
+            time_s=CLOCK_S + number + 100 * stop,
+            noise=Noise(1),
+            number=number,
+            threads=1,
+        )
+
+
+@contextmanager
+def mapping(url: str, folder: Path, robot: str, *, token: str | None = None) -> Iterator[Robot]:
+    """A robot of the team, with a link."""
+    with Robot(HEADS[robot], url, directory=folder / robot, name=robot, token=token, stay=True) as made:
+        yield made
+
+
+def push_measurement(robot: Robot, name: str, stop: int) -> str:
+    """Let a robot map from one stop and push that; the commit's id."""
+    for scan in scans_of(load_scene("small-room"), name, stop):
+        robot.observe(scan)
+    commit = robot.commit()
+    assert commit is not None
+    robot.sync()
+    return str(commit.id)

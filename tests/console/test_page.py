@@ -1,0 +1,209 @@
+"""The operator's page in a real browser, over a real server with a room that robots mapped.
+
+The tests go on with one tab, in the order in which an operator would: in, look, ask, watch, take out, lose the link.
+"""
+
+import gzip
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from tests.console.browsing import VIEW, Console, browser, tab
+from tests.console.casting import first_met, lattice_corners, occupied
+from tests.console.conftest import Room
+from tests.console.room import GEOMETRY, MAP
+
+from cairn_server.console_files import STATIC
+
+PAGE_GZIP_BYTES_MAX = 250_000
+FIRST_PICTURE_BYTES_MAX = 500_000
+BYTES_PER_VOXEL_MAX = 5
+PICKS = 50
+LOADED_MACHINE = 10
+"""Machines that run other tests beside this one are so much slower than the figures of the console are for."""
+
+
+@pytest.fixture(scope="module")
+def console(room: Room) -> Iterator[Console]:
+    with browser() as made, made.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
+        found = tab(context, room)
+        yield found
+
+
+def test_the_page_is_small() -> None:
+    files = [path for path in STATIC.rglob("*") if path.suffix in (".html", ".js", ".css", ".svg")]
+    assert sum(len(gzip.compress(path.read_bytes(), 9)) for path in files) <= PAGE_GZIP_BYTES_MAX
+
+
+def test_a_stranger_logs_in_and_sees_the_map(console: Console) -> None:
+    console.open()
+    console.log_in("not-a-token-of-this-server")
+    console.page.get_by_role("alert").get_by_text("token").wait_for()
+    console.errors.clear()  # the browser tells of each 401
+    start_s = time.monotonic()
+    console.log_in()
+    console.until("c && c.cells.firstPictureMs !== null", "the first picture")
+    assert time.monotonic() - start_s < 2 * LOADED_MACHINE
+    assert console.tell("window.cairn.api.received") <= FIRST_PICTURE_BYTES_MAX
+    console.settled()
+    assert console.picture().std() > 10
+    assert console.errors == []
+
+
+def test_all_of_the_map_is_drawn_voxel_by_voxel(console: Console, room: Room) -> None:
+    drawn = console.tell("[...c.cells.all.values()].map((cell) => [cell.key, cell.depth, cell.count])")
+    assert {depth for _, depth, count in drawn if count} == {GEOMETRY.depth}
+    voxels = occupied(room)
+    assert sum(count for *_, count in drawn) == len(voxels.numbers)
+    assert console.tell("window.cairn.api.received") < FIRST_PICTURE_BYTES_MAX
+    assert console.tell("window.cairn.api.received") <= 2 * BYTES_PER_VOXEL_MAX * len(voxels.numbers)
+
+
+def test_what_is_picked_is_what_a_ray_meets_first(console: Console, room: Room) -> None:
+    voxels = occupied(room)
+    edge_m = GEOMETRY.voxel_edge_m
+    corners = lattice_corners(voxels.numbers)
+    rng = np.random.default_rng(3)
+    size = console.tell("[c.stage.canvas.clientWidth, c.stage.canvas.clientHeight]")
+    places = (rng.random((PICKS, 2)) * (np.array(size) - 1)).astype(int)
+    lens = console.tell(
+        "(c.stage.camera.updateMatrixWorld(), [c.stage.camera.matrixWorld.elements, "
+        "c.stage.camera.projectionMatrix.elements])"
+    )
+    T_map_eye, projection = (np.array(part).reshape(4, 4).T for part in lens)
+    found = console.tell(
+        "a[0].map(([x, y]) => { const p = c.picker.at(x, y); return p && [p.cell.cell, p.node, p.isVoxel]; })",
+        places.tolist(),
+    )
+    hit = 0
+    for (x, y), picked in zip(places.tolist(), found, strict=True):
+        at = np.array([(x + 0.5) / size[0] * 2 - 1, 1 - (y + 0.5) / size[1] * 2])
+        ray = T_map_eye[:3, :3] @ [at[0] / projection[0, 0], at[1] / projection[1, 1], -1.0]
+        row, gap_m = first_met(corners, edge_m, T_map_eye[:3, 3], ray)
+        if gap_m < 1e-4:
+            continue  # an edge that two voxels share: either is right
+        assert (row is None) == (picked is None), (x, y)
+        if row is not None:
+            cell, node, is_voxel = picked
+            assert is_voxel
+            assert [node[n] + GEOMETRY.side * cell[n] for n in range(3)] == voxels.numbers[row].tolist()
+            hit += 1
+    assert hit > PICKS / 5
+
+
+def test_a_click_tells_the_servers_own_numbers_and_who_saw_it(console: Console, room: Room) -> None:
+    voxels = occupied(room)
+    console.tell("c.top()")
+    console.settled()
+    middle = console.page.locator(".host canvas").bounding_box()
+    assert middle is not None
+    with console.page.expect_response(lambda answer: "/main/voxels/" in answer.url) as asked:
+        console.page.mouse.click(middle["x"] + middle["width"] / 2, middle["y"] + middle["height"] / 2)
+    told = asked.value.json()
+    (row,) = np.nonzero((voxels.numbers == told["voxel"]).all(axis=1))[0]
+    assert [told["hits"], told["misses"]] == voxels.counts[row].tolist()
+    assert told["probability"] == pytest.approx(voxels.probability[row], abs=1e-6)
+    heat = next(channel for channel in told["channels"] if channel["kind"] == "temperature")
+    if heat["weight"]:
+        assert heat["mean"] == pytest.approx([voxels.temperature_k[row]], abs=1e-3)
+    assert sum(commit["hits"] for commit in told["commits"]) == told["hits"]
+    assert {commit["id"] for commit in told["commits"]} <= set(room.commits)
+    panel = console.page.get_by_role("region", name="Voxel")
+    panel.get_by_text("Who saw it").wait_for()
+    assert ",".join(map(str, told["voxel"])) in panel.inner_text()
+
+
+def test_another_colouring_asks_nothing_of_the_server_and_looks_otherwise(console: Console) -> None:
+    console.page.keyboard.press("h")
+    console.settled()
+    before = len([url for url in console.requests if ".view" in url])
+    pictures = {}
+    for key, field in enumerate(["colour", "temperature", "probability", "height", "age"], start=1):
+        console.page.keyboard.press(str(key))
+        console.settled()
+        pictures[field] = console.picture()
+        assert console.page.locator(f'[data-field="{field}"]').get_attribute("aria-pressed") == "true"
+    assert len([url for url in console.requests if ".view" in url]) == before
+    for field in ("temperature", "probability", "height"):
+        assert np.abs(pictures[field].astype(int) - pictures["colour"]).mean() > 3, field
+    console.page.keyboard.press("1")
+
+
+def test_the_ceiling_hides_what_is_above_it(console: Console) -> None:
+    highest = "Math.max(...a[0].map(([x, y]) => c.picker.at(x, y)?.centre.z ?? -9))"
+    places = [[x, y] for x in range(200, 700, 60) for y in range(150, 500, 50)]
+    whole = console.tell(highest, places)
+    console.page.get_by_label("Ceiling").fill("100")
+    console.settled()
+    assert console.tell(highest, places) < whole
+    assert console.tell(highest, places) <= console.tell("c.look.ceilingM")
+    address = console.tell("c.address")
+    console.page.get_by_label("Ceiling").fill("200")
+    assert "ceiling=" in address
+    assert f"map={MAP}" in address
+
+
+def test_a_new_measurement_is_drawn_within_seconds(console: Console, room: Room) -> None:
+    before = console.tell("c.cells.head")
+    room.measure("scout", 3)
+    seconds = console.until(f"c.cells.head > {before} && c.cells.waiting === 0", "the new commit is drawn")
+    assert seconds < 3 * LOADED_MACHINE
+    console.settled()
+    assert console.tell("c.cells.drawn") == len(occupied(room).numbers)
+    names = console.page.get_by_role("region", name="Robots").inner_text()
+    assert "scout" in names
+    assert "mole" in names
+
+
+def test_many_updates_of_a_cell_leave_nothing_behind(console: Console) -> None:
+    kept = "[c.stage.renderer.info.memory.geometries, c.cells.drawn, c.stage.renderer.info.programs.length]"
+    before = console.tell(kept)
+    for _ in range(20):
+        console.tell(
+            "c.cells.all.forEach((cell) => { if (cell.key === '0,0,0') { cell.dirty = true; cell.etag = null; } })"
+        )
+        console.until("(c.moved = true, c.cells.waiting === 0)", "the cell is there again")
+    console.settled()
+    assert console.tell(kept) == before
+
+
+def test_a_commit_is_taken_out_only_after_it_was_shown_and_confirmed(console: Console, room: Room) -> None:
+    before = console.tell("c.cells.drawn")
+    console.page.get_by_role("button", name=f"commit {room.commits[1]}").focus()
+    console.page.keyboard.press("Enter")
+    confirm = console.page.get_by_role("button", name="out for good")
+    assert confirm.is_disabled()
+    console.page.get_by_role("button", name="Show what that takes out").click()
+    console.page.get_by_text("1 commit:").wait_for()
+    confirm.click()
+    console.page.get_by_text("Done: 1 taken out").wait_for()
+    console.page.get_by_role("button", name="Close").click()
+    console.until(f"c.cells.drawn !== {before}", "the map without the commit")
+    console.settled()
+    assert console.tell("c.cells.drawn") == len(occupied(room).numbers)
+
+
+def test_the_keys_are_listed_and_turn_the_view(console: Console) -> None:
+    console.page.keyboard.press("?")
+    console.page.get_by_role("dialog", name="Keys").wait_for()
+    console.page.keyboard.press("Escape")
+    eye = console.tell("c.stage.view.eye")
+    console.page.locator(".host canvas").focus()
+    console.page.keyboard.press("ArrowLeft")
+    assert console.tell("c.stage.view.eye") != eye
+
+
+def test_a_lost_server_is_said_and_a_new_start_goes_on(console: Console, room: Room) -> None:
+    assert console.errors == []
+    drawn = console.tell("c.cells.drawn")
+    room.stop()
+    console.page.get_by_text("No link: the map is as it was").wait_for()
+    assert console.tell("c.cells.drawn") == drawn
+    room.start()
+    console.page.locator('.link[data-state="live"]').wait_for()
+    room.measure("mole", 5)
+    console.page.keyboard.press("h")  # all of it in the picture, else what lies beside it comes coarsely
+    console.until(f"c.cells.drawn !== {drawn} && c.cells.waiting === 0", "a commit after the new start")
+    console.settled()
+    assert console.tell("c.cells.drawn") == len(occupied(room).numbers)
