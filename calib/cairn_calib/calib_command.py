@@ -18,6 +18,7 @@ SUBCOMMANDS = (convert_command, corners_command, solve_command, thermal_command)
 GROUP = "cairn.calib"
 ELSEWHERE = {
     "verify": "how well a rig carries circle targets between its cameras",
+    "study": "which board images calibrate best, in the simulator",
 }
 
 

@@ -151,4 +151,4 @@ def _grown(part: npt.NDArray[np.generic], reach: int) -> npt.NDArray[np.bool_]:
 
 def _mean_place(weight: Floats) -> Floats:
     y, x = np.mgrid[: weight.shape[0], : weight.shape[1]]
-    return np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum()
+    return np.asarray(np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum())
