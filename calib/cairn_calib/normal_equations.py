@@ -36,12 +36,12 @@ class Loss:
         """
         squares = np.where(self.kept, squares, 0.0)
         if np.isnan(squares).any():
-            return np.ones_like(squares), np.inf
+            return np.ones(squares.shape), np.inf
         lengths, k = np.sqrt(squares), self.huber_sigmas
         beyond = lengths > k
         if not beyond.any():
             return self.kept.astype(np.float64), float(squares.sum())
-        weights = self.kept * np.where(beyond, k / np.maximum(lengths, 1e-300), 1.0)
+        weights = self.kept.astype(np.float64) * np.where(beyond, k / np.maximum(lengths, 1e-300), 1.0)
         return weights, float(np.where(beyond, 2 * k * lengths - k * k, squares).sum())
 
 

@@ -62,7 +62,7 @@ def _run(point: EntryPoint, arguments: list[str]) -> int:
 
 def _help(commands: dict[str, EntryPoint]) -> str:
     lines = [f"usage: cairn COMMAND ...\n\n{__doc__}\n"]
-    lines += [f"  {name:<10} {_first_line(point.module)}" for name, point in sorted(commands.items())]
+    lines += [f"  {name:<12} {_first_line(point.module)}" for name, point in sorted(commands.items())]
     return "\n".join([*lines, "", EXIT_CODES]) + "\n"
 
 

@@ -103,7 +103,8 @@ def _occupied(diff: Diff, geometry: Geometry) -> tuple[Floats, Floats]:
     """(N, 3) centres of occupied voxels, metres, and (N,) their temperatures, kelvin; NaN for none."""
     channel = next(each for each in geometry.channels if each.kind is ChannelKind.TEMPERATURE)
     planes = geometry.planes_of(channel.name)
-    centres, kelvin = [np.empty((0, 3))], [np.empty(0)]
+    centres: list[Floats] = [np.empty((0, 3))]
+    kelvin: list[Floats] = [np.empty(0)]
     for key, evidence in diff.items():
         occupied = SensorModel().log_odds(evidence.counts) > 0
         sums = np.zeros((len(evidence), 2))
@@ -112,7 +113,7 @@ def _occupied(diff: Diff, geometry: Geometry) -> tuple[Floats, Floats]:
             mean = sums[:, 0] / sums[:, 1] * channel.step + channel.zero
         voxels = voxels_in_cell(evidence.voxels[occupied], key, geometry)
         centres.append((voxels + 0.5) * geometry.voxel_edge_m)
-        kelvin.append(mean[occupied])
+        kelvin.append(np.asarray(mean[occupied], np.float64))
     return np.concatenate(centres), np.concatenate(kelvin)
 
 
