@@ -32,12 +32,13 @@ demo: .venv/run.stamp .venv/kernels.stamp .venv/console.stamp  ## three robots, 
 test: .venv/dev.stamp .venv/kernels.stamp .venv/console.stamp | system  ## all tests (PYTEST_ARGS="...")
 	$(BIN)/python -m pytest $(WORKERS) $(PYTEST_ARGS)
 
-soak: .venv/dev.stamp .venv/kernels.stamp  ## crash, crowd, simulate sync, fuzz (SOAK_SECONDS=600 of each, SOAK_ARGS="cell"), bad links, kills
+soak: .venv/dev.stamp .venv/kernels.stamp  ## crash, crowd, simulate sync, fuzz (SOAK_SECONDS=600 of each, SOAK_ARGS="cell"), bad links, kills, calibrations
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.crash --trials 1000 --kills 200)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.crowd --robots 200 --seconds $(SOAK_SECONDS))
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.sync_sim --seeds 100000)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.links --minutes 30)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.links --minutes 15 --kill)
+	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.rig_seeds --seeds 200)
 	$(BIN)/python -m tests.fuzz --seconds $(SOAK_SECONDS) $(SOAK_ARGS)
 
 lint: .venv/dev.stamp  ## ruff, mypy, pyright

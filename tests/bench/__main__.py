@@ -21,6 +21,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from tests.bench.calibration import calibration_rows
 from tests.bench.coding import coding_rows
 from tests.bench.imports import import_rows
 from tests.bench.integration import integration_rows
@@ -227,6 +228,7 @@ def _cpu_s(work: Callable[[], object]) -> float:
 
 PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "room": _room_rows,
+    "calibration": calibration_rows,
     "coding": coding_rows,
     "imports": import_rows,
     "integration": integration_rows,

@@ -1,0 +1,67 @@
+"""mrcal 2.2, an independent solver, on the same corners: the same cameras, and the same uncertainty of every pixel.
+
+mrcal is a Debian package for Python's NumPy 1, so what it gave is kept beside this file, with its corners.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cairn_calib.board import Board
+from cairn_calib.board_views import BoardView, BoardViews
+from cairn_calib.corners import Corners
+from cairn_calib.pose_vectors import vector_from_transform
+from cairn_calib.poses import inverse
+from cairn_calib.probe_points import image_grid
+from cairn_calib.rig import Spectrum
+from cairn_calib.solve import Solution, solve_rig
+from cairn_calib.solve_plan import STATED, CameraPlan, SolvePlan
+from cairn_calib.solved_rig import solved_rig
+from cairn_calib.world_uncertainty import pixel_covariance, world_covariance
+
+REFERENCE = json.loads((Path(__file__).parent / "mrcal_reference.json").read_text())
+NAMES = ("left", "right")
+
+
+@pytest.fixture(scope="module")
+def solution() -> Solution:
+    board = Board(columns=9, rows=6, pitch_m=0.025)
+    views = [
+        BoardView(
+            image[:-2], image[-2:], image, Corners(board, np.reshape(pixels, (54, 2)), np.tile(np.eye(2), (54, 1, 1)))
+        )
+        for image, pixels in zip(REFERENCE["images"], REFERENCE["corners_px"], strict=True)
+    ]
+    plan = SolvePlan(
+        cameras={name: CameraPlan(spectrum=Spectrum.COLOUR) for name in NAMES},
+        gauge="left",
+        pitch_sigma=0.0,
+        usual_priors=False,
+        noise=STATED,
+    )
+    return solve_rig(BoardViews(board, dict.fromkeys(NAMES, (640, 480)), tuple(views)), plan)
+
+
+def test_mrcal_finds_the_same_cameras(solution: Solution) -> None:
+    for name, lens in zip(NAMES, solution.state.lenses, strict=True):
+        theirs = lens.with_intrinsics(REFERENCE["intrinsics"][name])
+        rays = lens.unproject(image_grid(640, 480, 20, 15))
+        assert np.abs(theirs.project(rays) - lens.project(rays)).max() < 1e-4
+    rt_right_left = vector_from_transform(inverse(solution.state.T_rig_camera[1]))
+    assert rt_right_left == pytest.approx(REFERENCE["rt_right_left"], abs=1e-7)
+    assert solution.state.warp_m == pytest.approx(REFERENCE["warp_m"], abs=1e-8)
+    count = 2 * sum(len(view.corners.pixels) for view in solution.views.views)
+    assert np.sqrt(solution.adjusted.normal.cost / count) == pytest.approx(REFERENCE["rms_px"], rel=1e-7)
+
+
+def test_mrcal_states_the_same_uncertainty_of_every_pixel(solution: Solution) -> None:
+    rig, world = solved_rig(solution, made_s=0.0), world_covariance(solution)
+    pixels = np.array(REFERENCE["sigma_px"]["pixels"])
+    for name in NAMES:
+        for range_m, theirs in REFERENCE["sigma_px"]["by_range_m"][name].items():
+            covariance = pixel_covariance(solution, rig, world, name, pixels, float(range_m))
+            # mrcal takes the residuals' rms for the corners' noise; here it was stated as 1 px.
+            ours = REFERENCE["rms_px"] * np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
+            assert ours == pytest.approx(theirs, rel=1e-5)
