@@ -74,7 +74,7 @@ def area_centroid(polygon: Floats) -> Floats:
     """(2,) of a closed polygon's area."""
     (x, y), (u, v) = polygon.T, np.roll(polygon, -1, axis=0).T
     cross = x * v - u * y
-    return np.array([((x + u) * cross).sum(), ((y + v) * cross).sum()]) / (3 * cross.sum())
+    return np.asarray(np.array([((x + u) * cross).sum(), ((y + v) * cross).sum()]) / (3 * cross.sum()))
 
 
 def test_centroids_are_as_uncertain_as_is_said_and_grey_ones_half_as_much() -> None:
