@@ -15,7 +15,7 @@ body { font: 15px/1.5 system-ui, "DejaVu Sans", sans-serif; color: #1c2430; back
 h1 { font-size: 1.7rem; margin: 0 0 .3rem; } p { max-width: 78ch; } .lead { color: #46505e; margin-top: 0; }
 h2 { font-size: 1.2rem; margin: 2.2rem 0 .5rem; padding-top: .8rem; border-top: 1px solid #d5dae1; }
 table { border-collapse: collapse; margin: .8rem 0; font-variant-numeric: tabular-nums; font-size: .9rem; }
-th, td { padding: .28rem .6rem; text-align: right; border-bottom: 1px solid #e6e9ee; white-space: nowrap; }
+th, td { padding: .28rem .45rem; text-align: right; border-bottom: 1px solid #e6e9ee; white-space: nowrap; }
 thead th { border-bottom: 1px solid #98a2b0; } tbody th, thead th:first-child { text-align: left; font-weight: 500; }
 td.main { font-weight: 700; } td.paper { color: #6b4d12; background: #fbf6ea; } tr.best > * { background: #eef7ee; }
 td.words { text-align: left; white-space: normal; color: #46505e; }

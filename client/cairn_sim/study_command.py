@@ -1,10 +1,14 @@
 """Find out which images of a board calibrate best, in the simulator, where the truth is known.
 
     $ cairn calib study --output study
-    c10 9 tilted by 35 to 40 degrees, middle, sides and corners, near and far: solved
+    sigma, px, centroids by method paper; in brackets the paper's, of other images
+                colour_left       colour_right       thermal_left      thermal_right
+    c9         2.19   (3.6)       2.18   (4.0)       1.08   (1.3)       1.06   (1.2)
     ...
-    best: c10 (9 tilted by 35 to 40 degrees, middle, sides and corners, near and far)
-      grey  colour_left   sigma 1.01 px, at most 1.5: met; rms 1.02 px, expected 1.01 (+1%): met
+    best: c8 (8 tilted by 30 degrees, middle and corners, near and far)
+      paper colour_left   sigma 2.12 px, at most 2.8: met; rms 2.11 px, expected 2.07 (+2%): met
+      grey  colour_left   sigma 0.99 px, at most 1.5: met; rms 0.99 px, expected 1.03 (-4%): met
+      ...
 
 Ten configurations c1 to c10, of 2 to 9 images: how many, head-on or tilted, middle or corners, one distance or several.
 Each is photographed by the simulated head, its corners are found, the rig is solved from them alone, and verified with
