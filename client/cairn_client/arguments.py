@@ -39,8 +39,8 @@ def add_token(parser: argparse.ArgumentParser) -> None:
 
 
 def allow_negative_lists(parser: argparse.ArgumentParser) -> None:
-    """Take `-1,0,0` for a value and not for an option, as argparse by itself does with `-1` alone."""
-    parser._negative_number_matcher = re.compile(r"^-\d[-\d.,]*$")
+    """Take `-1,0,0` or `-5:40` for a value and not for an option, as argparse by itself does with `-1` alone."""
+    parser._negative_number_matcher = re.compile(r"^-\d[-\d.,:]*$")
 
 
 def api_of(map_url: str, token: str | None) -> tuple[MapApi, str]:

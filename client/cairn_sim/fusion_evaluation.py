@@ -82,10 +82,6 @@ def mapped_scores(
         total = EvidenceMap(geometry)
         for scans in stops:
             total.merge(integrate_scans(scans, rig, geometry, integrator=integrator))
-        diff = total.packed()
-        found[name] = {
-            "bodies": temperature_scores(scene, diff, geometry, chosen=is_body),
-            "pipes": temperature_scores(scene, diff, geometry, chosen=is_pipe),
-            "both": temperature_scores(scene, diff, geometry, chosen=lambda name: is_body(name) or is_pipe(name)),
-        }
+        groups = {"bodies": is_body, "pipes": is_pipe}
+        found[name] = temperature_scores(scene, total.packed(), geometry, groups=groups)
     return found

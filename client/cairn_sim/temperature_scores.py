@@ -7,7 +7,7 @@ A voxel is 'on' a solid whose surface is nearest to its centre, and passes throu
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import product
 
@@ -18,6 +18,7 @@ from cairn_map.channels import ChannelKind
 from cairn_map.evidence_map import Diff
 from cairn_map.grid import Geometry, voxels_in_cell
 from cairn_map.sensor_model import SensorModel
+from cairn_sim.distance_kernels import nearest_solids
 from cairn_sim.scene import Scene
 from cairn_sim.sensors import ThermalSensor
 from cairn_sim.solid_kernels import second_at
@@ -28,7 +29,7 @@ Ints = npt.NDArray[np.int32]
 
 BODIES = ("person", "technician", "operator", "chemist", "casualty", "fire fighter")
 PIPES = ("pipe", "riser")
-SAMPLES = 5
+SAMPLES = 3
 """Places along a voxel's edge at which its surfaces are looked for."""
 
 
@@ -69,25 +70,30 @@ def is_pipe(name: str) -> bool:
 
 
 def temperature_scores(
-    scene: Scene, diff: Diff, geometry: Geometry, *, chosen: Callable[[str], bool]
-) -> TemperatureScores:
-    """The scores of all occupied voxels on solids of chosen names.
+    scene: Scene, diff: Diff, geometry: Geometry, *, groups: Mapping[str, Callable[[str], bool]]
+) -> dict[str, TemperatureScores]:
+    """The scores of all occupied voxels on solids of each group, and of all groups as `all`.
 
     Args:
         scene: that was mapped.
         diff: the map's evidence by cell, `EvidenceMap.packed()`.
         geometry: of the map; it has a temperature channel.
-        chosen: by the name of a solid.
+        groups: which names of solids are in which; at most one each.
     """
-    solids = np.array([chosen(solid.name) for solid in scene.solids])
+    names = list(groups)
+    member = np.array([[chosen(solid.name) for solid in scene.solids] for chosen in groups.values()])
     centres, kelvin = _occupied(diff, geometry)
-    on = solids[scene.nearest_solid(centres)]
-    centres, kelvin = centres[on], kelvin[on]
-    low, high = _surface_temperatures(scene, centres, geometry.voxel_edge_m, solids)
-    through = np.isfinite(low)
-    known = through & np.isfinite(kelvin)
-    error = np.maximum(np.maximum(low[known] - kelvin[known], kelvin[known] - high[known]), 0.0)
-    return TemperatureScores(errors_k=error, without=int((through & ~known).sum()))
+    nearest = scene.nearest_solid(centres)
+    on = member.any(axis=0)[nearest]
+    centres, kelvin, nearest = centres[on], kelvin[on], nearest[on]
+    low, high = _surface_temperatures(scene, centres, geometry.voxel_edge_m, member.any(axis=0))
+    error = np.maximum(np.maximum(low - kelvin, kelvin - high), 0.0)
+    chosen = {name: member[n][nearest] for n, name in enumerate(names)} | {"all": np.ones(len(nearest), bool)}
+    through, known = np.isfinite(low), np.isfinite(kelvin)
+    return {
+        name: TemperatureScores(errors_k=error[of & through & known], without=int((of & through & ~known).sum()))
+        for name, of in chosen.items()
+    }
 
 
 def apparent_k(scene: Scene, points: Floats, solids: Ints) -> Floats:
@@ -124,8 +130,8 @@ def _surface_temperatures(scene: Scene, centres: Floats, edge_m: float, solids: 
     reach_m = edge_m / SAMPLES * math.sqrt(3) / 2
     for offset_m in product(places_m, repeat=3):
         points = centres + np.array(offset_m)
-        nearest = scene.nearest_solid(points)
-        here = np.abs(scene.distance_m(points)) <= reach_m
+        distance_m, nearest = nearest_solids(points, scene.shapes)
+        here = np.abs(distance_m) <= reach_m
         kelvin = apparent_k(scene, points, nearest)
         low, high = np.where(here, np.minimum(low, kelvin), low), np.where(here, np.maximum(high, kelvin), high)
         touched |= here & solids[nearest]

@@ -31,6 +31,7 @@ from tests.bench.queries import query_rows
 from tests.bench.server import server_rows
 from tests.bench.simulation import simulation_rows
 from tests.bench.start import start_rows
+from tests.bench.telepresence import telepresence_rows
 
 from cairn_client.api import MapApi
 from cairn_client.robot import Robot
@@ -238,6 +239,7 @@ PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "server": server_rows,
     "simulation": simulation_rows,
     "start": start_rows,
+    "telepresence": telepresence_rows,
     "recordings": _recording_rows,
     "sizes": _size_rows,
 }

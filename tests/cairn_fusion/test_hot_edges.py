@@ -1,0 +1,87 @@
+"""Hot things do not bleed on what is behind them, nor that on them: temperatures at edges are left out of the map."""
+
+import math
+
+import numpy as np
+import pytest
+
+from cairn_calib.poses import look_at
+from cairn_fusion.integrate import Integrator, integrate_scans
+from cairn_fusion.sample_kernels import doubt_edges_into
+from cairn_fusion.transfer import Label
+from cairn_map.errors import BadInputError
+from cairn_map.grid import geometry_for
+from cairn_sim.heads import RANGE_CAMERA, thermal_and_tof_head
+from cairn_sim.render import render_scan
+from cairn_sim.scene import scene_of
+from cairn_sim.sensors import Noise
+from cairn_sim.solids import Box, Cylinder, Solid, placed
+from cairn_sim.surfaces import Material, Surface
+from cairn_sim.temperature_scores import apparent_k, is_body, is_pipe, temperature_scores
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_doubted_points_are_those_with_a_step_around_them(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    image = (290 + 3 * rng.random((12, 15))).astype(np.float32)
+    image[4:7, 5:9], image[10, 2] = 310, np.nan
+    pixels = np.stack([rng.integers(0, 15, 60), rng.integers(0, 12, 60)], axis=1)
+    labels, reach_px = rng.choice([0, 0, 0, 1, 2], 60).astype(np.uint8), rng.integers(0, 3, 60).astype(np.int32)
+    expected = labels.copy()
+    for n, (x, y) in enumerate(pixels.tolist()):
+        r = int(reach_px[n])
+        around = image[max(y - r, 0) : y + r + 1, max(x - r, 0) : x + r + 1]
+        if labels[n] == Label.OK and not np.isnan(around).all() and np.nanmax(around) - np.nanmin(around) > 4.0:
+            expected[n] = Label.UNCERTAIN
+    doubt_edges_into(labels, pixels, reach_px, image, 4.0)
+    np.testing.assert_array_equal(labels, expected)
+    assert 3 < (labels == Label.UNCERTAIN).sum() < 50
+
+
+def test_a_hot_pipe_before_a_wall_keeps_its_temperature_and_the_wall_its_own() -> None:
+    def solid(name: str, shape: Box | Cylinder, at: tuple[float, float, float], celsius: float) -> Solid:
+        return Solid(name, shape, Surface(Material(temperature_k=celsius + 273.15)), placed(at))
+
+    wall = solid("wall", Box((0.2, 6, 4)), (2.1, 0, 0), 19.0)
+    scene = scene_of([wall, solid("hot pipe", Cylinder(0.08, 3.0), (1.88, 0.1, 0), 65.0)])
+    rig, geometry = thermal_and_tof_head(), geometry_for(voxel_edge_m=0.04)
+    scans = [
+        render_scan(
+            scene,
+            rig,
+            T_map_rig=look_at((0.3 * n, 0.2 * n - 0.3, 0), (2, 0.1 * n, 0)),
+            range_camera=RANGE_CAMERA,
+            time_s=float(n),
+            noise=Noise(1),
+            number=n,
+        )
+        for n in range(3)
+    ]
+    found = {}
+    groups = {"pipe": is_pipe, "wall": lambda name: name == "wall"}
+    for step_k in (4.0, math.inf):
+        diff = integrate_scans(scans, rig, geometry, integrator=Integrator(temperature_step_k=step_k))
+        found[step_k] = temperature_scores(scene, diff, geometry, groups=groups)
+    kept, all_of_them = found[4.0], found[math.inf]
+    assert all_of_them["pipe"].p95_k > 5 and kept["pipe"].p95_k < 2.0 and kept["pipe"].median_k < 0.5
+    assert kept["wall"].p95_k < 0.5
+    assert (all_of_them["wall"].errors_k > 5).sum() > 20 * (kept["wall"].errors_k > 5).sum()
+    assert kept["pipe"].known > 0.5 and all_of_them["pipe"].known > 0.99
+    assert kept["all"].without + len(kept["all"].errors_k) == all_of_them["all"].without + len(
+        all_of_them["all"].errors_k
+    )
+
+
+def test_bodies_and_pipes_are_known_by_name_and_bare_metal_mirrors() -> None:
+    assert is_body("technician/leg left") and is_body("waiting person/hair") and not is_body("hot pipe")
+    assert is_pipe("lab hot pipe") and is_pipe("bare riser") and not is_pipe("person in the corridor/head")
+    metal = Surface(Material(temperature_k=333.15, emissivity=0.2))
+    scene = scene_of([Solid("pipe", Box((1, 1, 1)), metal, placed((0, 0, 0)))])
+    shown = apparent_k(scene, np.array([[0.5, 0.0, 0.0]]), np.zeros(1, np.int32))[0]
+    assert scene.ambient_k < shown < scene.ambient_k + 0.35 * (333.15 - scene.ambient_k)
+
+
+def test_limits_that_are_none_are_refused() -> None:
+    for name in ("temperature_step_k", "hidden_behind_m"):
+        with pytest.raises(BadInputError, match=name):
+            Integrator(**{name: 0.0})

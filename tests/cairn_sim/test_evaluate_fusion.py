@@ -1,0 +1,83 @@
+"""`cairn sim evaluate-fusion`: what its scores count, on a truth made by hand; its pictures; real hot cups."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cairn_calib.poses import look_at
+from cairn_fusion.across import Across
+from cairn_fusion.eye_depth import EyeDepth
+from cairn_fusion.surface import Drawn
+from cairn_fusion.transfer import Label
+from cairn_fusion.view.temperature_scale import TemperatureScale
+from cairn_map.errors import BadInputError
+from cairn_sim.fusion_evaluation import WAYS, scored_view
+from cairn_sim.fusion_pictures import error_picture, figure_24
+from cairn_sim.fusion_scores import COLUMNS, fusion_scores
+from cairn_sim.fusion_truth import FusionTruth
+from cairn_sim.heads import RANGE_CAMERA, full_head
+from cairn_sim.labelled_frames import labelled_frames
+from cairn_sim.render import render_scan
+from cairn_sim.scene_file import load_scene
+from cairn_sim.sim_command import main
+
+
+def test_scores_count_what_their_names_say() -> None:
+    none = np.zeros((1, 1), np.float32)
+    origins = np.array([[1, 1, 2, 1, 0, 1]], np.uint8)
+    drawn = Drawn(step_px=1, nearness=none, marks=none.astype(np.uint8), hiding=none, slack=none)
+    depth = EyeDepth("colour", np.ones((1, 6), np.float32), origins, drawn)
+    labels = np.array([[Label.OK, Label.OK, Label.OK, Label.OCCLUDED, Label.NO_RANGE, Label.OK]], np.uint8)
+    values = np.array([[300, 303, 300.5, np.nan, np.nan, 290]], np.float32)[..., None]
+    fused = Across("colour", ("warm",), values, labels, np.zeros((1, 6), np.uint8), depth)
+    sees = np.array([[True, False, True, False, True, True]])
+    truth = FusionTruth(
+        values=np.full((1, 6, 1), 300, np.float32),
+        sees={"warm": sees},
+        in_view={"warm": np.ones((1, 6), bool)},
+        near_edge=np.array([[False, False, True, True, False, False]]),
+        beyond=np.array([[False, False, False, False, False, True]]),
+    )
+    scores = fusion_scores(fused, truth, unit="K")
+    assert (scores.pixels, scores.painted, scores.hidden_painted, scores.hidden_painted_away) == (5, 3, 1, 1)
+    assert (scores.called, scores.called_hidden, scores.hidden) == (1, 1, 2)
+    assert scores.precision == 1.0 and scores.recall == 0.5
+    np.testing.assert_allclose(scores.errors, [0, 3, 0.5])
+    np.testing.assert_allclose(scores.errors_away, [0, 3])
+    np.testing.assert_allclose(scores.errors_filled, [0.5])
+    np.testing.assert_allclose(scores.errors_beyond, [10])
+    twice = scores + scores
+    assert twice.painted == 6 and len(twice.errors) == 6
+    assert len(twice.row()) == len(COLUMNS) and twice.row()[0] == "60.0"
+
+
+def test_each_step_of_fusion_is_worth_something() -> None:
+    rig, scene = full_head(scale=0.25), load_scene("building")
+    torso = scene.solids[scene.number_of("technician/torso")].T_map_solid[:3, 3]
+    T_map_rig = look_at(torso + np.array([-1.4, 0.5, 0.2]), torso)
+    scan = render_scan(scene, rig, T_map_rig=T_map_rig, range_camera=RANGE_CAMERA, time_s=0.0)
+    view = scored_view(scene, rig, scan, "colour_left")
+    both, one, nothing, nominal = (view.scores[way] for way in WAYS)
+    assert both.painted > one.painted
+    assert one.hidden_painted < 0.5 * nothing.hidden_painted
+    assert (both.errors > 2).mean() < 0.5 * (nominal.errors > 2).mean()
+    assert np.median(both.errors) < 0.1
+    scale = TemperatureScale(288.0, 308.0)
+    assert figure_24(scan, rig, "colour_left", scale).shape == (480, 640, 3)
+    assert error_picture(scan, view.fused, view.truth, scale).shape == (240, 960, 3)
+
+
+@pytest.mark.recording
+@pytest.mark.skipif("CAIRN_TEST_DATA" not in os.environ, reason="CAIRN_TEST_DATA names no folder of recordings")
+def test_real_hot_cups_are_where_the_sets_own_registration_has_them() -> None:
+    frames = list(labelled_frames(Path(os.environ["CAIRN_TEST_DATA"]) / "mm5_rgbdt"))
+    assert len(frames) == 3
+    for frame in frames:
+        assert frame.fused_iou > frame.given_iou - 0.02 and frame.fused_iou > 0.7
+
+
+def test_the_command_refuses_numbers_that_mean_nothing(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="--scans"):
+        main(["evaluate-fusion", str(tmp_path), "--scans", "0"])
