@@ -82,11 +82,12 @@ def temperature_scores(
     """
     names = list(groups)
     member = np.array([[chosen(solid.name) for solid in scene.solids] for chosen in groups.values()])
+    anyone: Flags = np.logical_or.reduce(member)
     centres, kelvin = _occupied(diff, geometry)
     nearest = scene.nearest_solid(centres)
-    on = member.any(axis=0)[nearest]
+    on = anyone[nearest]
     centres, kelvin, nearest = centres[on], kelvin[on], nearest[on]
-    low, high = _surface_temperatures(scene, centres, geometry.voxel_edge_m, member.any(axis=0))
+    low, high = _surface_temperatures(scene, centres, geometry.voxel_edge_m, anyone)
     error = np.maximum(np.maximum(low - kelvin, kelvin - high), 0.0)
     chosen = {name: member[n][nearest] for n, name in enumerate(names)} | {"all": np.ones(len(nearest), bool)}
     through, known = np.isfinite(low), np.isfinite(kelvin)
@@ -118,8 +119,8 @@ def _occupied(diff: Diff, geometry: Geometry) -> tuple[Floats, Floats]:
         with np.errstate(invalid="ignore"):
             mean = sums[:, 0] / sums[:, 1] * channel.step + channel.zero
         voxels = voxels_in_cell(evidence.voxels[occupied], key, geometry)
-        centres.append((voxels + 0.5) * geometry.voxel_edge_m)
-        kelvin.append(np.asarray(mean[occupied], np.float64))
+        centres.append(np.asarray((voxels + 0.5) * geometry.voxel_edge_m, dtype=np.float64))
+        kelvin.append(np.asarray(mean[occupied], dtype=np.float64))
     return np.concatenate(centres), np.concatenate(kelvin)
 
 

@@ -29,6 +29,7 @@ def densify_into(
     coarse: Bytes,
     alike: Singles,
     close: Singles,
+    near_px: float,
     step_px: int,
     first: int,
     last: int,
@@ -36,7 +37,9 @@ def densify_into(
     """Fill rows `first` to `last` - 1 of (H, W) ranges and origins.
 
     Between four drawn pixels of one surface 1 / range is interpolated. Else the drawn pixels around vote: each with its
-    trust, how close it is, and how alike its colour is; only the stronger of two surfaces has a say in the range.
+    trust, how close it is, and how alike its colour is; only the stronger of two surfaces has a say in the range. The
+    nearer of two, and one alone, is not carried farther than `near_px`: too far out it would be painted
+    with what is not there, whereas what goes too far behind something is found to be hidden.
 
     Args:
         range_m: (H, W) takes metres; NaN where nothing is known.
@@ -48,6 +51,7 @@ def densify_into(
         coarse: (h, w, 3) the picture, as coarse as the drawing.
         alike: (3 * 256,) weight by the sum of the three differences of colour.
         close: (2 REACH + 2, 2 REACH + 2) weight by place, of rows and columns from the first that is looked at.
+        near_px: drawn pixels, about as wide as a range pixel.
         step_px: pixels along a drawn one.
         first: row.
         last: row.
@@ -57,6 +61,7 @@ def densify_into(
     middle_px, share = 0.5 * (step_px - 1), f(1.0 / step_px)
     voters = (2 * REACH + 2) ** 2
     qs, weights, colours = np.empty(voters, np.float32), np.empty(voters, np.float32), np.empty((voters, 3), np.int32)
+    at_hand, near_square = np.empty(voters, np.bool_), near_px * near_px
     # Pixels between the same four drawn ones, of which those beyond the border are the border's.
     for i in range(-1, rows):
         y0, y1 = max(first, math.ceil(i * step_px + middle_px)), min(last, math.ceil((i + 1) * step_px + middle_px))
@@ -82,6 +87,7 @@ def densify_into(
                     q = nearness[k, m]
                     if q > f(0.0):
                         qs[count], weights[count] = q, trust[k, m] * close[k - i + REACH, m - j + REACH]
+                        at_hand[count] = (k - i - 0.5) ** 2 + (m - j - 0.5) ** 2 <= near_square
                         # Signed: bytes would wrap round.
                         for c in range(3):
                             colours[count, c] = np.int32(coarse[k, m, c])
@@ -97,9 +103,12 @@ def densify_into(
             if most <= least * f(1.0 + STEP_SHARE):
                 total, weight = f(0.0), f(0.0)
                 for n in range(count):
-                    total += weights[n] * qs[n]
-                    weight += weights[n]
-                range_m[y0:y1, x0:x1] = weight / total
+                    if at_hand[n]:
+                        total += weights[n] * qs[n]
+                        weight += weights[n]
+                range_m[y0:y1, x0:x1] = weight / total if total > f(0.0) else np.nan
+                if total == f(0.0):
+                    origins[y0:y1, x0:x1] = NOTHING
                 continue
             middle = f(0.5) * (least + most)
             for y in range(y0, y1):
@@ -114,8 +123,9 @@ def densify_into(
                         other = abs(colours[n, 0] - red) + abs(colours[n, 1] - green) + abs(colours[n, 2] - blue)
                         weight = weights[n] * alike[other]
                         if qs[n] > middle:
-                            near += weight
-                            near_sum += weight * qs[n]
+                            if at_hand[n]:
+                                near += weight
+                                near_sum += weight * qs[n]
                         else:
                             far += weight
                             far_sum += weight * qs[n]

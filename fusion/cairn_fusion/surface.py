@@ -72,6 +72,8 @@ class Drawn:
 
     step_px: int
     """Pixels of the camera along one that is drawn."""
+    per_pixel: float
+    """Drawn pixels along one of the range camera."""
     nearness: Singles
     """1 / range from the camera, 1 / metres; 0 where nothing is known."""
     marks: Labels
@@ -125,7 +127,9 @@ def drawn_surface(surface: RangeSurface, rig: Rig, camera: str) -> Drawn:
     edges = nearness.copy()
     draw_squares_into(edges, surface.fronts, u, v, q, EDGE_REACH * per_pixel)
     hiding = nearest_of_nine(edges)
-    return Drawn(step_px=step, nearness=nearness, marks=marks, hiding=hiding, slack=_slack(edges, hiding))
+    return Drawn(
+        step_px=step, per_pixel=per_pixel, nearness=nearness, marks=marks, hiding=hiding, slack=_slack(edges, hiding)
+    )
 
 
 def places(range_m: Singles, rays: Singles, dst: AnyCamera, T_dst_src: Transform) -> tuple[Singles, Singles, Singles]:

@@ -81,6 +81,7 @@ def dense(
     coarse: npt.NDArray[np.uint8],
     alike: Singles,
     close: Singles,
+    near_px: float,
     step_px: int,
     reach: int,
 ) -> tuple[Floats, Labels]:
@@ -105,16 +106,17 @@ def dense(
                 if nearness[k, m] > 0:
                     other = int(np.abs(coarse[k, m].astype(int) - picture[y, x].astype(int)).sum())
                     weight = float(trust[k, m]) * float(close[k - i + reach, m - j + reach])
-                    votes.append((float(nearness[k, m]), weight, float(alike[other])))
+                    hand = float(np.hypot(k - i - 0.5, m - j - 0.5) <= near_px)
+                    votes.append((float(nearness[k, m]), weight, float(alike[other]), hand))
         if not votes:
             continue
-        q, weight, like = np.array(votes).T
-        origins[y, x] = 2
+        q, weight, like, hand = np.array(votes).T
         if q.max() <= q.min() * np.float32(1.05):
-            range_m[y, x] = 1 / np.average(q, weights=weight)
+            if hand.any():
+                range_m[y, x], origins[y, x] = 1 / np.average(q, weights=weight * hand), 2
             continue
-        middle, weight = (q.min() + q.max()) / 2, weight * like
-        near = q > middle
+        near, weight, origins[y, x] = q > (q.min() + q.max()) / 2, weight * like, 2
+        weight[near] *= hand[near]
         chosen = near if weight[near].sum() >= weight[~near].sum() else ~near
         range_m[y, x] = 1 / np.average(q[chosen], weights=weight[chosen])
     return range_m, origins

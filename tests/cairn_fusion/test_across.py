@@ -15,6 +15,8 @@ from cairn_calib.poses import inverse, look_at, transform_points
 from cairn_calib.rig import Rig, Spectrum, mounted
 from cairn_fusion.across import across
 from cairn_fusion.across_kernels import label_into, sample_into
+from cairn_fusion.certainty import pixel_covariance
+from cairn_fusion.fused_covariance import fused_covariance
 from cairn_fusion.scan import Scan
 from cairn_fusion.surface import beams, drawn_surface, places, surface_of
 from cairn_fusion.transfer import Label
@@ -220,3 +222,20 @@ def test_cameras_with_one_centre_hide_nothing_from_each_other() -> None:
     drawn = drawn_surface(surface_of(scan, rig), rig, "colour")
     none = across(view_depth(scan, rig, "colour", drawn), rig, {}, drawn={}, range_camera="tof")
     assert not none.ok.any() and none.sources == ()
+
+
+def test_every_fused_pixel_has_the_covariance_of_its_source() -> None:
+    scene, T_map_rig = poses(1, 7)[0]
+    fused = fuse(perfect_scan(scene, HEAD, T_map_rig), HEAD, "colour_left")
+    found = fused_covariance(fused, HEAD, range_camera=RANGE_CAMERA)
+    np.testing.assert_array_equal(np.isfinite(found).all(axis=2), fused.ok)
+    for number, name in enumerate(fused.sources):
+        y, x = (at[::97] for at in np.nonzero(fused.ok & (fused.source == number) & (fused.depth.origins == 1)))
+        range_m = fused.depth.shown_m[y, x].astype(np.float64)
+        points = HEAD["colour_left"].camera.rays()[y, x] * range_m[:, None]
+        sigma_m = HEAD[RANGE_CAMERA].range_sigma_m(range_m)
+        exact = pixel_covariance(points, sigma_m, HEAD, src="colour_left", dst=name)
+        trace = exact[:, 0, 0] + exact[:, 1, 1]
+        np.testing.assert_allclose(found[y, x, 0] + found[y, x, 2], trace, rtol=0.1)
+    filled = found[fused.ok & (fused.depth.origins == 2)].sum(axis=1).mean()
+    assert filled > 3 * found[fused.ok & (fused.depth.origins == 1)].sum(axis=1).mean()

@@ -55,9 +55,9 @@ def test_dense_depth_agrees_with_its_slow_twin(seed: int) -> None:
     range_m, origins = np.empty((23, 32), np.float32), np.empty((23, 32), np.uint8)
     arrays = (range_m, origins, picture, nearness, marks, trust.astype(np.float32), coarse, ALIKE, CLOSE)
     for band in ((0, 7), (7, 8), (8, 23)):
-        densify_into(*arrays, step, *band)
+        densify_into(*arrays, 2.0, step, *band)
     full = marks == Label.SATURATED
-    slow, slow_origins = naive_views.dense(picture, nearness, full, arrays[5], coarse, ALIKE, CLOSE, step, REACH)
+    slow, slow_origins = naive_views.dense(picture, nearness, full, arrays[5], coarse, ALIKE, CLOSE, 2.0, step, REACH)
     np.testing.assert_array_equal(origins, slow_origins)
     np.testing.assert_allclose(range_m, slow, rtol=2e-4)
     assert {0, 1, 2} == set(origins.ravel().tolist())

@@ -66,7 +66,7 @@ def test_a_hot_pipe_before_a_wall_keeps_its_temperature_and_the_wall_its_own() -
     assert all_of_them["pipe"].p95_k > 5 and kept["pipe"].p95_k < 2.0 and kept["pipe"].median_k < 0.5
     assert kept["wall"].p95_k < 0.5
     assert (all_of_them["wall"].errors_k > 5).sum() > 20 * (kept["wall"].errors_k > 5).sum()
-    assert kept["pipe"].known > 0.5 and all_of_them["pipe"].known > 0.99
+    assert kept["pipe"].known > 0.5 and all_of_them["pipe"].known > 0.9
     assert kept["all"].without + len(kept["all"].errors_k) == all_of_them["all"].without + len(
         all_of_them["all"].errors_k
     )

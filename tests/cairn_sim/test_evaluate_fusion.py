@@ -27,7 +27,7 @@ from cairn_sim.sim_command import main
 def test_scores_count_what_their_names_say() -> None:
     none = np.zeros((1, 1), np.float32)
     origins = np.array([[1, 1, 2, 1, 0, 1]], np.uint8)
-    drawn = Drawn(step_px=1, nearness=none, marks=none.astype(np.uint8), hiding=none, slack=none)
+    drawn = Drawn(step_px=1, per_pixel=1.0, nearness=none, marks=none.astype(np.uint8), hiding=none, slack=none)
     depth = EyeDepth("colour", np.ones((1, 6), np.float32), origins, drawn)
     labels = np.array([[Label.OK, Label.OK, Label.OK, Label.OCCLUDED, Label.NO_RANGE, Label.OK]], np.uint8)
     values = np.array([[300, 303, 300.5, np.nan, np.nan, 290]], np.float32)[..., None]
