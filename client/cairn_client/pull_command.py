@@ -13,9 +13,9 @@ from pydantic import BaseModel, ConfigDict
 from cairn_client.api import MapApi
 from cairn_client.arguments import api_of, say, shown_bytes
 from cairn_client.nearness import Wanted, within
-from cairn_client.replica_store import ReplicaStore
 from cairn_client.robot import Robot
 from cairn_client.robot_arguments import add_map, place, scope_of
+from cairn_client.state_folder import robot_of
 from cairn_map.errors import BadInputError
 from cairn_map.robot_status import Mode
 
@@ -40,7 +40,7 @@ class PullReport(BaseModel):
 
 def _pull(args: argparse.Namespace) -> int:
     api, map_name = api_of(args.map, args.token)
-    known = _robot_of(args.state)
+    known = robot_of(args.state)
     name = args.name or known or "viewer"
     mode: Mode = args.mode or ("high-end" if known and known != "viewer" else "viewer")
     scope = replace(scope_of(args), wanted=_wanted(args, api, map_name))
@@ -80,17 +80,6 @@ def _pulled(robot: Robot) -> PullReport:
         up_bytes=robot.traffic.up_bytes,
         down_bytes=robot.traffic.down_bytes,
     )
-
-
-def _robot_of(state: Path) -> str | None:
-    """Whose folder this is, or None if it is nobody's yet."""
-    if not state.exists():
-        return None
-    store = ReplicaStore(state)
-    try:
-        return store.get("robot")
-    finally:
-        store.close()
 
 
 def _wanted(args: argparse.Namespace, api: MapApi, map_name: str) -> Wanted | None:

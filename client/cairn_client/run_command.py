@@ -24,10 +24,10 @@ from pathlib import Path
 from cairn_client.arguments import say, shown_bytes
 from cairn_client.event_lines import lines_on_stderr, until_signal
 from cairn_client.replay_command import default_name, ensure_map
-from cairn_client.replica_store import FILE_NAME
 from cairn_client.robot import Robot
 from cairn_client.robot_arguments import add_limits, add_map, limits_of, scope_of
 from cairn_client.spool import Spool, Stop, remember
+from cairn_client.state_folder import is_state_folder
 from cairn_fusion.integrate import Integrator
 from cairn_map.cell_code import Profile
 from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
@@ -121,7 +121,7 @@ def _robot(args: argparse.Namespace, spool: Spool, stopping: threading.Event) ->
     name = args.name or default_name(args.spool.resolve().name)
     state: Path = args.state or Path(f"cairn-{name}")
     source = spool.next_recording()
-    while source is None and not (state / FILE_NAME).exists():
+    while source is None and not is_state_folder(state):
         if stopping.wait(LOOK_EVERY_S):
             return None
         source = spool.next_recording()

@@ -1,7 +1,7 @@
 """A robot's folder, or a copy's, looked at from outside: whose it is, and the map as it stands in it."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 from cairn_client.folder_status import MODE_KEY, URL_KEY
@@ -17,6 +17,14 @@ def is_state_folder(folder: Path) -> bool:
     return (folder / FILE_NAME).is_file()
 
 
+def robot_of(folder: Path) -> str | None:
+    """Whose folder it is; None: nobody's yet. Raises: ConflictError: a robot has it open."""
+    if not is_state_folder(folder):
+        return None
+    with closing(ReplicaStore(folder)) as store:
+        return store.get("robot")
+
+
 @contextmanager
 def opened_replica(folder: Path) -> Iterator[Replica]:
     """The map in a folder that exists, under the name that it has.
@@ -28,8 +36,7 @@ def opened_replica(folder: Path) -> Iterator[Replica]:
     """
     if not is_state_folder(folder):
         raise BadInputError("no_state_folder", f"{folder} is no robot's folder and no copy: there is no {FILE_NAME}")
-    store = ReplicaStore(folder)
-    try:
+    with closing(ReplicaStore(folder)) as store:
         robot, map_name, geometry = (store.get(key) for key in ("robot", "map", "geometry"))
         if robot is None or map_name is None or geometry is None:
             raise BadInputError("no_state_folder", f"{folder} was never used; begin with `cairn clone URL {folder}`")
@@ -39,8 +46,6 @@ def opened_replica(folder: Path) -> Iterator[Replica]:
             map_name=map_name,
             geometry=Geometry.model_validate_json(geometry),
         )
-    finally:
-        store.close()
 
 
 def url_of(folder: Path) -> str:
