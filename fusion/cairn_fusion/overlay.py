@@ -90,8 +90,10 @@ class OverlayStyle:
     """likewise at this age, where the age is known."""
     blur_max_px: float = 16.0
     """Nothing is drawn when half of it may be off by more (standard deviation)."""
-    step_px: int = 2
-    """What is behind is looked up once for so many pixels along both axes: stripes do not show more."""
+    through_m: float = 10.0
+    """So far behind the live surface things are looked for."""
+    step_px: int = 3
+    """All but the visible is looked up once for so many pixels along both axes: stripes and dots do not show more."""
 
     @property
     def colours(self) -> Scale:
@@ -106,23 +108,19 @@ class Overlay:
     picture: Rgb
     """(H, W, 3)"""
     front: Seen
-    """What the map has where the live surface is; without live depth, the nearest."""
+    """What the map has where the live surface is."""
     values: npt.NDArray[np.floating]
     """Of the layer, in front; (H, W), of colours (H, W, 3)."""
+    rest: Seen
+    """What lies behind the live surface, or, where there is no live depth, the nearest on the map; for each
+    `step_px`-th row and column."""
+    values_of_rest: npt.NDArray[np.floating]
     front_modes: npt.NDArray[np.uint8]
     """(H, W) VISIBLE, MAP_ONLY or NOTHING."""
-    behind: Seen
-    """What lies beyond, for each `step_px`-th row and column."""
-    values_behind: npt.NDArray[np.floating]
-    step_px: int
+    through: Flags
+    """(H, W) whether something lies behind the live surface."""
     withheld: str | None = None
     """Why nothing was drawn."""
-
-    @property
-    def through(self) -> Flags:
-        """(H, W) whether something lies behind the live surface."""
-        H, W = self.front_modes.shape
-        return self.behind.hit.repeat(self.step_px, axis=0).repeat(self.step_px, axis=1)[:H, :W]
 
     @property
     def modes(self) -> npt.NDArray[np.uint8]:
@@ -147,43 +145,35 @@ def draw_overlay(
         BadInputError: the map has no such layer, or the pose is no rigid transform.
     """
     tolerance_m = np.float32(style.tolerance_m or TOLERANCE_VOXELS * snapshot.geometry.voxel_edge_m)
-    range_m = np.asarray(live.range_m, np.float32)
-    is_live = ~np.isnan(range_m)
-    between = np.where(is_live, range_m - tolerance_m, 0), np.where(is_live, range_m + tolerance_m, np.inf)
-    reach = {"range_max_m": style.range_max_m}
-    front = renderer.nearest(snapshot, live.sight, live.T_map_camera, between_m=between, **reach)
-    modes = np.where(is_live, np.uint8(Mode.VISIBLE), np.uint8(Mode.MAP_ONLY))
-    modes[~front.hit] = Mode.NOTHING
-    coarse_m = range_m[:: style.step_px, :: style.step_px]
-    behind = renderer.beyond(
-        snapshot,
-        live.sight.every(style.step_px),
-        live.T_map_camera,
-        between_m=(coarse_m + tolerance_m, np.full_like(coarse_m, style.range_max_m)),
-        **reach,
-    )
+    range_m, step = np.asarray(live.range_m, np.float32), style.step_px
+    around = range_m - tolerance_m, range_m + tolerance_m
+    front = renderer.nearest(snapshot, live.sight, live.T_map_camera, range_max_m=style.range_max_m, between_m=around)
+    coarse_m = range_m[::step, ::step]
+    rest = _rest(renderer, snapshot, live, coarse_m, tolerance_m, style)
+    rest_modes = np.where(np.isnan(coarse_m), np.uint8(Mode.MAP_ONLY), np.uint8(Mode.SEE_THROUGH))
+    rest_modes[~rest.hit] = Mode.NOTHING
+    H, W = range_m.shape
+    everywhere = rest_modes.repeat(step, axis=0).repeat(step, axis=1)[:H, :W]
+    modes = np.where(front.hit, np.uint8(Mode.VISIBLE), np.uint8(Mode.NOTHING))
+    modes[np.isnan(range_m) & (everywhere == Mode.MAP_ONLY)] = Mode.MAP_ONLY
     values = layer_values(renderer, snapshot, front, style.layer, ages)
-    values_behind = layer_values(renderer, snapshot, behind, style.layer, ages)
-    sigma_px = live.spread.at(front.range_m, pixel_rad=live.sight.pixel_rad)
-    why = _too_uncertain(sigma_px[modes != Mode.NOTHING], style)
+    values_of_rest = layer_values(renderer, snapshot, rest, style.layer, ages)
+    sigma_px, why = None, None
+    if live.spread != EXACT:
+        rest_m = rest.range_m.repeat(step, axis=0).repeat(step, axis=1)[:H, :W]
+        sigma_px = live.spread.at(np.where(front.hit, front.range_m, rest_m), pixel_rad=live.sight.pixel_rad)
+        why = _too_uncertain(sigma_px[front.hit | (everywhere != Mode.NOTHING)], style)
     if why is not None:
         picture = live.rgb.copy()
         write_text_into(picture, f"map withheld: {why}", (8, 8), WARNING)
     else:
-        covers = _covers(renderer, snapshot, behind, coarse_m, style, ages)
-        covers[_unknown(values_behind)] *= GREY_COVER
+        covers = _covers(renderer, snapshot, rest, coarse_m, style, ages)
+        covers[_unknown(values_of_rest)] *= GREY_COVER
         front_covers = np.where(_unknown(values), np.float32(GREY_COVER), np.float32(1))
-        ink = np.empty((*modes.shape, 4), np.uint8)
-        kernels.ink_into(
-            painted(values, style.colours),
-            modes,
-            front_covers,
-            painted(values_behind, style.colours),
-            covers,
-            style.step_px,
-            ink,
-        )
-        if live.spread != EXACT:
+        colours = painted(values, style.colours), painted(values_of_rest, style.colours)
+        ink = np.empty((H, W, 4), np.uint8)
+        kernels.ink_into(colours[0], front_covers, modes, colours[1], covers, rest_modes, step, ink)
+        if sigma_px is not None:
             ink = spread_ink(ink, sigma_px)
         picture = np.empty_like(live.rgb)
         blend_into(np.ascontiguousarray(live.rgb).reshape(-1, 3), ink.reshape(-1, 4), picture.reshape(-1, 3))
@@ -191,11 +181,40 @@ def draw_overlay(
         picture=picture,
         front=front,
         values=values,
+        rest=rest,
+        values_of_rest=values_of_rest,
         front_modes=modes,
-        behind=behind,
-        values_behind=values_behind,
-        step_px=style.step_px,
+        through=everywhere == Mode.SEE_THROUGH,
         withheld=why,
+    )
+
+
+def _rest(
+    renderer: MapRenderer,
+    snapshot: MapSnapshot,
+    live: Live,
+    coarse_m: Values,
+    tolerance_m: np.float32,
+    style: OverlayStyle,
+) -> Seen:
+    """What is beyond the live surface, and the nearest where there is none."""
+    sight, far = live.sight.every(style.step_px), np.full_like(coarse_m, style.range_max_m)
+    is_alone = np.isnan(coarse_m)
+    nowhere = np.float32(np.nan)
+    behind_m = coarse_m + tolerance_m
+    asked = {"range_max_m": style.range_max_m}
+    behind = renderer.beyond(
+        snapshot, sight, live.T_map_camera, between_m=(behind_m, np.minimum(far, behind_m + style.through_m)), **asked
+    )
+    alone = renderer.nearest(
+        snapshot, sight, live.T_map_camera, between_m=(np.where(is_alone, np.float32(0), nowhere), far), **asked
+    )
+    return Seen(
+        sight,
+        np.where(is_alone, alone.range_m, behind.range_m),
+        np.where(is_alone, alone.slots, behind.slots),
+        np.where(is_alone, alone.places, behind.places),
+        np.where(is_alone, alone.nodes, behind.nodes),
     )
 
 
@@ -208,15 +227,15 @@ def with_overlay_legend(picture: Rgb, scale: Scale) -> Rgb:
 
 
 def _covers(
-    renderer: MapRenderer, snapshot: MapSnapshot, behind: Seen, live_m: Values, style: OverlayStyle, ages: Ages | None
+    renderer: MapRenderer, snapshot: MapSnapshot, rest: Seen, live_m: Values, style: OverlayStyle, ages: Ages | None
 ) -> Values:
-    """(h, w) of what lies behind: less the farther behind it is, and the older."""
-    fade = (behind.range_m - live_m) / np.float32(style.fade_m)
+    """(h, w) of the rest: less the farther behind the live surface it is, and the older."""
+    fade = np.nan_to_num((rest.range_m - live_m) / np.float32(style.fade_m))
     if ages is not None:
-        age = (ages.now - renderer.changed(snapshot, behind, ages.changes)).astype(np.float32)
+        age = (ages.now - renderer.changed(snapshot, rest, ages.changes)).astype(np.float32)
         fade += np.nan_to_num(np.maximum(age, 0)) / np.float32(style.fade_s)
-    covers: Values = np.maximum(THROUGH_COVER * np.exp(-fade), THROUGH_COVER_MIN).astype(np.float32)
-    return np.where(behind.hit, covers, np.float32(0))
+    full = np.where(np.isnan(live_m), np.float32(1), np.float32(THROUGH_COVER))
+    return np.maximum(full * np.exp(-fade), np.float32(THROUGH_COVER_MIN))
 
 
 def _too_uncertain(sigma_px: Values, style: OverlayStyle) -> str | None:

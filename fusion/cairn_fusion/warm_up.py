@@ -10,7 +10,11 @@ from cairn_calib.rig import Rig, Spectrum, mounted
 from cairn_fusion.integrate import Integrator, Method, integrate_scan, integrate_scans
 from cairn_fusion.place_covariance import PlaceCovariance
 from cairn_fusion.scan import Scan
+from cairn_map.evidence_map import EvidenceMap
 from cairn_map.grid import Geometry
+from cairn_map.map_render import MapRenderer
+from cairn_map.map_snapshot import snapshot_of
+from cairn_map.sight import Sight
 
 
 def warm_up() -> None:
@@ -40,8 +44,16 @@ def warm_up() -> None:
 
 
 def _look(rig: Rig, scan: Scan) -> None:
-    """Fuse the scan, with a second thermal camera, into a picture; views need OpenCV, which maps do without."""
+    """Fuse the scan, with a second thermal camera, into a picture, and draw a map over it; OpenCV is needed for both."""
+    from cairn_fusion.overlay import Live, OverlayStyle, draw_overlay
     from cairn_fusion.view.telepresence import Telepresence, ViewOptions
 
     both = Rig(name="warm-up", cameras={**rig.cameras, "second": rig["thermal"]})
     Telepresence(both, ViewOptions()).view(replace(scan, thermal={**scan.thermal, "second": scan.thermal["thermal"]}))
+    live = Live(
+        rgb=scan.colour["colour"],
+        range_m=scan.range_m,
+        sight=Sight(rig["colour"].camera.rays()),
+        T_map_camera=np.eye(4),
+    )
+    draw_overlay(MapRenderer(), snapshot_of(EvidenceMap(Geometry())), live, OverlayStyle(step_px=1))

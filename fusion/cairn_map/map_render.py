@@ -9,6 +9,7 @@ Each pixel is that of its ray, so any lens will do, and the result is the same w
 nodes read is worked out once, when the first pixel asks, and kept until the cell changes.
 """
 
+import math
 from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -197,7 +198,7 @@ class MapRenderer:
                 skips,
                 T,
                 sight.rays[rows].reshape(-1, 3),
-                sight.pixel_rad,
+                math.sqrt(2) * sight.pixel_rad,  # the diagonal: a ball as wide holds the middle of a pixel
                 starts[rows].reshape(-1),
                 ends[rows].reshape(-1),
                 is_beyond,

@@ -9,6 +9,7 @@ Camera frame: x right, y down, z forward; the centre of the top-left pixel is (0
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -29,7 +30,7 @@ class Sight:
     rays: Floats
     """(H, W, 3) unit vectors, camera frame; NaN for pixels that look nowhere."""
     pixel_rad: float = field(init=False)
-    """The least angle between neighbouring pixels: what is smaller is smaller than any pixel."""
+    """The largest angle between neighbouring pixels; of an ideal camera, that in the middle."""
 
     def __post_init__(self) -> None:
         rays = np.ascontiguousarray(self.rays, dtype=np.float64)
@@ -43,11 +44,11 @@ class Sight:
         object.__setattr__(self, "rays", rays)
         gaps = [np.linalg.norm(rays[1:] - rays[:-1], axis=2), np.linalg.norm(rays[:, 1:] - rays[:, :-1], axis=2)]
         known = [gap[gap > 0] for gap in gaps]  # NaN is not
-        object.__setattr__(self, "pixel_rad", min((float(gap.min()) for gap in known if gap.size), default=1.0))
+        object.__setattr__(self, "pixel_rad", max((float(gap.max()) for gap in known if gap.size), default=1.0))
 
     def every(self, step: int) -> "Sight":
         """The camera with only each `step`-th row and column."""
-        return Sight(self.rays[::step, ::step])
+        return self if step == 1 else _every(self, step)
 
     @property
     def height(self) -> int:
@@ -58,6 +59,11 @@ class Sight:
     def width(self) -> int:
         """Columns."""
         return int(self.rays.shape[1])
+
+
+@lru_cache(maxsize=8)
+def _every(sight: Sight, step: int) -> Sight:
+    return Sight(sight.rays[::step, ::step])
 
 
 def pinhole(width: int, height: int, *, focal_px: float, centre_px: tuple[float, float] | None = None) -> Sight:

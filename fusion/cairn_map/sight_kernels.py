@@ -81,7 +81,7 @@ def see_into(
         skips: of `skips_into`.
         T_map_camera: (4, 4), metres; within the numbered space.
         rays: (N, 3), camera frame; NaN looks nowhere.
-        pixel_rad: angle between neighbouring rays.
+        pixel_rad: angle that a node must span to be met by some ray.
         starts: (N,) where each walk begins; NaN for nowhere.
         ends: (N,) where it ends; NaN for nowhere.
         is_beyond: walk through whatever is there until a free voxel is met, and only then look: for what lies beyond a
@@ -96,6 +96,8 @@ def see_into(
         start[axis] = np.rint(T_map_camera[axis, 3] * NANOMETRES) / grid.edge_nm
     for n in range(rays.shape[0]):
         ranges[n], slots[n], places[n], nodes[n] = np.nan, NONE, 0, 0
+        if not starts[n] <= ends[n]:  # NaN, too
+            continue
         for axis in range(3):
             direction[axis] = (
                 T_map_camera[axis, 0] * rays[n, 0]
@@ -113,6 +115,14 @@ def see_into(
 def begin_into(grid: Grid, start: Floats, direction: Floats, at: float, voxel: Ints) -> float:
     """Where in the box of all cells a walk from `at` on begins, and in which voxel; NaN if it does not."""
     enters, leaves = float(at), np.inf
+    inside = True
+    for axis in range(3):
+        reached = start[axis] + enters * direction[axis]
+        inside &= (reached >= grid.low[axis]) & (reached < grid.high[axis])
+        if inside:
+            voxel[axis] = int(np.floor(reached))
+    if inside:
+        return enters
     for axis in range(3):
         if direction[axis] == 0:
             if not grid.low[axis] <= start[axis] < grid.high[axis]:

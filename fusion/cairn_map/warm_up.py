@@ -25,8 +25,13 @@ from cairn_map.evidence_kernels import channel_above
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.fingerprint import fingerprint
 from cairn_map.grid import BRICK_DEPTH, Geometry, cell_key, voxels_in_cell
+from cairn_map.map_picture import layer_picture
+from cairn_map.map_render import MapRenderer
 from cairn_map.map_snapshot import snapshot_of
+from cairn_map.paint_kernels import blend_into
+from cairn_map.render_picture import SCALES, Layer
 from cairn_map.sensor_model import SensorModel
+from cairn_map.sight import look_at, pinhole
 from cairn_map.view_code import decode_view, encode_view
 
 
@@ -77,6 +82,10 @@ def _ask(evidence: Evidence, geometry: Geometry) -> None:
     snapshot.nearest_unknown(points, radius_m=1)
     snapshot.frontier()
     snapshot.height_map()
+    renderer, T = MapRenderer(), look_at((-1, 0.1, 0.1), (0, 0, 0))
+    seen = renderer.nearest(snapshot, pinhole(4, 4, focal_px=4), T, range_max_m=2)
+    layer_picture(renderer.temperature(snapshot, seen), seen, SCALES[Layer.TEMPERATURE])
+    blend_into(np.zeros((1, 3), np.uint8), np.zeros((1, 4), np.uint8), np.zeros((1, 3), np.uint8))
 
 
 def _many_voxels(geometry: Geometry) -> Evidence:

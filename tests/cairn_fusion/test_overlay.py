@@ -1,0 +1,290 @@
+"""The map over a live image: where it is, what hides it, how far it may be off, and that unknown is never cold.
+
+`OVERLAY_POSES=1000` looks from as many places (30 otherwise).
+"""
+
+import os
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+from tests import naive_sight
+from tests.cairn_map.worlds import map_of
+
+from cairn_calib.camera import Camera
+from cairn_calib.poses import inverse
+from cairn_calib.rig import Rig, Spectrum, mounted
+from cairn_fusion import overlay_kernels as kernels
+from cairn_fusion.live_range import live_range
+from cairn_fusion.overlay import Live, Mode, OverlayStyle, draw_overlay, with_overlay_legend
+from cairn_fusion.overlay_blur import PoseSpread, spread_ink
+from cairn_fusion.scan import Scan
+from cairn_map.channels import TEMPERATURE
+from cairn_map.errors import BadInputError
+from cairn_map.evidence import packed_evidence
+from cairn_map.grid import Geometry
+from cairn_map.map_picture import Ages
+from cairn_map.map_render import MapRenderer
+from cairn_map.map_snapshot import MapSnapshot, snapshot_of
+from cairn_map.render_picture import NO_VALUE, SCALES, Layer, palette
+from cairn_map.sight import Sight, look_at, pinhole
+
+POSES = int(os.environ.get("OVERLAY_POSES", "30"))
+EDGE_M = 0.05
+GRID = Geometry(voxel_edge_um=50_000, depth=5, channels=(TEMPERATURE,))
+DISTORTED = Camera(
+    width=160, height=120, focal_px=(130.0, 131.0), centre_px=(78.0, 61.0), distortion=(-0.25, 0.08, 0.002, -0.001, 0.0)
+)
+Floats = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+HOT_K = 330.0
+
+
+def snapshot_with(voxels: dict[tuple[int, int, int], tuple[int, int]], *, kelvin: float | None = None) -> MapSnapshot:
+    """A map of these voxels, the occupied ones with a temperature, or all without."""
+    whole = map_of(GRID, voxels)
+    if kelvin is None:
+        return snapshot_of(whole)
+    step = int(TEMPERATURE.quantise(np.array([kelvin]))[0])
+    for key, evidence in whole.packed().items():
+        warm = evidence.counts[:, 0] > 0
+        samples = np.where(warm[:, None], np.array([[step, step**2, 1]]), 0)
+        whole.replace(key, packed_evidence(evidence.voxels, evidence.counts, samples, GRID))
+    return snapshot_of(whole)
+
+
+def box(
+    low: tuple[int, int, int], high: tuple[int, int, int], counts: tuple[int, int] = (3, 0)
+) -> dict[tuple[int, int, int], tuple[int, int]]:
+    spans = [range(a, b) for a, b in zip(low, high, strict=True)]
+    return {(x, y, z): counts for x in spans[0] for y in spans[1] for z in spans[2]}
+
+
+def image_of(sight: Sight, grey: int = 100) -> npt.NDArray[np.uint8]:
+    return np.full((sight.height, sight.width, 3), grey, np.uint8)
+
+
+def no_depth(sight: Sight) -> npt.NDArray[np.float32]:
+    return np.full((sight.height, sight.width), np.nan, np.float32)
+
+
+def projection_of_cubes(lows: npt.NDArray[np.int64], camera: Camera, T_map_camera: Floats) -> Flags:
+    """(H, W) pixels whose centre lies in the outline of a cube's image: its edges cut small, projected, their hull."""
+    mask = np.zeros((camera.height, camera.width), np.bool_)
+    steps = np.linspace(0, 1, 9)
+    grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    on_edges = grid[((grid == 0) | (grid == 1)).sum(axis=1) >= 2]
+    T = inverse(T_map_camera)
+    for low in lows:
+        pixels = camera.project((low + on_edges) * EDGE_M @ T[:3, :3].T + T[:3, 3])
+        hull = cv2.convexHull(pixels.astype(np.float32)).reshape(-1, 2)
+        left, top = np.maximum(np.floor(hull.min(axis=0)).astype(int), 0)
+        right, bottom = np.minimum(np.ceil(hull.max(axis=0)).astype(int) + 1, [camera.width, camera.height])
+        x, y = np.meshgrid(np.arange(left, max(left, right)), np.arange(top, max(top, bottom)))
+        following = np.roll(hull, -1, axis=0)
+        sides = [(b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]) for a, b in zip(hull, following, strict=True)]
+        inside = (np.array(sides) >= 0).all(axis=0) | (np.array(sides) <= 0).all(axis=0)
+        mask[y, x] |= inside
+    return mask
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_drawn_covers_the_projection_of_its_cubes_through_a_lens(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    lows = np.unique(rng.integers(-6, 6, (40, 3)), axis=0)
+    snapshot = snapshot_with({tuple(low): (3, 0) for low in lows.tolist()})
+    eye = rng.normal(size=3)
+    T = look_at((eye / np.linalg.norm(eye) * 0.9).tolist(), rng.uniform(-0.1, 0.1, 3).tolist())
+    mask = MapRenderer().nearest(snapshot, Sight(DISTORTED.rays()), T, range_max_m=5).hit
+    expected = projection_of_cubes(lows, DISTORTED, T)
+    assert expected.sum() > 1000
+    assert (mask & expected).sum() / (mask | expected).sum() >= 0.98
+
+
+def test_what_is_hidden_is_never_drawn_as_visible() -> None:
+    """From random places, with things in the way that the map does not know, and things in the map that are gone."""
+    mapped = box((-12, -8, -8), (-11, 8, 8)) | box((-2, -2, -2), (2, 2, 2)) | box((6, -8, -8), (8, -2, 0))
+    gone = box((-6, 3, -3), (-4, 6, 3))
+    unknown = box((3, -1, -3), (5, 3, 3)) | box((-8, -8, -2), (-6, -4, 4))
+    snapshot, renderer = snapshot_with(mapped | gone, kelvin=HOT_K), MapRenderer()
+    in_map, there = np.array([*mapped, *gone]), np.array([*mapped, *unknown])
+    rng, sight, style = (
+        np.random.default_rng(11),
+        pinhole(12, 8, focal_px=10),
+        OverlayStyle(tolerance_m=0.06, step_px=1),
+    )
+    object.__setattr__(sight, "pixel_rad", 1e-4)  # voxels, no nodes
+    counted = np.zeros(4, np.int64)
+    for _ in range(POSES):
+        eye = rng.normal(size=3)
+        T = look_at((eye / np.linalg.norm(eye) * rng.uniform(0.9, 2)).tolist(), rng.uniform(-0.4, 0.4, 3).tolist())
+        origin = np.rint(T[:3, 3] * 1e9) / 50_000_000
+        rays = sight.rays.reshape(-1, 3) @ T[:3, :3].T
+        live = np.array([naive_sight.first_cut(origin, ray, there, 0, 400)[0] for ray in rays]) * EDGE_M
+        live_m = live.reshape(8, 12).astype(np.float32)
+        drawn = draw_overlay(
+            renderer, snapshot, Live(rgb=image_of(sight), range_m=live_m, sight=sight, T_map_camera=T), style
+        )
+        for ray, range_m, mode in zip(rays, live_m.ravel(), drawn.front_modes.ravel(), strict=True):
+            if np.isnan(range_m):
+                row = naive_sight.first_cut(origin, ray, in_map, 0, 400)[1]
+                assert mode == (Mode.MAP_ONLY if row >= 0 else Mode.NOTHING)
+                continue
+            start = max(float(np.float32(range_m - np.float32(0.06))), 0) / EDGE_M
+            end = float(np.float32(range_m + np.float32(0.06))) / EDGE_M
+            agrees = naive_sight.first_cut(origin, ray, in_map, start, end)[1] >= 0
+            assert mode == (Mode.VISIBLE if agrees else Mode.NOTHING)
+        counted += np.bincount(drawn.modes.ravel(), minlength=4)
+    assert counted[Mode.VISIBLE] > 5 * POSES
+    assert counted[Mode.NOTHING] > POSES
+    assert counted[Mode.MAP_ONLY] > 0
+
+
+def test_a_thing_behind_a_wall_shines_through_it_in_stripes() -> None:
+    wall, room = box((20, -16, -16), (22, 16, 16)), box((22, -16, -16), (40, 16, 16), (0, 3))
+    thing = box((32, -3, -3), (36, 3, 3))
+    snapshot, sight = snapshot_with(wall | room | thing, kelvin=HOT_K), pinhole(80, 60, focal_px=80)
+    T = look_at((0, 0, 0), (1, 0, 0))
+    live = Live(rgb=image_of(sight), range_m=(1 / sight.rays[..., 2]).astype(np.float32), sight=sight, T_map_camera=T)
+    drawn = draw_overlay(MapRenderer(), snapshot, live, OverlayStyle())
+    assert (drawn.front_modes == Mode.VISIBLE).mean() > 0.9
+    middle, edge = (30, 40), (5, 5)
+    assert drawn.through[middle]
+    assert not drawn.through[edge]
+    assert drawn.rest.depth_m[10, 13] == pytest.approx(1.6, abs=0.01)
+    stripes = np.add.outer(np.arange(26, 34), np.arange(36, 44)) % kernels.STRIPES_PX < kernels.STRIPE_PX
+    part = drawn.picture[26:34, 36:44].astype(int)
+    assert (part[stripes] == part[stripes][0]).all()
+    assert (part[~stripes] == part[~stripes][0]).all()
+    assert (part[stripes][0] != part[~stripes][0]).any()
+    # Fainter when it is old, and not at all where nothing is known of its age.
+    key_of = {key: np.full(8**3, 0.0) for key in snapshot.frozen.keys}
+    old = draw_overlay(MapRenderer(), snapshot, live, OverlayStyle(), Ages(key_of, now=7200.0))
+    fresh = draw_overlay(MapRenderer(), snapshot, live, OverlayStyle(), Ages({}, now=7200.0))
+    hot = palette(Layer.TEMPERATURE)[-1].astype(int)
+    off = [int(np.abs(d.picture[26:34, 36:44][stripes][0] - hot).sum()) for d in (drawn, fresh, old)]
+    assert off[0] == off[1] < off[2]
+
+
+@pytest.mark.parametrize("kelvin", [None, HOT_K, 200.0])
+def test_no_temperature_is_grey_and_never_cold(kelvin: float | None) -> None:
+    snapshot, sight = snapshot_with(box((20, -16, -16), (22, 16, 16)), kelvin=kelvin), pinhole(40, 30, focal_px=60)
+    T, live_m = look_at((0, 0, 0), (1, 0, 0)), (1 / pinhole(40, 30, focal_px=60).rays[..., 2]).astype(np.float32)
+    live = Live(rgb=image_of(sight, NO_VALUE[0]), range_m=live_m, sight=sight, T_map_camera=T)
+    picture = draw_overlay(MapRenderer(), snapshot, live, OverlayStyle()).picture.astype(int)
+    ends = palette(Layer.TEMPERATURE).astype(int)
+    mixed = {None: np.array(NO_VALUE), HOT_K: ends[-1], 200.0: ends[0]}[kelvin]
+    expected = mixed if kelvin is None else mixed * kernels.VISIBLE_COVER + NO_VALUE[0] * (1 - kernels.VISIBLE_COVER)
+    assert np.abs(picture - expected).max() <= 1.5
+    assert with_overlay_legend(picture.astype(np.uint8), SCALES[Layer.TEMPERATURE]).shape[0] > 30
+
+
+@pytest.mark.parametrize(("turn_rad", "step_m"), [(np.radians(1), 0.0), (0.0, 0.02), (np.radians(1), 0.02)])
+def test_an_error_of_the_pose_moves_the_overlay_as_far_as_predicted(turn_rad: float, step_m: float) -> None:
+    depth_m, focal_px = 2.0, 500.0
+    plate = box((40, -3, -3), (41, 3, 3))
+    snapshot, sight, renderer = snapshot_with(plate), pinhole(320, 240, focal_px=focal_px), MapRenderer()
+    T = look_at((0, 0, 0), (1, 0, 0))
+    turned = np.eye(4)
+    turned[:3, :3] = cv2.Rodrigues(np.array([0, turn_rad, 0]))[0]
+    turned[0, 3] = step_m
+
+    def centre(pose: Floats) -> Floats:
+        y, x = np.nonzero(renderer.nearest(snapshot, sight, pose, range_max_m=5).hit)
+        return np.array([x.mean(), y.mean()])
+
+    moved = centre(T) - centre(T @ turned)
+    expected_px = focal_px * (np.tan(turn_rad) + step_m / depth_m)
+    assert moved[0] == pytest.approx(expected_px, abs=0.5)
+    assert moved[1] == pytest.approx(0, abs=0.3)
+    spread = PoseSpread(step_m, turn_rad).at(np.full((1, 1), depth_m, np.float32), pixel_rad=sight.pixel_rad)[0, 0]
+    assert spread == pytest.approx(np.hypot(focal_px * turn_rad, focal_px * step_m / depth_m), rel=0.001)
+
+
+@pytest.mark.parametrize("sigma_px", [1.0, 2.0, 4.0, 8.0])
+def test_ink_is_spread_by_the_standard_deviation_of_its_place(sigma_px: float) -> None:
+    ink = np.zeros((121, 121, 4), np.uint8)
+    ink[50:71, 50:71] = [200, 100, 50, 250]
+    spread = spread_ink(ink, np.full((121, 121), sigma_px, np.float32)).astype(float)
+    assert spread.sum() == pytest.approx(ink.sum(), rel=0.02)
+    y, _ = np.mgrid[:121, :121] - 60.0
+    of = [float((part[..., 3] * y**2).sum() / part[..., 3].sum()) for part in (spread, ink.astype(float))]
+    assert of[0] - of[1] == pytest.approx(sigma_px**2, rel=0.1)
+    sharp = spread_ink(ink, np.full((121, 121), 0.1, np.float32))
+    assert np.array_equal(sharp, ink)
+
+
+def test_a_pose_that_is_too_uncertain_withholds_the_map_and_says_why() -> None:
+    snapshot, sight = snapshot_with(box((20, -16, -16), (22, 16, 16)), kelvin=HOT_K), pinhole(320, 40, focal_px=200)
+    shown = {
+        "range_m": (1 / sight.rays[..., 2]).astype(np.float32),
+        "sight": sight,
+        "T_map_camera": look_at((0, 0, 0), (1, 0, 0)),
+    }
+    for spread, is_drawn in (
+        (PoseSpread(0.02, 0.01), True),
+        (PoseSpread(0.5, 0.0), False),
+        (PoseSpread(0, 0.1), False),
+    ):
+        live = Live(rgb=image_of(sight), spread=spread, **shown)  # type: ignore[arg-type]
+        drawn = draw_overlay(MapRenderer(), snapshot, live, OverlayStyle())
+        assert (drawn.withheld is None) == is_drawn
+        assert (drawn.picture[30, 160] != 100).any() == is_drawn
+        assert is_drawn or "uncertain" in str(drawn.withheld)
+    with pytest.raises(BadInputError):
+        PoseSpread(-1.0, 0.0)
+
+
+def test_the_other_cameras_depth_is_that_of_the_surface() -> None:
+    """A plane before a rig whose colour camera is finer and stands aside."""
+    tof = Camera(width=88, height=72, focal_px=(90.0, 90.0), centre_px=(43.5, 35.5))
+    T = np.eye(4)
+    T[0, 3] = 0.08
+    rig = Rig(
+        name="two",
+        cameras={
+            "tof": mounted(Spectrum.RANGE, tof, np.eye(4)),
+            "colour": mounted(Spectrum.COLOUR, DISTORTED, T),
+        },
+    )
+    wall_m = 2.0
+    range_m = (wall_m / tof.rays()[..., 2]).astype(np.float32)
+    range_m[:20, :30] = np.nan
+    scan = Scan(time_s=0.0, T_map_rig=np.eye(4), range_camera="tof", range_m=range_m)
+    found, true = live_range(scan, rig, camera="colour"), wall_m / DISTORTED.rays()[..., 2]
+    known = ~np.isnan(found)
+    assert 0.5 < known.mean() < 0.95
+    assert np.abs(found - true)[known].max() < 0.05
+    assert np.isnan(found[10, 20])
+    assert live_range(scan, rig, camera="tof") is not None
+
+
+def test_ink_is_what_the_modes_say() -> None:
+    rng = np.random.default_rng(3)
+    front, rest = (rng.integers(0, 256, (*size, 3)).astype(np.uint8) for size in ((12, 17), (6, 9)))
+    modes = rng.choice([Mode.NOTHING, Mode.VISIBLE, Mode.MAP_ONLY], (12, 17)).astype(np.uint8)
+    rest_modes = rng.choice([Mode.NOTHING, Mode.SEE_THROUGH, Mode.MAP_ONLY], (6, 9)).astype(np.uint8)
+    covers, rest_covers = (rng.random(size).astype(np.float32) for size in ((12, 17), (6, 9)))
+    ink = np.empty((12, 17, 4), np.uint8)
+    kernels.ink_into(front, covers, modes, rest, rest_covers, rest_modes, 2, ink)
+    for y in range(12):
+        for x in range(17):
+            is_dot = x % kernels.DOTS_PX < kernels.DOT_PX and y % kernels.DOTS_PX < kernels.DOT_PX
+            there = y // 2, x // 2
+            cover, colour = 0.0, front[y, x]
+            if rest_modes[there] == Mode.SEE_THROUGH and (x + y) % kernels.STRIPES_PX < kernels.STRIPE_PX:
+                cover, colour = rest_covers[there], rest[there]
+            elif modes[y, x] == Mode.MAP_ONLY:
+                cover, colour = rest_covers[there], rest[there]
+                cover *= kernels.DOT_COVER if is_dot else kernels.BETWEEN_COVER
+            elif modes[y, x] == Mode.VISIBLE:
+                cover = covers[y, x] * kernels.VISIBLE_COVER
+            assert np.abs(ink[y, x] - np.array([*(colour * cover), 255 * cover])).max() <= 0.51
+
+
+def test_images_of_another_size_are_refused() -> None:
+    sight = pinhole(40, 30, focal_px=60)
+    with pytest.raises(BadInputError) as caught:
+        Live(rgb=image_of(sight)[1:], range_m=no_depth(sight), sight=sight, T_map_camera=np.eye(4))
+    assert caught.value.kind == "image_size"
