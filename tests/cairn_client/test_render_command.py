@@ -1,0 +1,149 @@
+"""A robot without a thermal camera sees the temperatures that another one measured: through a server, by any door."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tests.cairn_client.conftest import LiveServer
+
+from cairn_client.api import MapApi
+from cairn_client.map_command import main
+from cairn_client.robot import Robot
+from cairn_fusion.live_range import live_range
+from cairn_fusion.overlay import Live, Mode, OverlayStyle, draw_overlay
+from cairn_map.errors import BadInputError
+from cairn_map.grid import geometry_for
+from cairn_map.map_render import MapRenderer
+from cairn_map.messages import CreateMap
+from cairn_map.render_picture import ZERO_CELSIUS_K
+from cairn_map.sight import Sight
+from cairn_sim.record import Plan, scans_of, shots_of
+from cairn_sim.robots import ROBOTS
+from cairn_sim.scene_file import load_scene
+from cairn_sim.sim_command import main as sim
+
+SCANS = 12
+CAMERA = "colour"
+
+
+@dataclass(frozen=True)
+class World:
+    """A server with what a robot with thermal cameras saw, and another robot's state and recording."""
+
+    url: str
+    state: Path
+    recording: Path
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    folder = tmp_path_factory.mktemp("telepresence")
+    server = LiveServer(folder / "server")
+    try:
+        url = f"{server.url}/maps/room"
+        with MapApi(server.url) as api:
+            api.create_map("room", CreateMap(geometry=geometry_for(voxel_edge_m=0.08)))
+        plan = Plan(scene=load_scene("small-room"), robot=ROBOTS["orpheus"], path="west", scale=0.1, truth="none")
+        rig = plan.robot.rig_of(plan.scale)
+        with Robot(rig, url, directory=folder / "orpheus", name="orpheus") as robot:
+            for _, scan, _ in scans_of(plan, shots_of(plan)[1 : 3 * SCANS : 3], rig):
+                robot.observe(scan)
+            robot.commit()
+            robot.sync()
+        words = ("record", "small-room", str(folder / "hand"), "--robot", "handheld", "--path", "west")
+        assert sim([*words, "--scale", "0.2", "--truth", "none", "--stops", "0:1"]) == 0
+        yield World(url, folder / "hand-state", folder / "hand")
+    finally:
+        server.stop()
+
+
+def test_a_robot_without_a_thermal_camera_shows_what_another_measured(world: World) -> None:
+    plan = Plan(scene=load_scene("small-room"), robot=ROBOTS["handheld"], path="west", scale=0.2, truth="none")
+    rig = plan.robot.rig_of(plan.scale)
+    assert not [name for name in rig.cameras if "thermal" in name]
+    (_, scan, _), *_ = scans_of(plan, shots_of(plan)[:1], rig)
+    with Robot(rig, world.url, directory=world.state, name="hand", stay=True) as robot:
+        robot.sync()
+        snapshot = robot.snapshot()
+    live = Live(
+        rgb=scan.colour[CAMERA],
+        range_m=live_range(scan, rig, camera=CAMERA),
+        sight=Sight(rig[CAMERA].camera.rays()),
+        T_map_camera=scan.T_map_rig @ rig[CAMERA].transform,
+    )
+    drawn = draw_overlay(MapRenderer(), snapshot, live, OverlayStyle())
+    visible = drawn.front_modes == Mode.VISIBLE
+    celsius = drawn.values[visible]
+    assert visible.mean() > 0.3
+    assert np.isfinite(celsius).mean() > 0.5
+    assert 10 < np.nanmedian(celsius) < 40
+    assert (drawn.picture != live.rgb)[visible].any()
+
+
+def rendered(path: Path) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+    image = cv2.imread(str(path))
+    assert image is not None
+    return np.asarray(image, np.uint8)
+
+
+def test_the_command_draws_the_same_from_a_server_and_from_a_folder(
+    world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cells, view = tmp_path / "cells", ["--from", "0.5,0.5,1.2", "--to", "3,2,0.5", "--size", "80x60"]
+    assert main(["export", world.url, "--cells", str(cells)]) == 0
+    for name, source in (("server", world.url), ("folder", str(cells))):
+        words = ["-o", str(tmp_path / f"{name}.png"), "--npz", str(tmp_path / f"{name}.npz")]
+        assert main(["render", source, *view, *words]) == 0
+    assert "on the map" in capsys.readouterr().out
+    assert np.array_equal(rendered(tmp_path / "server.png"), rendered(tmp_path / "folder.png"))
+    told = [dict(np.load(tmp_path / f"{name}.npz")) for name in ("server", "folder")]
+    assert told[0].keys() == told[1].keys() == {"range_m", "depth_m", "temperature_k"}
+    for name, values in told[0].items():
+        assert np.array_equal(values, told[1][name], equal_nan=True)
+    assert 280 < np.nanmedian(told[0]["temperature_k"]) < ZERO_CELSIUS_K + 60
+
+
+def test_the_command_draws_over_a_recorded_image(
+    world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cells, picture = tmp_path / "cells", tmp_path / "overlay.png"
+    main(["export", world.url, "--cells", str(cells)])
+    capsys.readouterr()
+    words = ["render", str(cells), "--over", str(world.recording), "-o", str(picture)]
+    assert main([*words, "--npz", str(tmp_path / "overlay.npz")]) == 0
+    out = capsys.readouterr().out
+    assert "temperature over colour, scan 0: visible" in out
+    told = np.load(tmp_path / "overlay.npz")
+    assert (told["modes"] == Mode.VISIBLE).mean() > 0.3
+    assert rendered(picture).shape[0] > told["modes"].shape[0]
+    assert main([*words, "--sigma", "2,20"]) == 0
+    assert "withheld, the pose is uncertain" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--from", "0,0,1", "--to", "1,0,1"], "say what to write"),
+        (["-o", "x.png"], "from where to look"),
+        (["-o", "x.png", "--from", "0,0,1", "--to", "0,0,1"], "two places"),
+        (["-o", "x.png", "--from", "0,0,1", "--to", "1,0,1", "--range", "1000"], "range_m"),
+        (["-o", "x.png", "--from", "0,0,1", "--to", "1,0,1", "--low", "60"], "scale"),
+        (["-o", "x.png", "--over", "recording"], "cairn map export"),
+    ],
+)
+def test_what_is_missing_is_said(world: World, words: list[str], told: str) -> None:
+    with pytest.raises(BadInputError, match=told):
+        main(["render", world.url, *words])
+
+
+def test_scans_and_cameras_that_are_not_there_are_said(world: World, tmp_path: Path) -> None:
+    cells = tmp_path / "cells"
+    main(["export", world.url, "--cells", str(cells)])
+    words = ["render", str(cells), "--over", str(world.recording), "-o", str(tmp_path / "x.png")]
+    for more, kind in ((["--scan", "99"], "no_scan"), (["--camera", "depth"], "unknown_camera")):
+        with pytest.raises(BadInputError) as caught:
+            main([*words, *more])
+        assert caught.value.kind == kind

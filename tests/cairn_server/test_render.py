@@ -1,0 +1,182 @@
+"""`GET .../main/render`: the same picture as at home, made anew when the map changes, bounded, and honest."""
+
+import io
+import threading
+from typing import Any
+
+import cv2
+import httpx
+import numpy as np
+import numpy.typing as npt
+import pytest
+from tests.cairn_map.made import PLAIN, SMALL
+from tests.cairn_server.live import Live
+from tests.cairn_server.pushes import pushed
+from tests.cairn_server.test_broken_cell import new_map as broken_map
+from tests.cairn_server.test_push import kind_of
+
+from cairn_map.cell_code import decode_cell
+from cairn_map.evidence_map import EvidenceMap
+from cairn_map.grid import CellKey
+from cairn_map.map_picture import layer_picture, layer_values
+from cairn_map.map_render import MapRenderer
+from cairn_map.map_snapshot import snapshot_of
+from cairn_map.render_picture import LEGEND_PX, Layer
+from cairn_map.render_request import RenderRequest, request_from
+from cairn_server import map_views
+from cairn_server.store_rows import MapRow
+
+LOOK = request_from((1.4, 1.3, 1.2), (0.1, 0.2, 0.3), width=64, height=48, focal_px=40.0, range_m=6.0)
+
+
+def mapped(live: Live, *numbers: int) -> MapRow:
+    row = live.new_map()
+    for number in numbers:
+        assert live.push(row, pushed(number, number)).status_code == 201
+    live.folded(row)
+    return row
+
+
+def ask(live: Live, row: MapRow, request: RenderRequest = LOOK, *, etag: str | None = None) -> httpx.Response:
+    headers = {"If-None-Match": etag} if etag else {}
+    query = request.model_dump(mode="json", exclude_none=True)
+    return live.http.get(f"/maps/{row.name}/main/render", params=query, headers=headers)
+
+
+def asking(request: RenderRequest = LOOK, **change: Any) -> RenderRequest:
+    return request.model_copy(update=change)
+
+
+def map_of(live: Live, row: MapRow) -> EvidenceMap:
+    whole = EvidenceMap(row.geometry)
+    for key, body in live.cells(row).items():
+        whole.replace(CellKey(key), decode_cell(body).evidence)
+    return whole
+
+
+def arrays(answer: httpx.Response) -> dict[str, npt.NDArray[Any]]:
+    assert answer.status_code == 200, answer.text
+    with np.load(io.BytesIO(answer.content)) as found:
+        return dict(found)
+
+
+@pytest.mark.parametrize("layer", [layer for layer in Layer if layer is not Layer.AGE])
+def test_a_picture_is_what_the_same_map_shows_at_home(live: Live, layer: Layer) -> None:
+    row, request = mapped(live, 0, 1), asking(layer=layer)
+    answer = ask(live, row, request)
+    assert (answer.status_code, answer.headers["Content-Type"]) == (200, "image/png")
+    found = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR)
+    assert found is not None
+    snapshot, renderer = snapshot_of(map_of(live, row), row.sensor_model), MapRenderer()
+    seen = renderer.nearest(snapshot, request.sight, request.T_map_camera, range_max_m=request.range_m)
+    assert 0.005 < seen.hit.mean() < 0.9
+    values = layer_values(renderer, snapshot, seen, layer)
+    assert np.array_equal(found[..., ::-1], layer_picture(values, seen, request.scale))
+    assert found.shape == (48 + LEGEND_PX, 64, 3)
+    told = arrays(ask(live, row, asking(request, format="npz")))
+    assert np.array_equal(told["range_m"], seen.range_m, equal_nan=True)
+    names = {Layer.TEMPERATURE: {"temperature_k"}, Layer.DEPTH: set()}.get(layer, {str(layer)})
+    assert told.keys() == {"range_m", "depth_m"} | names
+
+
+def test_the_etag_is_of_the_map_and_of_the_question(live: Live) -> None:
+    row = mapped(live, 0)
+    first = ask(live, row)
+    again = ask(live, row, etag=first.headers["ETag"])
+    assert (again.status_code, again.content) == (304, b"")
+    assert again.headers["ETag"] == first.headers["ETag"]
+    assert ask(live, row).content == first.content
+    other = ask(live, row, asking(low=0.0), etag=first.headers["ETag"])
+    assert other.status_code == 200
+    live.push(row, pushed(1, 1))
+    live.folded(row)
+    changed = ask(live, row, etag=first.headers["ETag"])
+    assert changed.status_code == 200
+    assert changed.headers["Cairn-Cursor"] != first.headers["Cairn-Cursor"]
+    live.retract(row, pushed(1, 1)).raise_for_status()
+    live.folded(row)
+    assert ask(live, row).content == first.content
+
+
+def test_ages_are_counted_from_the_newest_measurement(live: Live) -> None:
+    """Commit n was captured until 1.5e9 + n: what only commit 0 saw is as old as the newest one is younger."""
+    row = mapped(live, 0, 9)
+    told = arrays(ask(live, row, asking(layer=Layer.AGE, format="npz")))
+    seen = ~np.isnan(told["range_m"])
+    assert set(np.unique(told["age_s"][seen])) <= {0.0, 9.0}
+    assert np.isnan(told["age_s"][~seen]).all()
+    alone = arrays(ask(live, mapped(live, 9), asking(layer=Layer.AGE, format="npz")))
+    assert set(np.unique(alone["age_s"][~np.isnan(alone["age_s"])])) == {0.0}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"width": 1281, "height": 960},
+        {"width": 5000},
+        {"range_m": 51},
+        {"range_m": "inf"},
+        {"qw": 0.5},
+        {"x": "nan"},
+        {"low": 50, "high": 10},
+        {"layer": "smell"},
+        {"focal_px": 0},
+        {"format": "gif"},
+        {"more": 1},
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(live: Live, change: dict[str, Any]) -> None:
+    row = mapped(live, 0)
+    query = LOOK.model_dump(mode="json", exclude_none=True) | change
+    answer = live.http.get(f"/maps/{row.name}/main/render", params=query)
+    assert (answer.status_code, kind_of(answer)) == (422, "bad_message")
+
+
+def test_a_map_without_temperatures_says_so_and_still_shows_its_depth(live: Live) -> None:
+    row = live.new_map(PLAIN)
+    live.push(row, pushed(0, 0, geometry=PLAIN))
+    live.folded(row)
+    refused = ask(live, row)
+    assert (refused.status_code, kind_of(refused)) == (400, "unknown_channel")
+    assert ask(live, row, asking(layer=Layer.DEPTH)).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("limit", "value", "expected"),
+    [
+        ("CELLS_IN_VIEW_MAX", 1, (413, "too_large")),
+        ("VOXELS_READ_MAX", 1, (413, "too_large")),
+        ("RENDER_S", -1.0, (400, "too_costly")),
+    ],
+)
+def test_a_picture_that_takes_too_much_is_refused(
+    live: Live, monkeypatch: pytest.MonkeyPatch, limit: str, value: float, expected: tuple[int, str]
+) -> None:
+    row = mapped(live, 0, 1)
+    monkeypatch.setattr(map_views, limit, value)
+    answer = ask(live, row)
+    assert (answer.status_code, kind_of(answer)) == expected
+
+
+def test_only_so_many_are_made_at_once(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    row, views = mapped(live, 0), live.service.views
+    monkeypatch.setattr(map_views, "WAIT_S", 0.01)
+    monkeypatch.setattr(views, "_room", threading.BoundedSemaphore(1))
+    with views._turn():
+        answer = ask(live, row)
+        assert (answer.status_code, kind_of(answer)) == (503, "busy")
+        assert answer.headers["Retry-After"]
+    assert ask(live, row).status_code == 200
+
+
+def test_a_damaged_cell_is_no_empty_place(live: Live) -> None:
+    healed = broken_map(live, keep_diffs=True)
+    assert ask(live, healed).content == ask(live, mapped(live, 0)).content
+    broken = broken_map(live, keep_diffs=False)
+    answer = ask(live, broken)
+    assert (answer.status_code, kind_of(answer)) == (500, "damaged_store")
+
+
+def test_an_empty_map_is_drawn_as_nothing(live: Live) -> None:
+    told = arrays(ask(live, live.new_map(SMALL), asking(format="npz")))
+    assert np.isnan(told["range_m"]).all()
