@@ -44,7 +44,7 @@ def warm_up() -> None:
 
 
 def _look(rig: Rig, scan: Scan) -> None:
-    """Fuse the scan, with a second thermal camera, into a picture, and draw a map over it; OpenCV is needed for both."""
+    """Fuse the scan, with a second thermal camera, into a picture, and draw a map over it: both need OpenCV."""
     from cairn_fusion.overlay import Live, OverlayStyle, draw_overlay
     from cairn_fusion.view.telepresence import Telepresence, ViewOptions
 

@@ -26,6 +26,7 @@ from tests.bench.coding import coding_rows
 from tests.bench.imports import import_rows
 from tests.bench.integration import integration_rows
 from tests.bench.links import link_rows
+from tests.bench.overlay import overlay_rows
 from tests.bench.peers import peer_rows
 from tests.bench.queries import query_rows
 from tests.bench.server import server_rows
@@ -234,6 +235,7 @@ PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "imports": import_rows,
     "integration": integration_rows,
     "links": link_rows,
+    "overlay": overlay_rows,
     "peers": peer_rows,
     "queries": query_rows,
     "server": server_rows,

@@ -1,0 +1,171 @@
+"""How fast the map is drawn: over a live image, at 4 and 2 cm, and by a server, with cold cells and with warm ones.
+
+The map is the whole building's, 56 cells at 4 cm, which takes some 8 minutes to make; where CAIRN_OVERLAY_MAPS names a
+folder with `orpheus-4cm` and `orpheus-2cm` in it, as `cairn map export --cells` writes them, these are drawn instead.
+With --smoke it is one stop at 8 cm. Frames are those of a robot without a thermal camera, 640 x 480. A view is cold
+where the server, which has drawn others, has none of its cells in memory.
+"""
+
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import httpx
+import numpy as np
+import numpy.typing as npt
+from tests.cairn_server.live import Process
+
+from cairn_calib.rig import Rig
+from cairn_client.api import MapApi
+from cairn_client.map_folder import snapshot_of_folder
+from cairn_client.prior_data import push_prior_data
+from cairn_fusion.live_range import live_range
+from cairn_fusion.overlay import Live, OverlayStyle, draw_overlay
+from cairn_fusion.scan import Scan
+from cairn_map.cell_code import encode_cell
+from cairn_map.cell_folder import FolderHead, write_cell, write_head
+from cairn_map.grid import cell_of_key, geometry_for
+from cairn_map.map_render import MapRenderer
+from cairn_map.map_snapshot import MapSnapshot
+from cairn_map.render_request import RenderRequest, request_from
+from cairn_map.sensor_model import SensorModel
+from cairn_map.sight import Sight
+from cairn_sim.experiment_mapping import GrowingMap, map_all
+from cairn_sim.experiment_robots import simulated_robots
+from cairn_sim.record import Plan, scans_of, shots_of
+from cairn_sim.robots import ROBOTS
+from cairn_sim.scene_file import load_scene
+
+Row = tuple[str, str, str]
+THREADS = 2
+CAMERA = "colour"
+SCALE = 1.0
+"""Of the handheld robot's colour camera: 640 x 480."""
+FOLDED_S = 120.0
+
+
+def overlay_rows(smoke: bool) -> Iterator[Row]:
+    """One line each."""
+    rig, scans = _frames(2 if smoke else 6)
+    with tempfile.TemporaryDirectory() as name:
+        for cm, least in ((8, ""),) if smoke else ((4, "25"), (2, "10")):
+            folder = _map_folder(Path(name), cm, stops=1 if smoke else None)
+            snapshot = snapshot_of_folder(folder)
+            yield (
+                f"overlay of {len(snapshot.frozen.keys)} cells, {cm} cm",
+                f"{len(snapshot.frozen.grid.words)}",
+                "bricks",
+            )
+            yield from _overlay_rows(snapshot, rig, scans, least, repeats=2 if smoke else 5)
+            if cm != 2:
+                yield from _server_rows(folder, rig, scans)
+
+
+def _frames(count: int) -> tuple[Rig, list[Scan]]:
+    """What a robot without a thermal camera sees at stops of the first path."""
+    robot = ROBOTS["handheld"]
+    plan = Plan(scene=load_scene("building"), robot=robot, path="labs", scale=SCALE, truth="none")
+    rig, shots = robot.rig_of(plan.scale), shots_of(plan)
+    chosen = shots[:: max(1, len(shots) // count)][:count]
+    return rig, [scan for _, scan, _ in scans_of(plan, chosen, rig)]
+
+
+def _map_folder(inside: Path, cm: int, *, stops: int | None) -> Path:
+    """The building's map as a folder of cells."""
+    made = os.environ.get("CAIRN_OVERLAY_MAPS")
+    if made and (Path(made) / f"orpheus-{cm}cm").is_dir():
+        return Path(made) / f"orpheus-{cm}cm"
+    robots = simulated_robots(
+        load_scene("building"), ROBOTS["orpheus"], scale=0.25, seed=0, stops=stops, threads=THREADS
+    )
+    growing = GrowingMap(geometry_for(voxel_edge_m=cm / 100))
+    for _ in map_all(robots, [growing], threads=THREADS):
+        pass
+    folder = inside / f"{cm}cm"
+    write_head(folder, FolderHead(geometry=growing.geometry, sensor_model=SensorModel()))
+    for key, evidence in growing.map.packed().items():
+        write_cell(folder, cell_of_key(key), encode_cell(key, evidence, growing.geometry).data)
+    return folder
+
+
+def _overlay_rows(snapshot: MapSnapshot, rig: Rig, scans: Sequence[Scan], least: str, *, repeats: int) -> Iterator[Row]:
+    renderer, style = MapRenderer(threads=THREADS), OverlayStyle()
+    sight = Sight(rig[CAMERA].camera.rays())
+    lives = [
+        Live(
+            rgb=scan.colour[CAMERA],
+            range_m=live_range(scan, rig, camera=CAMERA),
+            sight=sight,
+            T_map_camera=scan.T_map_rig @ rig[CAMERA].transform,
+        )
+        for scan in scans
+    ]
+    for live in lives:
+        draw_overlay(renderer, snapshot, live, style)
+    start_s = time.perf_counter()
+    for _ in range(repeats):
+        for live in lives:
+            draw_overlay(renderer, snapshot, live, style)
+    seconds = (time.perf_counter() - start_s) / (repeats * len(lives))
+    size, goal = f"{sight.width} x {sight.height}", f"; at least {least} are asked for" if least else ""
+    yield f"  over a live image, {size}", f"{1 / seconds:.1f}", f"frames/s, {THREADS} threads{goal}"
+    start_s = time.perf_counter()
+    for live in lives:
+        renderer.nearest(snapshot, sight, live.T_map_camera, range_max_m=20)
+    seconds = (time.perf_counter() - start_s) / len(lives)
+    yield "  the nearest of each pixel alone", f"{1e3 * seconds:.0f}", "ms"
+
+
+def _server_rows(folder: Path, rig: Rig, scans: Sequence[Scan]) -> Iterator[Row]:
+    """Views from where the frames were taken, along the path: each has cells that the ones before had not."""
+    with tempfile.TemporaryDirectory() as data:
+        server = Process(Path(data))
+        try:
+            assert server.url
+            api = MapApi(server.url)
+            push_prior_data(api, "lab", str(folder))
+            _wait_until_folded(api)
+            views = [_view(scan.T_map_rig @ rig[CAMERA].transform) for scan in scans]
+            cold_s, warm_s = [], []
+            with httpx.Client(base_url=server.url, timeout=60) as http:
+                for view in views:
+                    cold_s.append(_ask_s(http, view))
+                    warm_s += [_ask_s(http, view) for _ in range(3)]
+            some = cold_s[1:] or cold_s  # with the first the kernels are loaded
+            yield (
+                "  a server's view, cold cells",
+                f"{1e3 * statistics.median(some):.0f}",
+                f"ms, at most {1e3 * max(some):.0f}; below 1000 is asked for",
+            )
+            yield (
+                "  a server's view, warm",
+                f"{1e3 * statistics.median(warm_s):.0f}",
+                f"ms, at most {1e3 * max(warm_s):.0f}; below 200 is asked for",
+            )
+        finally:
+            server.end()
+
+
+def _view(T_map_camera: npt.NDArray[np.float64]) -> RenderRequest:
+    x, y, z = T_map_camera[:3, 3].tolist()
+    ahead = (T_map_camera[:3, 3] + T_map_camera[:3, 2]).tolist()
+    return request_from((x, y, z), (ahead[0], ahead[1], ahead[2]))
+
+
+def _ask_s(http: httpx.Client, view: RenderRequest) -> float:
+    start_s = time.perf_counter()
+    http.get("/maps/lab/main/render", params=view.model_dump(mode="json", exclude_none=True)).raise_for_status()
+    return time.perf_counter() - start_s
+
+
+def _wait_until_folded(api: MapApi) -> None:
+    until_s = time.monotonic() + FOLDED_S
+    while api.map_info("lab").cells == 0 and time.monotonic() < until_s:
+        time.sleep(0.2)
+    sizes = [0]
+    while sizes[-1] != (size := api.map_info("lab").size_bytes) and time.monotonic() < until_s:
+        sizes.append(size)
+        time.sleep(1.0)
