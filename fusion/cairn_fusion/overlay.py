@@ -235,7 +235,7 @@ def _covers(
         age = (ages.now - renderer.changed(snapshot, rest, ages.changes)).astype(np.float32)
         fade += np.nan_to_num(np.maximum(age, 0)) / np.float32(style.fade_s)
     full = np.where(np.isnan(live_m), np.float32(1), np.float32(THROUGH_COVER))
-    return np.maximum(full * np.exp(-fade), np.float32(THROUGH_COVER_MIN))
+    return np.asarray(np.maximum(full * np.exp(-fade), THROUGH_COVER_MIN), np.float32)
 
 
 def _too_uncertain(sigma_px: Values, style: OverlayStyle) -> str | None:
