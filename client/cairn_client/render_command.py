@@ -7,8 +7,9 @@
     overlay.png: temperature over colour_left, scan 12: visible 71%, see-through 22%, map only 3%
 
 A map is the URL of one on a server, the folder that `cairn map export --cells` wrote, or the state folder of a robot
-that is not running. Layers: temperature, colour, probability, depth, age. The scale is fixed (--low, --high), so that
-pictures can be compared; what has no value is grey, and where nothing is mapped it is dark.
+that is not running. Layers: temperature, colour, probability, depth, and of a server age (seconds before its newest
+measurement). The scale is fixed (--low, --high), so that pictures can be compared; what has no value is grey, and where
+nothing is mapped it is dark.
 
 Over a recorded image the map is compared with the depth that the robot measured there and then: what agrees is painted
 solid; what lies behind the surface that the camera sees, beyond the next free space, in stripes, fainter the farther
@@ -65,6 +66,8 @@ def _run(args: argparse.Namespace) -> None:
     if args.output is None and args.npz is None:
         raise BadInputError("nothing_asked", "say what to write: -o FILE.png, or --npz FILE")
     is_url = args.map.startswith(("http://", "https://"))
+    if args.layer is Layer.AGE and not is_url:
+        raise BadInputError("bad_option", "only a server knows when its map changed: give its URL for --layer age")
     if args.over is None:
         if args.eye is None or args.target is None:
             raise BadInputError("nothing_asked", "say from where to look, and at what: --from X,Y,Z --to X,Y,Z")

@@ -143,7 +143,11 @@ def test_scans_and_cameras_that_are_not_there_are_said(world: World, tmp_path: P
     cells = tmp_path / "cells"
     main(["export", world.url, "--cells", str(cells)])
     words = ["render", str(cells), "--over", str(world.recording), "-o", str(tmp_path / "x.png")]
-    for more, kind in ((["--scan", "99"], "no_scan"), (["--camera", "depth"], "unknown_camera")):
+    for more, kind in (
+        (["--layer", "age"], "bad_option"),
+        (["--scan", "99"], "no_scan"),
+        (["--camera", "depth"], "unknown_camera"),
+    ):
         with pytest.raises(BadInputError) as caught:
             main([*words, *more])
         assert caught.value.kind == kind
