@@ -64,7 +64,9 @@ export class Stage {
 
   /** Have the shaders of what will be drawn compiled beside the page's own work; then draw. */
   async prepare(): Promise<void> {
-    await this.renderer.compileAsync(this.scene, this.camera);
+    const canWait = this.renderer.getContext().getExtension("KHR_parallel_shader_compile");
+    if (canWait) await this.renderer.compileAsync(this.scene, this.camera);
+    else this.renderer.compile(this.scene, this.camera);
     this.ready = true;
     this.draw();
   }

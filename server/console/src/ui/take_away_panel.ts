@@ -21,6 +21,7 @@ export class TakeAwayPanel {
   }
 
   show(cell: string | null): void {
+    const origin = new URL(".", document.baseURI).href.replace(/\/$/, "");
     const server = new URL(`maps/${this.map}`, document.baseURI).href;
     const buttons = FORMS.map(([suffix, name, what]) =>
       h("button", { type: "button", title: what, onclick: (event: Event) => void this.save(cell!, suffix, event) }, name),
@@ -29,9 +30,9 @@ export class TakeAwayPanel {
       this.element,
       h("h2", {}, "Take away"),
       cell === null ? h("p", { class: "hint" }, "Click the map: the cell there can be saved.") : h("div", { class: "buttons" }, h("span", {}, `cell ${cell}`), ...buttons),
-      h("p", { class: "hint" }, "All of it, in a terminal or in Python:"),
-      copied(`cairn map export ${server} ${this.map}`),
-      copied(`from cairn_client.api import MapApi\nMapApi("${new URL(".", document.baseURI).href.replace(/\/$/, "")}").cell_index("${this.map}")`),
+      h("p", { class: "hint" }, "All of the map in a terminal, one cell in Python:"),
+      copied(`cairn map export ${server} --ply ${this.map}.ply`),
+      copied(`from cairn_client.api import MapApi\nMapApi("${origin}").cell("${this.map}", (${cell ?? "0,0,0"})).body  # bytes of the cell file`),
     );
   }
 
