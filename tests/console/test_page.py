@@ -7,6 +7,7 @@ import gzip
 import time
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
 import pytest
 from tests.console.browsing import VIEW, Console, browser, tab
@@ -154,6 +155,20 @@ def test_a_new_measurement_is_drawn_within_seconds(console: Console, room: Room)
     names = console.page.get_by_role("region", name="Robots").inner_text()
     assert "scout" in names
     assert "mole" in names
+
+
+def test_who_follows_a_robot_sees_what_it_sees(console: Console, room: Room) -> None:
+    picture = cv2.imencode(".png", np.full((30, 40, 3), 200, np.uint8))[1].tobytes()
+    with room.api as api:
+        api.put_view(MAP, "scout", picture)
+    console.page.get_by_title("Follow scout").click()
+    shown = console.page.get_by_alt_text("What scout sees")
+    shown.wait_for()
+    assert shown.evaluate("(image) => [image.naturalWidth, image.naturalHeight]") == [40, 30]
+    console.page.keyboard.press("Escape")
+    shown.wait_for(state="hidden")
+    console.page.keyboard.press("h")
+    console.settled()
 
 
 def test_many_updates_of_a_cell_leave_nothing_behind(console: Console) -> None:

@@ -76,6 +76,7 @@ export class Console {
     this.cells = new Cells(api, info);
     this.cells.budget = this.stage.isSoftware ? SOFTWARE_BUDGET : 2_000_000;
     this.team = new Team(api, info.name, labels, this.stage);
+    view.append(this.team.picture.element);
     left.append(this.presets(), this.team.panel.element, this.mapFacts());
     this.picker = new Picker(this.stage, this.cells);
     this.stage.add(this.cells.group, this.grid.lines, this.outline.lines, this.team.group);

@@ -2,10 +2,10 @@
 
 import { ClampToEdgeWrapping, DataTexture, LinearFilter, RGBAFormat, UnsignedByteType } from "three";
 
-/** Stops at equal distances; inferno, cividis and viridis are matplotlib's (CC0). */
+/** Stops at equal distances; matplotlib's (CC0), inferno without its black, which a dark ground would swallow. */
 const STOPS = {
   inferno: [
-    "000004", "1b0c41", "4a0c6b", "781c6d", "a52c60", "cf4446", "ed6925", "fb9b06", "f7d13d", "fcffa4",
+    "220c4a", "4a0c6b", "781c6d", "a52c60", "cf4446", "ed6925", "fb9b06", "f7d13d", "fcffa4",
   ],
   cividis: [
     "00224e", "123570", "3b496c", "575d6d", "707173", "8a8779", "a59c74", "c3b369", "e1cc55", "fee838",

@@ -7,6 +7,7 @@ import type { Branch, RobotSign, Triple } from "./messages.ts";
 import { robotColour } from "./palettes.ts";
 import { RobotMark } from "./scene/lines.ts";
 import type { Stage } from "./scene/stage.ts";
+import { RobotPicture } from "./ui/robot_picture.ts";
 import { isOffline, TeamPanel } from "./ui/team_panel.ts";
 
 const REFRESH_MS = 10_000;
@@ -16,6 +17,7 @@ const OFFLINE_COLOUR = "#8b949e";
 export class Team {
   readonly panel = new TeamPanel();
   readonly group = new Group();
+  readonly picture: RobotPicture;
   onFollow: () => void = () => {};
   private branches: Branch[] = [];
   private readonly signs = new Map<string, RobotSign>();
@@ -34,6 +36,7 @@ export class Team {
     this.map = map;
     this.host = host;
     this.stage = stage;
+    this.picture = new RobotPicture(api, map);
     this.panel.onFollow = (robot) => this.follow(this.followed === robot ? null : robot);
   }
 
@@ -81,6 +84,8 @@ export class Team {
   }
 
   tick(): void {
+    const followed = this.followed === null ? undefined : this.signs.get(this.followed);
+    this.picture.show(this.followed, followed?.view_s ?? null);
     if (performance.now() >= this.askAtMs) {
       this.askAtMs = performance.now() + REFRESH_MS;
       void this.ask();

@@ -7,7 +7,7 @@ import type { Cells, ShownCell } from "./cells.ts";
 
 const SAMPLES = 40_000;
 
-/** 2nd percentile and 99.5th of what is drawn, in the shader's units; null: nothing has this field. */
+/** 2nd percentile and 99th of what is drawn, in the shader's units; null: nothing has this field. */
 export function rangeOf(cells: Cells, field: Field, lowZ: number, highZ: number): [number, number] | null {
   if (field === "probability") return [0.5, 1];
   if (field === "age") return [0, Math.max(cells.head - Math.min(...[...cells.all.values()].map(({ lm }) => lm)), 1)];
@@ -26,7 +26,7 @@ export function rangeOf(cells: Cells, field: Field, lowZ: number, highZ: number)
   if (!found.length) return null;
   found.sort((a, b) => a - b);
   const low = found[Math.floor(found.length * 0.02)];
-  const high = found[Math.floor((found.length - 1) * 0.995)];
+  const high = found[Math.floor((found.length - 1) * 0.99)];
   return high - low > 0.1 ? [low, high] : [low - 0.5, high + 0.5];
 }
 
