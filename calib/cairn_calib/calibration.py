@@ -141,10 +141,10 @@ class InputFile(BaseModel):
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
-class Calibration(BaseModel):
+class Calibration(BaseModel, frozen=True):
     """The record of one calibration."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(extra="forbid")
 
     software: Annotated[str, Field(min_length=1, max_length=200)]
     made_s: Annotated[float, Field(ge=0, le=1e11)]

@@ -19,7 +19,7 @@ Floats = npt.NDArray[np.float64]
 NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
-class Camera(Lens):
+class Camera(Lens, frozen=True):
     """Pinhole camera with Brown's distortion: k1, k2, p1, p2, k3[, k4, k5, k6], in OpenCV's order."""
 
     distortion: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)

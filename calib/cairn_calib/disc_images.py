@@ -109,7 +109,8 @@ def _outlines(bright: Singles) -> Bytes | None:
     level = max(level, middle + STANDS_OUT * max(spread, 1.0))
     mask = (stretched > level).astype(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
-    mask = (mask * (stats[:, cv2.CC_STAT_AREA] >= SPECK * bright.size)[labels]).astype(np.uint8)
+    is_large = stats[:, cv2.CC_STAT_AREA] >= SPECK * bright.size
+    mask = (mask * is_large[np.asarray(labels, np.intp)]).astype(np.uint8)
     side = max(3, 2 * round(bright.shape[1] / CLOSING) + 1)
     mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8)), np.uint8)
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

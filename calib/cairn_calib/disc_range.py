@@ -43,7 +43,7 @@ def disc_range(disc: Disc, range_m: npt.NDArray[np.floating], mounted: MountedCa
     middle = float(np.median(1 / d))
     prior = np.diag([0.0, 1.0, 1.0]) / (SLANT_SIGMA * middle) ** 2
     weight = np.ones(len(d))
-    n = np.array([middle, 0.0, 0.0])
+    n, normal = np.array([middle, 0.0, 0.0]), prior
     for _ in range(ROUNDS):
         left = (1 / d - terms @ n) / sigma
         spread = max(1.0, 1.4826 * float(np.median(np.abs(left - np.median(left)))))

@@ -33,7 +33,7 @@ TOLERANCE = 5e-13
 """Error of theta' in radians: 3e-10 px at a focal length of 600 px. What is worse has no ray."""
 
 
-class FisheyeCamera(Lens):
+class FisheyeCamera(Lens, frozen=True):
     """Fisheye camera: k1, k2, k3, k4 of Kannala and Brandt; `focal_px` is pixels a radian on the axis."""
 
     model: Literal["kb4"] = "kb4"

@@ -46,7 +46,7 @@ class Unprojection:
     """(..., 3, P) radians a unit of each of `intrinsic_names`."""
 
 
-class Lens(Raster):
+class Lens(Raster, frozen=True):
     """A camera whose lens is a model with a few numbers."""
 
     focal_px: tuple[Focal, Focal]

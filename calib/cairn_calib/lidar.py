@@ -27,7 +27,7 @@ SINGLE_BEAM_DEG = 1.0
 """Height of the one row of a lidar with one beam; a spinning line scanner's divergence is less."""
 
 
-class SpinningLidar(Raster):
+class SpinningLidar(Raster, frozen=True):
     """Range camera that turns about its y axis: `width` azimuths times `height` beams."""
 
     model: Literal["spinning"] = "spinning"

@@ -88,9 +88,9 @@ class NormalEquations:
         A = self.A + damping * np.diag(np.diag(self.A))
         C = self.C * (1 + damping * np.eye(6))
         right = np.concatenate([np.swapaxes(self.B, 1, 2), self.b[..., None]], axis=2)
-        solved = np.linalg.solve(C, right)
+        solved = np.asarray(np.linalg.solve(C, right), np.float64)
         # F small products: a single large one makes BLAS start threads, 30 times slower where processors are busy.
-        inner = (self.B @ solved).sum(axis=0)
+        inner: Floats = (self.B @ solved).sum(axis=0)
         return A - inner[:, :-1], self.a - inner[:, -1], solved[..., :-1], solved[..., -1]
 
     def step(self, damping: float) -> tuple[Floats, Floats, float]:

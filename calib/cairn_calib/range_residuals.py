@@ -137,7 +137,7 @@ def _met(data: RangeData, state: RigState, board: Board, rays_camera: Floats) ->
     slant = np.einsum("vi,vmi->vm", n, v)
     offset = T_rig_board[:, :3, 3] - T_rig_camera[:3, 3]
     flat_m = np.einsum("vi,vi->v", n, offset)[:, None] / slant
-    range_m = flat_m
+    range_m, places, shape = flat_m, np.empty(0), np.empty(0)
     for _ in range(WARP_ROUNDS):
         places = (range_m[..., None] * v - offset[:, None]) @ R_rig_board
         shape = warp_at_places(board, places[..., :2])

@@ -20,10 +20,10 @@ MAX_SIDE_PX = 16384
 Side = Annotated[int, Field(ge=1, le=MAX_SIDE_PX)]
 
 
-class Raster(BaseModel, ABC):
+class Raster(BaseModel, ABC, frozen=True):
     """An image of `width` x `height` pixels and the directions that they look in."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(extra="forbid")
 
     width: Side
     height: Side

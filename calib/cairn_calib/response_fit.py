@@ -92,7 +92,7 @@ def _planck(T: Floats, sigma_k: Floats, U: Floats, sigma_u: Floats) -> tuple[Pla
     p = np.array([0.0, BAND_K, 0.0])
     light = 1 / np.expm1(BAND_K / T)
     p[0], p[2] = np.polyfit(light, U, 1)
-    prior = np.zeros((3, 3))
+    prior, normal, scale = np.zeros((3, 3)), np.eye(3), np.ones(3)
     if not told:
         prior[1, 1] = 1 / (BAND_SHARE * BAND_K) ** 2
     for _ in range(STEPS):
@@ -119,6 +119,7 @@ def _polynomial(T: Floats, sigma_k: Floats, U: Floats, sigma_u: Floats) -> tuple
     free = min(3, len(set(T)))
     terms = v[:, None] ** np.arange(free)
     slope = np.full(len(T), (T[-1] - T[0]) / (2 * per))
+    c, normal = np.zeros(3), np.eye(free)
     for _ in range(3):
         weight = 1 / (sigma_k**2 + (slope * sigma_u) ** 2)
         normal = (terms * weight[:, None]).T @ terms

@@ -56,10 +56,10 @@ def _model_of(camera: object) -> str | None:
     return str(camera["model"]) if camera["model"] in ("kb4", "spinning") else None
 
 
-class MountedCamera(BaseModel):
+class MountedCamera(BaseModel, frozen=True):
     """One camera and its place on the rig; a lidar's spectrum is range."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(extra="forbid")
 
     spectrum: Spectrum
     # One model is tried, not both: the message of a refusal is about what was meant.

@@ -134,7 +134,7 @@ def _known(depth: EyeDepth) -> Labels:
 def _smoothed(image: npt.NDArray[np.generic], ratio: float) -> Singles:
     """(H, W, C) float32, blurred where several of its pixels fall on one."""
     side = round(ratio)
-    values = np.asarray(image) if side <= 1 else np.asarray(cv2.blur(np.asarray(image), (side, side)))
+    values = np.asarray(image) if side <= 1 else np.asarray(cv2.blur(np.asarray(image, np.float32), (side, side)))
     return np.ascontiguousarray(np.atleast_3d(values), dtype=np.float32)
 
 

@@ -50,7 +50,12 @@ class PlaceCovariance:
         return cls(*_grid_of(rig.calibration, src, rig[src], dst, rig[dst]))
 
     def at(
-        self, pixels: npt.NDArray[np.floating], range_m: Singles, sigma_m: Singles, *, pixel_sigma_px: float = 0.0
+        self,
+        pixels: npt.NDArray[np.floating | np.integer],
+        range_m: Singles,
+        sigma_m: Singles,
+        *,
+        pixel_sigma_px: float = 0.0,
     ) -> Singles:
         """(N, 3) float32 xx, xy, yy, px^2 of `dst`; NaN where the range is, or the other camera cannot see.
 

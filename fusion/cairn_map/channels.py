@@ -48,10 +48,10 @@ PLANES = {
 }
 
 
-class Channel(BaseModel):
+class Channel(BaseModel, frozen=True):
     """One kind of sample that a map's voxels can hold."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(extra="forbid")
 
     kind: ChannelKind
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]

@@ -14,10 +14,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 Probability = Annotated[float, Field(gt=0, lt=1)]
 
 
-class SensorModel(BaseModel):
+class SensorModel(BaseModel, frozen=True):
     """Inverse sensor model: how much a hit and a miss say, and where certainty ends."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(extra="forbid")
 
     p_hit: Probability = 0.7
     p_miss: Probability = 0.4

@@ -108,7 +108,7 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = TIMEOUT_S
     server_version = "cairn"
     sys_version = ""
-    server: _Server
+    server: _Server  # type: ignore[assignment, unused-ignore]  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def do_GET(self) -> None:
         """Answer."""
