@@ -67,7 +67,8 @@ class History:
         self._robots = [SimRobot(f"r{n}", MODES[n], self._network.ask) for n in range(count)]
         self._mappers = [robot for robot in self._robots if robot.mode != "viewer"]
         self.may_misfit = False
-        """Bytes were damaged on their way, so that fingerprints may be the first to notice something."""
+        """Bytes were damaged on their way, or a disk rolled back and others mapped under its numbers: fingerprints may be
+        the first to notice."""
         self._weather()
 
     def time_s(self) -> float:
@@ -157,6 +158,7 @@ class History:
         self._random.choice(self._robots).save_disk()
 
     def _roll_back_disk(self) -> None:
+        self.may_misfit = True
         self._random.choice(self._robots).roll_back_disk()
 
     def _lose_disk(self) -> None:
