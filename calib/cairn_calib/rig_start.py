@@ -25,6 +25,8 @@ Poses = Mapping[str, Transform]
 
 AGREE_RAD = 0.2
 """Two readings of a relative pose further apart, rotation plus translation over the board's distance, disagree."""
+TURNED_RAD = 0.05
+"""How much better, a frame, boards must agree when one camera named their corners from the other end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,8 +114,9 @@ def _edge(
     T = T.reshape(count * 8, 4, 4)
     distance = float(np.median(np.linalg.norm(np.concatenate([one[:, 0], other[:, 0]])[:, :3, 3], axis=1)))
     apart = _apart(T, distance).reshape(len(T), count, 8)
-    # Of equals the first wins.
-    best = int(np.argmin(np.minimum(apart.min(axis=2), AGREE_RAD).sum(axis=1).round(6)))
+    # A board tilted about one spot fits mirrored and named from the other end as well: as it is, unless that is clear.
+    doubts = np.minimum(apart.min(axis=2), AGREE_RAD).sum(axis=1) + TURNED_RAD * count * (np.arange(len(T)) % 8 >= 4)
+    best = int(np.argmin(doubts.round(6)))
     nearest = apart[best].argmin(axis=1)
     agrees = apart[best].min(axis=1) < AGREE_RAD
     chosen = T[np.flatnonzero(agrees) * 8 + nearest[agrees]]

@@ -9,12 +9,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests.cairn_calib.simulated_views import SPECTRA, errors_of, ranges_of, views_of, world
+from tests.cairn_calib.simulated_views import BOARD, SPECTRA, World, errors_of, ranges_of, views_of, world
 
 from cairn_calib.adjustment import adjust
 from cairn_calib.board import Board
 from cairn_calib.board_views import BoardView, BoardViews
 from cairn_calib.corners import Corners
+from cairn_calib.pose_vectors import transform_from_vector
 from cairn_calib.poses import inverse
 from cairn_calib.probe_points import image_grid
 from cairn_calib.rig import Spectrum
@@ -222,3 +223,17 @@ def test_the_rig_says_how_certain_it_is() -> None:
     assert rig.calibration.covariance.sigmas == pytest.approx([sigmas[each] for each in parameters], rel=1e-6)
     assert rig.calibration.statistics is not None
     assert rig.calibration.statistics.cameras["tof"].images == 6
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_board_that_is_tilted_about_one_spot_is_not_called_reversed(seed: int) -> None:
+    middle = np.append(BOARD.points()[:, :2].mean(axis=0), 0.0)
+    boards = np.stack([np.eye(4)] * 9)
+    for T, about in zip(boards, np.radians(np.arange(0, 360, 40)), strict=True):
+        lean = np.radians(20) * np.array([np.cos(about), np.sin(about)])
+        T[:3, :3] = transform_from_vector([*lean, 0, 0, 0, 0])[:3, :3]
+        T[:3, 3] = [0.0, 0.0, 1.9] - T[:3, :3] @ middle
+    truth = World(("tof", "left", "right"), boards)
+    solution = solve_rig(views_of(truth, seed=seed), usual_plan({name: SPECTRA[name] for name in truth.names}))
+    left = solution.state.T_rig_camera[list(truth.names).index("left")]
+    assert np.abs(left - truth.T_rig_camera("left"))[:3, 3].max() < 0.05

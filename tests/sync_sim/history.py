@@ -67,8 +67,8 @@ class History:
         self._robots = [SimRobot(f"r{n}", MODES[n], self._network.ask) for n in range(count)]
         self._mappers = [robot for robot in self._robots if robot.mode != "viewer"]
         self.may_misfit = False
-        """Bytes were damaged on their way, or a disk rolled back and others mapped under its numbers: fingerprints may be
-        the first to notice."""
+        """Fingerprints may be the first to notice: bytes were damaged on their way, or a disk was rolled back, and its
+        numbers name others' bytes."""
         self._weather()
 
     def time_s(self) -> float:
