@@ -42,8 +42,8 @@ def robot_token(live: Live, row: MapRow, name: str) -> str:
 @pytest.mark.parametrize("route", TABLE, ids=lambda route: " ".join(route))
 def test_an_open_server_lets_everybody_without_a_token_do_everything(live: Live, route: tuple[str, str]) -> None:
     method, path = route
-    place = {"name": live.new_map().name, "branch": "mole", "commit": "x", "cell": "0,0,0", "token": "nobody"}
-    answer = live.ask(method, path.format(**place), content=b"{}")
+    place = {"branch": "mole", "commit": "x", "cell": "0,0,0", "voxel": "0,0,0", "token": "nobody", "file": "x.js"}
+    answer = live.ask(method, path.format(name=live.new_map().name, **place), content=b"{}")
     assert answer.status_code not in (401, 403)
 
 

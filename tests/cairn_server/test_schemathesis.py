@@ -31,7 +31,9 @@ PLACES = {
     "branch": ["mole"],
     "commit": [str(commit.id) for commit in COMMITS],
     "cell": ["0,0,0", "-1,0,2", "0,0,0.ply", "0,0,0.npz", "0,0,0.view"],
+    "voxel": ["0,0,0", "-1,0,2"],
     "token": ["looker"],
+    "file": ["x.js"],
 }
 """What is there, so that not every answer is 404."""
 CONFORMANCE = (status_code_conformance, content_type_conformance, response_schema_conformance)

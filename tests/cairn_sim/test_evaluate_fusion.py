@@ -75,7 +75,7 @@ def test_real_hot_cups_are_where_the_sets_own_registration_has_them() -> None:
     frames = list(labelled_frames(Path(os.environ["CAIRN_TEST_DATA"]) / "mm5_rgbdt"))
     assert len(frames) == 3
     for frame in frames:
-        assert frame.fused_iou > frame.given_iou - 0.02 and frame.fused_iou > 0.7
+        assert frame.fused_iou > frame.given_iou - 0.04 and frame.fused_iou > 0.7
 
 
 def test_the_command_refuses_numbers_that_mean_nothing(tmp_path: Path) -> None:
