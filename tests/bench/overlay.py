@@ -7,6 +7,7 @@ where the server, which has drawn others, has none of its cells in memory.
 """
 
 import os
+import signal
 import statistics
 import tempfile
 import time
@@ -146,6 +147,7 @@ def _server_rows(folder: Path, rig: Rig, scans: Sequence[Scan]) -> Iterator[Row]
                 f"ms, at most {1e3 * max(warm_s):.0f}; below 200 is asked for",
             )
         finally:
+            server.send(signal.SIGTERM)
             server.end()
 
 
