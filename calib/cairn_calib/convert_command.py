@@ -17,8 +17,8 @@ OUT's format follows its suffix (.json: rig.json; .cameramodel: mrcal); to .yaml
     mrcal     one camera       Brown to 8 coefficients                  extrinsics: rig to camera
 
 Every number of a lens comes back as it was, places to rounding. A number that the other format cannot say is an error
-that names it; what it may do without (T_rig_camera, sensing, calibration_sigma_px, radiometry, body, calibration) can
-be left out by --drop. No format says what spectrum a camera sees: coming back, --spectrum does.
+that names it; what it may do without (T_rig_camera, sensing, calibration_sigma_px, radiometry, range_bias, body,
+calibration) can be left out by --drop. No format says what spectrum a camera sees: coming back, --spectrum does.
 """
 
 import argparse

@@ -6,8 +6,8 @@
 `T_rig_camera` maps points from the camera's frame to the rig's, in metres. Which camera sees which
 spectrum is part of the rig, so an image's meaning never depends on its file name. A camera without `model` is a
 pinhole; a fisheye says `"model": "kb4"`, a spinning lidar `"model": "spinning"`. What is optional and not said is not
-in the document either: `sensing` of a range camera, `calibration_sigma_px` of a camera, the robot's `body`, and how
-the numbers came about and how certain they are (`calibration`).
+in the document either: `sensing` and `range_bias` of a range camera, `calibration_sigma_px` of a camera, the robot's
+`body`, and how the numbers came about and how certain they are (`calibration`).
 """
 
 import hashlib
@@ -27,6 +27,7 @@ from cairn_calib.fisheye import FisheyeCamera
 from cairn_calib.lidar import SpinningLidar
 from cairn_calib.poses import Transform, checked_transform
 from cairn_calib.radiometry import Radiometry
+from cairn_calib.range_bias import RangeBias, Real
 from cairn_calib.raster import Raster
 from cairn_calib.sensing import LIDAR, TIME_OF_FLIGHT, RangeSensing
 from cairn_map.errors import BadInputError, first_error
@@ -80,6 +81,8 @@ class MountedCamera(BaseModel, frozen=True):
     """How far off, in its own pixels, points of the range camera are expected in it: one axis, standard deviation."""
     radiometry: Radiometry | None = None
     """Of a thermal camera: what its counts mean."""
+    range_bias: RangeBias | None = None
+    """Of a range camera with a lens: what it adds to its ranges."""
 
     @model_validator(mode="after")
     def _rigid(self) -> Self:
@@ -107,6 +110,14 @@ class MountedCamera(BaseModel, frozen=True):
             raise ValueError(f"radiometry is of thermal cameras, not of {self.spectrum}")
         return self
 
+    @model_validator(mode="after")
+    def _biases_are_of_range_cameras(self) -> Self:
+        is_lidar = isinstance(self.camera, SpinningLidar)
+        if self.range_bias is not None and (is_lidar or self.spectrum is not Spectrum.RANGE):
+            other = "lidars" if is_lidar else str(self.spectrum)
+            raise ValueError(f"range_bias is of range cameras with a lens, not of {other}")
+        return self
+
     @property
     def transform(self) -> Transform:
         """`T_rig_camera` as (4, 4) float64, read-only."""
@@ -118,9 +129,23 @@ class MountedCamera(BaseModel, frozen=True):
         return self.sensing or RangeSensing()
 
     def range_sigma_m(self, range_m: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-        """(...) standard deviation of the range camera at ranges, metres: as stated, else as is usual."""
+        """(...) standard deviation of the range camera at ranges, metres: as stated, else as is usual.
+
+        What is not known of its `range_bias` is in it, as if it were noise.
+        """
         usual = LIDAR if isinstance(self.camera, SpinningLidar) else TIME_OF_FLIGHT
-        return self.known_sensing.sigma_at(range_m, usual=usual)
+        sigma_m = self.known_sensing.sigma_at(range_m, usual=usual)
+        return sigma_m if self.range_bias is None else np.hypot(sigma_m, self.range_bias.sigma_at(range_m))
+
+    def true_ranges(self, range_m: npt.NDArray[Real]) -> npt.NDArray[Real]:
+        """(H, W) ranges, metres, of (H, W) that the range camera measured: without its bias.
+
+        The same array where the rig states no bias.
+
+        Raises:
+            BadInputError: the image has another size.
+        """
+        return range_m if self.range_bias is None else self.range_bias.true_image(self.camera, range_m)
 
 
 @lru_cache(maxsize=256)

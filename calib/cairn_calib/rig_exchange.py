@@ -23,7 +23,7 @@ from cairn_calib.ros_camera_info import read_ros, write_ros
 from cairn_map.errors import BadInputError, first_error
 
 RIG = "rig"
-DROPPABLE = ("T_rig_camera", "sensing", "calibration_sigma_px", "radiometry", "body", "calibration")
+DROPPABLE = ("T_rig_camera", "sensing", "calibration_sigma_px", "radiometry", "range_bias", "body", "calibration")
 """Fields of a rig that may be left out: none of them changes where a pixel of a camera looks in that camera's frame."""
 
 
@@ -97,7 +97,7 @@ def cameras_of_rig(rig: Rig, *, format_name: str, drop: Sequence[str] = ()) -> F
             raise BadInputError(
                 KIND, f"cameras.{name}.camera: {format_name} has no spinning lidar; choose others with --camera"
             )
-        optional = ("sensing", "calibration_sigma_px", "radiometry")
+        optional = ("sensing", "calibration_sigma_px", "radiometry", "range_bias")
         said += [f"cameras.{name}.{field}" for field in optional if getattr(each, field)]
         is_said = held and "T_rig_camera" not in drop
         if not is_said and not np.array_equal(each.transform, np.eye(4)):

@@ -18,7 +18,7 @@ and by each camera's own noise, which is estimated; what is off by more than 4 s
 board may be bent (--flat: it is not), its pitch wrong by 0.02 % (--pitch-sigma). Free coefficients of a lens follow
 from the spectrum: colour k1,k2,p1,p2,k3, thermal k1,k2,k3, range k1,k2; --distortion says otherwise, --fisheye names
 cameras with Kannala and Brandt's model. With --range DIR the range camera's images of the same boards (16 bit, radial,
---range-units-per-m) show its bias.
+--range-units-per-m) show its bias, which rig.json states and mapping takes off.
 
 What the images cannot tell is warned about, with the threshold and what was measured: tilt, distances, the image's
 edge, numbers that come from assumptions, halves of the images that contradict each other, single frames that much hangs

@@ -1,4 +1,4 @@
-"""The `rig.json` of a solution: cameras, places, covariance, statistics, and what it came from."""
+"""The `rig.json` of a solution: cameras, places, range bias, covariance, statistics, and what it came from."""
 
 import importlib.metadata
 
@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from cairn_calib.calibration import Calibration, CameraStatistics, Statistics, covariance_from_matrix
 from cairn_calib.corner_residuals import CornerData, corner_misses
+from cairn_calib.range_bias import BIAS_NAMES, bias_from_matrix
 from cairn_calib.rig import Rig, mounted
 from cairn_calib.rig_state import warp_shape
 from cairn_calib.solve import Solution
@@ -21,7 +22,12 @@ def solved_rig(solution: Solution, *, made_s: float) -> Rig:
         name: mounted(camera.spectrum, lens, T)
         for (name, camera), lens, T in zip(plan.cameras.items(), state.lenses, state.T_rig_camera, strict=True)
     }
-    rows = [n for n, (owner, name) in enumerate(solution.layout.names) if owner in cameras and _is_of_camera(name)]
+    bias_at = solution.layout.bias_at
+    if len(bias_at):
+        owner = solution.layout.names[bias_at[0]][0]
+        bias = bias_from_matrix(state.bias, solution.covariance[np.ix_(bias_at, bias_at)])
+        cameras[owner] = cameras[owner].model_copy(update={"range_bias": bias})
+    rows = [n for n, (owner, name) in enumerate(solution.layout.names) if owner in cameras and name not in BIAS_NAMES]
     names = [solution.layout.names[n] for n in rows]
     calibration = Calibration(
         software=f"cairn {_version()}",
@@ -54,11 +60,6 @@ def statistics_of(solution: Solution) -> Statistics:
     unknown = solution.layout.size + 6 * len(solution.state.T_rig_board)
     freedom = count + len(solution.adjusted.problem.priors) - unknown
     return Statistics(chi2=solution.adjusted.normal.cost, degrees_of_freedom=max(freedom, 0), cameras=cameras)
-
-
-def _is_of_camera(name: str) -> bool:
-    """Whether `rig.json` knows the parameter: a range bias has no place in it yet."""
-    return name not in ("offset_m", "scale", "radial_m")
 
 
 def _version() -> str:

@@ -146,9 +146,10 @@ def add_sights(into: Sightings, found: Found, *, centroid_sigma_px: Mapping[Spec
     rig, source = into.rig, into.source
     sigmas = centroid_sigma_px or CENTROID_SIGMA_PX[into.method]
     into.images += 1
+    range_m = rig[source].true_ranges(np.asarray(found.range_m, np.float64))
     carried = []
     for disc in found.discs.get(source, ()):
-        measured = disc_range(disc, np.asarray(found.range_m, np.float64), rig[source])
+        measured = disc_range(disc, range_m, rig[source])
         if measured is None:
             into.note(f"{source}: no range on its middle")
             continue
@@ -158,8 +159,8 @@ def add_sights(into: Sightings, found: Found, *, centroid_sigma_px: Mapping[Spec
         if camera not in found.discs:
             continue
         free = list(found.discs[camera])
-        for disc, range_m, range_sigma_m in carried:
-            predicted, shares = _expected(rig, source, camera, disc.centroid, range_m, range_sigma_m, sigmas)
+        for disc, distance_m, range_sigma_m in carried:
+            predicted, shares = _expected(rig, source, camera, disc.centroid, distance_m, range_sigma_m, sigmas)
             lens = rig[camera].camera
             radius_px = disc.radius_px * _focal(rig, camera) / _focal(rig, source)
             if not _is_within(lens, predicted, radius_px):
@@ -176,7 +177,7 @@ def add_sights(into: Sightings, found: Found, *, centroid_sigma_px: Mapping[Spec
                     camera=camera,
                     source_px=disc.centroid,
                     radius_px=float(np.linalg.norm(disc.centroid - np.array(_lens(rig, source).centre_px))),
-                    range_m=range_m,
+                    range_m=distance_m,
                     predicted_px=predicted,
                     found_px=near.centroid,
                     disc_px=near.radius_px,

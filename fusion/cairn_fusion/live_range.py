@@ -25,8 +25,8 @@ def live_range(scan: Scan, rig: Rig, *, camera: str) -> Values:
     """
     seen_by, source = rig[camera], rig[scan.range_camera]
     if camera == scan.range_camera:
-        return np.asarray(scan.range_m, np.float32)
-    points = points_from_range(scan.range_m, source.camera).reshape(-1, 3)
+        return np.asarray(source.true_ranges(scan.range_m), np.float32)
+    points = points_from_range(source.true_ranges(scan.range_m), source.camera).reshape(-1, 3)
     points = transform_points(inverse(seen_by.transform) @ source.transform, points[~np.isnan(points[:, 0])])
     pixels = seen_by.camera.project(points)
     inside = seen_by.camera.contains(pixels)

@@ -43,10 +43,11 @@ def range_labels(
         max_range_m: nor farther ones.
         flying_step_m: how far a flying pixel must be from both its neighbours; infinite: none flies.
     """
-    labels = np.full(scan.range_m.shape, Label.OK, np.uint8)
-    labels[flying_pixels(scan.range_m, flying_step_m)] = Label.FLYING
+    range_m = rig[scan.range_camera].true_ranges(scan.range_m)
+    labels = np.full(range_m.shape, Label.OK, np.uint8)
+    labels[flying_pixels(range_m, flying_step_m)] = Label.FLYING
     # A comparison with NaN is false.
-    labels[~((scan.range_m >= min_range_m) & (scan.range_m <= max_range_m))] = Label.NO_RANGE
+    labels[~((range_m >= min_range_m) & (range_m <= max_range_m))] = Label.NO_RANGE
     labels[full_pixels(scan, rig[scan.range_camera])] = Label.SATURATED
     if scan.amplitude is not None:  # no count is higher: full, whatever the rig says
         labels[scan.amplitude == AMPLITUDE_MAX] = Label.SATURATED

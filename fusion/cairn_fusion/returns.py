@@ -4,7 +4,7 @@
     shield_m   what each pixel saw     flying pixels and the body too: a neighbour may have seen a part of it
     silent     beams that met nothing  where the rig says that silence means emptiness
 
-A pixel that is in none of the three says nothing.
+A pixel that is in none of the three says nothing. What the rig says that its camera adds to ranges is taken off first.
 """
 
 import math
@@ -59,22 +59,23 @@ def returns_of(
     """
     check_scan(scan, rig)
     mounted = rig[scan.range_camera]
+    true_m = mounted.true_ranges(scan.range_m)
     T_map_tof = scan.T_map_rig @ mounted.transform
     full = full_pixels(scan, mounted)
-    within = (scan.range_m >= min_range_m) & (scan.range_m <= max_range_m) & ~full
-    shield_m = np.where(within, scan.range_m, np.float32(np.nan))
+    within = (true_m >= min_range_m) & (true_m <= max_range_m) & ~full
+    shield_m = np.where(within, true_m, np.float32(np.nan))
     if flying_step_m < math.inf:
-        within &= ~flying_pixels(scan.range_m, flying_step_m)
+        within &= ~flying_pixels(true_m, flying_step_m)
     silent_m = min(mounted.known_sensing.no_return_clears_m or 0.0, max_range_m)
-    silent = np.isnan(scan.range_m) & ~full & (silent_m > 0)
+    silent = np.isnan(true_m) & ~full & (silent_m > 0)
     if rig.body is not None:
         T_body_tof = mounted.transform if scan.T_map_body is None else inverse(scan.T_map_body) @ T_map_tof
-        within &= ~_on_body(rig.body, scan.range_m, mounted, T_body_tof)
+        within &= ~_on_body(rig.body, true_m, mounted, T_body_tof)
         if silent.any():
             # What hides behind the body, or is it, may well return nothing.
             beams = mounted.camera.rays() @ T_body_tof[:3, :3].T
             silent &= ~rig.body.stops(T_body_tof[:3, 3], beams, silent_m)
-    range_m = np.where(within, scan.range_m, np.float32(np.nan))
+    range_m = np.where(within, true_m, np.float32(np.nan))
     pixels, points_map = returned_points(range_m, mounted.camera.rays(), T_map_tof)
     return Returns(T_map_tof, range_m, shield_m, silent, silent_m, pixels, points_map)
 

@@ -87,15 +87,16 @@ class Drawn:
 def surface_of(scan: Scan, rig: Rig) -> RangeSurface:
     """The surface of a scan's range image."""
     labels, mounted = range_labels(scan, rig), rig[scan.range_camera]
-    noise_m = np.maximum(JOIN_SIGMAS * mounted.range_sigma_m(scan.range_m), JOIN_STEP_M).astype(np.float32)
-    across, down = (joined(scan.range_m, labels, noise_m, *step) for step in ((1, 0), (0, 1)))
+    range_m = mounted.true_ranges(scan.range_m)
+    noise_m = np.maximum(JOIN_SIGMAS * mounted.range_sigma_m(range_m), JOIN_STEP_M).astype(np.float32)
+    across, down = (joined(range_m, labels, noise_m, *step) for step in ((1, 0), (0, 1)))
     return RangeSurface(
         range_camera=scan.range_camera,
-        range_m=borrowed_ranges(scan.range_m, labels, BORROW_PX),
+        range_m=borrowed_ranges(range_m, labels, BORROW_PX),
         labels=labels,
         across=across,
         down=down,
-        fronts=fronts(scan.range_m, labels, across, down, noise_m),
+        fronts=fronts(range_m, labels, across, down, noise_m),
     )
 
 
