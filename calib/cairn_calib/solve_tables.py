@@ -98,6 +98,7 @@ def board_table(seen: Examination) -> str:
         rows.append(["pitch over the stated one", plus_minus(values[SHARED, "scale"], sigmas[SHARED, "scale"])])
     units = {"offset_m": ("range offset, mm", 1000.0), "scale": ("range scale, mm/m", 1000.0)}
     units["radial_m"] = ("more at the image's corner, mm", 1000.0)
+    units["radial4_m"] = ("and with the fourth power, mm", 1000.0)
     for owner, name in seen.solution.layout.names:
         if owner != SHARED and name in BIAS_NAMES:
             text, factor = units[name]

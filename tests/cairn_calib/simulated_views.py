@@ -59,7 +59,7 @@ class World:
     """(F, 4, 4) T_rig_board."""
     warp_m: tuple[float, float] = (0.0, 0.0)
     scale: float = 1.0
-    bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    bias: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     lenses: dict[str, Camera] = field(default_factory=lambda: dict(LENSES))
 
     def T_rig_camera(self, name: str) -> Floats:

@@ -21,7 +21,7 @@ Floats = npt.NDArray[np.float64]
 def solution() -> Solution:
     """Three cameras, the gauge not the range camera, so that every kind of column is there."""
     names = ("left", "tof", "thermal-left")
-    truth = world(5, seed=8, names=names, warp_m=(0.001, 0.0), bias=(0.02, 0.004, 0.01))
+    truth = world(5, seed=8, names=names, warp_m=(0.001, 0.0), bias=(0.02, 0.004, 0.01, -0.02))
     views = replace(views_of(truth, seed=8), ranges=ranges_of(truth, "tof", seed=8, sigma_m=0.006))
     return solve_rig(views, usual_plan({name: SPECTRA[name] for name in names}, gauge="left"))
 

@@ -18,6 +18,7 @@ from cairn_calib.corners import Corners
 from cairn_calib.pose_vectors import transform_from_vector
 from cairn_calib.poses import inverse
 from cairn_calib.probe_points import image_grid
+from cairn_calib.range_bias import BIAS_NAMES
 from cairn_calib.rig import Spectrum
 from cairn_calib.rig_start import half_turn
 from cairn_calib.solve import Solution, solve_rig
@@ -151,13 +152,13 @@ def test_the_gauge_moves_no_projection() -> None:
 
 
 def test_ranges_show_their_bias() -> None:
-    bias = (0.024, 0.003, 0.012)
+    bias = (0.024, 0.003, 0.012, -0.015)
     truth = world(8, seed=4, names=PAIR, bias=bias)
     views = replace(views_of(truth, seed=4), ranges=ranges_of(truth, "tof", seed=4, sigma_m=0.006))
     solution = solve_rig(views, pair_plan())
     values, sigmas = solution.values(), solution.sigmas()
-    found = [values["tof", name] for name in ("offset_m", "scale", "radial_m")]
-    spread = [sigmas["tof", name] for name in ("offset_m", "scale", "radial_m")]
+    found = [values["tof", name] for name in BIAS_NAMES]
+    spread = [sigmas["tof", name] for name in BIAS_NAMES]
     assert np.abs((np.array(found) - bias) / spread).max() < 3
     assert spread[0] < 0.004
     ranged = solution.adjusted.problem.sensors[-1]

@@ -32,7 +32,7 @@ def written(views: BoardViews, folder: Path) -> dict[str, Path]:
 
 
 def test_folders_of_corners_become_a_rig_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    truth = world(8, seed=6, names=PAIR, bias=(0.02, 0.0, 0.0))
+    truth = world(8, seed=6, names=PAIR, bias=(0.02, 0.0, 0.0, 0.0))
     folders = written(views_of(truth, seed=6), tmp_path)
     (tmp_path / "range").mkdir()
     for each in ranges_of(truth, "tof", seed=6, sigma_m=0.006):

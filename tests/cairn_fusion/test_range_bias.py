@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests.cairn_calib.simulated_views import SPECTRA, TOF, World, ranges_of, views_of, world
+from tests.cairn_calib.simulated_views import BOARD, SPECTRA, TOF, World, ranges_of, views_of, world
 from tests.cairn_fusion.test_carve import BARREL, GEOMETRY, random_scan, rig_of
 
 from cairn_calib.board_views import RangeView
@@ -16,6 +16,7 @@ from cairn_calib.rig import MountedCamera, Rig, Spectrum, mounted, rig_from_json
 from cairn_calib.rig_exchange import cameras_of_rig
 from cairn_calib.solve import solve_rig
 from cairn_calib.solve_plan import usual_plan
+from cairn_calib.solve_warnings import warnings_of
 from cairn_calib.solved_rig import solved_rig
 from cairn_fusion.integrate import Integrator, integrate_scan
 from cairn_fusion.live_range import live_range
@@ -27,9 +28,13 @@ from cairn_map.errors import BadInputError
 Floats = npt.NDArray[np.float64]
 
 PAIR = ("tof", "left")
-BIAS = (0.04, 0.006, 0.03)
+BIAS = (0.04, 0.006, 0.03, -0.02)
 STATED = RangeBias(
-    offset_m=0.04, scale=0.006, radial_m=0.03, covariance_lower=((1e-4,), (-1e-5, 4e-6), (0.0, 0.0, 9e-6))
+    offset_m=0.04,
+    scale=0.006,
+    radial_m=0.03,
+    radial4_m=-0.02,
+    covariance_lower=((1e-4,), (-1e-5, 4e-6), (0.0, 0.0, 9e-6), (0.0, 0.0, -4e-6, 9e-6)),
 )
 
 
@@ -59,12 +64,14 @@ def test_after_a_solve_mapped_ranges_are_true_again() -> None:
     # Boards that the solve has not seen.
     other = world(6, seed=9, names=PAIR, bias=BIAS)
     measured = ranges_of(other, "tof", seed=1, sigma_m=0.006)
-    exact = ranges_of(replace(other, bias=(0.0, 0.0, 0.0)), "tof", seed=1, sigma_m=0.0)
+    exact = ranges_of(replace(other, bias=(0.0, 0.0, 0.0, 0.0)), "tof", seed=1, sigma_m=0.0)
     blind = rig.model_copy(update={"cameras": {"tof": rig["tof"].model_copy(update={"range_bias": None})}})
     assert abs(float(np.mean(off_by(blind, measured, exact)))) > 0.05
     left = off_by(rig, measured, exact)
     assert len(left) > 5000
-    assert abs(float(np.mean(left))) < 0.002
+    bias = rig["tof"].range_bias
+    assert bias is not None
+    assert abs(float(np.mean(left))) < min(3 * float(bias.sigma_at(np.array(2.0))), 0.005)
     assert float(np.std(left)) == pytest.approx(0.006, rel=0.1)
 
 
@@ -91,7 +98,7 @@ def test_a_rig_without_bias_leaves_every_range_as_it_is() -> None:
 def test_mapping_with_a_bias_is_mapping_the_ranges_without_it() -> None:
     scan, rig = random_scan(BARREL, 3), rig_of(BARREL)
     limits = Integrator(min_range_m=0.3, max_range_m=3.0)
-    certain = RangeBias(offset_m=0.04, scale=0.006, radial_m=0.03)
+    certain = RangeBias(offset_m=0.04, scale=0.006, radial_m=0.03, radial4_m=-0.02)
     biased = rig.model_copy(update={"cameras": {"tof": rig["tof"].model_copy(update={"range_bias": certain})}})
     y, x = np.mgrid[: BARREL.height, : BARREL.width]
     pixels = np.stack([x, y], axis=-1).astype(np.float64)
@@ -121,7 +128,7 @@ def test_taking_off_undoes_adding() -> None:
 def test_what_is_not_known_of_the_bias_is_in_the_range_s_sigma() -> None:
     rig = rig_of(BARREL)
     range_m = np.array([1.0, 4.0, np.nan])
-    s = np.array([1.0, 4.0, 1 / 3])
+    s = np.array([1.0, 4.0, 1 / 3, 1 / 9])
     expected = np.sqrt(rig["tof"].range_sigma_m(range_m)[1] ** 2 + s @ STATED.covariance @ s)
     sigma_m = stated(rig)["tof"].range_sigma_m(range_m)
     assert sigma_m[1] == pytest.approx(expected) and np.isnan(sigma_m[2])
@@ -141,8 +148,8 @@ def test_what_is_stated_comes_back_and_other_formats_want_it_dropped() -> None:
         {"version": 2},
         {"scale": -1.0},
         {"offset_m": 1e999},
-        {"covariance_lower": [[-1e-6], [0.0, 1e-6], [0.0, 0.0, 1e-6]]},
-        {"covariance_lower": [[1e-6], [2e-6, 1e-6], [0.0, 0.0, 1e-6]]},
+        {"covariance_lower": [[-1e-6], [0.0, 1e-6], [0.0, 0.0, 1e-6], [0.0, 0.0, 0.0, 1e-6]]},
+        {"covariance_lower": [[1e-6], [2e-6, 1e-6], [0.0, 0.0, 1e-6], [0.0, 0.0, 0.0, 1e-6]]},
         {"covariance_lower": [[1e-6], [0.0, 1e-6]]},
         {"wiggle": 1},
     ],
@@ -160,3 +167,20 @@ def test_only_range_cameras_with_a_lens_have_a_bias() -> None:
         document = each.model_dump() | {"range_bias": STATED.model_dump()}
         with pytest.raises(ValueError, match=f"not of {told}"):
             MountedCamera.model_validate(document)
+
+
+def test_the_fourth_power_is_found_at_the_image_s_corners_and_else_told_to_be_assumed() -> None:
+    plan = usual_plan({"tof": Spectrum.RANGE})
+    solutions = []
+    for frames, reach in ((8, 1.0), (16, 1.7)):
+        truth = world(frames, seed=4, names=("tof",), bias=BIAS)
+        boards = truth.boards.copy()
+        boards[:, :2, 3] += (reach - 1) * (boards @ np.append(BOARD.points().mean(axis=0), 1.0))[:, :2]
+        truth = replace(truth, boards=boards)
+        views = replace(views_of(truth, seed=4), ranges=ranges_of(truth, "tof", seed=4, sigma_m=0.006))
+        solutions.append(solve_rig(views, plan))
+    near, far = ([each.text for each in warnings_of(found, [], [], None, [])] for found in solutions)
+    assert any("radial4_m is what was assumed before" in text for text in near)
+    assert not any("radial4_m" in text for text in far)
+    value, sigma = solutions[1].values()["tof", "radial4_m"], solutions[1].sigmas()["tof", "radial4_m"]
+    assert abs(value - BIAS[3]) < 3 * sigma < 0.03
