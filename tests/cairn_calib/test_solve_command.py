@@ -51,11 +51,19 @@ def test_folders_of_corners_become_a_rig_and_a_report(tmp_path: Path, capsys: py
     assert rig.calibration is not None
     assert rig.calibration.gauge == "tof"
     assert len(rig.calibration.inputs) == 16
+    bias = rig["tof"].range_bias
+    assert bias is not None
+    files = [str(tmp_path / name) for name in ("rig.json", "tof.cameramodel")] + ["--camera", "tof"]
+    with pytest.raises(BadInputError, match=r"cameras\.tof\.range_bias"):
+        main(["convert", *files])
+    assert main(["convert", *files, "--drop", "range_bias,calibration"]) == 0
     page = report.read_text(encoding="utf-8")
     assert "range offset, mm" in page
     assert not re.search(r"(src|href)=", page)
     document = json.loads(report.with_suffix(".json").read_text())
     offset = next(each for each in document["parameters"] if each["name"] == "offset_m")
+    assert bias.offset_m == pytest.approx(offset["value"])
+    assert bias.covariance[0, 0] == pytest.approx(offset["sigma"] ** 2)
     assert abs(offset["value"] - 0.02) < 4 * offset["sigma"] < 0.02
     assert {each["kind"] for each in document["warnings"]} >= {"tof_edge"}
     assert document["cameras"]["left"]["images"][0]["rms_px"] < 0.3

@@ -12,6 +12,7 @@ from cairn_calib.camera import Camera
 from cairn_calib.disc_images import Disc
 from cairn_calib.pose_vectors import transform_from_vector
 from cairn_calib.poses import inverse
+from cairn_calib.range_bias import RangeBias
 from cairn_calib.rig import Rig, Spectrum, mounted
 from cairn_calib.verification import Found, Sight, Sightings, add_sights, carried_pixels, range_camera_of
 from cairn_calib.verification_report import verification_json, verification_page
@@ -82,6 +83,17 @@ def test_differences_are_predicted_minus_found_and_far_or_small_discs_are_not_ta
     side = Sightings(RIG, "tof", "grey")
     add_sights(side, seen(RIG, np.array([20.0, 70.0]), 3.0))
     assert side.left_out == {"left: not wholly in its view": 1}
+
+
+def test_what_the_range_camera_adds_is_taken_off_before_targets_are_carried() -> None:
+    found = seen(RIG, np.array([90.0, 70.0]), 3.0)
+    biased = replace(found, range_m=np.asarray(found.range_m, np.float64) * 1.01 + 0.2)
+    bias = RangeBias(offset_m=0.2, scale=0.01, radial_m=0.0)
+    stated = {**RIG.cameras, "tof": RIG["tof"].model_copy(update={"range_bias": bias})}
+    for rig, off_m in ((RIG.model_copy(update={"cameras": stated}), 0.0), (RIG, 0.23)):
+        sightings = Sightings(rig, "tof", "grey")
+        add_sights(sightings, biased)
+        assert sightings.sights[0].range_m == pytest.approx(3.0 + off_m, abs=1e-3)
 
 
 def test_shares_are_what_centroid_range_and_calibration_scatter_by() -> None:
