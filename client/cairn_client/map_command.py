@@ -31,6 +31,7 @@ from cairn_client.arguments import add_token, allow_negative_lists, api_of, pars
 from cairn_client.branch_table import branch_table
 from cairn_client.heal_command import add_heal_arguments, heal
 from cairn_client.log_graph import log_graph
+from cairn_client.part_export import add_part_arguments
 from cairn_client.prior_data import push_prior_data
 from cairn_client.query_command import add_query_arguments
 from cairn_client.render_command import add_render_arguments
@@ -208,12 +209,13 @@ def _parser() -> argparse.ArgumentParser:
     get.add_argument("cell", help="its number, i,j,k")
     allow_negative_lists(get)
     get.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=".cell, .npz, .ply or .view")
-    export = command("export", "download a whole map", map_export.export_map, "map")
+    export = command("export", "download a whole map, or a part of it as points", map_export.export_map, "map")
     export.add_argument("--cells", type=Path, metavar="DIR", help="one file a cell, named by its number")
     export.add_argument("--ply", type=Path, metavar="FILE", help="occupied voxels as a point cloud")
     export.add_argument("--npz", type=Path, metavar="FILE", help="all known voxels as NumPy arrays")
     export.add_argument("--picture", type=Path, metavar="FILE", help="PNG: colour, temperature, probability")
-    export.add_argument("--ceiling", type=float, metavar="METRES", help="picture: leave out what is higher")
+    export.add_argument("--ceiling", type=float, metavar="METRES", help="leave out what is higher")
+    add_part_arguments(export)
     add_query_arguments(commands.add_parser("query", help="ask a map that lies in a folder, without a server"))
     add_render_arguments(commands.add_parser("render", help="draw a map from a pose, or over a camera's image"))
     add_heal_arguments(command("heal", "send cells that the server's disk damaged", heal, "map"))

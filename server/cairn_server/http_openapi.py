@@ -11,6 +11,7 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
 from cairn_map.cell_files import CELL_MEDIA_TYPE, MEDIA_TYPES
+from cairn_map.map_points import EXPORT_TYPES
 from cairn_map.messages import Problem
 from cairn_server.openapi_examples import EXAMPLES
 from cairn_server.problems import MEDIA_TYPE as PROBLEM_MEDIA_TYPE
@@ -23,6 +24,7 @@ MAP = "/maps/{name}"
 UPLOAD = f"{MAP}/commits/{{commit}}/upload"
 CELL = f"{MAP}/main/cells/{{cell}}"
 RENDER = f"{MAP}/main/render"
+EXPORT = f"{MAP}/main/export"
 VIEW = f"{MAP}/branches/{{branch}}/view"
 COMMIT_MEDIA_TYPE = "application/vnd.cairn.commit"
 CELL_TYPES = (CELL_MEDIA_TYPE, *MEDIA_TYPES.values())
@@ -45,6 +47,7 @@ ANSWERS: dict[Route, dict[int, tuple[str, ...]]] = {
     ("get", f"{MAP}/main/vector"): {200: ("application/json",)},
     ("get", VIEW): {200: PICTURES, 304: ()},
     ("get", RENDER): {200: ("image/png", "application/x-npz"), 304: ()},
+    ("get", EXPORT): {200: tuple(EXPORT_TYPES.values())},
     ("get", f"{MAP}/events"): {200: ("text/event-stream",)},
     ("get", f"{MAP}/live"): {101: ()},
 }
@@ -63,6 +66,7 @@ PROBLEMS: dict[Route, tuple[int, ...]] = {
     ("get", f"{MAP}/main/vector"): (410,),
     ("get", CELL): (416,),
     ("get", RENDER): (413,),
+    ("get", EXPORT): (413,),
     ("get", f"{MAP}/events"): (429,),
     ("get", f"{MAP}/live"): (426,),
 }
@@ -73,6 +77,7 @@ HEADERS: dict[Route, tuple[str, ...]] = {
     ("head", CELL): CELL_HEADERS,
     ("get", VIEW): ("ETag", "Last-Modified"),
     ("get", RENDER): ("ETag", "Cairn-Cursor"),
+    ("get", EXPORT): ("Cairn-Cursor", "Cairn-Points"),
     ("get", f"{MAP}/commits/{{commit}}"): ("ETag", "Cairn-Seal"),
 }
 BYTES: Json = {"schema": {"type": "string", "format": "binary"}}

@@ -7,6 +7,7 @@ from cairn_server import (
     access_routes,
     cell_routes,
     console_routes,
+    export_routes,
     live_routes,
     map_routes,
     operations_routes,
@@ -37,6 +38,7 @@ ROUTERS = (
     robot_routes.router,
     upload_routes.router,
     render_routes.router,
+    export_routes.router,
     console_routes.router,
 )
 

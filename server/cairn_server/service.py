@@ -41,6 +41,7 @@ from cairn_server.healing import heal_cell, keep_healed
 from cairn_server.held_commits import HeldCommits
 from cairn_server.joining import Joining
 from cairn_server.live import Hub
+from cairn_server.map_exports import MapExports
 from cairn_server.map_views import MapViews
 from cairn_server.missing import Besides, asker_from_request, header_of, reply_frames
 from cairn_server.push_policy import EvidenceGoneError
@@ -99,6 +100,7 @@ class Service:
         self._stable = StableVectors(settings.stable_after_s)
         self._reads = ReadCache()
         self.views = MapViews(store, self.damaged)
+        self.exports = MapExports(store, self.damaged)
         self.cell_views = ViewCache()
         self._healing = threading.Lock()
         self.operator = new_incarnation()

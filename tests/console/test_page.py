@@ -6,6 +6,7 @@ The tests go on with one tab, in the order in which an operator would: in, look,
 import gzip
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -143,6 +144,29 @@ def test_the_ceiling_hides_what_is_above_it(console: Console) -> None:
     console.page.get_by_label("Ceiling").fill("200")
     assert "ceiling=" in address
     assert f"map={MAP}" in address
+
+
+def test_what_is_shown_is_what_is_saved(console: Console, room: Room) -> None:
+    voxels = occupied(room)
+    panel = console.page.get_by_role("region", name="Take away")
+    console.page.get_by_label("Ceiling").fill("100")
+    ceiling_m = console.tell("c.look.ceilingM")
+    with console.page.expect_download() as saved:
+        panel.get_by_role("button", name="NPZ").click()
+    with np.load(saved.value.path()) as arrays:
+        shown = (voxels.numbers[:, 2] + 0.5) * GEOMETRY.voxel_edge_m <= ceiling_m
+        assert len(arrays["points"]) == shown.sum()
+    assert 0 < shown.sum() < len(shown)
+    panel.get_by_text(f"{MAP}.npz: ").wait_for()
+    assert f"--ceiling={ceiling_m}" in panel.inner_text()
+    console.page.get_by_label("Ceiling").fill("200")
+    panel.get_by_label("Level").select_option(str(GEOMETRY.depth - 1))
+    with console.page.expect_download() as saved:
+        panel.get_by_role("button", name="PLY").click()
+    nodes = len(np.unique(voxels.numbers // 2, axis=0))
+    assert f"element vertex {nodes}\n".encode() in Path(saved.value.path()).read_bytes()
+    panel.get_by_label("Level").select_option(str(GEOMETRY.depth))
+    assert console.errors == []
 
 
 def test_a_new_measurement_is_drawn_within_seconds(console: Console, room: Room) -> None:

@@ -65,7 +65,7 @@ export class Console {
     const labels = h("div", { class: "labels", "aria-hidden": "true" });
     this.strip = new CommitStrip(api, info.name);
     this.voxel = new VoxelPanel(api, info.name);
-    this.takeAway = new TakeAwayPanel(api, info.name);
+    this.takeAway = new TakeAwayPanel(api, info, look);
     this.panel = new LookPanel(look);
     const view = h("main", { class: "view" }, host, labels, this.flag, this.legend.element);
     const left = h("aside", { class: "left", "aria-label": "Team and map" });
@@ -177,7 +177,7 @@ export class Console {
     const picked = this.picker.at(x, y);
     this.outline.show(picked);
     this.stage.draw();
-    this.takeAway.show(picked?.cell.key ?? null);
+    this.takeAway.choose(picked?.cell.key ?? null);
     if (picked) void this.voxel.show(picked, this.cells.depthMax);
     else this.voxel.clear();
   }
@@ -305,6 +305,7 @@ export class Console {
     this.cells.setMaterial(look.boxes ? boxes : squares);
     this.bar.showField(look.field);
     this.panel.show();
+    this.takeAway.show();
     this.refreshRange();
   }
 

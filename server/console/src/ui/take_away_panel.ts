@@ -1,52 +1,122 @@
-/** Files of the cell that was clicked, and the lines that fetch all of the map in a terminal or in Python. */
+/** What is shown as a file, made by the server, and the lines that fetch the same in a terminal or in Python. */
 
 import type { Api } from "../api.ts";
 import { fill, h } from "../dom.ts";
+import type { Look } from "../look.ts";
+import type { MapInfo } from "../messages.ts";
+import { bytes, metres, thousands } from "../units.ts";
 
 const FORMS: [string, string, string][] = [
-  ["", "octree", "exact evidence, as robots hold it"],
-  [".ply", "PLY", "points for CloudCompare, MeshLab, Blender"],
-  [".npz", "NPZ", "arrays for NumPy, free space included"],
+  ["ply", "PLY", "points for CloudCompare, MeshLab, Blender"],
+  ["pcd", "PCD", "points for PCL, Open3D, ROS"],
+  ["npz", "NPZ", "one array of records for NumPy"],
 ];
 
 export class TakeAwayPanel {
   readonly element = h("section", { "aria-label": "Take away" });
   private readonly api: Api;
-  private readonly map: string;
+  private readonly info: MapInfo;
+  private readonly look: Look;
+  private readonly level = h("select", { "aria-label": "Level" });
+  private readonly parts = h("p", { class: "hint" });
+  private readonly said = h("p", { role: "status" });
+  private readonly lines = h("div", {});
+  private readonly octree = h("div", { class: "buttons" });
+  private written = "";
 
-  constructor(api: Api, map: string) {
+  constructor(api: Api, info: MapInfo, look: Look) {
     this.api = api;
-    this.map = map;
-    this.show(null);
-  }
-
-  show(cell: string | null): void {
-    const origin = new URL(".", document.baseURI).href.replace(/\/$/, "");
-    const server = new URL(`maps/${this.map}`, document.baseURI).href;
-    const buttons = FORMS.map(([suffix, name, what]) =>
-      h("button", { type: "button", title: what, onclick: (event: Event) => void this.save(cell!, suffix, event) }, name),
+    this.info = info;
+    this.look = look;
+    const { depth, voxel_edge_um } = info.geometry;
+    for (let n = depth; n >= Math.max(1, depth - 4); n--) {
+      this.level.append(h("option", { value: String(n) }, `${n === depth ? "voxels" : "nodes"} of ${metres((voxel_edge_um / 1e6) * 2 ** (depth - n))}`));
+    }
+    this.level.addEventListener("change", () => this.show());
+    const buttons = FORMS.map(([form, name, what]) =>
+      h("button", { type: "button", title: what, onclick: (event: Event) => void this.save(this.path(form), `${info.name}.${form}`, event) }, name),
     );
     fill(
       this.element,
-      h("h2", {}, "Take away"),
-      cell === null ? h("p", { class: "hint" }, "Click the map: the cell there can be saved.") : h("div", { class: "buttons" }, h("span", {}, `cell ${cell}`), ...buttons),
-      h("p", { class: "hint" }, "All of the map in a terminal, one cell in Python:"),
-      copied(`cairn map export ${server} --ply ${this.map}.ply`),
-      copied(`from cairn_client.api import MapApi\nMapApi("${origin}").cell("${this.map}", (${cell ?? "0,0,0"})).body  # bytes of the cell file`),
+      h("h2", {}, "Take away what is shown"), this.parts,
+      h("div", { class: "buttons" }, this.level, ...buttons), this.said,
+      h("p", { class: "hint" }, "The same in a terminal, or in Python:"), this.lines, this.octree,
+    );
+    this.choose(null);
+    this.show();
+  }
+
+  /** The cell that was clicked: its exact evidence, as robots hold it. */
+  choose(cell: string | null): void {
+    const { name } = this.info;
+    const save = (event: Event) => void this.save(`maps/${name}/main/cells/${cell}`, `${name}_${cell}.cairn`, event);
+    fill(
+      this.octree,
+      cell === null
+        ? h("span", { class: "hint" }, "Click the map for the octree of the cell there.")
+        : h("button", { type: "button", title: "exact evidence, as robots hold it", onclick: save }, `Octree of cell ${cell}`),
     );
   }
 
-  private async save(cell: string, suffix: string, event: Event): Promise<void> {
+  /** As the look is now. */
+  show(): void {
+    const asked = this.asked();
+    const text = JSON.stringify(asked);
+    if (text === this.written) return;
+    this.written = text;
+    const words = [
+      asked.box ? "in the box" : "", asked.floor_m !== undefined ? `from ${metres(asked.floor_m)}` : "",
+      asked.ceiling_m !== undefined ? `to ${metres(asked.ceiling_m)}` : "", asked.p ? `p at least ${asked.p}` : "",
+    ].filter(Boolean);
+    this.parts.textContent = words.length ? `Occupied, ${words.join(", ")}.` : "All that is occupied.";
+    const { name } = this.info;
+    const server = new URL(`maps/${name}`, document.baseURI).href;
+    const options = Object.entries(asked).map(([key, value]) => ` --${key.replace("_m", "")}=${String(value)}`).join("");
+    const fields = ["format=\"ply\"", ...Object.entries(asked).map(([key, value]) => `${key}=${JSON.stringify(value)}`)].join(", ");
+    const origin = new URL(".", document.baseURI).href.replace(/\/$/, "");
+    fill(
+      this.lines,
+      copied(`cairn map export ${server} --ply ${name}.ply${options}`),
+      copied(
+        "from pathlib import Path\nfrom cairn_client.api import MapApi\nfrom cairn_client.part_export import export_points\n" +
+          "from cairn_map.export_request import ExportRequest\n" +
+          `export_points(MapApi("${origin}"), "${name}", ExportRequest(${fields}), Path("${name}.ply"))`,
+      ),
+    );
+  }
+
+  private asked(): { box?: string; floor_m?: number; ceiling_m?: number; p?: number; depth?: number } {
+    const { clip, floorM, ceilingM, minP } = this.look;
+    const depth = Number(this.level.value);
+    return {
+      ...(clip ? { box: clip.flat().join(",") } : {}),
+      ...(floorM !== null ? { floor_m: floorM } : {}), ...(ceilingM !== null ? { ceiling_m: ceilingM } : {}),
+      ...(minP > 0 ? { p: minP } : {}), ...(depth < this.info.geometry.depth ? { depth } : {}),
+    };
+  }
+
+  private path(form: string): string {
+    const query = new URLSearchParams(Object.entries(this.asked()).map(([key, value]) => [key, String(value)]));
+    query.set("format", form);
+    return `maps/${this.info.name}/main/export?${query.toString()}`;
+  }
+
+  private async save(path: string, name: string, event: Event): Promise<void> {
     const button = event.currentTarget as HTMLButtonElement;
     button.disabled = true;
+    this.said.className = "hint";
+    this.said.textContent = "The server makes the file ...";
     try {
-      const answer = await this.api.ask(`maps/${this.map}/main/cells/${cell}${suffix}`);
-      const url = URL.createObjectURL(await answer.blob());
-      const link = h("a", { href: url, download: `${this.map}_${cell}${suffix || ".cairn"}` });
-      link.click();
-      URL.revokeObjectURL(url);
+      const answer = await this.api.ask(path);
+      const blob = await answer.blob();
+      const url = URL.createObjectURL(blob);
+      h("a", { href: url, download: name }).click();
+      window.setTimeout(() => URL.revokeObjectURL(url), 60_000);
+      const points = answer.headers.get("Cairn-Points");
+      this.said.textContent = `${name}: ${points ? `${thousands(Number(points))} points, ` : ""}${bytes(blob.size)}`;
     } catch (error) {
-      this.element.append(h("p", { class: "error", role: "alert" }, (error as Error).message));
+      this.said.className = "error";
+      this.said.textContent = (error as Error).message;
     } finally {
       button.disabled = false;
     }

@@ -1,0 +1,28 @@
+"""The route by which a part of a map is taken away. Nothing is decided here."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query
+from fastapi.responses import StreamingResponse
+
+from cairn_map.export_request import ExportRequest
+from cairn_map.map_points import EXPORT_TYPES
+from cairn_server.http_access import READERS, Map, Operations
+
+router = APIRouter()
+
+
+@router.get("/maps/{name}/main/export", dependencies=READERS)
+def export(service: Operations, row: Map, asked: Annotated[ExportRequest, Query()]) -> StreamingResponse:
+    """Occupied nodes as PLY, PCD or NPZ, in a box, between two heights, above a probability, at an octree depth."""
+    made = service.exports.asked(row, asked)
+    headers = {
+        "Cache-Control": "no-store",
+        "Cairn-Cursor": str(made.head.cursor),
+        "Cairn-Points": str(made.count),
+        "Content-Disposition": f'attachment; filename="{row.name}.{asked.format}"',
+        "X-Content-Type-Options": "nosniff",
+    }
+    if made.size_bytes is not None:
+        headers["Content-Length"] = str(made.size_bytes)
+    return StreamingResponse(made.parts, media_type=EXPORT_TYPES[asked.format], headers=headers)

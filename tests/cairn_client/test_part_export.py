@@ -1,0 +1,58 @@
+"""`cairn map export` of a part: the file that the console offers, by the line that the console shows."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.cairn_client.conftest import LiveServer
+from tests.cairn_client.made import A, B, seen
+from tests.cairn_client.test_copy_commands import push
+
+from cairn_client.map_command import main
+from cairn_map.errors import BadInputError, NotFoundError
+
+
+def test_a_part_comes_as_every_kind_of_file(
+    server: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    push(server, tmp_path / "mole", {A: seen(1, 2, 300, kelvin_steps=9)}, {B: seen(5, kelvin_steps=9)})
+    files = [tmp_path / f"lab.{form}" for form in ("ply", "pcd", "npz")]
+    words = [word for path in files for word in (f"--{path.suffix[1:]}", str(path))]
+    assert main(["export", server.map_url, *words, "--floor=-100"]) == 0
+    assert f"{files[2]}: " in capsys.readouterr().out
+    with np.load(files[2]) as arrays:
+        points = arrays["points"]
+    assert b"element vertex %d\n" % len(points) in files[0].read_bytes()
+    assert b"POINTS %d\n" % len(points) in files[1].read_bytes()
+    heights = np.sort(points["z"])
+    ceiling_m = float(heights[0]) + 0.001
+    assert main(["export", server.map_url, "--npz", str(files[2]), f"--ceiling={ceiling_m}"]) == 0
+    with np.load(files[2]) as arrays:
+        assert len(arrays["points"]) == (heights <= ceiling_m).sum() < len(points)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--floor=1"], "--ply FILE"),
+        (["--ply=a.ply", "--box=1,2"], "lower corner first"),
+        (["--ply=a.ply", "--p=7"], "less than or equal to 1"),
+        (["--ply=a.ply", "--p=0.8", "--cells=there"], "--cells"),
+    ],
+)
+def test_what_cannot_be_a_part_is_said(
+    server: LiveServer, tmp_path: Path, words: list[str], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(BadInputError, match=said):
+        main(["export", server.map_url, *words])
+    assert not list(tmp_path.glob("a.ply*"))
+
+
+def test_what_was_there_stays_when_the_server_refuses(server: LiveServer, tmp_path: Path) -> None:
+    path = tmp_path / "lab.ply"
+    path.write_text("mine")
+    with pytest.raises(NotFoundError):
+        main(["export", server.map_url.replace("/maps/", "/maps/no-"), f"--ply={path}", "--p=0.8"])
+    assert [found.name for found in tmp_path.glob("lab*")] == ["lab.ply"]
+    assert path.read_text() == "mine"
