@@ -189,8 +189,12 @@ def test_who_follows_a_robot_sees_what_it_sees(console: Console, room: Room) -> 
     shown = console.page.get_by_alt_text("What scout sees")
     shown.wait_for()
     assert shown.evaluate("(image) => [image.naturalWidth, image.naturalHeight]") == [40, 30]
+    drawn = console.page.get_by_alt_text("The map as scout would see it")
+    drawn.wait_for()
+    assert drawn.evaluate("(image) => image.naturalWidth") >= 320
     console.page.keyboard.press("Escape")
     shown.wait_for(state="hidden")
+    drawn.wait_for(state="hidden")
     console.page.keyboard.press("h")
     console.settled()
 

@@ -76,7 +76,7 @@ export class Console {
     this.cells = new Cells(api, info);
     this.cells.budget = this.stage.isSoftware ? SOFTWARE_BUDGET : 2_000_000;
     this.team = new Team(api, info.name, labels, this.stage);
-    view.append(this.team.picture.element);
+    view.append(h("div", { class: "through" }, this.team.picture.element, this.team.fromPose.element));
     left.append(this.presets(), this.team.panel.element, this.mapFacts());
     this.picker = new Picker(this.stage, this.cells);
     this.stage.add(this.cells.group, this.grid.lines, this.outline.lines, this.team.group);
@@ -270,7 +270,7 @@ export class Console {
     this.grid.lines.visible = this.look.cells;
     this.grid.update([...this.cells.all.values()].filter(({ points }) => points).map(({ box }) => box));
     this.bar.showLink(this.state, this.cells.waiting, this.cells.error);
-    this.team.tick();
+    this.team.tick(this.look.field, this.cells.head);
     const drawn = `${thousands(this.cells.drawn)} nodes of ${this.cells.all.size} cells`;
     this.foot.textContent = this.stage.isSoftware ? `${drawn} · drawn without a graphics card: coarser and slower` : drawn;
   }

@@ -3,10 +3,12 @@
 import { Group, Vector3 } from "three";
 import type { Api } from "./api.ts";
 import { h } from "./dom.ts";
+import type { Field } from "./look.ts";
 import type { Branch, RobotSign, Triple } from "./messages.ts";
 import { robotColour } from "./palettes.ts";
 import { RobotMark } from "./scene/lines.ts";
 import type { Stage } from "./scene/stage.ts";
+import { RobotMap } from "./ui/robot_map.ts";
 import { RobotPicture } from "./ui/robot_picture.ts";
 import { isOffline, TeamPanel } from "./ui/team_panel.ts";
 
@@ -18,6 +20,7 @@ export class Team {
   readonly panel = new TeamPanel();
   readonly group = new Group();
   readonly picture: RobotPicture;
+  readonly fromPose: RobotMap;
   onFollow: () => void = () => {};
   private branches: Branch[] = [];
   private readonly signs = new Map<string, RobotSign>();
@@ -37,6 +40,7 @@ export class Team {
     this.host = host;
     this.stage = stage;
     this.picture = new RobotPicture(api, map);
+    this.fromPose = new RobotMap(api, map);
     this.panel.onFollow = (robot) => this.follow(this.followed === robot ? null : robot);
   }
 
@@ -83,9 +87,11 @@ export class Team {
     return places[0]?.clone() ?? null;
   }
 
-  tick(): void {
+  /** A few times a second: what the map is coloured by, and the newest log entry that is drawn. */
+  tick(field: Field, head: number): void {
     const followed = this.followed === null ? undefined : this.signs.get(this.followed);
     this.picture.show(this.followed, followed?.view_s ?? null);
+    this.fromPose.show(this.followed, followed?.status?.pose ?? null, field, head);
     if (performance.now() >= this.askAtMs) {
       this.askAtMs = performance.now() + REFRESH_MS;
       void this.ask();

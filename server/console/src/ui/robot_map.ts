@@ -1,0 +1,71 @@
+/** The map as the robot that is followed would see it: drawn by the server from the robot's pose. */
+
+import type { Api } from "../api.ts";
+import { fill, h } from "../dom.ts";
+import type { Field } from "../look.ts";
+import type { Pose } from "../messages.ts";
+
+/** Of two pictures, ms: a robot tells its pose several times a second, and the server draws for others, too. */
+const PAUSE_MS = 1500;
+const LAYERS: Record<Field, string> = {
+  colour: "colour", temperature: "temperature", probability: "probability", height: "depth", age: "age",
+};
+const SIZE = { width: "320", height: "240", focal_px: "250" };
+
+export class RobotMap {
+  readonly element = h("figure", { class: "seen", hidden: true });
+  private readonly api: Api;
+  private readonly map: string;
+  private shown = "";
+  private nextMs = 0;
+  private url: string | null = null;
+
+  constructor(api: Api, map: string) {
+    this.api = api;
+    this.map = map;
+  }
+
+  /** From a robot's pose, in the colours of a field, of the map at log entry `head`; null: nobody is followed. */
+  show(robot: string | null, pose: Pose | null, field: Field, head: number): void {
+    if (robot === null || pose === null) {
+      if (this.shown !== "") this.clear();
+      this.shown = "";
+      return;
+    }
+    const [x, y, z] = pose.t_map_rig;
+    const [qx, qy, qz, qw] = pose.q_map_rig;
+    const places = Object.entries({ x, y, z, qx, qy, qz, qw }).map(([name, value]) => [name, value.toFixed(4)]);
+    const query = new URLSearchParams([...places, ...Object.entries({ ...SIZE, layer: LAYERS[field] })]).toString();
+    const wanted = `${robot} ${head} ${query}`;
+    if (wanted === this.shown || performance.now() < this.nextMs) return;
+    this.nextMs = performance.now() + PAUSE_MS;
+    this.shown = wanted;
+    void this.load(robot, query, wanted);
+  }
+
+  private async load(robot: string, query: string, wanted: string): Promise<void> {
+    let picture: HTMLElement;
+    let url: string | null = null;
+    try {
+      const answer = await this.api.ask(`maps/${this.map}/main/render?${query}`);
+      url = URL.createObjectURL(await answer.blob());
+      picture = h("img", { src: url, alt: `The map as ${robot} would see it` });
+    } catch (error) {
+      picture = h("p", { class: "error" }, (error as Error).message);
+    }
+    if (wanted !== this.shown) {
+      if (url) URL.revokeObjectURL(url);
+      return;
+    }
+    this.clear();
+    this.url = url;
+    fill(this.element, picture, h("figcaption", {}, `The map from ${robot}'s pose`));
+    this.element.hidden = false;
+  }
+
+  private clear(): void {
+    this.element.hidden = true;
+    if (this.url) URL.revokeObjectURL(this.url);
+    this.url = null;
+  }
+}
