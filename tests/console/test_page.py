@@ -192,11 +192,35 @@ def test_who_follows_a_robot_sees_what_it_sees(console: Console, room: Room) -> 
     drawn = console.page.get_by_alt_text("The map as scout would see it")
     drawn.wait_for()
     assert drawn.evaluate("(image) => image.naturalWidth") >= 320
+    stale = console.page.get_by_role("region", name="Robots").get_by_text("amber borders")
+    stale.wait_for()
+    console.until("c.unseen.lines.geometry.attributes.position?.count > 0", "what it is missing is drawn")
     console.page.keyboard.press("Escape")
     shown.wait_for(state="hidden")
+    console.until("c.unseen.lines.geometry.attributes.position.count === 0", "nobody is followed")
     drawn.wait_for(state="hidden")
     console.page.keyboard.press("h")
     console.settled()
+
+
+def test_clicks_measure_lengths_and_areas(console: Console) -> None:
+    console.page.keyboard.press("m")
+    middle = console.page.locator(".host canvas").bounding_box()
+    assert middle is not None
+    x, y = middle["x"] + middle["width"] / 2, middle["y"] + middle["height"] / 2
+    for right, down in ((0, 0), (60, 0), (60, 50)):
+        console.page.mouse.click(x + right, y + down)
+    corners = np.array(console.tell("c.measure.points.map((point) => point.toArray())"))
+    assert corners.shape == (3, 3)
+    steps = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    area_m2 = np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0])) / 2
+    said = console.page.get_by_role("region", name="Measure").inner_text()
+    assert f"{steps.sum():.2f} m" in said
+    assert f"{area_m2:.2f} m²" in said
+    console.page.get_by_role("region", name="Measure").get_by_role("button", name="Clear").click()
+    console.page.locator(".host canvas").focus()
+    console.page.keyboard.press("m")
+    assert console.tell("[c.measure.isOn, c.measure.points.length]") == [False, 0]
 
 
 def test_many_updates_of_a_cell_leave_nothing_behind(console: Console, room: Room) -> None:

@@ -16,6 +16,7 @@ import { hottest, rangeOf } from "./scene/statistics.ts";
 import { Team } from "./team.ts";
 import { CommitStrip } from "./ui/commit_strip.ts";
 import { Legend } from "./ui/legend.ts";
+import { MeasurePanel } from "./ui/measure_panel.ts";
 import { LookPanel } from "./ui/look_panel.ts";
 import { openCommit } from "./ui/retract_dialog.ts";
 import { TakeAwayPanel } from "./ui/take_away_panel.ts";
@@ -23,6 +24,7 @@ import { applyTheme, type TopBar } from "./ui/top_bar.ts";
 import { VoxelPanel } from "./ui/voxel_panel.ts";
 import { celsius, KELVIN_ZERO_C, metres, thousands } from "./units.ts";
 
+const UNSEEN_COLOUR = 0xffb000;
 const SOFTWARE_BUDGET = 150_000;
 const TICK_MS = 250;
 const SIDE = new Vector3(-0.7, -1, 0.75);
@@ -36,6 +38,7 @@ export class Console {
   readonly team: Team;
   readonly strip: CommitStrip;
   readonly voxel: VoxelPanel;
+  readonly measure: MeasurePanel;
   private readonly api: Api;
   private readonly info: MapInfo;
   private readonly look: Look;
@@ -44,6 +47,8 @@ export class Console {
   private readonly panel: LookPanel;
   private readonly takeAway: TakeAwayPanel;
   private readonly grid = new CellGrid();
+  /** Cells that changed since the robot that is followed fetched last. */
+  private readonly unseen = new CellGrid(UNSEEN_COLOUR, 1);
   private readonly outline = new Outline();
   private readonly foot = h("span", { class: "figures" });
   private readonly flag = h("span", { class: "flag", role: "status" });
@@ -67,9 +72,10 @@ export class Console {
     this.voxel = new VoxelPanel(api, info.name);
     this.takeAway = new TakeAwayPanel(api, info, look);
     this.panel = new LookPanel(look);
+    this.measure = new MeasurePanel(info.geometry.voxel_edge_um / 1e6);
     const view = h("main", { class: "view" }, host, labels, this.flag, this.legend.element);
     const left = h("aside", { class: "left", "aria-label": "Team and map" });
-    const right = h("aside", { class: "right", "aria-label": "Tools" }, this.panel.element, this.voxel.element, this.takeAway.element);
+    const right = h("aside", { class: "right", "aria-label": "Tools" }, this.panel.element, this.voxel.element, this.measure.element, this.takeAway.element);
     this.element = h("div", { class: "console" }, left, view, right, h("footer", {}, this.strip.element, this.foot));
     document.body.append(this.element);
     this.stage = new Stage(host);
@@ -79,7 +85,7 @@ export class Console {
     view.append(h("div", { class: "through" }, this.team.picture.element, this.team.fromPose.element));
     left.append(this.presets(), this.team.panel.element, this.mapFacts());
     this.picker = new Picker(this.stage, this.cells);
-    this.stage.add(this.cells.group, this.grid.lines, this.outline.lines, this.team.group);
+    this.stage.add(this.cells.group, this.grid.lines, this.unseen.lines, this.outline.lines, this.measure.lines, this.team.group);
     this.framed = camera !== null;
     if (camera) this.stage.place(camera);
     else if (info.box_m) this.stage.place(this.stage.lookAt(new Box3(new Vector3(...info.box_m[0]), new Vector3(...info.box_m[1])), SIDE));
@@ -175,6 +181,10 @@ export class Console {
   /** Outline and name what lies under a place of the canvas. */
   ask(x: number, y: number): void {
     const picked = this.picker.at(x, y);
+    if (this.measure.isOn) {
+      if (picked) this.measure.add(picked.point);
+      return;
+    }
     this.outline.show(picked);
     this.stage.draw();
     this.takeAway.choose(picked?.cell.key ?? null);
@@ -215,6 +225,7 @@ export class Console {
     this.bar.onField = (field) => this.setField(field);
     this.bar.onTheme = () => this.theme();
     this.panel.onChange = () => this.apply();
+    this.measure.onChange = () => this.stage.draw();
     this.panel.boxInView = () => this.boxInView();
     this.legend.onRange = (range) => {
       if (range) this.look.ranges[this.look.field] = range;
@@ -271,6 +282,9 @@ export class Console {
     this.grid.update([...this.cells.all.values()].filter(({ points }) => points).map(({ box }) => box));
     this.bar.showLink(this.state, this.cells.waiting, this.cells.error);
     this.team.tick(this.look.field, this.cells.head);
+    const { lastSeq } = this.team;
+    const missed = lastSeq === null ? [] : [...this.cells.all.values()].filter(({ points, lm }) => points && lm > lastSeq);
+    this.unseen.update(missed.map(({ box }) => box));
     const drawn = `${thousands(this.cells.drawn)} nodes of ${this.cells.all.size} cells`;
     this.foot.textContent = this.stage.isSoftware ? `${drawn} · drawn without a graphics card: coarser and slower` : drawn;
   }

@@ -80,6 +80,7 @@ const keys: Key[] = [
   { keys: ["x"], what: "The hottest place shown", run: () => open?.jumpToHottest() },
   { keys: ["["], what: "Ceiling down 10 cm", run: () => open?.step(false) },
   { keys: ["]"], what: "Ceiling up 10 cm", run: () => open?.step(true) },
+  { keys: ["m"], what: "Measure: clicks set points", run: () => open?.measure.switch() },
   { keys: ["g"], what: "Borders of cells", run: () => open?.toggleGrid() },
   { keys: ["Enter", " "], what: "Ask what is in the middle of the picture", run: () => askMiddle() },
   { keys: ["ArrowLeft"], what: "Turn left", run: () => open?.stage.turn(1, 0) },

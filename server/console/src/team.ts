@@ -48,6 +48,15 @@ export class Team {
     return [...new Set([...this.branches.map(({ branch }) => branch), ...this.signs.keys()])].sort();
   }
 
+  /** Newest log entry that the robot that is followed has fetched; 0: none ever; null: nobody is followed, or it keeps no map. */
+  get lastSeq(): number | null {
+    if (this.followed === null) return null;
+    const branch = this.branches.find((one) => one.branch === this.followed);
+    if (branch?.mode !== "high-end") return null;
+    const { cursor } = branch;
+    return cursor ? Number(cursor.split(".")[1]) : 0;
+  }
+
   greet(robots: readonly RobotSign[]): void {
     for (const robot of robots) this.hear(robot);
     this.refresh();

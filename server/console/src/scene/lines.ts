@@ -13,10 +13,12 @@ const ARM_M = 0.35;
 
 /** Borders of cells; each edge once, however many cells share it. */
 export class CellGrid {
-  readonly lines = new LineSegments(
-    new BufferGeometry(), new LineBasicMaterial({ color: VIOLET, transparent: true, opacity: 0.55 }),
-  );
+  readonly lines: LineSegments;
   private drawn = "";
+
+  constructor(colour: number = VIOLET, opacity = 0.55) {
+    this.lines = new LineSegments(new BufferGeometry(), new LineBasicMaterial({ color: colour, transparent: true, opacity }));
+  }
 
   update(boxes: Box3[]): void {
     const keys = boxes.map(({ min }) => min.toArray().join()).sort();

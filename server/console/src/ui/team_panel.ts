@@ -31,6 +31,7 @@ export class TeamPanel {
       const pose = status?.pose ?? null;
       return {
         name: branch.branch, offline, mode: branch.mode, seen: ago(Date.now() / 1000 - lastSeenS), lag: lagOf(branch),
+        missing: followed === branch.branch && branch.mode === "high-end" && branch.behind !== 0 ? "amber borders: cells it has not fetched since they changed" : "",
         waiting: status?.waiting ? `${status.waiting} commits (${bytes(status.waiting_bytes)}) still on board` : "",
         battery: status?.battery == null ? "" : `battery ${Math.round(status.battery * 100)} %`,
         note: status?.note ?? "", hasPose: pose !== null, followed: followed === branch.branch,
@@ -46,7 +47,7 @@ export class TeamPanel {
   }
 
   private row(
-    row: { name: string; offline: boolean; mode: string; seen: string; lag: string; waiting: string; battery: string;
+    row: { name: string; offline: boolean; mode: string; seen: string; lag: string; missing: string; waiting: string; battery: string;
       note: string; hasPose: boolean; followed: boolean; sigma: string },
     names: readonly string[],
   ): HTMLElement {
@@ -62,7 +63,7 @@ export class TeamPanel {
       dot, h("strong", {}, row.name), h("span", { class: "mode" }, row.mode),
       h("span", { class: row.offline ? "state off" : "state on" }, row.offline ? "offline" : "online"),
     );
-    const lines = [`${row.lag} · seen ${row.seen}`, row.waiting, [row.sigma, row.battery].filter(Boolean).join(" · "), row.note];
+    const lines = [`${row.lag} · seen ${row.seen}`, row.missing, row.waiting, [row.sigma, row.battery].filter(Boolean).join(" · "), row.note];
     const said = lines.filter(Boolean).map((line) => h("p", {}, line));
     return h("li", { class: row.offline ? "robot offline" : "robot" }, button, ...said);
   }
