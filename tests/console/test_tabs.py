@@ -1,0 +1,83 @@
+"""Many tabs at once hear of a commit; and a page that comes over plain http from another address than loopback works.
+
+There browsers give a page less than on https or loopback: no clipboard, no Web Crypto, no Brotli.
+"""
+
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tests.console.browsing import browser, tab
+from tests.console.conftest import LOOPBACK, Room
+from tests.console.room import GEOMETRY, MAP
+from tests.console.test_page import LOADED_MACHINE
+
+from cairn_map.messages import CreateMap
+
+TABS = 8
+DRAWN_S = 3
+SMALL_VIEW = {"width": 480, "height": 360}
+
+
+def test_eight_tabs_hear_of_a_commit_and_draw_it(room: Room) -> None:
+    with browser() as made, made.new_context(viewport=SMALL_VIEW) as context:  # type: ignore[arg-type]
+        tabs = [tab(context, room) for _ in range(TABS)]
+        for number, each in enumerate(tabs):
+            each.open()
+            if number == 0:
+                each.page.get_by_label("computer").check()  # the others have the token from it
+                each.log_in()
+            each.settled()
+        before = max(each.tell("c.cells.head") for each in tabs)
+        room.measure("scout", 4)
+        start_s = time.monotonic()
+        for each in tabs:
+            each.until(f"c.cells.head > {before} && c.cells.waiting === 0", "the commit is drawn in every tab")
+        assert time.monotonic() - start_s < DRAWN_S * LOADED_MACHINE
+        assert [each.errors for each in tabs[1:]] == [[]] * (TABS - 1)
+
+
+@pytest.fixture
+def lan_room(room: Room, tmp_path: Path) -> Iterator[Room]:
+    """A room whose server listens where other machines would reach it."""
+    assert room.host == LOOPBACK
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing: it only asks which address would
+            host = probe.getsockname()[0]
+        except OSError:
+            host = LOOPBACK
+    if host == LOOPBACK:
+        pytest.skip("no network interface but loopback here")
+    with socket.socket() as free:
+        free.bind((host, 0))
+        port = free.getsockname()[1]
+    made = Room(tmp_path, port, host)
+    made.start()
+    try:
+        with made.api as api:
+            api.create_map(MAP, CreateMap(geometry=GEOMETRY))
+        made.measure("scout", 0)
+        yield made
+    finally:
+        made.stop()
+
+
+def test_over_plain_http_on_a_lan_the_page_is_whole(lan_room: Room) -> None:
+    with browser() as made, made.new_context(viewport=SMALL_VIEW) as context:  # type: ignore[arg-type]
+        console = tab(context, lan_room)
+        console.open()
+        console.log_in()
+        console.settled()
+        assert console.tell("isSecureContext") is False
+        console.errors.clear()  # the browser tells of the 401 before
+        before = console.tell("c.cells.head")
+        assert console.picture().std() > 5
+        lan_room.measure("scout", 1)
+        console.until(f"c.cells.head > {before} && c.cells.waiting === 0", "a new commit is drawn")
+        copy = console.page.get_by_role("region", name="Take away").get_by_role("button", name="Copy").first
+        copy.click()
+        console.page.get_by_role("button", name="Copied").wait_for()
+        assert console.errors == []
