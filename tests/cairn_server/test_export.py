@@ -104,7 +104,7 @@ def test_ply_and_pcd_say_the_same_as_the_arrays(live: Live) -> None:
     assert body == table.tobytes()
     head, _, body = pcd.content.partition(b"DATA binary\n")
     assert f"POINTS {len(table)}\n".encode() in head
-    rows = np.frombuffer(body, PCD_POINT)
+    rows: npt.NDArray[np.void] = np.frombuffer(body, PCD_POINT)
     np.testing.assert_array_equal(rows["hottest"], table["hottest"])
     rgb = rows["rgb"].copy().view(np.uint32)
     np.testing.assert_array_equal(rgb, table["red"].astype(int) << 16 | table["green"].astype(int) << 8 | table["blue"])

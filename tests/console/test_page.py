@@ -121,13 +121,13 @@ def test_another_colouring_asks_nothing_of_the_server_and_looks_otherwise(consol
     console.settled()
     before = len([url for url in console.requests if ".view" in url])
     pictures = {}
-    for key, field in enumerate(["colour", "temperature", "probability", "height", "age"], start=1):
+    for key, field in enumerate(["colour", "temperature", "probability", "height", "age", "robot"], start=1):
         console.page.keyboard.press(str(key))
         console.settled()
         pictures[field] = console.picture()
         assert console.page.locator(f'[data-field="{field}"]').get_attribute("aria-pressed") == "true"
     assert len([url for url in console.requests if ".view" in url]) == before
-    for field in ("temperature", "probability", "height"):
+    for field in ("temperature", "probability", "height", "robot"):
         assert np.abs(pictures[field].astype(int) - pictures["colour"]).mean() > 3, field
     console.page.keyboard.press("1")
 

@@ -6,7 +6,7 @@ import { h } from "./dom.ts";
 import { LiveLink, type LinkState } from "./live.ts";
 import { FIELDS, toHash, type CameraView, type Field, type Look } from "./look.ts";
 import type { LiveEvent, MapInfo, Triple } from "./messages.ts";
-import { textureOf, type Palette } from "./palettes.ts";
+import { rgbOf, robotColour, textureOf, type Palette } from "./palettes.ts";
 import { Cells } from "./scene/cells.ts";
 import { CellGrid, Outline } from "./scene/lines.ts";
 import { boxes, FIELD_CODES, squares, uniforms } from "./scene/materials.ts";
@@ -222,6 +222,10 @@ export class Console {
     };
     this.cells.onChange = () => this.stage.draw();
     this.cells.onRefused = onRefused;
+    this.cells.colourOf = (lm) => {
+      const robot = this.strip.robotAt(lm);
+      return robot === null ? null : rgbOf(robotColour(robot, this.team.names));
+    };
     this.bar.onField = (field) => this.setField(field);
     this.bar.onTheme = () => this.theme();
     this.panel.onChange = () => this.apply();
@@ -292,12 +296,12 @@ export class Console {
   private refreshRange(): void {
     const { look } = this;
     const { uLow, uHigh, uRange } = uniforms;
-    const found = look.field === "colour" ? null : rangeOf(this.cells, look.field, uLow.value.z, uHigh.value.z);
+    const found = look.field === "colour" || look.field === "robot" ? null : rangeOf(this.cells, look.field, uLow.value.z, uHigh.value.z);
     const zero = look.field === "temperature" ? KELVIN_ZERO_C : 0;
     const locked = look.ranges[look.field];
     const range = locked ?? (found && (found.map((end) => end - zero) as [number, number]));
     if (range) uRange.value.set(range[0] + zero, range[1] + zero);
-    this.legend.show(look, range);
+    this.legend.show(look, range, this.team.names);
     this.stage.draw();
   }
 

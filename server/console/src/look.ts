@@ -3,7 +3,7 @@
 import type { Triple } from "./messages.ts";
 import type { Palette } from "./palettes.ts";
 
-export type Field = "colour" | "temperature" | "probability" | "height" | "age";
+export type Field = "colour" | "temperature" | "probability" | "height" | "age" | "robot";
 
 export const FIELDS: { field: Field; label: string; palette: Palette | null; unit: string }[] = [
   { field: "colour", label: "Colour", palette: null, unit: "" },
@@ -11,6 +11,7 @@ export const FIELDS: { field: Field; label: string; palette: Palette | null; uni
   { field: "probability", label: "Probability", palette: "cividis", unit: "" },
   { field: "height", label: "Height", palette: "viridis", unit: "m" },
   { field: "age", label: "Age", palette: "cividis", unit: "entries" },
+  { field: "robot", label: "Robot", palette: null, unit: "" },
 ];
 
 export interface Look {

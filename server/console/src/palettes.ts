@@ -47,3 +47,8 @@ const ROBOTS = ["#56b4e9", "#e69f00", "#009e73", "#cc79a7", "#f0e442", "#d55e00"
 export function robotColour(name: string, names: readonly string[]): string {
   return ROBOTS[Math.max(names.indexOf(name), 0) % ROBOTS.length];
 }
+
+/** #rrggbb as parts of 1. */
+export function rgbOf(hex: string): [number, number, number] {
+  return [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16) / 255) as [number, number, number];
+}

@@ -60,6 +60,8 @@ export class Cells {
   readonly byNumber: ShownCell[] = [];
   readonly edgeM: number;
   readonly depthMax: number;
+  /** Colour of the robot behind a log entry, 0 to 1; null: not known. */
+  colourOf: (lm: number) => Triple | null = () => null;
   /** Largest `lm` heard of: how far the map is. */
   head = 0;
   budget = 2_000_000;
@@ -252,6 +254,7 @@ export class Cells {
     points.updateMatrix();
     points.onBeforeRender = (_renderer, _scene, _camera: Camera, _geometry, material) => {
       uniforms.uAge.value = this.head - cell.lm;
+      uniforms.uRobot.value.set(...(this.colourOf(cell.lm) ?? ([-1, -1, -1] as Triple)));
       uniforms.uObject.value = cell.number;
       uniforms.uFresh.value = Math.max(0, (cell.freshMs - performance.now()) / FRESH_MS) * 0.55;
       (material as ShaderMaterial).uniformsNeedUpdate = true;

@@ -7,7 +7,7 @@ import { DataTexture, DoubleSide, GLSL3, ShaderMaterial, Vector2, Vector3, Vecto
 import { HEAT_STEP_K, HEAT_ZERO_K } from "../decode/pack.ts";
 import { textureOf } from "../palettes.ts";
 
-export const FIELD_CODES = { colour: 0, temperature: 1, probability: 2, height: 3, age: 4 } as const;
+export const FIELD_CODES = { colour: 0, temperature: 1, probability: 2, height: 3, age: 4, robot: 5 } as const;
 /** A box spreads over at most this much of its edge in a picture: the diagonal, and some for perspective. */
 const SPREAD = 1.9;
 
@@ -27,6 +27,8 @@ export const uniforms = {
   /** Of the object that is drawn: its age from 0 to 1, how freshly it changed, its number. */
   uAge: { value: 0 },
   uFresh: { value: 0 },
+  /** Colour of the robot that changed it last; negative: nobody knows. */
+  uRobot: { value: new Vector3(-1, -1, -1) },
   uObject: { value: 0 },
 } satisfies Record<string, IUniform>;
 
@@ -36,7 +38,7 @@ in vec4 colour;   // red, green, blue; flags in 1/255
 in vec4 heat;     // mean and hottest, in steps, two bytes each
 uniform int uField;
 uniform vec2 uRange, uBand;
-uniform vec3 uLow, uHigh, uBare;
+uniform vec3 uLow, uHigh, uBare, uRobot;
 uniform float uMinP, uPointMax, uAge, uFresh;
 uniform vec4 uViewport;
 uniform sampler2D uPalette;
@@ -87,7 +89,10 @@ void main() {
     vBare = warm ? 0.0 : 1.0;
   } else if (uField == 2) vColour = shade((p - uRange.x) / span);
   else if (uField == 3) vColour = shade((world.z - uRange.x) / span);
-  else vColour = shade(1.0 - (uAge - uRange.x) / span);
+  else if (uField == 5) {
+    vColour = uRobot.x < 0.0 ? uBare : uRobot * (0.45 + 0.55 * p);
+    vBare = uRobot.x < 0.0 ? 1.0 : 0.0;
+  } else vColour = shade(1.0 - (uAge - uRange.x) / span);
   if (uBand.x <= uBand.y && !(warm && hottest >= uBand.x && kelvin <= uBand.y)) {
     vColour = mix(uBare * 0.45, vColour, 0.12);
     vBare = 0.0;

@@ -39,6 +39,12 @@ export class CommitStrip {
     this.waiting = true;
   }
 
+  /** Whose commit a log entry folded; null: it took one out, or is older than those that are kept here. */
+  robotAt(seq: number): string | null {
+    const entry = this.entries.get(seq);
+    return entry?.kind === "+" ? robotOf(entry.id) : null;
+  }
+
   get robots(): string[] {
     return [...new Set([...this.entries.values()].map(({ id }) => robotOf(id)))].sort();
   }

@@ -2,7 +2,7 @@
 
 import { fill, h } from "../dom.ts";
 import { FIELDS, type Field, type Look } from "../look.ts";
-import { stopsOf } from "../palettes.ts";
+import { robotColour, stopsOf } from "../palettes.ts";
 
 export class Legend {
   readonly element = h("section", { class: "legend", "aria-label": "Legend" });
@@ -10,13 +10,14 @@ export class Legend {
   private shown = "";
 
   /** `range` in the legend's unit; null: nothing that is shown has this field. */
-  show(look: Look, range: [number, number] | null): void {
+  show(look: Look, range: [number, number] | null, robots: readonly string[]): void {
     const locked = look.ranges[look.field] !== undefined;
-    const state = JSON.stringify([look.field, range?.map((end) => end.toFixed(2)), locked]);
+    const state = JSON.stringify([look.field, range?.map((end) => end.toFixed(2)), locked, look.field === "robot" && robots]);
     if (state === this.shown || this.element.contains(document.activeElement)) return;
     this.shown = state;
     const { label, palette, unit } = FIELDS.find(({ field }) => field === look.field)!;
     const bare = h("p", { class: "bare" }, h("span", { class: "hatch", "aria-hidden": "true" }), bareText(look.field));
+    if (look.field === "robot") return fill(this.element, h("h2", {}, "Robot that changed the cell last"), ...robots.map((name) => named(name, robots)), bare);
     if (!palette) return fill(this.element, h("h2", {}, label), h("p", {}, "As the cameras saw it."), bare);
     if (!range) return fill(this.element, h("h2", {}, label), h("p", {}, `Nothing shown has a ${label.toLowerCase()}.`), bare);
     const title = look.field === "age" ? "Age: log entries since a cell changed" : `${label}${unit ? `, ${unit}` : ""}`;
@@ -45,7 +46,14 @@ export class Legend {
 }
 
 function bareText(field: Field): string {
+  if (field === "robot") return "not known: taken out, or long ago";
   return field === "temperature" ? "no temperature was measured" : "no colour was measured";
+}
+
+function named(name: string, robots: readonly string[]): HTMLElement {
+  const dot = h("span", { class: "dot", "aria-hidden": "true" });
+  dot.style.background = robotColour(name, robots);
+  return h("p", {}, dot, ` ${name}`);
 }
 
 /** A canvas, because a strict page takes no gradient in an attribute. */

@@ -8,7 +8,7 @@ import type { Pose } from "../messages.ts";
 /** Of two pictures, ms: a robot tells its pose several times a second, and the server draws for others, too. */
 const PAUSE_MS = 1500;
 const LAYERS: Record<Field, string> = {
-  colour: "colour", temperature: "temperature", probability: "probability", height: "depth", age: "age",
+  colour: "colour", temperature: "temperature", probability: "probability", height: "depth", age: "age", robot: "colour",
 };
 const SIZE = { width: "320", height: "240", focal_px: "250" };
 
