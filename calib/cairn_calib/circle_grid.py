@@ -23,7 +23,7 @@ from cairn_map.errors import BadInputError
 Floats = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 
-BLOCKS = (0.06, 0.15, 0.4)
+BLOCKS = (0.06, 0.03, 0.15, 0.4)
 """Neighbourhoods of the adaptive threshold, shares of the shorter side."""
 OFFSET = 0.08
 """Of the image's contrast, that a disc must differ from its neighbourhood."""
@@ -43,11 +43,12 @@ SPECK = 0.12
 """Of the usual area: what is smaller is noise."""
 SMOOTH_PX = 1.4
 SEEN_MIN = 0.9
-SCALES = (1.0, 2.0, 4.0)
-LARGE_PX = 320
-"""Longest side above which images are not enlarged."""
+SCALES = ((320, (1.0, 2.0, 4.0)), (1000, (1.0, 2.0)), (1 << 30, (1.0,)))
+"""Longest side up to which images are so enlarged."""
 RIM = 0.42
-"""Pitches from a disc's centre; what lies beyond, up to half, is the ground."""
+"""Pitches from a disc's centre; what lies beyond, up to half along rows and columns, is the ground."""
+ASYMMETRIC_RIM, ASYMMETRIC_REACH = 0.55, 0.7
+"""The same from and to which there is ground about asymmetric discs, whose neighbours are 1.41 pitches away."""
 CONTRAST_RATIO = 3.0
 
 
@@ -79,7 +80,7 @@ def find_circles(
             "stands upright",
         )
     attempts: list[Attempt] = []
-    for scale in SCALES if max(counts.shape) <= LARGE_PX else SCALES[:1]:
+    for scale in next(scales for longest, scales in SCALES if max(counts.shape) <= longest):
         even = cv2.resize(stretched(signed), None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
         for block in BLOCKS:
             blobs = (_blobs(np.asarray(even, np.float32), block, board.count) + 0.5) / scale - 0.5
@@ -110,7 +111,7 @@ def _blobs(even: Image, block: float, count: int) -> Floats:
     ground = cv2.blur(even, (size, size))
     dark = (even < ground - OFFSET).astype(np.uint8)
     contours, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    centres, areas = [], []
+    centres, areas, depths = [], [], []
     for contour in contours:
         m = cv2.moments(contour)
         if not AREA_MIN_PX <= m["m00"] <= AREA_MAX * even.size:
@@ -119,13 +120,17 @@ def _blobs(even: Image, block: float, count: int) -> Floats:
         long, short = (float(v) for v in np.linalg.eigvalsh([[xx, xy], [xy, yy]])[::-1])
         if short <= FLATTEST**2 * long or m["m00"] < ELLIPSE_MIN * 4 * np.pi * np.sqrt(long * short):
             continue
-        centres.append((m["m10"] / m["m00"], m["m01"] / m["m00"]))
+        x, y = m["m10"] / m["m00"], m["m01"] / m["m00"]
+        centres.append((x, y))
         areas.append(m["m00"])
+        depths.append(float((ground - even)[round(y), round(x)]))
     if not centres:
         return np.zeros((0, 2))
     order = np.argsort(-np.array(areas))[:BLOBS_MAX]
-    usual = float(np.median(np.array(areas)[order][:count]))
-    return _apart(np.array(centres)[order][np.array(areas)[order] > SPECK * usual])
+    area, depth = np.array(areas)[order], np.array(depths)[order]
+    dark_as_usual = depth > np.median(np.sort(depth)[::-1][:count]) / CONTRAST_RATIO
+    usual = float(np.median(area[dark_as_usual][:count])) if dark_as_usual.any() else 0.0
+    return _apart(np.array(centres)[order][dark_as_usual & (area > SPECK * usual)])
 
 
 def _apart(centres: Floats) -> Floats:
@@ -209,7 +214,7 @@ def _measured(signed: Image, board: Board, homography: Floats) -> Corners | str:
     for index in range(board.count):
         centre = at[index]
         for _ in range(2):  # the second time about the first one's centroid
-            centre, covariance[index], contrast[index] = _centroid(signed, centre, steps[index])
+            centre, covariance[index], contrast[index] = _centroid(signed, centre, steps[index], board)
         pixels[index] = centre
     usual = float(np.nanmedian(contrast))
     sound = np.isfinite(pixels[:, 0]) & (contrast > usual / CONTRAST_RATIO) & (contrast < usual * CONTRAST_RATIO)
@@ -226,19 +231,21 @@ def _measured(signed: Image, board: Board, homography: Floats) -> Corners | str:
     return Corners(board, pixels, covariance)
 
 
-def _centroid(signed: Image, centre: Floats, steps: Floats) -> tuple[Floats, Floats, float]:
+def _centroid(signed: Image, centre: Floats, steps: Floats, board: Board) -> tuple[Floats, Floats, float]:
     """Centroid (2,), covariance (2, 2) px^2 and contrast of a dark disc; NaN and 0 where there is none."""
     nothing = np.full(2, np.nan), np.full((2, 2), np.nan), 0.0
     if not np.isfinite(centre).all():
         return nothing
-    reach = 0.5 * np.abs(steps).sum(axis=0)
+    asymmetric = board.pattern == "asymmetric-circles"
+    reach = (ASYMMETRIC_REACH if asymmetric else 0.5) * np.abs(steps).sum(axis=0)
     low, high = np.floor(centre - reach).astype(int), np.ceil(centre + reach).astype(int) + 1
     if (low < 0).any() or high[0] > signed.shape[1] or high[1] > signed.shape[0]:
         return nothing
     y, x = np.mgrid[low[1] : high[1], low[0] : high[0]].astype(np.float64)
     cells = np.linalg.solve(steps.T, np.stack([x - centre[0], y - centre[1]]).reshape(2, -1)).reshape(2, *x.shape)
-    inside = (np.abs(cells) < 0.5).all(axis=0)
-    rim = inside & (np.hypot(*cells) > RIM)
+    radius = np.hypot(*cells)
+    inside = radius < ASYMMETRIC_REACH if asymmetric else (np.abs(cells) < 0.5).all(axis=0)
+    rim = inside & (radius > (ASYMMETRIC_RIM if asymmetric else RIM))
     if rim.sum() < 6:
         return nothing
     terms = np.stack([np.ones_like(x), x - centre[0], y - centre[1]], axis=-1)

@@ -1,7 +1,7 @@
 """Grids of discs: found in order, centroids where the projected discs have theirs."""
 
 import numpy as np
-from tests.cairn_calib.board_images import DISC, TOF, Floats, Spectrum, picture, pose
+from tests.cairn_calib.board_images import DISC, THERMAL, TOF, Floats, Spectrum, picture, pose
 
 from cairn_calib.board import Board
 from cairn_calib.circle_grid import find_circles
@@ -33,6 +33,17 @@ def test_discs_are_found_in_order_with_the_errors_that_are_stated() -> None:
         root = np.linalg.cholesky(detection.corners.covariance_px2[seen])
         errors.append(np.linalg.solve(root, error[..., None])[..., 0])
     assert 0.7 < np.concatenate(errors).std() < 1.3
+
+
+def test_a_heated_board_is_found_far_off_and_beside_weak_strays() -> None:
+    # 11: the board's corners look like faint discs. 35: discs nearer to each other than what they are compared with.
+    for seed in (11, 35):
+        rng = np.random.default_rng(seed)
+        T = pose(rng, THERMAL, board=DISCS, tilt_deg=45)
+        detection = find_circles(picture(THERMAL, T, rng, board=DISCS), DISCS, polarity="reversed")
+        assert detection.corners is not None, [str(attempt) for attempt in detection.attempts]
+        error = detection.corners.pixels - disc_centroids(THERMAL, T, DISCS)
+        assert np.nanmax(np.abs(error)) < 1
 
 
 def test_a_chessboard_is_no_grid_of_discs() -> None:
