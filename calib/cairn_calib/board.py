@@ -11,11 +11,11 @@ dark**. A thermal camera may see dark cells bright; that is the pair's polarity,
 """
 
 import re
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cairn_map.errors import BadInputError
 
@@ -39,6 +39,17 @@ class Board(BaseModel):
     columns: Side
     rows: Side
     pitch_m: Length
+    disc_m: Length | None = None
+    """Diameter of its discs. None: a chessboard, or unknown; then centroids are taken for the images of centres."""
+
+    @model_validator(mode="after")
+    def _discs_apart(self) -> Self:
+        if self.disc_m is None:
+            return self
+        apart = self.pitch_m * (2**0.5 if self.pattern == "asymmetric-circles" else 1.0)
+        if self.pattern == "chessboard" or self.disc_m >= apart:
+            raise ValueError(f"disc_m is the diameter of discs that are {apart:g} m apart, got {self.disc_m:g} m")
+        return self
 
     @property
     def count(self) -> int:

@@ -5,6 +5,10 @@
 
 A board's point moves with its pose by dt + dr x (R p); the rig's camera moves the other way. So one matrix, pixels by
 a point of the rig, makes all columns.
+
+Of a disc, the predicted pixel is the centroid of its image (disc_shift.py). How that shift from the centre's image
+changes with the parameters is left out of the derivatives: it is a few thousandths of how the centre's image changes,
+and steps converge to the same place but for such a share of a standard deviation.
 """
 
 from collections.abc import Sequence
@@ -14,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.board_views import BoardView
+from cairn_calib.disc_shift import disc_shift
 from cairn_calib.normal_equations import Block, Indices, Loss
 from cairn_calib.rig_state import Layout, RigState
 
@@ -36,6 +41,8 @@ class CornerData:
     """(V, N)"""
     sigma_px: float
     """Root mean square of the stated standard deviations, one axis."""
+    disc_radius_m: float = 0.0
+    """0: points, or discs of unknown size, whose centroids are taken for their centres."""
 
 
 def corner_data(camera: int, views: Sequence[BoardView], frames: Sequence[str]) -> CornerData:
@@ -54,6 +61,7 @@ def corner_data(camera: int, views: Sequence[BoardView], frames: Sequence[str]) 
         whitening,
         seen,
         float(np.sqrt(variance)),
+        (views[0].corners.board.disc_m or 0.0) / 2,
     )
 
 
@@ -71,7 +79,16 @@ def corner_misses(data: CornerData, state: RigState, lattice: Floats, shape: Flo
         board_points(state, lattice, shape) @ np.swapaxes(T_rig_board[:, :3, :3], 1, 2) + T_rig_board[:, None, :3, 3]
     )
     p_camera = (p_rig - T_rig_camera[:3, 3]) @ T_rig_camera[:3, :3]
-    return np.where(data.seen[..., None], state.lenses[data.camera].project(p_camera) - data.pixels, 0.0)
+    predicted = state.lenses[data.camera].project(p_camera)
+    if data.disc_radius_m:
+        predicted = predicted + _disc_shift(data, state, p_camera)
+    return np.where(data.seen[..., None], predicted - data.pixels, 0.0)
+
+
+def _disc_shift(data: CornerData, state: RigState, p_camera: Floats) -> Floats:
+    R_rig_camera = state.T_rig_camera[data.camera, :3, :3]
+    R_camera_board = R_rig_camera.T @ state.T_rig_board[data.frames, :3, :3]
+    return disc_shift(state.lenses[data.camera], p_camera, R_camera_board, state.scale * data.disc_radius_m)
 
 
 def corner_derivatives(
@@ -99,7 +116,10 @@ def corner_derivatives(
         J[..., ends[2]] = np.einsum("vnij,vnj->vni", G, lattice @ np.swapaxes(R_rig_board, 1, 2))
     _crossed_into(J[..., ends[3] : ends[3] + 3], G, -turned)
     J[..., ends[3] + 3 :] = G
-    misses = np.where(data.seen[..., None], there.pixels - data.pixels, 0.0)
+    predicted = there.pixels
+    if data.disc_radius_m:
+        predicted = predicted + _disc_shift(data, state, q @ R_rig_camera)
+    misses = np.where(data.seen[..., None], predicted - data.pixels, 0.0)
     return misses, J, np.concatenate(at)
 
 

@@ -21,7 +21,8 @@ first row, end of last row, start of last row, and pass the file as `--outer-cor
     {"format": "cairn-outer-corners", "version": 1,
      "images": {"left02.png": [[412, 96], [688, 130], [655, 310], [401, 288]]}}
 
-For grids of discs say `--pattern circles` or `asymmetric-circles`; `--square` is then from disc to disc.
+For grids of discs say `--pattern circles` or `asymmetric-circles`; `--square` is then from disc to disc, and `--disc`
+their diameter: a tilted disc's image has its centroid beside its centre, which `cairn calib solve` must know.
 If no board was found in any image, that is an error (exit code 3).
 """
 
@@ -31,6 +32,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import ValidationError
 
 from cairn_calib.board import Board, board_size
 from cairn_calib.circle_grid import find_circles
@@ -38,7 +40,7 @@ from cairn_calib.corner_detection import find_chessboard, fit_pointed_at
 from cairn_calib.corner_file import corner_file, read_outer_corners
 from cairn_calib.corner_pictures import Grey, overlay, read_grey, write_picture
 from cairn_calib.corners import Detection
-from cairn_map.errors import BadInputError, CairnError, NotFoundError
+from cairn_map.errors import BadInputError, CairnError, NotFoundError, first_error
 
 Floats = npt.NDArray[np.float64]
 
@@ -71,6 +73,7 @@ def _add_arguments(corners: argparse.ArgumentParser) -> None:
     corners.add_argument(
         "--pattern", choices=("chessboard", "circles", "asymmetric-circles"), default="chessboard", help="(chessboard)"
     )
+    corners.add_argument("--disc", type=float, metavar="METRES", help="diameter of a disc, for grids of discs")
     corners.add_argument(
         "--polarity",
         choices=("normal", "reversed"),
@@ -124,7 +127,12 @@ def _board(args: argparse.Namespace) -> Board:
     columns, rows = board_size(args.board)
     if not 0 < args.square <= 100:
         raise BadInputError("bad_board", f"--square is an edge in metres, above 0 and at most 100, got {args.square}")
-    return Board(pattern=args.pattern, columns=columns, rows=rows, pitch_m=args.square)
+    if (args.pattern == "chessboard") != (args.disc is None):
+        raise BadInputError("bad_board", "--disc is the diameter in metres of a grid's discs: give it for them alone")
+    try:
+        return Board(pattern=args.pattern, columns=columns, rows=rows, pitch_m=args.square, disc_m=args.disc)
+    except ValidationError as exc:
+        raise BadInputError("bad_board", f"--disc: {first_error(exc)}") from exc
 
 
 def _detected(counts: Grey, board: Board, args: argparse.Namespace, pointed: Floats | None) -> Detection:
