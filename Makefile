@@ -39,6 +39,7 @@ soak: .venv/dev.stamp .venv/kernels.stamp  ## crash, crowd, simulate sync, fuzz 
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.links --minutes 30)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.links --minutes 15 --kill)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.rig_seeds --seeds 200)
+	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.board_finding --boards 1000 --empty 10000)
 	$(if $(SOAK_ARGS),,OVERLAY_POSES=1000 $(BIN)/python -m pytest tests/cairn_fusion/test_overlay.py)
 	$(BIN)/python -m tests.fuzz --seconds $(SOAK_SECONDS) $(SOAK_ARGS)
 

@@ -141,7 +141,8 @@ def fitted_grid(grid: Floats, counts: Image, board: Board) -> Judged | None:
         if homography is None:
             return None
         guesses = np.where(known[:, None], guesses, _predicted(homography, lattice, guesses, known))
-        fitted = _only(fit_corners(counts, guesses, steps_between(homography, lattice)), signs)
+        steps = steps_between(homography, lattice)
+        fitted = _only(fit_corners(counts, guesses, steps), signs, apart_px=0.5 * _shortest(steps))
         guesses = fitted.pixels
         if not np.isnan(guesses).any():
             break
@@ -158,9 +159,20 @@ def _predicted(homography: Floats, lattice: Floats, guesses: Floats, known: npt.
     return np.asarray(plain + off[away.argmin(axis=1)])
 
 
-def _only(fitted: FittedCorners, signs: Floats) -> FittedCorners:
-    """The fitted corners, NaN for those that are no corners of this board."""
+def _shortest(steps: Floats) -> float:
+    return float(np.nan_to_num(np.linalg.norm(steps, axis=2), nan=np.inf).min())
+
+
+def _only(fitted: FittedCorners, signs: Floats, *, apart_px: float) -> FittedCorners:
+    """The fitted corners, NaN for those that are no corners of this board.
+
+    Where two names have come to one place, either may be wrong, so neither is kept: the others predict both anew.
+    """
     lost = ~sound_corners(fitted, signs)
+    apart = np.linalg.norm(fitted.pixels[:, None] - fitted.pixels[None], axis=2)
+    apart[np.diag_indices(len(apart))] = np.inf
+    with np.errstate(invalid="ignore"):
+        lost |= ((apart < apart_px) & ~lost).any(axis=1)
     return FittedCorners(
         pixels=np.where(lost[:, None], np.nan, fitted.pixels),
         covariance_px2=np.where(lost[:, None, None], np.nan, fitted.covariance_px2),
