@@ -26,7 +26,9 @@ TABLE = (("cells", "cell_px", (4, 6, 10, 40, 400)), ("tilt", "tilt_deg", (0, 15,
 
 def main() -> int:
     """Draw, find, print."""
-    parser = argparse.ArgumentParser("python -m tests.board_finding", description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(
+        "python -m tests.board_finding", description="How many boards are found, and how many false."
+    )
     parser.add_argument("--boards", type=int, default=1000, help="of each spectrum")
     parser.add_argument("--empty", type=int, default=10000)
     args = parser.parse_args()
