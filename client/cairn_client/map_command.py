@@ -214,7 +214,9 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--ply", type=Path, metavar="FILE", help="occupied voxels as a point cloud")
     export.add_argument("--npz", type=Path, metavar="FILE", help="all known voxels as NumPy arrays")
     export.add_argument("--picture", type=Path, metavar="FILE", help="PNG: colour, temperature, probability")
-    export.add_argument("--ceiling", type=float, metavar="METRES", help="leave out what is higher")
+    export.add_argument(
+        "--ceiling", type=float, metavar="METRES", help="leave out what is higher; with --picture, of the picture alone"
+    )
     add_part_arguments(export)
     add_query_arguments(commands.add_parser("query", help="ask a map that lies in a folder, without a server"))
     add_render_arguments(commands.add_parser("render", help="draw a map from a pose, or over a camera's image"))

@@ -34,7 +34,8 @@ def is_part(args: argparse.Namespace) -> bool:
     """Whether the server is asked for points, not for whole cells."""
     if args.pcd is not None or any(value is not None for value in (args.box, args.floor, args.p, args.depth)):
         return True
-    return args.ceiling is not None and (args.ply is not None or args.npz is not None)
+    # With a picture the ceiling is the picture's, and files are of the whole map.
+    return args.ceiling is not None and args.picture is None and (args.ply is not None or args.npz is not None)
 
 
 def export_part(api: MapApi, name: str, args: argparse.Namespace) -> None:

@@ -207,7 +207,8 @@ def test_what_hangs_is_cut_by_another_thread_and_can_be_asked_again(server: Live
         until(lambda: bool(silent.taken))
         api.sockets.cut()
         asking.join(SOON_S)
-        assert [error.kind for error in errors] == ["no_link"]
+        # Taken is not yet asked: what was cut before that is told otherwise.
+        assert [error.kind for error in errors] in (["no_link"], ["interrupted"])
         ask()
         assert errors[1].kind == "interrupted"
     silent.close()
