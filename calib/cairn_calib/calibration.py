@@ -31,7 +31,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Unit = Literal["px", "1", "rad", "m"]
 
 PARAMETERS_MAX = 240
-"""Their covariance is 0.9 MB of JSON: a `rig.json` holds 1 MiB."""
+"""Their covariance is 0.9 MB of JSON: a `rig.json` holds 4 MiB, and maybe a map of pixels besides."""
 POSE_UNITS: dict[str, Unit] = {"rx": "rad", "ry": "rad", "rz": "rad", "tx": "m", "ty": "m", "tz": "m"}
 PIXEL_NAMES = frozenset({"fx", "fy", "cx", "cy"})
 INDEFINITE_SHARE = 1e-9

@@ -34,7 +34,7 @@ ELLIPSE_MIN = 0.88
 """Area over that of the ellipse with the same moments: 1 for a disc, 0.95 for a square, less for anything else."""
 FLATTEST = 0.3
 """Short axis over long one: tilted by 70 degrees."""
-NEAR = 0.25
+NEAR = 0.35
 """Pitches from a predicted disc to a blob."""
 BLOBS_MAX = 400
 HULL_MAX = 8

@@ -4,7 +4,6 @@ CONVENTIONS.md has both formats. A document of an image without a board has no c
 which stage it ended.
 """
 
-import hashlib
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -55,6 +54,8 @@ class CornerFile(BaseModel):
     version: Literal[1] = 1
     image: str
     image_sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    frames: Annotated[int, Field(ge=1, le=1 << 20)] = 1
+    """Of a still pose, of which the image is the mean."""
     width: Annotated[int, Field(ge=1, le=16384)]
     height: Annotated[int, Field(ge=1, le=16384)]
     board: Board
@@ -91,14 +92,22 @@ class OuterCornersFile(BaseModel):
 
 
 def corner_file(
-    detection: Detection, board: Board, *, image: str, data: bytes, size: tuple[int, int], polarity: Polarity
+    detection: Detection,
+    board: Board,
+    *,
+    image: str,
+    sha256: str,
+    size: tuple[int, int],
+    polarity: Polarity,
+    frames: int = 1,
 ) -> CornerFile:
-    """The document of what was found in an image file of `data`, `size` (width, height)."""
+    """The document of what was found in an image, `size` (width, height), the mean of `frames` frames."""
     found = detection.corners
     entries = [] if found is None else [_entry(found, int(at)) for at in np.flatnonzero(found.seen)]
     return CornerFile(
         image=image,
-        image_sha256=hashlib.sha256(data).hexdigest(),
+        image_sha256=sha256,
+        frames=frames,
         width=size[0],
         height=size[1],
         board=board,

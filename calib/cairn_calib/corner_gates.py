@@ -32,7 +32,12 @@ CONTRAST_RATIO = 4.0
 FLAT_RMS_PX = 0.5
 FLAT_RMS_CELLS = 0.01
 """A lens with more than one radial term still bends a large board a little."""
+UNEVEN_PX, UNEVEN_CELLS = 0.15, 0.03
+"""Every other line of corners to one side: of 240 boards at most 0.09 px or 0.018 cells, of a fence 0.42 of 3.8 px."""
 ALTERNATING_MIN = 0.9
+EVEN = (0.7, 1.6)
+"""Contrast of the corners over that of the cells between them: 0.95 to 1.25 of 300 boards, simulated and real ones.
+Where dark and bright patches are of unequal size, as between the wires of a fence, it was 5.7."""
 CELL_MIDDLE = 0.25
 """Half width of the middle of a cell, cells."""
 BEYOND_MAX = 0.6
@@ -105,6 +110,15 @@ def _seen(judged: Judged) -> str | None:
     if count < SEEN_MIN * judged.board.count:
         total = judged.board.count
         return f"{count} of {total} corners are crossings of two sharp edges, at least {SEEN_MIN:.0%} are needed"
+    grid = judged.kept.reshape(judged.board.rows, judged.board.columns)
+    for name, line in (
+        ("first row", grid[0]),
+        ("last row", grid[-1]),
+        ("first column", grid[:, 0]),
+        ("last column", grid[:, -1]),
+    ):
+        if not line.any():
+            return f"none of the {len(line)} corners of the {name} is there, so that they may be the next one's"
     return None
 
 
@@ -134,6 +148,17 @@ def _flat(judged: Judged) -> str | None:
     return None if rms < limit else f"the corners lie {rms:.2f} px (rms) off a plane behind a lens, at most {limit:.2f}"
 
 
+def _evenly_spaced(judged: Judged) -> str | None:
+    """Whether wide and narrow cells take turns along the rows or the columns."""
+    lattice, pixels = judged.board.lattice()[judged.kept], judged.fitted.pixels[judged.kept]
+    off = pixels - mapped(judged.homography, lattice)
+    turns = np.where(lattice % 2 == 0, 1.0, -1.0)
+    turns -= turns.mean(axis=0)
+    uneven = float(np.linalg.norm(turns.T @ off / (turns**2).sum(axis=0)[:, None], axis=1).max())
+    limit = UNEVEN_PX + UNEVEN_CELLS * float(np.linalg.norm(judged.steps[judged.kept], axis=2).mean())
+    return None if uneven < limit else f"every other line of corners is {uneven:.2f} px off, at most {limit:.2f}"
+
+
 def _crisp(judged: Judged) -> str | None:
     usual = float(np.median(judged.fitted.misfit[judged.kept]))
     if usual > MISFIT_USUAL_MAX:
@@ -144,13 +169,9 @@ def _crisp(judged: Judged) -> str | None:
 def _alternating(judged: Judged) -> str | None:
     """Means of the middles of cells whose four corners are there, each against its neighbours."""
     board = judged.board
-    kept = judged.kept.reshape(board.rows, board.columns)
-    whole = kept[1:, 1:] & kept[1:, :-1] & kept[:-1, 1:] & kept[:-1, :-1]
-    middles = _cell_means(judged).reshape(board.rows - 1, board.columns - 1)
+    whole, middles, signs = _cells(judged)
     row, column = np.nonzero(whole)
-    signs = np.where((np.arange(board.rows - 1)[:, None] + np.arange(board.columns - 1)) % 2 == 0, 1.0, -1.0)
-    way = 1.0 if np.nansum(judged.fitted.contrast * checker_signs(board)) > 0 else -1.0
-    signed = middles * signs * way
+    signed = middles * signs
     right = total = 0
     for down, across in ((0, 1), (1, 0)):
         ends = (row + down < board.rows - 1) & (column + across < board.columns - 1)
@@ -164,6 +185,31 @@ def _alternating(judged: Judged) -> str | None:
             f"{right} of {total} pairs of cells alternate between dark and bright, at least {ALTERNATING_MIN:.0%} must"
         )
     return None
+
+
+def _even(judged: Judged) -> str | None:
+    """Whether corners have the contrast that the cells between them have."""
+    whole, middles, signs = _cells(judged)
+    bright, dark = middles[whole & (signs > 0)], middles[whole & (signs < 0)]
+    if not len(bright) or not len(dark):
+        return "no four corners that enclose a bright cell, or a dark one, are there"
+    half = float(np.median(bright) - np.median(dark)) / 2
+    corners = float(np.median(np.abs(judged.fitted.contrast[judged.kept])))
+    if not EVEN[0] * half < corners < EVEN[1] * half:
+        ratio = corners / half if half > 0 else np.inf
+        return f"corners have {ratio:.1f} times the contrast of cells, a chessboard's {EVEN[0]} to {EVEN[1]} times"
+    return None
+
+
+def _cells(judged: Judged) -> tuple[npt.NDArray[np.bool_], Floats, Floats]:
+    """Of the (rows - 1, columns - 1) cells: whose four corners are there, brightness, and 1 for bright, -1 for dark."""
+    board = judged.board
+    kept = judged.kept.reshape(board.rows, board.columns)
+    whole = kept[1:, 1:] & kept[1:, :-1] & kept[:-1, 1:] & kept[:-1, :-1]
+    middles = _cell_means(judged).reshape(board.rows - 1, board.columns - 1)
+    signs = np.where((np.arange(board.rows - 1)[:, None] + np.arange(board.columns - 1)) % 2 == 0, 1.0, -1.0)
+    way = 1.0 if np.nansum(judged.fitted.contrast * checker_signs(board)) > 0 else -1.0
+    return whole, middles, signs * way
 
 
 def _ends(judged: Judged) -> str | None:
@@ -245,8 +291,10 @@ GATES: tuple[tuple[str, Gate], ...] = (
     ("cell size", _cell_size),
     ("distinct", _distinct),
     ("flatness", _flat),
+    ("spacing", _evenly_spaced),
     ("crispness", _crisp),
     ("alternation", _alternating),
+    ("evenness", _even),
     ("border", _ends),
 )
 """In the order in which they are asked: cheap ones first."""

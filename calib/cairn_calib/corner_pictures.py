@@ -20,6 +20,9 @@ LONGEST_PX = 1000
 SIGMAS = 150.0
 """Ellipses are drawn this many standard deviations large: corners are good to hundredths of a pixel."""
 STRETCH = (0.5, 99.8)
+BAND_PX = 28
+"""Above the image, for the title."""
+THUMBNAIL_PX, JPEG_QUALITY = 320, 82
 FIRST, LAST, TEXT = (60, 60, 255), (255, 160, 40), (80, 255, 80)
 
 
@@ -66,7 +69,7 @@ def overlay(counts: Grey, corners: Corners | None, *, title: str) -> Picture:
     picture = np.asarray(cv2.cvtColor(large, cv2.COLOR_GRAY2BGR), np.uint8)
     if corners is not None:
         _draw(picture, corners, scale)
-    band = np.full((28, picture.shape[1], 3), 24, np.uint8)
+    band = np.full((BAND_PX, picture.shape[1], 3), 24, np.uint8)
     cv2.putText(band, title, (8, 19), cv2.FONT_HERSHEY_SIMPLEX, 0.5, TEXT, 1, cv2.LINE_AA)
     return np.concatenate([band, picture])
 
@@ -74,6 +77,21 @@ def overlay(counts: Grey, corners: Corners | None, *, title: str) -> Picture:
 def write_picture(path: Path, picture: Picture) -> None:
     """A PNG file of a picture."""
     path.write_bytes(bytes(cv2.imencode(".png", picture)[1]))
+
+
+def thumbnail(path: Path) -> bytes | None:
+    """A JPEG, 320 pixels wide, of a picture that `overlay` made and `write_picture` wrote; None if there is none."""
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError:
+        return None
+    picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    if picture is None or picture.shape[0] <= BAND_PX:
+        return None
+    image = picture[BAND_PX:]
+    height = max(1, round(image.shape[0] * THUMBNAIL_PX / image.shape[1]))
+    small = cv2.resize(image, (THUMBNAIL_PX, height), interpolation=cv2.INTER_AREA)
+    return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
 
 
 def write_grey16(path: Path, counts: npt.NDArray[np.uint16]) -> None:

@@ -119,7 +119,7 @@ def _fit(image: Image, guesses: Floats, steps: Floats, shading: Floats) -> _Fit:
         prior[:, 4] = strength / (BLUR_LOG * unknown[:, 4]) ** 2
         gradient[:, 2:4] += prior[:, 2:4] * _wrapped(angles - unknown[:, 2:4])
         gradient[:, 4] += prior[:, 4] * unknown[:, 4] * np.log(0.8 / unknown[:, 4])
-        normal += (prior + 1e-9 * scale[:, None] ** 2)[..., None] * np.eye(UNKNOWNS)
+        normal += _ridge(normal, prior, scale)
         step = np.linalg.solve(normal, gradient[..., None])[..., 0]
         step[:, :2] *= np.minimum(1, limit / np.maximum(2 * np.linalg.norm(step[:, :2], axis=1), 1e-12))[:, None]
         step[:, 2:4] = np.clip(step[:, 2:4], -0.3, 0.3)
@@ -128,7 +128,7 @@ def _fit(image: Image, guesses: Floats, steps: Floats, shading: Floats) -> _Fit:
         if np.abs(step[usable, :2]).max(initial=0.0) < 1e-4:
             break
     residual, normal, _ = _normal(unknown, x, y, values, weight)
-    normal += (prior + 1e-9 * scale[:, None] ** 2)[..., None] * np.eye(UNKNOWNS)
+    normal += _ridge(normal, prior, scale)
     dof = np.maximum(count - UNKNOWNS, 1)
     lost = ~usable | (np.linalg.norm(unknown[:, :2] - start, axis=1) > limit)
     unknown[lost] = np.nan
@@ -140,6 +140,12 @@ def _fit(image: Image, guesses: Floats, steps: Floats, shading: Floats) -> _Fit:
         mean=unknown[:, 5],
         contrast=unknown[:, 6],
     )
+
+
+def _ridge(normal: Floats, prior: Floats, scale: Floats) -> Floats:
+    """(N, 7, 7) on the diagonal: the prior, and just enough that a window without any edge is not singular."""
+    own = np.diagonal(normal, axis1=1, axis2=2)
+    return np.asarray((prior + 1e-9 * (scale[:, None] ** 2 + own))[..., None] * np.eye(UNKNOWNS))
 
 
 def _windows(

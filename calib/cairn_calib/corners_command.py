@@ -3,17 +3,24 @@
     $ cairn calib corners left/*.png --board 9x6 --square 0.05 --output corners/
     left01.png: 54 of 54 corners, sigma 0.02 px (saddles x1)
     left02.png: no board (candidates: 31 places look like a corner, the board has 54)
+    polarity normal: 11 for normal, 0 for reversed of 13 images
     found in 12 of 13 images; the others: left02.png; look at corners/*.png
 
 `--board` counts inner corners, not cells; one number should be odd and the other even, since of other boards no
 image tells which way up they are (`--upright` says that yours always stands upright). `--square` is the edge of a cell
-in metres. Colour, near-infrared amplitude and thermal images need no options but one: where the camera sees the
-printed dark cells bright, as a thermal camera sees a heated board, say `--polarity reversed`. Their order is then
-the same in all cameras, which a joint calibration relies on: run the command once for each camera.
+in metres. Colour, near-infrared amplitude and thermal images need no options. Where a camera
+sees the printed dark cells bright, as a thermal camera sees a heated board, the board's margin tells, by a vote of all
+images: run the command once for each camera, with all of its images. Corners are then named in the same order in all
+cameras, which a joint calibration relies on. Of a board without a paper-white margin say `--polarity` yourself.
+
+Noisy cameras: take several frames of each still pose and give a folder for each pose instead of an image; its frames
+are averaged (corners of 8 are almost 3 times as certain), and a board that moved between them is refused.
+
+    $ cairn calib corners tof/pose01 tof/pose02 tof/pose03 --board 9x6 --square 0.05 --output corners/tof
 
 Each image gets a JSON document of its corners with covariances in pixels squared (CONVENTIONS.md), and a picture to
 look at. Parts of the board may be hidden, but each of its four sides must be seen in part. What only looks like a
-board is refused, and both files say at which stage.
+board is refused, and both files say at which stage; so is an image that repeats another one, count for count.
 
 Where detection fails, help it: name the outer four of the inner corners, to a few pixels, in the order first, end of
 first row, end of last row, start of last row, and pass the file as `--outer-corners`:
@@ -27,22 +34,29 @@ If no board was found in any image, that is an error (exit code 3).
 """
 
 import argparse
+import hashlib
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from cairn_calib.board import Board, board_size
-from cairn_calib.circle_grid import find_circles
-from cairn_calib.corner_detection import find_chessboard, fit_pointed_at
+from cairn_calib.board import Board, Polarity, board_size
 from cairn_calib.corner_file import corner_file, read_outer_corners
-from cairn_calib.corner_pictures import Grey, overlay, read_grey, write_picture
-from cairn_calib.corners import Detection
+from cairn_calib.corner_pictures import overlay, write_picture
+from cairn_calib.corners import Attempt, Detection
+from cairn_calib.looked import Looked, looked_for_corners, looked_for_discs
+from cairn_calib.polarity_vote import vote_of
+from cairn_calib.progress import with_progress
+from cairn_calib.still_frames import if_still, read_still
 from cairn_map.errors import BadInputError, CairnError, NotFoundError, first_error
 
 Floats = npt.NDArray[np.float64]
+NAMED_MAX = 8
+"""Images without a board that the last line names."""
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -66,7 +80,13 @@ def main(argv: list[str]) -> int:
 
 
 def _add_arguments(corners: argparse.ArgumentParser) -> None:
-    corners.add_argument("images", type=Path, nargs="+", metavar="IMAGE", help="PNG, JPEG or TIFF, 8 or 16 bits")
+    corners.add_argument(
+        "images",
+        type=Path,
+        nargs="+",
+        metavar="IMAGE",
+        help="PNG, JPEG, TIFF, 8 or 16 bits; folder: a still pose",
+    )
     corners.add_argument("--board", required=True, metavar="COLUMNSxROWS", help="inner corners, such as 9x6")
     corners.add_argument("--square", type=float, required=True, metavar="METRES", help="edge of a cell")
     corners.add_argument("--output", type=Path, required=True, metavar="DIR", help="for the documents and pictures")
@@ -76,9 +96,9 @@ def _add_arguments(corners: argparse.ArgumentParser) -> None:
     corners.add_argument("--disc", type=float, metavar="METRES", help="diameter of a disc, for grids of discs")
     corners.add_argument(
         "--polarity",
-        choices=("normal", "reversed"),
-        default="normal",
-        help="reversed: what is printed dark looks bright (normal)",
+        choices=("vote", "normal", "reversed"),
+        default="vote",
+        help="reversed: what is printed dark looks bright; vote: the images tell (vote)",
     )
     corners.add_argument(
         "--upright", action="store_true", help="rows of the board run along rows of the image, left to right"
@@ -90,31 +110,51 @@ def _add_arguments(corners: argparse.ArgumentParser) -> None:
 def _run(args: argparse.Namespace) -> int:
     board = _board(args)
     pointed = read_outer_corners(args.outer_corners, board) if args.outer_corners else {}
-    names = [path.stem for path in args.images]
+    names = [_name(path) for path in args.images]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise BadInputError("image_name", f"images must have names of their own, {', '.join(twice)} comes twice")
+    for path, name in zip(args.images, names, strict=True):
+        # A picture among a still pose's frames would be one of them the next time.
+        if path.resolve() in ((args.output / f"{name}.png").resolve(), args.output.resolve()):
+            raise BadInputError(
+                "image_name", f"the picture of {path}'s corners would overwrite it: give another --output"
+            )
+    by_hand = args.outer_corners.resolve() if args.outer_corners else None
+    if by_hand in [(args.output / f"{name}.json").resolve() for name in names]:
+        raise BadInputError("image_name", f"a document of corners would overwrite {args.outer_corners}: move that")
     unknown = sorted(set(pointed) - {path.name for path in args.images})
     if unknown:
         raise BadInputError(
             "image_name", f"{args.outer_corners} names images that were not given: {', '.join(unknown)}"
         )
     args.output.mkdir(parents=True, exist_ok=True)
+    seen_before: dict[bytes, str] = {}
+    looked = [
+        _looked(path, board, args, pointed.get(path.name), seen_before) for path in with_progress(args.images, "images")
+    ]
+    polarity = _polarity(looked, args)
     lost = []
-    for path in args.images:
-        counts, data = read_grey(path)
-        detection = _detected(counts, board, args, pointed.get(path.name))
+    for path, name, each in zip(args.images, names, looked, strict=True):
+        image = read_still(path)
+        detection = each.named(polarity)
         document = corner_file(
-            detection, board, image=path.name, data=data, size=counts.shape[::-1], polarity=args.polarity
+            detection,
+            board,
+            image=path.name,
+            sha256=image.sha256,
+            size=image.counts.shape[::-1],
+            polarity=polarity,
+            frames=image.frames,
         )
-        (args.output / f"{path.stem}.json").write_text(document.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        (args.output / f"{name}.json").write_text(document.model_dump_json(indent=1) + "\n", encoding="utf-8")
         line = f"{path.name}: {_told(detection)}"
-        write_picture(args.output / f"{path.stem}.png", overlay(counts, detection.corners, title=line))
-        _say(line)
+        write_picture(args.output / f"{name}.png", overlay(image.counts, detection.corners, title=line))
         if detection.corners is None:
             lost.append(path.name)
     found = len(args.images) - len(lost)
-    others = f"; the others: {', '.join(lost)}" if lost else ""
+    more = f" and {len(lost) - NAMED_MAX} more" if len(lost) > NAMED_MAX else ""
+    others = f"; the others: {', '.join(lost[:NAMED_MAX])}{more}" if lost else ""
     _say(f"found in {found} of {len(args.images)} images{others}; look at {args.output}/*.png")
     if not found:
         raise NotFoundError(
@@ -135,12 +175,47 @@ def _board(args: argparse.Namespace) -> Board:
         raise BadInputError("bad_board", f"--disc: {first_error(exc)}") from exc
 
 
-def _detected(counts: Grey, board: Board, args: argparse.Namespace, pointed: Floats | None) -> Detection:
-    if board.pattern != "chessboard":
-        return find_circles(counts, board, polarity=args.polarity, upright=args.upright, pointed=pointed)
-    if pointed is not None:
-        return fit_pointed_at(counts, board, pointed)
-    return find_chessboard(counts, board, polarity=args.polarity, upright=args.upright)
+def _name(path: Path) -> str:
+    return path.resolve().name if path.is_dir() else path.stem
+
+
+def _looked(
+    path: Path, board: Board, args: argparse.Namespace, pointed: Floats | None, seen_before: dict[bytes, str]
+) -> Looked:
+    """What an image shows, told at once; `seen_before` names an image by the digest of its counts."""
+    image = read_still(path)
+    twin = seen_before.setdefault(hashlib.sha256(image.counts.tobytes()).digest(), path.name)
+    if twin != path.name:
+        repeated = _repeated(twin)
+        _say(f"{path.name}: {_told(repeated)}")
+        return Looked(repeated, repeated, None)
+    look = looked_for_discs if board.pattern != "chessboard" else looked_for_corners
+    found = look(image.counts, board, polarity=args.polarity, upright=args.upright, pointed=pointed)
+    found = found.checked(lambda detection: if_still(image, detection))
+    _say(f"{path.name}: {_told(found.likely)}")
+    return found
+
+
+def _polarity(looked: Sequence[Looked], args: argparse.Namespace) -> Polarity:
+    told: Polarity | Literal["vote"] = args.polarity
+    if told != "vote":
+        return told
+    vote = vote_of([each.vote for each in looked])
+    if vote.polarity is not None:
+        _say(f"polarity {vote.polarity}: {vote} of {len(looked)} images")
+        return vote.polarity
+    if any(each.likely.corners is not None for each in looked):
+        _say(
+            f"polarity unknown, taken for normal: {vote} of {len(looked)} images; if this camera sees what is printed "
+            "dark as bright, say --polarity reversed"
+        )
+    return "normal"
+
+
+def _repeated(twin: str) -> Detection:
+    """Of an image that is the one before it once more: the board has moved since, and its place is not in it."""
+    reason = f"the same counts as {twin}; cameras repeat an image when they lose one, or level themselves"
+    return Detection(None, (Attempt("image", 1.0, "repeated", reason),))
 
 
 def _told(detection: Detection) -> str:

@@ -82,13 +82,15 @@ def _half(solution: Solution, frames: Sequence[str]) -> Solution:
         for sensor in solution.adjusted.problem.sensors
         if isinstance(sensor.data, CornerData)
     }
-    return solve_from(views, solution.plan, state, scales)
+    terms = None if solution.ranges is None else solution.ranges.terms
+    return solve_from(views, replace(solution.plan, range_terms=terms), state, scales)
 
 
 def _camera_rows(solution: Solution) -> npt.NDArray[np.intp]:
-    """Where the cameras' parameters stand: warp and scale are not compared."""
+    """Where the cameras' parameters stand: warp and scale are not compared, nor the nodes, many of which nobody saw."""
     names = solution.layout.names
-    return np.array([n for n, (owner, _) in enumerate(names) if owner in solution.plan.cameras], np.intp)
+    cameras = solution.plan.cameras
+    return np.array([n for n, (o, name) in enumerate(names) if o in cameras and not name.startswith("node")], np.intp)
 
 
 def _step(solution: Solution, half: Solution) -> Floats:

@@ -6,6 +6,7 @@ from cairn_calib.cross_validation import Halves, cross_validated
 from cairn_calib.frame_influence import Influence, influences
 from cairn_calib.next_image import NextImage, next_images
 from cairn_calib.probe_points import Probes, probes_of
+from cairn_calib.range_warnings import range_warnings
 from cairn_calib.rig import Rig
 from cairn_calib.solve import Solution
 from cairn_calib.solve_warnings import Warned, refuse_undetermined, warnings_of
@@ -52,5 +53,5 @@ def examined(solution: Solution, rig: Rig) -> Examination:
         halves,
         tuple(modes),
         tuple(next_images(solution, probes)),
-        tuple(warnings_of(solution, covered, moved, halves, modes)),
+        (*warnings_of(solution, covered, moved, halves, modes), *range_warnings(solution)),
     )

@@ -128,5 +128,8 @@ def _distortion_of(each: PlacedCamera) -> tuple[str, tuple[float, ...]]:
     if any(camera.distortion[RADTAN_COEFFICIENTS:]):
         held = dict(zip(camera.coefficient_names, camera.distortion, strict=True))
         names = ", ".join(f"{key} = {value:g}" for key, value in list(held.items())[RADTAN_COEFFICIENTS:] if value)
-        raise not_held(each, "camera.distortion", f"Kalibr's radtan has k1, k2, p1, p2 only, the lens has {names}")
+        told = (
+            f"Kalibr's radtan has k1, k2, p1, p2 only, the lens has {names} (solve with --distortion to hold it at 0)"
+        )
+        raise not_held(each, "camera.distortion", told)
     return "radtan", camera.distortion[:RADTAN_COEFFICIENTS]

@@ -1,9 +1,10 @@
 """How warm a thing is that a thermal camera sees: its counts, its emissivity, what it mirrors, the air between.
 
-    U = eps tau U(T) + (1 - eps) tau U(T_reflected) + (1 - tau) U(T_air)         U(T): radiometry.py
+    U = eps tau U(T) + (1 - eps) tau U(T_reflected) + (1 - tau) U(T_air) + h (T_housing - T_0)
 
-solved for T, with the standard deviation that the certainty of everything in it leaves. Counts of a camera of which
-nobody knows the response come back as `NotRadiometric`: a type that has no kelvin to read.
+U(T) and h are in radiometry.py. Solved for T, with the standard deviation that the certainty of everything in it
+leaves. Counts of a camera of which nobody knows the response come back as `NotRadiometric`: a type that has no kelvin
+to read.
 """
 
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.flat_field import FlatField
-from cairn_calib.radiometry import Radiometry
+from cairn_calib.radiometry import ZERO_C_K, Radiometry
 from cairn_map.errors import BadInputError
 
 Floats = npt.NDArray[np.float64]
@@ -79,6 +80,7 @@ def temperatures(
     *,
     viewing: Viewing | None = None,
     flat_field: FlatField | None = None,
+    housing_k: float | None = None,
 ) -> Temperatures | NotRadiometric:
     """What a thermal image's counts say of the temperature.
 
@@ -87,6 +89,10 @@ def temperatures(
         radiometry: of the camera; None where nobody knows it.
         viewing: of the surface; None: black, through clear air, so that temperatures are apparent.
         flat_field: how pixels differ; None where the camera itself levels them.
+        housing_k: how warm the camera itself was, kelvin; None: nobody said, which the standard deviation tells.
+
+    Returns:
+        Counts alone where nobody knows the response, or it does not hold for so warm a camera.
 
     Raises:
         BadInputError: a temperature of the viewing has no counts, or the flat field is of another size.
@@ -94,7 +100,19 @@ def temperatures(
     if radiometry is None:
         return NotRadiometric(np.asarray(counts, np.float32), "the camera has no radiometry: no reference was measured")
     seen, response = viewing or Viewing(), radiometry.response
+    housing, warmer_k, warmer_sigma_k = radiometry.housing, 0.0, 0.0
+    if housing is not None:
+        low_k, high_k = housing.range_k
+        if housing_k is not None and not low_k <= housing_k <= high_k:
+            return NotRadiometric(
+                np.asarray(counts, np.float32),
+                f"the camera's housing was at {housing_k - ZERO_C_K:.1f} C, and references were taken at "
+                f"{low_k - ZERO_C_K:.1f} to {high_k - ZERO_C_K:.1f} C",
+            )
+        warmer_k, warmer_sigma_k = (0.0, housing.spread_k) if housing_k is None else (housing_k - housing.at_k, 0.0)
     level = np.asarray(counts, np.float64) if flat_field is None else flat_field.levelled(counts)
+    maps_sigma = 0.0 if flat_field is None else flat_field.level_sigma(level)
+    level = level - warmer_k * (housing.counts_per_k if housing else 0.0)
     eps, tau = seen.emissivity, seen.transmission
     mirrored, air = (_counts_at(radiometry, k) for k in (seen.reflected_k, seen.air_k))
     with np.errstate(invalid="ignore"):
@@ -110,11 +128,15 @@ def temperatures(
         by_response = by_response + weight * response.by_parameters(k)
     common = np.einsum("...i,ij,...j", by_response, radiometry.covariance, by_response)
     common += (by_kelvin * radiometry.accuracy_k) ** 2
+    if housing is not None:
+        *with_response, variance = housing.covariance_row
+        common += warmer_k * (2 * by_response @ np.array(with_response) + warmer_k * variance)
+        common += (housing.counts_per_k * warmer_sigma_k) ** 2
     common += (tau * (own - mirrored) * seen.emissivity_sigma) ** 2
     common += ((eps * own + (1 - eps) * mirrored - air) * seen.transmission_sigma) ** 2
     for (weight, k), sigma_k in zip(weights, (seen.reflected_sigma_k, seen.air_sigma_k), strict=True):
         common += (weight * float(response.slope(k)) * sigma_k) ** 2 if weight else 0.0
-    each = radiometry.noise_counts**2 + radiometry.pattern_counts**2
+    each = radiometry.noise_counts**2 + np.maximum(radiometry.pattern_counts, maps_sigma) ** 2
     return Temperatures(
         kelvin.astype(np.float32),
         (np.sqrt(np.maximum(common, 0) + each) / by_kelvin).astype(np.float32),

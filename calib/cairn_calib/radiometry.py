@@ -123,6 +123,22 @@ class MapsFile(BaseModel):
     sha256: Sha256
 
 
+class Housing(BaseModel):
+    """What the warmth of the camera itself adds to its counts: `counts_per_k` (T_housing - at_k)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    at_k: Kelvin
+    """The response holds for this: the references' mean."""
+    counts_per_k: Finite
+    covariance_row: tuple[Finite, Finite, Finite, AtLeast0]
+    """Of `counts_per_k` with the response's three numbers, and its own variance."""
+    range_k: tuple[Kelvin, Kelvin]
+    """Housings between these were looked at; of a colder or warmer one there is no temperature."""
+    spread_k: AtLeast0
+    """Standard deviation of the references' housings: how far off one is of which nobody says how warm it was."""
+
+
 class Radiometry(BaseModel):
     """The response of one camera, its range, how certain it is; `radiometry` in rig.json, or a file of its own."""
 
@@ -141,6 +157,8 @@ class Radiometry(BaseModel):
     """Of a pixel from image to image, standard deviation."""
     pattern_counts: AtLeast0 = 0.0
     """What is left of the pixels' own offsets after the maps, standard deviation."""
+    housing: Housing | None = None
+    """Absent: nobody said how warm the camera was, or it was always as warm."""
     source: Annotated[str, Field(min_length=1, max_length=400)]
     """Where the numbers come from, for people."""
     maps: MapsFile | None = None
@@ -158,13 +176,16 @@ class Radiometry(BaseModel):
 
     @model_validator(mode="after")
     def _is_a_covariance(self) -> Self:
-        if self.covariance_lower is not None:
-            if [len(row) for row in self.covariance_lower] != [1, 2, 3]:
-                raise ValueError("covariance_lower must have rows of 1, 2 and 3 numbers")
-            sigma = np.sqrt(np.maximum(np.diag(self.covariance), 0))
-            safe = np.where(sigma > 0, sigma, 1)
-            if np.linalg.eigvalsh(self.covariance / safe[:, None] / safe)[0] < -1e-6:
-                raise ValueError("covariance_lower has a negative eigenvalue")
+        if self.covariance_lower is not None and [len(row) for row in self.covariance_lower] != [1, 2, 3]:
+            raise ValueError("covariance_lower must have rows of 1, 2 and 3 numbers")
+        whole = np.zeros((4, 4))
+        whole[:3, :3] = self.covariance
+        if self.housing is not None:
+            whole[3] = whole[:, 3] = self.housing.covariance_row
+        sigma = np.sqrt(np.maximum(np.diag(whole), 0))
+        safe = np.where(sigma > 0, sigma, 1)
+        if np.linalg.eigvalsh(whole / safe[:, None] / safe)[0] < -1e-6:
+            raise ValueError("the covariance, that of the housing included, has a negative eigenvalue")
         return self
 
     @property

@@ -32,7 +32,8 @@ from cairn_calib.raster import Raster
 from cairn_calib.sensing import LIDAR, TIME_OF_FLIGHT, RangeSensing
 from cairn_map.errors import BadInputError, first_error
 
-RIG_BYTES_MAX = 1 << 20
+RIG_BYTES_MAX = 4 << 20
+"""A covariance of all parameters is 0.9 MB, a map of 640 x 480 pixels' offsets as much."""
 VERSION = 1
 Row = tuple[float, float, float, float]
 
@@ -116,6 +117,12 @@ class MountedCamera(BaseModel, frozen=True):
         if self.range_bias is not None and (is_lidar or self.spectrum is not Spectrum.RANGE):
             other = "lidars" if is_lidar else str(self.spectrum)
             raise ValueError(f"range_bias is of range cameras with a lens, not of {other}")
+        offsets = None if self.range_bias is None else self.range_bias.pixel_offsets
+        if offsets is not None and (offsets.width, offsets.height) != (self.camera.width, self.camera.height):
+            raise ValueError(
+                f"range_bias.pixel_offsets must be of the camera's {self.camera.width} x {self.camera.height} pixels, "
+                f"got {offsets.width} x {offsets.height}"
+            )
         return self
 
     @property
@@ -133,19 +140,57 @@ class MountedCamera(BaseModel, frozen=True):
 
         What is not known of its `range_bias` is in it, as if it were noise.
         """
-        usual = LIDAR if isinstance(self.camera, SpinningLidar) else TIME_OF_FLIGHT
-        sigma_m = self.known_sensing.sigma_at(range_m, usual=usual)
+        sigma_m = self.range_noise_m(range_m)
         return sigma_m if self.range_bias is None else np.hypot(sigma_m, self.range_bias.sigma_at(range_m))
 
-    def true_ranges(self, range_m: npt.NDArray[Real]) -> npt.NDArray[Real]:
+    def range_sigma_image(self, range_m: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+        """(H, W) the same for an image of ranges, with what is known of each pixel's own part of `range_bias`."""
+        if self.range_bias is None:
+            return self.range_sigma_m(range_m)
+        usual = self.known_sensing.sigma_at(range_m, usual=TIME_OF_FLIGHT)
+        return np.hypot(usual, self.range_bias.sigma_image(self.camera, range_m))
+
+    def range_noise_m(self, range_m: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+        """(...) the same without the bias: what is independent from pixel to pixel."""
+        usual = LIDAR if isinstance(self.camera, SpinningLidar) else TIME_OF_FLIGHT
+        return self.known_sensing.sigma_at(range_m, usual=usual)
+
+    def true_ranges(
+        self, range_m: npt.NDArray[Real], amplitude: npt.NDArray[np.generic] | None = None
+    ) -> npt.NDArray[Real]:
         """(H, W) ranges, metres, of (H, W) that the range camera measured: without its bias.
 
-        The same array where the rig states no bias.
+        The same array where the rig states no bias. `amplitude` are counts, (H, W); None: the usual ones.
 
         Raises:
-            BadInputError: the image has another size.
+            BadInputError: an image has another size.
         """
-        return range_m if self.range_bias is None else self.range_bias.true_image(self.camera, range_m)
+        return range_m if self.range_bias is None else self.range_bias.true_image(self.camera, range_m, amplitude)
+
+    def true_points(self, points: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+        """(N, 3) points in the range camera's frame, metres, of (N, 3) that it measured: each moved along its ray.
+
+        The pixel of a point is where the camera sees it; its amplitude is taken for the usual one. The same array where
+        the rig states no bias.
+
+        Raises:
+            BadInputError: a point is not in the camera's image, so it is of another sensor.
+        """
+        if self.range_bias is None:
+            return points
+        known = np.isfinite(points).all(axis=1) & points.any(axis=1)  # its own place is no point
+        pixels = self.camera.project(points[known])
+        if strange := int((~self.camera.contains(pixels)).sum()):
+            raise BadInputError(
+                "bad_points",
+                f"{strange} of {len(points)} points are not in the image of the range camera ({self.camera.width} x "
+                f"{self.camera.height} pixels), so its range_bias cannot be taken off: name the camera they are of",
+            )
+        measured_m = np.linalg.norm(points[known].astype(np.float64), axis=1)
+        share = self.range_bias.true_at(self.camera, pixels, measured_m) / measured_m
+        true = points.astype(np.float64)
+        true[known] *= share[:, None]
+        return true
 
 
 @lru_cache(maxsize=256)

@@ -29,6 +29,8 @@ SEEN_MIN = 0.6
 """Share of the board's corners that must be seen."""
 STRAY = 0.34
 """Of an outer row: with fewer corners than this share it is no part of the board."""
+BENDS = 0.5
+"""Between a step and the one before it, or beside it: share of that."""
 GROW_MIN = 9
 LONGER = 2.1
 """Longest step over the shortest at one corner: a board tilted by 60 degrees has 2, a step past a corner 2.2."""
@@ -38,6 +40,8 @@ MORE = 4
 """Rows or columns of strays that may surround a board; whether the pattern goes on, corner_gates.py finds out."""
 CROWDED_SEEN_MIN = 0.85
 """Share that must be seen where there are strays, which might fill a row that is hidden."""
+NEAREST = 32
+"""Saddles about one among which its neighbours are."""
 TRIED = 6
 """Lattices of more than a few corners that are looked at."""
 
@@ -47,6 +51,10 @@ class NoGrid:
     """Why there is no lattice."""
 
     reason: str
+    largest: int = 0
+    """Corners of the largest lattice; 0 where there is none."""
+    step_px: float = 0.0
+    """From one of them to the next, in the image that was given."""
 
 
 def saddle_grid(points: SaddlePoints, board: Board) -> Floats | NoGrid:
@@ -80,41 +88,48 @@ def saddle_grid(points: SaddlePoints, board: Board) -> Floats | NoGrid:
     across, down = (max(key[k] for key in best) - min(key[k] for key in best) + 1 for k in (0, 1))
     return NoGrid(
         f"the largest lattice has {across} x {down} corners, {len(best)} of them seen; the board has "
-        f"{board.columns} x {board.rows}"
+        f"{board.columns} x {board.rows}",
+        largest=len(best),
+        step_px=_step_px(best, points.pixels),
     )
 
 
 def _neighbours(points: SaddlePoints) -> npt.NDArray[np.intp]:
     """(N, 2, 2) index of the next saddle along each edge, forwards and backwards; -1 for none."""
     count = len(points.pixels)
-    to = points.pixels[None] - points.pixels[:, None]
-    far = np.hypot(to[..., 0], to[..., 1])
+    far = np.linalg.norm(points.pixels[None] - points.pixels[:, None], axis=2)
     far[np.diag_indices(count)] = np.inf
+    near = (
+        np.argpartition(far, NEAREST, axis=1)[:, :NEAREST] if count > NEAREST else np.tile(np.arange(count), (count, 1))
+    )
+    far = np.take_along_axis(far, near, axis=1)
+    to = points.pixels[near] - points.pixels[:, None]
     unit = to / np.where(np.isfinite(far), far, 1.0)[..., None]
-    cos = np.einsum("ijc,iec->ije", unit, points.edges)
+    # (N, K, 2) along each of both edges, of the saddle itself and of the other one.
+    cos = unit @ np.swapaxes(points.edges, 1, 2)
+    their = np.abs((points.edges[near] * unit[:, :, None]).sum(axis=-1)) > ANGLE_COS
     along = np.abs(cos) > ANGLE_COS
     # Past the edge between them, bright and dark are mirrored.
-    across = np.einsum("ijc,ic->ij", unit, points.bright)
+    across = (unit @ points.bright[..., None])[..., 0]
     mirrored = 2 * across[..., None] * unit - points.bright[:, None]
-    swapped = np.abs(np.einsum("ijc,jc->ij", mirrored, points.bright)) > SWAP_COS
-    ratio = np.abs(np.log(points.strength[:, None] / points.strength))
-    fits = along.any(axis=2) & along.any(axis=2).T & swapped & swapped.T & (ratio < np.log(ALIKE))
-    found = np.full((count, 2, 2), -1, np.intp)
+    swapped = np.abs((mirrored * points.bright[near]).sum(axis=-1)) > SWAP_COS
+    ratio = np.abs(np.log(points.strength[:, None] / points.strength[near]))
+    fits = along.any(axis=2) & their.any(axis=2) & swapped & (ratio < np.log(ALIKE))
+    found, own = np.full((count, 2, 2), -1, np.intp), np.full((count, 2, 2), np.inf)
+    every = np.arange(count)
     for edge in (0, 1):
         for way, sign in ((0, 1), (1, -1)):
             distance = np.where(fits & along[..., edge] & (sign * cos[..., edge] > 0), far, np.inf)
             nearest = distance.argmin(axis=1)
-            found[:, edge, way] = np.where(np.isfinite(distance[np.arange(count), nearest]), nearest, -1)
-    found = _of_one_size(found, far)
-    back = (found[found] == np.arange(count)[:, None, None, None, None]).any(axis=(3, 4))
+            own[:, edge, way] = distance[every, nearest]
+            found[:, edge, way] = np.where(np.isfinite(own[:, edge, way]), near[every, nearest], -1)
+    found = _of_one_size(found, own)
+    back = (found[found] == every[:, None, None, None, None]).any(axis=(3, 4))
     return np.where((found >= 0) & back, found, -1)
 
 
-def _of_one_size(found: npt.NDArray[np.intp], far: Floats) -> npt.NDArray[np.intp]:
-    """Neighbours without those much further away than the nearest one of either end."""
-    own = np.where(
-        found >= 0, np.take_along_axis(far, np.maximum(found, 0).reshape(len(far), 4), 1).reshape(found.shape), np.inf
-    )
+def _of_one_size(found: npt.NDArray[np.intp], own: Floats) -> npt.NDArray[np.intp]:
+    """Neighbours without those much further away (`own`) than the nearest one of either end."""
     nearest = own.min(axis=(1, 2))
     limit = LONGER * np.minimum(nearest[:, None, None], nearest[np.maximum(found, 0)])
     return np.where(own <= limit, found, -1)
@@ -140,13 +155,41 @@ def _lattice(points: SaddlePoints, neighbours: npt.NDArray[np.intp], *, start: i
             column, row = placed[here]
             way = 1 if cos[axis] > 0 else -1
             key = (column + way, row) if axis == 0 else (column, row + way)
-            if key in lattice:
+            if key in lattice or not _goes_on(lattice, points.pixels, placed[here], key, there):
                 continue
             lattice[key] = there
             placed[there] = key
             frames[there] = _turned(points.edges[there], frames[here])
             waiting.append(there)
     return lattice
+
+
+def _goes_on(lattice: Lattice, pixels: Floats, here: tuple[int, int], key: tuple[int, int], there: int) -> bool:
+    """Whether a saddle lies where the lattice goes on to: straight on from the step before, and beside the next row's.
+
+    In a board that is seen very aslant the nearest saddle along an edge may be the one across a cell.
+    """
+    column, row = key[0] - here[0], key[1] - here[1]
+    at = pixels[lattice[here]]
+    step = pixels[there] - at
+    steps = []
+    behind = (here[0] - column, here[1] - row)
+    if behind in lattice:
+        steps.append(at - pixels[lattice[behind]])
+    for side in (1, -1):
+        beside, ahead = ((here[0] + side * row, here[1] + side * column), (key[0] + side * row, key[1] + side * column))
+        if beside in lattice and ahead in lattice:
+            steps.append(pixels[lattice[ahead]] - pixels[lattice[beside]])
+    return all(float(np.linalg.norm(step - other)) < BENDS * float(np.linalg.norm(other)) for other in steps)
+
+
+def _step_px(lattice: Lattice, pixels: Floats) -> float:
+    steps = [
+        float(np.linalg.norm(pixels[here] - pixels[lattice[column + 1, row]]))
+        for (column, row), here in lattice.items()
+        if (column + 1, row) in lattice
+    ]
+    return float(np.median(steps)) if steps else 0.0
 
 
 def _turned(edges: Floats, frame: Floats) -> Floats:
@@ -167,6 +210,7 @@ def _grown(lattice: Lattice, points: SaddlePoints) -> Lattice:
     used = set(lattice.values())
     pixels = points.pixels
     usual = float(np.median(points.strength[list(used)]))
+    failed: dict[tuple[int, int], bytes] = {}
     for _ in range(8):
         low = [min(key[k] for key in lattice) - 1 for k in (0, 1)]
         high = [max(key[k] for key in lattice) + 1 for k in (0, 1)]
@@ -183,6 +227,10 @@ def _grown(lattice: Lattice, points: SaddlePoints) -> Lattice:
             near = np.argsort(np.abs(keys - key).max(axis=1) + 1e-3 * np.abs(keys - key).sum(axis=1))[:16]
             if np.abs(keys[near[4]] - key).max() > 2 or len(near) < GROW_MIN:
                 continue
+            seen_with = keys[near].tobytes()
+            if failed.get(key) == seen_with:
+                continue
+            failed[key] = seen_with
             homography = fit_homography(keys[near], known[near])
             if homography is None:
                 continue

@@ -16,23 +16,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.adjustment import Adjusted, Problem, Sensor, adjust
+from cairn_calib.adjustment import Adjusted, Problem, Sensor, adjust, resumed
 from cairn_calib.board_views import BoardViews
 from cairn_calib.camera_alone import CameraAlone, camera_alone
 from cairn_calib.corner_residuals import CornerData, corner_data, corner_misses
 from cairn_calib.normal_equations import Uncertainty, uncertainty
+from cairn_calib.pixel_pattern import Pattern, pixel_pattern
 from cairn_calib.poses import Transform
-from cairn_calib.range_bias import BIAS_NAMES
+from cairn_calib.range_choice import RangeSpans, chosen_terms, range_spans
+from cairn_calib.range_nodes import NODES
 from cairn_calib.range_residuals import RangeData, range_data
+from cairn_calib.range_terms import NODE_SIGMA_M
 from cairn_calib.rig_start import rig_start
 from cairn_calib.rig_state import Layout, RigState, layout_of, value_of, warp_shape
 from cairn_calib.solve_plan import SolvePlan
-from cairn_calib.usual_priors import usual_priors
+from cairn_calib.usual_priors import one, usual_priors
 from cairn_calib.zhang import mirrored_pose
 from cairn_map.errors import BadInputError
 
 Floats = npt.NDArray[np.float64]
 
+SMOOTH_M = 5e-4
+"""Of what blocks of pixels add: from there on nodes are solved for."""
 RANGE_SIGMA_M = 0.01
 """Stated noise of a range; what it really is, is estimated."""
 
@@ -48,6 +53,16 @@ class Solution:
     known: Uncertainty
     turned: tuple[tuple[str, str], ...] = ()
     """(camera, frame) of views left out, for their corners were named from the wrong end."""
+    spans: RangeSpans | None = None
+    """What the range images covered; None: there are none."""
+    pattern: Pattern | None = None
+    """What the range camera's pixels add of their own; None: it was not looked for."""
+
+    @property
+    def ranges(self) -> RangeData | None:
+        """Those of the boards that were used; None: there are none."""
+        last = self.adjusted.problem.sensors[-1].data
+        return last if isinstance(last, RangeData) else None
 
     @property
     def layout(self) -> Layout:
@@ -88,9 +103,36 @@ def solve_rig(views: BoardViews, plan: SolvePlan) -> Solution:
     start = rig_start({name: each.T_camera_board for name, each in alone.items()}, views.board, plan.gauge, weights)
     views = views.without(start.turned)
     state = _first_state(views, plan, alone, start.T_rig_camera)
-    return replace(
-        solve_from(views, plan, state, {name: each.scale for name, each in alone.items()}), turned=start.turned
-    )
+    solution = solve_from(views, plan, state, {name: each.scale for name, each in alone.items()})
+    return replace(_with_pixels(solution), turned=start.turned)
+
+
+def _with_pixels(solution: Solution) -> Solution:
+    """The solution with what the range camera's pixels add, solved on with nodes where that is smooth."""
+    found = pixel_pattern(solution.views, solution.adjusted, solution.covariance)
+    if found is not None and found.smooth_m >= SMOOTH_M:
+        done = _with_nodes(solution.adjusted, solution.views, solution.plan)
+        solution = replace(solution, adjusted=done, known=uncertainty(done.normal))
+        found = pixel_pattern(solution.views, done, solution.covariance)
+    return replace(solution, pattern=found)
+
+
+def _with_nodes(done: Adjusted, views: BoardViews, plan: SolvePlan) -> Adjusted:
+    """The minimum with a grid of nodes in the range bias, too, from one without."""
+    *corners, last = done.problem.sensors
+    if not isinstance(last.data, RangeData):
+        return done
+    owner, lens = list(plan.cameras)[last.data.camera], done.state.lenses[last.data.camera]
+    terms = replace(last.data.terms, nodes=NODES)
+    more = terms.names[len(terms.document_names) :]
+    layout = layout_of(plan, dict(zip(plan.cameras, done.state.lenses, strict=True)), [(owner, n) for n in terms.names])
+    priors = (*done.problem.priors, *(one(owner, name, 0.0, NODE_SIGMA_M) for name in more))
+    sensors = (*corners, replace(last, data=last.data.with_terms(terms, lens)))
+    state = replace(done.state, bias=np.append(done.state.bias, np.zeros(len(more))))
+    try:
+        return resumed(Problem(views.board, layout, sensors, priors), state, plan.noise)
+    except np.linalg.LinAlgError as exc:
+        raise BadInputError("not_observable", f"the images do not determine the range bias ({exc}): take more") from exc
 
 
 def solve_from(views: BoardViews, plan: SolvePlan, state: RigState, scales: Mapping[str, float]) -> Solution:
@@ -110,14 +152,21 @@ def solve_from(views: BoardViews, plan: SolvePlan, state: RigState, scales: Mapp
     priors = usual_priors(plan, lenses, counts, views.board, ranges=None)
     done = _adjusted(Problem(views.board, layout, sensors, priors), state, plan)
     ranged = _range_data(views, plan, done.state)
-    if ranged is not None:
-        owner = names[ranged.camera]
-        priors = usual_priors(plan, lenses, counts, views.board, ranges=owner)
-        layout = layout_of(plan, lenses, [(owner, name) for name in BIAS_NAMES])
-        sensors = (*done.problem.sensors, Sensor(ranged, 1.0, ranged.measured))
-        problem = Problem(views.board, layout, sensors, priors)
-        done = _adjusted(problem, replace(done.state, bias=np.zeros(len(BIAS_NAMES))), plan)
-    return Solution(views, plan, done, uncertainty(done.normal))
+    if ranged is None:
+        return Solution(views, plan, done, uncertainty(done.normal))
+    spans = range_spans(ranged, done.state, views.board)
+    wanted = plan.range_terms or chosen_terms(spans, plan.modulation_hz)
+    terms = replace(wanted, nodes=None)
+    owner = names[ranged.camera]
+    priors = usual_priors(plan, lenses, counts, views.board, ranges=(owner, terms))
+    layout = layout_of(plan, lenses, [(owner, name) for name in terms.names])
+    ranged = ranged.with_terms(terms, done.state.lenses[ranged.camera])
+    sensors = (*done.problem.sensors, Sensor(ranged, 1.0, ranged.measured))
+    problem = Problem(views.board, layout, sensors, priors)
+    done = _adjusted(problem, replace(done.state, bias=np.zeros(len(terms.names))), plan)
+    if wanted.nodes is not None:
+        done = _with_nodes(done, views, plan)
+    return Solution(views, plan, done, uncertainty(done.normal), spans=spans)
 
 
 def _adjusted(problem: Problem, state: RigState, plan: SolvePlan) -> Adjusted:

@@ -15,10 +15,15 @@ A camera's name is its folder's. Images of one place of the board have the same 
 
 First each camera is solved alone, then all of them with all places of the board. Corners count by their covariance
 and by each camera's own noise, which is estimated; what is off by more than 4 sigma is left out and counted. The
-board may be bent (--flat: it is not), its pitch wrong by 0.02 % (--pitch-sigma). Free coefficients of a lens follow
-from the spectrum: colour k1,k2,p1,p2,k3, thermal k1,k2,k3, range k1,k2; --distortion says otherwise, --fisheye names
-cameras with Kannala and Brandt's model. With --range DIR the range camera's images of the same boards (16 bit, radial,
---range-units-per-m) show its bias, which rig.json states and mapping takes off.
+board may be bent (--flat: it is not), its pitch wrong by 0.02 % (--pitch-sigma). Free coefficients of every lens are
+k1,k2,p1,p2,k3, with p1 and p2 assumed to be 0 +- 0.002 and k3 0 +- 0.1; --distortion says otherwise, --fisheye names
+cameras with Kannala and Brandt's model.
+
+With --range DIR the range camera's images of the same boards (16 bit, radial, --range-units-per-m) show what it adds
+to its ranges, which rig.json states and mapping takes off: an offset, a scale, more at the image's corners, and each
+pixel's own part where pixels differ. With --amplitude DIR (16 bit, same names) also how that depends on the amplitude,
+with --modulation-mhz F its circular error: each only if amplitudes and ranges of the boards differ enough; else a
+warning says so.
 
 What the images cannot tell is warned about, with the threshold and what was measured: tilt, distances, the image's
 edge, numbers that come from assumptions, halves of the images that contradict each other, single frames that much hangs
@@ -30,17 +35,18 @@ and 5 m.
 import argparse
 import sys
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from cairn_calib.board_views import BoardViews, RangeView, frame_of, read_board_views
+from cairn_calib.board_views import read_board_views
 from cairn_calib.calibration import Statistics
-from cairn_calib.corner_pictures import read_grey
-from cairn_calib.examination import examined
+from cairn_calib.examination import Examination, examined
+from cairn_calib.range_images import with_ranges
+from cairn_calib.range_report import told_ranges
+from cairn_calib.report_images import ReportImage, report_images
 from cairn_calib.rig import Spectrum
-from cairn_calib.solve import solve_rig
+from cairn_calib.solve import Solution, solve_rig
 from cairn_calib.solve_json import examination_json
 from cairn_calib.solve_plan import PITCH_SIGMA, CameraPlan, SolvePlan, usual_plan
 from cairn_calib.solve_report import report_page
@@ -81,30 +87,59 @@ def add_parser(commands: "_SubParsersAction[argparse.ArgumentParser]") -> None:
     )
     added.add_argument("--range", type=Path, metavar="DIR", help="range images of the range camera, 16 bit")
     added.add_argument("--range-units-per-m", type=float, default=1000.0, metavar="N", help="of those images (1000)")
+    added.add_argument("--amplitude", type=Path, metavar="DIR", help="their amplitude images, 16 bit")
+    added.add_argument("--modulation-mhz", type=float, metavar="F", help="of its light, by the data sheet")
     added.set_defaults(run=run)
+
+
+def solved(args: argparse.Namespace) -> Solution:
+    """What the arguments ask for, solved."""
+    plan = _plan(args)
+    folders = dict(zip(plan.cameras, args.folders, strict=True))
+    views = read_board_views(folders)
+    if args.range is None and (args.amplitude is not None or args.modulation_mhz is not None):
+        raise BadInputError("bad_arguments", "--amplitude and --modulation-mhz are of range images: add --range")
+    if args.range is not None:
+        views = with_ranges(views, plan, args.range, args.range_units_per_m, amplitudes=args.amplitude)
+    return solve_rig(views, plan)
 
 
 def run(args: argparse.Namespace) -> None:
     """Solve, and write what was asked for."""
-    plan = _plan(args)
-    folders = dict(zip(plan.cameras, args.folders, strict=True))
-    views = read_board_views(folders)
-    if args.range is not None:
-        views = _with_ranges(views, plan, args.range, args.range_units_per_m)
-    solution = solve_rig(views, plan)
+    refuse_overwriting(args.report, args.output)
+    solution = solved(args)
     rig = solved_rig(solution, made_s=time.time())
     seen = examined(solution, rig)
     _write(args.output, rig.to_json())
-    sys.stdout.write(told(statistics_of(solution)))
+    sys.stdout.write(told(statistics_of(solution)) + told_ranges(solution))
     for each in seen.warnings:
         sys.stderr.write(f"warning: {each}\n")
     if seen.next_images and seen.warnings:
         sys.stderr.write(f"next: {seen.next_images[0]}\n")
     sys.stdout.write(f"{args.output}: {', '.join(rig.cameras)}\n")
     if args.report is not None:
-        _write(args.report, report_page(seen).encode())
-        _write(args.report.with_suffix(".json"), examination_json(seen))
-        sys.stdout.write(f"{args.report}: {len(seen.warnings)} warnings; the same as {args.report.stem}.json\n")
+        write_report(args.report, seen, report_images(dict(zip(solution.plan.cameras, args.folders, strict=True))))
+
+
+def refuse_overwriting(report: Path | None, rig: Path) -> None:
+    """Whether a report's JSON would be written over rig.json.
+
+    Raises:
+        BadInputError: it would.
+    """
+    if report is not None and report.with_suffix(".json").resolve() == rig.resolve():
+        raise BadInputError(
+            "bad_arguments",
+            f"the report's numbers go to {report.with_suffix('.json')}, which is {rig}: name the report otherwise",
+        )
+
+
+def write_report(path: Path, seen: Examination, images: Mapping[str, Sequence[ReportImage]]) -> None:
+    """The report as HTML, and beside it as JSON."""
+    _write(path, report_page(seen, images).encode())
+    _write(path.with_suffix(".json"), examination_json(seen))
+    count = f"{len(seen.warnings)} warning{'s' * (len(seen.warnings) != 1)}"
+    sys.stdout.write(f"{path}: {count}; the same as {path.stem}.json\n")
 
 
 def _write(path: Path, data: bytes) -> None:
@@ -143,7 +178,12 @@ def _plan(args: argparse.Namespace) -> SolvePlan:
     if not 0 <= args.pitch_sigma < 0.1:
         raise BadInputError("bad_arguments", f"--pitch-sigma is a share, 0 to 0.1, got {args.pitch_sigma:g}")
     return SolvePlan(
-        cameras=cameras, gauge=usual.gauge, rig_name=args.name, warp=not args.flat, pitch_sigma=args.pitch_sigma
+        cameras=cameras,
+        gauge=usual.gauge,
+        rig_name=args.name,
+        warp=not args.flat,
+        pitch_sigma=args.pitch_sigma,
+        modulation_hz=_modulation_hz(args.modulation_mhz),
     )
 
 
@@ -172,15 +212,7 @@ def _distortion(text: str, names: list[str]) -> tuple[str, tuple[str, ...]]:
     return name, tuple(value for value in values.split(",") if value)
 
 
-def _with_ranges(views: BoardViews, plan: SolvePlan, folder: Path, units_per_m: float) -> BoardViews:
-    owner = next((name for name, camera in plan.cameras.items() if camera.spectrum is Spectrum.RANGE), None)
-    if owner is None or not units_per_m > 0:
-        raise BadInputError("bad_arguments", "--range needs a camera of spectrum range, and units per metre above 0")
-    ranges = []
-    for path in sorted(folder.glob("*.png")):
-        counts, _ = read_grey(path)
-        range_m = np.where(counts > 0, counts / units_per_m, np.nan)
-        ranges.append(RangeView(owner, frame_of(path.stem), range_m))
-    if not ranges:
-        raise BadInputError("bad_arguments", f"{folder} holds no range images (*.png)")
-    return BoardViews(views.board, views.sizes_px, views.views, tuple(ranges), views.inputs, views.polarities)
+def _modulation_hz(modulation_mhz: float | None) -> float | None:
+    if modulation_mhz is not None and not 0.1 <= modulation_mhz <= 10_000:
+        raise BadInputError("bad_arguments", f"--modulation-mhz is 0.1 to 10000 MHz, got {modulation_mhz:g}")
+    return None if modulation_mhz is None else 1e6 * modulation_mhz

@@ -3,9 +3,12 @@
     {"format": "cairn-calibration-report", "version": 1, "rig": "orpheus-head", "gauge": "tof",
      "parameters": [{"owner": "tof", "name": "fx", "value": 130.1, "sigma": 0.11}, ...],
      "cameras": {"tof": {"tilt_deg": 54.1, "images": [{"frame": "000003", "rms_px": 0.1, "outliers": 0}, ...], ...}},
-     "halves": {...}, "influences": [...], "weak_modes": [...], "next_images": [...], "warnings": [...]}
+     "ranges": {"camera": "tof", "nearest_m": 1.1, "harmonics": [4], "pixels": {"pattern_sigma_m": 0.006, ...}, ...},
+     "halves": {...}, "influences": [...], "weak_modes": [...], "next_images": [...],
+     "radiometry": {"thermal": null}, "warnings": [...]}
 
 An owner "" is the board: warp_x and warp_y in metres, scale of its pitch. Parameters of a pose are errors: value 0.
+Radiometry is of every thermal camera, as in rig.json; null: not radiometric.
 """
 
 import json
@@ -15,6 +18,8 @@ import numpy as np
 
 from cairn_calib.examination import Examination
 from cairn_calib.probe_points import RANGES_M
+from cairn_calib.range_report import ranges_json
+from cairn_calib.report_radiometry import radiometry_json
 from cairn_calib.view_residuals import view_residuals
 from cairn_calib.world_uncertainty import sigma_map
 
@@ -39,10 +44,12 @@ def examination_json(seen: Examination) -> bytes:
             for owner, name in solution.layout.names
         ],
         "cameras": {name: _camera(seen, name) for name in solution.plan.cameras},
+        "ranges": ranges_json(solution),
         "halves": None if seen.halves is None else asdict(seen.halves),
         "influences": [asdict(each) for each in seen.influences],
         "weak_modes": [asdict(each) for each in seen.modes],
         "next_images": [{**asdict(each), "text": str(each)} for each in seen.next_images],
+        "radiometry": radiometry_json(seen.rig),
         "warnings": [asdict(each) for each in seen.warnings],
     }
     return json.dumps(_finite(document), indent=1, allow_nan=False).encode() + b"\n"

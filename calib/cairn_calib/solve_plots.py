@@ -28,7 +28,7 @@ def quiver(size_px: tuple[int, int], corners: Floats, misses: Floats, kept: Flag
     Residuals of a good fit point anywhere; neighbours that point the same way show a lens that the model cannot say.
     """
     factor = ARROW_SHARE * size_px[0] / max(2 * sigma_px, 1e-9)
-    parts = [_open(size_px, f"Residuals, {factor:.0f} times enlarged")]
+    parts = [opened(size_px, f"Residuals, {factor:.0f} times enlarged")]
     for flags, kind in ((kept, "miss"), (~kept, "out")):
         ends = corners[flags] + np.clip(factor * misses[flags], -0.3 * size_px[0], 0.3 * size_px[0])
         lines = "".join(
@@ -43,10 +43,10 @@ def coverage_picture(size_px: tuple[int, int], seen: Coverage, corners: Floats, 
     rows, columns = seen.counts.shape
     step_x, step_y = size_px[0] / columns, size_px[1] / rows
     most = max(int(seen.counts.max()), 1)
-    parts = [_open(size_px, "Coverage")]
+    parts = [opened(size_px, "Coverage")]
     for row, column in np.ndindex(rows, columns):
         count = int(seen.counts[row, column])
-        shade = "#fbe3df" if count == 0 else f"rgb({_mixed((226, 236, 246), (70, 125, 180), count / most)})"
+        shade = "#fbe3df" if count == 0 else f"rgb({mixed((226, 236, 246), (70, 125, 180), count / most)})"
         parts.append(
             f'<rect x="{column * step_x - 0.5:.1f}" y="{row * step_y - 0.5:.1f}" width="{step_x:.1f}" '
             f'height="{step_y:.1f}" fill="{shade}"><title>{count} corners</title></rect>'
@@ -69,7 +69,7 @@ def heat_map(size_px: tuple[int, int], sigmas_px: Floats, what: str) -> str:
     """A (rows, columns) map of standard deviations over an image; grey where there is none (NaN)."""
     rows, columns = sigmas_px.shape
     step_x, step_y = size_px[0] / columns, size_px[1] / rows
-    parts = [_open(size_px, what)]
+    parts = [opened(size_px, what)]
     for row, column in np.ndindex(rows, columns):
         sigma = float(sigmas_px[row, column])
         parts.append(
@@ -86,20 +86,21 @@ def heat(sigma_px: float) -> str:
     share = float(np.clip(np.log(max(sigma_px, 1e-9) / LOW_PX) / np.log(HIGH_PX / LOW_PX), 0, 1))
     for (low, cold), (high, warm) in pairwise(HEAT):
         if share <= high:
-            return f"rgb({_mixed(cold, warm, (share - low) / (high - low))})"
+            return f"rgb({mixed(cold, warm, (share - low) / (high - low))})"
     return "#fde725"
 
 
 def heat_legend() -> str:
     """The heat maps' scale, as HTML."""
-    stops = ",".join(f"rgb({_mixed(colour, colour, 0)})" for _, colour in HEAT)
+    stops = ",".join(f"rgb({mixed(colour, colour, 0)})" for _, colour in HEAT)
     return (
         f'<p class="legend">{LOW_PX:g} px <i class="ramp" style="background:linear-gradient(90deg,{stops})"></i> '
         f"{HIGH_PX:g} px, logarithmic; sigma of one axis, in the camera's own pixels; grey: not seen</p>"
     )
 
 
-def _open(size_px: tuple[int, int], what: str) -> str:
+def opened(size_px: tuple[int, int], what: str) -> str:
+    """The head of an SVG over an image of that size."""
     width, height = size_px
     return (
         f'<svg class="image" viewBox="-0.5 -0.5 {width} {height}" role="img" aria-label="{escape(what)}" '
@@ -107,5 +108,6 @@ def _open(size_px: tuple[int, int], what: str) -> str:
     )
 
 
-def _mixed(one: tuple[int, int, int], other: tuple[int, int, int], share: float) -> str:
+def mixed(one: tuple[int, int, int], other: tuple[int, int, int], share: float) -> str:
+    """A colour between two, as `r,g,b`."""
     return ",".join(str(round(a + (b - a) * share)) for a, b in zip(one, other, strict=True))

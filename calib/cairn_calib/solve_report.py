@@ -1,13 +1,16 @@
 """The calibration's report: one HTML file with everything in it, to be read without a network and to be printed."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 
 import numpy as np
 
 from cairn_calib.examination import Examination
 from cairn_calib.probe_points import RANGES_M
+from cairn_calib.range_report import range_section
+from cairn_calib.report_images import ReportImage, images_section
+from cairn_calib.report_radiometry import radiometry_section
 from cairn_calib.solve_plots import coverage_picture, heat_legend, heat_map, quiver
 from cairn_calib.solve_tables import board_table, image_table, lens_table, place_table, statistics_table, table
 from cairn_calib.view_residuals import ViewResiduals, view_residuals
@@ -33,6 +36,8 @@ thead th { border-bottom: 1px solid #98a2b0; } tbody th { text-align: left; font
 .row { display: grid; grid-template-columns: 1fr 1fr; gap: .6rem 1.4rem; }
 .three { display: grid; grid-template-columns: 1fr 1fr 1fr; gap: .5rem 1rem; }
 figure { margin: .4rem 0; break-inside: avoid; } figcaption { font-size: .85rem; }
+.shots { display: grid; grid-template-columns: repeat(auto-fill, minmax(200px, 1fr)); gap: .5rem .9rem; }
+.shots svg { width: 100%; height: auto; display: block; } .shots figcaption { font-size: .78rem; }
 svg.image { width: 100%; height: auto; border: 1px solid #c5ccd6; background: #fbfcfd; overflow: hidden; }
 svg rect { shape-rendering: crispEdges; }
 svg path { fill: none; stroke-width: var(--line); }
@@ -42,12 +47,15 @@ circle.next { fill: #fff; stroke: #c2570c; stroke-width: calc(2 * var(--line)); 
 text.next { fill: #c2570c; text-anchor: middle; font-weight: 700; font-family: system-ui, sans-serif; }
 .ramp { display: inline-block; width: 12em; height: .8em; vertical-align: middle; margin: 0 .4em; }
 .legend { font-size: .85rem; }
-@media print { body { margin: 0; max-width: none; font-size: 11px; } h2, h3 { break-after: avoid; } }
+@media print { html { font-size: 10px; } body { margin: 0; padding: 0; max-width: none; font-size: 11px;
+    print-color-adjust: exact; -webkit-print-color-adjust: exact; }
+  h2, h3, .legend { break-after: avoid; } tr, .card, .warning { break-inside: avoid; } th, td { padding: .2rem .4rem; }
+  .wide { overflow: visible; } .shots { grid-template-columns: repeat(5, 1fr); } }
 """
 
 
-def report_page(seen: Examination) -> str:
-    """The whole page of an examined solution."""
+def report_page(seen: Examination, images: Mapping[str, Sequence[ReportImage]] | None = None) -> str:
+    """The whole page of an examined solution; `images` by camera, to be looked at."""
     residuals = view_residuals(seen.solution)
     cameras = list(seen.solution.plan.cameras)
     parts = [
@@ -60,6 +68,7 @@ def report_page(seen: Examination) -> str:
         "<p>A value and its standard deviation, of everything estimated together.</p>",
         place_table(seen),
         board_table(seen),
+        range_section(seen),
         "<h2>Residuals, coverage and certainty</h2>",
         heat_legend(),
         *(_camera(seen, name, [each for each in residuals if each.camera == name]) for name in cameras),
@@ -69,6 +78,8 @@ def report_page(seen: Examination) -> str:
         "<p>Root mean square of an image's residuals, pixels of one axis.</p>",
         image_table(residuals, cameras, seen.solution.views.frames),
         _influences(seen),
+        radiometry_section(seen.rig),
+        images_section(images or {}, residuals),
     ]
     title = f"cairn: calibration of {escape(seen.rig.name)}"
     return (
@@ -108,7 +119,7 @@ def _warnings(seen: Examination) -> str:
         return '<h2>Warnings</h2><p class="fine">None: the images determine all that was estimated.</p>'
     items = "".join(
         f'<p class="warning">{escape(f"{each.camera}: " if each.camera else "")}{escape(each.text)}. <small>'
-        f"{escape(each.kind)}: {each.measured:.3g}, threshold {each.threshold:g} {escape(each.unit)}</small></p>"
+        f"{escape(each.kind)}: {each.measured:.3g}, threshold {each.threshold:.3g} {escape(each.unit)}</small></p>"
         for each in seen.warnings
     )
     return f"<h2>Warnings</h2>{items}"

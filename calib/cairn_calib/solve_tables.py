@@ -7,7 +7,6 @@ import numpy as np
 
 from cairn_calib.calibration import PIXEL_NAMES, Statistics
 from cairn_calib.examination import Examination
-from cairn_calib.range_bias import BIAS_NAMES
 from cairn_calib.solve_plan import SHARED
 from cairn_calib.view_residuals import ViewResiduals
 
@@ -27,7 +26,8 @@ def plus_minus(value: float, sigma: float, *, factor: float = 1.0) -> str:
     if not sigma > 0:
         return f"{value:.6g}"
     places = max(0, 1 - int(np.floor(np.log10(sigma))))
-    return f"{value:.{places}f} ± {sigma:.{places}f}"
+    # + 0.0: no "-0".
+    return f"{round(value, places) + 0.0:.{places}f} ± {sigma:.{places}f}"
 
 
 def statistics_table(statistics: Statistics) -> str:
@@ -88,7 +88,7 @@ def place_table(seen: Examination) -> str:
 
 
 def board_table(seen: Examination) -> str:
-    """The board, and the range camera's bias where it was estimated."""
+    """The board."""
     values, sigmas = seen.solution.values(), seen.solution.sigmas()
     rows = []
     for name, text in (("warp_x", "bent along x, mm"), ("warp_y", "bent along y, mm")):
@@ -96,15 +96,6 @@ def board_table(seen: Examination) -> str:
             rows.append([text, plus_minus(values[SHARED, name], sigmas[SHARED, name], factor=1000)])
     if (SHARED, "scale") in sigmas:
         rows.append(["pitch over the stated one", plus_minus(values[SHARED, "scale"], sigmas[SHARED, "scale"])])
-    units = {"offset_m": ("range offset, mm", 1000.0), "scale": ("range scale, mm/m", 1000.0)}
-    units["radial_m"] = ("more at the image's corner, mm", 1000.0)
-    units["radial4_m"] = ("and with the fourth power, mm", 1000.0)
-    for owner, name in seen.solution.layout.names:
-        if owner != SHARED and name in BIAS_NAMES:
-            text, factor = units[name]
-            rows.append(
-                [f"{escape(owner)}: {text}", plus_minus(values[owner, name], sigmas[owner, name], factor=factor)]
-            )
     return table(["", "estimate"], rows) if rows else ""
 
 

@@ -1,13 +1,14 @@
 """The `rig.json` of a solution: cameras, places, range bias, covariance, statistics, and what it came from."""
 
 import importlib.metadata
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.calibration import Calibration, CameraStatistics, Statistics, covariance_from_matrix
 from cairn_calib.corner_residuals import CornerData, corner_misses
-from cairn_calib.range_bias import BIAS_NAMES, bias_from_matrix
+from cairn_calib.range_bias import RangeBias, bias_from_matrix
 from cairn_calib.rig import Rig, mounted
 from cairn_calib.rig_state import warp_shape
 from cairn_calib.solve import Solution
@@ -25,9 +26,8 @@ def solved_rig(solution: Solution, *, made_s: float) -> Rig:
     bias_at = solution.layout.bias_at
     if len(bias_at):
         owner = solution.layout.names[bias_at[0]][0]
-        bias = bias_from_matrix(state.bias, solution.covariance[np.ix_(bias_at, bias_at)])
-        cameras[owner] = cameras[owner].model_copy(update={"range_bias": bias})
-    rows = [n for n, (owner, name) in enumerate(solution.layout.names) if owner in cameras and name not in BIAS_NAMES]
+        cameras[owner] = cameras[owner].model_copy(update={"range_bias": _range_bias(solution)})
+    rows = [n for n, (owner, _) in enumerate(solution.layout.names) if owner in cameras and n not in bias_at]
     names = [solution.layout.names[n] for n in rows]
     calibration = Calibration(
         software=f"cairn {_version()}",
@@ -38,6 +38,22 @@ def solved_rig(solution: Solution, *, made_s: float) -> Rig:
         inputs=solution.views.inputs[:1000],
     )
     return Rig(name=plan.rig_name, cameras=cameras, calibration=calibration)
+
+
+def _range_bias(solution: Solution) -> RangeBias | None:
+    used, at = solution.ranges, solution.layout.bias_at
+    if used is None or solution.spans is None:
+        return None
+    amplitudes = solution.spans.amplitudes
+    count = len(used.terms.document_names)
+    at = at[:count]
+    bias = bias_from_matrix(
+        replace(used.terms, nodes=None),
+        solution.state.bias[:count],
+        solution.covariance[np.ix_(at, at)],
+        amplitudes=None if amplitudes is None else (amplitudes[0], amplitudes[2]),
+    )
+    return bias if solution.pattern is None else bias.model_copy(update={"pixel_offsets": solution.pattern.offsets})
 
 
 def statistics_of(solution: Solution) -> Statistics:

@@ -14,8 +14,13 @@
 `fit` takes a table of black bodies (CSV with a head line): image, celsius, sigma_k (standard deviation of the black
 body's temperature), and, where it does not fill the view, x, y, width, height of the part of the image that it fills,
 in pixels. List several images of each temperature: they tell the noise. Two temperatures will do, and four or more tell
-Planck's B, too. Where black bodies fill the view, maps of the pixels' gain, offset and shading come out beside it.
-Cameras that compute a temperature themselves, whose counts step by so many a kelvin, need `--law polynomial`.
+Planck's B, too. Where black bodies fill the view, maps of the pixels' gain, offset and shading come out beside it, each
+with its standard deviation. Cameras that compute a temperature themselves, whose counts step by so many a kelvin, need
+`--law polynomial`.
+
+A warm camera sees itself: give `housing_celsius`, what its own thermometer said, in the table, black bodies seen by a
+cold and by a warm camera, and `read --housing` later. Images during a flat-field correction (the shutter) and within
+2 s after it are left out: the column `since_ffc_s` says how long ago it was, 0 during it; repeated images are noticed.
 
 `read` turns 16-bit images into kelvin; radiometric JPEGs of FLIR bring their camera's numbers along. Temperatures of
 surfaces need their emissivity and what they mirror: `--emissivity`, `--reflected`. What nobody measured has no
@@ -23,20 +28,19 @@ temperature: without radiometry you get counts, and beyond its range nothing.
 """
 
 import argparse
-import csv
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.corner_pictures import overlay, read_grey, write_grey16, write_picture
 from cairn_calib.flat_field import FlatField, FlatFieldFit, fit_flat_field, read_flat_field, write_flat_field
 from cairn_calib.flir_file import read_flir
 from cairn_calib.object_temperature import NotRadiometric, Viewing, temperatures
 from cairn_calib.radiometry import ZERO_C_K, Radiometry, radiometry_from_json
+from cairn_calib.reference_table import COLUMNS, HOUSING, REGION, SINCE_FFC, BlackBody, read_references, repeated
 from cairn_calib.response_fit import Reference, ResponseFit, fit_response
 from cairn_calib.rig import RIG_BYTES_MAX, load_rig, rig_from_json
 from cairn_map.errors import BadInputError
@@ -44,14 +48,8 @@ from cairn_map.errors import BadInputError
 if TYPE_CHECKING:
     from argparse import _SubParsersAction
 
-COLUMNS = ["image", "celsius", "sigma_k"]
-REGION = ["x", "y", "width", "height"]
 COUNTS_PER_KELVIN = 100
 """Of `--output`, as in recordings; 0 is no reading."""
-Region = tuple[int, int, int, int]
-Row = tuple[float, float, Region | None]
-"""Temperature, its standard deviation, and the part of the image."""
-Rows = dict[Row, list[Path]]
 
 
 def add_parser(commands: "_SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -64,7 +62,8 @@ def add_parser(commands: "_SubParsersAction[argparse.ArgumentParser]") -> None:
     )
     actions = added.add_subparsers(required=True, metavar="ACTION")
     fit = actions.add_parser("fit", help="the response of a camera, from black bodies")
-    fit.add_argument("table", type=Path, metavar="CSV", help=f"{', '.join(COLUMNS)}[, {', '.join(REGION)}]")
+    columns = f"{', '.join(COLUMNS)}[, {', '.join(REGION)}][, {HOUSING}][, {SINCE_FFC}]"
+    fit.add_argument("table", type=Path, metavar="CSV", help=columns)
     fit.add_argument("out", type=Path, metavar="OUT", help="JSON to write; maps go beside it")
     fit.add_argument("--law", choices=("planck", "polynomial"), default="planck", help="(planck)")
     fit.add_argument("--rig", type=Path, metavar="FILE", help="OUT is this rig.json with the radiometry in it")
@@ -77,6 +76,7 @@ def add_parser(commands: "_SubParsersAction[argparse.ArgumentParser]") -> None:
     read.add_argument("--emissivity-sigma", type=float, default=0.0, help="its standard deviation (0)")
     read.add_argument("--reflected", type=float, metavar="CELSIUS", help="what it mirrors (20, or as the JPEG says)")
     read.add_argument("--reflected-sigma", type=float, default=0.0, metavar="K", help="its standard deviation (0)")
+    read.add_argument("--housing", type=float, metavar="CELSIUS", help="how warm the camera itself was")
     read.add_argument("--output", type=Path, metavar="PNG", help="write 16 bits, 0.01 K a count, 0: no reading")
     read.add_argument("--picture", type=Path, metavar="PNG", help="write a picture to look at")
     read.set_defaults(run=_read)
@@ -86,13 +86,13 @@ def add_parser(commands: "_SubParsersAction[argparse.ArgumentParser]") -> None:
 
 def _fit(args: argparse.Namespace) -> None:
     _check_camera(args)
-    rows = _rows(args.table)
-    stacks = {row: np.array([read_grey(path)[0] for path in paths]) for row, paths in rows.items()}
-    full = [stack for (_, _, region), stack in stacks.items() if region is None and len(stack) > 1]
+    table = read_references(args.table)
+    full = [body.counts for body in table.bodies if body.region is None and len(body.counts) > 1]
     flat = fit_flat_field(full) if full else None
-    references = [_reference(row, stack, flat) for row, stack in stacks.items()]
-    source = f"{len(references)} black bodies, {args.table.name}"
-    noise = flat.noise_counts if flat else _noise(stacks)
+    references = [_reference(body, flat) for body in table.bodies]
+    lost = f"; {len(table.left_out)} images left out" if table.left_out else ""
+    source = f"{len(references)} black bodies, {args.table.name}{lost}"
+    noise = flat.noise_counts if flat else _noise(table.bodies)
     fitted = fit_response(references, law=args.law, source=source, noise_counts=noise)
     update: dict[str, object] = {}
     if flat:
@@ -100,14 +100,14 @@ def _fit(args: argparse.Namespace) -> None:
         update = {"maps": maps, "pattern_counts": flat.pattern_counts}
     radiometry = fitted.radiometry.model_copy(update=update)
     _write(args, radiometry)
+    for line in table.left_out:
+        _say(f"left out: {line}")
     _tell(fitted, references, flat)
 
 
-def _reference(
-    row: tuple[float, float, Region | None], stack: npt.NDArray[np.float32], flat: FlatFieldFit | None
-) -> Reference:
-    celsius, sigma_k, region = row
-    level = np.array([flat.flat_field.levelled(image) if flat else image for image in stack], np.float64)
+def _reference(body: BlackBody, flat: FlatFieldFit | None) -> Reference:
+    level = np.array([flat.flat_field.levelled(image) if flat else image for image in body.counts], np.float64)
+    region = body.region
     if region is not None:
         x, y, width, height = region
         if x < 0 or y < 0 or min(width, height) < 1 or x + width > level.shape[2] or y + height > level.shape[1]:
@@ -116,12 +116,14 @@ def _reference(
     each = level.mean(axis=0)
     each = each[np.isfinite(each)]
     if not each.size:
-        raise BadInputError("bad_references", f"every pixel of the black body at {celsius:g} C is bad")
-    return Reference(celsius + ZERO_C_K, sigma_k, float(each.mean()), float(each.std() / np.sqrt(each.size)))
+        raise BadInputError("bad_references", f"every pixel of the black body at {body.celsius:g} C is bad")
+    sigma = float(each.std() / np.sqrt(each.size))
+    return Reference(body.celsius + ZERO_C_K, body.sigma_k, float(each.mean()), sigma, body.housing_k)
 
 
-def _noise(stacks: dict[Row, npt.NDArray[np.float32]]) -> float:
-    spreads = [float(np.sqrt(np.median(s.var(axis=0, ddof=1)))) for s in stacks.values() if len(s) > 1]
+def _noise(bodies: Sequence[BlackBody]) -> float:
+    stacks = (body.counts for body in bodies)
+    spreads = [float(np.sqrt(np.median(s.var(axis=0, ddof=1)))) for s in stacks if len(s) > 1]
     return float(np.median(spreads)) if spreads else 0.0
 
 
@@ -136,6 +138,7 @@ def _tell(fitted: ResponseFit, references: Sequence[Reference], flat: FlatFieldF
     for each, residual in zip(rows, fitted.residuals_k, strict=True):
         celsius = each.kelvin - ZERO_C_K
         _say(f"  {celsius:8.2f} C  read as {celsius + residual:8.2f} C   sigma {each.sigma_k:.2f} K")
+    _tell_housing(fitted.radiometry, references)
     if flat is None:
         _say("pixels: no maps, for no black body fills the view in two images")
         return
@@ -146,6 +149,19 @@ def _tell(fitted: ResponseFit, references: Sequence[Reference], flat: FlatFieldF
         f"{flat.pattern_counts:.3g} counts ({flat.pattern_counts / per_k:.3f} K), shading "
         f"{np.ptp(field.shading):.3g} counts from end to end, {int(field.bad.sum())} bad"
     )
+
+
+def _tell_housing(radiometry: Radiometry, references: Sequence[Reference]) -> None:
+    housing = radiometry.housing
+    if housing is not None:
+        low, high = (k - ZERO_C_K for k in housing.range_k)
+        sigma = float(np.sqrt(housing.covariance_row[3]))
+        _say(
+            f"housing: {housing.counts_per_k:.3g} +- {sigma:.2g} counts a kelvin of it, {low:.1f} to {high:.1f} C; "
+            f"if nobody says how warm it is, {abs(housing.counts_per_k) * housing.spread_k:.3g} counts are open"
+        )
+    elif any(each.housing_k is not None for each in references):
+        _say("housing: it was nearly as warm all the time, or warmed with the black bodies: what it adds is not known")
 
 
 def _write(args: argparse.Namespace, radiometry: Radiometry) -> None:
@@ -163,6 +179,8 @@ def _read(args: argparse.Namespace) -> None:
     radiometry, flat = _known(args)
     if (args.output or args.picture) and len(args.images) > 1:
         raise BadInputError("bad_arguments", "--output and --picture take one image at a time")
+    housing_k = None if args.housing is None else args.housing + ZERO_C_K
+    seen_before: dict[bytes, str] = {}
     for path in args.images:
         viewing, own = Viewing(), radiometry
         if radiometry is None and path.suffix.lower() in (".jpg", ".jpeg"):
@@ -170,7 +188,9 @@ def _read(args: argparse.Namespace) -> None:
             counts, viewing, own = np.asarray(image.counts, np.float32), image.viewing, image.radiometry
         else:
             counts, _ = read_grey(path)
-        found = temperatures(counts, own, viewing=_viewing(viewing, args), flat_field=flat)
+        if (twin := seen_before.setdefault(counts.tobytes(), path.name)) != path.name:
+            _say(f"{path.name}: {repeated(twin)}")
+        found = temperatures(counts, own, viewing=_viewing(viewing, args), flat_field=flat, housing_k=housing_k)
         if isinstance(found, NotRadiometric):
             _say(f"{path.name}: counts {counts.min():g} to {counts.max():g}, not radiometric: {found.reason}")
             if args.output or args.picture:
@@ -227,34 +247,6 @@ def _viewing(told: Viewing, args: argparse.Namespace) -> Viewing:
 def _check_camera(args: argparse.Namespace) -> None:
     if bool(args.rig) != bool(args.camera):
         raise BadInputError("bad_arguments", "--rig and --camera go together: of which of its cameras?")
-
-
-def _rows(table: Path) -> Rows:
-    """The images of each black body."""
-    try:
-        with table.open(encoding="utf-8", newline="") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            lines = list(reader)
-    except (OSError, UnicodeDecodeError) as exc:
-        raise BadInputError("bad_references", f"cannot read {table}: {exc}") from exc
-    if missing := [name for name in COLUMNS if name not in (reader.fieldnames or ())]:
-        raise BadInputError("bad_references", f"{table} has no column {missing[0]}; its head line must name {COLUMNS}")
-    rows: Rows = {}
-    for number, line in enumerate(lines, start=2):
-        try:
-            key = (float(line["celsius"]), float(line["sigma_k"]), _region(line))
-        except (TypeError, ValueError) as exc:
-            raise BadInputError("bad_references", f"{table}, line {number}: {exc}") from exc
-        rows.setdefault(key, []).append(table.parent / line["image"])
-    return rows
-
-
-def _region(line: Mapping[str, str]) -> Region | None:
-    sides = [line.get(name) or "" for name in REGION]
-    if not any(sides):
-        return None
-    x, y, width, height = (int(side) for side in sides)
-    return x, y, width, height
 
 
 def _say(text: str) -> None:

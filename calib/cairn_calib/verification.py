@@ -33,7 +33,7 @@ STEP_PX, STEP_M = 0.5, 1e-3
 """Of the differences that tell how a predicted pixel moves; between them it is straight to 1e-4 of that."""
 CENTROID_SIGMA_PX: Mapping[Method, Mapping[Spectrum, float]] = {
     "paper": {Spectrum.RANGE: 0.19, Spectrum.COLOUR: 0.14, Spectrum.THERMAL: 0.085},
-    "grey": {Spectrum.RANGE: 0.092, Spectrum.COLOUR: 0.14, Spectrum.THERMAL: 0.085},
+    "grey": {Spectrum.RANGE: 0.088, Spectrum.COLOUR: 0.15, Spectrum.THERMAL: 0.085},
 }
 """One axis, of its own pixels: as measured on simulated targets (tests/cairn_sim/test_study.py)."""
 
@@ -104,6 +104,8 @@ class Found:
     """(H, W) of the range camera, metres along the beam."""
     discs: Mapping[str, Sequence[Disc]]
     """By camera."""
+    amplitude: Image | None = None
+    """(H, W) of the range camera, counts; None: not known."""
 
 
 def range_camera_of(rig: Rig) -> str:
@@ -132,7 +134,8 @@ def found_targets(rig: Rig, images: Mapping[str, Image], range_m: Image, *, name
         camera: find_discs(brightness_of(image, rig[camera].spectrum), rig[camera].spectrum, method=method)
         for camera, image in images.items()
     }
-    return Found(name, range_m, discs)
+    amplitude = next((each for camera, each in images.items() if rig[camera].spectrum is Spectrum.RANGE), None)
+    return Found(name, range_m, discs, amplitude)
 
 
 def add_sights(into: Sightings, found: Found, *, centroid_sigma_px: Mapping[Spectrum, float] | None = None) -> None:
@@ -146,7 +149,7 @@ def add_sights(into: Sightings, found: Found, *, centroid_sigma_px: Mapping[Spec
     rig, source = into.rig, into.source
     sigmas = centroid_sigma_px or CENTROID_SIGMA_PX[into.method]
     into.images += 1
-    range_m = rig[source].true_ranges(np.asarray(found.range_m, np.float64))
+    range_m = rig[source].true_ranges(np.asarray(found.range_m, np.float64), found.amplitude)
     carried = []
     for disc in found.discs.get(source, ()):
         measured = disc_range(disc, range_m, rig[source])

@@ -22,7 +22,9 @@ td.words { text-align: left; white-space: normal; color: #46505e; }
 .pair { display: grid; grid-template-columns: 1fr 1fr; gap: 1rem 1.6rem; } figure { margin: 0; break-inside: avoid; }
 svg { width: 100%; height: auto; } .plot text { font: 12px system-ui, "DejaVu Sans", sans-serif; fill: #46505e; }
 .plot .title { font-weight: 600; fill: #1c2430; } .plot .grid { stroke: #e9ecf0; } .plot .axis { stroke: #7b8794; }
-@media print { body { margin: 0; max-width: none; font-size: 11px; } table { break-inside: avoid; } }
+@media print { html { font-size: 10px; } body { margin: 0; padding: 0; max-width: none; font-size: 11px;
+    print-color-adjust: exact; -webkit-print-color-adjust: exact; }
+  h2 { break-after: avoid; } table { break-inside: avoid; } th, td { padding: .25rem .35rem; } }
 """
 AXES = ("x", "y")
 FIRST_FIGURE = 9

@@ -8,7 +8,7 @@ from pathlib import Path
 from cairn_client.api import MapApi
 from cairn_client.arguments import api_of, say, shown_bytes, with_progress
 from cairn_client.link import index_of
-from cairn_client.part_export import export_part, is_part
+from cairn_client.part_export import FORMATS, export_part, is_part
 from cairn_map.cell_code import DecodedCell, decode_cell
 from cairn_map.cell_files import cell_file, npz_file, ply_file
 from cairn_map.cell_folder import FolderHead, write_cell, write_head
@@ -42,7 +42,7 @@ def get_cell(args: argparse.Namespace) -> None:
 def export_map(args: argparse.Namespace) -> None:
     """Download all cells, and write what was asked for."""
     if is_part(args):
-        _check_outputs(args.ply, args.pcd, args.npz)
+        _check_outputs(*(getattr(args, form) for form in FORMATS))
         api, name = api_of(args.map, args.token)
         with api:
             export_part(api, name, args)

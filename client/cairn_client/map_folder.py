@@ -2,19 +2,36 @@
 robot's own state.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 
+from cairn_client.local_ages import ages_of
 from cairn_client.map_model import stored_model
 from cairn_client.replica_store import FILE_NAME
 from cairn_client.state_folder import is_state_folder, opened_replica
 from cairn_map.cell_folder import MAP_FILE, read_cells, read_head
 from cairn_map.errors import BadInputError
 from cairn_map.evidence_map import EvidenceMap
+from cairn_map.map_picture import Ages
 from cairn_map.map_snapshot import MapSnapshot, snapshot_of
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FolderMap:
+    """A map that lies in a folder."""
+
+    snapshot: MapSnapshot
+    ages: Ages | None
+    """Of what a robot measured itself; None: cells say nothing about when."""
+
+
 def snapshot_of_folder(folder: Path) -> MapSnapshot:
-    """The map in a folder, under its own sensor model.
+    """The map in a folder, under its own sensor model; raises as `map_of_folder`."""
+    return map_of_folder(folder).snapshot
+
+
+def map_of_folder(folder: Path) -> FolderMap:
+    """The map in a folder, under its own sensor model, and how old it is where that is known.
 
     Raises:
         BadInputError: kind `no_map_folder`: it holds neither cells nor a robot's state.
@@ -23,13 +40,13 @@ def snapshot_of_folder(folder: Path) -> MapSnapshot:
     """
     if is_state_folder(folder):
         with opened_replica(folder) as replica:
-            return replica.snapshot(stored_model(replica.store))
+            return FolderMap(replica.snapshot(stored_model(replica.store)), ages_of(replica))
     if (folder / MAP_FILE).is_file():
         head = read_head(folder)
         whole = EvidenceMap(head.geometry)
         for cell in read_cells(folder, head.geometry):
             whole.replace(cell.key, cell.evidence)
-        return snapshot_of(whole, head.sensor_model)
+        return FolderMap(snapshot_of(whole, head.sensor_model), None)
     raise BadInputError(
         "no_map_folder",
         f"{folder} holds no map: neither {MAP_FILE} and cells (`cairn map export URL --cells DIR`) nor a robot's "

@@ -1,7 +1,10 @@
-"""`cairn robot pull`: fetch what a state folder misses, and push what waits there.
+"""`cairn robot pull`: make or bring up to date a robot's folder: fetch what it misses, and push what waits there.
 
-$ cairn robot pull --map http://base:8750/maps/lab --state copy/
-14 cells, 81233 known voxels in copy/; 0 commits pushed, 1.2 MB down
+    $ cairn robot pull --map http://base:8750/maps/lab --state mole/ --mode low-end --near 4,2,0 --radius 15
+    14 cells, 81233 known voxels in mole/; 0 commits pushed, 1.2 MB down
+
+Not what you want?  A whole map to look at: `cairn clone URL`, and later `cairn pull DIR`, which push nothing.
+A robot's folder that is there, as it was set up: `cairn robot sync DIR`.
 """
 
 import argparse
@@ -92,10 +95,19 @@ def _wanted(args: argparse.Namespace, api: MapApi, map_name: str) -> Wanted | No
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the subcommand."""
-    pull = commands.add_parser("pull", help="fetch what is missing", description=__doc__)
+    pull = commands.add_parser(
+        "pull",
+        help="make a robot's folder, or fetch what it misses (a copy: cairn clone)",
+        description=__doc__,
+        formatter_class=argparse.RawTextHelpFormatter,
+    )
     add_map(pull)
     pull.add_argument("--state", type=Path, required=True, metavar="DIR", help="the robot's folder")
-    pull.add_argument("--mode", choices=("high-end", "low-end", "viewer"))
+    pull.add_argument(
+        "--mode",
+        choices=("high-end", "low-end", "viewer"),
+        help="high-end: differences; low-end: whole cells; viewer: pushes nothing\n(as before; a new folder's: viewer)",
+    )
     pull.add_argument("--near", type=place, metavar="X,Y,Z", help="low-end: only cells around this place, metres")
     pull.add_argument("--radius", type=float, default=10.0, metavar="METRES", help="low-end: how far around (10)")
     pull.add_argument("--json", action="store_true", help="print JSON: sizes in bytes")

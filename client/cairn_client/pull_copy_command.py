@@ -1,11 +1,12 @@
-"""Bring a copy of a map up to date: fetch what changed since.
+"""Bring a copy that `cairn clone` made up to date: fetch what changed since.
 
     $ cairn pull lab
     lab: 3 of 34 cells changed by 2 commits, 48.1 kB down
     $ cairn pull lab
     lab: up to date
 
-DIR is what `cairn clone` made. A robot's own folder is brought up to date by `cairn robot sync`, which pushes, too.
+It pushes nothing. A robot's own folder, with commits that wait, is brought up to date by `cairn robot sync DIR`; and
+`cairn robot pull --map URL --state DIR` makes such a folder, of a part of the map if need be.
 """
 
 import json

@@ -7,15 +7,20 @@
     overlay.png: temperature over colour_left, scan 12: visible 71%, see-through 22%, map only 3%
 
 A map is the URL of one on a server, the folder that `cairn map export --cells` wrote, or the state folder of a robot
-that is not running. Layers: temperature, colour, probability, depth, and of a server age (seconds before its newest
-measurement). The scale is fixed (--low, --high), so that pictures can be compared; what has no value is grey, and where
-nothing is mapped it is dark.
+that is not running. Layers: temperature, colour, probability, depth, and age, in seconds before the newest measurement:
+a server knows it of everything, a robot's state of what that robot measured and has not handed over for good. The scale
+is fixed (--low, --high), so that pictures can be compared; what has no value is grey, and where nothing is mapped it is
+dark.
 
 Over a recorded image the map is compared with the depth that the robot measured there and then: what agrees is painted
 solid; what lies behind the surface that the camera sees, beyond the next free space, in stripes, fainter the farther
-away; what no live depth says anything of in dots. So a robot without a thermal camera shows temperatures that others
-measured, also behind things. --sigma says how certain the pose is: the paint spreads by it, and is withheld when it
-could be anywhere. --npz writes the values as NumPy arrays, kelvin and metres.
+away and, where its age is known, the older; what no live depth says anything of in dots. So a robot without a thermal
+camera shows temperatures that others measured, also behind things. `cairn telepresence --map` does it live.
+
+--sigma says how certain the pose is, along and about any one axis: the paint spreads by it, and is withheld when it
+could be anywhere. --covariance says it in full: the lower triangle, row by row, of rx, ry, rz (rad), tx, ty, tz (m), of
+the motion by which the true pose differs, in the frame of what is posed (--over: the rig, else the camera), as
+`robot.align` gives it. --npz writes the values as NumPy arrays, kelvin and metres.
 """
 
 import argparse
@@ -26,12 +31,12 @@ from urllib.parse import urlencode
 import numpy as np
 
 from cairn_client.arguments import add_token, allow_negative_lists, api_of, say
-from cairn_client.map_folder import snapshot_of_folder
+from cairn_client.map_folder import FolderMap, map_of_folder
 from cairn_client.robot_arguments import place
+from cairn_client.spread_arguments import add_spread_arguments, spread_of
 from cairn_map.errors import BadInputError
 from cairn_map.map_picture import arrays_of, layer_picture, layer_values, npz_of
 from cairn_map.map_render import MapRenderer
-from cairn_map.map_snapshot import MapSnapshot
 from cairn_map.png import png_of
 from cairn_map.render_picture import SCALES, Layer, Scale
 from cairn_map.render_request import RenderRequest, request_from
@@ -57,7 +62,7 @@ def add_render_arguments(render: argparse.ArgumentParser) -> None:
     render.add_argument("--over", metavar="RECORDING", help="draw over what a camera saw: a recording's folder")
     render.add_argument("--scan", type=int, default=0, metavar="N", help="which of its scans (0)")
     render.add_argument("--camera", metavar="NAME", help="which of its colour cameras (the first)")
-    render.add_argument("--sigma", type=_sigma, default=(0.0, 0.0), metavar="M,DEG", help="of the pose (0,0)")
+    add_spread_arguments(render)
     add_token(render)
     render.set_defaults(run=_run)
 
@@ -66,8 +71,6 @@ def _run(args: argparse.Namespace) -> None:
     if args.output is None and args.npz is None:
         raise BadInputError("nothing_asked", "say what to write: -o FILE.png, or --npz FILE")
     is_url = args.map.startswith(("http://", "https://"))
-    if args.layer is Layer.AGE and not is_url:
-        raise BadInputError("bad_option", "only a server knows when its map changed: give its URL for --layer age")
     if args.over is None:
         if args.eye is None or args.target is None:
             raise BadInputError("nothing_asked", "say from where to look, and at what: --from X,Y,Z --to X,Y,Z")
@@ -75,25 +78,53 @@ def _run(args: argparse.Namespace) -> None:
         if is_url:
             _ask_server(args, request)
         else:
-            _look(args, request, snapshot_of_folder(Path(args.map)))
+            _look(args, request, _folder_map(args))
         return
     if is_url:
         raise BadInputError(
-            "bad_option", "an overlay needs the map here: `cairn map export URL --cells DIR`, and then DIR for the URL"
+            "bad_option", "an overlay needs the map here: `cairn clone URL DIR`, and then DIR for the URL"
         )
-    from cairn_client.overlay_drawing import draw_over_recording  # fusion, only where it is asked for
-
-    scale = _scale(args)
-    drawn = draw_over_recording(snapshot_of_folder(Path(args.map)), args, scale, threads=THREADS)
-    _write(args, drawn.picture, drawn.arrays)
-    say(f"{args.output or args.npz}: {args.layer} over {drawn.about}")
+    _draw_over(args, _folder_map(args))
 
 
-def _look(args: argparse.Namespace, request: RenderRequest, snapshot: MapSnapshot) -> None:
-    renderer, scale = MapRenderer(threads=THREADS), request.scale
+def _folder_map(args: argparse.Namespace) -> FolderMap:
+    """The map here; with an age, if that is asked for."""
+    found = map_of_folder(Path(args.map))
+    if args.layer is Layer.AGE and found.ages is None:
+        raise BadInputError(
+            "no_age",
+            f"{args.map} does not say when anything was measured: exported cells never do, and a robot's state only of "
+            "commits of its own that it still keeps; give the map's URL, whose server knows",
+        )
+    return found
+
+
+def _draw_over(args: argparse.Namespace, found: FolderMap) -> None:
+    """The map over one image of a recording."""
+    from cairn_client.overlay_drawing import MapOverlay, about, modes_of  # fusion, only where it is asked for
+    from cairn_fusion.importers import open_source
+    from cairn_fusion.overlay import OverlayStyle, with_overlay_legend
+
+    source = open_source(args.over)
+    if not 0 <= args.scan < len(source):
+        raise BadInputError("no_scan", f"{args.over} has scans 0 to {len(source) - 1}, got {args.scan}")
+    style = OverlayStyle(layer=args.layer, scale=_scale(args), range_max_m=args.range)
+    overlay = MapOverlay(rig=source.rig, map=found, style=style, camera=args.camera, spread=spread_of(args))
+    scan = source.scan(args.scan)
+    drawn = overlay.draw(scan)
+    picture = with_overlay_legend(drawn.picture, style.colours)
+    _write(args, picture, arrays_of(drawn.values, drawn.front, args.layer) | modes_of(drawn))
+    about_it = f"{overlay.camera_of(scan)}, scan {args.scan}: {about(drawn)}"
+    say(f"{args.output or args.npz}: {args.layer} over {about_it}")
+
+
+def _look(args: argparse.Namespace, request: RenderRequest, found: FolderMap) -> None:
+    snapshot, renderer, scale = found.snapshot, MapRenderer(threads=THREADS), request.scale
     seen = renderer.nearest(snapshot, request.sight, request.T_map_camera, range_max_m=request.range_m)
-    values = layer_values(renderer, snapshot, seen, request.layer)
-    _write(args, layer_picture(values, seen, scale), arrays_of(values, seen, request.layer))
+    values = layer_values(renderer, snapshot, seen, request.layer, found.ages)
+    spread = request.spread
+    picture = layer_picture(values, seen, scale, spread)
+    _write(args, picture, arrays_of(values, seen, request.layer, spread))
     near, far = (float(f(seen.range_m[seen.hit])) if seen.hit.any() else np.nan for f in (np.min, np.max))
     say(
         f"{args.output or args.npz}: {request.layer}, {request.width} x {request.height} pixels, "
@@ -128,6 +159,10 @@ def _request(args: argparse.Namespace) -> RenderRequest:
     focal_px = width / 2 / float(np.tan(np.radians(args.fov) / 2))
     scale = _scale(args)
     about = {"width": width, "height": height, "focal_px": focal_px, "layer": args.layer, "range_m": args.range}
+    if args.covariance is not None:
+        about["covariance_lower"] = ",".join(f"{number!r}" for number in args.covariance)
+    else:
+        about |= {"sigma_m": args.sigma[0], "sigma_rad": float(np.radians(args.sigma[1]))}
     return request_from(args.eye, args.target, low=scale.low, high=scale.high, **about)
 
 
@@ -142,11 +177,3 @@ def _size(text: str) -> tuple[int, int]:
     if not found:
         raise argparse.ArgumentTypeError(f"a size is WIDTHxHEIGHT in pixels, such as 640x480; got {text!r}")
     return int(found[1]), int(found[2])
-
-
-def _sigma(text: str) -> tuple[float, float]:
-    try:
-        metres, degrees = (float(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected METRES,DEGREES, such as 0.02,1; got {text!r}") from None
-    return metres, degrees

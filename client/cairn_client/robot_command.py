@@ -3,7 +3,7 @@
     $ cairn robot replay shelf/ --map http://127.0.0.1:8750/maps/shelf --voxel 0.01
     shelf: 15 scans; the first has 26% of its pixels, median range 0.57 m
     replayed 15 scans as 15 commits in 1.9 s (7.9 scans/s), 302.0 kB up, 62.8 kB down, 0 commits wait
-    $ cairn robot pull --map http://127.0.0.1:8750/maps/shelf --state copy/
+    $ cairn robot pull --map http://127.0.0.1:8750/maps/shelf --state mole/ --mode low-end --near 4,2,0
     $ cairn robot run spool/ --map http://127.0.0.1:8750/maps/shelf --name mole
     $ cairn robot status cairn-shelf/
     $ cairn robot queue cairn-shelf/
@@ -16,8 +16,9 @@ live robot would: each measurement becomes a commit, first kept in the state fol
 Without a link it goes on, and the next `replay` or `pull` with the same state folder pushes what waits. Two robots
 can share a recording: --share 1/2 takes every second measurement from the first on, --share 2/2 the others.
 
-`pull` fetches what the state folder's robot misses and pushes what waits there. With --mode low-end it fetches whole
-cells instead of differences, on request only those around a place (--near X,Y,Z --radius METRES).
+`pull` makes a robot's folder, or fetches what its robot misses and pushes what waits there. With --mode low-end it
+fetches whole cells instead of differences, on request only those around a place (--near X,Y,Z --radius METRES). For a
+copy to look at, there are `cairn clone` and `cairn pull`, which push nothing and need no robot.
 
 Both can fetch a part of the map: --box X0,Y0,Z0,X1,Y1,Z1 (metres in the map's frame) only the cells that share more
 than a face with this box; and in small helpings: with --reply-bytes 100000 each reply ends after 100 kB of cells, or

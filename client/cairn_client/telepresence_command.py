@@ -5,39 +5,63 @@
     $ cairn telepresence lab-1 --hotter 40 --scale 15:60 --output pictures/    # all scans; only what is hot
     $ cairn telepresence lab-1 --band 34:38 --mode stereo --serve 8760  # for a browser: http://127.0.0.1:8760/
     $ cairn telepresence lab-1 --mode colour-on-thermal --output view.png
+    $ cairn telepresence lab-1 --publish http://127.0.0.1:8750/maps/lab --robot scout    # on the page, beside the map
+    $ cairn telepresence lab-1 --map lab/ --mode map --serve 8760       # what the map knows, over what the robot sees
 
 Range carries each temperature to the colour pixel of the same place; what the thermal camera does not see from where
 it stands is taken from the second one. Where no temperature is known the picture is hatched: it is never shown as
-cold. The temperature scale is that of the first picture, or what --scale says, and stays. Temperatures are apparent,
-in deg C.
+cold. With --map, a folder as of `cairn map render`, what a mirror shows is hatched, too, where the map tells: behind a
+surface that others saw from elsewhere. Glass does not show: there the pane's own temperature is on what is behind it.
+The scale is that of the first picture, or what --scale says, and stays. Temperatures are apparent, in deg C.
+
+--mode map draws the map itself over the colour image, temperatures or another --layer, so that a robot without a
+thermal camera shows those that others measured: solid where the map agrees with the live depth, in stripes what lies
+behind it, fainter the farther and, where that is known, the older; in dots what the map alone knows. Its scale is that
+of the layer, or --scale. --sigma says how certain the rig's poses are, along and about any one axis, or --covariance in
+full, as `cairn map render --help` explains: the map spreads by it, and is withheld where it could be anywhere. One
+picture of it, with all options: `cairn map render --over`.
 """
 
 import argparse
 import math
 import time
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from cairn_client.arguments import allow_negative_lists, parser, say, with_progress
+import numpy as np
+import numpy.typing as npt
+
+from cairn_client.arguments import add_token, allow_negative_lists, api_of, parser, say, with_progress
 from cairn_client.frame_arguments import add_frame_arguments, frame_options
+from cairn_client.map_folder import map_of_folder
+from cairn_client.overlay_drawing import MapOverlay
+from cairn_client.spread_arguments import add_spread_arguments, spread_of
+from cairn_client.view_publishing import publish_views
 from cairn_fusion.images import write_colour
 from cairn_fusion.importers import open_source
+from cairn_fusion.overlay import OverlayStyle
 from cairn_fusion.recording import ScanSource
 from cairn_fusion.view.mjpeg import Latest, streaming
 from cairn_fusion.view.painting import Emphasis
 from cairn_fusion.view.telepresence import Mode, Telepresence, ViewOptions
 from cairn_fusion.view.temperature_scale import ZERO_CELSIUS_K, TemperatureScale
 from cairn_map.errors import BadInputError
+from cairn_map.render_picture import Layer, Scale
 
 RATE_HZ = 5.0
+MAP = "map"
+"""Mode: the map over the live image."""
 
 
 def main(argv: list[str]) -> int:
     """Write pictures, or serve them."""
     args = _parser().parse_args(argv)
     source = open_source(args.recording, options=frame_options(args), frames=args.frames)
-    telepresence = Telepresence(source.rig, _options(args))
+    telepresence = _pictures(source, args)
     if args.serve is not None:
         _serve(source, telepresence, args)
+    elif args.publish is not None:
+        _publish(source, telepresence, args)
     elif args.output.suffix.lower() == ".png":
         _write(telepresence, source, args.scan or 0, args.output)
         say(f"wrote {args.output}: {args.mode}, scan {args.scan or 0} of {len(source)} of {source.name}")
@@ -46,7 +70,27 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _write_all(source: ScanSource, telepresence: Telepresence, args: argparse.Namespace) -> None:
+def _pictures(source: ScanSource, args: argparse.Namespace) -> Telepresence | MapOverlay:
+    """What makes a picture of a scan."""
+    if args.map is not None and args.map.startswith(("http://", "https://")):
+        raise BadInputError(
+            "bad_option", f"the map is needed here: `cairn clone {args.map} FOLDER`, and then FOLDER for the URL"
+        )
+    found = None if args.map is None else map_of_folder(Path(args.map))
+    if args.mode != MAP:
+        if not spread_of(args).is_exact:
+            raise BadInputError("bad_option", f"a pose's certainty is that of a map over the image: --mode {MAP}")
+        return Telepresence(source.rig, _options(args), None if found is None else found.snapshot)
+    if found is None:
+        raise BadInputError("nothing_asked", "say which map: --map FOLDER, of exported cells or of a robot's state")
+    if args.layer is Layer.AGE and found.ages is None:
+        raise BadInputError("no_age", f"{args.map} does not say when anything was measured; choose another --layer")
+    scale = None if args.scale is None else Scale(args.layer, *args.scale)
+    style = OverlayStyle(layer=args.layer, scale=scale)
+    return MapOverlay(rig=source.rig, map=found, style=style, camera=args.camera, spread=spread_of(args))
+
+
+def _write_all(source: ScanSource, telepresence: Telepresence | MapOverlay, args: argparse.Namespace) -> None:
     """One PNG a scan."""
     try:
         args.output.mkdir(parents=True, exist_ok=True)
@@ -58,7 +102,7 @@ def _write_all(source: ScanSource, telepresence: Telepresence, args: argparse.Na
     say(f"wrote {len(numbers)} pictures into {args.output}: {args.mode} of {source.name}")
 
 
-def _write(telepresence: Telepresence, source: ScanSource, number: int, path: Path) -> None:
+def _write(telepresence: Telepresence | MapOverlay, source: ScanSource, number: int, path: Path) -> None:
     picture = telepresence.view(source.scan(number))
     try:
         write_colour(path, picture)
@@ -66,7 +110,7 @@ def _write(telepresence: Telepresence, source: ScanSource, number: int, path: Pa
         raise BadInputError("bad_output", f"cannot write {path}: {exc.strerror}") from exc
 
 
-def _serve(source: ScanSource, telepresence: Telepresence, args: argparse.Namespace) -> None:
+def _serve(source: ScanSource, telepresence: Telepresence | MapOverlay, args: argparse.Namespace) -> None:
     """Show the scans one after the other, again and again, or one for good, until interrupted."""
     host, port = args.serve
     latest = Latest()
@@ -79,6 +123,27 @@ def _serve(source: ScanSource, telepresence: Telepresence, args: argparse.Namesp
                 due_s = time.monotonic() + 1 / args.rate
                 latest.show(telepresence.view(source.scan(number)))
                 time.sleep(max(0.0, due_s - time.monotonic()))
+
+
+def _publish(source: ScanSource, telepresence: Telepresence | MapOverlay, args: argparse.Namespace) -> None:
+    """Show each scan once to who follows the robot on the server's page."""
+    if args.robot is None:
+        raise BadInputError("nothing_asked", "say whose view it is: --robot NAME, as it is registered with the map")
+    api, map_name = api_of(args.publish, args.token)
+    numbers = range(len(source)) if args.scan is None else [args.scan]
+    with api:
+        sent, lost = publish_views(_paced(source, telepresence, numbers, args.rate), api, map_name, args.robot)
+    missed = f", {lost} did not get through" if lost else ""
+    say(f"{args.robot} showed {sent} pictures of {source.name}: {args.mode}{missed}")
+
+
+def _paced(
+    source: ScanSource, telepresence: Telepresence | MapOverlay, numbers: Iterable[int], rate_hz: float
+) -> Iterator[npt.NDArray[np.uint8]]:
+    for number in numbers:
+        due_s = time.monotonic() + 1 / rate_hz
+        yield telepresence.view(source.scan(number))
+        time.sleep(max(0.0, due_s - time.monotonic()))
 
 
 def _options(args: argparse.Namespace) -> ViewOptions:
@@ -95,7 +160,9 @@ def _celsius(text: str) -> tuple[float, float]:
     """Two temperatures, LOW:HIGH."""
     low, colon, high = text.partition(":")
     try:
-        return float(low), float(high) if colon else math.nan
+        if not colon:
+            raise ValueError(text)
+        return float(low), float(high)
     except ValueError as exc:
         raise argparse.ArgumentTypeError(f"two temperatures in deg C are LOW:HIGH, got {text!r}") from exc
 
@@ -126,8 +193,14 @@ def _parser() -> argparse.ArgumentParser:
     where.add_argument(
         "--serve", type=_address, metavar="[HOST:]PORT", help="stream to browsers (host 127.0.0.1: this machine alone)"
     )
+    where.add_argument("--publish", metavar="URL", help="show them on the page of a server: http://HOST:PORT/maps/NAME")
+    options.add_argument("--robot", metavar="NAME", help="whose view is published")
+    add_token(options)
     options.add_argument("--scan", type=int, metavar="N", help="only this scan, from 0")
-    options.add_argument("--mode", choices=[mode.value for mode in Mode], default=Mode.THERMAL_ON_COLOUR.value)
+    options.add_argument("--mode", choices=[*(mode.value for mode in Mode), MAP], default=Mode.THERMAL_ON_COLOUR.value)
+    options.add_argument("--map", metavar="FOLDER", help="a robot's state, a clone, or exported cells")
+    options.add_argument("--layer", type=Layer, choices=list(Layer), default=Layer.TEMPERATURE, help="of the map")
+    add_spread_arguments(options)
     options.add_argument("--camera", help="of the rig, to look through (the first that fits)")
     options.add_argument("--alpha", type=float, default=0.5, help="of temperatures over colour, 0 to 1 (0.5)")
     painted = options.add_mutually_exclusive_group()

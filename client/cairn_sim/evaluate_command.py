@@ -2,11 +2,13 @@
 
 The table's columns: pixels painted; error, median and 95 %; share of errors above 2 K or 20 of 255; 95 % of pixels
 farther than a range pixel from any edge, and of those whose depth was filled in; median behind glass and in mirrors;
-pixels painted although hidden; precision and recall of the label OCCLUDED. With --map also the temperatures of a map
+pixels painted although hidden; precision and recall of the label OCCLUDED, by the pixel, and where one a range pixel
+away counts as well: where an edge is within a range pixel, no sensor said. With --map also the temperatures of a map
 of whole stops, and with --mm5 hot cups of real frames against hand labels.
 """
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -75,9 +77,9 @@ def _images(args: argparse.Namespace) -> None:
             for way, scores in view.scores.items():
                 totals[camera, way] = totals[camera, way] + scores if (camera, way) in totals else scores
     for camera, what in zip(cameras, ("temperature, K, on", "colour, of 255, on"), strict=True):
-        say(f"{what + ' ' + camera:<34}" + "".join(f"{column:>12}" for column in COLUMNS))
+        say(f"{what + ' ' + camera:<34}" + _in_columns(COLUMNS))
         for way in WAYS:
-            say(f"  {way:<32}" + "".join(f"{cell:>12}" for cell in totals[camera, way].row()))
+            say(f"  {way:<32}" + _in_columns(totals[camera, way].row()))
     stop, number = FIGURE
     shots = [shot for shot in shots_of(_plan(args, stop)) if shot.scan == number]
     scan = next(scan for _, scan, _ in scans_of(_plan(args, stop), shots, rig))
@@ -86,6 +88,11 @@ def _images(args: argparse.Namespace) -> None:
     write_colour(args.output / "fig24.png", figure_24(scan, rig, cameras[0], scale))
     write_colour(args.output / "errors.png", error_picture(scan, view.fused, view.truth, scale))
     say(f"wrote {args.output / 'fig24.png'} and {args.output / 'errors.png'}")
+
+
+def _in_columns(cells: Sequence[str]) -> str:
+    """A row's cells below their names."""
+    return "".join(f"{cell:>{max(len(name), 5) + 2}}" for name, cell in zip(COLUMNS, cells, strict=True))
 
 
 def _maps(args: argparse.Namespace) -> None:

@@ -75,13 +75,14 @@ def scored_view(scene: Scene, rig: Rig, scan: Scan, camera: str) -> ScoredView:
 def mapped_scores(
     scene: Scene, rig: Rig, stops: Sequence[Sequence[Scan]], *, voxel_edge_m: float
 ) -> dict[str, dict[str, TemperatureScores]]:
-    """By way of mapping, and of bodies and pipes: how true the temperatures of a map of all stops are."""
+    """How true a map's temperatures are: by way of mapping, of bodies, pipes, behind glass, in mirrors, and else."""
     geometry = geometry_for(voxel_edge_m=voxel_edge_m)
+    eyes_m = [scans[0].T_map_rig[:3, 3] for scans in stops]
     found = {}
     for name, integrator in MAPPINGS.items():
         total = EvidenceMap(geometry)
         for scans in stops:
             total.merge(integrate_scans(scans, rig, geometry, integrator=integrator))
         groups = {"bodies": is_body, "pipes": is_pipe}
-        found[name] = temperature_scores(scene, total.packed(), geometry, groups=groups)
+        found[name] = temperature_scores(scene, total.packed(), geometry, groups=groups, eyes_m=eyes_m)
     return found

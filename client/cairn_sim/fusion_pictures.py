@@ -28,7 +28,10 @@ LABEL_COLOURS = {
     Label.FLYING: (200, 80, 220),
     Label.NO_READING: (255, 255, 255),
     Label.UNCERTAIN: (80, 200, 220),
+    Label.BEYOND: (60, 160, 90),
 }
+GAP_PX = 8
+"""Between the panels of a figure."""
 ERROR_SPAN_K = 5.0
 """At which an error is as bright as it gets."""
 
@@ -49,7 +52,9 @@ def uncalibrated(rig: Rig) -> Rig:
 
 
 def figure_24(scan: Scan, rig: Rig, camera: str, scale: TemperatureScale) -> Rgb:
-    """(2 H, 2 W, 3) colour, thermal, fused without calibration, and with it, as in Fig. 24 of the paper.
+    """Colour, thermal, fused without calibration, and with it, as in Fig. 24 of the paper.
+
+    (2 H + GAP_PX, 2 W + GAP_PX, 3), each with its name at its lower edge.
 
     Args:
         scan: to show.
@@ -61,15 +66,21 @@ def figure_24(scan: Scan, rig: Rig, camera: str, scale: TemperatureScale) -> Rgb
     thermal = rig.of_spectrum(Spectrum.THERMAL)[0]
     kelvin = scan.thermal[thermal]
     warm = painted_alone(kelvin, np.where(np.isfinite(kelvin), Label.OK, Label.NO_READING).astype(np.uint8), scale)
-    fused = {"fused, not calibrated": fuse(scan, uncalibrated(rig), camera), "fused": fuse(scan, rig, camera)}
+    fused = {
+        "fused, not calibrated": fuse(scan, uncalibrated(rig), camera),
+        "fused, calibrated": fuse(scan, rig, camera),
+    }
     panels = {"colour": base.copy(), "thermal": _fitted(warm, base.shape[0], base.shape[1])}
     for name, each in fused.items():
-        panels[name] = painted(base, each.values[..., 0], each.labels, scale, half)
-    for name, panel in panels.items():
-        write_into(panel, name, (panel.shape[1] // 2 - 60, panel.shape[0] - 14))
-    draw_legend_into(panels["thermal"], scale)
-    pictures = list(panels.values())
-    return np.vstack([np.hstack(pictures[:2]), np.hstack(pictures[2:])])
+        panels[f"{name}; hatched: no temperature"] = painted(base, each.values[..., 0], each.labels, scale, half)
+    (H, W), out = base.shape[:2], np.full((2 * base.shape[0] + GAP_PX, 2 * base.shape[1] + GAP_PX, 3), 255, np.uint8)
+    for n, (name, panel) in enumerate(panels.items()):
+        if n:
+            draw_legend_into(panel, scale)
+        write_into(panel, name, (14, H - 14))
+        top, left = (n // 2) * (H + GAP_PX), (n % 2) * (W + GAP_PX)
+        out[top : top + H, left : left + W] = panel
+    return out
 
 
 def error_picture(scan: Scan, fused: Across, truth: FusionTruth, scale: TemperatureScale) -> Rgb:

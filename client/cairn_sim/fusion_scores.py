@@ -5,6 +5,7 @@
     hidden      painted although no source sees the place, of painted
     precision   pixels called occluded that are hidden, of those called so
     recall      hidden pixels called occluded, of the hidden ones in view that have a depth
+    ... +-1     the same, where one a range pixel away counts: nobody measured better where an edge is
 
 Pixels that look through glass or into a mirror are counted by themselves: there the range camera measured something
 else.
@@ -20,7 +21,7 @@ import numpy.typing as npt
 from cairn_fusion.across import Across
 from cairn_fusion.eye_depth import Origin
 from cairn_fusion.transfer import Label
-from cairn_sim.fusion_truth import FusionTruth
+from cairn_sim.fusion_truth import FusionTruth, grown
 
 Singles = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
@@ -43,8 +44,12 @@ class FusionScores:
     called: int = 0
     """Occluded, by the label, of those in view of the first source."""
     called_hidden: int = 0
+    called_near: int = 0
+    """Within a range pixel of one that is hidden."""
     hidden: int = 0
     """From the first source, in its view, and with a depth."""
+    hidden_near: int = 0
+    """Of these, within a range pixel of one that was called so."""
     errors: Singles = field(default_factory=lambda: EMPTY)
     """Of painted pixels."""
     errors_away: Singles = field(default_factory=lambda: EMPTY)
@@ -71,6 +76,16 @@ class FusionScores:
         """Of hidden pixels, those called occluded."""
         return self.called_hidden / self.hidden if self.hidden else math.nan
 
+    @property
+    def precision_near(self) -> float:
+        """As `precision`, where a hidden pixel a range pixel away will do."""
+        return self.called_near / self.called if self.called else math.nan
+
+    @property
+    def recall_near(self) -> float:
+        """As `recall`, where a called pixel a range pixel away will do."""
+        return self.hidden_near / self.hidden if self.hidden else math.nan
+
     def row(self) -> list[str]:
         """Text for a table, in the order of `COLUMNS`."""
         share, large = 100 / max(self.pixels, 1), LARGE[self.unit]
@@ -83,9 +98,12 @@ class FusionScores:
             f"{_quantile(self.errors_filled, 0.95):.2f}",
             f"{_quantile(self.errors_beyond, 0.5):.2f}",
             f"{100 * self.hidden_painted / max(self.painted, 1):.2f}",
-            f"{100 * self.precision:.1f}" if self.called else "-",
-            f"{100 * self.recall:.1f}" if self.called else "-",
+            *(f"{100 * share:.1f}" if self.called else "-" for share in self._of_hidden),
         ]
+
+    @property
+    def _of_hidden(self) -> tuple[float, float, float, float]:
+        return self.precision, self.recall, self.precision_near, self.recall_near
 
 
 COLUMNS = (
@@ -97,8 +115,10 @@ COLUMNS = (
     "95 % filled",
     "beyond",
     "hidden %",
-    "precision",
-    "recall",
+    "precision %",
+    "recall %",
+    "prec. +-1",
+    "recall +-1",
 )
 
 
@@ -120,6 +140,8 @@ def fusion_scores(fused: Across, truth: FusionTruth, *, unit: str) -> FusionScor
     alone = len(fused.sources) == 1
     judged = clear & truth.in_view[first] & ((fused.labels == Label.OK) | (fused.labels == Label.OCCLUDED)) & alone
     called, hidden = judged & (fused.labels == Label.OCCLUDED), judged & ~truth.sees[first]
+    is_near_hidden = grown(truth.in_view[first] & ~truth.sees[first], truth.pixel_px)
+    is_near_called = grown(fused.labels == Label.OCCLUDED, truth.pixel_px)
     return FusionScores(
         unit=unit,
         pixels=int(clear.sum()),
@@ -128,7 +150,9 @@ def fusion_scores(fused: Across, truth: FusionTruth, *, unit: str) -> FusionScor
         hidden_painted_away=int((painted & ~seen & ~truth.near_edge).sum()),
         called=int(called.sum()),
         called_hidden=int((called & hidden).sum()),
+        called_near=int((called & is_near_hidden).sum()),
         hidden=int(hidden.sum()),
+        hidden_near=int((hidden & is_near_called).sum()),
         errors=error[painted],
         errors_away=error[painted & ~truth.near_edge],
         errors_filled=error[painted & (fused.depth.origins == Origin.FILLED)],

@@ -26,7 +26,9 @@ Flags = npt.NDArray[np.bool_]
 HIDDEN_M = 0.1
 """What hides stands so much before what it hides: the bend of a surface seen at a glance hides nothing else."""
 EDGE_SHARE = 0.05
-"""Neighbours whose ranges differ by more are on both sides of an edge."""
+EDGE_M = HIDDEN_M / 2
+"""Neighbours whose ranges differ by more than the share, or by as much as may hide something, are on both sides of an
+edge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,6 +41,8 @@ class FusionTruth:
     in_view: Mapping[str, Flags]
     near_edge: Flags
     beyond: Flags
+    pixel_px: float = 1.0
+    """Pixels along one of the range camera, which is what can be known of where an edge is."""
 
 
 def fusion_truth(
@@ -61,7 +65,8 @@ def fusion_truth(
     range_m = np.where(own.solid < 0, np.nan, own.range_m).reshape(view.shape)
     points = transform_points(T_map_camera, seen_in.camera.rays() * range_m[..., None])
     focal_px = rig[range_camera].camera.focal_px[0]
-    near_edge = _near_edges(range_m, seen_in.camera.focal_px[0] / focal_px)
+    pixel_px = seen_in.camera.focal_px[0] / focal_px
+    near_edge = _near_edges(range_m, pixel_px)
     sees, in_view = {}, {}
     for name in sources:
         mounted = rig[name]
@@ -75,7 +80,7 @@ def fusion_truth(
         x, y = np.rint(np.where(in_view[name][..., None], pixels, 0)).astype(np.int64).transpose(2, 0, 1)
         near_edge |= in_view[name] & edges[y, x]
     beyond = (own.way != 0).reshape(view.shape)
-    return FusionTruth(values.astype(np.float32), sees, in_view, near_edge, beyond)
+    return FusionTruth(values.astype(np.float32), sees, in_view, near_edge, beyond, pixel_px)
 
 
 def _hidden(scene: Scene, points: Floats, T_map_source: Transform, *, opaque: bool) -> Flags:
@@ -94,11 +99,17 @@ def _hidden(scene: Scene, points: Floats, T_map_source: Transform, *, opaque: bo
 def _near_edges(range_m: Floats, pixel_px: float) -> Flags:
     """(H, W) pixels at most a range pixel, `pixel_px` of these, from a step in depth; what is endless is far away."""
     nearness = 1 / np.where(np.isnan(range_m), np.inf, range_m)
+    step = np.minimum(EDGE_SHARE, EDGE_M * nearness) * nearness
     edges = np.zeros(range_m.shape, np.uint8)
     for axis in (0, 1):
         ahead = np.diff(nearness, axis=axis, append=np.take(nearness, [-1], axis=axis))
         # Slant is the same on both sides, a step is not.
         bend = np.abs(np.diff(ahead, axis=axis, prepend=np.take(ahead, [0], axis=axis)))
-        edges |= (bend > EDGE_SHARE * nearness).astype(np.uint8)
+        edges |= (bend > step).astype(np.uint8)
+    return grown(edges.astype(bool), pixel_px)
+
+
+def grown(flags: Flags, pixel_px: float) -> Flags:
+    """(H, W) pixels at most a range pixel, `pixel_px` of these, from one of (H, W) flags."""
     side = 2 * int(np.ceil(pixel_px)) + 1
-    return np.asarray(cv2.dilate(edges, np.ones((side, side), np.uint8)), dtype=bool)
+    return np.asarray(cv2.dilate(flags.astype(np.uint8), np.ones((side, side), np.uint8)), dtype=bool)

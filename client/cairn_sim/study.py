@@ -10,7 +10,7 @@ Images of a place are taken once, whichever configurations have it; the drive is
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
@@ -23,7 +23,7 @@ from cairn_calib.corners import Corners
 from cairn_calib.disc_images import Method
 from cairn_calib.rig import Rig
 from cairn_calib.solve import solve_rig
-from cairn_calib.solve_plan import Prior, SolvePlan, usual_plan
+from cairn_calib.solve_plan import usual_plan
 from cairn_calib.solved_rig import solved_rig
 from cairn_calib.verification import Found, Sightings, add_sights, found_targets
 from cairn_calib.verification_table import CameraRow, table_of
@@ -38,9 +38,6 @@ from cairn_sim.study_scenes import T_MAP_HEAD, targets_in_view
 from cairn_sim.targets import Board, calibration_scene, target_scene
 
 METHODS: tuple[Method, ...] = ("paper", "grey")
-COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
-COEFFICIENT_SIGMAS = {"p1": 0.002, "p2": 0.002, "k3": 0.1}
-"""What is known of such lenses before: all five are estimated, and few images must not make them up."""
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 DRIVE_SEED, BOARD_SEED = 1, 2
 """Added to the study's."""
@@ -144,20 +141,9 @@ def calibrated(configuration: Configuration, corners: Mapping[Place, BoardCorner
         for camera, found in corners[place].items()
     )
     sizes = {camera: (each.camera.width, each.camera.height) for camera, each in head.cameras.items()}
-    solution = solve_rig(BoardViews(corner_board_of(Board()), sizes, views), plan_of(head, name=name))
-    return solved_rig(solution, made_s=0.0)
-
-
-def plan_of(head: Rig, *, name: str) -> SolvePlan:
-    """What is solved for: all five coefficients of every lens."""
     plan = usual_plan({camera: each.spectrum for camera, each in head.cameras.items()}, rig_name=name)
-    cameras = {camera: replace(each, free=COEFFICIENTS) for camera, each in plan.cameras.items()}
-    priors = tuple(
-        Prior(((camera, coefficient, 1.0),), 0.0, sigma)
-        for camera in cameras
-        for coefficient, sigma in COEFFICIENT_SIGMAS.items()
-    )
-    return replace(plan, cameras=cameras, priors=priors)
+    solution = solve_rig(BoardViews(corner_board_of(Board()), sizes, views), plan)
+    return solved_rig(solution, made_s=0.0)
 
 
 def corner_board_of(board: Board) -> CornerBoard:

@@ -3,11 +3,13 @@
     truth     what a thermal camera reads of the surfaces in a voxel: from the coldest to the warmest of them
     error     how far the voxel's mean is from that
 
-A voxel is 'on' a solid whose surface is nearest to its centre, and passes through it. Edges are among them.
+A voxel is 'on' a solid whose surface is nearest to its centre, and passes through it. Edges are among them. Range
+cameras look through glass that thermal cameras see: what stood behind some is counted once more, by itself; and so is
+what stands where a mirror shows something to them, as in the next room.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -19,6 +21,8 @@ from cairn_map.evidence_map import Diff
 from cairn_map.grid import Geometry, voxels_in_cell
 from cairn_map.sensor_model import SensorModel
 from cairn_sim.distance_kernels import nearest_solids
+from cairn_sim.fusion_truth import HIDDEN_M
+from cairn_sim.rays import POINTS_OF_BUNDLE, cast_directions
 from cairn_sim.scene import Scene
 from cairn_sim.sensors import ThermalSensor
 from cairn_sim.solid_kernels import second_at
@@ -29,6 +33,11 @@ Ints = npt.NDArray[np.int32]
 
 BODIES = ("person", "technician", "operator", "chemist", "casualty", "fire fighter")
 PIPES = ("pipe", "riser")
+BEHIND_GLASS = "behind glass"
+IN_MIRROR = "in a mirror"
+OTHERS = "all the others"
+MIRROR_EDGES = 4.0
+"""By how many of its edges a voxel may be off from what a mirror shows: range noise, and slanted surfaces."""
 SAMPLES = 3
 """Places along a voxel's edge at which its surfaces are looked for."""
 
@@ -70,15 +79,24 @@ def is_pipe(name: str) -> bool:
 
 
 def temperature_scores(
-    scene: Scene, diff: Diff, geometry: Geometry, *, groups: Mapping[str, Callable[[str], bool]]
+    scene: Scene,
+    diff: Diff,
+    geometry: Geometry,
+    *,
+    groups: Mapping[str, Callable[[str], bool]],
+    eyes_m: Sequence[Floats] = (),
 ) -> dict[str, TemperatureScores]:
     """The scores of all occupied voxels on solids of each group, and of all groups as `all`.
+
+    With places to look from, of those among them that some of these see through glass, of those where some see
+    something in a mirror, and of the others, too.
 
     Args:
         scene: that was mapped.
         diff: the map's evidence by cell, `EvidenceMap.packed()`.
         geometry: of the map; it has a temperature channel.
         groups: which names of solids are in which; at most one each.
+        eyes_m: (3,) each, map frame: where range was measured from.
     """
     names = list(groups)
     member = np.array([[chosen(solid.name) for solid in scene.solids] for chosen in groups.values()])
@@ -90,6 +108,11 @@ def temperature_scores(
     low, high = _surface_temperatures(scene, centres, geometry.voxel_edge_m, anyone)
     error = np.maximum(np.maximum(low - kelvin, kelvin - high), 0.0)
     chosen = {name: member[n][nearest] for n, name in enumerate(names)} | {"all": np.ones(len(nearest), bool)}
+    if eyes_m:
+        behind = np.logical_or.reduce([_behind_glass(scene, centres, eye_m) for eye_m in eyes_m])
+        shown = [_in_mirror(scene, centres, eye_m, geometry.voxel_edge_m) for eye_m in eyes_m]
+        mirrored = np.logical_or.reduce(shown) & ~behind
+        chosen |= {BEHIND_GLASS: behind, IN_MIRROR: mirrored, OTHERS: ~behind & ~mirrored}
     through, known = np.isfinite(low), np.isfinite(kelvin)
     return {
         name: TemperatureScores(errors_k=error[of & through & known], without=int((of & through & ~known).sum()))
@@ -122,6 +145,29 @@ def _occupied(diff: Diff, geometry: Geometry) -> tuple[Floats, Floats]:
         centres.append(np.asarray((voxels + 0.5) * geometry.voxel_edge_m, dtype=np.float64))
         kelvin.append(np.asarray(mean[occupied], dtype=np.float64))
     return np.concatenate(centres), np.concatenate(kelvin)
+
+
+def _behind_glass(scene: Scene, centres: Floats, eye_m: Floats) -> Flags:
+    """(N,) whether glass, and nothing else, stands between an eye (3,) and (N, 3) centres."""
+    T, way = np.eye(4), centres - eye_m
+    T[:3, 3] = eye_m
+    away_m = np.linalg.norm(way, axis=1)
+    through, stopped = (
+        cast_directions(scene, way / away_m[:, None], T, bundle=POINTS_OF_BUNDLE, opaque=opaque).straight_m
+        for opaque in (False, True)
+    )
+    nearly_m = away_m - HIDDEN_M
+    return np.asarray((stopped < nearly_m) & (through >= nearly_m))
+
+
+def _in_mirror(scene: Scene, centres: Floats, eye_m: Floats, edge_m: float) -> Flags:
+    """(N,) whether a range camera at an eye (3,) puts what a mirror shows into voxels with (N, 3) centres."""
+    T, way = np.eye(4), centres - eye_m
+    T[:3, 3] = eye_m
+    away_m = np.linalg.norm(way, axis=1)
+    hits = cast_directions(scene, way / away_m[:, None], T, bundle=POINTS_OF_BUNDLE, opaque=False)
+    # The whole way there, round the mirror, is what it measures; of several beams in a voxel this is one.
+    return np.asarray((hits.straight_m < away_m - HIDDEN_M) & (np.abs(hits.path_m - away_m) < MIRROR_EDGES * edge_m))
 
 
 def _surface_temperatures(scene: Scene, centres: Floats, edge_m: float, solids: Flags) -> tuple[Floats, Floats]:

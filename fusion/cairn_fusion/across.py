@@ -14,19 +14,18 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.poses import inverse
-from cairn_calib.rig import Rig
+from cairn_calib.rig import MountedCamera, Rig
 from cairn_fusion.across_kernels import fill_into, label_into, sample_into
 from cairn_fusion.bands import in_bands
 from cairn_fusion.eye_depth import EyeDepth, Origin
-from cairn_fusion.surface import Drawn, beams, places
+from cairn_fusion.surface import JOIN_SIGMAS, Drawn, beams, places
 from cairn_fusion.transfer import Label
 
 Singles = npt.NDArray[np.float32]
 Labels = npt.NDArray[np.uint8]
 
 HIDDEN_BEHIND = 0.03
-"""How much deeper, as a share, a point must be than what hides it, besides noise and slant."""
-HIDDEN_SIGMAS = 3.0
+"""How much deeper, as a share, a point must be than what hides it, besides slant and `JOIN_SIGMAS` of its noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,15 +104,14 @@ class _Seen:
         labels, values = known.copy(), np.full((*known.shape, smooth.shape[2]), np.nan, np.float32)
         # Without parallax nothing can hide anything.
         apart = float(np.linalg.norm(src.transform[:3, 3] - dst.transform[:3, 3])) > 1e-9
-        hiding, slack, step = np.zeros((1, 1), np.float32), np.zeros((1, 1), np.float32), 1 << 20
+        least, step = np.zeros((1, 1), np.float32), 1 << 20
         if (drawn := self.drawn.get(name)) is not None and apart:
-            hiding, slack, step = drawn.hiding, drawn.slack, drawn.step_px
-        tolerance = HIDDEN_BEHIND + HIDDEN_SIGMAS * _relative_noise(self.rig, self.range_camera)
+            least, step = _least_nearness(drawn, self.rig[self.range_camera]), drawn.step_px
         width, height = dst.camera.width, dst.camera.height
 
         def look(first: int, last: int) -> None:
             rows = slice(first, last)
-            label_into(labels[rows], u[rows], v[rows], q[rows], hiding, slack, step, width, height, tolerance)
+            label_into(labels[rows], u[rows], v[rows], q[rows], least, step, width, height)
             sample_into(values[rows], labels[rows], u[rows], v[rows], smooth)
 
         in_bands(look, len(known))
@@ -138,6 +136,12 @@ def _smoothed(image: npt.NDArray[np.generic], ratio: float) -> Singles:
     return np.ascontiguousarray(np.atleast_3d(values), dtype=np.float32)
 
 
-def _relative_noise(rig: Rig, range_camera: str) -> float:
-    """Standard deviation of a range as a share of it, at 2 m: near things hide, and there it is this or more."""
-    return float(rig[range_camera].range_sigma_m(np.array([2.0]))[0] / 2.0)
+def _least_nearness(drawn: Drawn, range_camera: MountedCamera) -> Singles:
+    """(h, w) 1 / metres: a point with less is behind what hides there, and 0 where nothing does.
+
+    Both ranges have noise, as much as is usual at the nearer: the farther a surface, the more it hides itself.
+    """
+    hides = drawn.hiding > 0
+    range_m = 1 / np.where(hides, drawn.hiding, np.float32(1.0))
+    tolerance = HIDDEN_BEHIND + JOIN_SIGMAS * range_camera.range_sigma_m(range_m) / range_m
+    return np.where(hides, drawn.hiding / (1 + tolerance) - drawn.slack, 0.0).astype(np.float32)

@@ -79,12 +79,10 @@ def label_into(
     us: Singles,
     vs: Singles,
     qs: Singles,
-    hiding: Singles,
-    slack: Singles,
+    least: Singles,
     step_px: int,
     width: int,
     height: int,
-    tolerance: float,
 ) -> None:
     """Label points that are out of another camera's view, or behind what it sees there; others keep their label.
 
@@ -93,26 +91,24 @@ def label_into(
         us: (H, W) of `places_into`.
         vs: (H, W)
         qs: (H, W)
-        hiding: (h, w) 1 / range of the nearest that the camera sees around a place; 0: it is not known.
-        slack: (h, w) by how much more a point may lie behind it, 1 / metres: the surface's slant there.
-        step_px: pixels of the camera along one of `hiding`.
+        least: (h, w) 1 / metres: a point with less lies behind what the camera sees around a place.
+        step_px: pixels of the camera along one of `least`.
         width: of the camera's image.
         height: of it.
-        tolerance: how much deeper, as a share, a point may be than what hides it.
     """
     f = np.float32
-    right, bottom, least = f(width - 0.5), f(height - 0.5), f(-0.5)
-    share, keep, half = f(1.0 / step_px), f(1.0 / (1.0 + tolerance)), f(0.5)
+    right, bottom, first = f(width - 0.5), f(height - 0.5), f(-0.5)
+    share, half = f(1.0 / step_px), f(0.5)
     for row in range(labels.shape[0]):
         for n in range(labels.shape[1]):
             if labels[row, n] != OK:
                 continue
             u, v = us[row, n], vs[row, n]
-            if not (u >= least and v >= least and u < right and v < bottom):
+            if not (u >= first and v >= first and u < right and v < bottom):
                 labels[row, n] = OUT_OF_VIEW
                 continue
             i, j = int((v + half) * share), int((u + half) * share)
-            if qs[row, n] < hiding[i, j] * keep - slack[i, j]:
+            if qs[row, n] < least[i, j]:
                 labels[row, n] = OCCLUDED
 
 

@@ -33,6 +33,6 @@ def clear_image(returns: Returns, mounted: MountedCamera, *, voxel_edge_m: float
         float(max(mounted.camera.focal_px)),
         voxel_edge_m,
     )
-    sigma_m = mounted.range_sigma_m(nearest_m)
+    sigma_m = mounted.range_sigma_image(nearest_m)
     kept_m = share * margins_m(sigma_m, voxel_edge_m=voxel_edge_m, noise_sigmas=noise_sigmas).astype(np.float32)
     return np.asarray(np.maximum(nearest_m - kept_m, np.float32(0.0)))

@@ -30,8 +30,6 @@ Bytes = npt.NDArray[np.uint8]
 
 ALIKE_SIGMA = 24.0
 """Of the sum of three differences of 8-bit colours: noise and shading; the edges of things are larger."""
-NEAR_LESS_PX = 0.35
-"""A near surface is carried a range pixel beyond what was measured, less half of what places are rounded by."""
 CLOSE_SIGMA = 1.5
 """Of the distance, drawn pixels."""
 
@@ -98,7 +96,7 @@ def eye_depth(drawn: Drawn, rig: Rig, camera: str, picture: npt.NDArray[np.gener
     def densify(first: int, last: int) -> None:
         densify_into(
             *(shown_m, origins, guide, drawn.nearness, drawn.marks, trust, coarse, ALIKE, CLOSE),
-            *(drawn.per_pixel - NEAR_LESS_PX, drawn.step_px, first, last),
+            *(drawn.per_pixel, drawn.step_px, first, last),
         )
 
     in_bands(densify, height)

@@ -39,7 +39,8 @@ def densify_into(
     Between four drawn pixels of one surface 1 / range is interpolated. Else the drawn pixels around vote: each with its
     trust, how close it is, and how alike its colour is; only the stronger of two surfaces has a say in the range. The
     nearer of two, and one alone, is not carried farther than `near_px`: too far out it would be painted
-    with what is not there, whereas what goes too far behind something is found to be hidden.
+    with what is not there, whereas what goes too far behind something is found to be hidden. A range pixel is how far:
+    the next one, had it been on the surface, would have said so, and up to there nobody knows where the surface ends.
 
     Args:
         range_m: (H, W) takes metres; NaN where nothing is known.
@@ -51,7 +52,7 @@ def densify_into(
         coarse: (h, w, 3) the picture, as coarse as the drawing.
         alike: (3 * 256,) weight by the sum of the three differences of colour.
         close: (2 REACH + 2, 2 REACH + 2) weight by place, of rows and columns from the first that is looked at.
-        near_px: drawn pixels, about as wide as a range pixel.
+        near_px: how far a range pixel is from the next, drawn pixels; counted from each pixel's own place.
         step_px: pixels along a drawn one.
         first: row.
         last: row.
@@ -61,7 +62,7 @@ def densify_into(
     middle_px, share = 0.5 * (step_px - 1), f(1.0 / step_px)
     voters = (2 * REACH + 2) ** 2
     qs, weights, colours = np.empty(voters, np.float32), np.empty(voters, np.float32), np.empty((voters, 3), np.int32)
-    at_hand, near_square = np.empty(voters, np.bool_), near_px * near_px
+    downs, rights, near_square = np.empty(voters, np.float32), np.empty(voters, np.float32), f(near_px * near_px)
     # Pixels between the same four drawn ones, of which those beyond the border are the border's.
     for i in range(-1, rows):
         y0, y1 = max(first, math.ceil(i * step_px + middle_px)), min(last, math.ceil((i + 1) * step_px + middle_px))
@@ -87,7 +88,7 @@ def densify_into(
                     q = nearness[k, m]
                     if q > f(0.0):
                         qs[count], weights[count] = q, trust[k, m] * close[k - i + REACH, m - j + REACH]
-                        at_hand[count] = (k - i - 0.5) ** 2 + (m - j - 0.5) ** 2 <= near_square
+                        downs[count], rights[count] = k - i, m - j
                         # Signed: bytes would wrap round.
                         for c in range(3):
                             colours[count, c] = np.int32(coarse[k, m, c])
@@ -100,19 +101,12 @@ def densify_into(
                 origins[y0:y1, x0:x1] = NOTHING
                 continue
             origins[y0:y1, x0:x1] = FILLED
-            if most <= least * f(1.0 + STEP_SHARE):
-                total, weight = f(0.0), f(0.0)
-                for n in range(count):
-                    if at_hand[n]:
-                        total += weights[n] * qs[n]
-                        weight += weights[n]
-                range_m[y0:y1, x0:x1] = weight / total if total > f(0.0) else np.nan
-                if total == f(0.0):
-                    origins[y0:y1, x0:x1] = NOTHING
-                continue
-            middle = f(0.5) * (least + most)
+            is_one = most <= least * f(1.0 + STEP_SHARE)
+            middle = f(0.0) if is_one else f(0.5) * (least + most)
             for y in range(y0, y1):
+                b = f(y - i * step_px - middle_px) * share
                 for x in range(x0, x1):
+                    a = f(x - j * step_px - middle_px) * share
                     red, green, blue = (
                         np.int32(picture[y, x, 0]),
                         np.int32(picture[y, x, 1]),
@@ -120,13 +114,19 @@ def densify_into(
                     )
                     near, near_sum, far, far_sum = f(0.0), f(0.0), f(0.0), f(0.0)
                     for n in range(count):
+                        if qs[n] > middle and (downs[n] - b) ** 2 + (rights[n] - a) ** 2 > near_square:
+                            continue
                         other = abs(colours[n, 0] - red) + abs(colours[n, 1] - green) + abs(colours[n, 2] - blue)
                         weight = weights[n] * alike[other]
                         if qs[n] > middle:
-                            if at_hand[n]:
-                                near += weight
-                                near_sum += weight * qs[n]
+                            near += weight
+                            near_sum += weight * qs[n]
                         else:
                             far += weight
                             far_sum += weight * qs[n]
-                    range_m[y, x] = near / near_sum if near >= far else far / far_sum
+                    if near >= far and near > f(0.0):
+                        range_m[y, x] = near / near_sum
+                    elif far > f(0.0):
+                        range_m[y, x] = far / far_sum
+                    else:
+                        range_m[y, x], origins[y, x] = np.nan, NOTHING

@@ -142,22 +142,25 @@ class Integration:
         Args:
             points: (N, 3) metres, sensor frame, all seen from its origin; NaN where nothing came back.
             T_map_sensor: where it was.
-            range_camera: the rig's camera whose noise they have; None: a lidar's usual noise.
+            range_camera: the rig's camera that measured them, as its driver made points of its ranges, in its own
+                frame; they have its noise, and what the rig says that it adds to ranges (`range_bias`) is taken off,
+                at the usual amplitude. None: another sensor, with a lidar's usual noise; points are taken as they are.
             T_map_body: where the frame of the rig's body was; None: nothing is taken for the robot's body.
 
         Raises:
-            BadInputError: not (N, 3), or it reaches beyond the numbered space; nothing was added.
+            BadInputError: not (N, 3), or it reaches beyond the numbered space, or points that the range camera cannot
+                have seen while its rig states a bias; nothing was added.
         """
         if points.ndim != 2 or points.shape[1] != 3:
             raise BadInputError("bad_points", f"points must be (N, 3), got {points.shape}")
         T = checked_transform(T_map_sensor, name="T_map_sensor")
-        own = points.astype(np.float64)
+        of = None if range_camera is None else self._rig[range_camera]
+        own = (points if of is None else of.true_points(points)).astype(np.float64)
         range_m = np.linalg.norm(own, axis=1)
         kept = (range_m >= self._integrator.min_range_m) & (range_m <= self._integrator.max_range_m)
         if self._rig.body is not None and T_map_body is not None:
             T_body_sensor = inverse(checked_transform(T_map_body, name="T_map_body")) @ T
             kept &= ~self._rig.body.holds(transform_points(T_body_sensor, own))
-        of = None if range_camera is None else self._rig[range_camera]
         sigma_m = LIDAR.sigma_at(range_m[kept], usual=LIDAR) if of is None else of.range_sigma_m(range_m[kept])
         points_map = transform_points(T, own[kept])
         clear_m = self._clear_ends(T[:3, 3], points_map, sigma_m)
@@ -191,7 +194,7 @@ class Integration:
     def _cast(self, scan: Scan, returns: Returns) -> None:
         """Hits where beams ended, misses along each beam."""
         mounted, origin_m = self._rig[scan.range_camera], returns.T_map_tof[:3, 3]
-        sigma_m = mounted.range_sigma_m(returns.range_m.ravel()[returns.pixels])
+        sigma_m = mounted.range_sigma_image(returns.range_m).ravel()[returns.pixels]
         clear_m = np.concatenate(
             [self._clear_ends(origin_m, returns.points_map, sigma_m), silent_ends(returns, mounted.camera.rays())]
         )

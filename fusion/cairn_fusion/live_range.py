@@ -4,29 +4,40 @@ Each range pixel covers as many of the camera's as lie between it and its neighb
 counts. It is for the eye, and for telling what hides what; it never becomes evidence.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.poses import inverse, transform_points
 from cairn_calib.rig import Rig
+from cairn_fusion.range_labels import range_labels
 from cairn_fusion.scan import Scan
-from cairn_fusion.transfer import points_from_range
+from cairn_fusion.transfer import Label, points_from_range
 
 Values = npt.NDArray[np.float32]
 COVER = 1.5
 """Width of what a range pixel covers, over the distance to the next one: slanted surfaces are sampled more widely."""
 
 
-def live_range(scan: Scan, rig: Rig, *, camera: str) -> Values:
+def live_range(scan: Scan, rig: Rig, *, camera: str, beyond: npt.NDArray[np.bool_] | None = None) -> Values:
     """(H, W) float32, metres along the rays of a camera; NaN where the range camera says nothing.
+
+    Nor does it where too much light came back or two surfaces are mixed (`range_labels`), or where it shows what is in
+    a mirror: `beyond`, (H, W) of the range camera, from `beyond_pixels`.
 
     Raises:
         BadInputError: kind `unknown_camera`, or images of another size.
     """
     seen_by, source = rig[camera], rig[scan.range_camera]
+    untrusted = np.isin(range_labels(scan, rig), (Label.SATURATED, Label.FLYING))
+    if beyond is not None:
+        untrusted |= beyond
+    scan = replace(scan, range_m=np.where(untrusted, np.float32(np.nan), scan.range_m))
+    true_m = source.true_ranges(scan.range_m, scan.amplitude)
     if camera == scan.range_camera:
-        return np.asarray(source.true_ranges(scan.range_m), np.float32)
-    points = points_from_range(source.true_ranges(scan.range_m), source.camera).reshape(-1, 3)
+        return np.asarray(true_m, np.float32)
+    points = points_from_range(true_m, source.camera).reshape(-1, 3)
     points = transform_points(inverse(seen_by.transform) @ source.transform, points[~np.isnan(points[:, 0])])
     pixels = seen_by.camera.project(points)
     inside = seen_by.camera.contains(pixels)

@@ -19,13 +19,14 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_fusion import overlay_kernels as kernels
-from cairn_fusion.overlay_blur import PoseSpread, spread_ink
 from cairn_map.errors import BadInputError
+from cairn_map.legend import with_legend
 from cairn_map.map_picture import Ages, layer_values
 from cairn_map.map_render import MapRenderer, Seen
 from cairn_map.map_snapshot import MapSnapshot
 from cairn_map.paint_kernels import blend_into
-from cairn_map.render_picture import LEGEND_PX, NOTHING, SCALES, TEXT, Layer, Scale, painted, with_legend
+from cairn_map.pose_spread import BLUR_MAX_PX, PoseSpread, spread_ink, why_withheld
+from cairn_map.render_picture import SCALES, WARNING, Layer, Scale, painted
 from cairn_map.sight import Sight
 from cairn_map.small_text import write_text_into
 
@@ -38,9 +39,8 @@ GREY_COVER = 0.4
 """Of what has no value, beside what has."""
 THROUGH_COVER = 0.9
 THROUGH_COVER_MIN = 0.2
-MEANINGS = "solid: visible   stripes: behind what is seen   dots: known from the map alone"
-EXACT = PoseSpread()
-WARNING = (255, 210, 60)
+MEANINGS = ("solid: visible", "stripes: behind that", "dots: from the map alone")
+EXACT = PoseSpread.of_sigmas()
 
 
 class Mode(IntEnum):
@@ -63,6 +63,7 @@ class Live:
     sight: Sight
     T_map_camera: npt.NDArray[np.float64]
     spread: PoseSpread = EXACT
+    """How certain `T_map_camera` is."""
 
     def __post_init__(self) -> None:
         size = (self.sight.height, self.sight.width)
@@ -88,7 +89,7 @@ class OverlayStyle:
     """Behind the live surface by this, stripes have faded to 1/e; and"""
     fade_s: float = 3600.0
     """likewise at this age, where the age is known."""
-    blur_max_px: float = 16.0
+    blur_max_px: float = BLUR_MAX_PX
     """Nothing is drawn when half of it may be off by more (standard deviation)."""
     through_m: float = 10.0
     """So far behind the live surface things are looked for."""
@@ -158,11 +159,12 @@ def draw_overlay(
     modes[np.isnan(range_m) & (everywhere == Mode.MAP_ONLY)] = Mode.MAP_ONLY
     values = layer_values(renderer, snapshot, front, style.layer, ages)
     values_of_rest = layer_values(renderer, snapshot, rest, style.layer, ages)
-    sigma_px, why = None, None
-    if live.spread != EXACT:
+    spread_px2, why = None, None
+    if not live.spread.is_exact:
         rest_m = rest.range_m.repeat(step, axis=0).repeat(step, axis=1)[:H, :W]
-        sigma_px = live.spread.at(np.where(front.hit, front.range_m, rest_m), pixel_rad=live.sight.pixel_rad)
-        why = _too_uncertain(sigma_px[front.hit | (everywhere != Mode.NOTHING)], style)
+        spread_px2 = live.spread.at(live.sight, np.where(front.hit, front.range_m, rest_m))
+        drawn = front.hit | (everywhere != Mode.NOTHING)
+        why = why_withheld(spread_px2[drawn], blur_max_px=style.blur_max_px)
     if why is not None:
         picture = live.rgb.copy()
         write_text_into(picture, f"map withheld: {why}", (8, 8), WARNING)
@@ -173,8 +175,8 @@ def draw_overlay(
         colours = painted(values, style.colours), painted(values_of_rest, style.colours)
         ink = np.empty((H, W, 4), np.uint8)
         kernels.ink_into(colours[0], front_covers, modes, colours[1], covers, rest_modes, step, ink)
-        if sigma_px is not None:
-            ink = spread_ink(ink, sigma_px)
+        if spread_px2 is not None:
+            ink = spread_ink(ink, spread_px2)
         picture = np.empty_like(live.rgb)
         blend_into(np.ascontiguousarray(live.rgb).reshape(-1, 3), ink.reshape(-1, 4), picture.reshape(-1, 3))
     return Overlay(
@@ -219,11 +221,8 @@ def _rest(
 
 
 def with_overlay_legend(picture: Rgb, scale: Scale) -> Rgb:
-    """The picture with two strips below: the scale, and what solid, stripes and dots mean."""
-    legend = with_legend(picture, scale)
-    strip = np.full((LEGEND_PX // 2, picture.shape[1], 3), NOTHING, np.uint8)
-    write_text_into(strip, MEANINGS, (8, 2), TEXT)
-    return np.concatenate([legend, strip])
+    """The picture with its legend below: the scale, and what solid, stripes and dots mean."""
+    return with_legend(picture, scale, MEANINGS)
 
 
 def _covers(
@@ -236,14 +235,6 @@ def _covers(
         fade += np.nan_to_num(np.maximum(age, 0)) / np.float32(style.fade_s)
     full = np.where(np.isnan(live_m), np.float32(1), np.float32(THROUGH_COVER))
     return np.asarray(np.maximum(full * np.exp(-fade), THROUGH_COVER_MIN), np.float32)
-
-
-def _too_uncertain(sigma_px: Values, style: OverlayStyle) -> str | None:
-    """Why half of what would be drawn may be too far off; None if it may not."""
-    middle = float(np.median(sigma_px)) if sigma_px.size else 0.0
-    if middle <= style.blur_max_px:
-        return None
-    return f"the pose is uncertain by {middle:.0f} px, more than {style.blur_max_px:g}"
 
 
 def _unknown(values: npt.NDArray[np.floating]) -> Flags:

@@ -6,6 +6,7 @@
     FLYING      a mixture of a near and a far surface (`flying_kernels`)
 
 What a range cannot tell is not told: behind glass and in mirrors a time-of-flight camera measures where its light went.
+Where a map is at hand it may tell (`beyond_labels`).
 """
 
 import numpy as np
@@ -43,7 +44,7 @@ def range_labels(
         max_range_m: nor farther ones.
         flying_step_m: how far a flying pixel must be from both its neighbours; infinite: none flies.
     """
-    range_m = rig[scan.range_camera].true_ranges(scan.range_m)
+    range_m = rig[scan.range_camera].true_ranges(scan.range_m, scan.amplitude)
     labels = np.full(range_m.shape, Label.OK, np.uint8)
     labels[flying_pixels(range_m, flying_step_m)] = Label.FLYING
     # A comparison with NaN is false.

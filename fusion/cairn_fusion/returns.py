@@ -59,7 +59,7 @@ def returns_of(
     """
     check_scan(scan, rig)
     mounted = rig[scan.range_camera]
-    true_m = mounted.true_ranges(scan.range_m)
+    true_m = mounted.true_ranges(scan.range_m, scan.amplitude)
     T_map_tof = scan.T_map_rig @ mounted.transform
     full = full_pixels(scan, mounted)
     within = (true_m >= min_range_m) & (true_m <= max_range_m) & ~full

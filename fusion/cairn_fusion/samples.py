@@ -141,7 +141,7 @@ class Sight:
                 tof=np.take(image_points.reshape(-1, 3), returned, axis=0),
                 range_m=range_m,
                 steps_m=depth_steps(image_points).ravel()[returned],
-                sigma_m=mounted.range_sigma_m(range_m),
+                sigma_m=mounted.range_sigma_image(self._returns.range_m).ravel()[returned],
             )
         return self._points
 

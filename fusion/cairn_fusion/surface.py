@@ -84,15 +84,20 @@ class Drawn:
     """How much that may be more than the surface at the place, 1 / metres, because it slants."""
 
 
-def surface_of(scan: Scan, rig: Rig) -> RangeSurface:
-    """The surface of a scan's range image."""
+def surface_of(scan: Scan, rig: Rig, beyond: Flags | None = None) -> RangeSurface:
+    """The surface of a scan's range image, but for what a map says that a mirror shows: (H, W) `beyond_pixels`."""
     labels, mounted = range_labels(scan, rig), rig[scan.range_camera]
-    range_m = mounted.true_ranges(scan.range_m)
-    noise_m = np.maximum(JOIN_SIGMAS * mounted.range_sigma_m(range_m), JOIN_STEP_M).astype(np.float32)
+    if beyond is not None:
+        labels[beyond & (labels == Label.OK)] = Label.BEYOND
+    range_m = mounted.true_ranges(scan.range_m, scan.amplitude)
+    noise_m = np.maximum(JOIN_SIGMAS * mounted.range_sigma_image(range_m), JOIN_STEP_M).astype(np.float32)
+    shown_m = borrowed_ranges(range_m, labels, BORROW_PX)
+    # A mirror may be large; what it shows is about where the mirror is, for cameras so near to each other.
+    shown_m = np.where(np.isnan(shown_m) & (labels == Label.BEYOND), range_m, shown_m)
     across, down = (joined(range_m, labels, noise_m, *step) for step in ((1, 0), (0, 1)))
     return RangeSurface(
         range_camera=scan.range_camera,
-        range_m=borrowed_ranges(range_m, labels, BORROW_PX),
+        range_m=shown_m,
         labels=labels,
         across=across,
         down=down,

@@ -49,6 +49,8 @@ class Label(IntEnum):
     """The camera sees it, and has no value there."""
     UNCERTAIN = 7
     """What the camera has there may be of another place (`certainty`, `samples`)."""
+    BEYOND = 8
+    """The beam went on behind a surface of the map: a mirror, or that is gone (`beyond_labels`)."""
 
 
 @dataclass(frozen=True, slots=True)

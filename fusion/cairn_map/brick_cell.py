@@ -53,6 +53,12 @@ class BrickCell:
         self._is_shared = copied._is_shared = True
         return copied
 
+    def zeros(self) -> "BrickCell":
+        """A cell of the same bricks, all sums zero, in hardly any memory; to be read only."""
+        empty = BrickCell(self._geometry)
+        empty._counts = self._counts.zeros()
+        return empty
+
     def packed(self) -> Evidence:
         """The canonical packed evidence: rising Morton order, no zeros."""
         sampled_voxels, samples = self._samples.packed()

@@ -63,6 +63,13 @@ class BrickCounts:
         copied._brick_of, copied._pool, copied._bound = self._brick_of.copy(), self._pool.copy(), self._bound
         return copied
 
+    def zeros(self) -> "BrickCounts":
+        """The same bricks with no hits and no misses, in the memory of none; to be read only."""
+        copied = BrickCounts.__new__(BrickCounts)
+        copied._brick_of, copied._bound = self._brick_of, 0
+        copied._pool = np.broadcast_to(np.int16(0), self._pool.shape)
+        return copied
+
     @property
     def brick_of(self) -> BrickNumbers:
         """(8^(depth - 3),) row of `pool` by a brick's Morton number, -1 where there is none; to be read only."""

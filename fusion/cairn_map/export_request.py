@@ -1,4 +1,4 @@
-"""What of a map is to be taken away as points: the query of `GET .../main/export`, and `cairn map export`'s options."""
+"""What of a map is to be taken away as a file: the query of `GET .../main/export`, and `cairn map export`'s options."""
 
 from typing import Annotated, Literal
 
@@ -10,8 +10,18 @@ from cairn_map.errors import BadInputError
 from cairn_map.grid import Geometry
 
 Floats = npt.NDArray[np.float64]
+Kelvin = Annotated[float, Field(ge=0, le=1e5)]
 Height = Annotated[float, Field(ge=-1e7, le=1e7)]
 BOX_CHARS_MAX = 160
+EXPORT_TYPES = {
+    "ply": "application/vnd.cairn.ply",
+    "pcd": "application/vnd.cairn.pcd",
+    "laz": "application/vnd.laszip",
+    "npz": "application/x-npz",
+    "ot": "application/octet-stream",
+    "bt": "application/octet-stream",
+}
+"""Media type of each format."""
 
 
 class ExportRequest(BaseModel):
@@ -19,7 +29,8 @@ class ExportRequest(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    format: Literal["ply", "pcd", "npz"] = "ply"
+    format: Literal["ply", "pcd", "laz", "npz", "ot", "bt"] = "ply"
+    """Points; or an octree of OctoMap's, `ot` with probability and colour, `bt` with neither."""
     box: Annotated[str, Field(max_length=BOX_CHARS_MAX)] | None = None
     """x0,y0,z0,x1,y1,z1: metres, map frame, ends included; None: everywhere."""
     floor_m: Height | None = None
@@ -28,6 +39,10 @@ class ExportRequest(BaseModel):
     """Nothing above."""
     p: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Least probability, compared in steps of 1/255 as on the console; unoccupied nodes never come."""
+    hotter_k: Kelvin | None = None
+    """Only nodes with a voxel as hot as this, kelvin; what has no temperature does not come."""
+    colder_k: Kelvin | None = None
+    """Only nodes that are as cold as this in the mean, kelvin; what has no temperature does not come."""
     depth: Annotated[int, Field(ge=1, le=64)] | None = None
     """Octree depth of the nodes; None: voxels."""
 
@@ -43,6 +58,15 @@ class ExportRequest(BaseModel):
         low[2] = max(low[2], -np.inf if self.floor_m is None else self.floor_m)
         high[2] = min(high[2], np.inf if self.ceiling_m is None else self.ceiling_m)
         return low, high
+
+    @property
+    def is_of_some_temperatures(self) -> bool:
+        """Whether a node must have a temperature to come."""
+        return self.hotter_k is not None or self.colder_k is not None
+
+    def band_k(self) -> tuple[float, float]:
+        """Least temperature of a node's hottest voxel, and highest mean of a node; kelvin."""
+        return self.hotter_k or 0.0, np.inf if self.colder_k is None else self.colder_k
 
     def depth_in(self, geometry: Geometry) -> int:
         """The nodes' octree depth.

@@ -16,7 +16,7 @@ from typing import Annotated, NamedTuple, NewType, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, FailFast, Field, model_validator
+from pydantic import BaseModel, FailFast, Field, model_validator
 
 from cairn_map.channels import STANDARD_CHANNELS, Channel
 from cairn_map.errors import BadInputError
@@ -48,10 +48,8 @@ class Cell(NamedTuple):
         return f"{self.i},{self.j},{self.k}"
 
 
-class Geometry(BaseModel):
+class Geometry(BaseModel, frozen=True, extra="forbid"):
     """Fixed at a map's creation: voxel edge, octree depth of a cell, channels."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     voxel_edge_um: Annotated[int, Field(ge=1000, le=1_000_000)] = 40_000
     """Micrometres: an integer, so that borders are exact."""

@@ -6,9 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.legend import with_legend
 from cairn_map.map_render import Changes, MapRenderer, Seen
 from cairn_map.map_snapshot import MapSnapshot
-from cairn_map.render_picture import NOTHING, ZERO_CELSIUS_K, Layer, Rgb, Scale, painted, with_legend
+from cairn_map.pose_spread import PoseSpread, spread_picture, why_withheld
+from cairn_map.render_picture import NOTHING, WARNING, ZERO_CELSIUS_K, Layer, Rgb, Scale, painted
+from cairn_map.small_text import write_text_into
 
 Values = npt.NDArray[np.floating]
 
@@ -46,19 +49,35 @@ def layer_values(
             return ages.now - renderer.changed(snapshot, seen, ages.changes)
 
 
-def layer_picture(values: Values, seen: Seen, scale: Scale) -> Rgb:
-    """(H + legend, W, 3) sRGB: values painted, grey where something is seen that has none, dark where nothing is."""
+def layer_picture(values: Values, seen: Seen, scale: Scale, spread: PoseSpread | None = None) -> Rgb:
+    """(H + legend, W, 3) sRGB: values painted, grey where something is seen that has none, dark where nothing is.
+
+    With a pose's spread all is blurred as far as it may be off, or withheld where that says nothing any more.
+    """
     image = painted(values, scale)
     image[~seen.hit] = NOTHING
+    if spread is not None:
+        spread_px2 = spread.at(seen.sight, seen.range_m)
+        why = why_withheld(spread_px2[seen.hit])
+        if why is None:
+            image = spread_picture(image, spread_px2)
+        else:
+            image[:] = NOTHING
+            write_text_into(image, f"map withheld: {why}", (8, 8), WARNING)
     return with_legend(image, scale)
 
 
-def arrays_of(values: Values, seen: Seen, layer: Layer) -> dict[str, npt.NDArray[np.generic]]:
+def arrays_of(
+    values: Values, seen: Seen, layer: Layer, spread: PoseSpread | None = None
+) -> dict[str, npt.NDArray[np.generic]]:
     """By name: `range_m`, `depth_m`, and the layer's values (`temperature_k`, `age_s`, `probability`, `colour`).
 
+    With a pose's spread also `spread_px2`, (H, W, 3): the covariance xx, xy, yy of where each pixel's content appears.
     All float32, NaN where nothing is seen or nothing is known.
     """
     arrays: dict[str, npt.NDArray[np.generic]] = {"range_m": seen.range_m, "depth_m": seen.depth_m}
+    if spread is not None:
+        arrays["spread_px2"] = spread.at(seen.sight, seen.range_m)
     match layer:
         case Layer.TEMPERATURE:
             arrays["temperature_k"] = values.astype(np.float32) + np.float32(ZERO_CELSIUS_K)

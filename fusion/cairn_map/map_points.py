@@ -1,22 +1,24 @@
-"""Parts of a map as point clouds, cell by cell: PLY, PCD or NPZ, none of which needs more memory than one cell.
+"""Parts of a map as point clouds, cell by cell: PLY, PCD, LAZ or NPZ, none of which needs more memory than one cell.
 
 A file begins with the number of its points, so whoever writes one counts them first. Values are those of a view
 (`view.py`): the highest probability, the mean colour and temperature of all below a node, and the hottest voxel.
 """
 
-import io
 import zipfile
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
 from cairn_map.cell_files import GREY
 from cairn_map.evidence import Evidence
+from cairn_map.export_choice import chosen_in_cell, chosen_places
 from cairn_map.export_request import ExportRequest
-from cairn_map.grid import CellKey, Geometry, cell_of_key, voxels_in_cell
+from cairn_map.grid import CellKey, Geometry
+from cairn_map.one_way import OneWay
 from cairn_map.sensor_model import SensorModel
-from cairn_map.view import Chance, Colours, View, ViewStyle, view_of
 
 Floats = npt.NDArray[np.float64]
 Table = npt.NDArray[np.void]
@@ -37,17 +39,41 @@ POINT = np.dtype(
 """Centre of a node, metres, map frame; 8-bit sRGB, grey where no colour camera looked; kelvin, NaN where unknown."""
 PCD_POINT = np.dtype([(name, "<f4") for name in ("x", "y", "z", "rgb", "probability", "temperature", "hottest")])
 """The Point Cloud Library has colours as 0x00RRGGBB in the bits of a float."""
-EXPORT_TYPES = {"ply": "application/vnd.cairn.ply", "pcd": "application/vnd.cairn.pcd", "npz": "application/x-npz"}
 NPZ_MEMBER = "points.npy"
 
 
-def count_of_cell(
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """What a file of points begins with: how many there are, and where."""
+
+    count: int = 0
+    low_m: Floats = field(default_factory=lambda: np.full(3, np.inf))
+    """(3,) lowest and highest centre, metres, map frame; infinite without points."""
+    high_m: Floats = field(default_factory=lambda: np.full(3, -np.inf))
+
+    def joined(self, other: Self) -> Self:
+        """Both together."""
+        low_m, high_m = np.minimum(self.low_m, other.low_m), np.maximum(self.high_m, other.high_m)
+        return type(self)(self.count + other.count, low_m, high_m)
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What a file says of itself."""
+
+    map_name: str
+    node_edge_m: float
+
+    def __str__(self) -> str:
+        return f"map {self.map_name}, nodes of {self.node_edge_m:g} m; metres, map frame; kelvin"
+
+
+def found_in_cell(
     key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel, asked: ExportRequest
-) -> int:
-    """How many points `points_of_cell` gives, without its colours and temperatures."""
-    style = ViewStyle(asked.depth_in(geometry), colours=Colours.NONE, temperature_step_k=None, chance=Chance.LOG_ODDS)
-    view = view_of(evidence, geometry, model, style)
-    return int(_asked_for(view, _centres_m(view, key, geometry), asked).sum())
+) -> Found:
+    """How many points `points_of_cell` gives, and where, without their colours."""
+    places = chosen_places(key, evidence, geometry, model, asked)
+    return Found(len(places), places.min(axis=0), places.max(axis=0)) if len(places) else Found()
 
 
 def points_of_cell(
@@ -58,12 +84,10 @@ def points_of_cell(
     Raises:
         BadInputError: kind `bad_box`, `bad_style`.
     """
-    style = ViewStyle(asked.depth_in(geometry), chance=Chance.LOG_ODDS, temperature_step_k=0.01)
-    view = view_of(evidence, geometry, model, style)
-    centres_m = _centres_m(view, key, geometry)
-    table = np.zeros(len(view), POINT)
+    chosen = chosen_in_cell(key, evidence, geometry, model, asked)
+    view, table = chosen.view, np.zeros(len(chosen.view), POINT)
     for axis, name in enumerate("xyz"):
-        table[name] = centres_m[:, axis]
+        table[name] = chosen.centres_m[:, axis]
     for c, name in enumerate(("red", "green", "blue")):
         table[name] = GREY
         table[name][view.coloured] = view.colour[:, c]
@@ -71,60 +95,47 @@ def points_of_cell(
     table["temperature"] = table["hottest"] = np.nan
     table["temperature"][view.warm] = view.temperature_k[:, 0]
     table["hottest"][view.warm] = view.temperature_k[:, -1]
-    return table[_asked_for(view, centres_m, asked)]
+    return table[chosen.rows]
 
 
-def cell_may_have(key: CellKey, geometry: Geometry, asked: ExportRequest) -> bool:
-    """Whether a cell reaches into what is asked for."""
-    low, high = asked.bounds_m()
-    corner = np.array(cell_of_key(key)) * geometry.cell_edge_m
-    return bool((corner <= high).all() and (corner + geometry.cell_edge_m >= low).all())
-
-
-def point_file(form: str, count: int, tables: Iterable[Table], about: str) -> Iterator[bytes]:
-    """A file of `count` points, part by part: PLY, PCD (both binary), or NPZ with one array `points`."""
+def point_file(form: str, found: Found, tables: Iterable[Table], about: About) -> Iterator[bytes]:
+    """A file of points, part by part: PLY, PCD (both binary), LAZ, or NPZ with one array `points`."""
     if form == "npz":
-        yield from _npz_parts(count, tables)
-        return
+        return _npz_parts(found.count, tables)
+    if form == "laz":
+        from cairn_map.laz_file import LazHead, laz_parts  # its libraries are a server's
+
+        low_m, high_m = (found.low_m, found.high_m) if found.count else (np.zeros(3), np.zeros(3))
+        return laz_parts(LazHead(found.count, low_m, high_m, about.node_edge_m, f"map {about.map_name}"), tables)
+    return _plain_parts(form, found.count, tables, about)
+
+
+def size_of_file(form: str, found: Found, about: About) -> int | None:
+    """Of a PLY or PCD, bytes; None: not known before an NPZ or LAZ is made."""
+    if form not in ("ply", "pcd"):
+        return None
+    head, point = (_ply_head, POINT) if form == "ply" else (_pcd_head, PCD_POINT)
+    return len(head(found.count, about)) + found.count * point.itemsize
+
+
+def _plain_parts(form: str, count: int, tables: Iterable[Table], about: About) -> Iterator[bytes]:
     head, row = (_ply_head, _plain) if form == "ply" else (_pcd_head, _pcd_rows)
     yield head(count, about)
     yield from (row(table) for table in tables)
-
-
-def size_of_file(form: str, count: int, about: str) -> int | None:
-    """Of a PLY or PCD, bytes; None: not known before an NPZ is made."""
-    if form == "npz":
-        return None
-    head, point = (_ply_head, POINT) if form == "ply" else (_pcd_head, PCD_POINT)
-    return len(head(count, about)) + count * point.itemsize
-
-
-def _centres_m(view: View, key: CellKey, geometry: Geometry) -> Floats:
-    nodes = geometry.model_copy(
-        update={"depth": view.depth, "voxel_edge_um": geometry.voxel_edge_um << (geometry.depth - view.depth)}
-    )
-    numbers = voxels_in_cell(view.nodes, key, nodes)
-    return np.asarray((numbers + 0.5) * nodes.voxel_edge_m, np.float64)
-
-
-def _asked_for(view: View, centres_m: Floats, asked: ExportRequest) -> npt.NDArray[np.bool_]:
-    low, high = asked.bounds_m()
-    inside = (centres_m >= low).all(axis=1) & (centres_m <= high).all(axis=1)
-    return np.asarray(inside & (np.rint(view.probability * 255) >= asked.p * 255 - 1e-6))
 
 
 def _plain(table: Table) -> bytes:
     return table.tobytes()
 
 
-def _ply_head(count: int, about: str) -> bytes:
+def _ply_head(count: int, about: About) -> bytes:
     words = {"f": "float", "u": "uchar"}
     lines = ["ply", "format binary_little_endian 1.0", f"comment cairn; {about}", f"element vertex {count}"]
     lines += [f"property {words[POINT[name].kind]} {name}" for name in POINT.names or ()]
     return "\n".join([*lines, "end_header", ""]).encode()
 
 
-def _pcd_head(count: int, about: str) -> bytes:
+def _pcd_head(count: int, about: About) -> bytes:
     names = PCD_POINT.names or ()
     lines = [
         f"# cairn; {about}",
@@ -152,29 +163,8 @@ def _pcd_rows(table: Table) -> bytes:
     return rows.tobytes()
 
 
-class _Sink(io.RawIOBase):
-    """What was written since it was last asked for; has no way back, so that a zip is written in one go."""
-
-    def __init__(self) -> None:
-        self._parts: list[bytes] = []
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, data: object) -> int:
-        part = bytes(data)  # type: ignore[call-overload]
-        self._parts.append(part)
-        return len(part)
-
-    def taken(self) -> bytes:
-        """And forget it."""
-        data = b"".join(self._parts)
-        self._parts.clear()
-        return data
-
-
 def _npz_parts(count: int, tables: Iterable[Table]) -> Iterator[bytes]:
-    sink = _Sink()
+    sink = OneWay()
     description = {"descr": np.lib.format.dtype_to_descr(POINT), "fortran_order": False, "shape": (count,)}
     with (
         zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED) as archive,

@@ -154,7 +154,7 @@ class MapRenderer:
         return found.reshape(H, W)
 
     def _mean(self, snapshot: MapSnapshot, seen: Seen, kind: ChannelKind, planes: int) -> Values:
-        channel, geometry = first_of_kind(snapshot.frozen, kind), snapshot.geometry
+        channel, geometry = first_of_kind(snapshot.geometry, kind), snapshot.geometry
         return self._read(
             snapshot,
             seen,

@@ -224,7 +224,7 @@ class MapSnapshot:
         return voxel_queries.voxels_in_box(self._frozen, box_m, occupied_only=True)
 
     def _first_at(self, points_m: npt.ArrayLike, kind: ChannelKind) -> Reading:
-        return point_queries.reading_at(self._frozen, points_m, point_queries.first_of_kind(self._frozen, kind))
+        return point_queries.reading_at(self._frozen, points_m, point_queries.first_of_kind(self.geometry, kind))
 
 
 def snapshot_of(whole: EvidenceMap, model: SensorModel = STANDARD_MODEL) -> MapSnapshot:

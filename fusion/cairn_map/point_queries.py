@@ -13,6 +13,7 @@ from cairn_map.brick_cell import BrickCell
 from cairn_map.channels import Channel, ChannelKind
 from cairn_map.errors import BadInputError
 from cairn_map.frozen_map import Floats, FrozenMap, as_points, check_within
+from cairn_map.grid import Geometry
 from cairn_map.sensor_model import known, log_odds
 from cairn_map.state_grid import odds_of_counts
 from cairn_map.voxels import Reading, reading_of_sums
@@ -87,13 +88,13 @@ def channel_named(frozen: FrozenMap, name: str) -> Channel:
     return channel
 
 
-def first_of_kind(frozen: FrozenMap, kind: ChannelKind) -> Channel:
+def first_of_kind(geometry: Geometry, kind: ChannelKind) -> Channel:
     """The map's first channel of a kind.
 
     Raises:
         BadInputError: kind `unknown_channel`: the map has none.
     """
-    found = next((channel for channel in frozen.geometry.channels if channel.kind is kind), None)
+    found = next((channel for channel in geometry.channels if channel.kind is kind), None)
     if found is None:
         raise BadInputError("unknown_channel", f"this map has no channel of kind {kind}")
     return found

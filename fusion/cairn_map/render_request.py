@@ -1,5 +1,6 @@
 """What a map is to be drawn as: the query of `GET .../main/render`, and what `cairn map render` asks for."""
 
+from functools import lru_cache
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from cairn_map.errors import BadInputError, first_error
+from cairn_map.pose_spread import SIGMA_MAX_M, SIGMA_MAX_RAD, PoseSpread
 from cairn_map.render_picture import SCALES, Layer, Scale
 from cairn_map.sight import Sight, look_at, pinhole
 
@@ -21,6 +23,7 @@ Part = Annotated[float, Field(ge=-1, le=1)]
 Side = Annotated[int, Field(ge=2, le=SIDE_MAX)]
 Level = Annotated[float, Field(gt=-1e9, lt=1e9)]
 TURN_TOLERANCE = 1e-3
+LOWER_CHARACTERS_MAX = 1000
 
 
 class RenderRequest(BaseModel):
@@ -49,6 +52,11 @@ class RenderRequest(BaseModel):
     high: Level | None = None
     range_m: Annotated[float, Field(gt=0, le=RANGE_MAX_M)] = 20.0
     """No ray goes farther."""
+    sigma_m: Annotated[float, Field(ge=0, le=SIGMA_MAX_M)] = 0.0
+    """How certain the pose is, along and about any one axis; the picture is blurred by it, or withheld."""
+    sigma_rad: Annotated[float, Field(ge=0, le=SIGMA_MAX_RAD)] = 0.0
+    covariance_lower: Annotated[str, Field(max_length=LOWER_CHARACTERS_MAX)] | None = None
+    """In place of both, in full: 21 numbers with commas between, `pose_spread.PoseSpread.of_lower`."""
     format: Literal["png", "npz"] = "png"
 
     @model_validator(mode="after")
@@ -60,6 +68,9 @@ class RenderRequest(BaseModel):
         low, high = self._ends
         if not low < high:
             raise ValueError(f"the scale must go from a low to a higher value, got {low} and {high}")
+        if self.covariance_lower is not None and (self.sigma_m or self.sigma_rad):
+            raise ValueError("give sigma_m and sigma_rad, or covariance_lower, not both")
+        _ = self.spread
         return self
 
     @property
@@ -77,11 +88,23 @@ class RenderRequest(BaseModel):
         return Scale(self.layer, *self._ends)
 
     @property
+    def spread(self) -> PoseSpread | None:
+        """How certain `T_map_camera` is; None for exact."""
+        if self.covariance_lower is None:
+            found = PoseSpread.of_sigmas(self.sigma_m, self.sigma_rad)
+        else:
+            try:
+                found = PoseSpread.of_lower(tuple(float(part) for part in self.covariance_lower.split(",")))
+            except BadInputError as exc:
+                raise ValueError(exc.message) from exc
+        return None if found.is_exact else found
+
+    @property
     def sight(self) -> Sight:
         """The camera."""
         middle = (self.width - 1) / 2, (self.height - 1) / 2
         centre = middle[0] if self.cx is None else self.cx, middle[1] if self.cy is None else self.cy
-        return pinhole(self.width, self.height, focal_px=self.focal_px, centre_px=centre)
+        return _camera(self.width, self.height, self.focal_px, centre)
 
     @property
     def T_map_camera(self) -> Floats:
@@ -111,6 +134,12 @@ def request_from(
         return RenderRequest.model_validate({"x": x, "y": y, "z": z, "qx": qx, "qy": qy, "qz": qz, "qw": qw, **about})
     except ValidationError as exc:
         raise BadInputError("bad_view", f"cannot look so: {first_error(exc)}") from exc
+
+
+@lru_cache(maxsize=2)
+def _camera(width: int, height: int, focal_px: float, centre_px: tuple[float, float]) -> Sight:
+    """An ideal camera; 30 MB at most each. Who looks around asks for the same one again."""
+    return pinhole(width, height, focal_px=focal_px, centre_px=centre_px)
 
 
 def _quaternion(R: Floats) -> tuple[float, float, float, float]:

@@ -135,16 +135,26 @@ def cells_in_sight(
     half_m = edge_m * np.sqrt(3) / 2  # of the sphere around a cell
     centres = ((cells + 0.5) * edge_m - T_map_camera[:3, 3]) @ T_map_camera[:3, :3]
     away_m = np.linalg.norm(centres, axis=1)
-    rays = sight.rays.reshape(-1, 3)
-    rays = rays[~np.isnan(rays[:, 0])]
-    middle = rays.mean(axis=0) if len(rays) else np.zeros(3)
-    length = float(np.linalg.norm(middle))
+    middle, widest = _span(sight)
     near = away_m - half_m <= range_max_m
-    if length < 1e-6:  # all around
-        return np.asarray(near & bool(len(rays)))
-    middle /= length
-    widest = float(np.arccos(np.clip((rays @ middle).min(), -1, 1)))
+    if np.isnan(widest) or widest == np.pi:  # nowhere, or all around
+        return np.asarray(near & (widest == np.pi))
     with np.errstate(invalid="ignore", divide="ignore"):
         off = np.arccos(np.clip(centres @ middle / away_m, -1, 1))
         spread = np.arcsin(np.clip(half_m / away_m, 0, 1))
     return np.asarray(near & ((away_m <= half_m) | (off <= widest + spread)))
+
+
+@lru_cache(maxsize=2)
+def _span(sight: Sight) -> tuple[Floats, float]:
+    """The middle of all rays, and the widest angle of one from it; pi: all around, NaN: no ray looks anywhere."""
+    rays = sight.rays.reshape(-1, 3)
+    rays = rays[~np.isnan(rays[:, 0])]
+    if not len(rays):
+        return np.zeros(3), np.nan
+    middle = rays.mean(axis=0)
+    length = float(np.linalg.norm(middle))
+    if length < 1e-6:
+        return np.zeros(3), np.pi
+    middle /= length
+    return middle, float(np.arccos(np.clip((rays @ middle).min(), -1, 1)))

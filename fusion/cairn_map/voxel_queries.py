@@ -51,7 +51,7 @@ def hottest(frozen: FrozenMap, n: int, *, min_probability: float, box_m: Box | N
     """The n known voxels of the highest mean temperature, hottest first."""
     if n < 0 or not 0 <= min_probability <= 1:
         raise BadInputError("bad_range", f"n must be 0 or more, a probability 0 to 1; got {n}, {min_probability}")
-    channel = first_of_kind(frozen, ChannelKind.TEMPERATURE)
+    channel = first_of_kind(frozen.geometry, ChannelKind.TEMPERATURE)
     planes = frozen.geometry.planes_of(channel.name)
     low, high = frozen.voxels_of_box(box_m)
     parts = []

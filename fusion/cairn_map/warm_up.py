@@ -25,10 +25,12 @@ from cairn_map.evidence_kernels import channel_above
 from cairn_map.evidence_map import EvidenceMap
 from cairn_map.fingerprint import fingerprint
 from cairn_map.grid import BRICK_DEPTH, Geometry, cell_key, voxels_in_cell
-from cairn_map.map_picture import layer_picture
+from cairn_map.map_picture import layer_picture, layer_values
 from cairn_map.map_render import MapRenderer
 from cairn_map.map_snapshot import snapshot_of
 from cairn_map.paint_kernels import blend_into
+from cairn_map.partial_map import draw_as_needed, read_cell
+from cairn_map.pose_spread import PoseSpread
 from cairn_map.render_picture import SCALES, Layer
 from cairn_map.sensor_model import SensorModel
 from cairn_map.sight import look_at, pinhole
@@ -64,6 +66,25 @@ def warm_up() -> None:
         reader.bricks(0, 1)
     for evidence in (small, large):
         _ask(evidence, geometry)
+    warm_up_pictures()
+
+
+def warm_up_pictures() -> None:
+    """Draw a cell that was read, in every layer, as a server does."""
+    geometry, model, key = Geometry(depth=BRICK_DEPTH), SensorModel(), cell_key((0, 0, 0))
+    stored = encode_cell(key, _many_voxels(geometry), geometry).data
+    whole = brick_cell(geometry, [decode_canonical_cell(stored).evidence])
+    for layer in Layer:
+        renderer, read = MapRenderer(), read_cell(whole, geometry, model, layer)
+        sight, T = pinhole(4, 4, focal_px=4), look_at((-1, 0.1, 0.1), (0, 0, 0))
+        drawing = draw_as_needed(
+            *(renderer, geometry, model, {}, [key], lambda _, read=read: {key: read}),
+            sight=sight,
+            T_map_camera=T,
+            range_max_m=2.0,
+        )
+        values = layer_values(renderer, drawing.snapshot, drawing.seen, layer)
+        layer_picture(values, drawing.seen, SCALES[layer], PoseSpread.of_sigmas(0.01, 0.01))
 
 
 def _ask(evidence: Evidence, geometry: Geometry) -> None:
@@ -82,9 +103,6 @@ def _ask(evidence: Evidence, geometry: Geometry) -> None:
     snapshot.nearest_unknown(points, radius_m=1)
     snapshot.frontier()
     snapshot.height_map()
-    renderer, T = MapRenderer(), look_at((-1, 0.1, 0.1), (0, 0, 0))
-    seen = renderer.nearest(snapshot, pinhole(4, 4, focal_px=4), T, range_max_m=2)
-    layer_picture(renderer.temperature(snapshot, seen), seen, SCALES[Layer.TEMPERATURE])
     blend_into(np.zeros((1, 3), np.uint8), np.zeros((1, 4), np.uint8), np.zeros((1, 3), np.uint8))
 
 

@@ -11,9 +11,8 @@ from cairn_map.grid import CellKey, cell_from_text, cell_key
 from cairn_map.ids import author_from_text
 from cairn_map.index_messages import INDEX_PAGE, INDEX_PAGE_MAX, CellIndex
 from cairn_map.version_vector import vector_digest, vector_text
-from cairn_map.view import ViewStyle
-from cairn_map.view_code import encode_view
 from cairn_map.voxel_messages import VoxelAnswer
+from cairn_server.asked_view import asked_cell_view, view_etag
 from cairn_server.asked_voxel import asked_voxel
 from cairn_server.auth import Caller
 from cairn_server.cell_index import IndexPage
@@ -80,11 +79,14 @@ def get_cell(
     """One cell: the octree, or by suffix `.npz`, `.ply`, `.view`; strong ETag, cursor and coverage in the headers."""
     number, dot, suffix = cell.partition(".")
     key = cell_key(cell_from_text(number))
-    form = _form(dot, suffix, depth, row)
-    stored, head = service.cell(row, key)
+    _check_form(dot, suffix, depth, row)
+    if depth is None:
+        (stored, head), view = service.cell(row, key), b""
+    else:
+        stored, head, view = asked_cell_view(service, row, key, depth, known=if_none_match)
     if stored is None:
         raise NotFoundError("no_cell", f"nobody has seen cell {number} of map {row.name}")
-    etag = f'"{stored.digest.hex()}{form}"'
+    etag = f'"{stored.digest.hex()}{dot}{suffix}"' if depth is None else view_etag(stored, depth)
     headers = {
         "ETag": etag,
         "Cache-Control": "no-cache",
@@ -95,11 +97,7 @@ def get_cell(
     }
     if is_same(etag, if_none_match):
         return Response(status_code=304, headers=headers)
-    if depth is None:
-        data, media_type = _file(suffix, key, stored, row)
-    else:
-        data = service.cell_views.view(f"{row.name}/{etag}", lambda: _view(depth, key, stored, row))
-        media_type = MEDIA_TYPES["view"]
+    data, media_type = _file(suffix, key, stored, row) if depth is None else (view, MEDIA_TYPES["view"])
     if suffix:
         headers["Content-Disposition"] = f'attachment; filename="{row.name}_{number}.{suffix}"'
     try:
@@ -115,28 +113,21 @@ def get_cell(
     return Response(data[start:stop], 206, media_type=media_type, headers=headers)
 
 
-def _form(dot: str, suffix: str, depth: int | None, row: MapRow) -> str:
-    """What the ETag says beside the digest."""
+def _check_form(dot: str, suffix: str, depth: int | None, row: MapRow) -> None:
     if dot and suffix not in MEDIA_TYPES:
         raise BadInputError("unknown_format", f"cells come as {FORMS}, not as .{suffix[:16]}")
     if depth is None:
-        return f"{dot}{suffix}"
+        return
     if suffix not in ("", "view"):
         raise BadInputError("unknown_format", f"only a view has a depth, a .{suffix} has none")
     if depth > row.geometry.depth:
         raise BadInputError("bad_style", f"a view's depth must be 1 to {row.geometry.depth}, got {depth}")
-    return f".view.{depth}"
 
 
 def _file(suffix: str, key: CellKey, stored: CellRow, row: MapRow) -> tuple[bytes, str]:
     if not suffix:
         return stored.body, CELL_MEDIA_TYPE
     return cell_file(suffix, key, stored_evidence(stored), row.geometry, row.sensor_model)
-
-
-def _view(depth: int, key: CellKey, stored: CellRow, row: MapRow) -> bytes:
-    style = ViewStyle(depth=depth)
-    return encode_view(key, stored_evidence(stored), row.geometry, row.sensor_model, style=style)
 
 
 def _coverage(head: Head) -> dict[str, str]:

@@ -5,8 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query
 from fastapi.responses import StreamingResponse
 
-from cairn_map.export_request import ExportRequest
-from cairn_map.map_points import EXPORT_TYPES
+from cairn_map.export_request import EXPORT_TYPES, ExportRequest
 from cairn_server.http_access import READERS, Map, Operations
 
 router = APIRouter()
@@ -14,7 +13,7 @@ router = APIRouter()
 
 @router.get("/maps/{name}/main/export", dependencies=READERS)
 def export(service: Operations, row: Map, asked: Annotated[ExportRequest, Query()]) -> StreamingResponse:
-    """Occupied nodes as PLY, PCD or NPZ, in a box, between two heights, above a probability, at an octree depth."""
+    """Occupied nodes by box, heights, probability, temperature, octree depth: as points, or an octree of OctoMap's."""
     made = service.exports.asked(row, asked)
     headers = {
         "Cache-Control": "no-store",

@@ -11,7 +11,7 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
 from cairn_map.cell_files import CELL_MEDIA_TYPE, MEDIA_TYPES
-from cairn_map.map_points import EXPORT_TYPES
+from cairn_map.export_request import EXPORT_TYPES
 from cairn_map.messages import Problem
 from cairn_server.openapi_examples import EXAMPLES
 from cairn_server.problems import MEDIA_TYPE as PROBLEM_MEDIA_TYPE

@@ -1,8 +1,9 @@
 """Parts of a map as files that leave: made cell by cell while they are sent, of one state of the map.
 
 Nothing is read from the store while a link is slow: the chosen cells, a few bytes a voxel, are first laid aside in a
-temporary file, and their points counted, because point clouds begin with their number. The file is gone as soon as
-the answer is, however it ends. So an export needs the memory of one cell, whatever its size.
+temporary file, and their points counted, because files begin with their number; of an octree the cells' branches are
+laid aside. The file is gone as soon as the answer is, however it ends. So an export needs the memory of one cell,
+whatever its size.
 """
 
 import tempfile
@@ -14,9 +15,12 @@ from dataclasses import dataclass
 from typing import IO
 
 from cairn_map.errors import BadInputError, UnreachableError
+from cairn_map.evidence import Evidence
+from cairn_map.export_choice import cell_may_have, node_geometry
 from cairn_map.export_request import ExportRequest
 from cairn_map.grid import CellKey
-from cairn_map.map_points import cell_may_have, count_of_cell, point_file, points_of_cell, size_of_file
+from cairn_map.map_points import About, Found, found_in_cell, point_file, points_of_cell, size_of_file
+from cairn_map.octomap_tree import TREE_FORMATS, Branch, branch_of_cell, tree_file
 from cairn_server.cells_at_rest import DamagedCellError, decode_stored, sound_cell, stored_evidence
 from cairn_server.damaged_cells import DamagedCells
 from cairn_server.healing import keep_healed
@@ -60,24 +64,19 @@ class MapExports:
         asked.depth_in(row.geometry)
         asked.bounds_m()
         healed: list[CellRow] = []
+        file = _TreeFile(row, asked) if asked.format in TREE_FORMATS else _PointFile(row, asked)
         with self._turn(), self._store.snapshot(row) as snapshot:
             head = snapshot.head
             aside = tempfile.TemporaryFile()  # noqa: SIM115 - goes with its last reader
             try:
-                sizes, count = _laid_aside(aside, snapshot, row, asked, healed)
+                sizes = _laid_aside(aside, snapshot, file, healed)
             except BaseException as exc:
                 aside.close()
                 if isinstance(exc, DamagedCellError):
                     self._damaged.note(row.name, [exc.key])
                 raise
         keep_healed(self._store, row, healed)
-        about = _about(row, asked)
-        tables = (
-            points_of_cell(key, decode_stored(key, body).evidence, row.geometry, row.sensor_model, asked)
-            for key, body in _bodies(aside, sizes)
-        )
-        size_bytes = size_of_file(asked.format, count, about)
-        return Export(head, count, size_bytes, point_file(asked.format, count, tables, about))
+        return Export(head, file.count, file.size_bytes, file.parts(_bodies(aside, sizes)))
 
     @contextmanager
     def _turn(self) -> Iterator[None]:
@@ -89,14 +88,71 @@ class MapExports:
             self._room.release()
 
 
+class _PointFile:
+    """Cells are laid aside as they are stored, and read a second time for their points."""
+
+    def __init__(self, row: MapRow, asked: ExportRequest) -> None:
+        self.row, self.asked = row, asked
+        self._found = Found()
+        self._about = About(row.name, node_geometry(row.geometry, asked).voxel_edge_m)
+
+    def kept(self, stored: CellRow, evidence: Evidence) -> bytes:
+        """What of a cell is laid aside, if anything."""
+        found = found_in_cell(stored.key, evidence, self.row.geometry, self.row.sensor_model, self.asked)
+        self._found = self._found.joined(found)
+        return stored.body if found.count else b""
+
+    @property
+    def count(self) -> int:
+        return self._found.count
+
+    @property
+    def size_bytes(self) -> int | None:
+        return size_of_file(self.asked.format, self._found, self._about)
+
+    def parts(self, bodies: Iterator[tuple[CellKey, bytes]]) -> Iterator[bytes]:
+        geometry, model = self.row.geometry, self.row.sensor_model
+        tables = (
+            points_of_cell(key, decode_stored(key, body).evidence, geometry, model, self.asked) for key, body in bodies
+        )
+        return point_file(self.asked.format, self._found, tables, self._about)
+
+
+class _TreeFile:
+    """What is laid aside of a cell is its branch, as it will stand in the file."""
+
+    size_bytes = None
+
+    def __init__(self, row: MapRow, asked: ExportRequest) -> None:
+        self.row, self.asked = row, asked
+        self._branches: list[Branch] = []
+
+    def kept(self, stored: CellRow, evidence: Evidence) -> bytes:
+        """What of a cell is laid aside, if anything."""
+        found = branch_of_cell(stored.key, evidence, self.row.geometry, self.row.sensor_model, self.asked)
+        if found is None:
+            return b""
+        self._branches.append(found[0])
+        return found[1]
+
+    @property
+    def count(self) -> int:
+        return sum(branch.leaves for branch in self._branches)
+
+    def parts(self, bodies: Iterator[tuple[CellKey, bytes]]) -> Iterator[bytes]:
+        about = str(About(self.row.name, node_geometry(self.row.geometry, self.asked).voxel_edge_m))
+        in_turn = (body for _, body in bodies)
+        return tree_file(self.asked.format, self._branches, in_turn, self.row.geometry, about)
+
+
 def _laid_aside(
-    aside: IO[bytes], snapshot: Snapshot, row: MapRow, asked: ExportRequest, healed: list[CellRow]
-) -> tuple[list[tuple[CellKey, int]], int]:
-    """Cells that have what is asked for, with the sizes of their bytes; and how many points."""
-    until_s = time.monotonic() + COUNT_S
-    voxels, count, sizes = 0, 0, list[tuple[CellKey, int]]()
+    aside: IO[bytes], snapshot: Snapshot, file: _PointFile | _TreeFile, healed: list[CellRow]
+) -> list[tuple[CellKey, int]]:
+    """Cells that have what is asked for, rising in number, with the sizes of their bytes."""
+    until_s, row = time.monotonic() + COUNT_S, file.row
+    voxels, sizes = 0, list[tuple[CellKey, int]]()
     for listed in snapshot.cells():
-        if not listed.voxels or not cell_may_have(listed.key, row.geometry, asked):
+        if not listed.voxels or not cell_may_have(listed.key, row.geometry, file.asked):
             continue
         voxels += listed.voxels
         if voxels > VOXELS_EXPORTED_MAX:
@@ -108,12 +164,11 @@ def _laid_aside(
         stored = sound_cell(snapshot, listed.key, row.geometry, healed)
         if stored is None:
             raise DamagedCellError(listed.key, "a cell is listed, but is not there")
-        found = count_of_cell(stored.key, stored_evidence(stored), row.geometry, row.sensor_model, asked)
-        if found:
-            aside.write(stored.body)
-            sizes.append((stored.key, len(stored.body)))
-            count += found
-    return sizes, count
+        kept = file.kept(stored, stored_evidence(stored))
+        if kept:
+            aside.write(kept)
+            sizes.append((stored.key, len(kept)))
+    return sizes
 
 
 def _bodies(aside: IO[bytes], sizes: list[tuple[CellKey, int]]) -> Iterator[tuple[CellKey, bytes]]:
@@ -121,8 +176,3 @@ def _bodies(aside: IO[bytes], sizes: list[tuple[CellKey, int]]) -> Iterator[tupl
         aside.seek(0)
         for key, size_bytes in sizes:
             yield key, aside.read(size_bytes)
-
-
-def _about(row: MapRow, asked: ExportRequest) -> str:
-    edge_m = row.geometry.voxel_edge_m * 2 ** (row.geometry.depth - asked.depth_in(row.geometry))
-    return f"map {row.name}, nodes of {edge_m:g} m; metres, map frame; kelvin"

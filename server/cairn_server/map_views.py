@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +26,7 @@ from cairn_map.png import png_of
 from cairn_map.render_picture import Layer
 from cairn_map.render_request import RenderRequest
 from cairn_map.sight import cells_in_sight
+from cairn_map.warm_up import warm_up_pictures
 from cairn_server.cells_at_rest import DamagedCellError, sound_cell, stored_evidence, stored_stamps
 from cairn_server.damaged_cells import DamagedCells
 from cairn_server.healing import keep_healed
@@ -34,7 +36,7 @@ from cairn_server.stamps import Stamps
 from cairn_server.store import Snapshot, Store
 from cairn_server.store_rows import CellRow, Head, MapRow
 
-VERSION = 1
+VERSION = 2
 """Of what a picture looks like: part of its ETag."""
 CELLS_IN_VIEW_MAX = 4096
 VOXELS_READ_MAX = 1 << 26
@@ -68,6 +70,8 @@ class _Task:
 
     snapshot: Snapshot
     row: MapRow
+    layer: Layer
+    """Whose values are read from cells; depths and ages need none."""
     listed: dict[CellKey, CellRow]
     until_s: float
     voxels: int = 0
@@ -92,7 +96,9 @@ class MapViews:
         self._store = store
         self._damaged = damaged
         self._room = threading.BoundedSemaphore(RENDERS_AT_ONCE)
-        self._cells: MadeOnce[State, ReadCell] = MadeOnce(limit_bytes=CELLS_BYTES, size_of=lambda read: read.size_bytes)
+        self._cells: MadeOnce[tuple[State, Layer], ReadCell] = MadeOnce(
+            limit_bytes=CELLS_BYTES, size_of=lambda read: read.size_bytes
+        )
         self._lists: MadeOnce[tuple[bytes, int], Listing] = MadeOnce(
             limit_bytes=LISTS_BYTES, size_of=lambda listing: LISTED_BYTES * (1 + len(listing[0]))
         )
@@ -112,7 +118,8 @@ class MapViews:
             if known is not None and etag in known:
                 return AskedView(etag, snapshot.head, None)
             with self._turn():
-                task = _Task(snapshot, row, {}, time.monotonic() + RENDER_S)
+                _get_ready()
+                task = _Task(snapshot, row, _read_of(request.layer), {}, time.monotonic() + RENDER_S)
                 try:
                     body = self._body(task, request)
                 except DamagedCellError as exc:
@@ -138,8 +145,8 @@ class MapViews:
         values = layer_values(renderer, snapshot, seen, request.layer, ages)
         task.check_time()
         if request.format == "npz":
-            return npz_of(arrays_of(values, seen, request.layer))
-        return png_of(layer_picture(values, seen, request.scale))
+            return npz_of(arrays_of(values, seen, request.layer, request.spread))
+        return png_of(layer_picture(values, seen, request.scale, request.spread))
 
     def _drawing(self, task: _Task, request: RenderRequest) -> tuple[Drawing, MapRenderer]:
         geometry, model, sight, T = task.row.geometry, task.row.sensor_model, request.sight, request.T_map_camera
@@ -151,7 +158,7 @@ class MapViews:
                 "too_large", f"{inside.sum()} cells are in sight, {CELLS_IN_VIEW_MAX} at most may be; lower range_m"
             )
         keys = [key for key, is_inside in zip(task.listed, inside, strict=True) if is_inside]
-        kept = {key: self._cells.here(state_of(task.snapshot, task.listed[key])) for key in keys}
+        kept = {key: self._cells.here((state_of(task.snapshot, task.listed[key]), task.layer)) for key in keys}
         here = {key: read for key, read in kept.items() if read is not None}
         renderer = MapRenderer(threads=THREADS, on_share=task.check_time)
         drawing = draw_as_needed(
@@ -189,7 +196,7 @@ class MapViews:
 
         def make(key: CellKey) -> ReadCell:
             state = state_of(task.snapshot, task.listed[key])
-            return self._cells.get(state, lambda: _ready(stored[key], task.row))
+            return self._cells.get((state, task.layer), lambda: _ready(stored[key], task))
 
         found: dict[CellKey, ReadCell] = {}
         with ThreadPoolExecutor(THREADS) as pool:
@@ -199,7 +206,7 @@ class MapViews:
                 found[key] = made.result()
             except DamagedDataError:
                 sound = sound_cell(task.snapshot, key, task.row.geometry, task.healed)
-                found[key] = _ready(sound, task.row)
+                found[key] = _ready(sound, task)
         return found
 
     def _ages(self, task: _Task, drawing: Drawing) -> Ages:
@@ -224,21 +231,36 @@ class MapViews:
 
     def _time_of(self, task: _Task, log_id: bytes, seq: int) -> float:
         """When the last scan of an entry's commit was taken; NaN where it states no time."""
-        if (log_id, seq) not in self._times:
-            task.check_time()
-            entries = task.snapshot.log(after_seq=seq - 1, limit=1)
-            captured_s = entries[0].captured_s if entries else None
-            if len(self._times) >= TIMES_MAX:
-                self._times.clear()
-            self._times[log_id, seq] = captured_s[1] if captured_s else np.nan
-        return self._times[log_id, seq]
+        known = self._times.get((log_id, seq))
+        if known is not None:
+            return known
+        task.check_time()
+        entries = task.snapshot.log(after_seq=seq - 1, limit=1)
+        captured_s = entries[0].captured_s if entries else None
+        time_s = captured_s[1] if captured_s else np.nan
+        if len(self._times) >= TIMES_MAX:
+            self._times.clear()  # another picture may look at the same time
+        self._times[log_id, seq] = time_s
+        return time_s
 
 
-def _ready(stored: CellRow | None, row: MapRow) -> ReadCell:
+@cache
+def _get_ready() -> None:
+    """Load the kernels that draw, or compile them, which takes a minute where nobody did: no picture's time."""
+    warm_up_pictures()
+
+
+def _read_of(layer: Layer) -> Layer:
+    """The layer whose values are taken from cells' sums: of depths and ages, none, as for depths."""
+    return Layer.DEPTH if layer is Layer.AGE else layer
+
+
+def _ready(stored: CellRow | None, task: _Task) -> ReadCell:
     """A stored cell, checked and ready to be drawn."""
     if stored is None:
         raise DamagedDataError("damaged_store", "a cell is listed, but is not there")
-    return read_cell(brick_cell(row.geometry, [stored_evidence(stored)]), row.sensor_model)
+    geometry, model = task.row.geometry, task.row.sensor_model
+    return read_cell(brick_cell(geometry, [stored_evidence(stored)]), geometry, model, task.layer)
 
 
 def _etag(head: Head, request: RenderRequest) -> str:

@@ -51,6 +51,7 @@ from cairn_server.service import Service
 from cairn_server.settings import LOOPBACK, Quotas, Settings
 from cairn_server.sqlite_store import FILE_NAME, SqliteStore
 from cairn_server.upstream import UPSTREAM_VARIABLE, add_upstream_arguments, joined
+from cairn_server.views_ahead import views_ahead
 
 log = logging.getLogger(__name__)
 
@@ -103,9 +104,8 @@ def main(argv: list[str]) -> int:
     keep_memory_small()
     with listen(settings.host, settings.port) as listener:
         try:
-            store = SqliteStore(settings.folder)
-            service = Service(store, settings, fold_process=folding, check_process=checking)
-            with closing(service), joined(service):
+            service = Service(SqliteStore(settings.folder), settings, fold_process=folding, check_process=checking)
+            with closing(service), closing(views_ahead(service)), joined(service):
                 _serve(service, listener)
         except KeyboardInterrupt:
             pass

@@ -223,6 +223,15 @@ class Service:
         keep_healed(self.store, row, healed)
         return found, head
 
+    def cell_unchecked(self, row: MapRow, key: CellKey) -> tuple[CellRow | None, Head]:
+        """The same, but its bytes may be damaged: for who decodes them, or wants no more than the digest.
+
+        Raises:
+            DamagedDataError: kind `damaged_store`: it cannot be read at all.
+        """
+        with self.store.snapshot(row) as snapshot:
+            return snapshot.cell(key), snapshot.head
+
     def heal_cell(self, row: MapRow, key: CellKey, data: bytes, *, by: Caller) -> bool:
         """Put a damaged cell right with bytes that somebody still has; False if it is sound."""
         with self._healing:

@@ -1,79 +1,107 @@
-"""How many simulated boards are found, and how many grids in images without a board.
+"""How many boards are found, simulated and real ones, and how many grids in images without a board.
 
-    $ python -m tests.board_finding --boards 1000 --empty 10000        # part of `make soak`
+    $ python -m tests.board_finding --boards 1000 --discs 300 --real 500 --empty 10000        # part of `make soak`
     tof      cells 4 to 6: found 99.8% of 600
     ...
-    images without a board (85 real ones among their sources): 0 false grids of 10000
+    real boards, changed: found 100.0% of 500; votes for the polarity: 460 right, 0 wrong, 40 open
+    images without a board: 0 false grids of 10000
 
 Boards vary in distance, tilt (up to 45 degrees), blur, noise (contrast 10 times it or more) and polarity. In
-time-of-flight images cells are 4 px or more. A board counts as found if each of its corners lies where it is, in order.
-Exit code 1 if fewer than 99 % are found, or any grid is false.
+time-of-flight images cells are 4 px or more. A board counts as found if each of its points lies where it is, in order.
+`--seed` draws others. Exit code 1 if fewer than 99 % are found, any grid is false, or any image votes wrongly.
 """
 
 import argparse
 import sys
+from dataclasses import replace
 from itertools import pairwise
 
-from tests.board_finding.empty_images import KINDS, empty_image, real_images
+import numpy as np
+from tests.board_finding.empty_images import KINDS, empty_image
+from tests.board_finding.real_boards import changed, found_as_recorded, recorded, voted
 from tests.board_finding.trials import SPECTRA, Trial, found_rightly, trial
 from tests.cairn_calib.board_images import BOARD
 
 from cairn_calib.corner_detection import find_chessboard
 
 FOUND_MIN = 0.99
+EMPTY = np.zeros((0, 0), np.uint8)
 TABLE = (("cells", "cell_px", (4, 6, 10, 40, 400)), ("tilt", "tilt_deg", (0, 15, 30, 45.1)))
 
 
 def main() -> int:
     """Draw, find, print."""
     parser = argparse.ArgumentParser(
-        "python -m tests.board_finding", description="How many boards are found, and how many false."
+        "python -m tests.board_finding", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--boards", type=int, default=1000, help="of each spectrum")
-    parser.add_argument("--empty", type=int, default=10000)
+    parser.add_argument("--boards", type=int, default=1000, help="chessboards of each spectrum (1000)")
+    parser.add_argument("--discs", type=int, default=300, help="grids of discs of each spectrum (300)")
+    parser.add_argument("--real", type=int, default=500, help="changed images of CAIRN_TEST_DATA's boards (500)")
+    parser.add_argument("--empty", type=int, default=10000, help="images without a board (10000)")
+    parser.add_argument("--seed", type=int, default=0, help="of the first of each (0)")
     args = parser.parse_args()
-    good = [_boards(name, args.boards) for name in SPECTRA]
-    false = _false_grids(args.empty)
-    return 0 if all(good) and not false else 1
+    seed = args.seed
+    good = [_boards(name, "chessboard", range(seed, seed + args.boards)) for name in SPECTRA]
+    good += [_boards(name, "discs", range(seed, seed + args.discs)) for name in SPECTRA]
+    good += [_real_boards(range(seed, seed + args.real)), _false_grids(range(seed, seed + args.empty))]
+    return 0 if all(good) else 1
 
 
-def _boards(name: str, count: int) -> bool:
-    trials = [trial(name, seed) for seed in range(count)]
-    found = [found_rightly(each) for each in trials]
+def _boards(name: str, target: str, seeds: range) -> bool:
+    trials: list[Trial] = []
+    found: list[bool] = []
+    for seed in seeds:
+        each = trial(name, seed, target=target)
+        found.append(found_rightly(each))
+        trials.append(replace(each, image=EMPTY))
+        if not found[-1]:
+            _say(f"    not {target}, seed {seed}: {each}")
     for label, field, bounds in TABLE:
         for low, high in pairwise(bounds):
             those = [right for each, right in zip(trials, found, strict=True) if low <= getattr(each, field) < high]
             if those:
-                _say(f"{name:8} {label} {low:g} to {high:g}: found {sum(those) / len(those):.1%} of {len(those)}")
+                _say(f"{name:8} {target} {label} {low:g} to {high:g}: found {_share(those)} of {len(those)}")
     for way in ("normal", "reversed"):
         those = [right for each, right in zip(trials, found, strict=True) if each.polarity == way]
-        _say(f"{name:8} {way}: found {sum(those) / max(len(those), 1):.1%} of {len(those)}")
-    share = sum(found) / count
-    _say(f"{name:8} all: found {share:.2%} of {count}, at least {FOUND_MIN:.0%}")
-    for each in [each for each, right in zip(trials, found, strict=True) if not right][:10]:
-        _say(f"    not {_told(each)}")
-    return share >= FOUND_MIN
+        if those:
+            _say(f"{name:8} {target} {way}: found {_share(those)} of {len(those)}")
+    if found:
+        _say(f"{name:8} {target} all: found {_share(found)} of {len(found)}, at least {FOUND_MIN:.0%}")
+    return sum(found) >= FOUND_MIN * len(found)
 
 
-def _told(each: Trial) -> str:
-    return (
-        f"seed {each.seed}: cells {each.cell_px:.1f} px, tilt {each.tilt_deg:.0f} deg, blur {each.blur_px:.2f} px, "
-        f"contrast {each.contrast:.0f} x noise, {each.polarity}"
-    )
+def _real_boards(seeds: range) -> bool:
+    if not recorded():
+        _say("real boards: none, CAIRN_TEST_DATA is not set")
+        return True
+    found, votes = [], {"right": 0, "wrong": 0, "open": 0}
+    for seed in seeds:
+        change = changed(seed)
+        found.append(found_as_recorded(change))
+        if not found[-1]:
+            _say(f"    not real, seed {seed}: {change.text}")
+        vote = voted(change)
+        votes["open" if vote is None else "right" if vote == change.polarity else "wrong"] += 1
+    told = ", ".join(f"{count} {way}" for way, count in votes.items())
+    if found:
+        _say(f"real boards, changed: found {_share(found)} of {len(found)}; votes for the polarity: {told}")
+    return sum(found) >= FOUND_MIN * len(found) and not votes["wrong"]
 
 
-def _false_grids(count: int) -> int:
-    real = real_images()
-    false = dict.fromkeys(KINDS, 0)
-    for seed in range(count):
-        kind, image = empty_image(seed, real)
+def _false_grids(seeds: range) -> bool:
+    false = 0
+    for seed in seeds:
+        kind, image = empty_image(seed)
         detection = find_chessboard(image, BOARD)
         if detection.corners is not None:
-            false[kind] += 1
+            false += 1
             _say(f"    false grid, seed {seed} ({kind}): {detection.attempts[-1]}")
-    total = sum(false.values())
-    _say(f"images without a board ({len(real)} real ones among their sources): {total} false grids of {count}")
-    return total
+    _say(f"images without a board, of {len(set(KINDS))} kinds: {false} false grids of {len(seeds)}")
+    return not false
+
+
+def _share(found: list[bool]) -> str:
+    return f"{sum(found) / len(found):.1%}"
 
 
 def _say(text: str) -> None:

@@ -11,7 +11,7 @@ from cairn_calib.calibration import POSE_UNITS
 from cairn_calib.camera import Camera
 from cairn_calib.corners import Corners
 from cairn_calib.pose_vectors import transform_from_vector, vector_from_transform
-from cairn_calib.range_bias import BIAS_NAMES, bias_shapes
+from cairn_calib.range_terms import ALWAYS, RangeTerms, off_middle_image
 from cairn_calib.rig import Spectrum
 from cairn_calib.rig_state import warp_at_places, warp_shape
 from cairn_calib.solve import Solution
@@ -59,7 +59,12 @@ class World:
     """(F, 4, 4) T_rig_board."""
     warp_m: tuple[float, float] = (0.0, 0.0)
     scale: float = 1.0
-    bias: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    bias: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    terms: RangeTerms = ALWAYS
+    """What `bias` is of."""
+    pattern_m: Floats | None = None
+    """(H, W) what each pixel of the range camera adds besides."""
+    has_amplitude: bool = False
     lenses: dict[str, Camera] = field(default_factory=lambda: dict(LENSES))
 
     def T_rig_camera(self, name: str) -> Floats:
@@ -120,11 +125,13 @@ def views_of(truth: World, *, seed: int, noise: float = 1.0) -> BoardViews:
 
 
 def ranges_of(truth: World, name: str, *, seed: int, sigma_m: float) -> tuple[RangeView, ...]:
-    """Range images of the boards, alone in the world, with noise and `truth.bias`."""
+    """Range images of the boards, alone in the world, with noise, `truth.bias` and the pixels' own offsets.
+
+    Amplitudes fall with the square of the range; dark cells return a quarter of what bright ones do.
+    """
     rng = np.random.default_rng([seed, 2])
     lens, T_camera_rig = truth.lenses[name], np.linalg.inv(truth.T_rig_camera(name))
     rays = lens.rays()
-    y, x = np.mgrid[: lens.height, : lens.width]
     result = []
     for frame, T_rig_board in enumerate(truth.boards):
         T = T_camera_rig @ T_rig_board
@@ -135,9 +142,13 @@ def ranges_of(truth: World, name: str, *, seed: int, sigma_m: float) -> tuple[Ra
         on_board = ((places > -0.5 * BOARD.pitch_m) & (places < BOARD.points()[-1, :2] + 0.5 * BOARD.pitch_m)).all(
             axis=-1
         )
-        shapes = bias_shapes(lens, np.stack([x, y], axis=-1).astype(np.float64), true_m)
-        measured = true_m + shapes @ np.array(truth.bias) + rng.normal(size=true_m.shape) * sigma_m
-        result.append(RangeView(name, f"{frame:03d}", np.where(on_board, measured, np.nan)))
+        dark = np.floor(places / BOARD.pitch_m).sum(axis=-1) % 2 == 0
+        amplitude = np.clip(np.where(dark, 1000.0, 4000.0) / true_m**2, 1, 60000).round()
+        off, faint = off_middle_image(lens.width, lens.height), truth.terms.faintness(amplitude)
+        measured = true_m + truth.terms.shapes(true_m, off, faint) @ np.array(truth.bias)
+        measured += rng.normal(size=true_m.shape) * sigma_m + (0.0 if truth.pattern_m is None else truth.pattern_m)
+        counts = np.where(on_board, amplitude, 0).astype(np.uint16) if truth.has_amplitude else None
+        result.append(RangeView(name, f"{frame:03d}", np.where(on_board, measured, np.nan), counts))
     return tuple(result)
 
 
@@ -145,7 +156,7 @@ def errors_of(solution: Solution, truth: World) -> dict[tuple[str, str], float]:
     """Estimate minus truth of every shared parameter; of poses, the error that `rig.json` speaks of, negated."""
     errors = {}
     board = {"warp_x": truth.warp_m[0], "warp_y": truth.warp_m[1], "scale": truth.scale}
-    bias = dict(zip(BIAS_NAMES, truth.bias, strict=True))
+    bias = dict(zip(truth.terms.names, truth.bias, strict=True))
     for (owner, name), value in solution.values().items():
         if owner == "":
             errors[owner, name] = value - board[name]

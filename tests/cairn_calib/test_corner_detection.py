@@ -11,6 +11,8 @@ from tests.cairn_calib.board_images import BOARD, COLOUR, THERMAL, TOF, Floats, 
 
 from cairn_calib.board import Board
 from cairn_calib.corner_detection import find_chessboard, fit_pointed_at
+from cairn_calib.corner_gates import sound_corners
+from cairn_calib.corner_refinement import fit_corners
 from cairn_calib.corners import FOUND, Corners, Detection
 from cairn_map.errors import BadInputError
 
@@ -99,6 +101,15 @@ def test_four_corners_pointed_at_by_hand_find_the_rest() -> None:
     corners = found(fit_pointed_at(image, BOARD, rough))
     assert np.abs(corners.pixels - at)[corners.seen].max() < 0.3
     assert corners.seen.sum() > 50
+
+
+def test_windows_without_an_edge_are_no_corners_and_no_error() -> None:
+    guesses, steps = np.array([[20.0, 20.0], [60.0, 20.0]]), np.tile(8 * np.eye(2), (2, 1, 1))
+    for contrast in (0.0, 1e-6, 1.0):
+        image = np.full((40, 80), 190, np.float32)
+        image[:, 58:] -= contrast
+        fitted = fit_corners(image, guesses, steps)
+        assert not sound_corners(fitted, np.ones(2)).any()
 
 
 def windows(rng: np.random.Generator) -> Floats:

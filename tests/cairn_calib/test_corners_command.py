@@ -40,6 +40,16 @@ def test_each_image_gets_a_document_and_a_picture_and_failures_name_their_stage(
         main([str(empty), *options])
 
 
+def test_an_image_that_repeats_another_is_left_out_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(4)
+    cv2.imwrite(str(tmp_path / "t1.png"), picture(TOF, pose(rng, TOF), rng))
+    (tmp_path / "t2.png").write_bytes((tmp_path / "t1.png").read_bytes())
+    paths = [str(tmp_path / name) for name in ("t1.png", "t2.png")]
+    assert main([*paths, "--board", "9x6", "--square", "0.05", "--output", str(tmp_path / "out")]) == 0
+    assert "t2.png: no board (repeated: the same counts as t1.png" in capsys.readouterr().err
+    assert read_corner_file(tmp_path / "out" / "t2.json").attempts[0].stage == "repeated"
+
+
 def test_corners_pointed_at_by_hand_are_taken_from_the_file(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     T_camera_board = pose(rng, TOF)
@@ -47,10 +57,15 @@ def test_corners_pointed_at_by_hand_are_taken_from_the_file(tmp_path: Path) -> N
     cv2.imwrite(str(tmp_path / "one.png"), picture(TOF, T_camera_board, rng))
     pointed = {"format": "cairn-outer-corners", "version": 1, "images": {"one.png": at[[0, 8, 53, 45]].tolist()}}
     (tmp_path / "by-hand.json").write_text(json.dumps(pointed))
-    options = ["--board", "9x6", "--square", "0.05", "--output", str(tmp_path), "--outer-corners"]
+    options = ["--board", "9x6", "--square", "0.05", "--output", str(tmp_path / "out"), "--outer-corners"]
     assert main([str(tmp_path / "one.png"), *options, str(tmp_path / "by-hand.json")]) == 0
-    document = read_corner_file(tmp_path / "one.json")
+    document = read_corner_file(tmp_path / "out" / "one.json")
     assert document.attempts[-1].method == "by hand"
+    named_alike = tmp_path / "out" / "one.json"
+    named_alike.write_text(json.dumps(pointed))
+    with pytest.raises(BadInputError, match="would overwrite"):
+        main([str(tmp_path / "one.png"), *options, str(named_alike)])
+    assert json.loads(named_alike.read_text()) == pointed
     pointed["images"] = {"one.png": [[1, 2]] * 5}
     (tmp_path / "by-hand.json").write_text(json.dumps(pointed))
     with pytest.raises(BadInputError, match="4 corners or all 54"):
@@ -58,3 +73,16 @@ def test_corners_pointed_at_by_hand_are_taken_from_the_file(tmp_path: Path) -> N
     (tmp_path / "one.json").write_text("{}")
     with pytest.raises(DamagedDataError, match="no file of corners"):
         read_corner_file(tmp_path / "one.json")
+
+
+def test_images_are_never_overwritten_by_pictures_of_them(tmp_path: Path) -> None:
+    image = tmp_path / "one.png"
+    cv2.imwrite(str(image), np.zeros((64, 64), np.uint8))
+    before = image.read_bytes()
+    with pytest.raises(BadInputError, match="would overwrite"):
+        main([str(image), "--board", "9x6", "--square", "0.05", "--output", str(tmp_path)])
+    assert image.read_bytes() == before
+    # A folder is a still pose, and its pictures are frames.
+    with pytest.raises(BadInputError, match="would overwrite"):
+        main([str(tmp_path), "--board", "9x6", "--square", "0.05", "--output", str(tmp_path)])
+    assert [each.name for each in tmp_path.iterdir()] == ["one.png"]

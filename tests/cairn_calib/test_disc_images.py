@@ -6,7 +6,8 @@ import pytest
 
 from cairn_calib.camera import Camera
 from cairn_calib.disc_images import Disc, Method, Singles, brightness_of, find_discs
-from cairn_calib.disc_range import disc_range
+from cairn_calib.disc_range import RELIEF_SIGMA_M, disc_range
+from cairn_calib.range_bias import RangeBias
 from cairn_calib.rig import MountedCamera, Spectrum, mounted
 from cairn_map.errors import BadInputError
 
@@ -137,7 +138,7 @@ def test_the_range_is_as_certain_as_it_says(radius_px: float) -> None:
         disc_range(disc_at(centre, radius_px), range_m + sigma_m * rng.standard_normal(SIZE), TOF) for _ in range(300)
     ]
     misses = np.array([each[0] - true for each in found if each is not None])
-    stated = np.array([each[1] for each in found if each is not None])
+    stated = np.sqrt([each[1] ** 2 - RELIEF_SIGMA_M**2 for each in found if each is not None])
     # Tukey's weights cost 5 % of the data, and few pixels more.
     assert np.std(misses) == pytest.approx(np.sqrt(np.mean(stated**2)), rel=0.25)
     assert abs(misses.mean()) < 4 * misses.std() / np.sqrt(len(misses)) + 5e-4
@@ -145,3 +146,12 @@ def test_the_range_is_as_certain_as_it_says(radius_px: float) -> None:
 
 def test_a_target_without_range_has_none() -> None:
     assert disc_range(disc_at(np.array([60.0, 60.0]), 6), np.full(SIZE, np.nan), TOF) is None
+
+
+def test_what_is_unknown_of_the_range_bias_does_not_fall_with_the_number_of_pixels() -> None:
+    unsure = ((4e-4,), (0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0))
+    bias = RangeBias(offset_m=0.0, scale=0.0, radial_m=0.0, covariance_lower=unsure)
+    range_m, disc = plane_range(TOF, NORMAL, 2.5), disc_at(np.array([60.3, 70.7]), 12.0)
+    sure, open_ = (disc_range(disc, range_m, each) for each in (TOF, TOF.model_copy(update={"range_bias": bias})))
+    assert sure is not None and open_ is not None
+    assert np.sqrt(open_[1] ** 2 - sure[1] ** 2) == pytest.approx(0.02, rel=1e-3)

@@ -11,9 +11,11 @@ from cairn_calib.board import Board
 from cairn_calib.board_views import BoardView, BoardViews
 from cairn_calib.corners import Corners
 from cairn_calib.disc_shift import disc_shift
+from cairn_calib.examination import examined
 from cairn_calib.rig import Spectrum
 from cairn_calib.solve import Solution, solve_rig
 from cairn_calib.solve_plan import STATED, usual_plan
+from cairn_calib.solved_rig import solved_rig
 
 CENTRES = Board(pattern="circles", columns=4, rows=3, pitch_m=0.15)
 """Few large discs, as on heated boards; of unknown size."""
@@ -58,9 +60,16 @@ def focal_off(solution: Solution) -> tuple[float, float]:
     return off, off / solution.sigmas()["thermal", lens.intrinsic_names[0]]
 
 
-def test_discs_calibrate_without_the_bias_that_taking_centroids_for_centres_has() -> None:
-    off_px, off = focal_off(solved(DISCS))
-    biased_px, biased = focal_off(solved(CENTRES))
+def warned(solution: Solution) -> bool:
+    told = examined(solution, solved_rig(solution, made_s=0.0)).warnings
+    return any(each.kind == "disc_diameter" for each in told)
+
+
+def test_discs_calibrate_without_the_bias_of_unknown_diameters_which_is_warned_about() -> None:
+    known, unknown = solved(DISCS), solved(CENTRES)
+    off_px, off = focal_off(known)
+    biased_px, biased = focal_off(unknown)
     assert abs(off) < 3
     assert abs(biased) > 5
     assert abs(biased_px) > 5 * abs(off_px)
+    assert (warned(known), warned(unknown)) == (False, True)

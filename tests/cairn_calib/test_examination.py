@@ -1,5 +1,6 @@
 """What is said of a solution is true: influence, next image, certainty of pixels, halves, warnings."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -18,7 +19,7 @@ from cairn_calib.projection_uncertainty import project_certain, transfer_certain
 from cairn_calib.rig_state import moved
 from cairn_calib.solve import Solution, solve_from, solve_rig
 from cairn_calib.solve_plan import STATED, usual_plan
-from cairn_calib.solve_warnings import Warned, refuse_undetermined
+from cairn_calib.solve_warnings import Warned, refuse_undetermined, warnings_of
 from cairn_calib.solved_rig import solved_rig
 from cairn_calib.view_coverage import coverage
 from cairn_calib.world_uncertainty import pixel_covariance, world_covariance
@@ -181,6 +182,9 @@ def test_warnings_name_what_the_images_lack() -> None:
     assert {
         ("few_images", "tof"),
         ("tilt_range", "tof"),
+        ("range_span", "tof"),
+        ("coverage", "tof"),
+        ("edge", "left"),
         ("tof_edge", "tof"),
         ("range_bias", "tof"),
         ("halves", ""),
@@ -189,6 +193,31 @@ def test_warnings_name_what_the_images_lack() -> None:
     tilt = next(each for each in told if each.kind == "tilt_range")
     assert tilt.measured < tilt.threshold == 30
     assert "prior" in {each.kind for each in told}
+    weak = next(each for each in told if each.kind == "weak_mode" and each.camera == "tof")
+    assert weak.measured > weak.threshold == 1
+    assert re.match(r".*fx.* of tof.* are open together: a longer lens looks like a farther board", weak.text)
+    few = world(4, seed=1, names=PAIR, tilt_deg=25.0)
+    solution = solve_rig(views_of(few, seed=1), PLAN)
+    told = examined(solution, solved_rig(solution, made_s=0.0)).warnings
+    alone = next(each for each in told if each.kind == "influence")
+    assert alone.measured > alone.threshold == 3 and "without frame 002 points would move by" in alone.text
+
+
+def test_warnings_name_corners_that_do_not_fit(solution: Solution) -> None:
+    assert not {"noise", "outliers", "image_outliers"} & {each.kind for each in told_of(solution)}
+    spoilt = solution.adjusted.problem.sensors[1]
+    kept = spoilt.kept.copy()
+    kept[2] = False
+    sensors = (solution.adjusted.problem.sensors[0], replace(spoilt, kept=kept, scale=40.0))
+    problem = replace(solution.adjusted.problem, sensors=sensors)
+    told = told_of(replace(solution, adjusted=replace(solution.adjusted, problem=problem)))
+    assert {("noise", "left"), ("outliers", "left"), ("image_outliers", "left")} <= kinds(told)
+    image = solution.views.of_camera("left")[2].image
+    assert next(each for each in told if each.kind == "image_outliers").text.startswith(f"{image} does not fit")
+
+
+def told_of(solution: Solution) -> Sequence[Warned]:
+    return warnings_of(solution, [], [], None, [])
 
 
 def test_coverage_counts_corners_by_part_of_the_image(solution: Solution) -> None:

@@ -25,8 +25,8 @@ REFERENCE = json.loads((Path(__file__).parent / "mrcal_reference.json").read_tex
 NAMES = ("left", "right")
 
 
-@pytest.fixture(scope="module")
-def solution() -> Solution:
+def reference_problem() -> tuple[BoardViews, SolvePlan]:
+    """The corners that mrcal was given, and what it was asked for."""
     board = Board(columns=9, rows=6, pitch_m=0.025)
     views = [
         BoardView(
@@ -41,7 +41,12 @@ def solution() -> Solution:
         usual_priors=False,
         noise=STATED,
     )
-    return solve_rig(BoardViews(board, dict.fromkeys(NAMES, (640, 480)), tuple(views)), plan)
+    return BoardViews(board, dict.fromkeys(NAMES, (640, 480)), tuple(views)), plan
+
+
+@pytest.fixture(scope="module")
+def solution() -> Solution:
+    return solve_rig(*reference_problem())
 
 
 def test_mrcal_finds_the_same_cameras(solution: Solution) -> None:

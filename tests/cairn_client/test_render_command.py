@@ -1,7 +1,7 @@
 """A robot without a thermal camera sees the temperatures that another one measured: through a server, by any door."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -10,15 +10,18 @@ import pytest
 from tests.cairn_client.conftest import LiveServer
 
 from cairn_client.api import MapApi
+from cairn_client.local_ages import ages_of
 from cairn_client.map_command import main
 from cairn_client.robot import Robot
+from cairn_client.telepresence_command import main as telepresence
 from cairn_fusion.live_range import live_range
 from cairn_fusion.overlay import Live, Mode, OverlayStyle, draw_overlay
 from cairn_map.errors import BadInputError
 from cairn_map.grid import geometry_for
+from cairn_map.map_picture import layer_values
 from cairn_map.map_render import MapRenderer
 from cairn_map.messages import CreateMap
-from cairn_map.render_picture import ZERO_CELSIUS_K
+from cairn_map.render_picture import ZERO_CELSIUS_K, Layer
 from cairn_map.sight import Sight
 from cairn_sim.record import Plan, scans_of, shots_of
 from cairn_sim.robots import ROBOTS
@@ -121,6 +124,72 @@ def test_the_command_draws_over_a_recorded_image(
     assert rendered(picture).shape[0] > told["modes"].shape[0]
     assert main([*words, "--sigma", "2,20"]) == 0
     assert "withheld, the pose is uncertain" in capsys.readouterr().out
+    wide = ",".join(["0.25" if n in (0, 2, 5) else "0" for n in range(21)])  # 0.5 rad about each axis
+    assert main([*words, "--covariance", wide]) == 0
+    assert "withheld" in capsys.readouterr().out
+
+
+def test_telepresence_draws_the_map_over_the_image_too(world: World, tmp_path: Path) -> None:
+    """As `cairn map render --over` does; heat on colour takes the map for its mirrors."""
+    cells, pictures, one = tmp_path / "cells", tmp_path / "pictures", tmp_path / "one.png"
+    main(["export", world.url, "--cells", str(cells)])
+    asked = [str(world.recording), "--map", str(cells)]
+    assert telepresence([*asked, "--mode", "map", "--scale", "10:50", "--output", str(pictures)]) == 0
+    assert main(["render", str(cells), "--over", str(world.recording), "-o", str(one)]) == 0
+    drawn = sorted(pictures.iterdir())
+    assert len(drawn) == 1 and np.array_equal(rendered(drawn[0]), rendered(one))
+    exact = rendered(one)
+    for sigma, least in (("0.01,0.5", 0.01), ("2,20", 0.3)):
+        live = tmp_path / "live.png"
+        assert telepresence([*asked, "--mode", "map", "--scan", "0", "--sigma", sigma, "--output", str(live)]) == 0
+        over = ["--over", str(world.recording), "--sigma", sigma, "-o", str(one)]
+        assert main(["render", str(cells), *over]) == 0
+        assert np.array_equal(rendered(live), rendered(one))
+        assert (rendered(one) != exact).any(axis=2).mean() > least
+    assert telepresence([*asked, "--output", str(one)]) == 0
+    for more, kind in (
+        (asked[:1], "nothing_asked"),
+        ([*asked, "--layer", "age"], "no_age"),
+        ([*asked[:2], world.url], "bad_option"),
+        ([*asked, "--covariance", "1,2"], "bad_pose"),
+    ):
+        with pytest.raises(BadInputError) as caught:
+            telepresence([*more, "--mode", "map", "--output", str(one)])
+        assert caught.value.kind == kind
+    with pytest.raises(BadInputError, match="--mode map"):
+        telepresence([*asked, "--sigma", "0.1,1", "--output", str(one)])
+
+
+def test_a_robots_own_map_has_the_ages_of_its_own_commits(tmp_path: Path) -> None:
+    """Offline, two measurements an hour apart; what was taken out again has no age, and an old thing is fainter."""
+    plan = Plan(scene=load_scene("small-room"), robot=ROBOTS["orpheus"], path="west", scale=0.1, truth="none")
+    rig, grid = plan.robot.rig_of(plan.scale), geometry_for(voxel_edge_m=0.08)
+    state, nowhere = tmp_path / "state", "http://127.0.0.1:9/maps/room"
+    shots = shots_of(plan)[1 : 3 * SCANS : 3]
+    scans = [scan for _, scan, _ in scans_of(plan, shots, rig)]
+    with Robot(rig, nowhere, directory=state, name="orpheus", geometry=grid) as robot:
+        assert ages_of(robot.replica) is None
+        for late_s, part in ((0.0, scans[:2]), (3600.0, scans[6:8]), (9000.0, scans[8:9])):
+            for scan in part:
+                robot.observe(replace(scan, time_s=1.5e9 + late_s))
+            last = robot.commit()
+        assert last is not None
+        robot.commit(retracts=(last.id,))
+        found, snapshot = ages_of(robot.replica), robot.snapshot()
+    assert found is not None and found.now == 1.5e9 + 3600
+    told = np.unique(np.concatenate([each[np.isfinite(each)] for each in found.changes.values()]))
+    assert told.tolist() == [1.5e9, 1.5e9 + 3600]
+    T = scans[0].T_map_rig @ rig["colour_left"].transform
+    sight, renderer = Sight(rig["colour_left"].camera.rays()), MapRenderer()
+    seen = renderer.nearest(snapshot, sight, T, range_max_m=8)
+    age_s = layer_values(renderer, snapshot, seen, Layer.AGE, found)
+    assert np.isfinite(age_s[seen.hit]).mean() > 0.99
+    assert set(np.unique(age_s[np.isfinite(age_s)])) <= {0.0, 3600.0}
+    picture, at = tmp_path / "age.png", ",".join(f"{x:.3f}" for x in T[:3, 3])
+    ahead = ",".join(f"{x:.3f}" for x in T[:3, 3] + 2 * T[:3, 2])
+    words = ["render", str(state), "--from", at, "--to", ahead, "--size", "80x60", "--layer", "age", "-o", str(picture)]
+    assert main(words) == 0
+    assert len(np.unique(rendered(picture)[:60].reshape(-1, 3), axis=0)) >= 2
 
 
 @pytest.mark.parametrize(
@@ -131,7 +200,7 @@ def test_the_command_draws_over_a_recorded_image(
         (["-o", "x.png", "--from", "0,0,1", "--to", "0,0,1"], "two places"),
         (["-o", "x.png", "--from", "0,0,1", "--to", "1,0,1", "--range", "1000"], "range_m"),
         (["-o", "x.png", "--from", "0,0,1", "--to", "1,0,1", "--low", "60"], "scale"),
-        (["-o", "x.png", "--over", "recording"], "cairn map export"),
+        (["-o", "x.png", "--over", "recording"], "cairn clone"),
     ],
 )
 def test_what_is_missing_is_said(world: World, words: list[str], told: str) -> None:
@@ -144,7 +213,8 @@ def test_scans_and_cameras_that_are_not_there_are_said(world: World, tmp_path: P
     main(["export", world.url, "--cells", str(cells)])
     words = ["render", str(cells), "--over", str(world.recording), "-o", str(tmp_path / "x.png")]
     for more, kind in (
-        (["--layer", "age"], "bad_option"),
+        (["--layer", "age"], "no_age"),
+        (["--covariance", "1,2"], "bad_pose"),
         (["--scan", "99"], "no_scan"),
         (["--camera", "depth"], "unknown_camera"),
     ):

@@ -1,16 +1,29 @@
 """`cairn telepresence` on a recording: one picture, a folder of pictures, and what is refused."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from tests.cairn_server.live import Live
 
+from cairn_client.api import MapApi
 from cairn_client.telepresence_command import main
+from cairn_client.view_publishing import publish_views
 from cairn_fusion.images import read_colour
 from cairn_map.errors import BadInputError, NotFoundError
+from cairn_map.ids import new_incarnation, robot_name
+from cairn_map.messages import Register
 from cairn_sim.record import Plan, record
 from cairn_sim.robots import ROBOTS
 from cairn_sim.scene_file import load_scene, shipped_text
+
+
+@pytest.fixture
+def live(tmp_path: Path) -> Iterator[Live]:
+    with Live(tmp_path / "server") as made:
+        yield made
 
 
 @pytest.fixture(scope="module")
@@ -26,6 +39,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
         rate_hz=1.0,
         last_stop=3,
     )
+    # Colour images of 160 x 120, which are shown twice as large.
     assert len(list(record(plan, folder, scene_text=shipped_text("small-room")))) == 3
     return folder
 
@@ -33,15 +47,37 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_one_scan_becomes_a_png(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(recording), "--output", str(tmp_path / "view.png"), "--scan", "1", "--mode", "side-by-side"]) == 0
     assert "side-by-side, scan 1 of 3" in capsys.readouterr().out
-    assert read_colour(tmp_path / "view.png").shape == (120, 320, 3)
+    assert read_colour(tmp_path / "view.png").shape == (240, 640, 3)
 
 
 def test_all_scans_become_a_folder_with_one_scale(recording: Path, tmp_path: Path) -> None:
     folder = tmp_path / "pictures"
     assert main([str(recording), "--output", str(folder), "--band", "-5:40", "--scale", "-10:50"]) == 0
     pictures = [read_colour(path) for path in sorted(folder.iterdir())]
-    assert len(pictures) == 3 and pictures[0].shape == (120, 160, 3)
+    assert len(pictures) == 3 and pictures[0].shape == (240, 320, 3)
     assert not np.array_equal(pictures[0], pictures[2])
+
+
+def test_what_a_robot_sees_is_shown_to_its_team(
+    recording: Path, live: Live, capsys: pytest.CaptureFixture[str]
+) -> None:
+    row = live.new_map()
+    url = f"http://127.0.0.1:{live.port}/maps/{row.name}"
+    view = [str(recording), "--publish", url, "--rate", "1000"]
+    with pytest.raises(NotFoundError, match="no branch 'scout'"):
+        main([*view, "--robot", "scout"])
+    with MapApi(f"http://127.0.0.1:{live.port}") as api:
+        api.register(row.name, Register(robot=robot_name("scout"), incarnation=new_incarnation()))
+    assert main([*view, "--robot", "scout"]) == 0
+    assert "scout showed 3 pictures" in capsys.readouterr().out
+    with MapApi(f"http://127.0.0.1:{live.port}") as api:
+        shown = cv2.imdecode(np.frombuffer(api.view(row.name, "scout"), np.uint8), cv2.IMREAD_COLOR)
+    assert shown is not None
+    assert shown.shape == (240, 320, 3)
+    with pytest.raises(BadInputError, match="whose view"):
+        main(view)
+    with MapApi("http://127.0.0.1:9") as nobody:
+        assert publish_views([np.zeros((6, 8, 3), np.uint8)], nobody, "lab", "scout") == (0, 1)
 
 
 def test_what_cannot_be_is_refused_in_words(recording: Path, tmp_path: Path) -> None:

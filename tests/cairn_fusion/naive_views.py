@@ -106,17 +106,15 @@ def dense(
                 if nearness[k, m] > 0:
                     other = int(np.abs(coarse[k, m].astype(int) - picture[y, x].astype(int)).sum())
                     weight = float(trust[k, m]) * float(close[k - i + reach, m - j + reach])
-                    hand = float(np.hypot(k - i - 0.5, m - j - 0.5) <= near_px)
+                    hand = float(np.hypot(k - v, m - u) <= near_px)
                     votes.append((float(nearness[k, m]), weight, float(alike[other]), hand))
         if not votes:
             continue
         q, weight, like, hand = np.array(votes).T
-        if q.max() <= q.min() * np.float32(1.05):
-            if hand.any():
-                range_m[y, x], origins[y, x] = 1 / np.average(q, weights=weight * hand), 2
-            continue
-        near, weight, origins[y, x] = q > (q.min() + q.max()) / 2, weight * like, 2
+        weight, is_one = weight * like, q.max() <= q.min() * np.float32(1.05)
+        near = np.ones(len(q), bool) if is_one else q > (q.min() + q.max()) / 2
         weight[near] *= hand[near]
         chosen = near if weight[near].sum() >= weight[~near].sum() else ~near
-        range_m[y, x] = 1 / np.average(q[chosen], weights=weight[chosen])
+        if weight[chosen].any():
+            range_m[y, x], origins[y, x] = 1 / np.average(q[chosen], weights=weight[chosen]), 2
     return range_m, origins

@@ -32,7 +32,7 @@ from cairn_sim.surfaces import Material, Surface
 Floats = npt.NDArray[np.float64]
 HEAD = full_head(scale=0.25)
 POSES = int(os.environ.get("CAIRN_FUSION_POSES", "30"))
-"""Random rooms and heads; 1000 by hand."""
+"""Random rooms and heads; 1000 in `make soak`."""
 
 
 def room(rng: np.random.Generator) -> Scene:
@@ -104,17 +104,17 @@ def test_labels_and_samples_agree_with_their_slow_twins(seed: int) -> None:
     u, v = rng.uniform(-3, 18, shape).astype(np.float32), rng.uniform(-3, 14, shape).astype(np.float32)
     u[0, 0], u[0, 1], v[0, 1] = np.nan, -0.5, -0.5
     q = rng.uniform(0.2, 1.0, shape).astype(np.float32)
-    hiding, slack = rng.uniform(0.0, 1.0, (4, 6)).astype(np.float32), np.full((4, 6), 0.05, np.float32)
+    least = rng.uniform(0.0, 0.9, (4, 6)).astype(np.float32)
     given = rng.choice([0, 0, 0, 3, 5], size=shape).astype(np.uint8)
     labels, values = given.copy(), np.zeros((*shape, 2), np.float32)
-    label_into(labels, u, v, q, hiding, slack, 3, 16, 12, 0.1)
+    label_into(labels, u, v, q, least, 3, 16, 12)
     sample_into(values, labels, u, v, image)
     for at in np.ndindex(shape):
         expected, value = int(given[at]), np.zeros(2)
         if expected == Label.OK:
             inside = -0.5 <= u[at] < 15.5 and -0.5 <= v[at] < 11.5
             cell = (int((v[at] + 0.5) / 3), int((u[at] + 0.5) / 3)) if inside else (0, 0)
-            hidden = q[at] < hiding[cell] / 1.1 - 0.05
+            hidden = q[at] < least[cell]
             expected = (Label.OCCLUDED if hidden else Label.OK) if inside else Label.OUT_OF_VIEW
         if expected == Label.OK:
             value = naive_views.bilinear(image, u[at], v[at])
@@ -160,7 +160,7 @@ def test_registered_depth_is_that_of_opencv() -> None:
 
 
 def test_without_noise_what_is_hidden_is_never_painted_away_from_edges() -> None:
-    painted = hidden = called = missed = 0
+    painted = hidden = called = missed = wrong = away = 0
     rig = HEAD.model_copy(update={"cameras": {n: m for n, m in HEAD.cameras.items() if n != "colour_right"}})
     for scene, T_map_rig in poses(POSES, 1):
         scan = perfect_scan(scene, rig, T_map_rig)
@@ -171,8 +171,11 @@ def test_without_noise_what_is_hidden_is_never_painted_away_from_edges() -> None
         one = fuse(replace(scan, thermal={"thermal_left": scan.thermal["thermal_left"]}), rig, "colour_left")
         alone = fusion_scores(one, truth, unit="K")
         hidden, called, missed = hidden + alone.hidden, called + alone.called_hidden, missed + alone.hidden_painted_away
-        assert np.quantile(scores.errors_away, 0.99) < 1.0
+        # Where two warm things meet without a step in depth, temperatures change within a thermal pixel of it.
+        assert np.mean(scores.errors_away > 1.0) < 0.02
+        wrong, away = wrong + int((scores.errors_away > 1.0).sum()), away + len(scores.errors_away)
     assert missed == 0
+    assert wrong < 1e-3 * away
     assert painted > 30_000 * POSES and hidden > 300 * POSES and called > 0.5 * hidden
 
 

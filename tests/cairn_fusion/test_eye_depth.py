@@ -78,6 +78,29 @@ def test_the_picture_says_on_which_side_of_an_edge_a_pixel_is_and_nothing_is_bet
     assert 0.01 < filled.mean() < 0.2 and not filled[20:-20, 20:60].any()
 
 
+@pytest.mark.parametrize("times", [1, 5])
+def test_what_has_nothing_beside_it_ends_a_range_pixel_beyond_its_last_on_all_sides(times: int) -> None:
+    lens = COLOUR if times == 5 else TOF
+    rig = Rig(name="one", cameras={**HEAD.cameras, "colour": mounted(Spectrum.COLOUR, lens, np.eye(4))})
+    range_m = np.full((36, 44), np.nan, np.float32)
+    range_m[10:20, 12:30] = 2.0
+    scan = Scan(time_s=0.0, T_map_rig=np.eye(4), range_camera="tof", range_m=range_m)
+    drawn = drawn_surface(surface_of(scan, rig), rig, "colour")
+    picture = np.zeros((lens.height, lens.width, 3), np.uint8)
+    known = eye_depth(drawn, rig, "colour", picture, range_camera="tof").origins != Origin.NOTHING
+    y, x = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
+    ends = np.array([[x[0] - lens.centre_px[0], x[-1] - lens.centre_px[0]], [y[0] - lens.centre_px[1], y[-1]]])
+    ends[1, 1] -= lens.centre_px[1]
+    # In range pixels; drawn ones are half as wide, and the surface's border is drawn to the last that it reaches.
+    last = np.array([[12, 29], [10, 19]]) - np.array(TOF.centre_px)[:, None]
+    beyond = (ends / times - last) * [-1, 1]
+    assert (beyond <= 1.0 + 1e-9).all() and (beyond > 0.4).all()
+    np.testing.assert_allclose(beyond[:, 0], beyond[:, 1], atol=0.5 / times + 1e-9)
+    measured = np.zeros_like(known)
+    measured[y[0] + times : y[-1] + 1 - times, x[0] + times : x[-1] + 1 - times] = True
+    assert known[measured].all()
+
+
 def test_where_too_much_light_returned_or_nothing_near_did_nothing_is_filled() -> None:
     range_m, picture = two_walls()
     amplitude = np.full(range_m.shape, 1000, np.uint16)

@@ -15,9 +15,17 @@ from cairn_sim.heads import RANGE_CAMERA, thermal_and_tof_head
 from cairn_sim.render import render_scan
 from cairn_sim.scene import scene_of
 from cairn_sim.sensors import Noise
-from cairn_sim.solids import Box, Cylinder, Solid, placed
-from cairn_sim.surfaces import Material, Surface
-from cairn_sim.temperature_scores import apparent_k, is_body, is_pipe, temperature_scores
+from cairn_sim.solids import Box, Cylinder, Shape, Solid, placed
+from cairn_sim.surfaces import Material, Optics, Surface
+from cairn_sim.temperature_scores import (
+    BEHIND_GLASS,
+    IN_MIRROR,
+    OTHERS,
+    apparent_k,
+    is_body,
+    is_pipe,
+    temperature_scores,
+)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -70,6 +78,44 @@ def test_a_hot_pipe_before_a_wall_keeps_its_temperature_and_the_wall_its_own() -
     assert kept["all"].without + len(kept["all"].errors_k) == all_of_them["all"].without + len(
         all_of_them["all"].errors_k
     )
+
+
+def test_what_stands_behind_glass_is_counted_by_itself() -> None:
+    """A range camera looks through the pane, a thermal camera sees it: nothing in a scan says so."""
+    cold = Surface(Material(temperature_k=290.0))
+    glass = Surface(Material(temperature_k=290.0, optics=Optics.GLASS))
+    pane = Solid("pane", Box((0.01, 1.0, 4)), glass, placed((1, -0.5, 0)))
+    pipe = Solid("hot pipe", Box((0.2, 2.0, 0.3)), Surface(Material(temperature_k=330.0)), placed((1.9, 0, 0)))
+    scene = scene_of([Solid("wall", Box((0.2, 6, 4)), cold, placed((2.1, 0, 0))), pane, pipe])
+    rig, geometry, T = thermal_and_tof_head(), geometry_for(voxel_edge_m=0.04), look_at((0, 0, 0), (2, 0, 0))
+    scan = render_scan(scene, rig, T_map_rig=T, range_camera=RANGE_CAMERA, time_s=0.0)
+    diff = integrate_scans([scan], rig, geometry, integrator=Integrator())
+    found = temperature_scores(scene, diff, geometry, groups={"pipes": is_pipe}, eyes_m=[T[:3, 3]])
+    behind, others = found[BEHIND_GLASS], found[OTHERS]
+    assert behind.median_k > 20 and others.p95_k < 1.0
+    assert len(behind.errors_k) > 50 < len(others.errors_k)
+    assert len(behind.errors_k) + len(others.errors_k) == len(found["all"].errors_k)
+
+
+def test_what_a_mirror_puts_on_a_thing_behind_it_is_counted_by_itself() -> None:
+    """A mirror before a pipe shows the wall behind the camera just where the pipe is."""
+    cold, warm = Surface(Material(temperature_k=290.0)), Surface(Material(temperature_k=330.0))
+    mirror = Surface(Material(temperature_k=290.0, optics=Optics.MIRROR, reflectivity_nir=0.1))
+    parts: list[tuple[str, Shape, tuple[float, float, float], Surface]] = [
+        ("back", Box((0.2, 6, 4)), (0.1, 0, 0), cold),
+        ("mirror", Box((0.02, 1.0, 4)), (1.01, -0.5, 0), mirror),
+        ("hot pipe", Box((0.2, 2.0, 0.3)), (1.9, 0, 0), warm),
+        ("wall", Box((0.2, 6, 4)), (2.1, 0, 0), cold),
+    ]
+    scene = scene_of([Solid(name, shape, surface, placed(at)) for name, shape, at, surface in parts])
+    rig, geometry, T = thermal_and_tof_head(), geometry_for(voxel_edge_m=0.04), look_at((0.5, 0, 0), (2, 0, 0))
+    scan = render_scan(scene, rig, T_map_rig=T, range_camera=RANGE_CAMERA, time_s=0.0)
+    diff = integrate_scans([scan], rig, geometry, integrator=Integrator())
+    found = temperature_scores(scene, diff, geometry, groups={"pipes": is_pipe}, eyes_m=[T[:3, 3]])
+    mirrored, others = found[IN_MIRROR], found[OTHERS]
+    assert mirrored.median_k > 20 and others.p95_k < 1.0
+    assert len(mirrored.errors_k) > 50 < len(others.errors_k)
+    assert not len(found[BEHIND_GLASS].errors_k)
 
 
 def test_bodies_and_pipes_are_known_by_name_and_bare_metal_mirrors() -> None:

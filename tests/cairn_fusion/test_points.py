@@ -7,7 +7,9 @@ import numpy.typing as npt
 import pytest
 from tests.cairn_fusion.test_carve import BARREL, GEOMETRY, random_scan, rig_of
 
+from cairn_calib.pixel_offsets import pixel_offsets
 from cairn_calib.poses import Transform, inverse
+from cairn_calib.range_bias import RangeBias
 from cairn_calib.rig import Rig, Spectrum, mounted
 from cairn_fusion.integrate import Integration, Integrator, Method, integrate_scan
 from cairn_fusion.measurement import Measurement
@@ -35,6 +37,45 @@ def test_points_mean_what_the_same_points_mean_as_an_image() -> None:
     one, other = (occupied(diff, GEOMETRY) for diff in (cloud.diff(), image))
     assert set(map(tuple, one.tolist())) == set(map(tuple, other.tolist()))
     assert len(returns_of(scan, rig, min_range_m=0.3, max_range_m=3.0).pixels) > len(one) > 100
+
+
+def test_points_of_a_range_camera_lose_its_bias_as_its_images_do() -> None:
+    scan, plain = random_scan(BARREL, 3), rig_of(BARREL)
+    rng = np.random.default_rng(2)
+    shape = (BARREL.height, BARREL.width)
+    pattern = pixel_offsets(
+        *(0.02 * rng.normal(size=shape), np.full(shape, 0.001), np.full(shape, 9)),
+        pattern_sigma_m=0.02,
+        noise_sigma_m=0.005,
+    )
+    bias = RangeBias(offset_m=0.15, scale=0.01, radial_m=0.03, pixel_offsets=pattern)
+    rig = plain.model_copy(update={"cameras": {"tof": plain["tof"].model_copy(update={"range_bias": bias})}})
+    limits = Integrator(min_range_m=0.3, max_range_m=3.0, method=Method.CAST)
+    points = (BARREL.rays() * scan.range_m[..., None]).reshape(-1, 3)
+    points[7] = 0.0  # what some drivers say for nothing
+    points[8] = np.nan
+
+    def map_of(by: Rig, range_camera: str | None) -> set[tuple[int, ...]]:
+        cloud = Integration(by, GEOMETRY, limits)
+        cloud.add_points(points, scan.T_map_rig @ plain["tof"].transform, range_camera=range_camera)
+        return set(map(tuple, occupied(cloud.diff(), GEOMETRY).tolist()))
+
+    scan.range_m.reshape(-1)[7:9] = np.nan
+    image = set(map(tuple, occupied(integrate_scan(scan, rig, GEOMETRY, integrator=limits), GEOMETRY).tolist()))
+    assert map_of(rig, "tof") == image
+    assert map_of(plain, "tof") == map_of(rig, None) != image
+
+
+def test_points_that_a_biased_camera_cannot_have_seen_are_refused() -> None:
+    rig = rig_of(BARREL)
+    bias = RangeBias(offset_m=0.15, scale=0.0, radial_m=0.0)
+    biased = rig.model_copy(update={"cameras": {"tof": rig["tof"].model_copy(update={"range_bias": bias})}})
+    behind = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    cloud = Integration(biased, GEOMETRY, Integrator())
+    with pytest.raises(BadInputError, match="1 of 2 points are not in the image of the range camera"):
+        cloud.add_points(behind, np.eye(4), range_camera="tof")
+    assert cloud.diff() == {}
+    cloud.add_points(behind, np.eye(4))
 
 
 def test_nothing_that_came_back_is_nothing_and_what_are_no_points_is_refused() -> None:

@@ -17,8 +17,18 @@ from cairn_fusion.scan import Scan
 from cairn_fusion.transfer import Label
 from cairn_fusion.view.mjpeg import Latest, streaming
 from cairn_fusion.view.paint_kernels import HATCH_PERIOD, HATCH_WIDTH
-from cairn_fusion.view.painting import Emphasis, hottest, painted, painted_alone
-from cairn_fusion.view.telepresence import Mode, Telepresence, ViewOptions, fuse
+from cairn_fusion.view.painting import (
+    CROSS_PX,
+    Emphasis,
+    Hottest,
+    draw_legend_into,
+    enlarged,
+    hottest,
+    mark_hottest_into,
+    painted,
+    painted_alone,
+)
+from cairn_fusion.view.telepresence import Mode, Telepresence, ViewOptions, fuse, seen_in
 from cairn_fusion.view.temperature_scale import PALETTE, TemperatureScale, locked_scale
 from cairn_map.errors import BadInputError
 from cairn_sim.heads import RANGE_CAMERA, full_head, tof_head
@@ -97,7 +107,7 @@ def test_a_scale_is_locked_on_the_first_picture_and_a_given_one_stays(scan: Scan
     ("mode", "shape"),
     [
         (Mode.THERMAL_ON_COLOUR, (240, 320, 3)),
-        (Mode.COLOUR_ON_THERMAL, (128, 160, 3)),
+        (Mode.COLOUR_ON_THERMAL, (256, 320, 3)),
         (Mode.SIDE_BY_SIDE, (240, 640, 3)),
         (Mode.STEREO, (240, 640, 3)),
     ],
@@ -109,6 +119,45 @@ def test_every_mode_gives_its_picture(scan: Scan, mode: Mode, shape: tuple[int, 
         np.testing.assert_array_equal(picture[:, :320], scan.colour["colour_left"])
     if mode is Mode.STEREO:
         assert not np.array_equal(picture[:, :320], picture[:, 320:])
+
+
+def test_a_small_picture_is_shown_larger_so_that_there_is_room_for_words(scan: Scan) -> None:
+    rng = np.random.default_rng(0)
+    for height, times in ((30, 8), (64, 4), (120, 2), (239, 2), (240, 1), (960, 1)):
+        base = rng.integers(0, 256, (height, 10, 3)).astype(np.uint8)
+        larger = enlarged(base)
+        assert larger.shape == (times * height, times * 10, 3) and larger is not base
+        np.testing.assert_array_equal(larger[times // 2 :: times, times // 2 :: times], base)
+
+
+@pytest.mark.parametrize(("width", "height"), [(320, 240), (640, 480), (1280, 960)])
+def test_the_hottest_places_label_leaves_the_legend_readable(width: int, height: int) -> None:
+    """Wherever the place is; the cross itself may be on it."""
+    alone = np.full((height, width, 3), 200, np.uint8)
+    end = draw_legend_into(alone, SCALE)
+    assert (alone[: end[1], end[0] + 3 :] == 200).all()
+    for y in range(0, height, height // 24):
+        marked = alone.copy()
+        mark_hottest_into(marked, Hottest(0, y, 305.0), legend_end=end)
+        same = (marked == alone).all(axis=2)[: end[1], : end[0]]
+        same[max(y - CROSS_PX - 2, 0) : y + CROSS_PX + 3, : CROSS_PX + 3] = True
+        assert same.all() and not np.array_equal(marked, alone)
+
+
+def test_both_eyes_have_the_hottest_marked_at_the_same_place(scan: Scan) -> None:
+    left, right = (fuse(scan, HEAD, name) for name in ("colour_left", "colour_right"))
+    place = hottest(left.values[..., 0], left.labels)
+    assert place is not None
+    found = seen_in(place, left, right, HEAD)
+    assert found is not None and found.kelvin == place.kelvin
+    points = []
+    for name, each, at in (("colour_left", left, place), ("colour_right", right, found)):
+        point = HEAD[name].camera.rays()[at.y, at.x] * float(each.depth.shown_m[at.y, at.x])
+        points.append(HEAD[name].transform[:3, :3] @ point + HEAD[name].transform[:3, 3])
+    assert np.linalg.norm(points[0] - points[1]) < 0.03 * float(left.depth.shown_m[place.y, place.x])
+    hidden = replace(right, depth=replace(right.depth, shown_m=0.5 * right.depth.shown_m))
+    assert seen_in(place, left, hidden, HEAD) is None
+    assert seen_in(replace(place, x=319, y=239), left, right, HEAD) is None  # beyond its image
 
 
 def test_only_what_is_hot_is_painted_when_asked(scan: Scan) -> None:

@@ -190,7 +190,7 @@ def test_cells_are_read_only_where_a_ray_comes_to_them() -> None:
         def read(keys: list[CellKey], asked: list[CellKey] = asked) -> dict[CellKey, ReadCell]:
             asked += keys
             found = {key: whole.cell(key) for key in keys}
-            return {key: read_cell(cell, model) for key, cell in found.items() if cell is not None}
+            return {key: read_cell(cell, SMALL, model, Layer.DEPTH) for key, cell in found.items() if cell is not None}
 
         drawn = draw_as_needed(
             MapRenderer(),

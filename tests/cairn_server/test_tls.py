@@ -15,6 +15,7 @@ from tests.cairn_server.live import Process
 from cairn_client.api import MapApi
 from cairn_map.errors import UnreachableError
 from cairn_map.messages import CreateMap
+from cairn_server.health_probe import why_not
 
 pytestmark = pytest.mark.skipif(not shutil.which("openssl"), reason="the openssl command makes the certificate")
 
@@ -52,6 +53,10 @@ def test_a_client_that_knows_the_certificate_works_over_https(url: str, certific
     assert url.startswith("https://")
     with MapApi(url, ca_file=certificate / "cert.pem") as api:
         assert api.create_map("lab", CreateMap()).name == "lab"
+
+
+def test_the_health_probe_finds_it_alive(url: str) -> None:
+    assert why_not(int(url.rpartition(":")[2])) is None
 
 
 def test_the_environment_names_the_certificate_for_every_command(url: str, certificate: Path) -> None:

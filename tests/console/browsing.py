@@ -1,7 +1,7 @@
 """The console in a browser, and what its test door (`?test=1`) tells of it."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -13,12 +13,14 @@ from tests.console.conftest import ADMIN_TOKEN, CHROMIUM, FLAGS, Room
 
 DEADLINE_S = 60.0
 VIEW = {"width": 1280, "height": 720}
+TABLET = {"width": 1024, "height": 768}
+UPRIGHT = {"width": 768, "height": 1024}
 
 
 class Console:
     """One tab."""
 
-    def __init__(self, page: Page, room: Room) -> None:
+    def __init__(self, page: Page, room: Room | None) -> None:
         self.page = page
         page.set_default_timeout(1000 * DEADLINE_S)
         self.room = room
@@ -29,6 +31,7 @@ class Console:
         page.on("request", lambda request: self.requests.append(request.url))
 
     def open(self, look: str = "") -> None:
+        assert self.room is not None
         self.page.goto(f"{self.room.url}/?test=1{look}")
 
     def log_in(self, token: str = ADMIN_TOKEN) -> None:
@@ -54,6 +57,20 @@ class Console:
         self.until("c && c.cells.all.size > 0 && c.cells.waiting === 0 && !c.cells.needsPlan", "everything is drawn")
         frames = self.tell("(c.stage.draw(), c.stage.frames)")
         self.until(f"c.stage.frames > {frames}", "a frame follows")
+
+    def click_about(self, steps: Sequence[tuple[int, int]]) -> None:
+        """Click the map, so many pixels right of and below its middle."""
+        box = self.page.locator(".host canvas").bounding_box()
+        assert box is not None
+        for right, down in steps:
+            self.page.mouse.click(box["x"] + box["width"] / 2 + right, box["y"] + box["height"] / 2 + down)
+
+    def ask_middle(self) -> None:
+        """Ask what is in the middle of the picture, from above, where there is something."""
+        self.page.locator(".host canvas").focus()
+        self.page.keyboard.press("t")
+        self.settled()
+        self.page.keyboard.press("Enter")
 
     def picture(self) -> npt.NDArray[np.uint8]:
         """(H, W, 3) what the canvas shows."""

@@ -23,6 +23,8 @@ class Occupied:
     probability: Floats
     temperature_k: Floats
     """NaN: none."""
+    rgb: Floats
+    """(V, 3); NaN: none."""
 
 
 def occupied(room: Room) -> Occupied:
@@ -33,7 +35,7 @@ def occupied(room: Room) -> Occupied:
             cell = ",".join(map(str, entry["cell"]))
             with np.load(io.BytesIO(http.get(f"/maps/{MAP}/main/cells/{cell}.npz").content)) as arrays:
                 keep = arrays["probability"] > 0.5
-                names = ("numbers", "counts", "probability", "temperature_mean")
+                names = ("numbers", "counts", "probability", "temperature_mean", "colour_mean")
                 parts.append([arrays[name][keep] for name in names])
     return Occupied(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 

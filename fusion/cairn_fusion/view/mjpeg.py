@@ -29,7 +29,7 @@ TIMEOUT_S = 10.0
 JPEG_QUALITY = 85
 BOUNDARY = "cairn-picture"
 PAGE = b"""<!doctype html><html lang="en"><meta charset="utf-8"><title>cairn telepresence</title>
-<style>html,body{margin:0;height:100%;background:#18191c}img{width:100%;height:100%;object-fit:contain}</style>
+<style>html,body{margin:0;height:100%;background:#18191c}img{display:block;width:100%;height:100%;object-fit:contain}</style>
 <img src="/stream.mjpg" alt="live view of the robot"></html>
 """
 

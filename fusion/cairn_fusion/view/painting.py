@@ -26,6 +26,10 @@ BAR_SHARE = 0.4
 """Of the picture's height."""
 MARGIN_PX = 12
 CROSS_PX = 9
+LABEL_GAP_PX = 6
+"""Between the legend and the label of the hottest place."""
+READABLE_PX = 240
+"""Lower pictures are shown larger: legend and marker would cover half of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,14 +88,25 @@ def painted_alone(kelvin: Singles, labels: Labels, scale: TemperatureScale) -> R
     return painted(np.full((*kelvin.shape, 3), 40, np.uint8), kelvin, labels, scale, Emphasis(alpha=1.0))
 
 
+def enlarging(picture: Rgb) -> int:
+    """By which whole number a picture is shown larger, so that there is room for words on it."""
+    return -(-READABLE_PX // len(picture))
+
+
+def enlarged(picture: Rgb) -> Rgb:
+    """A copy of a picture, `enlarging` times as large, each pixel a square."""
+    times = enlarging(picture)
+    return picture.repeat(times, axis=0).repeat(times, axis=1)
+
+
 def hottest(kelvin: Singles, labels: Labels) -> Hottest | None:
     """The hottest square of 3 x 3 pixels, by its mean: one noisy pixel is none; None where no square is known."""
     x, y, kelvin_there = hottest_square(kelvin, labels)
     return Hottest(x, y, kelvin_there) if x >= 0 else None
 
 
-def mark_hottest_into(picture: Rgb, place: Hottest) -> None:
-    """Draw a cross at the hottest place, and its temperature beside it."""
+def mark_hottest_into(picture: Rgb, place: Hottest, *, legend_end: tuple[int, int] = (0, 0)) -> None:
+    """Draw a cross at the hottest place, and its temperature beside it, right of the legend that ends at x, y."""
     at, size = (place.x, place.y), _text_size(picture)
     for ink, width in ((SHADOW, 3), (TEXT, 1)):
         cv2.drawMarker(picture, at, ink, cv2.MARKER_CROSS, 2 * CROSS_PX, width)
@@ -100,11 +115,14 @@ def mark_hottest_into(picture: Rgb, place: Hottest) -> None:
     right, below = place.x + CROSS_PX + 2, place.y + CROSS_PX + height_px
     x = right if right + width_px < picture.shape[1] else place.x - CROSS_PX - width_px
     y = below if below < picture.shape[0] else place.y - CROSS_PX
-    write_into(picture, text, (max(x, 0), max(y, height_px)))
+    x, y = max(x, 0), max(y, height_px)
+    if y - height_px < legend_end[1] + LABEL_GAP_PX:
+        x = max(x, legend_end[0] + LABEL_GAP_PX)
+    write_into(picture, text, (x, y))
 
 
-def draw_legend_into(picture: Rgb, scale: TemperatureScale) -> None:
-    """Draw the palette's bar at the left edge, with its ends and how they came about."""
+def draw_legend_into(picture: Rgb, scale: TemperatureScale) -> tuple[int, int]:
+    """Draw the palette's bar at the left edge, with its ends and how they came about; x, y where it ends."""
     height, size = picture.shape[0], _text_size(picture)
     top, length = 2 * MARGIN_PX + round(36 * size), max(8, round(BAR_SHARE * height))
     bar = PALETTE[np.linspace(255, 0, length).astype(np.uint8)]
@@ -113,18 +131,21 @@ def draw_legend_into(picture: Rgb, scale: TemperatureScale) -> None:
     cv2.rectangle(picture, (MARGIN_PX, top), (MARGIN_PX + BAR_PX, bottom - 1), SHADOW, 1)
     celsius = [limit - ZERO_CELSIUS_K for limit in (scale.high_k, (scale.low_k + scale.high_k) / 2, scale.low_k)]
     step = round(8 * size)
-    for value, y in zip(celsius, (top + step, (top + bottom) // 2 + step // 2, bottom - 2), strict=True):
-        write_into(picture, f"{value:g}", (MARGIN_PX + BAR_PX + 6, y))
-    write_into(picture, f"deg C, {scale.note}", (MARGIN_PX, top - MARGIN_PX - step))
+    rows = (top + step, (top + bottom) // 2 + step // 2, bottom - 2)
+    ends = [
+        write_into(picture, f"{value:g}", (MARGIN_PX + BAR_PX + 6, y)) for value, y in zip(celsius, rows, strict=True)
+    ]
+    return max(*ends, write_into(picture, f"deg C, {scale.note}", (MARGIN_PX, top - MARGIN_PX - step))), bottom
 
 
-def write_into(picture: Rgb, text: str, at: tuple[int, int]) -> None:
-    """Write light text on a darkened ground, readable on anything."""
+def write_into(picture: Rgb, text: str, at: tuple[int, int]) -> int:
+    """Write light text on a darkened ground, readable on anything; x where it ends."""
     size, (x, y) = _text_size(picture), at
     (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
     ground = picture[max(y - height - 2, 0) : y + below, max(x - 2, 0) : x + width + 2]
     ground >>= 1
     cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, TEXT, 1, cv2.LINE_AA)
+    return int(x + width)
 
 
 def _text_size(picture: Rgb) -> float:

@@ -8,16 +8,18 @@ side-by-side         colour, and beside it the temperatures of the same pixels
 stereo               thermal-on-colour for both eyes, from the left and the right colour camera
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
 
+from cairn_calib.poses import inverse, transform_points
 from cairn_calib.rig import Rig, Spectrum
 from cairn_fusion.across import Across, across
-from cairn_fusion.eye_depth import EyeDepth, eye_depth
+from cairn_fusion.beyond_labels import beyond_pixels
+from cairn_fusion.eye_depth import EyeDepth, Origin, eye_depth
 from cairn_fusion.scan import Scan, check_scan
 from cairn_fusion.surface import Drawn, drawn_surface, surface_of
 from cairn_fusion.transfer import Label
@@ -25,6 +27,8 @@ from cairn_fusion.view.painting import (
     Emphasis,
     Hottest,
     draw_legend_into,
+    enlarged,
+    enlarging,
     hottest,
     mark_hottest_into,
     painted,
@@ -33,9 +37,14 @@ from cairn_fusion.view.painting import (
 )
 from cairn_fusion.view.temperature_scale import TemperatureScale, locked_scale
 from cairn_map.errors import BadInputError
+from cairn_map.map_render import MapRenderer
+from cairn_map.map_snapshot import MapSnapshot
 
 Rgb = npt.NDArray[np.uint8]
 Image = npt.NDArray[np.generic]
+
+SAME_SHARE = 0.05
+"""Of a range: what differs by less is one place."""
 
 
 class Mode(StrEnum):
@@ -63,9 +72,14 @@ class ViewOptions:
 class Telepresence:
     """Pictures of one rig; the temperature scale is kept from one to the next."""
 
-    def __init__(self, rig: Rig, options: ViewOptions) -> None:
-        """Raises: BadInputError: the rig lacks a camera that the mode needs."""
-        self._rig, self._options, self._scale = rig, options, options.scale
+    def __init__(self, rig: Rig, options: ViewOptions, snapshot: MapSnapshot | None = None) -> None:
+        """With a map, what that says is in a mirror is not painted.
+
+        Raises:
+            BadInputError: the rig lacks a camera that the mode needs.
+        """
+        self._rig, self._options, self._scale, self._snapshot = rig, options, options.scale, snapshot
+        self._renderer = MapRenderer()
         self._eyes = _eyes(rig, options)
 
     @property
@@ -74,29 +88,35 @@ class Telepresence:
         return self._scale
 
     def view(self, scan: Scan) -> Rgb:
-        """(H, W, 3) sRGB: the picture of a scan; two side by side are twice as wide.
+        """(H, W, 3) sRGB: the picture of a scan; two side by side are twice as wide, and one lower than 240 pixels is a
+        whole number of times as large as the camera's.
 
         Raises:
             BadInputError: an image does not fit its camera, or that of the camera to look through is missing.
         """
-        fused = [fuse(scan, self._rig, camera) for camera in self._eyes]
+        beyond = None
+        if self._snapshot is not None:
+            beyond = beyond_pixels(scan, self._rig, self._snapshot, renderer=self._renderer)
+        fused = [fuse(scan, self._rig, camera, beyond) for camera in self._eyes]
         if self._options.mode is Mode.COLOUR_ON_THERMAL:
             return self._colour_on_thermal(scan, fused[0])
-        pictures = []
-        for each in fused:
+        pictures, places = [], self._hottest(fused)
+        for each, place in zip(fused, places, strict=True):
             base, kelvin = scan.colour[each.camera], each.values[..., 0]
             scale = self._locked(np.where(each.ok, kelvin, np.float32(np.nan))[::4, ::4])
             if self._options.mode is Mode.SIDE_BY_SIDE:
-                pictures += [
-                    base,
-                    self._finished(painted_alone(kelvin, each.labels, scale), hottest(kelvin, each.labels)),
-                ]
+                pictures += [enlarged(base), self._finished(painted_alone(kelvin, each.labels, scale), place)]
             else:
                 picture = painted(base, kelvin, each.labels, scale, self._options.emphasis)
-                pictures.append(self._finished(picture, hottest(kelvin, each.labels)))
+                pictures.append(self._finished(picture, place))
             if not each.sources:
-                write_into(pictures[-1], "no thermal image", (12, base.shape[0] - 12))
+                write_into(pictures[-1], "no thermal image", (12, len(pictures[-1]) - 12))
         return pictures[0] if len(pictures) == 1 else np.hstack(pictures)
+
+    def _hottest(self, fused: Sequence[Across]) -> list[Hottest | None]:
+        """What is marked for each eye: the same place for both, or they could not be seen as one."""
+        first = hottest(fused[0].values[..., 0], fused[0].labels)
+        return [first, *(first and seen_in(first, fused[0], each, self._rig) for each in fused[1:])]
 
     def _colour_on_thermal(self, scan: Scan, fused: Across) -> Rgb:
         kelvin = scan.thermal[fused.camera]
@@ -114,14 +134,17 @@ class Telepresence:
         return self._scale or TemperatureScale(273.15, 323.15, "no temperature yet")
 
     def _finished(self, picture: Rgb, place: Hottest | None) -> Rgb:
-        """With legend and marker."""
-        draw_legend_into(picture, self._scale or self._locked(np.empty(0, np.float32)))
+        """With legend and marker; a small one enlarged."""
+        times, larger = enlarging(picture), enlarged(picture)
+        end = draw_legend_into(larger, self._scale or self._locked(np.empty(0, np.float32)))
         if place is not None and self._options.marks_hottest:
-            mark_hottest_into(picture, place)
-        return picture
+            middle = (times - 1) // 2
+            there = replace(place, x=place.x * times + middle, y=place.y * times + middle)
+            mark_hottest_into(larger, there, legend_end=end)
+        return larger
 
 
-def fuse(scan: Scan, rig: Rig, camera: str) -> Across:
+def fuse(scan: Scan, rig: Rig, camera: str, beyond: npt.NDArray[np.bool_] | None = None) -> Across:
     """What the cameras of the other spectrum see at each pixel of a colour or thermal camera, with its depth.
 
     Several cameras of that spectrum are asked, the nearest first.
@@ -130,16 +153,27 @@ def fuse(scan: Scan, rig: Rig, camera: str) -> Across:
         scan: with the camera's image; of images of the other spectrum what there is.
         rig: of the scan.
         camera: whose pixels.
+        beyond: (H, W) range pixels that show what is in a mirror, `beyond_pixels`: nothing is painted there.
 
     Raises:
         BadInputError: an image does not fit its camera, the camera's own is missing, or it has none.
     """
     check_scan(scan, rig)
     images = source_order(scan, rig, camera)
-    surface = surface_of(scan, rig)
+    surface = surface_of(scan, rig, beyond)
     drawn = {name: drawn_surface(surface, rig, name) for name in (camera, *images)}
     depth = view_depth(scan, rig, camera, drawn[camera])
-    return across(depth, rig, images, drawn=drawn, range_camera=scan.range_camera)
+    fused = across(depth, rig, images, drawn=drawn, range_camera=scan.range_camera)
+    return fused if beyond is None else without_beyond(fused)
+
+
+def without_beyond(fused: Across) -> Across:
+    """The same, with nothing where a depth was filled in over what a mirror shows."""
+    step, (height, width) = fused.depth.drawn.step_px, fused.labels.shape
+    marked = (fused.depth.drawn.marks == Label.BEYOND).repeat(step, axis=0).repeat(step, axis=1)[:height, :width]
+    marked &= fused.depth.origins != Origin.MEASURED
+    labels = np.where(marked, np.uint8(Label.BEYOND), fused.labels)
+    return replace(fused, labels=labels, values=np.where(marked[..., None], np.float32(np.nan), fused.values))
 
 
 def source_order(scan: Scan, rig: Rig, camera: str) -> dict[str, Image]:
@@ -148,6 +182,20 @@ def source_order(scan: Scan, rig: Rig, camera: str) -> dict[str, Image]:
     place_m = rig[camera].transform[:3, 3]
     order = sorted(images, key=lambda name: float(np.linalg.norm(rig[name].transform[:3, 3] - place_m)))
     return {name: images[name] for name in order}
+
+
+def seen_in(place: Hottest, one: Across, other: Across, rig: Rig) -> Hottest | None:
+    """A place of one camera's picture in another's, at the same temperature; None where that does not see it."""
+    src, dst, range_m = rig[one.camera], rig[other.camera], one.depth.shown_m[place.y, place.x]
+    point = src.camera.rays()[place.y, place.x] * float(range_m)
+    there = transform_points(inverse(dst.transform) @ src.transform, point[None])
+    pixel = dst.camera.project(there)
+    if not dst.camera.contains(pixel)[0]:
+        return None
+    x, y = np.rint(pixel[0]).astype(int).tolist()
+    away_m = float(np.linalg.norm(there))
+    is_seen = abs(float(other.depth.shown_m[y, x]) - away_m) < SAME_SHARE * away_m
+    return replace(place, x=x, y=y) if is_seen else None
 
 
 def view_depth(scan: Scan, rig: Rig, camera: str, drawn: Drawn) -> EyeDepth:

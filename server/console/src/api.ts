@@ -1,6 +1,7 @@
 /** Requests to the one server that this page came from, with the token that the operator gave. */
 
 import type { CellEntry, CellIndex } from "./messages.ts";
+import { noteServerDate } from "./server_time.ts";
 
 const TOKEN_KEY = "cairn.token";
 const INDEX_PAGE = 10_000;
@@ -84,6 +85,7 @@ export class Api {
     } catch {
       throw new ApiError(0, "unreachable", "The server does not answer. The page goes on by itself when it does.");
     }
+    noteServerDate(answer.headers.get("Date"));
     if (answer.ok || answer.status === 304) return answer;
     const problem = (await answer.json().catch(() => ({}))) as { kind?: string; detail?: string };
     throw new ApiError(answer.status, problem.kind ?? "unknown", problem.detail ?? answer.statusText);

@@ -10,7 +10,7 @@ export const FIELDS: { field: Field; label: string; palette: Palette | null; uni
   { field: "temperature", label: "Temperature", palette: "inferno", unit: "°C" },
   { field: "probability", label: "Probability", palette: "cividis", unit: "" },
   { field: "height", label: "Height", palette: "viridis", unit: "m" },
-  { field: "age", label: "Age", palette: "cividis", unit: "entries" },
+  { field: "age", label: "Age", palette: "cividis", unit: "s" },
   { field: "robot", label: "Robot", palette: null, unit: "" },
 ];
 

@@ -74,10 +74,10 @@ function share(): void {
 
 const keys: Key[] = [
   ...FIELDS.map(({ field, label }, n) => ({ keys: [String(n + 1)], what: `Colour by ${label.toLowerCase()}`, run: () => open?.setField(field) })),
-  { keys: ["h", "f"], what: "All of the map", run: () => open?.home() },
-  { keys: ["t"], what: "From above", run: () => open?.top() },
-  { keys: ["w"], what: "Inside, at a person's height", run: () => open?.walk() },
-  { keys: ["x"], what: "The hottest place shown", run: () => open?.jumpToHottest() },
+  { keys: ["h", "f"], what: "All of the map", run: () => open?.camera.home() },
+  { keys: ["t"], what: "From above", run: () => open?.camera.top() },
+  { keys: ["w"], what: "Inside, at a person's height", run: () => open?.camera.walk() },
+  { keys: ["x"], what: "The hottest place shown", run: () => open?.camera.hottest() },
   { keys: ["["], what: "Ceiling down 10 cm", run: () => open?.step(false) },
   { keys: ["]"], what: "Ceiling up 10 cm", run: () => open?.step(true) },
   { keys: ["m"], what: "Measure: clicks set points", run: () => open?.measure.switch() },
@@ -101,4 +101,6 @@ function askMiddle(): void {
 
 applyTheme();
 listen(keys);
+// A shared link that is opened where the page already is.
+window.addEventListener("hashchange", () => void start());
 void start();

@@ -44,8 +44,12 @@ export function stopsOf(palette: Palette): string[] {
 /** Colours of robots: Okabe and Ito's, which everybody can tell apart, less black. */
 const ROBOTS = ["#56b4e9", "#e69f00", "#009e73", "#cc79a7", "#f0e442", "#d55e00", "#0072b2"];
 
+/** Of operators, and of robots that left. */
+const NOBODY = "#8b949e";
+
 export function robotColour(name: string, names: readonly string[]): string {
-  return ROBOTS[Math.max(names.indexOf(name), 0) % ROBOTS.length];
+  const at = names.indexOf(name);
+  return at < 0 ? NOBODY : ROBOTS[at % ROBOTS.length];
 }
 
 /** #rrggbb as parts of 1. */

@@ -37,3 +37,7 @@ export function clock(timeS: number): string {
 export function thousands(count: number): string {
   return Math.round(count).toLocaleString("en-GB").replaceAll(",", "\u202f");
 }
+
+export function counted(count: number, one: string, many: string): string {
+  return `${count} ${count === 1 ? one : many}`;
+}

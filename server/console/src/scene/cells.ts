@@ -1,58 +1,17 @@
 /** The map's cells as they are shown: what the server has, what lies on the graphics card, what is still to be fetched. */
 
-import {
-  Box3, BufferGeometry, Group, InterleavedBuffer, InterleavedBufferAttribute, Points, Sphere, Vector3,
-  type Camera, type PerspectiveCamera, type ShaderMaterial,
-} from "three";
+import { Box3, Group, type Camera, type PerspectiveCamera, type Points, type ShaderMaterial } from "three";
 import { ApiError, type Api } from "../api.ts";
-import { STRIDE } from "../decode/pack.ts";
 import type { CellEntry, MapInfo, Triple } from "../messages.ts";
 import { Decoders } from "./decoders.ts";
-import { plan } from "./detail.ts";
+import { COARSE, plan } from "./detail.ts";
 import { squares, uniforms } from "./materials.ts";
+import { NEVER_MS, samplePoints, ShownCell } from "./shown_cell.ts";
 
-const FETCHES = 4;
+/** Browsers open six connections to a server over plain http; one stays for what is clicked. */
+const FETCHES = 5;
 const RETRY_MS = 3000;
-/** failedMs of a cell that never failed. */
-const NEVER_MS = -1e9;
 const FRESH_MS = 1500;
-
-export class ShownCell {
-  readonly key: string;
-  readonly cell: Triple;
-  readonly box: Box3;
-  digest = "";
-  /** Log entry that last changed it. */
-  lm = 0;
-  counts: (number | undefined)[] = [];
-  points: Points | null = null;
-  bytes: Uint8Array = new Uint8Array(0);
-  depth = 0;
-  wanted = 0;
-  etag: string | null = null;
-  dirty = true;
-  busy = false;
-  failedMs = NEVER_MS;
-  freshMs = 0;
-  readonly number: number;
-
-  constructor(cell: Triple, edgeM: number, number: number) {
-    this.cell = cell;
-    this.key = cell.join(",");
-    this.number = number;
-    const low = new Vector3(...cell).multiplyScalar(edgeM);
-    this.box = new Box3(low, low.clone().addScalar(edgeM));
-  }
-
-  get count(): number {
-    return this.bytes.length / STRIDE;
-  }
-
-  /** Nothing in it is occupied, at whatever depth. */
-  get isEmpty(): boolean {
-    return this.etag !== null && this.count === 0 && this.counts.includes(0);
-  }
-}
 
 export class Cells {
   readonly group = new Group();
@@ -62,6 +21,8 @@ export class Cells {
   readonly depthMax: number;
   /** Colour of the robot behind a log entry, 0 to 1; null: not known. */
   colourOf: (lm: number) => Triple | null = () => null;
+  /** Age of what a log entry changed, and its unit: s, or log entries where no commit states a time. */
+  ageOf: (lm: number) => number = (lm) => this.head - lm;
   /** Largest `lm` heard of: how far the map is. */
   head = 0;
   budget = 2_000_000;
@@ -71,6 +32,8 @@ export class Cells {
   error: string | null = null;
   onChange: () => void = () => {};
   onRefused: () => void = () => {};
+  /** Numbers of cells that are gone. */
+  private readonly free: number[] = [];
   private running = 0;
   private readonly decoders = new Decoders();
   private readonly api: Api;
@@ -124,7 +87,7 @@ export class Cells {
   /** Cells of which what is shown is not what is wanted. */
   get waiting(): number {
     let sum = 0;
-    for (const shown of this.all.values()) if (shown.dirty || (shown.depth !== shown.wanted && !shown.isEmpty)) sum++;
+    for (const shown of this.all.values()) if (shown.dirty || shown.isOff) sum++;
     return sum;
   }
 
@@ -134,11 +97,14 @@ export class Cells {
     return box;
   }
 
-  /** The box of what is drawn, node by node: closer than that of the cells. */
+  /** Boxes of what is drawn of each cell, node by node: closer than those of the cells. */
+  get tightBoxes(): Box3[] {
+    const boxes = [...this.all.values()].flatMap(({ points }) => (points ? [points.userData.box as Box3] : []));
+    return boxes.length ? boxes : [this.bounds];
+  }
+
   get tightBounds(): Box3 {
-    const box = new Box3();
-    for (const { points } of this.all.values()) if (points) box.union(points.userData.box as Box3);
-    return box.isEmpty() ? this.bounds : box;
+    return this.tightBoxes.reduce((all, box) => all.union(box), new Box3());
   }
 
   /** Choose depths for where the eye is, and fetch what is missing. */
@@ -153,7 +119,7 @@ export class Cells {
     const depths = plan(candidates, this.budget);
     cells.forEach((cell, n) => {
       cell.wanted = depths[n];
-      if (cell.wanted === 0 && cell.points) this.drop(cell);
+      if (cell.wanted === 0 && cell.points) cell.drop();
     });
     const largest = cells.map((_, n) => n).sort((a, b) => candidates[b].sizePx - candidates[a].sizePx);
     this.queue = largest.map((n) => cells[n]);
@@ -172,11 +138,10 @@ export class Cells {
   private fetchMore(): void {
     const nowMs = performance.now();
     const may = this.queue.filter((cell) => !cell.busy && cell.wanted > 0 && nowMs - cell.failedMs >= RETRY_MS);
-    const coarse = (cell: ShownCell) => cell.depth !== cell.wanted && !cell.isEmpty;
     for (const cell of [
       ...may.filter(({ etag }) => etag === null),
       ...may.filter(({ etag, dirty }) => etag !== null && dirty),
-      ...may.filter((cell) => cell.etag !== null && !cell.dirty && coarse(cell)),
+      ...may.filter((cell) => cell.etag !== null && !cell.dirty && cell.isOff),
     ]) {
       if (this.running >= FETCHES) return;
       void this.fetch(cell);
@@ -188,7 +153,7 @@ export class Cells {
     cell.busy = true;
     cell.dirty = false;
     // The first picture is coarse, whatever will be wanted.
-    const depth = cell.etag === null ? Math.min(cell.wanted, Math.max(this.depthMax - 3, 1)) : cell.wanted;
+    const depth = cell.etag === null ? Math.min(cell.wanted, Math.max(this.depthMax - COARSE, 1)) : cell.wanted;
     try {
       const changes = depth === cell.depth;
       const { data, etag } = await this.api.view(this.map, cell.key, depth, changes ? cell.etag : null);
@@ -226,40 +191,22 @@ export class Cells {
     else this.error = `cell ${cell.key}: ${error instanceof Error ? error.message : String(error)}`;
   }
 
-  /** One voxel, hidden by a probability of 0: what the graphics card is made ready with. */
+  /** One voxel that nobody sees: what the graphics card is made ready with. */
   sample(): Points {
-    const points = new Points(geometryOf(new Uint8Array(STRIDE)), this.material);
-    points.frustumCulled = false;
-    points.scale.setScalar(0);
-    return points;
+    return samplePoints(this.material);
   }
 
   private show(cell: ShownCell, bytes: Uint8Array, depth: number): void {
-    this.drop(cell);
-    cell.bytes = bytes;
-    cell.depth = depth;
-    if (!bytes.length) return;
-    cell.points = this.pointsOf(cell, geometryOf(bytes), depth);
-    this.group.add(cell.points);
-  }
-
-  private pointsOf(cell: ShownCell, geometry: BufferGeometry, depth: number): Points {
-    const side = 2 ** depth;
-    geometry.boundingSphere = new Sphere(new Vector3(side / 2, side / 2, side / 2), side);
-    const points = new Points(geometry, this.material);
-    points.position.copy(cell.box.min);
-    points.scale.setScalar(this.edgeM / side);
-    points.userData.box = nodesBox(cell.bytes, points);
-    points.matrixAutoUpdate = false;
-    points.updateMatrix();
+    const points = cell.take(bytes, depth, this.material);
+    if (!points) return;
     points.onBeforeRender = (_renderer, _scene, _camera: Camera, _geometry, material) => {
-      uniforms.uAge.value = this.head - cell.lm;
+      uniforms.uAge.value = this.ageOf(cell.lm);
       uniforms.uRobot.value.set(...(this.colourOf(cell.lm) ?? ([-1, -1, -1] as Triple)));
       uniforms.uObject.value = cell.number;
       uniforms.uFresh.value = Math.max(0, (cell.freshMs - performance.now()) / FRESH_MS) * 0.55;
       (material as ShaderMaterial).uniformsNeedUpdate = true;
     };
-    return points;
+    this.group.add(points);
   }
 
   /** Whether something is still pulsing because it changed. */
@@ -276,54 +223,22 @@ export class Cells {
 
   dispose(): void {
     for (const shown of [...this.all.values()]) this.remove(shown);
+    this.decoders.close();
   }
 
   private at(cell: Triple): ShownCell {
     const key = cell.join(",");
     let shown = this.all.get(key);
     if (!shown) {
-      shown = new ShownCell(cell, this.edgeM, this.byNumber.length);
-      this.byNumber.push(shown);
+      shown = new ShownCell(cell, this.edgeM, this.free.pop() ?? this.byNumber.length);
+      this.byNumber[shown.number] = shown;
       this.all.set(key, shown);
     }
     return shown;
   }
 
-  private drop(cell: ShownCell): void {
-    if (cell.points) {
-      this.group.remove(cell.points);
-      cell.points.geometry.dispose();
-    }
-    cell.points = null;
-    cell.bytes = new Uint8Array(0);
-    cell.depth = 0;
-  }
-
   private remove(cell: ShownCell): void {
-    this.drop(cell);
-    this.all.delete(cell.key);
+    cell.drop();
+    if (this.all.delete(cell.key)) this.free.push(cell.number);
   }
-}
-
-function geometryOf(bytes: Uint8Array): BufferGeometry {
-  const geometry = new BufferGeometry();
-  const as8 = new InterleavedBuffer(bytes, STRIDE);
-  geometry.setAttribute("place", new InterleavedBufferAttribute(as8, 4, 0));
-  geometry.setAttribute("colour", new InterleavedBufferAttribute(as8, 4, 4, true));
-  geometry.setAttribute("heat", new InterleavedBufferAttribute(as8, 4, 8));
-  geometry.setDrawRange(0, bytes.length / STRIDE);
-  return geometry;
-}
-
-function nodesBox(bytes: Uint8Array, points: Points): Box3 {
-  const low = new Vector3(255, 255, 255);
-  const high = new Vector3(0, 0, 0);
-  for (let at = 0; at < bytes.length; at += STRIDE) {
-    for (let axis = 0; axis < 3; axis++) {
-      const place = bytes[at + axis];
-      if (place < low.getComponent(axis)) low.setComponent(axis, place);
-      if (place >= high.getComponent(axis)) high.setComponent(axis, place + 1);
-    }
-  }
-  return new Box3(low.multiply(points.scale).add(points.position), high.multiply(points.scale).add(points.position));
 }

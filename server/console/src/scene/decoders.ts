@@ -25,6 +25,10 @@ export class Decoders {
     });
   }
 
+  close(): void {
+    for (const worker of this.workers) worker.terminate();
+  }
+
   private done({ id, bytes, error }: Decoded): void {
     const asked = this.waiting.get(id);
     this.waiting.delete(id);

@@ -89,7 +89,8 @@ export class RobotMark {
 
   update(sign: RobotSign, colour: string): void {
     const pose = sign.status?.pose;
-    this.group.visible = pose !== null && pose !== undefined && !sign.gone;
+    // Who tells no pose any more stays where it was last.
+    this.group.visible = (pose != null || this.places.length > 0) && !sign.gone;
     for (const line of [this.body, this.trail]) (line.material as LineBasicMaterial).color.set(colour);
     if (!pose) return;
     const place = new Vector3(...(pose.t_map_rig as Triple));

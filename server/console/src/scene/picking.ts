@@ -1,12 +1,13 @@
 /** Which voxel lies under a pixel: the picture is drawn once more, one pixel of it, with numbers instead of colours. */
 
 import {
-  NearestFilter, RGBAIntegerFormat, Scene, UnsignedIntType, Vector3, WebGLRenderTarget, type Object3D,
+  Box3, NearestFilter, RGBAIntegerFormat, Scene, UnsignedIntType, Vector3, WebGLRenderTarget, type Object3D,
 } from "three";
 import { COLOURED, HEAT_STEP_K, HEAT_ZERO_K, STRIDE, WARM } from "../decode/pack.ts";
 import type { Triple } from "../messages.ts";
-import type { Cells, ShownCell } from "./cells.ts";
+import type { Cells } from "./cells.ts";
 import { numbers, uniforms } from "./materials.ts";
+import type { ShownCell } from "./shown_cell.ts";
 import type { Stage } from "./stage.ts";
 
 export interface Picked {
@@ -62,6 +63,21 @@ export class Picker {
     if (!read[3] || !read[0]) return null;
     const depthM = new Float32Array(read.buffer)[2];
     return this.named(this.cells.byNumber[read[0] - 1], read[1], x, y, depthM);
+  }
+
+  /** A box around what lies in the middle of the picture, 40 % of its sides, by 25 rays; null: nothing does. */
+  boxInView(): Box3 | null {
+    const { clientWidth, clientHeight } = this.stage.canvas;
+    const box = new Box3();
+    for (let n = 0; n < 25; n++) {
+      const picked = this.at(clientWidth * (0.3 + 0.1 * (n % 5)), clientHeight * (0.3 + 0.1 * Math.floor(n / 5)));
+      if (picked) box.expandByPoint(picked.point);
+    }
+    return box.isEmpty() ? null : box.expandByScalar(0.2);
+  }
+
+  dispose(): void {
+    this.target.dispose();
   }
 
   private named(cell: ShownCell, row: number, x: number, y: number, depthM: number): Picked | null {

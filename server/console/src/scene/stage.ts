@@ -7,7 +7,11 @@ import type { Triple } from "../messages.ts";
 import { uniforms } from "./materials.ts";
 
 const FLIGHT_MS = 450;
+/** Of a drawing without a graphics card, whose frame takes some 50 ms. */
+const SOON_MS = 120;
 const STEP_RAD = Math.PI / 30;
+/** Of the picture, by what is looked at. */
+const FILLED = 0.92;
 
 export class Stage {
   readonly renderer: WebGLRenderer;
@@ -20,7 +24,9 @@ export class Stage {
   onFrame: () => boolean = () => false;
   onMove: () => void = () => {};
   frames = 0;
+  private readonly resizes: ResizeObserver;
   private asked = false;
+  private later = 0;
   private ready = false;
   private flight: { from: CameraView; to: CameraView; startMs: number } | null = null;
 
@@ -50,7 +56,8 @@ export class Stage {
       this.draw();
     });
     this.controls.addEventListener("start", () => (this.flight = null));
-    new ResizeObserver(() => this.resize(host)).observe(host);
+    this.resizes = new ResizeObserver(() => this.resize(host));
+    this.resizes.observe(host);
     this.resize(host);
   }
 
@@ -76,6 +83,16 @@ export class Stage {
     if (this.asked || !this.ready) return;
     this.asked = true;
     requestAnimationFrame(() => this.frame());
+  }
+
+  /** Ask for a frame soon: cells that come one by one are drawn some at a time, where frames are slow. */
+  drawSoon(): void {
+    if (!this.isSoftware) return this.draw();
+    if (this.later) return;
+    this.later = window.setTimeout(() => {
+      this.later = 0;
+      this.draw();
+    }, SOON_MS);
   }
 
   get heightPx(): number {
@@ -108,14 +125,33 @@ export class Stage {
     this.draw();
   }
 
-  /** Look at a box from a side: `direction` from the box to the eye. */
-  lookAt(box: Box3, direction: Vector3): CameraView {
-    const centre = box.getCenter(new Vector3());
-    const size = box.getSize(new Vector3());
-    const radius = Math.max(size.length() / 2, 0.5);
-    const half = Math.min(this.camera.fov / 2, (this.camera.fov / 2) * this.camera.aspect) * (Math.PI / 180);
-    const eye = centre.clone().addScaledVector(direction.clone().normalize(), (radius / Math.sin(half)) * 0.82);
-    return { eye: eye.toArray() as Triple, target: centre.toArray() as Triple };
+  /** Look at boxes from a side, as near as all their corners are seen: `direction` from them to the eye. */
+  lookAt(boxes: readonly Box3[], direction: Vector3): CameraView {
+    const back = direction.clone().normalize();
+    const right = new Vector3().crossVectors(this.camera.up, back).normalize();
+    const up = new Vector3().crossVectors(back, right);
+    const corners = boxes.flatMap(({ min, max }) =>
+      Array.from({ length: 8 }, (_, n) => new Vector3(n & 1 ? max.x : min.x, n & 2 ? max.y : min.y, n & 4 ? max.z : min.z)),
+    );
+    const centre = new Box3().setFromPoints(corners).getCenter(new Vector3());
+    const tallness = Math.tan((this.camera.fov * Math.PI) / 360) * FILLED;
+    let distance = 1;
+    // What is nearer looms larger: a few steps bring the middle of the picture to the middle of what is seen.
+    for (let step = 0; step < 4; step++) {
+      const places = corners.map((corner) => corner.clone().sub(centre));
+      const across = places.map((place) => place.dot(right));
+      const above = places.map((place) => place.dot(up));
+      const nearness = places.map((place) => place.dot(back));
+      distance = places.reduce(
+        (far, _, n) => Math.max(far, Math.max(Math.abs(across[n]) / this.camera.aspect, Math.abs(above[n])) / tallness + nearness[n]), 1,
+      );
+      const middle = (values: number[]) => {
+        const seen = values.map((value, n) => value / Math.max(distance - nearness[n], 0.1));
+        return ((Math.min(...seen) + Math.max(...seen)) / 2) * distance;
+      };
+      if (step < 3) centre.addScaledVector(right, middle(across)).addScaledVector(up, middle(above));
+    }
+    return { eye: centre.clone().addScaledVector(back, distance).toArray() as Triple, target: centre.toArray() as Triple };
   }
 
   /** Go round what is looked at, in steps of 6 degrees. */
@@ -139,8 +175,19 @@ export class Stage {
     this.draw();
   }
 
+  /** Let go of the graphics card: browsers keep few pictures of this kind. */
+  dispose(): void {
+    window.clearTimeout(this.later);
+    this.ready = false;
+    this.resizes.disconnect();
+    this.controls.dispose();
+    this.renderer.dispose();
+    this.renderer.forceContextLoss();
+  }
+
   private frame(): void {
     this.asked = false;
+    if (!this.ready) return;
     this.stepFlight();
     const again = this.onFrame();
     const { width, height } = this.canvas;

@@ -3,14 +3,19 @@
 import { Vector3 } from "three";
 import { HEAT_STEP_K, HEAT_ZERO_K, STRIDE, WARM } from "../decode/pack.ts";
 import type { Field } from "../look.ts";
-import type { Cells, ShownCell } from "./cells.ts";
+import type { Cells } from "./cells.ts";
+import type { ShownCell } from "./shown_cell.ts";
 
 const SAMPLES = 40_000;
 
 /** 2nd percentile and 99th of what is drawn, in the shader's units; null: nothing has this field. */
 export function rangeOf(cells: Cells, field: Field, lowZ: number, highZ: number): [number, number] | null {
   if (field === "probability") return [0.5, 1];
-  if (field === "age") return [0, Math.max(cells.head - Math.min(...[...cells.all.values()].map(({ lm }) => lm)), 1)];
+  if (field === "age") {
+    let oldest = 1;
+    for (const { points, lm } of cells.all.values()) if (points) oldest = Math.max(oldest, cells.ageOf(lm));
+    return [0, oldest];
+  }
   const found: number[] = [];
   const stride = Math.max(1, Math.floor(cells.drawn / SAMPLES));
   for (const cell of cells.all.values()) {

@@ -2,6 +2,7 @@
 
 import type { Api } from "../api.ts";
 import { fill, h, svg } from "../dom.ts";
+import { LogTimes } from "../log_times.ts";
 import type { LogEntry } from "../messages.ts";
 import { robotColour } from "../palettes.ts";
 import { bytes, clock } from "../units.ts";
@@ -15,7 +16,9 @@ export const robotOf = (id: string): string => id.split(".")[0];
 
 export class CommitStrip {
   readonly element = h("section", { class: "strip", "aria-label": "Commits" });
+  readonly times = new LogTimes();
   onChoose: (entry: LogEntry) => void = () => {};
+  private names: readonly string[] = [];
   private readonly entries = new Map<number, LogEntry>();
   private readonly api: Api;
   private readonly map: string;
@@ -32,9 +35,17 @@ export class CommitStrip {
     this.add(await this.api.json<LogEntry[]>(`maps/${this.map}/log?after=${after}&limit=1000`));
   }
 
+  /** Robots of the team, whose colours are the same everywhere on the page. */
+  show(names: readonly string[]): void {
+    if (names.join() === this.names.join()) return;
+    this.names = names;
+    this.add([]);
+  }
+
   add(entries: readonly LogEntry[]): void {
     for (const entry of entries) this.entries.set(entry.seq, entry);
     for (const seq of [...this.entries.keys()].sort((a, b) => a - b).slice(0, -KEPT)) this.entries.delete(seq);
+    this.times.take(this.entries.values());
     if (!this.waiting) requestAnimationFrame(() => this.draw());
     this.waiting = true;
   }
@@ -58,7 +69,7 @@ export class CommitStrip {
     const lane = (id: string) => names.indexOf(robotOf(id)) * LANE_PX + LANE_PX / 2 + 3;
     const labels = names.map((name) => svg("text", { x: 4, y: lane(name) + 4, class: "lane" }, name));
     const lines = names.map((name) => svg("line", { x1: NAME_PX, x2: width, y1: lane(name), y2: lane(name), class: "rail" }));
-    const dots = entries.map((entry, n) => this.dot(entry, NAME_PX + 8 + n * STEP_PX, lane(entry.id), names, out.has(entry.id)));
+    const dots = entries.map((entry, n) => this.dot(entry, NAME_PX + 8 + n * STEP_PX, lane(entry.id), out.has(entry.id)));
     const picture = svg(
       "svg", { width, height: Math.max(names.length, 1) * LANE_PX + 6, role: "group", "aria-label": "Log of the map" },
       ...lines, ...labels, ...dots,
@@ -68,11 +79,11 @@ export class CommitStrip {
     if (atEnd) this.element.scrollLeft = this.element.scrollWidth;
   }
 
-  private dot(entry: LogEntry, x: number, y: number, names: string[], isOut: boolean): SVGElement {
+  private dot(entry: LogEntry, x: number, y: number, isOut: boolean): SVGElement {
     const taken = entry.kind === "-";
     const said = `${taken ? "taken out" : isOut ? "commit, taken out later" : "commit"} ${entry.id}, ${entry.cells} cells, ${bytes(entry.size_bytes)}`;
     const when = entry.captured_s ? `, ${clock(entry.captured_s[1])}` : "";
-    const colour = robotColour(robotOf(entry.id), names);
+    const colour = robotColour(robotOf(entry.id), this.names);
     const mark = taken
       ? svg("path", { d: `M${x - 4} ${y - 4}l8 8m0 -8l-8 8`, stroke: colour, "stroke-width": 2 })
       : svg("circle", { cx: x, cy: y, r: 5, fill: isOut ? "none" : colour, stroke: colour, "stroke-width": 2 });

@@ -4,28 +4,37 @@ import { fill, h } from "../dom.ts";
 import { FIELDS, type Field, type Look } from "../look.ts";
 import { robotColour, stopsOf } from "../palettes.ts";
 
+/** How ages are told: the unit, how much of the range's own it is, and whether some cells are older than is known. */
+export interface Ages {
+  readonly unit: string;
+  readonly size: number;
+  readonly mayBeOlder: boolean;
+}
+
 export class Legend {
   readonly element = h("section", { class: "legend", "aria-label": "Legend" });
   onRange: (range: [number, number] | null) => void = () => {};
   private shown = "";
 
-  /** `range` in the legend's unit; null: nothing that is shown has this field. */
-  show(look: Look, range: [number, number] | null, robots: readonly string[]): void {
+  /** `range` in the look's unit; null: nothing that is shown has this field. */
+  show(look: Look, range: [number, number] | null, robots: readonly string[], ages: Ages): void {
     const locked = look.ranges[look.field] !== undefined;
-    const state = JSON.stringify([look.field, range?.map((end) => end.toFixed(2)), locked, look.field === "robot" && robots]);
+    const state = JSON.stringify([look.field, range?.map((end) => end.toFixed(2)), locked, look.field === "robot" && robots, look.field === "age" && ages]);
     if (state === this.shown || this.element.contains(document.activeElement)) return;
     this.shown = state;
-    const { label, palette, unit } = FIELDS.find(({ field }) => field === look.field)!;
+    const { label, palette, unit: ofField } = FIELDS.find(({ field }) => field === look.field)!;
+    const isAge = look.field === "age";
+    const { unit, size } = isAge ? ages : { unit: ofField, size: 1 };
     const bare = h("p", { class: "bare" }, h("span", { class: "hatch", "aria-hidden": "true" }), bareText(look.field));
     if (look.field === "robot") return fill(this.element, h("h2", {}, "Robot that changed the cell last"), ...robots.map((name) => named(name, robots)), bare);
     if (!palette) return fill(this.element, h("h2", {}, label), h("p", {}, "As the cameras saw it."), bare);
     if (!range) return fill(this.element, h("h2", {}, label), h("p", {}, `Nothing shown has a ${label.toLowerCase()}.`), bare);
-    const title = look.field === "age" ? "Age: log entries since a cell changed" : `${label}${unit ? `, ${unit}` : ""}`;
+    const title = isAge ? `Age, ${unit} before the newest measurement` : `${label}${unit ? `, ${unit}` : ""}`;
     const ends = range.map((end, n) =>
       h("input", {
-        type: "number", step: "any", value: end.toFixed(look.field === "probability" ? 2 : look.field === "age" ? 0 : 1),
+        type: "number", step: "any", value: (end / size).toFixed(look.field === "probability" ? 2 : isAge && size === 1 ? 0 : 1),
         "aria-label": `${n ? "Upper" : "Lower"} end of the legend${unit ? `, ${unit}` : ""}`,
-        onchange: () => this.onRange(ends.map((input) => Number(input.value)) as [number, number]),
+        onchange: () => this.onRange(ends.map((input) => size * Number(input.value)) as [number, number]),
       }),
     );
     const lock = h(
@@ -38,9 +47,10 @@ export class Legend {
       locked ? "Locked" : "Auto",
     );
     fill(
-      this.element, h("h2", {}, title), bar(stopsOf(palette), look.field === "age"),
+      this.element, h("h2", {}, title), bar(stopsOf(palette), isAge),
       h("div", { class: "ends" }, ends[0], lock, ends[1]),
       look.field === "temperature" ? bare : null,
+      isAge && ages.mayBeOlder ? h("p", {}, "or older: their commits are no longer loaded here") : null,
     );
   }
 }

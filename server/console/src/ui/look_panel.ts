@@ -71,7 +71,7 @@ export class LookPanel {
   step(up: boolean): void {
     const now = this.look.ceilingM ?? this.highM;
     const next = now + (up ? 0.1 : -0.1);
-    this.look.ceilingM = next >= this.highM ? null : Math.max(next, this.lowM);
+    this.look.ceilingM = next >= this.highM ? null : toMillimetre(Math.max(next, this.lowM));
     this.show();
     this.onChange();
   }
@@ -101,7 +101,7 @@ export class LookPanel {
 
   private take(): void {
     const { look } = this;
-    const metresOf = (input: HTMLInputElement) => this.lowM + (Number(input.value) / 200) * (this.highM - this.lowM);
+    const metresOf = (input: HTMLInputElement) => toMillimetre(this.lowM + (Number(input.value) / 200) * (this.highM - this.lowM));
     look.floorM = this.floor.value === "0" ? null : metresOf(this.floor);
     look.ceilingM = this.ceiling.value === "200" ? null : metresOf(this.ceiling);
     look.minP = Number(this.least.value);
@@ -115,8 +115,13 @@ export class LookPanel {
 
   private toggleClip(): void {
     const box = this.look.clip ? null : this.boxInView();
-    this.look.clip = box && [box.min.toArray() as Triple, box.max.toArray() as Triple];
+    this.look.clip = box && [box.min.toArray().map(toMillimetre) as Triple, box.max.toArray().map(toMillimetre) as Triple];
     this.show();
     this.onChange();
   }
+}
+
+/** What is typed again in a terminal has no more digits than it needs. */
+function toMillimetre(metresExactly: number): number {
+  return Math.round(metresExactly * 1000) / 1000;
 }

@@ -13,7 +13,7 @@ export function openCommit(api: Api, map: string, entry: LogEntry): void {
   const what = h(
     "select", { id: "what" },
     h("option", { value: "one" }, "this commit"),
-    h("option", { value: "later" }, `this and all later ones of ${robot}`),
+    h("option", { value: "later", disabled: !entry.captured_s }, `this and all later ones of ${robot}`),
     h("option", { value: "all" }, `all commits of ${robot}`),
   );
   const note = h("input", { id: "note", maxlength: "1024", placeholder: "why, for those who read the log" });

@@ -7,6 +7,9 @@ import type { Pose } from "../messages.ts";
 
 /** Of two pictures, ms: a robot tells its pose several times a second, and the server draws for others, too. */
 const PAUSE_MS = 1500;
+/** After a picture that could not be made: the server may have been busy. */
+const AGAIN_MS = 5000;
+const WAIT_MS = 20_000;
 const LAYERS: Record<Field, string> = {
   colour: "colour", temperature: "temperature", probability: "probability", height: "depth", age: "age", robot: "colour",
 };
@@ -16,7 +19,10 @@ export class RobotMap {
   readonly element = h("figure", { class: "seen", hidden: true });
   private readonly api: Api;
   private readonly map: string;
-  private shown = "";
+  private robot: string | null = null;
+  /** What was asked for last. */
+  private asked = "";
+  private busy = false;
   private nextMs = 0;
   private url: string | null = null;
 
@@ -27,44 +33,49 @@ export class RobotMap {
 
   /** From a robot's pose, in the colours of a field, of the map at log entry `head`; null: nobody is followed. */
   show(robot: string | null, pose: Pose | null, field: Field, head: number): void {
-    if (robot === null || pose === null) {
-      if (this.shown !== "") this.clear();
-      this.shown = "";
-      return;
-    }
+    if (robot !== this.robot || pose === null) this.clear();
+    this.robot = robot;
+    if (robot === null || pose === null) return;
     const [x, y, z] = pose.t_map_rig;
     const [qx, qy, qz, qw] = pose.q_map_rig;
     const places = Object.entries({ x, y, z, qx, qy, qz, qw }).map(([name, value]) => [name, value.toFixed(4)]);
     const query = new URLSearchParams([...places, ...Object.entries({ ...SIZE, layer: LAYERS[field] })]).toString();
     const wanted = `${robot} ${head} ${query}`;
-    if (wanted === this.shown || performance.now() < this.nextMs) return;
+    if (wanted === this.asked || this.busy || performance.now() < this.nextMs) return;
     this.nextMs = performance.now() + PAUSE_MS;
-    this.shown = wanted;
-    void this.load(robot, query, wanted);
+    this.asked = wanted;
+    void this.load(robot, query);
   }
 
-  private async load(robot: string, query: string, wanted: string): Promise<void> {
+  /** One at a time: a robot that moves on must not leave each picture behind before it is drawn. */
+  private async load(robot: string, query: string): Promise<void> {
+    this.busy = true;
     let picture: HTMLElement;
     let url: string | null = null;
     try {
-      const answer = await this.api.ask(`maps/${this.map}/main/render?${query}`);
+      const answer = await this.api.ask(`maps/${this.map}/main/render?${query}`, { signal: AbortSignal.timeout(WAIT_MS) });
       url = URL.createObjectURL(await answer.blob());
       picture = h("img", { src: url, alt: `The map as ${robot} would see it` });
     } catch (error) {
       picture = h("p", { class: "error" }, (error as Error).message);
+      this.nextMs = performance.now() + AGAIN_MS;
+    } finally {
+      this.busy = false;
     }
-    if (wanted !== this.shown) {
+    if (robot !== this.robot || this.asked === "") {
       if (url) URL.revokeObjectURL(url);
       return;
     }
-    this.clear();
+    if (this.url) URL.revokeObjectURL(this.url);
     this.url = url;
+    if (url === null) this.asked = "failed";
     fill(this.element, picture, h("figcaption", {}, `The map from ${robot}'s pose`));
     this.element.hidden = false;
   }
 
   private clear(): void {
     this.element.hidden = true;
+    this.asked = "";
     if (this.url) URL.revokeObjectURL(this.url);
     this.url = null;
   }

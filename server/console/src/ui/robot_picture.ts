@@ -2,13 +2,22 @@
 
 import type { Api } from "../api.ts";
 import { fill, h } from "../dom.ts";
+import { serverNowS } from "../server_time.ts";
 import { ago } from "../units.ts";
+
+/** For a picture to come; then the next one is asked for. */
+const WAIT_MS = 15_000;
 
 export class RobotPicture {
   readonly element = h("figure", { class: "seen", hidden: true });
+  private readonly caption = h("figcaption", {});
   private readonly api: Api;
   private readonly map: string;
-  private shown = "";
+  private robot: string | null = null;
+  /** Time of the picture that was asked for last, and of the one that is shown. */
+  private askedS: number | null = null;
+  private shownS: number | null = null;
+  private busy = false;
   private url: string | null = null;
 
   constructor(api: Api, map: string) {
@@ -16,31 +25,46 @@ export class RobotPicture {
     this.map = map;
   }
 
-  /** Show a robot's picture of a time; null: none is followed, or it has none. */
+  /** Show a robot's picture of a time; null: none is followed, or it has none. One is fetched at a time, however many come. */
   show(robot: string | null, viewS: number | null): void {
-    const wanted = robot === null || viewS === null ? "" : `${robot} ${viewS}`;
-    if (wanted === this.shown) return;
-    this.shown = wanted;
-    if (robot === null || viewS === null) this.clear();
-    else void this.load(robot, viewS, wanted);
+    if (robot !== this.robot || viewS === null) this.clear();
+    this.robot = robot;
+    if (robot === null || viewS === null) return;
+    this.say();
+    if (viewS === this.askedS || this.busy) return;
+    this.askedS = viewS;
+    void this.load(robot, viewS);
   }
 
-  private async load(robot: string, viewS: number, wanted: string): Promise<void> {
+  private async load(robot: string, viewS: number): Promise<void> {
+    this.busy = true;
     try {
-      const blob = await (await this.api.ask(`maps/${this.map}/branches/${robot}/view`)).blob();
-      if (wanted !== this.shown) return;
-      this.clear();
+      const answer = await this.api.ask(`maps/${this.map}/branches/${robot}/view`, { signal: AbortSignal.timeout(WAIT_MS) });
+      const blob = await answer.blob();
+      if (robot !== this.robot || this.askedS === null) return;
+      if (this.url) URL.revokeObjectURL(this.url);
       this.url = URL.createObjectURL(blob);
-      const said = `${robot} saw this ${ago(Date.now() / 1000 - viewS)}`;
-      fill(this.element, h("img", { src: this.url, alt: `What ${robot} sees` }), h("figcaption", {}, said));
+      this.shownS = viewS;
+      this.say();
+      fill(this.element, h("img", { src: this.url, alt: `What ${robot} sees` }), this.caption);
       this.element.hidden = false;
     } catch {
-      this.shown = ""; // asked again with the next sign of it
+      // Asked again with the next one.
+    } finally {
+      this.busy = false;
     }
+  }
+
+  /** How old what is shown is by now. */
+  private say(): void {
+    if (this.shownS === null) return;
+    const said = `${this.robot} saw this ${ago(serverNowS() - this.shownS)}`;
+    if (this.caption.textContent !== said) this.caption.textContent = said;
   }
 
   private clear(): void {
     this.element.hidden = true;
+    this.askedS = this.shownS = null;
     if (this.url) URL.revokeObjectURL(this.url);
     this.url = null;
   }

@@ -4,12 +4,15 @@ import type { Api } from "../api.ts";
 import { fill, h } from "../dom.ts";
 import type { Look } from "../look.ts";
 import type { MapInfo } from "../messages.ts";
-import { bytes, metres, thousands } from "../units.ts";
+import { bytes, KELVIN_ZERO_C, metres, thousands } from "../units.ts";
 
 const FORMS: [string, string, string][] = [
   ["ply", "PLY", "points for CloudCompare, MeshLab, Blender"],
   ["pcd", "PCD", "points for PCL, Open3D, ROS"],
+  ["laz", "LAZ", "points for CloudCompare, PDAL, Potree and GIS, a fifth of the size"],
   ["npz", "NPZ", "one array of records for NumPy"],
+  ["ot", "OctoMap .ot", "OctoMap's octree with probability and colour"],
+  ["bt", "OctoMap .bt", "OctoMap's octree of occupied or not, small"],
 ];
 
 export class TakeAwayPanel {
@@ -40,7 +43,7 @@ export class TakeAwayPanel {
       this.element,
       h("h2", {}, "Take away what is shown"), this.parts,
       h("div", { class: "buttons" }, this.level, ...buttons), this.said,
-      h("p", { class: "hint" }, "The same in a terminal, or in Python:"), this.lines, this.octree,
+      h("p", { class: "hint" }, "The same in a terminal, or in Python; your token in the variable CAIRN_TOKEN:"), this.lines, this.octree,
     );
     this.choose(null);
     this.show();
@@ -67,31 +70,35 @@ export class TakeAwayPanel {
     const words = [
       asked.box ? "in the box" : "", asked.floor_m !== undefined ? `from ${metres(asked.floor_m)}` : "",
       asked.ceiling_m !== undefined ? `to ${metres(asked.ceiling_m)}` : "", asked.p ? `p at least ${asked.p}` : "",
+      this.look.band ? `${this.look.band[0]} to ${this.look.band[1]} °C` : "",
     ].filter(Boolean);
     this.parts.textContent = words.length ? `Occupied, ${words.join(", ")}.` : "All that is occupied.";
     const { name } = this.info;
     const server = new URL(`maps/${name}`, document.baseURI).href;
-    const options = Object.entries(asked).map(([key, value]) => ` --${key.replace("_m", "")}=${String(value)}`).join("");
+    const option = (key: string, value: string | number) => key.endsWith("_k") ? ` --${key.slice(0, -2)}=${celsius(Number(value))}` : ` --${key.replace("_m", "")}=${value}`;
+    const options = Object.entries(asked).map(([key, value]) => option(key, value)).join("");
     const fields = ["format=\"ply\"", ...Object.entries(asked).map(([key, value]) => `${key}=${JSON.stringify(value)}`)].join(", ");
     const origin = new URL(".", document.baseURI).href.replace(/\/$/, "");
     fill(
       this.lines,
       copied(`cairn map export ${server} --ply ${name}.ply${options}`),
       copied(
-        "from pathlib import Path\nfrom cairn_client.api import MapApi\nfrom cairn_client.part_export import export_points\n" +
-          "from cairn_map.export_request import ExportRequest\n" +
-          `export_points(MapApi("${origin}"), "${name}", ExportRequest(${fields}), Path("${name}.ply"))`,
+        "import os\nfrom pathlib import Path\n\nfrom cairn_client.api import MapApi\nfrom cairn_client.part_export import export_points\n" +
+          "from cairn_map.export_request import ExportRequest\n\n" +
+          `api = MapApi("${origin}", token=os.environ.get("CAIRN_TOKEN"))\n` +
+          `export_points(api, "${name}", ExportRequest(${fields}), Path("${name}.ply"))`,
       ),
     );
   }
 
-  private asked(): { box?: string; floor_m?: number; ceiling_m?: number; p?: number; depth?: number } {
-    const { clip, floorM, ceilingM, minP } = this.look;
+  private asked(): { box?: string; floor_m?: number; ceiling_m?: number; p?: number; hotter_k?: number; colder_k?: number; depth?: number } {
+    const { clip, floorM, ceilingM, minP, band } = this.look;
     const depth = Number(this.level.value);
     return {
       ...(clip ? { box: clip.flat().join(",") } : {}),
       ...(floorM !== null ? { floor_m: floorM } : {}), ...(ceilingM !== null ? { ceiling_m: ceilingM } : {}),
-      ...(minP > 0 ? { p: minP } : {}), ...(depth < this.info.geometry.depth ? { depth } : {}),
+      ...(minP > 0 ? { p: minP } : {}), ...(band ? { hotter_k: kelvin(band[0]), colder_k: kelvin(band[1]) } : {}),
+      ...(depth < this.info.geometry.depth ? { depth } : {}),
     };
   }
 
@@ -122,6 +129,10 @@ export class TakeAwayPanel {
     }
   }
 }
+
+/** Of degrees Celsius, to a hundredth: as fine as temperatures are told. */
+const kelvin = (value: number) => Math.max(0, Math.round((value + KELVIN_ZERO_C) * 100) / 100);
+const celsius = (value: number) => Math.round((value - KELVIN_ZERO_C) * 100) / 100;
 
 /** Text with a button that copies it; plain http has no clipboard, so there it is only selected. */
 export function copied(text: string): HTMLElement {

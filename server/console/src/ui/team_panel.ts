@@ -3,13 +3,14 @@
 import { fill, h } from "../dom.ts";
 import type { Branch, RobotSign } from "../messages.ts";
 import { robotColour } from "../palettes.ts";
+import { serverNowS } from "../server_time.ts";
 import { ago, bytes } from "../units.ts";
 
 /** Who was not heard of for so long counts as offline, s. */
 export const OFFLINE_S = 60;
 
 export function isOffline(lastSeenS: number): boolean {
-  return Date.now() / 1000 - lastSeenS > OFFLINE_S;
+  return serverNowS() - lastSeenS > OFFLINE_S;
 }
 
 export class TeamPanel {
@@ -30,7 +31,7 @@ export class TeamPanel {
       const offline = isOffline(lastSeenS);
       const pose = status?.pose ?? null;
       return {
-        name: branch.branch, offline, mode: branch.mode, seen: ago(Date.now() / 1000 - lastSeenS), lag: lagOf(branch),
+        name: branch.branch, offline, mode: branch.mode, seen: ago(serverNowS() - lastSeenS), lag: lagOf(branch),
         missing: followed === branch.branch && branch.mode === "high-end" && branch.behind !== 0 ? "amber borders: cells it has not fetched since they changed" : "",
         waiting: status?.waiting ? `${status.waiting} commits (${bytes(status.waiting_bytes)}) still on board` : "",
         battery: status?.battery == null ? "" : `battery ${Math.round(status.battery * 100)} %`,

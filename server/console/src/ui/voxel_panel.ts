@@ -4,7 +4,8 @@ import type { Api } from "../api.ts";
 import { facts, fill, h } from "../dom.ts";
 import type { Channel, Triple } from "../messages.ts";
 import { readingOf, type Picked } from "../scene/picking.ts";
-import { ago, celsius, clock, metres } from "../units.ts";
+import { serverNowS } from "../server_time.ts";
+import { ago, celsius, clock, counted, metres } from "../units.ts";
 
 export interface ChannelReading {
   name: string;
@@ -35,11 +36,14 @@ export class VoxelPanel {
   readonly element = h("section", { "aria-label": "Voxel", "aria-live": "polite" });
   private readonly api: Api;
   private readonly map: string;
+  /** Whose commit a log entry folded; null: not known here. */
+  private readonly robotAt: (seq: number) => string | null;
   private asked = 0;
 
-  constructor(api: Api, map: string) {
+  constructor(api: Api, map: string, robotAt: (seq: number) => string | null) {
     this.api = api;
     this.map = map;
+    this.robotAt = robotAt;
     this.clear();
   }
 
@@ -59,7 +63,7 @@ export class VoxelPanel {
     fill(this.element, h("h2", {}, "Voxel"), coarse(picked), h("p", { class: "hint" }, "Asking the server …"));
     try {
       const answer = await this.api.json<VoxelAnswer>(`maps/${this.map}/main/voxels/${voxel.join(",")}`);
-      if (mine === this.asked) fill(this.element, h("h2", {}, "Voxel"), exact(answer), whence(answer));
+      if (mine === this.asked) fill(this.element, h("h2", {}, "Voxel"), exact(answer), whence(answer, this.robotAt(answer.lm)));
     } catch (error) {
       if (mine === this.asked) fill(this.element, h("h2", {}, "Voxel"), coarse(picked), h("p", { class: "error" }, (error as Error).message));
     }
@@ -94,21 +98,22 @@ function exact(answer: VoxelAnswer): HTMLElement {
     ["seen", `${answer.hits} of ${seen} scans hit it`],
     ...answer.channels.map(({ name, kind, unit, mean, sigma, weight }): [string, Node | string] => {
       if (!weight) return [name, "none measured"];
-      if (kind === "colour") return [name, h("span", {}, swatch(mean), ` ${mean.map((value) => value.toFixed(1)).join(", ")} (${weight} samples)`)];
-      const spread = sigma === null ? "" : ` ± ${sigma.toFixed(2)} ${unit === "K" ? "°C" : unit}`;
+      if (kind === "colour") return [name, h("span", {}, swatch(mean), ` ${mean.map((value) => value.toFixed(1)).join(", ")} (${counted(weight, "sample", "samples")})`)];
+      const spread = sigma === null || weight < 2 ? "" : ` ± ${sigma.toFixed(2)} ${unit === "K" ? "°C" : unit}`;
       const value = unit === "K" ? celsius(mean[0], 2) : `${mean[0].toFixed(2)} ${unit}`;
-      return [name, `${value}${spread} (${weight} samples)`];
+      return [name, `${value}${spread} (${counted(weight, "sample", "samples")})`];
     }),
   ]);
 }
 
-function whence(answer: VoxelAnswer): HTMLElement {
+function whence(answer: VoxelAnswer, last: string | null): HTMLElement {
   const rows = answer.commits.map(({ id, hits, misses, captured_s }) => {
-    const when = captured_s ? `${clock(captured_s[1])} (${ago(Date.now() / 1000 - captured_s[1])})` : "at an unknown time";
-    return h("li", {}, h("strong", {}, id.split(".")[0]), ` ${hits} hits, ${misses} misses; ${when}`, h("code", {}, id));
+    const when = captured_s ? `${clock(captured_s[1])} (${ago(serverNowS() - captured_s[1])})` : "at an unknown time";
+    return h("li", {}, h("strong", {}, id.split(".")[0]), ` ${counted(hits, "hit", "hits")}, ${counted(misses, "miss", "misses")}; ${when}`, h("code", {}, id));
   });
   const left = [
-    answer.gone ? "Older commits are not kept any more: of them only the sum is known." : "",
+    `Log entry ${answer.lm}${last ? ` of ${last}` : ""} changed this cell last.`,
+    answer.gone ? "Commits before are not kept any more: of them only the sum is known." : "",
     answer.more ? "Only the newest 32 commits of this cell were looked at." : "",
   ].filter(Boolean);
   return h(

@@ -1,0 +1,51 @@
+"""What a cell looks like at an octree depth, as pages ask for it: hundreds at once, nearly all of them made before.
+
+So the cell's bytes are read, but not decoded before there is need to: its row says the digest, and that names the view.
+"""
+
+from cairn_map.errors import DamagedDataError
+from cairn_map.grid import CellKey
+from cairn_map.view import ViewStyle
+from cairn_map.view_code import encode_view
+from cairn_server.cells_at_rest import stored_evidence
+from cairn_server.http_ranges import is_same
+from cairn_server.service import Service
+from cairn_server.store_rows import CellRow, Head, MapRow
+from cairn_server.view_cache import view_name
+
+
+def view_etag(stored: CellRow, depth: int) -> str:
+    """Strong: the same cell and depth give the same bytes."""
+    return f'"{stored.digest.hex()}.view.{depth}"'
+
+
+def asked_cell_view(
+    service: Service, row: MapRow, key: CellKey, depth: int, *, known: str | None
+) -> tuple[CellRow | None, Head, bytes]:
+    """One cell (None: never seen), the state that it was read from, and its view; empty if `known` says its ETag.
+
+    Raises:
+        DamagedCellError: kind `damaged_store`: the cell is damaged, and nothing here says what it was.
+    """
+    try:
+        stored, head = service.cell_unchecked(row, key)
+        return stored, head, _view(service, row, stored, depth, known)
+    except DamagedDataError:
+        stored, head = service.cell(row, key)  # made anew from the log, if that says what it was
+        return stored, head, _view(service, row, stored, depth, known)
+
+
+def view_of_stored(row: MapRow, stored: CellRow, depth: int) -> bytes:
+    """A stored cell's view.
+
+    Raises:
+        DamagedDataError: kind `damaged_store`: its bytes are not sound.
+    """
+    style = ViewStyle(depth=depth)
+    return encode_view(stored.key, stored_evidence(stored), row.geometry, row.sensor_model, style=style)
+
+
+def _view(service: Service, row: MapRow, stored: CellRow | None, depth: int, known: str | None) -> bytes:
+    if stored is None or is_same(view_etag(stored, depth), known):
+        return b""
+    return service.cell_views.view(view_name(row, stored, depth), lambda: view_of_stored(row, stored, depth))

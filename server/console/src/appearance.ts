@@ -1,0 +1,83 @@
+/** The look as the graphics card takes it: uniforms, and the legend that tells them. Nothing is fetched for it. */
+
+import { ageUnit, type LogTimes } from "./log_times.ts";
+import { FIELDS, type Look } from "./look.ts";
+import type { Triple } from "./messages.ts";
+import { textureOf, type Palette } from "./palettes.ts";
+import type { Cells } from "./scene/cells.ts";
+import { boxes, FIELD_CODES, squares, uniforms } from "./scene/materials.ts";
+import type { Stage } from "./scene/stage.ts";
+import { rangeOf } from "./scene/statistics.ts";
+import { Legend, type Ages } from "./ui/legend.ts";
+import { applyTheme } from "./ui/top_bar.ts";
+import { KELVIN_ZERO_C } from "./units.ts";
+
+const FAR_M = 1e9;
+
+export class Appearance {
+  readonly legend = new Legend();
+  private readonly look: Look;
+  private readonly stage: Stage;
+  private readonly cells: Cells;
+  private readonly times: LogTimes;
+  private readonly palettes = new Map<Palette, ReturnType<typeof textureOf>>();
+
+  constructor(look: Look, stage: Stage, cells: Cells, times: LogTimes) {
+    this.look = look;
+    this.stage = stage;
+    this.cells = cells;
+    this.times = times;
+    look.boxes ??= !stage.isSoftware;
+  }
+
+  /** Everything as the look says. */
+  apply(robots: readonly string[]): void {
+    const { look } = this;
+    const { palette } = FIELDS.find(({ field }) => field === look.field)!;
+    uniforms.uField.value = FIELD_CODES[look.field];
+    if (palette) {
+      if (!this.palettes.has(palette)) this.palettes.set(palette, textureOf(palette));
+      uniforms.uPalette.value = this.palettes.get(palette)!;
+    }
+    const [low, high] = look.clip ?? [[-FAR_M, -FAR_M, -FAR_M], [FAR_M, FAR_M, FAR_M]];
+    uniforms.uLow.value.set(low[0], low[1], Math.max(low[2], look.floorM ?? -FAR_M));
+    uniforms.uHigh.value.set(high[0], high[1], Math.min(high[2], look.ceilingM ?? FAR_M));
+    uniforms.uMinP.value = look.minP;
+    const [from, to] = look.band ?? [1, 0];
+    const zero = look.band ? KELVIN_ZERO_C : 0;
+    uniforms.uBand.value.set(from + zero, to + zero);
+    this.cells.setMaterial(look.boxes ? boxes : squares);
+    this.refreshRange(robots);
+  }
+
+  /** Ends of the palette as locked, or as what is shown has them. */
+  refreshRange(robots: readonly string[]): void {
+    const { look } = this;
+    const { uLow, uHigh, uRange } = uniforms;
+    const zero = look.field === "temperature" ? KELVIN_ZERO_C : 0;
+    const found = look.field === "colour" || look.field === "robot" ? null : rangeOf(this.cells, look.field, uLow.value.z, uHigh.value.z);
+    const range = look.ranges[look.field] ?? (found && (found.map((end) => end - zero) as [number, number]));
+    if (range) uRange.value.set(range[0] + zero, range[1] + zero);
+    this.legend.show(look, range, robots, this.ages(range));
+    this.stage.draw();
+  }
+
+  /** In what ages are told, and whether some cells may be older than that. */
+  private ages(range: [number, number] | null): Ages {
+    const { head, all } = this.cells;
+    if (this.times.ageS(head) === null) return { unit: "log entries", size: 1, mayBeOlder: false };
+    const mayBeOlder = this.look.field === "age" && [...all.values()].some(({ points, lm }) => points && this.times.isBefore(lm));
+    return { ...ageUnit(range?.[1] ?? 0), mayBeOlder };
+  }
+
+  /** Dark or light, as the page is. */
+  theme(): void {
+    const light = applyTheme() === "light";
+    uniforms.uBare.value.set(...((light ? [0.62, 0.63, 0.66] : [0.42, 0.44, 0.47]) as Triple));
+    this.stage.setBackground(light ? "#eef0f3" : "#0e1116");
+  }
+
+  dispose(): void {
+    for (const texture of this.palettes.values()) texture.dispose();
+  }
+}

@@ -1,0 +1,92 @@
+/** Where to look from: all, above, inside, and the hottest place that is shown. */
+
+import { Box3, Vector3 } from "three";
+import { h } from "../dom.ts";
+import type { CameraView } from "../look.ts";
+import type { MapInfo, Triple } from "../messages.ts";
+import type { Cells } from "../scene/cells.ts";
+import { uniforms } from "../scene/materials.ts";
+import type { Stage } from "../scene/stage.ts";
+import { hottest, type HotPlace } from "../scene/statistics.ts";
+import type { Team } from "../team.ts";
+
+const SIDE = new Vector3(-0.7, -1, 0.75);
+const ABOVE = new Vector3(0, -0.001, 1);
+/** Of a person's eyes over the floor, and over a rig on a robot; m. */
+const EYES_M = 1.6;
+const OVER_RIG_M = 0.6;
+
+export class CameraPanel {
+  readonly element: HTMLElement;
+  /** Whether the camera stands where it was put, so that the first cells do not move it. */
+  isPlaced: boolean;
+  /** The operator wants the hottest place; it is there. */
+  onHottest: (place: HotPlace | null) => void = () => {};
+  onGo: () => void = () => {};
+  private readonly stage: Stage;
+  private readonly cells: Cells;
+  private readonly team: Team;
+
+  constructor(stage: Stage, cells: Cells, team: Team, info: MapInfo, camera: CameraView | null) {
+    this.stage = stage;
+    this.cells = cells;
+    this.team = team;
+    this.isPlaced = camera !== null;
+    if (camera) stage.place(camera);
+    else if (info.box_m) stage.place(stage.lookAt([new Box3(new Vector3(...info.box_m[0]), new Vector3(...info.box_m[1]))], SIDE));
+    const button = (label: string, title: string, run: () => void) => h("button", { type: "button", title, onclick: run }, label);
+    this.element = h(
+      "section", { "aria-label": "Camera" }, h("h2", {}, "Camera"),
+      h(
+        "div", { class: "buttons" },
+        button("All", "All of the map (H)", () => this.home()), button("Top", "From above (T)", () => this.top()),
+        button("Walk", "Inside, at a person's height (W)", () => this.walk()),
+        button("Hottest", "The hottest place shown (X)", () => this.hottest()),
+      ),
+    );
+  }
+
+  /** Look at what there is, once all of it is there, unless the operator looks elsewhere already. */
+  settle(): void {
+    if (this.isPlaced || this.cells.firstPictureMs === null) return;
+    this.isPlaced = true;
+    this.stage.place(this.stage.lookAt(this.cells.tightBoxes, SIDE));
+  }
+
+  home(): void {
+    this.fly(this.stage.lookAt(this.cells.tightBoxes, SIDE));
+  }
+
+  top(): void {
+    this.fly(this.stage.lookAt(this.cells.tightBoxes, ABOVE));
+  }
+
+  /** Stand inside, eyes at the height of a person's, where a robot is, and look towards the middle of the map. */
+  walk(): void {
+    const target = new Vector3(...this.stage.view.target);
+    const box = this.cells.tightBounds;
+    const robot = this.team.nearest(target);
+    const ahead = box.getCenter(new Vector3()).sub(robot ?? box.min).setZ(0);
+    if (ahead.lengthSq() < 1e-6) ahead.set(0, 1, 0);
+    const from = robot ?? box.clampPoint(target, new Vector3());
+    from.z = robot ? robot.z + OVER_RIG_M : box.min.z + EYES_M;
+    const to = from.clone().addScaledVector(ahead.normalize(), 3);
+    this.fly({ eye: from.toArray() as Triple, target: to.toArray() as Triple });
+  }
+
+  /** Go to the hottest place that is shown. */
+  hottest(): void {
+    const { uLow, uHigh, uMinP } = uniforms;
+    const shown = new Box3(uLow.value, uHigh.value);
+    const found = hottest(this.cells, (place, p) => shown.containsPoint(place) && p >= uMinP.value);
+    if (found) this.fly(this.stage.lookAt([new Box3().setFromCenterAndSize(found.centre, new Vector3(1.6, 1.6, 1.6))], SIDE));
+    this.onHottest(found);
+  }
+
+  private fly(to: CameraView): void {
+    this.onGo();
+    this.isPlaced = true;
+    this.team.follow(null);
+    this.stage.fly(to);
+  }
+}

@@ -1,0 +1,15 @@
+/** What the map is made of. */
+
+import { h } from "../dom.ts";
+import type { MapInfo } from "../messages.ts";
+import { metres } from "../units.ts";
+
+export function mapFacts({ geometry, sensor_model }: MapInfo): HTMLElement {
+  const edge = geometry.voxel_edge_um / 1e6;
+  const lines = [
+    `voxels of ${metres(edge)}, cells of ${metres(edge * 2 ** geometry.depth)}`,
+    `shown: p above ${sensor_model.p_occupied}`,
+    geometry.channels.map(({ name }) => name).join(", ") || "no channels",
+  ];
+  return h("section", { "aria-label": "Map" }, h("h2", {}, "Map"), ...lines.map((line) => h("p", { class: "hint" }, line)));
+}

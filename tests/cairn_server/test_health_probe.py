@@ -1,0 +1,33 @@
+"""The container's health check: what it says of a server, of none, and of another program."""
+
+import socket
+import threading
+
+from tests.cairn_server.live import Live
+
+from cairn_server.health_probe import why_not
+
+
+def test_a_server_is_alive(live: Live) -> None:
+    assert why_not(live.port) is None
+
+
+def test_where_nobody_listens_it_says_so() -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        assert "refused" in str(why_not(free.getsockname()[1]))
+
+
+def test_another_program_is_not_taken_for_it() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def answer() -> None:
+            link, _ = listener.accept()
+            with link:
+                link.recv(4096)
+                link.sendall(b"HTTP/1.1 503 Busy\r\nContent-Length: 0\r\nConnection: close\r\n\r\n")
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        assert why_not(listener.getsockname()[1]) == "/healthz says 503"
+        thread.join()

@@ -1,0 +1,164 @@
+"""https before the map server, as `docker/compose.yaml` sets it up: the same Caddyfile in Debian's Caddy.
+
+What this does not show: the containers' network, and certificates of others.
+"""
+
+import json
+import os
+import shutil
+import signal
+import socket
+import ssl
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+import pytest
+import yaml
+from tests.cairn_map.made import SMALL
+from tests.cairn_server.live import Process, until
+from tests.cairn_server.pushes import pushed
+from websockets.sync.client import connect
+from websockets.typing import Origin
+
+from cairn_client.api import MapApi
+from cairn_map.errors import UnreachableError
+from cairn_map.messages import CreateMap
+
+ROOT = Path(__file__).parents[1]
+CADDYFILE = ROOT / "docker" / "Caddyfile"
+COMPOSE = ROOT / "docker" / "compose.yaml"
+ADMIN_TOKEN = "admin-of-the-proxy-test"
+SITE = "127.0.0.1"
+needs_caddy = pytest.mark.skipif(shutil.which("caddy") is None, reason="needs caddy (apt-get install caddy)")
+
+
+@dataclass(frozen=True)
+class Site:
+    """The server as others see it."""
+
+    url: str
+    http_url: str
+    authority: Path
+    """Certificate of who signed the site's."""
+
+    @property
+    def tls(self) -> ssl.SSLContext:
+        return ssl.create_default_context(cafile=self.authority)
+
+    @property
+    def api(self) -> MapApi:
+        return MapApi(self.url, token=ADMIN_TOKEN, ca_file=self.authority)
+
+
+def free_port() -> int:
+    with socket.socket() as found:
+        found.bind((SITE, 0))
+        port: int = found.getsockname()[1]
+        return port
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    folder = tmp_path_factory.mktemp("proxy")
+    (folder / "token").write_text(ADMIN_TOKEN)
+    server = Process(folder / "data", "--admin-token-file", str(folder / "token"))
+    assert server.url
+    https_port, http_port = free_port(), free_port()
+    env = {
+        **{"PATH": os.environ["PATH"], "HOME": str(folder), "XDG_DATA_HOME": str(folder)},
+        **{"CAIRN_SITE": SITE, "CAIRN_BIND": SITE, "CAIRN_UPSTREAM": server.url.removeprefix("http://")},
+        **{"CAIRN_HTTPS_PORT": str(https_port), "CAIRN_HTTP_PORT": str(http_port)},
+    }
+    command = ["caddy", "run", "--config", str(CADDYFILE), "--adapter", "caddyfile"]
+    with (folder / "said").open("wb") as said, subprocess.Popen(command, env=env, stdout=said, stderr=said) as caddy:
+        try:
+            authority = folder / "caddy" / "pki" / "authorities" / "local" / "root.crt"
+            found = Site(f"https://{SITE}:{https_port}", f"http://{SITE}:{http_port}", authority)
+            until(lambda: caddy.poll() is not None or (authority.exists() and _answers(found)), "the proxy answers")
+            assert caddy.poll() is None, (folder / "said").read_text()
+            yield found
+        finally:
+            caddy.terminate()
+            caddy.wait(20)
+            server.send(signal.SIGTERM)
+            server.end()
+
+
+def _answers(site: Site) -> bool:
+    try:
+        return httpx.get(f"{site.url}/healthz", verify=site.tls).status_code == 200
+    except httpx.TransportError:
+        return False
+
+
+@needs_caddy
+def test_the_page_comes_over_https_and_http_leads_to_it(site: Site) -> None:
+    answer = httpx.get(f"{site.url}/", verify=site.tls)
+    assert answer.status_code == 200
+    assert "cairn" in answer.text
+    assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
+    led = httpx.get(f"{site.http_url}/")
+    assert led.status_code == 308
+    assert led.headers["Location"].startswith(f"https://{SITE}")
+
+
+@needs_caddy
+def test_who_does_not_know_the_authority_does_not_talk(site: Site) -> None:
+    with pytest.raises(UnreachableError, match=r"(?i)certificate"):
+        MapApi(site.url, token=ADMIN_TOKEN).maps()
+
+
+@needs_caddy
+def test_commits_and_live_news_pass_through_it(site: Site) -> None:
+    commit = pushed(0, 0)
+    with site.api as api:
+        api.create_map("lab", CreateMap(geometry=SMALL))
+        address = f"wss{site.url.removeprefix('https')}/maps/lab/live"
+        headers = {"Authorization": f"Bearer {ADMIN_TOKEN}"}
+        with connect(address, ssl=site.tls, additional_headers=headers, origin=Origin(site.url)) as live:
+            api.push("lab", commit)
+            told = json.loads(live.recv(timeout=30))
+            while told.get("head", 0) == 0 and not told.get("cells"):
+                told = json.loads(live.recv(timeout=30))
+        until(lambda: bool(api.cell_index("lab").cells), "the commit is folded")
+        assert api.commit("lab", commit.id)[0] == commit.data
+
+
+@needs_caddy
+def test_a_copy_is_pulled_through_it_with_the_authority_in_the_environment(site: Site, tmp_path: Path) -> None:
+    with site.api as api:
+        api.create_map("hall", CreateMap(geometry=SMALL))
+        api.push("hall", pushed(0, 1))
+        until(lambda: bool(api.cell_index("hall").cells), "the commit is folded")
+        count = len(api.cell_index("hall").cells)
+    env = {**os.environ, "SSL_CERT_FILE": str(site.authority), "CAIRN_TOKEN": ADMIN_TOKEN}
+    command = [sys.executable, "-m", "cairn_client.main", "clone", f"{site.url}/maps/hall", "hall"]
+    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"hall: {count} cells")
+
+
+@needs_caddy
+def test_the_caddyfile_is_written_as_caddy_would(tmp_path: Path) -> None:
+    written = subprocess.run(["caddy", "fmt", str(CADDYFILE)], capture_output=True, text=True, timeout=60, check=False)
+    assert written.stdout == CADDYFILE.read_text()
+
+
+def test_the_compose_file_names_what_is_there() -> None:
+    compose = yaml.safe_load(COMPOSE.read_text())
+    server, proxy = compose["services"]["server"], compose["services"]["proxy"]
+    assert (COMPOSE.parent / server["build"]["context"] / server["build"]["dockerfile"]).exists()
+    assert proxy["profiles"] == ["tls"]
+    for service in (server, proxy):
+        assert service["cap_drop"] == ["ALL"]
+        for place in service["volumes"]:
+            source = place.partition(":")[0]
+            assert source in compose["volumes"] or source.startswith(("./Caddyfile", "${CAIRN_CERTS"))
+    assert set(compose["volumes"]) == {"data", "proxy", "certs"}
+    asked = {word.partition("}")[0].partition(":")[0] for word in CADDYFILE.read_text().split("{$")[1:]}
+    assert set(proxy["environment"]) <= asked
+    assert "server:8750" in CADDYFILE.read_text()
