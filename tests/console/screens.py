@@ -13,12 +13,8 @@ from pathlib import Path
 from tests.console.browsing import TABLET, UPRIGHT, VIEW, Console, browser
 
 FIELDS = ("colour", "temperature", "probability", "height", "age", "robot")
-VOXEL_IN_SIGHT = """(() => {
-  for (let n = 0; n < 400; n++) {
-    const [x, y] = [120 + 27 * (n % 20), 120 + 19 * Math.floor(n / 20)];
-    if (c.picker.at(x, y)?.isVoxel) return [x, y];
-  }
-})()"""
+VOXELS_IN_SIGHT = """Array.from({length: 400}, (_, n) => [120 + 27 * (n % 20), 120 + 19 * Math.floor(n / 20)])
+    .filter(([x, y]) => c.picker.at(x, y)?.isVoxel)"""
 SIZES = (VIEW, TABLET, UPRIGHT)
 
 
@@ -30,6 +26,9 @@ def take_screens(console: Console, folder: Path, theme: str) -> list[Path]:
         console.settled()
         made.append(folder / f"{name}-{theme}-{width}.png")
         console.page.screenshot(path=made[-1])
+
+    def click(place: tuple[int, int]) -> None:
+        console.page.locator(".host canvas").click(position={"x": place[0], "y": place[1]})
 
     page = console.page
     for key, field in enumerate(FIELDS, start=1):
@@ -45,12 +44,13 @@ def take_screens(console: Console, folder: Path, theme: str) -> list[Path]:
     page.keyboard.press("w")
     shoot("walk")
     console.settled()
-    right, down = console.tell(VOXEL_IN_SIGHT)
-    page.locator(".host canvas").click(position={"x": right, "y": down})
+    seen = console.tell(VOXELS_IN_SIGHT)
+    click(seen[0])
     page.get_by_role("region", name="Voxel").get_by_text("Who saw it").wait_for()
     shoot("asked")
     page.keyboard.press("m")
-    console.click_about([(0, 0), (80, 10), (60, 90)])
+    for place in (seen[0], seen[len(seen) // 2], seen[-1]):
+        click(place)
     shoot("measured")
     page.keyboard.press("m")
     page.get_by_role("button", name="Clear").click()
