@@ -48,8 +48,7 @@ soak: .venv/dev.stamp .venv/kernels.stamp  ## crash, crowd, simulate sync, fuzz 
 lint: .venv/dev.stamp  ## ruff, mypy, pyright, hadolint
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
-	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright
+	$(BIN)/mypy & mypy=$$!; PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright; wait $$mypy
 	if [[ -x $(BIN)/hadolint ]]; then $(BIN)/hadolint docker/Dockerfile; fi
 
 bench: .venv/dev.stamp .venv/kernels.stamp  ## measure (BENCH_ARGS="--smoke" for a short run)
@@ -77,7 +76,8 @@ clean:  ## remove .venv, build/ and all caches
 .venv/kernels.stamp: $(KERNELS) | .venv/bin/python
 	# Numba keeps a kernel by its own file's age: one that calls a kernel of another file would stay as it was.
 	find . -path ./.venv -prune -o -name '*.nb[ic]' -exec rm -f {} +
-	$(BIN)/cairn compile
+	# What maps need takes as long as all the rest.
+	$(BIN)/cairn compile map & map=$$!; $(BIN)/cairn compile fusion sim; wait $$map
 	touch $@
 
 .venv/console.stamp: $(CONSOLE) | .venv/bin/python

@@ -5,6 +5,7 @@
     fusion: ready after 3.6 s
     map: ready after 1.8 s
     sim: ready after 6.9 s
+    $ cairn compile map     # that package's alone: on several cores, one command for each
 
 The first line is on standard error, and goes when the kernel is ready. Numba compiles a kernel when it is first
 called, and keeps the result in __pycache__ beside the source, or in the folder that NUMBA_CACHE_DIR names. A second
@@ -13,7 +14,7 @@ call only reads what the first one kept.
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from importlib.metadata import entry_points
 
 from cairn_client.arguments import parser
@@ -23,10 +24,15 @@ GROUP = "cairn.warm_up"
 
 
 def main(argv: list[str]) -> int:
-    """Call every installed package's warm-up function."""
-    parser("cairn compile", __doc__).parse_args(argv)
+    """Call every installed package's warm-up function, or those of the named ones."""
+    options = parser("cairn compile", __doc__)
+    known = [point.name for point in entry_points(group=GROUP)]
+    options.add_argument("packages", nargs="*", metavar="PACKAGE", help=f"of {', '.join(sorted(known))}; or all")
+    wanted = options.parse_args(argv).packages or known
+    if unknown := set(wanted) - set(known):
+        options.error(f"no package {', '.join(sorted(unknown))} has kernels; these have: {', '.join(sorted(known))}")
     show_compiling()
-    for name, warm_up in list(_warm_ups()):  # all loaded first, so that all kernels are counted from the start
+    for name, warm_up in list(_warm_ups(wanted)):  # all loaded first, so that all kernels are counted from the start
         start_s = time.monotonic()
         warm_up()
         sys.stdout.write(f"{name}: ready after {time.monotonic() - start_s:.1f} s\n")
@@ -34,8 +40,10 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _warm_ups() -> Iterator[tuple[str, Callable[[], None]]]:
+def _warm_ups(wanted: Collection[str]) -> Iterator[tuple[str, Callable[[], None]]]:
     for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
+        if point.name not in wanted:
+            continue
         try:
             yield point.name, point.load()
         except ModuleNotFoundError as exc:

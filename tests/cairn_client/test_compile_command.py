@@ -3,6 +3,10 @@
 import subprocess
 import sys
 
+import pytest
+
+from cairn_client.compile_command import main
+
 FIND_KERNELS_NOT_CALLED = """
 import sys
 from importlib import import_module
@@ -32,3 +36,11 @@ def test_every_kernel_is_compiled() -> None:
     done = subprocess.run([sys.executable, "-c", FIND_KERNELS_NOT_CALLED], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert [line.partition(":")[0] for line in done.stdout.splitlines()] == ["fusion", "map", "sim"]
+
+
+def test_only_the_named_packages_are_compiled(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sim"]) == 0
+    assert [line.partition(":")[0] for line in capsys.readouterr().out.splitlines()] == ["sim"]
+    with pytest.raises(SystemExit):
+        main(["wall"])
+    assert "fusion, map, sim" in capsys.readouterr().err
