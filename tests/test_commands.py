@@ -17,7 +17,7 @@ from cairn_sim.record import Plan, record
 from cairn_sim.robots import ROBOTS
 from cairn_sim.scene_file import load_scene
 
-COMMAND_S = 120
+COMMAND_S = 300
 VOXEL_M = "0.08"
 
 
