@@ -54,6 +54,7 @@ MAY_NAME = {
         "cairn_fusion/view/temperature_scale.py",
         "cairn_sim/contact_sheet.py",
         "cairn_sim/fusion_truth.py",
+        "cairn_sim/overlay_scores.py",
         "cairn_sim/render.py",
     ],
     "fastapi": [

@@ -3,11 +3,15 @@
 The table's columns: pixels painted; error, median and 95 %; share of errors above 2 K or 20 of 255; 95 % of pixels
 farther than a range pixel from any edge, and of those whose depth was filled in; median behind glass and in mirrors;
 pixels painted although hidden; precision and recall of the label OCCLUDED, by the pixel, and where one a range pixel
-away counts as well: where an edge is within a range pixel, no sensor said. With --map also the temperatures of a map
-of whole stops, and with --mm5 hot cups of real frames against hand labels.
+away counts as well: where an edge is within a range pixel, no sensor said.
+
+Then the map over a live image: intersection over union of what is drawn with the projection of the map's cubes, worked
+out without the map: where the live depth agrees, and where there is none. With --map also the temperatures of a map of
+whole stops, and with --mm5 hot cups of real frames against hand labels.
 """
 
 import argparse
+import statistics
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +19,7 @@ from pathlib import Path
 from cairn_calib.rig import Spectrum
 from cairn_client.arguments import say, with_progress
 from cairn_fusion.images import write_colour
+from cairn_fusion.overlay import OverlayStyle
 from cairn_fusion.view.telepresence import Mode, Telepresence, ViewOptions
 from cairn_fusion.view.temperature_scale import locked_scale
 from cairn_map.errors import BadInputError
@@ -22,6 +27,7 @@ from cairn_sim.fusion_evaluation import WAYS, mapped_scores, plan_scans, scored_
 from cairn_sim.fusion_pictures import error_picture, figure_24
 from cairn_sim.fusion_scores import COLUMNS, FusionScores
 from cairn_sim.labelled_frames import labelled_frames
+from cairn_sim.overlay_scores import overlay_scores
 from cairn_sim.record import Plan, scans_of, shots_of
 from cairn_sim.robots import SimRobot, robot_named
 from cairn_sim.scene_file import load_scene
@@ -40,6 +46,8 @@ def add_evaluate_arguments(options: argparse.ArgumentParser) -> None:
     options.add_argument("output", type=Path, metavar="FOLDER", help="for the pictures; made if it is not there")
     options.add_argument("--scans", type=int, default=12, metavar="N", help="to score, of 3 stops (12)")
     options.add_argument("--seed", type=int, default=1, help="of all noise (1)")
+    options.add_argument("--scale", type=float, default=1.0, help="of all images' sides, for a quick look (1)")
+    options.add_argument("--poses", type=int, default=20, metavar="N", help="of the map over live images (20)")
     options.add_argument("--perfect", action="store_true", help="sensors without noise")
     options.add_argument("--map", type=int, default=0, metavar="N", help="also map N whole stops, some 20 s each (0)")
     options.add_argument("--voxel", type=float, default=0.04, metavar="M", help="of the map (0.04)")
@@ -52,9 +60,13 @@ def evaluate(args: argparse.Namespace) -> int:
         args.output.mkdir(parents=True, exist_ok=True)
     except OSError as exc:
         raise BadInputError("bad_output", f"cannot make the folder {args.output}: {exc.strerror}") from exc
-    if args.scans < 1 or args.map < 0:
-        raise BadInputError("bad_option", f"--scans must be above 0 and --map from 0, got {args.scans}, {args.map}")
+    for option, least in (("scans", 1), ("poses", 1), ("map", 0)):
+        if getattr(args, option) < least:
+            raise BadInputError("bad_option", f"--{option} must be at least {least}, got {getattr(args, option)}")
+    if not 0.1 <= args.scale <= 1:
+        raise BadInputError("bad_option", f"--scale must be 0.1 to 1, got {args.scale:g}")
     _images(args)
+    _overlays(args)
     if args.map:
         _maps(args)
     if args.mm5 is not None:
@@ -65,7 +77,7 @@ def evaluate(args: argparse.Namespace) -> int:
 def _images(args: argparse.Namespace) -> None:
     """The table of fused images, Fig. 24, and a picture of errors."""
     scene, robot = load_scene("building"), _robot()
-    rig, per_stop = robot.rig_of(1.0), -(-args.scans // len(STOPS))
+    rig, per_stop = robot.rig_of(args.scale), -(-args.scans // len(STOPS))
     plans = [_plan(args, stop) for stop in STOPS]
     step = max(1, SCANS_OF_STOP // per_stop)
     scans = [scan for plan in plans for scan in list(plan_scans(plan, rig, step=step))[:per_stop]][: args.scans]
@@ -95,10 +107,24 @@ def _in_columns(cells: Sequence[str]) -> str:
     return "".join(f"{cell:>{max(len(name), 5) + 2}}" for name, cell in zip(COLUMNS, cells, strict=True))
 
 
+def _overlays(args: argparse.Namespace) -> None:
+    """The table of a map over live images."""
+    rig = _robot().rig_of(args.scale)
+    name = rig.of_spectrum(Spectrum.COLOUR)[0]
+    poses = overlay_scores(rig[name].camera, poses=args.poses, seed=args.seed)
+    scores = list(with_progress(poses, "drawing maps", total=args.poses))
+    say(f"{'map over ' + name + ', IoU':<34}" + "".join(f"{column:>12}" for column in ("poses", "mean", "least")))
+    for way, found in (
+        ("live depth agrees", [score.visible for score in scores]),
+        (f"no live depth, {OverlayStyle().step_px} px at a time", [score.map_only for score in scores]),
+    ):
+        say(f"  {way:<32}{len(found):>12}{statistics.fmean(found):>12.4f}{min(found):>12.4f}")
+
+
 def _maps(args: argparse.Namespace) -> None:
     """The table of a map's temperatures."""
     scene, robot = load_scene("building"), _robot()
-    rig = robot.rig_of(1.0)
+    rig = robot.rig_of(args.scale)
     # Colour is not looked at.
     rig = rig.model_copy(
         update={"cameras": {n: m for n, m in rig.cameras.items() if m.spectrum is not Spectrum.COLOUR}}
@@ -139,6 +165,7 @@ def _plan(args: argparse.Namespace, stop: int) -> Plan:
         scene=load_scene("building"),
         robot=_robot(),
         path=EXPERIMENT,
+        scale=args.scale,
         seed=args.seed,
         perfect=args.perfect,
         truth="none",

@@ -18,6 +18,7 @@ from cairn_fusion.images import read_colour
 from cairn_fusion.importers import open_source
 from cairn_fusion.scan import Scan
 from cairn_fusion.view.telepresence import fuse
+from cairn_sim.overlay_scores import intersection_over_union
 
 Flags = npt.NDArray[np.bool_]
 
@@ -67,7 +68,8 @@ def labelled_frames(folder: Path) -> Iterator[LabelledFrame]:
         fused, near = fuse(scan, source.rig, "colour"), _around(label)
         given = near & (kelvin > from_k)
         ours = near & fused.ok & (fused.values[..., 0] > from_k)
-        yield LabelledFrame(name, scan, source.rig, fused, label, _iou(given, label), _iou(ours, label))
+        ious = (intersection_over_union(each, label) for each in (given, ours))
+        yield LabelledFrame(name, scan, source.rig, fused, label, *ious)
 
 
 def _around(label: Flags) -> Flags:
@@ -77,7 +79,3 @@ def _around(label: Flags) -> Flags:
     top, left = max(rows[0] - AROUND_PX, 0), max(columns[0] - AROUND_PX, 0)
     near[top : rows[-1] + AROUND_PX + 1, left : columns[-1] + AROUND_PX + 1] = True
     return near
-
-
-def _iou(one: Flags, other: Flags) -> float:
-    return float((one & other).sum() / max(int((one | other).sum()), 1))

@@ -27,7 +27,7 @@ from cairn_map.map_snapshot import MapSnapshot
 from cairn_map.paint_kernels import blend_into
 from cairn_map.pose_spread import BLUR_MAX_PX, PoseSpread, spread_ink, why_withheld
 from cairn_map.render_picture import SCALES, WARNING, Layer, Scale, painted
-from cairn_map.sight import Sight
+from cairn_map.sight import Sight, middles
 from cairn_map.small_text import write_text_into
 
 Rgb = npt.NDArray[np.uint8]
@@ -113,8 +113,8 @@ class Overlay:
     values: npt.NDArray[np.floating]
     """Of the layer, in front; (H, W), of colours (H, W, 3)."""
     rest: Seen
-    """What lies behind the live surface, or, where there is no live depth, the nearest on the map; for each
-    `step_px`-th row and column."""
+    """What lies behind the live surface, or, where there is no live depth, the nearest on the map; for the middle of
+    each `step_px` rows and columns."""
     values_of_rest: npt.NDArray[np.floating]
     front_modes: npt.NDArray[np.uint8]
     """(H, W) VISIBLE, MAP_ONLY or NOTHING."""
@@ -149,7 +149,7 @@ def draw_overlay(
     range_m, step = np.asarray(live.range_m, np.float32), style.step_px
     around = range_m - tolerance_m, range_m + tolerance_m
     front = renderer.nearest(snapshot, live.sight, live.T_map_camera, range_max_m=style.range_max_m, between_m=around)
-    coarse_m = range_m[::step, ::step]
+    coarse_m = middles(range_m, step)
     rest = _rest(renderer, snapshot, live, coarse_m, tolerance_m, style)
     rest_modes = np.where(np.isnan(coarse_m), np.uint8(Mode.MAP_ONLY), np.uint8(Mode.SEE_THROUGH))
     rest_modes[~rest.hit] = Mode.NOTHING

@@ -10,6 +10,7 @@ Camera frame: x right, y down, z forward; the centre of the top-left pixel is (0
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +18,7 @@ import numpy.typing as npt
 from cairn_map.errors import BadInputError
 
 Floats = npt.NDArray[np.float64]
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 PIXELS_MAX = 1 << 24
 UNIT_TOLERANCE = 1e-6
@@ -47,7 +49,7 @@ class Sight:
         object.__setattr__(self, "pixel_rad", max((float(gap.max()) for gap in known if gap.size), default=1.0))
 
     def every(self, step: int) -> "Sight":
-        """The camera with only each `step`-th row and column."""
+        """The camera with only the middle row and column of each `step`: those of `middles`."""
         return self if step == 1 else _every(self, step)
 
     @property
@@ -63,7 +65,13 @@ class Sight:
 
 @lru_cache(maxsize=8)
 def _every(sight: Sight, step: int) -> Sight:
-    return Sight(sight.rays[::step, ::step])
+    return Sight(middles(sight.rays, step))
+
+
+def middles(image: npt.NDArray[Scalar], step: int) -> npt.NDArray[Scalar]:
+    """(h, w, ...) of (H, W, ...): the pixel in the middle of each `step` x `step`; the last ones may be cut."""
+    rows, columns = (np.minimum(np.arange(step // 2, size + step // 2, step), size - 1) for size in image.shape[:2])
+    return image[np.ix_(rows, columns)]
 
 
 def pinhole(width: int, height: int, *, focal_px: float, centre_px: tuple[float, float] | None = None) -> Sight:

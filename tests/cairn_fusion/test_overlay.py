@@ -6,7 +6,6 @@
 import os
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -15,7 +14,6 @@ from tests.cairn_map.worlds import map_of
 
 from cairn_calib.camera import Camera
 from cairn_calib.pose_vectors import transform_from_vector
-from cairn_calib.poses import inverse
 from cairn_calib.rig import Rig, Spectrum, mounted
 from cairn_fusion import overlay_kernels as kernels
 from cairn_fusion.live_range import live_range
@@ -32,6 +30,7 @@ from cairn_map.map_snapshot import MapSnapshot, snapshot_of
 from cairn_map.pose_spread import PoseSpread, motions
 from cairn_map.render_picture import NO_VALUE, SCALES, Layer, palette
 from cairn_map.sight import Sight, look_at, pinhole
+from cairn_sim.overlay_scores import overlay_scores
 
 POSES = int(os.environ.get("OVERLAY_POSES", "30"))
 EDGE_M = 0.05
@@ -72,37 +71,24 @@ def no_depth(sight: Sight) -> npt.NDArray[np.float32]:
     return np.full((sight.height, sight.width), np.nan, np.float32)
 
 
-def projection_of_cubes(lows: npt.NDArray[np.int64], camera: Camera, T_map_camera: Floats) -> Flags:
-    """(H, W) pixels whose centre lies in the outline of a cube's image: its edges cut small, projected, their hull."""
-    mask = np.zeros((camera.height, camera.width), np.bool_)
-    steps = np.linspace(0, 1, 9)
-    grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
-    on_edges = grid[((grid == 0) | (grid == 1)).sum(axis=1) >= 2]
-    T = inverse(T_map_camera)
-    for low in lows:
-        pixels = camera.project((low + on_edges) * EDGE_M @ T[:3, :3].T + T[:3, 3])
-        hull = cv2.convexHull(pixels.astype(np.float32)).reshape(-1, 2)
-        left, top = np.maximum(np.floor(hull.min(axis=0)).astype(int), 0)
-        right, bottom = np.minimum(np.ceil(hull.max(axis=0)).astype(int) + 1, [camera.width, camera.height])
-        x, y = np.meshgrid(np.arange(left, max(left, right)), np.arange(top, max(top, bottom)))
-        following = np.roll(hull, -1, axis=0)
-        sides = [(b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]) for a, b in zip(hull, following, strict=True)]
-        inside = (np.array(sides) >= 0).all(axis=0) | (np.array(sides) <= 0).all(axis=0)
-        mask[y, x] |= inside
-    return mask
-
-
 @pytest.mark.parametrize("seed", range(POSES))
 def test_what_is_drawn_covers_the_projection_of_its_cubes_through_a_lens(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    lows = np.unique(rng.integers(-6, 6, (40, 3)), axis=0)
-    snapshot = snapshot_with({tuple(low): (3, 0) for low in lows.tolist()})
-    eye = rng.normal(size=3)
-    T = look_at((eye / np.linalg.norm(eye) * 0.9).tolist(), rng.uniform(-0.1, 0.1, 3).tolist())
-    mask = MapRenderer().nearest(snapshot, Sight(DISTORTED.rays()), T, range_max_m=5).hit
-    expected = projection_of_cubes(lows, DISTORTED, T)
-    assert expected.sum() > 1000
-    assert (mask & expected).sum() / (mask | expected).sum() >= 0.98
+    (score,) = overlay_scores(DISTORTED, poses=1, seed=seed, style=OverlayStyle(step_px=1))
+    assert score.expected_px > 1000
+    assert score.visible >= 0.98 and score.map_only >= 0.98
+
+
+def test_what_the_map_alone_knows_is_looked_up_in_the_middle_of_each_block() -> None:
+    """So that its edges are off by at most half a block, and to no side more than to the other."""
+    snapshot, sight = snapshot_with(box((20, -2, -2), (22, 2, 2))), pinhole(80, 61, focal_px=100)
+    live = Live(rgb=image_of(sight), range_m=no_depth(sight), sight=sight, T_map_camera=look_at((0, 0, 0), (1, 0, 0)))
+    fine, coarse = (
+        draw_overlay(MapRenderer(), snapshot, live, OverlayStyle(step_px=step)).front_modes == Mode.MAP_ONLY
+        for step in (1, 3)
+    )
+    assert fine.any()
+    rows, columns = (np.minimum(np.arange(size) // 3 * 3 + 1, size - 1) for size in fine.shape)
+    np.testing.assert_array_equal(coarse, fine[np.ix_(rows, columns)])
 
 
 def test_what_is_hidden_is_never_drawn_as_visible() -> None:

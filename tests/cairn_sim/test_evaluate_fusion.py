@@ -1,6 +1,7 @@
 """`cairn sim evaluate-fusion`: what its scores count, on a truth made by hand; its pictures; real hot cups."""
 
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from cairn_calib.poses import look_at
 from cairn_calib.rig import Spectrum
 from cairn_fusion.across import Across
 from cairn_fusion.eye_depth import EyeDepth
+from cairn_fusion.images import read_colour
 from cairn_fusion.surface import Drawn
 from cairn_fusion.transfer import Label
 from cairn_fusion.view.temperature_scale import TemperatureScale
@@ -106,6 +108,61 @@ def test_real_hot_cups_are_where_the_sets_own_registration_has_them() -> None:
         assert frame.fused_iou > frame.given_iou - 0.02 and frame.fused_iou > 0.7
 
 
-def test_the_command_refuses_numbers_that_mean_nothing(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="--scans"):
-        main(["evaluate-fusion", str(tmp_path), "--scans", "0"])
+def test_the_command_prints_its_tables_and_writes_pictures_that_show_something(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = ["--scans", "1", "--poses", "2", "--scale", "0.25", "--map", "1", "--voxel", "0.08"]
+    assert main(["evaluate-fusion", str(tmp_path), *small]) == 0
+    tables = tables_of(capsys.readouterr().out)
+    warm, colour, over, mapped = (
+        tables[head] for head in ("temperature, K, on colour_left", "colour, of 255, on thermal_left", OVER, MAPPED)
+    )
+    assert set(warm) == set(colour) == set(WAYS)
+    assert warm["both cameras"]["median"] < 0.1 and colour["both cameras"]["median"] < 2
+    for table in (warm, colour):
+        assert table["both cameras"]["95 % away"] < table["not calibrated"]["95 % away"]
+        assert table["both cameras"]["painted %"] >= table["one camera"]["painted %"] > 20
+        assert table["one camera"]["hidden %"] < table["nothing hides"]["hidden %"]
+        assert table["one camera"]["recall +-1"] > 70
+    visible, alone = over["live depth agrees"], over["no live depth, 3 px at a time"]
+    assert visible["poses"] == alone["poses"] == 2
+    assert 0.98 <= visible["least"] <= visible["mean"] <= 1
+    # At most a pixel off, of cubes of a dozen.
+    assert 0.85 < alone["least"] <= alone["mean"] < visible["mean"]
+    kept, edges = mapped["as cairn maps, pipes"], mapped["edges painted, pipes"]
+    assert kept["voxels"] == edges["voxels"] > 100
+    assert kept["median K"] < 0.5 and kept["95 % K"] < 2 < edges["95 % K"]
+    assert 20 < kept["known %"] < edges["known %"] <= 100
+    figure, errors = (read_colour(tmp_path / name) for name in ("fig24.png", "errors.png"))
+    assert figure.shape == (488, 648, 3) and errors.shape == (240, 960, 3)
+    panels = [figure[top : top + 240, left : left + 320].astype(int) for top in (0, 248) for left in (0, 328)]
+    assert all(panel.std() > 10 for panel in [*panels, *np.hsplit(errors, 3)])
+    # Of the three that are made: calibration moves what is fused, and neither is the colour image alone.
+    assert all(np.abs(one - panels[3]).mean() > 2 for one in panels[:3])
+
+
+OVER = "map over colour_left, IoU"
+MAPPED = "map of 1 stops, 8 cm"
+
+
+def tables_of(printed: str) -> dict[str, dict[str, dict[str, float]]]:
+    """By head of the table, name of the row, and column; columns are two blanks apart."""
+    tables: dict[str, dict[str, dict[str, float]]] = {}
+    columns, rows = list[str](), dict[str, dict[str, float]]()
+    for line in printed.splitlines():
+        name, *cells = re.split(r"\s{2,}", line.strip())
+        if not cells:
+            continue
+        if line.startswith("  "):
+            values = [float("nan" if cell == "-" else cell) for cell in cells]
+            rows[name] = dict(zip(columns, values, strict=True))
+        else:
+            columns, rows = cells, {}
+            tables[name] = rows
+    return tables
+
+
+@pytest.mark.parametrize("option", [("--scans", "0"), ("--poses", "0"), ("--map", "-1"), ("--scale", "2")])
+def test_the_command_refuses_numbers_that_mean_nothing(tmp_path: Path, option: tuple[str, str]) -> None:
+    with pytest.raises(BadInputError, match=option[0]):
+        main(["evaluate-fusion", str(tmp_path), *option])
