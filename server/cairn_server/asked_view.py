@@ -11,12 +11,14 @@ from cairn_server.cells_at_rest import stored_evidence
 from cairn_server.http_ranges import is_same
 from cairn_server.service import Service
 from cairn_server.store_rows import CellRow, Head, MapRow
-from cairn_server.view_cache import view_name
+from cairn_server.view_cache import view_name, way_of_seeing
 
 
-def view_etag(stored: CellRow, depth: int) -> str:
-    """Strong: the same cell and depth give the same bytes."""
-    return f'"{stored.digest.hex()}.view.{depth}"'
+def cell_etag(row: MapRow, stored: CellRow, suffix: str, depth: int | None) -> str:
+    """Strong: the same cell, seen in the same way, gives the same bytes; its octree (no suffix, no depth) in any."""
+    if depth is not None:
+        suffix = f"view.{depth}"
+    return f'"{stored.digest.hex()}.{suffix}.{way_of_seeing(row)}"' if suffix else f'"{stored.digest.hex()}"'
 
 
 def asked_cell_view(
@@ -46,6 +48,6 @@ def view_of_stored(row: MapRow, stored: CellRow, depth: int) -> bytes:
 
 
 def _view(service: Service, row: MapRow, stored: CellRow | None, depth: int, known: str | None) -> bytes:
-    if stored is None or is_same(view_etag(stored, depth), known):
+    if stored is None or is_same(cell_etag(row, stored, "view", depth), known):
         return b""
     return service.cell_views.view(view_name(row, stored, depth), lambda: view_of_stored(row, stored, depth))

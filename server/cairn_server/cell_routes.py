@@ -12,7 +12,7 @@ from cairn_map.ids import author_from_text
 from cairn_map.index_messages import INDEX_PAGE, INDEX_PAGE_MAX, CellIndex
 from cairn_map.version_vector import vector_digest, vector_text
 from cairn_map.voxel_messages import VoxelAnswer
-from cairn_server.asked_view import asked_cell_view, view_etag
+from cairn_server.asked_view import asked_cell_view, cell_etag
 from cairn_server.asked_voxel import asked_voxel
 from cairn_server.auth import Caller
 from cairn_server.cell_index import IndexPage
@@ -86,7 +86,7 @@ def get_cell(
         stored, head, view = asked_cell_view(service, row, key, depth, known=if_none_match)
     if stored is None:
         raise NotFoundError("no_cell", f"nobody has seen cell {number} of map {row.name}")
-    etag = f'"{stored.digest.hex()}{dot}{suffix}"' if depth is None else view_etag(stored, depth)
+    etag = cell_etag(row, stored, suffix, depth)
     headers = {
         "ETag": etag,
         "Cache-Control": "no-cache",

@@ -59,7 +59,7 @@ def sound_cell(snapshot: Snapshot, key: CellKey, geometry: Geometry, healed: lis
     Raises:
         DamagedCellError: it is damaged, and the log does not tell any more what it was.
     """
-    stored = _row(snapshot, key)
+    stored = row_of_cell(snapshot, key)
     if stored is None or _SOUND.knows(stored):
         return stored
     try:
@@ -146,7 +146,7 @@ def cell_to_change(snapshot: Snapshot, key: CellKey, geometry: Geometry) -> tupl
     Raises:
         DamagedCellError: it is damaged, and so is what it was made from.
     """
-    stored = _row(snapshot, key)
+    stored = row_of_cell(snapshot, key)
     cell = BrickCell(geometry)
     if stored is None:
         return cell, no_stamps(geometry.depth)
@@ -159,7 +159,12 @@ def cell_to_change(snapshot: Snapshot, key: CellKey, geometry: Geometry) -> tupl
     return cell, stamps
 
 
-def _row(snapshot: Snapshot, key: CellKey) -> CellRow | None:
+def row_of_cell(snapshot: Snapshot, key: CellKey) -> CellRow | None:
+    """A cell as it is stored, not looked at; None: never seen.
+
+    Raises:
+        DamagedCellError: not even that can be read.
+    """
     try:
         return snapshot.cell(key)
     except DamagedDataError as exc:

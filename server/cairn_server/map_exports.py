@@ -6,6 +6,7 @@ laid aside. The file is gone as soon as the answer is, however it ends. So an ex
 whatever its size.
 """
 
+import math
 import tempfile
 import threading
 import time
@@ -149,7 +150,7 @@ def _laid_aside(
     aside: IO[bytes], snapshot: Snapshot, file: _PointFile | _TreeFile, healed: list[CellRow]
 ) -> list[tuple[CellKey, int]]:
     """Cells that have what is asked for, rising in number, with the sizes of their bytes."""
-    until_s, row = time.monotonic() + COUNT_S, file.row
+    until_s, row = math.inf, file.row
     voxels, sizes = 0, list[tuple[CellKey, int]]()
     for listed in snapshot.cells():
         if not listed.voxels or not cell_may_have(listed.key, row.geometry, file.asked):
@@ -165,6 +166,8 @@ def _laid_aside(
         if stored is None:
             raise DamagedCellError(listed.key, "a cell is listed, but is not there")
         kept = file.kept(stored, stored_evidence(stored))
+        if until_s == math.inf:
+            until_s = time.monotonic() + COUNT_S  # not from the start: with the first cell kernels may be compiled
         if kept:
             aside.write(kept)
             sizes.append((stored.key, len(kept)))

@@ -5,6 +5,7 @@ so many pictures are made at a time. A picture depends on the request and on the
 """
 
 import hashlib
+import logging
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -27,14 +28,16 @@ from cairn_map.render_picture import Layer
 from cairn_map.render_request import RenderRequest
 from cairn_map.sight import cells_in_sight
 from cairn_map.warm_up import warm_up_pictures
-from cairn_server.cells_at_rest import DamagedCellError, sound_cell, stored_evidence, stored_stamps
+from cairn_server.cells_at_rest import DamagedCellError, row_of_cell, sound_cell, stored_evidence
 from cairn_server.damaged_cells import DamagedCells
 from cairn_server.healing import keep_healed
 from cairn_server.made_once import MadeOnce
 from cairn_server.read_cache import State, state_of
-from cairn_server.stamps import Stamps
+from cairn_server.stamps import Stamps, decode_stamps, no_stamps
 from cairn_server.store import Snapshot, Store
 from cairn_server.store_rows import CellRow, Head, MapRow
+
+log = logging.getLogger(__name__)
 
 VERSION = 2
 """Of what a picture looks like: part of its ETag."""
@@ -113,12 +116,12 @@ class MapViews:
             UnreachableError: kind `busy`: others are being made.
             DamagedCellError: kind `damaged_store`: a cell in sight is damaged.
         """
+        _get_ready()
         with self._store.snapshot(row) as snapshot:
             etag = _etag(snapshot.head, request)
             if known is not None and etag in known:
                 return AskedView(etag, snapshot.head, None)
             with self._turn():
-                _get_ready()
                 task = _Task(snapshot, row, _read_of(request.layer), {}, time.monotonic() + RENDER_S)
                 try:
                     body = self._body(task, request)
@@ -192,7 +195,7 @@ class MapViews:
             raise BadInputError(
                 "too_large", f"more than {VOXELS_READ_MAX} voxels are in the cells in sight; lower range_m"
             )
-        stored = {key: task.snapshot.cell(key) for key in wanted}
+        stored = {key: row_of_cell(task.snapshot, key) for key in wanted}
 
         def make(key: CellKey) -> ReadCell:
             state = state_of(task.snapshot, task.listed[key])
@@ -224,10 +227,15 @@ class MapViews:
         return Ages(changes, now=self._time_of(task, head.log_id, head.seq))
 
     def _stamps(self, task: _Task, key: CellKey) -> Stamps:
-        stored = task.snapshot.cell(key)
+        """When each block was changed last, by log entry; where that is damaged, never: its age is unknown."""
+        stored, depth = row_of_cell(task.snapshot, key), task.row.geometry.depth
         if stored is None:
-            raise DamagedDataError("damaged_store", f"cell {cell_of_key(key)} is listed, but is not there")
-        return stored_stamps(stored, task.row.geometry)
+            raise DamagedCellError(key, "a cell is listed, but is not there")
+        try:
+            return decode_stamps(stored.stamps, depth=depth, lm=stored.lm)
+        except DamagedDataError as exc:
+            log.error("cell %s: %s; its age is unknown", cell_of_key(key), exc.message)
+            return no_stamps(depth)
 
     def _time_of(self, task: _Task, log_id: bytes, seq: int) -> float:
         """When the last scan of an entry's commit was taken; NaN where it states no time."""
@@ -244,10 +252,26 @@ class MapViews:
         return time_s
 
 
-@cache
 def _get_ready() -> None:
-    """Load the kernels that draw, or compile them, which takes a minute where nobody did: no picture's time."""
+    """Load the kernels that draw, or compile them, which takes a minute where nobody did: no picture's time or turn.
+
+    Raises:
+        UnreachableError: kind `busy`: another request is at it.
+    """
+    if not _loading.acquire(timeout=WAIT_S):
+        raise UnreachableError("busy", "the code that draws is being compiled", retry_after_s=5.0)
+    try:
+        _loaded()
+    finally:
+        _loading.release()
+
+
+@cache
+def _loaded() -> None:
     warm_up_pictures()
+
+
+_loading = threading.Lock()
 
 
 def _read_of(layer: Layer) -> Layer:

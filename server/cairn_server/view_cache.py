@@ -12,6 +12,7 @@ from functools import lru_cache
 
 from cairn_map.grid import Geometry
 from cairn_map.sensor_model import SensorModel
+from cairn_map.view_code import VERSION
 from cairn_server.store_rows import CellRow, MapRow
 
 BYTES_MAX = 1 << 26
@@ -20,13 +21,18 @@ BYTES_MAX = 1 << 26
 
 def view_name(row: MapRow, stored: CellRow, depth: int) -> str:
     """What tells one view from all others, also from those of another map that once had this name."""
-    return f"{row.name}/{_way_of_seeing(row.geometry, row.sensor_model)}/{stored.digest.hex()}/{depth}"
+    return f"{row.name}/{way_of_seeing(row)}/{stored.digest.hex()}/{depth}"
+
+
+def way_of_seeing(row: MapRow) -> str:
+    """What the looks of a map's cells depend on besides their evidence, in 16 hex digits."""
+    return _digest(row.geometry, row.sensor_model)
 
 
 @lru_cache(maxsize=256)
-def _way_of_seeing(geometry: Geometry, model: SensorModel) -> str:
-    """What a view depends on besides the cell."""
-    return hashlib.sha256(f"{geometry.model_dump_json()} {model.model_dump_json()}".encode()).hexdigest()[:16]
+def _digest(geometry: Geometry, model: SensorModel) -> str:
+    text = f"{VERSION} {geometry.model_dump_json()} {model.model_dump_json()}"
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 class ViewCache:

@@ -20,6 +20,7 @@ from tests.cairn_map.made import SMALL
 from cairn_map.commit import Commit
 from cairn_map.grid import Geometry
 from cairn_map.messages import CreateMap, Retract
+from cairn_map.sensor_model import SensorModel
 from cairn_server.routes import make_app
 from cairn_server.serve_command import config_of, listen
 from cairn_server.service import Service
@@ -66,10 +67,10 @@ class Live:
         self._thread.join()
         self.service.close()
 
-    def new_map(self, geometry: Geometry = SMALL) -> MapRow:
+    def new_map(self, geometry: Geometry = SMALL, sensor_model: SensorModel | None = None) -> MapRow:
         """An empty map of its own name."""
         name = next(self._names)
-        self.service.create_map(name, CreateMap(geometry=geometry))
+        self.service.create_map(name, CreateMap(geometry=geometry, sensor_model=sensor_model or SensorModel()))
         return self.service.store.map(name)
 
     def push(self, row: MapRow, commit: Commit, **options: Any) -> httpx.Response:

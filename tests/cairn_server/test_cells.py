@@ -18,6 +18,7 @@ from cairn_map.cursor import cursor_from_text
 from cairn_map.fingerprint import fingerprint
 from cairn_map.grid import cell_of_key
 from cairn_map.index_messages import CellIndex
+from cairn_map.sensor_model import SensorModel
 from cairn_map.version_vector import version_vector_from_json
 from cairn_server.store_rows import MapRow
 
@@ -61,6 +62,19 @@ def test_each_form_of_a_cell_has_its_own_etag(live: Live, row: MapRow) -> None:
     etags = [live.http.get(path_of(row, suffix)).headers["ETag"] for suffix in ("", ".npz", ".ply")]
     assert len(set(etags)) == 3
     assert live.http.get(path_of(row, ".ply"), headers={"If-None-Match": etags[0]}).status_code == 200
+
+
+@pytest.mark.parametrize("suffix", ["", ".npz", ".ply", ".view?depth=2", ".view?depth=3"])
+def test_what_another_sensor_model_makes_of_a_cell_has_another_etag(live: Live, row: MapRow, suffix: str) -> None:
+    """As of a server that was started anew in an empty folder, where robots brought the same evidence."""
+    other = live.new_map(sensor_model=SensorModel(p_hit=0.6))
+    live.push(other, pushed(0, 0))
+    live.folded(other)
+    etag = live.http.get(path_of(row, suffix)).headers["ETag"]
+    assert live.http.get(path_of(row, suffix), headers={"If-None-Match": etag}).status_code == 304
+    elsewhere = live.http.get(path_of(other, suffix), headers={"If-None-Match": etag})
+    assert elsewhere.status_code == (200 if suffix else 304)
+    assert (elsewhere.headers["ETag"] == etag) == (not suffix)
 
 
 def test_a_changed_cell_has_another_etag(live: Live, row: MapRow) -> None:

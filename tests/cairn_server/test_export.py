@@ -2,6 +2,7 @@
 
 import io
 import tracemalloc
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -17,8 +18,9 @@ from tests.cairn_server.test_push import kind_of
 from cairn_map.cell_code import decode_cell
 from cairn_map.export_request import ExportRequest
 from cairn_map.grid import CellKey
-from cairn_map.map_points import PCD_POINT, POINT
+from cairn_map.map_points import PCD_POINT, POINT, found_in_cell
 from cairn_map.voxels import joined_voxels, voxels_of_evidence
+from cairn_server import map_exports
 from cairn_server.store_rows import MapRow
 
 
@@ -150,3 +152,23 @@ def test_an_export_holds_one_cell_at_a_time(live: Live) -> None:
     assert sum(sizes) == made.size_bytes
     assert max(sizes) < made.size_bytes / 2
     assert peak < 100 * max(sizes) + (8 << 20)
+
+
+def test_compiling_kernels_is_no_part_of_an_exports_time(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    row, now_s, looked = mapped(live), [0.0], list[int]()
+
+    def slow_on(cell: int) -> None:
+        def found(*args: Any) -> Any:
+            looked.append(0)
+            now_s[0] += 2 * map_exports.COUNT_S if len(looked) == cell else 0.0
+            return found_in_cell(*args)
+
+        looked.clear()
+        monkeypatch.setattr(map_exports, "found_in_cell", found)
+
+    monkeypatch.setattr(map_exports, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    slow_on(1)
+    assert ask(live, row, format="npz").status_code == 200 and len(looked) > 2
+    slow_on(2)
+    answer = ask(live, row, format="npz")
+    assert (answer.status_code, kind_of(answer)) == (400, "too_costly")

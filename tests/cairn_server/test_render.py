@@ -2,6 +2,7 @@
 
 import io
 import threading
+from contextlib import ExitStack
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 from tests.cairn_map.made import PLAIN, SMALL
 from tests.cairn_server.live import Live
 from tests.cairn_server.pushes import pushed
+from tests.cairn_server.test_broken_cell import damage
 from tests.cairn_server.test_broken_cell import new_map as broken_map
 from tests.cairn_server.test_push import kind_of
 
@@ -129,6 +131,15 @@ def test_ages_are_counted_from_the_newest_measurement(live: Live) -> None:
     assert set(np.unique(alone["age_s"][~np.isnan(alone["age_s"])])) == {0.0}
 
 
+def test_the_age_of_what_nobody_can_tell_it_of_any_more_is_unknown(live: Live) -> None:
+    row, look = mapped(live, 0), asking(layer=Layer.AGE, format="npz")
+    seen = ~np.isnan(arrays(ask(live, row, look))["range_m"])
+    damage(live, "UPDATE cell SET stamps = x'01020304' WHERE map = ?", row.number)
+    told = arrays(ask(live, row, look))
+    np.testing.assert_array_equal(~np.isnan(told["range_m"]), seen)
+    assert seen.any() and np.isnan(told["age_s"]).all()
+
+
 def test_an_uncertain_pose_blurs_the_picture_or_withholds_it(live: Live) -> None:
     row, lower = mapped(live, 0), np.zeros(21)
     sharp = ask(live, row)
@@ -211,12 +222,27 @@ def test_compiling_kernels_is_no_part_of_a_pictures_time(live: Live, monkeypatch
     row, now_s = mapped(live, 0), [0.0]
 
     def compile_for_long() -> None:
+        with ExitStack() as all_turns:
+            for _ in range(map_views.RENDERS_AT_ONCE):
+                all_turns.enter_context(live.service.views._turn())
         warm_up_pictures()
         now_s[0] += 2 * map_views.RENDER_S
 
     monkeypatch.setattr(map_views, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
     monkeypatch.setattr(map_views, "_get_ready", compile_for_long)
     assert ask(live, row).status_code == 200 and now_s[0] > 0
+
+
+def test_who_asks_while_another_ones_request_compiles_is_told_to_come_later(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = mapped(live, 0)
+    monkeypatch.setattr(map_views, "WAIT_S", 0.01)
+    with map_views._loading:
+        answer = ask(live, row)
+    assert (answer.status_code, kind_of(answer)) == (503, "busy")
+    assert "compiled" in answer.text and answer.headers["Retry-After"]
+    assert ask(live, row).status_code == 200
 
 
 def test_only_so_many_are_made_at_once(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
