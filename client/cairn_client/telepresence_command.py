@@ -49,6 +49,11 @@ from cairn_map.errors import BadInputError
 from cairn_map.render_picture import Layer, Scale
 
 RATE_HZ = 5.0
+ALPHA = 0.5
+NO_IMAGE = ("missing_image", "unknown_camera")
+"""What a scan without an image of the camera is refused as."""
+View = tuple[int, npt.NDArray[np.uint8]]
+"""A scan's number and its picture."""
 MAP = "map"
 """Mode: the map over the live image."""
 
@@ -63,7 +68,7 @@ def main(argv: list[str]) -> int:
     elif args.publish is not None:
         _publish(source, telepresence, args)
     elif args.output.suffix.lower() == ".png":
-        _write(telepresence, source, args.scan or 0, args.output)
+        _write(telepresence.view(source.scan(args.scan or 0)), args.output)
         say(f"wrote {args.output}: {args.mode}, scan {args.scan or 0} of {len(source)} of {source.name}")
     else:
         _write_all(source, telepresence, args)
@@ -76,18 +81,62 @@ def _pictures(source: ScanSource, args: argparse.Namespace) -> Telepresence | Ma
         raise BadInputError(
             "bad_option", f"the map is needed here: `cairn clone {args.map} FOLDER`, and then FOLDER for the URL"
         )
+    _check_options(args)
+    if args.camera is not None:
+        _ = source.rig[args.camera]  # raises: there is none
     found = None if args.map is None else map_of_folder(Path(args.map))
     if args.mode != MAP:
-        if not spread_of(args).is_exact:
-            raise BadInputError("bad_option", f"a pose's certainty is that of a map over the image: --mode {MAP}")
         return Telepresence(source.rig, _options(args), None if found is None else found.snapshot)
     if found is None:
         raise BadInputError("nothing_asked", "say which map: --map FOLDER, of exported cells or of a robot's state")
-    if args.layer is Layer.AGE and found.ages is None:
+    layer = args.layer or Layer.TEMPERATURE
+    if layer is Layer.AGE and found.ages is None:
         raise BadInputError("no_age", f"{args.map} does not say when anything was measured; choose another --layer")
-    scale = None if args.scale is None else Scale(args.layer, *args.scale)
-    style = OverlayStyle(layer=args.layer, scale=scale)
+    style = OverlayStyle(layer=layer, scale=None if args.scale is None else Scale(layer, *args.scale))
     return MapOverlay(rig=source.rig, map=found, style=style, camera=args.camera, spread=spread_of(args))
+
+
+def _check_options(args: argparse.Namespace) -> None:
+    """Refuse what the mode would not show.
+
+    Raises:
+        BadInputError: kind `bad_option`.
+    """
+    painted = {f"--{name}" for name in ("alpha", "hotter", "band") if getattr(args, name) is not None}
+    marker = {"--no-marker"} if args.no_marker else set[str]()
+    spread = set[str]() if spread_of(args).is_exact else {f"--sigma or --covariance (of --mode {MAP})"}
+    of_map = spread if args.layer is None else spread | {f"--layer (of --mode {MAP})"}
+    unused = {
+        MAP: painted | marker,
+        Mode.SIDE_BY_SIDE: painted | of_map,
+        Mode.STEREO: of_map if args.camera is None else of_map | {"--camera"},
+    }.get(args.mode, of_map)
+    if unused:
+        raise BadInputError(
+            "bad_option", f"--mode {args.mode} does not show {', '.join(sorted(unused))}; leave that out"
+        )
+
+
+def _views(source: ScanSource, telepresence: Telepresence | MapOverlay, numbers: Iterable[int]) -> Iterator[View]:
+    """Numbers and pictures of scans, one after the other; what has no image of the camera is told and left out.
+
+    Raises:
+        BadInputError: kind `missing_image` or `unknown_camera`: none has one.
+    """
+    shown, why = 0, None
+    for number in numbers:
+        try:
+            picture = telepresence.view(source.scan(number))
+        except BadInputError as exc:
+            if exc.kind not in NO_IMAGE:
+                raise
+            say(f"left out scan {number}: {exc.message}")
+            why = exc
+        else:
+            shown += 1
+            yield number, picture
+    if why is not None and not shown:
+        raise why
 
 
 def _write_all(source: ScanSource, telepresence: Telepresence | MapOverlay, args: argparse.Namespace) -> None:
@@ -97,13 +146,14 @@ def _write_all(source: ScanSource, telepresence: Telepresence | MapOverlay, args
     except OSError as exc:
         raise BadInputError("bad_output", f"cannot make the folder {args.output}: {exc.strerror}") from exc
     numbers = range(len(source)) if args.scan is None else [args.scan]
-    for number in with_progress(numbers, "pictures", total=len(numbers)):
-        _write(telepresence, source, number, args.output / f"{number:06d}.png")
-    say(f"wrote {len(numbers)} pictures into {args.output}: {args.mode} of {source.name}")
+    written = 0
+    for number, picture in _views(source, telepresence, with_progress(numbers, "pictures", total=len(numbers))):
+        _write(picture, args.output / f"{number:06d}.png")
+        written += 1
+    say(f"wrote {written} pictures into {args.output}: {args.mode} of {source.name}")
 
 
-def _write(telepresence: Telepresence | MapOverlay, source: ScanSource, number: int, path: Path) -> None:
-    picture = telepresence.view(source.scan(number))
+def _write(picture: npt.NDArray[np.uint8], path: Path) -> None:
     try:
         write_colour(path, picture)
     except OSError as exc:
@@ -115,14 +165,19 @@ def _serve(source: ScanSource, telepresence: Telepresence | MapOverlay, args: ar
     host, port = args.serve
     latest = Latest()
     numbers = range(len(source)) if args.scan is None else [args.scan]
-    latest.show(telepresence.view(source.scan(numbers[0])))
+    # The first round finds out which scans have an image; the next ones show these.
+    pictures = _views(source, telepresence, numbers)
+    first, picture = next(pictures)
+    latest.show(picture)
     with streaming(latest, host=host, port=port) as url:
         say(f"{args.mode} of {source.name} at {url} ; end with Ctrl-C")
+        there = [first]
+        for number, picture in _paced(pictures, args.rate):
+            latest.show(picture)
+            there.append(number)
         while True:
-            for number in numbers:
-                due_s = time.monotonic() + 1 / args.rate
-                latest.show(telepresence.view(source.scan(number)))
-                time.sleep(max(0.0, due_s - time.monotonic()))
+            for _, picture in _paced(_views(source, telepresence, there), args.rate):
+                latest.show(picture)
 
 
 def _publish(source: ScanSource, telepresence: Telepresence | MapOverlay, args: argparse.Namespace) -> None:
@@ -132,23 +187,27 @@ def _publish(source: ScanSource, telepresence: Telepresence | MapOverlay, args: 
     api, map_name = api_of(args.publish, args.token)
     numbers = range(len(source)) if args.scan is None else [args.scan]
     with api:
-        sent, lost = publish_views(_paced(source, telepresence, numbers, args.rate), api, map_name, args.robot)
+        pictures = _paced(_views(source, telepresence, numbers), args.rate)
+        sent, lost = publish_views((picture for _, picture in pictures), api, map_name, args.robot)
     missed = f", {lost} did not get through" if lost else ""
     say(f"{args.robot} showed {sent} pictures of {source.name}: {args.mode}{missed}")
 
 
-def _paced(
-    source: ScanSource, telepresence: Telepresence | MapOverlay, numbers: Iterable[int], rate_hz: float
-) -> Iterator[npt.NDArray[np.uint8]]:
-    for number in numbers:
+def _paced(views: Iterator[View], rate_hz: float) -> Iterator[View]:
+    """The same, at most so many a second."""
+    while True:
         due_s = time.monotonic() + 1 / rate_hz
-        yield telepresence.view(source.scan(number))
+        view = next(views, None)
+        if view is None:
+            return
+        yield view
         time.sleep(max(0.0, due_s - time.monotonic()))
 
 
 def _options(args: argparse.Namespace) -> ViewOptions:
     from_c, to_c = args.band or (args.hotter if args.hotter is not None else -math.inf, math.inf)
-    emphasis = Emphasis(alpha=args.alpha, from_k=from_c + ZERO_CELSIUS_K, to_k=to_c + ZERO_CELSIUS_K)
+    alpha = ALPHA if args.alpha is None else args.alpha
+    emphasis = Emphasis(alpha=alpha, from_k=from_c + ZERO_CELSIUS_K, to_k=to_c + ZERO_CELSIUS_K)
     scale = None
     if args.scale is not None:
         scale = TemperatureScale(args.scale[0] + ZERO_CELSIUS_K, args.scale[1] + ZERO_CELSIUS_K)
@@ -199,10 +258,10 @@ def _parser() -> argparse.ArgumentParser:
     options.add_argument("--scan", type=int, metavar="N", help="only this scan, from 0")
     options.add_argument("--mode", choices=[*(mode.value for mode in Mode), MAP], default=Mode.THERMAL_ON_COLOUR.value)
     options.add_argument("--map", metavar="FOLDER", help="a robot's state, a clone, or exported cells")
-    options.add_argument("--layer", type=Layer, choices=list(Layer), default=Layer.TEMPERATURE, help="of the map")
+    options.add_argument("--layer", type=Layer, choices=list(Layer), help="of the map (temperature)")
     add_spread_arguments(options)
     options.add_argument("--camera", help="of the rig, to look through (the first that fits)")
-    options.add_argument("--alpha", type=float, default=0.5, help="of temperatures over colour, 0 to 1 (0.5)")
+    options.add_argument("--alpha", type=float, help=f"of temperatures over colour, 0 to 1 ({ALPHA:g})")
     painted = options.add_mutually_exclusive_group()
     painted.add_argument("--hotter", type=float, metavar="C", help="paint only what is hotter, deg C")
     painted.add_argument("--band", type=_celsius, metavar="LOW:HIGH", help="paint only what is between, deg C")

@@ -1,17 +1,26 @@
 """`cairn telepresence` on a recording: one picture, a folder of pictures, and what is refused."""
 
 from collections.abc import Iterator
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from tests.cairn_server.live import Live
 
+from cairn_client import telepresence_command
 from cairn_client.api import MapApi
 from cairn_client.telepresence_command import main
 from cairn_client.view_publishing import publish_views
 from cairn_fusion.images import read_colour
+from cairn_fusion.importers import open_source
+from cairn_fusion.recording import ScanSource
+from cairn_fusion.scan import Scan
+from cairn_fusion.view.mjpeg import Rgb
 from cairn_map.errors import BadInputError, NotFoundError
 from cairn_map.ids import new_incarnation, robot_name
 from cairn_map.messages import Register
@@ -92,3 +101,91 @@ def test_what_cannot_be_is_refused_in_words(recording: Path, tmp_path: Path) -> 
     for wrong in (["--serve", "loud"], ["--rate", "0", "--serve", "0"], ["--scale", "warm", "--serve", "0"], []):
         with pytest.raises(SystemExit):
             main([str(recording), *wrong])
+
+
+@pytest.mark.parametrize(
+    ("mode", "options"),
+    [
+        ("map", ["--hotter", "40"]),
+        ("map", ["--band", "20:30"]),
+        ("map", ["--alpha", "0.3"]),
+        ("map", ["--no-marker"]),
+        ("side-by-side", ["--hotter", "40"]),
+        ("stereo", ["--camera", "colour_left"]),
+        ("colour-on-thermal", ["--layer", "depth"]),
+        ("thermal-on-colour", ["--sigma", "0.1,1"]),
+    ],
+)
+def test_what_a_mode_would_not_show_is_refused(recording: Path, tmp_path: Path, mode: str, options: list[str]) -> None:
+    with pytest.raises(BadInputError, match=f"--mode {mode} does not show {options[0]}"):
+        main([str(recording), "--mode", mode, *options, "--output", str(tmp_path / "view.png")])
+
+
+class WithGaps:
+    """A recording, of some of whose scans there is no colour image."""
+
+    def __init__(self, source: ScanSource, gaps: list[int]) -> None:
+        self.name, self.rig = source.name, source.rig
+        self._source, self._gaps = source, gaps
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def scan(self, index: int) -> Scan:
+        scan = self._source.scan(index)
+        return replace(scan, colour={}) if index in self._gaps else scan
+
+
+@pytest.fixture
+def gaps(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Scans without colour images; to be filled in."""
+    missing: list[int] = []
+
+    def opened(*args: Any, **options: Any) -> WithGaps:
+        return WithGaps(open_source(*args, **options), missing)
+
+    monkeypatch.setattr(telepresence_command, "open_source", opened)
+    return missing
+
+
+@pytest.mark.parametrize("without", [[0], [1], [2]])
+def test_a_scan_without_an_image_is_told_and_left_out(
+    recording: Path, live: Live, gaps: list[int], without: list[int], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    row = live.new_map()
+    with MapApi(f"http://127.0.0.1:{live.port}") as api:
+        api.register(row.name, Register(robot=robot_name("scout"), incarnation=new_incarnation()))
+    gaps += without
+    url = f"http://127.0.0.1:{live.port}/maps/{row.name}"
+    assert main([str(recording), "--publish", url, "--rate", "1000", "--robot", "scout"]) == 0
+    told = capsys.readouterr().out
+    assert f"left out scan {without[0]}: the scan has no image of 'colour_left'" in told
+    assert "scout showed 2 pictures" in told
+    assert main([str(recording), "--output", str(tmp_path / "pictures")]) == 0
+    assert "wrote 2 pictures" in capsys.readouterr().out
+    assert f"{without[0]:06d}.png" not in {path.name for path in (tmp_path / "pictures").iterdir()}
+    gaps += [0, 1, 2]
+    with pytest.raises(BadInputError, match="no image"):
+        main([str(recording), "--publish", url, "--rate", "1000", "--robot", "scout"])
+
+
+def test_a_stream_goes_on_without_the_scans_that_have_no_image(
+    recording: Path, gaps: list[int], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[Rgb] = []
+
+    def show(picture: Rgb) -> None:
+        shown.append(picture)
+        if len(shown) == 5:
+            raise KeyboardInterrupt
+
+    gaps.append(0)
+    monkeypatch.setattr(telepresence_command, "Latest", lambda: SimpleNamespace(show=show))
+    monkeypatch.setattr(telepresence_command, "streaming", lambda *_, **__: nullcontext("http://127.0.0.1:0/"))
+    with pytest.raises(KeyboardInterrupt):
+        main([str(recording), "--serve", "0", "--rate", "1000"])
+    assert capsys.readouterr().out.count("left out scan") == 1
+    assert all(np.array_equal(shown[n], shown[n + 2]) for n in range(3)) and not np.array_equal(shown[0], shown[1])
+    gaps += [1, 2]
+    with pytest.raises(BadInputError, match="no image"):
+        main([str(recording), "--serve", "0", "--rate", "1000"])
