@@ -93,7 +93,7 @@ class Integrator:
         surfaces = f"flying_step_m={self.flying_step_m:g} noise_sigmas={self.noise_sigmas:g}"
         samples = f"sample_spread_voxels={self.sample_spread_voxels:g} temperature_step_k={self.temperature_step_k:g}"
         samples += f" hidden_behind_m={self.hidden_behind_m:g}"
-        return f"cairn-{self.method} 4 {limits} {surfaces} {samples}"
+        return f"cairn-{self.method} 5 {limits} {surfaces} {samples}"
 
 
 class Integration:

@@ -11,7 +11,7 @@ import signal
 import statistics
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import httpx
@@ -21,8 +21,10 @@ from tests.cairn_server.live import Process
 
 from cairn_calib.rig import Rig
 from cairn_client.api import MapApi
-from cairn_client.map_folder import snapshot_of_folder
+from cairn_client.map_folder import FolderMap, map_of_folder
+from cairn_client.overlay_drawing import MapOverlay
 from cairn_client.prior_data import push_prior_data
+from cairn_fusion.beyond_labels import beyond_pixels
 from cairn_fusion.live_range import live_range
 from cairn_fusion.overlay import Live, OverlayStyle, draw_overlay
 from cairn_fusion.scan import Scan
@@ -54,13 +56,15 @@ def overlay_rows(smoke: bool) -> Iterator[Row]:
     with tempfile.TemporaryDirectory() as name:
         for cm, least in ((8, ""),) if smoke else ((4, "25"), (2, "10")):
             folder = _map_folder(Path(name), cm, stops=1 if smoke else None)
-            snapshot = snapshot_of_folder(folder)
+            known = map_of_folder(folder)
+            snapshot = known.snapshot
             yield (
                 f"overlay of {len(snapshot.frozen.keys)} cells, {cm} cm",
                 f"{len(snapshot.frozen.grid.words)}",
                 "bricks",
             )
             yield from _overlay_rows(snapshot, rig, scans, least, repeats=2 if smoke else 5)
+            yield from _stream_rows(known, rig, scans, least, repeats=2 if smoke else 5)
             if cm != 2:
                 yield from _server_rows(folder, rig, scans)
 
@@ -118,6 +122,29 @@ def _overlay_rows(snapshot: MapSnapshot, rig: Rig, scans: Sequence[Scan], least:
         renderer.nearest(snapshot, sight, live.T_map_camera, range_max_m=20)
     seconds = (time.perf_counter() - start_s) / len(lives)
     yield "  the nearest of each pixel alone", f"{1e3 * seconds:.0f}", "ms"
+
+
+def _stream_rows(known: FolderMap, rig: Rig, scans: Sequence[Scan], least: str, *, repeats: int) -> Iterator[Row]:
+    """From scan to picture, as `cairn telepresence --mode map` does it: the colour camera's depth is found, too."""
+    overlay = MapOverlay(rig=rig, map=known, style=OverlayStyle(), camera=CAMERA)
+    for scan in scans:
+        overlay.view(scan)
+    seconds = _mean_s(overlay.view, scans, repeats=repeats)
+    goal = f"; at least {least} are asked for" if least else ""
+    yield "  from scan to picture", f"{1 / seconds:.1f}", f"frames/s, {THREADS} threads{goal}"
+    renderer, snapshot = overlay.renderer, known.snapshot
+    seconds = _mean_s(lambda scan: beyond_pixels(scan, rig, snapshot, renderer=renderer), scans, repeats=repeats)
+    yield "    what mirrors show", f"{1e3 * seconds:.1f}", "ms of it"
+    seconds = _mean_s(lambda scan: live_range(scan, rig, camera=CAMERA), scans, repeats=repeats)
+    yield "    the colour camera's depth", f"{1e3 * seconds:.1f}", "ms of it"
+
+
+def _mean_s(work: Callable[[Scan], object], scans: Sequence[Scan], *, repeats: int) -> float:
+    start_s = time.perf_counter()
+    for _ in range(repeats):
+        for scan in scans:
+            work(scan)
+    return (time.perf_counter() - start_s) / (repeats * len(scans))
 
 
 def _server_rows(folder: Path, rig: Rig, scans: Sequence[Scan]) -> Iterator[Row]:

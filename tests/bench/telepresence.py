@@ -4,8 +4,12 @@ import statistics
 import time
 from collections.abc import Iterator
 
+from cairn_fusion.integrate import Integrator, integrate_scans
 from cairn_fusion.scan import Scan
 from cairn_fusion.view.telepresence import Mode, Telepresence, ViewOptions
+from cairn_map.evidence_map import EvidenceMap
+from cairn_map.grid import geometry_for
+from cairn_map.map_snapshot import snapshot_of
 from cairn_sim.record import Plan, scans_of, shots_of
 from cairn_sim.robots import ROBOTS
 from cairn_sim.scene_file import load_scene
@@ -15,6 +19,7 @@ Row = tuple[str, str, str]
 
 STOP = 20
 """A laboratory with people, glass, hot things and a dark floor: with many edges, and so slower than most."""
+VOXEL_M = 0.04
 REPEATS = 5
 
 
@@ -29,13 +34,17 @@ def telepresence_rows(smoke: bool) -> Iterator[Row]:
     both = [scan for _, scan, _ in scans_of(plan, shots, rig)]
     # As the paper maps: one colour, one thermal camera; and with the second ones, too.
     single = [_with_one_thermal(scan) for scan in both]
-    for name, mode, scans in (
-        ("fused 640 x 512 view, colour on thermal", Mode.COLOUR_ON_THERMAL, single),
-        ("fused 1280 x 960 view, thermal on colour", Mode.THERMAL_ON_COLOUR, single),
-        ("  with the second thermal camera", Mode.THERMAL_ON_COLOUR, both),
-        ("stereo pair, 2 x 1280 x 960", Mode.STEREO, both),
+    mapped = EvidenceMap(geometry := geometry_for(voxel_edge_m=VOXEL_M))
+    mapped.merge(integrate_scans(both, rig, geometry, integrator=Integrator()))
+    snapshot = snapshot_of(mapped)
+    for name, mode, scans, known in (
+        ("fused 640 x 512 view, colour on thermal", Mode.COLOUR_ON_THERMAL, single, None),
+        ("fused 1280 x 960 view, thermal on colour", Mode.THERMAL_ON_COLOUR, single, None),
+        (f"  with a map of {VOXEL_M * 100:g} cm for its mirrors", Mode.THERMAL_ON_COLOUR, single, snapshot),
+        ("  with the second thermal camera", Mode.THERMAL_ON_COLOUR, both, None),
+        ("stereo pair, 2 x 1280 x 960", Mode.STEREO, both, None),
     ):
-        look = Telepresence(rig, ViewOptions(mode=mode))
+        look = Telepresence(rig, ViewOptions(mode=mode), known)
         look.view(scans[0])
         wall_s, cpu_s = zip(
             *(_seconds(look, scan) for _ in range(1 if smoke else REPEATS) for scan in scans), strict=True

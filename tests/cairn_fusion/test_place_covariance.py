@@ -134,6 +134,11 @@ def test_a_lidar_has_no_lens_to_look_from() -> None:
 def test_a_range_pixel_covers_half_of_itself_to_each_side_and_what_is_uncertain() -> None:
     plain = Rig(name="r", cameras={name: full_head()[name] for name in NAMES})
     far, near = reach_px_of(np.array([5.0, 0.5]), np.array([0.01, 0.05]), plain, src="tof", dst="thermal_left").tolist()
-    assert far == 2  # 3.6 / 2, and 0.02 from noise
-    assert near == int(np.ceil(1.82 + 465 * 0.085 * 0.05 / 0.25))
+    assert far == 1  # 3.6 / 2, and 0.02 from noise
+    assert near == int(1.82 + 465 * 0.085 * 0.05 / 0.25)
+    # Of a thermal camera with larger pixels than the range camera one pixel, for each may show both sides of an edge.
+    coarse = plain.model_copy(
+        update={"cameras": {**plain.cameras, "thermal_left": full_head(scale=0.2)["thermal_left"]}}
+    )
+    assert reach_px_of(np.array([5.0]), np.array([0.01]), coarse, src="tof", dst="thermal_left")[0] == 1
     assert reach_px_of(np.array([5.0]), np.array([0.01]), RIG, src="tof", dst="thermal_left")[0] > 2
