@@ -272,6 +272,8 @@ class LogEntry(_Model):
     """SHA-256 of the author's commit before it."""
     seen: CursorText | None = None
     """State of the server that the author had when it made it."""
+    place_m: tuple[float, float, float] | None = None
+    """Where the rig was for its last scan, metres, map frame; None: it has no scans, or is not kept any more."""
     via: str | None = None
     """Name of the token of the relay that handed it over; None: its robot did, or the server made it."""
 

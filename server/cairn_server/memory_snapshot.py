@@ -107,6 +107,7 @@ class MemorySnapshot:
     def _log_entry(self, seq: int, entry: Entry) -> LogEntry:
         kept = self._state.commits[self._state.ids[entry.commit]]
         meta = json.loads(kept.new.text) if kept.new.text else {}
+        scans = meta.get("scans")
         return LogEntry(
             seq=seq,
             kind="+" if entry.kind == ENTRY_FOLD else "-",
@@ -118,6 +119,7 @@ class MemorySnapshot:
             retracts=[str(target) for target in kept.new.retracts],
             parent=meta.get("parent"),
             seen=meta.get("seen"),
+            place_m=scans[-1]["t_map_rig"] if scans else None,
             via=kept.new.via,
         )
 

@@ -18,14 +18,14 @@ from cairn_server.sqlite_writer import first, rows
 from cairn_server.store_rows import CellRow, Contribution, Head, Selection, Totals
 
 CELL_COLUMNS = "cell, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k"
-PARENT, SEEN = (
-    f"CASE WHEN json_valid(CAST(meta AS TEXT)) THEN json_extract(CAST(meta AS TEXT), '$.{name}') END"
-    for name in ("parent", "seen")
+PARENT, SEEN, PLACE = (
+    f"CASE WHEN json_valid(CAST(meta AS TEXT)) THEN json_extract(CAST(meta AS TEXT), '$.{path}') END"
+    for path in ("parent", "seen", "scans[#-1].t_map_rig")
 )
 """Of a commit's meta; NULL, too, if that is damaged."""
 LOG_COLUMNS = (
     "seq, kind, robot, incarnation, n, sha, size_bytes, cells, captured_first_s, captured_last_s, retracts,"
-    f" {PARENT}, {SEEN}, via"
+    f" {PARENT}, {SEEN}, {PLACE}, via"
 )
 
 
@@ -225,6 +225,7 @@ def _log_entry(
     retracts: str,
     parent: str | None,
     seen: str | None,
+    place: str | None,
     via: str | None,
 ) -> LogEntry:
     return LogEntry.model_validate(
@@ -239,6 +240,7 @@ def _log_entry(
             "retracts": retracts.split(),
             "parent": parent,
             "seen": seen,
+            "place_m": json.loads(place) if place else None,
             "via": via,
         }
     )

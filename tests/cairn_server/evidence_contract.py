@@ -192,14 +192,16 @@ class EvidenceContract:
         fold(store, row, pushed(3, 0, cells={}, retracts=[first]))
         assert read(bodies(store, row)) == sum_of([first, second, out])
 
-    def test_the_log_tells_what_a_commit_was_made_on_while_its_meta_is_kept(self, store: Store) -> None:
+    def test_the_log_tells_what_a_commit_was_made_on_and_where_while_its_meta_is_kept(self, store: Store) -> None:
         row = new_map(store)
         parent, cursor = "ab" * 32, f"{'0' * 32}.0.{'0' * 32}"
-        meta = pushed(1, 0).meta.model_copy(update={"parent": parent, "seen": cursor})
+        meta = pushed(1, 0).meta
+        last = meta.scans[-1].model_copy(update={"t_map_rig": (1.5, -2.25, 0.4)})
+        meta = meta.model_copy(update={"parent": parent, "seen": cursor, "scans": (*meta.scans[:-1], last)})
         fold(store, row, make_commit(meta, {KEYS[0]: random_evidence(1, SMALL)}, SMALL))
         found = []
         for _ in range(2):
             with store.snapshot(row) as snapshot:
-                found += [(entry.parent, entry.seen) for entry in snapshot.log(after_seq=0, limit=9)]
+                found += [(entry.parent, entry.seen, entry.place_m) for entry in snapshot.log(after_seq=0, limit=9)]
             store.forget_evidence(row, before_s=SOON, limit=9)
-        assert found == [(parent, cursor), (None, None)]
+        assert found == [(parent, cursor, last.t_map_rig), (None, None, None)]

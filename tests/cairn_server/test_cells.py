@@ -167,3 +167,4 @@ def test_log_entries_tell_their_parent_and_what_their_author_had_seen(live: Live
     live.folded(made)
     entries = live.http.get(f"/maps/{made.name}/log").json()
     assert [(entry["parent"], entry["seen"]) for entry in entries][:2] == [(None, None), (first.sha.hex(), seen)]
+    assert [entry["place_m"] for entry in entries] == [[0.0, 0.0, 0.4]] * len(entries)

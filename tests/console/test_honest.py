@@ -77,7 +77,7 @@ def test_ages_are_told_as_time_by_the_commits_own_clocks(console: Console, room:
     highest = float(legend.get_by_label("Upper end").input_value()) * {"seconds": 1, "minutes": 60}[unit[1]]
     assert highest == pytest.approx(max(told.values()), abs=3)
     hours = console.tell(
-        "(c.strip.add([{ ...c.strip.entries.get(1), seq: 0, captured_s: [a[0], a[0]] }]), c.cells.ageOf(0))",
+        "(c.book.add([{ ...c.strip.entries.get(1), seq: 0, captured_s: [a[0], a[0]] }]), c.cells.ageOf(0))",
         max(times.values()) - 7200,
     )
     assert hours == pytest.approx(7200)

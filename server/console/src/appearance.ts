@@ -1,6 +1,6 @@
 /** The look as the graphics card takes it: uniforms, and the legend that tells them. Nothing is fetched for it. */
 
-import { ageUnit, type LogTimes } from "./log_times.ts";
+import { ageUnit, type LogBook } from "./log_book.ts";
 import { FIELDS, type Look } from "./look.ts";
 import type { Triple } from "./messages.ts";
 import { textureOf, type Palette } from "./palettes.ts";
@@ -8,7 +8,7 @@ import type { Cells } from "./scene/cells.ts";
 import { boxes, FIELD_CODES, squares, uniforms } from "./scene/materials.ts";
 import type { Stage } from "./scene/stage.ts";
 import { rangeOf } from "./scene/statistics.ts";
-import { Legend, type Ages } from "./ui/legend.ts";
+import { Legend, type Told } from "./ui/legend.ts";
 import { applyTheme } from "./ui/top_bar.ts";
 import { KELVIN_ZERO_C } from "./units.ts";
 
@@ -19,14 +19,14 @@ export class Appearance {
   private readonly look: Look;
   private readonly stage: Stage;
   private readonly cells: Cells;
-  private readonly times: LogTimes;
+  private readonly book: LogBook;
   private readonly palettes = new Map<Palette, ReturnType<typeof textureOf>>();
 
-  constructor(look: Look, stage: Stage, cells: Cells, times: LogTimes) {
+  constructor(look: Look, stage: Stage, cells: Cells, book: LogBook) {
     this.look = look;
     this.stage = stage;
     this.cells = cells;
-    this.times = times;
+    this.book = book;
     look.boxes ??= !stage.isSoftware;
   }
 
@@ -58,16 +58,18 @@ export class Appearance {
     const found = look.field === "colour" || look.field === "robot" ? null : rangeOf(this.cells, look.field, uLow.value.z, uHigh.value.z);
     const range = look.ranges[look.field] ?? (found && (found.map((end) => end - zero) as [number, number]));
     if (range) uRange.value.set(range[0] + zero, range[1] + zero);
-    this.legend.show(look, range, robots, this.ages(range));
+    this.legend.show(look, range, robots, this.told(range));
     this.stage.draw();
   }
 
-  /** In what ages are told, and whether some cells may be older than that. */
-  private ages(range: [number, number] | null): Ages {
+  /** In what ages are told, and whether the log that is known here reaches back to all that is shown. */
+  private told(range: [number, number] | null): Told {
     const { head, all } = this.cells;
-    if (this.times.ageS(head) === null) return { unit: "log entries", size: 1, mayBeOlder: false };
-    const mayBeOlder = this.look.field === "age" && [...all.values()].some(({ points, lm }) => points && this.times.isBefore(lm));
-    return { ...ageUnit(range?.[1] ?? 0), mayBeOlder };
+    const asks = this.look.field === "age" || this.look.field === "robot";
+    const isShort = asks && [...all.values()].some(({ points, lm }) => points && this.book.isBefore(lm));
+    const log = !isShort ? "whole" : this.book.isReading ? "read" : "short";
+    if (this.book.ageS(head) === null) return { unit: "log entries", size: 1, log };
+    return { ...ageUnit(range?.[1] ?? 0), log };
   }
 
   /** Dark or light, as the page is. */

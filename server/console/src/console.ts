@@ -3,6 +3,7 @@
 import type { Api } from "./api.ts";
 import { Appearance } from "./appearance.ts";
 import { h } from "./dom.ts";
+import { LogBook } from "./log_book.ts";
 import { LiveLink, type LinkState } from "./live.ts";
 import { toHash, type CameraView, type Field, type Look } from "./look.ts";
 import type { LiveEvent, MapInfo } from "./messages.ts";
@@ -13,7 +14,7 @@ import { Picker } from "./scene/picking.ts";
 import { Stage } from "./scene/stage.ts";
 import { Team } from "./team.ts";
 import { CameraPanel } from "./ui/camera_panel.ts";
-import { CommitStrip } from "./ui/commit_strip.ts";
+import { CommitStrip, SHOWN } from "./ui/commit_strip.ts";
 import { LookPanel } from "./ui/look_panel.ts";
 import { mapFacts } from "./ui/map_facts.ts";
 import { MeasurePanel } from "./ui/measure_panel.ts";
@@ -34,7 +35,8 @@ export class Console {
   readonly picker: Picker;
   readonly link: LiveLink;
   readonly team: Team;
-  readonly strip: CommitStrip;
+  readonly book: LogBook;
+  readonly strip = new CommitStrip();
   readonly voxel: VoxelPanel;
   readonly measure: MeasurePanel;
   readonly camera: CameraPanel;
@@ -53,6 +55,7 @@ export class Console {
   private readonly flag = h("span", { class: "flag", role: "status" });
   private state: LinkState = { live: false, heardMs: null };
   private moved = true;
+  private logged = false;
   private loading: Promise<void>;
   /** State that the index was last taken from. */
   private cursor = "";
@@ -65,8 +68,8 @@ export class Console {
     this.bar = bar;
     const host = h("div", { class: "host" });
     const labels = h("div", { class: "labels", "aria-hidden": "true" });
-    this.strip = new CommitStrip(api, info.name);
-    this.voxel = new VoxelPanel(api, info.name, (seq) => this.strip.robotAt(seq));
+    this.book = new LogBook(api, info.name);
+    this.voxel = new VoxelPanel(api, info.name, (seq) => this.book.robotAt(seq));
     this.takeAway = new TakeAwayPanel(api, info, look);
     this.panel = new LookPanel(look);
     this.measure = new MeasurePanel(info.geometry.voxel_edge_um / 1e6);
@@ -84,7 +87,7 @@ export class Console {
     this.stage.add(this.cells.group, this.grid.lines, this.unseen.lines, this.outline.lines, this.measure.lines, this.team.group);
     this.camera = new CameraPanel(this.stage, this.cells, this.team, info, camera);
     left.append(this.camera.element, this.team.panel.element, mapFacts(info));
-    this.appearance = new Appearance(look, this.stage, this.cells, this.strip.times);
+    this.appearance = new Appearance(look, this.stage, this.cells, this.book);
     view.append(this.appearance.legend.element);
     this.connect(onRefused);
     this.loading = Promise.resolve();
@@ -182,10 +185,11 @@ export class Console {
     this.cells.onChange = () => this.stage.drawSoon();
     this.cells.onRefused = onRefused;
     this.cells.colourOf = (lm) => {
-      const robot = this.strip.robotAt(lm);
+      const robot = this.book.robotAt(lm);
       return robot === null ? null : rgbOf(robotColour(robot, this.team.names));
     };
-    this.cells.ageOf = (lm) => this.strip.times.ageS(lm) ?? this.cells.head - lm;
+    this.cells.ageOf = (lm) => this.book.ageS(lm) ?? this.cells.head - lm;
+    this.book.onChange = () => (this.logged = true);
     this.bar.onField = (field) => this.setField(field);
     this.bar.onTheme = () => this.theme();
     this.panel.onChange = () => this.apply();
@@ -214,8 +218,9 @@ export class Console {
       if (event.cells === "many") void this.reload();
       else for (const [i, j, k, lm] of event.cells) this.cells.changed([i, j, k], lm);
     } else if (event.type === "log") {
+      this.book.add(event.entries);
       this.strip.add(event.entries);
-      this.moved = true;
+      if (event.left_out) void this.readLog(event.entries[event.entries.length - 1].seq, event.left_out + event.entries.length).catch(() => this.reload());
       this.team.refresh();
     } else if (event.type === "robot") {
       this.team.hear(event.robot);
@@ -232,15 +237,24 @@ export class Console {
       this.moved = true;
       this.tick();
       this.team.refresh();
-      await this.strip.load(entries.reduce((most, { lm }) => Math.max(most, lm), 0));
-      this.moved = true;
+      await this.readLog(Number(cursor.split(".")[1]), SHOWN);
+      await this.book.reachBack(entries.reduce((least, { lm, voxels }) => (voxels ? Math.min(least, lm) : least), Infinity));
     } catch (error) {
       this.cells.error = (error as Error).message;
     }
   }
 
+  private async readLog(head: number, count: number): Promise<void> {
+    this.strip.add(await this.book.newest(head, count));
+  }
+
   /** A few times a second: what has no event of its own. */
   private tick(): void {
+    if (this.logged) {
+      this.logged = false;
+      this.moved = true;
+      this.team.wereAt(this.book);
+    }
     if (this.moved || this.cells.needsPlan || this.cells.waiting) {
       this.moved = false;
       this.cells.update(this.stage.camera, this.stage.heightPx, this.stage.frustum);

@@ -83,6 +83,7 @@ export interface LogEntry {
   cells: number;
   captured_s: [number, number] | null;
   retracts: string[];
+  place_m: Triple | null;
   via: string | null;
 }
 

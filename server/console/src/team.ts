@@ -3,10 +3,11 @@
 import { Group, Vector3 } from "three";
 import type { Api } from "./api.ts";
 import { h } from "./dom.ts";
+import type { LogBook } from "./log_book.ts";
 import type { Field } from "./look.ts";
 import type { Branch, RobotSign, Triple } from "./messages.ts";
 import { robotColour } from "./palettes.ts";
-import { RobotMark } from "./scene/lines.ts";
+import { RobotMark, TRAIL_MAX } from "./scene/lines.ts";
 import type { Stage } from "./scene/stage.ts";
 import { RobotMap } from "./ui/robot_map.ts";
 import { RobotPicture } from "./ui/robot_picture.ts";
@@ -76,6 +77,14 @@ export class Team {
     this.askAtMs = Math.min(this.askAtMs, performance.now() + SOON_MS);
   }
 
+  /** Trails of all who measured, whether they are of the team still or not. */
+  wereAt(book: LogBook): void {
+    const places = book.places(TRAIL_MAX);
+    for (const name of places.keys()) this.markOf(name);
+    for (const [name, mark] of this.marks) mark.wasAt(places.get(name) ?? []);
+    this.stage.draw();
+  }
+
   follow(robot: string | null): void {
     this.followed = robot;
     const mark = robot === null ? null : this.marks.get(robot);
@@ -139,20 +148,25 @@ export class Team {
     this.stage.draw();
   }
 
-  private mark(sign: RobotSign): void {
-    const offline = isOffline(sign.time_s);
-    const colour = offline ? OFFLINE_COLOUR : robotColour(sign.branch, this.names);
-    let mark = this.marks.get(sign.branch);
+  private markOf(name: string): RobotMark {
+    let mark = this.marks.get(name);
     if (!mark) {
-      mark = new RobotMark(colour);
-      this.marks.set(sign.branch, mark);
+      mark = new RobotMark(robotColour(name, this.names));
+      this.marks.set(name, mark);
       this.group.add(mark.group);
-      const label = h("span", { class: "label" }, sign.branch);
-      this.labels.set(sign.branch, label);
+      const label = h("span", { class: "label" }, name);
+      this.labels.set(name, label);
       this.host.append(label);
     }
+    return mark;
+  }
+
+  private mark(sign: RobotSign): void {
+    const offline = isOffline(sign.time_s);
+    const mark = this.markOf(sign.branch);
     const before = mark.position?.clone();
-    mark.update(sign, colour);
+    mark.setColour(offline ? OFFLINE_COLOUR : robotColour(sign.branch, this.names));
+    mark.update(sign);
     this.labels.get(sign.branch)!.classList.toggle("offline", offline);
     if (this.followed === sign.branch && before && mark.position) {
       const step = mark.position.clone().sub(before);

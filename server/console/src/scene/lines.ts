@@ -4,11 +4,15 @@ import {
   BoxGeometry, BufferGeometry, EdgesGeometry, Float32BufferAttribute, Group, LineBasicMaterial, LineSegments, Quaternion,
   Vector3, type Box3,
 } from "three";
+import type { Place } from "../log_book.ts";
 import type { RobotSign, Triple } from "../messages.ts";
 import type { Picked } from "./picking.ts";
 
 const VIOLET = 0x9b5de5;
-const TRAIL_MAX = 500;
+/** Places of a trail, the newest of a robot. */
+export const TRAIL_MAX = 500;
+/** Nearer to the place before than this a place tells nothing, m. */
+const STEP_M = 0.02;
 const ARM_M = 0.35;
 
 /** Borders of cells; each edge once, however many cells share it. */
@@ -60,12 +64,14 @@ export class Outline {
   }
 }
 
-/** One robot: its body's axes and view, and where it was since the page was opened. */
+/** One robot: its body's axes and view, and where it was. */
 export class RobotMark {
   readonly group = new Group();
   private readonly body: LineSegments;
   private readonly trail: LineSegments;
-  private readonly places: Vector3[] = [];
+  /** What commits tell; and what it told itself since the page was opened, in between and beyond. */
+  private measured: readonly Place[] = [];
+  private readonly told: Place[] = [];
 
   constructor(colour: string) {
     this.body = new LineSegments(bodyGeometry(), new LineBasicMaterial({ color: colour, depthTest: false }));
@@ -74,12 +80,12 @@ export class RobotMark {
     );
     this.trail.frustumCulled = false;
     this.body.renderOrder = this.trail.renderOrder = 9;
+    this.body.visible = false;
     this.group.add(this.body, this.trail);
-    this.group.visible = false;
   }
 
   get position(): Vector3 | null {
-    return this.group.visible ? this.body.position : null;
+    return this.body.visible ? this.body.position : null;
   }
 
   /** What looks ahead along +x of its rig's z axis: cameras look along z. */
@@ -87,20 +93,41 @@ export class RobotMark {
     return new Vector3(0, 0, 1).applyQuaternion(this.body.quaternion);
   }
 
-  update(sign: RobotSign, colour: string): void {
+  /** The trail, in the order of time. */
+  get places(): Triple[] {
+    const places = [...this.measured, ...this.told].sort((a, b) => a.timeS - b.timeS).slice(-TRAIL_MAX);
+    return places.map(({ at }) => at);
+  }
+
+  setColour(colour: string): void {
+    for (const line of [this.body, this.trail]) (line.material as LineBasicMaterial).color.set(colour);
+  }
+
+  update(sign: RobotSign): void {
     const pose = sign.status?.pose;
     // Who tells no pose any more stays where it was last.
-    this.group.visible = (pose != null || this.places.length > 0) && !sign.gone;
-    for (const line of [this.body, this.trail]) (line.material as LineBasicMaterial).color.set(colour);
+    this.body.visible = (pose != null || this.body.visible) && !sign.gone;
     if (!pose) return;
-    const place = new Vector3(...(pose.t_map_rig as Triple));
-    this.body.position.copy(place);
+    const place = pose.t_map_rig;
+    this.body.position.set(...place);
     this.body.quaternion.copy(new Quaternion(...pose.q_map_rig));
-    const last = this.places[this.places.length - 1];
-    if (last && last.distanceTo(place) < 0.02) return;
-    this.places.push(place);
-    if (this.places.length > TRAIL_MAX) this.places.shift();
-    const points = this.places.slice(1).flatMap((to, n) => [...this.places[n].toArray(), ...to.toArray()]);
+    const last = this.told[this.told.length - 1];
+    if (last && new Vector3(...last.at).distanceTo(this.body.position) < STEP_M) return;
+    this.told.push({ timeS: pose.time_s, at: place });
+    if (this.told.length > TRAIL_MAX) this.told.shift();
+    this.drawTrail();
+  }
+
+  /** From where it measured what is in the map. */
+  wasAt(places: readonly Place[]): void {
+    if (places.length === this.measured.length && places.every(({ timeS }, n) => timeS === this.measured[n].timeS)) return;
+    this.measured = places;
+    this.drawTrail();
+  }
+
+  private drawTrail(): void {
+    const { places } = this;
+    const points = places.slice(1).flatMap((to, n) => [...places[n], ...to]);
     this.trail.geometry.dispose();
     this.trail.geometry = new BufferGeometry();
     this.trail.geometry.setAttribute("position", new Float32BufferAttribute(points, 3));

@@ -1,39 +1,23 @@
 /** The log as a strip: a lane for each robot, a dot for each commit; those taken out again are hollow. */
 
-import type { Api } from "../api.ts";
 import { fill, h, svg } from "../dom.ts";
-import { LogTimes } from "../log_times.ts";
+import { robotOf } from "../log_book.ts";
 import type { LogEntry } from "../messages.ts";
 import { robotColour } from "../palettes.ts";
 import { bytes, clock } from "../units.ts";
 
-const KEPT = 240;
+/** Entries that are shown. */
+export const SHOWN = 240;
 const LANE_PX = 14;
 const STEP_PX = 16;
 const NAME_PX = 84;
 
-export const robotOf = (id: string): string => id.split(".")[0];
-
 export class CommitStrip {
   readonly element = h("section", { class: "strip", "aria-label": "Commits" });
-  readonly times = new LogTimes();
   onChoose: (entry: LogEntry) => void = () => {};
   private names: readonly string[] = [];
   private readonly entries = new Map<number, LogEntry>();
-  private readonly api: Api;
-  private readonly map: string;
   private waiting = false;
-
-  constructor(api: Api, map: string) {
-    this.api = api;
-    this.map = map;
-  }
-
-  /** Load the newest entries, of a log that is `seq` long. */
-  async load(seq: number): Promise<void> {
-    const after = Math.max(seq - KEPT, 0);
-    this.add(await this.api.json<LogEntry[]>(`maps/${this.map}/log?after=${after}&limit=1000`));
-  }
 
   /** Robots of the team, whose colours are the same everywhere on the page. */
   show(names: readonly string[]): void {
@@ -44,16 +28,9 @@ export class CommitStrip {
 
   add(entries: readonly LogEntry[]): void {
     for (const entry of entries) this.entries.set(entry.seq, entry);
-    for (const seq of [...this.entries.keys()].sort((a, b) => a - b).slice(0, -KEPT)) this.entries.delete(seq);
-    this.times.take(this.entries.values());
+    for (const seq of [...this.entries.keys()].sort((a, b) => a - b).slice(0, -SHOWN)) this.entries.delete(seq);
     if (!this.waiting) requestAnimationFrame(() => this.draw());
     this.waiting = true;
-  }
-
-  /** Whose commit a log entry folded; null: it took one out, or is older than those that are kept here. */
-  robotAt(seq: number): string | null {
-    const entry = this.entries.get(seq);
-    return entry?.kind === "+" ? robotOf(entry.id) : null;
   }
 
   get robots(): string[] {

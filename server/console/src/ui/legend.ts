@@ -1,15 +1,21 @@
 /** What the colours mean: of the field that is shown, and of no other; its ends can be locked. */
 
 import { fill, h } from "../dom.ts";
+import { KEPT } from "../log_book.ts";
 import { FIELDS, type Field, type Look } from "../look.ts";
 import { robotColour, stopsOf } from "../palettes.ts";
+import { thousands } from "../units.ts";
 
-/** How ages are told: the unit, how much of the range's own it is, and whether some cells are older than is known. */
-export interface Ages {
+/** What the log tells: the unit of ages, how much of the range's own it is, and how far back the log is known. */
+export interface Told {
   readonly unit: string;
   readonly size: number;
-  readonly mayBeOlder: boolean;
+  /** To all that is shown; not yet; or not so far. */
+  readonly log: "whole" | "read" | "short";
 }
+
+const READING = "older entries of the log are being read";
+const FAR = `before the newest ${thousands(KEPT)} entries of the log`;
 
 export class Legend {
   readonly element = h("section", { class: "legend", "aria-label": "Legend" });
@@ -17,15 +23,15 @@ export class Legend {
   private shown = "";
 
   /** `range` in the look's unit; null: nothing that is shown has this field. */
-  show(look: Look, range: [number, number] | null, robots: readonly string[], ages: Ages): void {
+  show(look: Look, range: [number, number] | null, robots: readonly string[], told: Told): void {
     const locked = look.ranges[look.field] !== undefined;
-    const state = JSON.stringify([look.field, range?.map((end) => end.toFixed(2)), locked, look.field === "robot" && robots, look.field === "age" && ages]);
+    const state = JSON.stringify([look.field, range?.map((end) => end.toFixed(2)), locked, look.field === "robot" && robots, told]);
     if (state === this.shown || this.element.contains(document.activeElement)) return;
     this.shown = state;
     const { label, palette, unit: ofField } = FIELDS.find(({ field }) => field === look.field)!;
     const isAge = look.field === "age";
-    const { unit, size } = isAge ? ages : { unit: ofField, size: 1 };
-    const bare = h("p", { class: "bare" }, h("span", { class: "hatch", "aria-hidden": "true" }), bareText(look.field));
+    const { unit, size } = isAge ? told : { unit: ofField, size: 1 };
+    const bare = h("p", { class: "bare" }, h("span", { class: "hatch", "aria-hidden": "true" }), bareText(look.field, told));
     if (look.field === "robot") return fill(this.element, h("h2", {}, "Robot that changed the cell last"), ...robots.map((name) => named(name, robots)), bare);
     if (!palette) return fill(this.element, h("h2", {}, label), h("p", {}, "As the cameras saw it."), bare);
     if (!range) return fill(this.element, h("h2", {}, label), h("p", {}, `Nothing shown has a ${label.toLowerCase()}.`), bare);
@@ -50,13 +56,13 @@ export class Legend {
       this.element, h("h2", {}, title), bar(stopsOf(palette), isAge),
       h("div", { class: "ends" }, ends[0], lock, ends[1]),
       look.field === "temperature" ? bare : null,
-      isAge && ages.mayBeOlder ? h("p", {}, "or older: their commits are no longer loaded here") : null,
+      isAge && told.log !== "whole" ? h("p", {}, told.log === "read" ? READING : `or older: changed ${FAR}`) : null,
     );
   }
 }
 
-function bareText(field: Field): string {
-  if (field === "robot") return "not known: taken out, or long ago";
+function bareText(field: Field, { log }: Told): string {
+  if (field === "robot") return log === "read" ? READING : `not known: evidence was taken out last${log === "short" ? `, or it changed ${FAR}` : ""}`;
   return field === "temperature" ? "no temperature was measured" : "no colour was measured";
 }
 

@@ -2,9 +2,9 @@
 
 import type { Api } from "../api.ts";
 import { facts, fill, h } from "../dom.ts";
+import { robotOf } from "../log_book.ts";
 import type { LogEntry, Retracted, RetractRequest } from "../messages.ts";
 import { bytes, clock } from "../units.ts";
-import { robotOf } from "./commit_strip.ts";
 
 /** Open on one commit; closes when it is done or given up. */
 export function openCommit(api: Api, map: string, entry: LogEntry): void {
