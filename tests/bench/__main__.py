@@ -23,6 +23,7 @@ from pathlib import Path
 
 from tests.bench.calibration import calibration_rows
 from tests.bench.coding import coding_rows
+from tests.bench.console import console_rows
 from tests.bench.imports import import_rows
 from tests.bench.integration import integration_rows
 from tests.bench.links import link_rows
@@ -232,6 +233,7 @@ PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "room": _room_rows,
     "calibration": calibration_rows,
     "coding": coding_rows,
+    "console": console_rows,
     "imports": import_rows,
     "integration": integration_rows,
     "links": link_rows,

@@ -1,12 +1,9 @@
 """How fast the map is drawn: over a live image, at 4 and 2 cm, and by a server, with cold cells and with warm ones.
 
-The map is the whole building's, 56 cells at 4 cm, which takes some 8 minutes to make; where CAIRN_OVERLAY_MAPS names a
-folder with `orpheus-4cm` and `orpheus-2cm` in it, as `cairn map export --cells` writes them, these are drawn instead.
-With --smoke it is one stop at 8 cm. Frames are those of a robot without a thermal camera, 640 x 480. A view is cold
-where the server, which has drawn others, has none of its cells in memory.
+With --smoke the map is one stop at 8 cm. Frames are those of a robot without a thermal camera, 640 x 480. A view is
+cold where the server, which has drawn others, has none of its cells in memory.
 """
 
-import os
 import signal
 import statistics
 import tempfile
@@ -17,6 +14,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import numpy.typing as npt
+from tests.bench.building import building_map, wait_until_folded
 from tests.cairn_server.live import Process
 
 from cairn_calib.rig import Rig
@@ -28,16 +26,10 @@ from cairn_fusion.beyond_labels import beyond_pixels
 from cairn_fusion.live_range import live_range
 from cairn_fusion.overlay import Live, OverlayStyle, draw_overlay
 from cairn_fusion.scan import Scan
-from cairn_map.cell_code import encode_cell
-from cairn_map.cell_folder import FolderHead, write_cell, write_head
-from cairn_map.grid import cell_of_key, geometry_for
 from cairn_map.map_render import MapRenderer
 from cairn_map.map_snapshot import MapSnapshot
 from cairn_map.render_request import RenderRequest, request_from
-from cairn_map.sensor_model import SensorModel
 from cairn_map.sight import Sight
-from cairn_sim.experiment_mapping import GrowingMap, map_all
-from cairn_sim.experiment_robots import simulated_robots
 from cairn_sim.record import Plan, scans_of, shots_of
 from cairn_sim.robots import ROBOTS
 from cairn_sim.scene_file import load_scene
@@ -47,7 +39,6 @@ THREADS = 2
 CAMERA = "colour"
 SCALE = 1.0
 """Of the handheld robot's colour camera: 640 x 480."""
-FOLDED_S = 120.0
 
 
 def overlay_rows(smoke: bool) -> Iterator[Row]:
@@ -55,7 +46,7 @@ def overlay_rows(smoke: bool) -> Iterator[Row]:
     rig, scans = _frames(2 if smoke else 6)
     with tempfile.TemporaryDirectory() as name:
         for cm, least in ((8, ""),) if smoke else ((4, "25"), (2, "10")):
-            folder = _map_folder(Path(name), cm, stops=1 if smoke else None)
+            folder = building_map(Path(name), cm, stops=1 if smoke else None)
             known = map_of_folder(folder)
             snapshot = known.snapshot
             yield (
@@ -76,24 +67,6 @@ def _frames(count: int) -> tuple[Rig, list[Scan]]:
     rig, shots = robot.rig_of(plan.scale), shots_of(plan)
     chosen = shots[:: max(1, len(shots) // count)][:count]
     return rig, [scan for _, scan, _ in scans_of(plan, chosen, rig)]
-
-
-def _map_folder(inside: Path, cm: int, *, stops: int | None) -> Path:
-    """The building's map as a folder of cells."""
-    made = os.environ.get("CAIRN_OVERLAY_MAPS")
-    if made and (Path(made) / f"orpheus-{cm}cm").is_dir():
-        return Path(made) / f"orpheus-{cm}cm"
-    robots = simulated_robots(
-        load_scene("building"), ROBOTS["orpheus"], scale=0.25, seed=0, stops=stops, threads=THREADS
-    )
-    growing = GrowingMap(geometry_for(voxel_edge_m=cm / 100))
-    for _ in map_all(robots, [growing], threads=THREADS):
-        pass
-    folder = inside / f"{cm}cm"
-    write_head(folder, FolderHead(geometry=growing.geometry, sensor_model=SensorModel()))
-    for key, evidence in growing.map.packed().items():
-        write_cell(folder, cell_of_key(key), encode_cell(key, evidence, growing.geometry).data)
-    return folder
 
 
 def _overlay_rows(snapshot: MapSnapshot, rig: Rig, scans: Sequence[Scan], least: str, *, repeats: int) -> Iterator[Row]:
@@ -155,7 +128,7 @@ def _server_rows(folder: Path, rig: Rig, scans: Sequence[Scan]) -> Iterator[Row]
             assert server.url
             api = MapApi(server.url)
             push_prior_data(api, "lab", str(folder), token=None)
-            _wait_until_folded(api)
+            wait_until_folded(api, "lab")
             views = [_view(scan.T_map_rig @ rig[CAMERA].transform) for scan in scans]
             cold_s, warm_s = [], []
             with httpx.Client(base_url=server.url, timeout=60) as http:
@@ -188,13 +161,3 @@ def _ask_s(http: httpx.Client, view: RenderRequest) -> float:
     start_s = time.perf_counter()
     http.get("/maps/lab/main/render", params=view.model_dump(mode="json", exclude_none=True)).raise_for_status()
     return time.perf_counter() - start_s
-
-
-def _wait_until_folded(api: MapApi) -> None:
-    until_s = time.monotonic() + FOLDED_S
-    while api.map_info("lab").cells == 0 and time.monotonic() < until_s:
-        time.sleep(0.2)
-    sizes = [0]
-    while sizes[-1] != (size := api.map_info("lab").size_bytes) and time.monotonic() < until_s:
-        sizes.append(size)
-        time.sleep(1.0)
