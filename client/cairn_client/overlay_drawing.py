@@ -11,10 +11,10 @@ from cairn_fusion.beyond_labels import beyond_pixels
 from cairn_fusion.live_range import live_range
 from cairn_fusion.overlay import EXACT, Live, Mode, Overlay, OverlayStyle, draw_overlay, with_overlay_legend
 from cairn_fusion.scan import Scan
+from cairn_fusion.surface import sight_of
 from cairn_map.errors import BadInputError
 from cairn_map.map_render import MapRenderer
 from cairn_map.pose_spread import PoseSpread
-from cairn_map.sight import Sight
 
 THREADS = 2
 
@@ -44,7 +44,7 @@ class MapOverlay:
         live = Live(
             rgb=np.asarray(scan.colour[name]),
             range_m=live_range(scan, self.rig, camera=name, beyond=beyond),
-            sight=Sight(mounted.camera.rays()),
+            sight=sight_of(mounted.camera),
             T_map_camera=scan.T_map_rig @ mounted.transform,
             spread=self.spread.seen_from(mounted.transform),
         )

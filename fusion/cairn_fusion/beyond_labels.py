@@ -23,9 +23,10 @@ import numpy.typing as npt
 
 from cairn_calib.rig import Rig
 from cairn_fusion.scan import Scan
+from cairn_fusion.surface import sight_of
 from cairn_map.map_render import MapRenderer
 from cairn_map.map_snapshot import MapSnapshot
-from cairn_map.sight import Sight
+from cairn_map.sight import middles
 
 Flags = npt.NDArray[np.bool_]
 
@@ -35,6 +36,8 @@ THROUGH_M = 1.0
 """A beam that goes on for less behind a surface of the map only grazed it, or the pose is a little off."""
 NEAR_M = 0.3
 """What is nearer to the camera may be the robot itself."""
+ROWS_MAX = 240
+"""Of finer images every second pixel is looked at, or fewer: what is looked for is larger."""
 WINDOW_PX = 9
 SHARE = 0.8
 """Of the pixels with a range in a window around one, that say the same: a mirror is larger than a fleck."""
@@ -57,12 +60,16 @@ def beyond_pixels(scan: Scan, rig: Rig, snapshot: MapSnapshot, *, renderer: MapR
     known = np.isfinite(range_m)
     if not known.any():
         return known
-    T, sight = scan.T_map_rig @ mounted.transform, Sight(mounted.camera.rays())
-    start_m = np.where(known, np.float32(NEAR_M), np.float32(np.nan))
-    end_m = np.maximum(range_m - np.float32(THROUGH_M), 0)
+    T, step = scan.T_map_rig @ mounted.transform, max(1, range_m.shape[0] // ROWS_MAX)
+    sight, looked_m = sight_of(mounted.camera).every(step), middles(range_m, step)
+    asked = np.isfinite(looked_m)
+    start_m = np.where(asked, np.float32(NEAR_M), np.float32(np.nan))
+    end_m = np.maximum(looked_m - np.float32(THROUGH_M), 0)
     reach_m = max(float(range_m[known].max()), 2 * NEAR_M)
     met = renderer.nearest(snapshot, sight, T, range_max_m=reach_m, between_m=(start_m, end_m))
     through = met.hit & (renderer.probability(snapshot, met) >= SURE)
-    window = (WINDOW_PX, WINDOW_PX)
-    around, seen = (np.asarray(cv2.blur(each.astype(np.float32), window)) for each in (through, known))
-    return np.asarray(through & known & (around > SHARE * seen))
+    window = (WINDOW_PX // step | 1,) * 2
+    around, seen = (np.asarray(cv2.blur(each.astype(np.float32), window)) for each in (through, asked))
+    found = through & asked & (around > SHARE * seen)
+    height, width = known.shape
+    return np.asarray(found.repeat(step, axis=0).repeat(step, axis=1)[:height, :width] & known)

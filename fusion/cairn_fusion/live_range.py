@@ -4,16 +4,16 @@ Each range pixel covers as many of the camera's as lie between it and its neighb
 counts. It is for the eye, and for telling what hides what; it never becomes evidence.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.poses import inverse, transform_points
+from cairn_calib.poses import inverse
 from cairn_calib.rig import Rig
 from cairn_fusion.range_labels import range_labels
 from cairn_fusion.scan import Scan
-from cairn_fusion.transfer import Label, points_from_range
+from cairn_fusion.surface import beams, places
+from cairn_fusion.surface_kernels import draw_squares_into
+from cairn_fusion.transfer import Label
 
 Values = npt.NDArray[np.float32]
 COVER = 1.5
@@ -30,38 +30,22 @@ def live_range(scan: Scan, rig: Rig, *, camera: str, beyond: npt.NDArray[np.bool
         BadInputError: kind `unknown_camera`, or images of another size.
     """
     seen_by, source = rig[camera], rig[scan.range_camera]
-    untrusted = np.isin(range_labels(scan, rig), (Label.SATURATED, Label.FLYING))
+    labels = range_labels(scan, rig)
+    trusted = (labels != Label.SATURATED) & (labels != Label.FLYING)
     if beyond is not None:
-        untrusted |= beyond
-    scan = replace(scan, range_m=np.where(untrusted, np.float32(np.nan), scan.range_m))
+        trusted &= ~beyond
     true_m = source.true_ranges(scan.range_m, scan.amplitude)
+    range_m = np.where(trusted, true_m, np.float32(np.nan)).astype(np.float32, copy=False)
     if camera == scan.range_camera:
-        return np.asarray(true_m, np.float32)
-    points = points_from_range(true_m, source.camera).reshape(-1, 3)
-    points = transform_points(inverse(seen_by.transform) @ source.transform, points[~np.isnan(points[:, 0])])
-    pixels = seen_by.camera.project(points)
-    inside = seen_by.camera.contains(pixels)
-    x, y = np.rint(pixels[inside]).astype(np.int64).T
-    range_m = np.linalg.norm(points[inside], axis=1).astype(np.float32)
+        return range_m
+    at = places(range_m, beams(source.camera), seen_by.camera, inverse(seen_by.transform) @ source.transform)
+    u, v, q = (each.astype(np.float64) for each in at)
     gap_px = _pixel_rad(source.camera.rays()) / _pixel_rad(seen_by.camera.rays())
-    reach = int(COVER * max(gap_px, 1.0) / 2)
-    H, W = seen_by.camera.height, seen_by.camera.width
-    nearest = np.full((H + 2 * reach, W + 2 * reach), np.inf, np.float32)
-    sparse = np.full(nearest.shape, np.inf, np.float32)
-    np.minimum.at(sparse, (y + reach, x + reach), range_m)
-    nearest = _nearest_around(_nearest_around(sparse, reach, axis=0), reach, axis=1)[
-        reach : reach + H, reach : reach + W
-    ]
-    return np.where(np.isinf(nearest), np.float32(np.nan), nearest)
-
-
-def _nearest_around(values: Values, reach: int, *, axis: int) -> Values:
-    """The least within so many pixels along an axis; the image has as wide a margin."""
-    least = values.copy()
-    for shift in range(1, reach + 1):
-        for step in (-shift, shift):
-            np.minimum(least, np.roll(values, step, axis=axis), out=least)
-    return least
+    half_px = int(COVER * max(gap_px, 1.0) / 2) + 0.5
+    nearness = np.zeros((seen_by.camera.height, seen_by.camera.width), np.float32)
+    draw_squares_into(nearness, trusted, u, v, q, half_px)
+    with np.errstate(divide="ignore"):
+        return np.where(nearness > 0, 1 / nearness, np.float32(np.nan))
 
 
 def _pixel_rad(rays: npt.NDArray[np.float64]) -> float:

@@ -32,6 +32,7 @@ from cairn_fusion.surface_kernels import (
     nearest_of_nine,
 )
 from cairn_fusion.transfer import KERNEL_COEFFICIENTS, Label
+from cairn_map.sight import Sight
 
 Singles = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
@@ -175,6 +176,12 @@ def beams(camera: AnyCamera) -> Singles:
     planes = np.ascontiguousarray(np.moveaxis(camera.rays(), -1, 0), dtype=np.float32)
     planes.setflags(write=False)
     return planes
+
+
+@lru_cache(maxsize=16)
+def sight_of(camera: AnyCamera) -> Sight:
+    """A camera's rays as a map is drawn for them; kept, for what is worked out of them is."""
+    return Sight(camera.rays())
 
 
 def _slack(nearness: Singles, hiding: Singles) -> Singles:

@@ -7,6 +7,7 @@ import pytest
 from tests.cairn_map.worlds import map_of
 
 from cairn_calib.poses import look_at
+from cairn_fusion import beyond_labels
 from cairn_fusion.beyond_labels import beyond_pixels
 from cairn_fusion.live_range import live_range
 from cairn_fusion.scan import Scan
@@ -69,6 +70,16 @@ def test_what_a_mirror_shows_is_labelled_and_nothing_else(noise: Noise | None, w
     empty = snapshot_of(map_of(GRID, {(0, 0, 40): (3, 0)}))
     assert not beyond_pixels(scan, HEAD, empty).any()
     assert not beyond_pixels(replace(scan, range_m=np.full_like(scan.range_m, np.nan)), HEAD, wall).any()
+
+
+def test_of_a_fine_image_every_second_pixel_is_enough(wall: MapSnapshot, monkeypatch: pytest.MonkeyPatch) -> None:
+    scan, mirrored = scanned(None)
+    whole, known = beyond_pixels(scan, HEAD, wall), np.isfinite(scan.range_m)
+    monkeypatch.setattr(beyond_labels, "ROWS_MAX", scan.range_m.shape[0] // 2)
+    found = beyond_pixels(scan, HEAD, wall)
+    assert found.shape == whole.shape and (found != whole).any()
+    assert (found & mirrored).sum() > 0.75 * (mirrored & known).sum() > 1000
+    assert (found & ~mirrored).sum() <= 0.005 * (known & ~mirrored).sum() and not (found & ~known).any()
 
 
 def test_what_a_mirror_shows_is_never_painted(wall: MapSnapshot) -> None:
