@@ -8,12 +8,13 @@
     overlay.picture                      (H, W, 3), with `legend()` below
 
 A map surface in front of the live depth is gone now, and is not drawn. What the map has no value for is grey, never
-cold. Where the pose is uncertain the ink spreads as far as it may be off; where it is too uncertain, nothing is drawn,
-and the picture says why.
+cold. Where the pose is uncertain the ink spreads as far as it may be off, while stripes and dots stay sharp; where it
+is too uncertain, nothing is drawn, and the picture says why.
 """
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +34,7 @@ from cairn_map.small_text import write_text_into
 Rgb = npt.NDArray[np.uint8]
 Values = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 TOLERANCE_VOXELS = 2.0
 GREY_COVER = 0.4
@@ -154,17 +156,18 @@ def draw_overlay(
     rest_modes = np.where(np.isnan(coarse_m), np.uint8(Mode.MAP_ONLY), np.uint8(Mode.SEE_THROUGH))
     rest_modes[~rest.hit] = Mode.NOTHING
     H, W = range_m.shape
-    everywhere = rest_modes.repeat(step, axis=0).repeat(step, axis=1)[:H, :W]
+    everywhere = _wide(rest_modes, step, (H, W))
     modes = np.where(front.hit, np.uint8(Mode.VISIBLE), np.uint8(Mode.NOTHING))
     modes[np.isnan(range_m) & (everywhere == Mode.MAP_ONLY)] = Mode.MAP_ONLY
     values = layer_values(renderer, snapshot, front, style.layer, ages)
     values_of_rest = layer_values(renderer, snapshot, rest, style.layer, ages)
-    spread_px2, why = None, None
+    spreads, why = None, None
     if not live.spread.is_exact:
-        rest_m = rest.range_m.repeat(step, axis=0).repeat(step, axis=1)[:H, :W]
-        spread_px2 = live.spread.at(live.sight, np.where(front.hit, front.range_m, rest_m))
+        rest_m = _wide(rest.range_m, step, (H, W))
+        spreads = live.spread.at(live.sight, front.range_m), live.spread.at(live.sight, rest_m)
         drawn = front.hit | (everywhere != Mode.NOTHING)
-        why = why_withheld(spread_px2[drawn], blur_max_px=style.blur_max_px)
+        likely = np.where(front.hit[..., None], *spreads)
+        why = why_withheld(likely[drawn], blur_max_px=style.blur_max_px)
     if why is not None:
         picture = live.rgb.copy()
         write_text_into(picture, f"map withheld: {why}", (8, 8), WARNING)
@@ -174,9 +177,14 @@ def draw_overlay(
         front_covers = np.where(_unknown(values), np.float32(GREY_COVER), np.float32(1))
         colours = painted(values, style.colours), painted(values_of_rest, style.colours)
         ink = np.empty((H, W, 4), np.uint8)
-        kernels.ink_into(colours[0], front_covers, modes, colours[1], covers, rest_modes, step, ink)
-        if spread_px2 is not None:
-            ink = spread_ink(ink, spread_px2)
+        if spreads is None:
+            kernels.ink_into(colours[0], front_covers, modes, colours[1], covers, rest_modes, step, ink)
+        else:
+            front_covers[~front.hit], covers[~rest.hit] = 0, 0
+            wide = _wide(colours[1], step, (H, W)), _wide(covers, step, (H, W))
+            solid = spread_ink(_solid_ink(colours[0], front_covers * np.float32(kernels.VISIBLE_COVER)), spreads[0])
+            behind = spread_ink(_solid_ink(*wide), spreads[1])
+            kernels.hatch_into(solid, behind, ~np.isnan(range_m), ink)
         picture = np.empty_like(live.rgb)
         blend_into(np.ascontiguousarray(live.rgb).reshape(-1, 3), ink.reshape(-1, 4), picture.reshape(-1, 3))
     return Overlay(
@@ -235,6 +243,17 @@ def _covers(
         fade += np.nan_to_num(np.maximum(age, 0)) / np.float32(style.fade_s)
     full = np.where(np.isnan(live_m), np.float32(1), np.float32(THROUGH_COVER))
     return np.asarray(np.maximum(full * np.exp(-fade), THROUGH_COVER_MIN), np.float32)
+
+
+def _wide(values: npt.NDArray[Scalar], step: int, size: tuple[int, int]) -> npt.NDArray[Scalar]:
+    """(H, W, ...) of what is known of each `step` x `step` pixels."""
+    return values.repeat(step, axis=0).repeat(step, axis=1)[: size[0], : size[1]]
+
+
+def _solid_ink(colours: Rgb, covers: Values) -> Rgb:
+    """(H, W, 4) of `overlay_kernels`."""
+    ink = np.dstack([colours, np.full(covers.shape, 255, np.uint8)]) * covers[..., None]
+    return np.asarray(np.rint(ink), np.uint8)
 
 
 def _unknown(values: npt.NDArray[np.floating]) -> Flags:

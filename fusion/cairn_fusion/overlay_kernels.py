@@ -51,3 +51,26 @@ def ink_into(
             ink[y, x, 1] = int(green * cover + np.float32(0.5))
             ink[y, x, 2] = int(blue * cover + np.float32(0.5))
             ink[y, x, 3] = int(255 * cover + np.float32(0.5))
+
+
+@nb.njit(cache=True, nogil=True)
+def hatch_into(solid: Rgb, behind: Rgb, is_live: npt.NDArray[np.bool_], ink: Rgb) -> None:
+    """(H, W, 4) ink of two layers that were spread: the hatches are not, or what is behind looked as if in front.
+
+    Args:
+        solid: (H, W, 4) of what is visible.
+        behind: (H, W, 4) of the rest, without hatches.
+        is_live: (H, W) whether there is a live depth: stripes, else dots.
+        ink: out.
+    """
+    H, W = is_live.shape
+    for y in range(H):
+        for x in range(W):
+            if is_live[y, x]:
+                share = np.float32(1 if (x + y) % STRIPES_PX < STRIPE_PX else 0)
+            else:
+                is_dot = (x % DOTS_PX < DOT_PX) & (y % DOTS_PX < DOT_PX)
+                share = np.float32(DOT_COVER if is_dot else BETWEEN_COVER)
+            left = np.float32(1) - share * behind[y, x, 3] / np.float32(255)
+            for c in range(4):
+                ink[y, x, c] = int(share * behind[y, x, c] + left * solid[y, x, c] + np.float32(0.5))

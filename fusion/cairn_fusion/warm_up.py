@@ -14,6 +14,7 @@ from cairn_map.evidence_map import EvidenceMap
 from cairn_map.grid import Geometry
 from cairn_map.map_render import MapRenderer
 from cairn_map.map_snapshot import snapshot_of
+from cairn_map.pose_spread import PoseSpread
 from cairn_map.sight import Sight
 
 
@@ -50,10 +51,12 @@ def _look(rig: Rig, scan: Scan) -> None:
 
     both = Rig(name="warm-up", cameras={**rig.cameras, "second": rig["thermal"]})
     Telepresence(both, ViewOptions()).view(replace(scan, thermal={**scan.thermal, "second": scan.thermal["thermal"]}))
-    live = Live(
-        rgb=scan.colour["colour"],
-        range_m=scan.range_m,
-        sight=Sight(rig["colour"].camera.rays()),
-        T_map_camera=np.eye(4),
-    )
-    draw_overlay(MapRenderer(), snapshot_of(EvidenceMap(Geometry())), live, OverlayStyle(step_px=1))
+    for spread in (PoseSpread.of_sigmas(), PoseSpread.of_sigmas(0.01, 0.01)):
+        live = Live(
+            rgb=scan.colour["colour"],
+            range_m=scan.range_m,
+            sight=Sight(rig["colour"].camera.rays()),
+            T_map_camera=np.eye(4),
+            spread=spread,
+        )
+        draw_overlay(MapRenderer(), snapshot_of(EvidenceMap(Geometry())), live, OverlayStyle(step_px=1))

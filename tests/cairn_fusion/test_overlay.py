@@ -192,6 +192,34 @@ def test_an_error_of_the_pose_moves_the_overlay_as_far_as_predicted() -> None:
     assert np.sqrt(np.square(off).mean()) < 0.1
 
 
+def test_what_is_behind_is_in_stripes_however_uncertain_the_pose_is() -> None:
+    """A hot thing behind a wall must not look like a hot place on the wall."""
+    wall, room = box((20, -16, -16), (22, 16, 16)), box((22, -16, -16), (40, 16, 16), (0, 3))
+    snapshot = snapshot_with(wall | room | box((32, -3, -3), (36, 3, 3)), kelvin=HOT_K)
+    sight, T = pinhole(80, 60, focal_px=80), look_at((0, 0, 0), (1, 0, 0))
+    wall_m = (1 / sight.rays[..., 2]).astype(np.float32)
+    wall_m[:, 60:] = np.nan
+    sharp, blurred = (
+        draw_overlay(
+            MapRenderer(),
+            snapshot,
+            Live(rgb=image_of(sight), range_m=wall_m, sight=sight, T_map_camera=T, spread=spread),
+            OverlayStyle(),
+        )
+        for spread in (PoseSpread.of_sigmas(), PoseSpread.of_sigmas(0.02, 0.02))
+    )
+    stripes = np.add.outer(np.arange(60), np.arange(80)) % kernels.STRIPES_PX < kernels.STRIPE_PX
+    middle = np.zeros_like(stripes)
+    middle[26:34, 36:44] = True
+    pictures = [each.picture.astype(int) for each in (sharp, blurred)]
+    steps = [np.abs(p[middle & stripes].mean(axis=0) - p[middle & ~stripes].mean(axis=0)).sum() for p in pictures]
+    assert steps[1] > 0.3 * steps[0] > 10
+    # Where nothing is behind it the wall is as even as it was; where there is no live depth there are dots.
+    assert pictures[1][25:35, 8:18].std(axis=(0, 1)).max() < 3
+    assert (pictures[1][28:32, 64:68].reshape(-1, 3).std(axis=0) > 5).any()
+    assert np.abs(pictures[0] - pictures[1]).max() > 20
+
+
 def test_a_pose_that_is_too_uncertain_withholds_the_map_and_says_why() -> None:
     snapshot, sight = snapshot_with(box((20, -16, -16), (22, 16, 16)), kelvin=HOT_K), pinhole(320, 40, focal_px=200)
     shown = {
