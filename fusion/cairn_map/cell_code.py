@@ -26,6 +26,7 @@ from cairn_map.cell_content import (
     content_of,
     count_streams,
     evidence_of,
+    met_of,
     topology_streams,
 )
 from cairn_map.cell_head import CellHead, encode_head
@@ -140,6 +141,17 @@ def decode_cell(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) ->
     """
     reader = cell_reader(data, evidence_bytes_max=evidence_bytes_max)
     evidence = evidence_of(reader.content())
+    return DecodedCell(reader.head.key, reader.head.geometry, evidence, _digest(reader.canonical_bytes()))
+
+
+def decode_met(data: bytes) -> DecodedCell:
+    """`decode_cell`, but of the evidence only voxels that were hit or have samples: all that shows.
+
+    Raises:
+        DamagedDataError, BadInputError: as `decode_cell`.
+    """
+    reader = cell_reader(data)
+    evidence = evidence_of(met_of(reader.content()))
     return DecodedCell(reader.head.key, reader.head.geometry, evidence, _digest(reader.canonical_bytes()))
 
 

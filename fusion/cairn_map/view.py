@@ -134,17 +134,17 @@ def view_of(evidence: Evidence, geometry: Geometry, model: SensorModel, style: V
         chances = np.rint(255 / (1 + np.exp(-highest)))
     else:
         chances = np.rint(highest / LOG_ODDS_STEP) + LOG_ODDS_ZERO
-    sampled = evidence.voxels[evidence.sampled] >> np.uint32(3 * (geometry.depth - depth))
+    rows = _rows_of(evidence.voxels[evidence.sampled] >> np.uint32(3 * (geometry.depth - depth)), nodes)
     colour = next((c for c in geometry.channels if c.kind is ChannelKind.COLOUR), None)
     thermal = next((c for c in geometry.channels if c.kind is ChannelKind.TEMPERATURE), None)
     coloured, rgb = np.empty(0, np.int64), np.empty((0, len(TOPS[style.colours])), np.int64)
     if colour is not None and style.colours is not Colours.NONE:
-        coloured, rgb = _colours(evidence.samples[:, geometry.planes_of(colour.name)], colour, sampled, nodes, style)
+        coloured, rgb = _colours(evidence.samples[:, geometry.planes_of(colour.name)], colour, rows, style)
     columns = 0 if style.temperature_step_k is None else 1 if depth == geometry.depth else 2
     warm, temperatures = np.empty(0, np.int64), np.empty((0, columns), np.int64)
     if thermal is not None and style.temperature_step_k is not None:
         sums = evidence.samples[:, geometry.planes_of(thermal.name)]
-        warm, kelvin = _temperatures(sums, thermal, sampled, nodes)
+        warm, kelvin = _temperatures(sums, thermal, rows)
         temperatures = np.rint(np.maximum(kelvin[:, :columns], 0) / style.temperature_step_k).astype(np.int64)
     return View(depth, style, nodes, chances.astype(np.int64), coloured, rgb, warm, temperatures)
 
@@ -164,10 +164,8 @@ def _nodes(evidence: Evidence, model: SensorModel, extent: Extent, *, up: int) -
     return nodes[keep], odds[keep]
 
 
-def _colours(
-    sums: Ints, channel: Channel, sampled: npt.NDArray[np.uint32], nodes: npt.NDArray[np.uint32], style: ViewStyle
-) -> tuple[Ints, Ints]:
-    rows, starts, mine = _by_node(sums, sampled, nodes)
+def _colours(sums: Ints, channel: Channel, rows_of_samples: Ints, style: ViewStyle) -> tuple[Ints, Ints]:
+    rows, starts, mine = _by_node(sums, rows_of_samples)
     if not len(rows):
         return rows, np.empty((0, 3), np.int64)
     totals = np.add.reduceat(mine, starts, axis=0)
@@ -175,11 +173,9 @@ def _colours(
     return rows, np.rint(np.clip(mean, 0, 255) * np.array(TOPS[style.colours]) / 255).astype(np.int64)
 
 
-def _temperatures(
-    sums: Ints, channel: Channel, sampled: npt.NDArray[np.uint32], nodes: npt.NDArray[np.uint32]
-) -> tuple[Ints, Floats]:
+def _temperatures(sums: Ints, channel: Channel, rows_of_samples: Ints) -> tuple[Ints, Floats]:
     """Rows, and (W, 2) mean and hottest, kelvin."""
-    rows, starts, mine = _by_node(sums, sampled, nodes)
+    rows, starts, mine = _by_node(sums, rows_of_samples)
     if not len(rows):
         return rows, np.empty((0, 2))
     totals = np.add.reduceat(mine, starts, axis=0)
@@ -188,10 +184,17 @@ def _temperatures(
     return rows, means * channel.step + channel.zero
 
 
-def _by_node(sums: Ints, sampled: npt.NDArray[np.uint32], nodes: npt.NDArray[np.uint32]) -> tuple[Ints, Ints, Ints]:
-    """Of a channel's (S, planes) sums those with a weight: rows of their nodes, where each begins, and the sums."""
+def _rows_of(sampled: npt.NDArray[np.uint32], nodes: npt.NDArray[np.uint32]) -> Ints:
+    """(S,) the row of each sample's node; -1 where that is not told."""
     rows = np.searchsorted(nodes, sampled)
-    there = (sums[:, -1] > 0) & (rows < len(nodes))
-    there[there] = nodes[rows[there]] == sampled[there]
-    found, starts = np.unique(rows[there], return_index=True)
-    return found, starts, sums[there]
+    is_told = rows < len(nodes)
+    is_told[is_told] = nodes[rows[is_told]] == sampled[is_told]
+    return np.where(is_told, rows, -1)
+
+
+def _by_node(sums: Ints, rows: Ints) -> tuple[Ints, Ints, Ints]:
+    """Of a channel's (S, planes) sums those with a weight: rows of their nodes, where each begins, and the sums."""
+    there = (sums[:, -1] > 0) & (rows >= 0)
+    mine = rows[there]
+    starts = np.nonzero(np.diff(mine, prepend=-1))[0]
+    return mine[starts], starts, sums[there]

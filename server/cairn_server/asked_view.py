@@ -7,7 +7,7 @@ from cairn_map.errors import DamagedDataError
 from cairn_map.grid import CellKey
 from cairn_map.view import ViewStyle
 from cairn_map.view_code import encode_view
-from cairn_server.cells_at_rest import stored_evidence
+from cairn_server.cells_at_rest import stored_evidence, stored_surfaces
 from cairn_server.http_ranges import is_same
 from cairn_server.service import Service
 from cairn_server.store_rows import CellRow, Head, MapRow
@@ -43,8 +43,9 @@ def view_of_stored(row: MapRow, stored: CellRow, depth: int) -> bytes:
     Raises:
         DamagedDataError: kind `damaged_store`: its bytes are not sound.
     """
-    style = ViewStyle(depth=depth)
-    return encode_view(stored.key, stored_evidence(stored), row.geometry, row.sensor_model, style=style)
+    # What was never hit is below a half: where that does not show, neither does the air, which is most of a cell.
+    read = stored_surfaces if row.sensor_model.p_occupied >= 0.5 else stored_evidence
+    return encode_view(stored.key, read(stored), row.geometry, row.sensor_model, style=ViewStyle(depth=depth))
 
 
 def _view(service: Service, row: MapRow, stored: CellRow | None, depth: int, known: str | None) -> bytes:

@@ -2,13 +2,15 @@
 
     start   -->  what the file beside the store has
     folded  -->  a moment later, cell by cell with pauses between, what changed
-    now and then, and at the end  -->  the file
+    as soon as there are any, now and then, and at the end  -->  the file, if the disk has room
 
-One thread, which takes a quarter of a core at the most, and less than that from who pushes: a cell that changes all the
-time is made once in a few seconds.
+One thread. The first views of a new start are made at once: who looks then would wait for them. From then on it takes a
+quarter of a core at the most, and less than that from who pushes: a cell that changes all the time is made once in some
+seconds.
 """
 
 import logging
+import math
 import threading
 import time
 from pathlib import Path
@@ -29,6 +31,8 @@ DEPTHS_ABOVE_VOXELS = 3
 LOOK_EVERY_S = 3.0
 PAUSE_SHARE = 3.0
 """After each view, of the time that it took."""
+AT_ONCE = 100
+"""Views without a pause, with every start: some two seconds."""
 FILE_BYTES_MAX = 1 << 24
 WRITE_EVERY_S = 300.0
 
@@ -40,20 +44,33 @@ def first_depth(depth: int) -> int:
 
 def views_ahead(service: Service) -> "ViewsAhead":
     """Of a service, until closed."""
-    return ViewsAhead(service.store, service.cell_views, service.settings.folder)
+    return ViewsAhead(
+        service.store, service.cell_views, service.settings.folder, free_bytes_min=service.settings.disk_free_min_bytes
+    )
 
 
 class ViewsAhead:
     """Makes and keeps views of a store's maps until closed."""
 
-    def __init__(self, store: Store, views: ViewCache, folder: Path, *, look_every_s: float = LOOK_EVERY_S) -> None:
+    def __init__(
+        self,
+        store: Store,
+        views: ViewCache,
+        folder: Path,
+        *,
+        look_every_s: float = LOOK_EVERY_S,
+        free_bytes_min: int = 0,
+    ) -> None:
+        """`free_bytes_min` of the folder's disk are left for pushes, and the file is not written."""
         self._store = store
         self._views = views
         self._folder = folder
         self._look_every_s = look_every_s
         self._seen: dict[int, tuple[bytes, int]] = {}
         """By map: log and entry up to which all cells' views were made."""
-        self._written, self._write_s = 0, time.monotonic()
+        self._free_bytes_min = free_bytes_min
+        self._at_once = AT_ONCE
+        self._written, self._write_s = 0, -math.inf
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="cairn-views", daemon=True)
         self._thread.start()
@@ -110,7 +127,9 @@ class ViewsAhead:
                 return
             start_s = time.monotonic()
             self._make_one(row, key, depth)
-            self._closing.wait(PAUSE_SHARE * (time.monotonic() - start_s))
+            self._at_once -= 1
+            if self._at_once < 0:
+                self._closing.wait(PAUSE_SHARE * (time.monotonic() - start_s))
         self._seen[row.number] = (cursor.log_id, cursor.seq)
 
     def _make_one(self, row: MapRow, key: CellKey, depth: int) -> None:
@@ -123,13 +142,15 @@ class ViewsAhead:
             log.info("%s; who asks for it may heal it", exc.message)
 
     def _write(self) -> None:
-        """The file, if there is anything new to keep."""
-        self._write_s = time.monotonic()
+        """The file, if there is anything new to keep, and room for it."""
         made = self._views.made
         if made == self._written:
             return
+        self._write_s = time.monotonic()
+        views = self._views.newest(FILE_BYTES_MAX)
         try:
-            write_views(self._folder, self._views.newest(FILE_BYTES_MAX))
+            self._store.health.check_space(self._free_bytes_min + sum(map(len, views.values())))
+            write_views(self._folder, views)
             self._written = made
-        except OSError as exc:
+        except (OSError, CairnError) as exc:
             log.warning("views of cells are not kept over a restart: %s", exc)

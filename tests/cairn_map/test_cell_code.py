@@ -21,7 +21,7 @@ from tests.cairn_map.made import (
 from tests.cairn_map.stored import recoded
 
 from cairn_map.brick_cell import difference
-from cairn_map.cell_code import decode_canonical_cell, decode_cell, encode_cell
+from cairn_map.cell_code import decode_canonical_cell, decode_cell, decode_met, encode_cell
 from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence import SUM_MAX, Evidence, empty_evidence, packed_evidence
 from cairn_map.grid import Geometry, cell_key
@@ -44,6 +44,20 @@ def test_decoding_undoes_encoding(made: tuple[Evidence, Geometry], cell: tuple[i
     decoded = decode_cell(encoded.data)
     assert decoded.evidence == evidence
     assert (decoded.key, decoded.geometry, decoded.digest) == (cell_key(cell), geometry, encoded.digest)
+
+
+@given(MADE)
+def test_what_was_met_is_all_that_was_hit_or_sampled(made: tuple[Evidence, Geometry]) -> None:
+    evidence, geometry = made
+    encoded = encode_cell(KEY, evidence, geometry)
+    met = decode_met(encoded.data)
+    is_sampled = np.isin(np.arange(len(evidence)), evidence.sampled)
+    rows = np.nonzero((evidence.counts[:, 0] != 0) | is_sampled)[0]
+    assert met.digest == encoded.digest
+    assert met.evidence.voxels.tolist() == evidence.voxels[rows].tolist()
+    assert met.evidence.counts.tolist() == evidence.counts[rows].tolist()
+    assert rows[met.evidence.sampled].tolist() == evidence.sampled.tolist()
+    assert met.evidence.samples.tolist() == evidence.samples.tolist()
 
 
 @given(SIGNED)

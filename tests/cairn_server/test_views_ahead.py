@@ -60,6 +60,26 @@ def test_a_new_start_has_the_views_of_the_one_before(live: Live, tmp_path: Path)
     assert second.made == first.made
 
 
+def test_the_first_views_are_in_the_file_long_before_the_end(live: Live, tmp_path: Path) -> None:
+    row = live.new_map()
+    live.push(row, pushed(0, 0))
+    live.folded(row)
+    wanted = coarse_views(live, row)
+    with closing(ViewsAhead(live.service.store, ViewCache(), tmp_path, look_every_s=SOON_S)):
+        until(lambda: read_views(tmp_path).items() >= wanted.items(), "the first views are in the file")
+
+
+def test_what_the_disk_keeps_free_for_pushes_is_not_taken_by_views(live: Live, tmp_path: Path) -> None:
+    row = live.new_map()
+    live.push(row, pushed(0, 0))
+    live.folded(row)
+    views, wanted = ViewCache(), coarse_views(live, row)
+    free = live.service.store.health.figures().free_bytes
+    with closing(ViewsAhead(live.service.store, views, tmp_path, look_every_s=SOON_S, free_bytes_min=2 * free + 1)):
+        until(lambda: all(views.has(name) for name in wanted), "views are made")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_file_that_was_cut_or_changed_gives_what_is_sound_of_it(tmp_path: Path) -> None:
     views = {f"map/{n:064x}/4": bytes(range(n)) for n in range(5)}
     write_views(tmp_path, views)
