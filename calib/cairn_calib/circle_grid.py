@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.board import Board, Polarity
+from cairn_calib.board_flatness import flat_limit_px, flat_rms_px
 from cairn_calib.corner_detection import grey, stretched
-from cairn_calib.corner_gates import FLAT_RMS_CELLS, FLAT_RMS_PX, flat_rms_px
 from cairn_calib.corners import FOUND, Attempt, Corners, Detection
 from cairn_calib.homography import fit_homography, mapped, steps_between
 from cairn_map.errors import BadInputError
@@ -225,7 +225,7 @@ def _measured(signed: Image, board: Board, homography: Floats) -> Corners | str:
     if np.linalg.det(steps).min() <= 0:
         return "the grid is mirrored or folded"
     rms = flat_rms_px(lattice[sound], pixels[sound], signed.shape)
-    limit = FLAT_RMS_PX + FLAT_RMS_CELLS * float(np.linalg.norm(steps, axis=2).mean())
+    limit = flat_limit_px(float(np.linalg.norm(steps, axis=2).mean()))
     if rms > limit:
         return f"the discs lie {rms:.2f} px (rms) off a plane behind a lens, at most {limit:.2f}"
     return Corners(board, pixels, covariance)

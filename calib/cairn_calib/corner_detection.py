@@ -14,10 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.board import Board, Polarity
-from cairn_calib.corner_gates import Judged, checker_signs, refusal, sound_corners
+from cairn_calib.corner_gates import refusal, sound_corners
 from cairn_calib.corner_refinement import FittedCorners, fit_corners
 from cairn_calib.corners import FOUND, Attempt, Corners, Detection
 from cairn_calib.homography import fit_homography, mapped, steps_between
+from cairn_calib.judged_grid import Judged, checker_signs
 from cairn_calib.saddle_grid import NoGrid, saddle_grid
 from cairn_calib.saddle_points import saddle_points
 from cairn_map.errors import BadInputError

@@ -4,18 +4,16 @@ Each gate returns why it refuses, or None. They look at the fitted corners and a
 detector proposed the grid, it is judged alike.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.board import Board
-from cairn_calib.corner_refinement import FittedCorners, fit_corners
-from cairn_calib.homography import fit_homography, mapped, steps_between
+from cairn_calib.board_flatness import flat_limit_px, flat_rms_px
+from cairn_calib.corner_refinement import FittedCorners
+from cairn_calib.grid_ends import goes_on, starts_and_ends
+from cairn_calib.homography import mapped
+from cairn_calib.judged_grid import Gate, Judged, checker_signs
 
 Floats = npt.NDArray[np.float64]
-Image = npt.NDArray[np.float32]
 
 CELL_MIN_PX = 3.5
 """Shortest step from corner to corner. Below, the fit has fewer pixels than it needs."""
@@ -29,9 +27,6 @@ MOVED_MAX = 0.4
 """Cells between a proposed corner and the fitted one."""
 CONTRAST_RATIO = 4.0
 """Between a corner's contrast and the board's usual one."""
-FLAT_RMS_PX = 0.5
-FLAT_RMS_CELLS = 0.01
-"""A lens with more than one radial term still bends a large board a little."""
 UNEVEN_PX, UNEVEN_CELLS = 0.15, 0.03
 """Every other line of corners to one side: of 240 boards at most 0.09 px or 0.018 cells, of a fence 0.42 of 3.8 px."""
 ALTERNATING_MIN = 0.9
@@ -40,35 +35,6 @@ EVEN = (0.7, 1.6)
 Where dark and bright patches are of unequal size, as between the wires of a fence, it was 5.7."""
 CELL_MIDDLE = 0.25
 """Half width of the middle of a cell, cells."""
-BEYOND_MAX = 0.6
-"""Share of a rim's places that may look like corners too."""
-BEYOND_CONTRAST = 0.6
-BEYOND_MOVED = 0.15
-"""Cells between where the next corner of a pattern that goes on must lie and where one is. Where a board's outer cells
-are cut, their ends do look like corners, elsewhere."""
-
-
-@dataclass(frozen=True, slots=True)
-class Judged:
-    """A grid and what was found about it; arrays in the board's order."""
-
-    image: Image
-    board: Board
-    fitted: FittedCorners
-    homography: Floats
-
-    @property
-    def kept(self) -> npt.NDArray[np.bool_]:
-        """(N,) which corners are there."""
-        return np.isfinite(self.fitted.pixels[:, 0])
-
-    @property
-    def steps(self) -> Floats:
-        """(N, 2, 2) pixels to the next column and row."""
-        return steps_between(self.homography, self.board.lattice())
-
-
-Gate = Callable[[Judged], str | None]
 
 
 def sound_corners(fitted: FittedCorners, signs: Floats) -> npt.NDArray[np.bool_]:
@@ -91,11 +57,6 @@ def sound_corners(fitted: FittedCorners, signs: Floats) -> npt.NDArray[np.bool_]
     return np.asarray(there & alike & crisp & (np.nan_to_num(fitted.moved, nan=9.0) < MOVED_MAX))
 
 
-def checker_signs(board: Board) -> Floats:
-    """(N,) 1 where the cell towards the next column and row has the colour of the first cell, else -1."""
-    return np.where(board.lattice().sum(axis=1) % 2 == 0, 1.0, -1.0)
-
-
 def refusal(judged: Judged) -> tuple[str, str] | None:
     """The first gate that refuses, and why; None where all let it pass."""
     for name, gate in GATES:
@@ -110,15 +71,6 @@ def _seen(judged: Judged) -> str | None:
     if count < SEEN_MIN * judged.board.count:
         total = judged.board.count
         return f"{count} of {total} corners are crossings of two sharp edges, at least {SEEN_MIN:.0%} are needed"
-    grid = judged.kept.reshape(judged.board.rows, judged.board.columns)
-    for name, line in (
-        ("first row", grid[0]),
-        ("last row", grid[-1]),
-        ("first column", grid[:, 0]),
-        ("last column", grid[:, -1]),
-    ):
-        if not line.any():
-            return f"none of the {len(line)} corners of the {name} is there, so that they may be the next one's"
     return None
 
 
@@ -144,7 +96,7 @@ def _not_mirrored(judged: Judged) -> str | None:
 def _flat(judged: Judged) -> str | None:
     rms = flat_rms_px(judged.board.lattice()[judged.kept], judged.fitted.pixels[judged.kept], judged.image.shape)
     cell = float(np.linalg.norm(judged.steps[judged.kept], axis=2).mean())
-    limit = FLAT_RMS_PX + FLAT_RMS_CELLS * cell
+    limit = flat_limit_px(cell)
     return None if rms < limit else f"the corners lie {rms:.2f} px (rms) off a plane behind a lens, at most {limit:.2f}"
 
 
@@ -212,40 +164,6 @@ def _cells(judged: Judged) -> tuple[npt.NDArray[np.bool_], Floats, Floats]:
     return whole, middles, signs * way
 
 
-def _ends(judged: Judged) -> str | None:
-    """Whether the pattern goes on: then these corners may be any part of it."""
-    board = judged.board
-    lattice = judged.board.lattice()
-    columns, rows = np.arange(board.columns, dtype=float), np.arange(board.rows, dtype=float)
-    rims = {
-        "left": np.column_stack([np.full(board.rows, -1.0), rows]),
-        "right": np.column_stack([np.full(board.rows, float(board.columns)), rows]),
-        "top": np.column_stack([columns, np.full(board.columns, -1.0)]),
-        "bottom": np.column_stack([columns, np.full(board.columns, float(board.rows))]),
-    }
-    usual = float(np.median(np.abs(judged.fitted.contrast[judged.kept])))
-    way = 1.0 if np.nansum(judged.fitted.contrast * checker_signs(board)) > 0 else -1.0
-    misfit = float(np.median(judged.fitted.misfit[judged.kept]))
-    for name, rim in rims.items():
-        guesses = _extrapolated(judged, rim, lattice)
-        fitted = fit_corners(judged.image, guesses, steps_between(judged.homography, rim))
-        signs = np.where(rim.sum(axis=1) % 2 == 0, way, -way)
-        with np.errstate(invalid="ignore"):
-            strong, crisp = fitted.contrast * signs > BEYOND_CONTRAST * usual, fitted.misfit < 1.5 * misfit + 0.03
-            alike = strong & crisp & (fitted.moved < BEYOND_MOVED)
-        if alike.mean() > BEYOND_MAX:
-            return f"the pattern goes on {name} of the board: {int(alike.sum())} of {len(rim)} places there are corners"
-    return None
-
-
-def _extrapolated(judged: Judged, rim: Floats, lattice: Floats) -> Floats:
-    """(M, 2) pixels of places just outside: the homography, corrected by what it misses at the nearest corners."""
-    off = judged.fitted.pixels - mapped(judged.homography, lattice)
-    off = np.where(judged.kept[:, None], off, 0)
-    nearest = np.argmin(np.linalg.norm(rim[:, None] - lattice[None], axis=2), axis=1)
-    return np.asarray(mapped(judged.homography, rim) + off[nearest])
-
-
 def _cell_means(judged: Judged) -> Floats:
     """((rows - 1) * (columns - 1),) mean brightness of the middle of each cell, bilinear."""
     board, image = judged.board, judged.image
@@ -265,28 +183,9 @@ def _cell_means(judged: Judged) -> Floats:
     return np.asarray(np.mean(samples, axis=0).ravel())
 
 
-def flat_rms_px(lattice: Floats, pixels: Floats, shape: tuple[int, ...]) -> float:
-    """Root mean square distance, pixels, of (N, 2) corners from a plane seen through a lens with one radial term."""
-    centre = np.array([shape[1] - 1, shape[0] - 1]) / 2
-    scale = float(np.hypot(*centre))
-    plane = (pixels - centre) / scale
-    square = (plane**2).sum(axis=1, keepdims=True)
-
-    def off(k: float) -> Floats:
-        straight = plane * (1 + k * square)
-        homography = fit_homography(lattice, straight)
-        missed = np.full_like(plane, np.nan) if homography is None else straight - mapped(homography, lattice)
-        return np.asarray(missed.ravel() * scale)
-
-    k = 0.0
-    for _ in range(3):
-        here, slope = off(k), (off(k + 1e-3) - off(k)) / 1e-3
-        k = float(np.clip(k - (slope @ here) / max(float(slope @ slope), 1e-12), -0.4, 0.8))
-    return float(np.sqrt((off(k) ** 2).sum() / len(pixels)))
-
-
 GATES: tuple[tuple[str, Gate], ...] = (
     ("corners", _seen),
+    ("rims", starts_and_ends),
     ("orientation", _not_mirrored),
     ("cell size", _cell_size),
     ("distinct", _distinct),
@@ -295,6 +194,6 @@ GATES: tuple[tuple[str, Gate], ...] = (
     ("crispness", _crisp),
     ("alternation", _alternating),
     ("evenness", _even),
-    ("border", _ends),
+    ("border", goes_on),
 )
 """In the order in which they are asked: cheap ones first."""

@@ -37,7 +37,7 @@ LONGER = 2.1
 ALIKE = 3.0
 """Ratio of strengths that neighbours may have; noise beside a board is much weaker."""
 MORE = 4
-"""Rows or columns of strays that may surround a board; whether the pattern goes on, corner_gates.py finds out."""
+"""Rows or columns of strays that may surround a board; whether the pattern goes on, grid_ends.py finds out."""
 CROWDED_SEEN_MIN = 0.85
 """Share that must be seen where there are strays, which might fill a row that is hidden."""
 NEAREST = 32

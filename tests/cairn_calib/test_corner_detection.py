@@ -71,6 +71,16 @@ def test_hidden_corners_are_left_out_and_the_others_keep_their_names() -> None:
     assert np.abs(corners.pixels - at)[corners.seen].max() < 0.3
 
 
+def test_two_corners_of_an_outer_column_are_enough_to_name_it() -> None:
+    image, at = seen(TOF, 5)
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    across = [np.cos(np.radians(40)), np.sin(np.radians(40))]
+    image[x * across[0] + y * across[1] > np.quantile(at @ across, 0.88) + 0.3] = 6500
+    corners = found(find_chessboard(image, BOARD))
+    assert corners.seen.reshape(6, 9)[:, -1].sum() == 2
+    assert np.abs(corners.pixels - at)[corners.seen].max() < 0.3
+
+
 def test_a_board_of_which_a_side_is_hidden_is_refused_with_the_stage() -> None:
     image, at = seen(TOF, 5)
     grid = at.reshape(6, 9, 2)
