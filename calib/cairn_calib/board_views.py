@@ -156,10 +156,12 @@ def _documents(folder: Path) -> list[tuple[Path, CornerFile]]:
 
 
 def _one_size(camera: str, documents: Iterable[CornerFile]) -> tuple[int, int]:
-    sizes = sorted({(document.width, document.height) for document in documents})
+    sizes = sorted({(each.width, each.height) for each in documents if each.width and each.height})
     if len(sizes) > 1:
         told = " and ".join(f"{width} x {height}" for width, height in sizes)
         raise BadInputError(KIND, f"images of {camera} are of several sizes, {told}: one camera has one")
+    if not sizes:
+        raise BadInputError(KIND, f"no image of {camera} could be read: its documents say why")
     return sizes[0]
 
 

@@ -18,6 +18,7 @@ from cairn_map.errors import BadInputError, DamagedDataError, first_error
 Floats = npt.NDArray[np.float64]
 Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e6, le=1e6)]
 Pair = tuple[Number, Number]
+Side = Annotated[int, Field(ge=1, le=16384)]
 FILE_BYTES_MAX = 16 << 20
 SIGNIFICANT = 6
 """Decimals of pixels: a millionth."""
@@ -53,11 +54,12 @@ class CornerFile(BaseModel):
     format: Literal["cairn-corners"] = "cairn-corners"
     version: Literal[1] = 1
     image: str
-    image_sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    image_sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None
+    """None, as the size, of an image that could not be read."""
     frames: Annotated[int, Field(ge=1, le=1 << 20)] = 1
     """Of a still pose, of which the image is the mean."""
-    width: Annotated[int, Field(ge=1, le=16384)]
-    height: Annotated[int, Field(ge=1, le=16384)]
+    width: Side | None
+    height: Side | None
     board: Board
     polarity: Polarity
     corners: Annotated[tuple[CornerEntry, ...], Field(max_length=64 * 64)]
@@ -96,20 +98,24 @@ def corner_file(
     board: Board,
     *,
     image: str,
-    sha256: str,
-    size: tuple[int, int],
+    sha256: str | None,
+    size: tuple[int, int] | None,
     polarity: Polarity,
     frames: int = 1,
 ) -> CornerFile:
-    """The document of what was found in an image, `size` (width, height), the mean of `frames` frames."""
+    """The document of what was found in an image, `size` (width, height), the mean of `frames` frames.
+
+    Of an image that could not be read, digest and size are None.
+    """
+    width, height = (None, None) if size is None else size
     found = detection.corners
     entries = [] if found is None else [_entry(found, int(at)) for at in np.flatnonzero(found.seen)]
     return CornerFile(
         image=image,
         image_sha256=sha256,
         frames=frames,
-        width=size[0],
-        height=size[1],
+        width=width,
+        height=height,
         board=board,
         polarity=polarity,
         corners=tuple(entries),

@@ -20,7 +20,8 @@ are averaged (corners of 8 are almost 3 times as certain), and a board that move
 
 Each image gets a JSON document of its corners with covariances in pixels squared (CONVENTIONS.md), and a picture to
 look at. Parts of the board may be hidden, but each of its four sides must be seen in part. What only looks like a
-board is refused, and both files say at which stage; so is an image that repeats another one, count for count.
+board is refused, and both files say at which stage; so is an image that repeats another one, count for count. An
+image that cannot be read is named, and the others are done.
 
 Where detection fails, help it: name the outer four of the inner corners, to a few pixels, in the order first, end of
 first row, end of last row, start of last row, and pass the file as `--outer-corners`:
@@ -37,6 +38,7 @@ import argparse
 import hashlib
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -45,14 +47,15 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from cairn_calib.board import Board, Polarity, board_size
-from cairn_calib.corner_file import corner_file, read_outer_corners
+from cairn_calib.corner_detection import grey
+from cairn_calib.corner_file import CornerFile, corner_file, read_outer_corners
 from cairn_calib.corner_pictures import overlay, write_picture
 from cairn_calib.corners import Attempt, Detection
 from cairn_calib.looked import Looked, looked_for_corners, looked_for_discs
 from cairn_calib.polarity_vote import vote_of
 from cairn_calib.progress import with_progress
-from cairn_calib.still_frames import if_still, read_still
-from cairn_map.errors import BadInputError, CairnError, NotFoundError, first_error
+from cairn_calib.still_frames import StillImage, if_still, read_still
+from cairn_map.errors import BadInputError, CairnError, DamagedDataError, NotFoundError, first_error
 
 Floats = npt.NDArray[np.float64]
 NAMED_MAX = 8
@@ -123,6 +126,9 @@ def _run(args: argparse.Namespace) -> int:
     by_hand = args.outer_corners.resolve() if args.outer_corners else None
     if by_hand in [(args.output / f"{name}.json").resolve() for name in names]:
         raise BadInputError("image_name", f"a document of corners would overwrite {args.outer_corners}: move that")
+    missing = [str(path) for path in args.images if not path.exists()]
+    if missing:
+        raise BadInputError("missing_image", f"no such images: {', '.join(missing)}")
     unknown = sorted(set(pointed) - {path.name for path in args.images})
     if unknown:
         raise BadInputError(
@@ -130,28 +136,16 @@ def _run(args: argparse.Namespace) -> int:
         )
     args.output.mkdir(parents=True, exist_ok=True)
     seen_before: dict[bytes, str] = {}
-    looked = [
-        _looked(path, board, args, pointed.get(path.name), seen_before) for path in with_progress(args.images, "images")
+    shown = [
+        _shown(path, board, args, pointed.get(path.name), seen_before) for path in with_progress(args.images, "images")
     ]
-    polarity = _polarity(looked, args)
-    lost = []
-    for path, name, each in zip(args.images, names, looked, strict=True):
-        image = read_still(path)
-        detection = each.named(polarity)
-        document = corner_file(
-            detection,
-            board,
-            image=path.name,
-            sha256=image.sha256,
-            size=image.counts.shape[::-1],
-            polarity=polarity,
-            frames=image.frames,
-        )
-        (args.output / f"{name}.json").write_text(document.model_dump_json(indent=1) + "\n", encoding="utf-8")
-        line = f"{path.name}: {_told(detection)}"
-        write_picture(args.output / f"{name}.png", overlay(image.counts, detection.corners, title=line))
-        if detection.corners is None:
-            lost.append(path.name)
+    polarity = _polarity([each.looked for each in shown], args)
+    for each in shown:
+        if each.looked.named(polarity).corners is not each.looked.likely.corners:
+            _draw(each.path, read_still(each.path), each.looked.named(polarity), args.output)
+        document = each.document(board, polarity).model_dump_json(indent=1)
+        (args.output / f"{_name(each.path)}.json").write_text(document + "\n", encoding="utf-8")
+    lost = [each.path.name for each in shown if each.looked.named(polarity).corners is None]
     found = len(args.images) - len(lost)
     more = f" and {len(lost) - NAMED_MAX} more" if len(lost) > NAMED_MAX else ""
     others = f"; the others: {', '.join(lost[:NAMED_MAX])}{more}" if lost else ""
@@ -179,21 +173,72 @@ def _name(path: Path) -> str:
     return path.resolve().name if path.is_dir() else path.stem
 
 
-def _looked(
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """What was found in one image; of one that cannot be read there is neither digest nor size."""
+
+    path: Path
+    looked: Looked
+    sha256: str | None
+    size: tuple[int, int] | None
+    frames: int
+
+    def document(self, board: Board, polarity: Polarity) -> CornerFile:
+        """To be written once all images have voted."""
+        return corner_file(
+            self.looked.named(polarity),
+            board,
+            image=self.path.name,
+            sha256=self.sha256,
+            size=self.size,
+            polarity=polarity,
+            frames=self.frames,
+        )
+
+
+def _shown(
     path: Path, board: Board, args: argparse.Namespace, pointed: Floats | None, seen_before: dict[bytes, str]
+) -> _Shown:
+    """What an image shows, told and drawn at once; `seen_before` names an image by the digest of its counts."""
+    try:
+        image = read_still(path)
+        grey(image.counts)
+    except (BadInputError, DamagedDataError) as exc:
+        unread = _nothing("reading", exc.message)
+        (args.output / f"{_name(path)}.png").unlink(missing_ok=True)  # of another image of this name
+        _say(_line(path, unread.likely))
+        return _Shown(path, unread, None, None, 1)
+    looked = _looked(image, path, board, args, pointed, seen_before)
+    _say(_line(path, looked.likely))
+    _draw(path, image, looked.likely, args.output)
+    height, width = image.counts.shape
+    return _Shown(path, looked, image.sha256, (width, height), image.frames)
+
+
+def _looked(
+    image: StillImage,
+    path: Path,
+    board: Board,
+    args: argparse.Namespace,
+    pointed: Floats | None,
+    seen_before: dict[bytes, str],
 ) -> Looked:
-    """What an image shows, told at once; `seen_before` names an image by the digest of its counts."""
-    image = read_still(path)
     twin = seen_before.setdefault(hashlib.sha256(image.counts.tobytes()).digest(), path.name)
     if twin != path.name:
-        repeated = _repeated(twin)
-        _say(f"{path.name}: {_told(repeated)}")
-        return Looked(repeated, repeated, None)
+        # The board has moved since, and its place is not in it.
+        why = f"the same counts as {twin}; cameras repeat an image when they lose one, or level themselves"
+        return _nothing("repeated", why)
     look = looked_for_discs if board.pattern != "chessboard" else looked_for_corners
     found = look(image.counts, board, polarity=args.polarity, upright=args.upright, pointed=pointed)
-    found = found.checked(lambda detection: if_still(image, detection))
-    _say(f"{path.name}: {_told(found.likely)}")
-    return found
+    return found.checked(lambda detection: if_still(image, detection))
+
+
+def _draw(path: Path, image: StillImage, detection: Detection, folder: Path) -> None:
+    write_picture(folder / f"{_name(path)}.png", overlay(image.counts, detection.corners, title=_line(path, detection)))
+
+
+def _line(path: Path, detection: Detection) -> str:
+    return f"{path.name}: {_told(detection)}"
 
 
 def _polarity(looked: Sequence[Looked], args: argparse.Namespace) -> Polarity:
@@ -212,10 +257,10 @@ def _polarity(looked: Sequence[Looked], args: argparse.Namespace) -> Polarity:
     return "normal"
 
 
-def _repeated(twin: str) -> Detection:
-    """Of an image that is the one before it once more: the board has moved since, and its place is not in it."""
-    reason = f"the same counts as {twin}; cameras repeat an image when they lose one, or level themselves"
-    return Detection(None, (Attempt("image", 1.0, "repeated", reason),))
+def _nothing(stage: str, reason: str) -> Looked:
+    """Of an image that corners were not even looked for in."""
+    nothing = Detection(None, (Attempt("image", 1.0, stage, reason),))
+    return Looked(nothing, nothing, None)
 
 
 def _told(detection: Detection) -> str:

@@ -1,7 +1,7 @@
 """What one image of a camera shows of a board before it is settled, by all of its images, which polarity it has."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -35,8 +35,9 @@ class Looked:
         return self.normal if polarity == "normal" else self.reversed
 
     def checked(self, check: Callable[[Detection], Detection]) -> "Looked":
-        """The same of what passes a check."""
-        return Looked(check(self.normal), check(self.reversed), self.vote)
+        """The same of what passes a check; what does not pass has no vote."""
+        kept = Looked(check(self.normal), check(self.reversed), self.vote)
+        return kept if kept.likely.corners is not None else replace(kept, vote=None)
 
 
 def looked_for_corners(

@@ -68,7 +68,7 @@ def _figure(image: ReportImage, met: ViewResiduals | None) -> str:
 def _drawn(image: ReportImage) -> str:
     """The picture with its corners over it, as SVG: fine lines stay fine where it is printed."""
     document = image.document
-    width, height = document.width, document.height
+    width, height = document.width or 1, document.height or 1  # only of images without a picture are there none
     line = width / 200
     data = base64.b64encode(image.picture or b"").decode()
     parts = [

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from tests.cairn_calib.board_images import BOARD, TOF, picture, pose, truth
 
+from cairn_calib.board_views import read_board_views
 from cairn_calib.corner_file import read_corner_file
 from cairn_calib.corners_command import main
 from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError
@@ -48,6 +49,32 @@ def test_an_image_that_repeats_another_is_left_out_by_name(tmp_path: Path, capsy
     assert main([*paths, "--board", "9x6", "--square", "0.05", "--output", str(tmp_path / "out")]) == 0
     assert "t2.png: no board (repeated: the same counts as t1.png" in capsys.readouterr().err
     assert read_corner_file(tmp_path / "out" / "t2.json").attempts[0].stage == "repeated"
+
+
+def test_an_image_that_cannot_be_read_is_named_and_the_others_are_done(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(4)
+    good, bad, tiny = (tmp_path / f"{name}{n}.png" for n, name in enumerate(("good", "bad", "tiny"), 1))
+    cv2.imwrite(str(good), picture(TOF, pose(rng, TOF), rng))
+    bad.write_bytes(good.read_bytes()[:99])
+    cv2.imwrite(str(tiny), np.zeros((9, 9), np.uint8))
+    out = tmp_path / "out"
+    options = ["--board", "9x6", "--square", "0.05", "--output", str(out)]
+    with pytest.raises(BadInputError, match=r"no such images: .*gone.png"):
+        main([str(good), str(tmp_path / "gone.png"), *options])
+    assert main([str(bad), str(tiny), str(good), *options]) == 0
+    told = capsys.readouterr().err
+    assert "bad2.png: no board (reading: " in told
+    assert "found in 1 of 3 images; the others: bad2.png, tiny3.png" in told
+    nothing = read_corner_file(out / "bad2.json")
+    assert (nothing.attempts[0].stage, nothing.width, nothing.image_sha256) == ("reading", None, None)
+    assert {path.name for path in out.glob("*.png")} == {"good1.png"}
+    assert [view.frame for view in read_board_views({"tof": out}).views] == ["000001"]
+    for path in (out / "good1.json", out / "tiny3.json"):
+        path.unlink()
+    with pytest.raises(BadInputError, match="no image of tof could be read"):
+        read_board_views({"tof": out})
 
 
 def test_corners_pointed_at_by_hand_are_taken_from_the_file(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from tests.cairn_calib.test_circle_grid import DISCS
 
 from cairn_calib.corner_detection import find_chessboard, grey
 from cairn_calib.corner_file import read_corner_file
+from cairn_calib.corner_pictures import BAND_PX, overlay
 from cairn_calib.corners_command import main
 from cairn_calib.polarity_vote import Vote, margin_polarity, turned, vote_of
 
@@ -54,8 +55,17 @@ def test_images_of_a_thermal_camera_are_found_reversed_without_being_told(
         cv2.imwrite(str(tmp_path / f"{n}.png"), picture(THERMAL, T, rng))
     images = [str(tmp_path / f"{n}.png") for n in range(2)]
     options = ["--board", "9x6", "--square", "0.05", "--output", str(tmp_path / "out")]
-    assert main([*images, *options]) == 0
-    assert "polarity reversed: 0 for normal, 2 for reversed of 2 images" in capsys.readouterr().err
+    # Of this one there is no margin to look at: it has no vote, but the others' order, also in its picture.
+    x, y = np.clip(ats[1].min(axis=0) - 8, 0, None).astype(int)
+    right, bottom = (ats[1].max(axis=0) + 8).astype(int)
+    cut = np.asarray(cv2.imread(images[1], cv2.IMREAD_ANYDEPTH))[y:bottom, x:right]
+    cv2.imwrite(str(tmp_path / "2.png"), cut)
+    assert main([*images, str(tmp_path / "2.png"), *options]) == 0
+    assert "polarity reversed: 0 for normal, 2 for reversed of 3 images" in capsys.readouterr().err
+    ats.append(ats[1] - [x, y])
+    drawn = np.asarray(cv2.imread(str(tmp_path / "out" / "2.png")))
+    again = overlay(cut.astype(np.float32), read_corner_file(tmp_path / "out" / "2.json").to_corners(), title="")
+    assert np.array_equal(drawn[BAND_PX:], again[BAND_PX:])
     for n, at in enumerate(ats):
         document = read_corner_file(tmp_path / "out" / f"{n}.json")
         corners = document.to_corners()

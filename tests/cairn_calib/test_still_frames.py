@@ -45,12 +45,15 @@ def test_corners_of_a_mean_are_as_certain_as_they_say(tmp_path: Path) -> None:
     assert sigmas[0] / sigmas[1] == pytest.approx(np.sqrt(FRAMES), rel=0.25)
 
 
-def test_a_board_that_moves_between_frames_is_refused(tmp_path: Path) -> None:
+def test_a_board_that_moves_between_frames_is_refused_and_has_no_vote(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     T = pose(np.random.default_rng(6), TOF)
     pixel_m = T[2, 3] / TOF.camera.focal_px[0]
     frames(tmp_path / "pose1", T, sideways_m=1.5 * pixel_m)
     with pytest.raises(NotFoundError, match="no board in any image"):
         main([str(tmp_path / "pose1"), *OPTIONS, str(tmp_path)])
+    assert "polarity" not in capsys.readouterr().err
     last = read_corner_file(tmp_path / "pose1.json").attempts[-1]
     assert last.stage == "stillness"
     assert "moved by 0.7" in last.reason or "moved by 0.8" in last.reason
