@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 from cairn_calib.range_choice import AMPLITUDE_RATIO, HARMONICS, PERIOD_SHARE
 from cairn_calib.range_terms import wave_period_m
+from cairn_calib.rig import Spectrum
 from cairn_calib.solve import Solution
 from cairn_calib.solve_warnings import Warned
 
@@ -19,7 +20,7 @@ USUAL_TIMES = 4.0
 
 
 def range_warnings(solution: Solution) -> Iterator[Warned]:
-    """All that is to be said of them; nothing without range images."""
+    """All that is to be said of them, and of range cameras without any."""
     used, given = solution.ranges, solution.views.ranges
     count = 0 if used is None else len(used.frames)
     if count < len(given):
@@ -34,6 +35,19 @@ def range_warnings(solution: Solution) -> Iterator[Warned]:
         yield from _of_waves(name, solution)
         yield from _of_amplitude(name, solution)
         yield from _of_pixels(name, solution)
+    yield from _of_none(solution)
+
+
+def _of_none(solution: Solution) -> Iterator[Warned]:
+    """Of range cameras whose ranges nothing is known of."""
+    names = list(solution.plan.cameras)
+    shown = None if solution.ranges is None else names[solution.ranges.camera]
+    for name in names:
+        if solution.plan.cameras[name].spectrum is Spectrum.RANGE and name != shown:
+            text = "no range image shows what it adds to its ranges: give those of the same boards (--range)"
+            if shown is not None:
+                text = f"what it adds to its ranges is not known: --range is of {shown}; solve this camera alone for it"
+            yield Warned("range_bias", name, 0, 1, "range images", text)
 
 
 def _of_other_ranges(name: str, solution: Solution) -> Iterator[Warned]:

@@ -1,7 +1,7 @@
 """The examination of a calibration as one JSON document, for programs; the HTML report says the same to people.
 
     {"format": "cairn-calibration-report", "version": 1, "rig": "orpheus-head", "gauge": "tof",
-     "parameters": [{"owner": "tof", "name": "fx", "value": 130.1, "sigma": 0.11}, ...],
+     "parameters": [{"owner": "tof", "name": "fx", "unit": "px", "value": 130.1, "sigma": 0.11}, ...],
      "cameras": {"tof": {"tilt_deg": 54.1, "images": [{"frame": "000003", "rms_px": 0.1, "outliers": 0}, ...], ...}},
      "ranges": {"camera": "tof", "nearest_m": 1.1, "harmonics": [4], "pixels": {"pattern_sigma_m": 0.006, ...}, ...},
      "halves": {...}, "influences": [...], "weak_modes": [...], "next_images": [...],
@@ -16,10 +16,12 @@ from dataclasses import asdict
 
 import numpy as np
 
+from cairn_calib.calibration import unit_of
 from cairn_calib.examination import Examination
 from cairn_calib.probe_points import RANGES_M
 from cairn_calib.range_report import ranges_json
 from cairn_calib.report_radiometry import radiometry_json
+from cairn_calib.rig_state import WARP
 from cairn_calib.view_residuals import view_residuals
 from cairn_calib.world_uncertainty import sigma_map
 
@@ -40,7 +42,13 @@ def examination_json(seen: Examination) -> bytes:
         if seen.rig.calibration is None or seen.rig.calibration.statistics is None
         else seen.rig.calibration.statistics.model_dump(),
         "parameters": [
-            {"owner": owner, "name": name, "value": values[owner, name], "sigma": sigmas[owner, name]}
+            {
+                "owner": owner,
+                "name": name,
+                "unit": _unit(name),
+                "value": values[owner, name],
+                "sigma": sigmas[owner, name],
+            }
             for owner, name in solution.layout.names
         ],
         "cameras": {name: _camera(seen, name) for name in solution.plan.cameras},
@@ -75,6 +83,11 @@ def _camera(seen: Examination, name: str) -> dict[str, object]:
         "sigma_px_by_part": maps,
         "images": images,
     }
+
+
+def _unit(name: str) -> str:
+    """Of a free parameter, as it is named: warp and what a range camera adds are metres."""
+    return "m" if name.endswith("_m") or name in WARP else unit_of(name)
 
 
 def _finite(value: object) -> object:

@@ -87,7 +87,7 @@ def warnings_of(
 ) -> list[Warned]:
     """All that is to be said, cameras first."""
     found = [each for camera in covered for each in _of_coverage(camera, solution)]
-    found += [*_of_ranges(solution), *_of_priors(solution), *_of_coefficients(solution), *_of_noise(solution)]
+    found += [*_of_priors(solution), *_of_coefficients(solution), *_of_noise(solution)]
     found += [*_of_discs(solution), *(each for mode in modes for each in _of_mode(mode))]
     found += [*_of_turned(solution), *_of_influence(influences), *_of_halves(halves)]
     return found
@@ -111,14 +111,7 @@ def _of_coverage(seen: Coverage, solution: Solution) -> Iterator[Warned]:
         yield Warned(edge, name, seen.radius_share, RADIUS_SHARE, "of the half diagonal", text)
     if seen.cell_share < CELL_SHARE:
         text = "the boards covered little of the image: move them through all of it"
-        yield Warned("coverage", name, seen.cell_share, CELL_SHARE, "of 48 parts", text)
-
-
-def _of_ranges(solution: Solution) -> Iterator[Warned]:
-    for name, camera in solution.plan.cameras.items():
-        if camera.spectrum is Spectrum.RANGE and not len(solution.layout.bias_at):
-            text = "no range image shows what it adds to its ranges: give those of the same boards (--range)"
-            yield Warned("range_bias", name, 0, 1, "range images", text)
+        yield Warned("coverage", name, seen.cell_share, CELL_SHARE, "of the parts of its image", text)
 
 
 def _of_priors(solution: Solution) -> Iterator[Warned]:

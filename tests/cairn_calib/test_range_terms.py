@@ -11,6 +11,7 @@ from cairn_calib.range_bias import ByAmplitude, RangeBias, Wave, Wiggle
 from cairn_calib.range_choice import AMPLITUDE_RATIO, PERIOD_SHARE, RangeSpans, chosen_terms
 from cairn_calib.range_terms import BIAS_NAMES, RangeTerms, off_middle_image, wave_period_m
 from cairn_calib.range_warnings import range_warnings
+from cairn_calib.rig import Spectrum
 from cairn_calib.solve import Solution, solve_rig
 from cairn_calib.solve_plan import usual_plan
 from cairn_calib.solve_warnings import Warned
@@ -59,7 +60,10 @@ def test_circular_error_and_dependence_on_amplitude_are_found_within_their_sigma
     assert max(sigmas["tof", name] for name in WAVY.names[4:]) < 0.001
     lost = told(solution)["range_wiggle"]  # of the longer waves a half was seen at most
     assert "wave 1" in lost.text and "wave 4" not in lost.text and lost.measured < lost.threshold == PERIOD_SHARE
-    assert "range_amplitude" not in told(solution)
+    assert not {"range_amplitude", "range_bias"} & set(told(solution))
+    both = {name: replace(each, spectrum=Spectrum.RANGE) for name, each in solution.plan.cameras.items()}
+    other = told(replace(solution, plan=replace(solution.plan, cameras=both)))["range_bias"]
+    assert other.camera == "left" and "--range is of tof" in other.text
     bias = solved_rig(solution, made_s=0.0)["tof"].range_bias
     assert bias is not None and bias.parameters == WAVY.names
     assert bias.values == pytest.approx([values["tof", name] for name in WAVY.names])

@@ -74,6 +74,9 @@ def test_folders_of_corners_become_a_rig_and_a_report(tmp_path: Path, capsys: py
     document = json.loads(report.with_suffix(".json").read_text())
     offset = next(each for each in document["parameters"] if each["name"] == "offset_m")
     assert bias.offset_m == pytest.approx(offset["value"])
+    units = {each["name"]: each["unit"] for each in document["parameters"]}
+    named = ("fx", "k1", "rx", "tx", "warp_x", "scale", "offset_m", "faint_m")
+    assert [units[name] for name in named] == ["px", "1", "rad", "m", "m", "1", "m", "m"]
     assert bias.covariance[0, 0] == pytest.approx(offset["sigma"] ** 2)
     assert abs(offset["value"] - 0.02) < 4 * offset["sigma"] < 0.02
     assert {each["kind"] for each in document["warnings"]} >= {"tof_edge", "range_wiggle"}
