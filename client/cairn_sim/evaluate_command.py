@@ -13,8 +13,8 @@ out without the map: where the live depth agrees, and where there is none.
 
 With --map also the temperatures of a map of whole stops, on bodies and pipes: the share of their voxels that have one
 (known %), and how far these are off. A voxel has none where a step in the thermal image is nearer than a range pixel
-can tell sides: of pipes some 30 to 40 %, of bodies 5 to 15 %, until a robot comes nearer. With --mm5 also hot cups of
-real frames against hand labels.
+can tell sides: of pipes a third to a half, of bodies 5 to 20 %, until a robot comes nearer. With --mm5 also hot cups
+of real frames against hand labels.
 """
 
 import argparse
