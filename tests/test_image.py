@@ -169,9 +169,7 @@ def test_container_refuses_who_has_no_token(served: Served) -> None:
 
 def test_health_check_passes_while_the_server_runs(image: Image, served: Served) -> None:
     _, *command = image.config["Healthcheck"]["Test"]
-    port = served.url.rpartition(":")[2]
-    assert command[-1] == "8750"
-    buildah("run", "--isolation", "chroot", served.container, "--", *command[:-1], port)
+    buildah("run", "--isolation", "chroot", served.container, "--", *command)
 
 
 def test_a_backup_made_in_the_container_is_restored_by_another(served: Served) -> None:

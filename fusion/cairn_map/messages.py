@@ -257,11 +257,10 @@ class Retracted(_Model):
 
 
 class LogEntry(_Model):
-    """One row of the log."""
+    """One row of the log: evidence folded in, or taken out again."""
 
     seq: int
     kind: Literal["+", "-"]
-    """Evidence folded in, or taken out again."""
     id: IdText
     sha: ShaText
     size_bytes: int
@@ -269,9 +268,8 @@ class LogEntry(_Model):
     captured_s: tuple[float, float] | None
     retracts: list[IdText]
     parent: ShaText | None = None
-    """SHA-256 of the author's commit before it."""
     seen: CursorText | None = None
-    """State of the server that the author had when it made it."""
+    """SHA-256 of the author's commit before it, and the state of the server that the author had when it made it."""
     place_m: tuple[float, float, float] | None = None
     """Where the rig was for its last scan, metres, map frame; None: it has no scans, or is not kept any more."""
     via: str | None = None

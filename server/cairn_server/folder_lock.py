@@ -4,12 +4,16 @@ SQLite itself would let two servers share the file, but each believes that its c
 """
 
 import fcntl
+import logging
 from pathlib import Path
 from typing import BinaryIO
 
 from cairn_map.errors import ConflictError
 
+log = logging.getLogger(__name__)
+
 LOCK_NAME = "cairn.lock"
+"""Its text is the port of the server that holds it, or held it last."""
 
 
 def lock_folder(folder: Path) -> BinaryIO:
@@ -27,3 +31,19 @@ def lock_folder(folder: Path) -> BinaryIO:
             "store_in_use", f"another server works on {folder}; stop it, or choose another --data folder"
         ) from exc
     return lock
+
+
+def tell_port(folder: Path, port: int) -> None:
+    """Write down where the server of a locked folder listens, for who asks whether it is alive."""
+    try:
+        (folder / LOCK_NAME).write_text(f"{port}\n")
+    except OSError as exc:  # a full disk
+        log.warning("the health check cannot know the port: %s", exc)
+
+
+def told_port(folder: Path) -> int | None:
+    """Where a folder's server listens; None: nobody told."""
+    try:
+        return int((folder / LOCK_NAME).read_text())
+    except (OSError, ValueError):
+        return None

@@ -1,13 +1,17 @@
 """Whether the server of this machine answers, for a container's health check: exit code 0, or 1 and why.
 
-    $ python3 -m cairn_server.health_probe 8750
+    $ python3 -m cairn_server.health_probe /data
 
-It speaks http, or https if the server does, with whatever certificate: it asks nothing but whether it is alive.
+The port is the one that the server of this folder wrote down. The probe speaks http, or https if the server does, with
+whatever certificate: it asks nothing but whether it is alive.
 """
 
 import http.client
 import ssl
 import sys
+from pathlib import Path
+
+from cairn_server.folder_lock import told_port
 
 TIMEOUT_S = 2.0
 
@@ -34,4 +38,5 @@ def why_not(port: int) -> str | None:
 
 
 if __name__ == "__main__":
-    sys.exit(why_not(int(sys.argv[1])))
+    PORT = told_port(Path(sys.argv[1]))
+    sys.exit(f"no server told its port in {sys.argv[1]}" if PORT is None else why_not(PORT))

@@ -33,6 +33,7 @@ STATUS_OF_KIND = {
     "bad_range": 416,
     "upgrade_required": 426,
     "too_many_streams": 429,
+    "too_many_views": 429,
 }
 KIND_OF_STATUS = {404: "no_route", 405: "no_method"}
 """Of what the framework refuses."""

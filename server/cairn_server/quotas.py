@@ -10,13 +10,13 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
 
 from cairn_map.errors import BadInputError, UnreachableError
 from cairn_map.grid import CELL_LIMIT, CellKey
 from cairn_map.morton_kernels import deinterleave
+from cairn_server.allowance import Allowance, allowance
 from cairn_server.auth import UPSTREAM, Caller, Role
 from cairn_server.quota_store import Robot, Use, relay_of
 from cairn_server.settings import Quotas
@@ -29,14 +29,6 @@ BOX_EVERY_S = 5.0
 Corner = tuple[int, int, int]
 Box = tuple[Corner, Corner]
 """Lowest and highest cell."""
-
-
-@dataclass(slots=True)
-class _Minute:
-    """Commits that may come now: at most those of a minute, and every moment some more."""
-
-    left: float
-    seen_s: float
 
 
 class Meter:
@@ -57,7 +49,7 @@ class Meter:
         self._lock = threading.Lock()
         self._day = -1
         self._used: dict[Robot, Use] = {}
-        self._minutes: dict[Robot, _Minute] = {}
+        self._minutes: dict[Robot, Allowance] = {}
         self._boxes: dict[int, tuple[Box | None, float]] = {}
 
     def is_ready(self, row: MapRow) -> bool:
@@ -144,12 +136,9 @@ class Meter:
         if most is None:
             return
         now_s = self._steady_s()
-        minute = self._minutes.setdefault(robot, _Minute(most, now_s))
-        minute.left = min(float(most), minute.left + (now_s - minute.seen_s) * most / 60)
-        minute.seen_s = now_s
-        if minute.left < 1:
-            raise _quota(f"{robot[1]} may push {most} commits a minute", (1 - minute.left) * 60 / most)
-        minute.left -= 1
+        wait_s = self._minutes.setdefault(robot, allowance(most, most / 60, now_s=now_s)).take(now_s)
+        if wait_s:
+            raise _quota(f"{robot[1]} may push {most} commits a minute", wait_s)
 
     def _give_back(self, robot: Robot, use: Use, day: int) -> None:
         if day == self._day:

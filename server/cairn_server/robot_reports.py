@@ -1,7 +1,7 @@
 """What robots report of themselves: their status, of which the last is kept; and a picture of what they see.
 
 A status is told to listeners at once, and written at most every few seconds: a power cut loses no more. Pictures are
-in memory only, within a bound for all of them, the oldest dropped first.
+in memory only, within a bound for all of them, the oldest dropped first; and so many a second of each robot.
 """
 
 import hashlib
@@ -10,8 +10,9 @@ import time
 from collections import OrderedDict
 from dataclasses import dataclass, field
 
-from cairn_map.errors import BadInputError, NotFoundError
+from cairn_map.errors import BadInputError, NotFoundError, UnreachableError
 from cairn_map.robot_status import RobotStatus
+from cairn_server.allowance import Allowance, allowance
 from cairn_server.body_limit import VIEW_BYTES_MAX
 from cairn_server.live import Hub
 from cairn_server.store import Store
@@ -19,6 +20,10 @@ from cairn_server.store_rows import MapRow
 
 WRITE_EVERY_S = 10.0
 VIEWS_BYTES_MAX = 64 << 20
+VIEWS_PER_S = 30.0
+"""Of one robot: a camera's own rate."""
+VIEWS_AT_ONCE = 60
+"""After a pause."""
 MEDIA_TYPES = {b"\xff\xd8\xff": "image/jpeg", b"\x89PNG\r\n\x1a\n": "image/png"}
 """By the first bytes."""
 
@@ -49,6 +54,7 @@ class RobotReports:
         self._unwritten: dict[tuple[int, str], tuple[MapRow, RobotStatus]] = {}
         self._views: OrderedDict[tuple[int, str], RobotView] = OrderedDict()
         self._views_bytes = 0
+        self._view_rates: dict[tuple[int, str], Allowance] = {}
 
     def put_status(self, row: MapRow, branch: str, status: RobotStatus) -> None:
         """Take a robot's status.
@@ -73,9 +79,11 @@ class RobotReports:
 
         Raises:
             NotFoundError: kind `no_branch`.
+            UnreachableError: kind `too_many_views`: sooner than it may; with the seconds until it may again.
             BadInputError: kind `bad_picture`, or `too_large`.
         """
         self._check(row, branch)
+        self._take_view(row, branch)
         media_type = next((found for magic, found in MEDIA_TYPES.items() if data.startswith(magic)), None)
         if media_type is None:
             raise BadInputError("bad_picture", "a picture is JPEG or PNG; this begins like neither")
@@ -110,6 +118,7 @@ class RobotReports:
             self._drop(key)
             self._unwritten.pop(key, None)
             self._written_s.pop(key, None)
+            self._view_rates.pop(key, None)
 
     def close(self) -> None:
         """Write what was told of late."""
@@ -121,6 +130,15 @@ class RobotReports:
     def _check(self, row: MapRow, branch: str) -> None:
         if self._hub.robots(row).of(branch) is None:
             raise NotFoundError("no_branch", f"map {row.name} has no branch {branch!r}")
+
+    def _take_view(self, row: MapRow, branch: str) -> None:
+        now_s = time.monotonic()
+        with self._lock:
+            fresh = allowance(VIEWS_AT_ONCE, VIEWS_PER_S, now_s=now_s)
+            wait_s = self._view_rates.setdefault((row.number, branch), fresh).take(now_s)
+        if wait_s:
+            message = f"robot {branch} may show {VIEWS_PER_S:.0f} pictures a second"
+            raise UnreachableError("too_many_views", message, retry_after_s=wait_s)
 
     def _drop(self, key: tuple[int, str]) -> None:
         view = self._views.pop(key, None)

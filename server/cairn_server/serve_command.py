@@ -43,6 +43,7 @@ from cairn_server import backup_command, check_command, restore_command
 from cairn_server.allocator import keep_memory_small
 from cairn_server.check_process import fork_checking
 from cairn_server.fold_process import fork_folding
+from cairn_server.folder_lock import tell_port
 from cairn_server.http_deadlines import protocol_of
 from cairn_server.log_format import LogForm, start_logging
 from cairn_server.routes import make_app
@@ -119,6 +120,7 @@ def _serve(service: Service, listener: socket.socket) -> None:
     scheme = "https" if config.is_ssl else "http"
     if scheme == "http" and host not in LOOPBACK:
         log.warning("tokens and maps travel in the clear: give --tls-cert and --tls-key, or put a TLS proxy before it")
+    tell_port(service.settings.folder, port)
     sys.stdout.write(f"cairn map server on {scheme}://{shown}:{port}, data in {service.settings.folder}\n")
     sys.stdout.flush()
     _Server(config, service).run(sockets=[listener])
@@ -184,10 +186,8 @@ def listen(host: str, port: int) -> socket.socket:
         listener.bind((host, port))
     except OSError as exc:
         listener.close()
-        raise BadInputError(
-            "cannot_listen",
-            f"cannot listen on {host}:{port}: {exc.strerror}; another server may, try --port 0",
-        ) from exc
+        message = f"cannot listen on {host}:{port}: {exc.strerror}; another server may, try --port 0"
+        raise BadInputError("cannot_listen", message) from exc
     listener.listen(BACKLOG)
     return listener
 

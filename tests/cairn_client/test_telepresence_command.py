@@ -21,7 +21,7 @@ from cairn_fusion.importers import open_source
 from cairn_fusion.recording import ScanSource
 from cairn_fusion.scan import Scan
 from cairn_fusion.view.mjpeg import Rgb
-from cairn_map.errors import BadInputError, NotFoundError
+from cairn_map.errors import BadInputError, NotFoundError, UnreachableError
 from cairn_map.ids import new_incarnation, robot_name
 from cairn_map.messages import Register
 from cairn_sim.record import Plan, record
@@ -87,6 +87,20 @@ def test_what_a_robot_sees_is_shown_to_its_team(
         main(view)
     with MapApi("http://127.0.0.1:9") as nobody:
         assert publish_views([np.zeros((6, 8, 3), np.uint8)], nobody, "lab", "scout") == (0, 1)
+
+
+def test_a_server_that_wants_no_pictures_for_now_gets_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def put_view(name: str, branch: str, picture: bytes) -> None:
+        asked.append(branch)
+        if len(asked) == 2:
+            raise UnreachableError("too_many_views", "30 pictures a second", retry_after_s=3600)
+
+    with MapApi("http://127.0.0.1:9") as api:
+        monkeypatch.setattr(api, "put_view", put_view)
+        assert publish_views([np.zeros((6, 8, 3), np.uint8)] * 5, api, "lab", "scout") == (1, 4)
+    assert len(asked) == 2
 
 
 def test_what_cannot_be_is_refused_in_words(recording: Path, tmp_path: Path) -> None:

@@ -2,14 +2,26 @@
 
 import socket
 import threading
+from pathlib import Path
 
 from tests.cairn_server.live import Live
 
+from cairn_server.folder_lock import LOCK_NAME, tell_port, told_port
 from cairn_server.health_probe import why_not
 
 
 def test_a_server_is_alive(live: Live) -> None:
     assert why_not(live.port) is None
+
+
+def test_the_port_is_the_one_that_the_folders_server_told_last(tmp_path: Path) -> None:
+    assert told_port(tmp_path) is None
+    (tmp_path / LOCK_NAME).touch()
+    assert told_port(tmp_path) is None
+    for port in (54321, 80):
+        tell_port(tmp_path, port)
+        assert told_port(tmp_path) == port
+    tell_port(tmp_path / "nowhere", 80)
 
 
 def test_where_nobody_listens_it_says_so() -> None:

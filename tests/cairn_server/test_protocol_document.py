@@ -25,6 +25,7 @@ from cairn_server import (
     missing,
     problems,
     push_policy,
+    robot_reports,
     sqlite_tokens,
     uploads,
 )
@@ -100,6 +101,7 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("body of a status", body_limit.STATUS_BYTES_MAX),
         ("body of a view", body_limit.VIEW_BYTES_MAX),
         ("any other body", body_limit.JSON_BYTES_MAX),
+        ("views of one robot in a second", robot_reports.VIEWS_PER_S),
         ("bytes that are here of bodies that come in parts, of all robots", uploads.STAGED_BYTES_MAX),
         ("cells listed in `missing`", CURSORS_MAX),
         ("commits named in one retract request", RETRACTS_MAX),

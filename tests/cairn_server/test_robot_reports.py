@@ -241,3 +241,16 @@ def test_registering_again_keeps_the_row_and_a_new_incarnation_forgets_where_it_
     anew = branch_of(live, row)
     assert (anew["cursor"], anew["behind"], anew["incarnation"]) == (None, None, WREN.incarnation)
     assert RobotStatus.model_validate(anew["status"]) == STATUS
+
+
+def test_a_flood_of_pictures_is_held_back_and_others_show_theirs(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    row = live.new_map()
+    register(live, row)
+    register(live, row, "wren", WREN.incarnation)
+    monkeypatch.setattr(robot_reports, "VIEWS_PER_S", 1 / 64)
+    monkeypatch.setattr(robot_reports, "VIEWS_AT_ONCE", 2)
+    answers = [live.http.put(view_url(row), content=JPEG) for _ in range(3)]
+    assert [answer.status_code for answer in answers] == [204, 204, 429]
+    assert kind_of(answers[-1]) == "too_many_views"
+    assert 32 < int(answers[-1].headers["Retry-After"]) <= 64
+    assert live.http.put(view_url(row, "wren"), content=JPEG).status_code == 204

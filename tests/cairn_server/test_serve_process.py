@@ -15,6 +15,8 @@ from cairn_map.frames import frames_of
 from cairn_map.grid import cell_of_key
 from cairn_map.ids import Author, CommitId
 from cairn_map.messages import CreateMap, ReplyHeader
+from cairn_server.folder_lock import told_port
+from cairn_server.health_probe import why_not
 
 
 def client(process: Process) -> httpx.Client:
@@ -115,5 +117,6 @@ def test_sigterm_ends_with_0_and_what_was_pending_is_folded_after_the_next_start
         assert code == 4
         assert complaint.startswith(f"cairn serve: another server works on {tmp_path}; stop it")
         assert http.get("/healthz").status_code == 200
+        assert why_not(told_port(tmp_path) or 0) is None, "the health check finds the server by its folder"
     again.send(signal.SIGINT)
     assert again.end() == (0, "")
