@@ -165,7 +165,8 @@ export class Team {
     const offline = isOffline(sign.time_s);
     const mark = this.markOf(sign.branch);
     const before = mark.position?.clone();
-    mark.setColour(offline ? OFFLINE_COLOUR : robotColour(sign.branch, this.names));
+    const colour = robotColour(sign.branch, this.names);
+    mark.setColours(offline ? OFFLINE_COLOUR : colour, colour);
     mark.update(sign);
     this.labels.get(sign.branch)!.classList.toggle("offline", offline);
     if (this.followed === sign.branch && before && mark.position) {

@@ -76,7 +76,7 @@ export class RobotMark {
   constructor(colour: string) {
     this.body = new LineSegments(bodyGeometry(), new LineBasicMaterial({ color: colour, depthTest: false }));
     this.trail = new LineSegments(
-      new BufferGeometry(), new LineBasicMaterial({ color: colour, transparent: true, opacity: 0.8, depthTest: false }),
+      new BufferGeometry(), new LineBasicMaterial({ color: colour, transparent: true, opacity: 0.9, depthTest: false }),
     );
     this.trail.frustumCulled = false;
     this.body.renderOrder = this.trail.renderOrder = 9;
@@ -99,8 +99,10 @@ export class RobotMark {
     return places.map(({ at }) => at);
   }
 
-  setColour(colour: string): void {
-    for (const line of [this.body, this.trail]) (line.material as LineBasicMaterial).color.set(colour);
+  /** The trail tells whose it is, whoever is online. */
+  setColours(body: string, trail: string): void {
+    (this.body.material as LineBasicMaterial).color.set(body);
+    (this.trail.material as LineBasicMaterial).color.set(trail);
   }
 
   update(sign: RobotSign): void {
