@@ -153,7 +153,8 @@ def _windows(
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], Floats, Flags]:
     """(N, K) pixels x and y about each guess, which of them belong to its cells, and (N,) which guesses have enough."""
     lengths = np.linalg.norm(steps, axis=2)
-    sound = np.isfinite(guesses).all(axis=1) & (lengths > 1).all(axis=1)
+    # One that is not in the image, however far, lacks half of its window.
+    sound = ((guesses > -1) & (guesses < image.shape[::-1])).all(axis=1) & (lengths > 1).all(axis=1)
     reach = np.clip(REACH_PX / np.maximum(lengths, 1e-9), REACH, REACH_MAX)
     wanted = float(np.max(np.where(sound, (reach * lengths).sum(axis=1), 0.0), initial=0.0))
     radius = int(np.clip(np.ceil(wanted), *RADIUS_PX))
