@@ -42,6 +42,7 @@ from typing import TYPE_CHECKING
 from cairn_calib.board_views import read_board_views
 from cairn_calib.calibration import Statistics
 from cairn_calib.examination import Examination, examined
+from cairn_calib.progress import while_working
 from cairn_calib.range_images import with_ranges
 from cairn_calib.range_report import told_ranges
 from cairn_calib.report_images import ReportImage, report_images
@@ -107,9 +108,11 @@ def solved(args: argparse.Namespace) -> Solution:
 def run(args: argparse.Namespace) -> None:
     """Solve, and write what was asked for."""
     refuse_overwriting(args.report, args.output)
-    solution = solved(args)
-    rig = solved_rig(solution, made_s=time.time())
-    seen = examined(solution, rig)
+    with while_working("solving"):
+        solution = solved(args)
+        rig = solved_rig(solution, made_s=time.time())
+    with while_working("comparing halves of the images, and without each of them"):
+        seen = examined(solution, rig)
     _write(args.output, rig.to_json())
     sys.stdout.write(told(statistics_of(solution)) + told_ranges(solution))
     for each in seen.warnings:
