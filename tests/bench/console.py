@@ -20,8 +20,7 @@ from playwright.sync_api import Browser
 from tests.bench.building import building_map, wait_until_folded
 from tests.bench.pushing import Diff, meta_of
 from tests.cairn_server.live import Process
-from tests.console.browsing import VIEW, Console, browser
-from tests.console.conftest import CHROMIUM
+from tests.console.browsing import CHROMIUM, VIEW, Console, browser
 
 from cairn_client.api import MapApi
 from cairn_client.prior_data import push_prior_data

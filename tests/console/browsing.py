@@ -1,16 +1,24 @@
 """The console in a browser, and what its test door (`?test=1`) tells of it."""
 
+import shutil
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
-from tests.console.conftest import ADMIN_TOKEN, CHROMIUM, FLAGS, Room
+from tests.console.room import ADMIN_TOKEN
 
+if TYPE_CHECKING:
+    from tests.console.conftest import Room
+
+CHROMIUM = shutil.which("chromium")
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
+"""WebGL without a graphics card, in a container that has no namespaces and little shared memory."""
+SETTLED = "c && c.cells.all.size > 0 && c.cells.waiting === 0 && !c.cells.needsPlan && !c.moved"
 DEADLINE_S = 60.0
 VIEW = {"width": 1280, "height": 720}
 TABLET = {"width": 1024, "height": 768}
@@ -20,7 +28,7 @@ UPRIGHT = {"width": 768, "height": 1024}
 class Console:
     """One tab."""
 
-    def __init__(self, page: Page, room: Room | None) -> None:
+    def __init__(self, page: Page, room: "Room | None") -> None:
         self.page = page
         page.set_default_timeout(1000 * DEADLINE_S)
         self.room = room
@@ -54,7 +62,10 @@ class Console:
 
     def settled(self) -> None:
         """Return when all that is wanted is there, and drawn."""
-        self.until("c && c.cells.all.size > 0 && c.cells.waiting === 0 && !c.cells.needsPlan", "everything is drawn")
+        self.until(
+            "c && c.cells.all.size > 0 && c.cells.waiting === 0 && !c.cells.needsPlan && !c.moved",
+            "everything is drawn",
+        )
         frames = self.tell("(c.stage.draw(), c.stage.frames)")
         self.until(f"c.stage.frames > {frames}", "a frame follows")
 
@@ -89,5 +100,5 @@ def browser() -> Iterator[Browser]:
         made.close()
 
 
-def tab(context: BrowserContext, room: Room) -> Console:
+def tab(context: BrowserContext, room: "Room") -> Console:
     return Console(context.new_page(), room)

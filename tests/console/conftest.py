@@ -1,25 +1,22 @@
 """A real server with a room in it, and Debian's browser to look at it."""
 
 import os
-import shutil
 import socket
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
+from playwright.sync_api import Browser
 from tests.cairn_server.live import Process, until
-from tests.console.room import GEOMETRY, MAP, mapping, push_measurement
+from tests.console.browsing import CHROMIUM, browser
+from tests.console.room import ADMIN_TOKEN, GEOMETRY, MAP, mapping, push_measurement
 
 from cairn_client.api import MapApi
 from cairn_map.messages import CreateMap
 from cairn_server.console_files import STATIC
 
-CHROMIUM = shutil.which("chromium")
 LOOPBACK = "127.0.0.1"
-ADMIN_TOKEN = "admin-of-the-console-tests"
-FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
-"""WebGL without a graphics card, in a container that has no namespaces and little shared memory."""
 
 
 @dataclass
@@ -29,6 +26,9 @@ class Room:
     folder: Path
     port: int
     host: str = LOOPBACK
+    name: str = MAP
+    options: tuple[str, ...] = ()
+    """More arguments of the server."""
     process: Process | None = None
     commits: list[str] = field(default_factory=list)
 
@@ -44,7 +44,7 @@ class Room:
         token = self.folder / "token"
         token.write_text(ADMIN_TOKEN)
         place = ("--host", self.host, "--port", str(self.port))
-        self.process = Process(self.folder / "server", *place, "--admin-token-file", str(token))
+        self.process = Process(self.folder / "server", *place, "--admin-token-file", str(token), *self.options)
         # A process tells of loopback only.
         assert self.process.url == (self.url if self.host == LOOPBACK else None), self.process.said()
 
@@ -62,17 +62,33 @@ class Room:
             until(lambda: any(entry.id == self.commits[-1] for entry in api.log(MAP)), "the commit is folded")
 
 
-@pytest.fixture(scope="package")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Room]:
-    """Two robots measured from a stop each."""
+def skip_without_page() -> None:
+    """Skip a test where there is no page or no browser to show it."""
     if not (STATIC / "index.html").exists():
         pytest.skip("the console is not built: `make console` where npm's packages can be had")
     if CHROMIUM is None and not os.environ.get("CAIRN_REQUIRE_BROWSER"):
         pytest.skip("no chromium here: apt-get install chromium")
+
+
+def free_port(host: str) -> int:
+    """A port of this machine at which nobody listens."""
     with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    made = Room(tmp_path_factory.mktemp("console"), port)
+        free.bind((host, 0))
+        return int(free.getsockname()[1])
+
+
+@pytest.fixture(scope="package")
+def chromium(room: Room) -> Iterator[Browser]:
+    """One browser for all, each test with a profile of its own in it."""
+    with browser() as made:
+        yield made
+
+
+@pytest.fixture(scope="package")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Room]:
+    """Two robots measured from a stop each."""
+    skip_without_page()
+    made = Room(tmp_path_factory.mktemp("console"), free_port(LOOPBACK))
     made.start()
     try:
         with made.api as api:

@@ -16,6 +16,7 @@ from cairn_sim.sensors import Noise
 from cairn_sim.trajectories import path_names, stops
 
 MAP = "room"
+ADMIN_TOKEN = "admin-of-the-console-tests"
 GEOMETRY = Geometry(voxel_edge_um=80_000, depth=5)
 SCALE = 0.1
 HEADS = {"scout": full_head(scale=SCALE), "mole": thermal_and_tof_head(scale=SCALE)}

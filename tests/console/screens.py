@@ -13,7 +13,7 @@ from pathlib import Path
 from tests.console.browsing import TABLET, UPRIGHT, VIEW, Console, browser
 
 FIELDS = ("colour", "temperature", "probability", "height", "age", "robot")
-VOXELS_IN_SIGHT = """Array.from({length: 400}, (_, n) => [120 + 27 * (n % 20), 120 + 19 * Math.floor(n / 20)])
+VOXELS_IN_SIGHT = """Array.from({length: 100}, (_, n) => [120 + 54 * (n % 10), 120 + 38 * Math.floor(n / 10)])
     .filter(([x, y]) => c.picker.at(x, y)?.isVoxel)"""
 SIZES = (VIEW, TABLET, UPRIGHT)
 

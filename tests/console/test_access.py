@@ -5,10 +5,10 @@ from collections.abc import Iterator
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Route
-from tests.console.browsing import TABLET, UPRIGHT, VIEW, Console, browser, tab
-from tests.console.conftest import ADMIN_TOKEN, Room
-from tests.console.room import MAP
+from playwright.sync_api import Browser, Route
+from tests.console.browsing import TABLET, UPRIGHT, VIEW, Console, tab
+from tests.console.conftest import Room
+from tests.console.room import ADMIN_TOKEN, MAP
 
 FIELDS = ("colour", "temperature", "probability", "height", "age", "robot")
 OFFLINE_S = 100
@@ -27,8 +27,8 @@ FOCUSED = """() => {
 
 
 @pytest.fixture(params=["dark", "light"])
-def console(request: pytest.FixtureRequest, room: Room) -> Iterator[Console]:
-    with browser() as made, made.new_context(viewport=VIEW, color_scheme=request.param) as context:  # type: ignore[arg-type]
+def console(request: pytest.FixtureRequest, chromium: Browser, room: Room) -> Iterator[Console]:
+    with chromium.new_context(viewport=VIEW, color_scheme=request.param) as context:  # type: ignore[arg-type]
         found = tab(context, room)
         found.open()
         yield found

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests.console.browsing import VIEW, Console, browser, tab
+from playwright.sync_api import Browser
+from tests.console.browsing import VIEW, Console, tab
 from tests.console.casting import occupied
 from tests.console.conftest import Room
 from tests.console.room import GEOMETRY, MAP
@@ -16,7 +17,7 @@ WARM = 2
 """Flag of a voxel whose temperature was measured: decode/pack.ts."""
 GREY_SPREAD_MAX = 16
 """Largest difference of a bare surface's red, green and blue; the palette's coldest colour has 38 when shaded most."""
-PLACES = [[x, y] for x in range(150, 560, 10) for y in range(80, 420, 10)]
+PLACES = [[x, y] for x in range(150, 560, 15) for y in range(80, 420, 15)]
 PICKED_FLAGS = "a[0].map(([x, y]) => { const p = c.picker.at(x, y); return p ? p.cell.bytes[12 * p.row + 7] : -1; })"
 SLOW_LINK_MS, EVERY_MS = 600, 100
 SHOW_OFTEN = f"""() => {{
@@ -32,8 +33,8 @@ SHOW_OFTEN = f"""() => {{
 
 
 @pytest.fixture(scope="module")
-def console(room: Room) -> Iterator[Console]:
-    with browser() as made, made.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
+def console(chromium: Browser, room: Room) -> Iterator[Console]:
+    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
         found = tab(context, room)
         found.open()
         found.log_in()

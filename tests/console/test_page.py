@@ -11,8 +11,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tests.console.browsing import VIEW, Console, browser, tab
-from tests.console.casting import Occupied, first_met, lattice_corners, occupied
+from playwright.sync_api import Browser
+from tests.console.browsing import VIEW, Console, tab
+from tests.console.casting import occupied, picks_met_first
 from tests.console.conftest import Room
 from tests.console.room import GEOMETRY, MAP
 
@@ -22,8 +23,6 @@ PAGE_GZIP_BYTES_MAX = 250_000
 FIRST_PICTURE_BYTES_MAX = 500_000
 BYTES_PER_VOXEL_MAX = 5
 PICKS = 50
-HEAT_ZERO_K, HEAT_STEP_K = 150, 0.02
-"""Of decode/pack.ts."""
 UPDATES = 200
 HEAP_BYTES_MAX = 1_000_000
 """What the page may hold more after so many updates: were anything of a cell kept, it would be ten times that."""
@@ -48,8 +47,8 @@ LOADED_MACHINE = 10
 
 
 @pytest.fixture(scope="module")
-def console(room: Room) -> Iterator[Console]:
-    with browser() as made, made.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
+def console(chromium: Browser, room: Room) -> Iterator[Console]:
+    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
         found = tab(context, room)
         yield found
 
@@ -83,51 +82,10 @@ def test_all_of_the_map_is_drawn_voxel_by_voxel(console: Console, room: Room) ->
     assert console.tell("window.cairn.api.received") <= 2 * BYTES_PER_VOXEL_MAX * len(voxels.numbers)
 
 
-def assert_values_are_the_servers(told: list[int], voxels: Occupied, row: int) -> None:
-    """The 12 bytes of a voxel on the graphics card, against the server's numbers."""
-    assert told[3] == pytest.approx(255 * voxels.probability[row], abs=0.51)
-    is_coloured, is_warm = bool(told[7] & 1), bool(told[7] & 2)
-    assert is_coloured == bool(np.isfinite(voxels.rgb[row]).all())
-    assert is_warm == bool(np.isfinite(voxels.temperature_k[row]))
-    if is_coloured:
-        assert told[4:7] == pytest.approx(voxels.rgb[row], abs=0.51)
-    if is_warm:
-        mean_k = HEAT_ZERO_K + HEAT_STEP_K * (told[8] + 256 * told[9])
-        assert mean_k == pytest.approx(voxels.temperature_k[row], abs=0.051 + HEAT_STEP_K)
-
-
 def test_what_is_picked_is_what_a_ray_meets_first(console: Console, room: Room) -> None:
-    voxels = occupied(room)
-    edge_m = GEOMETRY.voxel_edge_m
-    corners = lattice_corners(voxels.numbers)
-    rng = np.random.default_rng(3)
     size = console.tell("[c.stage.canvas.clientWidth, c.stage.canvas.clientHeight]")
-    places = (rng.random((4 * PICKS, 2)) * (np.array(size) - 1)).astype(int)
-    lens = console.tell(
-        "(c.stage.camera.updateMatrixWorld(), [c.stage.camera.matrixWorld.elements, "
-        "c.stage.camera.projectionMatrix.elements])"
-    )
-    T_map_eye, projection = (np.array(part).reshape(4, 4).T for part in lens)
-    found = console.tell(
-        "a[0].map(([x, y]) => { const p = c.picker.at(x, y);"
-        " return p && [p.cell.cell, p.node, p.isVoxel, [...p.cell.bytes.subarray(12 * p.row, 12 * p.row + 12)]]; })",
-        places.tolist(),
-    )
-    hit = 0
-    for (x, y), picked in zip(places.tolist(), found, strict=True):
-        at = np.array([(x + 0.5) / size[0] * 2 - 1, 1 - (y + 0.5) / size[1] * 2])
-        ray = T_map_eye[:3, :3] @ [at[0] / projection[0, 0], at[1] / projection[1, 1], -1.0]
-        row, gap_m = first_met(corners, edge_m, T_map_eye[:3, 3], ray)
-        if gap_m < 1e-4:
-            continue  # an edge that two voxels share: either is right
-        assert (row is None) == (picked is None), (x, y)
-        if row is not None:
-            cell, node, is_voxel, told = picked
-            assert is_voxel
-            assert [node[n] + GEOMETRY.side * cell[n] for n in range(3)] == voxels.numbers[row].tolist()
-            assert_values_are_the_servers(told, voxels, row)
-            hit += 1
-    assert hit >= PICKS
+    places = np.random.default_rng(3).integers(0, size, (4 * PICKS, 2))
+    assert picks_met_first(console, occupied(room), GEOMETRY, places) >= PICKS
 
 
 def test_a_click_tells_the_servers_own_numbers_and_who_saw_it(console: Console, room: Room) -> None:
@@ -169,17 +127,18 @@ def test_another_colouring_asks_nothing_of_the_server_and_looks_otherwise(consol
     console.page.keyboard.press("1")
 
 
-def test_the_ceiling_hides_what_is_above_it(console: Console) -> None:
-    highest = "Math.max(...a[0].map(([x, y]) => c.picker.at(x, y)?.centre.z ?? -9))"
+@pytest.mark.parametrize(("slider", "way"), [("Ceiling", 1), ("Floor", -1)])
+def test_ceiling_and_floor_hide_what_is_beyond_them(console: Console, slider: str, way: int) -> None:
+    farthest = f"Math.max(...a[0].map(([x, y]) => {way} * (c.picker.at(x, y)?.centre.z ?? {-9 * way})))"
     places = [[x, y] for x in range(200, 700, 60) for y in range(150, 500, 50)]
-    whole = console.tell(highest, places)
-    console.page.get_by_label("Ceiling").fill("100")
+    whole = console.tell(farthest, places)
+    console.page.get_by_label(slider).fill("100")
     console.settled()
-    assert console.tell(highest, places) < whole
-    assert console.tell(highest, places) <= console.tell("c.look.ceilingM")
+    assert console.tell(farthest, places) < whole
+    assert console.tell(farthest, places) <= way * console.tell(f"c.look.{slider.lower()}M")
     address = console.tell("c.address")
-    console.page.get_by_label("Ceiling").fill("200")
-    assert "ceiling=" in address
+    console.page.get_by_label(slider).fill("200" if way > 0 else "0")
+    assert f"{slider.lower()}=" in address
     assert f"map={MAP}" in address
 
 
@@ -246,15 +205,18 @@ def test_clicks_measure_lengths_and_areas(console: Console) -> None:
     middle = console.page.locator(".host canvas").bounding_box()
     assert middle is not None
     x, y = middle["x"] + middle["width"] / 2, middle["y"] + middle["height"] / 2
-    for right, down in ((0, 0), (60, 0), (60, 50)):
+    clicks = ((0, 0), (60, 0), (60, 50), (30, 20), (0, 50))
+    for count, (right, down) in enumerate(clicks, start=1):
         console.page.mouse.click(x + right, y + down)
-    corners = np.array(console.tell("c.measure.points.map((point) => point.toArray())"))
-    assert corners.shape == (3, 3)
-    steps = np.linalg.norm(np.diff(corners, axis=0), axis=1)
-    area_m2 = np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0])) / 2
-    said = console.page.get_by_role("region", name="Measure").inner_text()
-    assert f"{steps.sum():.2f} m" in said
-    assert f"{area_m2:.2f} m²" in said
+        if count < 3:
+            continue
+        corners = np.array(console.tell("c.measure.points.map((point) => point.toArray())"))
+        assert corners.shape == (count, 3)
+        length_m = np.linalg.norm(np.diff(corners, axis=0), axis=1).sum()
+        area_m2 = np.linalg.norm(np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)) / 2
+        said = console.page.get_by_role("region", name="Measure").inner_text()
+        assert f"{length_m:.2f} m" in said
+        assert f"{area_m2:.2f} m²" in said
     console.page.get_by_role("region", name="Measure").get_by_role("button", name="Clear").click()
     console.page.locator(".host canvas").focus()
     console.page.keyboard.press("m")
@@ -291,6 +253,32 @@ def test_a_commit_is_taken_out_only_after_it_was_shown_and_confirmed(console: Co
     console.until(f"c.cells.drawn !== {before}", "the map without the commit")
     console.settled()
     assert console.tell("c.cells.drawn") == len(occupied(room).numbers)
+
+
+def test_a_span_of_a_robot_is_taken_out(console: Console, room: Room) -> None:
+    before = len(occupied(room).numbers)
+    with room.api as api:
+        retracted = {entry.id for entry in api.log(MAP) if entry.kind == "-"}
+    first = len(room.commits)
+    room.measure("scout", 2)
+    room.measure("scout", 4)
+    console.until(f"c.strip.entries.size >= {first + 2 + len(retracted)}", "both are in the log")
+    page = console.page
+    page.get_by_role("button", name=f"commit {room.commits[first]}").focus()
+    page.keyboard.press("Enter")
+    preview, confirm = (page.get_by_role("button", name=name) for name in ("Show what", "out for good"))
+    preview.click()
+    page.get_by_text("1 commit:").wait_for()
+    page.get_by_label("What", exact=True).select_option("later")
+    assert confirm.is_disabled(), "that was not shown"
+    preview.click()
+    page.get_by_text("2 commits:").wait_for()
+    assert page.locator("dialog .said li").all_inner_texts() == room.commits[first:]
+    confirm.click()
+    page.get_by_text("Done: 2 taken out").wait_for()
+    page.get_by_role("button", name="Close").click()
+    console.until(f"c.cells.drawn === {before}", "the map as it was before both")
+    assert len(occupied(room).numbers) == before
 
 
 def test_the_keys_are_listed_and_turn_the_view(console: Console) -> None:

@@ -5,14 +5,15 @@ from pathlib import Path
 
 import cv2
 import pytest
-from tests.console.browsing import VIEW, browser, tab
+from playwright.sync_api import Browser
+from tests.console.browsing import VIEW, tab
 from tests.console.conftest import Room
 from tests.console.screens import take_screens
 
 
 @pytest.mark.parametrize("theme", ["dark", "light"])
-def test_every_mode_has_its_picture(room: Room, tmp_path: Path, theme: str) -> None:
-    with browser() as made, made.new_context(viewport=VIEW, color_scheme=theme) as context:  # type: ignore[arg-type]
+def test_every_mode_has_its_picture(chromium: Browser, room: Room, tmp_path: Path, theme: str) -> None:
+    with chromium.new_context(viewport=VIEW, color_scheme=theme) as context:  # type: ignore[arg-type]
         console = tab(context, room)
         console.open()
         console.page.get_by_label("Token").wait_for()

@@ -9,8 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.console.browsing import browser, tab
-from tests.console.conftest import LOOPBACK, Room
+from playwright.sync_api import Browser
+from tests.console.browsing import tab
+from tests.console.conftest import LOOPBACK, Room, free_port
 from tests.console.room import GEOMETRY, MAP
 from tests.console.test_page import LOADED_MACHINE
 
@@ -21,8 +22,8 @@ DRAWN_S = 3
 SMALL_VIEW = {"width": 480, "height": 360}
 
 
-def test_eight_tabs_hear_of_a_commit_and_draw_it(room: Room) -> None:
-    with browser() as made, made.new_context(viewport=SMALL_VIEW) as context:  # type: ignore[arg-type]
+def test_eight_tabs_hear_of_a_commit_and_draw_it(chromium: Browser, room: Room) -> None:
+    with chromium.new_context(viewport=SMALL_VIEW) as context:  # type: ignore[arg-type]
         tabs = [tab(context, room) for _ in range(TABS)]
         for number, each in enumerate(tabs):
             each.open()
@@ -41,7 +42,7 @@ def test_eight_tabs_hear_of_a_commit_and_draw_it(room: Room) -> None:
 
 @pytest.fixture
 def lan_room(room: Room, tmp_path: Path) -> Iterator[Room]:
-    """A room whose server listens where other machines would reach it."""
+    """A room whose server listens where other machines would reach it, and keeps no more than the map."""
     assert room.host == LOOPBACK
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
@@ -51,10 +52,7 @@ def lan_room(room: Room, tmp_path: Path) -> Iterator[Room]:
             host = LOOPBACK
     if host == LOOPBACK:
         pytest.skip("no network interface but loopback here")
-    with socket.socket() as free:
-        free.bind((host, 0))
-        port = free.getsockname()[1]
-    made = Room(tmp_path, port, host)
+    made = Room(tmp_path, free_port(host), host, options=("--keep-evidence", "0"))
     made.start()
     try:
         with made.api as api:
@@ -65,8 +63,8 @@ def lan_room(room: Room, tmp_path: Path) -> Iterator[Room]:
         made.stop()
 
 
-def test_over_plain_http_on_a_lan_the_page_is_whole(lan_room: Room) -> None:
-    with browser() as made, made.new_context(viewport=SMALL_VIEW) as context:  # type: ignore[arg-type]
+def test_over_plain_http_on_a_lan_the_page_is_whole_and_tells_what_is_gone(chromium: Browser, lan_room: Room) -> None:
+    with chromium.new_context(viewport=SMALL_VIEW) as context:  # type: ignore[arg-type]
         console = tab(context, lan_room)
         console.open()
         console.log_in()
@@ -77,6 +75,9 @@ def test_over_plain_http_on_a_lan_the_page_is_whole(lan_room: Room) -> None:
         assert console.picture().std() > 5
         lan_room.measure("scout", 1)
         console.until(f"c.cells.head > {before} && c.cells.waiting === 0", "a new commit is drawn")
+        console.ask_middle()
+        # This server keeps no commit's evidence once it is in the map.
+        console.page.get_by_text("Commits before are not kept any more: of them only the sum is known.").wait_for()
         copy = console.page.get_by_role("region", name="Take away").get_by_role("button", name="Copy").first
         copy.click()
         console.page.get_by_role("button", name="Copied").wait_for()

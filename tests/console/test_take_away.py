@@ -6,10 +6,11 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from tests.console.browsing import VIEW, Console, browser, tab
+from playwright.sync_api import Browser
+from tests.console.browsing import VIEW, Console, tab
 from tests.console.casting import occupied
-from tests.console.conftest import ADMIN_TOKEN, Room
-from tests.console.room import MAP
+from tests.console.conftest import Room
+from tests.console.room import ADMIN_TOKEN, MAP
 
 BEGINNINGS = {
     "PLY": b"ply\n",
@@ -20,8 +21,10 @@ BEGINNINGS = {
 }
 
 
-def test_every_kind_of_file_is_saved_and_the_lines_bring_the_same(room: Room, tmp_path: Path) -> None:
-    with browser() as made, made.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
+def test_every_kind_of_file_is_saved_and_the_lines_bring_the_same(
+    chromium: Browser, room: Room, tmp_path: Path
+) -> None:
+    with chromium.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
         console = tab(context, room)
         console.open()
         console.log_in()
