@@ -12,12 +12,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.console.browsing import VIEW, browser, tab
+from tests.console.casting import occupied, picks_met_first
+from tests.console.conftest import LOOPBACK, Room, free_port, skip_without_page
 
 from cairn_sim.record import Plan, record
 from cairn_sim.robots import ROBOTS
 from cairn_sim.scene_file import load_scene
 
 COMMAND_S = 300
+PLACES, PICKS = 100, 50
+"""That are asked for, and voxels that are found there at least."""
 VOXEL_M = "0.08"
 
 
@@ -235,12 +240,43 @@ def test_a_robot_without_the_server_extra_is_told_what_to_install(tmp_path: Path
     assert 'pip install "cairn-robotics[server]"' in done.stderr
 
 
-def test_the_demo_ends_with_maps_that_agree(tmp_path: Path) -> None:
-    out = cairn("demo", "--quick", "--output", "demo", folder=tmp_path)
+@pytest.fixture(scope="session")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The demo's folder, and what it said."""
+    folder = tmp_path_factory.mktemp("demo")
+    return folder / "demo", cairn("demo", "--quick", "--output", "demo", folder=folder)
+
+
+def test_the_demo_ends_with_maps_that_agree(demo: tuple[Path, str]) -> None:
+    folder, out = demo
     assert re.search(r"all equal: server, scout, mole, late hold the same \d+ cells,\s+byte for byte", out)
     assert "every map equals one that never had it" in out
-    assert (tmp_path / "demo" / "map.png").stat().st_size > 10_000
-    assert (tmp_path / "demo" / "map.ply").read_bytes().startswith(b"ply\n")
+    assert (folder / "map.png").stat().st_size > 10_000
+    assert (folder / "map.ply").read_bytes().startswith(b"ply\n")
+
+
+def test_the_demos_map_is_in_the_browser_what_the_server_has(demo: tuple[Path, str]) -> None:
+    skip_without_page()
+    room = Room(demo[0], free_port(LOOPBACK), name="building")
+    room.start()
+    try:
+        with browser() as chromium, chromium.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
+            console = tab(context, room)
+            console.open()
+            console.log_in()
+            console.settled()
+            assert console.picture().std() > 10
+            console.page.keyboard.press("w")
+            console.settled()
+            assert console.picture().std() > 10
+            size = console.tell("[c.stage.canvas.clientWidth, c.stage.canvas.clientHeight]")
+            places = np.random.default_rng(5).integers(0, size, (PLACES, 2))
+            with room.api as api:
+                geometry = api.map_info(room.name).geometry
+            assert picks_met_first(console, occupied(room), geometry, places) >= PICKS
+            assert console.errors[1:] == []  # the browser tells of the 401 before
+    finally:
+        room.stop()
 
 
 @pytest.mark.recording
