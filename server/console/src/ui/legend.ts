@@ -21,13 +21,18 @@ export class Legend {
   readonly element = h("section", { class: "legend", "aria-label": "Legend" });
   onRange: (range: [number, number] | null) => void = () => {};
   private shown = "";
+  private locked = false;
 
   /** `range` in the look's unit; null: nothing that is shown has this field. */
   show(look: Look, range: [number, number] | null, robots: readonly string[], told: Told): void {
     const locked = look.ranges[look.field] !== undefined;
     const state = JSON.stringify([look.field, range?.map((end) => end.toFixed(2)), locked, look.field === "robot" && robots, told]);
-    if (state === this.shown || this.element.contains(document.activeElement)) return;
+    const controls = () => [...this.element.querySelectorAll<HTMLElement>("input, button")];
+    const focused = controls().indexOf(document.activeElement as HTMLElement);
+    // Whoever types an end is not disturbed by one that follows what is shown.
+    if (state === this.shown || (focused >= 0 && locked === this.locked)) return;
     this.shown = state;
+    this.locked = locked;
     const { label, palette, unit: ofField } = FIELDS.find(({ field }) => field === look.field)!;
     const isAge = look.field === "age";
     const { unit, size } = isAge ? told : { unit: ofField, size: 1 };
@@ -58,6 +63,7 @@ export class Legend {
       look.field === "temperature" ? bare : null,
       isAge && told.log !== "whole" ? h("p", {}, told.log === "read" ? READING : `or older: changed ${FAR}`) : null,
     );
+    controls()[focused]?.focus();
   }
 }
 
