@@ -260,8 +260,8 @@ def test_a_span_of_a_robot_is_taken_out(console: Console, room: Room) -> None:
     with room.api as api:
         retracted = {entry.id for entry in api.log(MAP) if entry.kind == "-"}
     first = len(room.commits)
-    room.measure("scout", 2)
     room.measure("scout", 4)
+    room.measure("scout", 5)
     console.until(f"c.strip.entries.size >= {first + 2 + len(retracted)}", "both are in the log")
     page = console.page
     page.get_by_role("button", name=f"commit {room.commits[first]}").focus()
