@@ -55,10 +55,7 @@ export class Cells {
       if (!voxels) continue;
       const shown = this.at(cell);
       there.add(shown.key);
-      if (shown.digest !== digest) {
-        shown.dirty = true;
-        shown.counts = [];
-      }
+      if (shown.digest !== digest) shown.dirty = true;
       shown.digest = digest;
       shown.lm = lm;
     }
@@ -71,7 +68,6 @@ export class Cells {
   changed(cell: Triple, lm: number): void {
     const shown = this.at(cell);
     shown.lm = lm;
-    shown.counts = [];
     shown.digest = "";
     shown.dirty = true;
     this.head = Math.max(this.head, lm);
@@ -165,7 +161,7 @@ export class Cells {
         }
       }
       cell.etag = etag;
-      cell.counts[depth] = cell.count;
+      cell.counted(depth);
       cell.failedMs = NEVER_MS;
       this.error = null;
       if (this.firstPictureMs === null && ![...this.all.values()].some(({ etag }) => etag === null)) {

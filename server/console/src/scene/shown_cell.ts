@@ -54,6 +54,14 @@ export class ShownCell {
     return this.depth !== this.wanted && !this.isEmpty;
   }
 
+  /** What is shown is all that its depth has; where that changed, other depths are guessed to have changed alike. */
+  counted(depth: number): void {
+    const before = this.counts[depth];
+    if (before === 0 || (before && !this.count)) this.counts = [];
+    else if (before) this.counts = this.counts.map((count) => count && (count * this.count) / before);
+    this.counts[depth] = this.count;
+  }
+
   /** Take other nodes; their points, which the caller adds to the picture, or null if there are none. */
   take(bytes: Uint8Array, depth: number, material: ShaderMaterial): Points | null {
     this.drop();
