@@ -3,10 +3,11 @@
 from collections.abc import Iterator
 
 import pytest
+from playwright.sync_api import Browser
 from tests.cairn_map.made import SMALL, surface_evidence
 from tests.cairn_server.live import until
 from tests.cairn_server.pushes import KEYS, MOLE, WREN, pushed
-from tests.console.browsing import Console, browser, tab
+from tests.console.browsing import Console, tab
 from tests.console.conftest import Room
 from tests.console.test_tabs import SMALL_VIEW
 
@@ -22,7 +23,7 @@ SCANS = 64
 
 
 @pytest.fixture(scope="module")
-def console(room: Room) -> Iterator[Console]:
+def console(chromium: Browser, room: Room) -> Iterator[Console]:
     """A map of which the first commit was wren's, and all others mole's, who saw another cell."""
     with room.api as api:
         api.create_map(LONG, CreateMap(geometry=SMALL))
@@ -33,7 +34,7 @@ def console(room: Room) -> Iterator[Console]:
             pose = meta.scans[-1].model_copy(update={"t_map_rig": (n / 100, 0.5, 0.4)})
             api.push(LONG, make_commit(meta.model_copy(update={"scans": (*meta.scans[:-1], pose)}), cells, SMALL))
         until(lambda: len(api.log(LONG, limit=1000)) == COMMITS, "all commits are folded")
-    with browser() as made, made.new_context(viewport=SMALL_VIEW) as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=SMALL_VIEW) as context:  # type: ignore[arg-type]
         found = tab(context, room)
         found.open(f"#map={LONG}")
         found.log_in()
