@@ -38,6 +38,7 @@ GAIN_SIGMA = 0.02
 """Of a pixel's gain from 1 where only one temperature was shown: as uncooled sensors scatter unlevelled."""
 FILE_BYTES_MAX = 64 << 20
 SIGMAS = ("gain_sigma", "offset_sigma", "shading_sigma")
+UNITS = "gain, gain_sigma: 1 (levelled counts per count); bad: true or false; all else: counts of the camera"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,7 +158,7 @@ def write_flat_field(path: Path, flat_field: FlatField) -> MapsFile:
     buffer = io.BytesIO()
     maps = {name: getattr(flat_field, name) for name in ("gain", "offset", "shading", "bad", *SIGMAS)}
     maps = {name: each for name, each in maps.items() if each is not None}
-    np.savez_compressed(buffer, at_counts=np.float64(flat_field.at_counts), **maps)
+    np.savez_compressed(buffer, at_counts=np.float64(flat_field.at_counts), units=np.array(UNITS), **maps)
     data = buffer.getvalue()
     path.write_bytes(data)
     return MapsFile(name=path.name, sha256=hashlib.sha256(data).hexdigest())

@@ -110,6 +110,8 @@ def test_uncertain_maps_make_uncertain_pixels(tmp_path: Path) -> None:
     true = scene(rng, bad=0)
     field = fit_flat_field([images(true, level, 4, rng) for level in (4000.0, 4400.0)]).flat_field
     named = write_flat_field(tmp_path / "m.npz", field)
+    with np.load(tmp_path / "m.npz") as kept:
+        assert "counts" in str(kept["units"])
     back = read_flat_field(tmp_path / "m.npz", named)
     known = Radiometry(response=RESPONSE, range_k=(255.0, 400.0), noise_counts=2.0, source="made up")
     near, far = (temperatures(images(true, at, 1, rng)[0], known, flat_field=back) for at in (4200.0, 8000.0))
