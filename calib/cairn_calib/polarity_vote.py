@@ -29,6 +29,8 @@ OUTWARDS = np.arange(INSIDE, 1.6, 0.05)
 LONGER = 0.1
 """Cells by which cells of paper go on for longer than those that are printed."""
 PAIRS_MIN = 6
+AGAINST_MAX = 1
+"""Sides of the board that may say otherwise: of which the cells are cut, or on which something lies."""
 MAJORITY = 0.75
 
 
@@ -67,10 +69,14 @@ def margin_polarity(counts: npt.NDArray[np.float32], corners: Corners) -> Polari
     if homography is None:
         return None
     longer = [_longer(_brightness(counts, mapped(homography, _beyond(board, side)))) for side in range(4)]
-    pairs = np.concatenate(longer)
-    pairs = pairs[np.isfinite(pairs)]
-    by = float(np.median(pairs)) if len(pairs) >= PAIRS_MIN else 0.0
-    return "normal" if by > LONGER else "reversed" if by < -LONGER else None
+    sides = [told for each in longer if len(told := each[np.isfinite(each)])]
+    if sum(map(len, sides)) < PAIRS_MIN:
+        return None
+    by = float(np.median(np.concatenate(sides)))
+    against = sum(float(np.median(side)) * np.sign(by) < -LONGER for side in sides)
+    if abs(by) <= LONGER or against > AGAINST_MAX:
+        return None
+    return "normal" if by > 0 else "reversed"
 
 
 def turned(corners: Corners) -> Corners:
