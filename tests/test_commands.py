@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cairn_server.live import free_port
 from tests.console.browsing import VIEW, browser, tab
 from tests.console.casting import occupied, picks_met_first
-from tests.console.conftest import LOOPBACK, Room, free_port, skip_without_page
+from tests.console.conftest import LOOPBACK, Room, skip_without_page
 
 from cairn_sim.record import Plan, record
 from cairn_sim.robots import ROBOTS

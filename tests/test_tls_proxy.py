@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import ssl
 import subprocess
 import sys
@@ -19,7 +18,7 @@ import httpx
 import pytest
 import yaml
 from tests.cairn_map.made import SMALL
-from tests.cairn_server.live import Process, until
+from tests.cairn_server.live import Process, free_port, until
 from tests.cairn_server.pushes import pushed
 from websockets.sync.client import connect
 from websockets.typing import Origin
@@ -54,20 +53,13 @@ class Site:
         return MapApi(self.url, token=ADMIN_TOKEN, ca_file=self.authority)
 
 
-def free_port() -> int:
-    with socket.socket() as found:
-        found.bind((SITE, 0))
-        port: int = found.getsockname()[1]
-        return port
-
-
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     folder = tmp_path_factory.mktemp("proxy")
     (folder / "token").write_text(ADMIN_TOKEN)
     server = Process(folder / "data", "--admin-token-file", str(folder / "token"))
     assert server.url
-    https_port, http_port = free_port(), free_port()
+    https_port, http_port = free_port(SITE), free_port(SITE)
     env = {
         **{"PATH": os.environ["PATH"], "HOME": str(folder), "XDG_DATA_HOME": str(folder)},
         **{"CAIRN_SITE": SITE, "CAIRN_BIND": SITE, "CAIRN_UPSTREAM": server.url.removeprefix("http://")},

@@ -69,9 +69,9 @@ def opencv_views(detector: Callable[[npt.NDArray[np.uint8]], Floats] = classic) 
     return BoardViews(board, {"left": (640, 480), "right": (640, 480)}, tuple(views))
 
 
-def test_opencv_finds_the_same_rig_from_the_same_corners() -> None:
-    views = opencv_views()
-    plan = SolvePlan(
+def opencv_plan() -> SolvePlan:
+    """What stereoCalibrate solves: a flat board of known size, no priors."""
+    return SolvePlan(
         cameras={name: CameraPlan(spectrum=Spectrum.COLOUR) for name in ("left", "right")},
         gauge="left",
         pitch_sigma=0.0,
@@ -79,7 +79,11 @@ def test_opencv_finds_the_same_rig_from_the_same_corners() -> None:
         usual_priors=False,
         noise=STATED,
     )
-    ours = solve_rig(views, plan)
+
+
+def test_opencv_finds_the_same_rig_from_the_same_corners() -> None:
+    views = opencv_views()
+    ours = solve_rig(views, opencv_plan())
     left, right = ([view.corners.pixels.astype(np.float32) for view in views.of_camera(name)] for name in views.cameras)
     points = [views.board.points().astype(np.float32)] * len(left)
     assert len(left) == len(right) == 13
@@ -107,15 +111,7 @@ def test_opencv_finds_the_same_rig_from_the_same_corners() -> None:
 
 def test_the_published_figures_of_opencvs_stereo_pairs_come_out() -> None:
     """As stereoCalibrate, mrcal 2.2 and a third solver gave them from these corners (OpenCV 5.0's detector)."""
-    plan = SolvePlan(
-        cameras={name: CameraPlan(spectrum=Spectrum.COLOUR) for name in ("left", "right")},
-        gauge="left",
-        pitch_sigma=0.0,
-        warp=False,
-        usual_priors=False,
-        noise=STATED,
-    )
-    solution = solve_rig(opencv_views(sector_based), plan)
+    solution = solve_rig(opencv_views(sector_based), opencv_plan())
     values = solution.values()
     assert [values["left", "fx"], values["right", "fx"]] == pytest.approx([532.499, 535.165], abs=1e-3)
     T_right_left = inverse(solution.state.T_rig_camera[1])

@@ -3,6 +3,7 @@
 import itertools
 import os
 import re
+import socket
 import subprocess
 import sys
 import tempfile
@@ -30,6 +31,13 @@ from cairn_server.store import Store
 from cairn_server.store_rows import MapRow
 
 DEADLINE_S = 60.0
+
+
+def free_port(host: str) -> int:
+    """A port of this machine at which nobody listens."""
+    with socket.socket() as free:
+        free.bind((host, 0))
+        return int(free.getsockname()[1])
 
 
 def until(condition: Callable[[], bool], what: str) -> None:

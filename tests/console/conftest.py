@@ -1,15 +1,14 @@
 """A real server with a room in it, and Debian's browser to look at it."""
 
 import os
-import socket
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser
-from tests.cairn_server.live import Process, until
-from tests.console.browsing import CHROMIUM, browser
+from tests.cairn_server.live import Process, free_port, until
+from tests.console.browsing import CHROMIUM, VIEW, Console, browser, tab
 from tests.console.room import ADMIN_TOKEN, GEOMETRY, MAP, mapping, push_measurement
 
 from cairn_client.api import MapApi
@@ -70,18 +69,23 @@ def skip_without_page() -> None:
         pytest.skip("no chromium here: apt-get install chromium")
 
 
-def free_port(host: str) -> int:
-    """A port of this machine at which nobody listens."""
-    with socket.socket() as free:
-        free.bind((host, 0))
-        return int(free.getsockname()[1])
-
-
 @pytest.fixture(scope="package")
 def chromium(room: Room) -> Iterator[Browser]:
     """One browser for all, each test with a profile of its own in it."""
     with browser() as made:
         yield made
+
+
+@pytest.fixture(scope="module")
+def console(chromium: Browser, room: Room) -> Iterator[Console]:
+    """A tab that shows the room, the same for all tests of a file."""
+    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
+        found = tab(context, room)
+        found.open()
+        found.log_in()
+        found.settled()
+        found.errors.clear()  # the browser tells that a stranger was refused
+        yield found
 
 
 @pytest.fixture(scope="package")

@@ -1,29 +1,14 @@
 """The controls that turn the view and the look: each does to the picture, or to the map, what it says."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import numpy.typing as npt
 import pytest
-from playwright.sync_api import Browser
-from tests.console.browsing import VIEW, Console, tab
-from tests.console.conftest import Room
+from tests.console.browsing import Console
 
 ON_PICTURE = """c.cells.tightBoxes.flatMap(({ min, max }) => Array.from({ length: 8 }, (_, n) =>
   min.clone().set(n & 1 ? max.x : min.x, n & 2 ? max.y : min.y, n & 4 ? max.z : min.z)
     .project(c.stage.camera).toArray().slice(0, 2)))"""
 """Corners of the boxes around what is drawn of each cell; the picture goes from -1 to 1."""
-
-
-@pytest.fixture(scope="module")
-def console(chromium: Browser, room: Room) -> Iterator[Console]:
-    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
-        found = tab(context, room)
-        found.open()
-        found.log_in()
-        found.settled()
-        found.errors.clear()  # the browser tells that a stranger was refused
-        yield found
 
 
 def ahead(console: Console) -> npt.NDArray[np.float64]:

@@ -1,14 +1,12 @@
 """What the page shows is what is known: no cold where nothing was measured, ages in hours, old pictures called old."""
 
 import re
-from collections.abc import Iterator
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
-from playwright.sync_api import Browser
-from tests.console.browsing import VIEW, Console, tab
+from tests.console.browsing import Console
 from tests.console.casting import occupied
 from tests.console.conftest import Room
 from tests.console.room import GEOMETRY, MAP
@@ -30,16 +28,6 @@ SHOW_OFTEN = f"""() => {{
   const told = c.team.signs.get("scout");
   window.showing = setInterval(() => c.team.hear({{ ...told, view_s: Date.now() / 1000 }}), {EVERY_MS});
 }}"""
-
-
-@pytest.fixture(scope="module")
-def console(chromium: Browser, room: Room) -> Iterator[Console]:
-    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
-        found = tab(context, room)
-        found.open()
-        found.log_in()
-        found.settled()
-        yield found
 
 
 def test_what_has_no_temperature_is_grey_and_not_cold(console: Console) -> None:

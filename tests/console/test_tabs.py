@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser
+from tests.cairn_server.live import free_port
 from tests.console.browsing import tab
-from tests.console.conftest import LOOPBACK, Room, free_port
+from tests.console.conftest import LOOPBACK, Room
 from tests.console.room import GEOMETRY, MAP
 from tests.console.test_page import LOADED_MACHINE
 
