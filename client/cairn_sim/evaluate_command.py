@@ -26,7 +26,6 @@ from pathlib import Path
 from cairn_calib.rig import Spectrum
 from cairn_client.arguments import say, with_progress
 from cairn_fusion.images import write_colour
-from cairn_fusion.overlay import OverlayStyle
 from cairn_fusion.view.telepresence import Mode, Telepresence, ViewOptions
 from cairn_fusion.view.temperature_scale import locked_scale
 from cairn_map.errors import BadInputError
@@ -124,7 +123,7 @@ def _overlays(args: argparse.Namespace) -> None:
     say(f"{'map over ' + name + ', IoU':<34}" + "".join(f"{column:>12}" for column in ("poses", "mean", "least")))
     for way, found in (
         ("live depth agrees", [score.visible for score in scores]),
-        (f"no live depth, {OverlayStyle().step_px} px at a time", [score.map_only for score in scores]),
+        ("no live depth", [score.map_only for score in scores]),
     ):
         say(f"  {way:<32}{len(found):>12}{statistics.fmean(found):>12.4f}{min(found):>12.4f}")
 

@@ -96,7 +96,8 @@ class OverlayStyle:
     through_m: float = 10.0
     """So far behind the live surface things are looked for."""
     step_px: int = 3
-    """All but the visible is looked up once for so many pixels along both axes: stripes and dots do not show more."""
+    """All but the visible, and the outline of what the map alone has, is looked up once for so many pixels along both
+    axes: stripes and dots do not show more."""
 
     @property
     def colours(self) -> Scale:
@@ -111,7 +112,7 @@ class Overlay:
     picture: Rgb
     """(H, W, 3)"""
     front: Seen
-    """What the map has where the live surface is."""
+    """What the map has where the live surface is, and, where there is no live depth, along the outlines of `rest`."""
     values: npt.NDArray[np.floating]
     """Of the layer, in front; (H, W), of colours (H, W, 3)."""
     rest: Seen
@@ -149,16 +150,23 @@ def draw_overlay(
     """
     tolerance_m = np.float32(style.tolerance_m or TOLERANCE_VOXELS * snapshot.geometry.voxel_edge_m)
     range_m, step = np.asarray(live.range_m, np.float32), style.step_px
-    around = range_m - tolerance_m, range_m + tolerance_m
-    front = renderer.nearest(snapshot, live.sight, live.T_map_camera, range_max_m=style.range_max_m, between_m=around)
     coarse_m = middles(range_m, step)
     rest = _rest(renderer, snapshot, live, coarse_m, tolerance_m, style)
     rest_modes = np.where(np.isnan(coarse_m), np.uint8(Mode.MAP_ONLY), np.uint8(Mode.SEE_THROUGH))
     rest_modes[~rest.hit] = Mode.NOTHING
     H, W = range_m.shape
     everywhere = _wide(rest_modes, step, (H, W))
-    modes = np.where(front.hit, np.uint8(Mode.VISIBLE), np.uint8(Mode.NOTHING))
-    modes[np.isnan(range_m) & (everywhere == Mode.MAP_ONLY)] = Mode.MAP_ONLY
+    is_alone = np.isnan(range_m)
+    # Ink that is spread has no outline.
+    is_fine = is_alone & _wide(_outlines(rest_modes), step, (H, W)) & live.spread.is_exact
+    around = (
+        np.where(is_fine, np.float32(0), range_m - tolerance_m),
+        np.where(is_fine, np.float32(style.range_max_m), range_m + tolerance_m),
+    )
+    front = renderer.nearest(snapshot, live.sight, live.T_map_camera, range_max_m=style.range_max_m, between_m=around)
+    modes = np.where(front.hit, np.where(is_alone, np.uint8(Mode.MAP_ONLY), np.uint8(Mode.VISIBLE)), Mode.NOTHING)
+    modes = modes.astype(np.uint8)
+    modes[is_alone & ~is_fine & (everywhere == Mode.MAP_ONLY)] = Mode.MAP_ONLY
     values = layer_values(renderer, snapshot, front, style.layer, ages)
     values_of_rest = layer_values(renderer, snapshot, rest, style.layer, ages)
     spreads, why = None, None
@@ -174,13 +182,18 @@ def draw_overlay(
     else:
         covers = _covers(renderer, snapshot, rest, coarse_m, style, ages)
         covers[_unknown(values_of_rest)] *= GREY_COVER
-        front_covers = np.where(_unknown(values), np.float32(GREY_COVER), np.float32(1))
+        front_covers = np.ones((H, W), np.float32)
+        if ages is not None and is_fine.any():
+            as_dots = _covers(renderer, snapshot, front, np.full_like(range_m, np.nan), style, ages)
+            front_covers[is_fine] = as_dots[is_fine]
+        front_covers[_unknown(values)] *= GREY_COVER
+        front_covers[~front.hit] = 0
         colours = painted(values, style.colours), painted(values_of_rest, style.colours)
         ink = np.empty((H, W, 4), np.uint8)
         if spreads is None:
             kernels.ink_into(colours[0], front_covers, modes, colours[1], covers, rest_modes, step, ink)
         else:
-            front_covers[~front.hit], covers[~rest.hit] = 0, 0
+            covers[~rest.hit] = 0
             wide = _wide(colours[1], step, (H, W)), _wide(covers, step, (H, W))
             solid = spread_ink(_solid_ink(colours[0], front_covers * np.float32(kernels.VISIBLE_COVER)), spreads[0])
             behind = spread_ink(_solid_ink(*wide), spreads[1])
@@ -226,6 +239,13 @@ def _rest(
         np.where(is_alone, alone.places, behind.places),
         np.where(is_alone, alone.nodes, behind.nodes),
     )
+
+
+def _outlines(modes: Rgb) -> Flags:
+    """(h, w) where what the map alone has begins or ends: there or next to it, along an axis or both."""
+    is_alone = np.pad(modes == Mode.MAP_ONLY, 1, mode="edge")
+    around = np.lib.stride_tricks.sliding_window_view(is_alone, (3, 3))
+    return np.asarray(around.any(axis=(2, 3)) & ~around.all(axis=(2, 3)))
 
 
 def with_overlay_legend(picture: Rgb, scale: Scale) -> Rgb:

@@ -23,8 +23,8 @@ def ink_into(
     """(H, W, 4) ink of what is visible, and of the rest, which is known for `step` x `step` pixels at a time.
 
     Args:
-        front: (H, W, 3) colours of what is visible.
-        front_covers: (H, W) by which its cover is multiplied.
+        front: (H, W, 3) colours of what is visible, or was looked up for this pixel on the map alone.
+        front_covers: (H, W) by which its cover is multiplied; 0 where there is neither.
         modes: (H, W) VISIBLE, MAP_ONLY or NOTHING.
         rest: (h, w, 3) colours of what is behind, or on the map alone.
         rest_covers: (h, w) its cover; on the map alone, by which it is multiplied.
@@ -42,8 +42,11 @@ def ink_into(
                 cover = front_covers[y, x] * np.float32(VISIBLE_COVER)
             is_stripe = (rest_modes[row, column] == SEE_THROUGH) & ((x + y) % STRIPES_PX < STRIPE_PX)
             if is_stripe | (modes[y, x] == MAP_ONLY):
-                red, green, blue = rest[row, column, 0], rest[row, column, 1], rest[row, column, 2]
-                cover = rest_covers[row, column]
+                if is_stripe | (front_covers[y, x] == 0):
+                    red, green, blue = rest[row, column, 0], rest[row, column, 1], rest[row, column, 2]
+                    cover = rest_covers[row, column]
+                else:
+                    cover = front_covers[y, x]
                 if not is_stripe:
                     is_dot = (x % DOTS_PX < DOT_PX) & (y % DOTS_PX < DOT_PX)
                     cover *= np.float32(DOT_COVER if is_dot else BETWEEN_COVER)

@@ -78,17 +78,37 @@ def test_what_is_drawn_covers_the_projection_of_its_cubes_through_a_lens(seed: i
     assert score.visible >= 0.98 and score.map_only >= 0.98
 
 
-def test_what_the_map_alone_knows_is_looked_up_in_the_middle_of_each_block() -> None:
-    """So that its edges are off by at most half a block, and to no side more than to the other."""
-    snapshot, sight = snapshot_with(box((20, -2, -2), (22, 2, 2))), pinhole(80, 61, focal_px=100)
+@pytest.mark.parametrize("seed", range(POSES))
+def test_what_the_map_alone_has_is_outlined_to_the_pixel_though_looked_up_by_blocks(seed: int) -> None:
+    (score,) = overlay_scores(DISTORTED, poses=1, seed=seed)
+    assert score.map_only >= 0.98
+
+
+def test_inside_an_outline_the_middle_of_each_block_is_looked_up() -> None:
+    """So that what is shown there is off by at most half a block, and to no side more than to the other."""
+    snapshot, sight = snapshot_with(box((20, -5, -5), (22, 5, 5)), kelvin=HOT_K), pinhole(80, 61, focal_px=100)
     live = Live(rgb=image_of(sight), range_m=no_depth(sight), sight=sight, T_map_camera=look_at((0, 0, 0), (1, 0, 0)))
-    fine, coarse = (
-        draw_overlay(MapRenderer(), snapshot, live, OverlayStyle(step_px=step)).front_modes == Mode.MAP_ONLY
-        for step in (1, 3)
+    fine, coarse = (draw_overlay(MapRenderer(), snapshot, live, OverlayStyle(step_px=step)) for step in (1, 3))
+    np.testing.assert_array_equal(coarse.front_modes, fine.front_modes)
+    np.testing.assert_array_equal(coarse.picture, fine.picture)
+    is_alone = fine.front_modes == Mode.MAP_ONLY
+    assert 0 < (coarse.front.hit & is_alone).sum() < is_alone.sum() / 2
+    rows, columns = (np.minimum(np.arange(size) // 3 * 3 + 1, size - 1) for size in is_alone.shape)
+    middles = fine.rest.range_m[np.ix_(rows, columns)]
+    np.testing.assert_array_equal(coarse.rest.range_m, middles[::3, ::3])
+
+
+def test_an_outline_fades_with_age_as_the_inside_does() -> None:
+    snapshot, sight = snapshot_with(box((20, -5, -5), (22, 5, 5)), kelvin=HOT_K), pinhole(80, 61, focal_px=100)
+    live = Live(rgb=image_of(sight), range_m=no_depth(sight), sight=sight, T_map_camera=look_at((0, 0, 0), (1, 0, 0)))
+    cells = {key: np.zeros(8 ** (GRID.depth - 2)) for key in snapshot.frozen.keys}
+    now, later = (
+        draw_overlay(MapRenderer(), snapshot, live, OverlayStyle(), Ages(now=now, changes=cells)).picture
+        for now in (0.0, 3600.0)
     )
-    assert fine.any()
-    rows, columns = (np.minimum(np.arange(size) // 3 * 3 + 1, size - 1) for size in fine.shape)
-    np.testing.assert_array_equal(coarse, fine[np.ix_(rows, columns)])
+    changed = (now != later).any(axis=-1)
+    shown = (now != live.rgb).any(axis=-1)
+    assert (changed == shown).mean() > 0.99 and shown.any()
 
 
 def test_what_is_hidden_is_never_drawn_as_visible() -> None:
@@ -279,6 +299,7 @@ def test_ink_is_what_the_modes_say() -> None:
     modes = rng.choice([Mode.NOTHING, Mode.VISIBLE, Mode.MAP_ONLY], (12, 17)).astype(np.uint8)
     rest_modes = rng.choice([Mode.NOTHING, Mode.SEE_THROUGH, Mode.MAP_ONLY], (6, 9)).astype(np.uint8)
     covers, rest_covers = (rng.random(size).astype(np.float32) for size in ((12, 17), (6, 9)))
+    covers[rng.random(covers.shape) < 0.5] = 0
     ink = np.empty((12, 17, 4), np.uint8)
     kernels.ink_into(front, covers, modes, rest, rest_covers, rest_modes, 2, ink)
     for y in range(12):
@@ -289,7 +310,7 @@ def test_ink_is_what_the_modes_say() -> None:
             if rest_modes[there] == Mode.SEE_THROUGH and (x + y) % kernels.STRIPES_PX < kernels.STRIPE_PX:
                 cover, colour = rest_covers[there], rest[there]
             elif modes[y, x] == Mode.MAP_ONLY:
-                cover, colour = rest_covers[there], rest[there]
+                cover, colour = (covers[y, x], front[y, x]) if covers[y, x] else (rest_covers[there], rest[there])
                 cover *= kernels.DOT_COVER if is_dot else kernels.BETWEEN_COVER
             elif modes[y, x] == Mode.VISIBLE:
                 cover = covers[y, x] * kernels.VISIBLE_COVER
