@@ -181,7 +181,15 @@ def test_a_backup_made_in_the_container_is_restored_by_another(served: Served) -
 
 
 def test_no_kernel_is_compiled_after_the_build(served: Served) -> None:
+    """By what a map is asked for: a view and a picture of it, a box as points, and the numbers of a voxel."""
     assert served.kernels_built > 0
+    main, bearer = f"{served.url}/maps/lab/main", ["--header", f"Authorization: Bearer {ADMIN_TOKEN}"]
+    for asked in (
+        f"cells/{cell_of_key(served.key)}.view",
+        "render?x=0&y=0&z=0",
+        "export?format=ply",
+    ):
+        ran(["curl", "--fail", "--silent", "--show-error", *bearer, "--output", os.devnull, f"{main}/{asked}"])
     assert kernel_count(served.container) == served.kernels_built
 
 

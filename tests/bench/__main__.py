@@ -55,6 +55,7 @@ from cairn_sim.robots import ROBOTS
 from cairn_sim.scene_file import load_scene
 
 Row = tuple[str, str, str]
+NAME_WIDTH = 66
 
 
 def main() -> None:
@@ -65,10 +66,12 @@ def main() -> None:
     args = parser.parse_args()
     if unknown := set(args.parts) - PARTS.keys():
         parser.error(f"there is no part {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}")
-    rows = [row for name in args.parts or PARTS for row in PARTS[name](args.smoke)]
-    width = max(len(name) for name, _, _ in rows)
-    for name, value, unit in rows:
-        sys.stdout.write(f"{name:<{width}}  {value:>12}  {unit}\n")
+    for part in args.parts or PARTS:
+        start_s = time.perf_counter()
+        for name, value, unit in PARTS[part](args.smoke):
+            sys.stdout.write(f"{name:<{NAME_WIDTH}}  {value:>12}  {unit}\n")
+            sys.stdout.flush()
+        sys.stdout.write(f"  ({part} took {time.perf_counter() - start_s:.0f} s)\n")
 
 
 def _room_rows(smoke: bool) -> Iterator[Row]:
