@@ -174,6 +174,11 @@ class Listener:
         """The server is shutting down."""
         return self._hub.is_closed
 
+    @property
+    def is_behind(self) -> bool:
+        """The map changed since it was told last."""
+        return self._hello is not None or self.live.changes.head.seq > self._seen.seq
+
     def start(self, after: Seen | None) -> None:
         """Say hello, and go on behind an event that was seen, if it was one of this log."""
         head = self.live.changes.head

@@ -70,18 +70,26 @@ class _Stream:
         beat_at_s = time.monotonic() + listener.beat_s
         while not listener.is_over:
             self._woken.clear()
-            for event in listener.take():
-                await send(event)
-            with suppress(TimeoutError):
-                await asyncio.wait_for(self._woken.wait(), max(0.0, beat_at_s - time.monotonic()))
+            if events := listener.take():
+                for event in events:
+                    await send(event)
+                await asyncio.sleep(SPACING_S)
+            await self._wait(beat_at_s - time.monotonic())
             if time.monotonic() >= beat_at_s:
                 if not await run_in_threadpool(self._may_listen):
                     return NOT_ALLOWED
                 await send(listener.beat())
                 beat_at_s = time.monotonic() + listener.beat_s
-            elif not listener.is_over:
-                await asyncio.sleep(SPACING_S)
+            elif not (listener.is_behind or listener.is_over):
+                # A robot was heard; what it pushed is folded in a moment, and is not to wait behind that.
+                self._woken.clear()
+                await self._wait(SPACING_S)
         return GOING_AWAY
+
+    async def _wait(self, seconds: float) -> None:
+        """Return when woken, or after so long."""
+        with suppress(TimeoutError):
+            await asyncio.wait_for(self._woken.wait(), max(0.0, seconds))
 
     def leave(self) -> None:
         """Stop listening."""
