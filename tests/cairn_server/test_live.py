@@ -2,6 +2,7 @@
 
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -22,9 +23,9 @@ from cairn_map.errors import UnreachableError
 from cairn_map.grid import cell_key, cell_of_key
 from cairn_map.live_events import CellsChanged, HeadMoved, LiveEvent, LogGrew, RobotHeard, seen_from_text
 from cairn_map.messages import MissingRequest, Register
-from cairn_server import live_changes
+from cairn_server import live_changes, live_routes
 from cairn_server.live import LISTENERS_OF_TOKEN_MAX, Listener
-from cairn_server.live_routes import NOT_ALLOWED
+from cairn_server.live_routes import NOT_ALLOWED, SPACING_S
 from cairn_server.store_rows import MapRow
 
 Listen = Callable[..., AbstractContextManager[Iterator[LiveEvent]]]
@@ -243,6 +244,22 @@ def test_robots_are_heard_of_when_they_come_push_fetch_and_leave(guarded: Live, 
         assert isinstance(left := next(events), RobotHeard) and left.robot.gone
     with listen(guarded, row, **shown) as events:
         assert hello_of(events).robots == []
+
+
+@WAYS
+def test_what_a_robot_pushed_does_not_wait_behind_the_sign_of_the_robot(
+    live: Live, listen: Listen, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = live.new_map()
+    live.service.register(row, REGISTRATION)
+    with listen(live, row) as events:
+        hello_of(events)
+        time.sleep(3 * SPACING_S)  # streams pause so long after what they sent
+        monkeypatch.setattr(live_routes, "SPACING_S", 100.0)
+        live.service.live.robot_heard(row, "mole")
+        time.sleep(3 * SPACING_S)  # the stream was woken, and waits for more
+        push(live, row, 0)
+        assert changed(up_to_head(events, 1))
 
 
 def test_a_stream_beats_while_nothing_happens(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
