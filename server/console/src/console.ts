@@ -180,9 +180,14 @@ export class Console {
     this.stage.onMove = () => (this.moved = true);
     this.stage.onFrame = () => {
       this.team.place();
-      return this.cells.isFresh;
+      // Without a graphics card, frames would take the time of the cells that are still to come.
+      return this.cells.isFresh && !(this.stage.isSoftware && this.cells.isFetching);
     };
-    this.cells.onChange = () => this.stage.drawSoon();
+    this.cells.onChange = (isWhole) => {
+      if (isWhole) this.stage.draw();
+      else this.stage.drawSoon();
+      if (!this.cells.isFetching) this.plan();
+    };
     this.cells.onRefused = onRefused;
     this.cells.colourOf = (lm) => {
       const robot = this.book.robotAt(lm);
@@ -216,7 +221,10 @@ export class Console {
       if (!event.resumed) void this.loading.then(() => (this.cursor === event.cursor ? undefined : this.reload()));
     } else if (event.type === "cells") {
       if (event.cells === "many") void this.reload();
-      else for (const [i, j, k, lm] of event.cells) this.cells.changed([i, j, k], lm);
+      else {
+        for (const [i, j, k, lm] of event.cells) this.cells.changed([i, j, k], lm);
+        this.plan();
+      }
     } else if (event.type === "log") {
       this.book.add(event.entries);
       this.strip.add(event.entries);
@@ -257,7 +265,7 @@ export class Console {
     }
     if (this.moved || this.cells.needsPlan || this.cells.waiting) {
       this.moved = false;
-      this.cells.update(this.stage.camera, this.stage.heightPx, this.stage.frustum);
+      this.plan();
       this.appearance.refreshRange(this.team.names);
     }
     this.camera.settle();
@@ -273,6 +281,10 @@ export class Console {
     this.unseen.update(missed.map(({ box }) => box));
     const drawn = `${thousands(this.cells.drawn)} nodes of ${this.cells.all.size} cells`;
     this.foot.textContent = this.stage.isSoftware ? `${drawn} · drawn without a graphics card: coarser and slower` : drawn;
+  }
+
+  private plan(): void {
+    this.cells.update(this.stage.camera, this.stage.heightPx, this.stage.frustum);
   }
 
   /** Uniforms as the look says; nothing else is touched, so nothing is fetched. */

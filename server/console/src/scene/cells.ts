@@ -30,7 +30,8 @@ export class Cells {
   /** When the whole map was there for the first time, if only coarsely; ms since the page began. */
   firstPictureMs: number | null = null;
   error: string | null = null;
-  onChange: () => void = () => {};
+  /** Other nodes are there, or others are wanted; `isWhole` says that no more are on their way to what was shown or asked for first. */
+  onChange: (isWhole: boolean) => void = () => {};
   onRefused: () => void = () => {};
   /** Numbers of cells that are gone. */
   private readonly free: number[] = [];
@@ -61,7 +62,7 @@ export class Cells {
     }
     for (const shown of [...this.all.values()]) if (!there.has(shown.key)) this.remove(shown);
     this.planned = false;
-    this.onChange();
+    this.onChange(false);
   }
 
   /** A cell changed: what is shown of it is fetched again. */
@@ -83,7 +84,7 @@ export class Cells {
   /** Cells of which what is shown is not what is wanted. */
   get waiting(): number {
     let sum = 0;
-    for (const shown of this.all.values()) if (shown.dirty || shown.isOff) sum++;
+    for (const shown of this.all.values()) if (shown.busy || shown.dirty || shown.isOff) sum++;
     return sum;
   }
 
@@ -125,6 +126,10 @@ export class Cells {
 
   private queue: ShownCell[] = [];
 
+  get isFetching(): boolean {
+    return this.running > 0;
+  }
+
   /** Whether `update` is worth calling though the eye did not move. */
   get needsPlan(): boolean {
     return !this.planned;
@@ -145,6 +150,7 @@ export class Cells {
   }
 
   private async fetch(cell: ShownCell): Promise<void> {
+    let isWhole = false;
     this.running++;
     cell.busy = true;
     cell.dirty = false;
@@ -166,6 +172,7 @@ export class Cells {
       this.error = null;
       if (this.firstPictureMs === null && ![...this.all.values()].some(({ etag }) => etag === null)) {
         this.firstPictureMs = performance.now();
+        isWhole = true;
       }
     } catch (error) {
       this.failed(cell, error);
@@ -173,15 +180,15 @@ export class Cells {
       this.running--;
       cell.busy = false;
       this.planned = false;
-      this.onChange();
       this.fetchMore();
+      this.onChange(isWhole || !this.isFetching);
     }
   }
 
   private failed(cell: ShownCell, error: unknown): void {
     cell.dirty = true;
     cell.failedMs = performance.now();
-    window.setTimeout(() => this.onChange(), RETRY_MS);
+    window.setTimeout(() => this.onChange(false), RETRY_MS);
     if (error instanceof ApiError && error.wantsToken) this.onRefused();
     else if (error instanceof ApiError && error.kind === "no_cell") this.remove(cell);
     else this.error = `cell ${cell.key}: ${error instanceof Error ? error.message : String(error)}`;
