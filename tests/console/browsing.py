@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 CHROMIUM = shutil.which("chromium")
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
 """WebGL without a graphics card, in a container that has no namespaces and little shared memory."""
-SETTLED = "c && c.cells.all.size > 0 && c.cells.waiting === 0 && !c.cells.needsPlan && !c.moved"
+SETTLED = """c && c.cells.all.size > 0 && c.cells.waiting === 0 && c.cells.running === 0
+  && !c.cells.needsPlan && !c.moved"""
 DEADLINE_S = 60.0
 VIEW = {"width": 1280, "height": 720}
 TABLET = {"width": 1024, "height": 768}
@@ -62,10 +63,7 @@ class Console:
 
     def settled(self) -> None:
         """Return when all that is wanted is there, and drawn."""
-        self.until(
-            "c && c.cells.all.size > 0 && c.cells.waiting === 0 && !c.cells.needsPlan && !c.moved",
-            "everything is drawn",
-        )
+        self.until(SETTLED, "everything is drawn")
         frames = self.tell("(c.stage.draw(), c.stage.frames)")
         self.until(f"c.stage.frames > {frames}", "a frame follows")
 

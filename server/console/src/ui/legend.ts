@@ -30,7 +30,8 @@ export class Legend {
     const controls = () => [...this.element.querySelectorAll<HTMLElement>("input, button")];
     const focused = controls().indexOf(document.activeElement as HTMLElement);
     // Whoever types an end is not disturbed by one that follows what is shown.
-    if (state === this.shown || (focused >= 0 && locked === this.locked)) return;
+    const isTyping = document.activeElement instanceof HTMLInputElement && focused >= 0;
+    if (state === this.shown || (isTyping && locked === this.locked)) return;
     this.shown = state;
     this.locked = locked;
     const { label, palette, unit: ofField } = FIELDS.find(({ field }) => field === look.field)!;
