@@ -208,6 +208,7 @@ export class Console {
     this.strip.onChoose = (entry) => openCommit(this.api, this.info.name, entry);
     this.team.onFollow = () => this.stage.draw();
     this.camera.onGo = () => this.say("");
+    this.camera.onNoFloor = () => this.say("Nobody could stand there: no floor is known.");
     this.camera.onHottest = (place) => {
       if (!place) return this.say("Nothing that is shown has a temperature.");
       this.setField("temperature");

@@ -36,3 +36,15 @@ export function fill(element: Element, ...children: Child[]): void {
 export function facts(rows: [string, Child][]): HTMLElement {
   return h("dl", { class: "facts" }, ...rows.flatMap(([term, what]) => [h("dt", {}, term), h("dd", {}, what)]));
 }
+
+/** A picture, once it is there: nothing refers to its bytes any more, whoever takes it from the page when. */
+export async function pictureOf(blob: Blob, alt: string): Promise<HTMLImageElement> {
+  const url = URL.createObjectURL(blob);
+  try {
+    const picture = h("img", { src: url, alt });
+    await picture.decode();
+    return picture;
+  } finally {
+    URL.revokeObjectURL(url);
+  }
+}

@@ -3,18 +3,16 @@
 import { Box3, Vector3 } from "three";
 import { h } from "../dom.ts";
 import type { CameraView } from "../look.ts";
-import type { MapInfo, Triple } from "../messages.ts";
+import type { MapInfo } from "../messages.ts";
 import type { Cells } from "../scene/cells.ts";
 import { uniforms } from "../scene/materials.ts";
 import type { Stage } from "../scene/stage.ts";
+import { standing } from "../scene/standpoint.ts";
 import { hottest, type HotPlace } from "../scene/statistics.ts";
 import type { Team } from "../team.ts";
 
 const SIDE = new Vector3(-0.7, -1, 0.75);
 const ABOVE = new Vector3(0, -0.001, 1);
-/** Of a person's eyes over the floor, and over a rig on a robot; m. */
-const EYES_M = 1.6;
-const OVER_RIG_M = 0.6;
 
 export class CameraPanel {
   readonly element: HTMLElement;
@@ -23,6 +21,7 @@ export class CameraPanel {
   /** The operator wants the hottest place; it is there. */
   onHottest: (place: HotPlace | null) => void = () => {};
   onGo: () => void = () => {};
+  onNoFloor: () => void = () => {};
   private readonly stage: Stage;
   private readonly cells: Cells;
   private readonly team: Team;
@@ -61,17 +60,12 @@ export class CameraPanel {
     this.fly(this.stage.lookAt(this.cells.tightBoxes, ABOVE));
   }
 
-  /** Stand inside, eyes at the height of a person's, where a robot is, and look towards the middle of the map. */
+  /** Stand on the floor, as near as can be to where a robot is, and look where most of the map is seen. */
   walk(): void {
     const target = new Vector3(...this.stage.view.target);
-    const box = this.cells.tightBounds;
-    const robot = this.team.nearest(target);
-    const ahead = box.getCenter(new Vector3()).sub(robot ?? box.min).setZ(0);
-    if (ahead.lengthSq() < 1e-6) ahead.set(0, 1, 0);
-    const from = robot ?? box.clampPoint(target, new Vector3());
-    from.z = robot ? robot.z + OVER_RIG_M : box.min.z + EYES_M;
-    const to = from.clone().addScaledVector(ahead.normalize(), 3);
-    this.fly({ eye: from.toArray() as Triple, target: to.toArray() as Triple });
+    const view = standing(this.cells, this.team.nearest(target) ?? target);
+    if (view) this.fly(view);
+    else this.onNoFloor();
   }
 
   /** Go to the hottest place that is shown. */

@@ -1,7 +1,7 @@
 /** The map as the robot that is followed would see it: drawn by the server from the robot's pose. */
 
 import type { Api } from "../api.ts";
-import { fill, h } from "../dom.ts";
+import { fill, h, pictureOf } from "../dom.ts";
 import type { Field } from "../look.ts";
 import type { Pose } from "../messages.ts";
 
@@ -24,7 +24,6 @@ export class RobotMap {
   private asked = "";
   private busy = false;
   private nextMs = 0;
-  private url: string | null = null;
 
   constructor(api: Api, map: string) {
     this.api = api;
@@ -51,24 +50,19 @@ export class RobotMap {
   private async load(robot: string, query: string): Promise<void> {
     this.busy = true;
     let picture: HTMLElement;
-    let url: string | null = null;
+    let failed = false;
     try {
       const answer = await this.api.ask(`maps/${this.map}/main/render?${query}`, { signal: AbortSignal.timeout(WAIT_MS) });
-      url = URL.createObjectURL(await answer.blob());
-      picture = h("img", { src: url, alt: `The map as ${robot} would see it` });
+      picture = await pictureOf(await answer.blob(), `The map as ${robot} would see it`);
     } catch (error) {
+      failed = true;
       picture = h("p", { class: "error" }, (error as Error).message);
       this.nextMs = performance.now() + AGAIN_MS;
     } finally {
       this.busy = false;
     }
-    if (robot !== this.robot || this.asked === "") {
-      if (url) URL.revokeObjectURL(url);
-      return;
-    }
-    if (this.url) URL.revokeObjectURL(this.url);
-    this.url = url;
-    if (url === null) this.asked = "failed";
+    if (robot !== this.robot || this.asked === "") return;
+    if (failed) this.asked = "failed";
     fill(this.element, picture, h("figcaption", {}, `The map from ${robot}'s pose`));
     this.element.hidden = false;
   }
@@ -76,7 +70,5 @@ export class RobotMap {
   private clear(): void {
     this.element.hidden = true;
     this.asked = "";
-    if (this.url) URL.revokeObjectURL(this.url);
-    this.url = null;
   }
 }

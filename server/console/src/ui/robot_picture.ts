@@ -1,7 +1,7 @@
 /** What the robot that is followed sees: the last picture that it showed the server. */
 
 import type { Api } from "../api.ts";
-import { fill, h } from "../dom.ts";
+import { fill, h, pictureOf } from "../dom.ts";
 import { serverNowS } from "../server_time.ts";
 import { ago } from "../units.ts";
 
@@ -18,7 +18,6 @@ export class RobotPicture {
   private askedS: number | null = null;
   private shownS: number | null = null;
   private busy = false;
-  private url: string | null = null;
 
   constructor(api: Api, map: string) {
     this.api = api;
@@ -40,13 +39,11 @@ export class RobotPicture {
     this.busy = true;
     try {
       const answer = await this.api.ask(`maps/${this.map}/branches/${robot}/view`, { signal: AbortSignal.timeout(WAIT_MS) });
-      const blob = await answer.blob();
+      const picture = await pictureOf(await answer.blob(), `What ${robot} sees`);
       if (robot !== this.robot || this.askedS === null) return;
-      if (this.url) URL.revokeObjectURL(this.url);
-      this.url = URL.createObjectURL(blob);
       this.shownS = viewS;
       this.say();
-      fill(this.element, h("img", { src: this.url, alt: `What ${robot} sees` }), this.caption);
+      fill(this.element, picture, this.caption);
       this.element.hidden = false;
     } catch {
       // Asked again with the next one.
@@ -65,7 +62,5 @@ export class RobotPicture {
   private clear(): void {
     this.element.hidden = true;
     this.askedS = this.shownS = null;
-    if (this.url) URL.revokeObjectURL(this.url);
-    this.url = null;
   }
 }
