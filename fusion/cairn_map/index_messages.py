@@ -24,6 +24,9 @@ class CellEntry(BaseModel):
     hottest_k: float | None = None
     """Mean temperature of its hottest voxel, kelvin; None: it has none, or the server does not know it, or was not
     asked for it: robots of old refuse what they do not know."""
+    held_lm: int | None = None
+    """Newest log entry whose evidence is still in the cell: `lm`, unless that took some out. None: nothing is in it,
+    or the server does not know it any more, or was not asked for it."""
 
 
 class CellIndex(BaseModel):

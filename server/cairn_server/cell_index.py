@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from cairn_map.cursor import ENTRY_FOLD
 from cairn_map.grid import CellKey, cell_of_key
 from cairn_map.index_messages import INDEX_PAGE, CellEntry
 from cairn_server.store import Snapshot
@@ -20,9 +21,13 @@ class IndexPage:
     """Only cells of which it says yes."""
     is_hottest_asked: bool = False
     """Whether each entry says how hot its cell is."""
+    is_held_asked: bool = False
+    """Whether each entry says whose evidence is still in its cell."""
 
 
 FIRST_PAGE = IndexPage()
+TOUCHES_MAX = 32
+"""Log entries of a cell that are looked at, the newest."""
 
 
 def entries_of(snapshot: Snapshot, page: IndexPage) -> list[CellEntry]:
@@ -32,7 +37,7 @@ def entries_of(snapshot: Snapshot, page: IndexPage) -> list[CellEntry]:
     while len(found) < page.limit:
         rows = list(snapshot.cells(after_key=after, limit=page.limit))
         inside = (row for row in rows if page.inside is None or page.inside(cell_of_key(row.key)))
-        found += map(_entry_with_hottest if page.is_hottest_asked else _entry, inside)
+        found += (_asked_entry(snapshot, row, page) for row in inside)
         if len(rows) < page.limit:
             break
         after = rows[-1].key
@@ -50,5 +55,21 @@ def _entry(row: CellRow) -> CellEntry:
     )
 
 
-def _entry_with_hottest(row: CellRow) -> CellEntry:
-    return _entry(row).model_copy(update={"hottest_k": row.hottest_k})
+def _asked_entry(snapshot: Snapshot, row: CellRow, page: IndexPage) -> CellEntry:
+    more: dict[str, float | None] = {}
+    if page.is_hottest_asked:
+        more["hottest_k"] = row.hottest_k
+    if page.is_held_asked:
+        more["held_lm"] = _held_lm(snapshot, row.key)
+    return _entry(row).model_copy(update=more)
+
+
+def _held_lm(snapshot: Snapshot, key: CellKey) -> int | None:
+    """Newest entry that brought evidence which no later one took out; None: none of the newest did."""
+    out: set[int] = set()
+    for touch in reversed(snapshot.contributions(key, after_seq=0, newest=TOUCHES_MAX)):
+        if touch.kind != ENTRY_FOLD:
+            out.add(touch.diff)
+        elif touch.diff not in out:
+            return touch.seq
+    return None

@@ -38,6 +38,7 @@ def cell_index(
     after: Annotated[str | None, Query(max_length=32, description="i,j,k: the last cell of the page before")] = None,
     limit: Annotated[int, Query(ge=1, le=INDEX_PAGE_MAX)] = INDEX_PAGE,
     hottest: Annotated[bool, Query(description="each entry has hottest_k, too")] = False,
+    held: Annotated[bool, Query(description="each entry has held_lm, too")] = False,
 ) -> CellIndex:
     """Cells that were ever touched, all or those in a box, a page at a time."""
     page = IndexPage(
@@ -45,6 +46,7 @@ def cell_index(
         limit=limit,
         inside=box_from_text(box) if box is not None else None,
         is_hottest_asked=hottest,
+        is_held_asked=held,
     )
     return service.cell_index(row, author_from_text(author) if author else None, page)
 

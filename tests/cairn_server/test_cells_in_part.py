@@ -21,6 +21,7 @@ from cairn_map.cursor import Cursor, cursor_from_text
 from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.grid import cell_key, cell_of_key
 from cairn_map.ids import Author, Incarnation, RobotName
+from cairn_map.index_messages import CellIndex
 from cairn_map.version_vector import VersionVector, version_vector_from_json
 from cairn_map.view import ViewStyle
 from cairn_map.view_code import encode_view
@@ -315,3 +316,24 @@ def test_a_short_coverage_stays_in_its_header(live: Live, row: MapRow) -> None:
     assert answer.headers["Content-Type"] == CELL_MEDIA_TYPE
     at = live.http.get(vector_url(row), params={"at": answer.headers["Cairn-Cursor"]})
     assert answer.headers["Cairn-Coverage"] == at.text
+
+
+def test_the_index_tells_whose_evidence_is_still_there_if_it_is_asked(live: Live) -> None:
+    row = live.new_map()
+    commits = [pushed(n, 0, author) for n, author in ((0, WREN), (0, MOLE), (1, MOLE))]
+    for commit in commits:
+        live.push(row, commit)
+    live.folded(row)
+
+    def held() -> list[int | None]:
+        answer = live.http.get(f"/maps/{row.name}/main/cells", params={"held": "true"})
+        found = CellIndex.model_validate_json(answer.content).cells
+        assert {entry.cell for entry in found} == {cell_of_key(key) for key in KEYS[:2]}
+        return [entry.held_lm for entry in found]
+
+    assert held() == [3, 3]
+    assert "held_lm" not in live.http.get(f"/maps/{row.name}/main/cells").json()["cells"][0]
+    for commit, left in ((commits[2], 2), (commits[0], 2), (commits[1], None)):
+        live.retract(row, commit)
+        live.folded(row)
+        assert held() == [left, left]

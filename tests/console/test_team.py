@@ -1,4 +1,4 @@
-"""The team as the server knows it: where each robot is and looks, its mode and lag, and who is gone."""
+"""The team as the server knows it: where each robot is and looks, its mode and lag, who is gone, and what is whose."""
 
 import time
 from collections.abc import Iterator
@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from playwright.sync_api import Browser, Locator, Route
-from tests.cairn_map.made import SMALL
+from tests.cairn_map.made import SMALL, surface_evidence
 from tests.cairn_server.live import until
-from tests.cairn_server.pushes import MOLE, WREN, pushed
+from tests.cairn_server.pushes import KEYS, MOLE, WREN, pushed
 from tests.console.browsing import VIEW, Console, tab
 from tests.console.conftest import Room
 from tests.console.room import ADMIN_TOKEN
@@ -18,7 +18,7 @@ from tests.console.room import ADMIN_TOKEN
 from cairn_client.api import MapApi
 from cairn_map.commit import ScanPose
 from cairn_map.cursor import cursor_from_text
-from cairn_map.messages import BranchInfo, CreateMap, MissingRequest, Register
+from cairn_map.messages import BranchInfo, CreateMap, MissingRequest, Register, Retract
 from cairn_map.robot_status import RobotStatus
 
 CREW = "crew"
@@ -32,6 +32,12 @@ FROM_ABOVE = "&cells=0&eye=0.1,-0.01,6&target=0.1,0,0.5"
 GREY = (0x8B, 0x94, 0x9E)
 LATER_S = 90
 """Longer than a robot may be quiet and still be online."""
+SCANS = 64
+"""Enough for the counts of `surface_evidence`."""
+LAST = "c.cells.all.get('0,0,0')?.lm"
+TOLD_COLOUR = """(c.cells.all.get('0,0,0').points.onBeforeRender(null, null, null, null, {}),
+  c.cells.material.uniforms.uRobot.value.toArray())"""
+"""Of the robot by which the cell is coloured, as the graphics card gets it."""
 NEAR_PX = 100
 """The frustum is 0.9 m long, a metre 105 px."""
 PROJECTED = """(() => {
@@ -182,3 +188,21 @@ def later(route: Route) -> None:
     answer = route.fetch()
     date = formatdate(time.time() + LATER_S, usegmt=True)
     route.fulfill(response=answer, headers={**answer.headers, "date": date})
+
+
+def test_what_a_retract_leaves_has_the_colour_of_who_brought_it(console: Console, crew: MapApi) -> None:
+    colours = {name: (colour_of(console, name) / 255).tolist() for name in (MOLE.robot, WREN.robot)}
+    console.page.keyboard.press("6")
+    commit = pushed(0, 0, MOLE, cells={KEYS[0]: surface_evidence(0, SMALL)}, scans=SCANS)
+    crew.push(CREW, commit)
+    console.until(f"c.book.robotAt({LAST}) === 'mole'", "mole added to the cell")
+    console.settled()
+    assert console.tell(TOLD_COLOUR) == pytest.approx(colours[MOLE.robot])
+    crew.retract(CREW, Retract(commits=[str(commit.id)]))
+    console.until(f"c.book.isOut({LAST}) && c.cells.all.get('0,0,0').held?.lm === {LAST}", "that is taken out")
+    assert console.tell(TOLD_COLOUR) == pytest.approx(colours[WREN.robot])
+    console.page.reload()
+    console.settled()
+    console.until(f"c.book.isOut({LAST}) && c.cells.all.get('0,0,0').held?.lm === {LAST}", "the page asks again")
+    assert console.tell(TOLD_COLOUR) == pytest.approx(colours[WREN.robot])
+    assert console.errors == []

@@ -54,12 +54,12 @@ export class Api {
     return (await this.ask(path, { method: "POST", body: JSON.stringify(body), headers })).json() as Promise<T>;
   }
 
-  /** All cells that were ever touched, and the state that the first page is of. */
-  async cells(map: string): Promise<{ cursor: string; entries: CellEntry[] }> {
+  /** All cells that were ever touched, and the state that the first page is of; `besides`: more to ask of each. */
+  async cells(map: string, besides = ""): Promise<{ cursor: string; entries: CellEntry[] }> {
     const entries: CellEntry[] = [];
     let cursor: string | null = null;
     for (let after = ""; ; ) {
-      const page = await this.json<CellIndex>(`maps/${map}/main/cells?limit=${INDEX_PAGE}${after}`);
+      const page = await this.json<CellIndex>(`maps/${map}/main/cells?limit=${INDEX_PAGE}${besides}${after}`);
       cursor ??= page.header.to;
       entries.push(...page.cells);
       if (page.cells.length < INDEX_PAGE) return { cursor, entries };

@@ -257,12 +257,20 @@ export class Console {
     this.strip.add(await this.book.newest(head, count));
   }
 
+  /** Where evidence was taken out last, the log alone does not tell whose is left. */
+  private async askHeld(): Promise<void> {
+    if (![...this.cells.all.values()].some(({ lm, held }) => held?.lm !== lm && this.book.isOut(lm))) return;
+    // Without an answer they stay grey, and are asked for again with the next entry of the log.
+    await this.api.cells(this.info.name, "&held=true").then(({ entries }) => this.cells.takeHeld(entries), () => undefined);
+  }
+
   /** A few times a second: what has no event of its own. */
   private tick(): void {
     if (this.logged) {
       this.logged = false;
       this.moved = true;
       this.team.wereAt(this.book);
+      void this.askHeld();
     }
     if (this.moved || this.cells.needsPlan || this.cells.waiting) {
       this.moved = false;

@@ -89,7 +89,12 @@ export class LogBook {
   /** Whose commit a log entry folded; null: it took one out, or is older than those that are known here. */
   robotAt(seq: number): string | null {
     const entry = this.known.get(seq);
-    return entry && !entry.isOut ? robotOf(entry.id) : null;
+    return entry && !this.isOut(seq) ? robotOf(entry.id) : null;
+  }
+
+  /** Whether an entry took evidence out. */
+  isOut(seq: number): boolean {
+    return this.known.get(seq)?.isOut === true;
   }
 
   /** Seconds between what an entry brought and the newest measurement; null: no entry states a time.

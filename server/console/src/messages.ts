@@ -28,6 +28,8 @@ export interface CellEntry {
   digest: string;
   lm: number;
   voxels: number;
+  /** Asked for: newest entry whose evidence is still in it; null: not known. */
+  held_lm?: number | null;
 }
 
 export interface CellIndex {

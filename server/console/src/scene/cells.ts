@@ -65,6 +65,15 @@ export class Cells {
     this.onChange(false);
   }
 
+  /** Whose evidence is still in each cell, if some was taken out. */
+  takeHeld(entries: readonly CellEntry[]): void {
+    for (const { cell, lm, held_lm } of entries) {
+      const shown = this.all.get(cell.join(","));
+      if (shown) shown.held = { lm, seq: held_lm ?? lm };
+    }
+    this.onChange();
+  }
+
   /** A cell changed: what is shown of it is fetched again. */
   changed(cell: Triple, lm: number): void {
     const shown = this.at(cell);
@@ -204,7 +213,7 @@ export class Cells {
     if (!points) return;
     points.onBeforeRender = (_renderer, _scene, _camera: Camera, _geometry, material) => {
       uniforms.uAge.value = this.ageOf(cell.lm);
-      uniforms.uRobot.value.set(...(this.colourOf(cell.lm) ?? ([-1, -1, -1] as Triple)));
+      uniforms.uRobot.value.set(...(this.colourOf(cell.heldLm) ?? ([-1, -1, -1] as Triple)));
       uniforms.uObject.value = cell.number;
       uniforms.uFresh.value = Math.max(0, (cell.freshMs - performance.now()) / FRESH_MS) * 0.55;
       (material as ShaderMaterial).uniformsNeedUpdate = true;

@@ -14,6 +14,8 @@ export class ShownCell {
   digest = "";
   /** Log entry that last changed it. */
   lm = 0;
+  /** Newest entry whose evidence was still in it when `lm` had changed it; null: nobody asked. */
+  held: { lm: number; seq: number } | null = null;
   /** Nodes counted by depth; undefined: not yet. */
   counts: (number | undefined)[] = [];
   points: Points | null = null;
@@ -38,6 +40,11 @@ export class ShownCell {
     this.number = number;
     const low = new Vector3(...cell).multiplyScalar(edgeM);
     this.box = new Box3(low, low.clone().addScalar(edgeM));
+  }
+
+  /** Whose evidence is the newest in it, as far as that is known. */
+  get heldLm(): number {
+    return this.held?.lm === this.lm ? this.held.seq : this.lm;
   }
 
   get count(): number {

@@ -38,7 +38,7 @@ export class Legend {
     const isAge = look.field === "age";
     const { unit, size } = isAge ? told : { unit: ofField, size: 1 };
     const bare = h("p", { class: "bare" }, h("span", { class: "hatch", "aria-hidden": "true" }), bareText(look.field, told));
-    if (look.field === "robot") return fill(this.element, h("h2", {}, "Robot that changed the cell last"), ...robots.map((name) => named(name, robots)), bare);
+    if (look.field === "robot") return fill(this.element, h("h2", {}, "Robot that added to the cell last"), ...robots.map((name) => named(name, robots)), bare);
     if (!palette) return fill(this.element, h("h2", {}, label), h("p", {}, "As the cameras saw it."), bare);
     if (!range) return fill(this.element, h("h2", {}, label), h("p", {}, `Nothing shown has a ${label.toLowerCase()}.`), bare);
     const title = isAge ? `Age, ${unit} before the newest measurement` : `${label}${unit ? `, ${unit}` : ""}`;
@@ -69,7 +69,7 @@ export class Legend {
 }
 
 function bareText(field: Field, { log }: Told): string {
-  if (field === "robot") return log === "read" ? READING : `not known: evidence was taken out last${log === "short" ? `, or it changed ${FAR}` : ""}`;
+  if (field === "robot") return log === "read" ? READING : `not known: evidence was taken out, and who brought the rest is not kept${log === "short" ? `, or it changed ${FAR}` : ""}`;
   return field === "temperature" ? "no temperature was measured" : "no colour was measured";
 }
 
