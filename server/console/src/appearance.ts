@@ -73,10 +73,14 @@ export class Appearance {
   }
 
   /** Dark or light, as the page is. */
-  theme(): void {
-    const light = applyTheme() === "light";
+  theme(): "dark" | "light" {
+    const theme = applyTheme();
+    const light = theme === "light";
     uniforms.uBare.value.set(...((light ? [0.62, 0.63, 0.66] : [0.42, 0.44, 0.47]) as Triple));
+    // Nearer to the ground than what stands out from it.
+    uniforms.uFaded.value.set(...((light ? [0.83, 0.84, 0.86] : [0.19, 0.2, 0.21]) as Triple));
     this.stage.setBackground(light ? "#eef0f3" : "#0e1116");
+    return theme;
   }
 
   dispose(): void {

@@ -165,7 +165,7 @@ export class Console {
   }
 
   theme(): void {
-    this.appearance.theme();
+    this.outline.contrastWith(this.appearance.theme());
   }
 
   private connect(onRefused: () => void): void {

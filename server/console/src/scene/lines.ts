@@ -56,6 +56,10 @@ export class Outline {
     this.lines.renderOrder = 10;
   }
 
+  contrastWith(theme: "dark" | "light"): void {
+    this.lines.material.color.set(theme === "light" ? 0x101418 : 0xffffff);
+  }
+
   show(picked: Picked | null): void {
     this.lines.visible = picked !== null;
     if (!picked) return;

@@ -24,6 +24,8 @@ export const uniforms = {
   uNearFar: { value: new Vector2(0.05, 1000) },
   uPointMax: { value: 64 },
   uBare: { value: new Vector3(0.45, 0.47, 0.5) },
+  /** What is not in the band that stands out. */
+  uFaded: { value: new Vector3(0.2, 0.21, 0.22) },
   /** Of the object that is drawn: its age from 0 to 1, how freshly it changed, its number. */
   uAge: { value: 0 },
   uFresh: { value: 0 },
@@ -38,7 +40,7 @@ in vec4 colour;   // red, green, blue; flags in 1/255
 in vec4 heat;     // mean and hottest, in steps, two bytes each
 uniform int uField;
 uniform vec2 uRange, uBand;
-uniform vec3 uLow, uHigh, uBare, uRobot;
+uniform vec3 uLow, uHigh, uBare, uFaded, uRobot;
 uniform float uMinP, uPointMax, uAge, uFresh;
 uniform vec4 uViewport;
 uniform sampler2D uPalette;
@@ -94,7 +96,7 @@ void main() {
     vBare = uRobot.x < 0.0 ? 1.0 : 0.0;
   } else vColour = shade(1.0 - (uAge - uRange.x) / span);
   if (uBand.x <= uBand.y && !(warm && hottest >= uBand.x && kelvin <= uBand.y)) {
-    vColour = mix(uBare * 0.45, vColour, 0.12);
+    vColour = mix(uFaded, vColour, 0.12);
     vBare = 0.0;
   }
   vColour = mix(vColour, vec3(1.0, 1.0, 0.85), uFresh);

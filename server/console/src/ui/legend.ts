@@ -44,7 +44,7 @@ export class Legend {
     const title = isAge ? `Age, ${unit} before the newest measurement` : `${label}${unit ? `, ${unit}` : ""}`;
     const ends = range.map((end, n) =>
       h("input", {
-        type: "number", step: "any", value: (end / size).toFixed(look.field === "probability" ? 2 : isAge && size === 1 ? 0 : 1),
+        type: "number", step: "any", value: rounded(end / size, look.field === "probability" ? 2 : isAge && size === 1 ? 0 : 1),
         "aria-label": `${n ? "Upper" : "Lower"} end of the legend${unit ? `, ${unit}` : ""}`,
         onchange: () => this.onRange(ends.map((input) => size * Number(input.value)) as [number, number]),
       }),
@@ -66,6 +66,11 @@ export class Legend {
     );
     controls()[focused]?.focus();
   }
+}
+
+/** Never minus nothing. */
+function rounded(end: number, digits: number): string {
+  return end.toFixed(digits).replace(/^-(0(\.0*)?)$/, "$1");
 }
 
 function bareText(field: Field, { log }: Told): string {

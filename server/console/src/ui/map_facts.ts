@@ -7,7 +7,8 @@ import { metres } from "../units.ts";
 export function mapFacts({ geometry, sensor_model }: MapInfo): HTMLElement {
   const edge = geometry.voxel_edge_um / 1e6;
   const lines = [
-    `voxels of ${metres(edge)}, cells of ${metres(edge * 2 ** geometry.depth)}`,
+    `voxels of ${metres(edge)}`,
+    `cells of ${metres(edge * 2 ** geometry.depth)}`,
     `shown: p above ${sensor_model.p_occupied}`,
     geometry.channels.map(({ name }) => name).join(", ") || "no channels",
   ];

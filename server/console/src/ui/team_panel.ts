@@ -64,7 +64,7 @@ export class TeamPanel {
       dot, h("strong", {}, row.name), h("span", { class: "mode" }, row.mode),
       h("span", { class: row.offline ? "state off" : "state on" }, row.offline ? "offline" : "online"),
     );
-    const lines = [`${row.lag} · seen ${row.seen}`, row.missing, row.waiting, [row.sigma, row.battery].filter(Boolean).join(" · "), row.note];
+    const lines = [row.lag, `seen ${row.seen}`, row.missing, row.waiting, [row.sigma, row.battery].filter(Boolean).join(" · "), row.note];
     const said = lines.filter(Boolean).map((line) => h("p", {}, line));
     return h("li", { class: row.offline ? "robot offline" : "robot" }, button, ...said);
   }
