@@ -9,6 +9,7 @@ import { STRIDE } from "../decode/pack.ts";
 import type { CameraView } from "../look.ts";
 import type { Triple } from "../messages.ts";
 import type { Cells } from "./cells.ts";
+import type { ShownCell } from "./shown_cell.ts";
 
 /** Of a person's eyes over the floor, and of what is over their head; m. */
 const EYES_M = 1.6;
@@ -18,6 +19,8 @@ const FLAT_M = 0.2;
 const STOREY_M = 3.5;
 /** Columns are as wide as a person, or as the coarsest node; m. */
 const COLUMN_M = 0.4;
+/** More than a map has side by side. */
+const COLUMNS = 2 ** 24;
 /** Looks are counted in steps of 5 degrees: all round, and so many to each side and up and down of what the eye takes in. */
 const STEP_RAD = Math.PI / 36;
 const HEADINGS = 72;
@@ -25,64 +28,65 @@ const ASIDE = 6;
 const UP = 5;
 const AHEAD_M = 3;
 
-interface Node {
-  readonly centre: Vector3;
-  readonly edgeM: number;
-}
+/** Floors are looked for so near first, of as many nodes as there may be; m. */
+const NEAR_M = 8;
 
-interface Floor {
+interface Node {
   readonly x: number;
   readonly y: number;
   readonly z: number;
+  readonly edgeM: number;
 }
 
 /** As near to a place as a floor is known that is not above it; null: none is. Two callings give the same. */
 export function standing(cells: Cells, near: Vector3): CameraView | null {
-  const nodes = nodesOf(cells);
-  const floors = floorsBelow(nodes, near.z);
+  const all = [...cells.all.values()];
+  const close = all.filter(({ box }) => box.distanceToPoint(near.clone().setZ(box.min.z)) <= NEAR_M);
+  const found = floorsBelow(close, cells.edgeM, near.z);
+  const floors = found.length ? found : floorsBelow(all, cells.edgeM, near.z);
   const counts = new Map<number, number>();
   const levelOf = (z: number) => Math.round(z / FLAT_M);
   for (const { z } of floors) counts.set(levelOf(z), (counts.get(levelOf(z)) ?? 0) + 1);
   const [level] = [...counts].reduce((most, one) => (one[1] > most[1] || (one[1] === most[1] && one[0] < most[0]) ? one : most), [0, 0]);
-  const off = ({ x, y }: Floor) => Math.hypot(x - near.x, y - near.y);
+  const off = ({ x, y }: Node) => Math.hypot(x - near.x, y - near.y);
   const at = floors.filter(({ z }) => Math.abs(z - level * FLAT_M) <= FLAT_M).sort((a, b) => off(a) - off(b) || a.x - b.x || a.y - b.y)[0];
   if (!at) return null;
   const eye = new Vector3(at.x, at.y, at.z + EYES_M);
-  const heading = clearest(nodes, eye) * STEP_RAD;
+  const heading = clearest(all, cells.edgeM, eye) * STEP_RAD;
   const target = eye.clone().add(new Vector3(Math.cos(heading), Math.sin(heading), 0).multiplyScalar(AHEAD_M));
   return { eye: eye.toArray() as Triple, target: target.toArray() as Triple };
 }
 
-function nodesOf(cells: Cells): Node[] {
-  const found: Node[] = [];
-  for (const cell of cells.all.values()) {
-    const edgeM = cells.edgeM / 2 ** cell.depth;
-    for (let at = 0; at < cell.bytes.length; at += STRIDE) {
-      const centre = new Vector3(cell.bytes[at], cell.bytes[at + 1], cell.bytes[at + 2]).addScalar(0.5);
-      found.push({ centre: centre.multiplyScalar(edgeM).add(cell.box.min), edgeM });
+/** All nodes: their centres, m in the map, and edges. */
+function visit(cells: readonly ShownCell[], cellEdgeM: number, take: (x: number, y: number, z: number, edgeM: number) => void): void {
+  for (const { bytes, depth, box } of cells) {
+    const edgeM = cellEdgeM / 2 ** depth;
+    const { x, y, z } = box.min;
+    for (let at = 0; at < bytes.length; at += STRIDE) {
+      take(x + (bytes[at] + 0.5) * edgeM, y + (bytes[at + 1] + 0.5) * edgeM, z + (bytes[at + 2] + 0.5) * edgeM, edgeM);
     }
   }
-  return found;
 }
 
 /** Tops of nodes with room for a person above them, one a column: the highest that is not above a height. */
-function floorsBelow(nodes: readonly Node[], topM: number): Floor[] {
-  const widthM = nodes.reduce((most, { edgeM }) => Math.max(most, edgeM), COLUMN_M);
-  const columns = new Map<string, Node[]>();
-  for (const node of nodes) {
-    const key = `${Math.floor(node.centre.x / widthM)},${Math.floor(node.centre.y / widthM)}`;
-    if (!columns.has(key)) columns.set(key, []);
-    columns.get(key)!.push(node);
-  }
-  const found: Floor[] = [];
+function floorsBelow(cells: readonly ShownCell[], cellEdgeM: number, topM: number): Node[] {
+  const widthM = cells.reduce((most, { points, depth }) => (points ? Math.max(most, cellEdgeM / 2 ** depth) : most), COLUMN_M);
+  const columns = new Map<number, Node[]>();
+  visit(cells, cellEdgeM, (x, y, z, edgeM) => {
+    if (z < topM - STOREY_M - edgeM || z > topM + ROOM_M + edgeM) return;
+    const key = Math.floor(x / widthM) * COLUMNS + Math.floor(y / widthM);
+    const column = columns.get(key);
+    if (column) column.push({ x, y, z, edgeM });
+    else columns.set(key, [{ x, y, z, edgeM }]);
+  });
+  const found: Node[] = [];
   for (const column of columns.values()) {
-    const rising = column.sort((a, b) => a.centre.z - b.centre.z || a.centre.x - b.centre.x || a.centre.y - b.centre.y);
+    const rising = column.sort((a, b) => a.z - b.z || a.x - b.x || a.y - b.y);
     for (let n = rising.length - 1; n >= 0; n--) {
-      const { centre, edgeM } = rising[n];
-      const z = centre.z + edgeM / 2;
+      const z = rising[n].z + rising[n].edgeM / 2;
       const above = rising[n + 1];
-      if (z > topM || z < topM - STOREY_M || (above && above.centre.z - above.edgeM / 2 < z + ROOM_M)) continue;
-      found.push({ x: centre.x, y: centre.y, z });
+      if (z > topM || z < topM - STOREY_M || (above && above.z - above.edgeM / 2 < z + ROOM_M)) continue;
+      found.push({ ...rising[n], z });
       break;
     }
   }
@@ -90,23 +94,21 @@ function floorsBelow(nodes: readonly Node[], topM: number): Floor[] {
 }
 
 /** The heading, counted from +x to +y, in which one sees farthest on the average; where nothing is met is no sight. */
-function clearest(nodes: readonly Node[], eye: Vector3): number {
+function clearest(cells: readonly ShownCell[], cellEdgeM: number, eye: Vector3): number {
   const rows = 2 * UP + 1;
   const metM = new Array<number>(HEADINGS * rows).fill(Infinity);
-  const off = new Vector3();
-  for (const { centre, edgeM } of nodes) {
-    off.subVectors(centre, eye);
-    const distanceM = Math.max(off.length(), edgeM);
+  visit(cells, cellEdgeM, (x, y, z, edgeM) => {
+    const distanceM = Math.max(Math.sqrt((x - eye.x) ** 2 + (y - eye.y) ** 2 + (z - eye.z) ** 2), edgeM);
     const half = edgeM / 2 / distanceM / STEP_RAD;
-    const up = Math.asin(off.z / distanceM) / STEP_RAD;
-    const aside = Math.atan2(off.y, off.x) / STEP_RAD;
+    const up = Math.asin((z - eye.z) / distanceM) / STEP_RAD;
+    const aside = Math.atan2(y - eye.y, x - eye.x) / STEP_RAD;
     for (let row = Math.max(Math.round(up - half), -UP); row <= Math.min(Math.round(up + half), UP); row++) {
       for (let n = Math.round(aside - half); n <= Math.round(aside + half); n++) {
         const at = ((n + HEADINGS) % HEADINGS) * rows + row + UP;
         metM[at] = Math.min(metM[at], distanceM);
       }
     }
-  }
+  });
   const sums = Array.from({ length: HEADINGS }, (_, n) =>
     metM.slice(n * rows, (n + 1) * rows).reduce((sum, metres) => sum + (Number.isFinite(metres) ? metres : 0), 0),
   );
