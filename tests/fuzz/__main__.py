@@ -9,7 +9,6 @@ the inputs in `tests/fuzz/findings`, where anything was found.
 
 import argparse
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 
 from tests.fuzz.soak import FINDINGS, SoakReport, soak
@@ -29,9 +28,8 @@ def main() -> int:
         sys.stdout.write("atheris is not installed: it has wheels for Linux on x86-64 only; nothing was fuzzed\n")
         return 1
     sys.stdout.write(f"{'target':<16}{'inputs':>10}{'per s':>8}{'slowest':>9}{'memory':>9}  result\n")
-    with ThreadPoolExecutor(given.jobs) as pool:
-        names = given.targets or list(TARGETS)
-        reports = list(pool.map(lambda name: _shown(soak(name, seconds=given.seconds, findings=FINDINGS)), names))
+    names = given.targets or list(TARGETS)
+    reports = [_shown(report) for report in soak(names, seconds=given.seconds, jobs=given.jobs, findings=FINDINGS)]
     found = [report for report in reports if report.finding or report.failure]
     for report in found:
         sys.stdout.write(f"\n{report.target}: {report.failure}\n{report.how_to_repeat}\n")

@@ -3,7 +3,7 @@
     $ python -m tests.fuzz.one_target cell tests/fuzz/findings/cell-0123456789ab.input
     refused
 
-A finding is read again without atheris. The soak calls it with --seconds; its environment says how kernels run.
+A finding is read again without atheris; the environment says how kernels run. `each_target.py` fuzzes.
 """
 
 import argparse
@@ -16,7 +16,10 @@ import traceback
 import warnings
 from importlib import import_module
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
+
+if TYPE_CHECKING:
+    from tests.fuzz.targets import Target
 
 CORPUS = Path(__file__).parent / "corpus"
 PACKAGES = ("cairn_map", "cairn_calib", "cairn_fusion", "cairn_client", "cairn_sim")
@@ -32,27 +35,20 @@ MEMORY_BYTES_MAX = 1 << 30
 
 
 def main() -> None:
-    """Fuzz, or read one input."""
+    """Read one input."""
+    from tests.fuzz.targets import TARGETS, survives
+
     parser = argparse.ArgumentParser("python -m tests.fuzz.one_target", description=__doc__)
     parser.add_argument("target")
-    parser.add_argument("input", nargs="?", type=Path)
-    parser.add_argument("--seconds", type=int)
-    parser.add_argument("--grown", type=Path, help="folder of inputs that were found to reach more")
-    parser.add_argument("--findings", type=Path, help="folder for a finding")
+    parser.add_argument("input", type=Path)
     given = parser.parse_args()
-    if given.input is not None:
-        from tests.fuzz.targets import TARGETS, survives
-
-        warnings.simplefilter("error")
-        taken = survives(TARGETS[given.target], given.input.read_bytes())
-        sys.stdout.write("taken\n" if taken else "refused\n")
-    else:
-        fuzz(given.target, seconds=given.seconds, grown=given.grown, findings=given.findings)
+    warnings.simplefilter("error")
+    taken = survives(TARGETS[given.target], given.input.read_bytes())
+    sys.stdout.write("taken\n" if taken else "refused\n")
 
 
-def fuzz(name: str, *, seconds: int, grown: Path, findings: Path) -> None:
-    """Never returns: libFuzzer ends the process, with 0 where nothing was found."""
-    import atheris
+def instrumented_targets() -> "dict[str, Target]":
+    """Every target, over packages that tell libFuzzer what they run; they must not have been imported before."""
     from atheris.import_hook import HookManager
 
     for package in PACKAGES:
@@ -60,12 +56,25 @@ def fuzz(name: str, *, seconds: int, grown: Path, findings: Path) -> None:
             import_module(f"{package}.{path.stem}")  # first, since Numba compiles no instrumented code
     # As `instrument_imports`, but comparisons are left alone: their hook keeps every array that one gives, for ever.
     with HookManager(set(PACKAGES), set(), enable_loader_override=True, trace_dataflow=False):
-        from tests.fuzz.targets import TARGETS, survives
-    warnings.simplefilter("error")
-    target = TARGETS[name]
-    seeds = CORPUS / name
+        from tests.fuzz.targets import TARGETS
+    return TARGETS
+
+
+def read_seeds(target: "Target", seeds: Path) -> None:
+    """Compiles kernels and builds tables, which must not count as slow."""
+    from tests.fuzz.targets import survives
+
     for path in sorted(seeds.iterdir()):
-        survives(target, path.read_bytes())  # compiles kernels and builds tables, which must not count as slow
+        survives(target, path.read_bytes())
+
+
+def fuzz(target: "Target", seeds: Path, *, seconds: int, grown: Path, findings: Path) -> None:
+    """Never returns: libFuzzer ends the process, with 0 where nothing was found."""
+    import atheris
+    from tests.fuzz.targets import survives
+
+    warnings.simplefilter("error")
+    read_seeds(target, seeds)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY_BYTES_MAX,) * 2)
 

@@ -1,4 +1,4 @@
-"""One target fuzzed for a while in a process of its own, and what came of it."""
+"""Targets fuzzed for a while, each in a process of its own, and what came of it."""
 
 import hashlib
 import os
@@ -6,18 +6,18 @@ import re
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.fuzz.one_target import START_OF_ERROR
+from tests.fuzz.each_target import FOUND_IN, GROWN, SAID
+from tests.fuzz.one_target import BROKEN, START_OF_ERROR
 
 ROOT = Path(__file__).parents[2]
 BUILD = ROOT / "build" / "fuzz"
 FINDINGS = Path(__file__).parent / "findings"
 KERNELS = {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(BUILD / "kernels")}
 """Array bounds are checked; in a folder of their own, since Numba would take one kind of kernel for the other."""
-STARTING_S = 300
-"""Of wall time, for imports and for compiling kernels the first time."""
 REASON_LINES, LINE_LENGTH_MAX = 12, 300
 
 
@@ -44,27 +44,41 @@ class SoakReport:
         return f"to repeat: {settings} python -m tests.fuzz.one_target {self.target} {self.finding}"
 
 
-def soak(target: str, *, seconds: int, findings: Path) -> SoakReport:
-    """Fuzz one target; a finding ends it early."""
-    grown = BUILD / "corpus" / target
-    grown.mkdir(parents=True, exist_ok=True)
+def soak(targets: Sequence[str], *, seconds: int, jobs: int, findings: Path) -> Iterator[SoakReport]:
+    """Fuzz targets, a few at a time, and report each as it ends; a finding ends it early."""
     paths = os.pathsep.join(path for path in sys.path if path)
-    with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "tests.fuzz.one_target", target, f"--seconds={seconds}"]
-        try:
-            done = subprocess.run(
-                [*command, f"--grown={grown}", f"--findings={folder}"],
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for target in targets:
+            (folder / target / FOUND_IN).mkdir(parents=True)
+            (BUILD / "corpus" / target).mkdir(parents=True, exist_ok=True)
+            (folder / target / GROWN).symlink_to(BUILD / "corpus" / target)
+        command = [sys.executable, "-m", "tests.fuzz.each_target", *targets, f"--seconds={seconds}", f"--jobs={jobs}"]
+        with (
+            (folder / SAID).open("wb") as said,
+            subprocess.Popen(
+                [*command, f"--folder={folder}"],
                 cwd=ROOT,
                 env=os.environ | KERNELS | {"PYTHONPATH": paths},
                 stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                timeout=seconds + STARTING_S,
-                check=False,
-            )
-            code, said = done.returncode, done.stdout.decode(errors="replace")
-        except subprocess.TimeoutExpired as exc:
-            code, said = 1, f"did not end in time\n{(exc.stdout or b'').decode(errors='replace')}"
-        kept = [_kept(path, target, findings) for path in sorted(Path(folder).iterdir())]
+                stderr=said,
+                text=True,
+            ) as process,
+        ):
+            assert process.stdout is not None
+            left = set(targets)
+            for line in process.stdout:
+                target, code = line.split()
+                left.remove(target)
+                yield _report(target, int(code), folder / target, findings)
+        for target in sorted(left):
+            (folder / target / SAID).write_bytes((folder / SAID).read_bytes())
+            yield _report(target, process.returncode or BROKEN, folder / target, findings)
+
+
+def _report(target: str, code: int, folder: Path, findings: Path) -> SoakReport:
+    said = (folder / SAID).read_text(errors="replace")
+    kept = [_kept(path, target, findings) for path in sorted((folder / FOUND_IN).iterdir())]
     return SoakReport(
         target=target,
         inputs=_figure(said, "number_of_executed_units"),

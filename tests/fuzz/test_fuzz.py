@@ -11,24 +11,26 @@ from pathlib import Path
 import pytest
 from tests.fuzz.make_corpus import seeds
 from tests.fuzz.one_target import CORPUS, FOUND
-from tests.fuzz.soak import FINDINGS, ROOT, soak
+from tests.fuzz.soak import FINDINGS, ROOT, SoakReport, soak
 from tests.fuzz.targets import TARGETS, survives
 
 SECONDS = 60 // len(TARGETS) - 2
-"""Of each target, after some two seconds for starting."""
+"""Of each target, after some two seconds for starting and ending."""
+JOBS = 2
 INPUTS = sorted(CORPUS.glob("*/*.input"))
 
-BROKEN_TARGET = """
+GREEDY_TARGET = """
 import sys
 from pathlib import Path
-from tests.fuzz import one_target, targets
+from tests.fuzz.one_target import MEMORY_BYTES_MAX, fuzz
+from tests.fuzz.targets import Target
 
 def greedy(data: bytes) -> None:
     if len(data) > 64:
-        bytearray(2 * one_target.MEMORY_BYTES_MAX)
+        bytearray(2 * MEMORY_BYTES_MAX)
 
-targets.TARGETS["text"] = targets.Target(greedy)
-one_target.fuzz("text", seconds=60, grown=Path(sys.argv[1]), findings=Path(sys.argv[2]))
+seeds, grown, findings = map(Path, sys.argv[1:])
+fuzz(Target(greedy), seeds, seconds=60, grown=grown, findings=findings)
 """
 
 needs_atheris = pytest.mark.skipif(
@@ -75,21 +77,27 @@ def test_mutators_get_past_checksums(name: str) -> None:
     assert len(set(taken) - set(sound)) >= 5
 
 
+@pytest.fixture(scope="module")
+def reports() -> dict[str, SoakReport]:
+    return {report.target: report for report in soak(list(TARGETS), seconds=SECONDS, jobs=JOBS, findings=FINDINGS)}
+
+
 @needs_atheris
 @every_target
-def test_a_short_fuzz_finds_nothing(name: str) -> None:
-    report = soak(name, seconds=SECONDS, findings=FINDINGS)
+def test_a_short_fuzz_finds_nothing(reports: dict[str, SoakReport], name: str) -> None:
+    report = reports[name]
     assert not report.failure, f"{report.failure}\n{report.how_to_repeat}"
     assert report.inputs > 0
 
 
 @needs_atheris
 def test_too_much_memory_is_a_finding(tmp_path: Path) -> None:
-    grown, findings = tmp_path / "grown", tmp_path / "findings"
-    grown.mkdir()
-    findings.mkdir()
+    folders = seeds, _, findings = tmp_path / "seeds", tmp_path / "grown", tmp_path / "findings"
+    for folder in folders:
+        folder.mkdir()
+    (seeds / "short").write_bytes(bytes(64))
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-    command = [sys.executable, "-c", BROKEN_TARGET, str(grown), str(findings)]
+    command = [sys.executable, "-c", GREEDY_TARGET, *map(str, folders)]
     done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == FOUND
     assert "MemoryError" in done.stdout
