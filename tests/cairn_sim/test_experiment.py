@@ -211,11 +211,15 @@ def test_cells_that_are_not_all_taken_leave_no_folder(tmp_path: Path) -> None:
     assert encode_cell(first.key, first.evidence, MIDDLE).digest == first.digest
 
 
-def test_an_interrupted_run_keeps_finished_resolutions_and_nothing_half(tmp_path: Path) -> None:
+def test_an_interrupted_run_keeps_finished_resolutions_and_nothing_half(recording: Path, tmp_path: Path) -> None:
     output = tmp_path / "out"
-    command = [sys.executable, "-m", "cairn_client.main", "experiment", "--resolutions", "16", "2"]
+    command = [sys.executable, "-m", "cairn_client.main", "experiment", "--recording", str(recording)]
     with subprocess.Popen(
-        [*command, "--output", str(output), *SHORT], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        # 2 cm takes 10 s more where all else takes 3.
+        [*command, "--resolutions", "16", "2", "--output", str(output)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     ) as process:
         for _ in range(SECONDS_MAX * 20):
             if (output / "report.html").exists():
