@@ -71,7 +71,7 @@ export class Cells {
       const shown = this.all.get(cell.join(","));
       if (shown) shown.held = { lm, seq: held_lm ?? lm };
     }
-    this.onChange();
+    this.onChange(false);
   }
 
   /** A cell changed: what is shown of it is fetched again. */
