@@ -1,1 +1,4 @@
-"""The operator's page in a real browser; a package, so that the browser ends with its tests: others have loops of their own."""
+"""The operator's page in a real browser.
+
+A package, so that the browser ends with its tests: others have event loops of their own.
+"""
