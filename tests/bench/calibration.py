@@ -31,7 +31,7 @@ PATTERN_M = 0.006 * np.random.default_rng(5).normal(size=(144, 176))
 
 def calibration_rows(smoke: bool) -> Iterator[Row]:
     """Five cameras of three spectra before 40 places of a board; then the two colour cameras, with OpenCV."""
-    repeats = 3 if smoke else 9
+    repeats = 1 if smoke else 9
     truth = world(FRAMES, seed=5)
     views, plan = views_of(truth, seed=5), usual_plan(SPECTRA)
     solution = solve_rig(views, plan)

@@ -21,7 +21,7 @@ def simulation_rows(smoke: bool) -> Iterator[Row]:
     """One line each."""
     scene, robot, noise = load_scene("building"), ROBOTS["orpheus"], Noise(1)
     rig = robot.rig_of(1.0)
-    standing = stops(scene, "experiment")[:: 18 if smoke else 6]
+    standing = stops(scene, "experiment")[:: 54 if smoke else 6]
     poses = [T for place in standing for T in robot.head_poses(place)[:: 12 if smoke else 6]]
 
     def render(number: int, *, with_noise: bool) -> None:
@@ -44,7 +44,7 @@ def simulation_rows(smoke: bool) -> Iterator[Row]:
             f"{median_s:.2f}",
             f"s median, {worst_s:.2f} worst of {len(poses)}",
         )
-    plan = Plan(scene=scene, robot=ROBOTS["tof"], path="experiment", truth="none", last_stop=2 if smoke else 16)
+    plan = Plan(scene=scene, robot=ROBOTS["tof"], path="experiment", truth="none", last_stop=1 if smoke else 16)
     shots = shots_of(plan)
     seconds_s = _wall_s(lambda: sum(1 for _ in scans_of(plan, shots, ROBOTS["tof"].rig_of(1.0))))
     yield f"render ToF alone, {len(shots)} scans", f"{len(shots) / seconds_s:.0f}", "images/s"
