@@ -89,19 +89,15 @@ def test_the_index_of_leaves_finds_who_holds_each_place(made: Made) -> None:
 @given(MADE, st.data())
 def test_earlier_rows_are_those_beside_that_come_before(made: Made, data: st.DataObject) -> None:
     evidence, geometry = made
-    depth, side = geometry.depth, 2**geometry.depth
+    depth = geometry.depth
     octree, _ = build_octree(evidence, depth=depth)
     voxels = np.nonzero(octree.sizes == 1)[0]
     leaves = voxels[np.random.default_rng(data.draw(st.integers(0, 99))).random(len(voxels)) < 0.7]
     found = earlier_rows(octree.starts, leaves, *index_leaves(octree.starts, octree.sizes, depth), depth)
-    row_of = {int(octree.starts[leaf]): s for s, leaf in enumerate(leaves)}
-    for s, leaf in enumerate(leaves):
-        corner = naive.deinterleave(int(octree.starts[leaf]))
-        for i, step in enumerate(STEPS.tolist()):
-            place = tuple(v + d for v, d in zip(corner, step, strict=True))
-            inside = all(0 <= v < side for v in place)
-            row = row_of.get(naive.interleave(*place), NONE) if inside else NONE
-            assert found[s, i] == (row if row < s else NONE)
+    row_at = {naive.deinterleave(start): s for s, start in enumerate(octree.starts[leaves].tolist())}
+    for (x, y, z), s in row_at.items():
+        rows = [row_at.get((x + i, y + j, z + k), NONE) for i, j, k in STEPS.tolist()]
+        assert found[s].tolist() == [row if row < s else NONE for row in rows]
 
 
 def test_the_steps_are_all_that_can_come_before() -> None:
