@@ -9,6 +9,7 @@ import re
 import tomllib
 from collections.abc import Iterator
 from fnmatch import fnmatch
+from functools import cache
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -110,28 +111,34 @@ def modules() -> Iterator[tuple[str, Path]]:
             yield path.relative_to(ROOT / folder).as_posix(), path
 
 
-def imports(path: Path) -> Iterator[str]:
-    """Dotted names that a module imports, anywhere in it; `from a import b` is a and a.b."""
+@cache
+def imports(path: Path) -> set[str]:
+    """Dotted names of the modules that a module imports from, anywhere in it."""
+    names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            names.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: import from the defining module by its full name"
-            yield str(node.module)
+            names.add(str(node.module))
+    return names
 
 
 def is_within(name: str, parents: set[str]) -> bool:
     return any(name == parent or name.startswith(f"{parent}.") for parent in parents)
 
 
-def texts() -> Iterator[tuple[str, str]]:
-    """Path and content of every text file that is shipped."""
+@cache
+def texts() -> dict[str, str]:
+    """Content of every text file that is shipped, by path."""
     folders = ["calib", "fusion", "client", "server", "tests", "docs"]
     found = {path for folder in folders for path in (ROOT / folder).rglob("*")}
     found |= {path for pattern in SHIPPED for path in ROOT.glob(pattern)}
-    for path in sorted(found):
-        if path.is_file() and path.suffix in TEXT and "__pycache__" not in path.parts:
-            yield path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")
+    return {
+        path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
+        for path in sorted(found)
+        if path.suffix in TEXT and path.is_file() and "__pycache__" not in path.parts
+    }
 
 
 def test_packages_import_only_the_floors_below_them() -> None:
@@ -183,12 +190,12 @@ def test_modules_are_named_for_what_they_hold() -> None:
 
 def test_shipped_files_name_no_folder_of_somebodys_machine() -> None:
     machine_path = re.compile(r"(?<![\w.~])/(?:home|root|work|Users)/\w+")
-    assert {path: found for path, text in texts() if (found := machine_path.findall(text))} == {}
+    assert {path: found for path, text in texts().items() if (found := machine_path.findall(text))} == {}
 
 
 def test_shipped_files_leave_nothing_to_do() -> None:
     left = re.compile(r"\b(?:T[O]DO|F[I]XME|X[X]X)\b")
-    assert {path: found for path, text in texts() if (found := left.findall(text))} == {}
+    assert {path: found for path, text in texts().items() if (found := left.findall(text))} == {}
 
 
 def test_every_entry_point_resolves() -> None:
