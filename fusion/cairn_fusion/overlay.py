@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import TypeVar
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -42,6 +43,7 @@ GREY_COVER = 0.4
 THROUGH_COVER = 0.9
 THROUGH_COVER_MIN = 0.2
 MEANINGS = ("solid: visible", "stripes: behind that", "dots: from the map alone")
+NEIGHBOURS = np.ones((3, 3), np.uint8)
 EXACT = PoseSpread.of_sigmas()
 
 
@@ -243,9 +245,8 @@ def _rest(
 
 def _outlines(modes: Rgb) -> Flags:
     """(h, w) where what the map alone has begins or ends: there or next to it, along an axis or both."""
-    is_alone = np.pad(modes == Mode.MAP_ONLY, 1, mode="edge")
-    around = np.lib.stride_tricks.sliding_window_view(is_alone, (3, 3))
-    return np.asarray(around.any(axis=(2, 3)) & ~around.all(axis=(2, 3)))
+    is_alone = (modes == Mode.MAP_ONLY).astype(np.uint8)
+    return np.asarray(cv2.dilate(is_alone, NEIGHBOURS) != cv2.erode(is_alone, NEIGHBOURS))
 
 
 def with_overlay_legend(picture: Rgb, scale: Scale) -> Rgb:
