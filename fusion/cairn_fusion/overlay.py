@@ -160,7 +160,7 @@ def draw_overlay(
     everywhere = _wide(rest_modes, step, (H, W))
     is_alone = np.isnan(range_m)
     # Ink that is spread has no outline.
-    is_fine = is_alone & _wide(_outlines(rest_modes), step, (H, W)) & live.spread.is_exact
+    is_fine = is_alone & _wide(_outlines(rest_modes, coarse_m), step, (H, W)) & live.spread.is_exact
     around = (
         np.where(is_fine, np.float32(0), range_m - tolerance_m),
         np.where(is_fine, np.float32(style.range_max_m), range_m + tolerance_m),
@@ -243,10 +243,11 @@ def _rest(
     )
 
 
-def _outlines(modes: Rgb) -> Flags:
-    """(h, w) where what the map alone has begins or ends: there or next to it, along an axis or both."""
-    is_alone = (modes == Mode.MAP_ONLY).astype(np.uint8)
-    return np.asarray(cv2.dilate(is_alone, NEIGHBOURS) != cv2.erode(is_alone, NEIGHBOURS))
+def _outlines(modes: Rgb, coarse_m: Values) -> Flags:
+    """(h, w) where the map has something, and has nothing, in the 3 x 3 around, without any live depth in both."""
+    is_something = (modes == Mode.MAP_ONLY).astype(np.uint8)
+    is_nothing = (np.isnan(coarse_m) & (modes == Mode.NOTHING)).astype(np.uint8)
+    return np.asarray((cv2.dilate(is_something, NEIGHBOURS) & cv2.dilate(is_nothing, NEIGHBOURS)).astype(np.bool_))
 
 
 def with_overlay_legend(picture: Rgb, scale: Scale) -> Rgb:
