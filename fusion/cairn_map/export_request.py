@@ -79,6 +79,31 @@ class ExportRequest(BaseModel):
         return geometry.depth if self.depth is None else self.depth
 
 
+class TicketedExport(ExportRequest):
+    """The query of an export that is asked for by token, or by ticket."""
+
+    ticket: Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")] | None = None
+
+    @property
+    def request(self) -> ExportRequest:
+        """What is asked for, by whomever."""
+        return ExportRequest.model_validate(self.model_dump(exclude={"ticket"}))
+
+
+class ExportTicket(BaseModel):
+    """Answer to who asked for a ticket: it stands for a token once, for one file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    ticket: str
+    ends_s: float
+    """UTC since 1970."""
+    points: int
+    """Of the file."""
+    size_bytes: int | None
+    """Of the file; None: known when it is made."""
+
+
 def _corners(text: str) -> tuple[Floats, Floats]:
     try:
         numbers = np.array([float(part) for part in text.split(",")])

@@ -36,6 +36,10 @@ class Role(StrEnum):
     RELAY = "relay"
 
 
+READING = (Role.READER, Role.ROBOT, Role.OPERATOR, Role.RELAY)
+"""Who may read a map."""
+
+
 @dataclass(frozen=True, slots=True)
 class Caller:
     """Who makes a request."""

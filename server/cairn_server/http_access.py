@@ -13,13 +13,11 @@ from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from cairn_map.errors import NotFoundError
-from cairn_server.auth import Caller, Role, bad_token, caller_of, require, require_all_maps
+from cairn_server.auth import READING, Caller, Role, bad_token, caller_of, require, require_all_maps
 from cairn_server.service import Service
 from cairn_server.store_rows import MapRow
 
 bearer = HTTPBearer(auto_error=False)
-READING = (Role.READER, Role.ROBOT, Role.OPERATOR, Role.RELAY)
-"""Who may read a map."""
 
 
 async def service_of(request: Request) -> Service:

@@ -25,6 +25,7 @@ UPLOAD = f"{MAP}/commits/{{commit}}/upload"
 CELL = f"{MAP}/main/cells/{{cell}}"
 RENDER = f"{MAP}/main/render"
 EXPORT = f"{MAP}/main/export"
+TICKETS = f"{EXPORT}/tickets"
 VIEW = f"{MAP}/branches/{{branch}}/view"
 COMMIT_MEDIA_TYPE = "application/vnd.cairn.commit"
 CELL_TYPES = (CELL_MEDIA_TYPE, *MEDIA_TYPES.values())
@@ -67,6 +68,7 @@ PROBLEMS: dict[Route, tuple[int, ...]] = {
     ("get", CELL): (416,),
     ("get", RENDER): (413,),
     ("get", EXPORT): (413,),
+    ("post", TICKETS): (429,),
     ("get", f"{MAP}/events"): (429,),
     ("get", f"{MAP}/live"): (426,),
 }

@@ -23,8 +23,8 @@ from starlette.types import Receive, Scope, Send
 
 from cairn_map.errors import BadInputError, CairnError, DeniedError
 from cairn_map.live_events import Beat, LiveEvent, Seen, seen_from_text
-from cairn_server.auth import require
-from cairn_server.http_access import READERS, READING, Credentials, Map, Operations, caller_now, map_now
+from cairn_server.auth import READING, require
+from cairn_server.http_access import READERS, Credentials, Map, Operations, caller_now, map_now
 from cairn_server.live import Listener
 from cairn_server.problems import answer_to
 from cairn_server.service import Service

@@ -44,6 +44,12 @@ class Export:
     count: int
     size_bytes: int | None
     parts: Iterator[bytes]
+    aside: IO[bytes]
+    """What they are made of, on the disk."""
+
+    def close(self) -> None:
+        """Let that go: nobody takes the file."""
+        self.aside.close()
 
 
 class MapExports:
@@ -77,7 +83,7 @@ class MapExports:
                     self._damaged.note(row.name, [exc.key])
                 raise
         keep_healed(self._store, row, healed)
-        return Export(head, file.count, file.size_bytes, file.parts(_bodies(aside, sizes)))
+        return Export(head, file.count, file.size_bytes, file.parts(_bodies(aside, sizes)), aside)
 
     @contextmanager
     def _turn(self) -> Iterator[None]:

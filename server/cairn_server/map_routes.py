@@ -5,8 +5,8 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Query, Response
 
 from cairn_map.messages import BranchInfo, CreateMap, LogEntry, MapInfo, Register, Registered, Retract, Retracted
-from cairn_server.auth import Caller, Role
-from cairn_server.http_access import READERS, READING, Map, Operations, admin, allowed, own_branch, reader_somewhere
+from cairn_server.auth import READING, Caller, Role
+from cairn_server.http_access import READERS, Map, Operations, admin, allowed, own_branch, reader_somewhere
 
 LOG_PAGE_MAX = 1000
 

@@ -19,6 +19,7 @@ EXAMPLES: dict[tuple[str, str], Any] = {
         "kinds": ["delta", "full"],
     },
     ("post", "/maps/{name}/retracts"): {"commits": ["mole.1f2e3d4c5b6a7988.12"], "note": "wrong calibration"},
+    ("post", "/maps/{name}/main/export/tickets"): {"format": "laz", "box": "-4,-4,0,4,4,2.5", "p": 0.7},
     ("put", "/maps/{name}/branches/{branch}/status"): {
         "time_s": 1795253400.0,
         "pose": {

@@ -25,6 +25,7 @@ MEDIA_TYPE = "application/problem+json"
 STATUS_OF_KIND = {
     "no_token": 401,
     "bad_token": 401,
+    "bad_ticket": 401,
     "too_large": 413,
     "other_log": 410,
     "quota": 429,
@@ -34,6 +35,7 @@ STATUS_OF_KIND = {
     "upgrade_required": 426,
     "too_many_streams": 429,
     "too_many_views": 429,
+    "too_many_tickets": 429,
 }
 KIND_OF_STATUS = {404: "no_route", 405: "no_method"}
 """Of what the framework refuses."""

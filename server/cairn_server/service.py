@@ -33,6 +33,7 @@ from cairn_server.cell_index import FIRST_PAGE, IndexPage, entries_of
 from cairn_server.cells_at_rest import DamagedCellError, sound_cell
 from cairn_server.check_process import CheckProcess
 from cairn_server.damaged_cells import DamagedCells
+from cairn_server.export_tickets import ExportTickets
 from cairn_server.fold_health import FoldHealth
 from cairn_server.fold_process import FoldProcess
 from cairn_server.folder import Folder
@@ -101,6 +102,7 @@ class Service:
         self._reads = ReadCache()
         self.views = MapViews(store, self.damaged)
         self.exports = MapExports(store, self.damaged)
+        self.tickets = ExportTickets(store, settings, self.exports)
         self.cell_views = ViewCache()
         self._healing = threading.Lock()
         self.operator = new_incarnation()
@@ -276,6 +278,7 @@ class Service:
         self.readiness.is_closing = True
         self.live.close()
         self.pushes.close()
+        self.tickets.close()
         self._folder.close()
         self.reports.close()
         self.store.close()

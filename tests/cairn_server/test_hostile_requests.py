@@ -23,6 +23,7 @@ SOUND: dict[str, list[bytes]] = {
     "POST /maps/{name}/branches": [b'{"robot":"mole","incarnation":"0123456789abcdef"}'],
     "PUT /maps/{name}/commits/{commit}": [COMMIT.data],
     "POST /maps/{name}/retracts": [b'{"robot":"mole"}', json.dumps({"commits": [str(COMMIT.id)]}).encode()],
+    "POST /maps/{name}/main/export/tickets": [b'{"format":"npz","box":"0,0,0,1,1,1","p":0.5}'],
     "PUT /maps/{name}/branches/{branch}/status": [b'{"time_s":1,"battery":0.5,"note":"x"}'],
     "PUT /maps/{name}/branches/{branch}/view": [b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"],
     "POST /maps/{name}/branches/{branch}/missing": [

@@ -16,7 +16,7 @@ ADMIN, ENROLLER, WRONG = "admin-secret-1234567", "enroller-secret-1234567", "wro
 
 
 def run(tmp_path: Path, *options: str) -> tuple[list[str], set[str]]:
-    """Log lines of a server that was asked all kinds of things, and the tokens that were shown to it."""
+    """Log lines of a server that was asked all kinds of things, and the tokens and the ticket that were shown to it."""
     for name, secret in (("admin", ADMIN), ("enroller", ENROLLER)):
         (tmp_path / name).write_text(secret)
     files = ("--admin-token-file", str(tmp_path / "admin"), "--enrolment-token-file", str(tmp_path / "enroller"))
@@ -41,12 +41,15 @@ def run(tmp_path: Path, *options: str) -> tuple[list[str], set[str]]:
                 http.get("/maps", params={"token": secret}, headers=headers)
                 http.post("/maps/lab/branches", content=json.dumps({"robot": secret}), headers=headers)
                 http.post("/maps/lab/retracts", content=secret, headers=headers)
+        export = "/maps/lab/main/export"
+        ticket = http.post(f"{export}/tickets", json={}, headers={"Authorization": f"Bearer {ADMIN}"}).json()["ticket"]
+        assert [http.get(export, params={"ticket": ticket}).status_code for _ in range(2)] == [200, 401]
         http.get("/maps/lab/nothing%0a2026-01-01 forged")
         http.get("/healthz")
     process.send(signal.SIGTERM)
     code, log = process.end()
     assert code == 0
-    return log.splitlines(), {ADMIN, ENROLLER, WRONG, token}
+    return log.splitlines(), {ADMIN, ENROLLER, WRONG, token, ticket}
 
 
 def test_every_request_is_one_line_with_its_ids_and_no_line_has_a_token(tmp_path: Path) -> None:

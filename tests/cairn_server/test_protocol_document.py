@@ -19,6 +19,7 @@ from cairn_server import (
     check_pool,
     commit_checks,
     commit_cost,
+    export_tickets,
     live,
     map_exports,
     map_views,
@@ -87,7 +88,10 @@ def test_every_kind_in_the_code_is_in_the_document_and_no_other() -> None:
     assert code == documented_kinds()
 
 
-@pytest.mark.parametrize("kind", ["no_token", "too_large", "other_log", "quota", "damaged_store", "disk_full"])
+@pytest.mark.parametrize(
+    "kind",
+    ["no_token", "bad_ticket", "too_many_tickets", "too_large", "other_log", "quota", "damaged_store", "disk_full"],
+)
 def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
     row = next(line for line in DOCUMENT.splitlines() if line.startswith("| `") and f"`{kind}`" in line)
     assert int(row.split("|")[2]) == problems.STATUS_OF_KIND[kind]
@@ -122,6 +126,9 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("known voxels of the cells that an export looks at", map_exports.VOXELS_EXPORTED_MAX),
         ("counting an export's points", map_exports.COUNT_S),
         ("exports counted at once", map_exports.COUNTS_AT_ONCE),
+        ("tickets for exports of one token", export_tickets.TICKETS_OF_TOKEN_MAX),
+        ("tickets for exports", export_tickets.TICKETS_MAX),
+        ("until a ticket ends", export_tickets.TICKET_S),
         ("header `Cairn-Coverage`", cell_routes.COVERAGE_BYTES_MAX),
         ("cells in one live event", live_events.CELLS_MAX),
         ("problem's `detail`", problems.DETAIL_CHARACTERS_MAX),

@@ -103,6 +103,12 @@ export interface Retracted {
   commits: string[];
 }
 
+export interface ExportTicket {
+  ticket: string;
+  points: number;
+  size_bytes: number | null;
+}
+
 export type LiveEvent =
   | { type: "hello"; id: string; map: string; cursor: string; resumed: boolean; robots: RobotSign[]; beat_s: number }
   | { type: "cells"; id: string; cells: [number, number, number, number][] | "many" }

@@ -3,7 +3,7 @@
 import type { Api } from "../api.ts";
 import { fill, h } from "../dom.ts";
 import type { Look } from "../look.ts";
-import type { MapInfo } from "../messages.ts";
+import type { ExportTicket, MapInfo } from "../messages.ts";
 import { bytes, KELVIN_ZERO_C, metres, thousands } from "../units.ts";
 
 const FORMS: [string, string, string][] = [
@@ -37,7 +37,7 @@ export class TakeAwayPanel {
     }
     this.level.addEventListener("change", () => this.show());
     const buttons = FORMS.map(([form, name, what]) =>
-      h("button", { type: "button", title: what, onclick: (event: Event) => void this.save(this.path(form), `${info.name}.${form}`, event) }, name),
+      h("button", { type: "button", title: what, onclick: (event: Event) => void this.save(event, () => this.part(form)) }, name),
     );
     fill(
       this.element,
@@ -51,13 +51,14 @@ export class TakeAwayPanel {
 
   /** The cell that was clicked: its exact evidence, as robots hold it. */
   choose(cell: string | null): void {
-    const { name } = this.info;
-    const save = (event: Event) => void this.save(`maps/${name}/main/cells/${cell}`, `${name}_${cell}.cairn`, event);
     fill(
       this.octree,
       cell === null
         ? h("span", { class: "hint" }, "Click the map for the octree of the cell there.")
-        : h("button", { type: "button", title: "exact evidence, as robots hold it", onclick: save }, `Octree of cell ${cell}`),
+        : h(
+            "button", { type: "button", title: "exact evidence, as robots hold it", onclick: (event: Event) => void this.save(event, () => this.cell(cell)) },
+            `Octree of cell ${cell}`,
+          ),
     );
   }
 
@@ -102,25 +103,35 @@ export class TakeAwayPanel {
     };
   }
 
-  private path(form: string): string {
-    const query = new URLSearchParams(Object.entries(this.asked()).map(([key, value]) => [key, String(value)]));
-    query.set("format", form);
-    return `maps/${this.info.name}/main/export?${query.toString()}`;
+  /** What is shown: the browser saves it as it comes, from a link with a ticket, so that no part of it is in the page. */
+  private async part(form: string): Promise<string> {
+    const path = `maps/${this.info.name}/main/export`;
+    const file = `${this.info.name}.${form}`;
+    const asked = { ...this.asked(), format: form };
+    const { ticket, points, size_bytes } = await this.api.post<ExportTicket>(`${path}/tickets`, asked);
+    const query = new URLSearchParams(Object.entries({ ...asked, ticket }).map(([key, value]) => [key, String(value)]));
+    h("a", { href: `${path}?${query.toString()}`, download: file }).click();
+    return `${file}: ${thousands(points)} points${size_bytes === null ? "" : `, ${bytes(size_bytes)}`}`;
   }
 
-  private async save(path: string, name: string, event: Event): Promise<void> {
+  /** One cell's bytes: few enough to be fetched by the page. */
+  private async cell(cell: string): Promise<string> {
+    const { name } = this.info;
+    const blob = await (await this.api.ask(`maps/${name}/main/cells/${cell}`)).blob();
+    const file = `${name}_${cell}.cairn`;
+    const url = URL.createObjectURL(blob);
+    h("a", { href: url, download: file }).click();
+    window.setTimeout(() => URL.revokeObjectURL(url), 60_000);
+    return `${file}: ${bytes(blob.size)}`;
+  }
+
+  private async save(event: Event, fetched: () => Promise<string>): Promise<void> {
     const button = event.currentTarget as HTMLButtonElement;
     button.disabled = true;
     this.said.className = "hint";
     this.said.textContent = "The server makes the file ...";
     try {
-      const answer = await this.api.ask(path);
-      const blob = await answer.blob();
-      const url = URL.createObjectURL(blob);
-      h("a", { href: url, download: name }).click();
-      window.setTimeout(() => URL.revokeObjectURL(url), 60_000);
-      const points = answer.headers.get("Cairn-Points");
-      this.said.textContent = `${name}: ${points ? `${thousands(Number(points))} points, ` : ""}${bytes(blob.size)}`;
+      this.said.textContent = await fetched();
     } catch (error) {
       this.said.className = "error";
       this.said.textContent = (error as Error).message;
