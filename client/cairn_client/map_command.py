@@ -58,17 +58,21 @@ def _create(args: argparse.Namespace) -> None:
     api, name = api_of(args.map, args.token)
     geometry = _geometry(args)
     if args.source is not None:
-        info, count, added = push_prior_data(api, name, args.source, token=args.token)
+        with api:
+            info, count, added = push_prior_data(api, name, args.source, token=args.token)
         _say_map(info)
         say(f"started from {args.source}: {count} cells, as the commit of author `initial`")
         if added < count:
             say(f"{count - added} of them were pushed before, and are not added again (nor if they were retracted)")
         return
-    _say_map(api.create_map(name, CreateMap(geometry=geometry)))
+    with api:
+        made = api.create_map(name, CreateMap(geometry=geometry))
+    _say_map(made)
 
 
 def _ls(args: argparse.Namespace) -> None:
-    infos = MapApi(args.server, token=args.token).maps()
+    with MapApi(args.server, token=args.token) as api:
+        infos = api.maps()
     if args.json:
         say(json.dumps([info.model_dump(mode="json") for info in infos]))
         return
@@ -83,7 +87,8 @@ def _ls(args: argparse.Namespace) -> None:
 
 def _info(args: argparse.Namespace) -> None:
     api, name = api_of(args.map, args.token)
-    info, branches = api.map_info(name), api.branches(name)
+    with api:
+        info, branches = api.map_info(name), api.branches(name)
     if args.json:
         branch_json = [branch.model_dump(mode="json") for branch in branches]
         say(json.dumps({**info.model_dump(mode="json"), "branch_list": branch_json}))
@@ -102,7 +107,8 @@ def _info(args: argparse.Namespace) -> None:
 
 def _log(args: argparse.Namespace) -> None:
     api, name = api_of(args.map, args.token)
-    entries = api.log(name, after=args.after, limit=args.limit)
+    with api:
+        entries = api.log(name, after=args.after, limit=args.limit)
     if args.json:
         say(json.dumps([entry.model_dump(mode="json") for entry in entries]))
         return
@@ -118,7 +124,8 @@ def _log(args: argparse.Namespace) -> None:
 
 def _branches(args: argparse.Namespace) -> None:
     api, name = api_of(args.map, args.token)
-    branches = api.branches(name)
+    with api:
+        branches = api.branches(name)
     if args.json:
         say(json.dumps([branch.model_dump(mode="json") for branch in branches]))
         return

@@ -27,9 +27,10 @@ def get_cell(args: argparse.Namespace) -> None:
     if suffix not in (".cell", ".npz", ".ply", ".view"):
         raise BadInputError("unknown_format", f"a cell is written as .cell, .npz, .ply or .view, got {output.name!r}")
     _check_outputs(output)
-    info = api.map_info(name)
-    cell = cell_from_text(args.cell)
-    body, decoded = fetch_cell(api, name, cell)
+    with api:
+        info = api.map_info(name)
+        cell = cell_from_text(args.cell)
+        body, decoded = fetch_cell(api, name, cell)
     if suffix == ".cell":
         data = body
     else:

@@ -49,9 +49,13 @@ def _open(source: str, token: str | None) -> tuple[FolderHead, Iterable[DecodedC
         return head, read_cells(Path(source), head.geometry)
     api, name = api_of(source, token)
     info = api.map_info(name)
-    return FolderHead(geometry=info.geometry, sensor_model=info.sensor_model), (
-        cell for _, cell in fetch_map(api, name)
-    )
+    return FolderHead(geometry=info.geometry, sensor_model=info.sensor_model), _fetched(api, name)
+
+
+def _fetched(api: MapApi, name: str) -> Iterator[DecodedCell]:
+    with api:
+        for _, cell in fetch_map(api, name):
+            yield cell
 
 
 def _groups(cells: Iterable[DecodedCell]) -> Iterator[list[DecodedCell]]:

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from cairn_client.api import MapApi
 from cairn_client.arguments import api_of, say, shown_bytes
 from cairn_client.nearness import Wanted, within
 from cairn_client.robot import Robot
@@ -42,11 +41,10 @@ class PullReport(BaseModel):
 
 
 def _pull(args: argparse.Namespace) -> int:
-    api, map_name = api_of(args.map, args.token)
     known = robot_of(args.state)
     name = args.name or known or "viewer"
     mode: Mode = args.mode or ("high-end" if known and known != "viewer" else "viewer")
-    scope = replace(scope_of(args), wanted=_wanted(args, api, map_name))
+    scope = replace(scope_of(args), wanted=_wanted(args))
     with Robot(
         *(None, args.map),
         directory=args.state,
@@ -85,12 +83,15 @@ def _pulled(robot: Robot) -> PullReport:
     )
 
 
-def _wanted(args: argparse.Namespace, api: MapApi, map_name: str) -> Wanted | None:
+def _wanted(args: argparse.Namespace) -> Wanted | None:
     if args.near is None:
         return None
     if args.mode != "low-end":
         raise BadInputError("bad_option", "--near goes with --mode low-end; a high-end copy holds the whole map")
-    return within(args.near, radius_m=args.radius, cell_edge_m=api.map_info(map_name).geometry.cell_edge_m)
+    api, name = api_of(args.map, args.token)
+    with api:
+        geometry = api.map_info(name).geometry
+    return within(args.near, radius_m=args.radius, cell_edge_m=geometry.cell_edge_m)
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cairn_client.api import MapApi
 from cairn_client.arguments import (
     api_of,
     say,
@@ -128,6 +129,11 @@ def _try_sync(robot: Robot) -> bool:
 def ensure_map(args: argparse.Namespace, source: ScanSource) -> Geometry | None:
     """The map's geometry; makes the map if there is none. None: no link, and perhaps the state folder knows it."""
     api, name = api_of(args.map, args.token)
+    with api:
+        return _ensured(api, name, args, source)
+
+
+def _ensured(api: MapApi, name: str, args: argparse.Namespace, source: ScanSource) -> Geometry | None:
     wished = geometry_for(voxel_edge_m=args.voxel) if args.voxel is not None else None
     try:
         geometry = api.map_info(name).geometry
