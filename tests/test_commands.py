@@ -1,5 +1,6 @@
-"""The commands as a user runs them: real processes, a real server, real files."""
+"""The commands as a user runs them: a real server, real files; each command once at least in a process of its own."""
 
+import io
 import json
 import os
 import re
@@ -7,16 +8,22 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import chdir, redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cairn_client.conftest import wait_until
 from tests.cairn_server.live import free_port
 from tests.console.browsing import VIEW, browser, tab
 from tests.console.casting import occupied, picks_met_first
 from tests.console.conftest import LOOPBACK, Room, skip_without_page
 
+from cairn_client.arguments import api_of
+from cairn_client.link import index_of
+from cairn_client.main import main
+from cairn_map.cell_folder import read_cells, read_head
 from cairn_sim.record import Plan, record
 from cairn_sim.robots import ROBOTS
 from cairn_sim.scene_file import load_scene
@@ -29,15 +36,25 @@ VOXEL_M = "0.08"
 
 def cairn(*arguments: object, folder: Path, code: int = 0) -> str:
     """Run a command in a folder; its standard output, or with another exit code what it complained about."""
+    with chdir(folder), redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
+        ended = main([*map(str, arguments)])
+    assert ended == code, out.getvalue() + err.getvalue()
+    return out.getvalue() if code == 0 else err.getvalue()
+
+
+def typed(*arguments: object, folder: Path, code: int = 0) -> str:
+    """The same in a process of its own, which takes a second to start."""
     command = [sys.executable, "-m", "cairn_client.main", *map(str, arguments)]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=COMMAND_S, check=False)
     assert done.returncode == code, done.stdout + done.stderr
     return done.stdout if code == 0 else done.stderr
 
 
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[str]:
-    command = [sys.executable, "-m", "cairn_client.main", "serve", "--data", str(tmp_path / "server"), "--port", "0"]
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """One for all tests, each of which has maps of its own."""
+    data = tmp_path_factory.mktemp("server")
+    command = [sys.executable, "-m", "cairn_client.main", "serve", "--data", str(data), "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         found = re.search(r"http://\S+:\d+", process.stdout.readline())
@@ -47,7 +64,7 @@ def server(tmp_path: Path) -> Iterator[str]:
         assert process.wait(timeout=30) == 0
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def room_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two stops of four scans in the simulated room, all channels, as a recording on disk."""
     folder = tmp_path_factory.mktemp("recording") / "room"
@@ -57,10 +74,16 @@ def room_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def digests(map_url: str, folder: Path, name: str) -> dict[str, bytes]:
-    """The cells of a map as `export --cells` writes them, without what the server's compressor may choose."""
-    from cairn_map.cell_folder import read_cells, read_head
+def wait_for_fold(map_url: str) -> None:
+    """Wait until nothing is pending that the server has acknowledged."""
+    api, name = api_of(map_url, None)
+    with api:
+        wait_until(lambda: not index_of(api, name).header.pending)
 
+
+def digests(map_url: str, folder: Path, name: str) -> dict[str, bytes]:
+    """The folded cells as `export --cells` writes them, without what the server's compressor may choose."""
+    wait_for_fold(map_url)
     cairn("map", "export", map_url, "--cells", name, folder=folder)
     geometry = read_head(folder / name).geometry
     return {str(cell.key): cell.digest for cell in read_cells(folder / name, geometry)}
@@ -70,11 +93,11 @@ def test_two_robots_that_share_a_recording_make_the_map_of_one(
     server: str, room_recording: Path, tmp_path: Path
 ) -> None:
     one, two = f"{server}/maps/one", f"{server}/maps/two"
-    out = cairn("robot", "replay", room_recording, "--map", one, "--voxel", VOXEL_M, folder=tmp_path)
+    out = typed("robot", "replay", room_recording, "--map", one, "--voxel", VOXEL_M, folder=tmp_path)
     assert re.search(r"replayed 8 scans as 2 commits in .* scans/s\), .* 0 commits wait", out)
     for part in ("1/2", "2/2"):
         name = f"part{part[0]}"
-        cairn(
+        typed(
             *("robot", "replay", room_recording, "--map", two, "--voxel", VOXEL_M, "--share", part, "--name", name),
             folder=tmp_path,
         )
@@ -87,11 +110,11 @@ def test_a_map_starts_from_a_folder_of_cells_or_from_another_map(
     source = f"{server}/maps/source"
     cairn("robot", "replay", room_recording, "--map", source, "--voxel", VOXEL_M, folder=tmp_path)
     cells = digests(source, tmp_path, "cells")
-    cairn("map", "create", f"{server}/maps/from-folder", "--from", "cells", folder=tmp_path)
+    typed("map", "create", f"{server}/maps/from-folder", "--from", "cells", folder=tmp_path)
     cairn("map", "create", f"{server}/maps/from-map", "--from", source, folder=tmp_path)
     assert digests(f"{server}/maps/from-folder", tmp_path, "a") == cells
     assert digests(f"{server}/maps/from-map", tmp_path, "b") == cells
-    log = json.loads(cairn("map", "log", f"{server}/maps/from-map", "--json", folder=tmp_path))
+    log = json.loads(typed("map", "log", f"{server}/maps/from-map", "--json", folder=tmp_path))
     assert [entry["id"].partition(".")[0] for entry in log] == ["initial"]
     again = cairn("map", "create", f"{server}/maps/from-folder", "--from", "cells", folder=tmp_path)
     assert "pushed before, and are not added again" in again
@@ -107,8 +130,8 @@ def test_retracting_a_robot_leaves_the_map_of_the_others(server: str, room_recor
             *("--name", name, "--state", state),
             folder=tmp_path,
         )
-    assert "takes out 1 commits" in cairn("map", "retract", both, "--robot", "bad", folder=tmp_path)
-    cairn("robot", "pull", "--map", both, "--state", "copy", folder=tmp_path)  # waits for nothing, but must not fail
+    assert "takes out 1 commits" in typed("map", "retract", both, "--robot", "bad", folder=tmp_path)
+    typed("robot", "pull", "--map", both, "--state", "copy", folder=tmp_path)  # waits for nothing, but must not fail
     expected = digests(alone, tmp_path, "expected")
     for attempt in range(100):
         if digests(both, tmp_path, f"try{attempt}") == expected:
@@ -119,6 +142,7 @@ def test_retracting_a_robot_leaves_the_map_of_the_others(server: str, room_recor
 def test_a_low_end_copy_holds_only_the_cells_near_a_place(server: str, room_recording: Path, tmp_path: Path) -> None:
     url = f"{server}/maps/near"
     cairn("robot", "replay", room_recording, "--map", url, "--voxel", VOXEL_M, folder=tmp_path)
+    wait_for_fold(url)
     near = ("--mode", "low-end", "--near", "1,1,1", "--radius", "0.1")
     assert "1 cells," in cairn("robot", "pull", "--map", url, "--state", "low", *near, folder=tmp_path)
     whole = cairn("robot", "pull", "--map", url, "--state", "whole", "--mode", "low-end", folder=tmp_path)
@@ -144,13 +168,14 @@ def test_cells_and_maps_download_as_files_that_other_programs_read(
 ) -> None:
     url = f"{server}/maps/files"
     cairn("robot", "replay", room_recording, "--map", url, "--voxel", VOXEL_M, folder=tmp_path)
-    cairn("map", "get", url, "0,0,0", "-o", "cell.npz", folder=tmp_path)
+    wait_for_fold(url)
+    typed("map", "get", url, "0,0,0", "-o", "cell.npz", folder=tmp_path)
     with np.load(tmp_path / "cell.npz") as arrays:
         occupied = arrays["probability"] > 0.5
         assert 290 < np.nanmedian(arrays["temperature_mean"][occupied]) < 300
         assert (arrays["centres_m"] >= 0).all() and (arrays["centres_m"] < 5.12).all()
     outputs = ("--ply", "map.ply", "--npz", "map.npz", "--picture", "map.png", "--ceiling", "1.7")
-    cairn("map", "export", url, *outputs, folder=tmp_path)
+    typed("map", "export", url, *outputs, folder=tmp_path)
     head = (tmp_path / "map.ply").read_bytes().partition(b"end_header\n")
     count = int(re.search(rb"element vertex (\d+)", head[0]).group(1))  # type: ignore[union-attr]
     assert count > 1000
@@ -160,11 +185,11 @@ def test_cells_and_maps_download_as_files_that_other_programs_read(
 
 def test_errors_name_the_cause_and_have_an_exit_code_of_their_own(server: str, tmp_path: Path) -> None:
     cairn("map", "create", f"{server}/maps/lab", folder=tmp_path)
-    assert "[no_cell]" in cairn("map", "get", f"{server}/maps/lab", "9,9,9", "-o", "x.ply", folder=tmp_path, code=3)
+    assert "[no_cell]" in typed("map", "get", f"{server}/maps/lab", "9,9,9", "-o", "x.ply", folder=tmp_path, code=3)
     assert "[no_map]" in cairn("map", "info", f"{server}/maps/none", folder=tmp_path, code=3)
     other = cairn("map", "create", f"{server}/maps/lab", "--voxel", "0.02", folder=tmp_path, code=4)
     assert "another geometry" in other
-    assert "is `cairn serve` running?" in cairn("map", "ls", "http://127.0.0.1:9", folder=tmp_path, code=5)
+    assert "is `cairn serve` running?" in typed("map", "ls", "http://127.0.0.1:9", folder=tmp_path, code=5)
     assert "http://HOST:PORT/maps/NAME" in cairn("map", "info", server, folder=tmp_path, code=1)
     assert "looked for" in cairn("robot", "replay", ".", "--map", f"{server}/maps/lab", folder=tmp_path, code=1)
 
@@ -186,8 +211,9 @@ def test_after_a_replay_the_server_knows_that_the_robot_is_level(
 ) -> None:
     url = f"{server}/maps/level"
     cairn("robot", "replay", room_recording, "--map", url, "--voxel", VOXEL_M, folder=tmp_path)
+    wait_for_fold(url)
     cairn("robot", "pull", "--map", url, "--state", "cairn-room", folder=tmp_path)
-    assert "0 log entries since it last asked" in cairn("map", "info", url, folder=tmp_path)
+    assert "0 log entries since it last asked" in typed("map", "info", url, folder=tmp_path)
 
 
 def test_files_that_cannot_be_written_and_cells_with_negative_numbers(
@@ -195,6 +221,7 @@ def test_files_that_cannot_be_written_and_cells_with_negative_numbers(
 ) -> None:
     url = f"{server}/maps/out"
     cairn("robot", "replay", room_recording, "--map", url, "--voxel", VOXEL_M, folder=tmp_path)
+    wait_for_fold(url)
     assert "[bad_output]" in cairn("map", "export", url, "--ply", "no/such/x.ply", folder=tmp_path, code=1)
     assert "[bad_output]" in cairn("map", "get", url, "0,0,0", "-o", "no/such/x.ply", folder=tmp_path, code=1)
     assert "-9,0,0" in cairn("map", "get", url, "-9,0,0", "-o", "x.ply", folder=tmp_path, code=3)
@@ -207,14 +234,14 @@ def test_files_that_cannot_be_written_and_cells_with_negative_numbers(
 def test_a_server_refuses_tokens_that_protect_nothing(tmp_path: Path) -> None:
     (tmp_path / "one").write_text("a secret of many letters")
     only = ("serve", "--port", "0", "--enrolment-token-file", "one")
-    assert "[weak_tokens]" in cairn(*only, folder=tmp_path, code=1)
+    assert "[weak_tokens]" in typed(*only, folder=tmp_path, code=1)
     assert "[weak_tokens]" in cairn(*only, "--admin-token-file", "one", folder=tmp_path, code=1)
 
 
 def test_the_example_robot_shares_what_it_sees(server: str, tmp_path: Path) -> None:
-    cairn("map", "create", f"{server}/maps/lab", folder=tmp_path)
+    cairn("map", "create", f"{server}/maps/example", folder=tmp_path)
     script = Path(__file__).parent.parent / "docs" / "examples" / "simulated_robot.py"
-    command = [sys.executable, str(script), f"{server}/maps/lab"]
+    command = [sys.executable, str(script), f"{server}/maps/example"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=COMMAND_S, check=True)
     assert re.search(r"commit walle\.[0-9a-f]{16}\.1: \d+ cells, \d+ bytes", done.stdout)
     assert " 0 commits wait" in done.stdout
@@ -223,7 +250,7 @@ def test_the_example_robot_shares_what_it_sees(server: str, tmp_path: Path) -> N
 @pytest.mark.parametrize("command", ["map", "robot", "serve", "demo", "experiment"])
 def test_help_of_a_command_is_its_module_docstring(command: str, tmp_path: Path) -> None:
     first_line = cairn("--help", folder=tmp_path).partition(f"  {command} ")[2].splitlines()[0].strip()
-    assert first_line and first_line in cairn(command, "--help", folder=tmp_path)
+    assert first_line and first_line in typed(command, "--help", folder=tmp_path)
 
 
 def test_a_robot_without_the_server_extra_is_told_what_to_install(tmp_path: Path) -> None:
@@ -245,7 +272,7 @@ def test_a_robot_without_the_server_extra_is_told_what_to_install(tmp_path: Path
 def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The demo's folder, and what it said."""
     folder = tmp_path_factory.mktemp("demo")
-    return folder / "demo", cairn("demo", "--quick", "--output", "demo", folder=folder)
+    return folder / "demo", typed("demo", "--quick", "--output", "demo", folder=folder)
 
 
 def test_the_demo_ends_with_maps_that_agree(demo: tuple[Path, str]) -> None:
@@ -284,7 +311,7 @@ def test_the_demos_map_is_in_the_browser_what_the_server_has(demo: tuple[Path, s
 @pytest.mark.skipif("CAIRN_TEST_DATA" not in os.environ, reason="CAIRN_TEST_DATA names no folder of recordings")
 def test_two_robots_on_a_real_recording_make_the_map_of_one(server: str, tmp_path: Path) -> None:
     recording = Path(os.environ["CAIRN_TEST_DATA"]) / "apc_shelf_rgbd"
-    one, two = f"{server}/maps/one", f"{server}/maps/two"
+    one, two = f"{server}/maps/shelf-one", f"{server}/maps/shelf-two"
     cairn("robot", "replay", recording, "--map", one, "--voxel", "0.01", "--name", "single", folder=tmp_path)
     for part in ("1/2", "2/2"):
         name = f"part{part[0]}"
