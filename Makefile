@@ -9,6 +9,9 @@ SHELL := bash
 # Installing comes before compiling, in the order in which the targets name them.
 .NOTPARALLEL:
 
+# Where it is set, each of the hundreds of commands that tests start would compile all modules anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
