@@ -1,5 +1,7 @@
 """The controls that turn the view and the look: each does to the picture, or to the map, what it says."""
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -9,6 +11,8 @@ from tests.console.conftest import Room
 from tests.console.room import GEOMETRY
 
 EYES_M = 1.6
+NEAREST_M, BEFORE_M, FAR_M = 0.3, 0.1, float(np.hypot(3, 2.2))
+"""Of the eye from who is followed, and from what would be in between."""
 
 ON_PICTURE = """c.cells.tightBoxes.flatMap(({ min, max }) => Array.from({ length: 8 }, (_, n) =>
   min.clone().set(n & 1 ? max.x : min.x, n & 2 ? max.y : min.y, n & 4 ? max.z : min.z)
@@ -89,7 +93,6 @@ def test_who_is_followed_stays_in_the_middle(console: Console) -> None:
     place = np.array(console.tell("c.team.marks.get('scout').position.toArray()"))
     view = console.tell("c.stage.view")
     assert view["target"] == pytest.approx(place)
-    assert np.linalg.norm(np.subtract(view["eye"], place)) == pytest.approx(np.hypot(3, 2.2))
     told = console.tell("c.team.signs.get('scout')")
     pose = told["status"]["pose"]
     step = np.array([0.5, -0.25, 0.0])
@@ -102,6 +105,54 @@ def test_who_is_followed_stays_in_the_middle(console: Console) -> None:
     console.page.locator(".host canvas").focus()
     console.page.keyboard.press("Escape")
     assert console.page.get_by_title("Follow scout").get_attribute("aria-pressed") == "false"
+
+
+def test_nothing_stands_between_the_eye_and_who_is_followed(console: Console, room: Room) -> None:
+    console.page.keyboard.press("h")
+    console.settled()
+    depths = "[...c.cells.all.values()].filter(({ points }) => points).map(({ depth }) => depth)"
+    assert set(console.tell(depths)) == {GEOMETRY.depth}, "each voxel is shown"
+    boxes = np.asarray(occupied(room).numbers * GEOMETRY.voxel_edge_m, np.float64)
+    told = console.tell("c.team.signs.get('scout')")
+    place = np.array(told["status"]["pose"]["t_map_rig"])
+    met = {}
+    for heading in np.radians(np.arange(0, 360, 45) + 5):
+        back = np.array([-3 * np.cos(heading), -3 * np.sin(heading), 2.2]) / FAR_M
+        met[heading] = met_m(boxes, place, back)
+        away = eye_of(console, told, place, heading) - place
+        expected = max(met[heading] - BEFORE_M, NEAREST_M) if met[heading] < FAR_M else FAR_M
+        np.testing.assert_allclose(away, expected * back, atol=0.002)
+    heading = min(met, key=lambda heading: met[heading])
+    assert NEAREST_M + BEFORE_M < met[heading] < FAR_M
+    back = np.array([-3 * np.cos(heading), -3 * np.sin(heading), 2.2]) / FAR_M
+    close = place + (met[heading] - 0.2) * back
+    assert np.linalg.norm(eye_of(console, told, close, heading) - close) == pytest.approx(NEAREST_M, abs=1e-6)
+    console.page.get_by_label("Ceiling").fill("0")
+    away = eye_of(console, told, place, heading) - place
+    assert np.linalg.norm(away) == pytest.approx(FAR_M), "what is not shown is not in the way"
+    console.page.get_by_label("Ceiling").fill("200")
+    console.tell("c.team.hear(a[0])", told)
+    console.tell("c.team.follow(null)")
+
+
+def met_m(boxes: npt.NDArray[np.float64], eye: npt.NDArray[np.float64], ray: npt.NDArray[np.float64]) -> float:
+    """How far it is to the voxel that a ray meets first, m."""
+    n, _ = first_met(boxes, np.full((len(boxes), 1), GEOMETRY.voxel_edge_m), eye, ray)
+    if n is None:
+        return float(np.inf)
+    return float(np.minimum((boxes[n] - eye) / ray, (boxes[n] + GEOMETRY.voxel_edge_m - eye) / ray).max())
+
+
+def eye_of(
+    console: Console, told: dict[str, Any], place: npt.NDArray[np.float64], heading: float
+) -> npt.NDArray[np.float64]:
+    """Where the eye follows scout from, at a place and looking level, rad from +x to +y."""
+    s, c = np.sin(heading / 2) * np.sqrt(0.5), np.cos(heading / 2) * np.sqrt(0.5)
+    pose = told["status"]["pose"] | {"t_map_rig": place.tolist(), "q_map_rig": [-s, c, s, c]}
+    console.tell("c.team.follow(null)")
+    console.tell("c.team.hear(a[0])", told | {"status": told["status"] | {"pose": pose}})
+    console.tell("c.team.follow('scout')")
+    return np.array(console.tell("c.stage.view")["eye"])
 
 
 def test_a_robot_may_be_let_go_while_its_picture_comes(console: Console) -> None:

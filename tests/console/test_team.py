@@ -3,11 +3,12 @@
 import time
 from collections.abc import Iterator
 from email.utils import formatdate
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-from playwright.sync_api import Browser, Locator, Route
+from playwright.sync_api import Browser, FloatRect, Locator, Route
 from tests.cairn_map.made import SMALL, surface_evidence
 from tests.cairn_server.live import until
 from tests.cairn_server.pushes import KEYS, MOLE, WREN, pushed
@@ -206,3 +207,42 @@ def test_what_a_retract_leaves_has_the_colour_of_who_brought_it(console: Console
     console.until(f"c.book.isOut({LAST}) && c.cells.all.get('0,0,0').held?.lm === {LAST}", "the page asks again")
     assert console.tell(TOLD_COLOUR) == pytest.approx(colours[WREN.robot])
     assert console.errors == []
+
+
+def stand(api: MapApi, robot: str, place: tuple[float, float, float]) -> None:
+    """A robot tells where it is."""
+    now_s = time.time()
+    pose = ScanPose(time_s=now_s, t_map_rig=place, q_map_rig=LOOKS_NORTH)
+    api.put_status(CREW, robot, RobotStatus(time_s=now_s, pose=pose))
+
+
+@pytest.mark.parametrize("place", [PLACE, (0.1, 2.6, 0.5)], ids=["middle", "upper edge"])
+def test_labels_of_robots_at_one_place_stand_in_a_stack(
+    console: Console, crew: MapApi, place: tuple[float, float, float]
+) -> None:
+    robots = (FINCH, MOLE.robot, WREN.robot)
+    for robot in robots:
+        stand(crew, robot, place)
+        console.until(f"c.team.marks.get('{robot}')?.position?.y === {place[1]}", f"{robot} is there")
+    console.settled()
+    boxes = labels(console)
+    assert set(boxes) == set(robots)
+    host = console.page.locator(".host").bounding_box()
+    assert host
+    column = sorted(boxes.values(), key=lambda box: box["y"])
+    for above, below in pairwise(column):
+        assert 0 < below["y"] - above["y"] - above["height"] < 5, "next to each other, and none over another"
+    assert column[0]["y"] >= host["y"]
+    assert len({round(box["x"]) for box in column}) == 1, "beside where they are"
+    own_y = column[0 if place[1] > PLACE[1] else -1]["y"]
+    assert boxes[FINCH]["y"] == own_y, "the first by name stands at its own place"
+    stand(crew, MOLE.robot, (place[0] - 1.5, place[1], place[2]))
+    console.until(f"c.team.marks.get('mole').position.x < {place[0] - 1}", "mole goes away")
+    console.settled()
+    assert labels(console)[MOLE.robot]["y"] == pytest.approx(own_y, abs=1)
+
+
+def labels(console: Console) -> dict[str, FloatRect]:
+    """Where the labels are that are seen."""
+    found = console.page.locator(".label:visible").all()
+    return {label.inner_text(): box for label in found if (box := label.bounding_box())}

@@ -81,7 +81,7 @@ export class Console {
     this.stage = new Stage(host);
     this.cells = new Cells(api, info);
     this.cells.budget = this.stage.isSoftware ? SOFTWARE_BUDGET : 2_000_000;
-    this.team = new Team(api, info.name, labels, this.stage);
+    this.team = new Team(api, info.name, labels, this.stage, this.cells);
     view.append(h("div", { class: "through" }, this.team.picture.element, this.team.fromPose.element));
     this.picker = new Picker(this.stage, this.cells);
     this.stage.add(this.cells.group, this.grid.lines, this.unseen.lines, this.outline.lines, this.measure.lines, this.team.group);

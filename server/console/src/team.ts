@@ -7,8 +7,11 @@ import type { LogBook } from "./log_book.ts";
 import type { Field } from "./look.ts";
 import type { Branch, RobotSign, Triple } from "./messages.ts";
 import { robotColour } from "./palettes.ts";
+import type { Cells } from "./scene/cells.ts";
+import { freeM } from "./scene/line_of_sight.ts";
 import { RobotMark, TRAIL_MAX } from "./scene/lines.ts";
 import type { Stage } from "./scene/stage.ts";
+import { stacked } from "./ui/label_stack.ts";
 import { RobotMap } from "./ui/robot_map.ts";
 import { RobotPicture } from "./ui/robot_picture.ts";
 import { isOffline, TeamPanel } from "./ui/team_panel.ts";
@@ -16,6 +19,11 @@ import { isOffline, TeamPanel } from "./ui/team_panel.ts";
 const REFRESH_MS = 10_000;
 const SOON_MS = 1000;
 const OFFLINE_COLOUR = "#8b949e";
+/** Where the eye is that follows a robot, m: so far behind it and over it, or nearer, this far before what is in the way. */
+const BEHIND_M = 3;
+const OVER_M = 2.2;
+const NEAREST_M = 0.3;
+const BEFORE_M = 0.1;
 
 export class Team {
   readonly panel = new TeamPanel();
@@ -31,15 +39,17 @@ export class Team {
   private readonly api: Api;
   private readonly map: string;
   private readonly stage: Stage;
+  private readonly cells: Cells;
   private followed: string | null = null;
   private askAtMs = 0;
   private wasOffline = new Map<string, boolean>();
 
-  constructor(api: Api, map: string, host: HTMLElement, stage: Stage) {
+  constructor(api: Api, map: string, host: HTMLElement, stage: Stage, cells: Cells) {
     this.api = api;
     this.map = map;
     this.host = host;
     this.stage = stage;
+    this.cells = cells;
     this.picture = new RobotPicture(api, map);
     this.fromPose = new RobotMap(api, map);
     this.panel.onFollow = (robot) => this.follow(this.followed === robot ? null : robot);
@@ -89,13 +99,20 @@ export class Team {
     this.followed = robot;
     const mark = robot === null ? null : this.marks.get(robot);
     if (mark?.position) {
-      const ahead = mark.ahead.setZ(0);
-      const eye = mark.position.clone().addScaledVector(ahead.lengthSq() > 0.01 ? ahead.normalize() : new Vector3(0, 1, 0), -3);
-      eye.z += 2.2;
+      const eye = this.behind(mark.position, mark.ahead.setZ(0));
       this.stage.fly({ eye: eye.toArray() as Triple, target: mark.position.toArray() as Triple });
     }
     this.panel.show(this.branches, this.signs, this.names, this.followed);
     this.onFollow();
+  }
+
+  /** Where the eye sees a robot from behind, with nothing that is shown between them. */
+  private behind(robot: Vector3, ahead: Vector3): Vector3 {
+    const back = (ahead.lengthSq() > 0.01 ? ahead.normalize() : new Vector3(0, 1, 0)).multiplyScalar(-BEHIND_M).setZ(OVER_M);
+    const wantedM = back.length();
+    const freeToM = freeM(this.cells, robot, robot.clone().add(back));
+    const awayM = freeToM < wantedM ? Math.max(freeToM - BEFORE_M, NEAREST_M) : wantedM;
+    return robot.clone().addScaledVector(back, awayM / wantedM);
   }
 
   /** Where the robot next to a place stands; null: no robot told. */
@@ -125,16 +142,19 @@ export class Team {
     this.panel.show(this.branches, this.signs, this.names, this.followed);
   }
 
-  /** Labels beside the robots, where these are in the picture now. */
+  /** Labels beside the robots, where these are in the picture now; by name, so that a stack keeps its order. */
   place(): void {
     const { clientWidth, clientHeight } = this.stage.canvas;
-    for (const [name, mark] of this.marks) {
+    const seen: { label: HTMLElement; x: number; y: number }[] = [];
+    for (const [name, mark] of [...this.marks].sort(([a], [b]) => (a < b ? -1 : 1))) {
       const label = this.labels.get(name)!;
       const at = mark.position?.clone().project(this.stage.camera);
       label.hidden = !at || at.z > 1 || Math.abs(at.x) > 1 || Math.abs(at.y) > 1;
-      if (!at || label.hidden) continue;
-      label.style.transform = `translate(${((at.x + 1) / 2) * clientWidth}px, ${((1 - at.y) / 2) * clientHeight}px)`;
+      if (at && !label.hidden) seen.push({ label, x: ((at.x + 1) / 2) * clientWidth, y: ((1 - at.y) / 2) * clientHeight });
     }
+    const boxes = seen.map(({ label, x, y }) => ({ x, y, width: label.offsetWidth, height: label.offsetHeight }));
+    const tops = stacked(boxes, clientHeight);
+    seen.forEach(({ label, x }, n) => (label.style.transform = `translate(${x}px, ${tops[n]}px)`));
   }
 
   private async ask(): Promise<void> {
