@@ -7,8 +7,8 @@ import type { Triple } from "../messages.ts";
 import { uniforms } from "./materials.ts";
 
 const FLIGHT_MS = 450;
-/** Of a drawing without a graphics card, whose frame takes some 50 ms. */
-const SOON_MS = 250;
+/** Of a drawing without a graphics card, whose frame takes 50 ms and more of all cores: cells come sooner without it. */
+const SOON_MS = 1000;
 const STEP_RAD = Math.PI / 30;
 /** Of the picture, by what is looked at. */
 const FILLED = 0.92;
