@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import TypeVar
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -43,7 +42,6 @@ GREY_COVER = 0.4
 THROUGH_COVER = 0.9
 THROUGH_COVER_MIN = 0.2
 MEANINGS = ("solid: visible", "stripes: behind that", "dots: from the map alone")
-NEIGHBOURS = np.ones((3, 3), np.uint8)
 EXACT = PoseSpread.of_sigmas()
 
 
@@ -245,9 +243,14 @@ def _rest(
 
 def _outlines(modes: Rgb, coarse_m: Values) -> Flags:
     """(h, w) where the map has something, and has nothing, in the 3 x 3 around, without any live depth in both."""
-    is_something = (modes == Mode.MAP_ONLY).astype(np.uint8)
-    is_nothing = (np.isnan(coarse_m) & (modes == Mode.NOTHING)).astype(np.uint8)
-    return np.asarray((cv2.dilate(is_something, NEIGHBOURS) & cv2.dilate(is_nothing, NEIGHBOURS)).astype(np.bool_))
+    return _spread(modes == Mode.MAP_ONLY) & _spread(np.isnan(coarse_m) & (modes == Mode.NOTHING))
+
+
+def _spread(flags: Flags) -> Flags:
+    """(h, w) whether any of the 3 x 3 around is set."""
+    wide = np.pad(flags, 1)
+    rows = wide[:-2] | wide[1:-1] | wide[2:]
+    return np.asarray(rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:])
 
 
 def with_overlay_legend(picture: Rgb, scale: Scale) -> Rgb:

@@ -20,6 +20,8 @@ from cairn_server.cells_at_rest import stored_evidence
 from cairn_server.http_access import READERS, Map, Operations, body_of, reader
 from cairn_server.http_ranges import is_same, part_of
 from cairn_server.problems import answer_to
+from cairn_server.ready_views import MEDIA_TYPE as VIEWS_MEDIA_TYPE
+from cairn_server.ready_views import ready_views
 from cairn_server.store_rows import CellRow, Head, MapRow
 from cairn_server.vectors import box_from_text
 
@@ -49,6 +51,14 @@ def cell_index(
         is_held_asked=held,
     )
     return service.cell_index(row, author_from_text(author) if author else None, page)
+
+
+@router.get("/maps/{name}/main/views", dependencies=READERS, response_class=Response)
+def views(service: Operations, row: Map) -> Response:
+    """What all cells look like, at a coarse depth, as far as the server has it ready: for a page's first picture."""
+    depth, found = ready_views(service, row)
+    headers = {"Cache-Control": "no-store", "Cairn-View-Depth": str(depth)}
+    return Response(found, media_type=VIEWS_MEDIA_TYPE, headers=headers)
 
 
 @router.get("/maps/{name}/main/vector", dependencies=READERS)

@@ -15,6 +15,7 @@ from cairn_map.export_request import EXPORT_TYPES
 from cairn_map.messages import Problem
 from cairn_server.openapi_examples import EXAMPLES
 from cairn_server.problems import MEDIA_TYPE as PROBLEM_MEDIA_TYPE
+from cairn_server.ready_views import MEDIA_TYPE as VIEWS_MEDIA_TYPE
 from cairn_server.sync_routes import REPLY_MEDIA_TYPE
 
 Json = dict[str, Any]
@@ -23,6 +24,7 @@ Route = tuple[str, str]
 MAP = "/maps/{name}"
 UPLOAD = f"{MAP}/commits/{{commit}}/upload"
 CELL = f"{MAP}/main/cells/{{cell}}"
+VIEWS = f"{MAP}/main/views"
 RENDER = f"{MAP}/main/render"
 EXPORT = f"{MAP}/main/export"
 TICKETS = f"{EXPORT}/tickets"
@@ -46,6 +48,7 @@ ANSWERS: dict[Route, dict[int, tuple[str, ...]]] = {
     ("get", CELL): {200: CELL_TYPES, 206: CELL_TYPES, 304: ()},
     ("head", CELL): {200: CELL_TYPES, 304: ()},
     ("get", f"{MAP}/main/vector"): {200: ("application/json",)},
+    ("get", VIEWS): {200: (VIEWS_MEDIA_TYPE,)},
     ("get", VIEW): {200: PICTURES, 304: ()},
     ("get", RENDER): {200: ("image/png", "application/x-npz"), 304: ()},
     ("get", EXPORT): {200: tuple(EXPORT_TYPES.values())},
@@ -78,6 +81,7 @@ HEADERS: dict[Route, tuple[str, ...]] = {
     ("get", CELL): CELL_HEADERS,
     ("head", CELL): CELL_HEADERS,
     ("get", VIEW): ("ETag", "Last-Modified"),
+    ("get", VIEWS): ("Cairn-View-Depth",),
     ("get", RENDER): ("ETag", "Cairn-Cursor"),
     ("get", EXPORT): ("Cairn-Cursor", "Cairn-Points"),
     ("get", f"{MAP}/commits/{{commit}}"): ("ETag", "Cairn-Seal"),

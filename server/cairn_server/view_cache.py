@@ -45,13 +45,19 @@ class ViewCache:
         self.made = 0
         """How many were put in."""
 
-    def view(self, name: str, make: Callable[[], bytes]) -> bytes:
-        """The view of a name, made unless it is here."""
+    def ready(self, name: str) -> bytes | None:
+        """The view of a name, if it is here."""
         with self._lock:
             found = self._views.get(name)
             if found is not None:
                 self._views.move_to_end(name)
-                return found
+            return found
+
+    def view(self, name: str, make: Callable[[], bytes]) -> bytes:
+        """The view of a name, made unless it is here."""
+        found = self.ready(name)
+        if found is not None:
+            return found
         # Not under the lock: two may make the same at once, which is rare and does no harm.
         made = make()
         self.put({name: made})

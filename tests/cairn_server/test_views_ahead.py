@@ -1,5 +1,6 @@
 """Views of cells: made before anybody asks, kept over a restart, and right whatever happened to the bytes at rest."""
 
+import json
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from tests.cairn_server.tiny_disk import tiny_disk
 from cairn_map.grid import cell_of_key
 from cairn_map.sensor_model import SensorModel
 from cairn_map.view_code import decode_view
+from cairn_server import ready_views
 from cairn_server.asked_view import view_of_stored
 from cairn_server.store_rows import MapRow
 from cairn_server.view_cache import ViewCache, view_name
@@ -166,3 +168,35 @@ def test_a_view_of_a_cell_damaged_at_rest_is_made_from_the_log_or_refused(live: 
     assert live.http.get(url(lost, BROKEN, query)).status_code == 500
     assert live.http.get(url(lost, SOUND, query)).status_code == 200
     assert live.http.get(url(lost, KEYS[2], query)).status_code == 404
+
+
+def parts_of(body: bytes) -> list[bytes]:
+    """Heads and views in turn: PROTOCOL.md section 4.3."""
+    found, at = [], 0
+    while at < len(body):
+        size = int.from_bytes(body[at : at + 4], "little")
+        found.append(body[at + 4 : at + 4 + size])
+        assert len(found[-1]) == size
+        at += 4 + size
+    return found
+
+
+def test_views_that_are_ready_come_in_one_answer_as_they_come_one_by_one(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = live.new_map()
+    live.push(row, pushed(0, 0))
+    live.folded(row)
+    main, depth = f"/maps/{row.name}/main", first_depth(row.geometry.depth)
+    answer = live.http.get(f"{main}/views")
+    assert (answer.content, answer.headers["Cairn-View-Depth"]) == (b"", str(depth))
+    asked = {
+        cell: live.http.get(f"{main}/cells/{cell}.view?depth={depth}") for cell in map(cell_of_key, pushed(0, 0).cells)
+    }
+    parts = parts_of(live.http.get(f"{main}/views").content)
+    heads = [json.loads(head) for head in parts[::2]]
+    told = {tuple(head["cell"]): (head["etag"], view) for head, view in zip(heads, parts[1::2], strict=True)}
+    assert told == {cell: (one.headers["ETag"], one.content) for cell, one in asked.items()}
+    assert len(told) > 1
+    monkeypatch.setattr(ready_views, "SIZE_BYTES_MAX", 8 + len(parts[0]) + len(parts[1]))
+    assert parts_of(live.http.get(f"{main}/views").content) == parts[:2]

@@ -183,3 +183,22 @@ def test_a_legend_that_is_locked_keeps_its_ends_when_more_comes_into_sight(
     console.settled()
     assert heights(console) == pytest.approx(told_heights(room), abs=0.051), "it goes on to follow"
     assert heights(console)[1] > after[1] + 0.5
+
+
+def test_what_the_server_has_ready_is_shown_after_one_request(chromium: Browser, room: Room) -> None:
+    with chromium.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
+        first = tab(context, room)
+        first.open()
+        first.log_in()
+        first.settled()  # what was not ready is from now on
+    with chromium.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
+        second = tab(context, room)
+        asked: list[str] = []
+        second.page.on("request", lambda request: asked.append(request.url))
+        second.open()
+        second.log_in()
+        second.until("c && c.cells.firstPictureMs !== null", "the first picture")
+        coarse = [url for url in asked if f".view?depth={COARSE}" in url]
+        assert coarse == [] and sum(url.endswith("/main/views") for url in asked) == 1
+        second.settled()
+        assert second.tell("c.cells.drawn") > 0

@@ -1,6 +1,6 @@
 /** Requests to the one server that this page came from, with the token that the operator gave. */
 
-import type { CellEntry, CellIndex } from "./messages.ts";
+import type { CellEntry, CellIndex, Triple } from "./messages.ts";
 import { noteServerDate } from "./server_time.ts";
 
 const TOKEN_KEY = "cairn.token";
@@ -27,6 +27,14 @@ export interface CellAnswer {
   readonly data: Uint8Array | null;
   readonly etag: string;
 }
+
+/** Views of many cells, by their numbers, all at one octree depth. */
+export interface ReadyViews {
+  readonly depth: number;
+  readonly cells: Map<string, CellAnswer>;
+}
+
+export const NONE_READY: ReadyViews = { depth: 0, cells: new Map() };
 
 export class Api {
   token: string | null = sessionStorage.getItem(TOKEN_KEY) ?? localStorage.getItem(TOKEN_KEY);
@@ -74,6 +82,26 @@ export class Api {
     const data = answer.status === 304 ? null : new Uint8Array(await answer.arrayBuffer());
     this.received += data?.length ?? 0;
     return { data, etag: answer.headers.get("ETag") ?? "" };
+  }
+
+  /** What the server has ready of all cells: PROTOCOL.md section 4.3. */
+  async readyViews(map: string): Promise<ReadyViews> {
+    const answer = await this.ask(`maps/${map}/main/views`, { cache: "no-store" });
+    const body = new Uint8Array(await answer.arrayBuffer());
+    this.received += body.length;
+    const cells = new Map<string, CellAnswer>();
+    const numbers = new DataView(body.buffer);
+    let at = 0;
+    const next = () => {
+      const begin = at + 4;
+      at = begin + numbers.getUint32(at, true);
+      return body.slice(begin, at);
+    };
+    while (at < body.length) {
+      const { cell, etag } = JSON.parse(new TextDecoder().decode(next())) as { cell: Triple; etag: string };
+      cells.set(cell.join(","), { data: next(), etag });
+    }
+    return { depth: Number(answer.headers.get("Cairn-View-Depth")), cells };
   }
 
   async ask(path: string, options: RequestInit = {}): Promise<Response> {

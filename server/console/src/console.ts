@@ -1,6 +1,6 @@
 /** One map on the page: the picture, the panels around it, and what flows between them. */
 
-import type { Api } from "./api.ts";
+import { NONE_READY, type Api } from "./api.ts";
 import { Appearance } from "./appearance.ts";
 import { h } from "./dom.ts";
 import { LogBook } from "./log_book.ts";
@@ -239,10 +239,14 @@ export class Console {
   /** Everything anew: what the page has of it stays. */
   private async reload(): Promise<void> {
     try {
-      const { cursor, entries } = await this.api.cells(this.info.name);
+      const { name } = this.info;
+      const isNew = this.cells.all.size === 0;
+      const [{ cursor, entries }, ready] = await Promise.all([
+        this.api.cells(name), isNew ? this.api.readyViews(name).catch(() => NONE_READY) : NONE_READY,
+      ]);
       this.cursor = cursor;
       this.cells.error = null;
-      this.cells.takeIndex(entries);
+      this.cells.takeIndex(entries, ready);
       this.moved = true;
       this.tick();
       this.team.refresh();

@@ -3,7 +3,7 @@
 export class DamagedError extends Error {}
 
 /** Odds of a context that nothing is known of: chance in the upper 22 bits, times seen in the lower 10. */
-const EVEN = 0x80000000;
+export const EVEN = 0x80000000;
 const SEEN_MAX = 255;
 const STEPS = Int32Array.from({ length: SEEN_MAX + 1 }, (_, n) => Math.floor((1 << 17) / (2 * n + 3)));
 

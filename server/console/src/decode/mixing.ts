@@ -1,6 +1,6 @@
 /** Bits under several contexts at once, and numbers made of them: FORMAT.md section 14, "Mixing" and "Number". */
 
-import { DamagedError, Decoder, evenOdds, learn } from "./arithmetic.ts";
+import { DamagedError, Decoder, EVEN, evenOdds, learn } from "./arithmetic.ts";
 
 const KNOTS = [
   1, 2, 3, 6, 10, 16, 27, 45, 73, 120, 194, 310, 488, 747, 1101, 1546, 2047, 2549, 2994, 3348, 3607, 3785, 3901, 3975,
@@ -26,6 +26,9 @@ const TAILS = 64 * 8;
 /** No number of a view is longer; the format allows 62. */
 const LENGTH_MAX = 40;
 
+/** Contexts of mixers that are done, by how many they are: to have new ones of the system takes longer than a small view. */
+const KEPT = new Map<number, Uint32Array>();
+
 /** Contexts of several opinions, and how loud each of them is. */
 export class Mixer {
   readonly contexts: Int32Array;
@@ -36,8 +39,14 @@ export class Mixer {
   constructor(opinions: number, rows: number, contexts: number) {
     this.opinions = opinions;
     this.contexts = new Int32Array(opinions);
-    this.odds = evenOdds(contexts);
+    this.odds = KEPT.get(contexts)?.fill(EVEN) ?? evenOdds(contexts);
+    KEPT.delete(contexts);
     this.weights = new Float64Array(rows * opinions).fill(Math.floor((65536 * 3) / (2 * opinions)));
+  }
+
+  /** What a later one may take over; this one is not used any more. */
+  done(): void {
+    KEPT.set(this.odds.length, this.odds);
   }
 
   bit(decoder: Decoder, slot: number, row: number): number {

@@ -69,6 +69,7 @@ export function readOctree(data: Uint8Array, childCount: number, leafCount: numb
     last = found;
     offset = below;
   }
+  mixer.done();
   decoder.finish();
   if (leaves !== N || masks !== childCount || leafMasks !== leafCount) {
     throw new DamagedError("the octree has other numbers of masks or leaves than the head names");

@@ -41,6 +41,7 @@ export function readRanks(data: Uint8Array, near: Int32Array, N: number): Int32A
     ranks[s] = mixer.number(decoder, 0, tails);
     if (ranks[s] < 0 || ranks[s] > RANK_MAX) throw new DamagedError("a probability is out of range");
   }
+  mixer.done();
   decoder.finish();
   return ranks;
 }
@@ -129,5 +130,6 @@ function readValues(decoder: Decoder, near: Int32Array, S: number, columns: numb
       before = Math.min(halfLog(Math.abs(rest)), 30) * 2 + (rest < 0 ? 1 : 0);
     }
   }
+  mixer.done();
   return values;
 }

@@ -1,7 +1,7 @@
 /** The map's cells as they are shown: what the server has, what lies on the graphics card, what is still to be fetched. */
 
 import { Box3, Group, type Camera, type PerspectiveCamera, type Points, type ShaderMaterial } from "three";
-import { ApiError, type Api } from "../api.ts";
+import { ApiError, NONE_READY, type Api, type CellAnswer, type ReadyViews } from "../api.ts";
 import type { CellEntry, MapInfo, Triple } from "../messages.ts";
 import { Decoders } from "./decoders.ts";
 import { COARSE, plan } from "./detail.ts";
@@ -40,6 +40,7 @@ export class Cells {
   private readonly api: Api;
   private readonly map: string;
   private planned = false;
+  private ready = NONE_READY;
 
   constructor(api: Api, info: MapInfo) {
     this.api = api;
@@ -48,8 +49,9 @@ export class Cells {
     this.edgeM = (info.geometry.voxel_edge_um * 2 ** this.depthMax) / 1e6;
   }
 
-  /** Take over the whole index: what differs from what is shown is fetched, what is gone goes. */
-  takeIndex(entries: readonly CellEntry[]): void {
+  /** Take over the whole index: what differs from what is shown is taken from `ready` or fetched, what is gone goes. */
+  takeIndex(entries: readonly CellEntry[], ready: ReadyViews): void {
+    this.ready = ready;
     const there = new Set<string>();
     for (const { cell, digest, lm, voxels } of entries) {
       this.head = Math.max(this.head, lm);
@@ -167,7 +169,8 @@ export class Cells {
     const depth = cell.etag === null ? Math.min(cell.wanted, Math.max(this.depthMax - COARSE, 1)) : cell.wanted;
     try {
       const changes = depth === cell.depth;
-      const { data, etag } = await this.api.view(this.map, cell.key, depth, changes ? cell.etag : null);
+      const ready = cell.etag === null ? this.takeReady(cell, depth) : null;
+      const { data, etag } = ready ?? (await this.api.view(this.map, cell.key, depth, changes ? cell.etag : null));
       if (data) {
         const bytes = await this.decoders.decode(data);
         if (this.all.get(cell.key) === cell) {
@@ -192,6 +195,15 @@ export class Cells {
       this.fetchMore();
       this.onChange(isWhole || !this.isFetching);
     }
+  }
+
+  /** A view that came with others, once; if it is older than the index, the cell is fetched, too. */
+  private takeReady(cell: ShownCell, depth: number): CellAnswer | null {
+    const found = depth === this.ready.depth ? this.ready.cells.get(cell.key) : undefined;
+    if (!found) return null;
+    this.ready.cells.delete(cell.key);
+    cell.dirty = !found.etag.startsWith(`"${cell.digest}.`);
+    return found;
   }
 
   private failed(cell: ShownCell, error: unknown): void {
