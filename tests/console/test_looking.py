@@ -91,9 +91,12 @@ def test_only_what_is_within_the_band_keeps_its_colour(console: Console, room: R
 
 
 def test_only_so_many_voxels_are_drawn_and_the_finest_are_where_the_eye_is(console: Console, room: Room) -> None:
+    nothing = {"status": 200, "body": b"", "headers": {"Cairn-View-Depth": str(COARSE)}}
+    console.page.route("**/main/views", lambda route: route.fulfill(**nothing))  # as if no view were ready
     console.requests.clear()
     console.page.reload()
     console.settled()
+    console.page.unroute("**/main/views")
     asked = [url.rpartition("/cells/")[2] for url in console.requests if ".view?" in url]
     cells = console.tell("c.cells.all.size")
     first = [each.split(".view?depth=") for each in asked[:cells]]

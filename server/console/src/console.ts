@@ -187,6 +187,7 @@ export class Console {
       if (isWhole) this.stage.draw();
       else this.stage.drawSoon();
       if (!this.cells.isFetching) this.plan();
+      this.moved = true; // the ends of the palette follow what is shown
     };
     this.cells.onRefused = onRefused;
     this.cells.colourOf = (lm) => {
