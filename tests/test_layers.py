@@ -90,6 +90,7 @@ MAY_NAME = {
     "numba": [
         "cairn_map/*_kernels.py",
         "cairn_map/compile_progress.py",
+        "cairn_map/kernel_interrupts.py",
         "cairn_fusion/*_kernels.py",
         "cairn_sim/*_kernels.py",
     ],

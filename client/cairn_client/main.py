@@ -13,6 +13,7 @@ from pathlib import Path
 from cairn_map.compile_progress import show_compiling
 from cairn_map.errors import CairnError
 from cairn_map.exit_codes import DONE, EXIT_CODES, FAILED, INTERRUPTED, USAGE, exit_code_of
+from cairn_map.kernel_interrupts import keep_interrupts_out_of_kernels
 
 GROUP = "cairn.commands"
 
@@ -56,6 +57,7 @@ def _run(point: EntryPoint, arguments: list[str]) -> int:
         )
         return FAILED
     show_compiling()
+    keep_interrupts_out_of_kernels()
     result: int = module.main(arguments)
     return result
 

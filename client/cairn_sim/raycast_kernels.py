@@ -53,7 +53,6 @@ class Hits(NamedTuple):
     """(N,) metres to where the light's way ends or turns, for the first time: what is before it is in plain sight."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
 def cast_rays(
     origin: Floats, R_map_camera: Floats, rays: Floats, order: Ints, starts: Ints, shapes: Shapes, opaque: bool
 ) -> Hits:
@@ -73,12 +72,37 @@ def cast_rays(
         opaque: whether glass and mirrors stop the ray, as they do in the far infrared.
     """
     n = len(rays)
-    range_m, path_m, straight_m = np.empty(n), np.empty(n), np.empty(n)
-    solid, seen = np.empty(n, np.int32), np.empty(n, np.int32)
-    second, way, passes = np.empty(n, np.uint8), np.empty(n, np.uint8), np.empty(n, np.uint8)
-    grain, incidence = np.empty(n, np.float32), np.empty(n, np.float32)
-    normal = np.empty((n, 3), np.float32)
+    hits = Hits(
+        range_m=np.empty(n),
+        solid=np.empty(n, np.int32),
+        path_m=np.empty(n),
+        seen=np.empty(n, np.int32),
+        second=np.empty(n, np.uint8),
+        grain=np.empty(n, np.float32),
+        normal=np.empty((n, 3), np.float32),
+        incidence=np.empty(n, np.float32),
+        way=np.empty(n, np.uint8),
+        passes=np.empty(n, np.uint8),
+        straight_m=np.empty(n),
+    )
+    _cast_into(hits, origin, R_map_camera, rays, order, starts, shapes, opaque)
+    return hits
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cast_into(
+    hits: Hits,
+    origin: Floats,
+    R_map_camera: Floats,
+    rays: Floats,
+    order: Ints,
+    starts: Ints,
+    shapes: Shapes,
+    opaque: bool,
+) -> None:
+    """As `cast_rays`; a kernel that made the `Hits` itself would crash at ^C: numba calls a class without a look."""
     # As plain arrays: each use of a tuple's member in the loop would count references, two thirds of the time.
+    range_m, solid, path_m, seen, second, grain, normal, incidence, way, passes, straight_m = hits
     kind, frame, half_m, optics, texture, bounds, endless, nodes, links, leaves = shapes
     stack, nears = np.empty(STACK, np.int32), np.empty(STACK)
     candidates, candidate_nears = np.empty(len(kind), np.int32), np.empty(len(kind))
@@ -139,7 +163,6 @@ def cast_rays(
                 nx, ny, nz, along = 0.0, 0.0, 0.0, 0.0
             normal[i, 0], normal[i, 1], normal[i, 2] = nx, ny, nz
             incidence[i] = -along
-    return Hits(range_m, solid, path_m, seen, second, grain, normal, incidence, way, passes, straight_m)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
