@@ -116,10 +116,10 @@ def main(argv: list[str]) -> int:
                 member.close()
     console.print(f"\ndone in {time.monotonic() - start_s:.0f} s. What to do next:")
     console.print(f"  look at {args.output / 'map.png'}, or open {args.output / 'map.ply'} in a point cloud viewer")
-    console.print(f"  cairn serve --data {args.output / 'server'}          # serve this map again, and open")
-    console.print("  http://127.0.0.1:8750/                            # in a browser: turn it, slice it, click it")
-    console.print(f"  cairn map info http://127.0.0.1:8750/maps/{MAP}      # in another terminal")
-    console.print("  cairn robot replay --help                       # map a recording of your own")
+    console.print(f"  cairn serve --data {args.output / 'server'}, and open http://127.0.0.1:8750/ in a browser:")
+    console.print("    turn the map, slice it, click it")
+    console.print(f"  cairn map info http://127.0.0.1:8750/maps/{MAP}, in another terminal")
+    console.print("  cairn robot replay --help: map a recording of your own")
     return 0
 
 
