@@ -50,7 +50,12 @@ def add_render_arguments(render: argparse.ArgumentParser) -> None:
     allow_negative_lists(render)
     render.add_argument("map", metavar="URL|DIR", help="http://HOST:PORT/maps/NAME, or a folder")
     render.add_argument("-o", "--output", type=Path, metavar="FILE", help="PNG")
-    render.add_argument("--npz", type=Path, metavar="FILE", help="the values as arrays")
+    render.add_argument(
+        "--npz",
+        type=Path,
+        metavar="FILE",
+        help="the values as arrays; with --over, `modes` tells where the image shows what the map does",
+    )
     render.add_argument("--from", dest="eye", type=place, metavar="X,Y,Z", help="where the eye is, metres, map frame")
     render.add_argument("--to", dest="target", type=place, metavar="X,Y,Z", help="what is in the middle of the picture")
     render.add_argument("--size", type=_size, default=(640, 480), metavar="WxH", help="pixels (640x480)")

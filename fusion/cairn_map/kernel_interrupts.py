@@ -14,10 +14,10 @@ LOOKUP = "_numba_unpickle"
 def keep_interrupts_out_of_kernels() -> None:
     """From now on ^C is a KeyboardInterrupt before or after a kernel, never within; to be called before the first one.
 
-    The very first result of a kind is still made in Python.
+    The very first result of a kind is still made in Python; a numba without that function is left as it is.
     """
     from numba.core import serialize
 
-    lookup = getattr(serialize, LOOKUP)
-    if not hasattr(lookup, "cache_info"):
+    lookup = getattr(serialize, LOOKUP, None)
+    if lookup is not None and not hasattr(lookup, "cache_info"):
         setattr(serialize, LOOKUP, cache(lookup))

@@ -66,6 +66,9 @@ def _asked_entry(snapshot: Snapshot, row: CellRow, page: IndexPage) -> CellEntry
 
 def _held_lm(snapshot: Snapshot, key: CellKey) -> int | None:
     """Newest entry that brought evidence which no later one took out; None: none of the newest did."""
+    newest = snapshot.contributions(key, after_seq=0, newest=1)
+    if newest and newest[0].kind == ENTRY_FOLD:  # nearly always
+        return newest[0].seq
     out: set[int] = set()
     for touch in reversed(snapshot.contributions(key, after_seq=0, newest=TOUCHES_MAX)):
         if touch.kind != ENTRY_FOLD:

@@ -5,7 +5,7 @@ For each cell, numbers little endian:
     uint32  bytes of the head      head: JSON, `cell` [i, j, k] and `etag` of the cell's own route
     uint32  bytes of the view      view (FORMAT.md 15)
 
-Nothing is made for it (`views_ahead` does that), so it costs next to nothing. What is missing is asked for by cell.
+Nothing is made for it (`views_ahead` does that): 15 us a cell. What is missing is asked for by cell.
 """
 
 import json

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 import pytest
-from playwright.sync_api import Browser
+from playwright.sync_api import Browser, Route
 from tests.cairn_map.made import SMALL, surface_evidence
 from tests.cairn_server.live import until
 from tests.cairn_server.pushes import MOLE, pushed
@@ -30,7 +30,7 @@ SURE_K = 0.06
 GREY_SPREAD_MAX = 40
 """Of red, green and blue outside of the band: an eighth of the palette's colour is left."""
 
-STAIR, FIRST, NEXT, LAST, SCANS = "stair", (0, 0, 0), (1, 0, 3), (1, 0, 6), 64
+STAIR, FIRST, NEXT, LAST, BEYOND, SCANS = "stair", (0, 0, 0), (1, 0, 3), (1, 0, 6), (1, 0, 9), 64
 """A map whose later cells lie higher than its first, and beside it; scans enough for its counts."""
 SIDEWAYS = "&by=height&boxes=1&cells=0&eye=0.2,-0.6,0.9&target=0.2,0.2,0.2"
 
@@ -186,6 +186,27 @@ def test_a_legend_that_is_locked_keeps_its_ends_when_more_comes_into_sight(
     console.settled()
     assert heights(console) == pytest.approx(told_heights(room), abs=0.051), "it goes on to follow"
     assert heights(console)[1] > after[1] + 0.5
+    page.get_by_role("button", name="Auto").hover()
+    page.mouse.down()
+    push_cell(api, 3, BEYOND)
+    console.until("c.cells.all.size === 4", "the page hears of a fourth")
+    console.settled()
+    page.mouse.up()
+    console.until("c.look.ranges.height", "a press on the button was a click, though the legend changed")
+
+
+def test_a_map_is_shown_cell_by_cell_where_all_at_once_takes_long(chromium: Browser, room: Room) -> None:
+    with chromium.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
+        console = tab(context, room)
+        held: list[Route] = []
+        console.page.route("**/main/views", lambda route: held.append(route))
+        console.open()
+        console.log_in()
+        console.until("c && c.cells.firstPictureMs !== null", "the first picture")
+        assert len(held) == 1
+        console.settled()
+        assert console.tell("c.cells.drawn") > 0
+        held[0].abort()
 
 
 def test_what_the_server_has_ready_is_shown_after_one_request(chromium: Browser, room: Room) -> None:

@@ -35,6 +35,8 @@ export interface ReadyViews {
 }
 
 export const NONE_READY: ReadyViews = { depth: 0, cells: new Map() };
+/** A link that brings them no sooner shows more with each cell by itself, the largest first. */
+const READY_MS = 1500;
 
 export class Api {
   token: string | null = sessionStorage.getItem(TOKEN_KEY) ?? localStorage.getItem(TOKEN_KEY);
@@ -84,9 +86,9 @@ export class Api {
     return { data, etag: answer.headers.get("ETag") ?? "" };
   }
 
-  /** What the server has ready of all cells: PROTOCOL.md section 4.3. */
+  /** What the server has ready of all cells, if that comes soon: PROTOCOL.md section 4.3. */
   async readyViews(map: string): Promise<ReadyViews> {
-    const answer = await this.ask(`maps/${map}/main/views`, { cache: "no-store" });
+    const answer = await this.ask(`maps/${map}/main/views`, { cache: "no-store", signal: AbortSignal.timeout(READY_MS) });
     const body = new Uint8Array(await answer.arrayBuffer());
     this.received += body.length;
     const cells = new Map<string, CellAnswer>();

@@ -56,6 +56,7 @@ export class Console {
   private state: LinkState = { live: false, heardMs: null };
   private moved = true;
   private logged = false;
+  private isAsking = false;
   private loading: Promise<void>;
   /** State that the index was last taken from. */
   private cursor = "";
@@ -264,9 +265,11 @@ export class Console {
 
   /** Where evidence was taken out last, the log alone does not tell whose is left. */
   private async askHeld(): Promise<void> {
-    if (![...this.cells.all.values()].some(({ lm, held }) => held?.lm !== lm && this.book.isOut(lm))) return;
+    if (this.isAsking || ![...this.cells.all.values()].some(({ lm, held }) => held?.lm !== lm && this.book.isOut(lm))) return;
+    this.isAsking = true;
     // Without an answer they stay grey, and are asked for again with the next entry of the log.
     await this.api.cells(this.info.name, "&held=true").then(({ entries }) => this.cells.takeHeld(entries), () => undefined);
+    this.isAsking = false;
   }
 
   /** A few times a second: what has no event of its own. */

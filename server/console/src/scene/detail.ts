@@ -45,21 +45,16 @@ export function plan(cells: readonly Candidate[], budget: number): number[] {
     depths[n] = depth;
     total += more;
   }
-  // The largest nodes of the picture first; a heap would be faster from some thousand cells on.
-  const waiting = nearest.filter((n) => depths[n] > 0 && depths[n] < cells[n].depthMax && cells[n].sizePx > 0);
-  const nodePx = (n: number) => cells[n].sizePx / 2 ** depths[n];
-  while (waiting.length) {
-    let best = 0;
-    for (let w = 1; w < waiting.length; w++) if (nodePx(waiting[w]) > nodePx(waiting[best])) best = w;
-    const n = waiting[best];
-    const cell = cells[n];
-    const more = expected(cell, depths[n] + 1) - expected(cell, depths[n]);
-    if (nodePx(n) > NODE_PX && total + more <= room) {
-      depths[n]++;
-      total += more;
-      if (depths[n] < cell.depthMax) continue;
-    }
-    waiting.splice(best, 1);
+  // The largest nodes of the picture first. A cell that has no room at one depth has none at the next.
+  const steps = nearest.filter((n) => depths[n] > 0 && cells[n].sizePx > 0).flatMap((n) =>
+    Array.from({ length: cells[n].depthMax - depths[n] }, (_, k) => ({ n, depth: depths[n] + k, nodePx: cells[n].sizePx / 2 ** (depths[n] + k) })),
+  );
+  for (const { n, depth, nodePx } of steps.sort((a, b) => b.nodePx - a.nodePx)) {
+    if (nodePx <= NODE_PX) break;
+    const more = expected(cells[n], depth + 1) - expected(cells[n], depth);
+    if (depths[n] !== depth || total + more > room) continue;
+    depths[n]++;
+    total += more;
   }
   return depths;
 }

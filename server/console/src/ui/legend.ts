@@ -31,7 +31,9 @@ export class Legend {
     const focused = controls().indexOf(document.activeElement as HTMLElement);
     // Whoever types an end is not disturbed by one that follows what is shown.
     const isTyping = document.activeElement instanceof HTMLInputElement && focused >= 0;
-    if (state === this.shown || (isTyping && locked === this.locked)) return;
+    // Nor is a button replaced between press and release, which would be no click.
+    const isPressed = this.element.querySelector("button:active") !== null;
+    if (state === this.shown || isPressed || (isTyping && locked === this.locked)) return;
     this.shown = state;
     this.locked = locked;
     const { label, palette, unit: ofField } = FIELDS.find(({ field }) => field === look.field)!;
