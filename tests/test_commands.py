@@ -15,18 +15,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.cairn_client.conftest import wait_until
-from tests.cairn_server.live import free_port
+from tests.cairn_server.live.hub import free_port
 from tests.console.browsing import VIEW, browser, tab
 from tests.console.casting import occupied, picks_met_first
 from tests.console.conftest import LOOPBACK, Room, skip_without_page
 
-from cairn_client.arguments import api_of
-from cairn_client.link import index_of
+from cairn_client.cli.arguments import api_of
+from cairn_client.http.http_link import index_of
 from cairn_client.main import main
-from cairn_map.cell_folder import read_cells, read_head
-from cairn_sim.record import Plan, record
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
+from cairn_map.files.cell_folder import read_cells, read_head
+from cairn_sim.robots.record import Plan, record
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.scene.scene_file import load_scene
 
 COMMAND_S = 300
 PLACES, PICKS = 100, 50

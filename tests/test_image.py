@@ -27,15 +27,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cairn_calib.camera import camera_from_field_of_view
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_client.api import MapApi
-from cairn_client.robot import Robot
-from cairn_fusion.scan import Scan
-from cairn_map.cell_code import decode_cell
-from cairn_map.evidence import Evidence
-from cairn_map.grid import CellKey, Geometry, cell_of_key
-from cairn_map.messages import CreateMap
+from cairn_calib.rig.camera import camera_from_field_of_view
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_client.http.api import MapApi
+from cairn_client.robot.robot import Robot
+from cairn_fusion.recording.scan import Scan
+from cairn_map.codec.cell_code import decode_cell
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
+from cairn_map.wire.messages import CreateMap
 
 pytestmark = [pytest.mark.image, pytest.mark.timeout(900)]
 

@@ -18,14 +18,14 @@ import httpx
 import pytest
 import yaml
 from tests.cairn_map.made import SMALL
-from tests.cairn_server.live import Process, free_port, until
-from tests.cairn_server.pushes import pushed
+from tests.cairn_server.live.hub import Process, free_port, until
+from tests.cairn_server.sync.pushes import pushed
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
-from cairn_client.api import MapApi
+from cairn_client.http.api import MapApi
 from cairn_map.errors import UnreachableError
-from cairn_map.messages import CreateMap
+from cairn_map.wire.messages import CreateMap
 
 ROOT = Path(__file__).parents[1]
 CADDYFILE = ROOT / "docker" / "Caddyfile"

@@ -1,1 +1,5 @@
-"""The robot's side: local map, outbox, sync and the command line."""
+"""The robot's side: local map, outbox, sync and the command line.
+
+Evidence comes from `cairn_fusion`; the server is another package that is never imported here. Start with
+`robot.robot`, the class that a program holds.
+"""

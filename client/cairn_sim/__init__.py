@@ -1,1 +1,4 @@
-"""Simulated robots in a room that is known exactly."""
+"""Simulated robots in scenes that are known exactly, and the experiments on them.
+
+Mapping and sync are the real packages'. Start with `scene.scene`, `render.render` and `robots.record`.
+"""

@@ -17,20 +17,20 @@ from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 
-from cairn_client.arguments import parser, say, with_progress
-from cairn_fusion.images import write_colour
+from cairn_client.cli.arguments import parser, say, with_progress
+from cairn_fusion.recording.images import write_colour
 from cairn_map.errors import BadInputError
-from cairn_sim.contact_sheet import contact_sheet, view_from_above
-from cairn_sim.evaluate_command import add_evaluate_arguments, evaluate
-from cairn_sim.heads import RANGE_CAMERA
-from cairn_sim.record import Plan, places_of, record, shots_of
-from cairn_sim.render import render_scan
-from cairn_sim.robots import ROBOTS, robot_named
-from cairn_sim.scene import Scene
-from cairn_sim.scene_file import SHIPPED, load_scene, shipped_text
-from cairn_sim.scene_format import ZERO_C_K
-from cairn_sim.targets import TARGET_SCENES
-from cairn_sim.trajectories import PoseErrors, path_names
+from cairn_sim.evaluation.evaluate_command import add_evaluate_arguments, evaluate
+from cairn_sim.render.render import render_scan
+from cairn_sim.robots.contact_sheet import contact_sheet, view_from_above
+from cairn_sim.robots.heads import RANGE_CAMERA
+from cairn_sim.robots.record import Plan, places_of, record, shots_of
+from cairn_sim.robots.robots import ROBOTS, robot_named
+from cairn_sim.robots.targets import TARGET_SCENES
+from cairn_sim.robots.trajectories import PoseErrors, path_names
+from cairn_sim.scene.scene import Scene
+from cairn_sim.scene.scene_file import SHIPPED, load_scene, shipped_text
+from cairn_sim.scene.scene_format import ZERO_C_K
 
 MEGABYTES_PER_SCAN = {"orpheus": 4.8, "tof": 0.24, "lidar": 0.2, "handheld": 3.1}
 """Of a recording at full size with the truth of the range camera, measured in the building."""
@@ -155,7 +155,7 @@ def _load(scene: str) -> Scene:
 def _text(scene: str) -> str:
     """The file of a scene that was loaded."""
     if scene in TARGET_SCENES:
-        return f"# {scene}: made by cairn_sim.targets, which has no file\n"
+        return f"# {scene}: made by cairn_sim.robots.targets, which has no file\n"
     return shipped_text(scene) if scene in SHIPPED else Path(scene).read_text(encoding="utf-8")
 
 

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from cairn_sim.heads import RANGE_CAMERA, full_head
-from cairn_sim.render import render_scan
-from cairn_sim.scene_file import load_scene
-from cairn_sim.sensors import Noise
-from cairn_sim.trajectories import stops
-from cairn_sim.truth_grid import VoxelBox, truths_of
+from cairn_sim.evaluation.truth_grid import VoxelBox, truths_of
+from cairn_sim.render.render import render_scan
+from cairn_sim.render.sensors import Noise
+from cairn_sim.robots.heads import RANGE_CAMERA, full_head
+from cairn_sim.robots.trajectories import stops
+from cairn_sim.scene.scene_file import load_scene
 
 
 def warm_up() -> None:

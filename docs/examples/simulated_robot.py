@@ -7,13 +7,13 @@ $ python docs/examples/simulated_robot.py http://127.0.0.1:8750/maps/lab
 
 import sys
 
-from cairn_client.robot import Robot
-from cairn_sim.heads import RANGE_CAMERA
-from cairn_sim.render import render_scan
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
-from cairn_sim.sensors import Noise
-from cairn_sim.trajectories import stops
+from cairn_client.robot.robot import Robot
+from cairn_sim.render.render import render_scan
+from cairn_sim.render.sensors import Noise
+from cairn_sim.robots.heads import RANGE_CAMERA
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.robots.trajectories import stops
+from cairn_sim.scene.scene_file import load_scene
 
 scene, walle, noise = load_scene("small-room"), ROBOTS["orpheus"], Noise(seed=1)
 rig = walle.rig_of(0.25)  # colour and thermal images a quarter as wide

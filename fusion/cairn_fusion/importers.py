@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 
-from cairn_fusion.bag_file import SUFFIXES, is_bag
-from cairn_fusion.bag_mapping import BagMapping
-from cairn_fusion.frame_folder import FrameFolderOptions, import_frames
-from cairn_fusion.recording import Recording, ScanSource, open_recording
-from cairn_fusion.recording_format import HEADER_FILE, RIG_FILE
+from cairn_fusion.recording.frame_folder import FrameFolderOptions, import_frames
+from cairn_fusion.recording.recording import Recording, ScanSource, open_recording
+from cairn_fusion.recording.recording_format import HEADER_FILE, RIG_FILE
+from cairn_fusion.ros.open_bag import SUFFIXES, is_bag
+from cairn_fusion.ros.topic_mapping import BagMapping
 from cairn_map.errors import BadInputError
 
 APC_SHELF = FrameFolderOptions(
@@ -115,7 +115,7 @@ def open_source(
     if frames is not None:
         raise BadInputError("unknown_frame", f"a {layout} has no frame ids to choose by")
     if layout is Layout.BAG:
-        from cairn_fusion.bag_survey import open_any_bag
+        from cairn_fusion.ros.bag_survey import open_any_bag
 
         return open_any_bag(Path(folder), mapping, scans_per_measurement=scans_per_measurement)
     return open_recording(folder, scans_per_measurement=scans_per_measurement)

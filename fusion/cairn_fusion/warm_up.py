@@ -5,17 +5,17 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from cairn_calib.camera import camera_from_field_of_view
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_fusion.integrate import Integrator, Method, integrate_scan, integrate_scans
-from cairn_fusion.place_covariance import PlaceCovariance
-from cairn_fusion.scan import Scan
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import Geometry
-from cairn_map.map_render import MapRenderer
-from cairn_map.map_snapshot import snapshot_of
-from cairn_map.pose_spread import PoseSpread
-from cairn_map.sight import Sight
+from cairn_calib.rig.camera import camera_from_field_of_view
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scan, integrate_scans
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.transfer.place_covariance import PlaceCovariance
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import Geometry
+from cairn_map.queries.map_snapshot import snapshot_of
+from cairn_map.render.camera_rays import Sight
+from cairn_map.render.map_render import MapRenderer
+from cairn_map.render.pose_spread import PoseSpread
 
 
 def warm_up() -> None:
@@ -46,7 +46,7 @@ def warm_up() -> None:
 
 def _look(rig: Rig, scan: Scan) -> None:
     """Fuse the scan, with a second thermal camera, into a picture, and draw a map over it: both need OpenCV."""
-    from cairn_fusion.overlay import Live, OverlayStyle, draw_overlay
+    from cairn_fusion.view.overlay import Live, OverlayStyle, draw_overlay
     from cairn_fusion.view.telepresence import Telepresence, ViewOptions
 
     both = Rig(name="warm-up", cameras={**rig.cameras, "second": rig["thermal"]})

@@ -8,12 +8,13 @@ from contextlib import suppress
 
 import numpy as np
 
-from cairn_map.brick_cell import brick_cell
-from cairn_map.cell_code import Profile, decode_canonical_cell, encode_cell
-from cairn_map.cell_reading import cell_reader
-from cairn_map.channels import planes_and_squares
+from cairn_map.codec.cell_code import Profile, decode_canonical_cell, encode_cell
+from cairn_map.codec.cell_reading import cell_reader
+from cairn_map.codec.view_code import decode_view, encode_view
 from cairn_map.errors import BadInputError
-from cairn_map.evidence import (
+from cairn_map.evidence.brick_cell import brick_cell
+from cairn_map.evidence.channels import planes_and_squares
+from cairn_map.evidence.evidence import (
     COUNT_MAX,
     SUM_MAX,
     Evidence,
@@ -21,20 +22,19 @@ from cairn_map.evidence import (
     largest,
     packed_evidence,
 )
-from cairn_map.evidence_kernels import channel_above
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.fingerprint import fingerprint
-from cairn_map.grid import BRICK_DEPTH, Geometry, cell_key, voxels_in_cell
-from cairn_map.map_picture import layer_picture, layer_values
-from cairn_map.map_render import MapRenderer
-from cairn_map.map_snapshot import snapshot_of
-from cairn_map.paint_kernels import blend_into
-from cairn_map.partial_map import draw_as_needed, read_cell
-from cairn_map.pose_spread import PoseSpread
-from cairn_map.render_picture import SCALES, Layer
-from cairn_map.sensor_model import SensorModel
-from cairn_map.sight import look_at, pinhole
-from cairn_map.view_code import decode_view, encode_view
+from cairn_map.evidence.evidence_kernels import channel_above
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.fingerprint import fingerprint
+from cairn_map.evidence.grid import BRICK_DEPTH, Geometry, cell_key, voxels_in_cell
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.queries.map_snapshot import snapshot_of
+from cairn_map.render.camera_rays import look_at, pinhole
+from cairn_map.render.colour_kernels import blend_into
+from cairn_map.render.map_picture import layer_picture, layer_values
+from cairn_map.render.map_render import MapRenderer
+from cairn_map.render.partial_map import draw_as_needed, read_cell
+from cairn_map.render.pose_spread import PoseSpread
+from cairn_map.render.render_picture import SCALES, Layer
 
 
 def warm_up() -> None:

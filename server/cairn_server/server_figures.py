@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from cairn_map.frames import CELL_HEAD, CellFrame, Frame
+from cairn_map.wire.frames import CELL_HEAD, CellFrame, Frame
 from cairn_server.metrics import Counter, Histogram, gauge_lines
-from cairn_server.store_health import Backlog, StoreFigures
+from cairn_server.store.store_health import Backlog, StoreFigures
 
 
 class ServerFigures:

@@ -8,15 +8,15 @@ import threading
 import time
 from itertools import chain
 
-from cairn_map.begun_frames import reply_digest, without_begun
-from cairn_map.cursor import Cursor
+from cairn_map.commits.cursor import Cursor
+from cairn_map.commits.ids import INITIAL, OPERATOR, Author, RobotName, new_incarnation, robot_name
+from cairn_map.commits.version_vector import VersionVector
 from cairn_map.errors import BadInputError
-from cairn_map.frames import encode_frame, start_of_reply
-from cairn_map.grid import CellKey
-from cairn_map.ids import INITIAL, OPERATOR, Author, RobotName, new_incarnation, robot_name
-from cairn_map.index_messages import CellIndex
-from cairn_map.live_events import RobotSign
-from cairn_map.messages import (
+from cairn_map.evidence.grid import CellKey
+from cairn_map.wire.frames import encode_frame, start_of_reply
+from cairn_map.wire.index_messages import CellIndex
+from cairn_map.wire.live_events import RobotSign
+from cairn_map.wire.messages import (
     BranchInfo,
     CreateMap,
     MapInfo,
@@ -26,40 +26,40 @@ from cairn_map.messages import (
     Retract,
     Retracted,
 )
-from cairn_map.version_vector import VersionVector
-from cairn_server.auth import Caller, new_token, token_hash
-from cairn_server.branch_list import branch_infos
-from cairn_server.cell_index import FIRST_PAGE, IndexPage, entries_of
-from cairn_server.cells_at_rest import DamagedCellError, sound_cell
-from cairn_server.check_process import CheckProcess
-from cairn_server.damaged_cells import DamagedCells
-from cairn_server.export_tickets import ExportTickets
-from cairn_server.fold_health import FoldHealth
-from cairn_server.fold_process import FoldProcess
-from cairn_server.folder import Folder
-from cairn_server.handing_over import server_key
-from cairn_server.healing import heal_cell, keep_healed
-from cairn_server.held_commits import HeldCommits
-from cairn_server.joining import Joining
-from cairn_server.live import Hub
-from cairn_server.map_exports import MapExports
-from cairn_server.map_views import MapViews
-from cairn_server.missing import Besides, asker_from_request, header_of, reply_frames
-from cairn_server.push_policy import EvidenceGoneError
-from cairn_server.pushes import Pushes
-from cairn_server.read_cache import ReadCache
-from cairn_server.readiness import Readiness
-from cairn_server.retracting import retract_builders, targets_of
-from cairn_server.robot_reports import RobotReports
+from cairn_map.wire.resumed_replies import reply_digest, without_begun
+from cairn_server.access.auth import Caller, new_token, token_hash
+from cairn_server.folding.cell_index import FIRST_PAGE, IndexPage, entries_of
+from cairn_server.folding.cells import Cells
+from cairn_server.folding.damaged_cells import DamagedCells
+from cairn_server.folding.fold_health import FoldHealth
+from cairn_server.folding.fold_process import FoldProcess
+from cairn_server.folding.fold_thread import Folder
+from cairn_server.folding.healing import heal_cell, keep_healed
+from cairn_server.folding.read_cache import ReadCache
+from cairn_server.folding.readiness import Readiness
+from cairn_server.live.branch_list import branch_infos
+from cairn_server.live.hub import Hub
+from cairn_server.live.robot_reports import RobotReports
 from cairn_server.server_figures import ServerFigures, process_lines, store_lines
 from cairn_server.settings import Settings
-from cairn_server.stable import StableVectors
-from cairn_server.store import Snapshot, Store
-from cairn_server.store_rows import Branch, CellRow, Head, MapRow
-from cairn_server.uploads import Uploads
-from cairn_server.vectors import vector_at
-from cairn_server.view_cache import ViewCache
-from cairn_server.wanted_commits import WantedCommits
+from cairn_server.store.numbering import EvidenceGoneError
+from cairn_server.store.store import Snapshot, Store
+from cairn_server.store.store_rows import Branch, MapRow
+from cairn_server.sync.checks.check_process import CheckProcess
+from cairn_server.sync.handing_over import server_key
+from cairn_server.sync.held_commits import HeldCommits
+from cairn_server.sync.missing import Besides, asker_from_request, header_of, reply_frames
+from cairn_server.sync.pushes import Pushes
+from cairn_server.sync.retracting import retract_builders, targets_of
+from cairn_server.sync.stable_commits import StableVectors
+from cairn_server.sync.uploads import Uploads
+from cairn_server.sync.upstream_progress import Joining
+from cairn_server.sync.vector_at import vector_at
+from cairn_server.sync.wanted_commits import WantedCommits
+from cairn_server.views.export_tickets import ExportTickets
+from cairn_server.views.map_exports import MapExports
+from cairn_server.views.map_views import MapViews
+from cairn_server.views.view_cache import ViewCache
 
 RESERVED_NAMES = frozenset({OPERATOR, INITIAL, RobotName("main")})
 
@@ -84,6 +84,7 @@ class Service:
         self.live = Hub(store)
         self.reports = RobotReports(store, self.live)
         self.joining = Joining(is_joined=settings.upstream is not None)
+        self.cells = Cells(store, self.damaged)
         self._folder = Folder(
             store,
             self.folds,
@@ -208,31 +209,6 @@ class Service:
         with self.store.snapshot(row) as snapshot:
             header = header_of(snapshot, author, self._besides(row, snapshot))
             return CellIndex(header=header, cells=entries_of(snapshot, page))
-
-    def cell(self, row: MapRow, key: CellKey) -> tuple[CellRow | None, Head]:
-        """One cell (None: never seen) and the state that it was read from.
-
-        Raises:
-            DamagedCellError: kind `damaged_store`: it is damaged, and nothing here says what it was.
-        """
-        healed: list[CellRow] = []
-        try:
-            with self.store.snapshot(row) as snapshot:
-                found, head = sound_cell(snapshot, key, row.geometry, healed), snapshot.head
-        except DamagedCellError:
-            self.damaged.note(row.name, [key])
-            raise
-        keep_healed(self.store, row, healed)
-        return found, head
-
-    def cell_unchecked(self, row: MapRow, key: CellKey) -> tuple[CellRow | None, Head]:
-        """The same, but its bytes may be damaged: for who decodes them, or wants no more than the digest.
-
-        Raises:
-            DamagedDataError: kind `damaged_store`: it cannot be read at all.
-        """
-        with self.store.snapshot(row) as snapshot:
-            return snapshot.cell(key), snapshot.head
 
     def heal_cell(self, row: MapRow, key: CellKey, data: bytes, *, by: Caller) -> bool:
         """Put a damaged cell right with bytes that somebody still has; False if it is sound."""

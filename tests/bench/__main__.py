@@ -35,24 +35,24 @@ from tests.bench.simulation import simulation_rows
 from tests.bench.start import start_rows
 from tests.bench.telepresence import telepresence_rows
 
-from cairn_client.api import MapApi
-from cairn_client.robot import Robot
+from cairn_client.http.api import MapApi
+from cairn_client.robot.robot import Robot
 from cairn_fusion.importers import open_source
-from cairn_fusion.measurement import Measurement
-from cairn_fusion.scan import Scan
-from cairn_map.brick_cell import brick_cell
-from cairn_map.cell_code import decode_canonical_cell, encode_cell
-from cairn_map.channels import COLOUR, TEMPERATURE, Channel
-from cairn_map.commit import CommitMeta, make_commit
-from cairn_map.evidence import Evidence
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.fingerprint import fingerprint
-from cairn_map.grid import CellKey, Geometry, geometry_for
-from cairn_map.messages import CreateMap, Register
-from cairn_sim.heads import full_head
-from cairn_sim.record import Plan, scans_of, shots_of
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
+from cairn_fusion.mapping.measurement import Measurement
+from cairn_fusion.recording.scan import Scan
+from cairn_map.codec.cell_code import decode_canonical_cell, encode_cell
+from cairn_map.commits.commit import CommitMeta, make_commit
+from cairn_map.evidence.brick_cell import brick_cell
+from cairn_map.evidence.channels import COLOUR, TEMPERATURE, Channel
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.fingerprint import fingerprint
+from cairn_map.evidence.grid import CellKey, Geometry, geometry_for
+from cairn_map.wire.messages import CreateMap, Register
+from cairn_sim.robots.heads import full_head
+from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.scene.scene_file import load_scene
 
 Row = tuple[str, str, str]
 NAME_WIDTH = 66

@@ -8,15 +8,15 @@ import os
 import time
 from pathlib import Path
 
-from cairn_client.api import MapApi
-from cairn_map.cell_code import encode_cell
-from cairn_map.cell_folder import FolderHead, write_cell, write_head
-from cairn_map.grid import cell_of_key, geometry_for
-from cairn_map.sensor_model import SensorModel
-from cairn_sim.experiment_mapping import GrowingMap, map_all
-from cairn_sim.experiment_robots import simulated_robots
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
+from cairn_client.http.api import MapApi
+from cairn_map.codec.cell_code import encode_cell
+from cairn_map.evidence.grid import cell_of_key, geometry_for
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.files.cell_folder import FolderHead, write_cell, write_head
+from cairn_sim.experiment.mapping import GrowingMap, map_all
+from cairn_sim.experiment.robots import simulated_robots
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.scene.scene_file import load_scene
 
 THREADS = 2
 FOLDED_S = 120.0

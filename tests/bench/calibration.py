@@ -14,12 +14,12 @@ from tests.cairn_calib.board_images import BOARD, COLOUR, THERMAL, TOF, picture,
 from tests.cairn_calib.simulated_views import SPECTRA, ranges_of, views_of, world
 from tests.cairn_calib.test_mrcal import mrcal_solved, reference_problem
 
-from cairn_calib.corner_detection import find_chessboard
-from cairn_calib.examination import examined
-from cairn_calib.pixel_pattern import pixel_pattern
-from cairn_calib.solve import solve_from, solve_rig
-from cairn_calib.solve_plan import usual_plan
-from cairn_calib.solved_rig import solved_rig
+from cairn_calib.board.corner_detection import find_chessboard
+from cairn_calib.diagnosis.examination import examined
+from cairn_calib.solve.pixel_pattern import pixel_pattern
+from cairn_calib.solve.solve import solve_from, solve_rig
+from cairn_calib.solve.solve_plan import usual_plan
+from cairn_calib.solve.solved_rig import solved_rig
 
 Row = tuple[str, str, str]
 
@@ -110,7 +110,7 @@ def _corner_rows(repeats: int) -> Iterator[Row]:
         for path, (image, _) in zip(paths, images, strict=True):
             cv2.imwrite(str(path), image)
         options = ["--board", "9x6", "--square", "0.05", "--output", str(Path(name) / "out")]
-        line = [sys.executable, "-m", "cairn_calib.corners_command", *map(str, paths), *options]
+        line = [sys.executable, "-m", "cairn_calib.cli.corners", *map(str, paths), *options]
 
         def command() -> object:
             return subprocess.run(line, check=True, capture_output=True)

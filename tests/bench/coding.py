@@ -16,18 +16,18 @@ import numpy.typing as npt
 import zstandard
 from tests.bench.timing import cpu_s, wall_s
 
-from cairn_fusion.integrate import Integrator, integrate_scans
-from cairn_map.cell_code import Profile, decode_cell, encode_cell, encode_cells
-from cairn_map.cell_content import CHILD_MASKS, HITS, LEAF_MASKS, MISSES
-from cairn_map.cell_reading import cell_reader
-from cairn_map.channel_streams import stream_of_channel
-from cairn_map.channels import Channel, ChannelKind
-from cairn_map.evidence import Evidence
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import CellKey, Geometry
-from cairn_sim.record import Plan, scans_of, shots_of
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
+from cairn_fusion.mapping.integrate import Integrator, integrate_scans
+from cairn_map.codec.cell_code import Profile, decode_cell, encode_cell, encode_cells
+from cairn_map.codec.cell_reading import cell_reader
+from cairn_map.codec.octree.cell_content import CHILD_MASKS, HITS, LEAF_MASKS, MISSES
+from cairn_map.codec.octree.channel_streams import stream_of_channel
+from cairn_map.evidence.channels import Channel, ChannelKind
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import CellKey, Geometry
+from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.scene.scene_file import load_scene
 
 Row = tuple[str, str, str]
 Diff = dict[CellKey, Evidence]

@@ -19,21 +19,21 @@ import httpx
 from playwright.sync_api import Browser
 from tests.bench.building import building_map, wait_until_folded
 from tests.bench.pushing import Diff, meta_of
-from tests.cairn_server.live import Process
+from tests.cairn_server.live.hub import Process
 from tests.console.browsing import CHROMIUM, VIEW, Console, browser
 
-from cairn_client.api import MapApi
-from cairn_client.prior_data import push_prior_data
-from cairn_fusion.integrate import Integrator, integrate_scans
-from cairn_map.commit import make_commit
-from cairn_map.grid import Geometry, geometry_for
-from cairn_map.messages import CreateMap, Register
-from cairn_map.view_code import decode_view
-from cairn_server.console_files import STATIC
-from cairn_sim.record import Plan, scans_of, shots_of
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
-from cairn_sim.trajectories import path_names
+from cairn_client.cli.maps.prior_data import push_prior_data
+from cairn_client.http.api import MapApi
+from cairn_fusion.mapping.integrate import Integrator, integrate_scans
+from cairn_map.codec.view_code import decode_view
+from cairn_map.commits.commit import make_commit
+from cairn_map.evidence.grid import Geometry, geometry_for
+from cairn_map.wire.messages import CreateMap, Register
+from cairn_server.http.routes.console_files import STATIC
+from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.robots.trajectories import path_names
+from cairn_sim.scene.scene_file import load_scene
 
 Row = tuple[str, str, str]
 MAP, EMPTY = "lab", "empty"

@@ -9,20 +9,20 @@ import apsw
 from tests.bench.pushing import Bodies, Diff
 from tests.bench.timing import cpu_s
 
-from cairn_map.blocks import of_blocks
-from cairn_map.cursor import Cursor
-from cairn_map.frames import CellFrame, frames_of
-from cairn_map.grid import Geometry
-from cairn_map.messages import MissingRequest
-from cairn_map.sensor_model import SensorModel
-from cairn_server.cell_cache import CellCache
-from cairn_server.folding import fold_pending
-from cairn_server.read_cache import ReadCache
+from cairn_map.commits.cursor import Cursor
+from cairn_map.evidence.blocks import of_blocks
+from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.wire.frames import CellFrame, frames_of
+from cairn_map.wire.messages import MissingRequest
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.folding import fold_pending
+from cairn_server.folding.read_cache import ReadCache
 from cairn_server.service import Service
 from cairn_server.settings import Settings
-from cairn_server.sqlite_store import FILE_NAME, SqliteStore
-from cairn_server.stamps import blocks_after
-from cairn_server.store_rows import MapRow
+from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
+from cairn_server.store.stamps import blocks_after
+from cairn_server.store.store_rows import MapRow
 
 Row = tuple[str, str, str]
 

@@ -12,8 +12,8 @@ import zstandard
 from tests.bench.peers import STREAM
 from tests.links.proxy import FaultProxy
 
-from cairn_map.cell_content import canonical_bytes
-from cairn_map.cell_head import decode_head
+from cairn_map.codec.octree.cell_content import canonical_bytes
+from cairn_map.codec.octree.cell_head import decode_head
 
 REPACK = ("-a", "-d", "-q", "--depth=50", "--window=10")
 """As a server that is kept well does, after every push; deltas that were found stay."""

@@ -19,8 +19,8 @@ PROGRAMS: Mapping[str, tuple[str, ...]] = {
     "python -c pass": ("-c", "pass"),
     "  import numpy": ("-c", "import numpy"),
     "  import numba": ("-c", "import numba"),
-    "  import cairn_client.robot": ("-c", "import cairn_client.robot"),
-    "  the same, and httpx": ("-c", "import cairn_client.robot, httpx"),
+    "  import cairn_client.robot.robot": ("-c", "import cairn_client.robot.robot"),
+    "  the same, and httpx": ("-c", "import cairn_client.robot.robot, httpx"),
     "  cairn --help": ("-c", "import sys; from cairn_client.main import main; sys.exit(main(['--help']))"),
 }
 

@@ -8,21 +8,21 @@ import numpy as np
 import numpy.typing as npt
 from tests.bench.timing import cpu_s, wall_s
 
-from cairn_calib.rig import Rig
-from cairn_calib.sensing import RangeSensing
-from cairn_fusion.integrate import Integrator, Method, integrate_scans
-from cairn_fusion.scan import Scan
-from cairn_map.evidence import Evidence
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import CellKey, Geometry, geometry_for
-from cairn_map.sensor_model import SensorModel
-from cairn_sim.heads import RANGE_CAMERA
-from cairn_sim.record import Plan, scans_of, shots_of
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
-from cairn_sim.scores import FREE, Scores, map_states, scores_of
-from cairn_sim.sensors import RangeSensor
-from cairn_sim.truth_grid import Truth, box_of_cell, truths_of
+from cairn_calib.rig.rig import Rig
+from cairn_calib.rig.sensing import RangeSensing
+from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scans
+from cairn_fusion.recording.scan import Scan
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import CellKey, Geometry, geometry_for
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_sim.evaluation.scores import FREE, Scores, map_states, scores_of
+from cairn_sim.evaluation.truth_grid import Truth, box_of_cell, truths_of
+from cairn_sim.render.sensors import RangeSensor
+from cairn_sim.robots.heads import RANGE_CAMERA
+from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.scene.scene_file import load_scene
 
 Row = tuple[str, str, str]
 Diff = dict[CellKey, Evidence]

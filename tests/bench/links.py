@@ -13,15 +13,15 @@ from random import Random
 
 from tests.bench.git_peer import GitPeer, missing, plain_file
 from tests.bench.pushing import Server, meta_of, served
-from tests.cairn_server.live import until
+from tests.cairn_server.live.hub import until
 from tests.crowd.building import SCANS, Survey, survey
 from tests.links.proxy import Cut, Fault, FaultProxy
 
-from cairn_client.api import MapApi
-from cairn_client.robot import Robot
-from cairn_map.cell_code import encode_cell
+from cairn_client.http.api import MapApi
+from cairn_client.robot.robot import Robot
+from cairn_map.codec.cell_code import encode_cell
 from cairn_map.errors import UnreachableError
-from cairn_map.grid import cell_of_key
+from cairn_map.evidence.grid import cell_of_key
 
 Row = tuple[str, str, str]
 FRAMES_BETWEEN_CUTS = 20

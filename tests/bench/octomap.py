@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.poses import transform_points
-from cairn_calib.rig import Rig
-from cairn_fusion.scan import Scan
-from cairn_fusion.transfer import points_from_range
+from cairn_calib.rig.poses import transform_points
+from cairn_calib.rig.rig import Rig
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.transfer.transfer import points_from_range
 
 DRIVER = "octomap_driver"
 QUERIES = "octomap_queries"

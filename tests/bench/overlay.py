@@ -15,24 +15,24 @@ import httpx
 import numpy as np
 import numpy.typing as npt
 from tests.bench.building import building_map, wait_until_folded
-from tests.cairn_server.live import Process
+from tests.cairn_server.live.hub import Process
 
-from cairn_calib.rig import Rig
-from cairn_client.api import MapApi
-from cairn_client.map_folder import FolderMap, map_of_folder
-from cairn_client.overlay_drawing import MapOverlay
-from cairn_client.prior_data import push_prior_data
-from cairn_fusion.beyond_labels import beyond_pixels
-from cairn_fusion.live_range import live_range
-from cairn_fusion.overlay import Live, OverlayStyle, draw_overlay
-from cairn_fusion.scan import Scan
-from cairn_map.map_render import MapRenderer
-from cairn_map.map_snapshot import MapSnapshot
-from cairn_map.render_request import RenderRequest, request_from
-from cairn_map.sight import Sight
-from cairn_sim.record import Plan, scans_of, shots_of
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
+from cairn_calib.rig.rig import Rig
+from cairn_client.cli.maps.overlay_drawing import MapOverlay
+from cairn_client.cli.maps.prior_data import push_prior_data
+from cairn_client.folders.map_folder import FolderMap, map_of_folder
+from cairn_client.http.api import MapApi
+from cairn_fusion.image_fusion.beyond_labels import beyond_pixels
+from cairn_fusion.image_fusion.live_range import live_range
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.view.overlay import Live, OverlayStyle, draw_overlay
+from cairn_map.queries.map_snapshot import MapSnapshot
+from cairn_map.render.camera_rays import Sight
+from cairn_map.render.map_render import MapRenderer
+from cairn_map.render.render_request import RenderRequest, request_from
+from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.scene.scene_file import load_scene
 
 Row = tuple[str, str, str]
 THREADS = 2

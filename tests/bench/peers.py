@@ -20,19 +20,19 @@ import zstandard
 from tests.bench import octomap
 from tests.bench.timing import cpu_s
 
-from cairn_calib.rig import Rig
-from cairn_fusion.integrate import Integrator, integrate_scans
-from cairn_fusion.scan import Scan
-from cairn_map.cell_code import Profile, encode_cell
-from cairn_map.cell_head import decode_head
-from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE
-from cairn_map.evidence import Evidence
-from cairn_map.grid import CellKey, Geometry, geometry_for
-from cairn_map.sensor_model import SensorModel
-from cairn_map.voxels import Voxels, joined_voxels, voxels_of_evidence
-from cairn_sim.record import Plan, scans_of, shots_of
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
+from cairn_calib.rig.rig import Rig
+from cairn_fusion.mapping.integrate import Integrator, integrate_scans
+from cairn_fusion.recording.scan import Scan
+from cairn_map.codec.cell_code import Profile, encode_cell
+from cairn_map.codec.octree.cell_head import decode_head
+from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey, Geometry, geometry_for
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.voxels import Voxels, joined_voxels, voxels_of_evidence
+from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.scene.scene_file import load_scene
 
 Row = tuple[str, str, str]
 Diff = dict[CellKey, Evidence]

@@ -19,13 +19,13 @@ from pathlib import Path
 
 import zstandard
 
-from cairn_map.cell_code import cell_digest
-from cairn_map.cell_head import decode_head
-from cairn_map.commit import HEAD, Commit, CommitMeta, ScanPose, commit_sha, make_commit
-from cairn_map.evidence import Evidence
-from cairn_map.grid import CellKey, Geometry
-from cairn_map.messages import CreateMap, MapInfo
-from cairn_server.store_rows import NewCommit
+from cairn_map.codec.cell_code import cell_digest
+from cairn_map.codec.octree.cell_head import decode_head
+from cairn_map.commits.commit import HEAD, Commit, CommitMeta, ScanPose, commit_sha, make_commit
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey, Geometry
+from cairn_map.wire.messages import CreateMap, MapInfo
+from cairn_server.store.store_rows import NewCommit
 
 Diff = dict[CellKey, Evidence]
 BOMB_BYTES = 1 << 30

@@ -16,14 +16,14 @@ import numpy as np
 import numpy.typing as npt
 from tests.bench import octomap
 
-from cairn_fusion.integrate import Integrator, integrate_scans
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import Geometry
-from cairn_map.map_snapshot import MapSnapshot, snapshot_of
-from cairn_map.state_grid import State
-from cairn_sim.record import Plan, scans_of, shots_of
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
+from cairn_fusion.mapping.integrate import Integrator, integrate_scans
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import Geometry
+from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
+from cairn_map.queries.occupancy_states import State
+from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.scene.scene_file import load_scene
 
 Row = tuple[str, str, str]
 Floats = npt.NDArray[np.float64]

@@ -15,16 +15,16 @@ from pathlib import Path
 from tests.bench.fetching import fetching_rows
 from tests.bench.pushing import BOMB_BYTES, Bodies, Diff, Robot, bomb, meta_of, served
 
-from cairn_fusion.integrate import Integrator, integrate_scans
-from cairn_map.commit import make_commit
-from cairn_map.frames import CellFrame, frames_of
-from cairn_map.grid import Geometry, geometry_for
-from cairn_map.messages import ReplyHeader
-from cairn_map.sensor_model import SensorModel
-from cairn_server.sqlite_store import SqliteStore
-from cairn_sim.record import Plan, scans_of, shots_of
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
+from cairn_fusion.mapping.integrate import Integrator, integrate_scans
+from cairn_map.commits.commit import make_commit
+from cairn_map.evidence.grid import Geometry, geometry_for
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.wire.frames import CellFrame, frames_of
+from cairn_map.wire.messages import ReplyHeader
+from cairn_server.store.sqlite.store import SqliteStore
+from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.scene.scene_file import load_scene
 
 Row = tuple[str, str, str]
 ROBOTS_PUSHING = 8

@@ -4,15 +4,15 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 
-from cairn_map.grid import Geometry, cell_key
-from cairn_sim.heads import RANGE_CAMERA
-from cairn_sim.record import Plan, scans_of, shots_of
-from cairn_sim.render import render_scan
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
-from cairn_sim.sensors import Noise
-from cairn_sim.trajectories import stops
-from cairn_sim.truth_grid import box_of_cell, solid_masks
+from cairn_map.evidence.grid import Geometry, cell_key
+from cairn_sim.evaluation.truth_grid import box_of_cell, solid_masks
+from cairn_sim.render.render import render_scan
+from cairn_sim.render.sensors import Noise
+from cairn_sim.robots.heads import RANGE_CAMERA
+from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.robots.trajectories import stops
+from cairn_sim.scene.scene_file import load_scene
 
 Row = tuple[str, str, str]
 

@@ -41,10 +41,10 @@ def start(folder: Path) -> tuple[float, float]:
 
 def write_recording(folder: Path) -> None:
     """Two ToF images of the simulated room, at full size."""
-    from cairn_fusion.recording_writer import RecordingWriter
-    from cairn_sim.record import Plan, scans_of, shots_of
-    from cairn_sim.robots import ROBOTS
-    from cairn_sim.scene_file import load_scene
+    from cairn_fusion.recording.recording_writer import RecordingWriter
+    from cairn_sim.robots.record import Plan, scans_of, shots_of
+    from cairn_sim.robots.robots import ROBOTS
+    from cairn_sim.scene.scene_file import load_scene
 
     robot = replace(ROBOTS["tof"], scans=(2, 1))
     plan = Plan(scene=load_scene("small-room"), robot=robot, path="west", scale=1.0, truth="none", last_stop=1)
@@ -56,9 +56,9 @@ def write_recording(folder: Path) -> None:
 
 def main() -> None:
     """Start as a robot does, with what it needs and no more."""
-    from cairn_client.robot import Robot
-    from cairn_fusion.recording import open_recording
-    from cairn_map.grid import Geometry
+    from cairn_client.robot.robot import Robot
+    from cairn_fusion.recording.recording import open_recording
+    from cairn_map.evidence.grid import Geometry
 
     recording = open_recording(sys.argv[1])
     with tempfile.TemporaryDirectory() as directory:

@@ -4,16 +4,16 @@ import statistics
 import time
 from collections.abc import Iterator
 
-from cairn_fusion.integrate import Integrator, integrate_scans
-from cairn_fusion.scan import Scan
+from cairn_fusion.mapping.integrate import Integrator, integrate_scans
+from cairn_fusion.recording.scan import Scan
 from cairn_fusion.view.telepresence import Mode, Telepresence, ViewOptions
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import geometry_for
-from cairn_map.map_snapshot import snapshot_of
-from cairn_sim.record import Plan, scans_of, shots_of
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
-from cairn_sim.trajectories import EXPERIMENT
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import geometry_for
+from cairn_map.queries.map_snapshot import snapshot_of
+from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.robots.trajectories import EXPERIMENT
+from cairn_sim.scene.scene_file import load_scene
 
 Row = tuple[str, str, str]
 

@@ -22,7 +22,7 @@ from tests.board_finding.real_boards import changed, found_as_recorded, recorded
 from tests.board_finding.trials import SPECTRA, Trial, found_rightly, trial
 from tests.cairn_calib.board_images import BOARD
 
-from cairn_calib.corner_detection import find_chessboard
+from cairn_calib.board.corner_detection import find_chessboard
 
 FOUND_MIN = 0.99
 EMPTY = np.zeros((0, 0), np.uint8)

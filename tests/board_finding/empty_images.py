@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from tests.board_finding.lookalikes import FLAT, MAKERS, Floats
 
-from cairn_sim.record import Plan, scans_of, shots_of
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
+from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.scene.scene_file import load_scene
 
 Bytes = npt.NDArray[np.uint8]
 

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from tests.cairn_calib.board_images import TOF, picture, pose, truth
 
-from cairn_calib.board import Board
+from cairn_calib.board.board import Board
 
 Floats = npt.NDArray[np.float64]
 Maker = Callable[[np.random.Generator, int, int], Floats]

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from tests.cairn_calib.board_images import BOARD
 
-from cairn_calib.board import Polarity
-from cairn_calib.corner_detection import find_chessboard, grey
-from cairn_calib.polarity_vote import margin_polarity
+from cairn_calib.board.board import Polarity
+from cairn_calib.board.corner_detection import find_chessboard, grey
+from cairn_calib.board.polarity_vote import margin_polarity
 
 Floats = npt.NDArray[np.float64]
 Bytes = npt.NDArray[np.uint8]

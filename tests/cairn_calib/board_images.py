@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.board import Board
-from cairn_calib.camera import Camera
+from cairn_calib.board.board import Board
+from cairn_calib.rig.camera import Camera
 
 Floats = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]

@@ -5,16 +5,16 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.board import Board
-from cairn_calib.board_views import BoardView, BoardViews, RangeView
-from cairn_calib.calibration import POSE_UNITS
-from cairn_calib.camera import Camera
-from cairn_calib.corners import Corners
-from cairn_calib.pose_vectors import transform_from_vector, vector_from_transform
-from cairn_calib.range_terms import ALWAYS, RangeTerms, off_middle_image
-from cairn_calib.rig import Spectrum
-from cairn_calib.rig_state import warp_at_places, warp_shape
-from cairn_calib.solve import Solution
+from cairn_calib.board.board import Board
+from cairn_calib.board.corners import Corners
+from cairn_calib.rig.calibration import POSE_UNITS
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.pose_vectors import transform_from_vector, vector_from_transform
+from cairn_calib.rig.range_terms import ALWAYS, RangeTerms, off_middle_image
+from cairn_calib.rig.rig import Spectrum
+from cairn_calib.solve.board_views import BoardView, BoardViews, RangeView
+from cairn_calib.solve.rig_state import warp_at_places, warp_shape
+from cairn_calib.solve.solve import Solution
 
 Floats = npt.NDArray[np.float64]
 

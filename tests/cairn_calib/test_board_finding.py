@@ -8,7 +8,7 @@ from tests.board_finding.real_boards import changed, found_as_recorded, recorded
 from tests.board_finding.trials import found_rightly, trial
 from tests.cairn_calib.board_images import BOARD
 
-from cairn_calib.corner_detection import find_chessboard
+from cairn_calib.board.corner_detection import find_chessboard
 
 EMPTY = int(os.environ.get("EMPTY_IMAGES", "300"))
 REAL = int(os.environ.get("REAL_BOARDS", "10"))

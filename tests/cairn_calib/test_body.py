@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from cairn_calib.body import Body, BodyBox
-from cairn_calib.camera import camera_from_field_of_view
-from cairn_calib.rig import Rig, Spectrum, mounted, rig_from_json
+from cairn_calib.rig.body import Body, BodyBox
+from cairn_calib.rig.camera import camera_from_field_of_view
+from cairn_calib.rig.rig import Rig, Spectrum, mounted, rig_from_json
 from cairn_map.errors import BadInputError
 
 BODY = Body(

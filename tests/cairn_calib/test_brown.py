@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cairn_calib.brown import RADIUS_MAX, Coefficients, distorted, jacobian, radius_limit, undistorted
-from cairn_calib.camera import Camera
+from cairn_calib.rig.brown import RADIUS_MAX, Coefficients, distorted, jacobian, radius_limit, undistorted
+from cairn_calib.rig.camera import Camera
 
 law = settings(max_examples=100, deadline=None, database=None)
 lenses = st.tuples(

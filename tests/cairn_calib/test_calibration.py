@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cairn_calib.calibration import Calibration, covariance_from_matrix
-from cairn_calib.camera import camera_from_field_of_view
-from cairn_calib.fisheye import FisheyeCamera
-from cairn_calib.pose_vectors import transform_from_vector
-from cairn_calib.rig import RIG_BYTES_MAX, Rig, Spectrum, mounted, rig_from_json
+from cairn_calib.rig.calibration import Calibration, covariance_from_matrix
+from cairn_calib.rig.camera import camera_from_field_of_view
+from cairn_calib.rig.fisheye import FisheyeCamera
+from cairn_calib.rig.pose_vectors import transform_from_vector
+from cairn_calib.rig.rig import RIG_BYTES_MAX, Rig, Spectrum, mounted, rig_from_json
 from cairn_map.errors import BadInputError
 
 FISHEYE = FisheyeCamera(

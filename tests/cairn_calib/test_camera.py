@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from cairn_calib.camera import Camera, camera_from_field_of_view
+from cairn_calib.rig.camera import Camera, camera_from_field_of_view
 from cairn_map.errors import BadInputError
 
 law = settings(max_examples=50, deadline=None, database=None)

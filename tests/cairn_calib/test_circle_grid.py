@@ -3,8 +3,8 @@
 import numpy as np
 from tests.cairn_calib.board_images import DISC, THERMAL, TOF, Floats, Spectrum, picture, pose
 
-from cairn_calib.board import Board
-from cairn_calib.circle_grid import find_circles
+from cairn_calib.board.board import Board
+from cairn_calib.board.circle_grid import find_circles
 
 DISCS = Board(pattern="asymmetric-circles", columns=4, rows=11, pitch_m=0.05)
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from tests.cairn_calib.board_images import BOARD, COLOUR, THERMAL, TOF, Floats, Image, Spectrum, picture, pose, truth
 
-from cairn_calib.board import Board
-from cairn_calib.corner_detection import find_chessboard, fit_pointed_at
-from cairn_calib.corner_gates import sound_corners
-from cairn_calib.corner_refinement import fit_corners
-from cairn_calib.corners import FOUND, Corners, Detection
+from cairn_calib.board.board import Board
+from cairn_calib.board.corner_detection import find_chessboard, fit_pointed_at
+from cairn_calib.board.corner_gates import sound_corners
+from cairn_calib.board.corner_refinement import fit_corners
+from cairn_calib.board.corners import FOUND, Corners, Detection
 from cairn_map.errors import BadInputError
 
 SPECTRA = {"colour": (COLOUR, 1, "normal"), "thermal": (THERMAL, 2, "reversed"), "tof": (TOF, 5, "normal")}

@@ -7,15 +7,15 @@ import pytest
 from tests.cairn_calib.board_images import DISC, THERMAL, Floats, pose
 from tests.cairn_calib.test_circle_grid import disc_centroids
 
-from cairn_calib.board import Board
-from cairn_calib.board_views import BoardView, BoardViews
-from cairn_calib.corners import Corners
-from cairn_calib.disc_shift import disc_shift
-from cairn_calib.examination import examined
-from cairn_calib.rig import Spectrum
-from cairn_calib.solve import Solution, solve_rig
-from cairn_calib.solve_plan import STATED, usual_plan
-from cairn_calib.solved_rig import solved_rig
+from cairn_calib.board.board import Board
+from cairn_calib.board.corners import Corners
+from cairn_calib.diagnosis.examination import examined
+from cairn_calib.rig.rig import Spectrum
+from cairn_calib.solve.board_views import BoardView, BoardViews
+from cairn_calib.solve.disc_shift import disc_shift
+from cairn_calib.solve.solve import Solution, solve_rig
+from cairn_calib.solve.solve_plan import STATED, usual_plan
+from cairn_calib.solve.solved_rig import solved_rig
 
 CENTRES = Board(pattern="circles", columns=4, rows=3, pitch_m=0.15)
 """Few large discs, as on heated boards; of unknown size."""

@@ -9,20 +9,20 @@ import numpy.typing as npt
 import pytest
 from tests.cairn_calib.simulated_views import SPECTRA, exact_pixels, views_of, world
 
-from cairn_calib.board_views import BoardView
-from cairn_calib.corners import Corners
-from cairn_calib.cross_validation import cross_validated
-from cairn_calib.examination import Examination, examined
-from cairn_calib.next_image import NextImage
-from cairn_calib.probe_points import probes_of
-from cairn_calib.projection_uncertainty import project_certain, transfer_certain
-from cairn_calib.rig_state import moved
-from cairn_calib.solve import Solution, solve_from, solve_rig
-from cairn_calib.solve_plan import STATED, usual_plan
-from cairn_calib.solve_warnings import Warned, refuse_undetermined, warnings_of
-from cairn_calib.solved_rig import solved_rig
-from cairn_calib.view_coverage import coverage
-from cairn_calib.world_uncertainty import pixel_covariance, world_covariance
+from cairn_calib.board.corners import Corners
+from cairn_calib.diagnosis.cross_validation import cross_validated
+from cairn_calib.diagnosis.examination import Examination, examined
+from cairn_calib.diagnosis.next_image import NextImage
+from cairn_calib.diagnosis.probe_points import probes_of
+from cairn_calib.diagnosis.solve_warnings import Warned, refuse_undetermined, warnings_of
+from cairn_calib.diagnosis.view_coverage import coverage
+from cairn_calib.diagnosis.world_uncertainty import pixel_covariance, world_covariance
+from cairn_calib.rig.projection_uncertainty import project_certain, transfer_certain
+from cairn_calib.solve.board_views import BoardView
+from cairn_calib.solve.rig_state import moved
+from cairn_calib.solve.solve import Solution, solve_from, solve_rig
+from cairn_calib.solve.solve_plan import STATED, usual_plan
+from cairn_calib.solve.solved_rig import solved_rig
 from cairn_map.errors import BadInputError
 
 Floats = npt.NDArray[np.float64]

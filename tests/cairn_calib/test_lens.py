@@ -5,11 +5,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.brown import Coefficients, distorted, radius_limit, undistorted
-from cairn_calib.camera import Camera
-from cairn_calib.fisheye import FisheyeCamera, angle_limit
-from cairn_calib.lens import Lens
-from cairn_calib.pose_vectors import moved_points, rotation_from_vector, transform_from_vector, vector_from_transform
+from cairn_calib.rig.brown import Coefficients, distorted, radius_limit, undistorted
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.fisheye import FisheyeCamera, angle_limit
+from cairn_calib.rig.lens import Lens
+from cairn_calib.rig.pose_vectors import (
+    moved_points,
+    rotation_from_vector,
+    transform_from_vector,
+    vector_from_transform,
+)
 
 Floats = npt.NDArray[np.float64]
 

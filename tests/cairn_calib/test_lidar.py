@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from cairn_calib.lidar import SpinningLidar
+from cairn_calib.rig.lidar import SpinningLidar
 from cairn_map.errors import BadInputError
 
 law = settings(max_examples=50, deadline=None, database=None)

@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cairn_calib.board import Board
-from cairn_calib.board_views import BoardView, BoardViews
-from cairn_calib.corners import Corners
-from cairn_calib.pose_vectors import vector_from_transform
-from cairn_calib.poses import inverse
-from cairn_calib.probe_points import image_grid
-from cairn_calib.rig import Spectrum
-from cairn_calib.solve import Solution, solve_rig
-from cairn_calib.solve_plan import STATED, CameraPlan, SolvePlan
-from cairn_calib.solved_rig import solved_rig
-from cairn_calib.world_uncertainty import pixel_covariance, world_covariance
+from cairn_calib.board.board import Board
+from cairn_calib.board.corners import Corners
+from cairn_calib.diagnosis.probe_points import image_grid
+from cairn_calib.diagnosis.world_uncertainty import pixel_covariance, world_covariance
+from cairn_calib.rig.pose_vectors import vector_from_transform
+from cairn_calib.rig.poses import inverse
+from cairn_calib.rig.rig import Spectrum
+from cairn_calib.solve.board_views import BoardView, BoardViews
+from cairn_calib.solve.solve import Solution, solve_rig
+from cairn_calib.solve.solve_plan import STATED, CameraPlan, SolvePlan
+from cairn_calib.solve.solved_rig import solved_rig
 
 REFERENCE_FILE = Path(__file__).parent / "mrcal_reference.json"
 REFERENCE = json.loads(REFERENCE_FILE.read_text())

@@ -7,12 +7,12 @@ import numpy.typing as npt
 import pytest
 from tests.cairn_calib.simulated_views import SPECTRA, ranges_of, views_of, world
 
-from cairn_calib.adjustment import Problem, Sensor
-from cairn_calib.corner_residuals import CornerData
-from cairn_calib.normal_equations import Loss, NormalEquations, uncertainty
-from cairn_calib.rig_state import RigState, moved
-from cairn_calib.solve import Solution, solve_rig
-from cairn_calib.solve_plan import usual_plan
+from cairn_calib.solve.adjustment import Problem, Sensor
+from cairn_calib.solve.corner_residuals import CornerData
+from cairn_calib.solve.normal_equations import Loss, NormalEquations, uncertainty
+from cairn_calib.solve.rig_state import RigState, moved
+from cairn_calib.solve.solve import Solution, solve_rig
+from cairn_calib.solve.solve_plan import usual_plan
 
 Floats = npt.NDArray[np.float64]
 

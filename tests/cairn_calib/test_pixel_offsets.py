@@ -8,18 +8,18 @@ import numpy.typing as npt
 import pytest
 from tests.cairn_calib.simulated_views import SPECTRA, TOF, World, ranges_of, views_of, world
 
-from cairn_calib.normal_equations import Loss
-from cairn_calib.pixel_offsets import UNIT_M, PixelOffsets, pixel_offsets
-from cairn_calib.range_nodes import NODES, pixel_nodes
-from cairn_calib.range_residuals import range_block
-from cairn_calib.range_terms import ALWAYS, BIAS_NAMES, off_middle_image
-from cairn_calib.range_warnings import range_warnings
-from cairn_calib.rig import Rig, rig_from_json
-from cairn_calib.rig_state import moved
-from cairn_calib.solve import SMOOTH_M, Solution, solve_rig
-from cairn_calib.solve_plan import usual_plan
-from cairn_calib.solve_warnings import warnings_of
-from cairn_calib.solved_rig import solved_rig
+from cairn_calib.diagnosis.range_warnings import range_warnings
+from cairn_calib.diagnosis.solve_warnings import warnings_of
+from cairn_calib.rig.pixel_offsets import UNIT_M, PixelOffsets, pixel_offsets
+from cairn_calib.rig.range_terms import ALWAYS, BIAS_NAMES, off_middle_image
+from cairn_calib.rig.rig import Rig, rig_from_json
+from cairn_calib.solve.normal_equations import Loss
+from cairn_calib.solve.range_nodes import NODES, pixel_nodes
+from cairn_calib.solve.range_residuals import range_block
+from cairn_calib.solve.rig_state import moved
+from cairn_calib.solve.solve import SMOOTH_M, Solution, solve_rig
+from cairn_calib.solve.solve_plan import usual_plan
+from cairn_calib.solve.solved_rig import solved_rig
 from cairn_map.errors import BadInputError
 
 Floats = npt.NDArray[np.float64]

@@ -9,11 +9,11 @@ from tests.board_finding.trials import SPECTRA, trial
 from tests.cairn_calib.board_images import BOARD, THERMAL, TOF, picture, pose, truth
 from tests.cairn_calib.test_circle_grid import DISCS
 
-from cairn_calib.corner_detection import find_chessboard, grey
-from cairn_calib.corner_file import read_corner_file
-from cairn_calib.corner_pictures import BAND_PX, overlay
-from cairn_calib.corners_command import main
-from cairn_calib.polarity_vote import Vote, margin_polarity, turned, vote_of
+from cairn_calib.board.corner_detection import find_chessboard, grey
+from cairn_calib.board.corner_file import read_corner_file
+from cairn_calib.board.corner_pictures import BAND_PX, overlay
+from cairn_calib.board.polarity_vote import Vote, margin_polarity, turned, vote_of
+from cairn_calib.cli.corners import main
 
 
 @pytest.mark.parametrize(("name", "count"), [("tof", 12), ("thermal", 3), ("colour", 1)])

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cairn_calib.poses import (
+from cairn_calib.rig.poses import (
     Transform,
     checked_transform,
     inverse,

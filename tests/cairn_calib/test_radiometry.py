@@ -8,8 +8,10 @@ import numpy.typing as npt
 import pytest
 from pydantic import ValidationError
 
-from cairn_calib.camera import camera_from_field_of_view
-from cairn_calib.object_temperature import (
+from cairn_calib.rig.camera import camera_from_field_of_view
+from cairn_calib.rig.radiometry import PlanckResponse, PolynomialResponse, Radiometry, Response, radiometry_from_json
+from cairn_calib.rig.rig import Spectrum, mounted
+from cairn_calib.thermal.object_temperature import (
     NotRadiometric,
     Temperatures,
     Viewing,
@@ -17,9 +19,7 @@ from cairn_calib.object_temperature import (
     seen_counts,
     temperatures,
 )
-from cairn_calib.radiometry import PlanckResponse, PolynomialResponse, Radiometry, Response, radiometry_from_json
-from cairn_calib.response_fit import Law, Reference, fit_response
-from cairn_calib.rig import Spectrum, mounted
+from cairn_calib.thermal.response_fit import Law, Reference, fit_response
 from cairn_map.errors import BadInputError
 
 Floats = npt.NDArray[np.float64]

@@ -7,15 +7,15 @@ import numpy.typing as npt
 import pytest
 from tests.cairn_calib.simulated_views import BOARD, SPECTRA, TOF, World, ranges_of, views_of, world
 
-from cairn_calib.range_bias import ByAmplitude, RangeBias, Wave, Wiggle
-from cairn_calib.range_choice import AMPLITUDE_RATIO, PERIOD_SHARE, RangeSpans, chosen_terms
-from cairn_calib.range_terms import BIAS_NAMES, RangeTerms, off_middle_image, wave_period_m
-from cairn_calib.range_warnings import range_warnings
-from cairn_calib.rig import Spectrum
-from cairn_calib.solve import Solution, solve_rig
-from cairn_calib.solve_plan import usual_plan
-from cairn_calib.solve_warnings import Warned
-from cairn_calib.solved_rig import solved_rig
+from cairn_calib.diagnosis.range_warnings import range_warnings
+from cairn_calib.diagnosis.solve_warnings import Warned
+from cairn_calib.rig.range_bias import ByAmplitude, RangeBias, Wave, Wiggle
+from cairn_calib.rig.range_terms import BIAS_NAMES, RangeTerms, off_middle_image, wave_period_m
+from cairn_calib.rig.rig import Spectrum
+from cairn_calib.solve.range_choice import AMPLITUDE_RATIO, PERIOD_SHARE, RangeSpans, chosen_terms
+from cairn_calib.solve.solve import Solution, solve_rig
+from cairn_calib.solve.solve_plan import usual_plan
+from cairn_calib.solve.solved_rig import solved_rig
 
 Floats = npt.NDArray[np.float64]
 

@@ -10,9 +10,9 @@ import pytest
 from tests.cairn_calib.simulated_views import views_of, world
 from tests.cairn_calib.test_solve_command import written
 
-from cairn_calib.calib_command import main
-from cairn_calib.radiometry import PlanckResponse, Radiometry
-from cairn_calib.rig import load_rig, rig_from_json
+from cairn_calib.cli.main import main
+from cairn_calib.rig.radiometry import PlanckResponse, Radiometry
+from cairn_calib.rig.rig import load_rig, rig_from_json
 from cairn_map.errors import BadInputError
 
 NAMES = ("tof", "thermal-left")

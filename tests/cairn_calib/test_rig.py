@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cairn_calib.camera import Camera, camera_from_field_of_view
-from cairn_calib.lidar import SpinningLidar
-from cairn_calib.poses import look_at
-from cairn_calib.rig import Rig, Spectrum, load_rig, mounted, rig_from_json
+from cairn_calib.rig.camera import Camera, camera_from_field_of_view
+from cairn_calib.rig.lidar import SpinningLidar
+from cairn_calib.rig.poses import look_at
+from cairn_calib.rig.rig import Rig, Spectrum, load_rig, mounted, rig_from_json
 from cairn_map.errors import BadInputError
 
 RIG = Rig(

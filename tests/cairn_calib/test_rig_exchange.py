@@ -9,15 +9,15 @@ import numpy.typing as npt
 import pytest
 import yaml
 
-from cairn_calib.calib_command import main
-from cairn_calib.camera import Camera
-from cairn_calib.fisheye import FisheyeCamera
-from cairn_calib.lens import Lens
-from cairn_calib.placed import PlacedCamera
-from cairn_calib.pose_vectors import transform_from_vector
-from cairn_calib.rig import Rig, Spectrum, load_rig, mounted
-from cairn_calib.rig_exchange import FORMATS, cameras_of_rig, format_of_text
-from cairn_calib.sensing import RangeSensing
+from cairn_calib.cli.main import main
+from cairn_calib.exchange.placed_camera import PlacedCamera
+from cairn_calib.exchange.rig_exchange import FORMATS, cameras_of_rig, format_of_text
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.fisheye import FisheyeCamera
+from cairn_calib.rig.lens import Lens
+from cairn_calib.rig.pose_vectors import transform_from_vector
+from cairn_calib.rig.rig import Rig, Spectrum, load_rig, mounted
+from cairn_calib.rig.sensing import RangeSensing
 from cairn_map.errors import BadInputError
 
 # Numbers that no decimal of few digits is, and some that are written with an exponent.

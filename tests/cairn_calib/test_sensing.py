@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from cairn_calib.camera import camera_from_field_of_view
-from cairn_calib.lidar import SpinningLidar
-from cairn_calib.rig import Rig, Spectrum, mounted, rig_from_json
-from cairn_calib.sensing import RangeSensing
+from cairn_calib.rig.camera import camera_from_field_of_view
+from cairn_calib.rig.lidar import SpinningLidar
+from cairn_calib.rig.rig import Rig, Spectrum, mounted, rig_from_json
+from cairn_calib.rig.sensing import RangeSensing
 from cairn_map.errors import BadInputError
 
 CAMERA = camera_from_field_of_view(4, 3, horizontal_deg=60)

@@ -11,19 +11,19 @@ import numpy.typing as npt
 import pytest
 from tests.cairn_calib.simulated_views import BOARD, SPECTRA, World, errors_of, ranges_of, views_of, world
 
-from cairn_calib.adjustment import adjust
-from cairn_calib.board import Board
-from cairn_calib.board_views import BoardView, BoardViews
-from cairn_calib.corners import Corners
-from cairn_calib.pose_vectors import transform_from_vector
-from cairn_calib.poses import inverse
-from cairn_calib.probe_points import image_grid
-from cairn_calib.range_terms import BIAS_NAMES
-from cairn_calib.rig import Spectrum
-from cairn_calib.rig_start import half_turn
-from cairn_calib.solve import Solution, solve_rig
-from cairn_calib.solve_plan import STATED, CameraPlan, Noise, SolvePlan, usual_plan
-from cairn_calib.solved_rig import solved_rig, statistics_of
+from cairn_calib.board.board import Board
+from cairn_calib.board.corners import Corners
+from cairn_calib.diagnosis.probe_points import image_grid
+from cairn_calib.rig.pose_vectors import transform_from_vector
+from cairn_calib.rig.poses import inverse
+from cairn_calib.rig.range_terms import BIAS_NAMES
+from cairn_calib.rig.rig import Spectrum
+from cairn_calib.solve.adjustment import adjust
+from cairn_calib.solve.board_views import BoardView, BoardViews
+from cairn_calib.solve.rig_start import half_turn
+from cairn_calib.solve.solve import Solution, solve_rig
+from cairn_calib.solve.solve_plan import STATED, CameraPlan, Noise, SolvePlan, usual_plan
+from cairn_calib.solve.solved_rig import solved_rig, statistics_of
 from cairn_map.errors import BadInputError
 
 Floats = npt.NDArray[np.float64]

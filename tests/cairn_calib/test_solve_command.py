@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from tests.cairn_calib.simulated_views import BOARD, ranges_of, views_of, world
 
-from cairn_calib.board_views import BoardViews, frame_of, read_board_views
-from cairn_calib.calib_command import main
-from cairn_calib.corner_file import corner_file
-from cairn_calib.corners import Attempt, Detection
-from cairn_calib.rig import Spectrum, load_rig
+from cairn_calib.board.corner_file import corner_file
+from cairn_calib.board.corners import Attempt, Detection
+from cairn_calib.cli.main import main
+from cairn_calib.rig.rig import Spectrum, load_rig
+from cairn_calib.solve.board_views import BoardViews, frame_of, read_board_views
 from cairn_map.errors import BadInputError
 
 PAIR = ("tof", "left")

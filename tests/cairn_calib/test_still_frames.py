@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from tests.cairn_calib.board_images import TOF, Floats, picture, pose, truth
 
-from cairn_calib.corner_file import read_corner_file
-from cairn_calib.corners_command import main
-from cairn_calib.still_frames import read_still
+from cairn_calib.board.corner_file import read_corner_file
+from cairn_calib.board.still_frames import read_still
+from cairn_calib.cli.corners import main
 from cairn_map.errors import BadInputError, NotFoundError
 
 NOISY = replace(TOF, noise=900.0)

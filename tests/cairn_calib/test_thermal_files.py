@@ -9,13 +9,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.calib_command import main
-from cairn_calib.camera import camera_from_field_of_view
-from cairn_calib.flat_field import FlatField, fit_flat_field, read_flat_field, write_flat_field
-from cairn_calib.flir_file import read_flir
-from cairn_calib.object_temperature import Temperatures, temperatures
-from cairn_calib.radiometry import PlanckResponse
-from cairn_calib.rig import Rig, Spectrum, load_rig, mounted
+from cairn_calib.cli.main import main
+from cairn_calib.rig.camera import camera_from_field_of_view
+from cairn_calib.rig.radiometry import PlanckResponse
+from cairn_calib.rig.rig import Rig, Spectrum, load_rig, mounted
+from cairn_calib.thermal.flat_field import FlatField, fit_flat_field, read_flat_field, write_flat_field
+from cairn_calib.thermal.flir_file import read_flir
+from cairn_calib.thermal.object_temperature import Temperatures, temperatures
 from cairn_map.errors import BadInputError, DamagedDataError
 
 Floats = npt.NDArray[np.float64]

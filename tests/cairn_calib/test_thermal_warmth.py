@@ -8,11 +8,11 @@ import numpy.typing as npt
 import pytest
 from tests.cairn_calib.test_thermal_files import RESPONSE, SIZE, images, scene
 
-from cairn_calib.calib_command import main
-from cairn_calib.flat_field import FlatField, fit_flat_field, read_flat_field, write_flat_field
-from cairn_calib.object_temperature import NotRadiometric, Temperatures, temperatures
-from cairn_calib.radiometry import PlanckResponse, PolynomialResponse, Radiometry, Response, radiometry_from_json
-from cairn_calib.response_fit import Law, Reference, ResponseFit, fit_response
+from cairn_calib.cli.main import main
+from cairn_calib.rig.radiometry import PlanckResponse, PolynomialResponse, Radiometry, Response, radiometry_from_json
+from cairn_calib.thermal.flat_field import FlatField, fit_flat_field, read_flat_field, write_flat_field
+from cairn_calib.thermal.object_temperature import NotRadiometric, Temperatures, temperatures
+from cairn_calib.thermal.response_fit import Law, Reference, ResponseFit, fit_response
 from cairn_map.errors import BadInputError
 
 Floats = npt.NDArray[np.float64]

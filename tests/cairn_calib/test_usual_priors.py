@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 from tests.cairn_calib.simulated_views import LENSES, SPECTRA, views_of, world
 
-from cairn_calib.camera import Camera
-from cairn_calib.examination import examined
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_calib.solve import Solution, solve_rig
-from cairn_calib.solve_plan import STATED, CameraPlan, SolvePlan, usual_plan
-from cairn_calib.solved_rig import solved_rig
-from cairn_calib.usual_priors import USUAL_SIGMAS
-from cairn_calib.verification import carried_pixels
+from cairn_calib.diagnosis.examination import examined
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.solve.priors import USUAL_SIGMAS
+from cairn_calib.solve.solve import Solution, solve_rig
+from cairn_calib.solve.solve_plan import STATED, CameraPlan, SolvePlan, usual_plan
+from cairn_calib.solve.solved_rig import solved_rig
+from cairn_calib.verify.verification import carried_pixels
 
 TILTED: dict[str, Camera] = {
     name: lens.model_copy(update={"distortion": (*lens.distortion[:2], 8e-4, -6e-4, -0.03)})

@@ -7,16 +7,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.calibration import Calibration, covariance_from_matrix
-from cairn_calib.camera import Camera
-from cairn_calib.disc_images import Disc
-from cairn_calib.pose_vectors import transform_from_vector
-from cairn_calib.poses import inverse
-from cairn_calib.range_bias import RangeBias
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_calib.verification import Found, Sight, Sightings, add_sights, carried_pixels, range_camera_of
-from cairn_calib.verification_report import verification_json, verification_page
-from cairn_calib.verification_table import table_of, table_text
+from cairn_calib.rig.calibration import Calibration, covariance_from_matrix
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.pose_vectors import transform_from_vector
+from cairn_calib.rig.poses import inverse
+from cairn_calib.rig.range_bias import RangeBias
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.verify.disc_images import Disc
+from cairn_calib.verify.verification import Found, Sight, Sightings, add_sights, carried_pixels, range_camera_of
+from cairn_calib.verify.verification_report import verification_json, verification_page
+from cairn_calib.verify.verification_table import table_of, table_text
 from cairn_map.errors import BadInputError
 
 Floats = npt.NDArray[np.float64]

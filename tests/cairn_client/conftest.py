@@ -11,12 +11,12 @@ import uvicorn
 from hypothesis import HealthCheck, settings
 from tests.cairn_client.made import GEOMETRY, MAP
 
-from cairn_client.api import MapApi
-from cairn_map.messages import CreateMap
-from cairn_server.routes import make_app
+from cairn_client.http.api import MapApi
+from cairn_map.wire.messages import CreateMap
+from cairn_server.http.app import make_app
 from cairn_server.service import Service
 from cairn_server.settings import Settings
-from cairn_server.sqlite_store import SqliteStore
+from cairn_server.store.sqlite.store import SqliteStore
 
 settings.register_profile(
     "cairn", max_examples=50, deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow]

@@ -5,19 +5,19 @@ from types import TracebackType
 from typing import Any, Self
 
 from tests.cairn_client.made import GEOMETRY, MAP, random_diff
-from tests.cairn_server.live import Live, until
+from tests.cairn_server.live.hub import Live, until
 
-from cairn_client.api import MapApi
-from cairn_client.robot import Robot
-from cairn_client.upstream import Upstream
-from cairn_map.access_messages import CreateToken
-from cairn_map.ids import CommitId
-from cairn_map.messages import CreateMap, Retract
-from cairn_server.auth import ADMIN_FILE
-from cairn_server.handing_over import server_key
-from cairn_server.own_end import OwnMaps
-from cairn_server.store_rows import MapRow
-from cairn_server.tokens import create_token
+from cairn_client.http.api import MapApi
+from cairn_client.relay.upstream import Upstream
+from cairn_client.robot.robot import Robot
+from cairn_map.commits.ids import CommitId
+from cairn_map.wire.access_messages import CreateToken
+from cairn_map.wire.messages import CreateMap, Retract
+from cairn_server.access.auth import ADMIN_FILE
+from cairn_server.access.tokens import create_token
+from cairn_server.operations.local_peer import OwnMaps
+from cairn_server.store.store_rows import MapRow
+from cairn_server.sync.handing_over import server_key
 
 ADMIN = "a" * 20
 EVERY_S = 0.02

@@ -5,22 +5,22 @@ from pathlib import Path
 
 import numpy as np
 
-from cairn_client.applying import Exchange
-from cairn_client.replica import Replica
-from cairn_client.replica_store import ReplicaStore
-from cairn_map.brick_cell import sum_evidence
-from cairn_map.cell_code import encode_cell
-from cairn_map.channels import TEMPERATURE
-from cairn_map.commit import Commit
-from cairn_map.cursor import Cursor
-from cairn_map.evidence import Evidence, empty_evidence, packed_evidence
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.fingerprint import fingerprint
-from cairn_map.frames import CellFrame, Frame, FrameKind
-from cairn_map.grid import CellKey, Geometry, cell_key
-from cairn_map.ids import Author, CommitId, RobotName
-from cairn_map.messages import Done, ReplyHeader
-from cairn_map.version_vector import EMPTY, VersionVector
+from cairn_client.replica.replica import Replica
+from cairn_client.replica.replica_store import ReplicaStore
+from cairn_client.sync.applying import Exchange
+from cairn_map.codec.cell_code import encode_cell
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.cursor import Cursor
+from cairn_map.commits.ids import Author, CommitId, RobotName
+from cairn_map.commits.version_vector import EMPTY, VersionVector
+from cairn_map.evidence.brick_cell import sum_evidence
+from cairn_map.evidence.channels import TEMPERATURE
+from cairn_map.evidence.evidence import Evidence, empty_evidence, packed_evidence
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.fingerprint import fingerprint
+from cairn_map.evidence.grid import CellKey, Geometry, cell_key
+from cairn_map.wire.frames import CellFrame, Frame, FrameKind
+from cairn_map.wire.messages import Done, ReplyHeader
 
 MAP = "lab"
 GEOMETRY = Geometry(voxel_edge_um=50_000, depth=3, channels=(TEMPERATURE,))

@@ -9,12 +9,12 @@ from itertools import count
 import numpy as np
 from tests.cairn_client.made import GEOMETRY
 
-from cairn_calib.camera import Camera
-from cairn_calib.poses import look_at
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_client.robot import Robot
-from cairn_fusion.integrate import Integrator
-from cairn_fusion.scan import Scan
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.poses import look_at
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_client.robot.robot import Robot
+from cairn_fusion.mapping.integrate import Integrator
+from cairn_fusion.recording.scan import Scan
 
 TOF = Camera(width=4, height=3, focal_px=(4.0, 4.0), centre_px=(1.5, 1.0))
 RIG = Rig(name="head", cameras={"tof": mounted(Spectrum.RANGE, TOF, np.eye(4))})

@@ -10,26 +10,26 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.camera import Camera
-from cairn_calib.poses import Transform, checked_transform, inverse, transform_points
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_client import alignment
-from cairn_client.alignment import Aligning, align_points, one_a_voxel, starts_around
-from cairn_client.alignment_verdict import Alignment, Verdict
-from cairn_client.robot import Robot
-from cairn_fusion.integrate import Integrator, integrate_scans
-from cairn_fusion.measurement import Measurement
-from cairn_fusion.scan import Scan
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.poses import Transform, checked_transform, inverse, transform_points
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_client.robot import alignment
+from cairn_client.robot.alignment import Aligning, align_points, one_a_voxel, starts_around
+from cairn_client.robot.alignment_verdict import Alignment, Verdict
+from cairn_client.robot.robot import Robot
+from cairn_fusion.mapping.integrate import Integrator, integrate_scans
+from cairn_fusion.mapping.measurement import Measurement
+from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import BadInputError
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import Geometry, geometry_for
-from cairn_map.map_snapshot import MapSnapshot, snapshot_of
-from cairn_sim.heads import RANGE_CAMERA
-from cairn_sim.render import render_scan
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
-from cairn_sim.sensors import Noise
-from cairn_sim.trajectories import stops
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import Geometry, geometry_for
+from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
+from cairn_sim.render.render import render_scan
+from cairn_sim.render.sensors import Noise
+from cairn_sim.robots.heads import RANGE_CAMERA
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.robots.trajectories import stops
+from cairn_sim.scene.scene_file import load_scene
 
 Floats = npt.NDArray[np.float64]
 DATA = os.environ.get("CAIRN_TEST_DATA")

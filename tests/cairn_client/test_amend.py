@@ -11,15 +11,15 @@ from tests.cairn_client.made import GEOMETRY, cells_of
 from tests.cairn_client.robot_program import INTEGRATOR, RIG, scan_of
 from tests.cairn_client.world import stored_commits
 
-from cairn_calib.poses import Transform, look_at
-from cairn_client.kept_scans import OPEN
-from cairn_client.robot import Robot
-from cairn_fusion.integrate import integrate_scan
-from cairn_fusion.scan import Scan
-from cairn_map.commit import Commit
+from cairn_calib.rig.poses import Transform, look_at
+from cairn_client.robot.kept_scans import OPEN
+from cairn_client.robot.robot import Robot
+from cairn_fusion.mapping.integrate import integrate_scan
+from cairn_fusion.recording.scan import Scan
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.ids import CommitId
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, NotFoundError
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.ids import CommitId
+from cairn_map.evidence.evidence_map import EvidenceMap
 
 NOWHERE = "http://127.0.0.1:9/maps/lab"
 PLENTY = 10_000_000

@@ -5,10 +5,10 @@ import pytest
 from tests.cairn_fusion.bags import mapping_text, recorded, write_bag
 from tests.cairn_fusion.test_bags import GEOMETRY, small_recording
 
-from cairn_client.robot import Robot
-from cairn_client.robot_command import main
-from cairn_fusion.recording import Recording
-from cairn_map.cell_code import encode_cell
+from cairn_client.cli.robots.command import main
+from cairn_client.robot.robot import Robot
+from cairn_fusion.recording.recording import Recording
+from cairn_map.codec.cell_code import encode_cell
 from cairn_map.errors import BadInputError, ConflictError
 
 NOBODY = "http://127.0.0.1:9/maps/lab"

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 from tests.cairn_client.made import MAP
-from tests.cairn_server.pushes import pushed
+from tests.cairn_server.sync.pushes import pushed
 
-from cairn_client.carried import COMING, CarriedCommits
+from cairn_client.relay.carried import COMING, CarriedCommits
+from cairn_map.commits.ids import Author, CommitId, RobotName
+from cairn_map.commits.signature import TEXT_MAX, SigningKey, signatures_to_text
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, NotFoundError, UnreachableError
-from cairn_map.ids import Author, CommitId, RobotName
-from cairn_map.relay_end import SignedCommit
-from cairn_map.signature import TEXT_MAX, SigningKey, signatures_to_text
+from cairn_map.wire.relay_peer import SignedCommit
 
 KEY = SigningKey(bytes(32))
 AUTHOR = Author(RobotName("other"), KEY.incarnation)

@@ -8,18 +8,18 @@ from tests.cairn_client.conftest import LiveServer
 from tests.cairn_client.made import MAP, cells_of, cursor, header, seen
 from tests.cairn_client.test_sync import Team
 
-from cairn_client import api as api_module
-from cairn_client import cell_index as index_module
-from cairn_client.api import MapApi
-from cairn_client.asks import Box
-from cairn_client.cell_index import whole_index
-from cairn_client.link import Link, index_of
-from cairn_client.sync import fetch_cells
+from cairn_client.http import api as api_module
+from cairn_client.http.api import MapApi
+from cairn_client.http.http_link import Link, index_of
+from cairn_client.sync import cell_index as index_module
+from cairn_client.sync.cell_index import whole_index
+from cairn_client.sync.requests import Box
+from cairn_client.sync.sync import fetch_cells
+from cairn_map.commits.ids import Author
 from cairn_map.errors import UnreachableError
-from cairn_map.grid import Cell, CellKey, cell_key
-from cairn_map.ids import Author
-from cairn_map.index_messages import CellEntry, CellIndex
-from cairn_map.messages import Retract
+from cairn_map.evidence.grid import Cell, CellKey, cell_key
+from cairn_map.wire.index_messages import CellEntry, CellIndex
+from cairn_map.wire.messages import Retract
 
 PAGE = 2
 KEYS = sorted(cell_key((i, 0, 0)) for i in range(-3, 4))

@@ -13,10 +13,10 @@ from tests.cairn_client.robot_program import scan_of
 from tests.cairn_client.test_robot import ADMIN, NOWHERE, TOKEN, map_commit, robot_in
 from tests.cairn_client.world import stored_commits
 
-from cairn_client.api import MapApi
-from cairn_client.backoff import Backoff
-from cairn_map.access_messages import CreateToken
+from cairn_client.http.api import MapApi
+from cairn_client.http.backoff import Backoff
 from cairn_map.errors import BadInputError, DeniedError, UnreachableError
+from cairn_map.wire.access_messages import CreateToken
 
 Until = Callable[[Callable[[], bool]], None]
 SOON_S = 8.0

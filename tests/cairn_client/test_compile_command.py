@@ -5,14 +5,14 @@ import sys
 
 import pytest
 
-from cairn_client.compile_command import main
+from cairn_client.cli.compile import main
 
 LOOK_AT_KERNELS = """
 import sys
 from importlib import import_module
 from pathlib import Path
 
-from cairn_client.compile_command import main
+from cairn_client.cli.compile import main
 from numba.core.caching import NullCache
 from numba.core.dispatcher import Dispatcher
 from numba.core.types import BaseNamedTuple
@@ -20,8 +20,8 @@ from numba.core.types import BaseNamedTuple
 main([])
 for package in ("cairn_map", "cairn_fusion", "cairn_sim"):
     folder = Path(import_module(package).__file__).parent
-    for path in sorted(folder.glob("*_kernels.py")):
-        module = import_module(f"{package}.{path.stem}")
+    for path in sorted(folder.rglob("*_kernels.py")):
+        module = import_module(".".join(path.relative_to(folder.parent).with_suffix("").parts))
         for name, value in vars(module).items():
             if not isinstance(value, Dispatcher):
                 continue
@@ -29,7 +29,7 @@ for package in ("cairn_map", "cairn_fusion", "cairn_sim"):
             if isinstance(value._cache, NullCache):
                 continue
             if any(isinstance(kernel.signature.return_type, BaseNamedTuple) for kernel in value.overloads.values()):
-                sys.exit(f"{module.__name__}.{name} makes a named tuple: ^C crashes it (cairn_map.kernel_interrupts)")
+                sys.exit(f"{module.__name__}.{name} makes a named tuple: ^C crashes it (kernel_interrupts.py)")
             if not value.signatures and not name.startswith("_"):
                 sys.exit(f"{module.__name__}.{name} is not called by {package}.warm_up")
 """

@@ -6,15 +6,15 @@ from pathlib import Path
 import pytest
 from tests.cairn_client.made import GEOMETRY, A, committed, covering, cursor, exchanged, header, opened, seen
 
-from cairn_client.asks import GetMissing, NextFrame, Push
-from cairn_client.replica import Replica
-from cairn_client.replica_store import BaseCell
-from cairn_client.resting import REST_S, Resting
-from cairn_client.sync import fetch_missing, push_commits
-from cairn_map.commit import Commit, CommitMeta, make_commit
+from cairn_client.replica.refused_commits import REST_S, Resting
+from cairn_client.replica.replica import Replica
+from cairn_client.replica.replica_store import BaseCell
+from cairn_client.sync.requests import GetMissing, NextFrame, Push
+from cairn_client.sync.sync import fetch_missing, push_commits
+from cairn_map.commits.commit import Commit, CommitMeta, make_commit
+from cairn_map.commits.ids import OPERATOR, Author, CommitId, Incarnation
 from cairn_map.errors import BadInputError, CairnError, ConflictError, DamagedDataError, UnreachableError
-from cairn_map.fingerprint import ZERO
-from cairn_map.ids import OPERATOR, Author, CommitId, Incarnation
+from cairn_map.evidence.fingerprint import ZERO
 
 X, Y, Z = seen(1, 2), seen(2, 100), seen(300)
 OPERATORS = Author(OPERATOR, Incarnation("00000000000000aa"))

@@ -6,15 +6,18 @@ from tests.cairn_client.conftest import LiveServer
 from tests.cairn_client.made import GEOMETRY, A, B, cells_of, seen
 from tests.cairn_map.made import SMALL
 
-from cairn_client import clone_command, diff_command, map_command, pull_copy_command
-from cairn_client.api import MapApi
-from cairn_client.map_copy import clone, pull
-from cairn_client.robot import Robot
-from cairn_client.state_folder import opened_replica
+from cairn_client.cli.maps import clone as clone_command
+from cairn_client.cli.maps import command as map_command
+from cairn_client.cli.maps import diff as diff_command
+from cairn_client.cli.maps import pull as pull_copy_command
+from cairn_client.folders.map_copy import clone, pull
+from cairn_client.folders.state_folder import opened_replica
+from cairn_client.http.api import MapApi
+from cairn_client.robot.robot import Robot
 from cairn_map.errors import BadInputError, ConflictError, UnreachableError
-from cairn_map.evidence import Evidence
-from cairn_map.grid import CellKey
-from cairn_map.messages import CreateMap
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey
+from cairn_map.wire.messages import CreateMap
 
 
 def push(server: LiveServer, folder: Path, *diffs: dict[CellKey, Evidence]) -> None:

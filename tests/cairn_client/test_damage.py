@@ -10,10 +10,10 @@ from tests.cairn_client.conftest import LiveServer
 from tests.cairn_client.made import GEOMETRY, A, B, added, cells_of, seen
 from tests.cairn_client.test_sync import Team
 
-from cairn_map.commit import CommitMeta
+from cairn_map.commits.commit import CommitMeta
+from cairn_map.commits.ids import CommitId
 from cairn_map.errors import BadInputError, DamagedDataError
-from cairn_map.grid import CellKey
-from cairn_map.ids import CommitId
+from cairn_map.evidence.grid import CellKey
 
 X, Y, Z, W = seen(1, 2, kelvin_steps=7), seen(2, 100), seen(30, 31), seen(40, 41)
 FIRST_CELL, LAST_CELL = min(A, B), max(A, B)

@@ -4,13 +4,13 @@ from pathlib import Path
 import pytest
 from tests.cairn_client.conftest import LiveServer
 from tests.cairn_client.made import A, opened, seen
-from tests.cairn_server.live import Live
+from tests.cairn_server.live.hub import Live
 
-from cairn_client.doctor_checks import Verdict
-from cairn_client.doctor_command import main
-from cairn_client.doctor_link import clock_check
-from cairn_client.map_copy import clone
-from cairn_client.robot import Robot
+from cairn_client.cli.doctor import main
+from cairn_client.cli.doctor_checks import Verdict
+from cairn_client.cli.doctor_link import clock_check
+from cairn_client.folders.map_copy import clone
+from cairn_client.robot.robot import Robot
 
 
 def told(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, dict[str, dict[str, str]]]:

@@ -17,7 +17,7 @@ from tests.cairn_client.test_robot import NOWHERE, map_commit, robot_in
 from tests.cairn_client.world import stored_commits
 
 from cairn_client import main as cairn
-from cairn_client.robot_command import main as robot_command
+from cairn_client.cli.robots.command import main as robot_command
 from cairn_map.errors import UnreachableError
 
 

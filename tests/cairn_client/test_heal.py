@@ -11,13 +11,14 @@ from tests.cairn_client.test_damage import flip_a_bit
 from tests.cairn_client.test_robot import evidence_of, map_commit, robot_in
 from tests.cairn_client.test_sync import Team
 
-from cairn_client import map_command, replay_command
-from cairn_client.api import MapApi
-from cairn_map.cell_code import encode_cell
-from cairn_map.cell_folder import write_cell
+from cairn_client.cli.maps import command as map_command
+from cairn_client.cli.robots import replay as replay_command
+from cairn_client.http.api import MapApi
+from cairn_map.codec.cell_code import encode_cell
 from cairn_map.errors import CairnError, DamagedDataError
-from cairn_map.grid import CellKey, cell_of_key
-from cairn_map.robot_status import Mode
+from cairn_map.evidence.grid import CellKey, cell_of_key
+from cairn_map.files.cell_folder import write_cell
+from cairn_map.wire.robot_status import Mode
 
 MAP = "lab"
 X, Y = seen(1, 2, kelvin_steps=7), seen(2, 100)

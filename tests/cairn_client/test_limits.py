@@ -10,16 +10,16 @@ from tests.cairn_client.made import GEOMETRY, MAP, cells_of
 from tests.cairn_client.robot_program import scan_of
 from tests.cairn_client.test_robot import evidence_of, map_commit, robot_in
 
-from cairn_client import replica_store
-from cairn_client.limits import NO_LIMITS, Limits
-from cairn_client.robot import Robot
-from cairn_client.robot_events import CellsDropped, OutboxNearlyFull
-from cairn_client.room import Kept
-from cairn_map.commit import ScanPose
+from cairn_client.replica import replica_store
+from cairn_client.robot.cell_budget import Kept
+from cairn_client.robot.limits import NO_LIMITS, Limits
+from cairn_client.robot.robot import Robot
+from cairn_client.robot.robot_events import CellsDropped, OutboxNearlyFull
+from cairn_map.commits.commit import ScanPose
 from cairn_map.errors import BadInputError, UnreachableError
-from cairn_map.evidence import Evidence, packed_evidence
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import CellKey, cell_key, cell_of_key
+from cairn_map.evidence.evidence import Evidence, packed_evidence
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import CellKey, cell_key, cell_of_key
 
 EDGE_M = GEOMETRY.cell_edge_m
 SIDE = 16
@@ -31,8 +31,8 @@ def small_pages(monkeypatch: pytest.MonkeyPatch) -> None:
     """So that small cells fill a small disk."""
     pragmas = tuple(p for p in replica_store.PRAGMAS if "page_size" not in p and "synchronous" not in p)
     monkeypatch.setattr(replica_store, "PRAGMAS", ("page_size = 512", "synchronous = OFF", *pragmas))
-    monkeypatch.setattr("cairn_client.room.ROW_BYTES", 300)
-    monkeypatch.setattr("cairn_client.room.SLACK_BYTES", 4096)
+    monkeypatch.setattr("cairn_client.robot.cell_budget.ROW_BYTES", 300)
+    monkeypatch.setattr("cairn_client.robot.cell_budget.SLACK_BYTES", 4096)
 
 
 def full_cell(seed: int) -> Evidence:
@@ -192,7 +192,7 @@ def test_a_commit_drops_the_farthest_cells_and_then_refuses(row_server: LiveServ
 def test_a_full_outbox_refuses_and_the_measurement_stays_open(
     server: LiveServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cairn_client.limits.LEAST_BYTES", 1)
+    monkeypatch.setattr("cairn_client.robot.limits.LEAST_BYTES", 1)
     with robot_in(tmp_path, server.map_url) as robot:
         size_bytes = 0
         map_commit(robot, 1)

@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cairn_client.graph_drawing import LANES_MAX, draw
-from cairn_client.log_graph import graph_of, log_graph
-from cairn_map.messages import LogEntry
+from cairn_client.cli.maps.graph_drawing import LANES_MAX, draw
+from cairn_client.cli.maps.log_graph import graph_of, log_graph
+from cairn_map.wire.messages import LogEntry
 
 Graph = list[list[int]]
 UP, DOWN, LEFT, RIGHT = (-1, 0), (1, 0), (0, -1), (0, 1)

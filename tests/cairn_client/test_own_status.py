@@ -8,12 +8,12 @@ from tests.cairn_client.made import MAP
 from tests.cairn_client.robot_program import scan_of
 from tests.cairn_client.test_robot import map_commit, robot_in
 
-from cairn_client import own_status
-from cairn_client.api import MapApi
-from cairn_client.branch_table import branch_table, shown_age
-from cairn_map.commit import ScanPose
-from cairn_map.messages import BranchInfo
-from cairn_map.robot_status import RobotStatus
+from cairn_client.cli.maps.branch_table import branch_table, shown_age
+from cairn_client.http.api import MapApi
+from cairn_client.robot import status_report
+from cairn_map.commits.commit import ScanPose
+from cairn_map.wire.messages import BranchInfo
+from cairn_map.wire.robot_status import RobotStatus
 
 
 def branch_of(server: LiveServer, name: str = "mole") -> BranchInfo:
@@ -65,7 +65,7 @@ def test_a_status_is_told_when_it_says_something_new_or_is_a_minute_old(
         mole.sync()
         assert [status.note for status in told] == ["", "at the stairs"]
         for later_s, count in ((59.0, 2), (61.0, 3), (-5.0, 4)):  # the clock may be set back, too
-            monkeypatch.setattr(own_status.time, "time", lambda later_s=later_s: told[1].time_s + later_s)
+            monkeypatch.setattr(status_report.time, "time", lambda later_s=later_s: told[1].time_s + later_s)
             mole.sync()
             assert len(told) == count
 

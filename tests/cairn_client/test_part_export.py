@@ -9,7 +9,7 @@ from tests.cairn_client.conftest import LiveServer
 from tests.cairn_client.made import A, B, seen
 from tests.cairn_client.test_copy_commands import push
 
-from cairn_client.map_command import main
+from cairn_client.cli.maps.command import main
 from cairn_map.errors import BadInputError, NotFoundError
 
 

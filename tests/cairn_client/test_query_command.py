@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from tests.cairn_client.made import GEOMETRY, A, opened
 
-from cairn_client.map_command import main
-from cairn_client.map_folder import snapshot_of_folder
-from cairn_client.map_model import store_model
-from cairn_map.cell_code import encode_cell
-from cairn_map.cell_folder import FolderHead, write_cell, write_head
+from cairn_client.cli.maps.command import main
+from cairn_client.folders.map_folder import snapshot_of_folder
+from cairn_client.replica.map_model import store_model
+from cairn_map.codec.cell_code import encode_cell
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError
-from cairn_map.evidence import Evidence, packed_evidence
-from cairn_map.grid import cell_of_key
-from cairn_map.sensor_model import SensorModel
+from cairn_map.evidence.evidence import Evidence, packed_evidence
+from cairn_map.evidence.grid import cell_of_key
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.files.cell_folder import FolderHead, write_cell, write_head
 
 # Voxels of 5 cm: 0 is at the origin, 7 is the upper corner of its 2^3 block.
 HOT_K = 330.0

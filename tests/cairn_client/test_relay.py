@@ -8,23 +8,24 @@ import pytest
 from tests.cairn_client.joined import ADMIN, Server, mapped, opened, settled
 from tests.cairn_client.made import GEOMETRY, MAP, cells_of, random_diff
 from tests.cairn_client.test_uploads import HEAD_BYTES, large_commit
-from tests.cairn_server.live import until
+from tests.cairn_server.live.hub import until
 from tests.links.proxy import Cut, Fault, FaultProxy
 
-from cairn_client import relay_command, relay_link
-from cairn_client.api import MapApi
-from cairn_client.link import Link
-from cairn_client.relay import Resting, Side, relay_round
-from cairn_client.relay_link import RelayApi, ServerEnd, hold_between
-from cairn_client.robot import Robot
-from cairn_client.sync import push_commits
-from cairn_client.uploads import Parts
-from cairn_map.commit import renamed_commit
+from cairn_client.cli import relay as relay_command
+from cairn_client.http.api import MapApi
+from cairn_client.http.http_link import Link
+from cairn_client.relay import link as relay_link
+from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
+from cairn_client.relay.round import Resting, Side, relay_round
+from cairn_client.robot.robot import Robot
+from cairn_client.sync.sync import push_commits
+from cairn_client.sync.uploads import Parts
+from cairn_map.commits.commit import renamed_commit
+from cairn_map.commits.ids import OPERATOR
+from cairn_map.commits.signature import SigningKey
 from cairn_map.errors import BadInputError, CairnError
-from cairn_map.ids import OPERATOR
-from cairn_map.messages import Retract
-from cairn_map.relay_end import SignedCommit
-from cairn_map.signature import SigningKey
+from cairn_map.wire.messages import Retract
+from cairn_map.wire.relay_peer import SignedCommit
 
 
 @pytest.fixture

@@ -2,13 +2,14 @@
 
 import pytest
 
-from cairn_client import relay, relay_command
-from cairn_client.relay import RelayReport, Resting, Side, Why, relay_round
-from cairn_client.relay_link import hold_between
+from cairn_client.cli import relay as relay_command
+from cairn_client.relay import round as relay
+from cairn_client.relay.link import hold_between
+from cairn_client.relay.round import RelayReport, Resting, Side, Why, relay_round
+from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName
+from cairn_map.commits.version_vector import EMPTY
 from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
-from cairn_map.ids import Author, CommitId, Incarnation, RobotName
-from cairn_map.relay_end import Held, SignedCommit
-from cairn_map.version_vector import EMPTY
+from cairn_map.wire.relay_peer import Held, SignedCommit
 
 AUTHOR = Author(RobotName("mole"), Incarnation("0" * 16))
 CUT, BUSY = UnreachableError("no_link", "cut"), UnreachableError("quota", "enough for today", 3000.0)

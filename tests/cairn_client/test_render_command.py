@@ -9,23 +9,23 @@ import numpy as np
 import pytest
 from tests.cairn_client.conftest import LiveServer
 
-from cairn_client.api import MapApi
-from cairn_client.local_ages import ages_of
-from cairn_client.map_command import main
-from cairn_client.robot import Robot
-from cairn_client.telepresence_command import main as telepresence
-from cairn_fusion.live_range import live_range
-from cairn_fusion.overlay import Live, Mode, OverlayStyle, draw_overlay
+from cairn_client.cli.maps.command import main
+from cairn_client.cli.robots.telepresence import main as telepresence
+from cairn_client.folders.local_ages import ages_of
+from cairn_client.http.api import MapApi
+from cairn_client.robot.robot import Robot
+from cairn_fusion.image_fusion.live_range import live_range
+from cairn_fusion.view.overlay import Live, Mode, OverlayStyle, draw_overlay
 from cairn_map.errors import BadInputError
-from cairn_map.grid import geometry_for
-from cairn_map.map_picture import layer_values
-from cairn_map.map_render import MapRenderer
-from cairn_map.messages import CreateMap
-from cairn_map.render_picture import ZERO_CELSIUS_K, Layer
-from cairn_map.sight import Sight
-from cairn_sim.record import Plan, scans_of, shots_of
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
+from cairn_map.evidence.grid import geometry_for
+from cairn_map.render.camera_rays import Sight
+from cairn_map.render.map_picture import layer_values
+from cairn_map.render.map_render import MapRenderer
+from cairn_map.render.render_picture import ZERO_CELSIUS_K, Layer
+from cairn_map.wire.messages import CreateMap
+from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.scene.scene_file import load_scene
 from cairn_sim.sim_command import main as sim
 
 SCANS = 12

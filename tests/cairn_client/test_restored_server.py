@@ -9,7 +9,7 @@ from tests.cairn_client.conftest import LiveServer
 from tests.cairn_client.made import A, B, added, seen
 from tests.cairn_client.test_sync import Team
 
-from cairn_server.serve_command import main
+from cairn_server.operations.serve import main
 
 X, Y = seen(1, 2, kelvin_steps=7), seen(2, 100)
 

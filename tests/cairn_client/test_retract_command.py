@@ -4,11 +4,11 @@ from datetime import UTC, datetime
 
 import pytest
 from tests.cairn_server.conftest import live
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import MOLE, WREN, pushed, read, sum_of
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import MOLE, WREN, pushed, read, sum_of
 
+from cairn_client.cli.maps.retract import seconds_of
 from cairn_client.main import main
-from cairn_client.retract_command import seconds_of
 from cairn_map.errors import BadInputError
 
 __all__ = ["live"]

@@ -17,18 +17,18 @@ from tests.cairn_client.made import GEOMETRY, MAP, cells_of, opened
 from tests.cairn_client.robot_program import INTEGRATOR, RIG, scan_of
 from tests.cairn_client.world import stored_commits
 
-from cairn_client.api import MapApi
-from cairn_client.backoff import RETRY_AFTER_MAX_S, Backoff
-from cairn_client.map_url import split_map_url
-from cairn_client.robot import Robot
-from cairn_fusion.integrate import integrate_scan
-from cairn_map.access_messages import CreateToken
-from cairn_map.cell_code import Profile
+from cairn_client.http.api import MapApi
+from cairn_client.http.backoff import RETRY_AFTER_MAX_S, Backoff
+from cairn_client.http.map_url import split_map_url
+from cairn_client.robot.robot import Robot
+from cairn_fusion.mapping.integrate import integrate_scan
+from cairn_map.codec.cell_code import Profile
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, DeniedError, UnreachableError
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.messages import CreateMap, Register
-from cairn_map.sensor_model import SensorModel
-from cairn_map.state_grid import State
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.queries.occupancy_states import State
+from cairn_map.wire.access_messages import CreateToken
+from cairn_map.wire.messages import CreateMap, Register
 
 Until = Callable[[Callable[[], bool]], None]
 NOWHERE = "http://127.0.0.1:9/maps/lab"
@@ -377,7 +377,7 @@ def test_a_map_of_another_grid_is_refused(server: LiveServer, tmp_path: Path) ->
 
 
 def test_a_folder_that_is_open_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cairn_client.replica_store.BUSY_MS", 1)
+    monkeypatch.setattr("cairn_client.replica.replica_store.BUSY_MS", 1)
     with robot_in(tmp_path):
         with pytest.raises(ConflictError) as caught:
             robot_in(tmp_path)

@@ -9,8 +9,8 @@ from tests.cairn_client.conftest import LiveServer
 from tests.cairn_client.robot_program import scan_of
 from tests.cairn_client.test_robot import map_commit, robot_in
 
-from cairn_client.backoff import Backoff
-from cairn_client.robot_events import (
+from cairn_client.http.backoff import Backoff
+from cairn_client.robot.robot_events import (
     CellsChanged,
     Committed,
     Event,
@@ -22,7 +22,7 @@ from cairn_client.robot_events import (
     SyncFailed,
 )
 from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
-from cairn_map.grid import cell_of_key
+from cairn_map.evidence.grid import cell_of_key
 
 Until = Callable[[Callable[[], bool]], None]
 

@@ -5,11 +5,11 @@ from pathlib import Path
 
 from tests.cairn_client.made import MAP, A, committed, opened, seen
 
-from cairn_client.outbox import UNNUMBERED
-from cairn_client.replica_store import FILE_NAME
-from cairn_map.commit import Commit, CommitMeta
-from cairn_map.ids import CommitId
-from cairn_map.signature import Signature, check_signatures, signatures_from_text, speaks_for
+from cairn_client.replica.outbox import UNNUMBERED
+from cairn_client.replica.replica_store import FILE_NAME
+from cairn_map.commits.commit import Commit, CommitMeta
+from cairn_map.commits.ids import CommitId
+from cairn_map.commits.signature import Signature, check_signatures, signatures_from_text, speaks_for
 
 X = seen(1, 2)
 

@@ -22,22 +22,22 @@ from tests.cairn_client.made import (
     seen,
 )
 
-from cairn_client.answers import FetchedCell
-from cairn_client.applying import Exchange
-from cairn_client.link import Link
-from cairn_client.replica import Replica
-from cairn_client.sync import fetch_cells, fetch_missing, push_commits
-from cairn_map.cell_code import encode_cell
-from cairn_map.cursor import Cursor
+from cairn_client.http.http_link import Link
+from cairn_client.replica.replica import Replica
+from cairn_client.sync.applying import Exchange
+from cairn_client.sync.responses import FetchedCell
+from cairn_client.sync.sync import fetch_cells, fetch_missing, push_commits
+from cairn_map.codec.cell_code import encode_cell
+from cairn_map.commits.cursor import Cursor
+from cairn_map.commits.ids import CommitId
+from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.errors import ConflictError, DamagedDataError
-from cairn_map.evidence import Evidence
-from cairn_map.fingerprint import fingerprint
-from cairn_map.frames import FrameKind
-from cairn_map.grid import cell_of_key
-from cairn_map.ids import CommitId
-from cairn_map.index_messages import CellEntry, CellIndex
-from cairn_map.messages import MissingRequest
-from cairn_map.version_vector import EMPTY, VersionVector
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.fingerprint import fingerprint
+from cairn_map.evidence.grid import cell_of_key
+from cairn_map.wire.frames import FrameKind
+from cairn_map.wire.index_messages import CellEntry, CellIndex
+from cairn_map.wire.messages import MissingRequest
 
 C1, C2, C3 = cursor(1), cursor(2), cursor(3)
 X, Y, Z = seen(1, 2, kelvin_steps=7), seen(2, 100), seen(300, kelvin_steps=9)

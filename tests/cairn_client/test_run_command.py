@@ -19,15 +19,15 @@ from tests.cairn_client.test_robot import robot_in
 from tests.cairn_client.world import stored_commits
 
 from cairn_client import main as cairn
-from cairn_client.run_command import _commit, _map_what_came, _Tally
-from cairn_client.spool import Spool, remember
-from cairn_fusion.integrate import integrate_scan
-from cairn_fusion.recording import open_recording
-from cairn_fusion.recording_writer import RecordingWriter
-from cairn_map.cell_code import Profile
-from cairn_map.commit import Commit
+from cairn_client.cli.robots.run import _commit, _map_what_came, _Tally
+from cairn_client.folders.spool import Spool, remember
+from cairn_fusion.mapping.integrate import integrate_scan
+from cairn_fusion.recording.recording import open_recording
+from cairn_fusion.recording.recording_writer import RecordingWriter
+from cairn_map.codec.cell_code import Profile
+from cairn_map.commits.commit import Commit
 from cairn_map.errors import BadInputError, UnreachableError
-from cairn_map.evidence_map import EvidenceMap
+from cairn_map.evidence.evidence_map import EvidenceMap
 
 Until = Callable[[Callable[[], bool]], None]
 
@@ -220,7 +220,7 @@ def test_a_mark_is_kept_with_its_commit_or_not_at_all(
             raise UnreachableError("store_failed", "the disk is full")
 
         monkeypatch.setattr(mole.replica.store, "add_commit", full)
-        monkeypatch.setattr("cairn_client.run_command.COMMIT_AGAIN_S", 0.0)
+        monkeypatch.setattr("cairn_client.cli.robots.run.COMMIT_AGAIN_S", 0.0)
         assert not _commit(mole, stop, Profile.FAST, _Tally(), stopping)
         assert mole.replica.outbox.beside == {}
         monkeypatch.undo()

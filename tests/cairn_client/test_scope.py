@@ -9,16 +9,16 @@ from tests.cairn_client.made import GEOMETRY, MAP, cells_of, seen
 from tests.cairn_client.test_robot import evidence_of, map_commit, robot_in
 from tests.cairn_client.test_sync import Team
 
-from cairn_client import robot_command
-from cairn_client.api import MapApi
-from cairn_client.scope import BoxMetres, Scope
-from cairn_client.sync import ROUNDS_MAX
+from cairn_client.cli.robots import command as robot_command
+from cairn_client.http.api import MapApi
+from cairn_client.sync.scope import BoxMetres, Scope
+from cairn_client.sync.sync import ROUNDS_MAX
+from cairn_map.commits.ids import commit_id_from_text
 from cairn_map.errors import BadInputError
-from cairn_map.frames import CELL_HEAD, CellFrame
-from cairn_map.grid import Cell, cell_key, cell_of_key
-from cairn_map.ids import commit_id_from_text
-from cairn_map.messages import MissingRequest, More
-from cairn_map.robot_status import Mode
+from cairn_map.evidence.grid import Cell, cell_key, cell_of_key
+from cairn_map.wire.frames import CELL_HEAD, CellFrame
+from cairn_map.wire.messages import MissingRequest, More
+from cairn_map.wire.robot_status import Mode
 
 EDGE_M = GEOMETRY.cell_edge_m
 EVERY_CELL = {Cell(i, j, 0) for i in range(-5, 5) for j in range(7)}

@@ -20,14 +20,14 @@ from tests.cairn_client.made import (
     seen,
 )
 
-from cairn_client.replica import Replica
-from cairn_map.commit import Commit, CommitMeta, make_commit
-from cairn_map.cursor import Cursor
-from cairn_map.evidence import Evidence
-from cairn_map.frames import FrameKind
-from cairn_map.grid import CellKey
-from cairn_map.ids import CommitId
-from cairn_map.version_vector import EMPTY, VersionVector
+from cairn_client.replica.replica import Replica
+from cairn_map.commits.commit import Commit, CommitMeta, make_commit
+from cairn_map.commits.cursor import Cursor
+from cairn_map.commits.ids import CommitId
+from cairn_map.commits.version_vector import EMPTY, VersionVector
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey
+from cairn_map.wire.frames import FrameKind
 
 C1, C2, C3 = cursor(1), cursor(2), cursor(3)
 X, Y, Z, W = seen(1, 2, kelvin_steps=7), seen(2, 100), seen(300, kelvin_steps=9), seen(4, 5)

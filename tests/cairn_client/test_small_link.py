@@ -13,20 +13,21 @@ from tests.cairn_client.robot_program import INTEGRATOR, RIG, scan_of
 from tests.cairn_client.test_robot import robot_in
 from tests.links.proxy import Cut, Fault, FaultProxy
 
-from cairn_client import own_status, robot_command
-from cairn_client.api import MapApi
-from cairn_client.link import Link
-from cairn_client.link_profile import LINKS
-from cairn_client.nearness import cell_at
-from cairn_client.robot import Robot
-from cairn_client.scope import Scope
-from cairn_client.sync import push_commits
-from cairn_map.cell_code import Profile
-from cairn_map.commit import CommitMeta, ScanPose
+from cairn_client.cli.robots import command as robot_command
+from cairn_client.http.api import MapApi
+from cairn_client.http.http_link import Link
+from cairn_client.robot import status_report
+from cairn_client.robot.robot import Robot
+from cairn_client.sync.link_profile import LINKS
+from cairn_client.sync.near_cells import cell_at
+from cairn_client.sync.scope import Scope
+from cairn_client.sync.sync import push_commits
+from cairn_map.codec.cell_code import Profile
+from cairn_map.commits.commit import CommitMeta, ScanPose
 from cairn_map.errors import UnreachableError
-from cairn_map.evidence import packed_evidence
-from cairn_map.grid import Cell, cell_key, cell_of_key
-from cairn_map.messages import Register
+from cairn_map.evidence.evidence import packed_evidence
+from cairn_map.evidence.grid import Cell, cell_key, cell_of_key
+from cairn_map.wire.messages import Register
 
 SIZE = 6
 """Cells along one side of the made map."""
@@ -184,7 +185,7 @@ def test_on_a_small_link_commits_take_few_bytes_and_statuses_are_seldom(
 ) -> None:
     profiles = []
     now_s = [1.7e9]
-    monkeypatch.setattr(own_status.time, "time", lambda: now_s[0])
+    monkeypatch.setattr(status_report.time, "time", lambda: now_s[0])
     with (
         FaultProxy(server.port) as link,
         Robot(

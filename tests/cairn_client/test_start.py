@@ -9,7 +9,7 @@ import pytest
 @pytest.mark.parametrize(
     ("program", "late"),
     [
-        ("import cairn_client.robot", ["httpx", "rich", "cv2", "rosbags", "mcap", "ruamel.yaml"]),
+        ("import cairn_client.robot.robot", ["httpx", "rich", "cv2", "rosbags", "mcap", "ruamel.yaml"]),
         ("from cairn_client.main import main; main(['--help'])", ["numba", "numpy", "httpx", "rich"]),
     ],
 )

@@ -12,13 +12,13 @@ import pytest
 from tests.cairn_client.conftest import LiveServer
 from tests.cairn_client.made import GEOMETRY, MAP, A, B, added, cells_of, cursor, header, opened, random_diff, seen
 
-from cairn_client.api import MapApi
-from cairn_client.link import Link
-from cairn_client.nearness import Wanted, within
-from cairn_client.replica import Replica
-from cairn_client.sync import fetch_cells, fetch_missing, push_commits
-from cairn_map.cell_code import decode_cell
-from cairn_map.commit import make_commit
+from cairn_client.http.api import MapApi
+from cairn_client.http.http_link import Link
+from cairn_client.replica.replica import Replica
+from cairn_client.sync.near_cells import Wanted, within
+from cairn_client.sync.sync import fetch_cells, fetch_missing, push_commits
+from cairn_map.codec.cell_code import decode_cell
+from cairn_map.commits.commit import make_commit
 from cairn_map.errors import (
     BadInputError,
     CairnError,
@@ -28,9 +28,9 @@ from cairn_map.errors import (
     NotFoundError,
     UnreachableError,
 )
-from cairn_map.frames import encode_frame, start_of_reply
-from cairn_map.grid import Cell, cell_of_key
-from cairn_map.messages import CreateMap, MissingRequest, Register, Retract
+from cairn_map.evidence.grid import Cell, cell_of_key
+from cairn_map.wire.frames import encode_frame, start_of_reply
+from cairn_map.wire.messages import CreateMap, MissingRequest, Register, Retract
 
 X, Y = seen(1, 2, kelvin_steps=7), seen(2, 100)
 
@@ -339,7 +339,7 @@ def test_a_cell_without_its_headers_is_damage(canned: Callable[..., MapApi]) -> 
 def test_an_answer_without_end_is_not_read_to_the_end(
     canned: Callable[..., MapApi], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cairn_client.api.ANSWER_BYTES_MAX", 1000)
+    monkeypatch.setattr("cairn_client.http.api.ANSWER_BYTES_MAX", 1000)
     with pytest.raises(BadInputError):
         canned(200, bytes(2000)).maps()
 

@@ -10,23 +10,23 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from tests.cairn_server.live import Live
+from tests.cairn_server.live.hub import Live
 
-from cairn_client import telepresence_command
-from cairn_client.api import MapApi
-from cairn_client.telepresence_command import main
-from cairn_client.view_publishing import publish_views
-from cairn_fusion.images import read_colour
+from cairn_client.cli.robots import telepresence as telepresence_command
+from cairn_client.cli.robots.telepresence import main
+from cairn_client.cli.robots.view_publishing import publish_views
+from cairn_client.http.api import MapApi
 from cairn_fusion.importers import open_source
-from cairn_fusion.recording import ScanSource
-from cairn_fusion.scan import Scan
+from cairn_fusion.recording.images import read_colour
+from cairn_fusion.recording.recording import ScanSource
+from cairn_fusion.recording.scan import Scan
 from cairn_fusion.view.mjpeg import Rgb
+from cairn_map.commits.ids import new_incarnation, robot_name
 from cairn_map.errors import BadInputError, NotFoundError, UnreachableError
-from cairn_map.ids import new_incarnation, robot_name
-from cairn_map.messages import Register
-from cairn_sim.record import Plan, record
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene, shipped_text
+from cairn_map.wire.messages import Register
+from cairn_sim.robots.record import Plan, record
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.scene.scene_file import load_scene, shipped_text
 
 
 @pytest.fixture

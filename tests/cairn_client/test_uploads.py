@@ -11,15 +11,15 @@ from tests.cairn_client.conftest import LiveServer
 from tests.cairn_client.made import GEOMETRY, MAP, A, opened, seen
 from tests.links.proxy import Cut, Fault, FaultProxy
 
-from cairn_client.api import MapApi
-from cairn_client.link import Link
-from cairn_client.replica import Replica
-from cairn_client.robot import Robot
-from cairn_client.sync import push_commits
-from cairn_client.uploads import Parts
-from cairn_map.commit import Commit, CommitMeta, ScanPose, make_commit
+from cairn_client.http.api import MapApi
+from cairn_client.http.http_link import Link
+from cairn_client.replica.replica import Replica
+from cairn_client.robot.robot import Robot
+from cairn_client.sync.sync import push_commits
+from cairn_client.sync.uploads import Parts
+from cairn_map.commits.commit import Commit, CommitMeta, ScanPose, make_commit
 from cairn_map.errors import UnreachableError
-from cairn_map.messages import Register
+from cairn_map.wire.messages import Register
 
 PARTS = Parts(above_bytes=4000, part_bytes=2000)
 HEAD_BYTES = 600

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from tests.cairn_client.joined import Server, mapped
 from tests.cairn_client.made import MAP
-from tests.cairn_server.live import Process, until
+from tests.cairn_server.live.hub import Process, until
 
-from cairn_client.api import MapApi
+from cairn_client.http.api import MapApi
 from cairn_map.errors import BadInputError
-from cairn_server import serve_command
+from cairn_server.operations import serve as serve_command
 from cairn_server.settings import Settings
 
 ROOT = Path(__file__).parents[2]

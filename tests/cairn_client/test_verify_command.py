@@ -8,17 +8,17 @@ import cv2
 import numpy as np
 import pytest
 
-from cairn_calib.rig import Rig
-from cairn_client.verify_command import main
-from cairn_fusion.recording_writer import RecordingWriter
+from cairn_calib.rig.rig import Rig
+from cairn_client.cli.robots.verify import main
+from cairn_fusion.recording.recording_writer import RecordingWriter
 from cairn_map.errors import BadInputError, NotFoundError
-from cairn_sim.heads import RANGE_CAMERA, full_head
-from cairn_sim.render import render_scan
-from cairn_sim.scene import scene_of
-from cairn_sim.sensors import Noise
-from cairn_sim.solids import placed
-from cairn_sim.study_scenes import T_MAP_HEAD, targets_in_view
-from cairn_sim.targets import laboratory, target_scene
+from cairn_sim.render.render import render_scan
+from cairn_sim.render.sensors import Noise
+from cairn_sim.robots.heads import RANGE_CAMERA, full_head
+from cairn_sim.robots.targets import laboratory, target_scene
+from cairn_sim.scene.scene import scene_of
+from cairn_sim.scene.solids import placed
+from cairn_sim.study.scenes import T_MAP_HEAD, targets_in_view
 
 RIG = full_head(scale=0.5)
 SCANS = 4

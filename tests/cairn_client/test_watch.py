@@ -8,14 +8,14 @@ import pytest
 from tests.cairn_client.conftest import LiveServer
 from tests.cairn_client.made import MAP, A, seen
 
-from cairn_client import watch_command
-from cairn_client.api import MapApi
-from cairn_client.backoff import Backoff
-from cairn_client.live_listener import LINE_BYTES_MAX, Lost, listen, messages_of
-from cairn_client.robot import Robot
-from cairn_client.watch_command import lines_of
+from cairn_client.cli.maps import watch as watch_command
+from cairn_client.cli.maps.watch import lines_of
+from cairn_client.http.api import MapApi
+from cairn_client.http.backoff import Backoff
+from cairn_client.http.live_listener import LINE_BYTES_MAX, Lost, listen, messages_of
+from cairn_client.robot.robot import Robot
 from cairn_map.errors import DamagedDataError, NotFoundError
-from cairn_map.live_events import Hello, LiveEvent, LogGrew
+from cairn_map.wire.live_events import Hello, LiveEvent, LogGrew
 
 STREAM = b"retry: 500\n\nevent: head\nid: 5.aa\ndata: {\ndata: }\n\n: a comment\r\n\r\nevent: beat\r\ndata: {}\r\n\r\n"
 MESSAGES = [("head", "5.aa", "{\n}"), ("beat", "5.aa", "{}")]

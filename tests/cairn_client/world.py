@@ -16,35 +16,36 @@ import pytest
 from tests.cairn_client.made import GEOMETRY, MAP, cells_of, random_diff
 from tests.sync_sim.server import FoldOnRequest, StableBackup
 
-from cairn_client import replica_store
-from cairn_client.answers import FetchedCell
-from cairn_client.applying import is_within
-from cairn_client.link import Link
-from cairn_client.outbox import UNNUMBERED
-from cairn_client.replica import Replica
-from cairn_client.replica_store import ReplicaStore
-from cairn_client.sync import fetch_cells, fetch_missing, push_commits
-from cairn_map.begun_frames import Replies
-from cairn_map.cell_code import decode_cell
-from cairn_map.commit import Commit, CommitMeta, split_commit
+from cairn_client.http.http_link import Link
+from cairn_client.replica import replica_store
+from cairn_client.replica.outbox import UNNUMBERED
+from cairn_client.replica.replica import Replica
+from cairn_client.replica.replica_store import ReplicaStore
+from cairn_client.sync.applying import is_within
+from cairn_client.sync.responses import FetchedCell
+from cairn_client.sync.sync import fetch_cells, fetch_missing, push_commits
+from cairn_map.codec.cell_code import decode_cell
+from cairn_map.commits.commit import Commit, CommitMeta, split_commit
+from cairn_map.commits.ids import OPERATOR, Author, CommitId, RobotName, commit_id_from_text
+from cairn_map.commits.version_vector import EMPTY
 from cairn_map.errors import ConflictError, UnreachableError
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.fingerprint import ZERO, fingerprint
-from cairn_map.frames import Frame
-from cairn_map.grid import Cell, CellKey, cell_key
-from cairn_map.ids import OPERATOR, Author, CommitId, RobotName, commit_id_from_text
-from cairn_map.index_messages import CellIndex
-from cairn_map.messages import CreateMap, MissingRequest, Pushed, Retract
-from cairn_map.version_vector import EMPTY
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.fingerprint import ZERO, fingerprint
+from cairn_map.evidence.grid import Cell, CellKey, cell_key
+from cairn_map.wire.frames import Frame
+from cairn_map.wire.index_messages import CellIndex
+from cairn_map.wire.messages import CreateMap, MissingRequest, Pushed, Retract
+from cairn_map.wire.resumed_replies import Replies
 from cairn_server import service as service_module
-from cairn_server import sqlite_store, sqlite_writer
-from cairn_server.auth import Caller, Role
-from cairn_server.cell_cache import CellCache
-from cairn_server.folding import fold_pending
-from cairn_server.handing_over import found_commit
+from cairn_server.access.auth import Caller, Role
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.folding import fold_pending
 from cairn_server.service import Service
 from cairn_server.settings import Settings
-from cairn_server.sqlite_store import SqliteStore
+from cairn_server.store.sqlite import store as sqlite_store
+from cairn_server.store.sqlite import writer as sqlite_writer
+from cairn_server.store.sqlite.store import SqliteStore
+from cairn_server.sync.handing_over import found_commit
 
 MODES = ("high-end", "high-end", "low-end", "viewer")
 PUSHES = (0, 1, 2)
@@ -112,7 +113,7 @@ class DirectApi:
 
     def cell(self, name: str, cell: Cell, *, etag: str | None = None) -> FetchedCell:
         service = self._world.service
-        stored, head = service.cell(service.store.map(name), cell_key(cell))
+        stored, head = service.cells.sound(service.store.map(name), cell_key(cell))
         assert stored is not None
         found = f'"{stored.digest.hex()}"'
         body = None if etag == found else stored.body

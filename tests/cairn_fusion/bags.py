@@ -15,11 +15,11 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from cairn_calib.camera import Camera
-from cairn_calib.poses import Transform, quaternion_from_transform
-from cairn_calib.rig import Rig
-from cairn_fusion.images import read_colour, read_grey16
-from cairn_fusion.recording import Recording
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.poses import Transform, quaternion_from_transform
+from cairn_calib.rig.rig import Rig
+from cairn_fusion.recording.images import read_colour, read_grey16
+from cairn_fusion.recording.recording import Recording
 
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
 ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))

@@ -9,25 +9,25 @@ import numpy.typing as npt
 import pytest
 from tests.cairn_fusion import naive_views
 
-from cairn_calib.camera import Camera
-from cairn_calib.fisheye import FisheyeCamera
-from cairn_calib.poses import inverse, look_at, transform_points
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_fusion.across import across
-from cairn_fusion.across_kernels import label_into, sample_into
-from cairn_fusion.certainty import pixel_covariance
-from cairn_fusion.fused_covariance import fused_covariance
-from cairn_fusion.scan import Scan
-from cairn_fusion.surface import beams, drawn_surface, places, surface_of
-from cairn_fusion.transfer import Label
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.fisheye import FisheyeCamera
+from cairn_calib.rig.poses import inverse, look_at, transform_points
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_fusion.image_fusion.across import across
+from cairn_fusion.image_fusion.across_kernels import label_into, sample_into
+from cairn_fusion.image_fusion.fused_covariance import fused_covariance
+from cairn_fusion.image_fusion.surface import beams, drawn_surface, places, surface_of
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.transfer.certainty import pixel_covariance
+from cairn_fusion.transfer.transfer import Label
 from cairn_fusion.view.telepresence import fuse, view_depth
-from cairn_sim.fusion_scores import fusion_scores
-from cairn_sim.fusion_truth import fusion_truth
-from cairn_sim.heads import RANGE_CAMERA, full_head
-from cairn_sim.render import render_scan
-from cairn_sim.scene import Scene, scene_of
-from cairn_sim.solids import Box, Shape, Solid, Sphere, placed
-from cairn_sim.surfaces import Material, Surface
+from cairn_sim.evaluation.fusion_scores import fusion_scores
+from cairn_sim.evaluation.fusion_truth import fusion_truth
+from cairn_sim.render.render import render_scan
+from cairn_sim.robots.heads import RANGE_CAMERA, full_head
+from cairn_sim.scene.scene import Scene, scene_of
+from cairn_sim.scene.solids import Box, Shape, Solid, Sphere, placed
+from cairn_sim.scene.surfaces import Material, Surface
 
 Floats = npt.NDArray[np.float64]
 HEAD = full_head(scale=0.25)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from cairn_calib.camera import Camera
-from cairn_fusion.adapters import kelvin_from_counts, range_from_radial, range_from_z_depth
-from cairn_fusion.transfer import points_from_range
+from cairn_calib.rig.camera import Camera
+from cairn_fusion.recording.adapters import kelvin_from_counts, range_from_radial, range_from_z_depth
+from cairn_fusion.transfer.transfer import points_from_range
 from cairn_map.errors import BadInputError
 
 CAMERA = Camera(width=8, height=6, focal_px=(5.0, 6.0), centre_px=(3.4, 2.6), distortion=(0.1, -0.02, 0.01, 0.0, 0.0))

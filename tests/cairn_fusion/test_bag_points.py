@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from tests.cairn_fusion.bags import KINDS, ROS2, Messages, Timed, pose_of, write_bag
 
-from cairn_calib.lidar import SpinningLidar
-from cairn_fusion.bag_file import Wire
-from cairn_fusion.bag_survey import survey
+from cairn_calib.rig.lidar import SpinningLidar
 from cairn_fusion.importers import open_source
-from cairn_fusion.ros_points import R_LIDAR_CAMERA, RosPoints, elevations_of, read_points, sweep_image
+from cairn_fusion.ros.bag import Wire
+from cairn_fusion.ros.bag_survey import survey
+from cairn_fusion.ros.point_clouds import R_LIDAR_CAMERA, RosPoints, elevations_of, read_points, sweep_image
 from cairn_map.errors import DamagedDataError
 
 ELEVATIONS = (10.0, 4.0, 0.0, -3.5)

@@ -27,25 +27,26 @@ from tests.cairn_fusion.bags import (
     write_bag,
 )
 
-from cairn_fusion import bag_index, ros_frames
-from cairn_fusion.bag_file import BoundedFile, Wire, open_bag
-from cairn_fusion.bag_mapping import camera_of_info, mapping_from_yaml
-from cairn_fusion.bag_mcap import unpacked
-from cairn_fusion.bag_survey import survey
 from cairn_fusion.importers import Layout, detect_layout, open_source
-from cairn_fusion.measurement import Measurement
-from cairn_fusion.recording import Recording, ScanSource, open_recording
-from cairn_fusion.recording_writer import RecordingWriter
-from cairn_fusion.ros_images import colour_of, depth_of
-from cairn_fusion.ros_messages import RosCameraInfo, RosCompressedImage, RosHeader, RosImage, read_image
-from cairn_fusion.trajectory import interpolated
-from cairn_map.cell_code import encode_cell
-from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE
+from cairn_fusion.mapping.measurement import Measurement
+from cairn_fusion.recording.recording import Recording, ScanSource, open_recording
+from cairn_fusion.recording.recording_writer import RecordingWriter
+from cairn_fusion.recording.trajectory import interpolated
+from cairn_fusion.ros import bag_index, tf_tree
+from cairn_fusion.ros.bag import BoundedFile, Wire
+from cairn_fusion.ros.bag_survey import survey
+from cairn_fusion.ros.images import colour_of, depth_of
+from cairn_fusion.ros.mcap_bag import unpacked
+from cairn_fusion.ros.messages import RosCameraInfo, RosCompressedImage, RosHeader, RosImage, read_image
+from cairn_fusion.ros.open_bag import open_bag
+from cairn_fusion.ros.topic_mapping import camera_of_info, mapping_from_yaml
+from cairn_map.codec.cell_code import encode_cell
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError, NotFoundError
-from cairn_map.grid import Geometry, geometry_for
-from cairn_sim.record import Plan, scans_of, shots_of
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
+from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE
+from cairn_map.evidence.grid import Geometry, geometry_for
+from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.scene.scene_file import load_scene
 
 GEOMETRY = geometry_for(voxel_edge_m=0.05, channels=(COLOUR, INTENSITY, TEMPERATURE))
 
@@ -405,7 +406,7 @@ def test_a_file_is_not_asked_for_more_than_it_has(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("module", "limit", "kind"),
-    [(ros_frames, "POSES_MAX", "too_many_poses"), (bag_index, "MESSAGES_MAX", "bag_too_large")],
+    [(tf_tree, "POSES_MAX", "too_many_poses"), (bag_index, "MESSAGES_MAX", "bag_too_large")],
 )
 def test_what_does_not_fit_into_memory_is_refused(
     module: ModuleType, limit: str, kind: str, bag_path: Path, source: Recording, monkeypatch: pytest.MonkeyPatch

@@ -6,24 +6,24 @@ import numpy as np
 import pytest
 from tests.cairn_map.worlds import map_of
 
-from cairn_calib.poses import look_at
-from cairn_fusion import beyond_labels
-from cairn_fusion.beyond_labels import beyond_pixels
-from cairn_fusion.live_range import live_range
-from cairn_fusion.scan import Scan
-from cairn_fusion.surface import surface_of
-from cairn_fusion.transfer import Label
+from cairn_calib.rig.poses import look_at
+from cairn_fusion.image_fusion import beyond_labels
+from cairn_fusion.image_fusion.beyond_labels import beyond_pixels
+from cairn_fusion.image_fusion.live_range import live_range
+from cairn_fusion.image_fusion.surface import surface_of
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.transfer.transfer import Label
 from cairn_fusion.view.telepresence import Telepresence, ViewOptions, fuse
-from cairn_map.channels import TEMPERATURE
-from cairn_map.grid import Geometry
-from cairn_map.map_snapshot import MapSnapshot, snapshot_of
-from cairn_sim.fusion_truth import fusion_truth
-from cairn_sim.heads import RANGE_CAMERA, full_head
-from cairn_sim.render import render_scan, view_of
-from cairn_sim.scene import Scene, scene_of
-from cairn_sim.sensors import Noise
-from cairn_sim.solids import Box, Solid, placed
-from cairn_sim.surfaces import Material, Optics, Surface
+from cairn_map.evidence.channels import TEMPERATURE
+from cairn_map.evidence.grid import Geometry
+from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
+from cairn_sim.evaluation.fusion_truth import fusion_truth
+from cairn_sim.render.render import render_scan, view_of
+from cairn_sim.render.sensors import Noise
+from cairn_sim.robots.heads import RANGE_CAMERA, full_head
+from cairn_sim.scene.scene import Scene, scene_of
+from cairn_sim.scene.solids import Box, Solid, placed
+from cairn_sim.scene.surfaces import Material, Optics, Surface
 
 HEAD = full_head(scale=0.25)
 GRID = Geometry(voxel_edge_um=50_000, depth=5, channels=(TEMPERATURE,))

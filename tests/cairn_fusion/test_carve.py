@@ -7,26 +7,26 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.camera import Camera
-from cairn_calib.lidar import SpinningLidar
-from cairn_calib.poses import Transform, inverse, look_at, transform_points
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_fusion.carve import Window, carving_of, window_of
-from cairn_fusion.clear import clear_image
-from cairn_fusion.integrate import Integrator, Method, integrate_scan, integrate_scans
-from cairn_fusion.returns import returns_of
-from cairn_fusion.scan import Scan
-from cairn_fusion.tally import ScanHits, Tally, tally_around
-from cairn_map.channels import INTENSITY
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.lidar import SpinningLidar
+from cairn_calib.rig.poses import Transform, inverse, look_at, transform_points
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_fusion.mapping.beam_returns import returns_of
+from cairn_fusion.mapping.clear_range import clear_image
+from cairn_fusion.mapping.free_space import Window, carving_of, window_of
+from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scan, integrate_scans
+from cairn_fusion.mapping.tally import ScanHits, Tally, tally_around
+from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import BadInputError
-from cairn_map.evidence import Evidence
-from cairn_map.grid import CellKey, Geometry, centres_of_voxels, geometry_for, voxels_in_cell
-from cairn_sim.heads import THERMAL, TOF
-from cairn_sim.record import Plan, scans_of, shots_of
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
-from cairn_sim.scores import scores_of
-from cairn_sim.truth_grid import box_of_cell, truths_of
+from cairn_map.evidence.channels import INTENSITY
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey, Geometry, centres_of_voxels, geometry_for, voxels_in_cell
+from cairn_sim.evaluation.scores import scores_of
+from cairn_sim.evaluation.truth_grid import box_of_cell, truths_of
+from cairn_sim.robots.heads import THERMAL, TOF
+from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.scene.scene_file import load_scene
 
 Floats = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]

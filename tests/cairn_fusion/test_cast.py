@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests import naive
 
-from cairn_fusion.cast import SeenVoxels, seen_voxels
+from cairn_fusion.mapping.ray_casting import SeenVoxels, seen_voxels
 from cairn_map.errors import BadInputError
-from cairn_map.grid import Geometry, voxels_in_cell, voxels_of_points
+from cairn_map.evidence.grid import Geometry, voxels_in_cell, voxels_of_points
 
 law = settings(max_examples=50, deadline=None, database=None)  # the first call of a kernel compiles it
 GEOMETRY = Geometry(voxel_edge_um=100_000, depth=3, channels=())

@@ -7,19 +7,19 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.camera import Camera
-from cairn_calib.fisheye import FisheyeCamera
-from cairn_calib.lidar import SpinningLidar
-from cairn_calib.poses import inverse, look_at, transform_points
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_calib.sensing import RangeSensing
-from cairn_fusion.certainty import is_certain, pixel_covariance, spread_m, spread_px
-from cairn_fusion.integrate import Integrator, Method, integrate_scan
-from cairn_fusion.scan import Scan
-from cairn_map.channels import TEMPERATURE
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.fisheye import FisheyeCamera
+from cairn_calib.rig.lidar import SpinningLidar
+from cairn_calib.rig.poses import inverse, look_at, transform_points
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.sensing import RangeSensing
+from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scan
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.transfer.certainty import is_certain, pixel_covariance, spread_m, spread_px
 from cairn_map.errors import BadInputError
-from cairn_map.grid import Geometry
-from cairn_sim.heads import full_head
+from cairn_map.evidence.channels import TEMPERATURE
+from cairn_map.evidence.grid import Geometry
+from cairn_sim.robots.heads import full_head
 
 HEAD = full_head(scale=0.25)
 CAMERAS = ["colour_left", "colour_right", "thermal_left", "thermal_right"]

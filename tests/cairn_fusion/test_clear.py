@@ -7,18 +7,18 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.body import Body, BodyBox
-from cairn_calib.camera import Camera
-from cairn_calib.lidar import SpinningLidar
-from cairn_calib.poses import look_at
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_calib.sensing import RangeSensing
-from cairn_fusion.clear_kernels import EDGE_STEP_M, GRAZING_MAX, GRAZING_SHARE, SLANT_SHARE, nearest_around
-from cairn_fusion.integrate import Integration, Integrator, Method, integrate_scan
-from cairn_fusion.scan import Scan
-from cairn_map.channels import INTENSITY
-from cairn_map.evidence import Evidence
-from cairn_map.grid import CellKey, Geometry, centres_of_voxels, voxels_in_cell
+from cairn_calib.rig.body import Body, BodyBox
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.lidar import SpinningLidar
+from cairn_calib.rig.poses import look_at
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.sensing import RangeSensing
+from cairn_fusion.mapping.clear_kernels import EDGE_STEP_M, GRAZING_MAX, GRAZING_SHARE, SLANT_SHARE, nearest_around
+from cairn_fusion.mapping.integrate import Integration, Integrator, Method, integrate_scan
+from cairn_fusion.recording.scan import Scan
+from cairn_map.evidence.channels import INTENSITY
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey, Geometry, centres_of_voxels, voxels_in_cell
 
 EDGE_M = 0.05
 GEOMETRY = Geometry(voxel_edge_um=50_000, depth=4, channels=(INTENSITY,))

@@ -5,13 +5,13 @@ import numpy.typing as npt
 import pytest
 from tests.cairn_fusion import naive_views
 
-from cairn_calib.camera import Camera
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_fusion.eye_depth import ALIKE, CLOSE, EyeDepth, Origin, eye_depth
-from cairn_fusion.eye_depth_kernels import REACH, densify_into
-from cairn_fusion.scan import Scan
-from cairn_fusion.surface import drawn_surface, surface_of
-from cairn_fusion.transfer import Label
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_fusion.image_fusion.eye_depth import ALIKE, CLOSE, EyeDepth, Origin, eye_depth
+from cairn_fusion.image_fusion.eye_depth_kernels import REACH, densify_into
+from cairn_fusion.image_fusion.surface import drawn_surface, surface_of
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.transfer.transfer import Label
 from cairn_map.errors import BadInputError
 
 TOF = Camera(width=44, height=36, focal_px=(40.0, 40.0), centre_px=(21.5, 17.5))

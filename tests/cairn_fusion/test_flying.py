@@ -7,21 +7,21 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.poses import look_at
-from cairn_fusion.flying_kernels import SLANT_SHARE, flying_pixels
-from cairn_fusion.integrate import Integrator, integrate_scans
-from cairn_map.grid import geometry_for
-from cairn_sim.heads import RANGE_CAMERA, TOF, tof_head
-from cairn_sim.record import Plan, scans_of, shots_of
-from cairn_sim.render import render_scan
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene import scene_of
-from cairn_sim.scene_file import load_scene
-from cairn_sim.scores import scores_of
-from cairn_sim.sensors import Noise
-from cairn_sim.solids import Box, Solid, placed
-from cairn_sim.surfaces import Material, Surface
-from cairn_sim.truth_grid import box_of_cell, truths_of
+from cairn_calib.rig.poses import look_at
+from cairn_fusion.mapping.flying_kernels import SLANT_SHARE, flying_pixels
+from cairn_fusion.mapping.integrate import Integrator, integrate_scans
+from cairn_map.evidence.grid import geometry_for
+from cairn_sim.evaluation.scores import scores_of
+from cairn_sim.evaluation.truth_grid import box_of_cell, truths_of
+from cairn_sim.render.render import render_scan
+from cairn_sim.render.sensors import Noise
+from cairn_sim.robots.heads import RANGE_CAMERA, TOF, tof_head
+from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.scene.scene import scene_of
+from cairn_sim.scene.scene_file import load_scene
+from cairn_sim.scene.solids import Box, Solid, placed
+from cairn_sim.scene.surfaces import Material, Surface
 
 STEP_M = 0.05
 

@@ -5,19 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from cairn_calib.poses import look_at
-from cairn_fusion.integrate import Integrator, integrate_scans
-from cairn_fusion.sample_kernels import doubt_edges_into
-from cairn_fusion.transfer import Label
+from cairn_calib.rig.poses import look_at
+from cairn_fusion.mapping.integrate import Integrator, integrate_scans
+from cairn_fusion.mapping.sample_kernels import doubt_edges_into
+from cairn_fusion.transfer.transfer import Label
 from cairn_map.errors import BadInputError
-from cairn_map.grid import geometry_for
-from cairn_sim.heads import RANGE_CAMERA, thermal_and_tof_head
-from cairn_sim.render import render_scan
-from cairn_sim.scene import scene_of
-from cairn_sim.sensors import Noise
-from cairn_sim.solids import Box, Cylinder, Shape, Solid, placed
-from cairn_sim.surfaces import Material, Optics, Surface
-from cairn_sim.temperature_scores import (
+from cairn_map.evidence.grid import geometry_for
+from cairn_sim.evaluation.temperature_scores import (
     BEHIND_GLASS,
     IN_MIRROR,
     OTHERS,
@@ -26,6 +20,12 @@ from cairn_sim.temperature_scores import (
     is_pipe,
     temperature_scores,
 )
+from cairn_sim.render.render import render_scan
+from cairn_sim.render.sensors import Noise
+from cairn_sim.robots.heads import RANGE_CAMERA, thermal_and_tof_head
+from cairn_sim.scene.scene import scene_of
+from cairn_sim.scene.solids import Box, Cylinder, Shape, Solid, placed
+from cairn_sim.scene.surfaces import Material, Optics, Surface
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from cairn_calib.poses import inverse, transform_from_quaternion, transform_points
-from cairn_fusion.frame_folder import FrameFolderOptions, PoseConvention, import_frames
-from cairn_fusion.images import write_colour, write_grey16
+from cairn_calib.rig.poses import inverse, transform_from_quaternion, transform_points
 from cairn_fusion.importers import Layout, detect_layout, import_apc_shelf, import_mm5, open_source
-from cairn_fusion.recording import Recording, open_recording
-from cairn_fusion.recording_format import Convention, RangeEncoding, ThermalEncoding
-from cairn_fusion.recording_writer import RecordingWriter
+from cairn_fusion.recording.frame_folder import FrameFolderOptions, PoseConvention, import_frames
+from cairn_fusion.recording.images import write_colour, write_grey16
+from cairn_fusion.recording.recording import Recording, open_recording
+from cairn_fusion.recording.recording_format import Convention, RangeEncoding, ThermalEncoding
+from cairn_fusion.recording.recording_writer import RecordingWriter
 from cairn_map.errors import BadInputError
 
 WIDTH, HEIGHT = 6, 4

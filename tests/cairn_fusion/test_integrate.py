@@ -10,19 +10,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cairn_calib.camera import Camera
-from cairn_calib.poses import Transform, inverse, look_at, transform_points
-from cairn_calib.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.poses import Transform, inverse, look_at, transform_points
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
 from cairn_fusion.importers import open_source
-from cairn_fusion.integrate import Integrator, integrate_scan
-from cairn_fusion.measurement import Measurement
-from cairn_fusion.recording import Recording
-from cairn_fusion.scan import Scan
-from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
+from cairn_fusion.mapping.integrate import Integrator, integrate_scan
+from cairn_fusion.mapping.measurement import Measurement
+from cairn_fusion.recording.recording import Recording
+from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import BadInputError
-from cairn_map.evidence import Evidence
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import (
+from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import (
     CellKey,
     Geometry,
     centres_of_voxels,

@@ -4,14 +4,14 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.camera import camera_from_field_of_view
-from cairn_calib.fisheye import FisheyeCamera
-from cairn_calib.lidar import SpinningLidar
-from cairn_calib.poses import look_at
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_fusion.integrate import Integrator
-from cairn_fusion.measurement import Measurement
-from cairn_fusion.recording_format import (
+from cairn_calib.rig.camera import camera_from_field_of_view
+from cairn_calib.rig.fisheye import FisheyeCamera
+from cairn_calib.rig.lidar import SpinningLidar
+from cairn_calib.rig.poses import look_at
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_fusion.mapping.integrate import Integrator
+from cairn_fusion.mapping.measurement import Measurement
+from cairn_fusion.recording.recording_format import (
     Convention,
     RangeEncoding,
     RecordingHeader,
@@ -19,11 +19,11 @@ from cairn_fusion.recording_format import (
     decode_range,
     encode_range,
 )
-from cairn_fusion.scan import Scan
-from cairn_fusion.transfer import points_from_range
-from cairn_map.channels import COLOUR
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.transfer.transfer import points_from_range
 from cairn_map.errors import BadInputError
-from cairn_map.grid import Geometry, centres_of_voxels, voxels_in_cell
+from cairn_map.evidence.channels import COLOUR
+from cairn_map.evidence.grid import Geometry, centres_of_voxels, voxels_in_cell
 
 RADIUS_M = 2.0
 EDGE_M = 0.05

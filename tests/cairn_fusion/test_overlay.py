@@ -12,25 +12,25 @@ import pytest
 from tests import naive_sight
 from tests.cairn_map.worlds import map_of
 
-from cairn_calib.camera import Camera
-from cairn_calib.pose_vectors import transform_from_vector
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_fusion import overlay_kernels as kernels
-from cairn_fusion.live_range import live_range
-from cairn_fusion.overlay import Live, Mode, OverlayStyle, draw_overlay, with_overlay_legend
-from cairn_fusion.range_labels import AMPLITUDE_MAX
-from cairn_fusion.scan import Scan
-from cairn_map.channels import TEMPERATURE
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.pose_vectors import transform_from_vector
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_fusion.image_fusion.live_range import live_range
+from cairn_fusion.image_fusion.range_labels import AMPLITUDE_MAX
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.view import overlay_kernels as kernels
+from cairn_fusion.view.overlay import Live, Mode, OverlayStyle, draw_overlay, with_overlay_legend
 from cairn_map.errors import BadInputError
-from cairn_map.evidence import packed_evidence
-from cairn_map.grid import Geometry
-from cairn_map.map_picture import Ages
-from cairn_map.map_render import MapRenderer
-from cairn_map.map_snapshot import MapSnapshot, snapshot_of
-from cairn_map.pose_spread import PoseSpread, motions
-from cairn_map.render_picture import NO_VALUE, SCALES, Layer, palette
-from cairn_map.sight import Sight, look_at, pinhole
-from cairn_sim.overlay_scores import overlay_scores
+from cairn_map.evidence.channels import TEMPERATURE
+from cairn_map.evidence.evidence import packed_evidence
+from cairn_map.evidence.grid import Geometry
+from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
+from cairn_map.render.camera_rays import Sight, look_at, pinhole
+from cairn_map.render.map_picture import Ages
+from cairn_map.render.map_render import MapRenderer
+from cairn_map.render.pose_spread import PoseSpread, motions
+from cairn_map.render.render_picture import NO_VALUE, SCALES, Layer, palette
+from cairn_sim.evaluation.overlay_scores import overlay_scores
 
 POSES = int(os.environ.get("OVERLAY_POSES", "30"))
 EDGE_M = 0.05

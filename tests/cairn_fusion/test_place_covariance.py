@@ -4,17 +4,17 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.calibration import Calibration, covariance_from_matrix
-from cairn_calib.lens import Lens
-from cairn_calib.lidar import SpinningLidar
-from cairn_calib.pose_vectors import rotation_from_vector
-from cairn_calib.poses import inverse, transform_points
-from cairn_calib.rig import MountedCamera, Rig, Spectrum, mounted
-from cairn_fusion.calibration_certainty import place_gradients
-from cairn_fusion.certainty import pixel_covariance, reach_px_of
-from cairn_fusion.place_covariance import PlaceCovariance, calibration_bound_px
+from cairn_calib.rig.calibration import Calibration, covariance_from_matrix
+from cairn_calib.rig.lens import Lens
+from cairn_calib.rig.lidar import SpinningLidar
+from cairn_calib.rig.pose_vectors import rotation_from_vector
+from cairn_calib.rig.poses import inverse, transform_points
+from cairn_calib.rig.rig import MountedCamera, Rig, Spectrum, mounted
+from cairn_fusion.transfer.calibration_certainty import place_gradients
+from cairn_fusion.transfer.certainty import pixel_covariance, reach_px_of
+from cairn_fusion.transfer.place_covariance import PlaceCovariance, calibration_bound_px
 from cairn_map.errors import BadInputError
-from cairn_sim.heads import full_head
+from cairn_sim.robots.heads import full_head
 
 Floats = npt.NDArray[np.float64]
 NAMES = ("tof", "colour_left", "thermal_left")
@@ -44,7 +44,7 @@ RIG = calibrated()
 
 
 def moved(rig: Rig, shifts: dict[tuple[str, str], float]) -> Rig:
-    """The rig whose true numbers differ from the stated ones, as `cairn_calib.calibration` defines them."""
+    """The rig whose true numbers differ from the stated ones, as `cairn_calib.rig.calibration` defines them."""
     cameras = {}
     for name, each in rig.cameras.items():
         mine = {parameter: value for (camera, parameter), value in shifts.items() if camera == name}

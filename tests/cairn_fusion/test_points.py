@@ -7,17 +7,17 @@ import numpy.typing as npt
 import pytest
 from tests.cairn_fusion.test_carve import BARREL, GEOMETRY, random_scan, rig_of
 
-from cairn_calib.pixel_offsets import pixel_offsets
-from cairn_calib.poses import Transform, inverse
-from cairn_calib.range_bias import RangeBias
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_fusion.integrate import Integration, Integrator, Method, integrate_scan
-from cairn_fusion.measurement import Measurement
-from cairn_fusion.returns import returns_of
+from cairn_calib.rig.pixel_offsets import pixel_offsets
+from cairn_calib.rig.poses import Transform, inverse
+from cairn_calib.rig.range_bias import RangeBias
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_fusion.mapping.beam_returns import returns_of
+from cairn_fusion.mapping.integrate import Integration, Integrator, Method, integrate_scan
+from cairn_fusion.mapping.measurement import Measurement
 from cairn_map.errors import BadInputError
-from cairn_map.evidence import Evidence
-from cairn_map.grid import CellKey, Geometry, geometry_for, voxels_in_cell
-from cairn_sim.heads import lidar_head
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey, Geometry, geometry_for, voxels_in_cell
+from cairn_sim.robots.heads import lidar_head
 
 TENTH = geometry_for(voxel_edge_m=0.1, channels=())
 FAR = Integrator(min_range_m=0.5, max_range_m=80.0)

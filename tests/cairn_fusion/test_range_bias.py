@@ -9,21 +9,21 @@ import pytest
 from tests.cairn_calib.simulated_views import BOARD, SPECTRA, TOF, World, ranges_of, views_of, world
 from tests.cairn_fusion.test_carve import BARREL, GEOMETRY, random_scan, rig_of
 
-from cairn_calib.board_views import RangeView
-from cairn_calib.lidar import SpinningLidar
-from cairn_calib.range_bias import RangeBias
-from cairn_calib.range_terms import off_middle_image
-from cairn_calib.rig import MountedCamera, Rig, Spectrum, mounted, rig_from_json
-from cairn_calib.rig_exchange import cameras_of_rig
-from cairn_calib.solve import solve_rig
-from cairn_calib.solve_plan import usual_plan
-from cairn_calib.solve_warnings import warnings_of
-from cairn_calib.solved_rig import solved_rig
-from cairn_fusion.integrate import Integrator, integrate_scan
-from cairn_fusion.live_range import live_range
-from cairn_fusion.returns import returns_of
-from cairn_fusion.scan import Scan
-from cairn_fusion.surface import surface_of
+from cairn_calib.diagnosis.solve_warnings import warnings_of
+from cairn_calib.exchange.rig_exchange import cameras_of_rig
+from cairn_calib.rig.lidar import SpinningLidar
+from cairn_calib.rig.range_bias import RangeBias
+from cairn_calib.rig.range_terms import off_middle_image
+from cairn_calib.rig.rig import MountedCamera, Rig, Spectrum, mounted, rig_from_json
+from cairn_calib.solve.board_views import RangeView
+from cairn_calib.solve.solve import solve_rig
+from cairn_calib.solve.solve_plan import usual_plan
+from cairn_calib.solve.solved_rig import solved_rig
+from cairn_fusion.image_fusion.live_range import live_range
+from cairn_fusion.image_fusion.surface import surface_of
+from cairn_fusion.mapping.beam_returns import returns_of
+from cairn_fusion.mapping.integrate import Integrator, integrate_scan
+from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import BadInputError
 
 Floats = npt.NDArray[np.float64]

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cairn_calib.camera import Camera, camera_from_field_of_view
-from cairn_calib.poses import transform_from_quaternion
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_fusion.images import write_colour, write_grey16
-from cairn_fusion.recording import Recording, ScanSource, open_recording
-from cairn_fusion.recording_format import Convention, RangeEncoding, ThermalEncoding, contained
-from cairn_fusion.recording_writer import RecordingWriter
-from cairn_fusion.scan import Scan
+from cairn_calib.rig.camera import Camera, camera_from_field_of_view
+from cairn_calib.rig.poses import transform_from_quaternion
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_fusion.recording.images import write_colour, write_grey16
+from cairn_fusion.recording.recording import Recording, ScanSource, open_recording
+from cairn_fusion.recording.recording_format import Convention, RangeEncoding, ThermalEncoding, contained
+from cairn_fusion.recording.recording_writer import RecordingWriter
+from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import BadInputError, CairnError, ConflictError, DamagedDataError, NotFoundError
 
 START_S = 1_700_000_000.0

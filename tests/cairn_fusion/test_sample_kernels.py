@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from cairn_fusion.sample_kernels import write_means_into
-from cairn_map.channels import COLOUR, SAMPLE_MAX, TEMPERATURE, Channel
-from cairn_map.grid import Geometry
+from cairn_fusion.mapping.sample_kernels import write_means_into
+from cairn_map.evidence.channels import COLOUR, SAMPLE_MAX, TEMPERATURE, Channel
+from cairn_map.evidence.grid import Geometry
 
 GEOMETRY = Geometry(voxel_edge_um=50_000, depth=3, channels=(COLOUR, TEMPERATURE))
 

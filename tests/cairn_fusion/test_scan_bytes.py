@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cairn_calib.poses import look_at
-from cairn_fusion.scan import Scan
-from cairn_fusion.scan_bytes import decode_scan, encode_scan, moved_scan
+from cairn_calib.rig.poses import look_at
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.recording.scan_bytes import decode_scan, encode_scan, moved_scan
 from cairn_map.errors import DamagedDataError
 
 

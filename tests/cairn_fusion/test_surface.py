@@ -5,14 +5,13 @@ import numpy.typing as npt
 import pytest
 from tests.cairn_fusion import naive_views
 
-from cairn_calib.camera import Camera
-from cairn_calib.poses import look_at
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_calib.sensing import RangeSensing
-from cairn_fusion.range_labels import range_labels
-from cairn_fusion.scan import Scan
-from cairn_fusion.surface import drawn_surface, surface_of
-from cairn_fusion.surface_kernels import (
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.poses import look_at
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.sensing import RangeSensing
+from cairn_fusion.image_fusion.range_labels import range_labels
+from cairn_fusion.image_fusion.surface import drawn_surface, surface_of
+from cairn_fusion.image_fusion.surface_kernels import (
     borrowed_ranges,
     draw_labels_into,
     draw_squares_into,
@@ -20,7 +19,8 @@ from cairn_fusion.surface_kernels import (
     joined,
     nearest_of_nine,
 )
-from cairn_fusion.transfer import Label
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.transfer.transfer import Label
 
 Singles = npt.NDArray[np.float32]
 TOF = Camera(width=44, height=36, focal_px=(40.0, 40.0), centre_px=(21.5, 17.5))

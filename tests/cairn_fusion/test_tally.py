@@ -9,19 +9,19 @@ import numpy.typing as npt
 import pytest
 from tests import naive
 
-from cairn_calib.camera import Camera
-from cairn_calib.poses import look_at
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_fusion.carve import Carving, Scratch, carving_of, window_of
-from cairn_fusion.integrate import Integrator, integrate_scan, integrate_scans
-from cairn_fusion.scan import Scan
-from cairn_fusion.tally import ScanHits, Tally, tally_around
-from cairn_fusion.tally_kernels import hit_voxels
-from cairn_map.channels import INTENSITY
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.poses import look_at
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_fusion.mapping.free_space import Carving, Scratch, carving_of, window_of
+from cairn_fusion.mapping.integrate import Integrator, integrate_scan, integrate_scans
+from cairn_fusion.mapping.tally import ScanHits, Tally, tally_around
+from cairn_fusion.mapping.tally_kernels import hit_voxels
+from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import BadInputError
-from cairn_map.evidence import Evidence
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import CellKey, Geometry, voxels_in_cell, voxels_of_points
+from cairn_map.evidence.channels import INTENSITY
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import CellKey, Geometry, voxels_in_cell, voxels_of_points
 
 Voxel = tuple[int, int, int]
 GEOMETRY = Geometry(voxel_edge_um=50_000, depth=4, channels=(INTENSITY,))

@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.poses import look_at
-from cairn_calib.rig import Rig
-from cairn_fusion.scan import Scan
-from cairn_fusion.transfer import Label
+from cairn_calib.rig.poses import look_at
+from cairn_calib.rig.rig import Rig
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.transfer.transfer import Label
 from cairn_fusion.view.mjpeg import Latest, streaming
 from cairn_fusion.view.paint_kernels import HATCH_PERIOD, HATCH_WIDTH
 from cairn_fusion.view.painting import (
@@ -31,9 +31,9 @@ from cairn_fusion.view.painting import (
 from cairn_fusion.view.telepresence import Mode, Telepresence, ViewOptions, fuse, seen_in
 from cairn_fusion.view.temperature_scale import PALETTE, TemperatureScale, locked_scale
 from cairn_map.errors import BadInputError
-from cairn_sim.heads import RANGE_CAMERA, full_head, tof_head
-from cairn_sim.render import render_scan
-from cairn_sim.scene_file import load_scene
+from cairn_sim.render.render import render_scan
+from cairn_sim.robots.heads import RANGE_CAMERA, full_head, tof_head
+from cairn_sim.scene.scene_file import load_scene
 
 HEAD = full_head(scale=0.25)
 SCALE = TemperatureScale(290.0, 310.0)

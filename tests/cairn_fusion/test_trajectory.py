@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cairn_calib.poses import Transform, transform_from_quaternion
-from cairn_fusion.trajectory import interpolated, read_trajectory, trajectory_line
+from cairn_calib.rig.poses import Transform, transform_from_quaternion
+from cairn_fusion.recording.trajectory import interpolated, read_trajectory, trajectory_line
 from cairn_map.errors import BadInputError
 
 QUARTER = np.sqrt(0.5)

@@ -4,12 +4,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.camera import Camera, camera_from_field_of_view
-from cairn_calib.fisheye import FisheyeCamera
-from cairn_calib.lens import Lens
-from cairn_calib.poses import look_at
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_fusion.transfer import Label, depth_steps, points_from_range, transfer_points
+from cairn_calib.rig.camera import Camera, camera_from_field_of_view
+from cairn_calib.rig.fisheye import FisheyeCamera
+from cairn_calib.rig.lens import Lens
+from cairn_calib.rig.poses import look_at
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_fusion.transfer.transfer import Label, depth_steps, points_from_range, transfer_points
 from cairn_map.errors import BadInputError
 
 Floats = npt.NDArray[np.float64]

@@ -12,17 +12,17 @@ import numpy as np
 import zstandard
 from tests.cairn_map.made import KEY, ROBOT, made_cursor, made_meta
 
-from cairn_map.cell_code import decode_cell, encode_cell
-from cairn_map.cell_head import CellHead, encode_head
-from cairn_map.channels import Channel, ChannelKind
-from cairn_map.commit import HEAD as COMMIT_HEAD
-from cairn_map.commit_reading import open_commit
+from cairn_map.codec.cell_code import decode_cell, encode_cell
+from cairn_map.codec.octree.cell_head import CellHead, encode_head
+from cairn_map.codec.octree.streams import HEAD as STREAM_HEAD
+from cairn_map.codec.octree.streams import MODELLED
+from cairn_map.commits.commit import HEAD as COMMIT_HEAD
+from cairn_map.commits.commit_reading import open_commit
 from cairn_map.errors import CairnError
-from cairn_map.evidence import empty_evidence, packed_evidence
-from cairn_map.frames import frames_of, start_of_reply
-from cairn_map.grid import Geometry, cell_key
-from cairn_map.streams import HEAD as STREAM_HEAD
-from cairn_map.streams import MODELLED
+from cairn_map.evidence.channels import Channel, ChannelKind
+from cairn_map.evidence.evidence import empty_evidence, packed_evidence
+from cairn_map.evidence.grid import Geometry, cell_key
+from cairn_map.wire.frames import frames_of, start_of_reply
 
 DEEP = Geometry(depth=8, channels=())
 COLOURS = tuple(Channel(kind=ChannelKind.COLOUR, name=f"c{n}") for n in range(16))

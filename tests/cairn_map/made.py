@@ -4,15 +4,15 @@ import numpy as np
 from hypothesis import strategies as st
 from tests import naive
 
-from cairn_map.cell_code import encode_cell
-from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
-from cairn_map.commit import Commit, CommitMeta, ScanPose, make_commit
-from cairn_map.cursor import Cursor
-from cairn_map.evidence import Evidence, packed_evidence
-from cairn_map.fingerprint import fingerprint
-from cairn_map.frames import CellFrame, Frame, FrameKind
-from cairn_map.grid import CellKey, Geometry, cell_key
-from cairn_map.messages import Done, More, ReplyHeader
+from cairn_map.codec.cell_code import encode_cell
+from cairn_map.commits.commit import Commit, CommitMeta, ScanPose, make_commit
+from cairn_map.commits.cursor import Cursor
+from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
+from cairn_map.evidence.evidence import Evidence, packed_evidence
+from cairn_map.evidence.fingerprint import fingerprint
+from cairn_map.evidence.grid import CellKey, Geometry, cell_key
+from cairn_map.wire.frames import CellFrame, Frame, FrameKind
+from cairn_map.wire.messages import Done, More, ReplyHeader
 
 DOSE = Channel(kind=ChannelKind.SCALAR, name="dose", unit="µSv/h", step=0.01, zero=-1.5)
 SMALL = Geometry(voxel_edge_um=50_000, depth=3, channels=(COLOUR, INTENSITY, TEMPERATURE, DOSE))

@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import zstandard
 
-from cairn_map.cell_head import decode_head
-from cairn_map.cell_reading import cell_reader
-from cairn_map.streams import HEAD, StoredStream, join_streams
+from cairn_map.codec.cell_reading import cell_reader
+from cairn_map.codec.octree.cell_head import decode_head
+from cairn_map.codec.octree.streams import HEAD, StoredStream, join_streams
 
 GROUPS = {1: [1, 2], 3: [3, 4], 16: [16, 17, 18, 19, 20], 24: [24, 25, 26], 32: [32, 33, 34, 35], 40: [40, 41, 42]}
 """Of `made.SMALL`: each group's streams by the first."""

@@ -7,12 +7,12 @@ from random import Random
 import pytest
 from tests.cairn_map.made import KEY, made_frames
 
-from cairn_map import begun_frames
-from cairn_map.begun_frames import BEGUN_BYTES_MIN, Replies, reply_digest, without_begun
 from cairn_map.errors import DamagedDataError, UnreachableError
-from cairn_map.frames import CellFrame, Frame, encode_frame, start_of_reply
-from cairn_map.grid import CellKey, cell_of_key
-from cairn_map.messages import MissingRequest
+from cairn_map.evidence.grid import CellKey, cell_of_key
+from cairn_map.wire import resumed_replies
+from cairn_map.wire.frames import CellFrame, Frame, encode_frame, start_of_reply
+from cairn_map.wire.messages import MissingRequest
+from cairn_map.wire.resumed_replies import BEGUN_BYTES_MIN, Replies, reply_digest, without_begun
 
 HEADER, *CELLS = made_frames()
 CELL = next(frame for frame in CELLS if isinstance(frame, CellFrame) and frame.payload)
@@ -86,7 +86,7 @@ def going_on(replies: Replies, size: int, *, cut: int = 0) -> list[Frame]:
 
 
 def test_a_cell_that_goes_on_beyond_its_limit_is_no_cell(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(begun_frames, "CELL_BYTES_MAX", 10_000)
+    monkeypatch.setattr(resumed_replies, "CELL_BYTES_MAX", 10_000)
     replies = Replies()
     fetched(replies, [cell(0, 9000)], cut_at=5000)
     for _ in range(20):

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from tests import naive
 from tests.cairn_map.made import DOSE, GEOMETRIES, KEY, MIDDLE, PLAIN, SMALL, any_evidence, as_dict, random_evidence
 
-from cairn_map.brick_cell import BrickCell, brick_cell, difference, sum_evidence
-from cairn_map.cell_code import encode_cell
-from cairn_map.channels import TEMPERATURE
+from cairn_map.codec.cell_code import encode_cell
 from cairn_map.errors import BadInputError
-from cairn_map.evidence import COUNT_MAX, SUM_MAX, Evidence, empty_evidence, packed_evidence
-from cairn_map.fingerprint import fingerprint
-from cairn_map.grid import Geometry
+from cairn_map.evidence.brick_cell import BrickCell, brick_cell, difference, sum_evidence
+from cairn_map.evidence.channels import TEMPERATURE
+from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX, Evidence, empty_evidence, packed_evidence
+from cairn_map.evidence.fingerprint import fingerprint
+from cairn_map.evidence.grid import Geometry
 
 TWO_CHANNELS = Geometry(voxel_edge_um=50_000, depth=4, channels=(TEMPERATURE, DOSE))
 """Eight bricks."""

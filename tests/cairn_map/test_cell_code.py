@@ -20,13 +20,13 @@ from tests.cairn_map.made import (
 )
 from tests.cairn_map.stored import recoded
 
-from cairn_map.brick_cell import difference
-from cairn_map.cell_code import decode_canonical_cell, decode_cell, decode_met, encode_cell
+from cairn_map.codec.cell_code import decode_canonical_cell, decode_cell, decode_met, encode_cell
+from cairn_map.codec.octree.octree import build_octree
+from cairn_map.codec.octree.streams import HEAD
 from cairn_map.errors import BadInputError, DamagedDataError
-from cairn_map.evidence import SUM_MAX, Evidence, empty_evidence, packed_evidence
-from cairn_map.grid import Geometry, cell_key
-from cairn_map.octree import build_octree
-from cairn_map.streams import HEAD
+from cairn_map.evidence.brick_cell import difference
+from cairn_map.evidence.evidence import SUM_MAX, Evidence, empty_evidence, packed_evidence
+from cairn_map.evidence.grid import Geometry, cell_key
 
 CELLS = st.tuples(*[st.integers(-(1 << 20), (1 << 20) - 1)] * 3)
 MADE = st.builds(

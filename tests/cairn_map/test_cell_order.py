@@ -6,11 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.cairn_map.made import GEOMETRIES, MIDDLE, PLAIN, random_evidence
 
-from cairn_map.brick_cell import difference
-from cairn_map.cell_order import HOT_ABOVE_K, HOT_RINGS, first_to_last, hottest_k
-from cairn_map.channels import TEMPERATURE
-from cairn_map.evidence import Evidence, empty_evidence
-from cairn_map.grid import Cell, Geometry
+from cairn_map.evidence.brick_cell import difference
+from cairn_map.evidence.cell_order import HOT_ABOVE_K, HOT_RINGS, first_to_last, hottest_k
+from cairn_map.evidence.channels import TEMPERATURE
+from cairn_map.evidence.evidence import Evidence, empty_evidence
+from cairn_map.evidence.grid import Cell, Geometry
 
 HERE = Cell(0, 0, 0)
 COLD_K, FIRE_K = 293.0, 900.0

@@ -8,14 +8,14 @@ from tests.cairn_map.made import KEY, MIDDLE, SMALL, as_dict, surface_evidence
 from tests.cairn_map.stored import GROUPS, bodies_of, garbled, recoded, with_streams
 from tests.cairn_map.test_small_code import RANDOM, SMOOTH, Made
 
-from cairn_map.cell_code import Profile, decode_cell, encode_cell
-from cairn_map.cell_content import evidence_of
-from cairn_map.cell_head import decode_head
-from cairn_map.cell_reading import cell_reader
-from cairn_map.channel_streams import stream_of_channel
+from cairn_map.codec.cell_code import Profile, decode_cell, encode_cell
+from cairn_map.codec.cell_reading import cell_reader
+from cairn_map.codec.octree.cell_content import evidence_of
+from cairn_map.codec.octree.cell_head import decode_head
+from cairn_map.codec.octree.channel_streams import stream_of_channel
+from cairn_map.codec.octree.streams import MODELLED, STORED, StoredStream, join_streams
 from cairn_map.errors import BadInputError, CairnError
-from cairn_map.grid import Geometry
-from cairn_map.streams import MODELLED, STORED, StoredStream, join_streams
+from cairn_map.evidence.grid import Geometry
 
 
 def topology(data: bytes, depth: int) -> list[tuple[int, int]]:

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.cairn_map.made import SMALL
 
-from cairn_map.channel_streams import ChannelRows, join_samples, split_samples
+from cairn_map.codec.octree.channel_streams import ChannelRows, join_samples, split_samples
 from cairn_map.errors import DamagedDataError
-from cairn_map.evidence import SUM_MAX
+from cairn_map.evidence.evidence import SUM_MAX
 
 LEAVES = 20
 Ints = npt.NDArray[np.int64]

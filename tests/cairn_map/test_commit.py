@@ -21,13 +21,13 @@ from tests.cairn_map.made import (
 )
 from tests.cairn_map.stored import recoded
 
-from cairn_map.brick_cell import difference
-from cairn_map.cell_code import encode_cell
-from cairn_map.commit import CELLS_MAX, HEAD, META_BYTES_MAX, Commit, CommitMeta, make_commit
-from cairn_map.commit_reading import open_commit
+from cairn_map.codec.cell_code import encode_cell
+from cairn_map.commits.commit import CELLS_MAX, HEAD, META_BYTES_MAX, Commit, CommitMeta, make_commit
+from cairn_map.commits.commit_reading import open_commit
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError
-from cairn_map.evidence import Evidence, empty_evidence
-from cairn_map.grid import cell_key
+from cairn_map.evidence.brick_cell import difference
+from cairn_map.evidence.evidence import Evidence, empty_evidence
+from cairn_map.evidence.grid import cell_key
 
 
 def commit_bytes(meta: bytes, cells: list[bytes], *, count: int | None = None) -> bytes:

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from cairn_map.compile_progress import CLEAR_LINE, CompileProgress
+from cairn_map.kernels.compile_progress import CLEAR_LINE, CompileProgress
 
 FIRST_USE = """
-from cairn_map.compile_progress import show_compiling
-from cairn_map.evidence import empty_evidence
-from cairn_map.fingerprint import fingerprint
-from cairn_map.grid import CellKey, Geometry
+from cairn_map.kernels.compile_progress import show_compiling
+from cairn_map.evidence.evidence import empty_evidence
+from cairn_map.evidence.fingerprint import fingerprint
+from cairn_map.evidence.grid import CellKey, Geometry
 
 import sys
 sys.stderr.isatty = lambda: True

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cairn_map.cursor import ENTRY_FOLD, ENTRY_UNFOLD, Cursor, cursor_from_text, first_chain, next_chain
+from cairn_map.commits.cursor import ENTRY_FOLD, ENTRY_UNFOLD, Cursor, cursor_from_text, first_chain, next_chain
+from cairn_map.commits.ids import commit_id_from_text
 from cairn_map.errors import BadInputError
-from cairn_map.ids import commit_id_from_text
 
 ID = commit_id_from_text("mole.0123456789abcdef.4")
 SHA = bytes(32)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from tests.cairn_map.made import MIDDLE, PLAIN, SMALL, as_dict, random_evidence
 
 from cairn_map.errors import BadInputError
-from cairn_map.evidence import (
+from cairn_map.evidence.evidence import (
     COUNT_MAX,
     SUM_MAX,
     Evidence,
@@ -16,7 +16,7 @@ from cairn_map.evidence import (
     largest,
     packed_evidence,
 )
-from cairn_map.evidence_kernels import bounds_of_counts, channel_above, sums_without_weight
+from cairn_map.evidence.evidence_kernels import bounds_of_counts, channel_above, sums_without_weight
 
 I64_MIN = -(1 << 63)
 

@@ -5,9 +5,9 @@ import pytest
 from tests.cairn_map.made import SMALL, random_evidence
 
 from cairn_map.errors import BadInputError
-from cairn_map.evidence import COUNT_MAX, Evidence, empty_evidence, packed_evidence
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import CellKey
+from cairn_map.evidence.evidence import COUNT_MAX, Evidence, empty_evidence, packed_evidence
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import CellKey
 
 A, B, C = CellKey(5), CellKey(3), CellKey(9)
 

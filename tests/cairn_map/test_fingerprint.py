@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from tests import naive
 from tests.cairn_map.made import KEY, MIDDLE, SMALL, any_evidence, as_dict, random_evidence
 
-from cairn_map.brick_cell import difference, sum_evidence
 from cairn_map.errors import DamagedDataError
-from cairn_map.evidence import Evidence, empty_evidence
-from cairn_map.fingerprint import ZERO, Fingerprint, fingerprint, fingerprint_from_bytes, fingerprint_from_hex
-from cairn_map.grid import CellKey
+from cairn_map.evidence.brick_cell import difference, sum_evidence
+from cairn_map.evidence.evidence import Evidence, empty_evidence
+from cairn_map.evidence.fingerprint import ZERO, Fingerprint, fingerprint, fingerprint_from_bytes, fingerprint_from_hex
+from cairn_map.evidence.grid import CellKey
 
 SEEDS = st.integers(0, 10**6)
 WORDS = st.integers(0, (1 << 64) - 1)

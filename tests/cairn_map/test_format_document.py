@@ -8,13 +8,16 @@ import pytest
 from tests import naive
 from tests.cairn_map.made import as_dict
 
-from cairn_map import cell_reading, commit, frames, ids, streams, version_vector
-from cairn_map.cell_code import encode_cell
-from cairn_map.channels import TEMPERATURE
-from cairn_map.commit import CommitMeta, make_commit
-from cairn_map.evidence import Evidence, packed_evidence
-from cairn_map.fingerprint import fingerprint
-from cairn_map.grid import Geometry, cell_key
+from cairn_map.codec import cell_reading
+from cairn_map.codec.cell_code import encode_cell
+from cairn_map.codec.octree import streams
+from cairn_map.commits import commit, ids, version_vector
+from cairn_map.commits.commit import CommitMeta, make_commit
+from cairn_map.evidence.channels import TEMPERATURE
+from cairn_map.evidence.evidence import Evidence, packed_evidence
+from cairn_map.evidence.fingerprint import fingerprint
+from cairn_map.evidence.grid import Geometry, cell_key
+from cairn_map.wire import frames
 
 DOCUMENT = (Path(__file__).parents[2] / "fusion" / "FORMAT.md").read_text()
 LINE = re.compile(r"^    ([0-9a-f]{4})  ((?:[0-9a-f]{2} )+) ", re.MULTILINE)

@@ -11,7 +11,7 @@ from tests import naive
 from tests.cairn_map.made import KEY, made_cursor, made_frames
 
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError
-from cairn_map.frames import (
+from cairn_map.wire.frames import (
     BLOCK_LIMIT,
     FRAME_BYTES_MAX,
     JSON_BYTES_MAX,
@@ -23,7 +23,7 @@ from cairn_map.frames import (
     frames_of,
     start_of_reply,
 )
-from cairn_map.messages import ReplyHeader
+from cairn_map.wire.messages import ReplyHeader
 
 FRAMES = made_frames()
 REPLY = start_of_reply() + b"".join(encode_frame(frame) for frame in FRAMES)

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests import naive
 
-from cairn_map.channels import COLOUR, INTENSITY, Channel, ChannelKind
 from cairn_map.errors import BadInputError
-from cairn_map.grid import (
+from cairn_map.evidence.channels import COLOUR, INTENSITY, Channel, ChannelKind
+from cairn_map.evidence.grid import (
     CELL_LIMIT,
     Cell,
     Geometry,

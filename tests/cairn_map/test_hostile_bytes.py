@@ -27,14 +27,14 @@ from tests.cairn_map.made import (
 )
 from tests.cairn_map.stored import GROUPS, bodies_of, recoded, with_streams
 
-from cairn_map.brick_cell import brick_cell
-from cairn_map.cell_code import Profile, decode_cell, encode_cell
-from cairn_map.commit_reading import open_commit
+from cairn_map.codec.cell_code import Profile, decode_cell, encode_cell
+from cairn_map.commits.commit_reading import open_commit
 from cairn_map.errors import CairnError
-from cairn_map.evidence import Evidence
-from cairn_map.fingerprint import fingerprint
-from cairn_map.frames import FrameKind, encode_frame, frames_of, start_of_reply
-from cairn_map.grid import Geometry
+from cairn_map.evidence.brick_cell import brick_cell
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.fingerprint import fingerprint
+from cairn_map.evidence.grid import Geometry
+from cairn_map.wire.frames import FrameKind, encode_frame, frames_of, start_of_reply
 
 EVIDENCE = random_evidence(8, SMALL, voxels=12, air=1)
 CELL = encode_cell(KEY, EVIDENCE, SMALL).data

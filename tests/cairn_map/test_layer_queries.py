@@ -8,11 +8,11 @@ from tests import naive_queries as naive
 from tests.cairn_map.made import MIDDLE, PLAIN, SMALL
 from tests.cairn_map.worlds import random_map, snapshot_with, world_of
 
-from cairn_map import layer_queries, point_queries
 from cairn_map.errors import BadInputError
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import Geometry
-from cairn_map.map_snapshot import snapshot_of
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import Geometry
+from cairn_map.queries import layer_queries, point_queries
+from cairn_map.queries.map_snapshot import snapshot_of
 
 DEEPER = Geometry(voxel_edge_um=50_000, depth=4, channels=())
 BOX_M = [[-0.31, -0.2, -math.inf], [0.26, math.inf, 0.3]]

@@ -7,18 +7,18 @@ from tests import naive_sight
 from tests.cairn_map.made import PLAIN, SMALL
 from tests.cairn_map.worlds import map_of, random_map, snapshot_with
 
-from cairn_map import state_kernels
 from cairn_map.errors import BadInputError
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import CellKey, Geometry, cell_key
-from cairn_map.map_picture import layer_values
-from cairn_map.map_render import MapRenderer, Seen
-from cairn_map.map_snapshot import MapSnapshot, snapshot_of
-from cairn_map.partial_map import ReadCell, draw_as_needed, read_cell
-from cairn_map.render_picture import Layer
-from cairn_map.sensor_model import SensorModel
-from cairn_map.sight import Sight, cells_in_sight, look_at, pinhole
-from cairn_map.state_grid import State
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import CellKey, Geometry, cell_key
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.queries import occupancy_kernels
+from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
+from cairn_map.queries.occupancy_states import State
+from cairn_map.render.camera_rays import Sight, cells_in_sight, look_at, pinhole
+from cairn_map.render.map_picture import layer_values
+from cairn_map.render.map_render import MapRenderer, Seen
+from cairn_map.render.partial_map import ReadCell, draw_as_needed, read_cell
+from cairn_map.render.render_picture import Layer
 
 EDGE_M = 0.05
 SIGHT = pinhole(20, 14, focal_px=16)
@@ -41,7 +41,7 @@ def voxels_by_state(snapshot: MapSnapshot) -> tuple[npt.NDArray[np.int64], npt.N
 def voxels_seen(snapshot: MapSnapshot, seen: Seen) -> npt.NDArray[np.int64]:
     """(N, 3) numbers of the voxels at which what is seen is entered."""
     corners = snapshot.frozen.grid.cells[seen.slots[seen.hit]] * snapshot.geometry.side
-    inside = state_kernels.squeeze
+    inside = occupancy_kernels.squeeze
     places = seen.places[seen.hit].astype(np.uint64)
     return corners + np.array([[int(inside(place >> np.uint64(axis))) for axis in range(3)] for place in places])
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests import naive
 
-from cairn_map.morton_kernels import deinterleave, interleave
+from cairn_map.kernels.morton_kernels import deinterleave, interleave
 
 INDEX = st.integers(0, (1 << 21) - 1)
 

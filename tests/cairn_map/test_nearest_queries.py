@@ -9,10 +9,10 @@ from tests.cairn_map.made import PLAIN
 from tests.cairn_map.worlds import random_map, random_points, snapshot_with, world_of
 
 from cairn_map.errors import BadInputError
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import Geometry
-from cairn_map.map_snapshot import snapshot_of
-from cairn_map.state_grid import State
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import Geometry
+from cairn_map.queries.map_snapshot import snapshot_of
+from cairn_map.queries.occupancy_states import State
 
 EDGE_M = 0.05
 DEEPER = Geometry(voxel_edge_um=50_000, depth=4, channels=())

@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from tests import naive
 from tests.cairn_map.made import MIDDLE, PLAIN, SMALL, as_dict, random_evidence, surface_evidence
 
-from cairn_map.cell_content import content_of
-from cairn_map.evidence import Evidence
-from cairn_map.grid import Geometry
-from cairn_map.neighbour_kernels import NONE, STEPS, earlier_rows, index_leaves
-from cairn_map.octree import build_octree
-from cairn_map.octree_kernels import leaves_of_rows, list_leaves_into, measure_masks
+from cairn_map.codec.entropy.neighbour_kernels import NONE, STEPS, earlier_rows, index_leaves
+from cairn_map.codec.octree.cell_content import content_of
+from cairn_map.codec.octree.octree import build_octree
+from cairn_map.codec.octree.octree_kernels import leaves_of_rows, list_leaves_into, measure_masks
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import Geometry
 
 DEEP = Geometry(depth=6, channels=())
 MADE = st.builds(

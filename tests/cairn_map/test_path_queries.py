@@ -10,11 +10,11 @@ from tests.cairn_map.made import PLAIN
 from tests.cairn_map.test_body_queries import ROOM, poses, random_rotations
 from tests.cairn_map.worlds import random_map, random_points, snapshot_with
 
-from cairn_map import path_queries
 from cairn_map.errors import BadInputError
-from cairn_map.grid import Geometry
-from cairn_map.map_snapshot import snapshot_of
-from cairn_map.state_grid import State
+from cairn_map.evidence.grid import Geometry
+from cairn_map.queries import path_queries
+from cairn_map.queries.map_snapshot import snapshot_of
+from cairn_map.queries.occupancy_states import State
 
 EDGE_M = 0.05
 DEEPER = Geometry(voxel_edge_um=50_000, depth=4, channels=())

@@ -9,15 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.cairn_map.made import GEOMETRIES, KEY, any_evidence, random_evidence, surface_evidence
 
-from cairn_map import cell_reading
-from cairn_map.cell_code import decode_canonical_cell, decode_cell, encode_cell
-from cairn_map.cell_content import CellContent
-from cairn_map.cell_head import FIXED_PART
-from cairn_map.cell_reading import CellReader, cell_reader
+from cairn_map.codec import cell_reading
+from cairn_map.codec.cell_code import decode_canonical_cell, decode_cell, encode_cell
+from cairn_map.codec.cell_reading import CellReader, cell_reader
+from cairn_map.codec.octree.cell_content import CellContent
+from cairn_map.codec.octree.cell_head import FIXED_PART
+from cairn_map.codec.octree.streams import STORED, StoredStream, join_streams
 from cairn_map.errors import CairnError
-from cairn_map.evidence import Evidence
-from cairn_map.grid import Geometry
-from cairn_map.streams import STORED, StoredStream, join_streams
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import Geometry
 
 Arrays = list[list[int]]
 KINDS = {"bad_octree", "bad_cell", "bad_stream", "too_large", "not_canonical"}

@@ -9,15 +9,15 @@ from tests import naive_queries as naive
 from tests.cairn_map.made import DOSE, GEOMETRIES, MIDDLE, PLAIN, SMALL, random_evidence
 from tests.cairn_map.worlds import map_of, random_map, random_points, snapshot_with, world_of
 
-from cairn_map import point_queries
-from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel
 from cairn_map.errors import BadInputError
-from cairn_map.evidence import COUNT_MAX, packed_evidence
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import CELL_LIMIT, Geometry, cell_key
-from cairn_map.map_snapshot import MapSnapshot, snapshot_of
-from cairn_map.sensor_model import SensorModel
-from cairn_map.state_grid import State
+from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel
+from cairn_map.evidence.evidence import COUNT_MAX, packed_evidence
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import CELL_LIMIT, Geometry, cell_key
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.queries import point_queries
+from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
+from cairn_map.queries.occupancy_states import State
 
 HALVES = SensorModel(p_hit=0.6, p_miss=0.4)
 """A hit says as much as a miss: ties are many."""

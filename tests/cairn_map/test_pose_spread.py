@@ -4,13 +4,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.camera import Camera
-from cairn_calib.pose_vectors import transform_from_vector
-from cairn_calib.poses import inverse, look_at, transform_points
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.pose_vectors import transform_from_vector
+from cairn_calib.rig.poses import inverse, look_at, transform_points
 from cairn_map.errors import BadInputError
-from cairn_map.pose_spread import PoseSpread, motions, sigma_px, spread_ink, spread_picture, why_withheld
-from cairn_map.sight import Sight
-from cairn_map.spread_kernels import scatter_into
+from cairn_map.render.camera_rays import Sight
+from cairn_map.render.pose_spread import PoseSpread, motions, sigma_px, spread_ink, spread_picture, why_withheld
+from cairn_map.render.spread_kernels import scatter_into
 
 Floats = npt.NDArray[np.float64]
 CAMERA = Camera(

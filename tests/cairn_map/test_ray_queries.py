@@ -9,12 +9,12 @@ from tests import naive_queries as naive
 from tests.cairn_map.made import MIDDLE, PLAIN
 from tests.cairn_map.worlds import random_map, random_points, snapshot_with, world_of
 
-from cairn_map import ray_queries
 from cairn_map.errors import BadInputError
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import Geometry
-from cairn_map.map_snapshot import snapshot_of
-from cairn_map.state_grid import State
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import Geometry
+from cairn_map.queries import ray_queries
+from cairn_map.queries.map_snapshot import snapshot_of
+from cairn_map.queries.occupancy_states import State
 
 EDGE_M = 0.05
 WALL = {(10, y, z): (3, 0) for y in range(-12, 12) for z in range(-12, 12)}

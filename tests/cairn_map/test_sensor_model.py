@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.cairn_map.made import PLAIN
 
-from cairn_map.brick_cell import sum_evidence
-from cairn_map.evidence import COUNT_MAX, packed_evidence
-from cairn_map.sensor_model import SensorModel, known, log_odds
+from cairn_map.evidence.brick_cell import sum_evidence
+from cairn_map.evidence.evidence import COUNT_MAX, packed_evidence
+from cairn_map.evidence.sensor_model import SensorModel, known, log_odds
 
 NAN = math.nan
 MODEL = SensorModel()

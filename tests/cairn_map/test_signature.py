@@ -7,9 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.cairn_map.made import SMALL
 
-from cairn_map.errors import BadInputError
-from cairn_map.ids import Author, RobotName
-from cairn_map.signature import (
+from cairn_map.commits.ids import Author, RobotName
+from cairn_map.commits.signature import (
     SIGNATURES_MAX,
     Signature,
     SigningKey,
@@ -19,6 +18,7 @@ from cairn_map.signature import (
     signatures_to_text,
     speaks_for,
 )
+from cairn_map.errors import BadInputError
 
 KEY, OTHER = SigningKey(bytes(32)), SigningKey(bytes([1] * 32))
 SHA = hashlib.sha256(b"a commit").digest()

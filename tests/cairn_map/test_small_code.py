@@ -20,12 +20,12 @@ from tests.cairn_map.made import (
 )
 from tests.cairn_map.stored import GROUPS, bodies_of, recoded, with_streams
 
-from cairn_map.cell_code import Profile, decode_canonical_cell, decode_cell, encode_cell, recompressed_cell
-from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
+from cairn_map.codec.cell_code import Profile, decode_canonical_cell, decode_cell, encode_cell, recompressed_cell
+from cairn_map.codec.octree.streams import MODELLED
 from cairn_map.errors import DamagedDataError
-from cairn_map.evidence import COUNT_MAX, SUM_MAX, Evidence, empty_evidence, packed_evidence
-from cairn_map.grid import Geometry
-from cairn_map.streams import MODELLED
+from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
+from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX, Evidence, empty_evidence, packed_evidence
+from cairn_map.evidence.grid import Geometry
 
 CELL = (-1, 0, 2)
 SIXTEEN = Geometry(depth=4, channels=tuple(Channel(kind=ChannelKind.INTENSITY, name=f"i{n}") for n in range(16)))

@@ -5,9 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests import naive
 
-from cairn_map.errors import BadInputError
-from cairn_map.ids import NUMBER_LIMIT, Author, CommitId, author_from_text, commit_id_from_text
-from cairn_map.version_vector import (
+from cairn_map.commits.ids import NUMBER_LIMIT, Author, CommitId, author_from_text, commit_id_from_text
+from cairn_map.commits.version_vector import (
     AUTHORS_MAX,
     COMMITS_MAX,
     EMPTY,
@@ -15,6 +14,7 @@ from cairn_map.version_vector import (
     VersionVector,
     version_vector_from_json,
 )
+from cairn_map.errors import BadInputError
 
 AUTHORS = ("mole.0123456789abcdef", "ant.00000000000000ff")
 IDS = st.sets(st.tuples(st.sampled_from(AUTHORS), st.integers(0, 25)), max_size=30)

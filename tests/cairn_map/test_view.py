@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.cairn_map.made import GEOMETRIES, KEY, MIDDLE, SMALL, as_dict, random_evidence
 
-from cairn_map.channels import ChannelKind
+from cairn_map.codec.view_code import decode_view, encode_view
 from cairn_map.errors import BadInputError, CairnError
-from cairn_map.evidence import Evidence, empty_evidence
-from cairn_map.grid import Geometry
-from cairn_map.sensor_model import SensorModel, log_odds
-from cairn_map.view import FULL_STYLE, LOG_ODDS_ZERO, TOPS, Chance, Colours, Extent, View, ViewStyle, view_of
-from cairn_map.view_code import decode_view, encode_view
+from cairn_map.evidence.channels import ChannelKind
+from cairn_map.evidence.evidence import Evidence, empty_evidence
+from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.sensor_model import SensorModel, log_odds
+from cairn_map.evidence.view import FULL_STYLE, LOG_ODDS_ZERO, TOPS, Chance, Colours, Extent, View, ViewStyle, view_of
 
 MODEL = SensorModel()
 COLUMNS = ("nodes", "chances", "coloured", "rgb", "warm", "temperatures")

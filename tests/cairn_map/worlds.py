@@ -5,10 +5,10 @@ import numpy.typing as npt
 from tests import naive, naive_queries
 from tests.cairn_map.made import as_dict, random_evidence
 
-from cairn_map.evidence import packed_evidence
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import CellKey, Geometry, cell_key, cell_of_key
-from cairn_map.map_snapshot import MapSnapshot, snapshot_of
+from cairn_map.evidence.evidence import packed_evidence
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import CellKey, Geometry, cell_key, cell_of_key
+from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
 
 CELLS = ((0, 0, 0), (-1, 0, 0), (0, -1, 0), (0, 0, 1), (1, 1, 0), (-1, -1, -1), (3, 0, 0))
 """Around the origin, with gaps, and one apart."""

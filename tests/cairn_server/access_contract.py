@@ -9,17 +9,17 @@ import pytest
 from tests.cairn_map.made import SMALL
 from tests.cairn_server.branch_contract import branch, token
 from tests.cairn_server.commit_contract import new_map
-from tests.cairn_server.pushes import MOLE, WREN, pushed
 from tests.cairn_server.store_contract import NAMES, new_of
+from tests.cairn_server.sync.pushes import MOLE, WREN, pushed
 
 from cairn_map.errors import ConflictError, NotFoundError
-from cairn_server.cell_cache import CellCache
-from cairn_server.folding import fold_pending
-from cairn_server.quota_store import Use
-from cairn_server.store import Store
-from cairn_server.store_health import Backlog
-from cairn_server.store_rows import MapRow
-from cairn_server.token_store import Token, registration_name
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.folding import fold_pending
+from cairn_server.store.quota_store import Use
+from cairn_server.store.store import Store
+from cairn_server.store.store_health import Backlog
+from cairn_server.store.store_rows import MapRow
+from cairn_server.store.token_store import Token, registration_name
 
 
 def made(row: MapRow | None = None, *, robot: str | None = None, expires_s: float | None = None) -> Token:

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import pytest
 from tests.cairn_server.commit_contract import folded_map, new_map
-from tests.cairn_server.pushes import WREN, pushed
+from tests.cairn_server.sync.pushes import WREN, pushed
 
 from cairn_map.errors import NotFoundError
-from cairn_server.branch_notes import EntrySize
-from cairn_server.store import Store
-from cairn_server.store_rows import Branch, MapRow
+from cairn_server.store.branch_notes import EntrySize
+from cairn_server.store.store import Store
+from cairn_server.store.store_rows import Branch, MapRow
 
 
 def branch(name: str, *, mode: str = "high-end", sensors: tuple[str, ...] = ()) -> Branch:

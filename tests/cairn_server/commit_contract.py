@@ -4,22 +4,22 @@ import time
 
 import pytest
 from tests.cairn_map.made import SMALL
-from tests.cairn_server.pushes import MOLE, WREN, pushed, read, sum_of
 from tests.cairn_server.store_contract import NAMES, new_of
+from tests.cairn_server.sync.pushes import MOLE, WREN, pushed, read, sum_of
 
-from cairn_map.commit import Commit
-from cairn_map.cursor import ENTRY_FOLD, Cursor
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.cursor import ENTRY_FOLD, Cursor
+from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName
+from cairn_map.commits.version_vector import EMPTY
 from cairn_map.errors import BadInputError, NotFoundError
-from cairn_map.evidence import COUNT_MAX, SUM_MAX
-from cairn_map.ids import Author, CommitId, Incarnation, RobotName
-from cairn_map.sensor_model import SensorModel
-from cairn_map.version_vector import EMPTY
-from cairn_server import push_policy
-from cairn_server.cell_cache import CellCache
-from cairn_server.checking import new_commit
-from cairn_server.folding import fold_pending
-from cairn_server.store import Store
-from cairn_server.store_rows import Entry, Fold, MapRow, NewCommit, StoredCommit, Totals
+from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.folding import fold_pending
+from cairn_server.store.store import Store
+from cairn_server.store.store_rows import Entry, Fold, MapRow, NewCommit, StoredCommit, Totals
+from cairn_server.sync.checks import push_policy
+from cairn_server.sync.checks.checking import new_commit
 
 
 def new_map(store: Store, *commits: Commit) -> MapRow:

@@ -6,13 +6,13 @@ from functools import partial
 
 from tests.cairn_map.made import SMALL
 from tests.cairn_server.commit_contract import bodies, new_map
-from tests.cairn_server.pushes import MOLE, pushed, read, sum_of
 from tests.cairn_server.store_contract import new_of
+from tests.cairn_server.sync.pushes import MOLE, pushed, read, sum_of
 
-from cairn_map.ids import Author, RobotName
-from cairn_server.cell_cache import CellCache
-from cairn_server.folding import fold_pending
-from cairn_server.store import Store
+from cairn_map.commits.ids import Author, RobotName
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.folding import fold_pending
+from cairn_server.store.store import Store
 
 
 def all_at_once(jobs: Sequence[Callable[[], None]]) -> None:

@@ -7,22 +7,22 @@ import numpy as np
 import pytest
 from tests.cairn_map.made import SMALL, random_evidence
 from tests.cairn_server.commit_contract import bodies, folded_map, new_map
-from tests.cairn_server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 from tests.cairn_server.store_contract import new_of
+from tests.cairn_server.sync.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 
-from cairn_map.blocks import blocks_of
-from cairn_map.cell_code import decode_cell
-from cairn_map.cell_order import hottest_k
-from cairn_map.commit import Commit, make_commit
-from cairn_map.cursor import ENTRY_UNFOLD
+from cairn_map.codec.cell_code import decode_cell
+from cairn_map.commits.commit import Commit, make_commit
+from cairn_map.commits.cursor import ENTRY_UNFOLD
+from cairn_map.commits.ids import CommitId
 from cairn_map.errors import ConflictError
-from cairn_map.grid import CellKey
-from cairn_map.ids import CommitId
-from cairn_server.cell_cache import CellCache
-from cairn_server.folding import fold_pending
-from cairn_server.stamps import decode_stamps
-from cairn_server.store import Store
-from cairn_server.store_rows import CellRow, MapRow, NewCommit, Selection
+from cairn_map.evidence.blocks import blocks_of
+from cairn_map.evidence.cell_order import hottest_k
+from cairn_map.evidence.grid import CellKey
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.folding import fold_pending
+from cairn_server.store.stamps import decode_stamps
+from cairn_server.store.store import Store
+from cairn_server.store.store_rows import CellRow, MapRow, NewCommit, Selection
 
 SOON = float("inf")
 """Before this, everything was folded."""

@@ -7,12 +7,12 @@ from contextlib import contextmanager
 from typing import Any
 
 import httpx
-from tests.cairn_server.live import DEADLINE_S, Live
+from tests.cairn_server.live.hub import DEADLINE_S, Live
 from websockets.sync.client import connect
 
-from cairn_map.live_events import LIVE_EVENT, Hello, LiveEvent
-from cairn_server.live_routes import PROTOCOL, TOKEN_PREFIX
-from cairn_server.store_rows import MapRow
+from cairn_map.wire.live_events import LIVE_EVENT, Hello, LiveEvent
+from cairn_server.http.routes.live import PROTOCOL, TOKEN_PREFIX
+from cairn_server.store.store_rows import MapRow
 
 Events = Iterator[LiveEvent]
 

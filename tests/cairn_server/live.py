@@ -18,17 +18,17 @@ import httpx
 import uvicorn
 from tests.cairn_map.made import SMALL
 
-from cairn_map.commit import Commit
-from cairn_map.grid import Geometry
-from cairn_map.messages import CreateMap, Retract
-from cairn_map.sensor_model import SensorModel
-from cairn_server.routes import make_app
-from cairn_server.serve_command import config_of, listen
+from cairn_map.commits.commit import Commit
+from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.wire.messages import CreateMap, Retract
+from cairn_server.http.app import make_app
+from cairn_server.operations.serve import config_of, listen
 from cairn_server.service import Service
 from cairn_server.settings import Settings
-from cairn_server.sqlite_store import SqliteStore
-from cairn_server.store import Store
-from cairn_server.store_rows import MapRow
+from cairn_server.store.sqlite.store import SqliteStore
+from cairn_server.store.store import Store
+from cairn_server.store.store_rows import MapRow
 
 DEADLINE_S = 60.0
 

@@ -4,16 +4,16 @@ from collections.abc import Iterable
 
 from tests import naive
 from tests.cairn_map.made import as_dict
-from tests.cairn_server.pushes import Cells
+from tests.cairn_server.sync.pushes import Cells
 
-from cairn_map.cell_code import decode_cell
-from cairn_map.commit import Commit
-from cairn_map.fingerprint import ZERO, Fingerprint
-from cairn_map.frames import CellFrame, Frame, FrameKind
-from cairn_map.grid import CellKey, cell_key, cell_of_key
-from cairn_map.ids import Author
-from cairn_map.messages import CellCursor, Done, MissingRequest, More, ReplyHeader
-from cairn_map.version_vector import EMPTY, VersionVector
+from cairn_map.codec.cell_code import decode_cell
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.ids import Author
+from cairn_map.commits.version_vector import EMPTY, VersionVector
+from cairn_map.evidence.fingerprint import ZERO, Fingerprint
+from cairn_map.evidence.grid import CellKey, cell_key, cell_of_key
+from cairn_map.wire.frames import CellFrame, Frame, FrameKind
+from cairn_map.wire.messages import CellCursor, Done, MissingRequest, More, ReplyHeader
 
 
 class NaiveAsker:

@@ -5,11 +5,11 @@ from collections.abc import Iterable, Mapping
 from tests import naive
 from tests.cairn_map.made import SMALL, as_dict, random_evidence
 
-from cairn_map.cell_code import decode_cell
-from cairn_map.commit import Commit, CommitMeta, ScanPose, make_commit
-from cairn_map.evidence import Evidence
-from cairn_map.grid import CellKey, Geometry, cell_key
-from cairn_map.ids import Author, CommitId, Incarnation, RobotName, commit_id_from_text
+from cairn_map.codec.cell_code import decode_cell
+from cairn_map.commits.commit import Commit, CommitMeta, ScanPose, make_commit
+from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName, commit_id_from_text
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey, Geometry, cell_key
 
 MOLE = Author(RobotName("mole"), Incarnation("0123456789abcdef"))
 WREN = Author(RobotName("wren"), Incarnation("00000000000000aa"))

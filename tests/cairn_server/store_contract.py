@@ -11,19 +11,19 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tests.cairn_map.made import SMALL
-from tests.cairn_server.pushes import MOLE, WREN, Cells, pushed, read, sum_of
+from tests.cairn_server.sync.pushes import MOLE, WREN, Cells, pushed, read, sum_of
 
-from cairn_map.commit import Commit
-from cairn_map.cursor import ENTRY_FOLD, ENTRY_UNFOLD, next_chain
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.cursor import ENTRY_FOLD, ENTRY_UNFOLD, next_chain
+from cairn_map.commits.ids import CommitId
+from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
-from cairn_map.ids import CommitId
-from cairn_map.sensor_model import SensorModel
-from cairn_map.version_vector import EMPTY, VersionVector
-from cairn_server.cell_cache import CellCache
-from cairn_server.checking import new_commit
-from cairn_server.folding import fold_pending
-from cairn_server.store import Store
-from cairn_server.store_rows import Branch, Fold, Head, MapRow, NewCommit, Selection
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.folding import fold_pending
+from cairn_server.store.store import Store
+from cairn_server.store.store_rows import Branch, Fold, Head, MapRow, NewCommit, Selection
+from cairn_server.sync.checks.checking import new_commit
 
 NAMES = (f"map{n}" for n in itertools.count())
 COMMITS = [pushed(n, n + shift, author) for shift, author in enumerate((MOLE, WREN)) for n in range(3)]

@@ -14,19 +14,19 @@ from typing import Literal
 import httpx
 import pytest
 from starlette.routing import WebSocketRoute
-from tests.cairn_server.live import DEADLINE_S, Live
-from tests.cairn_server.pushes import MOLE, WREN, pushed
+from tests.cairn_server.live.hub import DEADLINE_S, Live
+from tests.cairn_server.sync.pushes import MOLE, WREN, pushed
 from tests.cairn_server.test_protocol_document import DOCUMENT, ROUTE
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from cairn_map.access_messages import RoleText
-from cairn_map.messages import Register
-from cairn_server.auth import new_token, token_hash
-from cairn_server.live_routes import PROTOCOL, TOKEN_PREFIX
-from cairn_server.routes import ROUTERS
-from cairn_server.store_rows import MapRow
-from cairn_server.token_store import Token
+from cairn_map.wire.access_messages import RoleText
+from cairn_map.wire.messages import Register
+from cairn_server.access.auth import new_token, token_hash
+from cairn_server.http.app import ROUTERS
+from cairn_server.http.routes.live import PROTOCOL, TOKEN_PREFIX
+from cairn_server.store.store_rows import MapRow
+from cairn_server.store.token_store import Token
 
 TABLE = {(found[1], found[2]): found[3].split(", ") for found in ROUTE.finditer(DOCUMENT)}
 READING = {"reader", "robot", "operator", "relay"}

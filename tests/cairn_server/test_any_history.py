@@ -10,21 +10,21 @@ from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 from tests.cairn_map.made import PLAIN, SMALL
-from tests.cairn_server.live import Live
+from tests.cairn_server.live.hub import Live
 from tests.cairn_server.naive_asker import NaiveAsker
-from tests.cairn_server.pushes import MOLE, WREN, pushed, read
 from tests.cairn_server.store_contract import Model
+from tests.cairn_server.sync.pushes import MOLE, WREN, pushed, read
 from tests.cairn_server.test_push import kind_of
 
-from cairn_map.commit import Commit
-from cairn_map.frames import frames_of
-from cairn_map.grid import CellKey, cell_of_key
-from cairn_map.ids import Author, CommitId, Incarnation
-from cairn_map.index_messages import CellIndex
-from cairn_map.messages import CreateMap, MapInfo, Register, Retract
-from cairn_map.version_vector import EMPTY
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.ids import Author, CommitId, Incarnation
+from cairn_map.commits.version_vector import EMPTY
+from cairn_map.evidence.grid import CellKey, cell_of_key
+from cairn_map.wire.frames import frames_of
+from cairn_map.wire.index_messages import CellIndex
+from cairn_map.wire.messages import CreateMap, MapInfo, Register, Retract
 from cairn_server.service import OPERATOR
-from cairn_server.store_rows import MapRow
+from cairn_server.store.store_rows import MapRow
 
 REBORN = Author(MOLE.robot, Incarnation("00000000000000bb"))
 AUTHORS = (MOLE, WREN, REBORN)

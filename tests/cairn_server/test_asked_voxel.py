@@ -2,15 +2,15 @@
 
 import numpy as np
 import pytest
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import KEYS, MOLE, WREN, pushed
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import KEYS, MOLE, WREN, pushed
 
-from cairn_map.cell_code import decode_cell
-from cairn_map.evidence import Evidence
-from cairn_map.grid import cell_of_key, voxels_in_cell
-from cairn_map.voxels import voxels_of_evidence
-from cairn_server.asked_voxel import ENTRIES_MAX
-from cairn_server.store_rows import MapRow
+from cairn_map.codec.cell_code import decode_cell
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import cell_of_key, voxels_in_cell
+from cairn_map.evidence.voxels import voxels_of_evidence
+from cairn_server.store.store_rows import MapRow
+from cairn_server.views.voxel_report import ENTRIES_MAX
 
 
 def asked(live: Live, row: MapRow, voxel: object) -> dict[str, object]:

@@ -6,17 +6,17 @@ from pathlib import Path
 
 import httpx
 import pytest
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import MOLE, WREN, pushed
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import MOLE, WREN, pushed
 from tests.cairn_server.test_access_matrix import TABLE
 from tests.cairn_server.test_body_limit import raw
 from tests.cairn_server.test_push import kind_of
 
+from cairn_map.commits.ids import INITIAL, Author, Incarnation
 from cairn_map.errors import BadInputError
-from cairn_map.ids import INITIAL, Author, Incarnation
-from cairn_server.serve_command import main
+from cairn_server.operations.serve import main
 from cairn_server.settings import Settings
-from cairn_server.store_rows import MapRow
+from cairn_server.store.store_rows import MapRow
 
 ADMIN, ENROLLER = "a" * 20, "e" * 20
 

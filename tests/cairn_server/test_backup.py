@@ -6,16 +6,16 @@ from pathlib import Path
 
 import apsw
 import pytest
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import WREN, pushed, read, sum_of
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import WREN, pushed, read, sum_of
 from tests.cairn_server.tiny_disk import tiny_disk
 
 from cairn_map.errors import BadInputError, CairnError, ConflictError, DamagedDataError, NotFoundError
-from cairn_server import sqlite_backup
-from cairn_server.serve_command import main
-from cairn_server.sqlite_backup import back_up
-from cairn_server.sqlite_store import FILE_NAME
-from cairn_server.store_rows import MapRow
+from cairn_server.operations.serve import main
+from cairn_server.store.sqlite import backup as sqlite_backup
+from cairn_server.store.sqlite.backup import back_up
+from cairn_server.store.sqlite.store import FILE_NAME
+from cairn_server.store.store_rows import MapRow
 
 COMMITS = [pushed(n, n) for n in range(4)]
 

@@ -4,13 +4,13 @@ import socket
 import zlib
 
 import pytest
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import pushed
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import pushed
 from tests.cairn_server.test_push import kind_of
 
-from cairn_map.messages import Problem
-from cairn_server import body_limit
-from cairn_server.body_limit import limit_of
+from cairn_map.wire.messages import Problem
+from cairn_server.http.middleware import body_limit
+from cairn_server.http.middleware.body_limit import limit_of
 
 
 def raw(live: Live, request: bytes) -> bytes:

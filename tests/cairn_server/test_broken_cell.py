@@ -3,17 +3,17 @@
 from pathlib import Path
 
 import pytest
-from tests.cairn_server.live import Live, until
+from tests.cairn_server.live.hub import Live, until
 from tests.cairn_server.naive_asker import NaiveAsker
-from tests.cairn_server.pushes import KEYS, MOLE, pushed, read, sum_of
+from tests.cairn_server.sync.pushes import KEYS, MOLE, pushed, read, sum_of
 from tests.cairn_server.test_push import kind_of
 
-from cairn_map.frames import CellFrame, FrameKind, frames_of
-from cairn_map.grid import CellKey, cell_of_key
-from cairn_map.messages import Done
-from cairn_server.cells_at_rest import stored_evidence
-from cairn_server.sqlite_store import FILE_NAME, SqliteStore
-from cairn_server.store_rows import MapRow
+from cairn_map.evidence.grid import CellKey, cell_of_key
+from cairn_map.wire.frames import CellFrame, FrameKind, frames_of
+from cairn_map.wire.messages import Done
+from cairn_server.folding.cells_at_rest import stored_evidence
+from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
+from cairn_server.store.store_rows import MapRow
 
 BROKEN, SOUND = KEYS[0], KEYS[1]
 SUFFIXES = ("", ".npz", ".ply", ".view")

@@ -7,20 +7,20 @@ import re
 import numpy as np
 import pytest
 from tests.cairn_map.made import as_dict
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import MOLE, pushed, sum_of
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import MOLE, pushed, sum_of
 from tests.cairn_server.test_push import kind_of
 
-from cairn_map.cell_code import decode_cell
-from cairn_map.cell_files import CELL_MEDIA_TYPE
-from cairn_map.commit import make_commit
-from cairn_map.cursor import cursor_from_text
-from cairn_map.fingerprint import fingerprint
-from cairn_map.grid import cell_of_key
-from cairn_map.index_messages import CellIndex
-from cairn_map.sensor_model import SensorModel
-from cairn_map.version_vector import version_vector_from_json
-from cairn_server.store_rows import MapRow
+from cairn_map.codec.cell_code import decode_cell
+from cairn_map.commits.commit import make_commit
+from cairn_map.commits.cursor import cursor_from_text
+from cairn_map.commits.version_vector import version_vector_from_json
+from cairn_map.evidence.fingerprint import fingerprint
+from cairn_map.evidence.grid import cell_of_key
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.files.cell_files import CELL_MEDIA_TYPE
+from cairn_map.wire.index_messages import CellIndex
+from cairn_server.store.store_rows import MapRow
 
 
 @pytest.fixture

@@ -9,26 +9,26 @@ import httpx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import KEYS, MOLE, WREN, pushed
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import KEYS, MOLE, WREN, pushed
 from tests.cairn_server.test_cells import path_of
 from tests.cairn_server.test_push import kind_of
 
-from cairn_client.api import MapApi
-from cairn_map.cell_code import decode_cell
-from cairn_map.cell_files import CELL_MEDIA_TYPE, MEDIA_TYPES
-from cairn_map.cursor import Cursor, cursor_from_text
+from cairn_client.http.api import MapApi
+from cairn_map.codec.cell_code import decode_cell
+from cairn_map.codec.view_code import encode_view
+from cairn_map.commits.cursor import Cursor, cursor_from_text
+from cairn_map.commits.ids import Author, Incarnation, RobotName
+from cairn_map.commits.version_vector import VersionVector, version_vector_from_json
 from cairn_map.errors import BadInputError, DamagedDataError
-from cairn_map.grid import cell_key, cell_of_key
-from cairn_map.ids import Author, Incarnation, RobotName
-from cairn_map.index_messages import CellIndex
-from cairn_map.version_vector import VersionVector, version_vector_from_json
-from cairn_map.view import ViewStyle
-from cairn_map.view_code import encode_view
-from cairn_server.cell_routes import COVERAGE_BYTES_MAX
-from cairn_server.http_ranges import part_of
-from cairn_server.store_rows import MapRow
-from cairn_server.vectors import ENTRIES_MAX
+from cairn_map.evidence.grid import cell_key, cell_of_key
+from cairn_map.evidence.view import ViewStyle
+from cairn_map.files.cell_files import CELL_MEDIA_TYPE, MEDIA_TYPES
+from cairn_map.wire.index_messages import CellIndex
+from cairn_server.http.routes.cell import COVERAGE_BYTES_MAX
+from cairn_server.http.routes.ranges import part_of
+from cairn_server.store.store_rows import MapRow
+from cairn_server.sync.vector_at import ENTRIES_MAX
 
 SAID = ("ETag", "Cairn-Cursor", "Cairn-Coverage", "Cairn-Fingerprint", "Accept-Ranges")
 

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import apsw
 import pytest
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import WREN, pushed, read, sum_of
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import WREN, pushed, read, sum_of
 
 from cairn_map.errors import ConflictError, DamagedDataError
-from cairn_server.serve_command import main
-from cairn_server.sqlite_store import FILE_NAME, SqliteStore
+from cairn_server.operations.serve import main
+from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
 
 COMMITS = [pushed(n, 0, scans=99) for n in range(3)] + [pushed(0, 1, WREN)]
 Check = Callable[..., tuple[int, str]]

@@ -4,10 +4,10 @@ import gzip
 from pathlib import Path
 
 import pytest
-from tests.cairn_server.live import Live
+from tests.cairn_server.live.hub import Live
 
 from cairn_map.errors import NotFoundError
-from cairn_server.console_files import ConsoleFiles
+from cairn_server.http.routes.console_files import ConsoleFiles
 
 
 @pytest.fixture

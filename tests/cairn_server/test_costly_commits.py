@@ -13,17 +13,17 @@ import httpx
 import numpy as np
 import pytest
 import zstandard
-from tests.cairn_server.live import DEADLINE_S, Live, Process, until
-from tests.cairn_server.pushes import KEYS, MOLE, WREN, pushed
+from tests.cairn_server.live.hub import DEADLINE_S, Live, Process, until
+from tests.cairn_server.sync.pushes import KEYS, MOLE, WREN, pushed
 
-from cairn_map.cell_code import Profile
-from cairn_map.cell_head import decode_head
-from cairn_map.commit import Commit, CommitMeta, ScanPose, make_commit
-from cairn_map.evidence import Evidence, packed_evidence
-from cairn_map.grid import Geometry, cell_key
-from cairn_map.ids import Author, CommitId
-from cairn_map.messages import CreateMap
-from cairn_server import check_pool
+from cairn_map.codec.cell_code import Profile
+from cairn_map.codec.octree.cell_head import decode_head
+from cairn_map.commits.commit import Commit, CommitMeta, ScanPose, make_commit
+from cairn_map.commits.ids import Author, CommitId
+from cairn_map.evidence.evidence import Evidence, packed_evidence
+from cairn_map.evidence.grid import Geometry, cell_key
+from cairn_map.wire.messages import CreateMap
+from cairn_server.sync.checks import check_pool
 
 LARGE = Geometry(depth=6, channels=())
 LIMIT_S = 2.0
@@ -102,7 +102,7 @@ def pushed_evidence(geometry: Geometry) -> Evidence:
 def test_modelled_numbers_are_bounded_by_the_bytes_pushed(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     row = live.new_map(LARGE)
     commit = of_cells(1, profile=Profile.SMALL)
-    monkeypatch.setattr("cairn_server.commit_cost.NUMBERS_MAX", 1000)
+    monkeypatch.setattr("cairn_server.sync.checks.commit_cost.NUMBERS_MAX", 1000)
     assert kind_of(live.push(row, commit)) == (400, "too_costly")
     assert live.push(row, of_cells(1)).status_code == 201
 

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import httpx
 import pytest
-from tests.cairn_server.live import Live, until
-from tests.cairn_server.pushes import pushed
+from tests.cairn_server.live.hub import Live, until
+from tests.cairn_server.sync.pushes import pushed
 from tests.cairn_server.test_body_limit import head
 
 from cairn_map.errors import BadInputError
-from cairn_server.serve_command import main
+from cairn_server.operations.serve import main
 
 HEAD_S, GRACE_S, RATE, PLACES = 0.4, 0.6, 50_000.0, 8
 

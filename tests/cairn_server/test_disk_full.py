@@ -7,17 +7,17 @@ from pathlib import Path
 
 import httpx
 import pytest
-from tests.cairn_server.live import Process, until
-from tests.cairn_server.pushes import KEYS, pushed, read, sum_of
+from tests.cairn_server.live.hub import Process, until
+from tests.cairn_server.sync.pushes import KEYS, pushed, read, sum_of
 from tests.cairn_server.test_push import kind_of
 from tests.cairn_server.test_serve_process import all_folded, client, make_map
 from tests.cairn_server.tiny_disk import TinyDisk, tiny_disk
 
-from cairn_client.api import MapApi
-from cairn_map.commit import Commit
+from cairn_client.http.api import MapApi
+from cairn_map.commits.commit import Commit
 from cairn_map.errors import BadInputError, UnreachableError
-from cairn_map.grid import cell_of_key
-from cairn_server.serve_command import main
+from cairn_map.evidence.grid import cell_of_key
+from cairn_server.operations.serve import main
 
 
 @pytest.fixture

@@ -10,18 +10,18 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from tests.cairn_map.made import PLAIN, SMALL, surface_evidence
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import KEYS, pushed
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import KEYS, pushed
 from tests.cairn_server.test_broken_cell import new_map as broken_map
 from tests.cairn_server.test_push import kind_of
 
-from cairn_map.cell_code import decode_cell
-from cairn_map.export_request import ExportRequest
-from cairn_map.grid import CellKey
-from cairn_map.map_points import PCD_POINT, POINT, found_in_cell
-from cairn_map.voxels import joined_voxels, voxels_of_evidence
-from cairn_server import map_exports
-from cairn_server.store_rows import MapRow
+from cairn_map.codec.cell_code import decode_cell
+from cairn_map.evidence.grid import CellKey
+from cairn_map.evidence.voxels import joined_voxels, voxels_of_evidence
+from cairn_map.files.export_request import ExportRequest
+from cairn_map.files.point_clouds import PCD_POINT, POINT, found_in_cell
+from cairn_server.store.store_rows import MapRow
+from cairn_server.views import map_exports
 
 
 def mapped(live: Live) -> MapRow:

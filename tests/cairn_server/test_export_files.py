@@ -13,19 +13,19 @@ import numpy.typing as npt
 import pytest
 from laspy import LazBackend
 from tests.cairn_map.made import SMALL, surface_evidence
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import pushed
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import pushed
 from tests.cairn_server.test_export import ask, mapped, places, points
 from tests.cairn_server.test_push import kind_of
 from tests.naive_octomap import Node, read_tree
 
-from cairn_map.evidence import packed_evidence
-from cairn_map.export_request import ExportRequest
-from cairn_map.grid import cell_key
-from cairn_map.laz_file import LazHead, laz_parts
-from cairn_map.map_points import POINT
-from cairn_map.octomap_tree import branch_of_cell, tree_file
-from cairn_map.sensor_model import SensorModel
+from cairn_map.evidence.evidence import packed_evidence
+from cairn_map.evidence.grid import cell_key
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.files.export_request import ExportRequest
+from cairn_map.files.laz import LazHead, laz_parts
+from cairn_map.files.octomap import branch_of_cell, tree_file
+from cairn_map.files.point_clouds import POINT
 
 BACKENDS = [LazBackend.Lazrs, LazBackend.Laszip]
 

@@ -8,20 +8,20 @@ from typing import Any
 
 import httpx
 import pytest
-from tests.cairn_server.live import Live, until
+from tests.cairn_server.live.hub import Live, until
 from tests.cairn_server.test_auth import ADMIN, bearer
 from tests.cairn_server.test_broken_cell import new_map as broken_map
 from tests.cairn_server.test_export import mapped
 from tests.cairn_server.test_push import kind_of
 
-from cairn_map.access_messages import CreateToken
-from cairn_map.export_request import EXPORT_TYPES
-from cairn_server import export_tickets
-from cairn_server.auth import ADMIN_FILE
-from cairn_server.export_tickets import TICKET_S, TICKETS_MAX, TICKETS_OF_TOKEN_MAX
-from cairn_server.map_exports import Export
-from cairn_server.store_rows import MapRow
-from cairn_server.tokens import create_token, revoke_token, rotate_token
+from cairn_map.files.export_request import EXPORT_TYPES
+from cairn_map.wire.access_messages import CreateToken
+from cairn_server.access.auth import ADMIN_FILE
+from cairn_server.access.tokens import create_token, revoke_token, rotate_token
+from cairn_server.store.store_rows import MapRow
+from cairn_server.views import export_tickets
+from cairn_server.views.export_tickets import TICKET_S, TICKETS_MAX, TICKETS_OF_TOKEN_MAX
+from cairn_server.views.map_exports import Export
 
 QUERY = {"format": "ply", "floor_m": -0.5, "p": 0.25}
 
@@ -206,7 +206,7 @@ def test_an_export_that_is_too_large_or_damaged_gets_no_ticket(
     guarded: Live, row: MapRow, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert refused(ask(guarded, broken_map(guarded, keep_diffs=False))) == (500, "damaged_store")
-    monkeypatch.setattr("cairn_server.map_exports.VOXELS_EXPORTED_MAX", 1)
+    monkeypatch.setattr("cairn_server.views.map_exports.VOXELS_EXPORTED_MAX", 1)
     assert refused(ask(guarded, row, **QUERY)) == (413, "too_large")
 
 

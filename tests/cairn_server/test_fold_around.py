@@ -5,16 +5,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from tests.cairn_server.live import Live, until
-from tests.cairn_server.pushes import KEYS, WREN, pushed, read, sum_of
+from tests.cairn_server.live.hub import Live, until
+from tests.cairn_server.sync.pushes import KEYS, WREN, pushed, read, sum_of
 from tests.cairn_server.test_broken_cell import BROKEN, damage, url
 
-from cairn_map.commit import Commit
-from cairn_server import fold_around as module
-from cairn_server.cell_cache import CellCache
-from cairn_server.damaged_cells import DamagedCells
-from cairn_server.fold_around import Waiting, fold_around
-from cairn_server.store_rows import MapRow
+from cairn_map.commits.commit import Commit
+from cairn_server.folding import fold_around as module
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.damaged_cells import DamagedCells
+from cairn_server.folding.fold_around import Waiting, fold_around
+from cairn_server.store.store_rows import MapRow
 
 FIRST, SECOND = pushed(0, 0), pushed(0, 0, WREN)
 """In the damaged cell, and in another."""

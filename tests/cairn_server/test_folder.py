@@ -3,11 +3,11 @@
 import threading
 
 import pytest
-from tests.cairn_server.live import Live, until
-from tests.cairn_server.pushes import pushed
+from tests.cairn_server.live.hub import Live, until
+from tests.cairn_server.sync.pushes import pushed
 
-from cairn_server import fold_here, folder
-from cairn_server.folder import REST_MAX_S, REST_SHARE, rest_s
+from cairn_server.folding import fold_in_process, fold_thread
+from cairn_server.folding.fold_thread import REST_MAX_S, REST_SHARE, rest_s
 
 
 def test_a_fold_is_followed_by_a_rest_only_if_commits_came_meanwhile() -> None:
@@ -19,7 +19,7 @@ def test_a_fold_is_followed_by_a_rest_only_if_commits_came_meanwhile() -> None:
 def test_what_comes_while_the_folder_rests_is_folded_together(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     """The rest lasts until all is there; then one fold takes it."""
     all_there, row, groups = threading.Event(), live.new_map(), []
-    fold_around = fold_here.fold_around
+    fold_around = fold_in_process.fold_around
 
     def noted(*args: object, **kwargs: object) -> int:
         count: int = fold_around(*args, **kwargs)  # type: ignore[arg-type]
@@ -35,8 +35,8 @@ def test_what_comes_while_the_folder_rests_is_folded_together(live: Live, monkey
             all_there.set()
         return 0.0
 
-    monkeypatch.setattr(fold_here, "fold_around", noted)
-    monkeypatch.setattr(folder, "rest_s", rest)
+    monkeypatch.setattr(fold_in_process, "fold_around", noted)
+    monkeypatch.setattr(fold_thread, "rest_s", rest)
     live.push(row, pushed(0, 0))
     assert all_there.wait(20)
     until(lambda: sum(groups) == 5, "all folded")

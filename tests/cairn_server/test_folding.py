@@ -9,18 +9,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.cairn_map.made import SMALL
-from tests.cairn_server.live import Live, until
-from tests.cairn_server.pushes import MOLE, WREN, pushed, read, sum_of
+from tests.cairn_server.live.hub import Live, until
 from tests.cairn_server.store_contract import NAMES, new_of
+from tests.cairn_server.sync.pushes import MOLE, WREN, pushed, read, sum_of
 
-from cairn_map.commit import Commit
-from cairn_map.grid import cell_of_key
-from cairn_map.sensor_model import SensorModel
-from cairn_server import fold_here, folder
-from cairn_server.cell_cache import CellCache
-from cairn_server.folding import fold_pending
-from cairn_server.sqlite_store import SqliteStore
-from cairn_server.store_rows import MapRow
+from cairn_map.commits.commit import Commit
+from cairn_map.evidence.grid import cell_of_key
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_server.folding import fold_in_process, fold_thread
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.folding import fold_pending
+from cairn_server.store.sqlite.store import SqliteStore
+from cairn_server.store.store_rows import MapRow
 
 
 @pytest.fixture(scope="module")
@@ -164,8 +164,8 @@ def test_a_map_that_cannot_be_folded_holds_up_no_other_and_is_tried_again(
             raise MemoryError
         return fold_pending(store, row, cache, limit=limit)
 
-    monkeypatch.setattr(fold_here, "fold_around", fold)
-    monkeypatch.setattr(folder, "RETRY_S", 0.01)
+    monkeypatch.setattr(fold_in_process, "fold_around", fold)
+    monkeypatch.setattr(fold_thread, "RETRY_S", 0.01)
     with Live(tmp_path) as live:
         first, second = live.new_map(), live.new_map()
         for row in (first, second):

@@ -2,18 +2,18 @@
 
 import numpy as np
 from tests.cairn_map.made import SMALL, random_evidence
-from tests.cairn_server.live import Live
+from tests.cairn_server.live.hub import Live
 from tests.cairn_server.naive_asker import NaiveAsker
-from tests.cairn_server.pushes import MOLE, SCANS, WREN, pushed
+from tests.cairn_server.sync.pushes import MOLE, SCANS, WREN, pushed
 from tests.cairn_server.test_missing import ask, fetch
 from tests.cairn_server.test_push import kind_of
 
-from cairn_map.begun_frames import reply_digest
-from cairn_map.evidence import packed_evidence
-from cairn_map.frames import CellFrame, frames_of
-from cairn_map.grid import cell_key, cell_of_key
-from cairn_map.messages import MissingRequest
-from cairn_server.store_rows import MapRow
+from cairn_map.evidence.evidence import packed_evidence
+from cairn_map.evidence.grid import cell_key, cell_of_key
+from cairn_map.wire.frames import CellFrame, frames_of
+from cairn_map.wire.messages import MissingRequest
+from cairn_map.wire.resumed_replies import reply_digest
+from cairn_server.store.store_rows import MapRow
 
 PLACES = [(0, 0, 0), (3, 0, 0), (-1, 1, 0), (2, 2, 2), (-4, 0, 1), (1, 0, 0)]
 

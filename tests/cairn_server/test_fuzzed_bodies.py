@@ -9,13 +9,13 @@ import httpx
 import pytest
 from tests.cairn_map.bombs import BOMBS, DEEP, commit_of
 from tests.cairn_map.made import ROBOT, SMALL
-from tests.cairn_server.live import DEADLINE_S, Process
-from tests.cairn_server.pushes import pushed
+from tests.cairn_server.live.hub import DEADLINE_S, Process
+from tests.cairn_server.sync.pushes import pushed
 from tests.fuzz.json_mutator import mutated_json
 from tests.fuzz.test_fuzz import bytewise
 from tests.fuzz.wrapping_mutator import mutated_commit
 
-from cairn_map.messages import CreateMap, MissingRequest, Problem
+from cairn_map.wire.messages import CreateMap, MissingRequest, Problem
 
 BODIES = 150
 """For each route."""

@@ -5,22 +5,22 @@ from collections.abc import Iterator
 import httpx
 import pytest
 from tests.cairn_map.made import SMALL
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import pushed, read, sum_of
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import pushed, read, sum_of
 from tests.cairn_server.test_auth import ADMIN, bearer
 from tests.cairn_server.test_push import kind_of
 from tests.cairn_server.test_uploads import add, state
 
-from cairn_map.access_messages import CreateToken
-from cairn_map.commit import Commit, renamed_commit
-from cairn_map.commit_reading import open_commit
-from cairn_map.ids import INITIAL, OPERATOR, Author, CommitId, RobotName
-from cairn_map.messages import Retract
-from cairn_map.signature import SigningKey, signatures_to_text
-from cairn_server.auth import ADMIN_FILE
-from cairn_server.handing_over import server_key
-from cairn_server.store_rows import MapRow
-from cairn_server.tokens import create_token
+from cairn_map.commits.commit import Commit, renamed_commit
+from cairn_map.commits.commit_reading import open_commit
+from cairn_map.commits.ids import INITIAL, OPERATOR, Author, CommitId, RobotName
+from cairn_map.commits.signature import SigningKey, signatures_to_text
+from cairn_map.wire.access_messages import CreateToken
+from cairn_map.wire.messages import Retract
+from cairn_server.access.auth import ADMIN_FILE
+from cairn_server.access.tokens import create_token
+from cairn_server.store.store_rows import MapRow
+from cairn_server.sync.handing_over import server_key
 
 KEYS = [SigningKey(bytes([n] * 32)) for n in range(4)]
 MOLE, OLD_MOLE, WREN = (

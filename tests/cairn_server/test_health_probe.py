@@ -4,10 +4,10 @@ import socket
 import threading
 from pathlib import Path
 
-from tests.cairn_server.live import Live
+from tests.cairn_server.live.hub import Live
 
-from cairn_server.folder_lock import LOCK_NAME, tell_port, told_port
-from cairn_server.health_probe import why_not
+from cairn_server.operations.health_probe import why_not
+from cairn_server.store.folder_lock import LOCK_NAME, tell_port, told_port
 
 
 def test_a_server_is_alive(live: Live) -> None:

@@ -7,11 +7,11 @@ import httpx
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import pushed
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import pushed
 from tests.cairn_server.test_protocol_document import DOCUMENT, ROUTE, documented_kinds
 
-from cairn_map.messages import MissingRequest, Problem
+from cairn_map.wire.messages import MissingRequest, Problem
 
 KINDS = documented_kinds()
 ROUTES = [(found[1], found[2]) for found in ROUTE.finditer(DOCUMENT)]

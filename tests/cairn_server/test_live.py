@@ -11,22 +11,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.cairn_server.listening import by_socket, by_sse, hello_of, socket_url, up_to_head
-from tests.cairn_server.live import Live, until
-from tests.cairn_server.pushes import MOLE, WREN, pushed
+from tests.cairn_server.live.hub import Live, until
+from tests.cairn_server.sync.pushes import MOLE, WREN, pushed
 from tests.cairn_server.test_auth import ADMIN, ENROLLER, bearer, robot_token
 from tests.cairn_server.test_push import kind_of
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from cairn_map.cursor import cursor_from_text
+from cairn_map.commits.cursor import cursor_from_text
 from cairn_map.errors import UnreachableError
-from cairn_map.grid import cell_key, cell_of_key
-from cairn_map.live_events import CellsChanged, HeadMoved, LiveEvent, LogGrew, RobotHeard, seen_from_text
-from cairn_map.messages import MissingRequest, Register
-from cairn_server import live_changes, live_routes
-from cairn_server.live import LISTENERS_OF_TOKEN_MAX, Listener
-from cairn_server.live_routes import NOT_ALLOWED, SPACING_S
-from cairn_server.store_rows import MapRow
+from cairn_map.evidence.grid import cell_key, cell_of_key
+from cairn_map.wire.live_events import CellsChanged, HeadMoved, LiveEvent, LogGrew, RobotHeard, seen_from_text
+from cairn_map.wire.messages import MissingRequest, Register
+from cairn_server.http.routes import live as live_routes
+from cairn_server.http.routes.live import NOT_ALLOWED, SPACING_S
+from cairn_server.live import live_changes
+from cairn_server.live.hub import LISTENERS_OF_TOKEN_MAX, Listener
+from cairn_server.store.store_rows import MapRow
 
 Listen = Callable[..., AbstractContextManager[Iterator[LiveEvent]]]
 WAYS = pytest.mark.parametrize("listen", [by_sse, by_socket])
@@ -368,7 +369,7 @@ def test_a_token_has_so_many_streams_and_gets_them_back(live: Live) -> None:
 
 
 def test_all_tokens_together_have_so_many_streams(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cairn_server.live.LISTENERS_MAX", 1)
+    monkeypatch.setattr("cairn_server.live.hub.LISTENERS_MAX", 1)
     row = live.new_map()
     with by_sse(live, row) as events:
         hello_of(events)

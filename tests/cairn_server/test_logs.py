@@ -6,11 +6,11 @@ import signal
 import sys
 from pathlib import Path
 
-from tests.cairn_server.live import Live, Process
-from tests.cairn_server.pushes import MOLE, pushed
+from tests.cairn_server.live.hub import Live, Process
+from tests.cairn_server.sync.pushes import MOLE, pushed
 from tests.cairn_server.test_serve_process import client, make_map
 
-from cairn_server.log_format import REQUEST_ID, JsonFormatter, TextFormatter, fields
+from cairn_server.http.middleware.log_format import REQUEST_ID, JsonFormatter, TextFormatter, fields
 
 ADMIN, ENROLLER, WRONG = "admin-secret-1234567", "enroller-secret-1234567", "wrong-secret-1234567"
 

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from cairn_server.made_once import IDLE_S, MadeOnce
+from cairn_server.folding.single_flight import IDLE_S, MadeOnce
 
 ASKERS = 8
 

@@ -11,20 +11,20 @@ from tests.cairn_server.branch_contract import BranchContract
 from tests.cairn_server.commit_contract import CommitContract
 from tests.cairn_server.crowd_contract import CrowdContract
 from tests.cairn_server.evidence_contract import EvidenceContract
-from tests.cairn_server.live import Live
+from tests.cairn_server.live.hub import Live
 from tests.cairn_server.naive_asker import NaiveAsker
-from tests.cairn_server.pushes import MOLE, WREN, pushed, read, sum_of
 from tests.cairn_server.store_contract import StoreContract
+from tests.cairn_server.sync.pushes import MOLE, WREN, pushed, read, sum_of
 from tests.cairn_server.test_auth import ADMIN, ENROLLER, bearer, robot_token
 from tests.cairn_server.test_missing import fetch
 from tests.cairn_server.test_push import kind_of
+from tests.memory_store import tokens as memory_tokens
+from tests.memory_store.store import MemoryStore
 
-from cairn_client.api import MapApi
-from cairn_map.access_messages import CreateToken
+from cairn_client.http.api import MapApi
 from cairn_map.errors import UnreachableError
-from cairn_map.sensor_model import SensorModel
-from cairn_server import memory_tokens
-from cairn_server.memory_store import MemoryStore
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.wire.access_messages import CreateToken
 
 
 @pytest.fixture(scope="module")

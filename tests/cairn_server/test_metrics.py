@@ -6,12 +6,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.cairn_server.live import Live, until
+from tests.cairn_server.live.hub import Live, until
 from tests.cairn_server.prometheus_text import families_of, value
-from tests.cairn_server.pushes import MOLE, pushed
+from tests.cairn_server.sync.pushes import MOLE, pushed
 from tests.cairn_server.test_protocol_document import DOCUMENT, ROOT
 
-from cairn_server import fold_here, folder, metrics
+from cairn_server import metrics
+from cairn_server.folding import fold_in_process, fold_thread
 from cairn_server.metrics import Counter, Histogram
 
 PUSH = "/maps/{name}/commits/{commit}"
@@ -74,9 +75,9 @@ def test_frames_are_counted_by_kind(fresh: Live) -> None:
 
 def test_what_waits_to_be_folded_shows_until_it_is(fresh: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     row = fresh.new_map()
-    monkeypatch.setattr(folder, "RETRY_S", 0.01)
+    monkeypatch.setattr(fold_thread, "RETRY_S", 0.01)
     with monkeypatch.context() as broken:
-        broken.setattr(fold_here, "fold_around", _no_memory)
+        broken.setattr(fold_in_process, "fold_around", _no_memory)
         fresh.push(row, pushed(0, 0))
         begin_s = time.monotonic()
         while not value(text := text_of(fresh), "cairn_fold_failures_total", map=row.name):

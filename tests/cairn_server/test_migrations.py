@@ -5,13 +5,13 @@ from pathlib import Path
 import apsw
 import pytest
 import zstandard
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import MOLE, WREN, pushed, read, sum_of
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import MOLE, WREN, pushed, read, sum_of
 
 from cairn_map.errors import BadInputError
-from cairn_server.sqlite_schema import STEPS, ensure_schema
-from cairn_server.sqlite_store import FILE_NAME, SqliteStore
-from cairn_server.store_rows import CellRow
+from cairn_server.store.sqlite.schema import STEPS, ensure_schema
+from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
+from cairn_server.store.store_rows import CellRow
 
 FORMATS = Path(__file__).parents[1] / "formats"
 HEADS = {"v1.sqlite.zst": "4243ca94aa4e5ac2bca4157d97a5ba33.10.0c13ae5711ebe0d9d9c007e2badf0262"}

@@ -6,18 +6,18 @@ import httpx
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.cairn_server.live import Live
+from tests.cairn_server.live.hub import Live
 from tests.cairn_server.naive_asker import KEY_FAR, NaiveAsker, cell_frames, fingerprint_sum
-from tests.cairn_server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
+from tests.cairn_server.sync.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 from tests.cairn_server.test_push import kind_of
 
-from cairn_map.cursor import Cursor, cursor_from_text
-from cairn_map.fingerprint import ZERO
-from cairn_map.frames import Frame, FrameKind, frames_of
-from cairn_map.grid import cell_of_key
-from cairn_map.messages import Done, MissingRequest, More, ReplyHeader
-from cairn_server import cell_changes, missing
-from cairn_server.store_rows import MapRow
+from cairn_map.commits.cursor import Cursor, cursor_from_text
+from cairn_map.evidence.fingerprint import ZERO
+from cairn_map.evidence.grid import cell_of_key
+from cairn_map.wire.frames import Frame, FrameKind, frames_of
+from cairn_map.wire.messages import Done, MissingRequest, More, ReplyHeader
+from cairn_server.store.store_rows import MapRow
+from cairn_server.sync import cell_changes, missing
 
 
 def ask(live: Live, row: MapRow, request: MissingRequest) -> httpx.Response:

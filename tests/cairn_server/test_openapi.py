@@ -6,15 +6,15 @@ from typing import Any
 
 import httpx
 import pytest
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import pushed
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import pushed
 from tests.cairn_server.test_cells import path_of
 from tests.cairn_server.test_protocol_document import routes_of
 from tests.cairn_server.test_robot_reports import JPEG, PNG, register
 
-from cairn_server.http_openapi import ANSWERS, BODIES, operations
-from cairn_server.openapi_examples import EXAMPLES
-from cairn_server.store_rows import MapRow
+from cairn_server.http.openapi import ANSWERS, BODIES, operations
+from cairn_server.http.openapi_examples import EXAMPLES
+from cairn_server.store.store_rows import MapRow
 
 UNDOCUMENTED = {("GET", "/openapi.json")}
 PROBLEM = "application/problem+json"

@@ -7,30 +7,22 @@ from pathlib import Path
 import pytest
 from fastapi.routing import APIRoute
 from starlette.routing import Route, WebSocketRoute
-from tests.cairn_server.live import Live
+from tests.cairn_server.live.hub import Live
 
-from cairn_map import live_events, render_request
-from cairn_map.commit import COMMIT_BYTES_MAX, RETRACTS_MAX
-from cairn_map.messages import CURSORS_MAX
-from cairn_server import (
-    body_limit,
-    cell_changes,
-    cell_routes,
-    check_pool,
-    commit_checks,
-    commit_cost,
-    export_tickets,
-    live,
-    map_exports,
-    map_views,
-    missing,
-    problems,
-    push_policy,
-    robot_reports,
-    sqlite_tokens,
-    uploads,
-)
+from cairn_map.commits.commit import COMMIT_BYTES_MAX, RETRACTS_MAX
+from cairn_map.render import render_request
+from cairn_map.wire import live_events
+from cairn_map.wire.messages import CURSORS_MAX
+from cairn_server.http.middleware import body_limit
+from cairn_server.http.routes import cell as cell_routes
+from cairn_server.http.routes import problems
+from cairn_server.live import hub as live
+from cairn_server.live import robot_reports
 from cairn_server.settings import Quotas, Settings
+from cairn_server.store.sqlite import tokens as sqlite_tokens
+from cairn_server.sync import cell_changes, missing, uploads
+from cairn_server.sync.checks import check_pool, commit_checks, commit_cost, push_policy
+from cairn_server.views import export_tickets, map_exports, map_views
 
 ROOT = Path(__file__).parents[2]
 DOCUMENT = (ROOT / "server" / "PROTOCOL.md").read_text()

@@ -5,15 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.cairn_map.made import MIDDLE, PLAIN, SMALL
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 
-from cairn_map.channels import SAMPLE_MAX
-from cairn_map.commit import Commit
-from cairn_map.evidence import packed_evidence
-from cairn_map.grid import Geometry
-from cairn_map.ids import INITIAL, Author, Incarnation
-from cairn_server import push_policy
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.ids import INITIAL, Author, Incarnation
+from cairn_map.evidence.channels import SAMPLE_MAX
+from cairn_map.evidence.evidence import packed_evidence
+from cairn_map.evidence.grid import Geometry
+from cairn_server.sync.checks import push_policy
 
 
 def kind_of(response: object) -> str:
@@ -136,7 +136,7 @@ def test_evidence_for_another_grid_is_refused_before_it_is_decoded(live: Live, m
     def not_now(*_: object, **__: object) -> None:
         raise AssertionError("decoded")
 
-    monkeypatch.setattr("cairn_map.commit_reading.read_canonical_cell", not_now)
+    monkeypatch.setattr("cairn_map.commits.commit_reading.read_canonical_cell", not_now)
     row = live.new_map(SMALL)
     assert kind_of(live.push(row, pushed(0, 1, geometry=MIDDLE))) == "other_geometry"
     assert kind_of(live.http.put(f"/maps/{row.name}/commits/{MOLE}.7", content=pushed(0, 1).data)) == "other_id"
@@ -144,7 +144,7 @@ def test_evidence_for_another_grid_is_refused_before_it_is_decoded(live: Live, m
 
 
 def test_a_map_that_would_overflow_takes_no_more(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cairn_server.sqlite_changes.COUNT_MAX", 12)
+    monkeypatch.setattr("cairn_server.store.sqlite.changes.COUNT_MAX", 12)
     row = live.new_map(PLAIN)
     one = with_counts(6, 0)
     assert live.push(row, one).status_code == 201

@@ -7,17 +7,18 @@ from pathlib import Path
 import apsw
 import pytest
 from tests.cairn_map.made import SMALL
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import pushed
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import pushed
 from tests.cairn_server.test_auth import bearer
 from tests.cairn_server.test_quotas import MOLE, Clock, guarded, metered, robot_token, spend
 
-from cairn_map.commit_reading import CommitReader
-from cairn_server import commit_checks, sync_routes
-from cairn_server.checking import Checked
-from cairn_server.quotas import DAY_S
-from cairn_server.sqlite_store import FILE_NAME
-from cairn_server.sqlite_writer import Writer, connect
+from cairn_map.commits.commit_reading import CommitReader
+from cairn_server.access.quotas import DAY_S
+from cairn_server.http.routes import sync as sync_routes
+from cairn_server.store.sqlite.store import FILE_NAME
+from cairn_server.store.sqlite.writer import Writer, connect
+from cairn_server.sync.checks import commit_checks
+from cairn_server.sync.checks.checking import Checked
 
 
 @pytest.fixture

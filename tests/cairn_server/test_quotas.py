@@ -8,25 +8,25 @@ import httpx
 import pytest
 from tests.cairn_map.made import SMALL, random_evidence
 from tests.cairn_server import test_handing_over as handing_over
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import KEYS, WREN, pushed
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import KEYS, WREN, pushed
 from tests.cairn_server.test_auth import ADMIN, ENROLLER, bearer, robot_token
 from tests.cairn_server.test_push import kind_of
 
-from cairn_client.api import MapApi
-from cairn_map.access_messages import CreateToken
-from cairn_map.commit import Commit
+from cairn_client.http.api import MapApi
+from cairn_map.commits.commit import Commit
 from cairn_map.errors import BadInputError, UnreachableError
-from cairn_map.grid import cell_key
-from cairn_map.sensor_model import SensorModel
-from cairn_server import quotas
-from cairn_server.auth import ADMIN_FILE, UPSTREAM, Caller, Role
-from cairn_server.quotas import DAY_S, Meter
-from cairn_server.serve_command import main
+from cairn_map.evidence.grid import cell_key
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.wire.access_messages import CreateToken
+from cairn_server.access import quotas
+from cairn_server.access.auth import ADMIN_FILE, UPSTREAM, Caller, Role
+from cairn_server.access.quotas import DAY_S, Meter
+from cairn_server.access.tokens import create_token
+from cairn_server.operations.serve import main
 from cairn_server.settings import Quotas
-from cairn_server.sqlite_store import SqliteStore
-from cairn_server.store_rows import MapRow
-from cairn_server.tokens import create_token
+from cairn_server.store.sqlite.store import SqliteStore
+from cairn_server.store.store_rows import MapRow
 
 OFF = dict.fromkeys(Quotas.model_fields)
 MOLE = Caller(Role.ROBOT, "mole")

@@ -5,20 +5,21 @@ from pathlib import Path
 
 import apsw
 import pytest
-from tests.cairn_server.live import Live, until
-from tests.cairn_server.pushes import pushed
+from tests.cairn_server.live.hub import Live, until
+from tests.cairn_server.sync.pushes import pushed
 from tests.cairn_server.test_push import kind_of
 
 from cairn_map.errors import DamagedDataError
-from cairn_server import fold_here, folder, readiness, sqlite_health
-from cairn_server.sqlite_store import SqliteStore
+from cairn_server.folding import fold_in_process, fold_thread, readiness
+from cairn_server.store.sqlite import health as sqlite_health
+from cairn_server.store.sqlite.store import SqliteStore
 
 
 @pytest.fixture
 def live(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Live]:
     """A server that looks anew every time it is asked."""
     monkeypatch.setattr(readiness, "KEEP_S", 0.0)
-    monkeypatch.setattr(folder, "RETRY_S", 0.01)
+    monkeypatch.setattr(fold_thread, "RETRY_S", 0.01)
     with Live(tmp_path, fold_lag_max_s=30.0) as server:
         yield server
 
@@ -70,7 +71,7 @@ def test_an_answer_is_kept_for_a_while_so_that_strangers_cannot_wear_out_the_dis
 def test_folding_that_fails_makes_it_not_ready_until_it_goes_again(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     row = live.new_map()
     with monkeypatch.context() as broken:
-        broken.setattr(fold_here, "fold_around", raising(MemoryError()))
+        broken.setattr(fold_in_process, "fold_around", raising(MemoryError()))
         live.push(row, pushed(0, 0))
         until(lambda: reasons(live) == "fold_failing: MemoryError", "it says that folding fails")
     until(lambda: reasons(live) == "", "it is ready again")
@@ -80,7 +81,7 @@ def test_a_map_with_a_damaged_cell_does_not_take_the_server_away_from_the_others
     live: Live, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     row = live.new_map()
-    monkeypatch.setattr(fold_here, "fold_around", raising(DamagedDataError("damaged_store", "one cell")))
+    monkeypatch.setattr(fold_in_process, "fold_around", raising(DamagedDataError("damaged_store", "one cell")))
     live.push(row, pushed(0, 0))
     until(lambda: row.name in live.service.folds.damaged(), "the fold failed")
     store_of(live)._writer.run(lambda c: c.execute("UPDATE commits SET received_s = 0").fetchall())
@@ -89,7 +90,7 @@ def test_a_map_with_a_damaged_cell_does_not_take_the_server_away_from_the_others
 
 def test_a_commit_that_waits_too_long_makes_it_not_ready(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     row = live.new_map()
-    monkeypatch.setattr(fold_here, "fold_around", lambda *arguments, **options: 0)  # as if it hung
+    monkeypatch.setattr(fold_in_process, "fold_around", lambda *arguments, **options: 0)  # as if it hung
     live.push(row, pushed(0, 0))
     assert reasons(live) == ""
     store_of(live)._writer.run(

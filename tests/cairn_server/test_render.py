@@ -12,23 +12,23 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from tests.cairn_map.made import PLAIN, SMALL
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import pushed
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import pushed
 from tests.cairn_server.test_broken_cell import damage
 from tests.cairn_server.test_broken_cell import new_map as broken_map
 from tests.cairn_server.test_push import kind_of
 
-from cairn_map.cell_code import decode_cell
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import CellKey
-from cairn_map.map_picture import layer_picture, layer_values
-from cairn_map.map_render import MapRenderer
-from cairn_map.map_snapshot import snapshot_of
-from cairn_map.render_picture import Layer
-from cairn_map.render_request import RenderRequest, request_from
+from cairn_map.codec.cell_code import decode_cell
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import CellKey
+from cairn_map.queries.map_snapshot import snapshot_of
+from cairn_map.render.map_picture import layer_picture, layer_values
+from cairn_map.render.map_render import MapRenderer
+from cairn_map.render.render_picture import Layer
+from cairn_map.render.render_request import RenderRequest, request_from
 from cairn_map.warm_up import warm_up_pictures
-from cairn_server import map_views
-from cairn_server.store_rows import MapRow
+from cairn_server.store.store_rows import MapRow
+from cairn_server.views import map_views
 
 LOOK = request_from((1.4, 1.3, 1.2), (0.1, 0.2, 0.3), width=64, height=48, focal_px=40.0, range_m=6.0)
 

@@ -5,15 +5,15 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.cairn_server.live import Live, until
+from tests.cairn_server.live.hub import Live, until
 from tests.cairn_server.naive_asker import NaiveAsker, cell_frames
-from tests.cairn_server.pushes import MOLE, WREN, pushed, read, sum_of
+from tests.cairn_server.sync.pushes import MOLE, WREN, pushed, read, sum_of
 from tests.cairn_server.test_missing import fetch
 from tests.cairn_server.test_push import kind_of
 
-from cairn_map.commit import Commit
-from cairn_map.frames import FrameKind
-from cairn_server.store_rows import MapRow
+from cairn_map.commits.commit import Commit
+from cairn_map.wire.frames import FrameKind
+from cairn_server.store.store_rows import MapRow
 
 NOW = float("inf")
 

@@ -5,16 +5,16 @@ import time
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 from tests.cairn_server.test_push import kind_of
 
-from cairn_map.cell_code import decode_cell
+from cairn_map.codec.cell_code import decode_cell
+from cairn_map.commits.ids import OPERATOR, Author
 from cairn_map.errors import DeniedError
-from cairn_map.grid import cell_of_key
-from cairn_map.ids import OPERATOR, Author
-from cairn_server.auth import Caller, Role
-from cairn_server.retracting import seal_of
+from cairn_map.evidence.grid import cell_of_key
+from cairn_server.access.auth import Caller, Role
+from cairn_server.sync.retracting import seal_of
 
 
 @settings(max_examples=9)
@@ -110,7 +110,7 @@ def test_a_commit_named_twice_is_retracted_once(live: Live) -> None:
 def test_a_robot_with_more_commits_than_one_retract_can_name_is_retracted_by_several(
     live: Live, monkeypatch: object
 ) -> None:
-    monkeypatch.setattr("cairn_server.retracting.RETRACTS_MAX", 2)  # type: ignore[attr-defined]
+    monkeypatch.setattr("cairn_server.sync.retracting.RETRACTS_MAX", 2)  # type: ignore[attr-defined]
     row = live.new_map()
     commits = [pushed(n, n) for n in range(5)]
     for commit in commits:

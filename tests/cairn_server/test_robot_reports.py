@@ -6,14 +6,14 @@ from typing import Any
 import httpx
 import pytest
 from tests.cairn_server.listening import by_socket, hello_of
-from tests.cairn_server.live import Live, until
-from tests.cairn_server.pushes import MOLE, WREN, pushed
+from tests.cairn_server.live.hub import Live, until
+from tests.cairn_server.sync.pushes import MOLE, WREN, pushed
 from tests.cairn_server.test_push import kind_of
 
-from cairn_map.live_events import RobotHeard
-from cairn_map.robot_status import RobotStatus
-from cairn_server import branch_list, robot_reports
-from cairn_server.store_rows import MapRow
+from cairn_map.wire.live_events import RobotHeard
+from cairn_map.wire.robot_status import RobotStatus
+from cairn_server.live import branch_list, robot_reports
+from cairn_server.store.store_rows import MapRow
 
 JPEG, PNG = b"\xff\xd8\xff\xe0 a jpeg", b"\x89PNG\r\n\x1a\n a png"
 STATUS = RobotStatus.model_validate(

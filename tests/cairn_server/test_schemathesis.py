@@ -14,15 +14,15 @@ from schemathesis.checks import (
     status_code_conformance,
 )
 from tests.cairn_map.made import SMALL
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import pushed
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import pushed
 from tests.cairn_server.test_hostile_requests import ROUTES
 from tests.cairn_server.test_protocol_document import documented_kinds
 from tests.fuzz.test_fuzz import bytewise
 from tests.fuzz.wrapping_mutator import mutated_commit
 
-from cairn_map.messages import CreateMap, Problem, Register
-from cairn_server.http_openapi import BODIES
+from cairn_map.wire.messages import CreateMap, Problem, Register
+from cairn_server.http.openapi import BODIES
 
 KINDS = documented_kinds()
 COMMITS = [pushed(n, n) for n in range(4)]

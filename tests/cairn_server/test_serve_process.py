@@ -7,16 +7,16 @@ from pathlib import Path
 
 import httpx
 from tests.cairn_map.made import SMALL
-from tests.cairn_server.live import DEADLINE_S, Process, until
-from tests.cairn_server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
+from tests.cairn_server.live.hub import DEADLINE_S, Process, until
+from tests.cairn_server.sync.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 
-from cairn_map.commit import Commit
-from cairn_map.frames import frames_of
-from cairn_map.grid import cell_of_key
-from cairn_map.ids import Author, CommitId
-from cairn_map.messages import CreateMap, ReplyHeader
-from cairn_server.folder_lock import told_port
-from cairn_server.health_probe import why_not
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.ids import Author, CommitId
+from cairn_map.evidence.grid import cell_of_key
+from cairn_map.wire.frames import frames_of
+from cairn_map.wire.messages import CreateMap, ReplyHeader
+from cairn_server.operations.health_probe import why_not
+from cairn_server.store.folder_lock import told_port
 
 
 def client(process: Process) -> httpx.Client:

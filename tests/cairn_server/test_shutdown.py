@@ -8,13 +8,13 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import httpx
-from tests.cairn_server.live import DEADLINE_S, Process
-from tests.cairn_server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
+from tests.cairn_server.live.hub import DEADLINE_S, Process
+from tests.cairn_server.sync.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 from tests.cairn_server.test_serve_process import all_folded, client, make_map
 
-from cairn_map.commit import Commit
-from cairn_map.grid import cell_of_key
-from cairn_map.ids import Author, CommitId, Incarnation, RobotName
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName
+from cairn_map.evidence.grid import cell_of_key
 
 STOP_S = 10.0
 AUTHORS = [MOLE, WREN, *(Author(RobotName("fox"), Incarnation(f"{n:016x}")) for n in range(2))]

@@ -15,22 +15,22 @@ from pathlib import Path
 import httpx
 import pytest
 from tests.cairn_map.made import SMALL
-from tests.cairn_server.live import DEADLINE_S, Live, Process, until
-from tests.cairn_server.pushes import KEYS, pushed
+from tests.cairn_server.live.hub import DEADLINE_S, Live, Process, until
+from tests.cairn_server.sync.pushes import KEYS, pushed
 from tests.cairn_server.test_broken_cell import BROKEN, damage
 from tests.cairn_server.test_costly_commits import children_of
 from tests.cairn_server.test_readyz import raising
 
-from cairn_map.commit import Commit
+from cairn_map.commits.commit import Commit
 from cairn_map.errors import UnreachableError
-from cairn_map.grid import cell_of_key
-from cairn_map.messages import CreateMap, MapInfo
-from cairn_map.sensor_model import SensorModel
-from cairn_server import check_process
-from cairn_server.check_process import CheckProcess, LostCheckError
-from cairn_server.damaged_cells import DamagedCells
-from cairn_server.fold_process import FoldProcess, LostProcessError, answer_folds
-from cairn_server.sqlite_store import SqliteStore
+from cairn_map.evidence.grid import cell_of_key
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.wire.messages import CreateMap, MapInfo
+from cairn_server.folding.damaged_cells import DamagedCells
+from cairn_server.folding.fold_process import FoldProcess, LostProcessError, answer_folds
+from cairn_server.store.sqlite.store import SqliteStore
+from cairn_server.sync.checks import check_process
+from cairn_server.sync.checks.check_process import CheckProcess, LostCheckError
 
 COMMITS = [pushed(n, n) for n in range(12)]
 JSON = {"Content-Type": "application/json"}

@@ -13,16 +13,17 @@ from tests.cairn_server.branch_contract import BranchContract, branch, token
 from tests.cairn_server.commit_contract import CommitContract
 from tests.cairn_server.crowd_contract import CrowdContract
 from tests.cairn_server.evidence_contract import EvidenceContract
-from tests.cairn_server.pushes import pushed
 from tests.cairn_server.store_contract import StoreContract, new_of
+from tests.cairn_server.sync.pushes import pushed
 
 from cairn_map.errors import BadInputError, ConflictError, UnreachableError
-from cairn_map.sensor_model import SensorModel
-from cairn_server import sqlite_readers, sqlite_tokens
-from cairn_server.sqlite_changes import append_commit
-from cairn_server.sqlite_schema import ensure_schema
-from cairn_server.sqlite_snapshot import CELL_COLUMNS
-from cairn_server.sqlite_store import FILE_NAME, SqliteStore
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_server.store.sqlite import readers as sqlite_readers
+from cairn_server.store.sqlite import tokens as sqlite_tokens
+from cairn_server.store.sqlite.changes import append_commit
+from cairn_server.store.sqlite.schema import ensure_schema
+from cairn_server.store.sqlite.snapshot import CELL_COLUMNS
+from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
 
 
 @pytest.fixture(scope="module")

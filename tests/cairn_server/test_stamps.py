@@ -5,20 +5,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.cairn_map.made import SMALL, random_evidence
-from tests.cairn_server.live import Live
+from tests.cairn_server.live.hub import Live
 from tests.cairn_server.naive_asker import NaiveAsker, cell_frames
-from tests.cairn_server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
+from tests.cairn_server.sync.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 from tests.cairn_server.test_missing import fetch
 
-from cairn_map.blocks import blocks_of, of_blocks, without_blocks
-from cairn_map.cell_code import decode_cell
-from cairn_map.commit import Commit
+from cairn_map.codec.cell_code import decode_cell
+from cairn_map.commits.commit import Commit
 from cairn_map.errors import DamagedDataError
-from cairn_map.evidence import packed_evidence
-from cairn_map.frames import CellFrame, FrameKind
-from cairn_map.grid import CellKey
-from cairn_server.stamps import blocks_after, decode_stamps, encode_stamps
-from cairn_server.store_rows import MapRow
+from cairn_map.evidence.blocks import blocks_of, of_blocks, without_blocks
+from cairn_map.evidence.evidence import packed_evidence
+from cairn_map.evidence.grid import CellKey
+from cairn_map.wire.frames import CellFrame, FrameKind
+from cairn_server.store.stamps import blocks_after, decode_stamps, encode_stamps
+from cairn_server.store.store_rows import MapRow
 
 SEQS = st.integers(1, (1 << 62) - 1) | st.integers(1, 40)
 

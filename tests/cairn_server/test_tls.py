@@ -10,12 +10,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.cairn_server.live import Process
+from tests.cairn_server.live.hub import Process
 
-from cairn_client.api import MapApi
+from cairn_client.http.api import MapApi
 from cairn_map.errors import UnreachableError
-from cairn_map.messages import CreateMap
-from cairn_server.health_probe import why_not
+from cairn_map.wire.messages import CreateMap
+from cairn_server.operations.health_probe import why_not
 
 pytestmark = pytest.mark.skipif(not shutil.which("openssl"), reason="the openssl command makes the certificate")
 

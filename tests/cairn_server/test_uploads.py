@@ -6,19 +6,19 @@ from random import Random
 
 import httpx
 import pytest
-from tests.cairn_server.live import Live
-from tests.cairn_server.pushes import MOLE, WREN, pushed
+from tests.cairn_server.live.hub import Live
+from tests.cairn_server.sync.pushes import MOLE, WREN, pushed
 from tests.cairn_server.test_auth import ADMIN, bearer, robot_token
 from tests.cairn_server.test_push import kind_of
 from tests.cairn_server.test_quotas import SIZE, assert_waits, guarded
 
-from cairn_map.commit import COMMIT_BYTES_MAX, Commit
+from cairn_map.commits.commit import COMMIT_BYTES_MAX, Commit
 from cairn_map.errors import BadInputError, UnreachableError
-from cairn_map.messages import CreateMap
-from cairn_server import uploads
-from cairn_server.auth import Caller, Role
-from cairn_server.store_rows import MapRow
-from cairn_server.uploads import Part, Uploads
+from cairn_map.wire.messages import CreateMap
+from cairn_server.access.auth import Caller, Role
+from cairn_server.store.store_rows import MapRow
+from cairn_server.sync import uploads
+from cairn_server.sync.uploads import Part, Uploads
 
 COMMIT = pushed(0, 0)
 

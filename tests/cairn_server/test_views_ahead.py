@@ -6,20 +6,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from tests.cairn_server.live import Live, until
-from tests.cairn_server.pushes import KEYS, pushed
+from tests.cairn_server.live.hub import Live, until
+from tests.cairn_server.sync.pushes import KEYS, pushed
 from tests.cairn_server.test_broken_cell import BROKEN, SOUND, new_map, url
 from tests.cairn_server.tiny_disk import tiny_disk
 
-from cairn_map.grid import cell_of_key
-from cairn_map.sensor_model import SensorModel
-from cairn_map.view_code import decode_view
-from cairn_server import ready_views
-from cairn_server.asked_view import view_of_stored
-from cairn_server.store_rows import MapRow
-from cairn_server.view_cache import ViewCache, view_name
-from cairn_server.view_file import NAME, read_views, write_views
-from cairn_server.views_ahead import ViewsAhead, first_depth
+from cairn_map.codec.view_code import decode_view
+from cairn_map.evidence.grid import cell_of_key
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_server.store.store_rows import MapRow
+from cairn_server.views import view_bundle
+from cairn_server.views.cell_view import view_of_stored
+from cairn_server.views.view_cache import ViewCache, view_name
+from cairn_server.views.view_file import NAME, read_views, write_views
+from cairn_server.views.views_ahead import ViewsAhead, first_depth
 
 SOON_S = 0.01
 
@@ -198,5 +198,5 @@ def test_views_that_are_ready_come_in_one_answer_as_they_come_one_by_one(
     told = {tuple(head["cell"]): (head["etag"], view) for head, view in zip(heads, parts[1::2], strict=True)}
     assert told == {cell: (one.headers["ETag"], one.content) for cell, one in asked.items()}
     assert len(told) > 1
-    monkeypatch.setattr(ready_views, "SIZE_BYTES_MAX", 8 + len(parts[0]) + len(parts[1]))
+    monkeypatch.setattr(view_bundle, "SIZE_BYTES_MAX", 8 + len(parts[0]) + len(parts[1]))
     assert parts_of(live.http.get(f"{main}/views").content) == parts[:2]

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 from tests.cairn_map.made import SMALL
-from tests.cairn_server.live import until
-from tests.cairn_server.pushes import pushed
+from tests.cairn_server.live.hub import until
 from tests.cairn_server.store_contract import new_of
+from tests.cairn_server.sync.pushes import pushed
 
-from cairn_map.sensor_model import SensorModel
-from cairn_server import sqlite_checkpoint
-from cairn_server.sqlite_store import SqliteStore
-from cairn_server.store_rows import MapRow
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_server.store.sqlite import checkpoint as sqlite_checkpoint
+from cairn_server.store.sqlite.store import SqliteStore
+from cairn_server.store.store_rows import MapRow
 
 COMMITS = [new_of(pushed(n, n % 5)) for n in range(60)]
 

@@ -1,4 +1,4 @@
-"""The slow, obvious twins of `cairn_sim.image_kernels`: whole arrays where they can be, complex numbers for waves.
+"""The slow, obvious twins of `cairn_sim.render.image_kernels`: whole arrays where they can be.
 
 `bloomed` has its twin in test_targets.py, beside what it is for.
 """
@@ -6,8 +6,8 @@
 import numpy as np
 import numpy.typing as npt
 
-from cairn_sim.image_kernels import GLOSS_EXPONENT, LIGHT_STEP, PASS_LEFT
-from cairn_sim.raycast_kernels import Hits
+from cairn_sim.render.image_kernels import GLOSS_EXPONENT, LIGHT_STEP, PASS_LEFT
+from cairn_sim.render.raycast_kernels import Hits
 
 Floats = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]

@@ -1,13 +1,13 @@
-"""The slow, obvious twin of `cairn_sim.raycast_kernels`: every face of every solid, one after the other."""
+"""The slow, obvious twin of `cairn_sim.render.raycast_kernels`: every face of every solid, one after the other."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from cairn_sim.scene import Scene
-from cairn_sim.solids import Box, Cylinder, Plane, Solid, Sphere
-from cairn_sim.surfaces import Optics
+from cairn_sim.scene.scene import Scene
+from cairn_sim.scene.solids import Box, Cylinder, Plane, Solid, Sphere
+from cairn_sim.scene.surfaces import Optics
 
 Floats = npt.NDArray[np.float64]
 

@@ -4,7 +4,7 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from cairn_sim.box_plot import BOTTOM, HEIGHT, TOP, box_plot, legend
+from cairn_sim.experiment.box_plot import BOTTOM, HEIGHT, TOP, box_plot, legend
 
 SVG = "{http://www.w3.org/2000/svg}"
 KNOWN = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 40.0]

@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from cairn_sim.raycast_kernels import Hits, cast_each, cast_rays
-from cairn_sim.scene import Scene, scene_of
-from cairn_sim.solid_kernels import enter
-from cairn_sim.solids import Box, Cylinder, Floats, Plane, Shape, Solid, Sphere, placed
-from cairn_sim.surfaces import Material, Surface
+from cairn_sim.render.raycast_kernels import Hits, cast_each, cast_rays
+from cairn_sim.scene.scene import Scene, scene_of
+from cairn_sim.scene.solid_kernels import enter
+from cairn_sim.scene.solids import Box, Cylinder, Floats, Plane, Shape, Solid, Sphere, placed
+from cairn_sim.scene.surfaces import Material, Surface
 
 GREY = Surface(Material())
 

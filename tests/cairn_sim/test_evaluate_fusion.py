@@ -8,28 +8,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cairn_calib.poses import look_at
-from cairn_calib.rig import Spectrum
-from cairn_fusion.across import Across
-from cairn_fusion.eye_depth import EyeDepth
-from cairn_fusion.images import read_colour
-from cairn_fusion.surface import Drawn
-from cairn_fusion.transfer import Label
+from cairn_calib.rig.poses import look_at
+from cairn_calib.rig.rig import Spectrum
+from cairn_fusion.image_fusion.across import Across
+from cairn_fusion.image_fusion.eye_depth import EyeDepth
+from cairn_fusion.image_fusion.surface import Drawn
+from cairn_fusion.recording.images import read_colour
+from cairn_fusion.transfer.transfer import Label
 from cairn_fusion.view.temperature_scale import TemperatureScale
 from cairn_map.errors import BadInputError
-from cairn_sim.fusion_evaluation import WAYS, mapped_scores, scored_view
-from cairn_sim.fusion_pictures import error_picture, figure_24
-from cairn_sim.fusion_scores import COLUMNS, fusion_scores
-from cairn_sim.fusion_truth import FusionTruth
-from cairn_sim.heads import RANGE_CAMERA, full_head
-from cairn_sim.labelled_frames import labelled_frames
-from cairn_sim.record import Plan, scans_of, shots_of
-from cairn_sim.render import render_scan
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
+from cairn_sim.evaluation.fusion_evaluation import WAYS, mapped_scores, scored_view
+from cairn_sim.evaluation.fusion_pictures import error_picture, figure_24
+from cairn_sim.evaluation.fusion_scores import COLUMNS, fusion_scores
+from cairn_sim.evaluation.fusion_truth import FusionTruth
+from cairn_sim.evaluation.labelled_frames import labelled_frames
+from cairn_sim.evaluation.temperature_scores import OTHERS
+from cairn_sim.render.render import render_scan
+from cairn_sim.robots.heads import RANGE_CAMERA, full_head
+from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.robots.trajectories import EXPERIMENT
+from cairn_sim.scene.scene_file import load_scene
 from cairn_sim.sim_command import main
-from cairn_sim.temperature_scores import OTHERS
-from cairn_sim.trajectories import EXPERIMENT
 
 
 def test_scores_count_what_their_names_say() -> None:

@@ -18,21 +18,21 @@ import pytest
 from tests.cairn_map.made import KEY, MIDDLE, random_evidence
 from tests.cairn_sim.test_experiment_report import read_page
 
-from cairn_fusion.integrate import Integrator, Method, integrate_scans
-from cairn_map.cell_code import DecodedCell, encode_cell
-from cairn_map.cell_folder import read_cells, read_head
+from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scans
+from cairn_map.codec.cell_code import DecodedCell, encode_cell
 from cairn_map.errors import BadInputError
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.sensor_model import SensorModel
-from cairn_sim.experiment_cells import measure_cells
-from cairn_sim.experiment_command import main
-from cairn_sim.experiment_robots import recorded_robot, simulated_robots
-from cairn_sim.pointer_octree import encode_pointer_octree, occupied_voxels
-from cairn_sim.record import Plan, record
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene, shipped_text
-from cairn_sim.scores import Scores, scores_of
-from cairn_sim.truth_grid import box_of_cell, truths_of
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.files.cell_folder import read_cells, read_head
+from cairn_sim.evaluation.scores import Scores, scores_of
+from cairn_sim.evaluation.truth_grid import box_of_cell, truths_of
+from cairn_sim.experiment.cells import measure_cells
+from cairn_sim.experiment.command import main
+from cairn_sim.experiment.pointer_octree import encode_pointer_octree, occupied_voxels
+from cairn_sim.experiment.robots import recorded_robot, simulated_robots
+from cairn_sim.robots.record import Plan, record
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.scene.scene_file import load_scene, shipped_text
 
 SHORT = ("--stops", "1", "--scale", "0.1", "--seed", "5")
 SECONDS_MAX = 120

@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_map.channels import STANDARD_CHANNELS
-from cairn_map.evidence import Evidence, packed_evidence
-from cairn_map.grid import Geometry, cell_key, split_voxels
-from cairn_map.sensor_model import SensorModel
-from cairn_sim.experiment_plan import HEAT, NO_TEMPERATURE, STRAY, PlanView
+from cairn_map.evidence.channels import STANDARD_CHANNELS
+from cairn_map.evidence.evidence import Evidence, packed_evidence
+from cairn_map.evidence.grid import Geometry, cell_key, split_voxels
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_sim.experiment.plan import HEAT, NO_TEMPERATURE, STRAY, PlanView
 
 GEOMETRY = Geometry(voxel_edge_um=500_000, depth=3)
 """A cell of 4 m has 8 voxels along its edge."""

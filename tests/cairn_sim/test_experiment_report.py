@@ -5,9 +5,10 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from cairn_map.grid import geometry_for
-from cairn_sim.codings import CODINGS
-from cairn_sim.experiment_figures import (
+from cairn_map.evidence.grid import geometry_for
+from cairn_sim.evaluation.scores import Scores
+from cairn_sim.experiment.codings import CODINGS
+from cairn_sim.experiment.figures import (
     CellFigures,
     CodedCell,
     MeasurementFigures,
@@ -15,11 +16,10 @@ from cairn_sim.experiment_figures import (
     RunFigures,
     TruthFigures,
 )
-from cairn_sim.experiment_plan import PlanView
-from cairn_sim.experiment_report import report_page
-from cairn_sim.experiment_tables import percent, shown
-from cairn_sim.scores import Scores
-from cairn_sim.table_three import table_three
+from cairn_sim.experiment.plan import PlanView
+from cairn_sim.experiment.report import report_page
+from cairn_sim.experiment.table_three import table_three
+from cairn_sim.experiment.tables import percent, shown
 
 VOID = {"meta", "br", "img", "input", "link", "hr"}
 SCORES = Scores(surface=100, surface_occupied=90, surface_free=3, free=50, free_free=50, map_free=50, map_occupied=95)

@@ -14,18 +14,26 @@ from tests.cairn_sim.naive_images import (
     naive_wave,
 )
 
-from cairn_calib.camera import Camera, camera_from_field_of_view
-from cairn_calib.poses import Transform, look_at
-from cairn_sim.heads import RANGE_CAMERA, full_head, tof_head
-from cairn_sim.image_kernels import bloomed, colours, edge_pixels, finer_rays, mixed_waves, returns, surface_values
-from cairn_sim.raycast_kernels import Hits
-from cairn_sim.rays import cast_directions, tiles
-from cairn_sim.render import AMBIENT, LIGHT, render_scan
-from cairn_sim.scene import Scene, scene_of
-from cairn_sim.scene_file import SHIPPED, load_scene
-from cairn_sim.solids import Box, Floats, Solid, Sphere, placed
-from cairn_sim.surfaces import Material, Optics, Surface
-from cairn_sim.trajectories import path_names, stops
+from cairn_calib.rig.camera import Camera, camera_from_field_of_view
+from cairn_calib.rig.poses import Transform, look_at
+from cairn_sim.render.image_kernels import (
+    bloomed,
+    colours,
+    edge_pixels,
+    finer_rays,
+    mixed_waves,
+    returns,
+    surface_values,
+)
+from cairn_sim.render.raycast_kernels import Hits
+from cairn_sim.render.rays import cast_directions, tiles
+from cairn_sim.render.render import AMBIENT, LIGHT, render_scan
+from cairn_sim.robots.heads import RANGE_CAMERA, full_head, tof_head
+from cairn_sim.robots.trajectories import path_names, stops
+from cairn_sim.scene.scene import Scene, scene_of
+from cairn_sim.scene.scene_file import SHIPPED, load_scene
+from cairn_sim.scene.solids import Box, Floats, Solid, Sphere, placed
+from cairn_sim.scene.surfaces import Material, Optics, Surface
 
 SKY = np.array([10, 200, 30], np.float32)
 PANES = "panes and mirrors"

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from tests.cairn_map.made import KEY, MIDDLE, PLAIN, SMALL, as_dict, random_evidence
 
 from cairn_map.errors import DamagedDataError
-from cairn_map.evidence import empty_evidence
-from cairn_map.grid import Geometry
-from cairn_map.sensor_model import SensorModel, log_odds
-from cairn_sim.pointer_octree import (
+from cairn_map.evidence.evidence import empty_evidence
+from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.sensor_model import SensorModel, log_odds
+from cairn_sim.experiment.pointer_octree import (
     FIELDS,
     HEAD,
     NO_TEMPERATURE,

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from tests.cairn_sim.naive_raycast import naive_cast, naive_sight
 
-from cairn_calib.poses import look_at
+from cairn_calib.rig.poses import look_at
 from cairn_map.errors import BadInputError
-from cairn_sim.raycast_kernels import Hits, cast_each, cast_rays
-from cairn_sim.scene import Scene, scene_of
-from cairn_sim.scene_file import load_scene
-from cairn_sim.solids import Box, Cylinder, Floats, Plane, Shape, Solid, Sphere, placed
-from cairn_sim.surfaces import Material, Optics, Surface
+from cairn_sim.render.raycast_kernels import Hits, cast_each, cast_rays
+from cairn_sim.scene.scene import Scene, scene_of
+from cairn_sim.scene.scene_file import load_scene
+from cairn_sim.scene.solids import Box, Cylinder, Floats, Plane, Shape, Solid, Sphere, placed
+from cairn_sim.scene.surfaces import Material, Optics, Surface
 
 GREY = Surface(Material())
 GLASS = Surface(Material(optics=Optics.GLASS))

@@ -6,14 +6,17 @@ import cv2
 import numpy as np
 import pytest
 
-from cairn_calib.camera import Camera
-from cairn_calib.lidar import SpinningLidar
-from cairn_calib.poses import Transform, inverse, look_at, transform_points
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_fusion.scan import Scan, check_scan
-from cairn_fusion.transfer import points_from_range
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.lidar import SpinningLidar
+from cairn_calib.rig.poses import Transform, inverse, look_at, transform_points
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_fusion.recording.scan import Scan, check_scan
+from cairn_fusion.transfer.transfer import points_from_range
 from cairn_map.errors import BadInputError
-from cairn_sim.heads import (
+from cairn_sim.render.rays import cast, cast_directions
+from cairn_sim.render.render import render_scan
+from cairn_sim.render.sensors import Noise
+from cairn_sim.robots.heads import (
     RANGE_CAMERA,
     colour_and_tof_head,
     full_head,
@@ -22,15 +25,12 @@ from cairn_sim.heads import (
     thermal_and_tof_head,
     tof_head,
 )
-from cairn_sim.rays import cast, cast_directions
-from cairn_sim.render import render_scan
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene import Scene, scene_of
-from cairn_sim.scene_file import load_scene
-from cairn_sim.sensors import Noise
-from cairn_sim.solids import Box, Plane, Solid, placed
-from cairn_sim.surfaces import Material, Optics, Surface
-from cairn_sim.trajectories import stops
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.robots.trajectories import stops
+from cairn_sim.scene.scene import Scene, scene_of
+from cairn_sim.scene.scene_file import load_scene
+from cairn_sim.scene.solids import Box, Plane, Solid, placed
+from cairn_sim.scene.surfaces import Material, Optics, Surface
 
 ROOM = load_scene("small-room")
 WALL = Surface(Material((200, 100, 50), 300.0, emissivity=1.0, reflectivity_nir=0.5))

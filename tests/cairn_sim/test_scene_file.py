@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cairn_map.errors import BadInputError
-from cairn_sim import scene_file
-from cairn_sim.scene import Scene
-from cairn_sim.scene_file import FILE_BYTES_MAX, SHIPPED, load_scene, scene_from_toml, shipped_text
-from cairn_sim.solids import Box, Cylinder, Plane, Solid, Sphere
-from cairn_sim.surfaces import Optics
+from cairn_sim.scene import scene_file
+from cairn_sim.scene.scene import Scene
+from cairn_sim.scene.scene_file import FILE_BYTES_MAX, SHIPPED, load_scene, scene_from_toml, shipped_text
+from cairn_sim.scene.solids import Box, Cylinder, Plane, Solid, Sphere
+from cairn_sim.scene.surfaces import Optics
 
 HEAD = """
 format = "cairn-scene"

@@ -10,14 +10,14 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.camera import camera_from_field_of_view
-from cairn_calib.poses import look_at
-from cairn_sim.raycast_kernels import GLASS, MIRROR
-from cairn_sim.rays import cast
-from cairn_sim.scene import Scene
-from cairn_sim.scene_file import load_scene
-from cairn_sim.solids import Box, Plane, Solid
-from cairn_sim.surfaces import Optics
+from cairn_calib.rig.camera import camera_from_field_of_view
+from cairn_calib.rig.poses import look_at
+from cairn_sim.render.raycast_kernels import GLASS, MIRROR
+from cairn_sim.render.rays import cast
+from cairn_sim.scene.scene import Scene
+from cairn_sim.scene.scene_file import load_scene
+from cairn_sim.scene.solids import Box, Plane, Solid
+from cairn_sim.scene.surfaces import Optics
 
 Floats = npt.NDArray[np.float64]
 

@@ -5,23 +5,23 @@ import math
 import numpy as np
 import pytest
 
-from cairn_calib.camera import camera_from_field_of_view
-from cairn_calib.poses import look_at
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_fusion.measurement import Measurement
-from cairn_fusion.scan import Scan
+from cairn_calib.rig.camera import camera_from_field_of_view
+from cairn_calib.rig.poses import look_at
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_fusion.mapping.measurement import Measurement
+from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import BadInputError
-from cairn_map.evidence import packed_evidence
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import CellKey, Geometry, geometry_for, split_voxels
-from cairn_map.sensor_model import SensorModel
-from cairn_sim.rays import cast
-from cairn_sim.scene import Scene, scene_of
-from cairn_sim.scores import FREE, OCCUPIED, UNKNOWN, Scores, States, map_states, scores_from, scores_of
-from cairn_sim.solids import Box, Cylinder, Plane, Shape, Solid, Sphere, placed
-from cairn_sim.surfaces import Material, Surface
-from cairn_sim.truth_grid import Truth, TruthClass, VoxelBox, box_of_metres, truth_from, truths_of
-from cairn_sim.truth_grid_kernels import HIT, PASSED
+from cairn_map.evidence.evidence import packed_evidence
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import CellKey, Geometry, geometry_for, split_voxels
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_sim.evaluation.scores import FREE, OCCUPIED, UNKNOWN, Scores, States, map_states, scores_from, scores_of
+from cairn_sim.evaluation.truth_grid import Truth, TruthClass, VoxelBox, box_of_metres, truth_from, truths_of
+from cairn_sim.evaluation.truth_grid_kernels import HIT, PASSED
+from cairn_sim.render.rays import cast
+from cairn_sim.scene.scene import Scene, scene_of
+from cairn_sim.scene.solids import Box, Cylinder, Plane, Shape, Solid, Sphere, placed
+from cairn_sim.scene.surfaces import Material, Surface
 
 GEOMETRY = geometry_for(voxel_edge_m=0.08)
 CAMERA = camera_from_field_of_view(88, 72, horizontal_deg=69)

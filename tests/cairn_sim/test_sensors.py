@@ -13,16 +13,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.poses import Transform, transform_points
-from cairn_calib.rig import Rig, Spectrum
-from cairn_fusion.scan import Scan
-from cairn_sim.heads import RANGE_CAMERA, full_head, tof_head
-from cairn_sim.kinematics import T_FORWARD_CAMERA
-from cairn_sim.render import render_scan
-from cairn_sim.scene import Scene, scene_of
-from cairn_sim.sensors import COUNT_MAX, ColourSensor, Noise, RangeSensor, Sensor, ThermalSensor
-from cairn_sim.solids import Box, Solid, placed
-from cairn_sim.surfaces import Material, Surface
+from cairn_calib.rig.poses import Transform, transform_points
+from cairn_calib.rig.rig import Rig, Spectrum
+from cairn_fusion.recording.scan import Scan
+from cairn_sim.render.render import render_scan
+from cairn_sim.render.sensors import COUNT_MAX, ColourSensor, Noise, RangeSensor, Sensor, ThermalSensor
+from cairn_sim.robots.heads import RANGE_CAMERA, full_head, tof_head
+from cairn_sim.robots.kinematics import T_FORWARD_CAMERA
+from cairn_sim.scene.scene import Scene, scene_of
+from cairn_sim.scene.solids import Box, Solid, placed
+from cairn_sim.scene.surfaces import Material, Surface
 
 Floats = npt.NDArray[np.float64]
 

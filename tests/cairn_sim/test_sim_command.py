@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cairn_fusion.recording import open_recording
+from cairn_fusion.recording.recording import open_recording
 from cairn_map.errors import BadInputError, ConflictError
 from cairn_sim.sim_command import main
 

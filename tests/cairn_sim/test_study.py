@@ -7,19 +7,19 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.disc_images import Method
-from cairn_calib.poses import inverse, transform_points
-from cairn_calib.rig import Rig, Spectrum, load_rig
-from cairn_calib.verification import CENTROID_SIGMA_PX
-from cairn_calib.verification_table import CameraRow
+from cairn_calib.rig.poses import inverse, transform_points
+from cairn_calib.rig.rig import Rig, Spectrum, load_rig
+from cairn_calib.verify.disc_images import Method
+from cairn_calib.verify.verification import CENTROID_SIGMA_PX
+from cairn_calib.verify.verification_table import CameraRow
 from cairn_map.errors import BadInputError
-from cairn_sim.heads import RANGE_CAMERA, full_head, tof_head
-from cairn_sim.study import METHODS, driven, places_of
-from cairn_sim.study_command import main
-from cairn_sim.study_configurations import CONFIGURATIONS, pose_of
-from cairn_sim.study_report import BARS, CAMERAS, PAPER, judged
-from cairn_sim.study_scenes import RANGES_M, T_MAP_HEAD, Target, targets_in_view
-from cairn_sim.targets import Board
+from cairn_sim.robots.heads import RANGE_CAMERA, full_head, tof_head
+from cairn_sim.robots.targets import Board
+from cairn_sim.study.command import main
+from cairn_sim.study.configurations import CONFIGURATIONS, pose_of
+from cairn_sim.study.report import BARS, CAMERAS, PAPER, judged
+from cairn_sim.study.run import METHODS, driven, places_of
+from cairn_sim.study.scenes import RANGES_M, T_MAP_HEAD, Target, targets_in_view
 
 Floats = npt.NDArray[np.float64]
 HEAD = full_head(scale=0.5)

@@ -13,19 +13,17 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.poses import Transform, inverse, transform_points
-from cairn_calib.rig import Rig
-from cairn_fusion.scan import Scan
+from cairn_calib.rig.poses import Transform, inverse, transform_points
+from cairn_calib.rig.rig import Rig
+from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import BadInputError
-from cairn_sim.heads import RANGE_CAMERA, full_head, tof_head
-from cairn_sim.image_kernels import BLOOM_PX, bloomed
-from cairn_sim.kinematics import T_FORWARD_CAMERA
-from cairn_sim.rays import visible_from
-from cairn_sim.render import render_scan
-from cairn_sim.scene import Scene, scene_of
-from cairn_sim.sensors import COUNT_MAX, ColourSensor, Noise, RangeSensor, Sensor, ThermalSensor
-from cairn_sim.solids import placed
-from cairn_sim.targets import (
+from cairn_sim.render.image_kernels import BLOOM_PX, bloomed
+from cairn_sim.render.rays import visible_from
+from cairn_sim.render.render import render_scan
+from cairn_sim.render.sensors import COUNT_MAX, ColourSensor, Noise, RangeSensor, Sensor, ThermalSensor
+from cairn_sim.robots.heads import RANGE_CAMERA, full_head, tof_head
+from cairn_sim.robots.kinematics import T_FORWARD_CAMERA
+from cairn_sim.robots.targets import (
     HEATED_K,
     ROOM_K,
     TAPE_M,
@@ -37,6 +35,8 @@ from cairn_sim.targets import (
     target_centre,
     target_scene,
 )
+from cairn_sim.scene.scene import Scene, scene_of
+from cairn_sim.scene.solids import placed
 
 Floats = npt.NDArray[np.float64]
 

@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from cairn_calib.poses import checked_transform
-from cairn_calib.rig import Spectrum, rig_from_json
+from cairn_calib.rig.poses import checked_transform
+from cairn_calib.rig.rig import Spectrum, rig_from_json
 from cairn_map.errors import BadInputError
-from cairn_sim.heads import RANGE_CAMERA, full_head, handheld_head, lidar_head, thermal_and_tof_head, tof_head
-from cairn_sim.kinematics import Joints, Manipulator, measurement_joints, with_backlash
-from cairn_sim.robots import ROBOTS, robot_named
-from cairn_sim.scene_file import SHIPPED, load_scene
-from cairn_sim.trajectories import PATHS, PoseErrors, believed, drive, path_names, stops
+from cairn_sim.robots.heads import RANGE_CAMERA, full_head, handheld_head, lidar_head, thermal_and_tof_head, tof_head
+from cairn_sim.robots.kinematics import Joints, Manipulator, measurement_joints, with_backlash
+from cairn_sim.robots.robots import ROBOTS, robot_named
+from cairn_sim.robots.trajectories import PATHS, PoseErrors, believed, drive, path_names, stops
+from cairn_sim.scene.scene_file import SHIPPED, load_scene
 
 BODY_M = 0.35
 """Half a robot's width."""

@@ -7,22 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cairn_calib.poses import look_at, transform_points
-from cairn_fusion.images import read_grey16
-from cairn_fusion.recording import open_recording
-from cairn_fusion.trajectory import read_trajectory
+from cairn_calib.rig.poses import look_at, transform_points
+from cairn_fusion.recording.images import read_grey16
+from cairn_fusion.recording.recording import open_recording
+from cairn_fusion.recording.trajectory import read_trajectory
 from cairn_map.errors import BadInputError, ConflictError
-from cairn_sim.heads import RANGE_CAMERA, full_head
-from cairn_sim.rays import cast, visible_from
-from cairn_sim.record import Plan, record, shots_of
-from cairn_sim.render import render_scan
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene import scene_of
-from cairn_sim.scene_file import load_scene, shipped_text
-from cairn_sim.solids import Box, Solid, placed
-from cairn_sim.surfaces import Material, Optics, Surface
-from cairn_sim.trajectories import PoseErrors, stops
-from cairn_sim.truth import camera_truth
+from cairn_sim.render.rays import cast, visible_from
+from cairn_sim.render.render import render_scan
+from cairn_sim.render.truth import camera_truth
+from cairn_sim.robots.heads import RANGE_CAMERA, full_head
+from cairn_sim.robots.record import Plan, record, shots_of
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.robots.trajectories import PoseErrors, stops
+from cairn_sim.scene.scene import scene_of
+from cairn_sim.scene.scene_file import load_scene, shipped_text
+from cairn_sim.scene.solids import Box, Solid, placed
+from cairn_sim.scene.surfaces import Material, Optics, Surface
 
 ROOM = load_scene("small-room")
 RIG = full_head(scale=0.25)

@@ -6,15 +6,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.camera import Camera, camera_from_field_of_view
-from cairn_calib.lidar import SpinningLidar
-from cairn_calib.poses import Transform, look_at
+from cairn_calib.rig.camera import Camera, camera_from_field_of_view
+from cairn_calib.rig.lidar import SpinningLidar
+from cairn_calib.rig.poses import Transform, look_at
 from cairn_map.errors import BadInputError
-from cairn_map.grid import cell_key, geometry_for, split_voxels, voxels_of_points
-from cairn_sim.scene import Scene, scene_of
-from cairn_sim.solids import Box, Cylinder, Plane, Shape, Solid, Sphere, placed
-from cairn_sim.surfaces import Material, Optics, Surface
-from cairn_sim.truth_grid import (
+from cairn_map.evidence.grid import cell_key, geometry_for, split_voxels, voxels_of_points
+from cairn_sim.evaluation.truth_grid import (
     TruthClass,
     VoxelBox,
     box_of_cell,
@@ -25,7 +22,10 @@ from cairn_sim.truth_grid import (
     truth_from,
     truths_of,
 )
-from cairn_sim.truth_grid_kernels import GRAZE_M, HIT, PASSED, mark_seen_into
+from cairn_sim.evaluation.truth_grid_kernels import GRAZE_M, HIT, PASSED, mark_seen_into
+from cairn_sim.scene.scene import Scene, scene_of
+from cairn_sim.scene.solids import Box, Cylinder, Plane, Shape, Solid, Sphere, placed
+from cairn_sim.scene.surfaces import Material, Optics, Surface
 
 Floats = npt.NDArray[np.float64]
 

@@ -8,9 +8,9 @@ import pytest
 from tests.console.browsing import Console
 from tests.console.conftest import Room
 
-from cairn_client.map_export import fetch_map
-from cairn_map.grid import Geometry
-from cairn_map.voxels import joined_voxels, voxels_of_evidence
+from cairn_client.cli.maps.map_export import fetch_map
+from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.voxels import joined_voxels, voxels_of_evidence
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

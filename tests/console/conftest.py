@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser
-from tests.cairn_server.live import Process, free_port, until
+from tests.cairn_server.live.hub import Process, free_port, until
 from tests.console.browsing import CHROMIUM, VIEW, Console, browser, tab
 from tests.console.room import ADMIN_TOKEN, GEOMETRY, MAP, mapping, push_measurement
 
-from cairn_client.api import MapApi
-from cairn_map.messages import CreateMap
-from cairn_server.console_files import STATIC
+from cairn_client.http.api import MapApi
+from cairn_map.wire.messages import CreateMap
+from cairn_server.http.routes.console_files import STATIC
 
 LOOPBACK = "127.0.0.1"
 

@@ -4,16 +4,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from cairn_client.robot import Robot
-from cairn_fusion.scan import Scan
-from cairn_map.grid import Geometry
-from cairn_sim.heads import RANGE_CAMERA, full_head, thermal_and_tof_head
-from cairn_sim.kinematics import Manipulator, measurement_joints
-from cairn_sim.render import render_scan
-from cairn_sim.scene import Scene
-from cairn_sim.scene_file import load_scene
-from cairn_sim.sensors import Noise
-from cairn_sim.trajectories import path_names, stops
+from cairn_client.robot.robot import Robot
+from cairn_fusion.recording.scan import Scan
+from cairn_map.evidence.grid import Geometry
+from cairn_sim.render.render import render_scan
+from cairn_sim.render.sensors import Noise
+from cairn_sim.robots.heads import RANGE_CAMERA, full_head, thermal_and_tof_head
+from cairn_sim.robots.kinematics import Manipulator, measurement_joints
+from cairn_sim.robots.trajectories import path_names, stops
+from cairn_sim.scene.scene import Scene
+from cairn_sim.scene.scene_file import load_scene
 
 MAP = "room"
 ADMIN_TOKEN = "admin-of-the-console-tests"

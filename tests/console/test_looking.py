@@ -7,16 +7,16 @@ import numpy.typing as npt
 import pytest
 from playwright.sync_api import Browser, Route
 from tests.cairn_map.made import SMALL, surface_evidence
-from tests.cairn_server.live import until
-from tests.cairn_server.pushes import MOLE, pushed
+from tests.cairn_server.live.hub import until
+from tests.cairn_server.sync.pushes import MOLE, pushed
 from tests.console.browsing import VIEW, Console, tab
 from tests.console.casting import occupied
 from tests.console.conftest import Room
 from tests.console.room import GEOMETRY
 
-from cairn_client.api import MapApi
-from cairn_map.grid import cell_key
-from cairn_map.messages import CreateMap
+from cairn_client.http.api import MapApi
+from cairn_map.evidence.grid import cell_key
+from cairn_map.wire.messages import CreateMap
 
 KELVIN = 273.15
 PLACES = [[x, y] for x in range(150, 560, 15) for y in range(80, 420, 15)]

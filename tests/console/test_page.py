@@ -17,7 +17,7 @@ from tests.console.casting import occupied, picks_met_first
 from tests.console.conftest import Room
 from tests.console.room import GEOMETRY, MAP
 
-from cairn_server.console_files import STATIC
+from cairn_server.http.routes.console_files import STATIC
 
 PAGE_GZIP_BYTES_MAX = 250_000
 FIRST_PICTURE_BYTES_MAX = 500_000

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser
-from tests.cairn_server.live import free_port
+from tests.cairn_server.live.hub import free_port
 from tests.console.browsing import tab
 from tests.console.conftest import LOOPBACK, Room
 from tests.console.room import GEOMETRY, MAP
 from tests.console.test_page import LOADED_MACHINE
 
-from cairn_map.messages import CreateMap
+from cairn_map.wire.messages import CreateMap
 
 TABS = 8
 DRAWN_S = 3

@@ -13,7 +13,7 @@ from tests.console.casting import occupied
 from tests.console.conftest import Room
 from tests.console.room import ADMIN_TOKEN, MAP
 
-from cairn_server.export_tickets import TICKETS_OF_TOKEN_MAX
+from cairn_server.views.export_tickets import TICKETS_OF_TOKEN_MAX
 
 BEGINNINGS = {
     "PLY": b"ply\n",

@@ -10,17 +10,17 @@ import numpy.typing as npt
 import pytest
 from playwright.sync_api import Browser, FloatRect, Locator, Route
 from tests.cairn_map.made import SMALL, surface_evidence
-from tests.cairn_server.live import until
-from tests.cairn_server.pushes import KEYS, MOLE, WREN, pushed
+from tests.cairn_server.live.hub import until
+from tests.cairn_server.sync.pushes import KEYS, MOLE, WREN, pushed
 from tests.console.browsing import VIEW, Console, tab
 from tests.console.conftest import Room
 from tests.console.room import ADMIN_TOKEN
 
-from cairn_client.api import MapApi
-from cairn_map.commit import ScanPose
-from cairn_map.cursor import cursor_from_text
-from cairn_map.messages import BranchInfo, CreateMap, MissingRequest, Register, Retract
-from cairn_map.robot_status import RobotStatus
+from cairn_client.http.api import MapApi
+from cairn_map.commits.commit import ScanPose
+from cairn_map.commits.cursor import cursor_from_text
+from cairn_map.wire.messages import BranchInfo, CreateMap, MissingRequest, Register, Retract
+from cairn_map.wire.robot_status import RobotStatus
 
 CREW = "crew"
 FINCH, MAPLESS = "finch", "low-end"

@@ -24,11 +24,11 @@ from tests.crash.lives import AUTHORS, NAME, commit_of
 from tests.crash.power_cut import Disk, PowerVfs
 from tests.crash.verdict import Verdict, verdict_on
 
-from cairn_map.commit import Commit
-from cairn_map.ids import Author, CommitId
-from cairn_map.messages import CreateMap
-from cairn_server.folder_lock import LOCK_NAME
-from cairn_server.serve_command import main as serve
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.ids import Author, CommitId
+from cairn_map.wire.messages import CreateMap
+from cairn_server.operations.serve import main as serve
+from cairn_server.store.folder_lock import LOCK_NAME
 
 DEADLINE_S = 60.0
 COMMITS_MAX = 60

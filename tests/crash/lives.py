@@ -12,19 +12,19 @@ from pathlib import Path
 
 import apsw
 from tests.cairn_map.made import SMALL
-from tests.cairn_server.pushes import MOLE, WREN, pushed
 from tests.cairn_server.store_contract import new_of
+from tests.cairn_server.sync.pushes import MOLE, WREN, pushed
 from tests.crash.power_cut import Disk, PowerVfs
 from tests.crash.verdict import Verdict, verdict_on
 
-from cairn_map.commit import Commit
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.ids import Author, CommitId
 from cairn_map.errors import CairnError
-from cairn_map.ids import Author, CommitId
-from cairn_map.sensor_model import SensorModel
-from cairn_server.cell_cache import CellCache
-from cairn_server.folding import fold_pending
-from cairn_server.sqlite_store import SqliteStore
-from cairn_server.store_rows import MapRow
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.folding import fold_pending
+from cairn_server.store.sqlite.store import SqliteStore
+from cairn_server.store.store_rows import MapRow
 
 NAME = "lab"
 AUTHORS = (MOLE, WREN)

@@ -8,17 +8,17 @@ from pathlib import Path
 import apsw
 from tests import naive
 from tests.cairn_map.made import as_dict
-from tests.cairn_server.pushes import Cells, read
+from tests.cairn_server.sync.pushes import Cells, read
 
-from cairn_map.cell_code import decode_cell
-from cairn_map.commit import Commit
-from cairn_map.cursor import next_chain
+from cairn_map.codec.cell_code import decode_cell
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.cursor import next_chain
+from cairn_map.commits.ids import CommitId, commit_id_from_text
 from cairn_map.errors import CairnError
-from cairn_map.ids import CommitId, commit_id_from_text
-from cairn_server.cell_cache import CellCache
-from cairn_server.folding import fold_pending
-from cairn_server.sqlite_store import FILE_NAME, SqliteStore
-from cairn_server.store_rows import MapRow, StoredCommit
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.folding import fold_pending
+from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
+from cairn_server.store.store_rows import MapRow, StoredCommit
 
 
 @dataclass(slots=True)

@@ -4,13 +4,13 @@ from dataclasses import dataclass, replace
 
 from tests.bench.pushing import Bodies, Diff
 
-from cairn_fusion.integrate import Integrator, integrate_scans
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import Geometry, geometry_for
-from cairn_sim.record import Plan, scans_of, shots_of
-from cairn_sim.robots import ROBOTS
-from cairn_sim.scene_file import load_scene
-from cairn_sim.trajectories import EXPERIMENT
+from cairn_fusion.mapping.integrate import Integrator, integrate_scans
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import Geometry, geometry_for
+from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.robots.robots import ROBOTS
+from cairn_sim.robots.trajectories import EXPERIMENT
+from cairn_sim.scene.scene_file import load_scene
 
 SCANS = (3, 2)
 """Pans and tilts at each stop: enough that the 54 stops see all 56 cells of the building."""

@@ -19,8 +19,8 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import WebSocketException
 from websockets.typing import Subprotocol
 
-from cairn_server.live_routes import PROTOCOL, TOKEN_PREFIX
-from cairn_server.sync_routes import COMMIT_MEDIA_TYPE
+from cairn_server.http.routes.live import PROTOCOL, TOKEN_PREFIX
+from cairn_server.http.routes.sync import COMMIT_MEDIA_TYPE
 
 INCARNATION = "0" * 16  # what `Bodies` writes
 LAST_FETCHES_AT_ONCE = 8

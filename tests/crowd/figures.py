@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from cairn_map.frames import FrameKind
+from cairn_map.wire.frames import FrameKind
 
 
 @dataclass(slots=True)

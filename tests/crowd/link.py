@@ -12,7 +12,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import Self
 
-from cairn_map.frames import MAGIC, PREFIX, FrameKind
+from cairn_map.wire.frames import MAGIC, PREFIX, FrameKind
 
 ANSWER_S = 60.0
 CHUNK_BYTES = 1 << 18

@@ -11,10 +11,10 @@ from tests.crowd.link import BadAnswerError, Told
 from tests.crowd.soak import soak
 from tests.crowd.verdict import findings, summary
 
-from cairn_map.cursor import Cursor
-from cairn_map.fingerprint import ZERO
-from cairn_map.frames import FrameKind, encode_frame, start_of_reply
-from cairn_map.messages import Done, ReplyHeader
+from cairn_map.commits.cursor import Cursor
+from cairn_map.evidence.fingerprint import ZERO
+from cairn_map.wire.frames import FrameKind, encode_frame, start_of_reply
+from cairn_map.wire.messages import Done, ReplyHeader
 
 CURSOR = str(Cursor(bytes(16), 7, bytes(16)))
 HEADER = encode_frame(ReplyHeader(to=CURSOR, vector={}, stable={}))

@@ -13,11 +13,11 @@ from pathlib import Path
 
 from tests.bench.pushing import Diff, meta_of
 
-from cairn_client.api import MapApi
-from cairn_client.robot import Robot
-from cairn_map.cell_code import encode_cell
+from cairn_client.http.api import MapApi
+from cairn_client.robot.robot import Robot
+from cairn_map.codec.cell_code import encode_cell
 from cairn_map.errors import CairnError
-from cairn_map.grid import Cell, Geometry, cell_key
+from cairn_map.evidence.grid import Cell, Geometry, cell_key
 
 NICENESS = 5
 """What they need to decode and keep a map is not the server's cost, and must not delay it."""

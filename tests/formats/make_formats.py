@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 from tests.naive import interleave
 
-from cairn_map.cell_code import Profile, encode_cell
-from cairn_map.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
-from cairn_map.commit import CommitMeta, ScanPose, make_commit
-from cairn_map.cursor import Cursor
-from cairn_map.evidence import Evidence, empty_evidence, packed_evidence
-from cairn_map.fingerprint import fingerprint
-from cairn_map.frames import CellFrame, FrameKind, encode_frame, start_of_reply
-from cairn_map.grid import Geometry, cell_key
-from cairn_map.messages import Done, More, ReplyHeader
+from cairn_map.codec.cell_code import Profile, encode_cell
+from cairn_map.commits.commit import CommitMeta, ScanPose, make_commit
+from cairn_map.commits.cursor import Cursor
+from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
+from cairn_map.evidence.evidence import Evidence, empty_evidence, packed_evidence
+from cairn_map.evidence.fingerprint import fingerprint
+from cairn_map.evidence.grid import Geometry, cell_key
+from cairn_map.wire.frames import CellFrame, FrameKind, encode_frame, start_of_reply
+from cairn_map.wire.messages import Done, More, ReplyHeader
 
 FOLDER = Path(__file__).parent
 DOSE = Channel(kind=ChannelKind.SCALAR, name="dose", unit="µSv/h", step=0.01, zero=-1.5)

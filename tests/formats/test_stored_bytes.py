@@ -7,12 +7,12 @@ import pytest
 from tests import naive
 from tests.formats.make_formats import GEOMETRY, KEY, evidence, wall
 
-from cairn_map.cell_code import decode_canonical_cell, decode_cell, encode_cell
-from cairn_map.cell_reading import cell_reader
-from cairn_map.commit_reading import open_commit
-from cairn_map.fingerprint import fingerprint
-from cairn_map.frames import CellFrame, frames_of
-from cairn_map.streams import MODELLED
+from cairn_map.codec.cell_code import decode_canonical_cell, decode_cell, encode_cell
+from cairn_map.codec.cell_reading import cell_reader
+from cairn_map.codec.octree.streams import MODELLED
+from cairn_map.commits.commit_reading import open_commit
+from cairn_map.evidence.fingerprint import fingerprint
+from cairn_map.wire.frames import CellFrame, frames_of
 
 FOLDER = Path(__file__).parent
 CELLS = ("v1-all-channels.cell", "v1-signed.cell", "v1-empty.cell", "v1-small.cell")

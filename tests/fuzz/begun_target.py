@@ -7,11 +7,11 @@ from contextlib import suppress
 from tests.fuzz.sections import joined, sections_of
 from tests.fuzz.wrapping_mutator import mutated_reply
 
-from cairn_map.begun_frames import Replies, without_begun
-from cairn_map.cell_reading import CELL_BYTES_MAX
+from cairn_map.codec.cell_reading import CELL_BYTES_MAX
 from cairn_map.errors import CairnError
-from cairn_map.frames import CellFrame, Frame, encode_frame, frames_of, start_of_reply
-from cairn_map.messages import MissingRequest
+from cairn_map.wire.frames import CellFrame, Frame, encode_frame, frames_of, start_of_reply
+from cairn_map.wire.messages import MissingRequest
+from cairn_map.wire.resumed_replies import Replies, without_begun
 
 PIECE_BYTES = 97
 

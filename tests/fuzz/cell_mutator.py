@@ -14,11 +14,11 @@ from dataclasses import replace
 import numpy as np
 import zstandard
 
-from cairn_map.cell_code import Profile, decode_cell, encode_cell
-from cairn_map.cell_head import CellHead, decode_head, encode_head
+from cairn_map.codec.cell_code import Profile, decode_cell, encode_cell
+from cairn_map.codec.octree.cell_head import CellHead, decode_head, encode_head
 from cairn_map.errors import CairnError
-from cairn_map.evidence import COUNT_MAX, SUM_MAX, packed_evidence
-from cairn_map.grid import CellKey, Geometry
+from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX, packed_evidence
+from cairn_map.evidence.grid import CellKey, Geometry
 
 Mutate = Callable[[bytes], bytes]
 Streams = dict[int, bytes]

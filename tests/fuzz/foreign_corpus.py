@@ -15,10 +15,10 @@ from tests.cairn_calib.test_rig_exchange import KALIBR, ROS
 from tests.cairn_fusion.bags import ROS1, ROS2, Messages, Timed, optical, png, write_bag
 from tests.fuzz.sections import joined
 
-from cairn_calib.camera import Camera, camera_from_field_of_view
-from cairn_calib.fisheye import FisheyeCamera
-from cairn_calib.placed import PlacedCamera
-from cairn_calib.rig_exchange import FORMATS
+from cairn_calib.exchange.placed_camera import PlacedCamera
+from cairn_calib.exchange.rig_exchange import FORMATS
+from cairn_calib.rig.camera import Camera, camera_from_field_of_view
+from cairn_calib.rig.fisheye import FisheyeCamera
 
 Seed = tuple[str, str, bytes]
 

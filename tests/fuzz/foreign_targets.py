@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 from tests.fuzz.sections import in_folder, sections_of
 
-from cairn_calib.lidar import SpinningLidar
-from cairn_calib.rig_exchange import FORMATS, format_of_text
-from cairn_fusion.bag_file import Wire, is_bag
-from cairn_fusion.bag_mapping import camera_of_info, mapping_of
-from cairn_fusion.bag_survey import open_any_bag, survey
-from cairn_fusion.ros_images import amplitude_of, colour_of, depth_of, thermal_counts_of
-from cairn_fusion.ros_messages import (
+from cairn_calib.exchange.rig_exchange import FORMATS, format_of_text
+from cairn_calib.rig.lidar import SpinningLidar
+from cairn_fusion.ros.bag import Wire
+from cairn_fusion.ros.bag_survey import open_any_bag, survey
+from cairn_fusion.ros.images import amplitude_of, colour_of, depth_of, thermal_counts_of
+from cairn_fusion.ros.messages import (
     CAMERA_INFO,
     COMPRESSED,
     IMAGE,
@@ -29,7 +28,9 @@ from cairn_fusion.ros_messages import (
     read_pose,
     read_transforms,
 )
-from cairn_fusion.ros_points import elevations_of, read_points, sweep_image
+from cairn_fusion.ros.open_bag import is_bag
+from cairn_fusion.ros.point_clouds import elevations_of, read_points, sweep_image
+from cairn_fusion.ros.topic_mapping import camera_of_info, mapping_of
 from cairn_map.errors import CairnError
 
 SCANS_MAX = 2

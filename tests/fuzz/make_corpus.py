@@ -21,19 +21,23 @@ from tests.cairn_map.stored import recoded
 from tests.fuzz.foreign_corpus import foreign_seeds
 from tests.fuzz.sections import joined
 
-from cairn_calib.camera import camera_from_field_of_view
-from cairn_calib.lidar import SpinningLidar
-from cairn_calib.rig import Rig, Spectrum, mounted
-from cairn_fusion.recording_writer import RecordingWriter
-from cairn_fusion.scan import Scan
-from cairn_fusion.trajectory import trajectory_line
-from cairn_map.cell_code import Profile, encode_cell
-from cairn_map.cell_folder import FolderHead
-from cairn_map.evidence import Evidence, empty_evidence
-from cairn_map.fingerprint import ZERO, fingerprint
-from cairn_map.frames import CellFrame, FrameKind, encode_frame, start_of_reply
-from cairn_map.index_messages import CellEntry, CellIndex
-from cairn_map.messages import (
+from cairn_calib.rig.camera import camera_from_field_of_view
+from cairn_calib.rig.lidar import SpinningLidar
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_fusion.recording.recording_writer import RecordingWriter
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.recording.trajectory import trajectory_line
+from cairn_map.codec.cell_code import Profile, encode_cell
+from cairn_map.codec.view_code import encode_view
+from cairn_map.commits.signature import Signature, signatures_to_text
+from cairn_map.evidence.evidence import Evidence, empty_evidence
+from cairn_map.evidence.fingerprint import ZERO, fingerprint
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.view import Chance, Extent, ViewStyle
+from cairn_map.files.cell_folder import FolderHead
+from cairn_map.wire.frames import CellFrame, FrameKind, encode_frame, start_of_reply
+from cairn_map.wire.index_messages import CellEntry, CellIndex
+from cairn_map.wire.messages import (
     CellCursor,
     CreateMap,
     Done,
@@ -47,10 +51,6 @@ from cairn_map.messages import (
     ReplyHeader,
     Retract,
 )
-from cairn_map.sensor_model import SensorModel
-from cairn_map.signature import Signature, signatures_to_text
-from cairn_map.view import Chance, Extent, ViewStyle
-from cairn_map.view_code import encode_view
 
 CORPUS = Path(__file__).parent / "corpus"
 SUFFIX = ".input"

@@ -3,7 +3,8 @@
 from pydantic import BaseModel
 from tests.fuzz.sections import sections_of
 
-from cairn_map import (
+from cairn_map.errors import BadInputError
+from cairn_map.wire import (
     access_messages,
     index_messages,
     live_events,
@@ -12,7 +13,6 @@ from cairn_map import (
     robot_status,
     upload_messages,
 )
-from cairn_map.errors import BadInputError
 
 MODULES = (access_messages, index_messages, live_events, messages, relay_messages, robot_status, upload_messages)
 MODELS: dict[str, type[BaseModel]] = {

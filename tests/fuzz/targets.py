@@ -19,30 +19,30 @@ from tests.fuzz.png_mutator import mutated_png
 from tests.fuzz.sections import in_folder, mutated_sections, sections_of
 from tests.fuzz.wrapping_mutator import mutated_commit, mutated_reply
 
-from cairn_calib.rig import rig_from_json
-from cairn_client.map_url import split_map_url
-from cairn_fusion.frame_folder import FrameFolderOptions, import_frames
-from cairn_fusion.images import image_header, read_colour, read_grey16
+from cairn_calib.rig.rig import rig_from_json
+from cairn_client.http.map_url import split_map_url
 from cairn_fusion.importers import detect_layout
-from cairn_fusion.recording import open_recording
-from cairn_fusion.trajectory import interpolated, read_trajectory, trajectory_line
-from cairn_map.brick_cell import brick_cell
-from cairn_map.cell_code import Profile, decode_canonical_cell, decode_cell, encode_cell
-from cairn_map.cell_folder import read_head
-from cairn_map.cell_reading import cell_reader
-from cairn_map.commit import commit_sha, renamed_commit, split_commit
-from cairn_map.commit_reading import open_commit
-from cairn_map.cursor import cursor_from_text
+from cairn_fusion.recording.frame_folder import FrameFolderOptions, import_frames
+from cairn_fusion.recording.images import image_header, read_colour, read_grey16
+from cairn_fusion.recording.recording import open_recording
+from cairn_fusion.recording.trajectory import interpolated, read_trajectory, trajectory_line
+from cairn_map.codec.cell_code import Profile, decode_canonical_cell, decode_cell, encode_cell
+from cairn_map.codec.cell_reading import cell_reader
+from cairn_map.codec.view_code import decode_view
+from cairn_map.commits.commit import commit_sha, renamed_commit, split_commit
+from cairn_map.commits.commit_reading import open_commit
+from cairn_map.commits.cursor import cursor_from_text
+from cairn_map.commits.ids import author_from_text, commit_id_from_text, robot_name
+from cairn_map.commits.signature import signatures_from_text, signatures_to_text
+from cairn_map.commits.version_vector import version_vector_from_json
 from cairn_map.errors import CairnError
-from cairn_map.evidence import Evidence
-from cairn_map.fingerprint import fingerprint, fingerprint_from_hex
-from cairn_map.frames import FrameReader, encode_frame, frames_of, start_of_reply
-from cairn_map.grid import DEPTH_MAX, CellKey, Geometry, cell_from_text
-from cairn_map.ids import author_from_text, commit_id_from_text, robot_name
-from cairn_map.signature import signatures_from_text, signatures_to_text
-from cairn_map.version_vector import version_vector_from_json
-from cairn_map.view_code import decode_view
-from cairn_sim.scene_file import load_scene
+from cairn_map.evidence.brick_cell import brick_cell
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.fingerprint import fingerprint, fingerprint_from_hex
+from cairn_map.evidence.grid import DEPTH_MAX, CellKey, Geometry, cell_from_text
+from cairn_map.files.cell_folder import read_head
+from cairn_map.wire.frames import FrameReader, encode_frame, frames_of, start_of_reply
+from cairn_sim.scene.scene_file import load_scene
 
 Mutate = Callable[[bytes], bytes]
 """Other bytes, of any length, that resemble those given."""

@@ -9,9 +9,9 @@ from random import Random
 
 from tests.bench.pushing import Diff, meta_of
 
-from cairn_client.link_profile import LinkName
-from cairn_client.robot import Robot
-from cairn_map.grid import Geometry
+from cairn_client.robot.robot import Robot
+from cairn_client.sync.link_profile import LinkName
+from cairn_map.evidence.grid import Geometry
 
 MAP = "building"
 LOG = "committed.txt"

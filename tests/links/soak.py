@@ -15,10 +15,10 @@ from tests.links.proxy import FaultProxy
 from tests.links.verdict import Verdict, verdict_on
 from tests.links.weather import Weather
 
-from cairn_client.api import MapApi
-from cairn_client.link_profile import LinkName
+from cairn_client.http.api import MapApi
+from cairn_client.sync.link_profile import LinkName
 from cairn_map.errors import UnreachableError
-from cairn_map.messages import CreateMap
+from cairn_map.wire.messages import CreateMap
 
 END_S = 60.0
 NAMES = ("ant", "bee", "cat")

@@ -4,17 +4,17 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.cairn_server.live import until
+from tests.cairn_server.live.hub import until
 from tests.links.life import LOG, MAP, Building, open_robot
 
-from cairn_client.api import MapApi
-from cairn_client.link import index_of
-from cairn_client.robot import Robot
-from cairn_map.cell_code import encode_cell
-from cairn_map.commit import split_commit
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import Cell, cell_key
-from cairn_map.ids import commit_id_from_text
+from cairn_client.http.api import MapApi
+from cairn_client.http.http_link import index_of
+from cairn_client.robot.robot import Robot
+from cairn_map.codec.cell_code import encode_cell
+from cairn_map.commits.commit import split_commit
+from cairn_map.commits.ids import commit_id_from_text
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import Cell, cell_key
 
 LOG_PAGE = 1000
 Cells = dict[int, bytes]

@@ -16,11 +16,11 @@ from dataclasses import replace
 import numpy as np
 from tests.cairn_calib.simulated_views import LENSES, SPECTRA, errors_of, views_of, world
 
-from cairn_calib.camera import Camera
-from cairn_calib.solve import solve_rig
-from cairn_calib.solve_plan import PITCH_SIGMA, STATED, usual_plan
-from cairn_calib.solved_rig import statistics_of
-from cairn_calib.usual_priors import USUAL_SIGMAS
+from cairn_calib.rig.camera import Camera
+from cairn_calib.solve.priors import USUAL_SIGMAS
+from cairn_calib.solve.solve import solve_rig
+from cairn_calib.solve.solve_plan import PITCH_SIGMA, STATED, usual_plan
+from cairn_calib.solve.solved_rig import statistics_of
 
 FRAMES = 12
 NORMAL_99 = 2.576

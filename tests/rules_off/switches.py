@@ -5,17 +5,17 @@ A switch replaces one piece of a source file by another that leaves the rule out
 
 from dataclasses import dataclass
 
-CELLS_CHANGED, RETENTION = "server/cairn_server/cell_changes.py", "server/cairn_server/sqlite_retention.py"
-RETRACTING = "server/cairn_server/retracting.py"
-MISSING, FOLDING = "server/cairn_server/missing.py", "server/cairn_server/folding.py"
-CHANGES, SNAPSHOT = "server/cairn_server/sqlite_changes.py", "server/cairn_server/sqlite_snapshot.py"
-READERS, CELLS = "server/cairn_server/sqlite_readers.py", "server/cairn_server/cell_routes.py"
-SERVICE, STABLE = "server/cairn_server/service.py", "server/cairn_server/stable.py"
-PUSHES = "server/cairn_server/pushes.py"
-HANDING_OVER = "server/cairn_server/handing_over.py"
-APPLYING, OUTBOX = "client/cairn_client/applying.py", "client/cairn_client/outbox.py"
-REPLICA, SYNC = "client/cairn_client/replica.py", "client/cairn_client/sync.py"
-SHOWN = "client/cairn_client/shown.py"
+CELLS_CHANGED, RETENTION = "server/cairn_server/sync/cell_changes.py", "server/cairn_server/store/sqlite/retention.py"
+RETRACTING = "server/cairn_server/sync/retracting.py"
+MISSING, FOLDING = "server/cairn_server/sync/missing.py", "server/cairn_server/folding/folding.py"
+CHANGES, SNAPSHOT = "server/cairn_server/store/sqlite/changes.py", "server/cairn_server/store/sqlite/snapshot.py"
+READERS, CELLS = "server/cairn_server/store/sqlite/readers.py", "server/cairn_server/http/routes/cell.py"
+SERVICE, STABLE = "server/cairn_server/service.py", "server/cairn_server/sync/stable_commits.py"
+PUSHES = "server/cairn_server/sync/pushes.py"
+HANDING_OVER = "server/cairn_server/sync/handing_over.py"
+APPLYING, OUTBOX = "client/cairn_client/sync/applying.py", "client/cairn_client/replica/outbox.py"
+REPLICA, SYNC = "client/cairn_client/replica/replica.py", "client/cairn_client/sync/sync.py"
+SHOWN = "client/cairn_client/replica/view_of_cell.py"
 
 
 @dataclass(frozen=True, slots=True)
@@ -717,7 +717,7 @@ SWITCHES = (
     Switch(
         10,
         "blocks that were emptied keep their stamp",
-        "server/cairn_server/cell_cache.py",
+        "server/cairn_server/folding/cell_cache.py",
         "            stamps=encode_stamps(stamps),",
         "            stamps=encode_stamps(stamps * np.isin(np.arange(len(stamps)), blocks_of(evidence))),",
         "cairn_server/test_stamps.py::test_voxels_that_were_taken_out_again_leave_the_asker_too",
@@ -773,7 +773,7 @@ SWITCHES = (
     Switch(
         11,
         "evidence that a retract needs is pushed again",
-        "client/cairn_client/outbox.py",
+        "client/cairn_client/replica/outbox.py",
         " and str(kept.id) not in wanted)",
         ")",
         "cairn_client/test_conversations.py::test_what_a_header_wants_again_is_pushed_once_though_it_is_covered",
@@ -781,7 +781,7 @@ SWITCHES = (
     Switch(
         11,
         "evidence that a retract needs is wanted",
-        "server/cairn_server/pushes.py",
+        "server/cairn_server/sync/pushes.py",
         "self._wanted.note(row.name, exc.commits)",
         "pass",
         "cairn_server/test_retention.py::test_evidence_that_a_refused_retract_needs_is_wanted_until_it_comes",
@@ -805,7 +805,7 @@ SWITCHES = (
     Switch(
         16,
         "a signature is of one map",
-        "fusion/cairn_map/signature.py",
+        "fusion/cairn_map/commits/signature.py",
         'return b"cairn-signed-commit-1\\0" + map_name.encode() + b"\\0" + sha',
         'return b"cairn-signed-commit-1\\0" + sha',
         "cairn_server/test_handing_over.py::test_a_commit_is_not_replayed_under_another_id_or_on_another_map",
@@ -821,7 +821,7 @@ SWITCHES = (
     Switch(
         16,
         "a robot signs by the keys of all its incarnations from which it takes something",
-        "client/cairn_client/robot_keys.py",
+        "client/cairn_client/replica/robot_keys.py",
         "dict.fromkeys([commit.id.author, *(target.author for target in commit.meta.retracted_ids)])",
         "dict.fromkeys([commit.id.author])",
         "cairn_client/test_relay.py::test_a_robot_takes_back_what_an_older_incarnation_of_it_said_on_every_server",
@@ -829,7 +829,7 @@ SWITCHES = (
     Switch(
         16,
         "evidence that the upstream lacks is not forgotten",
-        "server/cairn_server/folder.py",
+        "server/cairn_server/folding/fold_thread.py",
         "before_s = min(time.time() - self._keep_evidence_s, self._may_forget_s(row.name))",
         "before_s = time.time() - self._keep_evidence_s",
         "cairn_client/test_relay.py::test_a_field_server_forgets_nothing_that_its_upstream_has_not_got",
@@ -837,7 +837,7 @@ SWITCHES = (
     Switch(
         16,
         "a relay notices other bytes under one id",
-        "client/cairn_client/relay.py",
+        "client/cairn_client/relay/round.py",
         "report.split = _split(held[Side.HERE], held[Side.THERE])",
         "pass",
         "cairn_client/test_relay.py::test_two_servers_with_other_bytes_under_one_id_are_told_apart_and_a_retract_makes_them_equal",

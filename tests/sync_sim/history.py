@@ -7,19 +7,19 @@ from random import Random
 
 import pytest
 from tests.cairn_client.made import cells_of
+from tests.memory_store import map as memory_map
 from tests.sync_sim.events import Events
 from tests.sync_sim.joined import JoinedHistory
 from tests.sync_sim.network import Network, Weather
 from tests.sync_sim.robot import SimRobot
 from tests.sync_sim.server import FoldOnRequest, SimServer
 
-from cairn_client.applying import MISFIT, Exchange
-from cairn_client.room import drop_cells
-from cairn_map import ids
-from cairn_map.fingerprint import ZERO, fingerprint
-from cairn_map.grid import CellKey
-from cairn_map.ids import OPERATOR, CommitId
-from cairn_server import memory_map
+from cairn_client.robot.cell_budget import drop_cells
+from cairn_client.sync.applying import MISFIT, Exchange
+from cairn_map.commits import ids
+from cairn_map.commits.ids import OPERATOR, CommitId
+from cairn_map.evidence.fingerprint import ZERO, fingerprint
+from cairn_map.evidence.grid import CellKey
 from cairn_server import service as service_module
 
 MODES = ("high-end", "high-end", "low-end", "viewer", "high-end")

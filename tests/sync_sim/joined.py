@@ -14,10 +14,10 @@ from tests.sync_sim.relay import Bag, SimEnd, SimRelay
 from tests.sync_sim.robot import SimRobot
 from tests.sync_sim.server import SimServer
 
-from cairn_client.asks import Ask
-from cairn_map.fingerprint import ZERO, fingerprint
-from cairn_map.ids import OPERATOR, CommitId, commit_id_from_text
-from cairn_server.handing_over import server_key
+from cairn_client.sync.requests import Ask
+from cairn_map.commits.ids import OPERATOR, CommitId, commit_id_from_text
+from cairn_map.evidence.fingerprint import ZERO, fingerprint
+from cairn_server.sync.handing_over import server_key
 
 MODES = ("high-end", "low-end", "high-end", "viewer")
 LENGTH_S = 120.0

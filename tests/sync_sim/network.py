@@ -9,10 +9,10 @@ from tests.sync_sim.events import Events
 from tests.sync_sim.robot import SimRobot
 from tests.sync_sim.server import SimServer
 
-from cairn_client.asks import Ask, GetMissing, NextFrame
-from cairn_map.begun_frames import Replies, Reply
+from cairn_client.sync.requests import Ask, GetMissing, NextFrame
 from cairn_map.errors import CairnError, UnreachableError
-from cairn_map.frames import Frame
+from cairn_map.wire.frames import Frame
+from cairn_map.wire.resumed_replies import Replies, Reply
 
 TIMEOUT_S = 8.0
 

@@ -8,16 +8,16 @@ from tests.sync_sim.events import Events
 from tests.sync_sim.network import TIMEOUT_S, Weather
 from tests.sync_sim.server import SimServer
 
-from cairn_client.asks import Ask, Conversation
-from cairn_client.relay import GiveCommit, RelayReport, Resting, Side, relay_round
-from cairn_client.relay_link import answer_of
-from cairn_map.commit_reading import open_commit
+from cairn_client.relay.link import answer_of
+from cairn_client.relay.round import GiveCommit, RelayReport, Resting, Side, relay_round
+from cairn_client.sync.requests import Ask, Conversation
+from cairn_map.commits.commit_reading import open_commit
+from cairn_map.commits.ids import CommitId
+from cairn_map.commits.version_vector import EMPTY
 from cairn_map.errors import CairnError, NotFoundError, UnreachableError
-from cairn_map.ids import CommitId
-from cairn_map.relay_end import Held, MapEnd, SignedCommit
-from cairn_map.version_vector import EMPTY
-from cairn_server.auth import Caller, Role
-from cairn_server.own_end import OwnEnd
+from cairn_map.wire.relay_peer import Held, MapEnd, SignedCommit
+from cairn_server.access.auth import Caller, Role
+from cairn_server.operations.local_peer import OwnEnd
 
 FIELD = Caller(Role.RELAY, name="field")
 

@@ -12,16 +12,16 @@ import apsw
 from tests.cairn_client.made import GEOMETRY, MAP, B, random_diff
 from tests.sync_sim.server import meta_of
 
-from cairn_client.asks import Ask, Conversation
-from cairn_client.outbox import UNNUMBERED
-from cairn_client.replica import Replica
-from cairn_client.replica_store import ReplicaStore
-from cairn_client.sync import fetch_cells, fetch_missing, push_commits
-from cairn_client.uploads import PARTS, Parts
-from cairn_map.commit import split_commit
+from cairn_client.replica.outbox import UNNUMBERED
+from cairn_client.replica.replica import Replica
+from cairn_client.replica.replica_store import ReplicaStore
+from cairn_client.sync.requests import Ask, Conversation
+from cairn_client.sync.sync import fetch_cells, fetch_missing, push_commits
+from cairn_client.sync.uploads import PARTS, Parts
+from cairn_map.commits.commit import split_commit
+from cairn_map.commits.ids import CommitId, RobotName
 from cairn_map.errors import CairnError
-from cairn_map.grid import cell_of_key
-from cairn_map.ids import CommitId, RobotName
+from cairn_map.evidence.grid import cell_of_key
 
 ROUNDS_AT_ONCE = 2
 IN_PARTS = ("r1", "r2")

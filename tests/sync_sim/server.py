@@ -3,30 +3,30 @@
 from typing import Any
 
 from tests.cairn_client.made import GEOMETRY, MAP
+from tests.memory_store.map import MemoryMap
+from tests.memory_store.store import MemoryStore
 
-from cairn_client.answers import FetchedCell
-from cairn_client.asks import Ask, GetCell, GetCommit, GetIndex, GetMissing, GetUpload, Push, PutCell, PutPart
-from cairn_map.cell_code import decode_cell
-from cairn_map.commit import CommitMeta, split_commit
-from cairn_map.cursor import Cursor
+from cairn_client.sync.requests import Ask, GetCell, GetCommit, GetIndex, GetMissing, GetUpload, Push, PutCell, PutPart
+from cairn_client.sync.responses import FetchedCell
+from cairn_map.codec.cell_code import decode_cell
+from cairn_map.commits.commit import CommitMeta, split_commit
+from cairn_map.commits.cursor import Cursor
+from cairn_map.commits.ids import OPERATOR, CommitId
+from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
-from cairn_map.evidence_map import EvidenceMap
-from cairn_map.grid import CellKey, cell_key
-from cairn_map.ids import OPERATOR, CommitId
-from cairn_map.index_messages import CellIndex
-from cairn_map.messages import CreateMap, MissingRequest, Retract
-from cairn_map.relay_end import SignedCommit
-from cairn_map.version_vector import EMPTY, VersionVector
-from cairn_server.auth import Caller, Role
-from cairn_server.cell_cache import CellCache
-from cairn_server.folding import fold_pending
-from cairn_server.handing_over import found_commit
-from cairn_server.memory_map import MemoryMap
-from cairn_server.memory_store import MemoryStore
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import CellKey, cell_key
+from cairn_map.wire.index_messages import CellIndex
+from cairn_map.wire.messages import CreateMap, MissingRequest, Retract
+from cairn_map.wire.relay_peer import SignedCommit
+from cairn_server.access.auth import Caller, Role
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.folding import fold_pending
 from cairn_server.service import Service
 from cairn_server.settings import Settings
-from cairn_server.store_rows import MapRow
-from cairn_server.uploads import Part
+from cairn_server.store.store_rows import MapRow
+from cairn_server.sync.handing_over import found_commit
+from cairn_server.sync.uploads import Part
 
 Fingerprints = dict[CellKey, str]
 
@@ -149,7 +149,7 @@ class SimServer:
             case GetIndex(author):
                 return CellIndex.model_validate_json(service.cell_index(row, author).model_dump_json())
             case GetCell(cell, etag):
-                stored, head = service.cell(row, cell_key(cell))
+                stored, head = service.cells.sound(row, cell_key(cell))
                 if stored is None:
                     raise NotFoundError("no_cell", f"cell {cell} was never seen")
                 found_etag = f'"{stored.digest.hex()}"'

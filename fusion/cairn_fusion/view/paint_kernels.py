@@ -10,7 +10,7 @@ Singles = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
 
 OK = 0
-"""`cairn_fusion.transfer.Label`."""
+"""`cairn_fusion.transfer.transfer.Label`."""
 HATCH_PERIOD, HATCH_WIDTH = 16, 3
 HATCH_GREY = 150
 HATCH_MIX = 128

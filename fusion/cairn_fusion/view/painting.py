@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cairn_fusion.bands import in_bands
+from cairn_fusion.image_fusion.row_bands import in_bands
 from cairn_fusion.view.paint_kernels import hottest_square, paint_into
 from cairn_fusion.view.temperature_scale import PALETTE, ZERO_CELSIUS_K, TemperatureScale
 from cairn_map.errors import BadInputError

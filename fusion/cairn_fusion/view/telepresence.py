@@ -15,14 +15,14 @@ from enum import StrEnum
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.poses import inverse, transform_points
-from cairn_calib.rig import Rig, Spectrum
-from cairn_fusion.across import Across, across
-from cairn_fusion.beyond_labels import beyond_pixels
-from cairn_fusion.eye_depth import EyeDepth, Origin, eye_depth
-from cairn_fusion.scan import Scan, check_scan
-from cairn_fusion.surface import Drawn, drawn_surface, surface_of
-from cairn_fusion.transfer import Label
+from cairn_calib.rig.poses import inverse, transform_points
+from cairn_calib.rig.rig import Rig, Spectrum
+from cairn_fusion.image_fusion.across import Across, across
+from cairn_fusion.image_fusion.beyond_labels import beyond_pixels
+from cairn_fusion.image_fusion.eye_depth import EyeDepth, Origin, eye_depth
+from cairn_fusion.image_fusion.surface import Drawn, drawn_surface, surface_of
+from cairn_fusion.recording.scan import Scan, check_scan
+from cairn_fusion.transfer.transfer import Label
 from cairn_fusion.view.painting import (
     Emphasis,
     Hottest,
@@ -37,8 +37,8 @@ from cairn_fusion.view.painting import (
 )
 from cairn_fusion.view.temperature_scale import TemperatureScale, locked_scale
 from cairn_map.errors import BadInputError
-from cairn_map.map_render import MapRenderer
-from cairn_map.map_snapshot import MapSnapshot
+from cairn_map.queries.map_snapshot import MapSnapshot
+from cairn_map.render.map_render import MapRenderer
 
 Rgb = npt.NDArray[np.uint8]
 Image = npt.NDArray[np.generic]

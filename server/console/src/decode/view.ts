@@ -1,6 +1,6 @@
 /** What one cell looks like, from the bytes of `application/vnd.cairn.view`: FORMAT.md section 15.
  *
- * The mirror of `decode_view` in cairn_map/view_code.py; a test compares both on real cells. */
+ * The mirror of `decode_view` in cairn_map/codec/view_code.py; a test compares both on real cells. */
 
 import { DamagedError } from "./arithmetic.ts";
 import { LeafIndex } from "./neighbours.ts";

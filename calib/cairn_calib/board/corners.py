@@ -1,0 +1,49 @@
+"""What was found of a board in an image, and, where nothing was, at which stage each attempt ended."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.board.board import Board
+
+Floats = npt.NDArray[np.float64]
+FOUND = "found"
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """One method at one scale, and how it ended."""
+
+    method: str
+    scale: float
+    stage: str
+    """`found`, or the stage or gate that refused."""
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.method} x{self.scale:g}: {self.stage}{': ' if self.reason else ''}{self.reason}"
+
+
+@dataclass(frozen=True, slots=True)
+class Corners:
+    """The points of a board in one image, in the board's order."""
+
+    board: Board
+    pixels: Floats
+    """(N, 2) x, y; NaN where a point is hidden. Of discs, the centroid of the disc's image."""
+    covariance_px2: Floats
+    """(N, 2, 2) pixels squared; NaN where a point is hidden."""
+
+    @property
+    def seen(self) -> npt.NDArray[np.bool_]:
+        """(N,) which points are there."""
+        return np.isfinite(self.pixels[:, 0])
+
+
+@dataclass(frozen=True, slots=True)
+class Detection:
+    """The corners, or None, and what was tried."""
+
+    corners: Corners | None
+    attempts: tuple[Attempt, ...]

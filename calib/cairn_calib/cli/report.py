@@ -1,0 +1,149 @@
+"""The report of a calibration that is there already: from rig.json and the corners that it was solved from.
+
+    $ cairn calib report rig.json corners/tof corners/left --output report.html
+    rig.json comes from these corners: the same to 0.0001 sigma
+    report.html: 2 warnings; the same as report.json
+
+`cairn calib solve --report` writes the same page while it solves. Here it is made again, with what has come into
+rig.json since (the radiometry of `cairn calib thermal fit`), and nothing is changed: the corners are solved once more,
+as rig.json says that it was done, and if another rig comes out, or a document is not the one that went in, that is an
+error. What rig.json does not say goes into --solved-with: `--solved-with "--flat --range ranges"`.
+
+The page is one file, to be read without a network and to be printed: what was found and how certain it is, warnings,
+the image to shoot next, residuals, coverage, certainty at 1, 2 and 5 m, radiometry, and every image with its corners.
+"""
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cairn_calib.cli.solve import add_parser as add_solve
+from cairn_calib.cli.solve import refuse_overwriting, solved, write_report
+from cairn_calib.diagnosis.examination import examined
+from cairn_calib.report.report_images import report_images
+from cairn_calib.rig.calibration import PIXEL_NAMES, POSE_UNITS
+from cairn_calib.rig.lens import Lens
+from cairn_calib.rig.range_bias import RangeBias
+from cairn_calib.rig.rig import Rig, load_rig
+from cairn_calib.solve.board_views import BoardViews
+from cairn_calib.solve.solve import Solution
+from cairn_calib.solve.solved_rig import solved_rig
+from cairn_map.errors import BadInputError
+
+if TYPE_CHECKING:
+    from argparse import _SubParsersAction
+
+SAME_SIGMAS = 0.05
+"""Two solves of the same corners differ by rounding and where an outlier's fate hangs on it."""
+
+
+def add_parser(commands: "_SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add `report` to `cairn calib`."""
+    added = commands.add_parser(
+        "report",
+        help="the report of a calibration, again, with what came to rig.json since",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    added.add_argument("rig", type=Path, metavar="RIG", help="rig.json that cairn calib solve wrote")
+    added.add_argument("folders", nargs="+", type=Path, metavar="DIR", help="of corner documents, as given to solve")
+    added.add_argument("--output", type=Path, required=True, metavar="REPORT.HTML", help="beside it the same as .json")
+    added.add_argument("--solved-with", default="", metavar="OPTIONS", help="what else solve was told, in quotes")
+    added.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Solve again, compare, and write the report."""
+    refuse_overwriting(args.output, args.rig)
+    rig = load_rig(args.rig)
+    again = solved(solve_arguments(rig, args.folders, shlex.split(args.solved_with), args.rig))
+    _refuse_other_inputs(rig, again.views, args.rig)
+    off = sigmas_apart(rig, again)
+    if not off < SAME_SIGMAS:
+        raise BadInputError(
+            "not_that_rig",
+            f"these corners give another rig than {args.rig}, {off:.3g} sigma off: tell what else it was solved with, "
+            'such as --solved-with "--flat --range DIR", or solve again if it was changed by hand',
+        )
+    sys.stdout.write(f"{args.rig} comes from these corners: the same to {max(off, 1e-4):.1g} sigma\n")
+    folders = dict(zip(again.plan.cameras, args.folders, strict=True))
+    write_report(args.output, examined(again, rig), report_images(folders))
+
+
+def solve_arguments(rig: Rig, folders: list[Path], more: list[str], path: Path) -> argparse.Namespace:
+    """The arguments of `cairn calib solve` that a rig was made with, as far as it says."""
+    calibration = rig.calibration
+    if calibration is None or calibration.covariance is None:
+        raise BadInputError(
+            "not_calibrated", f"{path} does not say how it was calibrated: cairn calib solve makes such"
+        )
+    names = [folder.resolve().name for folder in folders]
+    if sorted(names) != sorted(rig.cameras):
+        raise BadInputError(
+            "unknown_camera",
+            f"the folders must be of {path}'s cameras {', '.join(rig.cameras)}, got {', '.join(names)}",
+        )
+    arguments = ["--spectrum", ",".join(f"{name}={rig[name].spectrum}" for name in names), "--gauge", calibration.gauge]
+    intrinsic = {*PIXEL_NAMES, *POSE_UNITS}
+    for name in names:
+        free = [each.name for each in calibration.covariance.parameters if each.camera == name]
+        arguments += ["--distortion", f"{name}={','.join(each for each in free if each not in intrinsic)}"]
+    fisheyes = [name for name in names if getattr(rig[name].camera, "model", "") == "kb4"]
+    arguments += ["--fisheye", ",".join(fisheyes), "--name", rig.name, "--output", str(path), *more]
+    parser = argparse.ArgumentParser("cairn calib report --solved-with")
+    add_solve(parser.add_subparsers())
+    return parser.parse_args(["solve", *map(str, folders), *arguments])
+
+
+def sigmas_apart(rig: Rig, again: Solution) -> float:
+    """The largest difference between a rig's cameras and a solution's, in standard deviations of the solution.
+
+    With their range bias: else the page of a rig that was solved with ranges would leave them out and not say so.
+    """
+    other, sigmas = solved_rig(again, made_s=0.0), again.sigmas()
+    apart = [0.0]
+    for name, mounted in rig.cameras.items():
+        lens, theirs = mounted.camera, other[name].camera
+        if not isinstance(lens, Lens) or not isinstance(theirs, Lens) or lens.intrinsic_names != theirs.intrinsic_names:
+            return np.inf
+        for each, one, two in zip(lens.intrinsic_names, lens.intrinsics, theirs.intrinsics, strict=True):
+            apart.append(_over(one - two, sigmas.get((name, each))))
+        moved = mounted.transform[:3, 3] - other[name].transform[:3, 3]
+        turned = (mounted.transform[:3, :3] @ other[name].transform[:3, :3].T - np.eye(3))[[2, 0, 1], [1, 2, 0]]
+        for each, off in zip(POSE_UNITS, (*turned, *moved), strict=True):
+            apart.append(_over(off, sigmas.get((name, each))))
+        apart.append(_biases_apart(mounted.range_bias, other[name].range_bias))
+    return float(np.max(apart))
+
+
+def _biases_apart(one: RangeBias | None, two: RangeBias | None) -> float:
+    """The same of what a camera adds to its ranges; infinite where it is of other shapes."""
+    if one is None or two is None:
+        return 0.0 if one is two else np.inf
+    if one.names != two.names or (one.pixel_offsets is None) != (two.pixel_offsets is None):
+        return np.inf
+    sigmas = np.sqrt(np.diag(two.covariance)).tolist()
+    return max(map(_over, (one.values - two.values).tolist(), sigmas))
+
+
+def _over(difference: float, sigma: float | None) -> float:
+    """In standard deviations; what is held must be the same."""
+    return abs(difference) / sigma if sigma else (0.0 if abs(difference) < 1e-9 else np.inf)
+
+
+def _refuse_other_inputs(rig: Rig, views: BoardViews, path: Path) -> None:
+    known = {each.name: each.sha256 for each in rig.calibration.inputs} if rig.calibration else {}
+    if not known:
+        return
+    found = {each.name: each.sha256 for each in views.inputs[: len(known)]}
+    strange = sorted(name for name in known.keys() | found.keys() if known.get(name) != found.get(name))
+    if strange:
+        raise BadInputError(
+            "not_those_corners",
+            f"{path} was not solved from these corners: {strange[0]} is another, or missing"
+            f"{f', and {len(strange) - 1} more' if len(strange) > 1 else ''}; solve them to get their rig",
+        )

@@ -1,0 +1,105 @@
+"""Half of the frames against the other half: whether two solves differ by no more than they say they may.
+
+Where noise is all that is wrong, parameters differ by their joint covariance, and probe points by about their predicted
+sigma. Where the model is wrong (a lens that Brown's model cannot say, a board that moved, images taken one after the
+other), they differ by more. Small sigmas alone never show that.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.diagnosis.probe_points import Probes
+from cairn_calib.rig.pose_vectors import vector_from_transform
+from cairn_calib.solve.corner_residuals import CornerData
+from cairn_calib.solve.rig_state import value_of
+from cairn_calib.solve.solve import Solution, solve_from
+from cairn_map.errors import BadInputError
+
+Floats = npt.NDArray[np.float64]
+
+FRAMES_MIN = 3
+"""Of each camera in each half."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraHalves:
+    """How one camera's probe points differ between the halves."""
+
+    camera: str
+    difference_px: float
+    """Root mean square, one axis."""
+    predicted_px: float
+    """Of the same, from both covariances."""
+
+    @property
+    def ratio(self) -> float:
+        """Measured over predicted."""
+        return self.difference_px / max(self.predicted_px, 1e-12)
+
+
+@dataclass(frozen=True, slots=True)
+class Halves:
+    """Two halves, compared."""
+
+    cameras: tuple[CameraHalves, ...]
+    chi2: float
+    """Of all parameters' differences, by their covariances; about `parameters` if the model is right."""
+    parameters: int
+
+
+def cross_validated(solution: Solution, probes: Sequence[Probes]) -> Halves | None:
+    """Every second frame against the others; None where a half does not determine the rig."""
+    frames = solution.views.frames
+    try:
+        one, other = (_half(solution, frames[start::2]) for start in (0, 1))
+    except BadInputError:
+        return None
+    rows = _camera_rows(solution)
+    step = (_step(solution, one) - _step(solution, other))[rows]
+    covariance = (one.covariance + other.covariance)[np.ix_(rows, rows)]
+    cameras = []
+    for each in probes:
+        G = each.rows[..., rows]
+        moved = G @ step
+        predicted = np.einsum("rip,pq,riq->r", G, covariance, G, optimize=True) / 2
+        cameras.append(CameraHalves(each.camera, float(np.sqrt(np.mean(moved**2))), float(np.sqrt(predicted.mean()))))
+    return Halves(tuple(cameras), float(step @ np.linalg.solve(covariance, step)), len(rows))
+
+
+def _half(solution: Solution, frames: Sequence[str]) -> Solution:
+    views = solution.views.of_frames(frames)
+    for camera in views.cameras:
+        if len(views.of_camera(camera)) < FRAMES_MIN:
+            raise BadInputError("not_observable", f"{camera} has too few frames for two halves")
+    every = solution.views.frames
+    rows = [every.index(frame) for frame in views.frames]
+    state = replace(solution.state, T_rig_board=solution.state.T_rig_board[rows])
+    scales = {
+        solution.views.cameras[sensor.data.camera]: sensor.scale
+        for sensor in solution.adjusted.problem.sensors
+        if isinstance(sensor.data, CornerData)
+    }
+    terms = None if solution.ranges is None else solution.ranges.terms
+    return solve_from(views, replace(solution.plan, range_terms=terms), state, scales)
+
+
+def _camera_rows(solution: Solution) -> npt.NDArray[np.intp]:
+    """Where the cameras' parameters stand: warp and scale are not compared, nor the nodes, many of which nobody saw."""
+    names = solution.layout.names
+    cameras = solution.plan.cameras
+    return np.array([n for n, (o, name) in enumerate(names) if o in cameras and not name.startswith("node")], np.intp)
+
+
+def _step(solution: Solution, half: Solution) -> Floats:
+    """(P,) from the solution to a half's: differences of parameters, errors of poses."""
+    step = value_of(half.state, half.layout) - value_of(solution.state, solution.layout)
+    for n, at in enumerate(solution.layout.pose_at):
+        if len(at):
+            T, T_half = solution.state.T_rig_camera[n], half.state.T_rig_camera[n]
+            turn = np.eye(4)
+            turn[:3, :3] = T_half[:3, :3] @ T[:3, :3].T
+            step[at] = np.concatenate([vector_from_transform(turn)[:3], T_half[:3, 3] - T[:3, 3]])
+    return step

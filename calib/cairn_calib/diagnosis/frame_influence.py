@@ -1,0 +1,69 @@
+"""What each frame does to a solution: how far everything would move without it, and what one more would add.
+
+    (S - S_f) da = -a_f          S: the reduced normal equations of all; S_f, a_f: the frame's share of them
+
+One step of Newton's from the solution: nothing is solved again. The same shares, of frames that are not yet taken, tell
+by how much they would sharpen the rig (`next_image.py`).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.diagnosis.probe_points import Probes
+from cairn_calib.solve.normal_equations import Block, solved_scaled
+from cairn_calib.solve.solve import Solution
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Influence:
+    """Of one frame."""
+
+    frame: str
+    moves_px: float
+    """How far the solution's probe points would move without it: the most moved of any camera."""
+    camera: str
+    """In which."""
+    sigmas: float
+    """The most moved point in its own standard deviations, of any camera."""
+
+
+def frame_shares(blocks: list[Block], size: int, frame_count: int, *, floor: float = 0.0) -> tuple[Floats, Floats]:
+    """(F, P, P) and (F, P): each frame's part of the reduced normal equations, its board eliminated.
+
+    `floor` is added to the diagonal of each board's own, so that one that nobody sees takes no effect.
+    """
+    A, a = np.zeros((frame_count, size, size)), np.zeros((frame_count, size))
+    B, C, b = np.zeros((frame_count, size, 6)), np.zeros((frame_count, 6, 6)), np.zeros((frame_count, 6))
+    for block in blocks:
+        k = len(block.at)
+        A[np.ix_(block.frames, block.at, block.at)] += block.square[:, :k, :k]
+        a[np.ix_(block.frames, block.at)] += block.pull[:, :k]
+        B[np.ix_(block.frames, block.at)] += block.square[:, :k, k:]
+        C[block.frames] += block.square[:, k:, k:]
+        b[block.frames] += block.pull[:, k:]
+    solved = np.linalg.solve(C + floor * np.eye(6), np.concatenate([np.swapaxes(B, 1, 2), b[..., None]], axis=2))
+    return A - B @ solved[..., :-1], a - (B @ solved[..., -1:])[..., 0]
+
+
+def influences(solution: Solution, probes: list[Probes]) -> list[Influence]:
+    """Of every frame, the strongest first; frames without which nothing is determined are infinitely strong."""
+    done = solution.adjusted
+    S, _, _, _ = done.normal.reduced()
+    shares, pulls = frame_shares(done.blocks, solution.layout.size, len(solution.views.frames))
+    sigmas = [each.sigmas_px(solution.covariance) for each in probes]
+    result = []
+    for frame, share, pull in zip(solution.views.frames, shares, pulls, strict=True):
+        try:
+            step = solved_scaled(S - share, -pull)
+        except np.linalg.LinAlgError:
+            result.append(Influence(frame, np.inf, probes[0].camera, np.inf))
+            continue
+        moves = [np.linalg.norm(each.rows @ step, axis=1) for each in probes]
+        most = max(range(len(probes)), key=lambda n: float(moves[n].max()))
+        strongest = max(float((move / sigma).max()) for move, sigma in zip(moves, sigmas, strict=True))
+        result.append(Influence(frame, float(moves[most].max()), probes[most].camera, strongest))
+    return sorted(result, key=lambda each: -each.sigmas)

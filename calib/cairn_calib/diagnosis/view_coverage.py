@@ -1,0 +1,62 @@
+"""How much of each camera's image, and of what lies before it, the boards covered."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig.poses import inverse
+from cairn_calib.solve.camera_alone import tilt_range_deg
+from cairn_calib.solve.solve import Solution
+
+Floats = npt.NDArray[np.float64]
+
+CELLS = (8, 6)
+"""Columns and rows that an image is divided into."""
+
+
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """Of one camera."""
+
+    camera: str
+    images: int
+    counts: npt.NDArray[np.intp]
+    """(6, 8) corners in each part of the image."""
+    radius_share: float
+    """The outermost corner's distance from the image's middle, over the image's corner's."""
+    tilt_deg: float
+    """Largest angle between two boards."""
+    nearest_m: float
+    farthest_m: float
+    """Distances of the boards' middles."""
+
+    @property
+    def cell_share(self) -> float:
+        """Of the parts of the image, those with corners."""
+        return float(np.mean(self.counts > 0))
+
+
+def coverage(solution: Solution, camera: str) -> Coverage:
+    """What the boards covered of a camera's image."""
+    views = solution.views.of_camera(camera)
+    width, height = solution.views.sizes_px[camera]
+    pixels = np.concatenate([view.corners.pixels[view.corners.seen] for view in views])
+    counts, _, _ = np.histogram2d(
+        pixels[:, 1], pixels[:, 0], bins=(CELLS[1], CELLS[0]), range=((-0.5, height - 0.5), (-0.5, width - 0.5))
+    )
+    middle = np.array([width - 1, height - 1]) / 2
+    frames = [solution.views.frames.index(view.frame) for view in views]
+    T_camera_rig = inverse(solution.state.T_rig_camera[solution.views.cameras.index(camera)])
+    T_camera_board = T_camera_rig @ solution.state.T_rig_board[frames]
+    board_middle = solution.views.board.points().mean(axis=0)
+    distances = np.linalg.norm(T_camera_board[:, :3, :3] @ board_middle + T_camera_board[:, :3, 3], axis=1)
+    return Coverage(
+        camera,
+        len(views),
+        counts.astype(np.intp),
+        float(np.linalg.norm(pixels - middle, axis=1).max() / np.linalg.norm(middle)),
+        tilt_range_deg(T_camera_board),
+        float(distances.min()),
+        float(distances.max()),
+    )

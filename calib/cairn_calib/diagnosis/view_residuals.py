@@ -1,0 +1,61 @@
+"""How well each image's corners were met by a solution, and which were left out."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.solve.corner_residuals import CornerData, corner_misses
+from cairn_calib.solve.rig_state import warp_shape
+from cairn_calib.solve.solve import Solution
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class ViewResiduals:
+    """Of one image."""
+
+    camera: str
+    frame: str
+    image: str
+    pixels: Floats
+    """(M, 2) of the corners that were found."""
+    misses_px: Floats
+    """(M, 2) predicted minus found."""
+    kept: npt.NDArray[np.bool_]
+    """(M,) which count."""
+
+    @property
+    def outliers(self) -> int:
+        """How many do not."""
+        return int(np.sum(~self.kept))
+
+    @property
+    def rms_px(self) -> float:
+        """Of one axis, of those that count."""
+        return float(np.sqrt(np.mean(self.misses_px[self.kept] ** 2))) if self.kept.any() else float("nan")
+
+
+def view_residuals(solution: Solution) -> list[ViewResiduals]:
+    """Of every image, by camera and frame."""
+    board = (solution.views.board.points(), warp_shape(solution.views.board))
+    result = []
+    for sensor in solution.adjusted.problem.sensors:
+        if not isinstance(sensor.data, CornerData):
+            continue
+        misses = corner_misses(sensor.data, solution.state, *board)
+        views = solution.views.of_camera(solution.views.cameras[sensor.data.camera])
+        for n, view in enumerate(views):
+            seen = sensor.there[n]
+            result.append(
+                ViewResiduals(
+                    view.camera,
+                    view.frame,
+                    view.image,
+                    sensor.data.pixels[n, seen],
+                    misses[n, seen],
+                    sensor.kept[n, seen],
+                )
+            )
+    return result

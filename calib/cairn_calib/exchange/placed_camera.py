@@ -1,0 +1,81 @@
+"""Cameras as other calibration programs' files hold them: a name, a lens, and a place in a common frame.
+
+    rig.json  <->  (PlacedCamera, ...)  <->  Kalibr, OpenCV, ROS, mrcal           a module each
+
+Each format's module reads text into `Foreign` and writes a sequence of placed cameras. A number that changes where a
+pixel looks and has no counterpart on the other side is an error that names it; what a file says besides, which no rig
+holds, is listed, so that whoever converts can tell the user.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from cairn_calib.rig.lens import Lens
+from cairn_calib.rig.poses import Transform
+from cairn_map.errors import BadInputError, first_error
+
+TEXT_BYTES_MAX = 1 << 24
+"""A .cameramodel with all that mrcal knows of its solve is some hundred kilobytes."""
+KIND = "bad_camera_file"
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+Model = TypeVar("Model", bound=BaseModel)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedCamera:
+    """One camera; `T_rig_camera` is None where the file has no place for a place."""
+
+    name: str
+    camera: Lens
+    T_rig_camera: Transform | None
+
+    def __post_init__(self) -> None:
+        if not NAME.fullmatch(self.name):
+            raise BadInputError(
+                KIND, f"a camera's name must be letters, digits, _, . or -, at most 64, got {self.name[:80]!r}"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Foreign:
+    """The cameras of a file, and the fields of it that a rig does not hold."""
+
+    cameras: tuple[PlacedCamera, ...]
+    left_out: tuple[str, ...] = ()
+
+
+def checked(model: type[Model], document: object, *, name: str) -> Model:
+    """What a file says, as a model.
+
+    Raises:
+        BadInputError: a field is missing or wrong; the message names it.
+    """
+    try:
+        return model.model_validate(document)
+    except ValidationError as exc:
+        raise BadInputError(KIND, f"{name}: {first_error(exc)}") from exc
+
+
+def only_camera(cameras: Sequence[PlacedCamera], *, format_name: str) -> PlacedCamera:
+    """The camera of a format that holds one.
+
+    Raises:
+        BadInputError: there are several.
+    """
+    if len(cameras) != 1:
+        names = ", ".join(each.name for each in cameras)
+        raise BadInputError(
+            KIND,
+            f"a file of {format_name} holds one camera, the rig has {names}: write them to one file each, with "
+            "{camera} in OUT, or choose one with --camera",
+        )
+    return cameras[0]
+
+
+def not_held(camera: PlacedCamera, field: str, why: str) -> BadInputError:
+    """What to raise where a format cannot say a number."""
+    return BadInputError(KIND, f"cameras.{camera.name}.{field}: {why}")

@@ -1,0 +1,156 @@
+"""Rigs from and to the files of Kalibr, OpenCV, ROS and mrcal: which format a file is of, what each side cannot say.
+
+None of these formats says which spectrum a camera sees, how a range camera measures, or how certain anything is. The
+spectrum comes from whoever converts; what a rig says and the other file cannot is refused by name, until it is named
+to be left out.
+"""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from pydantic import ValidationError
+
+from cairn_calib.exchange.kalibr_camchain import read_kalibr, write_kalibr
+from cairn_calib.exchange.mrcal_cameramodel import read_mrcal, write_mrcal
+from cairn_calib.exchange.opencv_yaml import read_opencv, write_opencv
+from cairn_calib.exchange.placed_camera import KIND, TEXT_BYTES_MAX, Foreign, PlacedCamera
+from cairn_calib.exchange.ros_camera_info import read_ros, write_ros
+from cairn_calib.rig.lens import Lens
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_map.errors import BadInputError, first_error
+
+RIG = "rig"
+DROPPABLE = ("T_rig_camera", "sensing", "calibration_sigma_px", "radiometry", "range_bias", "body", "calibration")
+"""Fields of a rig that may be left out: none of them changes where a pixel of a camera looks in that camera's frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """How a format's text is read and written, and whether it says where a camera is."""
+
+    read: Callable[..., Foreign]
+    write: Callable[[Sequence[PlacedCamera]], str]
+    holds_place: bool
+
+
+FORMATS = {
+    "kalibr": Format(read_kalibr, write_kalibr, holds_place=True),
+    "opencv": Format(read_opencv, write_opencv, holds_place=True),
+    "ros": Format(read_ros, write_ros, holds_place=False),
+    "mrcal": Format(read_mrcal, write_mrcal, holds_place=True),
+}
+
+
+def format_of_text(path: Path, text: str) -> str:
+    """The format of a file, by its suffix and, where several share one, by what it holds.
+
+    Raises:
+        BadInputError: none of them.
+    """
+    if path.suffix == ".json":
+        return RIG
+    if path.suffix == ".cameramodel":
+        return "mrcal"
+    if re.search(r"^cam0\s*:", text, re.MULTILINE):
+        return "kalibr"
+    if text.lstrip("\ufeff").startswith("%YAML") or "!!opencv-matrix" in text:
+        return "opencv"
+    if re.search(r"^camera_matrix\s*:", text, re.MULTILINE):
+        return "ros"
+    raise BadInputError(
+        KIND,
+        f"{path.name} is of no known format: expected rig.json, a .cameramodel, or YAML of Kalibr (cam0), OpenCV or "
+        "ROS (camera_matrix)",
+    )
+
+
+def read_text(path: Path) -> str:
+    """The text of a camera file.
+
+    Raises:
+        BadInputError: it cannot be read, is too large or no text.
+    """
+    try:
+        if path.stat().st_size > TEXT_BYTES_MAX:
+            raise BadInputError(KIND, f"{path} must be at most {TEXT_BYTES_MAX} bytes, got {path.stat().st_size}")
+        return path.read_text(encoding="utf-8")
+    except OSError as exc:
+        raise BadInputError(KIND, f"cannot read {path}: {exc.strerror}") from exc
+    except UnicodeDecodeError as exc:
+        raise BadInputError(KIND, f"{path} is no text: {exc.reason} at byte {exc.start}") from exc
+
+
+def cameras_of_rig(rig: Rig, *, format_name: str, drop: Sequence[str] = ()) -> Foreign:
+    """The cameras of a rig for a format; what it cannot say must be dropped.
+
+    Raises:
+        BadInputError: the rig says something that the format cannot; the message names all of it, and what to do.
+    """
+    held = FORMATS[format_name].holds_place
+    said: list[str] = []
+    placed = []
+    for name, each in rig.cameras.items():
+        if not isinstance(each.camera, Lens):
+            raise BadInputError(
+                KIND, f"cameras.{name}.camera: {format_name} has no spinning lidar; choose others with --camera"
+            )
+        optional = ("sensing", "calibration_sigma_px", "radiometry", "range_bias")
+        said += [f"cameras.{name}.{field}" for field in optional if getattr(each, field)]
+        is_said = held and "T_rig_camera" not in drop
+        if not is_said and not np.array_equal(each.transform, np.eye(4)):
+            said.append(f"cameras.{name}.T_rig_camera")
+        placed.append(PlacedCamera(name, each.camera, each.transform if is_said else None))
+    said += [field for field in ("body", "calibration") if getattr(rig, field)]
+    refused = [field for field in said if field.rpartition(".")[2] not in drop]
+    if refused:
+        fields = dict.fromkeys(field.rpartition(".")[2] for field in refused)
+        raise BadInputError(
+            KIND, f"{format_name} cannot say {', '.join(refused)}; to leave that out, add --drop {','.join(fields)}"
+        )
+    return Foreign(tuple(placed), (*said, *(f"cameras.{name}.spectrum" for name in rig.cameras)))
+
+
+def chosen(cameras: Sequence[PlacedCamera], names: Sequence[str]) -> tuple[PlacedCamera, ...]:
+    """The cameras with these names, in this order; all of them where no name is given.
+
+    Raises:
+        BadInputError: there is no such camera, or two have one name.
+    """
+    by_name = {each.name: each for each in cameras}
+    if len(by_name) < len(cameras):
+        raise BadInputError(KIND, f"two cameras have one name: {', '.join(each.name for each in cameras)}")
+    if missing := [name for name in names if name not in by_name]:
+        raise BadInputError("unknown_camera", f"there is no camera {missing[0]!r}; there are {', '.join(by_name)}")
+    return tuple(by_name[name] for name in names) if names else tuple(cameras)
+
+
+def rig_of_cameras(cameras: Sequence[PlacedCamera], *, name: str, spectra: Mapping[str, Spectrum]) -> Rig:
+    """A rig of cameras that were read from other files.
+
+    Args:
+        cameras: of which one alone may be without a place: it is the rig's frame then.
+        name: the rig's.
+        spectra: by camera.
+
+    Raises:
+        BadInputError: a spectrum or a place is missing, or the name is none.
+    """
+    if unknown := [each.name for each in cameras if each.name not in spectra]:
+        wanted = ",".join(f"{each}=colour" for each in unknown)
+        raise BadInputError(
+            KIND, f"which spectrum {', '.join(unknown)} sees is not in the file: add --spectrum {wanted}"
+        )
+    if len(cameras) == 1 and cameras[0].T_rig_camera is None:
+        cameras = [replace(cameras[0], T_rig_camera=np.eye(4))]
+    parts = {}
+    for each in cameras:
+        if each.T_rig_camera is None:
+            raise BadInputError(KIND, f"where {each.name} is on the rig is not in the file (T_rig_camera)")
+        parts[each.name] = mounted(spectra[each.name], each.camera, each.T_rig_camera)
+    try:
+        return Rig(name=name, cameras=parts)
+    except ValidationError as exc:
+        raise BadInputError("bad_rig", f"{name}: {first_error(exc)}") from exc

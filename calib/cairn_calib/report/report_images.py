@@ -1,0 +1,87 @@
+"""The images of a calibration for its report: small, with the corners that were found, or why there are none.
+
+`cairn calib corners` draws every image beside its document; here they are made small enough for one page.
+"""
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+from cairn_calib.board.corner_file import CornerFile, read_corner_file
+from cairn_calib.board.corner_pictures import thumbnail
+from cairn_calib.diagnosis.view_residuals import ViewResiduals
+
+IMAGES_MAX = 60
+"""Of one camera: a page of some megabytes at the most."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReportImage:
+    """One image of a camera."""
+
+    document: CornerFile
+    picture: bytes | None
+    """JPEG; None where there is no picture beside the document."""
+
+
+def report_images(folders: Mapping[str, Path]) -> dict[str, list[ReportImage]]:
+    """The images in folders of corner documents, by camera; the first sixty of each."""
+    return {
+        camera: [
+            ReportImage(read_corner_file(path), thumbnail(path.with_suffix(".png")))
+            for path in sorted(folder.glob("*.json"))[:IMAGES_MAX]
+        ]
+        for camera, folder in folders.items()
+    }
+
+
+def images_section(images: Mapping[str, Sequence[ReportImage]], residuals: Sequence[ViewResiduals]) -> str:
+    """HTML: every image with its corners; nothing where there are no pictures."""
+    met = {(each.camera, each.image): each for each in residuals}
+    parts = []
+    for camera, own in images.items():
+        drawn = [each for each in own if each.picture is not None]
+        figures = "".join(_figure(each, met.get((camera, each.document.image))) for each in drawn)
+        parts.append(f'<h3>{escape(camera)}</h3><div class="shots">{figures}</div>' if figures else "")
+    told = (
+        "<p>Corners joined in their order, the first one ringed. Look at these when something is wrong: what was taken "
+        "for the board and is none, or named from the other end, shows here.</p>"
+    )
+    return f"<h2>Images and their corners</h2>{told}{''.join(parts)}" if any(parts) else ""
+
+
+def _figure(image: ReportImage, met: ViewResiduals | None) -> str:
+    document = image.document
+    if not document.corners:
+        last = document.attempts[-1] if document.attempts else None
+        told = f"no board ({last.stage}: {last.reason})" if last else "no board"
+    elif met is None:
+        told = f"{len(document.corners)} corners, not used"
+    else:
+        out = f", {met.outliers} left out" if met.outliers else ""
+        told = f"{len(document.corners)} corners{out}, rms {met.rms_px:.2f} px"
+    return f"<figure>{_drawn(image)}<figcaption><b>{escape(document.image)}</b> {escape(told)}</figcaption></figure>"
+
+
+def _drawn(image: ReportImage) -> str:
+    """The picture with its corners over it, as SVG: fine lines stay fine where it is printed."""
+    document = image.document
+    width, height = document.width or 1, document.height or 1  # only of images without a picture are there none
+    line = width / 200
+    data = base64.b64encode(image.picture or b"").decode()
+    parts = [
+        f'<svg viewBox="-0.5 -0.5 {width} {height}" role="img" aria-label="{escape(document.image)}">'
+        f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" href="data:image/jpeg;base64,{data}"/>'
+    ]
+    if document.corners:
+        places = sorted((each.row, each.column, *each.pixel) for each in document.corners)
+        path = " ".join(f"{x:.1f},{y:.1f}" for _, _, x, y in places)
+        x, y = places[0][2:]
+        parts.append(
+            f'<polyline points="{path}" fill="none" stroke="#ff5a1f" stroke-width="{line:.2f}"/>'
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{4 * line:.1f}" fill="none" stroke="#19c37d" '
+            f'stroke-width="{1.5 * line:.2f}"/>'
+        )
+    return "".join([*parts, "</svg>"])

@@ -1,0 +1,285 @@
+"""A rig: the cameras of one sensor head and where each sits on it; `rig.json` on disk.
+
+    {"format": "cairn-rig", "version": 1, "name": "orpheus-head",
+     "cameras": {"tof": {"spectrum": "range", "camera": {...}, "T_rig_camera": [[...], ...]}, ...}}
+
+`T_rig_camera` maps points from the camera's frame to the rig's, in metres. Which camera sees which
+spectrum is part of the rig, so an image's meaning never depends on its file name. A camera without `model` is a
+pinhole; a fisheye says `"model": "kb4"`, a spinning lidar `"model": "spinning"`. What is optional and not said is not
+in the document either: `sensing` and `range_bias` of a range camera, `calibration_sigma_px` of a camera, the robot's
+`body`, and how the numbers came about and how certain they are (`calibration`).
+"""
+
+import hashlib
+from enum import StrEnum
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, field_validator, model_validator
+
+from cairn_calib.rig.body import Body
+from cairn_calib.rig.calibration import Calibration
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.fisheye import FisheyeCamera
+from cairn_calib.rig.lidar import SpinningLidar
+from cairn_calib.rig.poses import Transform, checked_transform
+from cairn_calib.rig.radiometry import Radiometry
+from cairn_calib.rig.range_bias import RangeBias, Real
+from cairn_calib.rig.raster import Raster
+from cairn_calib.rig.sensing import LIDAR, TIME_OF_FLIGHT, RangeSensing
+from cairn_map.errors import BadInputError, first_error
+
+RIG_BYTES_MAX = 4 << 20
+"""A covariance of all parameters is 0.9 MB, a map of 640 x 480 pixels' offsets as much."""
+VERSION = 1
+Row = tuple[float, float, float, float]
+
+
+class Spectrum(StrEnum):
+    """What a camera's pixels mean."""
+
+    RANGE = "range"
+    """Time of flight: metres along the beam, and optionally the amplitude (near infrared) that came back."""
+    COLOUR = "colour"
+    """Visible: sRGB, 8 bits."""
+    THERMAL = "thermal"
+    """Far infrared: apparent temperature in kelvin."""
+
+
+def _model_of(camera: object) -> str | None:
+    """Which model a camera in a document has; None: one that there is not."""
+    if not isinstance(camera, dict):
+        return str(getattr(camera, "model", "pinhole"))
+    if "model" not in camera:
+        return "pinhole"
+    return str(camera["model"]) if camera["model"] in ("kb4", "spinning") else None
+
+
+class MountedCamera(BaseModel, frozen=True):
+    """One camera and its place on the rig; a lidar's spectrum is range."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    spectrum: Spectrum
+    # One model is tried, not both: the message of a refusal is about what was meant.
+    camera: Annotated[
+        Annotated[Camera, Tag("pinhole")]
+        | Annotated[FisheyeCamera, Tag("kb4")]
+        | Annotated[SpinningLidar, Tag("spinning")],
+        Discriminator(
+            _model_of,
+            custom_error_type="camera_model",
+            custom_error_message="model must be 'kb4' (a fisheye), 'spinning' (a lidar), or absent (a pinhole)",
+        ),
+    ]
+    T_rig_camera: tuple[Row, Row, Row, Row]
+    sensing: RangeSensing | None = None
+    """Of a range camera."""
+    calibration_sigma_px: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
+    """How far off, in its own pixels, points of the range camera are expected in it: one axis, standard deviation."""
+    radiometry: Radiometry | None = None
+    """Of a thermal camera: what its counts mean."""
+    range_bias: RangeBias | None = None
+    """Of a range camera with a lens: what it adds to its ranges."""
+
+    @model_validator(mode="after")
+    def _rigid(self) -> Self:
+        try:
+            checked_transform(self.T_rig_camera, name="T_rig_camera")
+        except BadInputError as exc:
+            raise ValueError(exc.message) from exc
+        return self
+
+    @model_validator(mode="after")
+    def _lidar_measures_range(self) -> Self:
+        if isinstance(self.camera, SpinningLidar) and self.spectrum is not Spectrum.RANGE:
+            raise ValueError(f"a spinning lidar's spectrum must be range, got {self.spectrum}")
+        return self
+
+    @model_validator(mode="after")
+    def _range_is_sensed_by_range_cameras(self) -> Self:
+        if self.sensing is not None and self.spectrum is not Spectrum.RANGE:
+            raise ValueError(f"sensing is of range cameras, not of {self.spectrum}")
+        return self
+
+    @model_validator(mode="after")
+    def _temperatures_are_of_thermal_cameras(self) -> Self:
+        if self.radiometry is not None and self.spectrum is not Spectrum.THERMAL:
+            raise ValueError(f"radiometry is of thermal cameras, not of {self.spectrum}")
+        return self
+
+    @model_validator(mode="after")
+    def _biases_are_of_range_cameras(self) -> Self:
+        is_lidar = isinstance(self.camera, SpinningLidar)
+        if self.range_bias is not None and (is_lidar or self.spectrum is not Spectrum.RANGE):
+            other = "lidars" if is_lidar else str(self.spectrum)
+            raise ValueError(f"range_bias is of range cameras with a lens, not of {other}")
+        offsets = None if self.range_bias is None else self.range_bias.pixel_offsets
+        if offsets is not None and (offsets.width, offsets.height) != (self.camera.width, self.camera.height):
+            raise ValueError(
+                f"range_bias.pixel_offsets must be of the camera's {self.camera.width} x {self.camera.height} pixels, "
+                f"got {offsets.width} x {offsets.height}"
+            )
+        return self
+
+    @property
+    def transform(self) -> Transform:
+        """`T_rig_camera` as (4, 4) float64, read-only."""
+        return _transform_of(self.T_rig_camera)
+
+    @property
+    def known_sensing(self) -> RangeSensing:
+        """What is said of a range camera; nothing, where nothing is said."""
+        return self.sensing or RangeSensing()
+
+    def range_sigma_m(self, range_m: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+        """(...) standard deviation of the range camera at ranges, metres: as stated, else as is usual.
+
+        What is not known of its `range_bias` is in it, as if it were noise.
+        """
+        sigma_m = self.range_noise_m(range_m)
+        return sigma_m if self.range_bias is None else np.hypot(sigma_m, self.range_bias.sigma_at(range_m))
+
+    def range_sigma_image(self, range_m: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+        """(H, W) the same for an image of ranges, with what is known of each pixel's own part of `range_bias`."""
+        if self.range_bias is None:
+            return self.range_sigma_m(range_m)
+        usual = self.known_sensing.sigma_at(range_m, usual=TIME_OF_FLIGHT)
+        return np.hypot(usual, self.range_bias.sigma_image(self.camera, range_m))
+
+    def range_noise_m(self, range_m: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+        """(...) the same without the bias: what is independent from pixel to pixel."""
+        usual = LIDAR if isinstance(self.camera, SpinningLidar) else TIME_OF_FLIGHT
+        return self.known_sensing.sigma_at(range_m, usual=usual)
+
+    def true_ranges(
+        self, range_m: npt.NDArray[Real], amplitude: npt.NDArray[np.generic] | None = None
+    ) -> npt.NDArray[Real]:
+        """(H, W) ranges, metres, of (H, W) that the range camera measured: without its bias.
+
+        The same array where the rig states no bias. `amplitude` are counts, (H, W); None: the usual ones.
+
+        Raises:
+            BadInputError: an image has another size.
+        """
+        return range_m if self.range_bias is None else self.range_bias.true_image(self.camera, range_m, amplitude)
+
+    def true_points(self, points: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+        """(N, 3) points in the range camera's frame, metres, of (N, 3) that it measured: each moved along its ray.
+
+        The pixel of a point is where the camera sees it; its amplitude is taken for the usual one. The same array where
+        the rig states no bias.
+
+        Raises:
+            BadInputError: a point is not in the camera's image, so it is of another sensor.
+        """
+        if self.range_bias is None:
+            return points
+        known = np.isfinite(points).all(axis=1) & points.any(axis=1)  # its own place is no point
+        pixels = self.camera.project(points[known])
+        if strange := int((~self.camera.contains(pixels)).sum()):
+            raise BadInputError(
+                "bad_points",
+                f"{strange} of {len(points)} points are not in the image of the range camera ({self.camera.width} x "
+                f"{self.camera.height} pixels), so its range_bias cannot be taken off: name the camera they are of",
+            )
+        measured_m = np.linalg.norm(points[known].astype(np.float64), axis=1)
+        share = self.range_bias.true_at(self.camera, pixels, measured_m) / measured_m
+        true = points.astype(np.float64)
+        true[known] *= share[:, None]
+        return true
+
+
+@lru_cache(maxsize=256)
+def _transform_of(rows: tuple[Row, Row, Row, Row]) -> Transform:
+    # Kept: to make a rotation orthonormal takes 0.2 ms, as long as all the rest that is asked of a rig for a scan.
+    T = checked_transform(rows, name="T_rig_camera")
+    T.setflags(write=False)
+    return T
+
+
+class Rig(BaseModel):
+    """The cameras of one head by name; at least one, and all that are needed to read its images."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    format: Literal["cairn-rig"] = "cairn-rig"
+    version: Literal[1] = 1
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+    cameras: Annotated[dict[str, MountedCamera], Field(min_length=1, max_length=32)]
+    body: Body | None = None
+    """Of the robot that carries it."""
+    calibration: Calibration | None = None
+    """How the numbers came about, and how certain they are."""
+
+    @field_validator("version", mode="before")
+    @classmethod
+    def _known_version(cls, value: object) -> object:
+        if value != VERSION:
+            raise ValueError(f"this cairn reads version {VERSION}, the file is of {value!r}: a newer cairn wrote it")
+        return value
+
+    @model_validator(mode="after")
+    def _calibration_is_of_its_cameras(self) -> Self:
+        if self.calibration is not None:
+            self.calibration.check_cameras({name: each.camera for name, each in self.cameras.items()})
+            gauge = self.calibration.gauge
+            if not np.array_equal(self.cameras[gauge].transform, np.eye(4)):
+                raise ValueError(f"calibration.gauge is {gauge}: its T_rig_camera must be the identity")
+        return self
+
+    def __getitem__(self, name: str) -> MountedCamera:
+        try:
+            return self.cameras[name]
+        except KeyError:
+            raise BadInputError(
+                "unknown_camera", f"rig {self.name} has no camera {name!r}; it has {', '.join(self.cameras)}"
+            ) from None
+
+    def of_spectrum(self, spectrum: Spectrum) -> list[str]:
+        """Names of the cameras of one spectrum, in the rig's order."""
+        return [name for name, mounted in self.cameras.items() if mounted.spectrum is spectrum]
+
+    def to_json(self) -> bytes:
+        """The rig as `rig.json` bytes; the mirror of `rig_from_json`."""
+        return self.model_dump_json(indent=1, exclude_none=True).encode() + b"\n"
+
+    def digest(self) -> str:
+        """SHA-256, in hex, of the JSON bytes; commits carry it, so that a bad calibration can be found and undone."""
+        return hashlib.sha256(self.to_json()).hexdigest()
+
+
+def mounted(spectrum: Spectrum, camera: Raster, T_rig_camera: Transform) -> MountedCamera:
+    """A camera at a place given as an array."""
+    rows = [tuple(float(v) for v in row) for row in np.asarray(T_rig_camera)]
+    return MountedCamera.model_validate({"spectrum": spectrum, "camera": camera, "T_rig_camera": rows})
+
+
+def rig_from_json(data: bytes) -> Rig:
+    """The rig in `rig.json` bytes.
+
+    Raises:
+        BadInputError: not JSON, too large, or a field is missing or out of range; the message names the field.
+    """
+    if len(data) > RIG_BYTES_MAX:
+        raise BadInputError("bad_rig", f"rig.json must be at most {RIG_BYTES_MAX} bytes, got {len(data)}")
+    try:
+        return Rig.model_validate_json(data)
+    except ValidationError as exc:
+        raise BadInputError("bad_rig", f"rig.json: {first_error(exc)}") from exc
+
+
+def load_rig(path: Path | str) -> Rig:
+    """The rig in a file.
+
+    Raises:
+        BadInputError: the file is missing or not a rig.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as exc:
+        raise BadInputError("bad_rig", f"cannot read {path}: {exc.strerror}") from exc
+    return rig_from_json(data)

@@ -1,0 +1,220 @@
+"""Joint least squares: Levenberg and Marquardt's damping, robust loss, outliers, and the noise of each sensor.
+
+    1. Huber's loss (k = 1.5 sigma), noise from the median         -> close, whatever is wrong with some corners
+    2. least squares over what is within 4 sigma; noise of each sensor by its share of the redundancy (variance
+       components, Foerstner 1979); what fits again is let in again; until nothing changes
+
+Residuals are whitened by their corners' covariances, and by one scale for each sensor: pixels of a time-of-flight and a
+colour camera cannot be compared otherwise.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.board.board import Board
+from cairn_calib.solve.corner_residuals import CornerData, corner_block
+from cairn_calib.solve.normal_equations import Block, Loss, NormalEquations, Uncertainty, gathered, uncertainty
+from cairn_calib.solve.range_residuals import RangeData, range_block
+from cairn_calib.solve.rig_state import Layout, RigState, moved, value_of, warp_shape
+from cairn_calib.solve.solve_plan import Noise, Prior
+
+Floats = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+STEPS_MAX = 100
+DAMPING, DAMPING_MIN, DAMPING_MAX = 1e-4, 1e-12, 1e10
+WARM = 1e-8
+"""Damping near a minimum, where it would only slow down what is weakly determined."""
+ROUNDING = 1e-12
+"""Relative rise of the cost that is none."""
+SETTLED = 1e-10
+"""Expected fall of the cost, in squared sigmas, below which a step is not worth it: 1e-5 sigma."""
+COARSE = 1e-2
+"""The same where outliers and noise are still to be found: a tenth of a sigma."""
+SCALE_SETTLED = 1e-3
+"""Relative change of a sensor's noise."""
+MEDIAN_SQUARE = {1: 0.4549, 2: 1.3863}
+"""Of chi2 with 1 and 2 degrees of freedom."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """One source of residuals, and how its noise stands."""
+
+    data: CornerData | RangeData
+    scale: float
+    """Of the stated noise."""
+    kept: Flags
+    """(V, N) what counts: there, and no outlier."""
+
+    @property
+    def there(self) -> Flags:
+        """(V, N) what was measured."""
+        return self.data.seen if isinstance(self.data, CornerData) else self.data.measured
+
+    @property
+    def axes(self) -> int:
+        """Residuals of one point."""
+        return 2 if isinstance(self.data, CornerData) else 1
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """All that is to be met."""
+
+    board: Board
+    layout: Layout
+    sensors: tuple[Sensor, ...]
+    priors: tuple[Prior, ...]
+
+    def blocks(self, state: RigState, *, huber_sigmas: float = np.inf) -> list[Block]:
+        """One for each sensor."""
+        board = (self.board.points(), warp_shape(self.board))
+        blocks = []
+        for sensor in self.sensors:
+            loss = Loss(sensor.scale, sensor.kept, huber_sigmas)
+            if isinstance(sensor.data, CornerData):
+                blocks.append(corner_block(sensor.data, state, self.layout, board, loss))
+            else:
+                blocks.append(range_block(sensor.data, state, self.layout, self.board, loss))
+        return blocks
+
+    def normal(self, state: RigState, blocks: list[Block]) -> NormalEquations:
+        """The sum of all, and of the priors."""
+        normal = gathered(blocks, self.layout.size, len(state.T_rig_board))
+        A, a, cost = normal.A.copy(), normal.a.copy(), normal.cost
+        values = value_of(state, self.layout)
+        for prior in self.priors:
+            row = self.prior_row(prior)
+            miss = float(row @ values - prior.value) / prior.sigma
+            A += np.outer(row, row) / prior.sigma**2
+            a -= row * miss / prior.sigma
+            cost += miss**2
+        return replace(normal, A=A, a=a, cost=cost)
+
+    def prior_row(self, prior: Prior) -> Floats:
+        """(P,) its coefficients."""
+        row = np.zeros(self.layout.size)
+        for owner, name, coefficient in prior.terms:
+            at = self.layout.index(owner, name)
+            if at is not None:
+                row[at] += coefficient
+        return row
+
+
+@dataclass(frozen=True, slots=True)
+class Adjusted:
+    """Where it ended."""
+
+    problem: Problem
+    state: RigState
+    blocks: list[Block]
+    normal: NormalEquations
+    steps: int
+
+
+def adjust(problem: Problem, state: RigState, noise: Noise) -> Adjusted:
+    """The minimum, with outliers left out and the noise of each sensor estimated as `noise` says.
+
+    Raises:
+        numpy.linalg.LinAlgError: the data do not determine all parameters.
+    """
+    if noise.rounds == 0:
+        return descend(problem, state, huber_sigmas=noise.huber_sigmas)
+    result = descend(_median_scaled(problem, state), state, huber_sigmas=noise.huber_sigmas, settled=COARSE)
+    result = replace(result, problem=_median_scaled(result.problem, result.state))
+    for _ in range(noise.rounds):
+        before = result.problem.sensors
+        blocks = result.problem.blocks(result.state)
+        kept = tuple(_culled(sensor, each, noise.cull_sigmas) for sensor, each in zip(before, blocks, strict=True))
+        result = descend(replace(result.problem, sensors=kept), result.state, settled=COARSE, damping=WARM)
+        scaled = _scaled(result)
+        result = replace(result, problem=replace(result.problem, sensors=scaled))
+        if all(
+            np.array_equal(a.kept, b.kept) and abs(a.scale / c.scale - 1) < SCALE_SETTLED
+            for a, b, c in zip(before, kept, scaled, strict=True)
+        ):
+            break
+    return descend(result.problem, result.state, damping=WARM)
+
+
+def resumed(problem: Problem, state: RigState, noise: Noise) -> Adjusted:
+    """The minimum of a problem with more parameters than the one whose outliers, noise and state it begins with.
+
+    Raises:
+        numpy.linalg.LinAlgError: the data do not determine all parameters.
+    """
+    result = descend(problem, state, settled=COARSE, damping=WARM)
+    if noise.rounds == 0:
+        return descend(problem, result.state, damping=WARM)
+    return descend(replace(problem, sensors=_scaled(result)), result.state, damping=WARM)
+
+
+def descend(
+    problem: Problem,
+    state: RigState,
+    *,
+    huber_sigmas: float = np.inf,
+    settled: float = SETTLED,
+    damping: float = DAMPING,
+) -> Adjusted:
+    """The minimum for known noise and outliers, to a fall of the cost of `settled`.
+
+    Raises:
+        numpy.linalg.LinAlgError: the data do not determine all parameters.
+    """
+    blocks = problem.blocks(state, huber_sigmas=huber_sigmas)
+    normal = problem.normal(state, blocks)
+    if not np.isfinite(normal.cost):
+        raise np.linalg.LinAlgError("the start puts corners where the lens sees nothing")
+    for step in range(STEPS_MAX):
+        shared, boards, expected = normal.step(damping)
+        if expected < settled:
+            return Adjusted(problem, state, blocks, normal, step)
+        trial = moved(state, problem.layout, shared, boards)
+        trial_blocks = problem.blocks(trial, huber_sigmas=huber_sigmas)
+        trial_normal = problem.normal(trial, trial_blocks)
+        if trial_normal.cost < normal.cost:
+            state, blocks, normal = trial, trial_blocks, trial_normal
+            damping = max(damping / 10, DAMPING_MIN)
+        elif damping >= DAMPING_MAX or trial_normal.cost - normal.cost < ROUNDING * normal.cost:
+            # Rounding is all that is left to gain.
+            return Adjusted(problem, state, blocks, normal, step)
+        else:
+            damping *= 10
+    return Adjusted(problem, state, blocks, normal, STEPS_MAX)
+
+
+def redundancies(blocks: list[Block], known: Uncertainty, sensors: tuple[Sensor, ...]) -> list[float]:
+    """Of each sensor: how many of its residuals are left free by what is estimated."""
+    return [
+        float(sensor.kept.sum() * sensor.axes - np.sum(known.of_block(block.at, block.frames) * block.square))
+        for block, sensor in zip(blocks, sensors, strict=True)
+    ]
+
+
+def _culled(sensor: Sensor, block: Block, sigmas: float) -> Sensor:
+    squares = np.sum(block.residuals**2, axis=-1)
+    return replace(sensor, kept=sensor.there & (squares <= sigmas**2))
+
+
+def _scaled(result: Adjusted) -> tuple[Sensor, ...]:
+    """Sensors whose noise is what their residuals show, given how many of them are free."""
+    sensors = result.problem.sensors
+    free = redundancies(result.blocks, uncertainty(result.normal), sensors)
+    scaled = []
+    for sensor, block, count in zip(sensors, result.blocks, free, strict=True):
+        variance = float(np.sum(block.residuals[sensor.kept] ** 2)) / count if count > 1 else 1.0
+        scaled.append(replace(sensor, scale=sensor.scale * np.sqrt(variance) if variance > 0 else sensor.scale))
+    return tuple(scaled)
+
+
+def _median_scaled(problem: Problem, state: RigState) -> Problem:
+    scaled = []
+    for sensor, block in zip(problem.sensors, problem.blocks(state), strict=True):
+        squares = np.sum(block.residuals**2, axis=-1)[sensor.kept]
+        factor = np.sqrt(np.median(squares) / MEDIAN_SQUARE[sensor.axes]) if squares.size else 1.0
+        scaled.append(replace(sensor, scale=sensor.scale * float(factor or 1.0)))
+    return replace(problem, sensors=tuple(scaled))

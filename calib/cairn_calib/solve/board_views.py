@@ -1,0 +1,170 @@
+"""What a rig's cameras saw of one board: the input of a calibration.
+
+    frame "03":   tof/03.json   left/03.json   ...        one frame = one place of the board, seen by some cameras
+    frame "04":   tof/04.json                  ...
+
+Images belong to one frame if the last number in their names is the same (`left03.png`, `right03.png`), or, without a
+number, the whole name.
+"""
+
+import hashlib
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.board.board import Board, Polarity
+from cairn_calib.board.corner_file import CornerFile, read_corner_file
+from cairn_calib.board.corners import Corners
+from cairn_calib.rig.calibration import InputFile
+from cairn_map.errors import BadInputError
+
+Floats = npt.NDArray[np.float64]
+KIND = "bad_board_views"
+SEEN_MIN = 6
+"""Points of a board in one image: fewer, and its place is hardly more than the noise's."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoardView:
+    """One camera's image of one frame; `image` names it to a person."""
+
+    camera: str
+    frame: str
+    image: str
+    corners: Corners
+
+
+@dataclass(frozen=True, slots=True)
+class RangeView:
+    """The range image of one frame: (H, W) metres along the beam, NaN where nothing came back."""
+
+    camera: str
+    frame: str
+    range_m: npt.NDArray[np.floating]
+    amplitude: npt.NDArray[np.integer] | None = None
+    """(H, W) counts of the light that came back; 0: not known, 65535: too much."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoardViews:
+    """All views of one board by the cameras of one rig."""
+
+    board: Board
+    sizes_px: Mapping[str, tuple[int, int]]
+    """Width and height of the images of each camera, by name, in the rig's order."""
+    views: tuple[BoardView, ...]
+    ranges: tuple[RangeView, ...] = ()
+    inputs: tuple[InputFile, ...] = ()
+    polarities: Mapping[str, Polarity] | None = None
+    """As the corners were found with; only to be told."""
+
+    def __post_init__(self) -> None:
+        if len({(view.camera, view.frame) for view in self.views}) < len(self.views):
+            raise BadInputError(KIND, "a camera has two images of one frame")
+        named = {view.camera for view in self.views} | {each.camera for each in self.ranges}
+        if strangers := named - set(self.sizes_px):
+            raise BadInputError(KIND, f"views of unknown cameras: {', '.join(sorted(strangers))}")
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names, in the rig's order."""
+        return tuple(self.sizes_px)
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Names of the frames that any camera saw, sorted."""
+        return tuple(sorted({view.frame for view in self.views}))
+
+    def of_camera(self, name: str) -> tuple[BoardView, ...]:
+        """The views of one camera, by frame."""
+        return tuple(sorted((view for view in self.views if view.camera == name), key=lambda view: view.frame))
+
+    def alone(self, name: str) -> "BoardViews":
+        """The views of one camera, as if it were the rig."""
+        ranges = tuple(each for each in self.ranges if each.camera == name)
+        return replace(self, sizes_px={name: self.sizes_px[name]}, views=self.of_camera(name), ranges=ranges)
+
+    def of_frames(self, frames: Iterable[str]) -> "BoardViews":
+        """The views of some frames, with all cameras."""
+        kept = set(frames)
+        return replace(
+            self,
+            views=tuple(view for view in self.views if view.frame in kept),
+            ranges=tuple(each for each in self.ranges if each.frame in kept),
+        )
+
+    def without(self, views: Iterable[tuple[str, str]]) -> "BoardViews":
+        """All but some views, by camera and frame."""
+        left_out = set(views)
+        return replace(self, views=tuple(view for view in self.views if (view.camera, view.frame) not in left_out))
+
+
+def frame_of(name: str) -> str:
+    """The frame that an image belongs to, by its name without suffix."""
+    numbers = re.findall(r"\d+", name)
+    return numbers[-1].lstrip("0").zfill(6) if numbers else name
+
+
+def read_board_views(folders: Mapping[str, Path]) -> BoardViews:
+    """The views in folders of corner documents (`cairn calib corners`), by camera name.
+
+    Documents without corners count as inputs, not as views; so do those with fewer than 6.
+
+    Raises:
+        BadInputError: no documents, two of one frame, of two boards, or of two sizes.
+        DamagedDataError: a document is not of that format.
+    """
+    sizes: dict[str, tuple[int, int]] = {}
+    views: list[BoardView] = []
+    inputs: list[InputFile] = []
+    polarities: dict[str, Polarity] = {}
+    boards: dict[Board, Path] = {}
+    for camera, folder in folders.items():
+        documents = _documents(folder)
+        inputs += [_input_file(camera, path) for path, _ in documents]
+        polarities[camera] = documents[0][1].polarity
+        sizes[camera] = _one_size(camera, [document for _, document in documents])
+        frames: dict[str, Path] = {}
+        for path, document in documents:
+            boards.setdefault(document.board, path)
+            frame = frame_of(path.stem)
+            if frame in frames:
+                raise BadInputError(
+                    KIND,
+                    f"{frames[frame]} and {path} are of one frame: the last number in their names is the same; name "
+                    "images so that the number counts the places of the board",
+                )
+            frames[frame] = path
+            corners = document.to_corners()
+            if corners is not None and corners.seen.sum() >= SEEN_MIN:
+                views.append(BoardView(camera, frame, document.image, corners))
+    if len(boards) > 1:
+        first, other = list(boards.values())[:2]
+        raise BadInputError(KIND, f"{first} and {other} are of two boards: one calibration needs one board")
+    return BoardViews(next(iter(boards)), sizes, tuple(views), inputs=tuple(inputs), polarities=polarities)
+
+
+def _documents(folder: Path) -> list[tuple[Path, CornerFile]]:
+    paths = sorted(folder.glob("*.json"))
+    if not paths:
+        raise BadInputError(KIND, f"{folder} holds no corner documents (*.json): make them with cairn calib corners")
+    return [(path, read_corner_file(path)) for path in paths]
+
+
+def _one_size(camera: str, documents: Iterable[CornerFile]) -> tuple[int, int]:
+    sizes = sorted({(each.width, each.height) for each in documents if each.width and each.height})
+    if len(sizes) > 1:
+        told = " and ".join(f"{width} x {height}" for width, height in sizes)
+        raise BadInputError(KIND, f"images of {camera} are of several sizes, {told}: one camera has one")
+    if not sizes:
+        raise BadInputError(KIND, f"no image of {camera} could be read: its documents say why")
+    return sizes[0]
+
+
+def _input_file(camera: str, path: Path) -> InputFile:
+    data = path.read_bytes()
+    return InputFile(name=f"{camera}/{path.name}"[:200], size_bytes=len(data), sha256=hashlib.sha256(data).hexdigest())

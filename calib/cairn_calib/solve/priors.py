@@ -1,0 +1,84 @@
+"""What is known of cameras, boards and range sensors before anything is measured, and said only where it is needed.
+
+A prior that the data overrule does no harm; one that rules is told in the report (`solve_warnings.py`).
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from cairn_calib.board.board import Board
+from cairn_calib.rig.lens import Lens
+from cairn_calib.rig.range_terms import RangeTerms
+from cairn_calib.rig.rig import Spectrum
+from cairn_calib.solve.rig_state import SCALE, WARP
+from cairn_calib.solve.solve_plan import SHARED, CameraPlan, Prior, SolvePlan
+
+FEW_VIEWS = 4
+"""Each view says two things about fx, fy, cx and cy; with fewer than four the lens's bend has no say."""
+CENTRE_SIGMA = 0.03
+"""Of the image's width: how far from its middle makers put the axis."""
+ASPECT_SIGMA = 0.01
+"""Of fx / fy from 1."""
+USUAL_SIGMAS = {"p1": 0.002, "p2": 0.002, "k3": 0.1}
+"""Of every pinhole's coefficients from 0: lenses sit within some hundredths of a millimetre, and bend little more than
+k1 and k2 say. Images that reach the corners overrule them; images that do not must not make them up."""
+FEW_SIGMAS = {"k1": 0.5, "k2": 0.5, "k3": 0.5, "k4": 0.5, "p1": 0.01, "p2": 0.01}
+"""Of few views, where nothing else is said."""
+RANGE_K2_SIGMA = 0.3
+RATIONAL = {"k4", "k5", "k6"}
+"""With a denominator k3 is no small correction."""
+WARP_SIGMA = 0.005
+"""Of the board's longer side: 4 mm on 0.8 m."""
+
+
+def usual_priors(
+    plan: SolvePlan,
+    lenses: Mapping[str, Lens],
+    view_counts: Mapping[str, int],
+    board: Board,
+    *,
+    ranges: tuple[str, RangeTerms] | None,
+) -> tuple[Prior, ...]:
+    """The priors of a plan; `ranges` names the camera whose range bias is estimated, and its shapes."""
+    priors: list[Prior] = []
+    if plan.usual_priors:
+        for name, camera in plan.cameras.items():
+            known = _known(camera)
+            if view_counts[name] < FEW_VIEWS:
+                priors += _of_few_views(name, lenses[name])
+                known = {each: known.get(each, FEW_SIGMAS.get(each)) for each in camera.coefficients}
+            priors += [one(name, each, 0.0, sigma) for each, sigma in known.items() if sigma is not None]
+        if plan.warp:
+            side = float(np.ptp(board.points(), axis=0).max())
+            priors += [one(SHARED, axis, 0.0, WARP_SIGMA * side) for axis in WARP]
+    if plan.pitch_sigma > 0:
+        priors.append(one(SHARED, SCALE, 1.0, plan.pitch_sigma))
+    if ranges is not None:
+        owner, terms = ranges
+        priors += [one(owner, name, 0.0, sigma) for name, sigma in zip(terms.names, terms.sigmas, strict=True)]
+    return (*priors, *plan.priors)
+
+
+def one(owner: str, name: str, value: float, sigma: float) -> Prior:
+    """A prior of a single number."""
+    return Prior(((owner, name, 1.0),), value, sigma)
+
+
+def _known(camera: CameraPlan) -> dict[str, float | None]:
+    """Standard deviations of a lens's free coefficients from 0, as far as they are usual."""
+    free = camera.coefficients
+    if camera.model != "pinhole":
+        return {}
+    left_out = {"k3"} if RATIONAL & {*free} else set()
+    known: dict[str, float | None] = {
+        name: sigma for name, sigma in USUAL_SIGMAS.items() if name in free and name not in left_out
+    }
+    return known | ({"k2": RANGE_K2_SIGMA} if camera.spectrum is Spectrum.RANGE and "k2" in free else {})
+
+
+def _of_few_views(name: str, lens: Lens) -> list[Prior]:
+    cx, cy = (lens.width - 1) / 2, (lens.height - 1) / 2
+    sigma = CENTRE_SIGMA * lens.width
+    aspect = Prior(((name, "fx", 1.0), (name, "fy", -1.0)), 0.0, ASPECT_SIGMA * lens.focal_px[0])
+    return [one(name, "cx", cx, sigma), one(name, "cy", cy, sigma), aspect]

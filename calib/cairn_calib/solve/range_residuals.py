@@ -1,0 +1,240 @@
+"""By how much ranges miss the board's plane: what the range camera's images add to the normal equations.
+
+    true range = (n . (o - c) + w) / (n . v)      n, o: the board's normal and origin, w: its warp there; v: the pixel's
+    residual   = (true + bias - measured) / s     ray, c: the camera; all in the rig's frame, metres
+
+Every pixel that looks at the inside of the board measures its plane, whatever is printed on it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.board.board import Board
+from cairn_calib.rig.lens import Lens
+from cairn_calib.rig.range_terms import ALWAYS, RangeTerms, off_middle
+from cairn_calib.rig.raster import Raster
+from cairn_calib.solve.board_views import RangeView
+from cairn_calib.solve.normal_equations import Block, Indices, Loss
+from cairn_calib.solve.range_nodes import PixelNodes, pixel_nodes
+from cairn_calib.solve.rig_state import Layout, RigState, warp_at_places
+
+Floats = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+PIXELS_MAX = 400
+"""Of one image, evenly spread: more would only say the same again."""
+PIXELS_MIN = 12
+AMPLITUDE_FULL = 65535
+"""Counts: so much light that the range is worth nothing."""
+WARP_ROUNDS = 3
+"""Of finding where a ray meets the bent board; each is a thousand times nearer."""
+INSIDE = 0.0
+"""How far inside the outermost corners a pixel's middle must be, in pitches: half a cell of board is around them."""
+
+
+@dataclass(frozen=True, slots=True)
+class RangeData:
+    """Ranges of one camera, V views of at most M pixels; `measured` is False where there is none."""
+
+    camera: int
+    frames: Indices
+    """(V,)"""
+    pixels: Floats
+    """(V, M, 2)"""
+    range_m: Floats
+    """(V, M)"""
+    measured: Flags
+    """(V, M)"""
+    sigma_m: float
+    """Expected standard deviation."""
+    amplitude: Floats
+    """(V, M) counts; NaN where not known."""
+    terms: RangeTerms = ALWAYS
+    """Of the bias."""
+    nodes: PixelNodes | None = None
+    """Of the terms; None: there are none."""
+
+    def shapes(self, raster: Raster, range_m: Floats) -> Floats:
+        """(V, M, D) what one unit of each of `terms` but the nodes adds to (V, M) true ranges, metres."""
+        return self.terms.shapes(range_m, off_middle(raster, self.pixels), self.terms.faintness(self.amplitude))
+
+    def added_m(self, raster: Raster, range_m: Floats, bias: Floats) -> Floats:
+        """(V, M) what a bias (B,) adds to (V, M) true ranges, metres."""
+        smooth = self.shapes(raster, range_m) @ bias[: len(self.terms.document_names)]
+        return smooth if self.nodes is None else smooth + self.nodes.values(bias[len(self.terms.document_names) :])
+
+    def slope(self, range_m: Floats, bias: Floats) -> Floats:
+        """(V, M) measured range a metre of true range."""
+        return 1 + self.terms.slopes(range_m) @ bias[: len(self.terms.document_names)]
+
+    def with_terms(self, terms: RangeTerms, raster: Raster) -> "RangeData":
+        """The same for another bias."""
+        nodes = None if terms.nodes is None else pixel_nodes(raster, self.pixels, terms.nodes)
+        return replace(self, terms=terms, nodes=nodes)
+
+
+def range_data(
+    camera: int,
+    views: Sequence[RangeView],
+    frames: Sequence[str],
+    state: RigState,
+    board: Board,
+    *,
+    sigma_m: float,
+    pixels_max: int = PIXELS_MAX,
+) -> RangeData | None:
+    """The pixels that look at the board, where it is by a first solution; None where there are hardly any.
+
+    Raises:
+        BadInputError: an image has another size than the camera.
+    """
+    lens = state.lenses[camera]
+    chosen = []
+    for view in views:
+        if view.frame not in frames:
+            continue
+        lens.check_image(view.range_m, name=f"range image of frame {view.frame}")
+        amplitude = _known_amplitude(view, lens)
+        readable = np.isfinite(view.range_m) & ~(amplitude >= AMPLITUDE_FULL)
+        pixels = _inside(readable, lens.rays(), state, camera, frames.index(view.frame), board, pixels_max)
+        if len(pixels) >= PIXELS_MIN:
+            x, y = pixels.T
+            chosen.append((frames.index(view.frame), pixels, view.range_m[y, x], amplitude[y, x]))
+    if not chosen:
+        return None
+    width = max(len(pixels) for _, pixels, _, _ in chosen)
+    pixels_px, range_m = np.zeros((len(chosen), width, 2)), np.ones((len(chosen), width))
+    measured, amplitude = np.zeros((len(chosen), width), bool), np.full((len(chosen), width), np.nan)
+    for n, (_, pixels, ranges, amplitudes) in enumerate(chosen):
+        pixels_px[n, : len(pixels)], range_m[n, : len(pixels)] = pixels, ranges
+        amplitude[n, : len(pixels)], measured[n, : len(pixels)] = amplitudes, True
+    indices = np.array([frame for frame, _, _, _ in chosen], np.intp)
+    return RangeData(camera, indices, pixels_px, range_m, measured, sigma_m, amplitude)
+
+
+def plane_ranges(data: RangeData, state: RigState, board: Board) -> Floats:
+    """(V, M) ranges at which the pixels' rays meet the board, metres."""
+    return _met(data, state, board, state.lenses[data.camera].unproject(data.pixels)).range_m
+
+
+def range_block(data: RangeData, state: RigState, layout: Layout, board: Board, loss: Loss) -> Block:
+    """The camera's share; its noise is `sigma_m` times the loss's scale."""
+    c = data.camera
+    seen = state.lenses[c].unprojection(data.pixels)
+    met = _met(data, state, board, seen.rays)
+    R_rig_camera = state.T_rig_camera[c, :3, :3]
+    shapes = data.shapes(state.lenses[c], met.range_m)
+    n, v, d, slant = met.normals, met.rays, met.range_m, met.slant
+    by_ray = -(d / slant)[..., None] * n
+    columns = [
+        np.squeeze((by_ray @ R_rig_camera)[..., None, :] @ seen.by_intrinsics, -2)[..., layout.intrinsic_columns[c]]
+    ]
+    at = [layout.intrinsic_at[c]]
+    if len(layout.pose_at[c]):
+        columns += [np.cross(v, by_ray), -n / slant[..., None]]
+        at.append(layout.pose_at[c])
+    if len(layout.warp_at):
+        columns.append(met.warp_shape / slant[..., None])
+        at.append(layout.warp_at)
+    columns += [np.cross(n, met.off_board) / slant[..., None], n / slant[..., None]]
+    # All so far move the true range, with which the bias changes.
+    slope = data.slope(met.range_m, state.bias)
+    columns = [slope[..., None] * column for column in columns]
+    columns.insert(-2, shapes)
+    at.append(layout.bias_at[: shapes.shape[-1]])
+    noise_m = loss.scale * data.sigma_m
+    missed = d + data.added_m(state.lenses[c], d, state.bias) - data.range_m
+    residuals = np.where(data.measured, missed / noise_m, 0.0)
+    weights, cost = loss(residuals**2)
+    root = np.sqrt(weights)
+    J = np.nan_to_num(np.concatenate(columns, axis=-1) * (root / noise_m)[..., None])
+    J_t = np.swapaxes(J, 1, 2)
+    pull = -(J_t @ (root * residuals)[..., None])[..., 0]
+    block = Block(np.concatenate(at), data.frames, J_t @ J, pull, residuals[..., None], cost)
+    if data.nodes is None:
+        return block
+    root_a_metre = root * data.measured / noise_m
+    return _with_nodes(block, data.nodes, J, root_a_metre, root * residuals, layout.bias_at[shapes.shape[-1] :])
+
+
+def _with_nodes(
+    block: Block, nodes: PixelNodes, J: Floats, root_a_metre: Floats, residuals: Floats, at: Indices
+) -> Block:
+    """A block with the nodes' columns before the others.
+
+    Of the ranges (V, M, J) derivatives by the others, (V, M) roots of the weights, 1 / m, and weighted residuals.
+    """
+    count = nodes.count
+    sums = nodes.products(root_a_metre[..., None] * np.concatenate([J, residuals[..., None]], axis=-1))
+    cross, pull = sums[:, :-1], -sums[:, -1]
+    square = np.empty((len(cross), *(2 * (count + cross.shape[1],))))
+    square[:, :count, :count] = nodes.squares(root_a_metre**2)
+    square[:, count:, :count], square[:, :count, count:] = cross, np.swapaxes(cross, 1, 2)
+    square[:, count:, count:] = block.square
+    return replace(block, at=np.concatenate([at, block.at]), square=square, pull=np.concatenate([pull, block.pull], 1))
+
+
+@dataclass(frozen=True, slots=True)
+class _Met:
+    """Where rays meet the board, in the rig's frame."""
+
+    normals: Floats
+    """(V, M, 3) of the bent board, there; 1 long but for the bend."""
+    rays: Floats
+    """(V, M, 3)"""
+    slant: Floats
+    """(V, M) n . v"""
+    range_m: Floats
+    """(V, M)"""
+    off_board: Floats
+    """(V, M, 3) from where the ray meets it to the board's origin."""
+    warp_shape: Floats
+    """(V, M, 2)"""
+
+
+def _met(data: RangeData, state: RigState, board: Board, rays_camera: Floats) -> _Met:
+    T_rig_camera, T_rig_board = state.T_rig_camera[data.camera], state.T_rig_board[data.frames]
+    R_rig_board = T_rig_board[:, :3, :3]
+    n = R_rig_board[:, :, 2]
+    v = rays_camera @ T_rig_camera[:3, :3].T
+    slant = np.einsum("vi,vmi->vm", n, v)
+    offset = T_rig_board[:, :3, 3] - T_rig_camera[:3, 3]
+    flat_m = np.einsum("vi,vi->v", n, offset)[:, None] / slant
+    range_m, places, shape = flat_m, np.empty(0), np.empty(0)
+    for _ in range(WARP_ROUNDS):
+        places = (range_m[..., None] * v - offset[:, None]) @ R_rig_board
+        shape = warp_at_places(board, places[..., :2])
+        range_m = flat_m + (shape @ state.warp_m) / slant
+    last = board.points()[:, :2].max(axis=0)
+    slopes = -4 / last * (2 * places[..., :2] / last - 1) * state.warp_m
+    local = np.concatenate([-slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1) @ np.swapaxes(R_rig_board, 1, 2)
+    slant = np.einsum("vmi,vmi->vm", local, v)
+    return _Met(local, v, slant, range_m, offset[:, None] - range_m[..., None] * v, shape)
+
+
+def _known_amplitude(view: RangeView, lens: Lens) -> Floats:
+    """(H, W) counts; NaN where there is no image of them, or nothing in it."""
+    if view.amplitude is None:
+        return np.full(view.range_m.shape, np.nan)
+    lens.check_image(view.amplitude, name=f"amplitude image of frame {view.frame}")
+    counts = view.amplitude.astype(np.float64)
+    return np.where(counts > 0, counts, np.nan)
+
+
+def _inside(
+    readable: Flags, rays: Floats, state: RigState, camera: int, frame: int, board: Board, pixels_max: int
+) -> npt.NDArray[np.intp]:
+    """(M, 2) pixels whose rays meet the board inside its corners, of those that are readable."""
+    T_camera_board = np.linalg.inv(state.T_rig_camera[camera]) @ state.T_rig_board[frame]
+    n, o = T_camera_board[:3, 2], T_camera_board[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        places = (rays * ((n @ o) / (rays @ n))[..., None] - o) @ T_camera_board[:3, :2]
+        last = board.points()[:, :2].max(axis=0)
+        inside = ((places > INSIDE * board.pitch_m) & (places < last - INSIDE * board.pitch_m)).all(axis=-1)
+        inside &= readable & (rays @ n * (n @ o) > 0)
+    y, x = np.nonzero(inside)
+    step = max(1, -(-len(x) // pixels_max))
+    return np.stack([x, y], axis=-1)[::step]

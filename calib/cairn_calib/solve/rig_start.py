@@ -1,0 +1,153 @@
+"""Where the cameras of a rig are, from where each saw the boards: the start of the joint solve.
+
+    T_gauge_camera = T_gauge_board T_camera_board^-1       once for each frame that both saw
+
+They agree, up to noise, but for boards that were mistaken: a small board's tilt may be mirrored, and a board whose
+corners were named from the wrong end is turned by half a turn. So each frame votes with all readings of its two poses,
+the reading is taken that most frames agree on, and what agrees is averaged: rotations by the chordal mean (Hartley et
+al. 2013), translations by the median. Cameras hang together along a maximum spanning tree of what they saw in common.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.board.board import Board
+from cairn_calib.rig.poses import Transform, inverse
+from cairn_calib.solve.zhang import mirrored_pose
+from cairn_map.errors import BadInputError
+
+Floats = npt.NDArray[np.float64]
+Poses = Mapping[str, Transform]
+"""T_camera_board of one camera, by frame."""
+
+AGREE_RAD = 0.2
+"""Two readings of a relative pose further apart, rotation plus translation over the board's distance, disagree."""
+TURNED_RAD = 0.05
+"""How much better, a frame, boards must agree when one camera named their corners from the other end."""
+
+
+@dataclass(frozen=True, slots=True)
+class RigStart:
+    """Cameras and boards in the gauge's frame, and views whose corners are named from the wrong end."""
+
+    T_rig_camera: Mapping[str, Transform]
+    turned: tuple[tuple[str, str], ...]
+    """(camera, frame)"""
+
+
+@dataclass(frozen=True, slots=True)
+class _Edge:
+    one: str
+    other: str
+    T_one_other: Transform
+    weight: float
+    turned: tuple[str, ...]
+    """Frames in which one of both is turned."""
+
+
+def rig_start(
+    poses: Mapping[str, Poses], board: Board, gauge: str, weights: Mapping[tuple[str, str], float]
+) -> RigStart:
+    """The cameras' places from T_camera_board by camera and frame; `weights` by camera and frame, their corners.
+
+    Raises:
+        BadInputError: some cameras never saw a board together with the others, or all of a camera's corners are named
+            from the wrong end.
+    """
+    middle = board.points().mean(axis=0)
+    # Each as it is, then mirrored.
+    readings = {
+        name: {frame: np.stack([T, mirrored_pose(T, middle)]) for frame, T in frames.items()}
+        for name, frames in poses.items()
+    }
+    edges = []
+    names = list(poses)
+    for n, one in enumerate(names):
+        for other in names[n + 1 :]:
+            common = sorted(set(poses[one]) & set(poses[other]))
+            if common:
+                weight = sum(min(weights[one, frame], weights[other, frame]) for frame in common)
+                pairs = [np.stack([readings[name][frame] for frame in common]) for name in (one, other)]
+                edges.append(_edge((one, other), common, pairs[0], pairs[1], half_turn(board), weight))
+    T_rig_camera: dict[str, Transform] = {gauge: np.eye(4)}
+    turned: dict[str, list[_Edge]] = {name: [] for name in names}
+    while len(T_rig_camera) < len(names):
+        open_edges = [edge for edge in edges if (edge.one in T_rig_camera) != (edge.other in T_rig_camera)]
+        if not open_edges:
+            _refuse_unconnected(names, T_rig_camera)
+        best = max(open_edges, key=lambda edge: edge.weight)
+        known, new, T = (best.one, best.other, best.T_one_other)
+        if known not in T_rig_camera:
+            known, new, T = best.other, best.one, inverse(best.T_one_other)
+        T_rig_camera[new] = T_rig_camera[known] @ T
+        turned[new].append(best)
+        _refuse_reversed(new, known, best, len(set(poses[new]) & set(poses[known])))
+    return RigStart(
+        T_rig_camera, tuple((name, frame) for name, found in turned.items() for edge in found for frame in edge.turned)
+    )
+
+
+def chordal_mean(rotations: Floats) -> Floats:
+    """(3, 3) rotation nearest to (N, 3, 3) ones: that of their sum."""
+    U, _, Vt = np.linalg.svd(rotations.sum(axis=0))
+    return np.asarray(U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt)
+
+
+def half_turn(board: Board) -> Transform:
+    """`T_board_board` of a board whose points are named from the other end: half a turn about its middle."""
+    T = np.diag([-1.0, -1.0, 1.0, 1.0])
+    T[:2, 3] = board.points()[:, :2].max(axis=0)
+    return T
+
+
+def _edge(
+    names: tuple[str, str], frames: Sequence[str], one: Floats, other: Floats, turn: Transform, weight: float
+) -> _Edge:
+    """The relative pose that most of F frames agree on, of (F, 2, 4, 4) readings of each camera's."""
+    ways = np.stack([np.eye(4), turn])
+    # (F, way, reading of one, reading of the other): as they are stand before turned and mirrored.
+    T = one[:, None, :, None] @ ways[:, None, None] @ np.linalg.inv(other)[:, None, None]
+    count = len(frames)
+    T = T.reshape(count * 8, 4, 4)
+    distance = float(np.median(np.linalg.norm(np.concatenate([one[:, 0], other[:, 0]])[:, :3, 3], axis=1)))
+    apart = _apart(T, distance).reshape(len(T), count, 8)
+    # A board tilted about one spot fits mirrored and named from the other end as well: as it is, unless that is clear.
+    doubts = np.minimum(apart.min(axis=2), AGREE_RAD).sum(axis=1) + TURNED_RAD * count * (np.arange(len(T)) % 8 >= 4)
+    best = int(np.argmin(doubts.round(6)))
+    nearest = apart[best].argmin(axis=1)
+    agrees = apart[best].min(axis=1) < AGREE_RAD
+    chosen = T[np.flatnonzero(agrees) * 8 + nearest[agrees]]
+    mean = np.eye(4)
+    mean[:3, :3], mean[:3, 3] = chordal_mean(chosen[:, :3, :3]), np.median(chosen[:, :3, 3], axis=0)
+    turned = tuple(frame for n, frame in enumerate(frames) if agrees[n] and nearest[n] >= 4)
+    return _Edge(*names, mean, weight * max(float(agrees.mean()), 0.01), turned)
+
+
+def _apart(T: Floats, distance_m: float) -> Floats:
+    """(N, N) rotation between each two transforms, radians, plus translation over a distance."""
+    R, t = T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]
+    cosine = (R @ R.T - 1) / 2
+    shift = np.sqrt(np.sum((t[:, None] - t[None]) ** 2, axis=2))
+    return np.asarray(np.arccos(np.clip(cosine, -1, 1)) + shift / distance_m)
+
+
+def _refuse_unconnected(names: Sequence[str], placed: Mapping[str, Transform]) -> None:
+    lost = ", ".join(name for name in names if name not in placed)
+    raise BadInputError(
+        "not_observable",
+        f"no board was seen by {lost} together with {', '.join(placed)}: nothing tells where one is from the other; "
+        "take images of boards that both see at the same time",
+    )
+
+
+def _refuse_reversed(new: str, known: str, edge: _Edge, common: int) -> None:
+    if 2 * len(edge.turned) > common:
+        raise BadInputError(
+            "reversed_order",
+            f"{new} and {known} name the board's corners from opposite ends in {len(edge.turned)} of {common} frames: "
+            f"find the corners of one of them again with the other --polarity (a thermal camera that sees printed dark "
+            "bright is reversed)",
+        )

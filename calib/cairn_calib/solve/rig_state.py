@@ -1,0 +1,155 @@
+"""The unknowns of a calibration: a rig and the boards before it, and the small steps by which a solver changes them.
+
+    step = [shared: of each camera its free intrinsics and, but for the gauge, r and t; warp; scale; range bias]
+           [6 a frame: r and t of the board]
+
+A pose T steps to [exp(r) R | t + dt]: rotation about the axes of the rig, in radians, translation along them, metres.
+That is also how `rig.json` states its covariance.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.board.board import Board
+from cairn_calib.rig.calibration import POSE_UNITS
+from cairn_calib.rig.lens import Lens
+from cairn_calib.rig.pose_vectors import rotation_from_vector
+from cairn_calib.solve.solve_plan import SHARED, SolvePlan
+
+Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
+
+WARP = ("warp_x", "warp_y")
+SCALE = "scale"
+
+
+@dataclass(frozen=True, slots=True)
+class RigState:
+    """Lenses and places of C cameras and F boards."""
+
+    lenses: tuple[Lens, ...]
+    T_rig_camera: Floats
+    """(C, 4, 4)"""
+    T_rig_board: Floats
+    """(F, 4, 4)"""
+    warp_m: Floats
+    """(2,) metres: z of the board's middle before its edges' along x, and along y."""
+    scale: float
+    """True pitch over the stated one."""
+    bias: Floats
+    """(B,) of the range camera; empty where there is none (range_bias.py)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where each parameter stands in the shared part of a step."""
+
+    names: tuple[tuple[str, str], ...]
+    """Owner and name of each: a camera, or the board (SHARED)."""
+    intrinsic_columns: tuple[Indices, ...]
+    """Of each camera, which of its lens's intrinsics are free."""
+    intrinsic_at: tuple[Indices, ...]
+    """And where in the step they stand."""
+    pose_at: tuple[Indices, ...]
+    """(6,) for each camera; empty for the gauge."""
+    warp_at: Indices
+    scale_at: Indices
+    bias_at: Indices
+
+    @property
+    def size(self) -> int:
+        """How many shared parameters there are."""
+        return len(self.names)
+
+    def index(self, owner: str, name: str) -> int | None:
+        """Where a parameter stands; None: it is held."""
+        wanted = (owner, name)
+        return self.names.index(wanted) if wanted in self.names else None
+
+
+def layout_of(plan: SolvePlan, lenses: Mapping[str, Lens], bias_names: Sequence[tuple[str, str]]) -> Layout:
+    """The places of all free parameters; `bias_names` are owner and name of the range bias's."""
+    names: list[tuple[str, str]] = []
+
+    def placed(owner: str, added: Sequence[str]) -> Indices:
+        names.extend((owner, name) for name in added)
+        return np.arange(len(names) - len(added), len(names))
+
+    columns, intrinsic_at, pose_at = [], [], []
+    for name, camera in plan.cameras.items():
+        every = lenses[name].intrinsic_names
+        free = [each for each in every if each in ("fx", "fy", "cx", "cy", *camera.coefficients)]
+        columns.append(np.array([every.index(each) for each in free], np.intp))
+        intrinsic_at.append(placed(name, free))
+        pose_at.append(placed(name, [] if name == plan.gauge else list(POSE_UNITS)))
+    warp_at = placed(SHARED, WARP if plan.warp else ())
+    scale_at = placed(SHARED, (SCALE,) if plan.pitch_sigma > 0 else ())
+    start = len(names)
+    names.extend(bias_names)
+    return Layout(
+        tuple(names),
+        tuple(columns),
+        tuple(intrinsic_at),
+        tuple(pose_at),
+        warp_at,
+        scale_at,
+        np.arange(start, len(names)),
+    )
+
+
+def value_of(state: RigState, layout: Layout) -> Floats:
+    """(P,) the shared parameters as they are; those of poses, which are errors, 0."""
+    values = np.zeros(layout.size)
+    for lens, columns, at in zip(state.lenses, layout.intrinsic_columns, layout.intrinsic_at, strict=True):
+        values[at] = lens.intrinsics[columns]
+    values[layout.warp_at] = state.warp_m[: len(layout.warp_at)]
+    values[layout.scale_at] = state.scale
+    values[layout.bias_at] = state.bias
+    return values
+
+
+def moved(state: RigState, layout: Layout, shared: Floats, boards: Floats) -> RigState:
+    """The state after a step: (P,) shared and (F, 6) of the boards."""
+    lenses, poses = [], state.T_rig_camera.copy()
+    for n, lens in enumerate(state.lenses):
+        intrinsics = lens.intrinsics
+        intrinsics[layout.intrinsic_columns[n]] += shared[layout.intrinsic_at[n]]
+        lenses.append(lens.with_intrinsics(intrinsics))
+        if len(layout.pose_at[n]):
+            poses[n] = stepped(poses[n], shared[layout.pose_at[n]])
+    warp, bias = state.warp_m.copy(), state.bias + shared[layout.bias_at]
+    warp[: len(layout.warp_at)] += shared[layout.warp_at]
+    return replace(
+        state,
+        lenses=tuple(lenses),
+        T_rig_camera=poses,
+        T_rig_board=stepped(state.T_rig_board, boards),
+        warp_m=warp,
+        scale=state.scale + float(shared[layout.scale_at].sum()),
+        bias=bias,
+    )
+
+
+def stepped(T: Floats, step: Floats) -> Floats:
+    """(..., 4, 4) transforms after (..., 6) steps: [exp(r) R | t + dt]."""
+    result = T.copy()
+    result[..., :3, :3] = rotation_from_vector(step[..., :3]) @ T[..., :3, :3]
+    result[..., :3, 3] += step[..., 3:]
+    return result
+
+
+def warp_shape(board: Board) -> Floats:
+    """(N, 2) z of each point of a board with `warp_m` (1, 0), and (0, 1): parabolas, 1 in the middle, 0 at the edges.
+
+    The two numbers are mrcal's, with x and y from -1 at the first point to 1 at the last.
+    """
+    return warp_at_places(board, board.points()[:, :2])
+
+
+def warp_at_places(board: Board, places_m: Floats) -> Floats:
+    """(..., 2) the same at (..., 2) places of the board's plane, metres."""
+    last = board.points()[:, :2].max(axis=0)
+    return np.asarray(1 - (2 * places_m / last - 1) ** 2)

@@ -1,0 +1,115 @@
+"""What a solve is to find out: cameras and lenses, which numbers are free, what is known before, how noise is met.
+
+Free by default are fx fy cx cy k1 k2 p1 p2 k3 of every pinhole (k4 to k6 only by name; fisheyes have four others), with
+what is usual of such lenses as priors (`usual_priors.py`). Why so many: what is held at 0 and is not goes into cx, cy
+and the places of the cameras. Simulated head, found corners, what the ToF camera sees carried to the others, root mean
+square error against the truth, px, colour and thermal (stated sigma):
+
+    free                              8 images, to the corners    22 images
+    k1 k2 of range, k1 k2 k3 thermal  4.5 (4.0)  0.23 (0.07)      0.43 (0.10)  0.14 (0.02)
+    all five, no priors               5.3 (4.0)  0.06 (0.03)      0.17 (0.09)  0.02 (0.02)
+    all five, with priors             0.7 (0.5)  0.05 (0.03)      0.11 (0.08)  0.02 (0.02)
+
+A prior is a pseudo-observation: a sum of numbers times coefficients is a value, give or take a standard deviation.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from cairn_calib.rig.range_terms import RangeTerms
+from cairn_calib.rig.rig import Spectrum
+from cairn_map.errors import BadInputError
+
+PINHOLE = ("k1", "k2", "p1", "p2", "k3")
+FISHEYE = ("k1", "k2", "k3", "k4")
+BROWN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+SHARED = ""
+"""The owner of what belongs to no camera: the board's warp and scale."""
+PITCH_SIGMA = 2e-4
+"""Of the pitch of a printed board, relative: 20 um on 100 mm."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """sum(coefficient * parameter) = value +- sigma; parameters by owner (a camera, or `SHARED`) and name."""
+
+    terms: tuple[tuple[str, str, float], ...]
+    value: float
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraPlan:
+    """One camera: what it sees, its model, and the coefficients that are free."""
+
+    spectrum: Spectrum
+    model: str = "pinhole"
+    """`pinhole` or `kb4`."""
+    free: tuple[str, ...] | None = None
+    """Names of free distortion coefficients; None: as usual for the model."""
+
+    def __post_init__(self) -> None:
+        if self.model not in ("pinhole", "kb4"):
+            raise BadInputError("bad_arguments", f"a lens is pinhole or kb4, got {self.model!r}")
+        known = FISHEYE if self.model == "kb4" else BROWN
+        if strange := [name for name in self.coefficients if name not in known]:
+            raise BadInputError("bad_arguments", f"a {self.model} lens has {', '.join(known)}, got {strange[0]!r}")
+
+    @property
+    def coefficients(self) -> tuple[str, ...]:
+        """Names of the free distortion coefficients."""
+        if self.free is not None:
+            return self.free
+        return FISHEYE if self.model == "kb4" else PINHOLE
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Noise:
+    """How noise is met: a robust loss, culling with re-admission, and a scale of noise for each sensor."""
+
+    huber_sigmas: float = 1.5
+    """Beyond that residuals pull with constant force, until outliers are known; infinite: never."""
+    cull_sigmas: float = 4.0
+    """Points further off are left out, and let in again if they fit later; infinite: never."""
+    rounds: int = 8
+    """Of estimating noise and culling, at most; 0: the corners' covariances are taken as stated."""
+
+
+STATED = Noise(huber_sigmas=np.inf, cull_sigmas=np.inf, rounds=0)
+"""Plain least squares with the corners' own covariances."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SolvePlan:
+    """The whole of it; cameras by name, in the rig's order."""
+
+    cameras: Mapping[str, CameraPlan]
+    gauge: str
+    """The camera whose frame is the rig's."""
+    rig_name: str = "rig"
+    pitch_sigma: float = PITCH_SIGMA
+    """Of the board's pitch, relative; 0: exact."""
+    warp: bool = True
+    """Whether the board may be bent: a parabola along x and one along y."""
+    priors: tuple[Prior, ...] = ()
+    """Besides those that this module gives by itself."""
+    usual_priors: bool = True
+    """Whether those that few views or a coarse sensor need are added."""
+    noise: Noise = field(default_factory=Noise)
+    modulation_hz: float | None = None
+    """Of the range camera's light; None: not known, and so no circular error is looked for."""
+    range_terms: RangeTerms | None = None
+    """Of the range camera's bias; None: those that the images determine."""
+
+    def __post_init__(self) -> None:
+        if self.gauge not in self.cameras:
+            raise BadInputError("unknown_camera", f"the gauge {self.gauge} is none of {', '.join(self.cameras)}")
+
+
+def usual_plan(spectra: Mapping[str, Spectrum], *, rig_name: str = "rig", gauge: str | None = None) -> SolvePlan:
+    """The plan for cameras by spectrum: gauge is the first range camera, all else as usual."""
+    first_range = next((name for name, spectrum in spectra.items() if spectrum is Spectrum.RANGE), None)
+    cameras = {name: CameraPlan(spectrum=spectrum) for name, spectrum in spectra.items()}
+    return SolvePlan(cameras=cameras, gauge=gauge or first_range or next(iter(spectra)), rig_name=rig_name)

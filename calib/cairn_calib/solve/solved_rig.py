@@ -1,0 +1,85 @@
+"""The `rig.json` of a solution: cameras, places, range bias, covariance, statistics, and what it came from."""
+
+import importlib.metadata
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig.calibration import Calibration, CameraStatistics, Statistics, covariance_from_matrix
+from cairn_calib.rig.range_bias import RangeBias, bias_from_matrix
+from cairn_calib.rig.rig import Rig, mounted
+from cairn_calib.solve.corner_residuals import CornerData, corner_misses
+from cairn_calib.solve.rig_state import warp_shape
+from cairn_calib.solve.solve import Solution
+
+Floats = npt.NDArray[np.float64]
+
+
+def solved_rig(solution: Solution, *, made_s: float) -> Rig:
+    """The rig of a solution, `made_s` seconds since 1970; the covariance is of its cameras, all else eliminated."""
+    plan, state = solution.plan, solution.state
+    cameras = {
+        name: mounted(camera.spectrum, lens, T)
+        for (name, camera), lens, T in zip(plan.cameras.items(), state.lenses, state.T_rig_camera, strict=True)
+    }
+    bias_at = solution.layout.bias_at
+    if len(bias_at):
+        owner = solution.layout.names[bias_at[0]][0]
+        cameras[owner] = cameras[owner].model_copy(update={"range_bias": _range_bias(solution)})
+    rows = [n for n, (owner, _) in enumerate(solution.layout.names) if owner in cameras and n not in bias_at]
+    names = [solution.layout.names[n] for n in rows]
+    calibration = Calibration(
+        software=f"cairn {_version()}",
+        made_s=made_s,
+        gauge=plan.gauge,
+        covariance=covariance_from_matrix(names, solution.covariance[np.ix_(rows, rows)]),
+        statistics=statistics_of(solution),
+        inputs=solution.views.inputs[:1000],
+    )
+    return Rig(name=plan.rig_name, cameras=cameras, calibration=calibration)
+
+
+def _range_bias(solution: Solution) -> RangeBias | None:
+    used, at = solution.ranges, solution.layout.bias_at
+    if used is None or solution.spans is None:
+        return None
+    amplitudes = solution.spans.amplitudes
+    count = len(used.terms.document_names)
+    at = at[:count]
+    bias = bias_from_matrix(
+        replace(used.terms, nodes=None),
+        solution.state.bias[:count],
+        solution.covariance[np.ix_(at, at)],
+        amplitudes=None if amplitudes is None else (amplitudes[0], amplitudes[2]),
+    )
+    return bias if solution.pattern is None else bias.model_copy(update={"pixel_offsets": solution.pattern.offsets})
+
+
+def statistics_of(solution: Solution) -> Statistics:
+    """How well everything was met."""
+    cameras = {}
+    board = (solution.views.board.points(), warp_shape(solution.views.board))
+    names = list(solution.plan.cameras)
+    count = 0
+    for sensor in solution.adjusted.problem.sensors:
+        count += int(sensor.kept.sum()) * sensor.axes
+        if isinstance(sensor.data, CornerData):
+            misses = corner_misses(sensor.data, solution.state, *board)[sensor.kept]
+            cameras[names[sensor.data.camera]] = CameraStatistics(
+                images=len(sensor.data.frames),
+                points=int(sensor.there.sum()),
+                outliers=int(sensor.there.sum() - sensor.kept.sum()),
+                rms_px=float(np.sqrt(np.mean(misses**2))) if misses.size else 0.0,
+                sigma_px=float(sensor.scale * sensor.data.sigma_px),
+            )
+    unknown = solution.layout.size + 6 * len(solution.state.T_rig_board)
+    freedom = count + len(solution.adjusted.problem.priors) - unknown
+    return Statistics(chi2=solution.adjusted.normal.cost, degrees_of_freedom=max(freedom, 0), cameras=cameras)
+
+
+def _version() -> str:
+    try:
+        return importlib.metadata.version("cairn-robotics")
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"

@@ -1,0 +1,143 @@
+"""The table of black bodies that a thermal camera is calibrated with, and which of its images tell nothing.
+
+    image, celsius, sigma_k [, x, y, width, height] [, housing_celsius] [, since_ffc_s]
+
+Every few minutes such a camera closes a shutter and levels its pixels (a flat-field correction). Meanwhile it repeats
+its last image, and for a moment after it the shutter's warmth is still in the picture: what the table or a repeated
+image tells of that is left out, and told.
+"""
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.board.corner_pictures import read_grey
+from cairn_calib.rig.radiometry import ZERO_C_K
+from cairn_map.errors import BadInputError
+
+COLUMNS = ["image", "celsius", "sigma_k"]
+REGION = ["x", "y", "width", "height"]
+HOUSING, SINCE_FFC = "housing_celsius", "since_ffc_s"
+FFC_SETTLE_S = 2.0
+"""After a flat-field correction: a shutter opens within half a second, and cameras average over the frames after it."""
+Counts = npt.NDArray[np.float32]
+Region = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class BlackBody:
+    """Images of one black body at one temperature."""
+
+    celsius: float
+    sigma_k: float
+    region: Region | None
+    """x, y, width, height of the part of the image that it fills, pixels; None: all of it."""
+    housing_k: float | None
+    """How warm the camera was, kelvin; None: nobody said."""
+    counts: Counts
+    """(K, H, W)"""
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceTable:
+    """What is used of a table, and what is not."""
+
+    bodies: tuple[BlackBody, ...]
+    left_out: tuple[str, ...]
+    """A line for each image: its name, and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    image: Path
+    celsius: float
+    sigma_k: float
+    region: Region | None
+    housing_celsius: float | None
+    since_ffc_s: float | None
+
+    @property
+    def group(self) -> tuple[object, ...]:
+        """Lines of one black body: the same temperature, seen by a camera as warm, to a kelvin."""
+        warm = None if self.housing_celsius is None else round(self.housing_celsius)
+        return self.celsius, self.sigma_k, self.region, warm
+
+
+def read_references(table: Path) -> ReferenceTable:
+    """The black bodies of a table.
+
+    Raises:
+        BadInputError: it cannot be read, a column or number is missing, or images of a body differ in size.
+    """
+    groups: dict[tuple[object, ...], list[tuple[_Line, Counts]]] = {}
+    seen: dict[bytes, str] = {}
+    left_out = []
+    for line in _lines(table):
+        if line.since_ffc_s is not None and line.since_ffc_s < FFC_SETTLE_S:
+            when = f"{line.since_ffc_s:g} s after" if line.since_ffc_s > 0 else "during"
+            left_out.append(f"{line.image.name}: {when} a flat-field correction")
+            continue
+        counts = read_grey(line.image)[0]
+        if (twin := seen.setdefault(counts.tobytes(), line.image.name)) != line.image.name:
+            left_out.append(f"{line.image.name}: {repeated(twin)}")
+            continue
+        groups.setdefault(line.group, []).append((line, counts))
+    return ReferenceTable(tuple(_body(table, rows) for rows in groups.values()), tuple(left_out))
+
+
+def repeated(twin: str) -> str:
+    """What is said of an image that has the same counts as another one, which noise makes impossible."""
+    return f"the same counts as {twin}, as a camera repeats its last image during a flat-field correction"
+
+
+def _body(table: Path, rows: list[tuple[_Line, Counts]]) -> BlackBody:
+    first = rows[0][0]
+    if len({counts.shape for _, counts in rows}) > 1:
+        raise BadInputError("bad_references", f"{table}: the images at {first.celsius:g} C are of several sizes")
+    warm = [line.housing_celsius for line, _ in rows if line.housing_celsius is not None]
+    housing_k = float(np.mean(warm)) + ZERO_C_K if warm else None
+    return BlackBody(first.celsius, first.sigma_k, first.region, housing_k, np.array([counts for _, counts in rows]))
+
+
+def _lines(table: Path) -> list[_Line]:
+    try:
+        with table.open(encoding="utf-8", newline="") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            rows = list(reader)
+    except (OSError, UnicodeDecodeError) as exc:
+        raise BadInputError("bad_references", f"cannot read {table}: {exc}") from exc
+    if missing := [name for name in COLUMNS if name not in (reader.fieldnames or ())]:
+        raise BadInputError("bad_references", f"{table} has no column {missing[0]}; its head line must name {COLUMNS}")
+    lines = []
+    for number, row in enumerate(rows, start=2):
+        try:
+            lines.append(
+                _Line(
+                    table.parent / row["image"],
+                    float(row["celsius"]),
+                    float(row["sigma_k"]),
+                    _region(row),
+                    _number(row, HOUSING),
+                    _number(row, SINCE_FFC),
+                )
+            )
+        except (TypeError, ValueError) as exc:
+            raise BadInputError("bad_references", f"{table}, line {number}: {exc}") from exc
+    return lines
+
+
+def _region(row: Mapping[str, str]) -> Region | None:
+    sides = [row.get(name) or "" for name in REGION]
+    if not any(sides):
+        return None
+    x, y, width, height = (int(side) for side in sides)
+    return x, y, width, height
+
+
+def _number(row: Mapping[str, str], name: str) -> float | None:
+    text = row.get(name) or ""
+    return float(text) if text.strip() else None

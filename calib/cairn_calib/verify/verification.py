@@ -1,0 +1,253 @@
+"""How well a rig carries what its range camera sees into its other cameras: chapter V of Kocmanova et al.
+
+    targets in the range camera's amplitude --range of the matt middle--> Eq. 1-6 --> predicted pixel in each camera
+    targets in that camera's own image ---------------------------------------------> found pixel, if near enough
+    difference = predicted - found
+
+Each difference comes with what was to be expected of it, by source: the calibration (the rig's own covariance), the two
+centroids, the range. The perspective of a tilted disc moves its centroid off its centre's image, in both images alike.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig.lens import Lens
+from cairn_calib.rig.poses import inverse, transform_points
+from cairn_calib.rig.projection_uncertainty import transfer_certain
+from cairn_calib.rig.raster import Raster
+from cairn_calib.rig.rig import Rig, Spectrum
+from cairn_calib.verify.disc_images import Disc, Method, brightness_of, find_discs
+from cairn_calib.verify.disc_range import disc_range
+from cairn_map.errors import BadInputError
+
+Floats = npt.NDArray[np.float64]
+Image = npt.NDArray[np.generic]
+
+GATE_SIGMAS = 3.0
+SIZE_FACTOR = 1.7
+"""Between the radius that is found and the one that the range camera's predicts."""
+STEP_PX, STEP_M = 0.5, 1e-3
+"""Of the differences that tell how a predicted pixel moves; between them it is straight to 1e-4 of that."""
+CENTROID_SIGMA_PX: Mapping[Method, Mapping[Spectrum, float]] = {
+    "paper": {Spectrum.RANGE: 0.19, Spectrum.COLOUR: 0.14, Spectrum.THERMAL: 0.085},
+    "grey": {Spectrum.RANGE: 0.088, Spectrum.COLOUR: 0.15, Spectrum.THERMAL: 0.085},
+}
+"""One axis, of its own pixels: as measured on simulated targets (tests/cairn_sim/test_study.py)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sight:
+    """One target: seen by the range camera, carried to another, and found there."""
+
+    image: str
+    camera: str
+    source_px: Floats
+    """(2,) centroid in the range camera."""
+    radius_px: float
+    """Of that from the range camera's principal point: the paper's "ToF image radius"."""
+    range_m: float
+    predicted_px: Floats
+    """(2,)"""
+    found_px: Floats
+    """(2,)"""
+    disc_px: float
+    """Radius of the target in the other camera."""
+    shares_px: Mapping[str, Floats]
+    """(2,) standard deviations of x and y to be expected: `calibration` (absent where the rig does not say),
+    `centroid`, `range`."""
+
+    @property
+    def difference_px(self) -> Floats:
+        """(2,) predicted minus found."""
+        return self.predicted_px - self.found_px
+
+
+@dataclass(slots=True)
+class Sightings:
+    """All that was found in a set of images, and what was left out, by reason."""
+
+    rig: Rig
+    source: str
+    """The range camera."""
+    method: Method
+    sights: list[Sight] = field(default_factory=list)
+    left_out: dict[str, int] = field(default_factory=dict)
+    images: int = 0
+    targets: int = 0
+    """Seen by the range camera, with a range."""
+
+    def of_camera(self, name: str) -> list[Sight]:
+        """The sights of one camera."""
+        return [sight for sight in self.sights if sight.camera == name]
+
+    @property
+    def cameras(self) -> list[str]:
+        """The cameras that are looked at, in the rig's order."""
+        return [
+            name for name, each in self.rig.cameras.items() if name != self.source and isinstance(each.camera, Lens)
+        ]
+
+    def note(self, reason: str) -> None:
+        """One more target that is left out."""
+        self.left_out[reason] = self.left_out.get(reason, 0) + 1
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """The targets in one head pose's images, before any rig has a say."""
+
+    image: str
+    range_m: Image
+    """(H, W) of the range camera, metres along the beam."""
+    discs: Mapping[str, Sequence[Disc]]
+    """By camera."""
+    amplitude: Image | None = None
+    """(H, W) of the range camera, counts; None: not known."""
+
+
+def range_camera_of(rig: Rig) -> str:
+    """The one camera that measures range and has a lens.
+
+    Raises:
+        BadInputError: there is none.
+    """
+    for name in rig.of_spectrum(Spectrum.RANGE):
+        if isinstance(rig[name].camera, Lens):
+            return name
+    raise BadInputError("no_range_camera", f"rig {rig.name} has no range camera with a lens, so nothing to verify")
+
+
+def found_targets(rig: Rig, images: Mapping[str, Image], range_m: Image, *, name: str, method: Method) -> Found:
+    """The targets in the images of one head pose.
+
+    Args:
+        rig: of which only the spectra matter here.
+        images: by camera: amplitude, (H, W, 3) colour R, G, B, or temperature.
+        range_m: of the range camera.
+        name: of the pose, for people.
+        method: which centroid.
+    """
+    discs = {
+        camera: find_discs(brightness_of(image, rig[camera].spectrum), rig[camera].spectrum, method=method)
+        for camera, image in images.items()
+    }
+    amplitude = next((each for camera, each in images.items() if rig[camera].spectrum is Spectrum.RANGE), None)
+    return Found(name, range_m, discs, amplitude)
+
+
+def add_sights(into: Sightings, found: Found, *, centroid_sigma_px: Mapping[Spectrum, float] | None = None) -> None:
+    """Carry the range camera's targets of one pose to the other cameras, and keep those that were found there.
+
+    Args:
+        into: grows.
+        found: the targets of the pose.
+        centroid_sigma_px: one axis, by spectrum; None for those of the method.
+    """
+    rig, source = into.rig, into.source
+    sigmas = centroid_sigma_px or CENTROID_SIGMA_PX[into.method]
+    into.images += 1
+    range_m = rig[source].true_ranges(np.asarray(found.range_m, np.float64), found.amplitude)
+    carried = []
+    for disc in found.discs.get(source, ()):
+        measured = disc_range(disc, range_m, rig[source])
+        if measured is None:
+            into.note(f"{source}: no range on its middle")
+            continue
+        into.targets += 1
+        carried.append((disc, *measured))
+    for camera in into.cameras:
+        if camera not in found.discs:
+            continue
+        free = list(found.discs[camera])
+        for disc, distance_m, range_sigma_m in carried:
+            predicted, shares = _expected(rig, source, camera, disc.centroid, distance_m, range_sigma_m, sigmas)
+            lens = rig[camera].camera
+            radius_px = disc.radius_px * _focal(rig, camera) / _focal(rig, source)
+            if not _is_within(lens, predicted, radius_px):
+                into.note(f"{camera}: not wholly in its view")
+                continue
+            near = _nearest(free, predicted, shares, radius_px)
+            if near is None:
+                into.note(f"{camera}: not found where predicted")
+                continue
+            free.remove(near)
+            into.sights.append(
+                Sight(
+                    image=found.image,
+                    camera=camera,
+                    source_px=disc.centroid,
+                    radius_px=float(np.linalg.norm(disc.centroid - np.array(_lens(rig, source).centre_px))),
+                    range_m=distance_m,
+                    predicted_px=predicted,
+                    found_px=near.centroid,
+                    disc_px=near.radius_px,
+                    shares_px=shares,
+                )
+            )
+
+
+def carried_pixels(rig: Rig, source: str, target: str, pixels: Floats, range_m: Floats) -> Floats:
+    """(..., 2) where pixels with ranges of one camera appear in another: Eq. 1 to 6, with the lenses of both."""
+    T_target_source = inverse(rig[target].transform) @ rig[source].transform
+    points = rig[source].camera.unproject(pixels) * np.asarray(range_m, np.float64)[..., None]
+    return rig[target].camera.project(transform_points(T_target_source, points))
+
+
+def source_pixel_in(rig: Rig, source: str, target: str) -> float:
+    """How many pixels of another camera one of the range camera is wide: the ratio of their focal lengths."""
+    return _focal(rig, target) / _focal(rig, source)
+
+
+def _expected(
+    rig: Rig,
+    source: str,
+    target: str,
+    pixel: Floats,
+    range_m: float,
+    range_sigma_m: float,
+    sigmas: Mapping[Spectrum, float],
+) -> tuple[Floats, dict[str, Floats]]:
+    """(2,) the predicted pixel, and (2,) the standard deviation of the difference by each source."""
+    steps = np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float64)
+    at = carried_pixels(rig, source, target, pixel + STEP_PX * steps[:, :2], range_m + STEP_M * steps[:, 2])
+    by_x, by_y = (at[1] - at[2]) / (2 * STEP_PX), (at[3] - at[4]) / (2 * STEP_PX)
+    by_range = (at[5] - at[6]) / (2 * STEP_M)
+    source_px, own_px = sigmas[rig[source].spectrum], sigmas[rig[target].spectrum]
+    shares = {
+        "centroid": np.sqrt(source_px**2 * (by_x**2 + by_y**2) + own_px**2),
+        "range": np.abs(by_range) * range_sigma_m,
+    }
+    if rig.calibration is not None and rig.calibration.covariance is not None:
+        known = transfer_certain(rig, source, target, pixel, np.array(range_m)).calibration_px2
+        shares["calibration"] = np.sqrt(np.maximum(np.diagonal(known), 0))
+    return at[0], shares
+
+
+def _is_within(lens: Raster, pixel: Floats, radius_px: float) -> bool:
+    """Whether a disc about a pixel lies in the image."""
+    edge = np.array([lens.width - 1, lens.height - 1])
+    return bool(np.isfinite(pixel).all() and (pixel >= radius_px).all() and (pixel <= edge - radius_px).all())
+
+
+def _nearest(discs: Sequence[Disc], predicted: Floats, shares: Mapping[str, Floats], radius_px: float) -> Disc | None:
+    """The disc of about the right size nearest to the prediction, within the target's own outline and 3 sigma."""
+    sigma = float(np.sqrt(sum(float(share @ share) for share in shares.values())))
+    sized = [disc for disc in discs if 1 / SIZE_FACTOR < disc.radius_px / radius_px < SIZE_FACTOR]
+    if not sized:
+        return None
+    near = min(sized, key=lambda disc: float(np.linalg.norm(disc.centroid - predicted)))
+    return near if np.linalg.norm(near.centroid - predicted) < radius_px + GATE_SIGMAS * sigma else None
+
+
+def _lens(rig: Rig, camera: str) -> Lens:
+    lens = rig[camera].camera
+    if not isinstance(lens, Lens):
+        raise BadInputError("no_lens", f"{camera} is a lidar: it has no image of targets")
+    return lens
+
+
+def _focal(rig: Rig, camera: str) -> float:
+    return float(np.mean(_lens(rig, camera).focal_px))

@@ -1,0 +1,84 @@
+"""Check this installation, a state folder, and the way to a server.
+
+    $ cairn doctor http://127.0.0.1:8750/maps/lab
+    ok    python        3.11.9 on x86_64
+    ok    cairn         0.1.0
+    ok    extra robot   all there
+    warn  kernels       31 of 48 compiled
+                        -> `cairn compile` compiles them now, half a minute; else the first scans wait for it
+    ok    disk          212.40 GB free at /data
+    ok    server        answers in 1.2 ms (median of 5; 1.9 ms at worst)
+    ok    protocol      version 1, here and there
+    ok    clock         the server's is +0.1 s from ours, to within 0.5 s
+    ok    ready         takes pushes and folds them
+    ok    token         no token: map lab may be read; 34 cells, 15 commits
+    ok    speed         48.1 MB/s down: a cell of 212.0 kB in 4 ms
+
+Without an argument, the installation alone; with a server's or a map's URL, the way there as well; with a state folder
+(of a robot, or of `cairn clone`), what is in it, and of a copy the way to its server. Lines that are not `ok` have the
+next step below them. It ends with 0 if nothing failed (warnings may be there), else with 1.
+"""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+from cairn_client.cli.arguments import add_token, parser, say
+from cairn_client.cli.doctor_checks import Check, Verdict, disk_check, installation_checks
+from cairn_client.cli.doctor_link import folder_checks, server_checks
+from cairn_client.folders.state_folder import opened_replica
+from cairn_client.http.map_url import split_map_url
+from cairn_client.replica.replica_identity import URL_KEY
+from cairn_map.errors import CairnError
+
+SOUND, ILL = 0, 1
+
+
+def main(argv: list[str]) -> int:
+    """Check."""
+    command = parser("cairn doctor", __doc__)
+    command.add_argument("target", nargs="?", metavar="URL|DIR", help="a server, a map, or a state folder")
+    command.add_argument("--json", action="store_true", help="print JSON")
+    add_token(command)
+    args = command.parse_args(argv)
+    checks: list[Check] = []
+    for check in _checks(args.target, args.token):
+        checks.append(check)
+        if not args.json:
+            _show(check)
+    if args.json:
+        say(json.dumps([check.as_json() for check in checks]))
+    return ILL if any(check.verdict is Verdict.FAIL for check in checks) else SOUND
+
+
+def _checks(target: str | None, token: str | None) -> Iterator[Check]:
+    yield from installation_checks()
+    if target is None or "://" in target:
+        yield disk_check(Path())
+    if target is not None and "://" in target:
+        yield from _of_url(target, token)
+    elif target is not None:
+        yield from folder_checks(Path(target))
+        url, own_token = _link_of(Path(target))
+        if url is not None:
+            yield from _of_url(url, own_token or token)
+
+
+def _of_url(url: str, token: str | None) -> Iterator[Check]:
+    server, name = split_map_url(url) if "/maps/" in url else (url, None)
+    yield from server_checks(server, name, token=token)
+
+
+def _link_of(folder: Path) -> tuple[str | None, str | None]:
+    """The URL that a copy is from, and the token that it has; Nones where the folder cannot be opened."""
+    try:
+        with opened_replica(folder) as replica:
+            return replica.store.get(URL_KEY), replica.token()
+    except CairnError:  # said already
+        return None, None
+
+
+def _show(check: Check) -> None:
+    say(f"{check.verdict.value:<4}  {check.what:<12}  {check.found}")
+    if check.advice:
+        say(f"{'':<20}-> {check.advice}")

@@ -1,0 +1,70 @@
+"""Command-line options for a folder of frames that is no recording: patterns, intrinsics, conventions."""
+
+import argparse
+
+from pydantic import ValidationError
+
+from cairn_fusion.recording.frame_folder import FrameFolderOptions, PoseConvention
+from cairn_fusion.recording.recording_format import Convention
+from cairn_map.errors import BadInputError
+
+TEXT = """Any folder with one file per frame and image: give --depth, --pose and --intrinsics, and what else there is.
+Patterns are relative to the folder and hold {id}, e.g. --depth 'frames/{id}.depth.png' --pose 'frames/{id}.pose.txt'.
+All images must be one raster (registered); a pose is a 4x4 matrix in text, without {id} one file for all frames."""
+OPTIONS = (
+    *("depth", "colour", "thermal", "pose", "distortion", "depth_units", "depth_convention"),
+    *("pose_convention", "kelvin_per_count", "kelvin_at_zero", "frame_rate"),
+)
+FIELD_OF_OPTION = {"depth_units": "depth_units_per_m", "frame_rate": "frame_rate_hz"}
+
+
+def add_frame_arguments(command: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    group = command.add_argument_group("a folder of frames", TEXT)
+    group.add_argument("--depth", metavar="PATTERN", help="16-bit PNG")
+    group.add_argument("--colour", metavar="PATTERN", help="8-bit PNG or JPEG")
+    group.add_argument("--thermal", metavar="PATTERN", help="16-bit PNG, linear in kelvin")
+    group.add_argument("--pose", metavar="PATTERN", help="4x4 matrix in text")
+    group.add_argument("--intrinsics", metavar="FILE|FX,FY,CX,CY", help="3x3 matrix in text, or four numbers, pixels")
+    group.add_argument("--distortion", type=_numbers, metavar="K1,K2,P1,P2,K3", help="Brown's model (none)")
+    group.add_argument("--depth-units", type=float, metavar="N", help="depth units in a metre (1000)")
+    group.add_argument("--depth-convention", choices=[c.value for c in Convention], help="along z or the beam (z)")
+    group.add_argument("--pose-convention", choices=[c.value for c in PoseConvention], help="(camera_to_map)")
+    group.add_argument("--kelvin-per-count", type=float, metavar="K", help="of the thermal image (0.01)")
+    group.add_argument("--kelvin-at-zero", type=float, metavar="K", help="of the thermal image (0)")
+    group.add_argument("--frame-rate", type=float, metavar="HZ", help="frames in a second (1)")
+    command.add_argument("--frames", type=lambda text: text.split(","), metavar="ID,ID,...", help="only these frames")
+
+
+def frame_options(args: argparse.Namespace) -> FrameFolderOptions | None:
+    """The options given, or None if there are none: then the folder's own layout counts.
+
+    Raises:
+        BadInputError: options that do not make a whole.
+    """
+    given = {
+        FIELD_OF_OPTION.get(name, name): getattr(args, name) for name in OPTIONS if getattr(args, name) is not None
+    }
+    if args.intrinsics is not None:
+        given |= _intrinsics(args.intrinsics)
+    if not given:
+        return None
+    try:
+        return FrameFolderOptions.model_validate(given)
+    except ValidationError as exc:
+        first = exc.errors()[0]
+        where = f"--{first['loc'][0]}" if first["loc"] else "a folder of frames"
+        what = "is missing" if first["type"] == "missing" else first["msg"]
+        raise BadInputError("bad_option", f"{where}: {what}; see `cairn robot replay --help`") from exc
+
+
+def _intrinsics(text: str) -> dict[str, object]:
+    try:
+        fx, fy, cx, cy = _numbers(text)
+    except ValueError:
+        return {"intrinsics_file": text}
+    return {"focal_px": (fx, fy), "centre_px": (cx, cy)}
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    return tuple(float(part) for part in text.split(","))

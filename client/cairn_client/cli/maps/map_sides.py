@@ -1,0 +1,153 @@
+"""Two maps side by side, wherever each is: which cells and commits only one of them has, and which cells differ.
+
+http://HOST:PORT/maps/NAME     a server's map, by its cell index; no cell is downloaded
+DIR with robot.sqlite          a copy's or robot's folder: the map that it sees, commits that wait included
+DIR with map.json              a folder of cells (`cairn map export --cells`); it knows of no commits
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from cairn_client.cli.arguments import api_of
+from cairn_client.folders.state_folder import is_state_folder, opened_replica
+from cairn_client.http.http_link import index_of
+from cairn_map.codec.cell_code import encode_cell
+from cairn_map.commits.version_vector import EMPTY, VersionVector
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.fingerprint import Fingerprint, fingerprint, fingerprint_from_hex
+from cairn_map.evidence.grid import CellKey, Geometry, cell_key
+from cairn_map.files.cell_folder import MAP_FILE, read_cells, read_head
+
+
+@dataclass(frozen=True, slots=True)
+class SideCell:
+    """One cell of one side."""
+
+    fingerprint: Fingerprint
+    voxels: int
+    """Known ones."""
+    size_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Side:
+    """One map."""
+
+    name: str
+    geometry: Geometry
+    cells: Mapping[CellKey, SideCell]
+    """Those that hold evidence."""
+    commits: VersionVector | None
+    """In it; None: not known."""
+
+    @property
+    def voxels(self) -> int:
+        """Known voxels of all cells."""
+        return sum(cell.voxels for cell in self.cells.values())
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of all cells as they are kept."""
+        return sum(cell.size_bytes for cell in self.cells.values())
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """What two sides do not have in common."""
+
+    only_a: list[CellKey]
+    only_b: list[CellKey]
+    other: list[CellKey]
+    """In both, with other evidence."""
+    commits_only_a: int | None
+    """None: one of the sides does not know its commits."""
+    commits_only_b: int | None
+
+    @property
+    def is_equal(self) -> bool:
+        """Whether both are the same map: all cells equal, whichever commits made them."""
+        return not (self.only_a or self.only_b or self.other)
+
+
+def side_of(place: str, *, token: str | None) -> Side:
+    """The map at a place.
+
+    Raises:
+        BadInputError: it is none of the three kinds.
+        CairnError: it cannot be read, or is damaged.
+    """
+    if "://" in place:
+        return _of_server(place, token)
+    folder = Path(place)
+    if is_state_folder(folder):
+        return _of_state(folder)
+    if (folder / MAP_FILE).is_file():
+        return _of_cells(folder)
+    raise BadInputError(
+        "no_map",
+        f"{place} is no map: a URL http://HOST:PORT/maps/NAME, a folder of `cairn clone` or of a robot, or one "
+        "of `cairn map export --cells` is expected",
+    )
+
+
+def difference(a: Side, b: Side) -> Difference:
+    """What two sides do not have in common.
+
+    Raises:
+        BadInputError: kind `other_geometry`: their grids differ, so nothing can be compared.
+    """
+    if a.geometry != b.geometry:
+        raise BadInputError(
+            "other_geometry",
+            f"{a.name} and {b.name} have other grids: voxels of {a.geometry.voxel_edge_m:g} m and "
+            f"{b.geometry.voxel_edge_m:g} m, or other channels",
+        )
+    common = a.cells.keys() & b.cells.keys()
+    only_a = None if a.commits is None or b.commits is None else len(a.commits.minus(b.commits))
+    only_b = None if a.commits is None or b.commits is None else len(b.commits.minus(a.commits))
+    return Difference(
+        only_a=sorted(a.cells.keys() - common),
+        only_b=sorted(b.cells.keys() - common),
+        other=sorted(key for key in common if a.cells[key].fingerprint != b.cells[key].fingerprint),
+        commits_only_a=only_a,
+        commits_only_b=only_b,
+    )
+
+
+def _of_server(url: str, token: str | None) -> Side:
+    api, name = api_of(url, token)
+    with api:
+        geometry, index = api.map_info(name).geometry, index_of(api, name)
+    cells = {
+        cell_key(entry.cell): SideCell(fingerprint_from_hex(entry.fingerprint), entry.voxels, entry.size_bytes)
+        for entry in index.cells
+        if entry.voxels
+    }
+    return Side(url, geometry, cells, index.header.coverage)
+
+
+def _of_state(folder: Path) -> Side:
+    with opened_replica(folder) as replica:
+        geometry, packed = replica.geometry, replica.view.packed()
+        folded = replica.header.coverage if replica.header else EMPTY
+        commits = folded.with_commits(replica.commits)
+    cells = {
+        key: SideCell(fingerprint(cell, key), len(cell), len(encode_cell(key, cell, geometry).data))
+        for key, cell in packed.items()
+    }
+    return Side(str(folder), geometry, cells, commits)
+
+
+def _of_cells(folder: Path) -> Side:
+    geometry = read_head(folder).geometry
+    cells = {
+        cell.key: SideCell(
+            fingerprint(cell.evidence, cell.key),
+            len(cell.evidence),
+            len(encode_cell(cell.key, cell.evidence, geometry).data),
+        )
+        for cell in read_cells(folder, geometry)
+        if len(cell.evidence)
+    }
+    return Side(str(folder), geometry, cells, None)

@@ -1,0 +1,202 @@
+"""Ask a map that lies in a folder, without a server.
+
+    $ cairn map export http://127.0.0.1:8750/maps/lab --cells lab/
+    $ cairn map query lab/ points 1.02,2.5,0.4 -0.3,0,1
+         x m     y m     z m  state     probability  colour        intensity  temperature
+       1.020   2.500   0.400  occupied         0.97  (180 92 40)      1210.0  57.3 C +- 0.4
+      -0.300   0.000   1.000  unknown             -  -                     -  -
+    $ cairn map query lab/ ray 1,2,0.4 0,1,0 --range 10      # what is in the way, and how far
+    $ cairn map query lab/ nearest 1,2,0.4 --radius 3         # the nearest occupied voxel (--unknown: unknown)
+    $ cairn map query lab/ hottest --count 5                  # where it is hot
+    $ cairn map query lab/ slice 0.5                          # a horizontal layer: # occupied, . free
+    $ cairn map query lab/ height --box=-5,-5,0,5,5,2         # the highest surface of each column, metres
+
+The folder is what `cairn map export --cells` wrote, or the state folder of a robot that is not running. All lengths are
+metres in the map's frame, temperatures degrees Celsius here and kelvin in JSON; what is unknown is `-`, in JSON null.
+--json prints what programs want; `slice` and `height` then give all pixels, rows along y and columns along x.
+"""
+
+import argparse
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_client.cli.arguments import allow_negative_lists, say
+from cairn_client.cli.robot_arguments import box, place
+from cairn_client.folders.map_folder import snapshot_of_folder
+from cairn_map.evidence.channels import ChannelKind
+from cairn_map.evidence.voxels import Reading
+from cairn_map.queries.layer_queries import MapImage
+from cairn_map.queries.map_snapshot import MapSnapshot
+from cairn_map.queries.occupancy_states import State
+
+ZERO_CELSIUS_K = 273.15
+WIDTH = 100
+"""Of a slice on a terminal, in characters."""
+SIGNS = {State.UNKNOWN: " ", State.FREE: ".", State.OCCUPIED: "#"}
+Answer = Callable[[MapSnapshot, argparse.Namespace], tuple[Any, list[str]]]
+"""What a question says as JSON, and as lines for people."""
+
+
+def add_query_arguments(query: argparse.ArgumentParser) -> None:
+    """The questions, each a subcommand."""
+    query.description, query.formatter_class = __doc__, argparse.RawDescriptionHelpFormatter
+    query.add_argument("folder", type=Path, help="of cells, or a robot's state")
+    query.set_defaults(run=_run)
+    questions = query.add_subparsers(required=True, metavar="QUESTION")
+
+    def question(name: str, text: str, answer: Answer) -> argparse.ArgumentParser:
+        added = questions.add_parser(name, help=text, description=text)
+        allow_negative_lists(added)
+        added.add_argument("--json", action="store_true", help="print JSON")
+        added.set_defaults(answer=answer)
+        return added
+
+    points = question("points", "state, probability and readings at points", _points)
+    points.add_argument("points", nargs="+", type=place, metavar="X,Y,Z", help="metres, map frame")
+    ray = question("ray", "the first occupied voxel along a ray", _ray)
+    ray.add_argument("origin", type=place, metavar="X,Y,Z", help="metres, map frame")
+    ray.add_argument("direction", type=place, metavar="DX,DY,DZ", help="of any length")
+    ray.add_argument("--range", type=float, default=math.inf, metavar="METRES", help="at most (as far as the map goes)")
+    nearest = question("nearest", "the nearest occupied voxel of points", _nearest)
+    nearest.add_argument("points", nargs="+", type=place, metavar="X,Y,Z", help="metres, map frame")
+    nearest.add_argument("--radius", type=float, default=5.0, metavar="METRES", help="look so far (5)")
+    nearest.add_argument("--unknown", action="store_true", help="the nearest unknown voxel instead")
+    hottest = question("hottest", "the occupied voxels with the highest temperature", _hottest)
+    hottest.add_argument("--count", type=int, default=10, help="how many (10)")
+    layer = question("slice", "the horizontal layer of voxels at a height", _slice)
+    layer.add_argument("z", type=float, metavar="Z", help="metres, map frame")
+    layer.add_argument("--what", default="state", help="state, probability, log_odds or a channel's name (state)")
+    height = question("height", "the highest occupied surface of each column", _height)
+    for limited in (hottest, layer, height):
+        limited.add_argument("--box", type=box, metavar="X0,Y0,Z0,X1,Y1,Z1", help="only in this box, metres")
+
+
+def _run(args: argparse.Namespace) -> None:
+    answer: Answer = args.answer
+    found, lines = answer(snapshot_of_folder(args.folder), args)
+    for line in [json.dumps(found)] if args.json else lines:
+        say(line)
+
+
+def _points(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
+    points = np.array(args.points)
+    states, probability = snapshot.state_at(points), snapshot.probability_at(points)
+    readings = {c.name: snapshot.reading_at(points, c.name) for c in snapshot.geometry.channels}
+    widths = {name: max(14, len(name)) for name in readings}
+    lines = [f"{'x m':>8}{'y m':>8}{'z m':>8}  {'state':<9}{'probability':>12}" + _columns(widths, widths.keys())]
+    found = []
+    for n, (x, y, z) in enumerate(args.points):
+        state, p = State(int(states[n])).name.lower(), _or_none(probability[n])
+        shown = {name: _shown(reading, n) for name, reading in readings.items()}
+        text = f"{x:8.3f}{y:8.3f}{z:8.3f}  {state:<9}{'-' if p is None else f'{p:.2f}':>12}"
+        lines.append(text + _columns(widths, shown.values()))
+        values = {name: _value(reading, n) for name, reading in readings.items()}
+        found.append({"point_m": [x, y, z], "state": state, "probability": p, "readings": values})
+    return found, lines
+
+
+def _ray(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
+    ends = snapshot.cast_rays([args.origin], [args.direction], max_range_m=args.range)
+    if not ends.hit[0]:
+        far = "as far as the map goes" if math.isinf(args.range) else f"within {args.range:g} m"
+        return {"hit": False, "distance_m": None, "voxel": None}, [f"nothing is in the way {far}"]
+    distance_m, voxel = float(ends.distance_m[0]), ends.voxels[0].tolist()
+    return {"hit": True, "distance_m": distance_m, "voxel": voxel}, [f"occupied after {distance_m:.3f} m"]
+
+
+def _nearest(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
+    ask = snapshot.nearest_unknown if args.unknown else snapshot.nearest_occupied
+    what = "unknown" if args.unknown else "occupied"
+    nearest = ask(args.points, radius_m=args.radius)
+    found, lines = [], []
+    for (x, y, z), distance_m in zip(args.points, nearest.distance_m.tolist(), strict=True):
+        found.append({"point_m": [x, y, z], "distance_m": _or_none(distance_m)})
+        text = f"{distance_m:.3f} m to {what} space" if math.isfinite(distance_m) else f"none within {args.radius:g} m"
+        lines.append(f"{x:8.3f}{y:8.3f}{z:8.3f}  {text}")
+    return found, lines
+
+
+def _hottest(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
+    voxels = snapshot.hottest(args.count, box_m=_corners(args))
+    reading = voxels.of_kind(ChannelKind.TEMPERATURE)
+    found, lines = [], [f"{'x m':>8}{'y m':>8}{'z m':>8}  temperature"]
+    for n, (x, y, z) in enumerate(voxels.centres_m.tolist()):
+        assert reading is not None  # noqa: S101 - or the snapshot had refused
+        found.append({"point_m": [x, y, z], **(_value(reading, n) or {})})
+        lines.append(f"{x:8.3f}{y:8.3f}{z:8.3f}  {_shown(reading, n)}")
+    return found, lines if found else ["no occupied voxel has a temperature"]
+
+
+def _slice(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
+    image = snapshot.layer_at(args.z, args.what, box_m=_corners(args))
+    drawn = _drawn(image.values) if args.what == "state" else _span(image.values, args.what)
+    return _image_json(image), [_image_head(image), *drawn]
+
+
+def _height(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
+    image = snapshot.height_map(box_m=_corners(args))
+    return _image_json(image), [_image_head(image), *_span(image.values, "height in m")]
+
+
+def _corners(args: argparse.Namespace) -> npt.NDArray[np.float64] | None:
+    return None if args.box is None else np.array(args.box).reshape(2, 3)
+
+
+def _or_none(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _value(reading: Reading, n: int) -> dict[str, Any] | None:
+    """What a channel says of a voxel, with its unit; None if nothing."""
+    if not reading.weight[n]:
+        return None
+    value = {"mean": reading.mean[n].tolist(), "unit": reading.channel.unit, "weight": int(reading.weight[n])}
+    return value | ({"spread": float(reading.spread[n])} if reading.spread is not None else {})
+
+
+def _shown(reading: Reading, n: int) -> str:
+    if not reading.weight[n]:
+        return "-"
+    mean = reading.mean[n]
+    if reading.channel.kind is ChannelKind.COLOUR:
+        return "({:.0f} {:.0f} {:.0f})".format(*mean)
+    if reading.channel.kind is ChannelKind.TEMPERATURE and reading.spread is not None:
+        return f"{mean - ZERO_CELSIUS_K:.1f} C +- {reading.spread[n]:.1f}"
+    return f"{mean:.4g} {reading.channel.unit}"
+
+
+def _columns(widths: dict[str, int], texts: Any) -> str:
+    return "".join(f"  {text:<{width}}" for width, text in zip(widths.values(), texts, strict=True)).rstrip()
+
+
+def _image_json(image: MapImage) -> dict[str, Any]:
+    values = image.values.astype(object)
+    values[~np.isfinite(image.values.astype(np.float64))] = None
+    return {"origin_m": list(image.origin_m), "edge_m": image.edge_m, "values": values.tolist()}
+
+
+def _image_head(image: MapImage) -> str:
+    H, W = image.values.shape[:2]
+    x, y = (value - image.edge_m / 2 for value in image.origin_m)
+    return f"x {x:.2f} to {x + W * image.edge_m:.2f} m, y {y:.2f} to {y + H * image.edge_m:.2f} m"
+
+
+def _span(values: npt.NDArray[np.number], what: str) -> list[str]:
+    known = values[np.isfinite(values)]
+    text = f"{known.min():.4g} to {known.max():.4g}" if known.size else "nothing is known"
+    return [f"{what}: {text} ({known.size} of {values.size} values known; --json prints them)"]
+
+
+def _drawn(states: npt.NDArray[np.number]) -> list[str]:
+    """The layer in characters, y upwards; of several voxels, the one that says most: occupied, then free."""
+    H, W = states.shape
+    step = max(1, -(-W // WIDTH))
+    rows = [states[y : y + 2 * step, :] for y in range(0, H, 2 * step)]  # a character is twice as high as wide
+    worst = [[int(row[:, x : x + step].max()) for x in range(0, W, step)] for row in rows]
+    return ["".join(SIGNS[State(state)] for state in row).rstrip() for row in reversed(worst)]

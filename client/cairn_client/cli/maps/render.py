@@ -1,0 +1,184 @@
+"""Look at a map from any pose, or over what a robot's camera saw.
+
+    $ cairn map render lab/ --from 1,2,1.4 --to 4,2.5,1 -o view.png
+    view.png: temperature, 640 x 480 pixels, 91% of them on the map, 0.3 to 11.2 m away
+    $ cairn map render http://127.0.0.1:8750/maps/lab --from 1,2,1.4 --to 4,2.5,1 --layer colour -o view.png
+    $ cairn map render lab/ --over recordings/run1 --scan 12 --camera colour_left -o overlay.png
+    overlay.png: temperature over colour_left, scan 12: visible 71%, see-through 22%, map only 3%
+
+A map is the URL of one on a server, the folder that `cairn map export --cells` wrote, or the state folder of a robot
+that is not running. Layers: temperature, colour, probability, depth, and age, in seconds before the newest measurement:
+a server knows it of everything, a robot's state of what that robot measured and has not handed over for good. The scale
+is fixed (--low, --high), so that pictures can be compared; what has no value is grey, and where nothing is mapped it is
+dark.
+
+Over a recorded image the map is compared with the depth that the robot measured there and then: what agrees is painted
+solid; what lies behind the surface that the camera sees, beyond the next free space, in stripes, fainter the farther
+away and, where its age is known, the older; what no live depth says anything of in dots. So a robot without a thermal
+camera shows temperatures that others measured, also behind things. `cairn telepresence --map` does it live.
+
+--sigma says how certain the pose is, along and about any one axis: the paint spreads by it, and is withheld when it
+could be anywhere. --covariance says it in full: the lower triangle, row by row, of rx, ry, rz (rad), tx, ty, tz (m), of
+the motion by which the true pose differs, in the frame of what is posed (--over: the rig, else the camera), as
+`robot.align` gives it. --npz writes the values as NumPy arrays, kelvin and metres.
+"""
+
+import argparse
+import re
+from pathlib import Path
+from urllib.parse import urlencode
+
+import numpy as np
+
+from cairn_client.cli.arguments import add_token, allow_negative_lists, api_of, say
+from cairn_client.cli.robot_arguments import place
+from cairn_client.cli.spread_arguments import add_spread_arguments, spread_of
+from cairn_client.folders.map_folder import FolderMap, map_of_folder
+from cairn_map.errors import BadInputError
+from cairn_map.render.map_picture import arrays_of, layer_picture, layer_values, npz_of
+from cairn_map.render.map_render import MapRenderer
+from cairn_map.render.png import png_of
+from cairn_map.render.render_picture import SCALES, Layer, Scale
+from cairn_map.render.render_request import RenderRequest, request_from
+
+THREADS = 2
+
+
+def add_render_arguments(render: argparse.ArgumentParser) -> None:
+    """What to look at, from where, and what to write."""
+    render.description, render.formatter_class = __doc__, argparse.RawDescriptionHelpFormatter
+    allow_negative_lists(render)
+    render.add_argument("map", metavar="URL|DIR", help="http://HOST:PORT/maps/NAME, or a folder")
+    render.add_argument("-o", "--output", type=Path, metavar="FILE", help="PNG")
+    render.add_argument(
+        "--npz",
+        type=Path,
+        metavar="FILE",
+        help="the values as arrays; with --over, `modes` tells where the image shows what the map does",
+    )
+    render.add_argument("--from", dest="eye", type=place, metavar="X,Y,Z", help="where the eye is, metres, map frame")
+    render.add_argument("--to", dest="target", type=place, metavar="X,Y,Z", help="what is in the middle of the picture")
+    render.add_argument("--size", type=_size, default=(640, 480), metavar="WxH", help="pixels (640x480)")
+    render.add_argument("--fov", type=float, default=70.0, metavar="DEG", help="across the picture (70)")
+    render.add_argument("--layer", type=Layer, choices=list(Layer), default=Layer.TEMPERATURE, help="(temperature)")
+    render.add_argument("--low", type=float, help="lower end of the scale (10 deg C)")
+    render.add_argument("--high", type=float, help="upper end of the scale (50 deg C)")
+    render.add_argument("--range", type=float, default=20.0, metavar="METRES", help="look so far (20)")
+    render.add_argument("--over", metavar="RECORDING", help="draw over what a camera saw: a recording's folder")
+    render.add_argument("--scan", type=int, default=0, metavar="N", help="which of its scans (0)")
+    render.add_argument("--camera", metavar="NAME", help="which of its colour cameras (the first)")
+    add_spread_arguments(render)
+    add_token(render)
+    render.set_defaults(run=_run)
+
+
+def _run(args: argparse.Namespace) -> None:
+    if args.output is None and args.npz is None:
+        raise BadInputError("nothing_asked", "say what to write: -o FILE.png, or --npz FILE")
+    is_url = args.map.startswith(("http://", "https://"))
+    if args.over is None:
+        if args.eye is None or args.target is None:
+            raise BadInputError("nothing_asked", "say from where to look, and at what: --from X,Y,Z --to X,Y,Z")
+        request = _request(args)
+        if is_url:
+            _ask_server(args, request)
+        else:
+            _look(args, request, _folder_map(args))
+        return
+    if is_url:
+        raise BadInputError(
+            "bad_option", "an overlay needs the map here: `cairn clone URL DIR`, and then DIR for the URL"
+        )
+    _draw_over(args, _folder_map(args))
+
+
+def _folder_map(args: argparse.Namespace) -> FolderMap:
+    """The map here; with an age, if that is asked for."""
+    found = map_of_folder(Path(args.map))
+    if args.layer is Layer.AGE and found.ages is None:
+        raise BadInputError(
+            "no_age",
+            f"{args.map} does not say when anything was measured: exported cells never do, and a robot's state only of "
+            "commits of its own that it still keeps; give the map's URL, whose server knows",
+        )
+    return found
+
+
+def _draw_over(args: argparse.Namespace, found: FolderMap) -> None:
+    """The map over one image of a recording."""
+    from cairn_client.cli.maps.overlay_drawing import MapOverlay, about, modes_of  # fusion, only where it is asked for
+    from cairn_fusion.importers import open_source
+    from cairn_fusion.view.overlay import OverlayStyle, with_overlay_legend
+
+    source = open_source(args.over)
+    if not 0 <= args.scan < len(source):
+        raise BadInputError("no_scan", f"{args.over} has scans 0 to {len(source) - 1}, got {args.scan}")
+    style = OverlayStyle(layer=args.layer, scale=_scale(args), range_max_m=args.range)
+    overlay = MapOverlay(rig=source.rig, map=found, style=style, camera=args.camera, spread=spread_of(args))
+    scan = source.scan(args.scan)
+    drawn = overlay.draw(scan)
+    picture = with_overlay_legend(drawn.picture, style.colours)
+    _write(args, picture, arrays_of(drawn.values, drawn.front, args.layer) | modes_of(drawn))
+    about_it = f"{overlay.camera_of(scan)}, scan {args.scan}: {about(drawn)}"
+    say(f"{args.output or args.npz}: {args.layer} over {about_it}")
+
+
+def _look(args: argparse.Namespace, request: RenderRequest, found: FolderMap) -> None:
+    snapshot, renderer, scale = found.snapshot, MapRenderer(threads=THREADS), request.scale
+    seen = renderer.nearest(snapshot, request.sight, request.T_map_camera, range_max_m=request.range_m)
+    values = layer_values(renderer, snapshot, seen, request.layer, found.ages)
+    spread = request.spread
+    picture = layer_picture(values, seen, scale, spread)
+    _write(args, picture, arrays_of(values, seen, request.layer, spread))
+    near, far = (float(f(seen.range_m[seen.hit])) if seen.hit.any() else np.nan for f in (np.min, np.max))
+    say(
+        f"{args.output or args.npz}: {request.layer}, {request.width} x {request.height} pixels, "
+        f"{seen.hit.mean():.0%} of them on the map, {near:.1f} to {far:.1f} m away"
+    )
+
+
+def _ask_server(args: argparse.Namespace, request: RenderRequest) -> None:
+    api, name = api_of(args.map, args.token)
+    with api:
+        for path, form in ((args.output, "png"), (args.npz, "npz")):
+            if path is not None:
+                asked = request.model_copy(update={"format": form})
+                query = urlencode(asked.model_dump(mode="json", exclude_none=True))
+                path.write_bytes(api.probe(f"/maps/{name}/main/render?{query}").body)
+                say(f"{path}: {request.layer}, {request.width} x {request.height} pixels, drawn by the server")
+
+
+def _write(
+    args: argparse.Namespace, picture: "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]", arrays: object
+) -> None:
+    if args.output is not None:
+        args.output.write_bytes(png_of(picture))
+    if args.npz is not None:
+        args.npz.write_bytes(npz_of(arrays))  # type: ignore[arg-type]
+
+
+def _request(args: argparse.Namespace) -> RenderRequest:
+    width, height = args.size
+    if not 1 <= args.fov < 170:
+        raise BadInputError("bad_option", f"--fov must be 1 to 170 degrees, got {args.fov:g}")
+    focal_px = width / 2 / float(np.tan(np.radians(args.fov) / 2))
+    scale = _scale(args)
+    about = {"width": width, "height": height, "focal_px": focal_px, "layer": args.layer, "range_m": args.range}
+    if args.covariance is not None:
+        about["covariance_lower"] = ",".join(f"{number!r}" for number in args.covariance)
+    else:
+        about |= {"sigma_m": args.sigma[0], "sigma_rad": float(np.radians(args.sigma[1]))}
+    return request_from(args.eye, args.target, low=scale.low, high=scale.high, **about)
+
+
+def _scale(args: argparse.Namespace) -> Scale:
+    usual = SCALES[args.layer]
+    low, high = (own if own is not None else common for own, common in ((args.low, usual.low), (args.high, usual.high)))
+    return Scale(args.layer, low, high)
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    if not found:
+        raise argparse.ArgumentTypeError(f"a size is WIDTHxHEIGHT in pixels, such as 640x480; got {text!r}")
+    return int(found[1]), int(found[2])

@@ -1,0 +1,119 @@
+"""Carry signed commits between servers that do not reach each other.
+
+    $ cairn relay http://field:8750/maps/lab ./carried        # at the field server: what it has
+    map lab: 12 commits to ./carried, 0 from there
+    $ cairn relay ./carried http://base:8750/maps/lab         # at the base, days later
+    map lab: 12 commits to http://base:8750/maps/lab, 3 from there
+
+Each place gets what it lacks and the other has, and a repetition changes nothing. A place is a map's URL or a folder;
+two URLs join two servers, with --every SECONDS until stopped. Servers take commits from a token of role relay (`cairn
+token create URL NAME --role relay --map MAP`), and only as they were signed: whoever carries them can change none
+and add none in the name of a robot whose key it has not; of robots that it invents, `cairn map log --json` says by
+whom they came (`via`). `cairn serve --upstream` does the same for all maps of a server. Ends with 1 if something could
+not be handed over; the log says what, and why.
+"""
+
+import argparse
+import logging
+import os
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from cairn_client.cli.arguments import parser, say
+from cairn_client.http.backoff import Backoff
+from cairn_client.http.map_url import split_map_url
+from cairn_client.relay.carried import CarriedCommits
+from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
+from cairn_client.relay.log import tell
+from cairn_client.relay.round import REST_S, RelayReport, Resting, Side, relay_round
+from cairn_client.sync.uploads import CAME_IN_PART
+from cairn_map.errors import BadInputError, UnreachableError
+from cairn_map.wire.relay_peer import MapEnd
+
+log = logging.getLogger(__name__)
+
+TOKENS = ("CAIRN_TOKEN", "CAIRN_TOKEN_THERE")
+CUTS_MAX = 6
+"""Rounds that break, one after the other, without a commit, or a part of one, that moved."""
+WAIT_MAX_S = 60.0
+"""Who should come back later than this is told so."""
+FOLDER_MB = 10_000.0
+MEGABYTE = 1e6
+
+
+def main(argv: list[str]) -> int:
+    """Hand over once, or again and again."""
+    args = _parser().parse_args(argv)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    if "://" not in args.here + args.there:
+        raise BadInputError("bad_url", "one of the two places must be a map's URL: http://HOST:PORT/maps/NAME")
+    name = Path((args.here if "://" in args.here else args.there).rstrip("/")).name
+    with ExitStack() as stack:
+        here, there = (
+            stack.enter_context(_place(text, token, name, size_bytes_max=int(args.folder_mb * MEGABYTE)))
+            for text, token in ((args.here, args.token), (args.there, args.token_there))
+        )
+        resting = Resting()
+        report = _once(here, there, resting, map_name=name, where=args.there)
+        backoff = Backoff()
+        while args.every is not None:
+            time.sleep(args.every)
+            try:
+                report = _once(here, there, resting, map_name=name, where=args.there)
+                backoff.reset()
+            except UnreachableError as exc:
+                wait_s = backoff.next_s(min(exc.retry_after_s or 0.0, REST_S))
+                log.warning("no link (%s); trying again in %.1f s", exc.message, wait_s)
+                time.sleep(wait_s)
+    return int(bool(report.kept_back or report.refused or report.split or any(map(resting.may_come_later, Side))))
+
+
+def _once(here: MapEnd, there: MapEnd, resting: Resting, *, map_name: str, where: str) -> RelayReport:
+    """Rounds until there is nothing more to hand over; what all of them did."""
+    total, backoff, cuts = RelayReport(has_more=True), Backoff(), 0
+    while total.has_more:
+        report = hold_between(relay_round(resting), here, there)
+        tell(report, map_name, there=where)
+        total.has_more, total.split = report.has_more, report.split
+        for side in Side:
+            total.moved[side] += report.moved[side]
+        total.kept_back |= report.kept_back
+        total.refused += report.refused
+        error = report.cut or report.later
+        if error:  # a commit at which this comes twice rests, so that what follows it has its turn
+            cuts = 1 if any(report.moved.values()) or error.kind == CAME_IN_PART else cuts + 1
+            if cuts == CUTS_MAX or (error.retry_after_s or 0.0) > WAIT_MAX_S:
+                raise error
+            time.sleep(backoff.next_s(error.retry_after_s))
+            total.has_more = True
+    say(f"map {map_name}: {total.moved[Side.THERE]} commits to {where}, {total.moved[Side.HERE]} from there")
+    return total
+
+
+@contextmanager
+def _place(text: str, token: str | None, map_name: str, *, size_bytes_max: int) -> Iterator[MapEnd]:
+    if "://" not in text:
+        yield CarriedCommits(Path(text), map_name, size_bytes_max=size_bytes_max)
+        return
+    server_url, map_name = split_map_url(text)
+    with RelayApi(server_url, token=token) as api:
+        yield ServerEnd(api, map_name)
+
+
+def _parser() -> argparse.ArgumentParser:
+    added = parser("cairn relay", __doc__)
+    added.add_argument("here", metavar="PLACE", help="a map's URL (http://HOST:PORT/maps/NAME) or a folder")
+    added.add_argument("there", metavar="PLACE", help="another one")
+    added.add_argument("--token", default=os.environ.get(TOKENS[0]), help=f"of the first place (${TOKENS[0]})")
+    added.add_argument("--token-there", default=os.environ.get(TOKENS[1]), help=f"of the second (${TOKENS[1]})")
+    added.add_argument("--every", type=float, metavar="SECONDS", help="go on, with such a pause; without it: once")
+    added.add_argument(
+        "--folder-mb",
+        type=float,
+        default=FOLDER_MB,
+        metavar="MB",
+        help=f"of a folder; when it is full, the oldest commits in it give way ({FOLDER_MB:.0f})",
+    )
+    return added

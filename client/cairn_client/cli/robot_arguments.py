@@ -1,0 +1,75 @@
+"""Arguments that the robot's commands share."""
+
+import argparse
+
+from cairn_client.cli.arguments import add_token, allow_negative_lists
+from cairn_client.robot.limits import Limits
+from cairn_client.sync.link_profile import LINKS
+from cairn_client.sync.scope import Scope
+from cairn_map.errors import BadInputError
+
+
+def add_map(command: argparse.ArgumentParser) -> None:
+    """Which map, as whom, and how much of it."""
+    command.add_argument("--map", required=True, metavar="URL", help="http://HOST:PORT/maps/NAME")
+    command.add_argument("--name", help="the robot's name on the map")
+    add_amount(command)
+
+
+def add_amount(command: argparse.ArgumentParser) -> None:
+    """How much of the map, and the token."""
+    allow_negative_lists(command)
+    command.add_argument("--box", type=box, metavar="X0,Y0,Z0,X1,Y1,Z1", help="fetch only cells in it, metres")
+    command.add_argument(
+        "--reply-bytes", type=int, metavar="BYTES", help="of cells in one reply; the rest comes in the next ones"
+    )
+    command.add_argument(
+        "--link",
+        choices=list(LINKS),
+        default="good",
+        help="small: some ten to some hundred kbit/s: commits in few bytes and parts, short replies (good)",
+    )
+    add_token(command)
+
+
+def scope_of(args: argparse.Namespace) -> Scope:
+    """What of the map to fetch."""
+    if args.reply_bytes is not None and args.mode == "low-end":
+        raise BadInputError("bad_option", "--reply-bytes bounds the answers with differences; low-end fetches cells")
+    return Scope(box_m=(args.box[:3], args.box[3:]) if args.box else None, reply_bytes_max=args.reply_bytes)
+
+
+def add_limits(command: argparse.ArgumentParser) -> None:
+    """How much the robot may keep, megabytes (10^6)."""
+    for name, what in (
+        ("disk", "of the robot's file: then the server's farthest cells go"),
+        ("memory", "of the map in memory: likewise"),
+        ("outbox", "of commits that the server does not have for good: then no more are taken"),
+    ):
+        command.add_argument(f"--{name}-max", type=float, metavar="MB", help=f"{what} (no limit)")
+
+
+def limits_of(args: argparse.Namespace) -> Limits:
+    """The limits that were given."""
+    disk, memory, outbox = (
+        None if megabytes is None else round(megabytes * 1e6)
+        for megabytes in (args.disk_max, args.memory_max, args.outbox_max)
+    )
+    return Limits(disk_bytes_max=disk, memory_bytes_max=memory, outbox_bytes_max=outbox)
+
+
+def place(text: str) -> tuple[float, float, float]:
+    """X,Y,Z in metres."""
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected X,Y,Z in metres, got {text!r}") from None
+    return x, y, z
+
+
+def box(text: str) -> tuple[float, ...]:
+    """X0,Y0,Z0,X1,Y1,Z1 in metres."""
+    parts = text.split(",")
+    if len(parts) != 6:
+        raise argparse.ArgumentTypeError(f"expected X0,Y0,Z0,X1,Y1,Z1 in metres, got {text!r}")
+    return (*place(",".join(parts[:3])), *place(",".join(parts[3:])))

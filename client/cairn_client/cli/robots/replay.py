@@ -1,0 +1,208 @@
+"""`cairn robot replay`: map a recording as a live robot would."""
+
+import argparse
+import logging
+import time
+from pathlib import Path
+
+import numpy as np
+
+from cairn_client.cli.arguments import (
+    api_of,
+    say,
+    shown_bytes,
+    shown_length,
+    with_progress,
+)
+from cairn_client.cli.frame_arguments import add_frame_arguments, frame_options
+from cairn_client.cli.robot_arguments import add_map, scope_of
+from cairn_client.http.api import MapApi
+from cairn_client.robot.robot import Robot
+from cairn_fusion.importers import open_source
+from cairn_fusion.mapping.integrate import Integrator
+from cairn_fusion.recording.recording import ScanSource
+from cairn_fusion.ros.topic_mapping import mapping_of
+from cairn_map.codec.cell_code import Profile
+from cairn_map.commits.commit import Commit
+from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError, UnreachableError
+from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel
+from cairn_map.evidence.grid import Geometry, geometry_for
+from cairn_map.wire.messages import CreateMap
+
+log = logging.getLogger(__name__)
+
+REPLAYED_FILE = "replayed.txt"
+SYNC_EVERY_S = 2.0
+"""While replaying; at the end everything is pushed and fetched once more."""
+
+
+def _replay(args: argparse.Namespace) -> int:
+    integrator = Integrator(min_range_m=args.min_range, max_range_m=args.max_range)
+    options, size = frame_options(args), args.scans_per_measurement
+    mapping = mapping_of(args.topics) if args.topics else None
+    source = open_source(
+        args.recording, options=options, mapping=mapping, frames=args.frames, scans_per_measurement=size
+    )
+    _say_range(source)
+    geometry = ensure_map(args, source)
+    name = args.name or default_name(source.name)
+    state = args.state or Path(f"cairn-{name}")
+    part = f"{args.recording.resolve()} {args.share[0]}/{args.share[1]}"
+    if not args.again and part in _replayed(state):
+        raise BadInputError(
+            "replayed_before", f"{state} has replayed this recording already; --again counts its evidence once more"
+        )
+    stops = source.measurements()[args.share[0] - 1 :: args.share[1]]
+    start_s = time.monotonic()
+    commits = scans = 0
+    with Robot(
+        source.rig,
+        args.map,
+        directory=state,
+        name=name,
+        token=args.token,
+        mode=args.mode,
+        geometry=geometry,
+        integrator=integrator,
+        scope=scope_of(args),
+        link=args.link,
+        stay=True,
+    ) as robot:
+        last_sync_s = start_s
+        for stop in with_progress(stops, source.name, total=len(stops)):
+            for index in stop:
+                robot.observe(source.scan(index))
+                scans += 1
+            commits += _commit(robot, Profile(args.profile) if args.profile else None) is not None
+            if time.monotonic() - last_sync_s > SYNC_EVERY_S:
+                _try_sync(robot)
+                last_sync_s = time.monotonic()
+        with (state / REPLAYED_FILE).open("a") as file:
+            file.write(f"{part}\n")
+        mapped_s = time.monotonic() - start_s
+        # The second round tells the server where this robot stands now.
+        is_linked = _try_sync(robot) and _try_sync(robot)
+        waiting, traffic = robot.waiting, robot.traffic
+    say(
+        f"replayed {scans} scans as {commits} commits in {mapped_s:.1f} s ({scans / mapped_s:.1f} scans/s), "
+        f"{shown_bytes(traffic.up_bytes)} up, {shown_bytes(traffic.down_bytes)} down, {waiting} commits wait"
+    )
+    if not is_linked:
+        say(f"no link to {args.map}: `cairn robot pull --map URL --state {state}` pushes them when there is one")
+    return 0
+
+
+def _say_range(source: ScanSource) -> None:
+    """Ranges of the first scan: who sees 5 m for a shelf at arm's length has given the wrong depth units."""
+    range_m = source.scan(0).range_m
+    seen = range_m[np.isfinite(range_m)]
+    median = f"median range {np.median(seen):.2f} m" if len(seen) else "no range at all"
+    say(f"{source.name}: {len(source)} scans; the first has {len(seen) / range_m.size:.0%} of its pixels, {median}")
+
+
+def _replayed(state: Path) -> set[str]:
+    """Recordings, with the share, that a robot's folder has replayed."""
+    path = state / REPLAYED_FILE
+    return set(path.read_text().splitlines()) if path.exists() else set()
+
+
+def _commit(robot: Robot, profile: Profile | None) -> Commit | None:
+    """If the folder's limits are reached, after a sync: it may make room."""
+    try:
+        return robot.commit(profile=profile)
+    except UnreachableError as exc:
+        if exc.kind != "outbox_full" or not (_try_sync(robot) and _try_sync(robot)):
+            raise
+        return robot.commit(profile=profile)
+
+
+def _try_sync(robot: Robot) -> bool:
+    try:
+        robot.sync()
+    except UnreachableError:
+        return False
+    except DamagedDataError as exc:
+        log.error("%s", exc.message)  # mapping goes on: what is sound came, and own commits are pushed
+    return True
+
+
+def ensure_map(args: argparse.Namespace, source: ScanSource) -> Geometry | None:
+    """The map's geometry; makes the map if there is none. None: no link, and perhaps the state folder knows it."""
+    api, name = api_of(args.map, args.token)
+    with api:
+        return _ensured(api, name, args, source)
+
+
+def _ensured(api: MapApi, name: str, args: argparse.Namespace, source: ScanSource) -> Geometry | None:
+    wished = geometry_for(voxel_edge_m=args.voxel) if args.voxel is not None else None
+    try:
+        geometry = api.map_info(name).geometry
+    except UnreachableError:
+        return geometry_for(voxel_edge_m=args.voxel, channels=_channels(source)) if args.voxel else None
+    except NotFoundError as exc:
+        if exc.kind != "no_map":
+            raise
+        if args.voxel is None:
+            raise BadInputError(
+                "no_map", f"there is no map {name} yet; make one with `cairn map create`, or give --voxel METRES"
+            ) from exc
+        made = geometry_for(voxel_edge_m=args.voxel, channels=_channels(source))
+        return api.create_map(name, CreateMap(geometry=made)).geometry
+    if wished is not None and wished.voxel_edge_um != geometry.voxel_edge_um:
+        raise BadInputError(
+            "other_geometry",
+            f"map {name} has voxels of {shown_length(geometry.voxel_edge_m)}, not {shown_length(wished.voxel_edge_m)}; "
+            "leave --voxel out, or choose another map",
+        )
+    return geometry
+
+
+def _channels(source: ScanSource) -> tuple[Channel, ...]:
+    """What the recording's first scan can fill."""
+    scan = source.scan(0)
+    has = ((COLOUR, bool(scan.colour)), (INTENSITY, scan.amplitude is not None), (TEMPERATURE, bool(scan.thermal)))
+    return tuple(channel for channel, found in has if found)
+
+
+def default_name(text: str) -> str:
+    """A robot's name made of any text."""
+    name = "".join(letter if letter.isascii() and letter.isalnum() else "-" for letter in text.lower()).strip("-")
+    return name[:32] or "robot"
+
+
+def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the subcommand."""
+    replay = commands.add_parser("replay", help="map a recording", description="map a recording")
+    add_map(replay)
+    replay.add_argument("recording", type=Path, help="recording folder, known published layout, or bag of ROS")
+    replay.add_argument("--topics", type=Path, metavar="YAML", help="which topics of a bag are what; see inspect")
+    replay.add_argument("--voxel", type=float, metavar="METRES", help="make the map with this voxel edge if needed")
+    replay.add_argument("--again", action="store_true", help="replay what this robot has replayed before once more")
+    replay.add_argument("--share", type=_share, default=(1, 1), metavar="I/N", help="every N-th measurement from I on")
+    replay.add_argument("--scans-per-measurement", type=int, metavar="N", help="regroup the scans")
+    replay.add_argument(
+        "--min-range", type=float, default=Integrator().min_range_m, metavar="METRES", help="ignore what is nearer"
+    )
+    replay.add_argument(
+        "--max-range",
+        type=float,
+        default=Integrator().max_range_m,
+        metavar="METRES",
+        help="ignore what is farther (10)",
+    )
+    replay.add_argument("--state", type=Path, metavar="DIR", help="the robot's folder (cairn-NAME)")
+    replay.add_argument("--mode", choices=("high-end", "low-end"), default="high-end")
+    replay.add_argument(
+        "--profile",
+        choices=list(Profile),
+        help="small: four tenths fewer bytes, more work (as --link wants it)",
+    )
+    add_frame_arguments(replay)
+    replay.set_defaults(run=_replay)
+
+
+def _share(text: str) -> tuple[int, int]:
+    part, slash, parts = text.partition("/")
+    if not slash or not part.isdigit() or not parts.isdigit() or not 1 <= int(part) <= int(parts):
+        raise argparse.ArgumentTypeError(f"expected PART/PARTS such as 1/2, got {text!r}")
+    return int(part), int(parts)

@@ -1,0 +1,198 @@
+"""`cairn robot run`: map what a driver puts into a folder, and sync, until a signal ends it.
+
+    $ cairn robot run spool/ --map http://base:8750/maps/lab --voxel 0.04 --name mole
+    committed mole.5f0c2a9be1d3f607.0: 4 cells, 40.6 kB
+    pushed mole.5f0c2a9be1d3f607.0
+    ^Cmapped 12 scans as 3 commits, 120.5 kB up, 8.1 kB down; 0 commits wait
+
+SPOOL holds recordings (RECORDING.md), a folder each, in the order of their names; one counts from when it has its
+recording.json, which is written last. So a driver writes each stop as a recording of its own. Each measurement is
+mapped once, whatever happens: what is done stands in the robot's folder. --delete removes recordings that are mapped
+whole. What no commit can be made of is left out; the log says why.
+
+What happens is told on standard error. Without a link it maps on. ^C or SIGTERM: what waits is pushed for some seconds,
+and the robot leaves the map, if nothing is left and unless --stay; a measurement under way is mapped at the next start.
+A second ^C ends it at once, and nothing is lost.
+"""
+
+import argparse
+import logging
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+from cairn_client.cli.arguments import say, shown_bytes
+from cairn_client.cli.event_lines import lines_on_stderr, until_signal
+from cairn_client.cli.robot_arguments import add_limits, add_map, limits_of, scope_of
+from cairn_client.cli.robots.replay import default_name, ensure_map
+from cairn_client.folders.spool import Spool, Stop, remember
+from cairn_client.folders.state_folder import is_state_folder
+from cairn_client.robot.robot import Robot
+from cairn_fusion.mapping.integrate import Integrator
+from cairn_map.codec.cell_code import Profile
+from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
+
+log = logging.getLogger(__name__)
+
+LOOK_EVERY_S = 1.0
+"""For recordings that have come."""
+COMMIT_AGAIN_S = 5.0
+"""After the disk or the outbox was full."""
+FLUSH_S = 8.0
+"""How long what waits is pushed at the end: containers are killed ten seconds after they were asked to stop."""
+
+
+@dataclass(slots=True)
+class _Tally:
+    """What was mapped."""
+
+    scans: int = 0
+    commits: int = 0
+
+
+def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the subcommand."""
+    run = commands.add_parser("run", help="map what comes into a folder, until a signal", description=__doc__)
+    run.add_argument("spool", type=Path, metavar="SPOOL", help="the folder that recordings come into")
+    add_map(run)
+    run.add_argument("--voxel", type=float, metavar="METRES", help="make the map with this voxel edge if needed")
+    run.add_argument(
+        "--min-range", type=float, default=Integrator().min_range_m, metavar="METRES", help="ignore nearer"
+    )
+    run.add_argument(
+        "--max-range", type=float, default=Integrator().max_range_m, metavar="METRES", help="ignore farther"
+    )
+    run.add_argument("--state", type=Path, metavar="DIR", help="the robot's folder (cairn-NAME)")
+    run.add_argument("--mode", choices=("high-end", "low-end"), default="high-end")
+    run.add_argument(
+        "--profile", choices=list(Profile), default=Profile.FAST, help="small: fewer bytes, more work (fast)"
+    )
+    run.add_argument("--every", type=float, default=5.0, metavar="SECONDS", help="sync at least so often (5)")
+    add_limits(run)
+    run.add_argument(
+        "--keep-scans",
+        type=float,
+        default=0.0,
+        metavar="MB",
+        help="keep so much of the newest scans in the robot's folder, so that a program can correct their poses (0)",
+    )
+    run.add_argument(
+        "--carry",
+        type=float,
+        default=0.0,
+        metavar="MB",
+        help="room for what other robots mapped, taken along to the next server; needs a token of role relay (0)",
+    )
+    run.add_argument("--delete", action="store_true", help="delete recordings that are mapped")
+    run.add_argument("--stay", action="store_true", help="stay on the map at the end")
+    run.set_defaults(run=_run)
+
+
+def _run(args: argparse.Namespace) -> int:
+    if args.every <= 0:
+        raise BadInputError("bad_option", f"--every takes seconds above 0, got {args.every:g}")
+    if args.carry < 0 or args.keep_scans < 0:
+        raise BadInputError("bad_option", "--carry and --keep-scans take megabytes of 0 or more")
+    limits_of(args)  # before it waits for the first recording
+    spool, tally = Spool(args.spool), _Tally()
+    with until_signal() as stopping:
+        robot = _robot(args, spool, stopping)
+        if robot is None:
+            return 0
+        try:
+            with lines_on_stderr(robot.events()):
+                robot.start_sync(every_s=args.every)
+                while not stopping.is_set():
+                    _map_what_came(robot, spool, args, tally, stopping)
+                    stopping.wait(LOOK_EVERY_S)
+                robot.close(flush_s=FLUSH_S)
+        finally:
+            robot.close(flush_s=FLUSH_S)
+    traffic = robot.traffic
+    say(
+        f"mapped {tally.scans} scans as {tally.commits} commits, {shown_bytes(traffic.up_bytes)} up, "
+        f"{shown_bytes(traffic.down_bytes)} down; {robot.waiting} commits wait"
+    )
+    return 0
+
+
+def _robot(args: argparse.Namespace, spool: Spool, stopping: threading.Event) -> Robot | None:
+    """The robot; one that knows no map yet waits for the first recording, which says what there is to map."""
+    name = args.name or default_name(args.spool.resolve().name)
+    state: Path = args.state or Path(f"cairn-{name}")
+    source = spool.next_recording()
+    while source is None and not is_state_folder(state):
+        if stopping.wait(LOOK_EVERY_S):
+            return None
+        source = spool.next_recording()
+    return Robot(
+        source.rig if source else None,
+        args.map,
+        directory=state,
+        name=name,
+        token=args.token,
+        mode=args.mode,
+        geometry=ensure_map(args, source) if source else None,
+        integrator=Integrator(min_range_m=args.min_range, max_range_m=args.max_range),
+        scope=scope_of(args),
+        limits=limits_of(args),
+        link=args.link,
+        stay=args.stay,
+        keep_scans_bytes=round(args.keep_scans * 1e6),
+        carry_bytes_max=round(args.carry * 1e6),
+    )
+
+
+def _map_what_came(
+    robot: Robot, spool: Spool, args: argparse.Namespace, tally: _Tally, stopping: threading.Event
+) -> None:
+    for stop in spool.stops(robot.replica):
+        robot.mount(stop.source.rig)
+        for index in stop.scans:
+            if stopping.is_set():
+                break
+            try:
+                robot.observe(stop.source.scan(index))
+                tally.scans += 1
+            except (BadInputError, DamagedDataError) as exc:
+                log.error("scan %d of %s is left out: %s", index, stop.folder, exc.message)
+        try:
+            if not _commit(robot, stop, Profile(args.profile), tally, stopping):
+                return
+        except BadInputError as exc:  # it would be refused at every start
+            _leave_out(robot, stop, exc)
+    if args.delete:
+        spool.delete_done(robot.replica)
+
+
+def _leave_out(robot: Robot, stop: Stop, exc: BadInputError) -> None:
+    """Nothing can be made of a measurement: go on without it."""
+    log.error(
+        "measurement %d of %s is left out: %s; put its scans into the spool again, under a new name and in smaller "
+        "measurements",
+        *(stop.number, stop.folder, exc.message),
+    )
+    robot.replica.outbox.beside = {}
+    robot.discard()
+    remember(robot.replica, stop.mark_left_out())
+
+
+def _commit(robot: Robot, stop: Stop, profile: Profile, tally: _Tally, stopping: threading.Event) -> bool:
+    """Keep a measurement together with the mark that it is done; False, and nothing is kept, if it is to stop first."""
+    outbox = robot.replica.outbox
+    outbox.beside = stop.mark()
+    while not stopping.is_set():
+        try:
+            commit = robot.commit(note=stop.source.name, profile=profile)
+        except UnreachableError as exc:  # a full disk or outbox: there may be room later
+            log.error("%s; trying again in %.0f s", exc.message, COMMIT_AGAIN_S)
+            stopping.wait(COMMIT_AGAIN_S)
+            continue
+        if commit is None:
+            outbox.beside = {}
+            remember(robot.replica, stop.mark())
+        tally.commits += commit is not None
+        return True
+    outbox.beside = {}
+    robot.discard()
+    return False

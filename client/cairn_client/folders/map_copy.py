@@ -1,0 +1,90 @@
+"""A copy of a map in a folder, that a later pull brings up to date by what changed alone."""
+
+import secrets
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from cairn_client.folders.state_folder import is_copy, is_state_folder, opened_replica, url_of
+from cairn_client.robot.robot import Robot
+from cairn_map.errors import BadInputError, ConflictError
+
+
+@dataclass(frozen=True, slots=True)
+class Pulled:
+    """What a clone or pull did."""
+
+    map_url: str
+    folder: Path
+    cells: int
+    """In the copy now."""
+    voxels: int
+    """Known ones."""
+    changed_cells: int
+    new_commits: int
+    """That the copy did not have before."""
+    down_bytes: int
+    cursor: str
+    """State of the server that the copy is."""
+
+    def as_json(self) -> dict[str, object]:
+        """Its fields, for JSON."""
+        return {**asdict(self), "folder": str(self.folder)}
+
+
+def clone(map_url: str, folder: Path, *, token: str | None, name: str | None = None) -> Pulled:
+    """Copy a map into a new folder. Cut off, it is finished by `pull`.
+
+    Args:
+        map_url: `http://HOST:PORT/maps/NAME`.
+        folder: new, or empty.
+        token: to register by, where the server wants one.
+        name: of this copy among the robots of the map; None: one that nobody else has.
+
+    Raises:
+        ConflictError: kind `copy_exists`: there is something in the folder.
+        CairnError: the server cannot be reached, has no such map, or refuses.
+    """
+    if folder.exists() and any(folder.iterdir()):
+        known = "; `cairn pull` brings it up to date" if is_state_folder(folder) else ""
+        raise ConflictError("copy_exists", f"{folder} is not empty{known}")
+    return _pull(map_url, folder, token=token, name=name or f"copy-{secrets.token_hex(4)}")
+
+
+def pull(folder: Path, *, token: str | None = None) -> Pulled:
+    """Bring a copy up to date.
+
+    Raises:
+        BadInputError: the folder is no copy.
+        CairnError: the server cannot be reached, or refuses.
+    """
+    map_url = url_of(folder)
+    with opened_replica(folder) as replica:
+        name, is_robot = replica.author.robot, not is_copy(replica)
+    if is_robot:
+        raise BadInputError(
+            "no_copy", f"{folder} is robot {name}'s folder; `cairn robot sync {folder}` brings it up to date"
+        )
+    return _pull(map_url, folder, token=token, name=name)
+
+
+def _pull(map_url: str, folder: Path, *, token: str | None, name: str) -> Pulled:
+    with Robot(None, map_url, directory=folder, name=name, token=token, mode="viewer", stay=True) as robot:
+        replica = robot.replica
+        with replica.lock:
+            before = {key: cell.fingerprint for key, cell in replica.cells.items()}
+            commits = len(replica.header.coverage) if replica.header else 0
+        robot.sync()
+        robot.sync()  # tells the server where this copy stands now
+        with replica.lock:
+            after = {key: cell.fingerprint for key, cell in replica.cells.items()}
+            header, packed = replica.header, robot.map.packed()
+        return Pulled(
+            map_url=map_url,
+            folder=folder,
+            cells=len(packed),
+            voxels=sum(len(evidence) for evidence in packed.values()),
+            changed_cells=sum(before.get(key) != after.get(key) for key in before.keys() | after.keys()),
+            new_commits=len(header.coverage) - commits if header else 0,
+            down_bytes=robot.traffic.down_bytes,
+            cursor=header.to if header else "",
+        )

@@ -1,0 +1,94 @@
+"""Conversations held over HTTP."""
+
+from collections.abc import Generator
+from typing import Any, TypeVar
+
+from cairn_client.http.api import MapApi
+from cairn_client.sync.cell_index import whole_index
+from cairn_client.sync.requests import (
+    Ask,
+    Conversation,
+    GetCell,
+    GetCommit,
+    GetIndex,
+    GetMissing,
+    GetUpload,
+    NextFrame,
+    Push,
+    PutCell,
+    PutPart,
+)
+from cairn_map.errors import CairnError
+from cairn_map.wire.frames import Frame
+from cairn_map.wire.index_messages import CellIndex
+from cairn_map.wire.resumed_replies import Replies
+
+T = TypeVar("T")
+
+
+class Link:
+    """One robot's way to one map."""
+
+    def __init__(self, api: MapApi, map_name: str, *, branch: str) -> None:
+        self._api = api
+        self._map_name = map_name
+        self._branch = branch
+        self._frames: Generator[Frame, None, None] | None = None
+        self._replies = Replies()
+
+    def hold(self, conversation: Conversation[T]) -> T:
+        """The result of a conversation with the server.
+
+        Raises:
+            CairnError: what the conversation does not deal with itself.
+        """
+        try:
+            ask = next(conversation)
+            while True:
+                try:
+                    answer = self._answer(ask)
+                except CairnError as exc:
+                    ask = conversation.throw(exc)
+                else:
+                    ask = conversation.send(answer)
+        except StopIteration as end:
+            result: T = end.value
+            return result
+        finally:
+            self._stop_reading()
+
+    def _answer(self, ask: Ask[Any]) -> Any:
+        api, name = self._api, self._map_name
+        match ask:
+            case Push(commit, seal, signatures):
+                api.push(name, commit, seal=seal, signatures=signatures)
+                return None
+            case GetUpload() | PutPart():
+                return api.upload(name, ask)
+            case GetCommit(commit_id):
+                return api.commit(name, commit_id)
+            case GetMissing(request):
+                self._stop_reading()
+                self._frames = api.missing(name, self._branch, request, replies=self._replies)
+                return next(self._frames, None)
+            case NextFrame():
+                return next(self._frames, None) if self._frames else None
+            case GetIndex(author, box, after):
+                return api.cell_index(name, author, box=box, after=after)
+            case GetCell(cell, etag):
+                return api.cell(name, cell, etag=etag)
+            case PutCell(cell, body):
+                api.put_cell(name, cell, body)
+                return None
+        raise TypeError(f"no way to ask {ask!r}")
+
+    def _stop_reading(self) -> None:
+        """Close a reply that was not read to its end."""
+        if self._frames is not None:
+            self._frames.close()
+            self._frames = None
+
+
+def index_of(api: MapApi, map_name: str) -> CellIndex:
+    """All cells of a map, without their bytes, for who is no robot."""
+    return Link(api, map_name, branch="").hold(whole_index())

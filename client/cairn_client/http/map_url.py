@@ -1,0 +1,23 @@
+"""Where a map is: `http://HOST:PORT/maps/NAME`."""
+
+from urllib.parse import urlsplit
+
+from cairn_map.commits.ids import robot_name
+from cairn_map.errors import BadInputError
+
+
+def split_map_url(map_url: str) -> tuple[str, str]:
+    """Server and map of `http://HOST:PORT/maps/NAME`.
+
+    Raises:
+        BadInputError: it is not of that form.
+    """
+    try:
+        parts = urlsplit(map_url)
+        is_host = bool(parts.hostname) and parts.port != 0  # reading the port checks it
+    except ValueError:
+        parts, is_host = urlsplit(""), False
+    head, _, name = parts.path.rstrip("/").rpartition("/maps/")
+    if parts.scheme not in ("http", "https") or not is_host or not name or "/" in name:
+        raise BadInputError("bad_url", f"a map's URL is http://HOST:PORT/maps/NAME, got {map_url[:200]!r}")
+    return f"{parts.scheme}://{parts.netloc}{head}", robot_name(name)

@@ -1,0 +1,128 @@
+"""Commits of others that a robot has with it: a folder with a file for each, from one server on its way to the next.
+
+    mole.1f2e3d4c5b6a7988.7      the signatures, a line feed, the commit's bytes; empty once there was no room for it
+
+It is a relay's place like a server. What is in it is on some server, too, so when it is full the oldest give way;
+their names stay, so that they are not fetched again.
+"""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from cairn_map.commits.commit_reading import open_commit
+from cairn_map.commits.ids import INITIAL, OPERATOR, CommitId, commit_id_from_text
+from cairn_map.commits.signature import TEXT_MAX, check_signatures, signatures_from_text, speaks_for
+from cairn_map.commits.version_vector import EMPTY
+from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, NotFoundError, UnreachableError
+from cairn_map.wire.relay_peer import Held, SignedCommit
+
+SERVERS_OWN = (OPERATOR, INITIAL)
+"""Authors in whose name servers speak, by keys that only a server knows whether to trust."""
+COMING = ".coming"
+"""Ends the name of a file that is not whole."""
+
+
+class CarriedCommits:
+    """`relay_end.MapEnd` in a folder; of one program at a time."""
+
+    def __init__(self, folder: Path, map_name: str, *, size_bytes_max: int) -> None:
+        """Open or make the folder; for commits of this map.
+
+        Raises:
+            BadInputError: kind `bad_folder`.
+        """
+        self._folder = folder
+        self._map_name = map_name
+        self._size_bytes_max = size_bytes_max
+        try:
+            folder.mkdir(0o700, parents=True, exist_ok=True)
+        except OSError as exc:
+            raise BadInputError("bad_folder", f"cannot make the folder {folder}: {exc.strerror}") from exc
+
+    def held(self) -> Held:
+        """What is or was carried.
+
+        Raises:
+            UnreachableError: kind `store_failed`: the folder cannot be read.
+        """
+        try:
+            return Held(vector=EMPTY.with_commits(commit for commit, _ in self._files()))
+        except OSError as exc:
+            raise UnreachableError("store_failed", f"cannot read {self._folder}: {exc.strerror}") from exc
+
+    def commit(self, commit: CommitId) -> SignedCommit:
+        """A commit that is carried."""
+        try:
+            signatures, _, data = (self._folder / str(commit)).read_bytes().partition(b"\n")
+        except FileNotFoundError as exc:
+            raise NotFoundError("no_commit", f"{commit} is not carried") from exc
+        except OSError as exc:
+            path = self._folder / str(commit)
+            raise DamagedDataError("damaged_store", f"cannot read {path}: {exc.strerror}; remove it") from exc
+        if not signatures:
+            raise ConflictError("evidence_gone", f"there was no room to carry {commit} on")
+        if len(signatures) > TEXT_MAX or not signatures.isascii():
+            raise DamagedDataError("damaged_store", f"{self._folder / str(commit)} is damaged; remove it")
+        return SignedCommit(commit, data, signatures.decode())
+
+    def push(self, commit: SignedCommit) -> None:
+        """Carry a commit; durable on return.
+
+        Raises:
+            BadInputError: not what its author signed: kept, it would keep the true one out; or larger than all room.
+            DamagedDataError: no sound commit.
+        """
+        self._check(commit)
+        content = (commit.signatures or "").encode() + b"\n" + commit.data
+        path = self._folder / str(commit.id)
+        coming = path.with_name(path.name + COMING)
+        try:
+            self._make_room(len(content))
+            with coming.open("wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            coming.replace(path)
+            _sync_folder(self._folder)
+        except OSError as exc:
+            raise UnreachableError("store_failed", f"cannot write to {self._folder}: {exc.strerror}") from exc
+
+    def _check(self, commit: SignedCommit) -> None:
+        size_bytes = len(commit.signatures or "") + 1 + len(commit.data)
+        if size_bytes > self._size_bytes_max:
+            raise BadInputError(
+                "too_large", f"{commit.id} takes {size_bytes} bytes, and {self._folder} has {self._size_bytes_max}"
+            )
+        found, _ = open_commit(commit.data)
+        if found.id != commit.id:
+            raise BadInputError("other_id", f"came as {commit.id}, and is {found.id}")
+        signed = signatures_from_text(commit.signatures or "")
+        check_signatures(signed, self._map_name, found.sha)
+        if commit.id.author.robot not in SERVERS_OWN and not speaks_for(signed, commit.id.author):
+            raise BadInputError("bad_signature", f"{commit.id} is not signed by its author")
+
+    def _make_room(self, size_bytes: int) -> None:
+        """Let the oldest give way."""
+        found = sorted((path.stat().st_mtime_ns, path) for _, path in self._files())
+        total = sum(path.stat().st_size for _, path in found) + size_bytes
+        for _, path in found:
+            if total <= self._size_bytes_max:
+                return
+            total -= path.stat().st_size
+            os.truncate(path, 0)
+
+    def _files(self) -> Iterator[tuple[CommitId, Path]]:
+        for path in self._folder.iterdir():
+            try:
+                yield commit_id_from_text(path.name), path
+            except BadInputError:
+                continue  # not whole, or somebody else's
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

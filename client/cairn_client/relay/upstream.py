@@ -1,0 +1,110 @@
+"""A server joined to another one: the thread that `cairn serve --upstream` starts.
+
+All maps of the upstream server are made here if they are not, and from then on hold the same commits. Without a link
+both servers go on by themselves.
+"""
+
+import logging
+import threading
+import time
+
+from cairn_client.http.backoff import Backoff
+from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
+from cairn_client.relay.log import tell
+from cairn_client.relay.round import Resting, relay_round
+from cairn_map.errors import CairnError, UnreachableError
+from cairn_map.wire.relay_peer import OwnServer
+
+log = logging.getLogger(__name__)
+
+EVERY_S = 5.0
+"""Rounds without anything to hand over take two small requests."""
+STOP_S = 3.0
+SAY_AGAIN_S = 600.0
+
+
+class Upstream:
+    """Relays between a server and its upstream until stopped."""
+
+    def __init__(self, url: str, token: str | None, server: OwnServer, *, every_s: float = EVERY_S) -> None:
+        """Begin.
+
+        Raises:
+            BadInputError: the URL is none of a server.
+        """
+        logging.getLogger("httpx").setLevel(logging.WARNING)  # a line for each request is no help in a server's log
+        self._api = RelayApi(url, token=token)
+        self._url = url
+        self._server = server
+        self._every_s = every_s
+        self._resting: dict[str, Resting] = {}
+        self._said_s: dict[str, float] = {}
+        self._stopping = threading.Event()
+        self._woken = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="cairn-upstream", daemon=True)
+        self._thread.start()
+
+    def wake(self) -> None:
+        """There is something new here."""
+        self._woken.set()
+
+    def stop(self) -> None:
+        """End soon, in the middle of a round if the link is slow: what was not handed over will be."""
+        self._stopping.set()
+        self._woken.set()
+        self._thread.join(STOP_S)
+        if not self._thread.is_alive():
+            self._api.close()
+
+    def _run(self) -> None:
+        backoff = Backoff()
+        while not self._stopping.is_set():
+            self._woken.clear()
+            try:
+                has_more = self._round()
+            except UnreachableError as exc:
+                self._say(logging.WARNING, f"no link to upstream {self._url}, going on alone: {exc.message}")
+                self._stopping.wait(backoff.next_s(exc.retry_after_s))
+            except CairnError as exc:
+                self._say(logging.ERROR, f"upstream {self._url}: {exc.kind}: {exc.message}")
+                self._stopping.wait(backoff.next_s(None))
+            except Exception:
+                log.exception("upstream %s: the relay failed, and tries again", self._url)
+                self._stopping.wait(backoff.next_s(None))
+            else:
+                backoff.reset()
+                if not has_more:
+                    self._woken.wait(self._every_s)
+
+    def _round(self) -> bool:
+        """All maps once; whether there is more to do at once."""
+        found = self._api.maps()
+        for name in sorted(set(self._server.map_names()) - {info.name for info in found}):
+            self._say(logging.WARNING, f"upstream {self._url} has no map {name} for this token; create it there")
+        has_more, cut = False, None
+        for info in found:
+            if self._stopping.is_set():
+                return False
+            try:
+                here = self._server.open(info)
+            except CairnError as exc:
+                self._say(logging.ERROR, f"map {info.name} cannot be joined: {exc.message}")
+                continue
+            begun_s = time.time()
+            resting = self._resting.setdefault(info.name, Resting())
+            report = hold_between(relay_round(resting), here, ServerEnd(self._api, info.name))
+            tell(report, info.name, there=self._url)
+            has_more, cut = has_more or report.has_more, cut or report.cut
+            if report.is_all_there:
+                self._server.handed_over(info.name, begun_s)
+        if cut:
+            raise cut
+        return has_more
+
+    def _say(self, level: int, text: str) -> None:
+        """A line of the log, the same one not again too soon."""
+        now_s = time.monotonic()
+        if now_s - self._said_s.get(text, float("-inf")) >= SAY_AGAIN_S:
+            self._said_s = {said: said_s for said, said_s in self._said_s.items() if now_s - said_s < SAY_AGAIN_S}
+            self._said_s[text] = now_s
+            log.log(level, "%s", text)

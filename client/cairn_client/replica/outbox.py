@@ -1,0 +1,298 @@
+"""A robot's own commits: numbered without gaps, kept until no restore can lose them, renamed if an id is taken.
+
+    add -> push_set -> acknowledge        the server has the bytes for good
+                    -> rename             the server has other bytes under this id (SYNC.md rule 13)
+    forget                                stable and covered everywhere (rule 12): the SHA stays, the bytes go
+
+All methods are called under the replica's lock.
+"""
+
+import logging
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+
+from cairn_client.replica.replica_store import KeptCommit, ReplicaStore
+from cairn_client.replica.robot_keys import RobotKeys
+from cairn_client.replica.successors import Successors
+from cairn_map.codec.cell_code import Profile, decode_cell
+from cairn_map.commits.commit import Commit, CommitMeta, make_commit, renamed_commit, split_commit
+from cairn_map.commits.ids import NUMBER_LIMIT, Author, CommitId, Incarnation, RobotName
+from cairn_map.commits.version_vector import EMPTY, VersionVector
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey, Geometry
+from cairn_map.wire.messages import ReplyHeader
+
+log = logging.getLogger(__name__)
+
+UNNUMBERED = NUMBER_LIMIT - 1
+"""Number in a meta that has not got its own yet: one that no commit in it can be named to retract."""
+
+
+class Outbox:
+    """The commits in a replica's store."""
+
+    def __init__(self, store: ReplicaStore, robot: RobotName, geometry: Geometry) -> None:
+        self._store = store
+        self._robot = robot
+        self._geometry = geometry
+        self._keys = RobotKeys(store, robot)
+        known = store.get("incarnation")
+        if known is None or not self._keys.has(Incarnation(known)):  # a folder from before commits were signed
+            with store.transaction():
+                known = self._keys.draw()
+                store.put("incarnation", known)
+                self._set_next(0, None)
+        self._incarnation = Incarnation(known)
+        self._commits: dict[CommitId, KeptCommit] = {}
+        self._touching: dict[CellKey, dict[CommitId, None]] = {}
+        self._acked_since_header: set[CommitId] = set()
+        self._retracts: dict[CommitId, tuple[CommitId, ...]] = {}
+        """What the kept commits take out, of those that somebody asked for."""
+        self.make_room: Callable[[int], None] = lambda size_bytes: None
+        """Called before a commit of so many bytes is kept; raises if there is no room (`room`)."""
+        self.beside: Mapping[str, str] = {}
+        """Texts to remember in the transaction of the next commit, and of no other."""
+        self.successors = Successors(store)
+        self.amendable: Callable[[], Iterable[CommitId]] = tuple
+        """Commits that may still be amended: their bytes are kept, to subtract them at once."""
+        for kept in store.commits():
+            self._note(kept)
+
+    def __iter__(self) -> Iterator[KeptCommit]:
+        """Commits whose bytes are kept, oldest first."""
+        return (kept for kept in self._commits.values() if kept.has_data)
+
+    @property
+    def author(self) -> Author:
+        """The robot in its present incarnation."""
+        return Author(self._robot, self._incarnation)
+
+    @property
+    def cells(self) -> set[CellKey]:
+        """Cells that a kept commit touches."""
+        return set(self._touching)
+
+    def add(
+        self,
+        diff: Mapping[CellKey, Evidence],
+        meta: CommitMeta | None,
+        *,
+        seen: str | None,
+        profile: Profile = Profile.FAST,
+    ) -> Commit:
+        """Keep evidence as the next commit; durable on return.
+
+        Raises:
+            BadInputError: kind `not_own`: it retracts another robot's commit; only an operator may.
+        """
+        foreign = [target for target in (meta.retracted_ids if meta else ()) if target.author.robot != self._robot]
+        if foreign:
+            raise BadInputError("not_own", f"{foreign[0]} is not {self._robot}'s own; an operator can retract it")
+        n = self._next_n()
+        known = {
+            "id": str(CommitId(self.author, n)),
+            "geometry": self._geometry.digest().hex(),
+            "parent": self._store.get("tip_sha"),
+            "seen": seen,
+        }
+        meta = CommitMeta.model_validate({**dict(meta or ()), **known})
+        commit = make_commit(meta, diff, self._geometry, profile=profile)
+        self.make_room(len(commit.data))
+        with self._store.transaction():
+            self._store.add_commit(commit)
+            self._set_next(n + 1, commit)
+            for key, text in self.beside.items():
+                self._store.put(key, text)
+            self._put_successor(commit)
+        self.beside = {}
+        self._note(_kept(commit))
+        self._read_successors(commit.meta.retracted_ids)
+        self._retracts[commit.id] = commit.meta.retracted_ids
+        return commit
+
+    def keep_sealed(self, commit: Commit, seal: str) -> None:
+        """Keep a server's own retract, to push it back if the server is restored to a time before it (rule 11)."""
+        with self._store.transaction():
+            self._store.add_commit(commit, seal=seal)
+            self._put_successor(commit)
+        self._note(replace(_kept(commit), acked=True, seal=seal))
+        self._read_successors(commit.meta.retracted_ids)
+
+    def knows(self, commit: CommitId) -> bool:
+        """Whether it is here, or was."""
+        return commit in self._commits
+
+    def seal(self, commit: CommitId) -> str | None:
+        """The seal that a kept commit bears."""
+        return self._commits[commit].seal
+
+    def signatures(self, commit: Commit) -> str | None:
+        """Of this robot on a commit of its own, as `Cairn-Signature` has them; None for a server's retract."""
+        return self._keys.signatures(commit)
+
+    def push_set(self, header: ReplyHeader | None) -> list[CommitId]:
+        """Commits that the server may lack, oldest first.
+
+        All minus what the newest header covers, unless it wants it again, minus what is on the server's desk or was
+        acknowledged since. A
+        commit that was never acknowledged is pushed even if its id is covered: after a roll-back of this robot's disk
+        another commit may have that id (rule 13).
+        """
+        covered = header.coverage if header else EMPTY
+        pending = header.pending_vector if header else EMPTY
+        wanted = set(header.wanted) if header else set()
+        return [
+            kept.id
+            for kept in self._commits.values()
+            if kept.has_data
+            and kept.id not in self._acked_since_header
+            and not (kept.acked and (kept.id in covered or kept.id in pending) and str(kept.id) not in wanted)
+        ]
+
+    def whole(self, commit: CommitId) -> Commit | None:
+        """A commit with its bytes; None if they are not kept any more."""
+        data = self._store.commit_data(commit)
+        if data is None:
+            return None
+        meta, cells = split_commit(data)
+        return Commit(meta, cells, self._commits[commit].sha, data)
+
+    def acknowledge(self, commit: CommitId) -> None:
+        """The server has these bytes for good. It counts for nothing else: only coverage says what a cell holds."""
+        with self._store.transaction():
+            self._store.set_acked(commit)
+        self._commits[commit] = replace(self._commits[commit], acked=True)
+        self._acked_since_header.add(commit)
+
+    def rename(self, commit: CommitId) -> Commit:
+        """Give a commit whose id is taken on the server a new one, in a new incarnation (rule 13)."""
+        data = self._store.commit_data(commit)
+        if data is None:
+            raise BadInputError("no_bytes", f"the bytes of {commit} are not kept any more")
+        if commit.author == self.author:
+            self.new_incarnation(f"the id {commit} is taken by other bytes")
+        n = self._next_n()
+        renamed = renamed_commit(data, commit=CommitId(self.author, n), parent=self._store.get("tip_sha"))
+        amends = list(self._naming(commit, renamed.id))
+        with self._store.transaction():
+            self._store.remove_commit(commit)
+            self._store.add_commit(renamed)
+            self._set_next(n + 1, renamed)
+            for amend in amends:
+                self._store.replace_commit(amend)
+            self.successors.rename(commit, renamed.id, takes_out=renamed.meta.retracted_ids)
+        for key in self._commits.pop(commit).cells:
+            del self._touching[key][commit]
+        for changed in (renamed, *amends):
+            self._note(_kept(changed))
+        self._read_successors(renamed.meta.retracted_ids)
+        return renamed
+
+    def _naming(self, old: CommitId, new: CommitId) -> Iterator[Commit]:
+        """Commits that retract one which gets a new id, saying the new one; on the server the old is another's.
+
+        Commits are pushed oldest first, so none of these can have been pushed before the one they name.
+        """
+        for kept in self._commits.values():
+            data = None if kept.acked else self._store.commit_data(kept.id)
+            meta = split_commit(data)[0] if data else None
+            if data is not None and meta is not None and old in meta.retracted_ids:
+                targets = tuple(str(new if target == old else target) for target in meta.retracted_ids)
+                yield renamed_commit(data, commit=kept.id, parent=meta.parent, retracts=targets)
+
+    def new_incarnation(self, reason: str) -> None:
+        """Number commits anew under a fresh incarnation: this robot's disk was rolled back or lost."""
+        log.warning("robot %s takes a new incarnation: %s", self._robot, reason)
+        with self._store.transaction():
+            fresh = self._keys.draw()
+            self._store.put("incarnation", fresh)
+            self._set_next(0, None)
+        self._incarnation = fresh
+
+    def check_tip(self, header: ReplyHeader, *, asked_by: Author) -> None:
+        """Note a newer header, and whether the server knows of commits that this disk forgot (rule 13)."""
+        self._acked_since_header.clear()
+        if header.tip is None or asked_by != self.author:
+            return
+        n, sha = header.tip
+        known = self._commits.get(CommitId(self.author, n))
+        if n >= self._next_n() or (known is not None and known.sha.hex() != sha):
+            self.new_incarnation(f"the server has commit {n} of it with bytes that are not here")
+
+    def named(self) -> set[CommitId]:
+        """What the kept commits take out, for whoever holds an amend keeps what it names (rule 11); or may yet."""
+        amendable = {self.successors.latest(commit) for commit in self.amendable()}
+        return amendable | {target for kept in self for target in self._retracts_of(kept.id)}
+
+    def forget(self, gone: Iterable[CommitId]) -> None:
+        """Drop the bytes of commits; their SHA stays."""
+        commits = list(gone)
+        if commits:
+            with self._store.transaction():
+                self._store.forget_data(commits)
+        for commit in commits:
+            self._commits[commit] = replace(self._commits[commit], has_data=False)
+            self._retracts.pop(commit, None)
+
+    def reread(self) -> None:
+        """Take over what the store was changed to: whether commits are acknowledged."""
+        self._acked_since_header.clear()
+        for kept in self._store.commits():
+            self._note(kept)
+
+    def touching(self, key: CellKey) -> list[KeptCommit]:
+        """Commits with bytes that touch a cell, oldest first."""
+        return [kept for commit in self._touching.get(key, ()) if (kept := self._commits[commit]).has_data]
+
+    def kept(self, commit: CommitId) -> KeptCommit | None:
+        """A commit, if its bytes are kept."""
+        kept = self._commits.get(commit)
+        return kept if kept is not None and kept.has_data else None
+
+    def own_evidence(self, key: CellKey, news: VersionVector, author: Author) -> list[Evidence] | None:
+        """What an author's commits among `news` say about a cell; None if the bytes of one are not kept any more."""
+        mine = [commit for commit in self._touching.get(key, ()) if commit.author == author and commit in news]
+        if not all(self._commits[commit].has_data for commit in mine):
+            return None
+        return [self.evidence(commit, key) for commit in mine]
+
+    def evidence(self, commit: CommitId, key: CellKey) -> Evidence:
+        """What one commit says about a cell that it touches.
+
+        Raises:
+            DamagedDataError: its bytes at rest are not sound any more.
+        """
+        return decode_cell(split_commit(self._store.commit_data(commit) or b"")[1][key]).evidence
+
+    def _note(self, kept: KeptCommit) -> None:
+        self._retracts.pop(kept.id, None)
+        self._commits[kept.id] = kept
+        for key in kept.cells:
+            self._touching.setdefault(key, {})[kept.id] = None
+        self.successors.read(kept.id)
+
+    def _put_successor(self, commit: Commit) -> None:
+        for target in commit.meta.retracted_ids:
+            self.successors.put(target, commit.id)
+
+    def _read_successors(self, commits: Iterable[CommitId]) -> None:
+        for commit in commits:
+            self.successors.read(commit)
+
+    def _retracts_of(self, commit: CommitId) -> tuple[CommitId, ...]:
+        if commit not in self._retracts:
+            data = self._store.commit_data(commit)
+            self._retracts[commit] = split_commit(data)[0].retracted_ids if data else ()
+        return self._retracts[commit]
+
+    def _next_n(self) -> int:
+        return int(self._store.get("next_n") or 0)
+
+    def _set_next(self, n: int, tip: Commit | None) -> None:
+        self._store.put("next_n", str(n))
+        self._store.put("tip_sha", tip.sha.hex() if tip else None)
+
+
+def _kept(commit: Commit) -> KeptCommit:
+    return KeptCommit(commit.id, commit.sha, tuple(sorted(commit.cells)))

@@ -1,0 +1,298 @@
+"""What a robot must not forget, in one SQLite file: its name and number, its commits, the server's cells it holds.
+
+Every change is one transaction with `synchronous=FULL`, so that power may be cut between any two steps. One robot
+at a time has the file open; others may look at it (`sqlite_glance`). All methods are called under the replica's lock.
+"""
+
+import json
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import apsw
+
+from cairn_client.replica.folder_lock import lock_folder, make_folder
+from cairn_client.replica.sqlite_failures import failure_of
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.cursor import Cursor, cursor_from_text
+from cairn_map.commits.ids import Author, CommitId
+from cairn_map.commits.version_vector import VersionVector, version_vector_from_json
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.fingerprint import Fingerprint, fingerprint_from_bytes
+from cairn_map.evidence.grid import CellKey
+
+FILE_NAME = "robot.sqlite"
+VERSION = 2
+BUSY_MS = 1000
+"""How long a folder may still be held by a robot that is just closing."""
+PRAGMAS = (
+    "page_size = 16384",
+    "journal_mode = WAL",
+    "synchronous = FULL",
+    "mmap_size = 0",
+    "journal_size_limit = 67108864",
+)
+DDL = """
+CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE commits (
+    number INTEGER PRIMARY KEY,
+    robot TEXT NOT NULL, incarnation TEXT NOT NULL, n INTEGER NOT NULL,
+    sha BLOB NOT NULL,
+    acked INTEGER NOT NULL DEFAULT 0,   -- the server said once that it has exactly these bytes
+    cells TEXT NOT NULL,                -- numbers of the cells it touches, as JSON
+    data BLOB,                          -- NULL once the commit may be forgotten
+    seal TEXT,                          -- of a server's own retract, kept for it
+    UNIQUE (robot, incarnation, n)
+);
+CREATE TABLE coverage (name INTEGER PRIMARY KEY, vector TEXT NOT NULL UNIQUE);
+CREATE TABLE cell (
+    cell INTEGER PRIMARY KEY,
+    cursor TEXT,                        -- NULL: not proven any more, to be fetched whole
+    coverage INTEGER NOT NULL REFERENCES coverage,
+    fingerprint BLOB NOT NULL,
+    etag TEXT,
+    body BLOB NOT NULL
+);
+CREATE INDEX cell_coverage ON cell (coverage);
+"""
+ONE_COMMIT = "robot = ? AND incarnation = ? AND n = ?"
+Values = tuple[str | int | bytes | None, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class BaseCell:
+    """The server's cell as this robot last had it, without its bytes."""
+
+    cursor: Cursor | None
+    """None: not proven, to be fetched whole."""
+    coverage: VersionVector
+    fingerprint: Fingerprint
+    etag: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class KeptCommit:
+    """A commit in the store, without its bytes."""
+
+    id: CommitId
+    sha: bytes
+    cells: tuple[CellKey, ...]
+    acked: bool = False
+    has_data: bool = True
+    """False where only the SHA is remembered."""
+    seal: str | None = None
+    """Of a server's own retract, which is kept to be pushed back if the server loses it."""
+
+
+class ReplicaStore:
+    """The file behind a replica."""
+
+    _lock: BinaryIO | None = None
+
+    def __init__(self, folder: Path) -> None:
+        """Open or make the file.
+
+        Raises:
+            ConflictError: kind `folder_in_use`: another process has it open.
+            DamagedDataError: it is no SQLite file, or a broken one.
+            BadInputError: it is of another version, or the folder cannot be made.
+        """
+        self._folder = folder
+        make_folder(folder, secret_file=FILE_NAME)
+        with self._translated():
+            self._connection = apsw.Connection(str(folder / FILE_NAME))
+        try:
+            self._lock = lock_folder(folder, wait_s=BUSY_MS / 1000)
+            self._prepare()
+        except BaseException:
+            self.close()
+            raise
+
+    def _prepare(self) -> None:
+        with self._translated():
+            self._connection.set_busy_timeout(BUSY_MS)
+            for pragma in PRAGMAS:
+                self._connection.execute(f"PRAGMA {pragma}")
+        version = self._first("PRAGMA user_version", ())
+        if version == 0:
+            with self.transaction():
+                self._connection.execute(DDL)
+                self._connection.execute(f"PRAGMA user_version = {VERSION}")
+        elif version == 1:
+            with self.transaction():
+                self._connection.execute("ALTER TABLE commits ADD COLUMN seal TEXT")
+                self._connection.execute(f"PRAGMA user_version = {VERSION}")
+        elif version != VERSION:
+            raise BadInputError("store_version", f"{self._folder} has version {version}, this cairn needs {VERSION}")
+
+    @contextmanager
+    def transaction(self) -> Iterator[None]:
+        """All or nothing of what is written inside.
+
+        Raises:
+            UnreachableError: kind `store_failed`: the disk is full or broken; nothing was written.
+        """
+        with self._translated():
+            self._connection.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+                self._connection.execute("COMMIT")
+            except BaseException:
+                if self._connection.in_transaction:
+                    self._connection.execute("ROLLBACK")
+                raise
+
+    def get(self, key: str) -> str | None:
+        """A remembered text."""
+        value: str | None = self._first("SELECT value FROM meta WHERE key = ?", (key,))
+        return value
+
+    def put(self, key: str, value: str | None) -> None:
+        """Remember a text, or forget it."""
+        if value is None:
+            self._run("DELETE FROM meta WHERE key = ?", (key,))
+        else:
+            self._run(
+                "INSERT INTO meta VALUES (?, ?) ON CONFLICT (key) DO UPDATE SET value = excluded.value", (key, value)
+            )
+
+    def commits(self) -> list[KeptCommit]:
+        """All commits, in the order in which they came."""
+        rows = self._run(
+            "SELECT robot, incarnation, n, sha, cells, acked, data IS NOT NULL, seal FROM commits ORDER BY number"
+        )
+        return [
+            KeptCommit(CommitId(Author(r, i), n), sha, tuple(json.loads(cells)), bool(acked), bool(has_data), seal)
+            for r, i, n, sha, cells, acked, has_data, seal in rows
+        ]
+
+    def data_bytes(self, commits: Iterable[CommitId]) -> int:
+        """How many bytes of these commits are kept."""
+        query = f"SELECT coalesce(sum(length(data)), 0) FROM commits WHERE {ONE_COMMIT}"  # noqa: S608
+        return sum(int(self._first(query, _values(commit)) or 0) for commit in commits)
+
+    def commit_data(self, commit: CommitId) -> bytes | None:
+        """Bytes of a commit, if they are still kept."""
+        data: bytes | None = self._first(f"SELECT data FROM commits WHERE {ONE_COMMIT}", _values(commit))  # noqa: S608
+        return data
+
+    def add_commit(self, commit: Commit, *, seal: str | None = None) -> None:
+        """Keep a commit; one with a seal is the server's own, which has it already."""
+        self._run(
+            "INSERT INTO commits (robot, incarnation, n, sha, cells, data, seal, acked)"
+            " VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+            (*_values(commit.id), commit.sha, json.dumps(sorted(commit.cells)), commit.data, seal, seal is not None),
+        )
+
+    def replace_commit(self, commit: Commit) -> None:
+        """Keep a commit with other bytes in its old place."""
+        self._run(
+            "UPDATE commits SET sha = ?, data = ? WHERE robot = ? AND incarnation = ? AND n = ?",
+            (commit.sha, commit.data, *commit.id.author, commit.id.n),
+        )
+
+    def set_acked(self, commit: CommitId) -> None:
+        """Note that the server has exactly these bytes."""
+        self._run(f"UPDATE commits SET acked = 1 WHERE {ONE_COMMIT}", _values(commit))  # noqa: S608
+
+    def clear_acked(self) -> None:
+        """Forget what the server said it has: it is another server now."""
+        self._run("UPDATE commits SET acked = 0")
+
+    def forget_data(self, commits: Iterable[CommitId]) -> None:
+        """Drop the bytes of commits that no restore can lose; their SHA stays."""
+        for commit in commits:
+            self._run(f"UPDATE commits SET data = NULL WHERE {ONE_COMMIT}", _values(commit))  # noqa: S608
+
+    def remove_commit(self, commit: CommitId) -> None:
+        """Remove a commit that lives on under another id."""
+        self._run(f"DELETE FROM commits WHERE {ONE_COMMIT}", _values(commit))  # noqa: S608
+
+    def cells(self) -> dict[CellKey, BaseCell]:
+        """All cells held, without their bytes."""
+        vectors = {
+            name: version_vector_from_json(json.loads(vector))
+            for name, vector in self._run("SELECT name, vector FROM coverage")
+        }
+        return {
+            CellKey(cell): BaseCell(
+                cursor_from_text(cursor) if cursor else None, vectors[name], fingerprint_from_bytes(sums), etag
+            )
+            for cell, cursor, name, sums, etag in self._run(
+                "SELECT cell, cursor, coverage, fingerprint, etag FROM cell ORDER BY cell"
+            )
+        }
+
+    def body(self, key: CellKey) -> bytes | None:
+        """Bytes of a cell held."""
+        body: bytes | None = self._first("SELECT body FROM cell WHERE cell = ?", (key,))
+        return body
+
+    def cell_bytes(self) -> dict[CellKey, int]:
+        """Sizes of the cells held, as they are at rest."""
+        return {CellKey(cell): size for cell, size in self._run("SELECT cell, length(body) FROM cell")}
+
+    def used_bytes(self) -> int:
+        """Size of the file, without its free pages."""
+        pages, free, size = (self._first(f"PRAGMA {n}", ()) for n in ("page_count", "freelist_count", "page_size"))
+        return int(pages - free) * int(size)
+
+    def put_cell(self, key: CellKey, cell: BaseCell, *, body: bytes) -> None:
+        """Hold a cell; its cursor, coverage and bytes change together."""
+        name = self._coverage(cell.coverage)
+        self._run(
+            "INSERT INTO cell (cell, cursor, coverage, fingerprint, etag, body) VALUES (?, ?, ?, ?, ?, ?)"
+            " ON CONFLICT (cell) DO UPDATE SET cursor = excluded.cursor, coverage = excluded.coverage,"
+            " fingerprint = excluded.fingerprint, etag = excluded.etag, body = excluded.body",
+            (key, str(cell.cursor) if cell.cursor else None, name, cell.fingerprint.to_bytes(), cell.etag, body),
+        )
+
+    def move_cells(self, keys: Iterable[CellKey], *, to: Cursor | None, coverage: VersionVector | None) -> None:
+        """Give held cells another cursor, and coverage unless None; their bytes stay."""
+        name = None if coverage is None else self._coverage(coverage)
+        for key in keys:
+            self._run(
+                "UPDATE cell SET cursor = ?, coverage = coalesce(?, coverage) WHERE cell = ?",
+                (str(to) if to else None, name, key),
+            )
+        self._run("DELETE FROM coverage WHERE name NOT IN (SELECT coverage FROM cell)")
+
+    def drop_cells(self) -> None:
+        """Hold nothing of the server any more."""
+        self._run("DELETE FROM cell")
+        self._run("DELETE FROM coverage")
+
+    def close(self) -> None:
+        """Close the file; may be called twice."""
+        self._connection.close()
+        if self._lock is not None:
+            self._lock.close()
+
+    def _coverage(self, coverage: VersionVector) -> int:
+        """Name under which a coverage is kept: one row for all cells that share it."""
+        text = json.dumps(coverage.to_json())
+        self._run("INSERT INTO coverage (vector) VALUES (?) ON CONFLICT (vector) DO NOTHING", (text,))
+        name: int = self._first("SELECT name FROM coverage WHERE vector = ?", (text,))
+        return name
+
+    def _first(self, query: str, values: Values) -> Any:
+        with self._translated():
+            return self._connection.execute(query, values).get
+
+    def _run(self, query: str, values: Values = ()) -> list[tuple[Any, ...]]:
+        with self._translated():
+            return self._connection.execute(query, values).fetchall()
+
+    @contextmanager
+    def _translated(self) -> Iterator[None]:
+        """SQLite's errors as ours."""
+        try:
+            yield
+        except apsw.Error as exc:
+            raise failure_of(exc, self._folder / FILE_NAME) from exc
+
+
+def _values(commit: CommitId) -> tuple[str, str, int]:
+    return commit.author.robot, commit.author.incarnation, commit.n

@@ -1,0 +1,274 @@
+"""Where a robot's own frame lies in the shared map: its scans laid onto the map's occupied voxels.
+
+    starts     the guess, and places around it            a step of the search apart
+    GICP       from each start to the nearest minimum     Segal et al. 2009; small_gicp (Koide 2024)
+    fit        of the points in known space, how many lie on surfaces
+    verdict    accepted, ambiguous or failed, with the reason in words: `alignment_verdict`
+
+A wrong place would be pushed to everybody, so what could as well be another place is refused: another minimum that fits
+nearly as well (rooms that are alike), or a motion that nothing holds (along a bare corridor).
+"""
+
+import dataclasses
+import math
+import os
+from collections.abc import Callable, Iterator, Sequence
+from itertools import product
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig.poses import Transform, checked_transform, transform_points
+from cairn_calib.rig.rig import Rig
+from cairn_client.robot.alignment_verdict import Alignment, Matches, Minimum, Verdict, apart_m, failed, judged
+from cairn_fusion.mapping.beam_returns import returns_of
+from cairn_fusion.mapping.integrate import Integrator
+from cairn_fusion.recording.scan import Scan
+from cairn_map.errors import BadInputError
+from cairn_map.queries.map_snapshot import MapSnapshot
+from cairn_map.queries.occupancy_states import State
+
+Floats = npt.NDArray[np.float64]
+
+STEP_M, STEP_RAD = 0.5, math.radians(15)
+"""Of the search: from half of it, and more, GICP comes home where there is anything to hold on to."""
+STARTS_MAX = 1000
+COARSE_POINTS, FINE_POINTS = 1000, 20_000
+"""Of the scans, in the search and at its end."""
+COARSE_EDGE_M = 0.12
+"""Of the map's surfaces in the search; its voxels, if they are larger."""
+COARSE_STEPS, FINE_STEPS = 15, 50
+"""Of a GICP, likewise."""
+FOLLOWED = 32
+"""So many of the best minima of the search are found more closely, and compared."""
+COMPARED, RIVALS_MAX = 0.7, 6
+"""Those of at least so much of the best one's worth, and so many, are found on all voxels."""
+POINTS_MIN = 200
+"""Fewer, one a voxel, say too little."""
+NEIGHBOURS = 20
+"""Voxels that make a surface's normal: a patch of 4 x 5."""
+
+
+class Aligning:
+    """Alignments of one robot; its method is the robot's."""
+
+    def __init__(
+        self, snapshot: Callable[[], MapSnapshot], rig: Callable[[], Rig | None], integrator: Integrator
+    ) -> None:
+        """Args: snapshot: the map as it is now. rig: the head as it is now. integrator: range limits."""
+        self._snapshot = snapshot
+        self._rig = rig
+        self._integrator = integrator
+
+    def align(
+        self,
+        scans: Sequence[Scan],
+        *,
+        T_map_robot: npt.ArrayLike,
+        reach_m: float = STEP_M,
+        reach_rad: float = STEP_RAD,
+    ) -> Alignment:
+        """Where this robot's own frame lies in the map as it is here: before anything is observed from that frame.
+
+        Args:
+            scans: a look around, whose poses are in the robot's own frame: their `T_map_rig` is meant as `T_robot_rig`.
+            T_map_robot: a guess, (4, 4), metres; its roll and pitch to some 10 degrees, its height to half a metre.
+            reach_m: how far off the guess may be along x and along y of the map. Farther off, a room that looks alike
+                may be accepted.
+            reach_rad: how far off its heading may be; pi: any heading. The search takes some 0.1 s for each of nine
+                starts (reach_m up to 0.5) every 15 degrees.
+
+        Raises:
+            BadInputError: a scan does not fit the rig, the guess is no rigid transform, the reach asks for too many
+                starts, there is no rig, or small_gicp is not installed.
+        """
+        rig, limits = self._rig(), self._integrator
+        if rig is None:
+            raise BadInputError("no_rig", "this robot was opened without a rig, so it cannot read scans")
+        seen = (
+            returns_of(
+                scan,
+                rig,
+                min_range_m=limits.min_range_m,
+                max_range_m=limits.max_range_m,
+                flying_step_m=limits.flying_step_m,
+            )
+            for scan in scans
+        )
+        points = np.concatenate([np.empty((0, 3)), *(returns.points_map for returns in seen)])
+        return align_points(self._snapshot(), points, T_map_robot=T_map_robot, reach_m=reach_m, reach_rad=reach_rad)
+
+
+def align_points(
+    snapshot: MapSnapshot,
+    points_robot: npt.NDArray[np.floating],
+    *,
+    T_map_robot: npt.ArrayLike,
+    reach_m: float = STEP_M,
+    reach_rad: float = STEP_RAD,
+) -> Alignment:
+    """Lay (N, 3) points of a robot's own frame, metres, onto the map, as `Aligning.align`; NaN is left out."""
+    guess = checked_transform(T_map_robot, name="T_map_robot")
+    edge_m = snapshot.geometry.voxel_edge_m
+    finite = np.asarray(points_robot, np.float64)[np.isfinite(points_robot).all(axis=1)]
+    points = some(one_a_voxel(finite, edge_m), FINE_POINTS)
+    if len(points) < POINTS_MIN:
+        return failed(guess, f"the scans have {len(points)} points, one a voxel; {POINTS_MIN} are needed")
+    starts = list(starts_around(guess, reach_m=reach_m, reach_rad=reach_rad))
+    corners = np.concatenate([transform_points(start, _corners(points)) for start in starts])
+    box_m = np.stack([corners.min(axis=0) - STEP_M, corners.max(axis=0) + STEP_M])
+    surfaces = snapshot.occupied_in(box_m).centres_m
+    if len(surfaces) < POINTS_MIN:
+        text = f"the map has {len(surfaces)} occupied voxels where the points may be"
+        return failed(guess, f"{text}; {POINTS_MIN} are needed")
+    rough = _searched(snapshot, Surfaces(one_a_voxel(surfaces, max(edge_m, COARSE_EDGE_M))), points, starts)
+    all_surfaces = Surfaces(surfaces)
+    cloud = all_surfaces.cloud(points)
+    fine = (all_surfaces.registered(cloud, minimum.T, 3 * edge_m, steps=FINE_STEPS) for minimum in rough)
+    best, *others = _distinct([minimum_at(snapshot, points, T) for T in fine], points, edge_m)
+    found = judged(best, others, points, all_surfaces.matches(points, best.T, 2 * edge_m), edge_m=edge_m)
+    shift_m = float(np.linalg.norm(best.T[:3, 3] - guess[:3, 3]))
+    if shift_m > math.sqrt(2) * reach_m + STEP_M:
+        reason = f"it ended {shift_m:.2f} m from the guess: if that may be, give a larger reach_m"
+        return dataclasses.replace(found, verdict=Verdict.FAILED, reason=reason)
+    return found
+
+
+def _searched(
+    snapshot: MapSnapshot, surfaces: "Surfaces", points: Floats, starts: Sequence[Transform]
+) -> list[Minimum]:
+    """The minima that the starts lead to, each once, the best first; without those that are no match for it."""
+    edge_m = snapshot.geometry.voxel_edge_m
+    cloud = surfaces.cloud(some(points, COARSE_POINTS))
+    ends = (surfaces.registered(cloud, start, 2 * STEP_M, steps=COARSE_STEPS) for start in starts)
+    rough = _distinct([minimum_at(snapshot, points, T) for T in ends], points, edge_m)[:FOLLOWED]
+    closer = (surfaces.registered(cloud, minimum.T, 0.2 + 2 * edge_m, steps=FINE_STEPS) for minimum in rough)
+    minima = _distinct([minimum_at(snapshot, points, T) for T in closer], points, edge_m)
+    return [minimum for minimum in minima if minimum.worth >= COMPARED * minima[0].worth][:RIVALS_MAX]
+
+
+def minimum_at(snapshot: MapSnapshot, points: Floats, T: Transform) -> Minimum:
+    """How well points in the robot's frame fit at a place."""
+    there = transform_points(T, points)
+    hits = snapshot.nearest_occupied(there, radius_m=snapshot.geometry.voxel_edge_m).found
+    known = hits | (snapshot.state_at(there) != State.UNKNOWN)
+    return Minimum(T, float(hits.sum() / max(known.sum(), 1)), float(known.mean()))
+
+
+def _distinct(minima: Sequence[Minimum], points: Floats, edge_m: float) -> list[Minimum]:
+    """The best first, without those that are within two voxels of a better one."""
+    few = some(points, 100)
+    kept: list[Minimum] = []
+    for minimum in sorted(minima, key=_worth, reverse=True):
+        if all(apart_m(other.T, minimum.T, few) > 2 * edge_m for other in kept):
+            kept.append(minimum)
+    return kept
+
+
+def _worth(minimum: Minimum) -> float:
+    return minimum.worth
+
+
+class Surfaces:
+    """Points of a map's surfaces, as small_gicp takes them."""
+
+    def __init__(self, points_m: Floats) -> None:
+        """Args: points_m: (V, 3) map frame."""
+        try:
+            import small_gicp
+        except ImportError as exc:
+            raise BadInputError(
+                "no_small_gicp", 'align needs small_gicp; get it with pip install "cairn-robotics[robot]"'
+            ) from exc
+        self._gicp = small_gicp
+        self._cloud = small_gicp.PointCloud(points_m)
+        self._tree = small_gicp.KdTree(self._cloud)
+        small_gicp.estimate_normals_covariances(self._cloud, self._tree, NEIGHBOURS, os.cpu_count() or 1)
+
+    def cloud(self, points: Floats) -> Any:
+        """(N, 3) points with their covariances."""
+        cloud = self._gicp.PointCloud(points)
+        self._gicp.estimate_normals_covariances(cloud, self._gicp.KdTree(cloud), NEIGHBOURS // 2)
+        return cloud
+
+    def registered(self, cloud: Any, start: Transform, distance_m: float, *, steps: int) -> Transform:
+        """From a start to the nearest minimum, by matches within a distance.
+
+        On one thread: more would add up in another order each time.
+        """
+        return checked_transform(
+            self._gicp.align(
+                self._cloud,
+                cloud,
+                self._tree,
+                start,
+                max_correspondence_distance=distance_m,
+                max_iterations=steps,
+                rotation_epsilon=1e-4,
+                translation_epsilon=1e-4,
+            ).T_target_source
+        )
+
+    def matches(self, points: Floats, T: Transform, distance_m: float) -> Matches:
+        """The points within a distance of surfaces, with the surfaces' normals in the robot's frame."""
+        there = transform_points(T, points)
+        numbers, squares = self._tree.batch_nearest_neighbor_search(there)
+        near = np.asarray(squares) < distance_m**2
+        found = np.asarray(numbers)[near]
+        normals, centres = self._cloud.normals()[found, :3], self._cloud.points()[found, :3]
+        offsets_m = ((there[near] - centres) * normals).sum(axis=1)
+        return Matches(points[near], normals @ T[:3, :3], offsets_m)
+
+
+def starts_around(guess: Transform, *, reach_m: float, reach_rad: float) -> Iterator[Transform]:
+    """The guess, and places around it, a step of the search apart: moved, and the robot turned where it stands.
+
+    Raises:
+        BadInputError: too many.
+    """
+    if not (0 <= reach_m < math.inf and 0 <= reach_rad <= math.pi):
+        raise BadInputError(
+            "bad_option", f"reach_m must be 0 or more and reach_rad 0 to pi, got {reach_m}, {reach_rad}"
+        )
+    shifts_m, turns_rad = (_steps(*pair) for pair in ((reach_m, STEP_M), (reach_rad, STEP_RAD)))
+    if len(shifts_m) ** 2 * len(turns_rad) > STARTS_MAX:
+        raise BadInputError("too_large", f"the search would have more than {STARTS_MAX} starts; give a smaller reach")
+    for x, y, turn in product(shifts_m, shifts_m, turns_rad):
+        R = np.array([[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]])
+        start = guess.copy()
+        start[:3, :3] = R @ guess[:3, :3]
+        start[:2, 3] += (x, y)
+        yield start
+
+
+def one_a_voxel(points: Floats, edge_m: float) -> Floats:
+    """The mean of the points in each voxel of an edge, (M, 3) of (N, 3), in the order of the voxels' numbers."""
+    if not len(points):
+        return points
+    numbers = np.floor(points / edge_m).astype(np.int64)
+    numbers -= numbers.min(axis=0)
+    spans = numbers.max(axis=0) + 1
+    rows = (numbers[:, 0] * spans[1] + numbers[:, 1]) * spans[2] + numbers[:, 2]  # as one number: 5 times as fast
+    _, voxel_of, counts = np.unique(rows, return_inverse=True, return_counts=True)
+    sums = [np.bincount(voxel_of, points[:, axis], len(counts)) for axis in range(3)]
+    return np.asarray(np.stack(sums, axis=1) / counts[:, None])
+
+
+def some(points: Floats, count: int) -> Floats:
+    """At most so many of the points, always the same ones."""
+    if len(points) <= count:
+        return points
+    return points[np.sort(np.random.default_rng(0).permutation(len(points))[:count])]
+
+
+def _steps(reach: float, step: float) -> list[float]:
+    """0 and steps to both sides, as far as the reach; round the circle each heading once."""
+    count = math.ceil(reach / step - 1e-9)
+    steps = [n * reach / count for n in range(-count, count + 1)] if count else [0.0]
+    return steps[1:] if reach == math.pi else steps
+
+
+def _corners(points: Floats) -> Floats:
+    """(8, 3) corners of the points' box."""
+    return np.array(list(product(*np.stack([points.min(axis=0), points.max(axis=0)], axis=1))))

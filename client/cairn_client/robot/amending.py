@@ -1,0 +1,164 @@
+"""Measurements integrated anew when a pose graph corrects where their scans were taken.
+
+    C  the measurement's commit             scans kept under C
+    M  names C, with the new evidence       scans kept under M from here on: the next amend names M
+
+The map is then the one that the corrected poses would have given from the start, byte for byte.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig.poses import checked_transform
+from cairn_client.replica.replica import Replica
+from cairn_client.robot.kept_scans import KeptScans
+from cairn_fusion.mapping.measurement import Measurement
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.recording.scan_bytes import moved_scan
+from cairn_map.codec.cell_code import Profile
+from cairn_map.commits.commit import Commit, CommitMeta
+from cairn_map.commits.ids import CommitId, commit_id_from_text
+from cairn_map.errors import BadInputError, ConflictError, NotFoundError
+
+AnyCommit = Commit | CommitId | str
+"""A commit, its id, or that as text."""
+Move = Callable[[Iterator[Scan]], Iterator[Scan]]
+"""The scans of a measurement from other poses."""
+MetaOf = Callable[[Measurement, str, tuple[CommitId, ...]], CommitMeta]
+"""What the commit of a measurement says, with its note and what it takes out."""
+
+
+class Amending:
+    """Amends of one robot's commits; its methods are the robot's. By the thread that observes."""
+
+    def __init__(
+        self,
+        replica: Replica,
+        kept: KeptScans,
+        usual: Profile,
+        *,
+        fresh: Callable[[], Measurement | None],
+        meta_of: MetaOf,
+        on_commit: Callable[[Commit], None],
+    ) -> None:
+        """Args: usual: the profile unless one is asked for. fresh: an empty measurement; None without a rig."""
+        self._replica = replica
+        self._kept = kept
+        self._usual = usual
+        self._fresh = fresh
+        self._meta_of = meta_of
+        self._on_commit = on_commit
+
+    def amend(
+        self,
+        measurement: AnyCommit,
+        T_map_rig: npt.ArrayLike | None = None,
+        *,
+        T_map_observed: npt.ArrayLike | None = None,
+        note: str = "",
+        profile: Profile | None = None,
+    ) -> Commit:
+        """A measurement's scans, integrated anew from other poses, as the commit that takes the first one's place.
+
+        This robot shows it at once, also where the first one was never pushed; everybody else once they sync. The map
+        is then the one that these poses would have given from the start, byte for byte. The rig and the integrator
+        are those of this robot now.
+
+        Args:
+            measurement: what `commit` returned, or any amend of it: the latest one is replaced.
+            T_map_rig: (N, 4, 4) the pose of each of its N scans, in their order, metres; the body moves with the rig.
+            T_map_observed: or (4, 4), one correction of the poses that were observed: `T_map_observed @ T_observed`,
+                counted from what was given to `observe`, also if the measurement was amended before.
+            note: up to 1024 characters for the map's log.
+            profile: as for `commit`.
+
+        Raises:
+            NotFoundError: kind `no_scans`: the scans are not kept (any more); the message says how to keep more.
+            ConflictError: kind `taken_back`: the measurement was taken back, and not by an amend.
+            BadInputError: no rigid poses, or not one for each scan; or the scans do not fit the rig any more.
+            DamagedDataError: the disk damaged the scans.
+            UnreachableError: kind `store_failed`: the disk is full or broken. In all cases nothing was changed.
+        """
+        found = self._scans_of(measurement)
+        return self._amend(found, _move(T_map_rig, T_map_observed), note=note, profile=profile)
+
+    def amend_all(
+        self, T_map_rig: Mapping[CommitId | str, npt.ArrayLike], *, note: str = "", profile: Profile | None = None
+    ) -> list[Commit]:
+        """Amends of many measurements, as after a loop closure: none if the scans of one of them are not kept.
+
+        Args:
+            T_map_rig: for the id of each measurement's commit (N, 4, 4), the pose of each of its N scans.
+            note: as for `amend`.
+            profile: as for `commit`.
+
+        Raises:
+            CairnError: as `amend`; but for `no_scans` and `taken_back`, the amends before it have been made.
+        """
+        found = [(self._scans_of(measurement), _move(poses, None)) for measurement, poses in T_map_rig.items()]
+        return [self._amend(commit, move, note=note, profile=profile) for commit, move in found]
+
+    def _amend(self, found: CommitId, move: Move, *, note: str, profile: Profile | None) -> Commit:
+        measurement = self._fresh()
+        if measurement is None:
+            raise BadInputError("no_rig", "this robot was opened without a rig, so it cannot read scans")
+        for scan in move(self._kept.scans(found)):
+            measurement.add(scan)
+        diff = measurement.diff()
+        with self._replica.lock:  # the sync may give the commit another id, but not meanwhile
+            latest = self._replica.outbox.successors.latest(found)
+            meta = self._meta_of(measurement, note, (latest,))
+            commit = self._replica.commit(diff, meta, profile=profile or self._usual)
+        self._kept.rename(found, commit.id)
+        self._on_commit(commit)
+        return commit
+
+    def _scans_of(self, measurement: AnyCommit) -> CommitId:
+        """Under which commit a measurement's scans are kept."""
+        commit = _commit_id(measurement)
+        with self._replica.lock:
+            outbox = self._replica.outbox
+            latest = outbox.successors.latest(commit)
+            found = next((file for file in self._kept.commits if outbox.successors.latest(file) == latest), None)
+            found = commit if commit in self._kept.commits else found
+            if found is None:
+                raise NotFoundError(
+                    "no_scans", f"{commit} cannot be amended, its scans are not kept: {self._kept.why_gone()}"
+                )
+            if found != latest and outbox.knows(found):  # not known: it got a new id (SYNC.md rule 13)
+                raise ConflictError("taken_back", f"{found} was taken back by {latest}: there is nothing to amend")
+        return found
+
+
+def _commit_id(commit: AnyCommit) -> CommitId:
+    if isinstance(commit, Commit):
+        return commit.id
+    return commit_id_from_text(commit) if isinstance(commit, str) else commit
+
+
+def _move(T_map_rig: npt.ArrayLike | None, T_map_observed: npt.ArrayLike | None) -> Move:
+    """Scans to where they were taken: as given, or as observed and then corrected.
+
+    Raises:
+        BadInputError: not exactly one of both, or another shape.
+    """
+    if (T_map_rig is None) == (T_map_observed is None):
+        raise BadInputError("bad_option", "amend needs either T_map_rig, a pose for each scan, or T_map_observed")
+    if T_map_observed is not None:
+        correction = checked_transform(T_map_observed, name="T_map_observed")
+        return lambda scans: (moved_scan(scan, correction @ scan.T_map_rig) for scan in scans)
+    poses = np.asarray(T_map_rig, np.float64)
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4):
+        raise BadInputError("bad_transform", f"T_map_rig must be (N, 4, 4), a pose for each scan, got {poses.shape}")
+
+    def moved(scans: Iterator[Scan]) -> Iterator[Scan]:
+        count = 0
+        for count, scan in enumerate(scans, 1):
+            if count <= len(poses):
+                yield moved_scan(scan, poses[count - 1])
+        if count != len(poses):
+            raise BadInputError("bad_transform", f"the measurement has {count} scans, got {len(poses)} poses for them")
+
+    return moved

@@ -1,0 +1,42 @@
+"""What is near: which cells a robot wants at all, and which first."""
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.evidence.cell_order import first_to_last
+from cairn_map.evidence.grid import CELL_LIMIT, Cell
+from cairn_map.wire.index_messages import CellEntry
+
+Wanted = Callable[[Cell], bool]
+"""Which cells a low-end robot keeps."""
+
+
+def within(position_m: npt.ArrayLike, *, radius_m: float, cell_edge_m: float) -> Wanted:
+    """Cells of which some point lies within a radius of a position."""
+    centre = np.asarray(position_m, dtype=np.float64)
+
+    def is_near(cell: Cell) -> bool:
+        low = np.array(cell) * cell_edge_m
+        nearest = np.clip(centre, low, low + cell_edge_m)
+        return bool(np.linalg.norm(nearest - centre) <= radius_m)
+
+    return is_near
+
+
+def cell_at(position_m: Sequence[float], cell_edge_m: float) -> Cell:
+    """The cell that holds a position in the map's frame, or the outermost one in that direction."""
+    return Cell(*(max(-CELL_LIMIT, min(CELL_LIMIT - 1, math.floor(value / cell_edge_m))) for value in position_m))
+
+
+def in_order(entries: Sequence[CellEntry], near: Cell | None) -> list[CellEntry]:
+    """The cells around a cell first, and hot ones before others (`cell_order`)."""
+    order = first_to_last(
+        np.array([entry.cell for entry in entries], np.int64).reshape(-1, 3),
+        near=near,
+        changed=np.array([entry.lm for entry in entries], np.int64),
+        hottest_k=np.array([entry.hottest_k for entry in entries], np.float64),
+    )
+    return [entries[n] for n in order]

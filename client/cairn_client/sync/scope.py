@@ -1,0 +1,96 @@
+"""What of a map a robot fetches, and in what helpings."""
+
+import math
+from dataclasses import dataclass
+
+from cairn_client.replica.replica import Replica
+from cairn_client.sync.applying import is_within
+from cairn_client.sync.near_cells import Wanted
+from cairn_client.sync.requests import Box, Conversation
+from cairn_client.sync.sync import RoundReport, fetch_cells, fetch_missing
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.grid import CELL_LIMIT, Cell, cell_key
+
+BoxMetres = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Lowest and highest corner in the map's frame, metres."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scope:
+    """All of it, unless something is said."""
+
+    box_m: BoxMetres | None = None
+    """Only cells that share more than a face with this box."""
+    wanted: Wanted | None = None
+    """Low-end: only these cells, of those in the box."""
+    reply_bytes_max: int | None = None
+    """High-end and viewer: after so many bytes of cells a reply ends, and the rest is asked for by another request."""
+    round_bytes_max: int | None = None
+    """After so many bytes of cells a round ends, and the next one goes on: a commit does not wait for the whole map."""
+
+    def __post_init__(self) -> None:
+        """Raises: BadInputError: the box is none, or there is no room for a cell in a reply."""
+        if self.box_m is not None:
+            low, high = self.box_m
+            if not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(low, high, strict=True)):
+                raise BadInputError(
+                    "bad_box", f"a box is its lowest and its highest corner in metres, got {self.box_m}"
+                )
+        for size_bytes in (self.reply_bytes_max, self.round_bytes_max):
+            if size_bytes is not None and size_bytes < 1:
+                raise BadInputError("bad_option", f"a reply and a round have at least 1 byte, got {size_bytes}")
+
+    def box(self, cell_edge_m: float) -> Box | None:
+        """The box as cells, lowest and highest, both included."""
+        if self.box_m is None:
+            return None
+        low, high = self.box_m
+        first = Cell(*(_number(math.floor(_cells(value, cell_edge_m))) for value in low))
+        last = Cell(*(_number(math.ceil(_cells(value, cell_edge_m)) - 1) for value in high))
+        return first, last
+
+
+EVERYTHING = Scope()
+
+
+def fetch(
+    replica: Replica, *, is_low_end: bool, scope: Scope, room: Box | None = None, near: Cell | None = None
+) -> Conversation[RoundReport]:
+    """Bring what is in the scope to the server's head: whole cells for a low-end robot, else what is missing.
+
+    Of the scope only what is in `room`, if that is given. The cells next to `near` come first.
+
+    Raises:
+        UnreachableError: the link broke; what came is kept.
+        DamagedDataError: the server's answer is not sound.
+    """
+    box = room or scope.box(replica.geometry.cell_edge_m)
+    wanted = scope.wanted
+
+    def is_in_scope(cell: Cell) -> bool:
+        return is_within(cell_key(cell), box) and (wanted is None or wanted(cell))
+
+    if is_low_end:
+        needed = is_in_scope if box or wanted else None
+        most = scope.round_bytes_max
+        return (yield from fetch_cells(replica, wanted=needed, box=box, round_bytes_max=most, near=near))
+    report = yield from fetch_missing(
+        replica,
+        box=box,
+        reply_bytes_max=scope.reply_bytes_max,
+        round_bytes_max=scope.round_bytes_max,
+        near=near,
+    )
+    if box is not None:  # what is outside never comes, so own commits must not wait for it
+        replica.forget_stable_commits(wanted=is_in_scope)
+    return report
+
+
+def _cells(metres: float, cell_edge_m: float) -> float:
+    """A length in cells; three edges are three, and not a little more as floats have it."""
+    return round(metres / cell_edge_m, 9)
+
+
+def _number(value: int) -> int:
+    """A cell's number on one axis, or the outermost one of the grid."""
+    return max(-CELL_LIMIT, min(CELL_LIMIT - 1, value))

@@ -1,0 +1,294 @@
+"""One round with the server: push what it may lack, fetch what is missing. Repeating a round changes nothing.
+
+These are conversations (`asks`): what to ask next, given what was answered. There is no I/O but the replica's own.
+
+high-end   push commits; frames that bring every held cell to the server's head
+low-end    push commits; the index of cells; whole cells that changed, all or those near a place
+viewer     fetch as high-end does; push nothing but the operator's retracts that a restored server lost
+"""
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from cairn_client.replica.replica import Replica
+from cairn_client.replica.replica_store import BaseCell
+from cairn_client.sync.applying import Exchange, is_within
+from cairn_client.sync.cell_index import whole_index
+from cairn_client.sync.heal import heal_damaged
+from cairn_client.sync.near_cells import Wanted, in_order
+from cairn_client.sync.requests import Box, Conversation, GetCell, GetCommit, GetMissing, NextFrame, Push
+from cairn_client.sync.uploads import PARTS, Parts, push_whole_or_in_parts
+from cairn_map.codec.cell_code import decode_cell
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.commit_reading import open_commit
+from cairn_map.commits.ids import CommitId
+from cairn_map.errors import (
+    BadInputError,
+    CairnError,
+    ConflictError,
+    DamagedDataError,
+    DeniedError,
+    UnreachableError,
+)
+from cairn_map.evidence.fingerprint import ZERO, fingerprint
+from cairn_map.evidence.grid import Cell, CellKey, cell_key, cell_of_key
+from cairn_map.wire.frames import CellFrame
+
+log = logging.getLogger(__name__)
+
+ROUNDS_MAX = 64
+"""Requests in one fetch: a reply may ask to come back, or to compare; it may not go on for ever."""
+REPLIES_MAX = 4096
+"""The same with those that end before their cells do, by the asker's or the server's limit of bytes."""
+
+
+@dataclass(slots=True)
+class RoundReport:
+    """What one round did."""
+
+    pushed: int = 0
+    refused: dict[CommitId, CairnError] = field(default_factory=dict)
+    """Commits that the server will not take, and why; they stay in the outbox."""
+    frames: int = 0
+    cells_fetched: int = 0
+    size_bytes: int = 0
+    """Of cells that came."""
+    has_more: bool = False
+    """The round ended at its limit of bytes: the next one goes on."""
+    healed: int = 0
+    """Cells that the server had damaged and has from here again."""
+
+
+def push_commits(
+    replica: Replica,
+    *,
+    sealed_only: bool = False,
+    on_push: Callable[[CommitId], None] | None = None,
+    parts: Parts = PARTS,
+) -> Conversation[RoundReport]:
+    """Push every commit that the server may lack, oldest first; or of them only the server's own retracts.
+
+    Raises:
+        UnreachableError: the link broke; what was acknowledged before stays so.
+        DeniedError: the server does not know this robot.
+    """
+    report = RoundReport()
+    for commit_id in replica.push_set():
+        if (refusal := replica.resting.refusal(commit_id)) is not None:
+            report.refused[commit_id] = refusal
+            continue
+        commit, seal = replica.kept_commit(commit_id), replica.seal(commit_id)
+        if commit is None or (sealed_only and seal is None):
+            continue
+        try:
+            pushed = yield from _push(replica, commit, seal, parts)
+        except ConflictError as exc:
+            log.error("the server will not take commit %s: %s: %s", commit_id, exc.kind, exc.message)
+            report.refused[commit_id] = exc
+            continue
+        except DeniedError as exc:
+            if exc.kind != "not_allowed":  # the token is not good: that is no fault of the commit
+                raise
+            log.error("the server refuses commit %s: %s", commit_id, exc.message)
+            report.refused[commit_id] = exc
+            continue
+        except (BadInputError, DamagedDataError) as exc:  # it must not hold up all that come after it
+            log.error("the server refuses commit %s: %s: %s", commit_id, exc.kind, exc.message)
+            report.refused[commit_id] = exc
+            replica.resting.note(commit_id, exc)
+            continue
+        replica.acknowledge(pushed)
+        report.pushed += 1
+        if on_push:
+            on_push(pushed)
+    return report
+
+
+def _push(replica: Replica, commit: Commit, seal: str | None, parts: Parts) -> Conversation[CommitId]:
+    """Push one commit; its id, which is a new one if the server has other bytes under the old (rule 13)."""
+    try:
+        yield from push_whole_or_in_parts(_signed(replica, commit, seal), parts)
+    except ConflictError as exc:
+        if exc.kind == "evidence_gone":
+            # The server forgot what this commit takes out: it takes it from whoever still has it (rule 11).
+            for target in commit.meta.retracted_ids:
+                if (kept := replica.kept_commit(target)) is not None:
+                    yield from push_whole_or_in_parts(_signed(replica, kept), parts)
+            yield from push_whole_or_in_parts(_signed(replica, commit, seal), parts)
+            return commit.id
+        if exc.kind != "id_taken" or seal is not None:
+            raise
+        renamed = replica.kept_commit(replica.rename(commit.id))
+        assert renamed is not None  # noqa: S101 - it was just kept
+        yield from push_whole_or_in_parts(_signed(replica, renamed), parts)
+        return renamed.id
+    return commit.id
+
+
+def _signed(replica: Replica, commit: Commit, seal: str | None = None) -> Push:
+    with replica.lock:
+        return Push(commit, seal, replica.outbox.signatures(commit))
+
+
+def keep_retracts(replica: Replica) -> Conversation[None]:
+    """Fetch and keep the operator's retracts until no restore of the server can lose them (SYNC.md rule 11).
+
+    Raises:
+        UnreachableError: the link broke; the others are fetched next time.
+    """
+    for commit_id in replica.lacking_retracts():
+        try:
+            data, seal = yield from GetCommit(commit_id)
+            commit, _ = open_commit(data)
+        except CairnError as exc:
+            if isinstance(exc, UnreachableError | DeniedError):
+                raise
+            log.error("the operator's retract %s cannot be kept: %s", commit_id, exc.message)
+            continue
+        if seal is not None and commit.id == commit_id and not commit.cells:
+            replica.keep_sealed(commit, seal)
+
+
+def fetch_missing(
+    replica: Replica,
+    *,
+    box: Box | None = None,
+    reply_bytes_max: int | None = None,
+    round_bytes_max: int | None = None,
+    near: Cell | None = None,
+) -> Conversation[RoundReport]:
+    """Bring every held cell to the server's head, or those in a box; what arrives before a cut is kept.
+
+    With `reply_bytes_max` a reply ends after so many bytes of cells, and the rest is asked for by the next request;
+    with `round_bytes_max` that is left to the next round, so that commits need not wait. The cells next to `near`
+    come first.
+
+    Raises:
+        UnreachableError: the link broke, or the server keeps asking to come back.
+        DamagedDataError: the server's answer is not sound.
+    """
+    report = RoundReport()
+    compare = False
+    rounds = replies = 0
+    while rounds < ROUNDS_MAX and replies < REPLIES_MAX:
+        replies += 1
+        exchange = Exchange(replica, compare=compare, box=box, reply_bytes_max=reply_bytes_max, near=near)
+        try:
+            frame = yield from GetMissing(exchange.request())
+            while frame is not None:
+                exchange.take(frame)
+                report.frames += 1
+                report.size_bytes += len(frame.payload) if isinstance(frame, CellFrame) else 0
+                frame = yield from NextFrame()
+        except ConflictError as exc:
+            if exc.kind != "other_log":
+                raise
+            log.warning("another server answers for this map; starting without its old state")
+            replica.forget_server()
+            rounds += 1
+            continue
+        report.healed += yield from heal_damaged(replica)
+        _complain(exchange.damaged)
+        compare = exchange.must_compare
+        rounds += not exchange.has_more
+        if exchange.is_done and not _has_unproven(replica, box):
+            yield from keep_retracts(replica)
+            return report
+        if exchange.has_more and round_bytes_max is not None and report.size_bytes >= round_bytes_max:
+            report.has_more = True
+            return report
+    raise UnreachableError("no_end", f"no end of the answer after {replies} requests", retry_after_s=30.0)
+
+
+def fetch_cells(
+    replica: Replica,
+    *,
+    wanted: Wanted | None = None,
+    box: Box | None = None,
+    round_bytes_max: int | None = None,
+    near: Cell | None = None,
+) -> Conversation[RoundReport]:
+    """Low-end: whole cells that changed since they were fetched last; all, or those in a box, or the wanted ones of it.
+
+    The index tells which did, so that cells that are still the same cost no request. Those next to `near` come first,
+    and hot ones before others (`cell_order`).
+
+    Raises:
+        UnreachableError: the link broke; the cells before it are kept.
+        DamagedDataError: some cells are damaged; all others came.
+    """
+    report = RoundReport()
+    author = replica.author
+    index = yield from whole_index(author, box=box)
+    to, coverage = index.header.to_cursor, index.header.coverage
+    digests = {cell_key(entry.cell): entry.digest for entry in index.cells}
+    later = {cell_key(entry.cell) for entry in index.cells if entry.lm > to.seq}
+    with replica.lock:
+        if replica.header and replica.header.to_cursor.log_id != to.log_id:
+            log.warning("another server answers for this map; starting without its old state")
+            replica.forget_server()
+        replica.take_header(index.header, asked_by=author)
+        held = [key for key, cell in replica.cells.items() if cell.etag == f'"{digests.get(key)}"']
+        same = {key for key in held if key not in later}
+        replica.move(same, to=to, coverage=coverage)
+        for key in replica.cells.keys() - digests.keys():  # a server that was restored forgot them
+            if is_within(key, box):
+                replica.hold_nothing(key, BaseCell(to, coverage, ZERO))
+    report.healed = yield from heal_damaged(replica)
+    damaged = []
+    for entry in in_order(index.cells, near):
+        key = cell_key(entry.cell)
+        if key in same:
+            continue
+        report.has_more = round_bytes_max is not None and report.size_bytes >= round_bytes_max
+        if report.has_more:
+            break
+        if wanted is None or wanted(cell_of_key(key)):
+            try:
+                size_bytes = yield from fetch_cell(replica, cell_of_key(key))
+                report.cells_fetched += size_bytes > 0
+                report.size_bytes += size_bytes
+            except DamagedDataError as exc:
+                log.error("cell %s: %s", cell_of_key(key), exc.message)
+                damaged.append(key)
+    if not report.has_more:
+        replica.forget_stable_commits(wanted=wanted)
+        yield from keep_retracts(replica)
+    _complain(damaged)
+    return report
+
+
+def fetch_cell(replica: Replica, cell: Cell) -> Conversation[int]:
+    """Low-end: one cell, if it changed; the bytes that came.
+
+    Raises:
+        DamagedDataError: the cell does not have the fingerprint that the server states.
+    """
+    key = cell_key(cell)
+    held = replica.cells.get(key)
+    fetched = yield from GetCell(cell, held.etag if held else None)
+    with replica.lock:
+        if fetched.body is None and held is not None:
+            replica.move([key], to=fetched.cursor, coverage=fetched.coverage)
+            return 0
+        decoded = decode_cell(fetched.body or b"")
+        is_ours = decoded.key == key and decoded.geometry == replica.geometry
+        if not is_ours or fingerprint(decoded.evidence, key) != fetched.fingerprint:
+            raise DamagedDataError("fingerprint_mismatch", f"cell {cell} is not what the server says it is")
+        base = BaseCell(fetched.cursor, fetched.coverage, fetched.fingerprint, fetched.etag)
+        replica.hold(key, base, decoded.evidence, body=fetched.body)
+        return len(fetched.body or b"")
+
+
+def _complain(damaged: Sequence[CellKey]) -> None:
+    """Raises: DamagedDataError: for cells that came whole but not sound, or could not come; if there are any."""
+    if damaged:
+        names = ", ".join(str(cell_of_key(key)) for key in damaged)
+        raise DamagedDataError("fingerprint_mismatch", f"the server's cells {names} are damaged; all others came")
+
+
+def _has_unproven(replica: Replica, box: Box | None) -> bool:
+    """Whether a cell still waits to be fetched whole."""
+    with replica.lock:
+        return any(cell.cursor is None for key, cell in replica.cells.items() if is_within(key, box))

@@ -1,0 +1,88 @@
+"""How true fusion is, in the simulator: images against `fusion_truth`, and the temperatures of a map.
+
+Images are scored in several ways from the same depth, so that each row says what one step is worth:
+
+    both cameras       as an operator sees it: what the first does not see, the second may
+    one camera         with occlusion handled
+    nothing hides      painted without a z-test
+    not calibrated     by the data sheets' fields of view alone, as in Fig. 24 of the paper
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from cairn_calib.rig.rig import Rig, Spectrum
+from cairn_fusion.image_fusion.across import Across, across
+from cairn_fusion.image_fusion.surface import drawn_surface, surface_of
+from cairn_fusion.mapping.integrate import Integrator, integrate_scans
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.view.telepresence import fuse, source_order, view_depth
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import geometry_for
+from cairn_sim.evaluation.fusion_pictures import uncalibrated
+from cairn_sim.evaluation.fusion_scores import FusionScores, fusion_scores
+from cairn_sim.evaluation.fusion_truth import FusionTruth, fusion_truth
+from cairn_sim.evaluation.temperature_scores import TemperatureScores, is_body, is_pipe, temperature_scores
+from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.scene.scene import Scene
+
+WAYS = ("both cameras", "one camera", "nothing hides", "not calibrated")
+MAPPINGS: Mapping[str, Integrator] = {
+    "as cairn maps": Integrator(),
+    "edges painted": Integrator(temperature_step_k=math.inf),
+    "nothing hides": Integrator(temperature_step_k=math.inf, hidden_behind_m=math.inf),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScoredView:
+    """One camera of one scan."""
+
+    scan: Scan
+    fused: Across
+    truth: FusionTruth
+    scores: Mapping[str, FusionScores]
+    """By way."""
+
+
+def plan_scans(plan: Plan, rig: Rig, *, step: int) -> Iterator[Scan]:
+    """Every `step`-th scan of a plan, as its sensors see it, with true poses."""
+    shots = [shot for shot in shots_of(plan) if shot.scan % step == step // 2]
+    for _, scan, _ in scans_of(plan, shots, rig):
+        yield scan
+
+
+def scored_view(scene: Scene, rig: Rig, scan: Scan, camera: str) -> ScoredView:
+    """A camera's fused image and its scores, in all ways."""
+    unit = "K" if rig[camera].spectrum is Spectrum.COLOUR else "of 255"
+    images = source_order(scan, rig, camera)
+    truth = fusion_truth(*(scene, rig, camera, list(images)), T_map_rig=scan.T_map_rig, range_camera=scan.range_camera)
+    surface = surface_of(scan, rig)
+    drawn = {name: drawn_surface(surface, rig, name) for name in (camera, *images)}
+    depth = view_depth(scan, rig, camera, drawn[camera])
+    first = dict(list(images.items())[:1])
+    fused = {
+        WAYS[0]: across(depth, rig, images, drawn=drawn, range_camera=scan.range_camera),
+        WAYS[1]: across(depth, rig, first, drawn=drawn, range_camera=scan.range_camera),
+        WAYS[2]: across(depth, rig, first, drawn={}, range_camera=scan.range_camera),
+        WAYS[3]: fuse(scan, uncalibrated(rig), camera),
+    }
+    scores = {way: fusion_scores(each, truth, unit=unit) for way, each in fused.items()}
+    return ScoredView(scan, fused[WAYS[0]], truth, scores)
+
+
+def mapped_scores(
+    scene: Scene, rig: Rig, stops: Sequence[Sequence[Scan]], *, voxel_edge_m: float
+) -> dict[str, dict[str, TemperatureScores]]:
+    """How true a map's temperatures are: by way of mapping, of bodies, pipes, behind glass, in mirrors, and else."""
+    geometry = geometry_for(voxel_edge_m=voxel_edge_m)
+    eyes_m = [scans[0].T_map_rig[:3, 3] for scans in stops]
+    found = {}
+    for name, integrator in MAPPINGS.items():
+        total = EvidenceMap(geometry)
+        for scans in stops:
+            total.merge(integrate_scans(scans, rig, geometry, integrator=integrator))
+        groups = {"bodies": is_body, "pipes": is_pipe}
+        found[name] = temperature_scores(scene, total.packed(), geometry, groups=groups, eyes_m=eyes_m)
+    return found

@@ -1,0 +1,260 @@
+"""A simulated robot's recording, with the truth beside it.
+
+    lab-1/             a recording as any other (RECORDING.md): images, and the poses that the robot believed
+      raw/           thermal images as the camera counted, 16-bit PNG (when asked for)
+      truth/
+        truth.json     how it was made: scene, robot, path, seed, errors
+        scene.toml     the scene
+        trajectory.txt the true poses, T_map_rig
+        <camera>/000000.npz   the truth behind each image (`truth.CameraTruth`)
+
+Scans are rendered side by side and written in order. Every image's noise depends on the seed, the camera and the scan's
+number alone, so the same plan gives the same bytes on one machine, whatever the number of cores.
+"""
+
+import json
+import math
+import os
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+from cairn_calib.rig.poses import Transform
+from cairn_calib.rig.rig import Rig, Spectrum
+from cairn_fusion.recording.images import write_grey16
+from cairn_fusion.recording.recording_format import RangeEncoding
+from cairn_fusion.recording.recording_writer import RecordingWriter
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.recording.trajectory import trajectory_line
+from cairn_map.errors import BadInputError
+from cairn_sim.render.render import SENSORS, render_scan
+from cairn_sim.render.sensors import Noise, RangeSensor, ThermalSensor
+from cairn_sim.render.truth import CameraTruth, camera_truth
+from cairn_sim.robots.heads import RANGE_CAMERA
+from cairn_sim.robots.robots import SimRobot
+from cairn_sim.robots.trajectories import PoseErrors, believed, drive, stops
+from cairn_sim.scene.scene import Scene
+
+CLOCK_START_S = 1_760_000_000.0
+"""Time stamp of the first scan."""
+SCAN_S = 0.5
+"""From one head pose to the next, at a stop."""
+MILLIMETRES_REACH_M = 65.0
+AHEAD = 2
+"""Scans rendered before their turn to be written, for each thread."""
+Truths = Literal["none", "range", "all"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """What to record."""
+
+    scene: Scene
+    robot: SimRobot
+    path: str
+    seed: int = 1
+    perfect: bool = False
+    """Whether sensors are without noise."""
+    scale: float = 1.0
+    """Of colour and thermal images."""
+    raw: bool = False
+    """Whether thermal images are written as raw counts, too."""
+    truth: Truths = "range"
+    """For which images the truth is written."""
+    errors: PoseErrors = field(default_factory=PoseErrors)
+    backlash_rad: float = 0.0
+    """Play of the manipulator's gears; a tenth of it shakes them."""
+    speed_m_s: float = 0.0
+    """0: the robot stops along the path; else it drives through, and every scan is a measurement."""
+    rate_hz: float = 5.0
+    """Scans a second of a drive."""
+    first_stop: int = 0
+    last_stop: int | None = None
+    """The first stop that is not recorded; None for all."""
+
+    def __post_init__(self) -> None:
+        if self.seed < 0 or not (0 <= self.speed_m_s < math.inf and 0 < self.rate_hz < math.inf):
+            raise BadInputError(
+                "bad_plan",
+                "a recording needs a seed from 0, a speed from 0 m/s and a rate above 0 Hz, got "
+                f"{self.seed}, {self.speed_m_s:g}, {self.rate_hz:g}",
+            )
+        if not 0 <= self.backlash_rad < 1:
+            raise BadInputError("bad_plan", f"backlash must be 0 to 1 rad (57 degrees), got {self.backlash_rad:g} rad")
+
+    @property
+    def noise(self) -> Noise | None:
+        """The source of the images' noise."""
+        return None if self.perfect else Noise(self.seed)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shot:
+    """One scan to take."""
+
+    number: int
+    """Of all scans of the path."""
+    stop: int
+    scan: int
+    """Of the stop."""
+    time_s: float
+    T_map_rig: Transform
+    """Where the head truly is."""
+    T_believed: Transform
+    """Where the robot says it is."""
+    ends_stop: bool
+
+
+def places_of(plan: Plan) -> list[Transform]:
+    """`T_map_robot`, true, at each of a plan's measurements, chosen or not.
+
+    Raises:
+        BadInputError: the scene has no such path.
+    """
+    if plan.speed_m_s > 0:
+        return drive(plan.scene, plan.path, speed_m_s=plan.speed_m_s, rate_hz=plan.rate_hz)
+    return stops(plan.scene, plan.path)
+
+
+def shots_of(plan: Plan) -> list[Shot]:
+    """The scans of a plan, in order.
+
+    Raises:
+        BadInputError: the scene has no such path, or no such stops.
+    """
+    rng, places = Noise(plan.seed).of_poses(), places_of(plan)
+    if not places[plan.first_stop : plan.last_stop]:
+        raise BadInputError("no_stops", f"path {plan.path} has {len(places)} stops, none of them chosen")
+    robot = replace(plan.robot, scans=(1, 1)) if plan.speed_m_s > 0 else plan.robot
+    scan_s = 1 / plan.rate_hz if plan.speed_m_s > 0 else SCAN_S
+    told = [T for place in believed(places, plan.errors, rng) for T in robot.head_poses(place)]
+    gap = plan.backlash_rad
+    true = robot.true_head_poses(places, gap_rad=gap, sigma_rad=gap / 10, rng=rng)
+    shots = [
+        Shot(
+            number=number,
+            stop=number // robot.scans_per_stop,
+            scan=number % robot.scans_per_stop,
+            time_s=CLOCK_START_S + number * scan_s,
+            T_map_rig=T,
+            T_believed=T_believed,
+            ends_stop=(number + 1) % robot.scans_per_stop == 0,
+        )
+        for number, (T, T_believed) in enumerate(zip(true, told, strict=True))
+    ]
+    last = len(places) if plan.last_stop is None else plan.last_stop
+    return [shot for shot in shots if plan.first_stop <= shot.stop < last]
+
+
+def scans_of(
+    plan: Plan, shots: Sequence[Shot], rig: Rig, *, threads: int | None = None
+) -> Iterator[tuple[Shot, Scan, dict[str, CameraTruth]]]:
+    """Each shot with its scan and the truth behind its images, in order; rendered side by side (None: on all cores)."""
+    cameras = {"none": [], "range": [RANGE_CAMERA], "all": list(rig.cameras)}[plan.truth]
+
+    def take(shot: Shot) -> tuple[Shot, Scan, dict[str, CameraTruth]]:
+        scan = render_scan(
+            plan.scene,
+            rig,
+            T_map_rig=shot.T_map_rig,
+            range_camera=RANGE_CAMERA,
+            time_s=shot.time_s,
+            noise=plan.noise,
+            number=shot.number,
+            sensors=plan.robot.sensors,
+            threads=1,
+        )
+        truths = {name: camera_truth(plan.scene, rig, name, T_map_rig=shot.T_map_rig) for name in cameras}
+        return shot, replace(scan, T_map_rig=shot.T_believed), truths
+
+    workers = threads or os.cpu_count() or 1
+    with ThreadPoolExecutor(workers) as pool:
+        waiting: deque[Future[tuple[Shot, Scan, dict[str, CameraTruth]]]] = deque()
+        try:
+            for shot in shots:
+                waiting.append(pool.submit(take, shot))
+                if len(waiting) > AHEAD * workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def record(plan: Plan, folder: Path, *, scene_text: str) -> Iterator[Shot]:
+    """Write the recording of a plan, and its truth, into a new folder; yields each shot when its scan is written.
+
+    Args:
+        plan: what to record.
+        folder: new or empty.
+        scene_text: the scene's file, kept beside the truth.
+
+    The recording is finished when the iterator came to its end; one that is left early stays unfinished.
+
+    Raises:
+        ConflictError: the folder holds something already.
+        BadInputError: the scene has no such path.
+    """
+    shots, rig = shots_of(plan), plan.robot.rig_of(plan.scale)
+    sensor = plan.robot.sensors.get(RANGE_CAMERA, SENSORS[Spectrum.RANGE])
+    reach_m = sensor.wrap_m if isinstance(sensor, RangeSensor) else 0.0
+    encoding = RangeEncoding(units_per_m=1000.0 if reach_m < MILLIMETRES_REACH_M else 500.0)
+    name = f"{plan.scene.name}-{plan.robot.name}-{plan.path}"
+    with RecordingWriter(folder, rig, name=name, note=_note(plan), range_encoding=encoding) as writer:
+        truth = folder / "truth"
+        truth.mkdir()
+        (truth / "scene.toml").write_text(scene_text, encoding="utf-8")
+        (truth / "truth.json").write_text(json.dumps(_about(plan, rig), indent=1) + "\n", encoding="utf-8")
+        with (truth / "trajectory.txt").open("w", encoding="utf-8", newline="\n") as poses:
+            poses.write("# time tx ty tz qx qy qz qw (T_map_rig, true)\n")
+            for index, (shot, scan, truths) in enumerate(scans_of(plan, shots, rig)):
+                writer.add(scan)
+                poses.write(trajectory_line(shot.time_s, shot.T_map_rig))
+                if plan.raw:
+                    _write_raw(scan, plan.robot, folder, index)
+                for camera, behind in truths.items():
+                    (truth / camera).mkdir(exist_ok=True)
+                    behind.write(truth / camera / f"{index:06d}.npz")
+                if shot.ends_stop:
+                    writer.end_measurement()
+                yield shot
+
+
+def _write_raw(scan: Scan, robot: SimRobot, folder: Path, index: int) -> None:
+    for camera, kelvin in scan.thermal.items():
+        (folder / "raw" / camera).mkdir(parents=True, exist_ok=True)
+        write_grey16(folder / "raw" / camera / f"{index:06d}.png", _thermal_sensor(robot, camera).raw_counts(kelvin))
+
+
+def _thermal_sensor(robot: SimRobot, camera: str) -> ThermalSensor:
+    sensor = robot.sensors.get(camera, SENSORS[Spectrum.THERMAL])
+    if not isinstance(sensor, ThermalSensor):
+        raise BadInputError("bad_sensor", f"camera {camera} of {robot.name} needs a thermal sensor, has {sensor}")
+    return sensor
+
+
+def _note(plan: Plan) -> str:
+    return (
+        f"Simulated: {plan.robot.about}; scene {plan.scene.name}, path {plan.path}, seed {plan.seed}. Truth in truth/."
+    )
+
+
+def _about(plan: Plan, rig: Rig) -> dict[str, object]:
+    return {
+        "format": "cairn-truth",
+        "version": 1,
+        "scene": plan.scene.name,
+        "robot": plan.robot.name,
+        "path": plan.path,
+        "seed": plan.seed,
+        "perfect": plan.perfect,
+        "errors": asdict(plan.errors),
+        "backlash_rad": plan.backlash_rad,
+        "cameras": list(rig.cameras),
+        "thermal": {name: asdict(_thermal_sensor(plan.robot, name)) for name in rig.of_spectrum(Spectrum.THERMAL)},
+        "solids": [solid.name for solid in plan.scene.solids],
+    }

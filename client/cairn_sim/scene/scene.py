@@ -1,0 +1,171 @@
+"""A scene that is known exactly: solids, the light around them, and the same as arrays for the kernels.
+
+Three questions about the truth have exact answers: which solid is at a point (`Scene.solid_at`), how far the nearest
+surface is and how warm (`Scene.distance_m`, `Scene.temperature_k_at`), which one a ray meets (`rays.cast`).
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.errors import BadInputError
+from cairn_sim.scene.distance_kernels import nearest_solids
+from cairn_sim.scene.solid_kernels import Shapes, second_at
+from cairn_sim.scene.solids import Box, Cylinder, Plane, Solid, Sphere
+from cairn_sim.scene.surfaces import TEMPERATURE_K, Material, Rgb
+from cairn_sim.scene.tree import tree_of
+
+Floats = npt.NDArray[np.float64]
+Singles = npt.NDArray[np.float32]
+Ints = npt.NDArray[np.int32]
+
+AMBIENT_K = 293.15
+SOLIDS_MAX = 20_000
+"""A solid's number fits 16 bits; and a scene file of a few lines may ask for millions."""
+BOUNDS_MARGIN_M = 1e-9 * np.array([-1, -1, -1, 1, 1, 1])
+"""So that rounding never lets a ray slip past a box around a solid whose face is the box's own."""
+KINDS: tuple[type, ...] = (Box, Cylinder, Sphere, Plane)
+"""In the order of the kernels' kind codes."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surfaces:
+    """What P solids look like, by number; the second axis of materials is the first and the second of a texture."""
+
+    colours_srgb: Singles
+    """(P, 2, 3) 0 to 255."""
+    temperature_k: Singles
+    """(P, 2)"""
+    emissivity: Singles
+    """(P, 2)"""
+    reflectivity_nir: Singles
+    """(P, 2) diffuse."""
+    gloss_nir: Singles
+    """(P, 2)"""
+    retroreflection: Singles
+    """(P, 2)"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """Solids and what is around them; made by `scene_of`."""
+
+    name: str
+    solids: tuple[Solid, ...]
+    shapes: Shapes
+    surfaces: Surfaces
+    ambient_k: float
+    """Of the surroundings that bare metal mirrors in the far infrared."""
+    sky_k: float
+    """Apparent temperature where nothing is met."""
+    sky_srgb: Rgb
+
+    def solid_at(self, points: npt.NDArray[np.floating]) -> Ints:
+        """(...) int32, number of the solid at each (..., 3) point; -1 in free space, and for NaN."""
+        distance, nearest = self._nearest(points)
+        return np.where(distance <= 0, nearest, np.int32(-1)).astype(np.int32)
+
+    def distance_m(self, points: npt.NDArray[np.floating]) -> Floats:
+        """(...) metres from each (..., 3) point to the nearest solid, negative inside; NaN for NaN."""
+        return self._nearest(points)[0]
+
+    def nearest_solid(self, points: npt.NDArray[np.floating]) -> Ints:
+        """(...) int32, number of the solid nearest to each (..., 3) point, or that it lies deepest in; -1 for NaN."""
+        return self._nearest(points)[1]
+
+    def temperature_k_at(self, points: npt.NDArray[np.floating], solids: Ints | None = None) -> Floats:
+        """(...) kelvin of the surface nearest to each (..., 3) point: true, not apparent; NaN for NaN.
+
+        Args:
+            points: map frame, metres.
+            solids: (...) whose surface is meant; None for the nearest's. NaN for -1.
+        """
+        p = np.asarray(points, dtype=np.float64)
+        nearest = (self._nearest(p)[1] if solids is None else solids).reshape(-1)
+        second = second_at(np.ascontiguousarray(p.reshape(-1, 3)), nearest, self.shapes)
+        kelvin = self.surfaces.temperature_k[nearest, second].astype(np.float64)
+        return np.where(nearest < 0, np.nan, kelvin).reshape(p.shape[:-1])
+
+    def number_of(self, name: str) -> int:
+        """The number of the first solid of a name.
+
+        Raises:
+            BadInputError: none has it.
+        """
+        for number, solid in enumerate(self.solids):
+            if solid.name == name:
+                return number
+        raise BadInputError("unknown_solid", f"scene {self.name} has no solid named {name!r}")
+
+    def _nearest(self, points: npt.NDArray[np.floating]) -> tuple[Floats, Ints]:
+        p = np.asarray(points, dtype=np.float64)
+        distance, nearest = nearest_solids(np.ascontiguousarray(p.reshape(-1, 3)), self.shapes)
+        return distance.reshape(p.shape[:-1]), nearest.reshape(p.shape[:-1])
+
+
+def scene_of(
+    solids: Iterable[Solid],
+    *,
+    name: str = "scene",
+    ambient_k: float = AMBIENT_K,
+    sky_k: float = AMBIENT_K,
+    sky_srgb: Rgb = (0, 0, 0),
+) -> Scene:
+    """A scene of these solids, at least one, which may touch and overlap; numbered as given.
+
+    Raises:
+        BadInputError: no solids, or too many.
+    """
+    given = tuple(solids)
+    if not 1 <= len(given) <= SOLIDS_MAX:
+        raise BadInputError("bad_scene", f"a scene needs 1 to {SOLIDS_MAX} solids, got {len(given)}")
+    if not all(TEMPERATURE_K[0] <= kelvin <= TEMPERATURE_K[1] for kelvin in (ambient_k, sky_k)):
+        raise BadInputError(
+            "bad_scene",
+            f"surroundings and sky need {TEMPERATURE_K[0]} to {TEMPERATURE_K[1]} K, got {ambient_k:g} and {sky_k:g}",
+        )
+    pairs = [solid.surface.materials for solid in given]
+    return Scene(
+        name=name,
+        solids=given,
+        shapes=_shapes(given),
+        surfaces=Surfaces(
+            colours_srgb=np.array([[m.colour_srgb for m in pair] for pair in pairs], dtype=np.float32),
+            temperature_k=_of(pairs, "temperature_k"),
+            emissivity=_of(pairs, "emissivity"),
+            reflectivity_nir=_of(pairs, "reflectivity_nir"),
+            gloss_nir=_of(pairs, "gloss_nir"),
+            retroreflection=_of(pairs, "retroreflection"),
+        ),
+        ambient_k=ambient_k,
+        sky_k=sky_k,
+        sky_srgb=sky_srgb,
+    )
+
+
+def _of(pairs: Iterable[tuple[Material, Material]], field: str) -> Singles:
+    return np.array([[getattr(m, field) for m in pair] for pair in pairs], dtype=np.float32)
+
+
+def _shapes(solids: tuple[Solid, ...]) -> Shapes:
+    surfaces = [solid.surface for solid in solids]
+    endless = [k for k, solid in enumerate(solids) if isinstance(solid.shape, Plane)]
+    bounded = [k for k, solid in enumerate(solids) if not isinstance(solid.shape, Plane)]
+    bounds = np.array([np.concatenate(solid.bounds_m()) for solid in solids]) + BOUNDS_MARGIN_M
+    nodes, links, order = tree_of(bounds[bounded])
+    return Shapes(
+        kind=np.array([KINDS.index(type(solid.shape)) for solid in solids], dtype=np.int8),
+        frame=np.array([[*s.T_map_solid[:3, :3].T.ravel(), *s.T_map_solid[:3, 3]] for s in solids], dtype=np.float64),
+        half_m=np.array([solid.shape.half_m for solid in solids], dtype=np.float64),
+        optics=np.array([surface.material.optics for surface in surfaces], dtype=np.int8),
+        texture=np.array(
+            [[*(1 / p for p in s.period_m), *s.phase_m, s.grain, 1 / s.grain_m] for s in surfaces], dtype=np.float64
+        ),
+        bounds=bounds,
+        endless=np.array(endless, dtype=np.int32),
+        nodes=nodes,
+        links=links,
+        leaves=np.array(bounded, dtype=np.int32)[order],
+    )

@@ -1,0 +1,147 @@
+"""What one camera sees, on another camera's pixels: thermal on colour, colour on thermal, through range.
+
+    pixel of the one --its depth--> point --Eq. 5-6--> pixel of the other --what hides it?--> value, or why not
+
+This is for the eye, on every pixel of an image. The map's samples go the other way, from the range camera's own pixels
+(`transfer`, `samples`). Several cameras may see the same spectrum: what is hidden from the first, the second may see.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig.poses import inverse
+from cairn_calib.rig.rig import MountedCamera, Rig
+from cairn_fusion.image_fusion.across_kernels import fill_into, label_into, sample_into
+from cairn_fusion.image_fusion.eye_depth import EyeDepth, Origin
+from cairn_fusion.image_fusion.row_bands import in_bands
+from cairn_fusion.image_fusion.surface import JOIN_SIGMAS, Drawn, beams, places
+from cairn_fusion.transfer.transfer import Label
+
+Singles = npt.NDArray[np.float32]
+Labels = npt.NDArray[np.uint8]
+
+HIDDEN_BEHIND = 0.03
+"""How much deeper, as a share, a point must be than what hides it, besides slant and `JOIN_SIGMAS` of its noise."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Across:
+    """Values of other cameras on the pixels of one."""
+
+    camera: str
+    """Whose pixels."""
+    sources: tuple[str, ...]
+    """Whose values, in the order in which they were asked."""
+    values: Singles
+    """(H, W, C); NaN where the label is not OK."""
+    labels: Labels
+    """(H, W) `Label`; where no source has a value, why the first has none."""
+    source: Labels
+    """(H, W) number of the source that the value comes from."""
+    depth: EyeDepth
+
+    @property
+    def ok(self) -> npt.NDArray[np.bool_]:
+        """(H, W) pixels with a value."""
+        return np.asarray(self.labels == Label.OK)
+
+
+def across(
+    depth: EyeDepth,
+    rig: Rig,
+    images: Mapping[str, npt.NDArray[np.generic]],
+    *,
+    drawn: Mapping[str, Drawn],
+    range_camera: str,
+) -> Across:
+    """What other cameras see at the pixels of the camera that a depth is of.
+
+    Args:
+        depth: of the camera.
+        rig: with all cameras.
+        images: by camera, the one to ask first, first: (H, W) or (H, W, C); NaN for no value. None: no value anywhere.
+        drawn: the surface as each of these cameras sees it; where one is missing, nothing hides.
+        range_camera: that measured the depth.
+    """
+    seen = _Seen(rig, depth.camera, range_camera, drawn)
+    names, known, rays = tuple(images), _known(depth), beams(rig[depth.camera].camera)
+    if not names:
+        labels = np.where(known == Label.OK, np.uint8(Label.NO_READING), known)
+        return Across(
+            depth.camera, (), np.full((*known.shape, 1), np.nan, np.float32), labels, np.zeros_like(known), depth
+        )
+    values, labels = seen.by(names[0], images[names[0]], depth.shown_m, rays, known)
+    source = np.zeros(labels.shape, np.uint8)
+    for number, name in enumerate(names[1:], 1):
+        # Few pixels are left, so that it is quicker to pick them out.
+        left = np.flatnonzero((labels.ravel() != Label.OK) & (known.ravel() == Label.OK))
+        range_m, picked = depth.shown_m.ravel()[left][None], rays.reshape(3, -1)[:, left][:, None]
+        others, other_labels = seen.by(name, images[name], range_m, picked, known.ravel()[left][None])
+        fill_into(values, labels, source, left, others[0], other_labels[0], number)
+    return Across(depth.camera, names, values, labels, source, depth)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """Who looks at whose pixels."""
+
+    rig: Rig
+    camera: str
+    range_camera: str
+    drawn: Mapping[str, Drawn]
+
+    def by(
+        self, name: str, image: npt.NDArray[np.generic], range_m: Singles, rays: Singles, known: Labels
+    ) -> tuple[Singles, Labels]:
+        """Values (H, W, C) and labels (H, W) of one source, at points `range_m` (H, W) along (3, H, W) rays."""
+        src, dst = self.rig[self.camera], self.rig[name]
+        u, v, q = places(range_m, rays, dst.camera, inverse(dst.transform) @ src.transform)
+        smooth = _smoothed(image, dst.camera.focal_px[0] / src.camera.focal_px[0])
+        labels, values = known.copy(), np.full((*known.shape, smooth.shape[2]), np.nan, np.float32)
+        # Without parallax nothing can hide anything.
+        apart = float(np.linalg.norm(src.transform[:3, 3] - dst.transform[:3, 3])) > 1e-9
+        least, step = np.zeros((1, 1), np.float32), 1 << 20
+        if (drawn := self.drawn.get(name)) is not None and apart:
+            least, step = _least_nearness(drawn, self.rig[self.range_camera]), drawn.step_px
+        width, height = dst.camera.width, dst.camera.height
+
+        def look(first: int, last: int) -> None:
+            rows = slice(first, last)
+            label_into(labels[rows], u[rows], v[rows], q[rows], least, step, width, height)
+            sample_into(values[rows], labels[rows], u[rows], v[rows], smooth)
+
+        in_bands(look, len(known))
+        return values, labels
+
+
+def _known(depth: EyeDepth) -> Labels:
+    """(H, W) OK where there is a depth, else why there is none."""
+    height, width = depth.origins.shape
+    marks = np.asarray(
+        cv2.resize(
+            depth.drawn.marks, (0, 0), fx=depth.drawn.step_px, fy=depth.drawn.step_px, interpolation=cv2.INTER_NEAREST
+        )
+    )[:height, :width]
+    return np.where(depth.origins == Origin.NOTHING, marks, np.uint8(Label.OK)).astype(np.uint8)
+
+
+def _smoothed(image: npt.NDArray[np.generic], ratio: float) -> Singles:
+    """(H, W, C) float32, blurred where several of its pixels fall on one."""
+    side = round(ratio)
+    values = np.asarray(image) if side <= 1 else np.asarray(cv2.blur(np.asarray(image, np.float32), (side, side)))
+    return np.ascontiguousarray(np.atleast_3d(values), dtype=np.float32)
+
+
+def _least_nearness(drawn: Drawn, range_camera: MountedCamera) -> Singles:
+    """(h, w) 1 / metres: a point with less is behind what hides there, and 0 where nothing does.
+
+    Both ranges have noise, as much as is usual at the nearer: the farther a surface, the more it hides itself.
+    """
+    hides = drawn.hiding > 0
+    range_m = 1 / np.where(hides, drawn.hiding, np.float32(1.0))
+    tolerance = HIDDEN_BEHIND + JOIN_SIGMAS * range_camera.range_sigma_m(range_m) / range_m
+    return np.where(hides, drawn.hiding / (1 + tolerance) - drawn.slack, 0.0).astype(np.float32)

@@ -1,0 +1,118 @@
+"""Depth of every pixel of a camera, for the operator's eye and never for the map.
+
+    drawn surface (coarse)  +  the picture  ->  range of each pixel, and whether it was measured or filled in
+
+A time-of-flight pixel is ten colour pixels wide, and where a thing ends in it nobody measured. The picture knows:
+depth is carried to pixels of the same colour (joint bilateral upsampling, Kopf et al. 2007), by votes that count the
+more the more certain the range is, and of two surfaces in a window only one has a say, so that nothing is put between
+them.
+
+What comes out is a guess at edges. `EyeDepth` is no array and becomes none: neither mypy nor `Scan` lets it into a map.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING, Never
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig.rig import Rig
+from cairn_fusion.image_fusion.eye_depth_kernels import REACH, densify_into
+from cairn_fusion.image_fusion.row_bands import in_bands
+from cairn_fusion.image_fusion.surface import Drawn
+from cairn_fusion.recording.scan import Scan
+from cairn_map.errors import BadInputError
+
+Singles = npt.NDArray[np.float32]
+Bytes = npt.NDArray[np.uint8]
+
+ALIKE_SIGMA = 24.0
+"""Of the sum of three differences of 8-bit colours: noise and shading; the edges of things are larger."""
+CLOSE_SIGMA = 1.5
+"""Of the distance, drawn pixels."""
+
+
+class Origin(IntEnum):
+    """Where a pixel's range comes from."""
+
+    NOTHING = 0
+    """No range is known near it."""
+    MEASURED = 1
+    """Interpolated between ranges of one surface."""
+    FILLED = 2
+    """Guessed from ranges near it and the picture."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EyeDepth:
+    """Ranges of all pixels of a camera, to look at."""
+
+    camera: str
+    shown_m: Singles
+    """(H, W) metres along the beam; NaN where nothing is known."""
+    origins: Bytes
+    """(H, W) `Origin`."""
+    drawn: Drawn
+    """What it was made of."""
+
+    def __array__(self, *_: object, **__: object) -> Never:
+        """Refused: as an array it could get into a map."""
+        raise BadInputError(
+            "filled_depth", "an EyeDepth is partly guessed, and no range image: give the map the scan's"
+        )
+
+
+if TYPE_CHECKING:
+
+    def _no_map_takes_it(depth: EyeDepth) -> Scan:
+        """Refused by mypy; the day it were not, mypy would call the comment unused, which is an error, too."""
+        return Scan(time_s=0.0, T_map_rig=np.eye(4), range_camera="tof", range_m=depth)  # type: ignore[arg-type]
+
+
+def eye_depth(drawn: Drawn, rig: Rig, camera: str, picture: npt.NDArray[np.generic], *, range_camera: str) -> EyeDepth:
+    """The depth of a camera's pixels.
+
+    Args:
+        drawn: the surface as that camera sees it.
+        rig: with the camera.
+        camera: whose pixels.
+        picture: (H, W, 3) uint8, sRGB, or (H, W) kelvin: what it sees.
+        range_camera: that measured; its noise says how much each range is trusted.
+    """
+    guide = _guide(picture)
+    height, width = guide.shape[:2]
+    rows, columns = drawn.nearness.shape
+    # Padded to whole drawn pixels, so that each is the mean of just its own.
+    down, right = rows * drawn.step_px - height, columns * drawn.step_px - width
+    whole = guide if not down and not right else cv2.copyMakeBorder(guide, 0, down, 0, right, cv2.BORDER_REPLICATE)
+    coarse = np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    with np.errstate(divide="ignore"):
+        sigma_m = rig[range_camera].range_sigma_m(1 / drawn.nearness)
+    trust = (1 / np.square(sigma_m)).astype(np.float32)
+    shown_m, origins = np.empty((height, width), np.float32), np.empty((height, width), np.uint8)
+
+    def densify(first: int, last: int) -> None:
+        densify_into(
+            *(shown_m, origins, guide, drawn.nearness, drawn.marks, trust, coarse, ALIKE, CLOSE),
+            *(drawn.per_pixel, drawn.step_px, first, last),
+        )
+
+    in_bands(densify, height)
+    return EyeDepth(camera, shown_m, origins, drawn)
+
+
+def _guide(picture: npt.NDArray[np.generic]) -> Bytes:
+    """(H, W, 3) uint8 of a colour or thermal picture."""
+    if picture.ndim == 3:
+        return np.ascontiguousarray(picture, dtype=np.uint8)
+    kelvin = picture.astype(np.float32)
+    low, high = np.nanpercentile(kelvin[::4, ::4], (1, 99))
+    grey = np.clip((np.nan_to_num(kelvin, nan=low) - low) * (255 / max(high - low, 1e-3)), 0, 255).astype(np.uint8)
+    return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
+
+
+ALIKE = np.exp(-0.5 * np.square(np.arange(3 * 256) / ALIKE_SIGMA)).astype(np.float32).clip(1e-6)
+_PLACES = np.square(np.arange(2 * REACH + 2) - REACH - 0.5)
+CLOSE = np.exp(-0.5 * (_PLACES[:, None] + _PLACES[None, :]) / CLOSE_SIGMA**2).astype(np.float32)

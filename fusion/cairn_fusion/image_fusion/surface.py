@@ -1,0 +1,195 @@
+"""The surface that a scan's range image shows, and how it looks from the rig's other cameras.
+
+    range image --labels, steps--> pixels joined to a surface --Eq. 1-6--> 1 / range, drawn coarsely in each camera
+
+It is drawn about twice as fine as the range camera sees: there is no more in it. Drawn are triangles between pixels
+of one surface, and the nearest wins; across a step in depth nothing is drawn, because nobody knows what is there.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig.brown import radius_limit
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.lidar import AnyCamera
+from cairn_calib.rig.poses import Transform, inverse, transform_points
+from cairn_calib.rig.rig import Rig
+from cairn_fusion.image_fusion.across_kernels import places_into
+from cairn_fusion.image_fusion.range_labels import range_labels
+from cairn_fusion.image_fusion.row_bands import in_bands
+from cairn_fusion.image_fusion.surface_kernels import (
+    borrowed_ranges,
+    draw_labels_into,
+    draw_squares_into,
+    draw_triangles_into,
+    fronts,
+    joined,
+    nearest_of_nine,
+)
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.transfer.transfer import KERNEL_COEFFICIENTS, Label
+from cairn_map.render.camera_rays import Sight
+
+Singles = npt.NDArray[np.float32]
+Flags = npt.NDArray[np.bool_]
+Labels = npt.NDArray[np.uint8]
+
+JOIN_SIGMAS = 3 * math.sqrt(2)
+"""Of the range: what a step between two pixels of one surface may have from noise."""
+JOIN_STEP_M = 0.06
+"""A lower step is none: the views of cameras 10 cm apart differ by 2 colour pixels where it is at 2 m."""
+DRAWN_PER_PIXEL = 2.2
+"""Drawn pixels along a range pixel, about."""
+EDGE_REACH = 0.6
+"""How far around a range pixel something may hide what is behind it, in range pixels: its half, and a little."""
+BORROW_PX = 6
+"""How far from a pixel with a range one without is shown, range pixels."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeSurface:
+    """What one range image shows."""
+
+    range_camera: str
+    range_m: Singles
+    """(H, W) metres along the beam; of a pixel without a trusted one that of the nearest pixel with one, or NaN."""
+    labels: Labels
+    """(H, W) of `range_labels`."""
+    across: Flags
+    """(H, W) whether a pixel and the next in its row are of one surface."""
+    down: Flags
+    """(H, W) and the next in its column."""
+    fronts: Flags
+    """(H, W) pixels where a surface ends before a farther one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawn:
+    """A range surface as another camera sees it, (h, w)."""
+
+    step_px: int
+    """Pixels of the camera along one that is drawn."""
+    per_pixel: float
+    """Drawn pixels along one of the range camera."""
+    nearness: Singles
+    """1 / range from the camera, 1 / metres; 0 where nothing is known."""
+    marks: Labels
+    """Where nothing is known, why: `Label`."""
+    hiding: Singles
+    """1 / range of the nearest around, 1 / metres, with the half pixels beyond edges; 0 where nothing is known."""
+    slack: Singles
+    """How much that may be more than the surface at the place, 1 / metres, because it slants."""
+
+
+def surface_of(scan: Scan, rig: Rig, beyond: Flags | None = None) -> RangeSurface:
+    """The surface of a scan's range image, but for what a map says that a mirror shows: (H, W) `beyond_pixels`."""
+    labels, mounted = range_labels(scan, rig), rig[scan.range_camera]
+    if beyond is not None:
+        labels[beyond & (labels == Label.OK)] = Label.BEYOND
+    range_m = mounted.true_ranges(scan.range_m, scan.amplitude)
+    noise_m = np.maximum(JOIN_SIGMAS * mounted.range_sigma_image(range_m), JOIN_STEP_M).astype(np.float32)
+    shown_m = borrowed_ranges(range_m, labels, BORROW_PX)
+    # A mirror may be large; what it shows is about where the mirror is, for cameras so near to each other.
+    shown_m = np.where(np.isnan(shown_m) & (labels == Label.BEYOND), range_m, shown_m)
+    across, down = (joined(range_m, labels, noise_m, *step) for step in ((1, 0), (0, 1)))
+    return RangeSurface(
+        range_camera=scan.range_camera,
+        range_m=shown_m,
+        labels=labels,
+        across=across,
+        down=down,
+        fronts=fronts(range_m, labels, across, down, noise_m),
+    )
+
+
+def drawn_surface(surface: RangeSurface, rig: Rig, camera: str) -> Drawn:
+    """A surface as a camera of the rig sees it.
+
+    Args:
+        surface: of a scan.
+        rig: its rig.
+        camera: to look from.
+    """
+    src, dst = rig[surface.range_camera], rig[camera]
+    seen_by, ratio = dst.camera, dst.camera.focal_px[0] / src.camera.focal_px[0]
+    step = max(1, round(ratio / DRAWN_PER_PIXEL))
+    at = places(surface.range_m, beams(src.camera), seen_by, inverse(dst.transform) @ src.transform)
+    # Pixel k drawn stands for the camera's k step to k step + step - 1.
+    u, v = (((axis - (step - 1) / 2) / step).astype(np.float64) for axis in at[:2])
+    q = at[2].astype(np.float64)
+    shape = -(-seen_by.height // step), -(-seen_by.width // step)
+    nearness, marks, drawn = (
+        np.zeros(shape, np.float32),
+        np.full(shape, Label.NO_RANGE, np.uint8),
+        np.zeros(u.shape, bool),
+    )
+    draw_triangles_into(nearness, drawn, u, v, q, surface.across, surface.down)
+    trusted, per_pixel = surface.labels == Label.OK, ratio / step
+    draw_squares_into(nearness, trusted & ~drawn, u, v, q, 0.5 * per_pixel)
+    draw_labels_into(marks, nearness, surface.labels, u, v, 0.5 * per_pixel)
+    edges = nearness.copy()
+    draw_squares_into(edges, surface.fronts, u, v, q, EDGE_REACH * per_pixel)
+    hiding = nearest_of_nine(edges)
+    return Drawn(
+        step_px=step, per_pixel=per_pixel, nearness=nearness, marks=marks, hiding=hiding, slack=_slack(edges, hiding)
+    )
+
+
+def places(range_m: Singles, rays: Singles, dst: AnyCamera, T_dst_src: Transform) -> tuple[Singles, Singles, Singles]:
+    """Where the points of an image appear in another camera.
+
+    Args:
+        range_m: (H, W) metres along the beams; NaN for no point.
+        rays: (3, H, W) float32, their unit rays, frame of the image's camera: `beams`, or some of them.
+        dst: to look from.
+        T_dst_src: its place.
+
+    Returns:
+        (H, W) float32 each: x and y, pixels, also beyond the image, x NaN for a point that `dst` cannot see; and
+        1 / range from there.
+    """
+    if isinstance(dst, Camera) and len(dst.distortion) == KERNEL_COEFFICIENTS:
+        u, v, q = (np.empty(range_m.shape, np.float32) for _ in range(3))
+        lens, coefficients = np.array([*dst.focal_px, *dst.centre_px]), np.array(dst.distortion)
+        numbers = (
+            np.ascontiguousarray(rays),
+            np.ascontiguousarray(T_dst_src),
+            lens,
+            coefficients,
+            radius_limit(dst.distortion),
+        )
+        in_bands(lambda first, last: places_into(u, v, q, range_m, *numbers, first, last), len(range_m))
+        return u, v, q
+    points = transform_points(T_dst_src, np.moveaxis(rays, 0, -1).astype(np.float64) * range_m[..., None])
+    pixels = dst.project(points).astype(np.float32)
+    nearness = (1 / np.linalg.norm(points, axis=-1)).astype(np.float32)
+    return np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1]), nearness
+
+
+@lru_cache(maxsize=16)
+def beams(camera: AnyCamera) -> Singles:
+    """(3, H, W) float32 unit ray of every pixel: as vector instructions like them; read-only."""
+    planes = np.ascontiguousarray(np.moveaxis(camera.rays(), -1, 0), dtype=np.float32)
+    planes.setflags(write=False)
+    return planes
+
+
+@lru_cache(maxsize=16)
+def sight_of(camera: AnyCamera) -> Sight:
+    """A camera's rays as a map is drawn for them; kept, for what is worked out of them is."""
+    return Sight(camera.rays())
+
+
+def _slack(nearness: Singles, hiding: Singles) -> Singles:
+    """(h, w) what a slanted surface differs by from its nearest neighbour, on a place where it goes on."""
+    steps = np.zeros_like(nearness)
+    for axis in (0, 1):
+        ahead = np.abs(np.diff(nearness, axis=axis, append=np.float32(np.inf)))
+        behind = np.abs(np.diff(nearness, axis=axis, prepend=np.float32(np.inf)))
+        steps += np.minimum(ahead, behind)
+    steps[~np.isfinite(steps)] = 0
+    return np.minimum(2 * steps, hiding).astype(np.float32)

@@ -1,0 +1,95 @@
+"""What came back to a scan's range camera: points of the map, and what the camera knows beyond them.
+
+    range_m    a hit each              no flying pixels, no full ones, not the robot's own body, within limits
+    shield_m   what each pixel saw     flying pixels and the body too: a neighbour may have seen a part of it
+    silent     beams that met nothing  where the rig says that silence means emptiness
+
+A pixel that is in none of the three says nothing. What the rig says that its camera adds to ranges is taken off first.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig.body import Body
+from cairn_calib.rig.poses import Transform, inverse, transform_points
+from cairn_calib.rig.rig import MountedCamera, Rig
+from cairn_fusion.mapping.flying_kernels import flying_pixels
+from cairn_fusion.mapping.tally_kernels import returned_points
+from cairn_fusion.recording.scan import Scan, check_scan
+
+Floats = npt.NDArray[np.float64]
+Singles = npt.NDArray[np.float32]
+Flags = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Returns:
+    """What came back to the range camera of a scan: N points."""
+
+    T_map_tof: Transform
+    range_m: Singles
+    """(H, W) within limits; NaN elsewhere."""
+    shield_m: Singles
+    """(H, W) as `range_m`, with flying pixels and the robot's body; beside them nothing beyond is free."""
+    silent: Flags
+    """(H, W) nothing came back, and the camera is known to see whatever is within `silent_m`."""
+    silent_m: float
+    pixels: npt.NDArray[np.int32]
+    """(N,) numbers of the pixels."""
+    points_map: Floats
+    """(N, 3)"""
+
+    @property
+    def reach_m(self) -> float:
+        """How far away anything is that this says; 0 when it says nothing."""
+        farthest_m = float(np.nanmax(self.range_m)) if len(self.pixels) else 0.0
+        return max(farthest_m, self.silent_m if self.silent.any() else 0.0)
+
+
+def returns_of(
+    scan: Scan, rig: Rig, *, min_range_m: float, max_range_m: float, flying_step_m: float = math.inf
+) -> Returns:
+    """The points of a scan (Eq. 1-5), and what else its range image says.
+
+    Raises:
+        BadInputError: an image does not fit its camera.
+    """
+    check_scan(scan, rig)
+    mounted = rig[scan.range_camera]
+    true_m = mounted.true_ranges(scan.range_m, scan.amplitude)
+    T_map_tof = scan.T_map_rig @ mounted.transform
+    full = full_pixels(scan, mounted)
+    within = (true_m >= min_range_m) & (true_m <= max_range_m) & ~full
+    shield_m = np.where(within, true_m, np.float32(np.nan))
+    if flying_step_m < math.inf:
+        within &= ~flying_pixels(true_m, flying_step_m)
+    silent_m = min(mounted.known_sensing.no_return_clears_m or 0.0, max_range_m)
+    silent = np.isnan(true_m) & ~full & (silent_m > 0)
+    if rig.body is not None:
+        T_body_tof = mounted.transform if scan.T_map_body is None else inverse(scan.T_map_body) @ T_map_tof
+        within &= ~_on_body(rig.body, true_m, mounted, T_body_tof)
+        if silent.any():
+            # What hides behind the body, or is it, may well return nothing.
+            beams = mounted.camera.rays() @ T_body_tof[:3, :3].T
+            silent &= ~rig.body.stops(T_body_tof[:3, 3], beams, silent_m)
+    range_m = np.where(within, true_m, np.float32(np.nan))
+    pixels, points_map = returned_points(range_m, mounted.camera.rays(), T_map_tof)
+    return Returns(T_map_tof, range_m, shield_m, silent, silent_m, pixels, points_map)
+
+
+def full_pixels(scan: Scan, mounted: MountedCamera) -> Flags:
+    """(H, W) where too much light returned for a range."""
+    limit = mounted.known_sensing.saturated_amplitude
+    if limit is None or scan.amplitude is None:
+        return np.zeros(scan.range_m.shape, bool)
+    return np.asarray(scan.amplitude >= limit)
+
+
+def _on_body(body: Body, range_m: Singles, mounted: MountedCamera, T_body_tof: Transform) -> Flags:
+    """(H, W) where the point lies on the robot itself."""
+    with np.errstate(invalid="ignore"):  # an endless range along an axis: 0 times infinity
+        points_tof = mounted.camera.rays() * range_m[..., None].astype(np.float64)
+    return body.holds(transform_points(T_body_tof, points_tof))

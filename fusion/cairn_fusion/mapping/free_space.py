@@ -1,0 +1,173 @@
+"""Free space from a range image, projectively: a pinhole window on the camera, and the bricks that it looks through.
+
+Whatever the camera's lens, its image is first looked up through a pinhole window of the same fineness (`window_of`), so
+that a voxel's centre finds its pixel by one division. Hits are not decided here: they lie where the beams ended.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig.lidar import AnyCamera
+from cairn_calib.rig.poses import Transform
+from cairn_fusion.mapping.cull_kernels import (
+    BRICK_VOXELS,
+    LEVELS_MAX,
+    cull_bricks_into,
+    split_bricks_into,
+    window_extremes_into,
+)
+
+Floats = npt.NDArray[np.float64]
+Singles = npt.NDArray[np.float32]
+Ints = npt.NDArray[np.int64]
+Index = npt.NDArray[np.int32]
+
+DEPTH_SHARE_MIN = 0.2
+"""Least cosine of a ray to the optical axis, 78 degrees, that a pinhole window can hold; wider lenses are cast."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """A pinhole image that shows what a camera sees."""
+
+    width: int
+    height: int
+    lens: Floats
+    """(4,) fx, fy, cx, cy of the padded window, with half a pixel added, so that rounding down finds the pixel."""
+    pixel_of: Index
+    """(height width,) number of the camera's pixel that each of the window's shows; one past the last for none."""
+
+    def shown(self, clear_m: Singles) -> Singles:
+        """(height + 2, width + 2) how far each pixel of the window is clear, from (H, W) of the camera; 0 around it."""
+        padded = np.zeros((self.height + 2, self.width + 2), np.float32)
+        found = np.append(clear_m.ravel(), np.float32(0.0))[self.pixel_of]
+        padded[1:-1, 1:-1] = found.reshape(self.height, self.width)
+        return padded
+
+
+@lru_cache(maxsize=32)
+def window_of(camera: AnyCamera) -> Window | None:
+    """The window on a camera; None for one that looks around too far for a plane."""
+    rays = camera.rays()
+    known = np.isfinite(rays[..., 2])
+    if not known.any() or rays[known][:, 2].min() < DEPTH_SHARE_MIN:
+        return None
+    plane = rays[..., :2] / rays[..., 2:]
+    low, high = plane[known].min(axis=0), plane[known].max(axis=0)
+    fx, fy = (float(f) for f in camera.focal_px)
+    width, height = (int(np.ceil(span)) + 1 for span in (high - low) * (fx, fy))
+    x, y = np.meshgrid(np.arange(width) / fx + low[0], np.arange(height) / fy + low[1])
+    pixels = camera.project(np.stack([x, y, np.ones_like(x)], axis=-1))
+    shown = camera.contains(pixels)
+    nearest = np.rint(np.where(shown[..., None], pixels, 0)).astype(np.int64)
+    number = np.where(shown, nearest[..., 1] * camera.width + nearest[..., 0], camera.width * camera.height)
+    lens = np.array([fx, fy, 1.5 - low[0] * fx, 1.5 - low[1] * fy])
+    return Window(width, height, lens, number.ravel().astype(np.int32))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Carving:
+    """What a view looks through: numbers of bricks of a box, which octants of each, and what kernels need."""
+
+    bricks: Ints
+    masks: Index
+    """(K,) of `cull_kernels`."""
+    squares: Singles
+    """Padded image of how far each pixel is clear, squared."""
+    lens: Singles
+    corners_view: Singles
+    """(3, K or more) the centre of each brick's first voxel, camera frame, metres.
+
+    From whole voxel numbers, and number by number: which box a brick is found in, and with how many others, must not
+    change a bit of where it lies, or the evidence would not depend on the scan alone.
+    """
+    offsets_view: Singles
+    """(3, 512) from there to each voxel's centre, in Morton order."""
+    min_square: float
+
+
+class Scratch:
+    """Memory that one thread uses for view after view: fresh memory comes page by page, and takes longer."""
+
+    def __init__(self) -> None:
+        self._extremes: Singles = np.empty((0, 0, 0), np.float32)
+        self._found: Index = np.empty((1 << 14, 2), np.int32)
+
+    def extremes(self, clear_m: Singles) -> Singles:
+        """Of `window_extremes_into`, for an image of this size."""
+        height, width = clear_m.shape
+        levels = min(LEVELS_MAX, min(width, height).bit_length())
+        if self._extremes.shape != (levels, height, 2 * width):
+            self._extremes = np.empty((levels, height, 2 * width), np.float32)
+        window_extremes_into(self._extremes, clear_m)
+        return self._extremes
+
+    def found(self, count: int) -> Index:
+        """At least (count, 2)."""
+        if count > len(self._found):
+            self._found = np.empty((2 * count, 2), np.int32)
+        return self._found
+
+
+def carving_of(
+    clear_m: Singles,
+    window: Window,
+    T_map_camera: Transform,
+    *,
+    corner: Ints,
+    dims: Ints,
+    voxel_edge_m: float,
+    min_range_m: float,
+    scratch: Scratch,
+) -> Carving:
+    """The bricks of a box that a view looks through.
+
+    Args:
+        clear_m: of `Window.shown`.
+        window: on the camera.
+        T_map_camera: where it was.
+        corner: (3,) the box's first voxel.
+        dims: (3,) bricks of the box.
+        voxel_edge_m: of the map.
+        min_range_m: nothing nearer is free.
+        scratch: of this thread.
+    """
+    R: Floats = np.ascontiguousarray(T_map_camera[:3, :3])
+    t: Floats = np.ascontiguousarray(T_map_camera[:3, 3])
+    corner_m: Floats = corner.astype(np.float64) * voxel_edge_m
+    reach_m = float(clear_m.max())
+    around = (t - corner_m + np.array([[-reach_m], [reach_m]])) / (BRICK_VOXELS * voxel_edge_m)
+    low, high = np.clip(np.floor(around + np.array([[-0.1], [0.1]])).astype(np.int64), [[0], [-1]], dims - 1)
+    view = (corner_m - t, voxel_edge_m, R, window.lens, min_range_m, reach_m, scratch.extremes(clear_m))
+    count = cull_bricks_into(scratch.found(0), low, high, dims, *view)
+    if count > len(scratch.found(0)):
+        cull_bricks_into(scratch.found(count), low, high, dims, *view)
+    found, corners_view = scratch.found(count)[:count], np.empty((3, count), np.float32)
+    count = split_bricks_into(found, corners_view, dims, corner, t, *view)
+    return Carving(
+        bricks=found[:count, 0].astype(np.int64),
+        masks=found[:count, 1].copy(),
+        squares=np.square(clear_m),
+        lens=window.lens.astype(np.float32),
+        corners_view=corners_view,
+        offsets_view=_offsets_in_view(R, voxel_edge_m),
+        min_square=min_range_m**2,
+    )
+
+
+def _offsets_in_view(R: Floats, voxel_edge_m: float) -> Singles:
+    """(3, 512) from the first voxel's centre of a brick to each voxel's, camera frame."""
+    x, y, z = MORTON_XYZ * voxel_edge_m
+    return np.stack([x * R[0, a] + y * R[1, a] + z * R[2, a] for a in range(3)]).astype(np.float32)
+
+
+def _morton_xyz() -> Floats:
+    """(3, 512) x, y, z of a brick's voxels in Morton order."""
+    places = np.arange(512)
+    return np.stack([sum((places >> (3 * b + a) & 1) << b for b in range(3)) for a in range(3)]).astype(float)
+
+
+MORTON_XYZ = _morton_xyz()

@@ -1,0 +1,263 @@
+"""A scan as evidence: the paper's chapter IV from images to voxels.
+
+    returns  points of the map                       Eq. 1-5
+    samples  what cameras saw of them                Eq. 5-6: `samples`
+    clear    how far each beam is certainly free                           `clear`
+    hits     where beams ended, misses where the image looks through      `tally`, `carve`; for lidars `beams`
+    pack     evidence by cell
+
+Inverse sensor model: one count per voxel and scan, and a hit wins over a miss. The result depends on the scan alone,
+never on the map, nor on how many scans are added in what order on how many threads.
+"""
+
+import math
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig.poses import Transform, checked_transform, inverse, transform_points
+from cairn_calib.rig.rig import Rig
+from cairn_calib.rig.sensing import LIDAR
+from cairn_fusion.mapping.beam_returns import Returns, returns_of
+from cairn_fusion.mapping.clear_range import clear_image
+from cairn_fusion.mapping.free_space import Window, carving_of, window_of
+from cairn_fusion.mapping.lidar_beams import beam_evidence, clear_ends, silent_ends
+from cairn_fusion.mapping.samples import sample_sums
+from cairn_fusion.mapping.tallies import Tallies
+from cairn_fusion.mapping.tally import Each
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.transfer.transfer import DEPTH_TOLERANCE_M
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.channels import ChannelKind
+from cairn_map.evidence.evidence import Evidence, packed_evidence
+from cairn_map.evidence.grid import CellKey, Geometry, split_voxels, voxels_of_points
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+
+class Method(StrEnum):
+    """How free space is found."""
+
+    CARVE = "carve"
+    """Projectively, where the camera's image fits in a plane; else as `CAST`."""
+    CAST = "cast"
+    """Ray by ray: for lidars, and as the slow twin."""
+
+
+@dataclass(frozen=True, slots=True)
+class Integrator:
+    """How scans become evidence; its text goes into every commit."""
+
+    min_range_m: float = 0.1
+    max_range_m: float = 10.0
+    """Beyond it a time-of-flight camera wraps round; a return there is ignored, not taken for free space."""
+    method: Method = Method.CARVE
+    flying_step_m: float = 0.05
+    """What a pixel must differ from both its neighbours by to be taken for a mixture of them (`flying_kernels`), and
+    so for no return; of images that are carved. Infinite: none is."""
+    noise_sigmas: float = 2.0
+    """How many standard deviations of the range, by the rig's `sensing`, free space keeps from a surface; never less
+    than one voxel."""
+    sample_spread_voxels: float = 1.0
+    """How uncertain, in voxels, the place of a colour or temperature may be (`certainty`); beyond it there is none."""
+    temperature_step_k: float = 4.0
+    """How much the thermal image may differ within what a range pixel covers; beyond it there is no temperature, for it
+    could be that of the background, or a hot thing's on the background. Infinite: whatever the pixel says."""
+
+    hidden_behind_m: float = DEPTH_TOLERANCE_M
+    """How much deeper than what hides it from a camera a point must be (`transfer`). Infinite: nothing hides."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_range_m < self.max_range_m < float("inf"):
+            raise BadInputError(
+                "bad_range", f"0 <= min_range_m < max_range_m must hold, got {self.min_range_m}, {self.max_range_m}"
+            )
+        if not self.flying_step_m > 0:
+            raise BadInputError("bad_range", f"flying_step_m must be above 0, got {self.flying_step_m}")
+        if not 0 <= self.noise_sigmas < float("inf"):
+            raise BadInputError("bad_range", f"noise_sigmas must be finite, from 0, got {self.noise_sigmas}")
+        if not self.sample_spread_voxels > 0:
+            raise BadInputError("bad_range", f"sample_spread_voxels must be above 0, got {self.sample_spread_voxels}")
+        for name in ("temperature_step_k", "hidden_behind_m"):
+            if not getattr(self, name) > 0:
+                raise BadInputError("bad_range", f"{name} must be above 0, got {getattr(self, name)}")
+
+    def __str__(self) -> str:
+        limits = f"min_range_m={self.min_range_m:g} max_range_m={self.max_range_m:g}"
+        surfaces = f"flying_step_m={self.flying_step_m:g} noise_sigmas={self.noise_sigmas:g}"
+        samples = f"sample_spread_voxels={self.sample_spread_voxels:g} temperature_step_k={self.temperature_step_k:g}"
+        samples += f" hidden_behind_m={self.hidden_behind_m:g}"
+        return f"cairn-{self.method} 5 {limits} {surfaces} {samples}"
+
+
+class Integration:
+    """Scans being integrated, by any number of threads, which take turns only to count. Memory: see `tally`."""
+
+    def __init__(self, rig: Rig, geometry: Geometry, integrator: Integrator, *, around_m: Floats | None = None) -> None:
+        """Args: around_m: (3,) where the first tally is to be centred; None: where the first scan was taken."""
+        self._rig = rig
+        self._geometry = geometry
+        self._integrator = integrator
+        self._tallies = Tallies(geometry, max_range_m=integrator.max_range_m, around_m=around_m)
+
+    def add(self, scan: Scan) -> None:
+        """Add a scan.
+
+        Raises:
+            BadInputError: an image does not fit its camera, the scan names a channel that the map lacks, or reaches
+                beyond the numbered space; nothing was added.
+        """
+        limits, rig, camera = self._integrator, self._rig, self._rig[scan.range_camera].camera
+        window = window_of(camera) if limits.method is Method.CARVE else None  # pyright: ignore[reportArgumentType]
+        returns = returns_of(
+            scan,
+            rig,
+            min_range_m=limits.min_range_m,
+            max_range_m=limits.max_range_m,
+            flying_step_m=limits.flying_step_m if window is not None else math.inf,
+        )
+        scalars = _scalar_evidence(scan, self._geometry)
+        if window is None:
+            self._cast(scan, returns)
+        elif returns.reach_m > 0:
+            self._carve(scan, returns, window)
+        self._tallies.merge(scalars)
+
+    def add_points(
+        self,
+        points: npt.NDArray[np.floating],
+        T_map_sensor: Transform,
+        *,
+        range_camera: str | None = None,
+        T_map_body: Transform | None = None,
+    ) -> None:
+        """Add a sweep of a sensor whose points have no order, ray by ray.
+
+        Args:
+            points: (N, 3) metres, sensor frame, all seen from its origin; NaN where nothing came back.
+            T_map_sensor: where it was.
+            range_camera: the rig's camera that measured them, as its driver made points of its ranges, in its own
+                frame; they have its noise, and what the rig says that it adds to ranges (`range_bias`) is taken off,
+                at the usual amplitude. None: another sensor, with a lidar's usual noise; points are taken as they are.
+            T_map_body: where the frame of the rig's body was; None: nothing is taken for the robot's body.
+
+        Raises:
+            BadInputError: not (N, 3), or it reaches beyond the numbered space, or points that the range camera cannot
+                have seen while its rig states a bias; nothing was added.
+        """
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise BadInputError("bad_points", f"points must be (N, 3), got {points.shape}")
+        T = checked_transform(T_map_sensor, name="T_map_sensor")
+        of = None if range_camera is None else self._rig[range_camera]
+        own = (points if of is None else of.true_points(points)).astype(np.float64)
+        range_m = np.linalg.norm(own, axis=1)
+        kept = (range_m >= self._integrator.min_range_m) & (range_m <= self._integrator.max_range_m)
+        if self._rig.body is not None and T_map_body is not None:
+            T_body_sensor = inverse(checked_transform(T_map_body, name="T_map_body")) @ T
+            kept &= ~self._rig.body.holds(transform_points(T_body_sensor, own))
+        sigma_m = LIDAR.sigma_at(range_m[kept], usual=LIDAR) if of is None else of.range_sigma_m(range_m[kept])
+        points_map = transform_points(T, own[kept])
+        clear_m = self._clear_ends(T[:3, 3], points_map, sigma_m)
+        self._tallies.merge(beam_evidence(T[:3, 3], points_map, clear_m, self._geometry, sums_of=self._no_sums))
+
+    def diff(self, each: Each = map) -> dict[CellKey, Evidence]:
+        """The evidence of all scans, by cell; `each` as for `Tally.packed`. Not while scans are being added."""
+        return self._tallies.packed(each)
+
+    def _carve(self, scan: Scan, returns: Returns, window: Window) -> None:
+        """Hits where beams ended, misses where the image looks through."""
+        edge_m = self._geometry.voxel_edge_m
+        mounted, sigmas = self._rig[scan.range_camera], self._integrator.noise_sigmas
+        clear_m = clear_image(returns, mounted, voxel_edge_m=edge_m, noise_sigmas=sigmas)
+        with self._tallies.around(returns.T_map_tof[:3, 3], returns.reach_m) as (tally, hits):
+            voxel_of, count = hits.number(returns.points_map, tally)
+            sums = self._sample_sums(scan, returns, voxel_of, count)
+            carving = carving_of(
+                window.shown(clear_m),
+                window,
+                returns.T_map_tof,
+                corner=tally.corner,
+                dims=tally.dims,
+                voxel_edge_m=edge_m,
+                min_range_m=self._integrator.min_range_m,
+                scratch=hits.scratch,
+            )
+            tally.add_hits(hits, sums)
+            tally.add_misses(hits, carving)
+
+    def _cast(self, scan: Scan, returns: Returns) -> None:
+        """Hits where beams ended, misses along each beam."""
+        mounted, origin_m = self._rig[scan.range_camera], returns.T_map_tof[:3, 3]
+        sigma_m = mounted.range_sigma_image(returns.range_m).ravel()[returns.pixels]
+        clear_m = np.concatenate(
+            [self._clear_ends(origin_m, returns.points_map, sigma_m), silent_ends(returns, mounted.camera.rays())]
+        )
+
+        def sums_of(voxel_of: Ints, count: int) -> Ints:
+            return self._sample_sums(scan, returns, voxel_of, count)
+
+        self._tallies.merge(beam_evidence(origin_m, returns.points_map, clear_m, self._geometry, sums_of=sums_of))
+
+    def _sample_sums(self, scan: Scan, returns: Returns, voxel_of: npt.NDArray[np.integer], count: int) -> Ints:
+        limit_m = self._integrator.sample_spread_voxels * self._geometry.voxel_edge_m
+        return sample_sums(
+            *(scan, self._rig, self._geometry, returns, voxel_of, count),
+            spread_max_m=limit_m,
+            step_max_k=self._integrator.temperature_step_k,
+            hidden_behind_m=self._integrator.hidden_behind_m,
+        )
+
+    def _clear_ends(self, origin_m: Floats, points_map: Floats, sigma_m: Floats) -> Floats:
+        edge_m, sigmas = self._geometry.voxel_edge_m, self._integrator.noise_sigmas
+        return clear_ends(origin_m, points_map, sigma_m, voxel_edge_m=edge_m, noise_sigmas=sigmas)
+
+    def _no_sums(self, _: Ints, count: int) -> Ints:
+        return np.zeros((count, self._geometry.plane_count), np.int64)
+
+
+def integrate_scan(scan: Scan, rig: Rig, geometry: Geometry, *, integrator: Integrator) -> dict[CellKey, Evidence]:
+    """The evidence of one scan, by cell: every voxel has one hit or one miss, or only a scalar sample.
+
+    Raises:
+        BadInputError: as `Integration.add`.
+    """
+    one = Integration(rig, geometry, integrator)
+    one.add(scan)
+    return one.diff()
+
+
+def integrate_scans(
+    scans: Sequence[Scan], rig: Rig, geometry: Geometry, *, integrator: Integrator, threads: int | None = None
+) -> dict[CellKey, Evidence]:
+    """The evidence of many scans, by cell; the same bits on any number of threads, because all of it is integers.
+
+    Raises:
+        BadInputError: as `Integration.add`.
+    """
+    count = max(1, min(threads or os.cpu_count() or 1, len(scans)))
+    around_m = scans[0].T_map_rig[:3, 3] if scans else None
+    integration = Integration(rig, geometry, integrator, around_m=around_m)
+    with ThreadPoolExecutor(count) as pool:
+        # Whoever is done takes the next scan.
+        list(pool.map(integration.add, scans))
+        return integration.diff(pool.map)
+
+
+def _scalar_evidence(scan: Scan, geometry: Geometry) -> dict[CellKey, Evidence]:
+    """Named readings, at the voxel where the rig stands."""
+    if not scan.scalars:
+        return {}
+    samples = np.zeros((1, geometry.plane_count), np.int64)
+    for name, value in scan.scalars.items():
+        channel = geometry.channel(name)
+        if channel is None or channel.kind is not ChannelKind.SCALAR:
+            raise BadInputError("unknown_channel", f"the map has no scalar channel {name!r}; create it with one")
+        samples[0, geometry.planes_of(name)] = [int(channel.quantise(np.array([value]))[0]), 1]
+    cells, places = split_voxels(voxels_of_points(scan.T_map_rig[:3, 3], geometry), geometry)
+    return {CellKey(int(cells[0])): packed_evidence(places, np.zeros((1, 2), np.int32), samples, geometry)}

@@ -1,0 +1,91 @@
+"""A measurement: the scans of one stop, summed, and what a commit must say about them."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig.poses import Transform, quaternion_from_transform
+from cairn_calib.rig.rig import Rig
+from cairn_fusion.mapping.integrate import Integration, Integrator
+from cairn_fusion.recording.scan import Scan
+from cairn_map.commits.commit import ScanPose
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey, Geometry
+
+SCANS_MAX = 4096
+"""Poses that a commit can state."""
+
+
+@dataclass(slots=True)
+class Measurement:
+    """Scans added so far; `diff` is their evidence."""
+
+    rig: Rig
+    geometry: Geometry
+    integrator: Integrator = field(default_factory=Integrator)
+    poses: list[ScanPose] = field(default_factory=list)
+    _integration: Integration = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._integration = Integration(self.rig, self.geometry, self.integrator)
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def add(self, scan: Scan) -> None:
+        """Add a scan.
+
+        Raises:
+            BadInputError: the scan does not fit the rig or the map, or the measurement is full; nothing was added.
+        """
+        self._check_room()
+        self._integration.add(scan)
+        self._note_pose(scan.time_s, scan.T_map_rig)
+
+    def add_points(
+        self,
+        points: npt.NDArray[np.floating],
+        T_map_sensor: Transform,
+        *,
+        T_map_rig: Transform,
+        time_s: float,
+        range_camera: str | None = None,
+        T_map_body: Transform | None = None,
+    ) -> None:
+        """Add a sweep of unordered points as `Integration.add_points`; the commit says where the rig was.
+
+        A body whose place is not given is in the rig's frame.
+
+        Raises:
+            BadInputError: the points are none, or the measurement is full; nothing was added.
+        """
+        self._check_room()
+        body = T_map_rig if T_map_body is None else T_map_body
+        self._integration.add_points(points, T_map_sensor, range_camera=range_camera, T_map_body=body)
+        self._note_pose(time_s, T_map_rig)
+
+    def _check_room(self) -> None:
+        if len(self) == SCANS_MAX:
+            raise BadInputError("measurement_full", f"a measurement has at most {SCANS_MAX} scans; commit it first")
+
+    def _note_pose(self, time_s: float, T_map_rig: Transform) -> None:
+        self.poses.append(scan_pose(time_s, T_map_rig))
+
+    def diff(self) -> dict[CellKey, Evidence]:
+        """The evidence of all scans, by cell."""
+        return self._integration.diff()
+
+    @property
+    def captured_s(self) -> tuple[float, float] | None:
+        """First and last scan's time, UTC seconds; None without scans."""
+        times = [pose.time_s for pose in self.poses]
+        return (min(times), max(times)) if times else None
+
+
+def scan_pose(time_s: float, T_map_rig: Transform) -> ScanPose:
+    """Where the rig was for one scan, as a commit states it."""
+    x, y, z = (float(v) for v in T_map_rig[:3, 3])
+    q = [float(v) for v in quaternion_from_transform(T_map_rig)]
+    return ScanPose(time_s=time_s, t_map_rig=(x, y, z), q_map_rig=(q[0], q[1], q[2], q[3]))

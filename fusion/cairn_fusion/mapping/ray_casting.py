@@ -1,0 +1,104 @@
+"""The voxels that one scan saw: hits at its end points, misses between them and the sensor.
+
+Each voxel gets one count at most, and a hit wins over a miss, so the result does not depend on the order of the
+rays, nor on how many pixels a voxel fills. One ray is cast per end voxel (the first that ends there): the others
+would pass through nearly the same voxels again.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_fusion.mapping.cast_kernels import HIT, mark_hits_into, mark_misses_into
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.grid import BRICK_DEPTH, CELL_LIMIT, Geometry, voxels_of_points
+from cairn_map.kernels.morton_kernels import interleave
+
+Ints = npt.NDArray[np.int64]
+Floats = npt.NDArray[np.float64]
+
+BOX_BRICKS_MAX = 1 << 27
+"""Bricks in the box around one scan: 512 MB of index. 40 m at 1 cm."""
+
+
+@dataclass(frozen=True, slots=True)
+class SeenVoxels:
+    """Hits and misses of one scan, by cell, ready to be packed.
+
+    cells (N,) uint64 cell numbers, rising; places (N,) uint32 Morton codes, rising inside a cell; hit (N,) bool.
+    """
+
+    cells: npt.NDArray[np.uint64]
+    places: npt.NDArray[np.uint32]
+    hit: npt.NDArray[np.bool_]
+
+
+def seen_voxels(
+    origin_m: Floats, ends_m: Floats, ends: Ints, geometry: Geometry, *, hits: Ints | None = None
+) -> SeenVoxels:
+    """What rays from one origin saw.
+
+    Args:
+        origin_m: (3,) metres, map frame.
+        ends_m: (N, 3) metres, map frame: one end point in each voxel of `ends`.
+        ends: (N, 3) voxel numbers, all different.
+        geometry: of the map.
+        hits: (M, 3) voxels that were hit, all different; None: those where the rays end. A ray that ends in a voxel
+            which was not hit, because it is clear only so far, says nothing of that voxel.
+
+    Raises:
+        BadInputError: the scan spans more bricks than fit in memory; limit the range or coarsen the map.
+    """
+    start = voxels_of_points(origin_m, geometry)
+    struck = ends if hits is None else hits
+    reached = np.concatenate([ends, struck, start])
+    low, high = reached.min(axis=0) >> BRICK_DEPTH, reached.max(axis=0) >> BRICK_DEPTH
+    dims = high - low + 1
+    if float(np.prod(dims.astype(np.float64))) > BOX_BRICKS_MAX:
+        size_m = dims * 8 * geometry.voxel_edge_m
+        raise BadInputError(
+            "scan_too_large",
+            f"one scan spans {size_m.round(1).tolist()} m, too much at {geometry.voxel_edge_m} m voxels; "
+            "limit its range or use a coarser map",
+        )
+    corner = low << BRICK_DEPTH
+    brick_of = np.full(int(np.prod(dims)), -1, np.int32)
+    bricks = np.empty(len(struck) + 1024, np.int64)
+    marks = np.empty((len(bricks), 512), np.uint8)
+    box_ends = ends - corner
+    origin = _inside(origin_m, start[0], geometry) - corner
+    targets = ends_m / geometry.voxel_edge_m - corner
+    used = mark_hits_into(struck - corner, dims, brick_of, bricks, marks, 0)
+    ray = 0
+    while ray < len(ends):
+        ray, used = mark_misses_into(origin, targets, box_ends, ray, dims, brick_of, bricks, marks, used)
+        if ray < len(ends):
+            room = len(bricks) + max(len(bricks) // 2, int(dims.sum()) + 1)
+            bricks, marks = np.resize(bricks, room), _with_room(marks, room, used)
+    return _by_cell(bricks[:used], marks[:used], dims, low, geometry)
+
+
+def _inside(origin_m: Floats, start: Ints, geometry: Geometry) -> Floats:
+    """The origin in voxels, moved by rounding at most, so that its floor is the voxel that the grid says."""
+    exact = np.asarray(origin_m, dtype=np.float64) / geometry.voxel_edge_m
+    inside: Floats = np.clip(exact, start, np.nextafter(start + 1.0, start))
+    return inside
+
+
+def _with_room(marks: npt.NDArray[np.uint8], room: int, used: int) -> npt.NDArray[np.uint8]:
+    grown = np.empty((room, 512), np.uint8)
+    grown[:used] = marks[:used]
+    return grown
+
+
+def _by_cell(bricks: Ints, marks: npt.NDArray[np.uint8], dims: Ints, low: Ints, geometry: Geometry) -> SeenVoxels:
+    xyz = np.stack([bricks % dims[0], bricks // dims[0] % dims[1], bricks // (dims[0] * dims[1])], axis=1) + low
+    up = geometry.depth - BRICK_DEPTH
+    cells = interleave((xyz >> up) + CELL_LIMIT)
+    numbers = interleave(xyz & ((1 << up) - 1)).astype(np.uint32)
+    order = np.lexsort((numbers, cells))
+    marks = marks[order]
+    row, inner = np.nonzero(marks)
+    places = (numbers[order][row] << np.uint32(9)) | inner.astype(np.uint32)
+    return SeenVoxels(cells[order][row], places, marks[row, inner] == HIT)

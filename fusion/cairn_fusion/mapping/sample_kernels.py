@@ -1,0 +1,111 @@
+"""What an image says of the voxels that a scan hit: sums of the pixels that fell on each."""
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+from cairn_fusion.transfer.transfer_kernels import OK, UNCERTAIN
+from cairn_map.evidence.channels import SAMPLE_MAX
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Index = npt.NDArray[np.int32]
+
+
+@nb.njit(cache=True, nogil=True)
+def doubt_edges_into(
+    labels: npt.NDArray[np.uint8],
+    pixels: Ints,
+    reach_px: Index,
+    image: npt.NDArray[np.float32],
+    step_max: float,
+) -> None:
+    """Label points UNCERTAIN around whose pixel the image differs by more than a step.
+
+    Args:
+        labels: (N,) only what is OK is looked at.
+        pixels: (N, 2) x, y, where the label is OK.
+        reach_px: (N,) how many pixels to each side the point may be from there.
+        image: (H, W); what is not a number is not looked at.
+        step_max: between the least and the most.
+    """
+    height, width = image.shape
+    for n in range(labels.shape[0]):
+        if labels[n] != OK:
+            continue
+        x, y, reach = pixels[n, 0], pixels[n, 1], np.int64(reach_px[n])
+        least, most = np.float32(np.inf), np.float32(-np.inf)
+        for j in range(max(y - reach, 0), min(y + reach + 1, height)):
+            for i in range(max(x - reach, 0), min(x + reach + 1, width)):
+                value = image[j, i]
+                least = value if value < least else least
+                most = value if value > most else most
+        if most - least > step_max:
+            labels[n] = UNCERTAIN
+
+
+@nb.njit(cache=True, nogil=True)
+def add_pixels_into(
+    totals: Floats,
+    counts: Ints,
+    taken: npt.NDArray[np.bool_],
+    image: npt.NDArray[np.generic],
+    pixels: Ints,
+    labels: npt.NDArray[np.uint8],
+    voxel_of: Index,
+) -> None:
+    """Add each point's pixel to its voxel, but for points that are taken already, and take those that had a value.
+
+    Args:
+        totals: (U, C) sums of values by voxel.
+        counts: (U,) pixels by voxel.
+        taken: (N,) points that another image spoke for.
+        image: (H, W, C); what is not finite is no value.
+        pixels: (N, 2) x, y, where the label is OK.
+        labels: (N,)
+        voxel_of: (N,)
+    """
+    for n in range(labels.shape[0]):
+        if taken[n] or labels[n] != OK:
+            continue
+        x, y = pixels[n, 0], pixels[n, 1]
+        valid = True
+        for c in range(image.shape[2]):
+            valid &= bool(np.isfinite(image[y, x, c]))
+        if not valid:
+            continue
+        taken[n] = True
+        counts[voxel_of[n]] += 1
+        for c in range(image.shape[2]):
+            totals[voxel_of[n], c] += np.float64(image[y, x, c])
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def write_means_into(
+    sums: Ints, first: int, last: int, totals: Floats, counts: Ints, zero: float, step: float, is_squared: bool
+) -> bool:
+    """Write a sample of weight 1, the mean of its pixels, to each voxel that has none yet; whether all are in range.
+
+    Args:
+        sums: (U, P)
+        first: the channel's first plane.
+        last: its weight.
+        totals: (U, C) sums of values.
+        counts: (U,) pixels.
+        zero: value of the sample 0.
+        step: of `cairn_map.evidence.channels.Channel.quantise`.
+        is_squared: whether the square of the one value is kept too.
+    """
+    for n in range(counts.shape[0]):
+        if counts[n] == 0 or sums[n, last] != 0:
+            continue
+        for c in range(totals.shape[1]):
+            sample = np.rint((totals[n, c] / counts[n] - zero) / step)
+            # A comparison with NaN is false.
+            if not (sample >= 0.0 and sample <= SAMPLE_MAX):
+                return False
+            sums[n, first + c] = np.int64(sample)
+        if is_squared:
+            sums[n, first + 1] = sums[n, first] ** 2
+        sums[n, last] = 1
+    return True

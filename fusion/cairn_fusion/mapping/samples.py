@@ -1,0 +1,169 @@
+"""What the cameras of a scan say about the points that came back: one sample a voxel, channel and scan.
+
+    points   in the range camera's frame            Eq. 1-4
+    samples  colour, temperature, amplitude          Eq. 5-6 with a z-buffer; only what a camera really saw
+
+Each voxel that was hit gets at most one sample per channel and scan: the mean of the pixels that fell on it, with
+weight 1. So a voxel's weights never exceed its hits, however fine the images are, and samples stay small numbers.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig.rig import Rig
+from cairn_fusion.mapping.beam_returns import Returns
+from cairn_fusion.mapping.sample_kernels import add_pixels_into, doubt_edges_into, write_means_into
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.transfer.certainty import is_certain, reach_px_of, spread_m
+from cairn_fusion.transfer.transfer import (
+    DEPTH_TOLERANCE_M,
+    Label,
+    Transfer,
+    depth_steps,
+    points_from_range,
+    transfer_points,
+)
+from cairn_map.evidence.channels import Channel, ChannelKind
+from cairn_map.evidence.grid import Geometry
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Numbers = npt.NDArray[np.integer]
+Labels = npt.NDArray[np.uint8]
+
+
+def sample_sums(
+    scan: Scan,
+    rig: Rig,
+    geometry: Geometry,
+    returns: Returns,
+    voxel_of: Numbers,
+    count: int,
+    *,
+    spread_max_m: float = math.inf,
+    step_max_k: float = math.inf,
+    hidden_behind_m: float = DEPTH_TOLERANCE_M,
+) -> Ints:
+    """(count, P) sums of the scan's voxels: one sample of weight 1 for each channel that a camera saw there.
+
+    Colours and temperatures whose place is uncertain by more than `spread_max_m` are left out (`certainty`); and
+    temperatures at whose place the thermal image differs by more than `step_max_k`, within what a range pixel covers:
+    of an edge of something hot nobody knows which side the range is of. `hidden_behind_m` is that of
+    `transfer_points`.
+    """
+    sums = np.zeros((count, geometry.plane_count), np.int64)
+    limits = SightLimits(spread_max_m, step_max_k, hidden_behind_m)
+    sight, numbers = Sight(scan, rig, returns, limits), voxel_of.astype(np.int32, copy=False)
+    for channel in geometry.channels:
+        taken = np.zeros(len(returns.pixels), np.bool_)
+        # The first camera speaks for what it sees; the next ones only fill what was hidden from those before.
+        for image, pixels, labels in sight.images_of(channel.kind):
+            totals, counts = np.zeros((count, channel.value_count)), np.zeros(count, np.int64)
+            add_pixels_into(totals, counts, taken, np.atleast_3d(image), pixels, labels, numbers)
+            _write_means_into(sums, geometry, channel, totals, counts)
+    return sums
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Points:
+    """What the range camera saw."""
+
+    tof: Floats
+    """(N, 3) in its frame."""
+    range_m: Floats
+    steps_m: Floats
+    """(N,) how steep the surface is there: `depth_steps`."""
+    sigma_m: Floats
+    """(N,) of their ranges."""
+
+
+@dataclass(frozen=True, slots=True)
+class SightLimits:
+    """What is taken for seen; arguments of `sample_sums`."""
+
+    spread_max_m: float
+    step_max_k: float
+    hidden_behind_m: float
+
+
+class Sight:
+    """Where the points of a scan appear in its images, each found when it is asked for."""
+
+    def __init__(self, scan: Scan, rig: Rig, returns: Returns, limits: SightLimits) -> None:
+        self._scan = scan
+        self._rig = rig
+        self._returns = returns
+        self._limits = limits
+        self._points: _Points | None = None
+
+    def images_of(self, kind: ChannelKind) -> Iterator[tuple[npt.NDArray[np.generic], Ints, Labels]]:
+        """For each image of a kind: it, and pixels (N, 2) and labels (N,) of the points."""
+        scan = self._scan
+        if kind is ChannelKind.INTENSITY and scan.amplitude is not None:
+            # `take`: indexing by rows takes ten times as long.
+            pixels = np.take(_pixels_of(*scan.amplitude.shape), self._returns.pixels, axis=0)
+            yield scan.amplitude, pixels, np.full(len(pixels), Label.OK, np.uint8)
+        images: dict[str, npt.NDArray[np.generic]] = {}
+        if kind is ChannelKind.COLOUR:
+            images = dict(scan.colour)
+        elif kind is ChannelKind.TEMPERATURE:
+            images = dict(scan.thermal)
+        for name, image in images.items():
+            transfer = self._transfer(name)
+            yield image, transfer.pixels, transfer.labels
+
+    def _transfer(self, name: str) -> Transfer:
+        """Where all points appear in a camera's image; those whose place there is too uncertain are so labelled."""
+        src, limits = self._scan.range_camera, self._limits
+        points = self._seen_points()
+        transfer = transfer_points(
+            *(points.tof, self._rig),
+            src=src,
+            dst=name,
+            steps_m=points.steps_m,
+            hidden_behind_m=limits.hidden_behind_m,
+        )
+        certain = is_certain(points.range_m, points.sigma_m, self._rig, src=src, dst=name, limit_m=limits.spread_max_m)
+        doubtful = np.nonzero(transfer.ok & ~certain)[0]
+        if len(doubtful):
+            spread = spread_m(points.tof[doubtful], points.sigma_m[doubtful], self._rig, src=src, dst=name)
+            transfer.labels[doubtful[~(spread <= limits.spread_max_m)]] = Label.UNCERTAIN
+        if name in self._scan.thermal and limits.step_max_k < math.inf:
+            reach_px = reach_px_of(points.range_m, points.sigma_m, self._rig, src=src, dst=name)
+            image = np.ascontiguousarray(self._scan.thermal[name])
+            doubt_edges_into(transfer.labels, transfer.pixels, reach_px, image, limits.step_max_k)
+        return transfer
+
+    def _seen_points(self) -> "_Points":
+        if self._points is None:
+            mounted, returned = self._rig[self._scan.range_camera], self._returns.pixels
+            range_m = self._returns.range_m.ravel()[returned].astype(np.float64)
+            image_points = points_from_range(self._returns.range_m, mounted.camera)
+            self._points = _Points(
+                tof=np.take(image_points.reshape(-1, 3), returned, axis=0),
+                range_m=range_m,
+                steps_m=depth_steps(image_points).ravel()[returned],
+                sigma_m=mounted.range_sigma_image(self._returns.range_m).ravel()[returned],
+            )
+        return self._points
+
+
+def _write_means_into(sums: Ints, geometry: Geometry, channel: Channel, totals: Floats, counts: Ints) -> None:
+    """One sample of weight 1, the mean of its pixels, for every voxel that has none of this channel yet."""
+    planes, is_squared = geometry.planes_of(channel.name), channel.kind is ChannelKind.TEMPERATURE
+    ends = (planes.start, planes.stop - 1)
+    if not write_means_into(sums, *ends, totals, counts, channel.zero, channel.step, is_squared):
+        seen = counts > 0
+        channel.quantise(totals[seen] / counts[seen, None])  # raises: one is out of range
+
+
+@lru_cache(maxsize=32)
+def _pixels_of(height: int, width: int) -> Ints:
+    """(height width, 2) x, y of an image's pixels, row by row."""
+    y, x = np.divmod(np.arange(height * width), width)
+    return np.stack([x, y], axis=1)

@@ -1,0 +1,228 @@
+"""Any folder of frames as a recording: one file per frame and image, found by a pattern with `{id}` in it.
+
+    frames/frame-{id}.depth.png  ->  ids 000000 000001 ...  ->  colour, thermal and pose of the same id
+
+Depth, colour and thermal are registered: one raster, one camera model, so the rig's cameras `depth`, `colour`
+and `thermal` are the same camera at the rig's origin. What is not registered is a matter for the recording
+format, with a rig of its own.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from enum import StrEnum
+from glob import escape
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from cairn_calib.rig.brown import Coefficients
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.poses import Transform, checked_transform, inverse
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_fusion.recording.images import image_header
+from cairn_fusion.recording.recording import Recording, ScanFiles, measurements_of
+from cairn_fusion.recording.recording_format import (
+    Convention,
+    Name,
+    Positive,
+    RangeEncoding,
+    ThermalEncoding,
+    contained,
+)
+from cairn_fusion.recording.timed_lists import read_text
+from cairn_map.errors import BadInputError
+
+TEXT_BYTES_MAX = 1 << 16
+"""Of a matrix in a text file."""
+FRAME_ID = "{id}"
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class PoseConvention(StrEnum):
+    """Which way a pose file's matrix maps points."""
+
+    CAMERA_TO_MAP = "camera_to_map"
+    MAP_TO_CAMERA = "map_to_camera"
+
+
+class FrameFolderOptions(BaseModel):
+    """What a folder of frames cannot say of itself; patterns are relative, `{id}` is the frame's id, no slash in it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: Name = "frames"
+    note: str = ""
+    depth: str
+    """16-bit PNG; its ids are the frames."""
+    colour: str | None = None
+    thermal: str | None = None
+    pose: str
+    """4x4 or 3x4 matrix in text; without `{id}`, one file for all frames."""
+    intrinsics_file: str | None = None
+    """3x3 matrix in text; else `focal_px` and `centre_px`."""
+    focal_px: tuple[Positive, Positive] | None = None
+    centre_px: tuple[Finite, Finite] | None = None
+    distortion: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)
+    depth_units_per_m: Positive = 1000.0
+    depth_convention: Convention = Convention.Z
+    pose_convention: PoseConvention = PoseConvention.CAMERA_TO_MAP
+    kelvin_per_count: Positive = 0.01
+    kelvin_at_zero: Finite = 0.0
+    frame_rate_hz: Positive = 1.0
+    """Frame n of the folder (ids in order, numbers by value) is n / rate after the start."""
+    start_time_s: Finite = 0.0
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        for pattern in (self.depth, self.colour, self.thermal):
+            if pattern is not None and FRAME_ID not in pattern:
+                raise ValueError(f"an image pattern needs {FRAME_ID}, got {pattern!r}")
+        given = (self.focal_px is not None, self.centre_px is not None)
+        if given != (self.intrinsics_file is None,) * 2:
+            raise ValueError("give either intrinsics_file, or both focal_px and centre_px")
+        return self
+
+
+def import_frames(
+    folder: str | Path,
+    options: FrameFolderOptions,
+    *,
+    frames: Sequence[str] | None = None,
+    scans_per_measurement: int = 1,
+) -> Recording:
+    """A folder of frames as a recording; images are read when asked for.
+
+    Args:
+        folder: what the patterns are relative to.
+        options: patterns and conventions.
+        frames: only these ids, each in the folder; they keep the times and the order that they have among all.
+        scans_per_measurement: group scans by this count.
+
+    Raises:
+        BadInputError: no frames, an image or pose missing for one of them, a path that leads out of the folder, a
+            matrix that is none, or images that are not one raster.
+    """
+    root = Path(folder).resolve()
+    ids = _frame_ids(root, options.depth)
+    if frames is not None and (not frames or not set(frames) <= set(ids)):
+        unknown = ", ".join(sorted(set(frames) - set(ids))[:10]) or "of an empty choice"
+        raise BadInputError("unknown_frame", f"{root} has {len(ids)} frames, but none {unknown}")
+    pose = _pose_reader(root, options)
+    wanted = set(ids if frames is None else frames)
+    files = tuple(
+        _scan_files(root, options, frame_id, time_s=options.start_time_s + n / options.frame_rate_hz, pose=pose)
+        for n, frame_id in enumerate(ids)
+        if frame_id in wanted
+    )
+    return Recording(
+        name=options.name,
+        note=options.note,
+        rig=_registered_rig(root, options, files[0].range_path),
+        files=files,
+        stops=measurements_of(len(files), scans_per_measurement),
+        range_encodings={
+            "depth": RangeEncoding(units_per_m=options.depth_units_per_m, convention=options.depth_convention)
+        },
+        thermal_encodings={
+            "thermal": ThermalEncoding(kelvin_per_count=options.kelvin_per_count, kelvin_at_zero=options.kelvin_at_zero)
+        },
+    )
+
+
+def _frame_ids(root: Path, pattern: str) -> list[str]:
+    """The ids that a pattern finds, numbers by value."""
+    contained(root, pattern)
+    pattern = PurePosixPath(pattern).as_posix()
+    wanted = re.escape(pattern).replace(re.escape(FRAME_ID), r"(?P<id>[^/]+)", 1)
+    wanted = wanted.replace(re.escape(FRAME_ID), r"(?P=id)")
+    glob = "*".join(escape(part) for part in pattern.split(FRAME_ID))
+    matches = (re.fullmatch(wanted, path.relative_to(root).as_posix()) for path in root.glob(glob))
+    ids = [match["id"] for match in matches if match]
+    if not ids:
+        raise BadInputError("no_frames", f"no file in {root} fits {pattern}")
+    return sorted(ids, key=lambda word: (0, int(word), word) if word.isdecimal() else (1, 0, word))
+
+
+def _scan_files(
+    root: Path, options: FrameFolderOptions, frame_id: str, *, time_s: float, pose: Callable[[str], Transform]
+) -> ScanFiles:
+    def image(pattern: str) -> Path:
+        path = contained(root, pattern.replace(FRAME_ID, frame_id))
+        if not path.is_file():
+            raise BadInputError(
+                "missing_image", f"frame {frame_id} of {root} lacks {pattern.replace(FRAME_ID, frame_id)}"
+            )
+        return path
+
+    return ScanFiles(
+        time_s=time_s,
+        T_map_rig=pose(frame_id),
+        range_camera="depth",
+        range_path=image(options.depth),
+        colour={"colour": image(options.colour)} if options.colour else {},
+        thermal={"thermal": image(options.thermal)} if options.thermal else {},
+    )
+
+
+def _pose_reader(root: Path, options: FrameFolderOptions) -> Callable[[str], Transform]:
+    """The pose of a frame id; a static pose is read once."""
+    if FRAME_ID not in options.pose:
+        static = _pose(root, options.pose, options.pose_convention)
+        return lambda _: static
+    return lambda frame_id: _pose(root, options.pose.replace(FRAME_ID, frame_id), options.pose_convention)
+
+
+def _pose(root: Path, relative: str, convention: PoseConvention) -> Transform:
+    values = _numbers(contained(root, relative))
+    if values.size == 12:
+        values = np.append(values, (0, 0, 0, 1))
+    if values.size != 16:
+        raise BadInputError("bad_transform", f"{root / relative} must hold 16 or 12 numbers, got {values.size}")
+    T = checked_transform(values.reshape(4, 4), name=str(root / relative))
+    return inverse(T) if convention is PoseConvention.MAP_TO_CAMERA else T
+
+
+def _registered_rig(root: Path, options: FrameFolderOptions, first_depth: Path) -> Rig:
+    """The one camera of the raster, once for every image that the folder has."""
+    header = image_header(first_depth)
+    focal_px, centre_px = _intrinsics(root, options)
+    camera = Camera(
+        width=header.width,
+        height=header.height,
+        focal_px=focal_px,
+        centre_px=centre_px,
+        distortion=options.distortion,
+    )
+    spectra = {"depth": Spectrum.RANGE}
+    if options.colour:
+        spectra["colour"] = Spectrum.COLOUR
+    if options.thermal:
+        spectra["thermal"] = Spectrum.THERMAL
+    return Rig(
+        name=options.name, cameras={name: mounted(spectrum, camera, np.eye(4)) for name, spectrum in spectra.items()}
+    )
+
+
+def _intrinsics(root: Path, options: FrameFolderOptions) -> tuple[tuple[float, float], tuple[float, float]]:
+    if options.focal_px is not None and options.centre_px is not None:
+        return options.focal_px, options.centre_px
+    path = contained(root, options.intrinsics_file or "")
+    K = _numbers(path)
+    if K.size != 9 or not np.array_equal(K[[1, 3, 6, 7, 8]], (0, 0, 0, 0, 1)) or K[0] <= 0 or K[4] <= 0:
+        raise BadInputError("bad_intrinsics", f"{path} must hold fx 0 cx, 0 fy cy, 0 0 1; got {K.tolist()[:9]}")
+    return (float(K[0]), float(K[4])), (float(K[2]), float(K[5]))
+
+
+def _numbers(path: Path) -> npt.NDArray[np.float64]:
+    """All numbers of a small text file, between blanks or commas."""
+    words = read_text(path, TEXT_BYTES_MAX).replace(",", " ").split()
+    try:
+        values = np.array([float(word) for word in words], dtype=np.float64)
+    except ValueError as exc:
+        raise BadInputError("bad_matrix", f"{path} must hold numbers only: {exc}") from exc
+    if not np.isfinite(values).all():
+        raise BadInputError("bad_matrix", f"{path} must hold finite numbers")
+    return values

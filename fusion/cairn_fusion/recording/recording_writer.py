@@ -1,0 +1,220 @@
+"""Writing a recording, so that a half-written one is never taken for a whole one.
+
+    rig.json first  ->  images, then their list lines, scan by scan  ->  recording.json last, by rename
+
+A folder with `rig.json` and no `recording.json` is one whose writer died; what its lists name is there.
+"""
+
+import os
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Self, TextIO
+
+import numpy as np
+
+from cairn_calib.rig.rig import Rig
+from cairn_fusion.recording.images import write_colour, write_grey16
+from cairn_fusion.recording.recording_format import (
+    BODY_FILE,
+    CHANNEL,
+    HEADER_FILE,
+    MEASUREMENTS_FILE,
+    RIG_FILE,
+    SCALARS_FILE,
+    TRAJECTORY_FILE,
+    RangeEncoding,
+    RecordingHeader,
+    ThermalEncoding,
+    check_camera_name,
+    encode_kelvin,
+    encode_range,
+)
+from cairn_fusion.recording.scan import Scan, check_scan
+from cairn_fusion.recording.trajectory import trajectory_line
+from cairn_map.errors import BadInputError, ConflictError
+
+RANGE_ENCODING = RangeEncoding()
+THERMAL_ENCODING = ThermalEncoding()
+LIST_COMMENTS: Mapping[str, str] = {
+    TRAJECTORY_FILE: "# time tx ty tz qx qy qz qw (T_map_rig)\n",
+    BODY_FILE: "# time tx ty tz qx qy qz qw (T_map_body)\n",
+    MEASUREMENTS_FILE: "# first_time last_time\n",
+    SCALARS_FILE: "# time channel value\n",
+}
+
+
+class RecordingWriter:
+    """A recording being written; finished when the `with` block ends without an error.
+
+    with RecordingWriter(folder, rig, name="lab-1") as recording:
+        for scan in stop:
+            recording.add(scan)
+        recording.end_measurement()
+
+    Args:
+        path: a new or empty folder.
+        rig: the cameras of all scans.
+        name: of the recording; letters, digits, dot, dash, underscore.
+        note: free text for people.
+        range_encoding: units and convention of range images; what does not fit 16 bits is refused, not clipped.
+        thermal_encoding: the scale of all thermal images; likewise.
+
+    Raises:
+        ConflictError: the folder holds something already.
+        BadInputError: a name that cannot be written, or a folder that cannot be made.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        rig: Rig,
+        *,
+        name: str,
+        note: str = "",
+        range_encoding: RangeEncoding = RANGE_ENCODING,
+        thermal_encoding: ThermalEncoding = THERMAL_ENCODING,
+    ) -> None:
+        self.folder = Path(path)
+        self.rig = rig
+        self._range_encoding = range_encoding
+        self._thermal_encoding = thermal_encoding
+        for camera in rig.cameras:
+            check_camera_name(camera)
+        try:
+            self._header = RecordingHeader(name=name, note=note, range={})
+        except ValueError as exc:
+            raise BadInputError("bad_recording", f"not a recording's name and note: {name!r}") from exc
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if any(self.folder.iterdir()):
+                raise ConflictError("recording_exists", f"{self.folder} must be empty to record into it")
+            (self.folder / RIG_FILE).write_bytes(rig.to_json())
+        except OSError as exc:
+            raise BadInputError("bad_output", f"cannot record into {self.folder}: {exc.strerror}") from exc
+        self._stack = ExitStack()
+        self._lists: dict[str, TextIO] = {}
+        self._recorded: dict[tuple[str, str], None] = {}
+        """(list in the header, camera), in order of first use."""
+        self._scan_count = 0
+        self._first_s: float | None = None
+        self._last_s = -np.inf
+        self._grouped = False
+        self._finished = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.finish()
+        else:
+            self._stack.close()
+
+    def add(self, scan: Scan) -> None:
+        """Write one scan's images and lines; scans come in order of time.
+
+        Raises:
+            BadInputError: the scan does not fit the rig, is not later than the one before, has a value that the
+                encodings cannot hold, or says where the body was when others did not, or the other way round.
+                Nothing of it is in the lists then.
+        """
+        if self._finished:
+            raise ConflictError("recording_exists", f"{self.folder} is finished; nothing can be added")
+        check_scan(scan, self.rig)
+        if scan.time_s <= self._last_s:
+            raise BadInputError("bad_scan", f"scan times must increase, got {scan.time_s!r} after {self._last_s!r}")
+        for channel, value in scan.scalars.items():
+            if not CHANNEL.fullmatch(channel) or not np.isfinite(value):
+                raise BadInputError(
+                    "bad_scan", f"a channel's name and a finite number expected, got {channel!r} {value}"
+                )
+        if self._scan_count and (scan.T_map_body is not None) != (BODY_FILE in self._lists):
+            raise BadInputError("bad_scan", "either every scan of a recording says where the body was, or none does")
+        time_s = float(scan.time_s)
+        for list_name, relative in self._write_images(scan).items():
+            self._list(list_name).write(f"{time_s!r} {relative}\n")
+        self._list(TRAJECTORY_FILE).write(trajectory_line(time_s, scan.T_map_rig))
+        if scan.T_map_body is not None:
+            self._list(BODY_FILE).write(trajectory_line(time_s, scan.T_map_body))
+        for channel, value in scan.scalars.items():
+            self._list(SCALARS_FILE).write(f"{time_s!r} {channel} {float(value)!r}\n")
+        self._scan_count += 1
+        self._last_s = time_s
+        self._first_s = time_s if self._first_s is None else self._first_s
+
+    def end_measurement(self) -> None:
+        """Close the measurement of all scans since the last one; nothing when there are none.
+
+        When it is never called, there is no `measurements.txt`, and every scan is a measurement of its own.
+        """
+        if self._first_s is not None:
+            self._list(MEASUREMENTS_FILE).write(f"{self._first_s!r} {self._last_s!r}\n")
+            self._first_s = None
+            self._grouped = True
+
+    def finish(self) -> None:
+        """Close every list, bring it to the disk, and put `recording.json` in place, in one step; once.
+
+        Images are left to the system's write-back: one that a power cut took is noticed when it is read.
+        """
+        if self._finished:
+            return
+        if self._grouped:
+            self.end_measurement()
+        self._list(TRAJECTORY_FILE)
+        with self._stack:
+            for file in self._lists.values():
+                file.flush()
+                os.fsync(file.fileno())
+        header = self._header.model_copy(
+            update={
+                "range": dict.fromkeys(self._cameras("range"), self._range_encoding),
+                "amplitude": tuple(self._cameras("amplitude")),
+                "colour": tuple(self._cameras("colour")),
+                "thermal": dict.fromkeys(self._cameras("thermal"), self._thermal_encoding),
+            }
+        )
+        partial = self.folder / f"{HEADER_FILE}.partial"
+        with partial.open("wb") as head:
+            head.write(header.to_json())
+            head.flush()
+            os.fsync(head.fileno())
+        partial.replace(self.folder / HEADER_FILE)
+        self._finished = True
+
+    def _write_images(self, scan: Scan) -> dict[str, str]:
+        """Every image of the scan, all encoded before one is written; each one's list, and its path in it."""
+        name = f"{self._scan_count:06d}.png"
+        camera = self.rig[scan.range_camera].camera
+        counts = {scan.range_camera: encode_range(scan.range_m, camera, self._range_encoding)}
+        counts |= {thermal: encode_kelvin(kelvin, self._thermal_encoding) for thermal, kelvin in scan.thermal.items()}
+        if scan.amplitude is not None:
+            counts[f"{scan.range_camera}.amplitude"] = scan.amplitude
+        for folder in [*counts, *scan.colour]:
+            (self.folder / "images" / folder).mkdir(parents=True, exist_ok=True)
+        for folder, image in counts.items():
+            write_grey16(self.folder / "images" / folder / name, image)
+        for folder, colour in scan.colour.items():
+            write_colour(self.folder / "images" / folder / name, colour)
+        self._recorded["range", scan.range_camera] = None
+        if scan.amplitude is not None:
+            self._recorded["amplitude", scan.range_camera] = None
+        self._recorded |= dict.fromkeys(("colour", folder) for folder in scan.colour)
+        self._recorded |= dict.fromkeys(("thermal", folder) for folder in scan.thermal)
+        return {f"{folder}.txt": f"images/{folder}/{name}" for folder in [*counts, *scan.colour]}
+
+    def _cameras(self, kind: str) -> list[str]:
+        return [camera for recorded, camera in self._recorded if recorded == kind]
+
+    def _list(self, name: str) -> TextIO:
+        if name not in self._lists:
+            file = self._stack.enter_context(
+                (self.folder / name).open("w", encoding="utf-8", newline="\n", buffering=1)
+            )
+            file.write(LIST_COMMENTS.get(name, "# time path\n"))
+            self._lists[name] = file
+        return self._lists[name]

@@ -1,0 +1,76 @@
+"""One scan: a head pose and all its images.
+
+    range_m      (H, W) float32   metres along each beam of `range_camera`; NaN = nothing came back (not "free")
+    amplitude    (H, W) uint16    what the time-of-flight camera's own light returned
+    colour       {camera: (H, W, 3) uint8}     sRGB, in R, G, B order
+    thermal      {camera: (H, W) float32}      apparent temperature, kelvin; NaN = no reading
+    scalars      {channel: float}              named readings at the rig's origin (dose, gas, ...)
+    T_map_body   where the robot's body was, so that its own points can be left out
+
+Other conventions (z-depth, millimetres, raw counts) enter through `adapters.py` only.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig.poses import Transform, checked_transform
+from cairn_calib.rig.rig import Rig, Spectrum
+from cairn_map.errors import BadInputError
+
+Image = npt.NDArray[np.generic]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scan:
+    """All images of one head pose, at one time."""
+
+    time_s: float
+    """UTC, seconds since 1970."""
+    T_map_rig: Transform
+    range_camera: str
+    range_m: npt.NDArray[np.float32]
+    amplitude: npt.NDArray[np.uint16] | None = None
+    colour: Mapping[str, npt.NDArray[np.uint8]] = field(default_factory=dict)
+    thermal: Mapping[str, npt.NDArray[np.float32]] = field(default_factory=dict)
+    scalars: Mapping[str, float] = field(default_factory=dict)
+    T_map_body: Transform | None = None
+    """Where the frame of the rig's body is; None: the body's boxes are in the rig's frame."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "T_map_rig", checked_transform(self.T_map_rig, name="T_map_rig"))
+        if self.T_map_body is not None:
+            object.__setattr__(self, "T_map_body", checked_transform(self.T_map_body, name="T_map_body"))
+        if not isinstance(self.range_m, np.ndarray):
+            # Above all no `EyeDepth`: what was filled in for the eye is no measurement.
+            raise BadInputError("bad_scan", f"range_m must be an array of ranges, got {type(self.range_m).__name__}")
+        if not np.isfinite(self.time_s):
+            raise BadInputError("bad_scan", f"time_s must be finite seconds, got {self.time_s}")
+
+
+def check_scan(scan: Scan, rig: Rig) -> None:
+    """Refuse a scan whose images do not fit the rig's cameras in size, type or spectrum.
+
+    Raises:
+        BadInputError: with the camera's name and what was expected.
+    """
+    _check_image(rig, scan.range_camera, scan.range_m, Spectrum.RANGE, np.float32)
+    if scan.amplitude is not None:
+        _check_image(rig, scan.range_camera, scan.amplitude, Spectrum.RANGE, np.uint16)
+    for name, image in scan.colour.items():
+        _check_image(rig, name, image, Spectrum.COLOUR, np.uint8)
+        if image.ndim != 3 or image.shape[2] != 3:
+            raise BadInputError("bad_scan", f"colour image of {name} must be (H, W, 3), got {image.shape}")
+    for name, kelvin in scan.thermal.items():
+        _check_image(rig, name, kelvin, Spectrum.THERMAL, np.float32)
+
+
+def _check_image(rig: Rig, name: str, image: Image, spectrum: Spectrum, dtype: type[np.generic]) -> None:
+    mounted = rig[name]
+    if mounted.spectrum is not spectrum:
+        raise BadInputError("bad_scan", f"camera {name} is {mounted.spectrum}, but a {spectrum} image came for it")
+    if image.dtype != dtype:
+        raise BadInputError("bad_scan", f"{spectrum} image of {name} must be {np.dtype(dtype)}, got {image.dtype}")
+    mounted.camera.check_image(image, name=f"{spectrum} image of {name}")

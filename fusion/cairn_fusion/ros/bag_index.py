@@ -1,0 +1,191 @@
+"""What is in a bag, found in one pass: how many messages of which size when, and where frames were.
+
+Of images only the header is read; the pixels come when a scan is asked for (`bag_recording.py`).
+"""
+
+from array import array
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_fusion.ros.bag import Bag, BagMessage, Topic, Wire
+from cairn_fusion.ros.images import encoding_of
+from cairn_fusion.ros.messages import (
+    CAMERA_INFO,
+    COMPRESSED,
+    IMAGE,
+    ODOMETRY,
+    POINTS,
+    POSES,
+    STAMPED,
+    TRANSFORMS,
+    RosCameraInfo,
+    RosTransform,
+    read_camera_info,
+    read_compressed_image,
+    read_header,
+    read_image,
+    read_pose,
+    read_transforms,
+)
+from cairn_fusion.ros.point_clouds import elevations_of, read_points
+from cairn_fusion.ros.tf_tree import FrameTree
+from cairn_map.errors import BadInputError, DamagedDataError
+
+MESSAGES_MAX = 20_000_000
+"""Times of that many messages are 320 MB."""
+BASE = "base"
+"""What a pose that names no child is of."""
+STATIC_NAME = "static"
+"""In the name of a topic whose transforms count for ever."""
+
+
+@dataclass(slots=True)
+class TopicIndex:
+    """The messages of one topic, in the order in which they were recorded."""
+
+    topic: Topic
+    log_ns: "array[int]" = field(default_factory=lambda: array("q"))
+    times_s: "array[float]" = field(default_factory=lambda: array("d"))
+    """Of the headers; where there is none, of the recording."""
+    size_bytes: int = 0
+    frame: str = ""
+    """That the first message names."""
+    encoding: str = ""
+    """Of the first image, or the format of the first compressed one."""
+    image_size: tuple[int, int] | None = None
+    """Width and height of the first image or camera info."""
+    info: RosCameraInfo | None = None
+    elevations_deg: tuple[float, ...] | None = None
+    """Of the beams in the first point cloud, the highest first."""
+    columns: int = 0
+    """Points of a beam in it, at most."""
+
+    def __len__(self) -> int:
+        return len(self.log_ns)
+
+    @property
+    def rate_hz(self) -> float:
+        """Messages a second, from the first to the last; 0 for one alone."""
+        times_s = self.times()
+        length_s = float(times_s.max() - times_s.min()) if len(times_s) else 0.0
+        return (len(self) - 1) / length_s if length_s > 0 else 0.0
+
+    def times(self) -> npt.NDArray[np.float64]:
+        """(N,) `times_s`."""
+        return np.array(self.times_s, dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class BagIndex:
+    """All topics that were looked at, and all transforms."""
+
+    topics: dict[str, TopicIndex]
+    tree: FrameTree
+    """Of tf alone: who publishes odometry as well says the same twice."""
+    tracks: dict[str, FrameTree]
+    """Of each topic of odometry or poses: its one edge; a child without a name is `BASE`."""
+
+
+def index_bag(
+    bag: Bag, topics: Collection[str] | None = None, *, on_message: Callable[[], object] | None = None
+) -> BagIndex:
+    """Look through a bag once.
+
+    Args:
+        bag: the bag.
+        topics: which topics; None: all.
+        on_message: called after each message.
+
+    Raises:
+        DamagedDataError: the bag is damaged; the message names topic, time and a next step.
+        BadInputError: two topics of poses for one frame, or more than the memory should hold.
+    """
+    wanted = set(bag.topics if topics is None else topics)
+    index = BagIndex({name: TopicIndex(bag.topics[name]) for name in sorted(wanted)}, FrameTree(bag.path.name), {})
+    for n, message in enumerate(bag.messages(wanted)):
+        _add(index, message, bag)
+        if n >= MESSAGES_MAX:
+            raise BadInputError("bag_too_large", f"{bag.path} has more than {MESSAGES_MAX} messages; split it")
+        if on_message is not None:
+            on_message()
+    return index
+
+
+@contextmanager
+def message_told(bag: Bag, message: BagMessage) -> Iterator[None]:
+    """Turn what is wrong in a message's bytes into an error with topic and time."""
+    try:
+        yield
+    except ValueError as exc:
+        raise DamagedDataError(
+            "bad_message",
+            f"{bag.path}: the message of {message.topic} at {message.log_ns / 1e9:.6f} s is damaged: {exc}; leave the "
+            "topic out of the YAML, or record it again",
+        ) from exc
+
+
+def wire_of(topic: Topic) -> Wire:
+    """How a topic's messages are coded.
+
+    Raises:
+        BadInputError: in none of ROS's ways.
+    """
+    if topic.wire is None:
+        raise BadInputError(
+            "unknown_encoding", f"messages of {topic.name} ({topic.type}) are coded neither as ROS 1 nor CDR"
+        )
+    return topic.wire
+
+
+def _add(index: BagIndex, message: BagMessage, bag: Bag) -> None:
+    entry = index.topics[message.topic]
+    if entry.log_ns and message.log_ns < entry.log_ns[-1]:
+        raise DamagedDataError(
+            "bad_bag", f"{bag.path}: messages of {message.topic} are not in the order of their times"
+        )
+    time_s = message.log_ns / 1e9
+    topic = entry.topic
+    if topic.wire is not None:
+        with message_told(bag, message):
+            if topic.type in STAMPED:
+                header = read_header(message.data, topic.wire)
+                time_s, is_first = header.time_s, not entry.log_ns
+                if is_first:
+                    entry.frame = header.frame
+                    _look_closer(entry, message, topic.wire)
+            _add_poses(index, message, topic, topic.wire)
+    entry.log_ns.append(message.log_ns)
+    entry.times_s.append(time_s)
+    entry.size_bytes += len(message.data)
+
+
+def _look_closer(entry: TopicIndex, message: BagMessage, wire: Wire) -> None:
+    """What the first message of a topic shows of all."""
+    if entry.topic.type == IMAGE:
+        image = read_image(message.data, wire)
+        entry.encoding, entry.image_size = image.encoding, (image.width, image.height)
+    elif entry.topic.type == COMPRESSED:
+        entry.encoding = encoding_of(read_compressed_image(message.data, wire))
+    elif entry.topic.type == CAMERA_INFO:
+        entry.info = read_camera_info(message.data, wire)
+        entry.image_size = (entry.info.width, entry.info.height)
+    elif entry.topic.type == POINTS:
+        points = read_points(message.data, wire)
+        entry.elevations_deg, entry.image_size = elevations_of(points), (points.width, points.height)
+        beams = len(entry.elevations_deg or ()) or 1
+        entry.columns = -(-points.width * points.height // beams)
+
+
+def _add_poses(index: BagIndex, message: BagMessage, topic: Topic, wire: Wire) -> None:
+    """Keep the transforms, or the pose, in a message."""
+    if topic.type in TRANSFORMS:
+        for edge in read_transforms(message.data, wire):
+            index.tree.add(edge, is_static=STATIC_NAME in topic.name)
+    elif topic.type == ODOMETRY or topic.type in POSES:
+        pose = read_pose(message.data, wire, type_name=topic.type)
+        track = index.tracks.setdefault(topic.name, FrameTree(f"{index.tree.source}: {topic.name}"))
+        track.add(RosTransform(pose.time_s, pose.parent or "map", pose.child or BASE, pose.pose), is_static=False)

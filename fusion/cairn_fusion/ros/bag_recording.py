@@ -1,0 +1,240 @@
+"""Scans out of a bag: found in one pass, read one at a time.
+
+index_bag  ->  scans_of       times of all images, all poses           once
+BagRecording.scan(i)          decode the images of one range image     each time
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+from weakref import finalize
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.lidar import AnyCamera, SpinningLidar
+from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_fusion.recording.adapters import range_from_radial, range_from_z_depth
+from cairn_fusion.recording.recording import measurements_of
+from cairn_fusion.recording.recording_format import Convention, decode_kelvin, decode_range
+from cairn_fusion.recording.scan import Scan, check_scan
+from cairn_fusion.ros.bag import Bag, BagMessage, Wire
+from cairn_fusion.ros.bag_index import BagIndex, TopicIndex, index_bag, message_told, wire_of
+from cairn_fusion.ros.bag_scans import BagScan, scans_of
+from cairn_fusion.ros.images import AnyImage, Pixels, amplitude_of, colour_of, depth_of, thermal_counts_of
+from cairn_fusion.ros.messages import COMPRESSED, IMAGE, POINTS, TRANSFORMS, read_compressed_image, read_image
+from cairn_fusion.ros.open_bag import open_bag
+from cairn_fusion.ros.point_clouds import T_LIDAR_CAMERA, read_points, sweep_image
+from cairn_fusion.ros.topic_mapping import BagMapping, MappedCamera, camera_of_info
+from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError
+
+PixelsT = TypeVar("PixelsT", bound=Pixels)
+SKIP_MAX = 256
+"""So many messages are rather read past than the bag searched anew."""
+
+
+@dataclass(slots=True)
+class TopicReader:
+    """The messages of one topic by number; quick when asked for in order."""
+
+    bag: Bag
+    index: TopicIndex
+    _stream: Iterator[BagMessage] = field(default_factory=lambda: iter(()))
+    _next: int = -1
+    _last: tuple[int, BagMessage] | None = None
+
+    def message(self, n: int) -> BagMessage:
+        """Message n."""
+        if self._last is not None and self._last[0] == n:
+            return self._last[1]
+        if not 0 <= self._next <= n <= self._next + SKIP_MAX:
+            log_ns = np.array(self.index.log_ns, dtype=np.int64)
+            self._next = int(np.searchsorted(log_ns, log_ns[n]))
+            self._stream = self.bag.messages([self.index.topic.name], start_ns=int(log_ns[n]))
+        for message in self._stream:
+            self._next += 1
+            if self._next == n + 1:
+                self._last = n, message
+                return message
+        raise DamagedDataError("bad_bag", f"{self.bag.path}: message {n} of {self.index.topic.name} has gone")
+
+
+class BagRecording:
+    """The scans of a bag; see `recording.ScanSource`. The file is closed when nobody holds it any more."""
+
+    def __init__(
+        self, bag: Bag, index: BagIndex, mapping: BagMapping, *, scans_per_measurement: int | None = None
+    ) -> None:
+        """Find all scans in an index that holds the mapping's topics.
+
+        Raises:
+            BadInputError: a topic or frame is missing or of another type, a camera has no calibration, or there is no
+                pose for a scan between others.
+        """
+        self._mapping = mapping
+        self._bag = bag
+        self._topics = {topic: _images_of(index, topic, name, types) for topic, name, types in _image_topics(mapping)}
+        self._readers = {name: TopicReader(bag, entry) for name, entry in self._topics.items()}
+        self.name = mapping.name
+        self.rig = _rig_of(index, mapping, self._topics)
+        self._scans = scans_of(bag, index, mapping, self._topics)
+        size = mapping.scans_per_measurement if scans_per_measurement is None else scans_per_measurement
+        self._stops = measurements_of(len(self._scans), size)
+        finalize(self, bag.close)
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    def __iter__(self) -> Iterator[Scan]:
+        return map(self.scan, range(len(self)))
+
+    def measurements(self) -> Sequence[range]:
+        """The scan indices of each measurement, in order; together all scans, each once."""
+        return self._stops
+
+    def scan(self, index: int, /) -> Scan:
+        """One scan, its images read from the bag now.
+
+        Raises:
+            NotFoundError: `index` is not in 0 .. len - 1.
+            BadInputError: an image is not its camera's in size, or has an encoding that is not read.
+            DamagedDataError: an image cannot be decoded.
+        """
+        if not 0 <= index < len(self):
+            raise NotFoundError("no_such_scan", f"{self.name} has scans 0 to {len(self) - 1}, asked for {index}")
+        found = self._scans[index]
+        cameras = self._mapping.cameras
+        own = cameras[found.camera]
+        scan = Scan(
+            time_s=found.time_s,
+            T_map_rig=found.T_map_rig,
+            range_camera=found.camera,
+            range_m=self._sweep(own, found) if own.lidar else self._range(own, found),
+            amplitude=self._amplitude(own, found),
+            colour={
+                name: self._pixels(camera.topic, found, colour_of)
+                for name, camera in cameras.items()
+                if camera.spectrum is Spectrum.COLOUR and camera.topic in found.images
+            },
+            thermal={
+                name: decode_kelvin(self._pixels(camera.topic, found, thermal_counts_of), camera.thermal_encoding)
+                for name, camera in cameras.items()
+                if camera.spectrum is Spectrum.THERMAL and camera.topic in found.images
+            },
+        )
+        check_scan(scan, self.rig)
+        return scan
+
+    def _range(self, camera: MappedCamera, found: BagScan) -> npt.NDArray[np.float32]:
+        """(H, W) metres along the beam."""
+        return _range_of(self._pixels(camera.topic, found, depth_of), self.rig[found.camera].camera, camera)
+
+    def _sweep(self, camera: MappedCamera, found: BagScan) -> npt.NDArray[np.float32]:
+        """The same of a lidar's cloud."""
+        lidar = self.rig[found.camera].camera
+        message = self._readers[camera.topic].message(found.images[camera.topic])
+        with message_told(self._bag, message):
+            points = read_points(message.data, wire_of(self._topics[camera.topic].topic))
+            assert isinstance(lidar, SpinningLidar)  # noqa: S101 - `_camera_of` made it so
+            return sweep_image(points.xyz(), lidar)
+
+    def _amplitude(self, camera: MappedCamera, found: BagScan) -> npt.NDArray[np.uint16] | None:
+        has_one = camera.amplitude is not None and camera.amplitude in found.images
+        return self._pixels(camera.amplitude or "", found, amplitude_of) if has_one else None
+
+    def _pixels(self, topic: str, found: BagScan, decode: Callable[[AnyImage, str], PixelsT]) -> PixelsT:
+        """The pixels of a scan's image of one topic."""
+        message = self._readers[topic].message(found.images[topic])
+        entry = self._topics[topic]
+        with message_told(self._bag, message):
+            read: Callable[[bytes | memoryview, Wire], AnyImage]
+            read = read_image if entry.topic.type == IMAGE else read_compressed_image
+            image = read(message.data, wire_of(entry.topic))
+            return decode(image, f"{self._bag.path.name}: {topic} at {message.log_ns / 1e9:.6f} s")
+
+
+def open_bag_recording(
+    path: Path,
+    mapping: BagMapping,
+    *,
+    scans_per_measurement: int | None = None,
+) -> BagRecording:
+    """The scans of a bag, looked through once, its images not yet decoded.
+
+    Raises:
+        BadInputError: no bag, or as `BagRecording`.
+        DamagedDataError: it is damaged.
+    """
+    bag = open_bag(path)
+    try:
+        wanted = {*mapping.topics(), mapping.poses.topic}
+        if missing := sorted(wanted - bag.topics.keys()):
+            raise BadInputError(
+                "no_topic",
+                f"{path} has no topic {', '.join(missing)}; it has {', '.join(sorted(bag.topics))[:1000]}; "
+                "`cairn robot inspect` proposes what to take",
+            )
+        transforms = {name for name, topic in bag.topics.items() if topic.type in TRANSFORMS}
+        index = index_bag(bag, wanted | transforms)
+        return BagRecording(bag, index, mapping, scans_per_measurement=scans_per_measurement)
+    except BaseException:
+        bag.close()
+        raise
+
+
+def _image_topics(mapping: BagMapping) -> Iterator[tuple[str, str, tuple[str, ...]]]:
+    """Each topic of pixels, whose it is, and which types it may have."""
+    for name, camera in mapping.cameras.items():
+        yield camera.topic, name, (POINTS,) if camera.lidar else (IMAGE, COMPRESSED)
+        if camera.amplitude is not None:
+            yield camera.amplitude, name, (IMAGE, COMPRESSED)
+
+
+def _images_of(index: BagIndex, topic: str, camera: str, types: tuple[str, ...]) -> TopicIndex:
+    entry = index.topics[topic]
+    if entry.topic.type not in types:
+        raise BadInputError(
+            "wrong_topic", f"camera {camera}: {topic} holds {entry.topic.type}, {' or '.join(types)} is expected"
+        )
+    wire_of(entry.topic)
+    if not len(entry):
+        raise BadInputError("no_messages", f"camera {camera}: {topic} has no messages")
+    return entry
+
+
+def _rig_of(index: BagIndex, mapping: BagMapping, topics: Mapping[str, TopicIndex]) -> Rig:
+    """The cameras at their places on the base."""
+    cameras = {}
+    for name, camera in mapping.cameras.items():
+        if camera.T_base_camera is not None:
+            T_base_camera = np.array(camera.T_base_camera)
+        else:
+            frame = camera.frame or topics[camera.topic].frame
+            T_base_camera = index.tree.fixed_pose(mapping.frames.base, frame)
+        if camera.lidar is not None:
+            T_base_camera = T_base_camera @ T_LIDAR_CAMERA
+        cameras[name] = mounted(camera.spectrum, _camera_of(index, name, camera), T_base_camera)
+    return Rig(name=mapping.name, cameras=cameras)
+
+
+def _camera_of(index: BagIndex, name: str, camera: MappedCamera) -> AnyCamera:
+    if camera.lidar is not None:
+        return camera.lidar.lidar()
+    if camera.intrinsics is not None:
+        return Camera.model_validate(camera.intrinsics.model_dump())
+    info = index.topics[camera.info or ""].info
+    if info is None:
+        raise BadInputError(
+            "no_messages", f"camera {name}: {camera.info} has no CameraInfo messages; give intrinsics instead of info"
+        )
+    return camera_of_info(info, is_rectified=camera.is_rectified, name=f"camera {name}, {camera.info}")
+
+
+def _range_of(pixels: Pixels, camera: AnyCamera, mapped: MappedCamera) -> npt.NDArray[np.float32]:
+    """(H, W) float32, metres along the beam."""
+    if pixels.dtype == np.uint16:
+        return decode_range(pixels.astype(np.uint16, copy=False), camera, mapped.range_encoding)
+    convert = range_from_z_depth if mapped.convention is Convention.Z else range_from_radial
+    return convert(pixels, camera, units_per_m=1.0)

@@ -1,0 +1,120 @@
+"""Which images of a bag make a scan, and where the robot was for it.
+
+The range images are the scans, in order of their headers' times; of every other camera the nearest image within
+`time_tolerance_s` goes with it. Its pose leads from `frames.base` to `frames.map` at its time.
+"""
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from cairn_calib.rig.poses import Transform
+from cairn_calib.rig.rig import Spectrum
+from cairn_fusion.recording.timed_lists import TimedList
+from cairn_fusion.ros.bag import Bag
+from cairn_fusion.ros.bag_index import BASE, BagIndex, TopicIndex
+from cairn_fusion.ros.messages import TRANSFORMS
+from cairn_fusion.ros.topic_mapping import BagMapping, MappedCamera
+from cairn_map.errors import BadInputError
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class BagScan:
+    """Where the images of one scan are: numbers of messages in their topics."""
+
+    time_s: float
+    T_map_rig: Transform
+    camera: str
+    images: Mapping[str, int]
+    """By topic."""
+
+
+def scans_of(bag: Bag, index: BagIndex, mapping: BagMapping, topics: Mapping[str, TopicIndex]) -> tuple[BagScan, ...]:
+    """A scan for each range image between the first and the last pose, in order of time.
+
+    Args:
+        bag: only named.
+        index: of its topics and transforms.
+        mapping: which topic is what.
+        topics: of all images, as they are in the index.
+
+    Raises:
+        BadInputError: no poses of that kind, no way between the two frames, no scan with a pose, or too long a gap.
+    """
+    lists = {name: _by_time(entry) for name, entry in topics.items()}
+    pose_at, first_s, last_s = _poses_of(index, mapping)
+    scans: list[BagScan] = []
+    for name, camera in mapping.cameras.items():
+        if camera.spectrum is not Spectrum.RANGE:
+            continue
+        times_s = lists[camera.topic].times_s
+        has_pose = (times_s >= first_s) & (times_s <= last_s)
+        if not has_pose.all():
+            log.warning(
+                "%s: %d of %d images of %s are before the first or after the last pose, and are left out",
+                *(bag.path.name, int((~has_pose).sum()), len(times_s), camera.topic),
+            )
+        for time_s in times_s[has_pose].tolist():
+            images = _beside(mapping, camera, lists, time_s)
+            scans.append(BagScan(time_s=time_s, T_map_rig=pose_at(time_s), camera=name, images=images))
+    if not scans:
+        raise BadInputError(
+            "no_pose",
+            f"{bag.path} has no range image between its first pose ({first_s:.3f} s) and its last ({last_s:.3f} s) of "
+            f"{mapping.frames.base} in {mapping.frames.map}; see `cairn robot inspect` for its topics and times",
+        )
+    return tuple(sorted(scans, key=lambda scan: scan.time_s))
+
+
+def _beside(
+    mapping: BagMapping, camera: MappedCamera, lists: Mapping[str, TimedList[int]], time_s: float
+) -> dict[str, int]:
+    """The images of one scan: the range image itself, and the nearest of every other topic."""
+    others = [other.topic for other in mapping.cameras.values() if other.spectrum is not Spectrum.RANGE]
+    images = {camera.topic: lists[camera.topic].nearest(time_s, max_gap_s=0.0)}
+    for topic in [*others, *([camera.amplitude] if camera.amplitude else [])]:
+        images[topic] = lists[topic].nearest(time_s, max_gap_s=mapping.time_tolerance_s)
+    return {topic: n for topic, n in images.items() if n is not None}
+
+
+def _by_time(entry: TopicIndex) -> TimedList[int]:
+    """Numbers of messages in order of their headers' times; of equal times the first."""
+    times_s, first = np.unique(entry.times(), return_index=True)
+    return TimedList(times_s, tuple(first.tolist()))
+
+
+def _poses_of(index: BagIndex, mapping: BagMapping) -> tuple[Callable[[float], Transform], float, float]:
+    """`T_map_base` by time, and the first and last time of it."""
+    frames, poses = mapping.frames, mapping.poses
+    entry = index.topics[poses.topic]
+    if entry.topic.type in TRANSFORMS:
+        tree, target, source, T_source_base = index.tree, frames.map, frames.base, np.eye(4)
+    elif poses.topic in index.tracks:
+        tree = index.tracks[poses.topic]
+        ((source, edge),) = tree.edges.items()
+        target = edge.parent
+        # Poses of another frame of the same body, such as its footprint, or of the camera itself.
+        is_other = source not in (BASE, frames.base)
+        T_source_base = index.tree.fixed_pose(source, frames.base) if is_other else np.eye(4)
+        if target != frames.map:
+            raise BadInputError(
+                "bad_frames", f"{poses.topic} has poses in {target}, not in {frames.map}: say `map: {target}` in frames"
+            )
+    else:
+        raise BadInputError(
+            "wrong_topic",
+            f"{poses.topic} holds {len(entry)} messages of {entry.topic.type}; tf, nav_msgs/Odometry or "
+            "geometry_msgs/PoseStamped with poses is expected",
+        )
+    first_s, last_s = tree.span_s(target, source)
+
+    def pose_at(time_s: float) -> Transform:
+        T_target_source = tree.pose_at(target, source, time_s, max_gap_s=poses.max_gap_s)
+        return T_target_source @ T_source_base if is_moved else T_target_source
+
+    is_moved = not np.array_equal(T_source_base, np.eye(4))
+    return pose_at, first_s, last_s

@@ -1,0 +1,186 @@
+"""Bags in MCAP files (mcap.dev), with messages of ROS 1 or ROS 2.
+
+Found by the index at the file's end, chunk by chunk; a chunk is unpacked into no more than it states. A file whose
+writer died has no index: `mcap recover` makes one.
+"""
+
+import heapq
+import struct
+import zlib
+from collections.abc import Collection, Iterator
+from functools import lru_cache
+from io import SEEK_END, BytesIO
+from pathlib import Path
+from typing import TypeVar
+
+import lz4.frame
+import zstandard
+from mcap.exceptions import McapError
+from mcap.records import Channel, Chunk, ChunkIndex, Footer, Header, Schema, Statistics
+from mcap.stream_reader import StreamReader
+
+from cairn_fusion.ros.bag import CHUNK_BYTES_MAX, BagMessage, BoundedFile, Topic, Wire, damage_told
+from cairn_fusion.ros.messages import plain_type
+from cairn_map.errors import DamagedDataError
+
+ADVICE = "`mcap recover FILE -o FIXED` (github.com/foxglove/mcap) saves what is whole"
+FOOTER_BYTES = 9 + 20 + 8
+"""Record head, footer, and the magic at the end."""
+RECORD_HEAD = struct.Struct("<BQ")
+MESSAGE_HEAD = struct.Struct("<HIQQ")
+MESSAGE = 0x05
+WAITING_BYTES_MAX = 1 << 30
+"""Of messages in chunks that overlap in time."""
+Record = TypeVar("Record")
+
+
+class McapBag:
+    """An MCAP file; see `bag_file.Bag`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.topics: dict[str, Topic] = {}
+        self.start_ns = 0
+        self._topic_of: dict[int, str] = {}
+        self._chunks: list[ChunkIndex] = []
+        self._unpacked = lru_cache(maxsize=2)(self._unpack)
+        with damage_told(path, McapError, advice=ADVICE):
+            self._file = BoundedFile(path)
+            try:
+                self._read_index()
+            except BaseException:
+                self._file.close()
+                raise
+
+    def messages(self, topics: Collection[str], *, start_ns: int = 0) -> Iterator[BagMessage]:
+        """As `Bag.messages`. Chunks that overlap in time are sorted out while they are read."""
+        ids = {channel for channel, topic in self._topic_of.items() if topic in topics}
+        waiting: list[tuple[int, int, BagMessage]] = []
+        waiting_bytes = n = 0
+        for chunk in self._chunks:
+            if chunk.message_end_time < start_ns or not _may_hold(chunk, ids):
+                continue
+            while waiting and waiting[0][0] < chunk.message_start_time:
+                message = heapq.heappop(waiting)[2]
+                waiting_bytes -= len(message.data)
+                yield message
+            with damage_told(self.path, McapError, advice=ADVICE):
+                for message in self._messages_of(chunk, ids, start_ns):
+                    heapq.heappush(waiting, (message.log_ns, n, message))
+                    waiting_bytes += len(message.data)
+                    n += 1
+            if waiting_bytes > WAITING_BYTES_MAX:
+                raise DamagedDataError(
+                    "bad_bag", f"{self.path}: its messages lie too far out of order; `mcap sort FILE -o SORTED` helps"
+                )
+        while waiting:
+            yield heapq.heappop(waiting)[2]
+
+    def close(self) -> None:
+        """Close the file."""
+        self._unpacked.cache_clear()
+        self._file.close()
+
+    def _read_index(self) -> None:
+        self._file.seek(0)
+        _first(Header, self._records(0, skip_magic=False))
+        footer_at = self._file.seek(-FOOTER_BYTES, SEEK_END)
+        summary_at = _first(Footer, self._records(footer_at)).summary_start
+        if not 0 < summary_at < footer_at:
+            raise EOFError("it has no index")
+        channels: list[Channel] = []
+        schemas: dict[int, Schema] = {}
+        statistics: Statistics | None = None
+        for record in self._records(summary_at).records:
+            match record:
+                case Channel():
+                    channels.append(record)
+                case Schema():
+                    schemas[record.id] = record
+                case ChunkIndex():
+                    self._chunks.append(record)
+                case Statistics():
+                    statistics = record
+                case Chunk():
+                    raise ValueError("there is a chunk in the index")
+                case _:
+                    pass
+        if statistics is None or (statistics.message_count and not self._chunks):
+            raise EOFError("its index names no chunks")
+        self._chunks.sort(key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
+        self.start_ns = statistics.message_start_time
+        self._topic_of = {channel.id: channel.topic for channel in channels}
+        for channel in channels:
+            schema = schemas.get(channel.schema_id)
+            count = statistics.channel_message_counts.get(channel.id, 0)
+            self._add_topic(channel, plain_type(schema.name if schema else ""), count)
+
+    def _add_topic(self, channel: Channel, name: str, count: int) -> None:
+        wire = Wire(channel.message_encoding) if channel.message_encoding in list(Wire) else None
+        known = self.topics.get(channel.topic)  # each publisher has a channel of its own
+        if known is not None and (known.type, known.wire) != (name, wire):
+            raise ValueError(f"{channel.topic} is {known.type} and {name}")
+        self.topics[channel.topic] = Topic(channel.topic, name, wire, count + (known.count if known else 0))
+
+    def _records(self, at: int, *, skip_magic: bool = True) -> StreamReader:
+        self._file.seek(at)
+        limit = CHUNK_BYTES_MAX
+        return StreamReader(self._file, skip_magic=skip_magic, emit_chunks=True, record_size_limit=limit)
+
+    def _messages_of(self, chunk: ChunkIndex, ids: set[int], start_ns: int) -> Iterator[BagMessage]:
+        data = self._unpacked(chunk.chunk_start_offset)
+        at = 0
+        while at < len(data):
+            kind, size = RECORD_HEAD.unpack_from(data, at)
+            at += RECORD_HEAD.size
+            if size > len(data) - at:
+                raise EOFError("a chunk ends within a record")
+            if kind == MESSAGE:
+                channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(data, at)
+                if channel in ids and log_ns >= start_ns:
+                    yield BagMessage(self._topic_of[channel], log_ns, data[at + MESSAGE_HEAD.size : at + size])
+            at += size
+
+    def _unpack(self, at: int) -> memoryview:
+        chunk = _first(Chunk, self._records(at))
+        size = chunk.uncompressed_size
+        if size > CHUNK_BYTES_MAX:
+            raise ValueError(f"a chunk of {size} bytes, at most {CHUNK_BYTES_MAX} are read")
+        data = unpacked(chunk.data, chunk.compression, size)
+        if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+            raise ValueError(f"the checksum of the chunk at byte {at} does not match")
+        return memoryview(data)
+
+
+def unpacked(data: bytes, packing: str, size_bytes: int) -> bytes:
+    """A chunk's own bytes, exactly as many as it states, and never more than that in memory.
+
+    Raises:
+        ValueError: another packing, or another size.
+    """
+    if packing == "zstd":
+        try:
+            with zstandard.ZstdDecompressor().stream_reader(BytesIO(data)) as stream:
+                whole = stream.read(size_bytes + 1)
+        except zstandard.ZstdError as exc:
+            raise ValueError(f"a chunk cannot be unpacked: {exc}") from exc
+    elif packing == "lz4":
+        whole = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size_bytes + 1)
+    elif packing == "":
+        whole = data
+    else:
+        raise ValueError(f"chunks are packed by {packing[:40]!r}; known are zstd and lz4")
+    if len(whole) != size_bytes:
+        raise ValueError(f"a chunk of {size_bytes} bytes unpacks to {len(whole)} or more")
+    return whole
+
+
+def _may_hold(chunk: ChunkIndex, ids: set[int]) -> bool:
+    return not chunk.message_index_offsets or not ids.isdisjoint(chunk.message_index_offsets)
+
+
+def _first(kind: type[Record], reader: StreamReader) -> Record:
+    record = next(iter(reader.records), None)
+    if not isinstance(record, kind):
+        raise EOFError(f"a {kind.__name__.lower()} is expected, not {type(record).__name__}")
+    return record

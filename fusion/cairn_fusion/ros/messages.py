@@ -1,0 +1,155 @@
+"""The few ROS messages that a map is made of, as the standard packages define them.
+
+A bag carries the definitions of its messages. They are not used: to decode by a definition means to run a program
+that the bag's author wrote, and these types have been the same since ROS 1, but for `seq` in the header.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig.poses import Transform, transform_from_quaternion
+from cairn_fusion.ros.bag import Wire
+from cairn_fusion.ros.wire import WireReader
+
+IMAGE = "sensor_msgs/Image"
+COMPRESSED = "sensor_msgs/CompressedImage"
+CAMERA_INFO = "sensor_msgs/CameraInfo"
+TRANSFORMS = frozenset(["tf2_msgs/TFMessage", "tf/tfMessage"])
+ODOMETRY = "nav_msgs/Odometry"
+POSES = frozenset(["geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped"])
+POINTS = "sensor_msgs/PointCloud2"
+STAMPED = frozenset([IMAGE, COMPRESSED, CAMERA_INFO, ODOMETRY, POINTS]) | POSES
+"""Types that begin with a header."""
+TRANSFORM_BYTES_MIN = 72
+"""Time, two empty names, seven numbers."""
+
+
+@dataclass(frozen=True, slots=True)
+class RosHeader:
+    """When and in which frame."""
+
+    time_s: float
+    """Seconds since 1970; of the stamp's nanoseconds a float keeps 2e-7 s."""
+    frame: str
+
+
+@dataclass(frozen=True, slots=True)
+class RosImage:
+    """`sensor_msgs/Image`: rows of `step` bytes."""
+
+    header: RosHeader
+    width: int
+    height: int
+    encoding: str
+    is_big_endian: bool
+    step: int
+    data: memoryview
+
+
+@dataclass(frozen=True, slots=True)
+class RosCompressedImage:
+    """`sensor_msgs/CompressedImage`: a file, after some transports with a head of their own."""
+
+    header: RosHeader
+    format: str
+    data: memoryview
+
+
+@dataclass(frozen=True, slots=True)
+class RosCameraInfo:
+    """`sensor_msgs/CameraInfo` as far as a pinhole camera needs it; pixels."""
+
+    header: RosHeader
+    width: int
+    height: int
+    model: str
+    distortion: tuple[float, ...]
+    K: npt.NDArray[np.float64]
+    """(9,) of the raw image."""
+    P: npt.NDArray[np.float64]
+    """(12,) of the rectified image."""
+
+
+@dataclass(frozen=True, slots=True)
+class RosTransform:
+    """One edge of the tree of frames: `T_parent_child` at a time; also the content of pose messages."""
+
+    time_s: float
+    parent: str
+    child: str
+    pose: npt.NDArray[np.float64]
+    """(7,) x y z in metres, qx qy qz qw."""
+
+    @property
+    def T_parent_child(self) -> Transform:
+        """As (4, 4); raises BadInputError for a quaternion that is none."""
+        return transform_from_quaternion(self.pose[:3], self.pose[3:])
+
+
+def plain_type(name: str) -> str:
+    """`sensor_msgs/Image` of ROS 2's `sensor_msgs/msg/Image`."""
+    return name.replace("/msg/", "/")
+
+
+def read_header(data: bytes | memoryview, wire: Wire) -> RosHeader:
+    """The header that a message of a `STAMPED` type begins with. Here and below ValueError: the bytes are not that."""
+    return header_of(WireReader(data, wire), wire)
+
+
+def read_image(data: bytes | memoryview, wire: Wire) -> RosImage:
+    """A `sensor_msgs/Image`; its pixels stay where they are."""
+    fields = WireReader(data, wire)
+    header = header_of(fields, wire)
+    height, width, encoding = fields.integer("I"), fields.integer("I"), fields.text()
+    return RosImage(header, width, height, encoding, bool(fields.integer("B")), fields.integer("I"), fields.octets())
+
+
+def read_compressed_image(data: bytes | memoryview, wire: Wire) -> RosCompressedImage:
+    """A `sensor_msgs/CompressedImage`, not yet unpacked."""
+    fields = WireReader(data, wire)
+    return RosCompressedImage(header_of(fields, wire), fields.text(), fields.octets())
+
+
+def read_camera_info(data: bytes | memoryview, wire: Wire) -> RosCameraInfo:
+    """A `sensor_msgs/CameraInfo`."""
+    fields = WireReader(data, wire)
+    header = header_of(fields, wire)
+    height, width, model = fields.integer("I"), fields.integer("I"), fields.text()
+    distortion = tuple(fields.floats(fields.length(8)).tolist())
+    K, _, P = fields.floats(9), fields.floats(9), fields.floats(12)
+    return RosCameraInfo(header, width, height, model, distortion, K, P)
+
+
+def read_transforms(data: bytes | memoryview, wire: Wire) -> list[RosTransform]:
+    """The edges in a `tf2_msgs/TFMessage`."""
+    fields = WireReader(data, wire)
+    edges = []
+    for _ in range(fields.length(TRANSFORM_BYTES_MIN)):
+        header = header_of(fields, wire)
+        edges.append(RosTransform(header.time_s, _frame(header.frame), _frame(fields.text()), fields.floats(7)))
+    return edges
+
+
+def read_pose(data: bytes | memoryview, wire: Wire, *, type_name: str) -> RosTransform:
+    """The pose in a `nav_msgs/Odometry`, or in one of the `POSES`, whose child has no name."""
+    fields = WireReader(data, wire)
+    header = header_of(fields, wire)
+    child = fields.text() if type_name == ODOMETRY else ""
+    return RosTransform(header.time_s, _frame(header.frame), _frame(child), fields.floats(7))
+
+
+def header_of(fields: WireReader, wire: Wire) -> RosHeader:
+    """The header at the place that a reader is at."""
+    if wire is Wire.ROS1:
+        fields.integer("I")  # seq
+    seconds, nanoseconds = fields.integer("I" if wire is Wire.ROS1 else "i"), fields.integer("I")
+    if nanoseconds >= 10**9:
+        raise ValueError(f"a stamp has {nanoseconds} nanoseconds")
+    return RosHeader((seconds * 10**9 + nanoseconds) / 1e9, _frame(fields.text()))
+
+
+def _frame(name: str) -> str:
+    """ROS 1 wrote some names with a slash in front."""
+    return name.removeprefix("/")

@@ -1,0 +1,126 @@
+"""Point clouds of spinning lidars (`sensor_msgs/PointCloud2`) as range images of a `SpinningLidar`.
+
+A cloud has no raster: each point goes into the pixel whose ray is nearest to it, and of several the nearest counts. So
+a direction is exact to half a column and half the step between two beams; the range is the point's own. The rig's
+motion during one turn is left to the driver that published the cloud.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.rig.lidar import SpinningLidar
+from cairn_calib.rig.raster import MAX_SIDE_PX
+from cairn_fusion.ros.bag import Wire
+from cairn_fusion.ros.messages import RosHeader, header_of
+from cairn_fusion.ros.wire import WireReader
+
+FIELD_BYTES_MIN = 13
+FIELDS_MAX = 64
+TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""Of sensor_msgs/PointField."""
+STEP_MIN_DEG = 0.01
+"""Beams nearer to each other are one."""
+R_LIDAR_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""From a camera's axes (x right, y down, z forward) to those of a lidar in ROS (x forward, y left, z up; REP 103)."""
+T_LIDAR_CAMERA = np.block([[R_LIDAR_CAMERA, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+@dataclass(frozen=True, slots=True)
+class RosPoints:
+    """A cloud, its points still in their bytes."""
+
+    header: RosHeader
+    width: int
+    height: int
+    fields: dict[str, tuple[int, str]]
+    """Offset in the point, and NumPy's letter for the type."""
+    point_step: int
+    row_step: int
+    data: memoryview
+
+    def column(self, name: str) -> npt.NDArray[np.generic]:
+        """(N,) one field of all points.
+
+        Raises:
+            ValueError: there is no such field.
+        """
+        if name not in self.fields:
+            raise ValueError(f"points have no field {name!r}, but {', '.join(self.fields)}")
+        offset, letter = self.fields[name]
+        rows = np.frombuffer(self.data, np.uint8, count=self.row_step * self.height).reshape(self.height, self.row_step)
+        points = rows[:, : self.width * self.point_step].reshape(-1, self.point_step)
+        dtype = np.dtype(letter)
+        values: npt.NDArray[np.generic] = np.ascontiguousarray(points[:, offset : offset + dtype.itemsize]).view(dtype)
+        return values[:, 0]
+
+    def xyz(self) -> npt.NDArray[np.float64]:
+        """(N, 3) metres, the cloud's frame; NaN where nothing came back."""
+        return np.stack([self.column(axis).astype(np.float64) for axis in "xyz"], axis=-1)
+
+
+def read_points(data: bytes | memoryview, wire: Wire) -> RosPoints:
+    """A `sensor_msgs/PointCloud2`. ValueError: the bytes are not that."""
+    reader = WireReader(data, wire)
+    header = header_of(reader, wire)
+    height, width = reader.integer("I"), reader.integer("I")
+    count = reader.length(FIELD_BYTES_MIN)
+    if count > FIELDS_MAX:
+        raise ValueError(f"points of {count} fields, at most {FIELDS_MAX} are read")
+    found = [(reader.text(), reader.integer("I"), reader.integer("B"), reader.integer("I")) for _ in range(count)]
+    order = ">" if reader.integer("B") else "<"
+    point_step, row_step, octets = reader.integer("I"), reader.integer("I"), reader.octets()
+    fields = {name: (offset, order + TYPES[kind]) for name, offset, kind, _ in found if kind in TYPES}
+    if not (width and height):
+        width = height = 0  # no rows of nothing: 2^32 of them would take no bytes
+    elif not point_step:
+        raise ValueError("points of 0 bytes are announced")
+    if any(offset + np.dtype(letter).itemsize > point_step for offset, letter in fields.values()):
+        raise ValueError(f"a field lies outside its point of {point_step} bytes")
+    if width * point_step > row_step or row_step * height > len(octets):
+        raise ValueError(
+            f"{width} x {height} points of {point_step} bytes are announced, {len(octets)} bytes are there"
+        )
+    return RosPoints(header, width, height, fields, point_step, row_step, octets)
+
+
+def elevations_of(points: RosPoints) -> tuple[float, ...] | None:
+    """Degrees of each beam in a cloud, the highest first: by the field `ring`, else by rows; None: neither tells."""
+    if not {"x", "y", "z"} <= points.fields.keys():
+        return None
+    xyz = points.xyz()
+    if "ring" in points.fields:
+        beams = points.column("ring").astype(np.int64)
+    elif points.height > 1:
+        beams = np.repeat(np.arange(points.height), points.width)
+    else:
+        return None
+    across = np.hypot(xyz[:, 0], xyz[:, 1])
+    seen = np.isfinite(xyz).all(axis=1) & (across > 0)
+    beams, elevations_deg = beams[seen], np.degrees(np.arctan2(xyz[seen, 2], across[seen]))
+    numbers = np.unique(beams)
+    if not 0 < len(numbers) <= MAX_SIDE_PX // 16:
+        return None
+    medians_deg = np.sort([np.median(elevations_deg[beams == number]) for number in numbers])[::-1]
+    if np.any(-np.diff(medians_deg) < STEP_MIN_DEG):
+        return None
+    return tuple(round(float(value), 3) for value in medians_deg)
+
+
+def sweep_image(xyz: npt.NDArray[np.float64], lidar: SpinningLidar) -> npt.NDArray[np.float32]:
+    """(H, W) float32, metres along the beam; NaN where no point is.
+
+    Args:
+        xyz: (N, 3) metres, x forward, y left, z up; NaN where nothing came back.
+        lidar: the raster.
+    """
+    own = xyz[np.isfinite(xyz).all(axis=1)] @ R_LIDAR_CAMERA
+    range_m = np.linalg.norm(own, axis=1)
+    pixels = lidar.project(own)
+    kept = np.isfinite(pixels).all(axis=1) & (range_m > 0)
+    x = np.rint(pixels[kept, 0]).astype(np.int64) % lidar.width
+    y = np.clip(np.rint(pixels[kept, 1]).astype(np.int64), 0, lidar.height - 1)
+    nearest = np.full((lidar.height, lidar.width), np.inf)
+    np.minimum.at(nearest, (y, x), range_m[kept])
+    return np.where(np.isfinite(nearest), nearest, np.nan).astype(np.float32)

@@ -1,0 +1,226 @@
+"""Which topics of a bag are what: the YAML file that `cairn robot inspect` proposes and `replay` follows.
+
+name: lab-1
+frames: {map: odom, base: base_link}
+poses: {topic: /tf, max_gap_s: 0.2}
+time_tolerance_s: 0.02
+scans_per_measurement: 30
+cameras:
+  depth: {spectrum: range, topic: /camera/depth/image_raw, info: /camera/depth/camera_info, units_per_m: 1000}
+  colour: {spectrum: colour, topic: /camera/color/image_raw, info: /camera/color/camera_info}
+"""
+
+from pathlib import Path
+from typing import Annotated, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from cairn_calib.exchange.yaml_text import document_of_yaml
+from cairn_calib.rig.brown import Coefficients
+from cairn_calib.rig.camera import Camera
+from cairn_calib.rig.lidar import SpinningLidar
+from cairn_calib.rig.raster import Side
+from cairn_calib.rig.rig import Row, Spectrum
+from cairn_fusion.recording.recording_format import (
+    Convention,
+    Name,
+    Positive,
+    RangeEncoding,
+    Seconds,
+    ThermalEncoding,
+    check_camera_name,
+)
+from cairn_fusion.recording.timed_lists import read_text
+from cairn_fusion.ros.messages import RosCameraInfo
+from cairn_map.errors import BadInputError, first_error
+
+MAPPING_BYTES_MAX = 1 << 20
+PLUMB_BOB = ("plumb_bob", "")
+Topic = Annotated[str, Field(pattern=r"^\S{1,1024}$")]
+Frame = Annotated[str, Field(pattern=r"^[^/\s]\S{0,254}$")]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class Model(BaseModel):
+    """Values that do not change, and no fields that there are not."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Frames(Model):
+    """Two names out of the tree of frames."""
+
+    map: Frame
+    """The frame that stays: the map's voxels are in it."""
+    base: Frame
+    """The frame that moves, and carries the cameras."""
+
+
+class Poses(Model):
+    """Where poses come from."""
+
+    topic: Topic = "/tf"
+    """tf, nav_msgs/Odometry, or geometry_msgs/PoseStamped."""
+    max_gap_s: Seconds = 0.2
+    """How far apart the two poses may be between which one is interpolated."""
+
+
+class Intrinsics(Model):
+    """A pinhole camera; pixels, the centre of the top-left pixel is (0, 0)."""
+
+    width: Side
+    height: Side
+    focal_px: tuple[Positive, Positive]
+    centre_px: tuple[Finite, Finite]
+    distortion: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2, k3: ROS's plumb_bob."""
+
+
+class MappedLidar(Model):
+    """The raster that a spinning lidar's points are sorted into; its frame is ROS's: x forward, y left, z up."""
+
+    columns: Side
+    """In one turn."""
+    elevations_deg: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=1024)]
+    """Of each beam, the highest first."""
+
+    @model_validator(mode="after")
+    def _is_lidar(self) -> Self:
+        self.lidar()
+        return self
+
+    def lidar(self) -> SpinningLidar:
+        """As a camera."""
+        beams = self.elevations_deg
+        return SpinningLidar(width=self.columns, height=len(beams), elevations_deg=beams)
+
+
+class MappedCamera(Model):
+    """One camera: its topics, its place, and how its pixels are coded."""
+
+    spectrum: Spectrum
+    topic: Topic
+    amplitude: Topic | None = None
+    """Of a range camera: images of its own light, same raster."""
+    info: Topic | None = None
+    """CameraInfo; its first message counts."""
+    intrinsics: Intrinsics | None = None
+    """Instead of `info`."""
+    lidar: MappedLidar | None = None
+    """Instead of both: the topic holds the point clouds of a spinning lidar."""
+    is_rectified: bool = Field(default=False, alias="rectified")
+    """The images are rectified: of `info` then P counts, and no distortion."""
+    frame: Frame | None = None
+    """The optical frame; else the one that the images name."""
+    T_base_camera: tuple[Row, Row, Row, Row] | None = None
+    """Instead of `frame` and tf: maps points of the camera (x right, y down, z forward) to the base; metres."""
+    units_per_m: Positive = 1000.0
+    """Of range images with 16 bits; those with 32FC1 are metres."""
+    convention: Convention = Convention.Z
+    kelvin_per_count: Positive = 0.01
+    kelvin_at_zero: Finite = 0.0
+
+    @property
+    def range_encoding(self) -> RangeEncoding:
+        """How 16-bit range is coded."""
+        return RangeEncoding(units_per_m=self.units_per_m, convention=self.convention)
+
+    @property
+    def thermal_encoding(self) -> ThermalEncoding:
+        """How temperature is coded."""
+        return ThermalEncoding(kelvin_per_count=self.kelvin_per_count, kelvin_at_zero=self.kelvin_at_zero)
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Self:
+        if sum(given is not None for given in (self.info, self.intrinsics, self.lidar)) != 1:
+            raise ValueError("give either info, a CameraInfo topic, or intrinsics; or lidar, of point clouds")
+        if self.lidar is not None and (self.spectrum is not Spectrum.RANGE or self.amplitude is not None):
+            raise ValueError("a lidar's spectrum is range, and it has no amplitude")
+        if self.amplitude is not None and self.spectrum is not Spectrum.RANGE:
+            raise ValueError("amplitude is of range cameras")
+        return self
+
+
+class BagMapping(Model):
+    """The whole file."""
+
+    name: Name = "bag"
+    frames: Frames
+    poses: Poses = Poses()
+    time_tolerance_s: Seconds = 0.02
+    """How far another image may be from the range image."""
+    scans_per_measurement: Annotated[int, Field(ge=1, le=4096)] = 1
+    cameras: Annotated[dict[str, MappedCamera], Field(min_length=1, max_length=32)]
+
+    @model_validator(mode="after")
+    def _has_ranges(self) -> Self:
+        for name in self.cameras:
+            try:
+                check_camera_name(name)
+            except BadInputError as exc:
+                raise ValueError(exc.message) from exc
+        if all(camera.spectrum is not Spectrum.RANGE for camera in self.cameras.values()):
+            raise ValueError("one camera at least must have the spectrum range")
+        return self
+
+    def topics(self) -> dict[str, str]:
+        """All topics of images and camera infos, and what each is for."""
+        wanted: dict[str, str] = {}
+        for name, camera in self.cameras.items():
+            wanted |= {
+                topic: f"{what} of camera {name}"
+                for topic, what in ((camera.topic, "images"), (camera.amplitude, "amplitude"), (camera.info, "info"))
+                if topic is not None
+            }
+        return wanted
+
+
+def mapping_of(path: Path) -> BagMapping:
+    """The mapping in a YAML file.
+
+    Raises:
+        BadInputError: missing, too large, no YAML, or a field is missing or wrong; the message names it.
+    """
+    return mapping_from_yaml(read_text(path, MAPPING_BYTES_MAX), path)
+
+
+def mapping_from_yaml(text: str, path: Path | str) -> BagMapping:
+    """The mapping in a YAML text; errors as `mapping_of`."""
+    try:
+        content = document_of_yaml(text)
+    except ValueError as exc:
+        raise BadInputError("bad_mapping", f"{path} is no YAML: {exc}") from exc
+    try:
+        return BagMapping.model_validate(content)
+    except ValidationError as exc:
+        raise BadInputError(
+            "bad_mapping", f"{path}: {first_error(exc)}; `cairn robot inspect BAG` proposes a file"
+        ) from exc
+
+
+def camera_of_info(info: RosCameraInfo, *, is_rectified: bool, name: str) -> Camera:
+    """The pinhole camera that a CameraInfo describes.
+
+    Raises:
+        BadInputError: not calibrated, or a lens model that is no pinhole with Brown's distortion.
+    """
+    focal_centre = info.P[[0, 5, 2, 6]] if is_rectified else info.K[[0, 4, 2, 5]]
+    fx, fy, cx, cy = (float(value) for value in focal_centre)
+    if not (np.isfinite(focal_centre).all() and fx > 0 and fy > 0):
+        raise BadInputError(
+            "bad_intrinsics",
+            f"{name} is not calibrated: its focal lengths are {fx:g} and {fy:g} px; give intrinsics instead of info",
+        )
+    k1, k2, p1, p2, k3, *more = (*(() if is_rectified else info.distortion), 0.0, 0.0, 0.0, 0.0, 0.0)
+    k = (k1, k2, p1, p2, k3)
+    if any(more) or (info.model not in (*PLUMB_BOB, "rational_polynomial") and any(k)):
+        raise BadInputError(
+            "bad_intrinsics",
+            f"{name} has the lens model {info.model[:40]!r} with {len(info.distortion)} coefficients, of which only "
+            "plumb_bob's five are known; take the rectified images and say `rectified: true`",
+        )
+    try:
+        return Camera(width=info.width, height=info.height, focal_px=(fx, fy), centre_px=(cx, cy), distortion=k)
+    except ValidationError as exc:
+        raise BadInputError("bad_intrinsics", f"{name}: {first_error(exc)}") from exc

@@ -1,0 +1,263 @@
+"""A guess at which topics of a bag are what, as the YAML text that `bag_mapping.py` reads, and what it cannot know.
+
+    depth      16 bits or float, "depth" in its name          thermal    16 bits, a thermal camera's name
+    amplitude  grey, "infra", "ir" or "amplitude" in its name  colour     every other picture
+    poses      tf, if a moving edge lies above the range camera; else the one odometry or pose topic
+
+What is certain only to whoever made the bag becomes a question, and `replay` without a file refuses it.
+"""
+
+import json
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cairn_calib.rig.rig import Spectrum
+from cairn_fusion.ros.bag_index import BASE, BagIndex, TopicIndex
+from cairn_fusion.ros.images import COLOURS
+from cairn_fusion.ros.messages import CAMERA_INFO, COMPRESSED, IMAGE, POINTS, TRANSFORMS
+from cairn_fusion.ros.tf_tree import FrameTree
+
+AMPLITUDE_WORDS = re.compile(r"infra|amplitude|intensity|(^|[_/])(ir|nir)\d*([_/]|$)")
+THERMAL_WORDS = re.compile(r"therm|lwir|flir|boson|lepton|tau2|optris|seek")
+IGNORED_WORDS = re.compile(r"confidence|theora|ffmpeg|aligned_.*_mask|segmentation|label")
+CAMERA_WORDS = re.compile(r"depth|camera|stereo|rgb|color")
+"""In names of clouds that a depth camera's driver makes of its images."""
+TOLERANCE_S = (0.005, 0.05)
+GAP_S = (0.1, 5.0)
+GAPS = 3
+"""Poses that may be missing in a row."""
+
+
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """A text to start from."""
+
+    text: str
+    questions: tuple[str, ...]
+    """What must be decided by hand; none: the text can be used as it is."""
+
+
+@dataclass(slots=True)
+class Guess:
+    """One camera."""
+
+    name: str
+    spectrum: Spectrum
+    entry: TopicIndex
+    info: str | None
+    amplitude: str | None = None
+
+    @property
+    def is_rectified(self) -> bool:
+        """Whether its name says so, and its camera info makes a difference."""
+        return "rect" in self.entry.topic.name.rsplit("/", 1)[-1]
+
+
+def propose(index: BagIndex, path: Path) -> Proposal:
+    """The mapping that fits an index of all topics best.
+
+    Args:
+        index: of the whole bag.
+        path: of the bag; names the recording.
+    """
+    questions: list[str] = []
+    cameras = _cameras(index, questions)
+    ranges = [camera for camera in cameras if camera.spectrum is Spectrum.RANGE]
+    if not ranges:
+        questions.append("no topic looks like depth images; name one under cameras, with `spectrum: range`")
+    frame = ranges[0].entry.frame if ranges else ""
+    pose_lines = _pose_lines(index, frame, questions)
+    rate_hz = ranges[0].entry.rate_hz if ranges else 0.0
+    tolerance_s = float(np.clip(0.5 / rate_hz if rate_hz else 0.02, *TOLERANCE_S))
+    lines = [
+        f"# Which topics of {path.name} are what: cairn robot replay {path.name} --topics THIS_FILE --map URL",
+        *(f"# DECIDE: {question}" for question in questions),
+        f"name: {_quoted(_name(path))}",
+        *pose_lines,
+        f"time_tolerance_s: {tolerance_s:.2g}  # an image goes with a range image that is at most so far away in time",
+        f"scans_per_measurement: {max(1, round(rate_hz))}  # range images in one commit: about a second",
+        "cameras:" + ("" if cameras else " {}"),
+    ]
+    for camera in cameras:
+        lines += _camera_lines(camera, index)
+    return Proposal("\n".join(lines) + "\n", tuple(questions))
+
+
+def _cameras(index: BagIndex, questions: list[str]) -> list[Guess]:
+    """One guess a camera; of the raw and compressed topics of one camera the raw one."""
+    images = [entry for entry in index.topics.values() if entry.topic.type in (IMAGE, COMPRESSED) and len(entry)]
+    images = [entry for entry in images if entry.topic.wire is not None and not IGNORED_WORDS.search(_word(entry))]
+    plain = {entry.topic.name for entry in images if entry.topic.type == IMAGE}
+    images = [e for e in images if e.topic.type == IMAGE or e.topic.name.rsplit("/", 1)[0] not in plain]
+    roles = {entry.topic.name: _role(entry) for entry in images}
+    guesses: list[Guess] = []
+    for spectrum in Spectrum:
+        found = [entry for entry in images if roles[entry.topic.name] == spectrum.value]
+        for entry in _one_of_each_place(found):
+            name = _unique("depth" if spectrum is Spectrum.RANGE else spectrum.value, {g.name for g in guesses})
+            info = _info_of(entry, index)
+            guesses.append(Guess(name, spectrum, entry, info))
+            if info is None:
+                questions.append(f"camera {name}: no CameraInfo beside {entry.topic.name}; write its intrinsics")
+    ranges = [guess for guess in guesses if guess.spectrum is Spectrum.RANGE]
+    guesses += _lidars(index, questions)
+    if len(ranges) > 1:
+        names = ", ".join(guess.entry.topic.name for guess in ranges)
+        questions.append(f"{names} may be one sensor seen twice (aligned to another camera): keep one of such")
+    for guess in ranges:
+        guess.amplitude = _amplitude_of(guess, (e for e in images if roles[e.topic.name] == "amplitude"))
+    questions += [
+        f"camera {guess.name}: how many kelvin one count is, and at zero counts; 0.01 and 0 are only the usual"
+        for guess in guesses
+        if guess.spectrum is Spectrum.THERMAL
+    ]
+    return guesses
+
+
+def _lidars(index: BagIndex, questions: list[str]) -> list[Guess]:
+    """Every topic of point clouds that a lidar can have made."""
+    clouds = [e for e in index.topics.values() if e.topic.type == POINTS and len(e) and e.topic.wire is not None]
+    found = [e for e in clouds if not CAMERA_WORDS.search(_word(e))]
+    for n, entry in enumerate(found):
+        if entry.elevations_deg is None:
+            questions.append(f"lidar{n or ''}: which beams {entry.topic.name} has; neither rows nor rings tell them")
+    return [Guess(f"lidar{n or ''}", Spectrum.RANGE, entry, None) for n, entry in enumerate(found)]
+
+
+def _role(entry: TopicIndex) -> str:
+    """What a picture shows, by its encoding and name."""
+    word, encoding = _word(entry), entry.encoding
+    is_deep = encoding.startswith(("16UC1", "mono16", "32FC1")) or "compressedDepth" in encoding
+    if is_deep and ("depth" in word or encoding.startswith("32FC1") or "compressedDepth" in encoding):
+        return Spectrum.RANGE
+    if is_deep and THERMAL_WORDS.search(word):
+        return Spectrum.THERMAL
+    if AMPLITUDE_WORDS.search(word) and (is_deep or encoding in ("mono8", "8UC1")):
+        return "amplitude"
+    if entry.topic.type == COMPRESSED or encoding in COLOURS:
+        return "none" if THERMAL_WORDS.search(word) else Spectrum.COLOUR
+    return "none"
+
+
+def _one_of_each_place(entries: list[TopicIndex]) -> Iterator[TopicIndex]:
+    """The first topic of each camera: raw before rectified, as its calibration is the raw image's."""
+    seen = set()
+    for entry in sorted(entries, key=lambda e: ("rect" in e.topic.name.rsplit("/", 1)[-1], e.topic.name)):
+        if (place := _place(entry)) not in seen:
+            seen.add(place)
+            yield entry
+
+
+def _place(entry: TopicIndex) -> str:
+    """The namespace of a camera's topics."""
+    depth = 2 if entry.topic.type == COMPRESSED else 1
+    return entry.topic.name.rsplit("/", depth)[0]
+
+
+def _info_of(entry: TopicIndex, index: BagIndex) -> str | None:
+    infos = [e for e in index.topics.values() if e.topic.type == CAMERA_INFO and e.info is not None]
+    beside = [e for e in infos if e.topic.name == f"{_place(entry)}/camera_info"]
+    alike = [e for e in infos if e.frame == entry.frame and entry.image_size in (None, e.image_size)]
+    found = beside or alike
+    return found[0].topic.name if len(found) == 1 else None
+
+
+def _amplitude_of(guess: Guess, candidates: Iterable[TopicIndex]) -> str | None:
+    """The one picture that the range camera's own light can have made: same frame, same raster."""
+    mine = (guess.entry.frame, guess.entry.image_size)
+    found = [entry for entry in candidates if (entry.frame, entry.image_size) == mine]
+    return found[0].topic.name if len(found) == 1 else None
+
+
+def _pose_lines(index: BagIndex, camera_frame: str, questions: list[str]) -> list[str]:
+    """Frames and poses."""
+    tf_topics = [e.topic.name for e in index.topics.values() if e.topic.type in TRANSFORMS and len(e)]
+    way = index.tree.way_up(camera_frame) if camera_frame else []
+    moving = [child for child in way[:-1] if not index.tree.edges[child].is_fixed]
+    tracks = {topic: next(iter(track.edges.items())) for topic, track in index.tracks.items()}
+    if moving:
+        topic, base, root = next(t for t in [*tf_topics] if "static" not in t), moving[0], way[-1]
+        gap_s = max(_gap_s(index.tree, child) for child in moving)
+    elif len(tracks) == 1:
+        ((topic, (child, edge)),) = tracks.items()
+        base, root = child, edge.parent
+        gap_s = _gap_s(index.tracks[topic], child)
+        if child == BASE:
+            base = camera_frame or BASE
+            questions.append(f"{topic} does not say what its poses are of; {base} is a guess for frames.base")
+        elif camera_frame not in index.tree.frames() | {base} or base not in index.tree.frames() | {camera_frame}:
+            questions.append(f"no transforms lead from {camera_frame} to {base}: give each camera T_base_camera")
+    else:
+        topic, base, root, gap_s = "/tf", BASE, "map", GAP_S[0]
+        what = f"choose one of {', '.join(tracks)}" if tracks else "there are neither moving transforms nor odometry"
+        questions.append(f"where poses come from: {what}")
+    return [
+        "frames:",
+        f"  map: {_quoted(root)}  # stays; the map's voxels are in this frame",
+        f"  base: {_quoted(base)}  # moves, and carries the cameras rigidly",
+        "poses:",
+        f"  topic: {_quoted(topic)}  # tf, nav_msgs/Odometry or geometry_msgs/PoseStamped",
+        f"  max_gap_s: {gap_s:.2g}  # between two poses that are at most so far apart, one is interpolated (slerp)",
+    ]
+
+
+def _gap_s(tree: FrameTree, child: str) -> float:
+    """A few times what usually lies between two poses."""
+    gaps_s = np.diff(tree.edges[child].trajectory(child).poses.times_s)
+    return float(np.clip(GAPS * np.median(gaps_s) if len(gaps_s) else 0.0, *GAP_S))
+
+
+def _camera_lines(camera: Guess, index: BagIndex) -> Iterator[str]:
+    yield f"  {camera.name}:"
+    yield f"    spectrum: {camera.spectrum.value}"
+    yield f"    topic: {_quoted(camera.entry.topic.name)}  # {camera.entry.encoding}, {camera.entry.rate_hz:.3g} Hz"
+    if camera.entry.topic.type == POINTS:
+        elevations = list(camera.entry.elevations_deg or (15.0, 0.0, -15.0))
+        yield f"    lidar: {{columns: {min(camera.entry.columns, 4096)}, elevations_deg: {elevations}}}"
+        yield f"    frame: {_quoted(camera.entry.frame)}  # x forward, y left, z up"
+        return
+    if camera.info:
+        yield f"    info: {_quoted(camera.info)}"
+    else:
+        yield "    # intrinsics: {width: 640, height: 480, focal_px: [600, 600], centre_px: [319.5, 239.5]}"
+    if camera.is_rectified:
+        yield "    rectified: true  # undistorted: of info the matrix P counts, and no distortion"
+    yield f"    frame: {_quoted(camera.entry.frame)}  # optical: x right, y down, z forward"
+    if camera.entry.frame not in index.tree.frames():
+        yield "    # T_base_camera: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]  # instead of tf; metres"
+    if camera.spectrum is Spectrum.RANGE:
+        if not camera.entry.encoding.startswith("32FC1"):
+            yield "    units_per_m: 1000  # one count is a millimetre, as ROS wants it (REP 118)"
+        yield "    convention: z  # along the optical axis; `range`: along each beam, as time of flight measures"
+        if camera.amplitude:
+            yield f"    amplitude: {_quoted(camera.amplitude)}  # of the range camera's own light, same raster"
+    if camera.spectrum is Spectrum.THERMAL:
+        yield "    kelvin_per_count: 0.01  # kelvin = counts * kelvin_per_count + kelvin_at_zero"
+        yield "    kelvin_at_zero: 0"
+
+
+def _word(entry: TopicIndex) -> str:
+    return entry.topic.name.lower()
+
+
+def _unique(name: str, taken: set[str]) -> str:
+    return next(text for n in range(1, 1000) if (text := name if n == 1 else f"{name}{n}") not in taken)
+
+
+def _name(path: Path) -> str:
+    letters = "".join(c if c.isascii() and c.isalnum() else "-" for c in path.stem).strip("-")
+    return letters[:64] or "bag"
+
+
+def _quoted(text: str) -> str:
+    """A string as YAML: JSON's, where it is not plain."""
+    return (
+        text
+        if re.fullmatch(r"[A-Za-z/][A-Za-z0-9_/.-]*", text)
+        and text not in ("true", "false", "null", "yes", "no", "on", "off")
+        else json.dumps(text)
+    )

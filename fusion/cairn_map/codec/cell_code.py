@@ -1,0 +1,236 @@
+"""A cell's evidence as bytes and back: one file per cell, lossless and canonical.
+
+    head | child masks | leaf masks | hits | misses | per channel: presence, weight, value planes
+
+FORMAT.md is the norm. The same evidence always gives the same canonical bytes (the streams uncompressed), and
+the SHA-256 over them is the cell's identity; so bytes at rest may be compressed anew without changing it.
+"""
+
+import hashlib
+import os
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from cairn_map.codec.cell_reading import EVIDENCE_BYTES_MAX, CellReader, cell_reader
+from cairn_map.codec.entropy import small_profile
+from cairn_map.codec.octree import channel_streams
+from cairn_map.codec.octree.cell_content import (
+    CHILD_MASKS,
+    HITS,
+    LEAF_MASKS,
+    MISSES,
+    CellContent,
+    canonical_bytes,
+    content_of,
+    count_streams,
+    evidence_of,
+    met_of,
+    topology_streams,
+)
+from cairn_map.codec.octree.cell_head import CellHead, encode_head
+from cairn_map.codec.octree.channel_streams import ChannelRows, stream_of_channel
+from cairn_map.codec.octree.streams import MODELLED, StoredStream, join_streams, stored_streams
+from cairn_map.errors import DamagedDataError
+from cairn_map.evidence.evidence import Evidence, check_fits
+from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
+
+
+class Profile(StrEnum):
+    """How bytes are spent; both say the same, and have the same digest."""
+
+    FAST = "fast"
+    """Byte planes under zstd."""
+    SMALL = "small"
+    """Each number under a model of its neighbours: six tenths of the bytes for some ten times the time."""
+
+
+@dataclass(frozen=True, slots=True)
+class EncodedCell:
+    """A cell's bytes and the SHA-256 (32 bytes) of its canonical form."""
+
+    data: bytes
+    digest: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class CanonicalCell:
+    """What canonical bytes say, by leaf."""
+
+    key: CellKey
+    geometry: Geometry
+    content: CellContent
+    digest: bytes
+
+    @property
+    def evidence(self) -> Evidence:
+        """The same by voxel, made anew each time."""
+        return evidence_of(self.content)
+
+
+@dataclass(frozen=True, slots=True)
+class DecodedCell:
+    """What a cell's bytes say."""
+
+    key: CellKey
+    geometry: Geometry
+    evidence: Evidence
+    digest: bytes
+
+
+def encode_cell(
+    key: CellKey, evidence: Evidence, geometry: Geometry, *, profile: Profile = Profile.FAST
+) -> EncodedCell:
+    """The bytes of one cell; signed evidence (a difference) is marked as such in the head, and coded fast.
+
+    Raises:
+        BadInputError: kind `bad_evidence`: it is not of this geometry.
+    """
+    check_fits(evidence, geometry)
+    signed, content = evidence.is_signed, content_of(evidence, geometry)
+    parts = channel_streams.split_samples(content.sampled, content.samples, geometry)
+    head, streams = _canonical(key, content, parts, geometry, voxels=len(evidence), signed=signed)
+    stored = {stream.number: stream for stream in stored_streams(streams)}
+    if Profile(profile) is Profile.SMALL and not signed:
+        for first, data in _modelled(content, parts, geometry).items():
+            group = [number for number in streams if _group(number) == _group(first)]
+            if data is not None and len(data) < sum(len(stored[number].body) for number in group):
+                for number in group:
+                    body = data if number == first else b""
+                    stored[number] = StoredStream(number, MODELLED, len(streams[number]), body)
+    return EncodedCell(head + join_streams(list(stored.values())), _digest(canonical_bytes(head, streams)))
+
+
+def encode_cells(
+    diff: Mapping[CellKey, Evidence], geometry: Geometry, *, profile: Profile = Profile.FAST, threads: int | None = None
+) -> dict[CellKey, EncodedCell]:
+    """The bytes of many cells, rising in number, on as many threads as there are processors unless told otherwise.
+
+    Raises:
+        BadInputError: as `encode_cell`.
+    """
+    keys = sorted(diff)
+    if len(keys) == 1:
+        return {keys[0]: encode_cell(keys[0], diff[keys[0]], geometry, profile=profile)}
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+        encoded = pool.map(lambda key: encode_cell(key, diff[key], geometry, profile=profile), keys)
+        return dict(zip(keys, encoded, strict=True))
+
+
+def cell_digest(key: CellKey, evidence: Evidence, geometry: Geometry) -> bytes:
+    """The digest that `encode_cell` gives, without compressing anything.
+
+    Raises:
+        BadInputError: kind `bad_evidence`: it is not of this geometry.
+    """
+    return _digest(canonical_bytes(*_encoded(key, evidence, geometry)))
+
+
+def decode_cell(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) -> DecodedCell:
+    """What a cell's bytes say, with every size checked before anything is allocated.
+
+    The result is sound evidence, but the bytes might be another coding of it than the canonical one;
+    `decode_canonical_cell` refuses that. A hundred bytes can stand for 200 MB of evidence (collapsed air), so who
+    reads what strangers wrote sets `evidence_bytes_max`.
+
+    Raises:
+        DamagedDataError: cut off, contradictory or out of range.
+        BadInputError: a version or kind of cell that this reader does not know, or too large.
+    """
+    reader = cell_reader(data, evidence_bytes_max=evidence_bytes_max)
+    evidence = evidence_of(reader.content())
+    return DecodedCell(reader.head.key, reader.head.geometry, evidence, _digest(reader.canonical_bytes()))
+
+
+def decode_met(data: bytes) -> DecodedCell:
+    """`decode_cell`, but of the evidence only voxels that were hit or have samples: all that shows.
+
+    Raises:
+        DamagedDataError, BadInputError: as `decode_cell`.
+    """
+    reader = cell_reader(data)
+    evidence = evidence_of(met_of(reader.content()))
+    return DecodedCell(reader.head.key, reader.head.geometry, evidence, _digest(reader.canonical_bytes()))
+
+
+def decode_canonical_cell(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) -> DecodedCell:
+    """`decode_cell`, and refuse bytes that are not the canonical coding of what they say.
+
+    Raises:
+        DamagedDataError: kind `not_canonical`, or as `decode_cell`.
+        BadInputError: as `decode_cell`.
+    """
+    cell = read_canonical_cell(cell_reader(data, evidence_bytes_max=evidence_bytes_max))
+    return DecodedCell(cell.key, cell.geometry, cell.evidence, cell.digest)
+
+
+def read_canonical_cell(reader: CellReader) -> CanonicalCell:
+    """What a reader's bytes say, by leaf, if they are the canonical coding of it.
+
+    Raises:
+        DamagedDataError, BadInputError: as `decode_canonical_cell`.
+    """
+    head, content = reader.head, reader.content()
+    is_canonical, data = reader.is_canonical(content), reader.canonical_bytes()
+    if is_canonical is None:
+        is_canonical = canonical_bytes(*_encoded(head.key, evidence_of(content), head.geometry)) == data
+    if not is_canonical:
+        raise DamagedDataError("not_canonical", f"cell {cell_of_key(head.key)} is not in canonical form")
+    return CanonicalCell(head.key, head.geometry, content, _digest(data))
+
+
+def recompressed_cell(data: bytes, *, profile: Profile) -> bytes:
+    """The same cell, with the same digest, in another profile.
+
+    Raises:
+        DamagedDataError, BadInputError: as `decode_canonical_cell`.
+    """
+    cell = decode_canonical_cell(data)
+    return encode_cell(cell.key, cell.evidence, cell.geometry, profile=profile).data
+
+
+def _encoded(key: CellKey, evidence: Evidence, geometry: Geometry) -> tuple[bytes, dict[int, bytes]]:
+    """Head and raw streams of evidence that may not fit."""
+    check_fits(evidence, geometry)
+    content = content_of(evidence, geometry)
+    parts = channel_streams.split_samples(content.sampled, content.samples, geometry)
+    return _canonical(key, content, parts, geometry, voxels=len(evidence), signed=evidence.is_signed)
+
+
+def _canonical(
+    key: CellKey, content: CellContent, parts: list[ChannelRows], geometry: Geometry, *, voxels: int, signed: bool
+) -> tuple[bytes, dict[int, bytes]]:
+    """Head and raw streams of one cell."""
+    leaves = len(content.counts)
+    streams = topology_streams(content.octree) | count_streams(content.counts, signed=signed)
+    for c, (channel, rows) in enumerate(zip(geometry.channels, parts, strict=True)):
+        streams |= channel_streams.encode_channel(stream_of_channel(c), channel, rows, leaves=leaves, signed=signed)
+    head = CellHead(key=key, geometry=geometry, voxels=voxels, leaves=leaves, streams=len(streams), signed=signed)
+    return encode_head(head), streams
+
+
+def _modelled(content: CellContent, parts: list[ChannelRows], geometry: Geometry) -> dict[int, bytes | None]:
+    """By the number of its first stream, each group as its model says it; None where that does not pay."""
+    leaves = len(content.counts)
+    ground = small_profile.ground_of(content.octree, depth=geometry.depth)
+    groups = {
+        CHILD_MASKS: small_profile.encode_masks(content.octree, depth=geometry.depth),
+        HITS: small_profile.encode_counts(content, ground),
+    }
+    hits, before = content.counts[:, 0].copy(), np.zeros(leaves, np.int64)
+    for c, (channel, rows) in enumerate(zip(geometry.channels, parts, strict=True)):
+        groups[stream_of_channel(c)] = small_profile.encode_channel(channel, rows, hits, before, ground)
+        before = small_profile.weights_by_leaf(rows, leaves)
+    return groups
+
+
+def _group(number: int) -> int:
+    """The number of the first stream of the group that a stream belongs to."""
+    return {CHILD_MASKS: CHILD_MASKS, LEAF_MASKS: CHILD_MASKS, HITS: HITS, MISSES: HITS}.get(number, number & ~7)
+
+
+def _digest(data: bytes) -> bytes:
+    return hashlib.sha256(data).digest()

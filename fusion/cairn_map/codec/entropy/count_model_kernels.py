@@ -1,0 +1,158 @@
+"""Hits and misses of the leaves, modelled on the leaves beside them that come before.
+
+Whether a leaf was hit, opinions of: hits beside it, what lies above, hits across edges. How often: the mean of the hits
+beside it. Misses are guessed as the median of the three beside its faces; what is coded is what differs from that,
+opinions of: how each neighbour differs from the guess; those across edges; the guess itself; how good the neighbours'
+guesses were.
+"""
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.codec.entropy.arithmetic_kernels import EVEN, Coder, Data, Live, resumed, signed, suspend_into
+from cairn_map.codec.entropy.mixing_kernels import SLOTS, TAILS, code_mixed, code_number, start_weights
+from cairn_map.codec.entropy.neighbour_kernels import LOWER, NONE, Index, Ints, Words, beside, leaf_at, stepped
+
+Counts = npt.NDArray[np.int32]
+
+COUNT_MAX = (1 << 31) - 1
+HIT_TABLE = 1 << 14
+"""Contexts of one opinion on hits: first those of hit or not, then the numbers'."""
+NUMBERS_FROM = 1 << 13
+MISS_TABLE = 1 << 14
+"""Numbers of contexts of one opinion on misses, each of SLOTS."""
+
+
+@nb.njit(cache=True, nogil=True)
+def code_counts(
+    coder: Coder, data: Data, counts: Counts, starts: Words, sizes: Ints, brick_of: Index, leaf_of: Index, depth: int
+) -> bool:
+    """Code (N, 2) hits and misses of the leaves; False if one that was read is out of range."""
+    live = resumed(coder)
+    N = starts.shape[0]
+    hit_odds, hit_weights = np.full(3 * HIT_TABLE, EVEN, np.uint32), start_weights(2 * SLOTS, 3)
+    miss_odds, miss_weights = np.full(4 * MISS_TABLE * SLOTS, EVEN, np.uint32), start_weights(24 * SLOTS, 4)
+    tails = np.full(2 * TAILS, EVEN, np.uint32)
+    near, hit_contexts, miss_contexts = np.empty(7, np.int64), np.empty(3, np.int64), np.empty(4, np.int64)
+    errors = np.zeros(N + 1, np.uint8)
+    for n in range(N):
+        place = signed(starts[n])
+        for i in range(7):
+            near[i] = leaf_at(brick_of, leaf_of, beside(place, LOWER[i], depth))
+        above = 0
+        for axis in range(3):
+            up = stepped(place + sizes[n] - 1, axis, 1, depth)
+            above = 2 * above + (1 if leaf_at(brick_of, leaf_of, up) != NONE else 0)
+        hits, live = _code_hits(
+            live, data, counts, n, near, above, sizes[n], hit_odds, hit_contexts, hit_weights, tails
+        )
+        if hits < 0 or hits > COUNT_MAX:
+            return False
+        counts[n, 0] = hits
+        guess, row = _miss_contexts_into(miss_contexts, counts, n, near, above, sizes[n], errors)
+        rest = signed(counts[n, 1]) - guess
+        rest, live = code_number(live, data, miss_odds, miss_contexts, miss_weights, row * SLOTS, tails, TAILS, rest)
+        if guess + rest < 0 or guess + rest > COUNT_MAX:
+            return False
+        counts[n, 1] = guess + rest
+        errors[n] = min(abs(rest), 7)
+    suspend_into(coder, live)
+    return True
+
+
+@nb.njit(nogil=True)
+def _code_hits(
+    live: Live,
+    data: Data,
+    counts: Counts,
+    n: int,
+    near: Ints,
+    above: int,
+    size: int,
+    odds: Words,
+    contexts: Ints,
+    weights: Ints,
+    tails: Words,
+) -> tuple[int, Live]:
+    """Code leaf n's hits."""
+    faces = edges = total = struck = seen = misses = 0
+    for i in range(7):
+        leaf = near[i]
+        state = 0
+        if leaf != NONE:
+            state = 2 if counts[leaf, 0] > 0 else 1
+        if state == 2:
+            total += signed(counts[leaf, 0])
+            struck += 1
+        if i < 3:
+            faces = 3 * faces + state
+            if state:
+                misses += signed(counts[leaf, 1])
+                seen += 1
+        else:
+            edges = 3 * edges + state
+    mean = (2 * total + struck) // (2 * struck) if struck else 0
+    misses = misses // seen if seen else 0
+    large = 1 if size > 1 else 0
+    contexts[0] = (faces * 8 + above) * 2 + large
+    contexts[1] = HIT_TABLE + (faces * 81 + edges) * 2 + large
+    contexts[2] = 2 * HIT_TABLE + ((min(mean, 15) * 8 + above) * 8 + min(misses, 7)) * 8 + struck
+    struck_too, live = code_mixed(live, data, odds, contexts, 0, weights, 0, 1 if counts[n, 0] > 0 else 0)
+    if not struck_too:
+        return 0, live
+    contexts[0] = NUMBERS_FROM + min(mean, 60) * SLOTS
+    contexts[1] = HIT_TABLE + NUMBERS_FROM + (struck * 8 + min(mean, 7)) * SLOTS
+    contexts[2] = 2 * HIT_TABLE + NUMBERS_FROM + (min(misses, 20) * 8 + above) * SLOTS
+    rest = signed(counts[n, 0]) - 1 - mean
+    rest, live = code_number(live, data, odds, contexts, weights, SLOTS, tails, 0, rest)
+    return 1 + mean + rest, live
+
+
+@nb.njit(nogil=True)
+def _miss_contexts_into(
+    contexts: Ints, counts: Counts, n: int, near: Ints, above: int, size: int, errors: npt.NDArray[np.uint8]
+) -> tuple[int, int]:
+    """Contexts of leaf n's misses; the guess, and which row of weights."""
+    known = error = faces = 0
+    low, high, total, last = COUNT_MAX, 0, 0, 0
+    for i in range(3):
+        faces = 3 * faces
+        if near[i] != NONE:
+            value = signed(counts[near[i], 1])
+            low, high, total, last = min(low, value), max(high, value), total + value, value
+            known += 1
+            error += signed(errors[signed(near[i])])
+            faces += 2 if counts[near[i], 0] > 0 else 1
+    guess = last
+    if known == 3:
+        guess = total - low - high
+    elif known == 0:
+        for i in range(3, 7):
+            if near[i] != NONE:
+                guess = signed(counts[near[i], 1])
+    sides = corners = 0
+    for i in range(7):
+        if i < 3:
+            sides = 8 * sides + _against(counts, near[i], guess, 3)
+        else:
+            corners = 4 * corners + _against(counts, near[i], guess, 1)
+    hits = min(signed(counts[n, 0]), 2)
+    level = 0
+    while size > 1 and level < 2:
+        size >>= 3
+        level += 1
+    before = signed(errors[n - 1]) if n > 0 else 0
+    contexts[0] = (sides * 3 + hits) * SLOTS
+    contexts[1] = (MISS_TABLE + corners * 3 + level) * SLOTS
+    contexts[2] = (2 * MISS_TABLE + ((min(guess, 40) * 3 + hits) * 8 + above) * 3 + level) * SLOTS
+    contexts[3] = (3 * MISS_TABLE + ((min(error, 15) * 4 + known) * 27 + faces) * 8 + before) * SLOTS
+    return guess, (hits * 4 + known) * 2 + (1 if level else 0)
+
+
+@nb.njit(nogil=True)
+def _against(counts: Counts, leaf: int, guess: int, most: int) -> int:
+    """By how much a neighbour's misses differ from the guess, 0 to 2 most; 2 most + 1 if there is none."""
+    if leaf == NONE:
+        return 2 * most + 1
+    return min(max(signed(counts[leaf, 1]) - guess, -most), most) + most

@@ -1,0 +1,137 @@
+"""The octree's masks, modelled: each child's state under what is known of its neighbours.
+
+A child is absent, inner or a leaf. Depth by depth, its lower neighbours are known, and so are its parent's upper
+ones. Surfaces and borders of what was seen are smooth, so these say most. Three opinions, of
+
+    faces     three lower neighbours, three upper ones (one depth above, where they lie outside the parent)
+    edges     the lower neighbours across three edges and the corner, and the three across faces
+    family    which child it is, which children of this parent are there already, the parent's upper neighbours
+"""
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.codec.entropy.arithmetic_kernels import EVEN, Coder, Data, resumed, signed, suspend_into
+from cairn_map.codec.entropy.mixing_kernels import code_mixed, start_weights
+from cairn_map.codec.entropy.neighbour_kernels import LOWER, NONE, beside, stepped
+
+Bytes = npt.NDArray[np.uint8]
+
+ABSENT, INNER, LEAF, SIBLING = 0, 1, 2, 3
+"""States; SIBLING: an upper neighbour inside the same parent, of which nothing is known yet."""
+FACES = 27 * 64
+EDGES = 81 * 27
+FAMILY = 256 * 27 * 8
+GROUPS = 4
+"""Depths above the voxels that are told apart, the last for all further."""
+
+
+@nb.njit(cache=True, nogil=True)
+def code_masks(
+    coder: Coder, data: Data, child_masks: Bytes, leaf_masks: Bytes, depth: int, stop: int
+) -> tuple[int, int]:
+    """Code an octree's masks down to depth `stop`; how many child and leaf masks, or -1, -1 if they find no room.
+
+    Encoding reads the masks, decoding writes them.
+    """
+    live = resumed(coder)
+    odds = np.full(GROUPS * 2 * (FACES + EDGES + FAMILY), EVEN, np.uint32)
+    weights = start_weights(2 * GROUPS, 3)
+    contexts = np.empty(3, np.int64)
+    states = np.zeros((8 ** (stop + 1) - 1) // 7, np.uint8)
+    states[0] = INNER
+    keys = np.zeros(child_masks.shape[0] + 1, np.uint32)
+    first, last = 0, min(1, child_masks.shape[0])
+    at = leaf_at = offset = 0
+    for d in range(stop):
+        is_last = d == depth - 1
+        group = min(depth - 1 - d, GROUPS - 1)
+        found = last
+        for n in range(first, last):
+            if at >= child_masks.shape[0] or (not is_last and leaf_at >= leaf_masks.shape[0]):
+                return -1, -1
+            key = signed(keys[n])
+            upper = upper_states(states, offset, key, d)
+            child_mask = signed(child_masks[at])
+            leaf_mask = signed(leaf_masks[leaf_at]) if not is_last else 255
+            children = leaves = 0
+            for c in range(8):
+                child = 8 * key + c
+                _contexts_into(contexts, states, offset + 8**d, child, d + 1, upper, children, group)
+                there, live = code_mixed(live, data, odds, contexts, 0, weights, 2 * group, (child_mask >> c) & 1)
+                if not there:
+                    continue
+                leaf = 1
+                if not is_last:
+                    leaf, live = code_mixed(live, data, odds, contexts, 1, weights, 2 * group + 1, (leaf_mask >> c) & 1)
+                children |= 1 << c
+                leaves |= leaf << c
+                states[offset + 8**d + child] = LEAF if leaf else INNER
+                if not leaf:
+                    if found >= keys.shape[0]:
+                        return -1, -1
+                    keys[found] = child
+                    found += 1
+            child_masks[at] = children
+            at += 1
+            if not is_last:
+                leaf_masks[leaf_at] = leaves
+                leaf_at += 1
+        first, last = last, found
+        offset += 8**d
+    suspend_into(coder, live)
+    return at, leaf_at
+
+
+@nb.njit(nogil=True)
+def _contexts_into(
+    contexts: npt.NDArray[np.int64],
+    states: Bytes,
+    offset: int,
+    child: int,
+    depth: int,
+    upper: int,
+    before: int,
+    group: int,
+) -> None:
+    """Contexts of a child at its depth, whose states begin at `offset`; `before`: the siblings that are there."""
+    faces = edges = above = 0
+    for i in LOWER[:3]:
+        faces = 3 * faces + state_of(states, offset, beside(child, i, depth), depth)
+    for i in LOWER[3:]:
+        edges = 3 * edges + state_of(states, offset, beside(child, i, depth), depth)
+    near = faces
+    for axis in range(3):
+        state = (upper >> (2 * axis)) & 3
+        near = 4 * near + (state if (child >> axis) & 1 else SIBLING)
+        above = 3 * above + state
+    contexts[0] = 2 * (near * GROUPS + group)
+    contexts[1] = 2 * (GROUPS * FACES + (edges * 27 + faces) * GROUPS + group)
+    family = (above * 256 + before) * 8 + (child & 7)
+    contexts[2] = 2 * (GROUPS * (FACES + EDGES) + family * GROUPS + group)
+
+
+@nb.njit(nogil=True)
+def upper_states(states: Bytes, offset: int, key: int, depth: int) -> int:
+    """States of the three neighbours one up, two bits each."""
+    found = 0
+    for axis in range(3):
+        found |= state_of(states, offset, stepped(key, axis, 1, depth), depth) << (2 * axis)
+    return found
+
+
+@nb.njit(nogil=True)
+def state_of(states: Bytes, offset: int, key: int, depth: int) -> int:
+    """State of a node, whose depth's states begin at `offset`; LEAF in a larger leaf, ABSENT beyond the cell."""
+    if key == NONE:
+        return ABSENT
+    state = signed(states[offset + key])
+    while state == ABSENT and depth > 0:
+        depth -= 1
+        offset -= 8**depth
+        key >>= 3
+        state = signed(states[offset + key])
+        if state != ABSENT:
+            return LEAF if state == LEAF else ABSENT
+    return state

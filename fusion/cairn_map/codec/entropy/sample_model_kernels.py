@@ -1,0 +1,221 @@
+"""Samples, modelled: which leaves have some, their weights, and sums under what their neighbours' means let one guess.
+
+A sum is guessed as the mean of the rows beside it that come before, nearer ones counting more, times its own weight.
+How far off that will be is told by how far off it was there, by the plane before (colours change together), and by how
+the neighbours differ.
+"""
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.codec.entropy.arithmetic_kernels import EVEN, Coder, Data, code_bit, resumed, signed, suspend_into
+from cairn_map.codec.entropy.mixing_kernels import SLOTS, TAILS, code_number, start_weights
+from cairn_map.codec.entropy.neighbour_kernels import LOWER, NONE, Index, Ints, Words, beside, leaf_at
+from cairn_map.codec.octree.sum_kernels import square_guess
+
+Flags = npt.NDArray[np.bool_]
+Counts = npt.NDArray[np.int32]
+
+NEARNESS = np.array([4, 4, 4, 2, 2, 2, 2, 2, 2, 2, 2, 2, 1], np.int64)
+"""What a neighbour counts, by `neighbour_kernels.STEPS`: faces, edges, the corner."""
+SUM_MAX = 1 << 62
+GUESSED_MAX = 1 << 40
+"""A sum from which on nothing is guessed: products of it would leave 64 bits."""
+WEIGHT_MAX = 1 << 16
+"""Likewise a weight."""
+RANK_MAX = (1 << 16) - 1
+TABLE = 2048
+"""Numbers of contexts of one opinion, each of SLOTS."""
+
+
+@nb.njit(cache=True, nogil=True)
+def code_presence(
+    coder: Coder,
+    data: Data,
+    present: Flags,
+    starts: Words,
+    sizes: Ints,
+    references: Ints,
+    hits: Counts,
+    brick_of: Index,
+    leaf_of: Index,
+    depth: int,
+) -> None:
+    """Code which leaves have a row; only voxels may. `references` are the weights of the channel before, by leaf."""
+    live = resumed(coder)
+    odds = np.full(4 * 2 * 8, EVEN, np.uint32)
+    for n in range(starts.shape[0]):
+        if sizes[n] > 1:
+            present[n] = False
+            continue
+        near = 0
+        for i in LOWER[:3]:
+            leaf = leaf_at(brick_of, leaf_of, beside(signed(starts[n]), i, depth))
+            near = 2 * near + (1 if leaf != NONE and present[leaf] else 0)
+        context = (min(signed(hits[n]), 3) * 2 + (1 if references[n] > 0 else 0)) * 8 + near
+        bit, live = code_bit(live, data, odds, context, 1 if present[n] else 0)
+        present[n] = bit == 1
+    suspend_into(coder, live)
+
+
+@nb.njit(cache=True, nogil=True)
+def code_weights(coder: Coder, data: Data, weights: Ints, references: Ints, near: Index) -> bool:
+    """Code (S,) weights, each near its reference; False if one that was read is out of range."""
+    live = resumed(coder)
+    odds, loud = np.full(3 * TABLE * SLOTS, EVEN, np.uint32), start_weights(SLOTS, 3)
+    tails, contexts = np.full(TAILS, EVEN, np.uint32), np.empty(3, np.int64)
+    errors = np.zeros(weights.shape[0], np.int64)
+    for s in range(weights.shape[0]):
+        error = count = 0
+        for i in range(near.shape[1]):
+            row = signed(near[s, i])
+            if row != NONE:
+                error += signed(errors[row])
+                count += 1
+        error = min(half_log((4 * error) // count), 40) if count else 41
+        reference = references[s]
+        contexts[0] = min(reference, 60) * SLOTS
+        contexts[1] = (TABLE + min(count, 7) * 16 + min(reference, 15)) * SLOTS
+        contexts[2] = (2 * TABLE + error * 16 + min(reference, 15)) * SLOTS
+        rest, live = code_number(live, data, odds, contexts, loud, 0, tails, 0, weights[s] - reference)
+        weights[s] = reference + rest
+        errors[s] = min(abs(rest), GUESSED_MAX)
+        if weights[s] < 0 or weights[s] > SUM_MAX:
+            return False
+    suspend_into(coder, live)
+    return True
+
+
+@nb.njit(cache=True, nogil=True)
+def code_sums(coder: Coder, data: Data, sums: Ints, rests: Ints, weights: Ints, near: Index) -> bool:
+    """Code (S, C) sums; `rests` takes what the guesses left; False if a sum that was read is out of range."""
+    planes = sums.shape[1]
+    live = resumed(coder)
+    odds, loud = np.full(planes * 3 * TABLE * SLOTS, EVEN, np.uint32), start_weights(planes * 4 * SLOTS, 3)
+    tails, contexts = np.full(planes * TAILS, EVEN, np.uint32), np.empty(3, np.int64)
+    for s in range(sums.shape[0]):
+        weight = weights[s]
+        size = min(half_log(weight), 11)
+        before = 0
+        for c in range(planes):
+            guess, error, spread, count = _guess(sums, rests, weights, near, s, c)
+            contexts[0] = (3 * c * TABLE + min(weight, 23) * 48 + error) * SLOTS
+            contexts[1] = ((3 * c + 1) * TABLE + before * 16 + min(error // 2, 15)) * SLOTS
+            contexts[2] = ((3 * c + 2) * TABLE + spread * 12 + size) * SLOTS
+            row = (4 * c + min(count, 3)) * SLOTS
+            rest, live = code_number(live, data, odds, contexts, loud, row, tails, c * TAILS, sums[s, c] - guess)
+            sums[s, c] = guess + rest
+            if sums[s, c] < 0 or sums[s, c] > SUM_MAX:
+                return False
+            rests[s, c] = min(max(rest, -GUESSED_MAX), GUESSED_MAX)
+            before = min(half_log(abs(rests[s, c])), 30) * 2 + (1 if rest < 0 else 0)
+    suspend_into(coder, live)
+    return True
+
+
+@nb.njit(nogil=True)
+def _guess(sums: Ints, rests: Ints, weights: Ints, near: Index, s: int, c: int) -> tuple[int, int, int, int]:
+    """Of row s and plane c: the guess, how far off the neighbours' were, how they differ, and how many there are."""
+    total = worth = error = count = 0
+    low, high = SUM_MAX, 0
+    for i in range(near.shape[1]):
+        row = near[s, i]
+        if row == NONE or weights[row] <= 0 or weights[row] >= WEIGHT_MAX or sums[row, c] >= GUESSED_MAX:
+            continue
+        total += NEARNESS[i] * sums[row, c]
+        worth += NEARNESS[i] * weights[row]
+        error += abs(rests[row, c])
+        mean = 4 * sums[row, c] // weights[row]
+        low, high = min(low, mean), max(high, mean)
+        count += 1
+    if count == 0 or weights[s] >= WEIGHT_MAX:
+        return 0, 47, 40, 0
+    spread = min(half_log(high - low), 39) if count > 1 else 40
+    return (
+        total // worth * weights[s] + total % worth * weights[s] // worth,
+        min(half_log(4 * error // count), 46),
+        spread,
+        count,
+    )
+
+
+@nb.njit(cache=True, nogil=True)
+def code_squares(coder: Coder, data: Data, squares: Ints, sums: Ints, rests: Ints, weights: Ints, near: Index) -> bool:
+    """Code (S,) sums of squares; False if one that was read is out of range.
+
+    What is coded is how much they exceed the squares of equal samples: the spread; opinions of the neighbours' spread,
+    of how far off the sum itself was, and of the weight.
+    """
+    live = resumed(coder)
+    odds, loud = np.full(3 * TABLE * SLOTS, EVEN, np.uint32), start_weights(4 * SLOTS, 3)
+    tails, contexts = np.full(TAILS, EVEN, np.uint32), np.empty(3, np.int64)
+    spreads = np.zeros(squares.shape[0], np.int64)
+    for s in range(squares.shape[0]):
+        weight = weights[s]
+        total = worth = count = 0
+        for i in range(near.shape[1]):
+            row = near[s, i]
+            if row != NONE and 0 < weights[row] < WEIGHT_MAX:
+                total += NEARNESS[i] * spreads[row]
+                worth += NEARNESS[i] * weights[row]
+                count += 1
+        # Weights beyond their bound are rare enough to be guessed like that one.
+        heavy = min(max(weight, 1), WEIGHT_MAX)
+        expected = min(half_log(total // worth * heavy), 62) if count else 63
+        off = min(half_log(abs(rests[s]) // heavy), 30)
+        contexts[0] = (min(weight, 15) * 64 + expected) * SLOTS
+        contexts[1] = (TABLE + off * 16 + min(weight, 15)) * SLOTS
+        contexts[2] = (2 * TABLE + min(half_log(weight), 20) * 8 + min(count, 7)) * SLOTS
+        guess = 0
+        if 0 < weight < WEIGHT_MAX and sums[s] // weight < 1 << 20:
+            guess = signed(square_guess(np.uint64(sums[s]), np.uint64(weight)))
+        rest, live = code_number(live, data, odds, contexts, loud, min(weight, 3) * SLOTS, tails, 0, squares[s] - guess)
+        squares[s] = guess + rest
+        if squares[s] < 0 or squares[s] > SUM_MAX:
+            return False
+        spreads[s] = min(abs(rest), GUESSED_MAX)
+    suspend_into(coder, live)
+    return True
+
+
+@nb.njit(cache=True, nogil=True)
+def code_ranks(coder: Coder, data: Data, ranks: Ints, near: Index) -> bool:
+    """Code (S,) ranks, most of them low; False if one that was read is out of range.
+
+    Opinions: the mean of the neighbours' ranks; those across the faces; how many of them are the first.
+    """
+    live = resumed(coder)
+    odds, loud = np.full(3 * TABLE * SLOTS, EVEN, np.uint32), start_weights(SLOTS, 3)
+    tails, contexts = np.full(TAILS, EVEN, np.uint32), np.empty(3, np.int64)
+    for s in range(ranks.shape[0]):
+        total = worth = count = firsts = faces = 0
+        for i in range(near.shape[1]):
+            row = near[s, i]
+            if row != NONE:
+                total += NEARNESS[i] * ranks[row]
+                worth += NEARNESS[i]
+                count += 1
+                firsts += 1 if ranks[row] == 0 else 0
+            if i < 3:
+                faces = 9 * faces + (min(ranks[row], 7) if row != NONE else 8)
+        mean = min(half_log(4 * total // worth), 40) if count else 41
+        contexts[0] = (mean * 4 + min(count, 3)) * SLOTS
+        contexts[1] = (TABLE + faces) * SLOTS
+        contexts[2] = (2 * TABLE + firsts * 14 + count) * SLOTS
+        ranks[s], live = code_number(live, data, odds, contexts, loud, 0, tails, 0, ranks[s])
+        if ranks[s] < 0 or ranks[s] > RANK_MAX:
+            return False
+    suspend_into(coder, live)
+    return True
+
+
+@nb.njit(nogil=True)
+def half_log(x: int) -> int:
+    """Buckets that grow by half: 0, 1, 2, 3, 4 (4-5), 5 (6-7), 6 (8-11), 7 (12-15), ...; x is not negative."""
+    n = 0
+    y = x
+    while y >= 4:
+        y >>= 1
+        n += 2
+    return n + y

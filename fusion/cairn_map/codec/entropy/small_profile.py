@@ -1,0 +1,202 @@
+"""Streams coded by groups, each under a model of what its neighbours in space say: the profile *small*.
+
+    group      its streams                        modelled on
+    masks      1, 2                               states of neighbouring nodes
+    counts     3, 4                               leaves beside, and the octree
+    channel c  16 + 8c to 18 + 8c + planes        rows beside, hits, and the weights of the channel before
+
+The stored bytes of a group's first stream say all of it; the others of it are empty. What they mean is the same as
+ever: the raw streams, made anew from what was decoded, have the digest of the cell.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.codec.entropy.arithmetic_kernels import finish_decoding, start_decoding
+from cairn_map.codec.entropy.count_model_kernels import code_counts
+from cairn_map.codec.entropy.mask_model_kernels import code_masks
+from cairn_map.codec.entropy.modelled_stream import (
+    NUMBERS_PER_BYTE,
+    Bytes,
+    Code,
+    Coder,
+    read_modelled,
+    write_modelled,
+)
+from cairn_map.codec.entropy.neighbour_kernels import earlier_rows, index_leaves
+from cairn_map.codec.entropy.sample_model_kernels import code_presence, code_squares, code_sums, code_weights
+from cairn_map.codec.octree.cell_content import CellContent
+from cairn_map.codec.octree.channel_streams import ChannelRows
+from cairn_map.codec.octree.octree import Octree
+from cairn_map.errors import DamagedDataError
+from cairn_map.evidence.channels import Channel
+
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """Leaves of an octree and where they lie: what counts and samples are modelled on."""
+
+    octree: Octree
+    depth: int
+    brick_of: npt.NDArray[np.int32]
+    leaf_of: npt.NDArray[np.int32]
+
+
+def ground_of(octree: Octree, *, depth: int) -> Ground:
+    """The ground of one octree."""
+    return Ground(octree, depth, *index_leaves(octree.starts, octree.sizes, depth))
+
+
+def encode_masks(octree: Octree, *, depth: int) -> bytes | None:
+    """All masks, or None if that would not be shorter than they are."""
+    child_masks, leaf_masks = octree.child_masks.copy(), octree.leaf_masks.copy()
+    room = len(child_masks) + len(leaf_masks)
+
+    def code(coder: Coder, data: Bytes) -> bool:
+        code_masks(coder, data, child_masks, leaf_masks, depth, depth)
+        return True
+
+    return _encoded(code, room, room)
+
+
+def decode_masks(data: bytes, *, child_count: int, leaf_count: int, depth: int, stop: int) -> tuple[Bytes, Bytes]:
+    """The mirror of `encode_masks`, or with `stop` below `depth` the first ones of it.
+
+    Raises:
+        DamagedDataError: there are other numbers of masks.
+    """
+    child_masks, leaf_masks = np.zeros(child_count, np.uint8), np.zeros(leaf_count, np.uint8)
+    read = np.frombuffer(data, np.uint8).copy()
+    coder = start_decoding(read)
+    children, leaves = code_masks(coder, read, child_masks, leaf_masks, depth, stop)
+    complete = (children, leaves) == (child_count, leaf_count) and finish_decoding(coder, read)
+    if children < 0 or (stop == depth and not complete):
+        raise DamagedDataError("bad_stream", "modelled masks are cut off, left over, or not as many as stated")
+    return child_masks[:children], leaf_masks[:leaves]
+
+
+def encode_counts(content: CellContent, ground: Ground) -> bytes | None:
+    """Hits and misses, or None if that would not be shorter than they are."""
+    counts = content.counts.copy()
+    return _encoded(_counts_coder(counts, ground), len(counts), 2 * len(counts))
+
+
+def decode_counts(data: bytes, ground: Ground) -> npt.NDArray[np.int32]:
+    """The mirror of `encode_counts`.
+
+    Raises:
+        DamagedDataError: a count is out of range.
+    """
+    counts = np.zeros((len(ground.octree.starts), 2), np.int32)
+    read_modelled(_counts_coder(counts, ground), data)
+    return counts
+
+
+def encode_channel(
+    channel: Channel, rows: ChannelRows, hits: npt.NDArray[np.int32], before: Ints, ground: Ground
+) -> bytes | None:
+    """One channel's samples, or None if that would not be shorter than two bytes a number.
+
+    `hits` (N,) are those of the leaves, `before` (N,) the weights of the channel before, all zeros for the first.
+    """
+    present = np.zeros(len(hits), np.bool_)
+    present[rows.leaves] = True
+    sums = rows.sums.copy()
+
+    def code(coder: Coder, data: Bytes) -> bool:
+        _code_presence(coder, data, present, hits, before, ground)
+        return _code_rows(coder, data, channel, rows.leaves, sums, hits, before, ground)
+
+    return _encoded(code, len(hits), 64 + len(hits) // 8 + 2 * sums.size)
+
+
+def decode_channel(
+    data: bytes,
+    channel: Channel,
+    hits: npt.NDArray[np.int32],
+    before: Ints,
+    ground: Ground,
+    *,
+    check_count: Callable[[int], None],
+) -> ChannelRows:
+    """The mirror of `encode_channel`; `check_count` refuses too many rows, before they are made.
+
+    Raises:
+        DamagedDataError: a weight or sum is out of range.
+    """
+    found: list[ChannelRows] = []
+
+    def code(coder: Coder, read: Bytes) -> bool:
+        present = np.zeros(len(hits), np.bool_)
+        _code_presence(coder, read, present, hits, before, ground)
+        leaves = np.nonzero(present)[0]
+        check_count(len(leaves))
+        sums = np.zeros((len(leaves), len(channel.planes)), np.int64)
+        found.append(ChannelRows(leaves, sums))
+        return _code_rows(coder, read, channel, leaves, sums, hits, before, ground)
+
+    read_modelled(code, data)
+    return found[0]
+
+
+def weights_by_leaf(rows: ChannelRows, leaves: int) -> Ints:
+    """(N,) weights of a channel; 0 where it has no row."""
+    weights = np.zeros(leaves, np.int64)
+    weights[rows.leaves] = rows.sums[:, -1]
+    return weights
+
+
+def _counts_coder(counts: npt.NDArray[np.int32], ground: Ground) -> Code:
+    octree = ground.octree
+    where = (octree.starts, octree.sizes, ground.brick_of, ground.leaf_of, ground.depth)
+    return lambda coder, data: code_counts(coder, data, counts, *where)
+
+
+def _code_presence(
+    coder: Coder,
+    data: Bytes,
+    present: npt.NDArray[np.bool_],
+    hits: npt.NDArray[np.int32],
+    before: Ints,
+    ground: Ground,
+) -> None:
+    where = (ground.brick_of, ground.leaf_of, ground.depth)
+    code_presence(coder, data, present, ground.octree.starts, ground.octree.sizes, before, hits, *where)
+
+
+def _code_rows(
+    coder: Coder,
+    data: Bytes,
+    channel: Channel,
+    leaves: Ints,
+    sums: Ints,
+    hits: npt.NDArray[np.int32],
+    before: Ints,
+    ground: Ground,
+) -> bool:
+    """Code weights, sums and squares; `sums` is read, or written."""
+    near = earlier_rows(ground.octree.starts, leaves, ground.brick_of, ground.leaf_of, ground.depth)
+    references = np.where(before[leaves] > 0, before[leaves], hits[leaves].astype(np.int64))
+    weights = sums[:, -1].copy()
+    values = np.ascontiguousarray(sums[:, : channel.value_count])
+    rests = np.zeros_like(values)
+    sound = code_weights(coder, data, weights, references, near) and code_sums(
+        coder, data, values, rests, weights, near
+    )
+    sums[:, : channel.value_count], sums[:, -1] = values, weights
+    if "square_sum" in channel.planes and sound:
+        squares = sums[:, 1].copy()
+        sound = code_squares(coder, data, squares, values[:, 0].copy(), rests[:, 0].copy(), weights, near)
+        sums[:, 1] = squares
+    return sound
+
+
+def _encoded(code: Code, numbers: int, room: int) -> bytes | None:
+    """What a model writes, unless it needs more room or a reader would refuse so few bytes for so many numbers."""
+    data = write_modelled(code, room=room)
+    return None if data is None or numbers > NUMBERS_PER_BYTE * len(data) else data

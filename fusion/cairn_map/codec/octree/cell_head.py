@@ -1,0 +1,143 @@
+"""The head of a cell's file: which cell, on which grid, with which channels, and how much is to follow.
+
+It is read before anything else is, and on its word alone a reader refuses what would be too large: `CellHead`
+bounds the voxels, the leaves and the raw bytes of all streams together.
+"""
+
+import struct
+from dataclasses import dataclass
+from functools import lru_cache
+
+from pydantic import ValidationError
+
+from cairn_map.errors import BadInputError, DamagedDataError
+from cairn_map.evidence.channels import CODE_OF_KIND, Channel
+from cairn_map.evidence.grid import CELL_LIMIT, CellKey, Geometry, cell_key, cell_of_key
+
+MAGIC = b"CRNC"
+VERSION = 1
+KIND_EVIDENCE = 1
+FLAG_SIGNED = 1
+FIXED_PART = struct.Struct("<4sBBBBIiiiIIBB")
+CHANNEL_SIZES = struct.Struct("<BBB")
+CHANNEL_SCALE = struct.Struct("<dd")
+KIND_OF_CODE = {code: kind for kind, code in CODE_OF_KIND.items()}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CellHead:
+    """What the head says."""
+
+    key: CellKey
+    geometry: Geometry
+    voxels: int
+    leaves: int
+    streams: int
+    signed: bool
+
+    @property
+    def raw_bytes_max(self) -> int:
+        """Most bytes that the streams of a cell with so many leaves can hold (FORMAT.md, Limits).
+
+        Every inner node has a leaf of its own below it at each depth, so no depth has more inner nodes than leaves.
+        """
+        columns = 2 + self.geometry.plane_count
+        masks = (2 * self.geometry.depth - 1) * self.leaves
+        presence = len(self.geometry.channels) * ((self.leaves + 7) // 8)
+        return masks + presence + columns * (1 + 8 * self.leaves)
+
+
+def encode_head(head: CellHead) -> bytes:
+    """The head's bytes."""
+    data = FIXED_PART.pack(
+        MAGIC,
+        VERSION,
+        KIND_EVIDENCE,
+        head.geometry.depth,
+        FLAG_SIGNED if head.signed else 0,
+        head.geometry.voxel_edge_um,
+        *cell_of_key(head.key),
+        head.voxels,
+        head.leaves,
+        len(head.geometry.channels),
+        head.streams,
+    )
+    return data + _channel_bytes(head.geometry)
+
+
+def _channel_bytes(geometry: Geometry) -> bytes:
+    data = b""
+    for channel in geometry.channels:
+        name, unit = channel.name.encode(), channel.unit.encode()
+        data += CHANNEL_SIZES.pack(CODE_OF_KIND[channel.kind], len(name), len(unit)) + name + unit
+        data += CHANNEL_SCALE.pack(channel.step, channel.zero)
+    return data
+
+
+def decode_head(data: bytes) -> tuple[CellHead, bytes]:
+    """The head at the start of a cell's bytes, and its own bytes.
+
+    Raises:
+        DamagedDataError: cut off, contradictory or out of range.
+        BadInputError: a version or kind of cell that this reader does not know.
+    """
+    if len(data) < FIXED_PART.size or data[:4] != MAGIC:
+        raise DamagedDataError("bad_cell", "not a cairn cell: it must begin with CRNC and a whole head")
+    _, version, kind, depth, flags, edge_um, i, j, k, voxels, leaves, channel_count, streams = FIXED_PART.unpack_from(
+        data
+    )
+    if version != VERSION or kind != KIND_EVIDENCE:
+        raise BadInputError("unknown_version", f"this reader knows cells of version 1, kind 1; got {version}, {kind}")
+    if flags & ~FLAG_SIGNED or not all(-CELL_LIMIT <= v < CELL_LIMIT for v in (i, j, k)):
+        raise DamagedDataError("bad_cell", "unknown flags, or a cell number out of range")
+    at = FIXED_PART.size
+    try:
+        for _ in range(channel_count):
+            _, name_bytes, unit_bytes = CHANNEL_SIZES.unpack_from(data, at)
+            at += CHANNEL_SIZES.size + name_bytes + unit_bytes + CHANNEL_SCALE.size
+        geometry = _geometry(edge_um, depth, channel_count, data[FIXED_PART.size : at])
+    except (struct.error, UnicodeDecodeError, ValidationError) as exc:
+        raise DamagedDataError("bad_cell", f"the cell's head is damaged: {str(exc).splitlines()[0]}") from exc
+    if not leaves <= voxels <= 8**depth:
+        raise DamagedDataError("bad_cell", f"{voxels} voxels in {leaves} leaves do not fit a cell of depth {depth}")
+    head = CellHead(
+        key=cell_key((i, j, k)),
+        geometry=geometry,
+        voxels=voxels,
+        leaves=leaves,
+        streams=streams,
+        signed=bool(flags & FLAG_SIGNED),
+    )
+    return head, data[:at]
+
+
+def is_canonical_head(head: CellHead, data: bytes) -> bool:
+    """Whether a head's own bytes, as `decode_head` gave them, are those that `encode_head` makes of it."""
+    return _is_canonical(head.geometry, data[FIXED_PART.size :])  # pyright: ignore[reportArgumentType]
+
+
+@lru_cache(maxsize=16)
+def _is_canonical(geometry: Geometry, data: bytes) -> bool:
+    """All numbers before the channels are read as they stand."""
+    return _channel_bytes(geometry) == data
+
+
+@lru_cache(maxsize=16)
+def _geometry(edge_um: int, depth: int, channel_count: int, data: bytes) -> Geometry:
+    """The cells of a map, and of all that is pushed to it, have the same."""
+    channels: list[Channel] = []
+    at = 0
+    for _ in range(channel_count):
+        channel, at = _channel(data, at)
+        channels.append(channel)
+    return Geometry(voxel_edge_um=edge_um, depth=depth, channels=tuple(channels))
+
+
+def _channel(data: bytes, at: int) -> tuple[Channel, int]:
+    code, name_bytes, unit_bytes = CHANNEL_SIZES.unpack_from(data, at)
+    at += CHANNEL_SIZES.size
+    name, unit = data[at : at + name_bytes], data[at + name_bytes : at + name_bytes + unit_bytes]
+    at += name_bytes + unit_bytes
+    step, zero = CHANNEL_SCALE.unpack_from(data, at)
+    fields = {"kind": KIND_OF_CODE.get(code), "name": name.decode(), "unit": unit.decode(), "step": step, "zero": zero}
+    return Channel.model_validate(fields), at + CHANNEL_SCALE.size

@@ -1,0 +1,188 @@
+"""A cell's samples as streams: for each channel which leaves have some, their weights, and their sums.
+
+    presence  one bit per leaf, lowest bit first      weight  like a count
+    sum       residual against the previous voxel's mean times this voxel's weight
+    square    residual against what it were if all samples were alike
+
+Streams of channel c start at number 16 + 8 c: presence, weight, then the value planes in order.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.codec.octree.streams import column_planes, encode_column, required, words_of_planes
+from cairn_map.codec.octree.sum_kernels import (
+    place_sums_into,
+    predict_sums,
+    restore_squares_into,
+    restore_sums_into,
+    square_guesses,
+)
+from cairn_map.errors import BadInputError, DamagedDataError
+from cairn_map.evidence.channels import Channel
+from cairn_map.evidence.evidence import SUM_MAX
+from cairn_map.evidence.grid import Geometry
+
+Ints = npt.NDArray[np.int64]
+Words = npt.NDArray[np.uint64]
+
+Planes = npt.NDArray[np.uint8]
+
+FIRST_STREAM = 16
+STREAMS_PER_CHANNEL = 8
+SMALL_PLANES = 3
+"""So many bytes hold no number that is out of range."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChannelRows:
+    """The samples of one channel: (S,) leaves that have some, rising, and their (S, planes) sums."""
+
+    leaves: Ints
+    sums: Ints
+
+
+def stream_of_channel(c: int) -> int:
+    """Number of the first stream of the channel number c."""
+    return FIRST_STREAM + STREAMS_PER_CHANNEL * c
+
+
+def split_samples(sampled: Ints, samples: Ints, geometry: Geometry) -> list[ChannelRows]:
+    """By channel: the (S, P) samples of the (S,) leaves."""
+    found: list[ChannelRows] = []
+    for channel in geometry.channels:
+        sums = samples[:, geometry.planes_of(channel.name)]
+        present = np.nonzero(_says_something(sums))[0]
+        found.append(ChannelRows(sampled[present], sums[present]))
+    return found
+
+
+def join_samples(
+    channels: list[ChannelRows], geometry: Geometry, *, leaves: int, signed: bool, sampled_max: int
+) -> tuple[Ints, Ints]:
+    """(S,) leaves that have samples, rising, and (S, P) samples; the mirror of `split_samples`.
+
+    Raises:
+        DamagedDataError: a row of zeros, or a sum out of range.
+        BadInputError: kind `too_large`: more than `sampled_max` leaves have samples.
+    """
+    has_samples = np.zeros(leaves, np.bool_)
+    for rows in channels:
+        has_samples[rows.leaves] = True
+    sampled = np.nonzero(has_samples)[0]
+    check_count(len(sampled), sampled_max)
+    samples = np.zeros((len(sampled), geometry.plane_count), np.int64)
+    low = -SUM_MAX if signed else 0
+    for channel, rows in zip(geometry.channels, channels, strict=True):
+        own = samples[:, geometry.planes_of(channel.name)]
+        if not place_sums_into(rows.leaves, rows.sums, sampled, own, low, SUM_MAX):
+            raise DamagedDataError("bad_stream", f"channel {channel.name} holds a sum that is zero or out of range")
+    return sampled, samples
+
+
+def encode_channel(number: int, channel: Channel, rows: ChannelRows, *, leaves: int, signed: bool) -> dict[int, bytes]:
+    """Streams of one channel, raw; the first has this number."""
+    bits = np.zeros(leaves, np.uint8)
+    bits[rows.leaves] = 1
+    planes = np.ascontiguousarray(rows.sums.T)
+    weights = planes[-1]
+    streams = {number: np.packbits(bits, bitorder="little").tobytes()}
+    streams[number + 1] = encode_column(words(weights, signed))
+    for p in range(channel.value_count):
+        streams[number + 2 + p] = encode_column(predict_sums(planes[p], weights))
+    if "square_sum" in channel.planes:
+        guesses = square_guesses(planes[0], weights)
+        streams[number + 3] = encode_column(_zigzag(planes[1].astype(np.uint64) - guesses))
+    return streams
+
+
+def decode_channel(
+    number: int,
+    channel: Channel,
+    streams: dict[int, bytes],
+    *,
+    leaves: int,
+    signed: bool,
+    sampled_max: int,
+    stop: int | None = None,
+) -> ChannelRows:
+    """The mirror of `encode_channel`; sums may still be out of range, which `join_samples` looks at.
+
+    With `stop`, of the leaves before that one: each row stands on the one before it, so nothing can be left out there.
+
+    Raises:
+        DamagedDataError: a stream is missing or of the wrong length.
+        BadInputError: kind `too_large`: more than `sampled_max` leaves have samples.
+    """
+    present = np.nonzero(_presence(required(streams, number), leaves))[0]
+    count = len(present)
+    check_count(count, sampled_max)
+    last = count if stop is None else int(np.searchsorted(present, stop))
+    sums = np.empty((last, len(channel.planes)), np.int64)
+    columns = [column_planes(required(streams, number + 1 + p), rows=count) for p in range(len(channel.planes))]
+    numbers_into(sums[:, -1], columns[0][:, :last], signed=signed, limit=SUM_MAX)
+    for p in range(channel.value_count):
+        restore_sums_into(sums, p, columns[1 + p])
+    if "square_sum" in channel.planes:
+        restore_squares_into(sums, columns[2])
+    return ChannelRows(present[:last], sums)
+
+
+def words(values: Ints, signed: bool) -> Words:
+    """Counts and weights as words: as they are, or zigzag where differences may be negative."""
+    raw = values.astype(np.uint64)
+    return _zigzag(raw) if signed else raw
+
+
+def numbers_into(out: npt.NDArray[np.signedinteger], planes: Planes, *, signed: bool, limit: int) -> None:
+    """The mirror of `words`, from (k, N) of `column_planes` to (N,).
+
+    Raises:
+        DamagedDataError: a magnitude above `limit`, which is no less than three bytes hold.
+    """
+    if not signed and len(planes) <= SMALL_PLANES:
+        out[:] = planes[0] if len(planes) else 0
+        for p, plane in enumerate(planes[1:], 1):
+            out |= plane.astype(out.dtype) << out.dtype.type(8 * p)
+        return
+    raw = words_of_planes(planes)
+    # As int64 a word of 2^63 and more is negative: out of range, too.
+    values = (_unzigzag(raw) if signed else raw).view(np.int64)
+    if len(values) and (values.max() > limit or values.min() < (-limit if signed else 0)):
+        raise DamagedDataError("bad_stream", f"a count or weight is beyond {limit}")
+    out[:] = values
+
+
+def check_count(count: int, sampled_max: int) -> None:
+    """Refuse more rows than a reader wants.
+
+    Raises:
+        BadInputError: kind `too_large`.
+    """
+    if count > sampled_max:
+        raise BadInputError("too_large", f"{count} voxels with samples, at most {sampled_max} are read")
+
+
+def _says_something(sums: Ints) -> npt.NDArray[np.bool_]:
+    """(S,) which rows are not all zeros: nearly always those with a weight."""
+    says = sums[:, -1] != 0
+    return says if says.all() else np.asarray(says | sums.any(axis=1))
+
+
+def _presence(raw: bytes, leaves: int) -> npt.NDArray[np.bool_]:
+    if len(raw) != (leaves + 7) // 8:
+        raise DamagedDataError("bad_stream", f"presence of {leaves} leaves needs {(leaves + 7) // 8} bytes")
+    bits = np.unpackbits(np.frombuffer(raw, np.uint8), bitorder="little")
+    if bits[leaves:].any():
+        raise DamagedDataError("bad_stream", "presence bits beyond the last leaf must be 0")
+    return bits[:leaves].view(np.bool_)
+
+
+def _zigzag(raw: Words) -> Words:
+    return (raw << np.uint64(1)) ^ (np.uint64(0) - (raw >> np.uint64(63)))
+
+
+def _unzigzag(raw: Words) -> Words:
+    return (raw >> np.uint64(1)) ^ (np.uint64(0) - (raw & np.uint64(1)))

@@ -1,0 +1,290 @@
+"""A commit: one measurement's evidence under an id, with all that is needed to find and undo it later.
+
+    "CRCM" | version u8 | meta length u32 | meta (JSON) | cell count u32 | per cell: length u32, cell bytes
+
+Its SHA-256 is taken over the meta bytes and the cells' canonical digests, so that cells may be compressed anew.
+A retract is a commit without cells that names others; an amend is one with both.
+"""
+
+import hashlib
+import json
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError, model_validator
+
+from cairn_map.codec.cell_code import Profile, decode_cell, encode_cells
+from cairn_map.codec.octree.cell_head import decode_head
+from cairn_map.commits.ids import CommitId, commit_id_from_text
+from cairn_map.errors import BadInputError, DamagedDataError, first_error
+from cairn_map.evidence.evidence import Evidence, every_sum_has_weight
+from cairn_map.evidence.grid import CellKey, Geometry
+
+MAGIC = b"CRCM"
+VERSION = 1
+HEAD = struct.Struct("<4sBI")
+META_BYTES_MAX = 1 << 20
+CELLS_MAX = 4096
+COMMIT_BYTES_MAX = 64 << 20
+"""Bytes of one encoded commit that a reader accepts."""
+RETRACTS_MAX = 4096
+EVIDENCE_BYTES_MAX = 1 << 29
+"""Bytes of all evidence of a commit, unpacked: 44 M voxels. A measurement in a large room at 2 cm has 20 M; without
+a bound a commit of 64 MB could stand for terabytes of collapsed air."""
+BRICKS_MAX = 1 << 17
+"""Bricks of 8^3 voxels that a commit touches: 4 kB each once merged, though a single voxel costs 12 bytes here."""
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Hex32 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class ScanPose(BaseModel):
+    """Where the rig was for one scan: translation (m), unit quaternion x y z w, one sigma for each (m, rad)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    time_s: Finite
+    t_map_rig: tuple[Finite, Finite, Finite]
+    q_map_rig: tuple[Finite, Finite, Finite, Finite]
+    sigma_m: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    sigma_rad: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+
+
+class CommitMeta(BaseModel):
+    """Everything a commit says about itself besides its evidence."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    id: Annotated[str, Field(max_length=96)]
+    geometry: Hex32
+    """Digest of the map's geometry: evidence for another grid is refused."""
+    parent: Hex32 | None = None
+    """SHA-256 of the author's previous commit."""
+    seen: Annotated[str, Field(max_length=128)] | None = None
+    """Cursor of the server's state that the author had when it made this."""
+    captured_s: tuple[Finite, Finite] | None = None
+    """First and last scan, UTC seconds since 1970."""
+    scans: Annotated[tuple[ScanPose, ...], Field(max_length=4096), FailFast()] = ()
+    sensors: Annotated[tuple[Annotated[str, Field(max_length=64)], ...], Field(max_length=64), FailFast()] = ()
+    rig: Hex32 | None = None
+    integrator: Annotated[str, Field(max_length=256)] = ""
+    """Name, version and parameters of what turned images into evidence."""
+    retracts: Annotated[
+        tuple[Annotated[str, Field(max_length=96)], ...], Field(max_length=RETRACTS_MAX), FailFast()
+    ] = ()
+    note: Annotated[str, Field(max_length=1024)] = ""
+    kind: Literal["commit"] = "commit"
+
+    @model_validator(mode="after")
+    def _ids_are_ids(self) -> Self:
+        try:
+            own = commit_id_from_text(self.id)
+            named = [commit_id_from_text(text) for text in self.retracts]
+        except BadInputError as exc:
+            raise ValueError(exc.message) from exc
+        if own in named or len(set(named)) != len(named):
+            raise ValueError("a commit names others to retract, each once")
+        return self
+
+    @property
+    def commit_id(self) -> CommitId:
+        """The id, parsed."""
+        return commit_id_from_text(self.id)
+
+    @property
+    def retracted_ids(self) -> tuple[CommitId, ...]:
+        """The ids that this commit takes out, parsed."""
+        return tuple(commit_id_from_text(text) for text in self.retracts)
+
+
+@dataclass(frozen=True, slots=True)
+class Commit:
+    """A whole commit: what it says, its cells' bytes and its SHA-256 (32 bytes)."""
+
+    meta: CommitMeta = field(repr=False)
+    cells: Mapping[CellKey, bytes] = field(repr=False)
+    sha: bytes = field(repr=False)
+    data: bytes = field(repr=False)
+
+    def __str__(self) -> str:
+        return f"commit {self.id}: {len(self.cells)} cells, {len(self.data)} bytes"
+
+    @property
+    def id(self) -> CommitId:
+        """The commit's id."""
+        return self.meta.commit_id
+
+    @property
+    def text(self) -> bytes:
+        """The meta as it stands in the bytes, which the SHA-256 is over."""
+        return self.data[HEAD.size : HEAD.size + int(HEAD.unpack_from(self.data)[2])]
+
+
+def make_commit(
+    meta: CommitMeta, diff: Mapping[CellKey, Evidence], geometry: Geometry, *, profile: Profile = Profile.FAST
+) -> Commit:
+    """The commit of a measurement's evidence; cells without evidence are left out. Its SHA is that of every profile.
+
+    Raises:
+        BadInputError: negative evidence, sums without weight, too many cells, or larger than a reader would accept.
+    """
+    if meta.geometry != geometry.digest().hex():
+        raise BadInputError("other_geometry", "the commit's meta names another geometry than its evidence has")
+    held = {key: evidence for key, evidence in diff.items() if len(evidence)}
+    for evidence in held.values():
+        if evidence.is_signed:
+            raise negative_evidence()
+        check_samples(evidence.samples, geometry)
+    encoded = encode_cells(held, geometry, profile=profile)
+    cells = {key: cell.data for key, cell in encoded.items()}
+    digests = [cell.digest for cell in encoded.values()]
+    text = meta.model_dump_json(exclude_defaults=True).encode()
+    data = commit_bytes(text, cells)
+    _check_size(len(data), len(cells), len(text))
+    check_evidence_size(sum(evidence.size_bytes for evidence in diff.values()), EVIDENCE_BYTES_MAX)
+    check_bricks(sum(evidence.brick_count for evidence in diff.values()))
+    return Commit(meta, cells, commit_sha(text, digests), data)
+
+
+def sha_without_evidence(data: bytes) -> bytes | None:
+    """SHA-256 of a commit in bytes that holds no evidence; None of one that does.
+
+    Raises:
+        DamagedDataError: cut off or contradictory.
+        BadInputError: an unknown version, or larger than allowed.
+    """
+    _, text, bodies = split_bytes(data)
+    return None if bodies else commit_sha(text, [])
+
+
+def renamed_commit(
+    data: bytes, *, commit: CommitId, parent: str | None, retracts: tuple[str, ...] | None = None
+) -> Commit:
+    """The evidence of a commit that was validated when it was kept, under another id, or naming other targets."""
+    meta, cells = split_commit(data)
+    targets = meta.retracts if retracts is None else retracts
+    meta = meta.model_copy(update={"id": str(commit), "parent": parent, "retracts": targets})
+    text = meta.model_dump_json(exclude_defaults=True).encode()
+    digests = [decode_cell(body).digest for body in cells.values()]
+    return Commit(meta, cells, commit_sha(text, digests), commit_bytes(text, cells))
+
+
+def split_commit(data: bytes) -> tuple[CommitMeta, dict[CellKey, bytes]]:
+    """Meta and cells' bytes of a commit that was validated when it was kept; no evidence is decoded.
+
+    Raises:
+        DamagedDataError: cut off or contradictory.
+        BadInputError: an unknown version, or larger than allowed.
+    """
+    meta, _, bodies = split_bytes(data)
+    return meta, {decode_head(body)[0].key: body for body in bodies}
+
+
+def negative_evidence() -> BadInputError:
+    """What whoever reads a commit that takes away says."""
+    return BadInputError("negative_evidence", "a commit only adds evidence; to undo, name a commit in a retract")
+
+
+def check_samples(samples: npt.NDArray[np.int64], geometry: Geometry) -> None:
+    """Refuse sums without weight.
+
+    Raises:
+        BadInputError: kind `bad_evidence`.
+    """
+    if not every_sum_has_weight(samples, geometry):
+        raise BadInputError("bad_evidence", "a channel has sums without weight")
+
+
+def check_evidence_size(size_bytes: int, limit_bytes: int) -> None:
+    """Refuse what would take more memory than a reader has for a commit.
+
+    Raises:
+        BadInputError: kind `too_large`.
+    """
+    if size_bytes > limit_bytes:
+        raise BadInputError(
+            "too_large", f"a commit has at most {limit_bytes} bytes of evidence, got {size_bytes}; make two of it"
+        )
+
+
+def commit_bytes(text: bytes, cells: Mapping[CellKey, bytes]) -> bytes:
+    """A commit's bytes, from its meta as it stands in them and its cells' bytes, rising in number."""
+    parts = [HEAD.pack(MAGIC, VERSION, len(text)), text, struct.pack("<I", len(cells))]
+    for data in cells.values():
+        parts += [struct.pack("<I", len(data)), data]
+    return b"".join(parts)
+
+
+def check_bricks(bricks: int) -> None:
+    """Refuse a commit that touches too many.
+
+    Raises:
+        BadInputError: kind `too_large`.
+    """
+    if bricks > BRICKS_MAX:
+        raise BadInputError("too_large", f"a commit touches at most {BRICKS_MAX} bricks, got {bricks}; make two of it")
+
+
+def split_bytes(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
+    """A commit's meta, the meta as it stands in the bytes, and its cells' bytes.
+
+    Raises:
+        DamagedDataError: cut off or contradictory.
+        BadInputError: an unknown version, or larger than allowed.
+    """
+    if len(data) < HEAD.size or data[:4] != MAGIC:
+        raise DamagedDataError("bad_commit", "not a cairn commit: it must begin with CRCM and a whole head")
+    _, version, meta_bytes = HEAD.unpack_from(data)
+    if version != VERSION:
+        raise BadInputError("unknown_version", f"this reader knows commits of version {VERSION}, got {version}")
+    _check_size(len(data), 0, meta_bytes)
+    text = data[HEAD.size : HEAD.size + meta_bytes]
+    at = HEAD.size + meta_bytes + 4
+    if at > len(data):
+        raise DamagedDataError("bad_commit", "the commit is cut off in its meta")
+    try:
+        meta = CommitMeta.model_validate_json(text, strict=True)
+        # Readers differ in which of two equal keys they take, and the SHA-256 is the same for all of them.
+        _UNIQUE.decode(text.decode())
+    except ValidationError as exc:
+        raise DamagedDataError("bad_commit", f"commit meta: {first_error(exc)}") from None
+    (count,) = struct.unpack_from("<I", data, at - 4)
+    _check_size(len(data), count, meta_bytes)
+    bodies: list[bytes] = []
+    for _ in range(count):
+        (size,) = struct.unpack_from("<I", data, at) if at + 4 <= len(data) else (len(data),)
+        bodies.append(data[at + 4 : at + 4 + size])
+        at += 4 + size
+    if at != len(data):
+        raise DamagedDataError("bad_commit", "the commit is cut off, or bytes are left over")
+    return meta, text, bodies
+
+
+def _object(pairs: list[tuple[str, object]]) -> None:
+    if len({key for key, _ in pairs}) != len(pairs):
+        raise DamagedDataError("bad_commit", "commit meta: a key is there twice")
+
+
+_UNIQUE = json.JSONDecoder(object_pairs_hook=_object, parse_int=float)
+"""Refuses keys that are there twice. `json.loads` would make it anew each time."""
+
+
+def _check_size(size_bytes: int, cells: int, meta_bytes: int) -> None:
+    if size_bytes > COMMIT_BYTES_MAX or cells > CELLS_MAX or meta_bytes > META_BYTES_MAX:
+        raise BadInputError(
+            "too_large",
+            f"a commit has at most {COMMIT_BYTES_MAX} bytes, {CELLS_MAX} cells and {META_BYTES_MAX} bytes of meta; "
+            f"got {size_bytes}, {cells} and {meta_bytes}",
+        )
+
+
+def commit_sha(text: bytes, digests: list[bytes]) -> bytes:
+    """Identity of a commit: SHA-256 over its meta as it stands and its cells' digests."""
+    sha = hashlib.sha256(b"cairn-commit-1" + struct.pack("<II", len(text), len(digests)) + text)
+    for digest in digests:
+        sha.update(digest)
+    return sha.digest()

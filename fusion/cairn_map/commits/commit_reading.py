@@ -1,0 +1,102 @@
+"""A commit's bytes, read in two steps: what its head and its cells' heads claim, and then all of it, validated.
+
+Between the two a server decides whether it wants a commit, and where so much is to be decoded.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from cairn_map.codec.cell_code import CanonicalCell, read_canonical_cell
+from cairn_map.codec.cell_limits import VOXEL_BYTES, sampled_max_of
+from cairn_map.codec.cell_reading import CellReader, cell_reader
+from cairn_map.commits.commit import (
+    EVIDENCE_BYTES_MAX,
+    Commit,
+    CommitMeta,
+    check_bricks,
+    check_evidence_size,
+    check_samples,
+    commit_sha,
+    negative_evidence,
+    split_bytes,
+)
+from cairn_map.errors import BadInputError, DamagedDataError
+from cairn_map.evidence.grid import CellKey
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CommitReader:
+    """A commit of which only the meta and the heads are decoded; not thread-safe."""
+
+    data: bytes
+    meta: CommitMeta
+    text: bytes
+    bodies: list[bytes]
+    readers: list[CellReader]
+    """One for each of the bodies."""
+
+    @property
+    def cells(self) -> dict[CellKey, bytes]:
+        """Their bytes, which may not be sound."""
+        return {reader.head.key: body for reader, body in zip(self.readers, self.bodies, strict=True)}
+
+    def read(self, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) -> tuple[Commit, Mapping[CellKey, CanonicalCell]]:
+        """All of it, validated completely: canonical cells, rising, of one geometry.
+
+        Needs up to about twice `evidence_bytes_max` of memory, whatever the bytes say.
+
+        Raises:
+            DamagedDataError: contradictory, not canonical.
+            BadInputError: too large, negative evidence, or sums without weight.
+        """
+        self._check_heads(evidence_bytes_max)
+        cells: dict[CellKey, CanonicalCell] = {}
+        left, bricks = evidence_bytes_max, 0
+        for reader in self.readers:
+            reader.sampled_max = sampled_max_of(reader.head, left)
+            cell = read_canonical_cell(reader)
+            check_samples(cell.content.samples, cell.geometry)
+            left -= cell.content.evidence_bytes
+            bricks += cell.content.octree.brick_count
+            cells[cell.key] = cell
+            reader.forget()
+        check_bricks(bricks)
+        sha = commit_sha(self.text, [cell.digest for cell in cells.values()])
+        return Commit(self.meta, self.cells, sha, self.data), cells
+
+    def _check_heads(self, evidence_bytes_max: int) -> None:
+        """Refuse by the heads alone what need not be decoded to be refused."""
+        last, geometry = -1, None
+        for reader in self.readers:
+            head = reader.head
+            if head.key <= last or not head.voxels:
+                raise DamagedDataError("bad_commit", "cells must have evidence and rise in number")
+            if head.signed:
+                raise negative_evidence()
+            if head.geometry is not geometry and head.geometry.digest().hex() != self.meta.geometry:
+                raise BadInputError("other_geometry", "a cell of the commit has another geometry than its meta names")
+            last, geometry = head.key, head.geometry
+        check_evidence_size(VOXEL_BYTES * sum(reader.head.voxels for reader in self.readers), evidence_bytes_max)
+
+
+def commit_reader(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) -> CommitReader:
+    """A reader of a commit's bytes; the heads and all sizes are checked.
+
+    Raises:
+        DamagedDataError: cut off or contradictory.
+        BadInputError: an unknown version, or too large.
+    """
+    meta, text, bodies = split_bytes(data)
+    readers = [cell_reader(body, evidence_bytes_max=evidence_bytes_max) for body in bodies]
+    return CommitReader(data, meta, text, bodies, readers)
+
+
+def open_commit(
+    data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX
+) -> tuple[Commit, Mapping[CellKey, CanonicalCell]]:
+    """The commit in bytes and all its evidence, validated completely.
+
+    Raises:
+        DamagedDataError, BadInputError: as `commit_reader` and `CommitReader.read`.
+    """
+    return commit_reader(data, evidence_bytes_max=evidence_bytes_max).read(evidence_bytes_max=evidence_bytes_max)

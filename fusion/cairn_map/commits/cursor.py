@@ -1,0 +1,61 @@
+"""A place in a server's log that proves its own history: `(log_id, seq, chain)`, always compared as a whole.
+
+    chain[0] = H(log_id, geometry)      chain[s] = H(chain[s - 1], kind, id, sha)
+
+A server that was restored from an older backup, and then folded other commits, has another chain at the same
+seq; so a cursor from before is noticed by itself.
+"""
+
+import hashlib
+from dataclasses import dataclass
+
+from cairn_map.commits.ids import CommitId
+from cairn_map.errors import BadInputError
+
+CHAIN_BYTES = 16
+ENTRY_FOLD = b"+"
+ENTRY_UNFOLD = b"-"
+
+
+@dataclass(frozen=True, slots=True)
+class Cursor:
+    """A state of one server's map: everything folded up to and including `seq`."""
+
+    log_id: bytes
+    seq: int
+    chain: bytes
+
+    def __post_init__(self) -> None:
+        if len(self.log_id) != 16 or len(self.chain) != CHAIN_BYTES or not 0 <= self.seq < 1 << 63:
+            raise BadInputError("bad_cursor", "a cursor is 16 bytes log id, a sequence number, 16 bytes chain")
+
+    def __str__(self) -> str:
+        return f"{self.log_id.hex()}.{self.seq}.{self.chain.hex()}"
+
+
+def cursor_from_text(text: str) -> Cursor:
+    """The cursor written `log_id.seq.chain` (hex, decimal, hex).
+
+    Raises:
+        BadInputError: it is not.
+    """
+    parts = text.split(".")
+    try:
+        if len(text) > 128 or len(parts) != 3 or not parts[1].isascii() or not parts[1].isdigit():
+            raise ValueError
+        cursor = Cursor(bytes.fromhex(parts[0]), int(parts[1]), bytes.fromhex(parts[2]))
+        if str(cursor) != text:  # bytes.fromhex skips spaces and takes capitals; a cursor has one text only
+            raise ValueError
+        return cursor
+    except (ValueError, BadInputError):
+        raise BadInputError("bad_cursor", f"a cursor is written log_id.seq.chain, got {text[:128]!r}") from None
+
+
+def first_chain(log_id: bytes, geometry_digest: bytes) -> bytes:
+    """The chain of an empty log."""
+    return hashlib.sha256(b"cairn-chain-0" + log_id + geometry_digest).digest()[:CHAIN_BYTES]
+
+
+def next_chain(chain: bytes, kind: bytes, commit: CommitId, sha: bytes) -> bytes:
+    """The chain after one more entry: a commit folded (`ENTRY_FOLD`) or taken out (`ENTRY_UNFOLD`)."""
+    return hashlib.sha256(chain + kind + str(commit).encode() + b"\0" + sha).digest()[:CHAIN_BYTES]

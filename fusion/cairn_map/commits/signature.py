@@ -1,0 +1,125 @@
+"""Who speaks in a commit, proven: Ed25519 signatures over the map's name and the commit's SHA-256.
+
+    key -> incarnation = first 16 hex digits of SHA-256("cairn-key-1" | key)
+
+A robot draws a key and takes the incarnation that follows from it, so that anybody can tell whose signature a commit
+of `robot.incarnation` needs without having met that robot. The signature stands beside the bytes, never in them.
+"""
+
+import hashlib
+import secrets
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple, Self
+
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
+from cairn_map.commits.ids import Author, Incarnation
+from cairn_map.errors import BadInputError
+
+KEY_BYTES, MARK_BYTES = 32, 64
+SIGNATURES_MAX = 16
+"""Of one commit: its author's, and those of the robot's older incarnations from which it takes something out."""
+TEXT_MAX = SIGNATURES_MAX * (2 * (KEY_BYTES + MARK_BYTES) + 2)
+
+
+class Signature(NamedTuple):
+    """One signature on a commit; in text `KEY.MARK`, both in hex."""
+
+    key: bytes
+    """(32 bytes) public key."""
+    mark: bytes
+    """(64 bytes) what only its holder can make."""
+
+    def __str__(self) -> str:
+        return f"{self.key.hex()}.{self.mark.hex()}"
+
+
+@dataclass(frozen=True)
+class SigningKey:
+    """A secret key, by which commits are signed."""
+
+    seed: bytes = field(repr=False)
+    """(32 bytes)"""
+
+    @classmethod
+    def drawn(cls) -> Self:
+        """A random one."""
+        return cls(bytes.fromhex(secrets.token_hex(KEY_BYTES)))
+
+    @cached_property
+    def public_key(self) -> bytes:
+        """(32 bytes) what others check its signatures by."""
+        return self._secret.public_key().public_bytes_raw()
+
+    @property
+    def incarnation(self) -> Incarnation:
+        """The incarnation that is this key's."""
+        return incarnation_of(self.public_key)
+
+    def sign(self, map_name: str, sha: bytes) -> Signature:
+        """A signature on the commit of this SHA-256, for the map of this name and no other."""
+        return Signature(self.public_key, self._secret.sign(signed_bytes(map_name, sha)))
+
+    @cached_property
+    def _secret(self) -> Ed25519PrivateKey:
+        return Ed25519PrivateKey.from_private_bytes(self.seed)
+
+
+def incarnation_of(key: bytes) -> Incarnation:
+    """The incarnation of a robot that signs with this public key."""
+    return Incarnation(hashlib.sha256(b"cairn-key-1" + key).hexdigest()[:16])
+
+
+def signed_bytes(map_name: str, sha: bytes) -> bytes:
+    """What a signature is over; the SHA-256 is over the id, the geometry and all evidence."""
+    return b"cairn-signed-commit-1\0" + map_name.encode() + b"\0" + sha
+
+
+def check_signatures(signatures: Collection[Signature], map_name: str, sha: bytes) -> None:
+    """Refuse a commit of which one signature is not good.
+
+    Raises:
+        BadInputError: kind `bad_signature`.
+    """
+    for signature in signatures:
+        try:
+            Ed25519PublicKey.from_public_bytes(signature.key).verify(signature.mark, signed_bytes(map_name, sha))
+        except (InvalidSignature, ValueError) as exc:
+            raise BadInputError(
+                "bad_signature",
+                f"the signature of key {signature.key.hex()[:16]}... is not one of this commit on map {map_name}: "
+                "somebody changed it on its way, or it was made for another map",
+            ) from exc
+
+
+def speaks_for(signatures: Collection[Signature], author: Author) -> bool:
+    """Whether one of the signatures is by an author's own key; they are sound."""
+    return any(incarnation_of(signature.key) == author.incarnation for signature in signatures)
+
+
+def signatures_to_text(signatures: Collection[Signature]) -> str:
+    """As the header `Cairn-Signature` has them."""
+    return ",".join(map(str, signatures))
+
+
+def signatures_from_text(text: str) -> tuple[Signature, ...]:
+    """The mirror of `signatures_to_text`; not checked yet.
+
+    Raises:
+        BadInputError: kind `bad_signature`: it is malformed, or there are too many.
+    """
+    try:
+        parts = [part.split(".") for part in text[: TEXT_MAX + 1].split(",")]
+        found = tuple(Signature(bytes.fromhex(key), bytes.fromhex(mark)) for key, mark in parts)
+        if len(text) > TEXT_MAX or any((len(key), len(mark)) != (KEY_BYTES, MARK_BYTES) for key, mark in found):
+            raise ValueError("too long, or not of 32 and 64 bytes")
+        if signatures_to_text(found) != text:
+            raise ValueError("not in lower-case hex")
+    except ValueError as exc:
+        raise BadInputError(
+            "bad_signature", f"signatures are written KEY.MARK in hex, separated by commas (at most {SIGNATURES_MAX})"
+        ) from exc
+    return found

@@ -1,0 +1,160 @@
+"""The evidence of one cell, packed: sorted rows, nothing that is zero. The form that is stored, sent and compared.
+
+    voxels   (V,)   uint32  Morton codes inside the cell, rising
+    counts   (V, 2) int32   hits, misses
+    sampled  (S,)   uint32  rows of `voxels` that have samples, rising
+    samples  (S, P) int64   sums, in the order of `Geometry.channels` and their planes
+
+Packed evidence is canonical: a voxel is there if and only if one of its numbers is not zero. Evidence
+that robots make is never negative; only the difference between two states of a map may be.
+`brick_cell.BrickCell` is the form that adds quickly.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.channels import planes_and_squares
+from cairn_map.evidence.evidence_kernels import bounds_of_counts, largest_into, sums_without_weight
+from cairn_map.evidence.grid import BRICK_DEPTH, Geometry
+
+COUNT_MAX = (1 << 31) - 1
+SUM_MAX = 1 << 62
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """Packed evidence of one cell; equal if all four arrays are."""
+
+    voxels: npt.NDArray[np.uint32]
+    counts: npt.NDArray[np.int32]
+    sampled: npt.NDArray[np.uint32]
+    samples: npt.NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        V, S = self.voxels.shape[:1], self.sampled.shape[:1]
+        arrays = (self.voxels, self.counts, self.sampled, self.samples)
+        dtypes = [array.dtype for array in arrays]
+        shapes_fit = self.counts.shape == (*V, 2) and self.samples.shape[:-1] == S and len(V) == len(S) == 1
+        if not shapes_fit or dtypes != [np.uint32, np.int32, np.uint32, np.int64]:
+            raise BadInputError("bad_evidence", f"arrays do not fit: {[(a.dtype.name, a.shape) for a in arrays]}")
+
+    def __hash__(self) -> int:
+        return hash((len(self.voxels), len(self.sampled)))
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, Evidence)
+            and np.array_equal(self.voxels, other.voxels)
+            and np.array_equal(self.counts, other.counts)
+            and np.array_equal(self.sampled, other.sampled)
+            and np.array_equal(self.samples, other.samples)
+        )
+
+    def __len__(self) -> int:
+        return len(self.voxels)
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory held by the arrays."""
+        return self.voxels.nbytes + self.counts.nbytes + self.sampled.nbytes + self.samples.nbytes
+
+    @property
+    def brick_count(self) -> int:
+        """Bricks of 8^3 voxels that it touches."""
+        bricks = self.voxels >> np.uint32(3 * BRICK_DEPTH)
+        return int(np.count_nonzero(bricks[1:] != bricks[:-1])) + min(1, len(bricks))
+
+    @property
+    def is_signed(self) -> bool:
+        """Whether any number is negative: true only of differences."""
+        return bool((self.counts < 0).any() or (self.samples < 0).any())
+
+
+def empty_evidence(geometry: Geometry) -> Evidence:
+    """No evidence at all: the zero of addition."""
+    return Evidence(
+        np.empty(0, np.uint32),
+        np.empty((0, 2), np.int32),
+        np.empty(0, np.uint32),
+        np.empty((0, geometry.plane_count), np.int64),
+    )
+
+
+def packed_evidence(
+    places: npt.NDArray[np.uint32],
+    counts: npt.NDArray[np.integer],
+    samples: npt.NDArray[np.integer],
+    geometry: Geometry,
+) -> Evidence:
+    """Evidence from one row per voxel in any order, zeros included.
+
+    Args:
+        places: (N,) Morton codes inside the cell, all different.
+        counts: (N, 2) hits and misses.
+        samples: (N, P) sums; rows of zeros mean "no sample".
+        geometry: of the map.
+
+    Raises:
+        BadInputError: wrong shapes, a place outside the cell or twice, a number outside its type.
+    """
+    N = len(places)
+    if counts.shape != (N, 2) or samples.shape != (N, geometry.plane_count):
+        raise BadInputError(
+            "bad_evidence",
+            f"expected counts ({N}, 2), samples ({N}, {geometry.plane_count}); got {counts.shape}, {samples.shape}",
+        )
+    order = np.argsort(places, kind="stable")
+    voxels, counts, samples = places[order], counts[order], samples[order]
+    if N and (int(voxels[0]) < 0 or int(voxels[-1]) >= 8**geometry.depth or (voxels[1:] == voxels[:-1]).any()):
+        raise BadInputError("bad_evidence", "places must be different Morton codes inside the cell")
+    # Not np.abs: the magnitude of the least integer is itself, and negative.
+    if any((array > top).any() or (array < -top).any() for array, top in ((counts, COUNT_MAX), (samples, SUM_MAX))):
+        raise BadInputError("evidence_overflow", f"counts are at most {COUNT_MAX}, sums at most {SUM_MAX}")
+    has_samples = (samples != 0).any(axis=1)
+    keep = has_samples | (counts != 0).any(axis=1)
+    return Evidence(
+        np.ascontiguousarray(voxels[keep], dtype=np.uint32),
+        np.ascontiguousarray(counts[keep], dtype=np.int32),
+        np.nonzero(has_samples[keep])[0].astype(np.uint32),
+        np.ascontiguousarray(samples[has_samples], dtype=np.int64),
+    )
+
+
+def largest(counts: npt.NDArray[np.int32], samples: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """(2 + P,) largest number of each plane, of numbers at least 0; the server adds these up against overflow."""
+    tops = np.zeros(2 + samples.shape[1], np.int64)
+    tops[:2] = bounds_of_counts(counts)[1:3]
+    largest_into(samples, tops[2:])
+    return tops
+
+
+def check_fits(evidence: Evidence, geometry: Geometry) -> None:
+    """Refuse evidence that is not packed, or of another geometry: kernels check nothing, and would write anywhere.
+
+    Raises:
+        BadInputError: kind `bad_evidence`: voxels or sampled rows that do not rise, a voxel outside the cell, a sampled
+            row that is not there, or other planes.
+    """
+    unsorted = not (_rise(evidence.voxels) and _rise(evidence.sampled))
+    outside = len(evidence) > 0 and int(evidence.voxels[-1]) >= 8**geometry.depth
+    missing = len(evidence.sampled) > 0 and int(evidence.sampled[-1]) >= len(evidence)
+    planes = evidence.samples.shape[1]
+    if unsorted or outside or missing or planes != geometry.plane_count:
+        raise BadInputError(
+            "bad_evidence",
+            f"evidence does not fit a cell of depth {geometry.depth} with {geometry.plane_count} planes; "
+            f"it has {planes} planes, unsorted rows: {unsorted}, voxels outside: {outside}, "
+            f"samples without voxel: {missing}",
+        )
+
+
+def _rise(numbers: npt.NDArray[np.uint32]) -> bool:
+    return bool((numbers[1:] > numbers[:-1]).all())
+
+
+def every_sum_has_weight(samples: npt.NDArray[np.int64], geometry: Geometry) -> bool:
+    """Whether each channel's sums come with a weight, as every real sample does: means divide by it."""
+    return not sums_without_weight(samples, planes_and_squares(geometry.channels))

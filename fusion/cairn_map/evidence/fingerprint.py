@@ -1,0 +1,75 @@
+"""A 128-bit sum that adds as evidence adds: fingerprint(a + b) = fingerprint(a) + fingerprint(b).
+
+After any frame a replica checks with it that its base is the server's, without encoding anything. It finds
+accidents, not forgers: a cell's identity is the SHA-256 of its canonical bytes.
+"""
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+
+from cairn_map.errors import DamagedDataError
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.fingerprint_kernels import weighted_sums
+from cairn_map.evidence.grid import CellKey
+
+MASK = (1 << 64) - 1
+
+
+@dataclass(frozen=True, slots=True)
+class Fingerprint:
+    """Two sums mod 2^64."""
+
+    first: int = 0
+    second: int = 0
+
+    def __add__(self, other: "Fingerprint") -> "Fingerprint":
+        return Fingerprint((self.first + other.first) & MASK, (self.second + other.second) & MASK)
+
+    def __sub__(self, other: "Fingerprint") -> "Fingerprint":
+        return Fingerprint((self.first - other.first) & MASK, (self.second - other.second) & MASK)
+
+    def to_bytes(self) -> bytes:
+        """16 bytes, little endian."""
+        return struct.pack("<QQ", self.first, self.second)
+
+    def hex(self) -> str:
+        """32 hex digits of the bytes."""
+        return self.to_bytes().hex()
+
+
+ZERO = Fingerprint()
+"""Of a cell without evidence."""
+
+
+def fingerprint(evidence: Evidence, key: CellKey) -> Fingerprint:
+    """The fingerprint of one cell's evidence, signed or not."""
+    first, second = weighted_sums(np.uint64(key), evidence.voxels, evidence.counts, evidence.sampled, evidence.samples)
+    return Fingerprint(int(first), int(second))
+
+
+def fingerprint_from_bytes(data: bytes) -> Fingerprint:
+    """The mirror of `Fingerprint.to_bytes`.
+
+    Raises:
+        DamagedDataError: not 16 bytes.
+    """
+    if len(data) != 16:
+        raise DamagedDataError("bad_fingerprint", f"a fingerprint is 16 bytes, got {len(data)}")
+    return Fingerprint(*struct.unpack("<QQ", data))
+
+
+def fingerprint_from_hex(text: str) -> Fingerprint:
+    """The mirror of `Fingerprint.hex`.
+
+    Raises:
+        DamagedDataError: not 32 hex digits, in lower case.
+    """
+    try:
+        found = fingerprint_from_bytes(bytes.fromhex(text))
+        if found.hex() != text:  # bytes.fromhex skips spaces and takes capitals; a fingerprint has one text only
+            raise ValueError
+        return found
+    except ValueError:
+        raise DamagedDataError("bad_fingerprint", f"a fingerprint is 32 hex digits, got {text[:40]!r}") from None

@@ -1,0 +1,194 @@
+"""Space, numbered: metres to voxels, voxels to cells, and back.
+
+    point (m)  --round to nanometres, floor-->  voxel (3 x int64)
+    voxel      --split at bit `depth`-->        cell (i, j, k) + place inside it (Morton code)
+
+The floor is taken in integers, so a point that lies exactly on a border always belongs to the upper
+neighbour: 0.15 m at 5 cm is voxel 3, although 0.15 / 0.05 is 2.9999999999999996 in floating point.
+Cells are numbered by signed (i, j, k) and, as one number, by the 63-bit Morton code of the shifted indices.
+"""
+
+import hashlib
+import json
+import re
+from functools import lru_cache
+from typing import Annotated, NamedTuple, NewType, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, FailFast, Field, model_validator
+
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.channels import STANDARD_CHANNELS, Channel
+from cairn_map.kernels.morton_kernels import deinterleave, interleave
+
+CellKey = NewType("CellKey", int)
+"""63-bit Morton number of a cell."""
+
+Ints = npt.NDArray[np.int64]
+
+CELL_LIMIT = 1 << 20
+"""Cell indices run from -CELL_LIMIT to CELL_LIMIT - 1: 5 368 km to each side at 5.12 m."""
+BRICK_DEPTH = 3
+"""A brick is 8^3 voxels, the three lowest octree depths."""
+DEPTH_MAX = 8
+CELL_TEXT = re.compile(",".join([r"(0|-?[1-9][0-9]{0,6})"] * 3))
+"""One way to write each cell: `int` alone would also take " 1", "+1", "1_0" and other scripts' digits."""
+NANOMETRES = 1e9
+
+
+class Cell(NamedTuple):
+    """Signed number of a cell along x, y, z; the cell spans [i L, (i + 1) L)."""
+
+    i: int
+    j: int
+    k: int
+
+    def __str__(self) -> str:
+        return f"{self.i},{self.j},{self.k}"
+
+
+class Geometry(BaseModel, frozen=True, extra="forbid"):
+    """Fixed at a map's creation: voxel edge, octree depth of a cell, channels."""
+
+    voxel_edge_um: Annotated[int, Field(ge=1000, le=1_000_000)] = 40_000
+    """Micrometres: an integer, so that borders are exact."""
+    depth: Annotated[int, Field(ge=BRICK_DEPTH, le=DEPTH_MAX)] = 7
+    """A cell has 2^depth voxels along an edge."""
+    channels: Annotated[tuple[Channel, ...], Field(max_length=16), FailFast()] = STANDARD_CHANNELS
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> Self:
+        names = [channel.name for channel in self.channels]
+        if len(set(names)) != len(names) or "occupancy" in names:
+            raise ValueError(f"channel names must differ from each other and from 'occupancy', got {names}")
+        return self
+
+    @property
+    def voxel_edge_m(self) -> float:
+        """Edge of a voxel, metres."""
+        return self.voxel_edge_um / 1e6
+
+    @property
+    def side(self) -> int:
+        """Voxels along a cell's edge."""
+        return 1 << self.depth
+
+    @property
+    def cell_edge_m(self) -> float:
+        """Edge of a cell, metres."""
+        return self.voxel_edge_um * self.side / 1e6
+
+    @property
+    def plane_count(self) -> int:
+        """Columns of the sample matrix."""
+        return sum(len(channel.planes) for channel in self.channels)
+
+    def planes_of(self, name: str) -> slice:
+        """Columns of one channel in the sample matrix.
+
+        Raises:
+            BadInputError: the map has no such channel.
+        """
+        start = 0
+        for channel in self.channels:
+            stop = start + len(channel.planes)
+            if channel.name == name:
+                return slice(start, stop)
+            start = stop
+        raise BadInputError("unknown_channel", f"map has no channel {name!r}; it has {[c.name for c in self.channels]}")
+
+    def channel(self, name: str) -> Channel | None:
+        """The channel of that name, or None."""
+        return next((channel for channel in self.channels if channel.name == name), None)
+
+    def digest(self) -> bytes:
+        """SHA-256 (32 bytes) over the geometry as JSON with sorted keys; two maps can share evidence only if equal."""
+        return _digest(self.voxel_edge_um, self.depth, self.channels)
+
+
+@lru_cache(maxsize=64)
+def _digest(voxel_edge_um: int, depth: int, channels: tuple[Channel, ...]) -> bytes:
+    geometry = Geometry(voxel_edge_um=voxel_edge_um, depth=depth, channels=channels)
+    text = json.dumps(geometry.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return hashlib.sha256(text.encode()).digest()
+
+
+def geometry_for(*, voxel_edge_m: float, channels: tuple[Channel, ...] = STANDARD_CHANNELS) -> Geometry:
+    """The geometry with the paper's cell edge of 5.12 m where the voxel edge allows it, else the nearest smaller power.
+
+    Raises:
+        BadInputError: the voxel edge is not 1 mm to 1 m.
+    """
+    edge_um = round(voxel_edge_m * 1e6)
+    if not 1000 <= edge_um <= 1_000_000:
+        raise BadInputError("bad_geometry", f"voxel edge must be 0.001 to 1 m, got {voxel_edge_m}")
+    depth = DEPTH_MAX
+    while depth > BRICK_DEPTH and (edge_um << depth) > 5_120_000:
+        depth -= 1
+    return Geometry(voxel_edge_um=edge_um, depth=depth, channels=channels)
+
+
+@lru_cache(maxsize=4096)
+def cell_key(cell: tuple[int, int, int]) -> CellKey:
+    """The 63-bit number of a cell.
+
+    Raises:
+        BadInputError: an index is beyond the numbered space.
+    """
+    if not all(-CELL_LIMIT <= v < CELL_LIMIT for v in cell):
+        raise BadInputError("cell_range", f"cell indices must lie in [-{CELL_LIMIT}, {CELL_LIMIT}), got {cell}")
+    return CellKey(int(interleave(np.array([cell], dtype=np.int64) + CELL_LIMIT)[0]))
+
+
+@lru_cache(maxsize=4096)
+def cell_of_key(key: int) -> Cell:
+    """Signed indices of a cell number; the mirror of `cell_key`."""
+    i, j, k = deinterleave(np.array([key], dtype=np.uint64))[0] - CELL_LIMIT
+    return Cell(int(i), int(j), int(k))
+
+
+def cell_from_text(text: str) -> Cell:
+    """The cell written `i,j,k`.
+
+    Raises:
+        BadInputError: not three integers, or beyond the numbered space.
+    """
+    found = CELL_TEXT.fullmatch(text)
+    if not found:
+        raise BadInputError("bad_cell", f"a cell is written i,j,k with integers, got {text[:64]!r}")
+    cell = Cell(*(int(part) for part in found.groups()))
+    cell_key(cell)
+    return cell
+
+
+def voxels_of_points(points_m: npt.NDArray[np.floating], geometry: Geometry) -> Ints:
+    """(N, 3) int64 voxel numbers of (N, 3) points in metres, map frame; points must be finite.
+
+    Raises:
+        BadInputError: a point lies outside the numbered space or is not finite.
+    """
+    points = np.asarray(points_m, dtype=np.float64).reshape(-1, 3)
+    reach_m = (CELL_LIMIT - 1) * geometry.cell_edge_m
+    if not (np.abs(points) < reach_m).all():  # also catches NaN
+        raise BadInputError("point_range", f"points must be finite and within {reach_m:.0f} m of the origin")
+    voxels: Ints = np.rint(points * NANOMETRES).astype(np.int64) // (geometry.voxel_edge_um * 1000)
+    return voxels
+
+
+def split_voxels(voxels: Ints, geometry: Geometry) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.uint32]]:
+    """Cell numbers (N,) uint64 and Morton codes inside the cell (N,) uint32 of (N, 3) voxel numbers."""
+    cells = interleave((voxels >> geometry.depth) + CELL_LIMIT)
+    places = interleave(voxels & (geometry.side - 1)).astype(np.uint32)
+    return cells, places
+
+
+def voxels_in_cell(places: npt.NDArray[np.uint32], key: int, geometry: Geometry) -> Ints:
+    """(N, 3) voxel numbers of places (Morton codes) inside one cell; the mirror of `split_voxels`."""
+    origin = np.array(cell_of_key(key), dtype=np.int64) * geometry.side
+    return deinterleave(places.astype(np.uint64)) + origin
+
+
+def centres_of_voxels(voxels: Ints, geometry: Geometry) -> npt.NDArray[np.float64]:
+    """(N, 3) float64 centres in metres, map frame, of (N, 3) voxel numbers."""
+    return np.asarray((voxels * 2 + 1) * (geometry.voxel_edge_um / 2e6), dtype=np.float64)

@@ -1,0 +1,200 @@
+"""What a map looks like: one cell read as probability, colour and temperature, at any octree depth.
+
+A view is for eyes, exports and robots that only drive; it is never merged. It is exact in what it states: the nearest
+step of each value. At a depth above the voxels, a node has
+
+    probability   the highest of the known voxels below: obstacles never vanish
+    colour        the mean of all samples below
+    temperature   the mean, and the hottest voxel below beside it
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.channels import Channel, ChannelKind
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.sensor_model import SensorModel, log_odds
+
+Ints = npt.NDArray[np.int64]
+Floats = npt.NDArray[np.float64]
+
+LOG_ODDS_STEP = 0.001
+LOG_ODDS_ZERO = 1 << 15
+"""Added to log-odds in steps, so that they are 16 bits without a sign."""
+
+
+class Extent(StrEnum):
+    """Which nodes are told."""
+
+    OCCUPIED = "occupied"
+    KNOWN = "known"
+    """The occupied and the free: what a robot needs that plans a path."""
+
+
+class Chance(StrEnum):
+    """How a probability is told."""
+
+    BYTE = "byte"
+    """p in 1/255."""
+    LOG_ODDS = "log-odds"
+    """ln(p / (1 - p)) in 0.001, 16 bits."""
+
+
+class Colours(StrEnum):
+    """How many bits red, green and blue have."""
+
+    NONE = "none"
+    RGB_565 = "5-6-5"
+    RGB_888 = "8-8-8"
+
+
+TOPS = {Colours.NONE: (), Colours.RGB_565: (31, 63, 31), Colours.RGB_888: (255, 255, 255)}
+"""The largest red, green and blue."""
+
+
+@dataclass(frozen=True, slots=True)
+class ViewStyle:
+    """What a view tells, and how finely."""
+
+    depth: int | None = None
+    """Octree depth, 1 to that of the cell; None: its voxels."""
+    extent: Extent = Extent.OCCUPIED
+    chance: Chance = Chance.BYTE
+    colours: Colours = Colours.RGB_888
+    temperature_step_k: float | None = 0.1
+    """None: no temperatures."""
+
+    def __post_init__(self) -> None:
+        step = self.temperature_step_k
+        if step is not None and not 0.001 <= step <= 1000:
+            raise BadInputError("bad_style", f"temperature_step_k must be 0.001 to 1000 kelvin or None, got {step}")
+
+
+FULL_STYLE = ViewStyle(chance=Chance.LOG_ODDS, temperature_step_k=0.01)
+"""The paper's fields at full precision."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """N nodes of one cell at one depth, rising in number, as integers; properties read them as physical values."""
+
+    depth: int
+    style: ViewStyle
+    nodes: npt.NDArray[np.uint32]
+    """(N,) Morton numbers at `depth`."""
+    chances: Ints
+    """(N,)"""
+    coloured: Ints
+    """(C,) rows of `nodes` that have a colour, rising."""
+    rgb: Ints
+    """(C, 3) 0 to the largest; (C, 0) without colours."""
+    warm: Ints
+    """(W,) rows of `nodes` that have a temperature, rising."""
+    temperatures: Ints
+    """(W, 1) means in steps, at the voxels' depth; else (W, 2) means and hottest voxels; (0, 0) where none are told."""
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    @property
+    def probability(self) -> Floats:
+        """(N,) that the node is occupied."""
+        if self.style.chance is Chance.BYTE:
+            return self.chances / 255
+        return np.asarray(1 / (1 + np.exp((LOG_ODDS_ZERO - self.chances) * LOG_ODDS_STEP)))
+
+    @property
+    def colour(self) -> npt.NDArray[np.uint8]:
+        """(C, 3) 8-bit sRGB."""
+        scaled: npt.NDArray[np.uint8] = np.rint(self.rgb * 255 / np.array(TOPS[self.style.colours])).astype(np.uint8)
+        return scaled
+
+    @property
+    def temperature_k(self) -> Floats:
+        """(W, 1 or 2) kelvin."""
+        return self.temperatures.astype(np.float64) * (self.style.temperature_step_k or np.nan)
+
+
+def view_of(evidence: Evidence, geometry: Geometry, model: SensorModel, style: ViewStyle) -> View:
+    """The view of one cell's evidence.
+
+    Raises:
+        BadInputError: kind `bad_style`: deeper than the cell.
+    """
+    depth = geometry.depth if style.depth is None else style.depth
+    if not 1 <= depth <= geometry.depth:
+        raise BadInputError("bad_style", f"a view's depth must be 1 to {geometry.depth}, got {depth}")
+    nodes, highest = _nodes(evidence, model, style.extent, up=3 * (geometry.depth - depth))
+    if style.chance is Chance.BYTE:
+        chances = np.rint(255 / (1 + np.exp(-highest)))
+    else:
+        chances = np.rint(highest / LOG_ODDS_STEP) + LOG_ODDS_ZERO
+    rows = _rows_of(evidence.voxels[evidence.sampled] >> np.uint32(3 * (geometry.depth - depth)), nodes)
+    colour = next((c for c in geometry.channels if c.kind is ChannelKind.COLOUR), None)
+    thermal = next((c for c in geometry.channels if c.kind is ChannelKind.TEMPERATURE), None)
+    coloured, rgb = np.empty(0, np.int64), np.empty((0, len(TOPS[style.colours])), np.int64)
+    if colour is not None and style.colours is not Colours.NONE:
+        coloured, rgb = _colours(evidence.samples[:, geometry.planes_of(colour.name)], colour, rows, style)
+    columns = 0 if style.temperature_step_k is None else 1 if depth == geometry.depth else 2
+    warm, temperatures = np.empty(0, np.int64), np.empty((0, columns), np.int64)
+    if thermal is not None and style.temperature_step_k is not None:
+        sums = evidence.samples[:, geometry.planes_of(thermal.name)]
+        warm, kelvin = _temperatures(sums, thermal, rows)
+        temperatures = np.rint(np.maximum(kelvin[:, :columns], 0) / style.temperature_step_k).astype(np.int64)
+    return View(depth, style, nodes, chances.astype(np.int64), coloured, rgb, warm, temperatures)
+
+
+def _nodes(evidence: Evidence, model: SensorModel, extent: Extent, *, up: int) -> tuple[npt.NDArray[np.uint32], Floats]:
+    """Nodes that are told, and their highest log-odds; `up` bits of places are left out."""
+    least = log_odds(model.p_occupied) if extent is Extent.OCCUPIED else -np.inf
+    hits, misses = evidence.counts.T
+    # Counts alone make a voxel known: one that holds scalar readings is not. And what was never hit is below a half.
+    told = np.nonzero(hits != 0 if least >= 0 else (hits | misses) != 0)[0]
+    nodes, odds = evidence.voxels[told], model.log_odds(evidence.counts[told])
+    if up and len(nodes):
+        nodes = nodes >> np.uint32(up)
+        starts = np.nonzero(np.diff(nodes, prepend=~nodes[:1]))[0]
+        nodes, odds = nodes[starts], np.maximum.reduceat(odds, starts)
+    keep = odds > least
+    return nodes[keep], odds[keep]
+
+
+def _colours(sums: Ints, channel: Channel, rows_of_samples: Ints, style: ViewStyle) -> tuple[Ints, Ints]:
+    rows, starts, mine = _by_node(sums, rows_of_samples)
+    if not len(rows):
+        return rows, np.empty((0, 3), np.int64)
+    totals = np.add.reduceat(mine, starts, axis=0)
+    mean = totals[:, :3] / totals[:, 3:] * channel.step + channel.zero
+    return rows, np.rint(np.clip(mean, 0, 255) * np.array(TOPS[style.colours]) / 255).astype(np.int64)
+
+
+def _temperatures(sums: Ints, channel: Channel, rows_of_samples: Ints) -> tuple[Ints, Floats]:
+    """Rows, and (W, 2) mean and hottest, kelvin."""
+    rows, starts, mine = _by_node(sums, rows_of_samples)
+    if not len(rows):
+        return rows, np.empty((0, 2))
+    totals = np.add.reduceat(mine, starts, axis=0)
+    hottest = np.maximum.reduceat(mine[:, 0] / mine[:, -1], starts)
+    means = np.stack([totals[:, 0] / totals[:, -1], hottest], axis=1)
+    return rows, means * channel.step + channel.zero
+
+
+def _rows_of(sampled: npt.NDArray[np.uint32], nodes: npt.NDArray[np.uint32]) -> Ints:
+    """(S,) the row of each sample's node; -1 where that is not told."""
+    rows = np.searchsorted(nodes, sampled)
+    is_told = rows < len(nodes)
+    is_told[is_told] = nodes[rows[is_told]] == sampled[is_told]
+    return np.where(is_told, rows, -1)
+
+
+def _by_node(sums: Ints, rows: Ints) -> tuple[Ints, Ints, Ints]:
+    """Of a channel's (S, planes) sums those with a weight: rows of their nodes, where each begins, and the sums."""
+    there = (sums[:, -1] > 0) & (rows >= 0)
+    mine = rows[there]
+    starts = np.nonzero(np.diff(mine, prepend=-1))[0]
+    return mine[starts], starts, sums[there]

@@ -1,0 +1,102 @@
+"""Evidence read as physical values: one row per voxel, NaN where nothing is known.
+
+This is where floats begin: probability is clamped here, means are taken here, and nowhere earlier.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.evidence.channels import Channel, ChannelKind
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey, Geometry, centres_of_voxels, voxels_in_cell
+from cairn_map.evidence.sensor_model import SensorModel
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """A channel's mean in its unit (N,) or (N, 3), and the weight (N,) behind it; NaN where the weight is 0."""
+
+    channel: Channel
+    mean: Floats
+    weight: npt.NDArray[np.int64]
+    spread: Floats | None = None
+    """(N,) standard deviation of the samples, temperature only."""
+
+    def rows(self, rows: npt.NDArray[np.int64]) -> "Reading":
+        """Of these voxels alone, in this order."""
+        spread = None if self.spread is None else self.spread[rows]
+        return Reading(self.channel, self.mean[rows], self.weight[rows], spread)
+
+
+@dataclass(frozen=True, slots=True)
+class Voxels:
+    """N voxels of a map: numbers (N, 3), centres (N, 3) in metres, counts (N, 2), probability (N,), readings."""
+
+    numbers: npt.NDArray[np.int64]
+    centres_m: Floats
+    counts: npt.NDArray[np.int32]
+    probability: Floats
+    readings: dict[str, Reading]
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def rows(self, rows: npt.NDArray[np.int64]) -> "Voxels":
+        """These voxels alone, in this order."""
+        readings = {name: reading.rows(rows) for name, reading in self.readings.items()}
+        return Voxels(self.numbers[rows], self.centres_m[rows], self.counts[rows], self.probability[rows], readings)
+
+    def of_kind(self, kind: ChannelKind) -> Reading | None:
+        """The first reading of a kind, or None if the map has no such channel."""
+        return next((r for r in self.readings.values() if r.channel.kind is kind), None)
+
+
+def voxels_of_evidence(
+    key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel, *, occupied_only: bool
+) -> Voxels:
+    """The voxels of one cell, all known ones or only the occupied."""
+    samples = np.zeros((len(evidence), geometry.plane_count), np.int64)
+    samples[evidence.sampled] = evidence.samples
+    keep = model.occupied(evidence.counts) if occupied_only else np.ones(len(evidence), np.bool_)
+    numbers = voxels_in_cell(evidence.voxels[keep], key, geometry)
+    counts = evidence.counts[keep]
+    readings = {
+        channel.name: reading_of_sums(channel, samples[keep][:, geometry.planes_of(channel.name)])
+        for channel in geometry.channels
+    }
+    return Voxels(numbers, centres_of_voxels(numbers, geometry), counts, model.probability(counts), readings)
+
+
+def joined_voxels(parts: list[Voxels]) -> Voxels:
+    """Voxels of several cells as one table; at least one part, all of one map."""
+    readings: dict[str, Reading] = {}
+    for name, first in parts[0].readings.items():
+        mine = [part.readings[name] for part in parts]
+        spread = None if first.spread is None else np.concatenate([r.spread for r in mine if r.spread is not None])
+        readings[name] = Reading(
+            first.channel, np.concatenate([r.mean for r in mine]), np.concatenate([r.weight for r in mine]), spread
+        )
+    return Voxels(
+        np.concatenate([part.numbers for part in parts]),
+        np.concatenate([part.centres_m for part in parts]),
+        np.concatenate([part.counts for part in parts]),
+        np.concatenate([part.probability for part in parts]),
+        readings,
+    )
+
+
+def reading_of_sums(channel: Channel, sums: npt.NDArray[np.int64]) -> Reading:
+    """What (N, planes) sums of one channel mean."""
+    weight = sums[:, -1]
+    divisor = np.where(weight > 0, weight, np.nan)
+    values = sums[:, : channel.value_count] / divisor[:, None]
+    mean = values * channel.step + channel.zero
+    spread: Floats | None = None
+    if channel.kind is ChannelKind.TEMPERATURE:
+        variance = np.maximum(sums[:, 1] / divisor - values[:, 0] ** 2, 0)
+        spread = np.sqrt(variance) * channel.step
+    return Reading(channel, mean if channel.value_count > 1 else mean[:, 0], weight, spread)

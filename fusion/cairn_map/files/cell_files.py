@@ -1,0 +1,94 @@
+"""A cell as other files: PLY for viewers, NPZ for NumPy, a view for robots that only drive."""
+
+import io
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.codec.view_code import encode_view
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.channels import ChannelKind
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey, Geometry
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.voxels import Voxels, voxels_of_evidence
+
+CELL_MEDIA_TYPE = "application/vnd.cairn.cell"
+MEDIA_TYPES = {
+    "npz": "application/x-npz",
+    "ply": "application/vnd.cairn.ply",
+    "view": "application/vnd.cairn.view",
+}
+FORMS = "octree (no suffix), .npz, .ply or .view"
+GREY = 128
+"""Of voxels that no colour camera saw."""
+
+
+def cell_file(
+    suffix: str, key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel
+) -> tuple[bytes, str]:
+    """One cell as a file of the given suffix, and its media type: all known voxels in NPZ, the occupied in PLY, view.
+
+    Raises:
+        BadInputError: kind `unknown_format`.
+    """
+    if suffix not in MEDIA_TYPES:
+        raise BadInputError("unknown_format", f"cells come as {FORMS}, not as .{suffix[:16]}")
+    if suffix == "view":
+        return encode_view(key, evidence, geometry, model), MEDIA_TYPES[suffix]
+    voxels = voxels_of_evidence(key, evidence, geometry, model, occupied_only=suffix == "ply")
+    return (ply_file(voxels) if suffix == "ply" else npz_file(voxels)), MEDIA_TYPES[suffix]
+
+
+def ply_file(voxels: Voxels) -> bytes:
+    """Voxel centres as a binary little-endian PLY point cloud.
+
+    Properties: x y z (float, metres, map frame), red green blue (uchar), probability (float), temperature (float,
+    kelvin, NaN where no thermal camera looked), intensity (float), hits, misses (int).
+    """
+    N = len(voxels)
+    fields: list[tuple[str, str]] = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+    fields += [(name, "u1") for name in ("red", "green", "blue")]
+    fields += [("probability", "<f4"), ("temperature", "<f4"), ("intensity", "<f4"), ("hits", "<i4"), ("misses", "<i4")]
+    table = np.zeros(N, np.dtype(fields))
+    for axis, name in enumerate("xyz"):
+        table[name] = voxels.centres_m[:, axis]
+    rgb = colours(voxels)
+    for c, name in enumerate(("red", "green", "blue")):
+        table[name] = rgb[:, c]
+    table["probability"] = voxels.probability
+    for name, kind in (("temperature", ChannelKind.TEMPERATURE), ("intensity", ChannelKind.INTENSITY)):
+        reading = voxels.of_kind(kind)
+        table[name] = reading.mean if reading else np.nan
+    table["hits"], table["misses"] = voxels.counts.T
+    words = {"<f4": "float", "u1": "uchar", "<i4": "int"}
+    head = ["ply", "format binary_little_endian 1.0", "comment cairn; metres, map frame; kelvin", f"element vertex {N}"]
+    head += [f"property {words[code]} {name}" for name, code in fields] + ["end_header", ""]
+    return "\n".join(head).encode() + table.tobytes()
+
+
+def npz_file(voxels: Voxels) -> bytes:
+    """Voxels as a compressed NPZ: numbers, centres_m, counts, probability, and per channel mean, weight, spread."""
+    arrays: dict[str, npt.NDArray[np.generic]] = {
+        "numbers": voxels.numbers,
+        "centres_m": voxels.centres_m,
+        "counts": voxels.counts,
+        "probability": voxels.probability,
+    }
+    for name, reading in voxels.readings.items():
+        arrays[f"{name}_mean"], arrays[f"{name}_weight"] = reading.mean, reading.weight
+        if reading.spread is not None:
+            arrays[f"{name}_spread"] = reading.spread
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    return buffer.getvalue()
+
+
+def colours(voxels: Voxels) -> npt.NDArray[np.uint8]:
+    """(N, 3) uint8 sRGB; grey where no colour camera looked."""
+    reading = voxels.of_kind(ChannelKind.COLOUR)
+    rgb = np.full((len(voxels), 3), GREY, np.uint8)
+    if reading is not None:
+        seen = reading.weight > 0
+        rgb[seen] = np.rint(np.clip(reading.mean[seen], 0, 255))
+    return rgb

@@ -1,0 +1,101 @@
+"""A map as a folder: `map.json` and one file for each cell, named by its number.
+
+    lab/map.json          geometry and sensor model
+    lab/0_-1_0.cell       the cell i = 0, j = -1, k = 0, as FORMAT.md describes it
+
+It is what `cairn map export --cells` writes and `cairn map create --from` reads: prior data for a new map.
+"""
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from cairn_map.codec.cell_code import DecodedCell, decode_canonical_cell
+from cairn_map.codec.cell_reading import CELL_BYTES_MAX
+from cairn_map.errors import BadInputError, DamagedDataError, first_error
+from cairn_map.evidence.grid import Cell, Geometry, cell_key
+from cairn_map.evidence.sensor_model import SensorModel
+
+MAP_FILE = "map.json"
+MAP_BYTES_MAX = 1 << 20
+CELL_NAME = re.compile(r"(-?[0-9]{1,7})_(-?[0-9]{1,7})_(-?[0-9]{1,7})\.cell")
+
+
+class FolderHead(BaseModel):
+    """`map.json`: what all cells of the folder share."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    geometry: Geometry
+    sensor_model: SensorModel = SensorModel()
+
+
+def write_head(folder: Path, head: FolderHead) -> None:
+    """Begin a folder; it may exist, but not hold another map.
+
+    Raises:
+        BadInputError: kind `other_map`: the folder holds a map with another grid.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if (folder / MAP_FILE).exists() and read_head(folder).geometry != head.geometry:
+        raise BadInputError("other_map", f"{folder} holds a map with another grid; choose another folder")
+    _write(folder / MAP_FILE, head.model_dump_json(indent=1).encode())
+
+
+def write_cell(folder: Path, cell: Cell, data: bytes) -> Path:
+    """Write one cell's bytes; a reader never sees half of it."""
+    path = folder / f"{cell.i}_{cell.j}_{cell.k}.cell"
+    _write(path, data)
+    return path
+
+
+def read_head(folder: Path) -> FolderHead:
+    """What `map.json` says.
+
+    Raises:
+        BadInputError: it is missing or not a map's.
+    """
+    path = folder / MAP_FILE
+    try:
+        with path.open("rb") as file:
+            text = file.read(MAP_BYTES_MAX + 1)
+        return FolderHead.model_validate_json(text)
+    except OSError as exc:
+        raise BadInputError("no_map_folder", f"{folder} is not a folder of cells: {path.name}: {exc.strerror}") from exc
+    except ValidationError as exc:
+        raise BadInputError("no_map_folder", f"{path} does not describe a map: {first_error(exc)}") from exc
+
+
+def read_cells(folder: Path, geometry: Geometry) -> Iterator[DecodedCell]:
+    """The cells of a folder, each validated, in order of their numbers.
+
+    Raises:
+        DamagedDataError: a file is not the cell that its name says; the message names it.
+        BadInputError: a cell of another grid.
+    """
+    named = ((CELL_NAME.fullmatch(path.name), path) for path in folder.iterdir())
+    found = [(Cell(*(int(part) for part in match.groups())), path) for match, path in named if match]
+    for cell, path in sorted(found, key=lambda pair: cell_key(pair[0])):
+        if path.stat().st_size > CELL_BYTES_MAX:
+            raise BadInputError("too_large", f"{path} is larger than a cell may be ({CELL_BYTES_MAX} bytes)")
+        try:
+            decoded = decode_canonical_cell(path.read_bytes())
+        except DamagedDataError as exc:
+            raise DamagedDataError(exc.kind, f"{path}: {exc.message}") from exc
+        if decoded.key != cell_key(cell):
+            raise DamagedDataError("bad_cell", f"{path} holds another cell than its name says")
+        if decoded.geometry != geometry:
+            raise BadInputError("other_geometry", f"{path} was made for another grid than {folder / MAP_FILE} says")
+        yield decoded
+
+
+def _write(path: Path, data: bytes) -> None:
+    fresh = path.with_name(path.name + ".new")
+    with fresh.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    fresh.replace(path)

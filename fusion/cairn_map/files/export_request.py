@@ -1,0 +1,117 @@
+"""What of a map is to be taken away as a file: the query of `GET .../main/export`, and `cairn map export`'s options."""
+
+from typing import Annotated, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.grid import Geometry
+
+Floats = npt.NDArray[np.float64]
+Kelvin = Annotated[float, Field(ge=0, le=1e5)]
+Height = Annotated[float, Field(ge=-1e7, le=1e7)]
+BOX_CHARS_MAX = 160
+EXPORT_TYPES = {
+    "ply": "application/vnd.cairn.ply",
+    "pcd": "application/vnd.cairn.pcd",
+    "laz": "application/vnd.laszip",
+    "npz": "application/x-npz",
+    "ot": "application/octet-stream",
+    "bt": "application/octet-stream",
+}
+"""Media type of each format."""
+
+
+class ExportRequest(BaseModel):
+    """Which nodes, and in what kind of file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    format: Literal["ply", "pcd", "laz", "npz", "ot", "bt"] = "ply"
+    """Points; or an octree of OctoMap's, `ot` with probability and colour, `bt` with neither."""
+    box: Annotated[str, Field(max_length=BOX_CHARS_MAX)] | None = None
+    """x0,y0,z0,x1,y1,z1: metres, map frame, ends included; None: everywhere."""
+    floor_m: Height | None = None
+    """Nothing below."""
+    ceiling_m: Height | None = None
+    """Nothing above."""
+    p: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Least probability, compared in steps of 1/255 as on the console; unoccupied nodes never come."""
+    hotter_k: Kelvin | None = None
+    """Only nodes with a voxel as hot as this, kelvin; what has no temperature does not come."""
+    colder_k: Kelvin | None = None
+    """Only nodes that are as cold as this in the mean, kelvin; what has no temperature does not come."""
+    depth: Annotated[int, Field(ge=1, le=64)] | None = None
+    """Octree depth of the nodes; None: voxels."""
+
+    def bounds_m(self) -> tuple[Floats, Floats]:
+        """(3,) lowest and highest place of a node's centre, metres, map frame; infinite where nothing is asked.
+
+        Raises:
+            BadInputError: kind `bad_box`: not six finite numbers, or the lower corner is not the first.
+        """
+        low, high = np.full(3, -np.inf), np.full(3, np.inf)
+        if self.box is not None:
+            low, high = _corners(self.box)
+        low[2] = max(low[2], -np.inf if self.floor_m is None else self.floor_m)
+        high[2] = min(high[2], np.inf if self.ceiling_m is None else self.ceiling_m)
+        return low, high
+
+    @property
+    def is_of_some_temperatures(self) -> bool:
+        """Whether a node must have a temperature to come."""
+        return self.hotter_k is not None or self.colder_k is not None
+
+    def band_k(self) -> tuple[float, float]:
+        """Least temperature of a node's hottest voxel, and highest mean of a node; kelvin."""
+        return self.hotter_k or 0.0, np.inf if self.colder_k is None else self.colder_k
+
+    def depth_in(self, geometry: Geometry) -> int:
+        """The nodes' octree depth.
+
+        Raises:
+            BadInputError: kind `bad_style`: deeper than the map's cells.
+        """
+        if self.depth is not None and self.depth > geometry.depth:
+            raise BadInputError("bad_style", f"depth must be 1 to {geometry.depth} on this map, got {self.depth}")
+        return geometry.depth if self.depth is None else self.depth
+
+
+class TicketedExport(ExportRequest):
+    """The query of an export that is asked for by token, or by ticket."""
+
+    ticket: Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")] | None = None
+
+    @property
+    def request(self) -> ExportRequest:
+        """What is asked for, by whomever."""
+        return ExportRequest.model_validate(self.model_dump(exclude={"ticket"}))
+
+
+class ExportTicket(BaseModel):
+    """Answer to who asked for a ticket: it stands for a token once, for one file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    ticket: str
+    ends_s: float
+    """UTC since 1970."""
+    points: int
+    """Of the file."""
+    size_bytes: int | None
+    """Of the file; None: known when it is made."""
+
+
+def _corners(text: str) -> tuple[Floats, Floats]:
+    try:
+        numbers = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        numbers = np.empty(0)
+    low, high = numbers[:3], numbers[3:]
+    if len(numbers) != 6 or not np.isfinite(numbers).all() or (low > high).any():
+        raise BadInputError(
+            "bad_box", f"a box is x0,y0,z0,x1,y1,z1 in metres with the lower corner first, got {text[:80]!r}"
+        )
+    return low, high

@@ -1,0 +1,129 @@
+"""Points as LAZ: LAS 1.4 (ASPRS), compressed by LASzip, made part by part with the memory of one chunk.
+
+Coordinates are whole numbers of half a node's edge, so they are exact. Format 7: colours have 16 bits (8-bit sRGB times
+256). What LAS has no field for are its extra bytes, each a float with its unit in the description:
+
+    probability        0 to 1
+    temperature        kelvin, mean below the node; NaN where no thermal camera looked
+    hottest            kelvin, the hottest voxel below the node
+
+LASzip corrects the place of its chunk table in the file's head at the end. What is sent cannot be corrected, and LASzip
+has a way for that: the place there is -1, and the file's last eight bytes say it.
+"""
+
+import struct
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import laspy
+import lazrs as untyped_lazrs
+import numpy as np
+import numpy.typing as npt
+from laspy.vlrs.known import LasZipVlr, WktCoordinateSystemVlr
+
+from cairn_map.files.forward_only_file import OneWay
+
+Floats = npt.NDArray[np.float64]
+Table = npt.NDArray[np.void]
+
+lazrs: Any = untyped_lazrs
+POINT_FORMAT = 7
+EXTRA = {
+    "probability": "0 to 1",
+    "temperature": "kelvin, mean; NaN: not seen",
+    "hottest": "kelvin, maximum; NaN: not seen",
+}
+"""Extra bytes and what they are, in at most 31 letters."""
+RETURN = 0x11
+"""The first of one return."""
+COLOUR_STEP = 256
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LazHead:
+    """What a file begins with, so it must be known before the first point."""
+
+    count: int
+    low_m: Floats
+    """(3,) lowest and highest centre, metres, map frame; zeros without points."""
+    high_m: Floats
+    node_edge_m: float
+    frame: str
+    """Name of the coordinate system."""
+
+
+def laz_parts(head: LazHead, tables: Iterable[Table]) -> Iterator[bytes]:
+    """The file, part by part; `tables` are (N,) of `map_points.POINT`, `count` points together."""
+    sink, header = _Uncorrected(), _header(head)
+    vlr = lazrs.LazVlr.new_for_compression(POINT_FORMAT, header.point_format.num_extra_bytes)
+    header.vlrs.append(LasZipVlr(vlr.record_data()))
+    header.write_to(sink)
+    yield sink.taken()
+    compressor = lazrs.LasZipCompressor(sink, vlr)
+    for table in tables:
+        rows = _rows(table, header.point_format.dtype(), head.node_edge_m)
+        compressor.compress_many(rows.view(np.uint8))
+        yield sink.taken()
+    compressor.done()
+    yield sink.taken() + struct.pack("<q", sink.corrected if head.count else -1)
+
+
+def _header(head: LazHead) -> Any:
+    header = laspy.LasHeader(version="1.4", point_format=POINT_FORMAT)
+    header.scales, header.offsets = np.full(3, head.node_edge_m / 2), np.zeros(3)
+    header.add_extra_dims([laspy.ExtraBytesParams(name, np.dtype("<f4"), description=EXTRA[name]) for name in EXTRA])
+    header.vlrs.append(WktCoordinateSystemVlr(f'LOCAL_CS["{head.frame}",LOCAL_DATUM["local",32767],UNIT["metre",1]]'))
+    header.global_encoding.wkt = True
+    header.generating_software = "cairn"
+    header.are_points_compressed = True
+    header.point_count = head.count
+    header.number_of_points_by_return = np.array([head.count] + [0] * 14)
+    header.mins, header.maxs = head.low_m, head.high_m
+    return header
+
+
+def _rows(table: Table, dtype: np.dtype[np.void], node_edge_m: float) -> Table:
+    rows = np.zeros(len(table), dtype)
+    for name in "xyz":
+        # Centres are odd numbers of half an edge: so single precision, which tables have, is enough.
+        rows[name.upper()] = 2 * np.floor(table[name].astype(np.float64) / node_edge_m).astype(np.int32) + 1
+    for name in ("red", "green", "blue"):
+        rows[name] = table[name].astype(np.uint16) * COLOUR_STEP
+    for name in EXTRA:
+        rows[name] = table[name]
+    rows["bit_fields"] = RETURN
+    return rows
+
+
+class _Uncorrected(OneWay):
+    """A file with places. What is written to where it is sent already comes too late, and is remembered."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._at = self._end = 0
+        self.corrected = -1
+        """Where the chunk table is."""
+
+    def seekable(self) -> bool:
+        """As far as LASzip sees."""
+        return True
+
+    def tell(self) -> int:
+        """Place of the next byte."""
+        return self._at
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Go to a place."""
+        self._at = offset + (0, self._at, self._end)[whence]
+        return self._at
+
+    def write(self, data: object) -> int:
+        """Add bytes at the end, or hear what should have been."""
+        if self._at < self._end:
+            (self.corrected,) = struct.unpack("<q", bytes(data))  # type: ignore[call-overload]
+            self._at += 8
+            return 8
+        written = super().write(data)
+        self._at = self._end = self._end + written
+        return written

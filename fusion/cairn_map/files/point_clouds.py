@@ -1,0 +1,178 @@
+"""Parts of a map as point clouds, cell by cell: PLY, PCD, LAZ or NPZ, none of which needs more memory than one cell.
+
+A file begins with the number of its points, so whoever writes one counts them first. Values are those of a view
+(`view.py`): the highest probability, the mean colour and temperature of all below a node, and the hottest voxel.
+"""
+
+import zipfile
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey, Geometry
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.files.cell_files import GREY
+from cairn_map.files.export_choice import chosen_in_cell, chosen_places
+from cairn_map.files.export_request import ExportRequest
+from cairn_map.files.forward_only_file import OneWay
+
+Floats = npt.NDArray[np.float64]
+Table = npt.NDArray[np.void]
+
+POINT = np.dtype(
+    [
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("red", "u1"),
+        ("green", "u1"),
+        ("blue", "u1"),
+        ("probability", "<f4"),
+        ("temperature", "<f4"),
+        ("hottest", "<f4"),
+    ]
+)
+"""Centre of a node, metres, map frame; 8-bit sRGB, grey where no colour camera looked; kelvin, NaN where unknown."""
+PCD_POINT = np.dtype([(name, "<f4") for name in ("x", "y", "z", "rgb", "probability", "temperature", "hottest")])
+"""The Point Cloud Library has colours as 0x00RRGGBB in the bits of a float."""
+NPZ_MEMBER = "points.npy"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """What a file of points begins with: how many there are, and where."""
+
+    count: int = 0
+    low_m: Floats = field(default_factory=lambda: np.full(3, np.inf))
+    """(3,) lowest and highest centre, metres, map frame; infinite without points."""
+    high_m: Floats = field(default_factory=lambda: np.full(3, -np.inf))
+
+    def joined(self, other: Self) -> Self:
+        """Both together."""
+        low_m, high_m = np.minimum(self.low_m, other.low_m), np.maximum(self.high_m, other.high_m)
+        return type(self)(self.count + other.count, low_m, high_m)
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What a file says of itself."""
+
+    map_name: str
+    node_edge_m: float
+
+    def __str__(self) -> str:
+        return f"map {self.map_name}, nodes of {self.node_edge_m:g} m; metres, map frame; kelvin"
+
+
+def found_in_cell(
+    key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel, asked: ExportRequest
+) -> Found:
+    """How many points `points_of_cell` gives, and where, without their colours."""
+    places = chosen_places(key, evidence, geometry, model, asked)
+    return Found(len(places), places.min(axis=0), places.max(axis=0)) if len(places) else Found()
+
+
+def points_of_cell(
+    key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel, asked: ExportRequest
+) -> Table:
+    """(N,) of `POINT`: the occupied nodes of one cell that are asked for, rising in Morton number.
+
+    Raises:
+        BadInputError: kind `bad_box`, `bad_style`.
+    """
+    chosen = chosen_in_cell(key, evidence, geometry, model, asked)
+    view, table = chosen.view, np.zeros(len(chosen.view), POINT)
+    for axis, name in enumerate("xyz"):
+        table[name] = chosen.centres_m[:, axis]
+    for c, name in enumerate(("red", "green", "blue")):
+        table[name] = GREY
+        table[name][view.coloured] = view.colour[:, c]
+    table["probability"] = view.probability
+    table["temperature"] = table["hottest"] = np.nan
+    table["temperature"][view.warm] = view.temperature_k[:, 0]
+    table["hottest"][view.warm] = view.temperature_k[:, -1]
+    return table[chosen.rows]
+
+
+def point_file(form: str, found: Found, tables: Iterable[Table], about: About) -> Iterator[bytes]:
+    """A file of points, part by part: PLY, PCD (both binary), LAZ, or NPZ with one array `points`."""
+    if form == "npz":
+        return _npz_parts(found.count, tables)
+    if form == "laz":
+        from cairn_map.files.laz import LazHead, laz_parts  # its libraries are a server's
+
+        low_m, high_m = (found.low_m, found.high_m) if found.count else (np.zeros(3), np.zeros(3))
+        return laz_parts(LazHead(found.count, low_m, high_m, about.node_edge_m, f"map {about.map_name}"), tables)
+    return _plain_parts(form, found.count, tables, about)
+
+
+def size_of_file(form: str, found: Found, about: About) -> int | None:
+    """Of a PLY or PCD, bytes; None: not known before an NPZ or LAZ is made."""
+    if form not in ("ply", "pcd"):
+        return None
+    head, point = (_ply_head, POINT) if form == "ply" else (_pcd_head, PCD_POINT)
+    return len(head(found.count, about)) + found.count * point.itemsize
+
+
+def _plain_parts(form: str, count: int, tables: Iterable[Table], about: About) -> Iterator[bytes]:
+    head, row = (_ply_head, _plain) if form == "ply" else (_pcd_head, _pcd_rows)
+    yield head(count, about)
+    yield from (row(table) for table in tables)
+
+
+def _plain(table: Table) -> bytes:
+    return table.tobytes()
+
+
+def _ply_head(count: int, about: About) -> bytes:
+    words = {"f": "float", "u": "uchar"}
+    lines = ["ply", "format binary_little_endian 1.0", f"comment cairn; {about}", f"element vertex {count}"]
+    lines += [f"property {words[POINT[name].kind]} {name}" for name in POINT.names or ()]
+    return "\n".join([*lines, "end_header", ""]).encode()
+
+
+def _pcd_head(count: int, about: About) -> bytes:
+    names = PCD_POINT.names or ()
+    lines = [
+        f"# cairn; {about}",
+        "VERSION 0.7",
+        f"FIELDS {' '.join(names)}",
+        f"SIZE {' '.join('4' for _ in names)}",
+        f"TYPE {' '.join('F' for _ in names)}",
+        f"COUNT {' '.join('1' for _ in names)}",
+        f"WIDTH {count}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {count}",
+        "DATA binary",
+        "",
+    ]
+    return "\n".join(lines).encode()
+
+
+def _pcd_rows(table: Table) -> bytes:
+    rows = np.empty(len(table), PCD_POINT)
+    for name in ("x", "y", "z", "probability", "temperature", "hottest"):
+        rows[name] = table[name]
+    red, green, blue = (table[name].astype(np.uint32) for name in ("red", "green", "blue"))
+    rows["rgb"] = (red << 16 | green << 8 | blue).view(np.float32)
+    return rows.tobytes()
+
+
+def _npz_parts(count: int, tables: Iterable[Table]) -> Iterator[bytes]:
+    sink = OneWay()
+    description = {"descr": np.lib.format.dtype_to_descr(POINT), "fortran_order": False, "shape": (count,)}
+    with (
+        zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED) as archive,
+        archive.open(NPZ_MEMBER, "w", force_zip64=True) as member,
+    ):
+        np.lib.format.write_array_header_1_0(member, description)
+        yield sink.taken()
+        for table in tables:
+            member.write(table.tobytes())
+            yield sink.taken()
+    yield sink.taken()

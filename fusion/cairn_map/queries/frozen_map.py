@@ -1,0 +1,111 @@
+"""A map as it was at one instant, laid out for queries: what all of them read.
+
+Cells share their arrays with the map that goes on changing, which copies one before it adds to it. So freezing costs
+the states of the cells that changed since, and a reader needs no lock.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.brick_cell import BrickCell
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import CELL_LIMIT, NANOMETRES, CellKey, Geometry, cell_of_key
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.queries.occupancy_kernels import Grid, brick_corners_into
+from cairn_map.queries.occupancy_states import CellStates, state_grid, states_of_counts
+
+Ints = npt.NDArray[np.int64]
+Floats = npt.NDArray[np.float64]
+Box = Sequence[Sequence[float]] | npt.NDArray[np.floating]
+"""(2, 3) lowest and highest corner, metres, map frame; infinite where a side is open."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrozenMap:
+    """Cells by slot, the states of their voxels under a sensor model, and both as kernels read them."""
+
+    geometry: Geometry
+    model: SensorModel
+    keys: tuple[CellKey, ...]
+    cells: tuple[BrickCell, ...]
+    states: tuple[CellStates, ...]
+    grid: Grid
+
+    @property
+    def reach_m(self) -> float:
+        """Points must be nearer to the origin than this along every axis."""
+        return (CELL_LIMIT - 1) * self.geometry.cell_edge_m
+
+    def brick_corners(self) -> Ints:
+        """(B, 3) first voxels of all bricks."""
+        corners = np.empty((len(self.grid.words), 3), np.int64)
+        brick_corners_into(self.grid, corners)
+        return corners
+
+    def voxels_of_box(self, box_m: Box | None) -> tuple[Ints, Ints]:
+        """The voxels whose centres lie in a box, low and high (3,), the latter exclusive, within that of all cells.
+
+        Raises:
+            BadInputError: kind `bad_box`: not two corners, the lower first.
+        """
+        if box_m is None:
+            return self.grid.low, self.grid.high
+        box = np.asarray(box_m, np.float64)
+        if box.shape != (2, 3) or not (box[0] <= box[1]).all():
+            raise BadInputError("bad_box", f"a box is its lowest and its highest corner, (2, 3) metres; got {box_m!r}")
+        edge_nm = self.grid.edge_nm
+        limit_nm = self.reach_m * NANOMETRES
+        nanometres = np.rint(np.clip(box * NANOMETRES, -limit_nm, limit_nm)).astype(np.int64)
+        # The first centre, edge / 2 above a voxel's border, that is not below the corner.
+        numbers = -((edge_nm - 2 * nanometres) // (2 * edge_nm))
+        low, high = np.clip(numbers, self.grid.low, self.grid.high)
+        return low, high
+
+
+def freeze(whole: EvidenceMap, model: SensorModel, *, earlier: FrozenMap | None = None) -> FrozenMap:
+    """The map as it is now; what has not changed since `earlier` is taken over from it."""
+    copied = whole.copy()
+    keys = tuple(copied)
+    cells = tuple(cell for key in keys if (cell := copied.cell(key)) is not None)
+    known: dict[CellKey, CellStates] = {}
+    if earlier is not None and earlier.model == model:
+        known = dict(zip(earlier.keys, earlier.states, strict=True))
+    states = tuple(
+        old
+        if (old := known.get(key)) is not None and old.counts is cell.counts
+        else states_of_counts(cell.counts, model)
+        for key, cell in zip(keys, cells, strict=True)
+    )
+    grid = state_grid([cell_of_key(key) for key in keys], states, whole.geometry)
+    return FrozenMap(whole.geometry, model, keys, cells, states, grid)
+
+
+def as_points(values: npt.ArrayLike, what: str) -> Floats:
+    """(N, 3) float64, row by row.
+
+    Raises:
+        BadInputError: kind `bad_points`: another shape, or no numbers.
+    """
+    try:
+        points = np.require(values, np.float64, ["C", "A", "W"])  # kernels are compiled for such alone
+    except (TypeError, ValueError) as exc:
+        raise BadInputError("bad_points", f"{what} must be numbers, (N, 3)") from exc
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise BadInputError("bad_points", f"{what} must be (N, 3), got {points.shape}")
+    return points
+
+
+def check_within(inside: bool, frozen: FrozenMap) -> None:
+    """Refuse what a kernel found outside.
+
+    Raises:
+        BadInputError: kind `point_range`.
+    """
+    if not inside:
+        raise BadInputError(
+            "point_range", f"points must be finite and within {frozen.reach_m:.0f} m of the origin along every axis"
+        )

@@ -1,0 +1,235 @@
+"""A map to ask: what is here, what is in the way, where is nobody yet. Arrays in, arrays out.
+
+    snapshot = robot.snapshot()
+    snapshot.probability_at([[1.0, 2.0, 0.4]])                         # NaN where unknown
+    snapshot.cast_rays(origins_m, directions, max_range_m=10).hit
+    snapshot.sweep_box(T_map_body, [[-0.4, -0.3, 0.0], [0.4, 0.3, 0.6]]).first_occupied
+
+A snapshot never changes, whatever the robot merges meanwhile: any number of threads may ask it, without a lock. Taking
+the next one costs the cells that changed since, and sharing costs the map a copy of each cell that changes.
+
+Points are (N, 3) metres in the map's frame, in anything that NumPy makes float64 of; a voxel is [low, low + edge) along
+each axis, so a point on a border is in the upper one. NaN, infinity or a point outside the numbered space raises
+`BadInputError` (`point_range`), another shape `bad_points`. A `box_m` is the (2, 3) lowest and highest corner, metres,
+map frame, sides may be infinite: it holds the voxels whose centres it holds; without one, the whole map is meant.
+Lengths are metres, temperatures kelvin (apparent), colours sRGB 0 to 255. Evidence is read under the snapshot's
+`SensorModel`: probabilities are clamped, and a voxel without hits and misses is unknown.
+"""
+
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.evidence.channels import ChannelKind
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import Cell, Geometry
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.voxels import Reading, Voxels
+from cairn_map.queries import (
+    body_queries,
+    layer_queries,
+    nearest_queries,
+    path_queries,
+    point_queries,
+    ray_queries,
+    voxel_queries,
+)
+from cairn_map.queries.body_queries import PathStates
+from cairn_map.queries.frozen_map import Box, Floats, FrozenMap, freeze
+from cairn_map.queries.layer_queries import MapImage
+from cairn_map.queries.nearest_queries import Nearest
+from cairn_map.queries.occupancy_states import State
+from cairn_map.queries.ray_queries import RayEnds
+
+STANDARD_MODEL = SensorModel()
+
+
+class MapSnapshot:
+    """A map at one instant, under one sensor model."""
+
+    __slots__ = ("_frozen",)
+
+    def __init__(self, frozen: FrozenMap) -> None:
+        self._frozen = frozen
+
+    def refreshed(self, whole: EvidenceMap) -> Self:
+        """The map as it is now; only the cells that changed since this snapshot are looked at anew."""
+        return type(self)(freeze(whole, self._frozen.model, earlier=self._frozen))
+
+    @property
+    def frozen(self) -> FrozenMap:
+        """What queries in other modules read, such as `map_render`."""
+        return self._frozen
+
+    @property
+    def geometry(self) -> Geometry:
+        """Voxel edge, cells and channels."""
+        return self._frozen.geometry
+
+    @property
+    def model(self) -> SensorModel:
+        """What hits and misses mean here."""
+        return self._frozen.model
+
+    def state_at(self, points_m: npt.ArrayLike) -> npt.NDArray[np.uint8]:
+        """(N,) `State`: 0 unknown, 1 free, 2 occupied."""
+        return point_queries.states_at(self._frozen, points_m)
+
+    def counts_at(self, points_m: npt.ArrayLike) -> npt.NDArray[np.int32]:
+        """(N, 2) hits and misses, in scans; zeros where unknown."""
+        return point_queries.counts_at(self._frozen, points_m)
+
+    def log_odds_at(self, points_m: npt.ArrayLike) -> Floats:
+        """(N,) ln(p / (1 - p)), clamped; NaN where unknown."""
+        return point_queries.log_odds_at(self._frozen, points_m)
+
+    def probability_at(self, points_m: npt.ArrayLike) -> Floats:
+        """(N,) probability that the voxel is occupied, clamped; NaN where unknown."""
+        return point_queries.probability_at(self._frozen, points_m)
+
+    def reading_at(self, points_m: npt.ArrayLike, channel: str) -> Reading:
+        """What a channel says: mean (N,) in its unit, or (N, 3) for colours, and weight (N,), in samples.
+
+        The mean is NaN where the weight is 0. Temperatures have a `spread`, too.
+
+        Raises:
+            BadInputError: kind `unknown_channel`: the map has no channel of that name.
+        """
+        return point_queries.reading_at(self._frozen, points_m, point_queries.channel_named(self._frozen, channel))
+
+    def colour_at(self, points_m: npt.ArrayLike) -> Reading:
+        """Mean (N, 3) sRGB 0 to 255, and weight, of the map's first colour channel."""
+        return self._first_at(points_m, ChannelKind.COLOUR)
+
+    def intensity_at(self, points_m: npt.ArrayLike) -> Reading:
+        """Mean (N,) time-of-flight amplitude, counts, and weight, of the map's first intensity channel."""
+        return self._first_at(points_m, ChannelKind.INTENSITY)
+
+    def temperature_at(self, points_m: npt.ArrayLike) -> Reading:
+        """Mean (N,), standard deviation of the samples (`spread`), kelvin, and weight; first temperature channel."""
+        return self._first_at(points_m, ChannelKind.TEMPERATURE)
+
+    def cast_rays(
+        self, origins_m: npt.ArrayLike, directions: npt.ArrayLike, *, max_range_m: float, ends_in_unknown: bool = False
+    ) -> RayEnds:
+        """Follow rays until an occupied voxel.
+
+        A ray meets a voxel if a part of it that is more than a point lies in it, or if it starts there; one along a
+        border is in the upper voxel. What lies at the maximum range itself is still met.
+
+        Args:
+            origins_m: (N, 3), anywhere.
+            directions: (N, 3), map frame, of any finite length but 0.
+            max_range_m: 0 or more; infinite for as far as the map goes.
+            ends_in_unknown: whether an unknown voxel ends a ray, too; else it is seen through.
+        """
+        return ray_queries.cast(
+            self._frozen, origins_m, directions, max_range_m=max_range_m, ends_in_unknown=ends_in_unknown
+        )
+
+    def check_box(self, T_map_body: npt.ArrayLike, box_m: npt.ArrayLike) -> PathStates:
+        """What a box meets at each pose of a path; between the poses `sweep_box` looks.
+
+        It meets the voxels that it overlaps; touching, to a millionth of a voxel, is not meeting.
+
+        Args:
+            T_map_body: (N, 4, 4) rigid transforms.
+            box_m: (2, 3) lowest and highest corner, metres, body frame; finite, at most 16 cells long.
+        """
+        return body_queries.check_box(self._frozen, T_map_body, box_m)
+
+    def check_sphere(self, centres_m: npt.ArrayLike, *, radius_m: float) -> PathStates:
+        """What a sphere meets at each of (N, 3) centres, as `check_box`."""
+        return body_queries.check_sphere(self._frozen, centres_m, radius_m=radius_m)
+
+    def sweep_box(self, T_map_body: npt.ArrayLike, box_m: npt.ArrayLike) -> PathStates:
+        """What a box meets on its way to each pose of a path, the pose included: straight, turning the shortest way.
+
+        Looked at wherever a point of the box has moved by half a voxel. What it reports is met; what it misses is
+        overlapped by less than a quarter of a voxel's edge: with a box larger by that to all sides nothing is missed.
+
+        Args:
+            T_map_body: (N, 4, 4) rigid transforms.
+            box_m: as for `check_box`.
+
+        Raises:
+            BadInputError: as `check_box`; kind `too_large`: more than a million steps.
+        """
+        return path_queries.sweep_box(self._frozen, T_map_body, box_m)
+
+    def sweep_sphere(self, centres_m: npt.ArrayLike, *, radius_m: float) -> PathStates:
+        """What a sphere meets on its straight ways to each of (N, 3) centres, as `sweep_box`."""
+        return path_queries.sweep_sphere(self._frozen, centres_m, radius_m=radius_m)
+
+    def nearest_occupied(self, points_m: npt.ArrayLike, *, radius_m: float) -> Nearest:
+        """The nearest occupied voxel of each point, within a finite radius."""
+        return nearest_queries.nearest(self._frozen, points_m, State.OCCUPIED, radius_m=radius_m)
+
+    def nearest_unknown(self, points_m: npt.ArrayLike, *, radius_m: float) -> Nearest:
+        """The nearest unknown voxel of each point, within a finite radius; around the map all is unknown."""
+        return nearest_queries.nearest(self._frozen, points_m, State.UNKNOWN, radius_m=radius_m)
+
+    def frontier(self, *, box_m: Box | None = None) -> npt.NDArray[np.int64]:
+        """(M, 3) numbers of the free voxels with an unknown voxel at a face, cell by cell in Morton order.
+
+        `grid.centres_of_voxels(numbers, snapshot.geometry)` are their centres.
+        """
+        return voxel_queries.frontier(self._frozen, box_m)
+
+    def frontier_cells(self, *, box_m: Box | None = None) -> dict[Cell, int]:
+        """The cells that hold frontier voxels, and how many: where to explore."""
+        return voxel_queries.frontier_cells(self._frozen, box_m)
+
+    def layer_at(self, z_m: float, what: str = "probability", *, box_m: Box | None = None) -> MapImage:
+        """The horizontal layer of voxels at a height, as an image.
+
+        Args:
+            z_m: height, map frame.
+            what: `state` (uint8), `probability`, `log_odds`, or a channel's name for its mean (float64, NaN where
+                unknown).
+            box_m: its x and y bound the image; its z does not matter.
+
+        Raises:
+            BadInputError: kind `too_large`: more than 67 million pixels.
+        """
+        return layer_queries.layer(self._frozen, z_m, what, box_m)
+
+    def height_map(self, *, box_m: Box | None = None) -> MapImage:
+        """Height of the upper face of the highest occupied voxel of each column, metres; NaN where there is none.
+
+        Indoors, give a `box_m` that ends below the ceiling.
+
+        Raises:
+            BadInputError: kind `too_large`: more than 67 million pixels.
+        """
+        return layer_queries.height_map(self._frozen, box_m)
+
+    def hottest(self, n: int, *, min_probability: float = 0.5, box_m: Box | None = None) -> Voxels:
+        """The n known voxels with the highest mean temperature, hottest first, fewer if there are no more.
+
+        Args:
+            n: how many.
+            min_probability: only voxels that are occupied with at least this probability.
+            box_m: where.
+        """
+        return voxel_queries.hottest(self._frozen, n, min_probability=min_probability, box_m=box_m)
+
+    def voxels_in(self, box_m: Box | None = None) -> Voxels:
+        """All voxels with evidence in a box, cell by cell in Morton order."""
+        return voxel_queries.voxels_in_box(self._frozen, box_m, occupied_only=False)
+
+    def occupied_in(self, box_m: Box | None = None) -> Voxels:
+        """All occupied voxels in a box, cell by cell in Morton order."""
+        return voxel_queries.voxels_in_box(self._frozen, box_m, occupied_only=True)
+
+    def _first_at(self, points_m: npt.ArrayLike, kind: ChannelKind) -> Reading:
+        return point_queries.reading_at(self._frozen, points_m, point_queries.first_of_kind(self.geometry, kind))
+
+
+def snapshot_of(whole: EvidenceMap, model: SensorModel = STANDARD_MODEL) -> MapSnapshot:
+    """The map as it is now, read under a sensor model.
+
+    Of a map that another thread changes, only while it cannot: a robot's `snapshot` sees to that.
+    """
+    return MapSnapshot(freeze(whole, model))

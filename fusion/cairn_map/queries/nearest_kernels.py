@@ -1,0 +1,122 @@
+"""The nearest occupied or unknown voxel; no checks. Lengths are in voxel edges, to the nearest point of the voxel.
+
+Bricks are looked at in growing cubes around the point's own, until the next cube is farther than what was found.
+"""
+
+import numba as nb
+import numpy as np
+
+from cairn_map.evidence.grid import NANOMETRES
+from cairn_map.queries.occupancy_kernels import (
+    KNOWN_BITS,
+    OCCUPIED_BITS,
+    Floats,
+    Grid,
+    Ints,
+    U,
+    brick_of,
+    voxel_of,
+    x_in_block,
+)
+from cairn_map.queries.point_kernels import is_within
+
+
+@nb.njit(cache=True, nogil=True)
+def nearest_into(
+    grid: Grid, points: Floats, reach_m: float, radius: float, unknown: bool, distances: Floats, voxels: Ints
+) -> bool:
+    """Distances (N,) from (N, 3) points (metres) to the nearest voxel, unknown or else occupied, and (N, 3) its number.
+
+    Infinite, and the point's own voxel, where none is within `radius`. Returns whether all points were within reach.
+    """
+    inside = True
+    start, own = np.empty(3), np.empty(3, np.int64)
+    for n in range(points.shape[0]):
+        inside &= is_within(points, n, reach_m)
+        for axis in range(3):
+            start[axis] = np.rint(points[n, axis] * NANOMETRES) / grid.edge_nm
+            own[axis] = voxel_of(points[n, axis], grid.edge_nm)
+        voxels[n] = own
+        distances[n] = np.inf
+        if inside:
+            distances[n] = search_into(grid, start, own, radius, unknown, voxels[n])
+    return inside
+
+
+@nb.njit(nogil=True)
+def search_into(grid: Grid, start: Floats, own: Ints, radius: float, unknown: bool, voxel: Ints) -> float:
+    """Distance from one point; writes the voxel found."""
+    best = np.nextafter(radius * radius, np.inf)  # squared; what lies at the radius itself still counts
+    found = False
+    bx, by, bz = own[0] >> 3, own[1] >> 3, own[2] >> 3
+    low_x, low_y, low_z = grid.low[0] >> 3, grid.low[1] >> 3, grid.low[2] >> 3
+    high_x, high_y, high_z = (grid.high[0] >> 3) - 1, (grid.high[1] >> 3) - 1, (grid.high[2] >> 3) - 1
+    if unknown:  # all around the map as well
+        low_x, low_y, low_z = min(low_x, bx) - 1, min(low_y, by) - 1, min(low_z, bz) - 1
+        high_x, high_y, high_z = max(high_x, bx) + 1, max(high_y, by) + 1, max(high_z, bz) + 1
+    first = max(low_x - bx, bx - high_x, low_y - by, by - high_y, low_z - bz, bz - high_z, 0)
+    last = max(high_x - bx, bx - low_x, high_y - by, by - low_y, high_z - bz, bz - low_z)
+    for shell in range(first, last + 1):
+        gap = shell_distance(start, bx, by, bz, shell)
+        if gap * gap >= best:
+            break
+        for x in range(max(bx - shell, low_x), min(bx + shell, high_x) + 1):
+            for y in range(max(by - shell, low_y), min(by + shell, high_y) + 1):
+                step = 1 if abs(x - bx) == shell or abs(y - by) == shell else max(2 * shell, 1)
+                from_z = bz - shell
+                if step == 1:
+                    from_z = max(from_z, low_z)
+                for z in range(from_z, min(bz + shell, high_z) + 1, step):
+                    if z < low_z or box_distance_squared(start, 8 * x, 8 * y, 8 * z, 8) >= best:
+                        continue
+                    closer = search_brick_into(grid, start, x, y, z, best, unknown, voxel)
+                    if closer < best:
+                        best, found = closer, True
+    return np.sqrt(best) if found else np.inf
+
+
+@nb.njit(nogil=True)
+def search_brick_into(
+    grid: Grid, start: Floats, bx: int, by: int, bz: int, best: float, unknown: bool, voxel: Ints
+) -> float:
+    """Least squared distance to a voxel of a brick, if it is below `best`, and that voxel; else `best`."""
+    brick = brick_of(grid, 8 * bx, 8 * by, 8 * bz)
+    if brick < 0:
+        if not unknown:
+            return best
+        corner = (8 * bx, 8 * by, 8 * bz)
+        for axis in range(3):
+            voxel[axis] = min(max(int(np.floor(start[axis])), corner[axis]), corner[axis] + 7)
+        return box_distance_squared(start, 8 * bx, 8 * by, 8 * bz, 8)
+    for w in range(8):
+        words = grid.words[brick, w]
+        bits = ~words[KNOWN_BITS] if unknown else words[OCCUPIED_BITS]
+        x, y, z = 8 * bx + 4 * (w & 1), 8 * by + 2 * (w & 2), 8 * bz + (w & 4)
+        if bits == U(0) or box_distance_squared(start, x, y, z, 4) >= best:
+            continue
+        for n in range(64):
+            if (bits >> U(n)) & U(1) != U(0):
+                vx, vy, vz = x + x_in_block(n), y + x_in_block(n >> 1), z + x_in_block(n >> 2)
+                distance = box_distance_squared(start, vx, vy, vz, 1)
+                if distance < best:
+                    best = distance
+                    voxel[0], voxel[1], voxel[2] = vx, vy, vz
+    return best
+
+
+@nb.njit(nogil=True, forceinline=True)
+def shell_distance(start: Floats, bx: int, by: int, bz: int, shell: int) -> float:
+    """A bound of the distance to the bricks that are `shell` bricks away from (bx, by, bz); 0 for its own."""
+    least = np.inf
+    for axis, brick in enumerate((bx, by, bz)):
+        least = min(least, start[axis] - 8 * (brick - shell + 1), 8 * (brick + shell) - start[axis])
+    return max(least, 0.0)
+
+
+@nb.njit(nogil=True, forceinline=True)
+def box_distance_squared(start: Floats, x: int, y: int, z: int, size: int) -> float:
+    """Squared distance from a point to the cube from (x, y, z) on; 0 inside."""
+    gx = max(x - start[0], start[0] - (x + size), 0.0)
+    gy = max(y - start[1], start[1] - (y + size), 0.0)
+    gz = max(z - start[2], start[2] - (z + size), 0.0)
+    return gx * gx + gy * gy + gz * gz  # type: ignore[no-any-return]

@@ -1,0 +1,163 @@
+"""States and sums at points; no checks, but they say whether a point was inside the numbered space.
+
+Sums are read in three steps: `locate_into` finds each point's cell and voxel, `group_into` lists the points cell by
+cell, and one call for each cell gathers, with all it needs in the processor's cache.
+"""
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.queries.occupancy_kernels import (
+    NONE,
+    UNKNOWN,
+    Bytes,
+    Floats,
+    Grid,
+    Index,
+    Ints,
+    Pool,
+    U,
+    place_of,
+    slot_of,
+    state_in,
+    voxel_of,
+)
+
+Places = npt.NDArray[np.uint32]
+Counts = npt.NDArray[np.int32]
+BLOCK = 256
+
+
+@nb.njit(nogil=True, forceinline=True)
+def is_within(points: Floats, n: int | np.uint64, reach_m: float) -> bool:
+    """Whether a point is finite and within reach along every axis."""
+    return bool((abs(points[n, 0]) < reach_m) & (abs(points[n, 1]) < reach_m) & (abs(points[n, 2]) < reach_m))
+
+
+@nb.njit(cache=True, nogil=True)
+def states_into(grid: Grid, points: Floats, reach_m: float, out: Bytes) -> bool:
+    """States of the voxels that hold (N, 3) points; returns whether all are finite and within reach.
+
+    All bricks of a block of points first, then all their bits: so that the processor fetches many at a time.
+    """
+    inside = True
+    bricks, places = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
+    for start in range(U(0), U(points.shape[0]), U(BLOCK)):
+        count = min(U(BLOCK), U(points.shape[0]) - start)
+        for n in range(count):
+            inside &= is_within(points, start + n, reach_m)
+            x = voxel_of(points[start + n, 0], grid.edge_nm)
+            y = voxel_of(points[start + n, 1], grid.edge_nm)
+            z = voxel_of(points[start + n, 2], grid.edge_nm)
+            slot = slot_of(grid, x >> grid.depth, y >> grid.depth, z >> grid.depth)
+            places[n] = place_of(x, y, z, (1 << grid.depth) - 1)
+            bricks[n] = grid.bricks[U(slot), U(places[n] >> 9)] if slot >= 0 else NONE
+        for n in range(count):
+            out[start + n] = state_in(grid.words, bricks[n], places[n]) if bricks[n] >= 0 else UNKNOWN
+    return inside
+
+
+@nb.njit(cache=True, nogil=True)
+def locate_into(grid: Grid, points: Floats, reach_m: float, slots: Index, places: Places) -> bool:
+    """Slots of the cells that hold (N, 3) points, -1 where there is no brick, and Morton codes inside the cell.
+
+    Returns whether all points are finite and within reach.
+    """
+    inside = True
+    for n in range(U(points.shape[0])):
+        px, py, pz = points[n, 0], points[n, 1], points[n, 2]
+        inside &= (abs(px) < reach_m) & (abs(py) < reach_m) & (abs(pz) < reach_m)
+        x, y, z = voxel_of(px, grid.edge_nm), voxel_of(py, grid.edge_nm), voxel_of(pz, grid.edge_nm)
+        slot = slot_of(grid, x >> grid.depth, y >> grid.depth, z >> grid.depth)
+        place = place_of(x, y, z, (1 << grid.depth) - 1)
+        places[n] = place
+        if slot >= 0 and grid.bricks[U(slot), U(place >> 9)] < 0:
+            slot = -1
+        slots[n] = slot
+    return inside
+
+
+@nb.njit(cache=True, nogil=True)
+def group_into(slots: Index, starts: Ints, order: Index) -> None:
+    """List the points of each slot: those of slot c are order[starts[c] : starts[c + 1]], of (C + 1,) starts."""
+    starts[:] = 0
+    for n in range(U(slots.shape[0])):
+        if slots[n] >= 0:
+            starts[U(slots[n]) + U(1)] += 1
+    for c in range(1, starts.shape[0]):
+        starts[c] += starts[c - 1]
+    at = starts.copy()
+    for n in range(U(slots.shape[0])):
+        if slots[n] >= 0:
+            order[at[U(slots[n])]] = n
+            at[U(slots[n])] += 1
+
+
+@nb.njit(cache=True, nogil=True)
+def counts_into(rows: Index, places: Places, bricks: npt.NDArray[np.int16], pool: Pool, out: Counts) -> None:
+    """Hits and misses of the listed points of one cell, all in its bricks."""
+    for n in range(U(rows.shape[0])):
+        row = U(rows[n])
+        place = U(places[row])
+        brick = U(bricks[place >> U(9)])
+        out[row, 0] = pool[brick, place & U(511), 0]
+        out[row, 1] = pool[brick, place & U(511), 1]
+
+
+@nb.njit(cache=True, nogil=True)
+def log_odds_into(
+    rows: Index,
+    places: Places,
+    bricks: npt.NDArray[np.int16],
+    pool: Pool,
+    of_hits: Floats,
+    of_misses: Floats,
+    least: float,
+    most: float,
+    out: Floats,
+) -> None:
+    """Clamped log-odds of the listed points of one cell, with a pool of 16 bits; NaN where unknown.
+
+    `of_hits` and `of_misses` as `state_kernels.states_of_counts_into` has them.
+    """
+    for n in range(U(rows.shape[0])):
+        row = U(rows[n])
+        place = U(places[row])
+        brick = U(bricks[place >> U(9)])
+        hits, misses = pool[brick, place & U(511), 0], pool[brick, place & U(511), 1]
+        odds = of_hits[np.uint16(hits)] + of_misses[np.uint16(misses)]
+        out[row] = min(max(odds, least), most) if hits | misses != 0 else np.nan
+
+
+@nb.njit(cache=True, nogil=True)
+def samples_into(
+    rows: Index,
+    places: Places,
+    known: Places,
+    row_of: Index,
+    narrow: npt.NDArray[np.int32],
+    wide_planes: Ints,
+    wide: Ints,
+    first_plane: int,
+    out: Ints,
+) -> None:
+    """Sums (N, P) of P planes from the first on, of the listed points of one cell; those without stay as they are."""
+    P = out.shape[1]
+    for n in range(rows.shape[0]):
+        place = places[rows[n]]
+        at, end = 0, known.shape[0]
+        while at < end:
+            middle = (at + end) >> 1
+            if known[middle] < place:
+                at = middle + 1
+            else:
+                end = middle
+        if at == known.shape[0] or known[at] != place:
+            continue
+        row = row_of[at]
+        for p in range(P):
+            out[rows[n], p] = narrow[row, first_plane + p]
+        for w in range(wide_planes.shape[0]):
+            if 0 <= wide_planes[w] - first_plane < P:
+                out[rows[n], wide_planes[w] - first_plane] = wide[row, w]

@@ -1,0 +1,81 @@
+"""Rays: how far one sees from a point before something is in the way."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.errors import BadInputError
+from cairn_map.queries import ray_kernels as kernels
+from cairn_map.queries.frozen_map import Floats, FrozenMap, as_points, check_within
+from cairn_map.queries.occupancy_states import State
+
+ONES = ~np.uint64(0)
+CHUNK = 1 << 14
+"""Rays whose directions are made of length 1 at a time."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RayEnds:
+    """Where N rays end."""
+
+    distance_m: Floats
+    """(N,) to where the ray enters the voxel that ends it, 0 if it starts there; infinite if none does."""
+    states: npt.NDArray[np.uint8]
+    """(N,) `State` of that voxel; FREE if the ray came to its maximum range."""
+    voxels: npt.NDArray[np.int64]
+    """(N, 3) number of that voxel; of no meaning where there is none."""
+
+    @property
+    def hit(self) -> npt.NDArray[np.bool_]:
+        """(N,) whether an occupied voxel ended the ray."""
+        return np.asarray(self.states == State.OCCUPIED)
+
+
+def cast(
+    frozen: FrozenMap,
+    origins_m: npt.ArrayLike,
+    directions: npt.ArrayLike,
+    *,
+    max_range_m: float,
+    ends_in_unknown: bool,
+) -> RayEnds:
+    """The ends of (N, 3) rays of any length other than 0."""
+    origins, directions = as_points(origins_m, "origins"), as_points(directions, "directions")
+    if origins.shape != directions.shape:
+        raise BadInputError("bad_points", f"as many directions as origins, got {len(directions)} and {len(origins)}")
+    if not max_range_m >= 0:
+        raise BadInputError("bad_range", f"the maximum range must be 0 or more, got {max_range_m}")
+    N, edge_m = len(origins), frozen.geometry.voxel_edge_m
+    ends = RayEnds(np.empty(N), np.empty(N, np.uint8), np.empty((N, 3), np.int64))
+    for start in range(0, N, CHUNK):
+        part = slice(start, start + CHUNK)
+        inside = kernels.cast_into(
+            frozen.grid,
+            origins[part],
+            _units(directions[part]),
+            frozen.reach_m,
+            max_range_m / edge_m,
+            ONES if ends_in_unknown else np.uint64(0),
+            ends.distance_m[part],
+            ends.states[part],
+            ends.voxels[part],
+        )
+        check_within(inside, frozen)
+    np.multiply(ends.distance_m, edge_m, out=ends.distance_m)
+    return ends
+
+
+def _units(directions: Floats) -> Floats:
+    """The same of length 1.
+
+    Raises:
+        BadInputError: one has no length, or is not finite.
+    """
+    largest = np.abs(directions).max(axis=1, keepdims=True)
+    if not ((largest > 0) & (largest < math.inf)).all():
+        raise BadInputError("bad_points", "directions must be finite and not of length 0")
+    scaled: Floats = directions / largest  # so that no square overflows or vanishes
+    units: Floats = scaled / np.sqrt((scaled * scaled).sum(axis=1, keepdims=True))
+    return units

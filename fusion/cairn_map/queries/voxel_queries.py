@@ -1,0 +1,92 @@
+"""Which voxels of a map are of interest: where the unknown begins, what is hot, what lies in a box."""
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.channels import ChannelKind
+from cairn_map.evidence.evidence import Evidence, empty_evidence
+from cairn_map.evidence.grid import Cell, CellKey, voxels_in_cell
+from cairn_map.evidence.voxels import Voxels, joined_voxels, voxels_of_evidence
+from cairn_map.queries import layer_kernels
+from cairn_map.queries.frozen_map import Box, FrozenMap
+from cairn_map.queries.occupancy_kernels import list_bits_into
+from cairn_map.queries.point_queries import first_of_kind
+
+Ints = npt.NDArray[np.int64]
+
+
+def frontier(frozen: FrozenMap, box_m: Box | None) -> Ints:
+    """(M, 3) numbers of the free voxels with an unknown one beside a face."""
+    low, high = frozen.voxels_of_box(box_m)
+    corners = frozen.brick_corners()
+    bits = np.empty((len(corners), 8), np.uint64)
+    found = np.empty((layer_kernels.frontier_into(frozen.grid, corners, bits), 3), np.int64)
+    list_bits_into(bits, corners, found)
+    return found if box_m is None else found[_are_within(found, low, high)]
+
+
+def frontier_cells(frozen: FrozenMap, box_m: Box | None) -> dict[Cell, int]:
+    """The cells with such voxels, and how many each has."""
+    cells, counts = np.unique(frontier(frozen, box_m) >> frozen.geometry.depth, axis=0, return_counts=True)
+    return {Cell(*cell): count for cell, count in zip(cells.tolist(), counts.tolist(), strict=True)}
+
+
+def voxels_in_box(frozen: FrozenMap, box_m: Box | None, *, occupied_only: bool) -> Voxels:
+    """The voxels with evidence whose centres lie in a box."""
+    low, high = frozen.voxels_of_box(box_m)
+    side = frozen.geometry.side
+    parts = []
+    for slot, first in enumerate(frozen.grid.cells * side):
+        if (first < high).all() and (first + side > low).all():
+            key = frozen.keys[slot]
+            evidence = frozen.cells[slot].packed()
+            numbers = voxels_in_cell(evidence.voxels, key, frozen.geometry)
+            part = _rows(evidence, _are_within(numbers, low, high))
+            parts.append(_voxels(frozen, key, part, occupied_only=occupied_only))
+    return joined_voxels(parts or [_voxels(frozen, CellKey(0), empty_evidence(frozen.geometry), occupied_only=False)])
+
+
+def hottest(frozen: FrozenMap, n: int, *, min_probability: float, box_m: Box | None) -> Voxels:
+    """The n known voxels of the highest mean temperature, hottest first."""
+    if n < 0 or not 0 <= min_probability <= 1:
+        raise BadInputError("bad_range", f"n must be 0 or more, a probability 0 to 1; got {n}, {min_probability}")
+    channel = first_of_kind(frozen.geometry, ChannelKind.TEMPERATURE)
+    planes = frozen.geometry.planes_of(channel.name)
+    low, high = frozen.voxels_of_box(box_m)
+    parts = []
+    for key, cell in zip(frozen.keys, frozen.cells, strict=True):
+        evidence = cell.packed()
+        sums = evidence.samples[:, planes]
+        numbers = voxels_in_cell(evidence.voxels[evidence.sampled], key, frozen.geometry)
+        # What is not known has no probability, and NaN is not above any.
+        likely = frozen.model.probability(evidence.counts[evidence.sampled]) >= min_probability
+        keep = (sums[:, -1] > 0) & likely & _are_within(numbers, low, high)
+        mean = np.full(len(sums), -np.inf)
+        mean[keep] = sums[keep, 0] / sums[keep, -1]
+        top = np.argsort(-mean, kind="stable")[: min(n, int(keep.sum()))]
+        chosen = np.zeros(len(evidence), np.bool_)
+        chosen[evidence.sampled[top]] = True
+        parts.append(_voxels(frozen, key, _rows(evidence, chosen), occupied_only=False))
+    voxels = joined_voxels(parts or [_voxels(frozen, CellKey(0), empty_evidence(frozen.geometry), occupied_only=False)])
+    return voxels.rows(np.argsort(-voxels.readings[channel.name].mean, kind="stable")[:n])
+
+
+def _voxels(frozen: FrozenMap, key: CellKey, evidence: Evidence, *, occupied_only: bool) -> Voxels:
+    return voxels_of_evidence(key, evidence, frozen.geometry, frozen.model, occupied_only=occupied_only)
+
+
+def _are_within(numbers: Ints, low: Ints, high: Ints) -> npt.NDArray[np.bool_]:
+    return np.asarray(((numbers >= low) & (numbers < high)).all(axis=1))
+
+
+def _rows(evidence: Evidence, keep: npt.NDArray[np.bool_]) -> Evidence:
+    """Those voxels of packed evidence, packed."""
+    sampled = keep[evidence.sampled]
+    new_row = np.cumsum(keep, dtype=np.int64) - 1
+    return Evidence(
+        evidence.voxels[keep],
+        evidence.counts[keep],
+        new_row[evidence.sampled[sampled]].astype(np.uint32),
+        evidence.samples[sampled],
+    )

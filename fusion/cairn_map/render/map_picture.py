@@ -1,0 +1,95 @@
+"""One layer of a map from one pose: as values, and as a picture."""
+
+import io
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.queries.map_snapshot import MapSnapshot
+from cairn_map.render.bitmap_font import write_text_into
+from cairn_map.render.legend import with_legend
+from cairn_map.render.map_render import Changes, MapRenderer, Seen
+from cairn_map.render.pose_spread import PoseSpread, spread_picture, why_withheld
+from cairn_map.render.render_picture import NOTHING, WARNING, ZERO_CELSIUS_K, Layer, Rgb, Scale, painted
+
+Values = npt.NDArray[np.floating]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ages:
+    """When things changed, and when it is now; both in the same unit, from the same zero."""
+
+    changes: Changes
+    now: float
+
+
+def layer_values(
+    renderer: MapRenderer, snapshot: MapSnapshot, seen: Seen, layer: Layer, ages: Ages | None = None
+) -> Values:
+    """(H, W) in the layer's unit: degrees Celsius, 1, metres, seconds (or what `ages` has); colours (H, W, 3).
+
+    NaN where nothing is seen, and where what is seen has no such value.
+
+    Raises:
+        BadInputError: kind `unknown_channel`: the map has no temperatures, or no colours.
+    """
+    match layer:
+        case Layer.DEPTH:
+            return seen.depth_m
+        case Layer.PROBABILITY:
+            return renderer.probability(snapshot, seen)
+        case Layer.COLOUR:
+            return renderer.colour(snapshot, seen)
+        case Layer.TEMPERATURE:
+            return renderer.temperature(snapshot, seen) - np.float32(ZERO_CELSIUS_K)
+        case Layer.AGE:
+            if ages is None:
+                return np.full_like(seen.range_m, np.nan)
+            return ages.now - renderer.changed(snapshot, seen, ages.changes)
+
+
+def layer_picture(values: Values, seen: Seen, scale: Scale, spread: PoseSpread | None = None) -> Rgb:
+    """(H + legend, W, 3) sRGB: values painted, grey where something is seen that has none, dark where nothing is.
+
+    With a pose's spread all is blurred as far as it may be off, or withheld where that says nothing any more.
+    """
+    image = painted(values, scale)
+    image[~seen.hit] = NOTHING
+    if spread is not None:
+        spread_px2 = spread.at(seen.sight, seen.range_m)
+        why = why_withheld(spread_px2[seen.hit])
+        if why is None:
+            image = spread_picture(image, spread_px2)
+        else:
+            image[:] = NOTHING
+            write_text_into(image, f"map withheld: {why}", (8, 8), WARNING)
+    return with_legend(image, scale)
+
+
+def arrays_of(
+    values: Values, seen: Seen, layer: Layer, spread: PoseSpread | None = None
+) -> dict[str, npt.NDArray[np.generic]]:
+    """By name: `range_m`, `depth_m`, and the layer's values (`temperature_k`, `age_s`, `probability`, `colour`).
+
+    With a pose's spread also `spread_px2`, (H, W, 3): the covariance xx, xy, yy of where each pixel's content appears.
+    All float32, NaN where nothing is seen or nothing is known.
+    """
+    arrays: dict[str, npt.NDArray[np.generic]] = {"range_m": seen.range_m, "depth_m": seen.depth_m}
+    if spread is not None:
+        arrays["spread_px2"] = spread.at(seen.sight, seen.range_m)
+    match layer:
+        case Layer.TEMPERATURE:
+            arrays["temperature_k"] = values.astype(np.float32) + np.float32(ZERO_CELSIUS_K)
+        case Layer.AGE:
+            arrays["age_s"] = values.astype(np.float32)
+        case Layer.PROBABILITY | Layer.COLOUR:
+            arrays[str(layer)] = values.astype(np.float32)
+    return arrays
+
+
+def npz_of(arrays: dict[str, npt.NDArray[np.generic]]) -> bytes:
+    """Arrays as the bytes of an `.npz` file."""
+    out = io.BytesIO()
+    np.savez_compressed(out, **arrays)  # type: ignore[arg-type]
+    return out.getvalue()

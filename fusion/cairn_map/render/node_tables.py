@@ -1,0 +1,57 @@
+"""What every node of a cell's bricks reads, ready to be looked up: a voxel, and the means of 2, 4 and 8 along an edge.
+
+    table [row of the brick, 0 .. 511]    its voxels in Morton order       n = 0
+                          [512 .. 575]    its nodes of 2 voxels            n = 1
+                          [576 .. 583]    of 4                             n = 2
+                          [584]           the brick itself                 n = 3
+
+The mean of a node is that of all samples below, its probability the highest below, as in `view`.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.evidence.brick_cell import BrickCell
+from cairn_map.evidence.channels import Channel
+from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.sensor_model import SensorModel, known
+
+Floats = npt.NDArray[np.float64]
+Table = npt.NDArray[np.float32]
+"""(B, 585, planes) float32; NaN where nothing is known."""
+
+NODES = 585
+FIRST_OF_NODE = np.array([0, 512, 576, 584], np.int64)
+"""Where in a brick's row the nodes of 2^n voxels begin."""
+
+
+def probability_table(cell: BrickCell, model: SensorModel) -> Table:
+    """Clamped probability, one plane."""
+    pool = cell.counts.pool.reshape(-1, 2)
+    odds = np.where(known(pool), model.log_odds(pool), -np.inf)
+    highest = _pyramid(odds[:, None], lambda parts: parts.max(axis=2))
+    with np.errstate(over="ignore"):  # of what is unknown
+        return np.where(highest > -np.inf, 1 / (1 + np.exp(-highest)), np.nan).astype(np.float32)
+
+
+def mean_table(cell: BrickCell, channel: Channel, geometry: Geometry) -> Table:
+    """Mean of a channel's samples in its unit, one plane; of colours three."""
+    places, samples = cell.samples.packed()
+    sums = samples[:, geometry.planes_of(channel.name)]
+    dense = np.zeros((len(cell.counts.pool) * 512, channel.value_count + 1))
+    rows = cell.counts.brick_of[places >> np.uint32(9)].astype(np.int64) * 512 + (places & np.uint32(511))
+    dense[rows, :-1], dense[rows, -1] = sums[:, : channel.value_count], sums[:, -1]
+    added = _pyramid(dense, lambda parts: parts.sum(axis=2))
+    weight = np.where(added[..., -1:] > 0, added[..., -1:], np.nan)
+    return np.asarray(added[..., :-1] / weight * channel.step + channel.zero, np.float32)
+
+
+def _pyramid(voxels: Floats, join: Callable[[Floats], Floats]) -> Floats:
+    """(B, 585, P) of (B * 512, P): eight neighbours in Morton order are joined to one, three times."""
+    B = len(voxels) // 512
+    nodes = [voxels.reshape(B, 512, -1)]
+    for count in (64, 8, 1):
+        nodes.append(join(nodes[-1].reshape(B, count, 8, -1)))
+    return np.concatenate(nodes, axis=1)

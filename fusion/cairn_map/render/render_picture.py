@@ -1,0 +1,89 @@
+"""Values as colours with a fixed scale; `legend` says what they mean.
+
+What has no value is grey, never the cold end of a palette; where nothing is seen it is dark.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.errors import BadInputError
+from cairn_map.render.colour_kernels import paint_into
+
+Rgb = npt.NDArray[np.uint8]
+Values = npt.NDArray[np.floating]
+
+ZERO_CELSIUS_K = 273.15
+NOTHING = (24, 26, 30)
+"""Where nothing is seen."""
+NO_VALUE = (112, 112, 112)
+"""Of what is seen, but has no value of the layer."""
+TEXT = (230, 230, 230)
+WARNING = (255, 210, 60)
+INFERNO = "000004160b39420a686a176e932667bc3754dd513af37819fca50af6d746fcffa4"
+VIRIDIS = "440154482475414487355f8d2a788e21918c22a88444bf707ad151bddf26fde725"
+"""Eleven colours each, evenly spaced, of the palettes of these names (van der Walt and Smith)."""
+DARKEST = 0.12
+"""Where painting begins on the inferno: its first colours are those of nothing."""
+
+
+class Layer(StrEnum):
+    """What of a map is drawn."""
+
+    TEMPERATURE = "temperature"
+    COLOUR = "colour"
+    PROBABILITY = "probability"
+    DEPTH = "depth"
+    AGE = "age"
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """How values become colours: between two ends, the same in every picture."""
+
+    layer: Layer
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if not -1e9 < self.low < self.high < 1e9:
+            raise BadInputError(
+                "bad_scale", f"a scale goes from a lower to a higher value, got {self.low}, {self.high}"
+            )
+
+
+SCALES = {
+    Layer.TEMPERATURE: Scale(Layer.TEMPERATURE, 10.0, 50.0),
+    Layer.PROBABILITY: Scale(Layer.PROBABILITY, 0.5, 1.0),
+    Layer.DEPTH: Scale(Layer.DEPTH, 0.0, 10.0),
+    Layer.AGE: Scale(Layer.AGE, 0.0, 3600.0),
+    Layer.COLOUR: Scale(Layer.COLOUR, 0.0, 255.0),
+}
+"""Of each layer where nobody says another: degrees Celsius, 1, metres, seconds."""
+
+
+@lru_cache(maxsize=8)
+def palette(layer: Layer) -> Rgb:
+    """(256, 3) from the low to the high end; of age, the newest is the brightest."""
+    anchors = INFERNO if layer is Layer.TEMPERATURE else VIRIDIS
+    known = np.frombuffer(bytes.fromhex(anchors), np.uint8).reshape(-1, 3)
+    first = DARKEST if layer is Layer.TEMPERATURE else 0.0
+    at = np.linspace(first, 1, 256) * (len(known) - 1)
+    colours = np.stack([np.interp(at, np.arange(len(known)), known[:, c]) for c in range(3)], axis=1)
+    painted: Rgb = np.rint(colours[::-1] if layer in (Layer.AGE, Layer.DEPTH) else colours).astype(np.uint8)
+    return painted
+
+
+def painted(values: Values, scale: Scale) -> Rgb:
+    """(H, W, 3) colours of (H, W) values in the scale's unit, or of (H, W, 3) colours; grey where they are NaN."""
+    if values.ndim == 3:
+        rgb = np.rint(np.clip(np.nan_to_num(values), 0, 255)).astype(np.uint8)
+        rgb[np.isnan(values[..., 0])] = NO_VALUE
+        return rgb
+    flat = np.ascontiguousarray(values, np.float32).reshape(-1)
+    rgb = np.empty((flat.size, 3), np.uint8)
+    paint_into(flat, palette(scale.layer), scale.low, scale.high, np.array(NO_VALUE, np.uint8), rgb)
+    return rgb.reshape(*values.shape, 3)

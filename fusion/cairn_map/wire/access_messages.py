@@ -1,0 +1,84 @@
+"""The JSON about who may do what: tokens, and the audit log with its chain of hashes."""
+
+import hashlib
+import json
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from cairn_map.wire.messages import NameText
+
+RoleText = Literal["admin", "operator", "robot", "reader", "enroller", "relay"]
+LIFETIME_MAX_S = 20 * 366 * 86_400.0
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class CreateToken(_Model):
+    """Body of `PUT /tokens/{token}`."""
+
+    role: RoleText
+    map: NameText | None = None
+    """The one map that it counts on; None: all maps, those to come included."""
+    robot: NameText | None = None
+    """Whose token it is; of role robot, or of a relay that is a robot, too."""
+    lifetime_s: Annotated[float, Field(gt=0, le=LIFETIME_MAX_S)] | None = None
+    """None: until it is revoked."""
+
+    @model_validator(mode="after")
+    def _check_robot(self) -> Self:
+        if self.role == "robot" and not (self.map and self.robot):
+            raise ValueError("a robot's token names its map and its robot")
+        if self.role == "relay" and self.robot and not self.map:
+            raise ValueError("a relay that is a robot names its map, too")
+        if self.role not in ("robot", "relay") and self.robot:
+            raise ValueError(f"a token of role {self.role} names no robot")
+        return self
+
+
+class TokenInfo(_Model):
+    """One token, without its secret, which nobody keeps."""
+
+    name: str
+    role: RoleText
+    map: NameText | None
+    robot: NameText | None
+    created_s: float
+    expires_s: float | None
+    last_used_s: float | None
+    """Written every few seconds at most."""
+
+
+class NewSecret(_Model):
+    """Answer to a creation or rotation: the secret, shown this once."""
+
+    token: str
+    info: TokenInfo
+
+
+class AuditEntry(_Model):
+    """One line of the audit log."""
+
+    number: int
+    time_s: float
+    who: str
+    """Name of the token, or `local` (an open server's caller), `admin` and `enroller` (its files), `server`."""
+    what: str
+    detail: str
+    chain: str
+    """SHA-256 over the line before and this one, in hex; empty for lines older than the chain."""
+
+    def is_next_after(self, before: "AuditEntry") -> bool:
+        """Whether this line follows that one, and nobody changed it since."""
+        chain = audit_chain(
+            bytes.fromhex(before.chain), self.number, self.time_s, who=self.who, what=self.what, detail=self.detail
+        )
+        return chain.hex() == self.chain
+
+
+def audit_chain(before: bytes, number: int, time_s: float, *, who: str, what: str, detail: str) -> bytes:
+    """The chain at a line of the audit log, from the chain at the line before (empty at the first)."""
+    line = json.dumps([number, time_s, who, what, detail], separators=(",", ":"))
+    return hashlib.sha256(before + line.encode()).digest()

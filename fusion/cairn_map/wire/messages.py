@@ -1,0 +1,300 @@
+"""The JSON that client and server exchange, as models that check what they read.
+
+Fields that hold cursors, fingerprints or version vectors carry their text forms; the properties parse them.
+"""
+
+from typing import Annotated, Literal, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field, ValidationError, model_validator
+
+from cairn_map.commits.cursor import Cursor, cursor_from_text
+from cairn_map.commits.ids import NUMBER_LIMIT
+from cairn_map.commits.version_vector import AUTHORS_MAX, VersionVector, version_vector_from_json
+from cairn_map.errors import DamagedDataError, first_error
+from cairn_map.evidence.fingerprint import Fingerprint, fingerprint_from_hex
+from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.wire.robot_status import RobotStatus
+
+Message = TypeVar("Message", bound=BaseModel)
+CursorText = Annotated[str, Field(max_length=128)]
+FingerprintText = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
+ShaText = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+NameText = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]
+IdText = Annotated[str, Field(max_length=96)]
+# Fail fast, else a few megabytes of wrong intervals become gigabytes of error messages.
+Interval = Annotated[list[int], Field(min_length=2, max_length=2), FailFast()]
+VectorJson = Annotated[dict[str, Annotated[list[Interval], FailFast()]], Field(max_length=AUTHORS_MAX)]
+Time = Annotated[float, Field(allow_inf_nan=False)]
+
+CURSORS_MAX = 100_000
+CellNumbers = Annotated[list[tuple[int, int, int]], Field(max_length=CURSORS_MAX), FailFast()]
+CursorGroup = tuple[CursorText | None, CellNumbers]
+WANTED_MAX = 256
+"""Commits that a header wants again."""
+DAMAGED_MAX = 256
+"""Damaged cells named in one header; the others are named when these are healed."""
+SELECTING_PARTS = ("robot", "rig", "pushed_after_s", "pushed_before_s", "captured_after_s", "captured_before_s")
+FIELDS_MAX = 64
+"""Of one object; more than any message here has."""
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+def _tuple_of(value: object) -> object:
+    """A JSON array as it must be where what was read is looked at before it is checked."""
+    return tuple(value) if isinstance(value, list) else value
+
+
+class _LongRequest(_Model):
+    """A request of which a server reads megabytes."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_few_fields(cls, value: object) -> object:
+        # Each unknown field is an error of its own: a million of them would take minutes and gigabytes.
+        if isinstance(value, dict) and len(value) > FIELDS_MAX:
+            raise ValueError(f"{len(value)} fields, at most {FIELDS_MAX} can be known")
+        return value
+
+
+class CreateMap(_Model):
+    """Body of `PUT /maps/{map}`."""
+
+    geometry: Geometry = Geometry()
+    sensor_model: SensorModel = SensorModel()
+
+
+class MapInfo(_Model):
+    """What a server says about one map."""
+
+    name: NameText
+    geometry: Geometry
+    sensor_model: SensorModel
+    cursor: CursorText
+    cells: int
+    size_bytes: int
+    """Sum of the encoded cells."""
+    commits: int
+    branches: int
+    box_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None
+    """Lowest and highest corner of the cells that hold evidence; None while the map is empty."""
+    server_key: ShaText | None = None
+    """Public key by which the server signs what it says itself, in hex: what `--trust-server` takes."""
+
+
+class Register(_Model):
+    """Body of `POST /maps/{map}/branches`."""
+
+    robot: NameText
+    mode: Literal["high-end", "low-end", "viewer"] = "high-end"
+    incarnation: Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
+    sensors: Annotated[list[Annotated[str, Field(max_length=64)]], Field(max_length=64)] = []
+
+
+class Registered(_Model):
+    """Answer to a registration; the token is shown once and kept only as a hash."""
+
+    branch: NameText
+    token: str
+    map: MapInfo
+
+
+class BranchInfo(_Model):
+    """One robot as the server sees it."""
+
+    branch: NameText
+    mode: str
+    sensors: list[str]
+    cursor: CursorText | None
+    behind: int | None
+    """Log entries folded since the branch's cursor; None before its first fetch."""
+    behind_bytes: int | None = None
+    """Bytes of others' commits in them; None before its first fetch, or if that was too long ago."""
+    incarnation: str = ""
+    """With which it registered last."""
+    last_seen_s: float
+    status: RobotStatus | None = None
+    """The last that it told."""
+    view_s: float | None = None
+    """When its latest picture came; None: there is none."""
+
+
+class Pushed(_Model):
+    """Answer to a push: the commit is durable (`new`), or was already (`known`)."""
+
+    id: IdText
+    state: Literal["new", "known"]
+
+
+class CellCursor(_LongRequest):
+    """One cell whose cursor differs from the request's default; None: hold nothing of it."""
+
+    cell: Annotated[tuple[int, int, int], BeforeValidator(_tuple_of)]
+    cursor: CursorText | None
+
+
+class MissingRequest(_LongRequest):
+    """Body of `POST /maps/{map}/branches/{branch}/missing`: what the asker holds."""
+
+    author: Annotated[str, Field(max_length=80)] | None = None
+    """`robot.incarnation` of the asker, whose own commits a delta leaves out."""
+    cursor: CursorText | None = None
+    """Cursor of every cell not listed; None: holds nothing."""
+    cells: Annotated[list[CellCursor], Field(max_length=CURSORS_MAX), FailFast()] = []
+    groups: Annotated[list[CursorGroup], Field(max_length=CURSORS_MAX), FailFast()] = []
+    """The same by cursor: those of a reply that was cut have the same one, and it is longer than a cell's number."""
+    compare: bool = False
+    """Answer every listed cell with a `reset` frame: only its fingerprint."""
+    box: tuple[tuple[int, int, int], tuple[int, int, int]] | None = None
+    """Lowest and highest cell (inclusive) that the asker wants to hear of; None: all."""
+    size_bytes_max: Annotated[int, Field(ge=1)] | None = None
+    """After so many bytes of cell frames the reply ends with `more`; None: the server's own limit."""
+    kinds: Annotated[list[Literal["delta", "state", "full"]], Field(max_length=3), FailFast()] = ["delta", "full"]
+    """Kinds of frame that the asker can use now; `full` is always understood to be."""
+    near: tuple[int, int, int] | None = None
+    """Frames of the cells next to this one come first, then those farther away; None: the newest everywhere."""
+    begun: tuple[tuple[int, int, int], Annotated[int, Field(ge=1)], ShaText] | None = None
+    """Cell, bytes of its frame's payload that came before a cut, SHA-256 of them: only the rest is sent."""
+    known: Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")] | None = None
+    """First digits of the SHA-256 of the last reply: if this one would be the same, 204 says so."""
+
+
+class ReplyHeader(_Model):
+    """First frame of a reply, and head of the cell index: one state of the map, and what a robot may conclude."""
+
+    to: CursorText
+    vector: VectorJson
+    """Ids folded at or before `to`."""
+    stable: VectorJson
+    """Ids that no restore can lose any more."""
+    pending: VectorJson = {}
+    """Ids that are durable here but not folded yet: they need not be pushed, and count for nothing else."""
+    tip: tuple[Annotated[int, Field(ge=0, lt=NUMBER_LIMIT)], ShaText] | None = None
+    """Highest folded number of the asker's own incarnation, and its SHA-256."""
+    retracts: list[IdText] = []
+    """Retracting commits that are not yet stable."""
+    damaged: Annotated[list[tuple[tuple[int, int, int], FingerprintText]], Field(max_length=DAMAGED_MAX)] = []
+    """Cells that the server cannot read any more, and what they were: whoever has one as it was may send it."""
+    wanted: Annotated[list[IdText], Field(max_length=WANTED_MAX)] = []
+    """Commits whose evidence a retract needs and the server forgot: whoever has one pushes it again."""
+
+    @property
+    def to_cursor(self) -> Cursor:
+        """`to`, parsed."""
+        return cursor_from_text(self.to)
+
+    @property
+    def coverage(self) -> VersionVector:
+        """`vector`, parsed."""
+        return version_vector_from_json(self.vector)
+
+    @property
+    def pending_vector(self) -> VersionVector:
+        """`pending`, parsed."""
+        return version_vector_from_json(self.pending)
+
+    @property
+    def stable_vector(self) -> VersionVector:
+        """`stable`, parsed."""
+        return version_vector_from_json(self.stable)
+
+
+class Done(_Model):
+    """Last frame of a whole reply: cells without a frame stand at `to` as they are."""
+
+    to: CursorText
+    rest: FingerprintText
+    """Sum of the fingerprints of the server's cells that got no frame."""
+
+    @property
+    def to_cursor(self) -> Cursor:
+        """`to`, parsed."""
+        return cursor_from_text(self.to)
+
+    @property
+    def rest_fingerprint(self) -> Fingerprint:
+        """`rest`, parsed."""
+        return fingerprint_from_hex(self.rest)
+
+
+class More(_Model):
+    """Last frame of a reply that reached its size limit: ask again for the rest."""
+
+    to: CursorText
+
+
+class Retract(_Model):
+    """Body of `POST /maps/{map}/retracts`: commits by id, and all that are here now and fit every other part named."""
+
+    commits: Annotated[list[IdText], Field(max_length=4096), FailFast()] = []
+    robot: NameText | None = None
+    rig: ShaText | None = None
+    """SHA-256 of the `rig.json` that they were made with."""
+    pushed_after_s: Time | None = None
+    pushed_before_s: Time | None = None
+    """When the server received them, UTC seconds since 1970."""
+    captured_after_s: Time | None = None
+    captured_before_s: Time | None = None
+    """When a scan of them was taken."""
+    note: Annotated[str, Field(max_length=1024)] = ""
+    preview: bool = False
+    """Only say which commits it would name."""
+
+    @property
+    def selects(self) -> bool:
+        """Whether it names commits by what they are, not only by id."""
+        return any(getattr(self, part) is not None for part in SELECTING_PARTS)
+
+
+class Retracted(_Model):
+    """Answer to a retract: the retracting commit, None for a preview, and what it names."""
+
+    id: IdText | None
+    commits: list[IdText]
+
+
+class LogEntry(_Model):
+    """One row of the log: evidence folded in, or taken out again."""
+
+    seq: int
+    kind: Literal["+", "-"]
+    id: IdText
+    sha: ShaText
+    size_bytes: int
+    cells: int
+    captured_s: tuple[float, float] | None
+    retracts: list[IdText]
+    parent: ShaText | None = None
+    seen: CursorText | None = None
+    """SHA-256 of the author's commit before it, and the state of the server that the author had when it made it."""
+    place_m: tuple[float, float, float] | None = None
+    """Where the rig was for its last scan, metres, map frame; None: it has no scans, or is not kept any more."""
+    via: str | None = None
+    """Name of the token of the relay that handed it over; None: its robot did, or the server made it."""
+
+
+class Problem(BaseModel):
+    """RFC 9457 problem; `kind` is our stable code."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    type: str = "about:blank"
+    title: str = ""
+    status: int = 0
+    detail: str = ""
+    kind: str = "unknown"
+
+
+def message_from_json(model: type[Message], data: bytes | str) -> Message:
+    """A checked message.
+
+    Raises:
+        DamagedDataError: not JSON, or a field is missing, unknown or out of range.
+    """
+    try:
+        return model.model_validate_json(data, strict=True)
+    except ValidationError as exc:
+        raise DamagedDataError("bad_message", f"{model.__name__}: {first_error(exc)}") from None

@@ -1,0 +1,136 @@
+"""A reply that a cut link carried in part, and the next one: no byte of a cell comes twice.
+
+    reply, cut:    ... | head of cell A, the first 80 kB of its payload |
+    request:       begun = (A, 80 kB, their SHA-256)
+    next reply:    header | ... | head of cell A, "continues", what comes after these 80 kB | ...
+
+The server keeps nothing: it compares the digest with the beginning of what it would send now. The same for a reply
+without cells, which says again and again that nothing changed: the asker names the last one by its digest.
+"""
+
+import hashlib
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+from cairn_map.codec.cell_reading import CELL_BYTES_MAX
+from cairn_map.errors import DamagedDataError, UnreachableError
+from cairn_map.evidence.grid import CellKey, cell_of_key
+from cairn_map.wire.frames import CellFrame, Frame, FrameReader
+from cairn_map.wire.messages import MissingRequest
+
+Begun = tuple[tuple[int, int, int], int, str]
+"""Cell, bytes of its frame's payload that are here, SHA-256 of them."""
+
+BEGUN_BYTES_MIN = 512
+"""Naming less costs more than it saves."""
+KNOWN_BYTES_MAX = 1 << 20
+"""A longer reply is not kept to compare the next one with."""
+KNOWN_DIGITS = 16
+
+
+def reply_digest(reply: bytes) -> str:
+    """What a request calls the last reply by."""
+    return hashlib.sha256(reply).hexdigest()[:KNOWN_DIGITS]
+
+
+def without_begun(frames: Iterable[Frame], begun: Begun | None) -> Iterator[Frame]:
+    """The frames, without the beginning of a payload that the asker has."""
+    cell, size, sha = begun or (None, 0, "")
+    for frame in frames:
+        if not isinstance(frame, CellFrame) or len(frame.payload) < size or cell_of_key(frame.cell) != cell:
+            yield frame
+        elif hashlib.sha256(frame.payload[:size]).hexdigest() == sha:
+            yield replace(frame, continues=True, payload=frame.payload[size:])
+        else:
+            yield frame
+
+
+class Replies:
+    """What one asker remembers of its replies."""
+
+    def __init__(self) -> None:
+        self.begun: tuple[CellKey, bytes] | None = None
+        """Of the frame that did not come whole, the cell and the beginning of its payload."""
+        self.known: bytes | None = None
+        """The last reply, if it had no cells."""
+
+    def reply_to(self, request: MissingRequest) -> "Reply":
+        """The reply that the next bytes are."""
+        return Reply(self, request)
+
+
+class Reply:
+    """One reply that comes in."""
+
+    def __init__(self, memory: Replies, request: MissingRequest) -> None:
+        self._memory = memory
+        self._begun = memory.begun
+        self._known = memory.known
+        self.request = request
+        """With what is here of the replies before."""
+        if self._begun is not None:
+            key, payload = self._begun
+            sha = hashlib.sha256(payload).hexdigest()
+            begun = (cell_of_key(key), len(payload), sha)
+            self.request = self.request.model_copy(update={"begun": begun})
+        if self._known is not None:
+            self.request = self.request.model_copy(update={"known": reply_digest(self._known)})
+
+    def again(self) -> Iterator[Frame]:
+        """The frames of the last reply, as this one is the same."""
+        return FrameReader().feed(self._known or b"")
+
+    def frames(self, parts: Iterable[bytes]) -> Iterator[Frame]:
+        """Whole frames out of its bytes.
+
+        Raises:
+            DamagedDataError: the bytes are not frames.
+            UnreachableError: kind `cut_off`: they end too early.
+        """
+        reader = FrameReader()
+        self._memory.known = None
+        short: bytearray | None = bytearray()
+        try:
+            for part in parts:
+                if short is not None:
+                    short += part
+                for frame in reader.feed(part):
+                    if isinstance(frame, CellFrame):
+                        short = None
+                    yield self._whole(frame) if isinstance(frame, CellFrame) else frame
+                if short is not None and len(short) > KNOWN_BYTES_MAX:
+                    short = None
+        finally:
+            self._note(reader)
+        if not reader.is_empty:
+            raise UnreachableError("cut_off", "the reply was cut off")
+        self._memory.known = bytes(short) if short is not None else None
+
+    def _whole(self, frame: CellFrame) -> CellFrame:
+        """A frame with the beginning that came with an earlier reply."""
+        if self._memory.begun is not None and self._memory.begun[0] == frame.cell:
+            self._memory.begun = None
+        if not frame.continues:
+            return frame
+        name = cell_of_key(frame.cell)
+        if self._begun is None or self._begun[0] != frame.cell:
+            raise DamagedDataError("bad_frame", f"the frame of cell {name} goes on from what is not here")
+        size_bytes = len(self._begun[1]) + len(frame.payload)
+        if size_bytes > CELL_BYTES_MAX:
+            raise DamagedDataError("bad_frame", f"cell {name} has at most {CELL_BYTES_MAX} bytes, got {size_bytes}")
+        return replace(frame, continues=False, payload=self._begun[1] + frame.payload)
+
+    def _note(self, reader: FrameReader) -> None:
+        """Keep what came of the frame at which the reply ended."""
+        if reader.begun is None:
+            return
+        key, continues, payload = reader.begun
+        if continues:
+            if self._begun is None or self._begun[0] != key:
+                return
+            if len(self._begun[1]) + len(payload) > CELL_BYTES_MAX:  # no cell; who always goes on must not fill us
+                self._memory.begun = None
+                return
+            payload = self._begun[1] + payload
+        if len(payload) >= BEGUN_BYTES_MIN:
+            self._memory.begun = key, payload

@@ -1,0 +1,153 @@
+"""Who may do what: a bearer token stands for a role, on one map or on all.
+
+admin     everything                           `admin_token`, or anybody while there is none (loopback only)
+operator  read, retract
+robot     read, push its own commits, fetch    given at registration; of one map and one robot
+reader    read
+relay     read, hand over what robots signed   a robot's, too, if it names one
+enroller  register robots                      `enrolment_token`
+
+Whoever may read may do it with any of the first four. Tokens are kept as SHA-256 only (`token_store`); the two secrets
+of the settings are kept by whoever starts the server.
+"""
+
+import hashlib
+import hmac
+import secrets
+import time
+from dataclasses import dataclass
+from enum import StrEnum
+
+from cairn_map.errors import DeniedError
+from cairn_server.settings import Settings
+from cairn_server.store.store import Store
+from cairn_server.store.store_rows import MapRow
+from cairn_server.store.token_store import Token
+
+
+class Role(StrEnum):
+    """What a token stands for."""
+
+    ADMIN = "admin"
+    OPERATOR = "operator"
+    ROBOT = "robot"
+    READER = "reader"
+    ENROLLER = "enroller"
+    RELAY = "relay"
+
+
+READING = (Role.READER, Role.ROBOT, Role.OPERATOR, Role.RELAY)
+"""Who may read a map."""
+
+
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """Who makes a request."""
+
+    role: Role
+    robot: str | None = None
+    name: str = ""
+    """Of the token, for the audit log."""
+    map_number: int | None = None
+    """The one map that the token counts on; None: all."""
+
+    def may_author(self, robot: str) -> bool:
+        """Whether commits of this robot may come from here."""
+        return self.role is Role.ADMIN or self.robot == robot
+
+    def counts_on(self, map_number: int | None) -> bool:
+        """Whether the token counts on a map (None: on the server as a whole)."""
+        return self.map_number in (None, map_number)
+
+
+ADMIN_FILE, ENROLLER_FILE, LOCAL = Caller(Role.ADMIN, name="admin"), Caller(Role.ENROLLER, name="enroller"), "local"
+UPSTREAM = Caller(Role.RELAY, name="upstream")
+"""This server's own relay, with what the upstream server has."""
+RESERVED_TOKEN_NAMES = frozenset({ADMIN_FILE.name, ENROLLER_FILE.name, LOCAL, UPSTREAM.name, "server"})
+
+
+def new_token() -> str:
+    """A random token of 256 bits, in digits that no command line takes for an option."""
+    return secrets.token_hex(32)
+
+
+def token_hash(token: str) -> bytes:
+    """What is kept of a token; random ones need no salt."""
+    return hashlib.sha256(token.encode()).digest()
+
+
+def caller_of(token: str | None, row: MapRow | None, store: Store, settings: Settings) -> Caller:
+    """Who shows this token, to do something with a map, or (None) with none in particular.
+
+    Raises:
+        DeniedError: kind `no_token` or `bad_token`; the latter also on a map that the token is not for.
+    """
+    if token is None:
+        if settings.admin_token is None:
+            return Caller(Role.ADMIN, name=LOCAL)
+        raise DeniedError(
+            "no_token",
+            "this server wants a token: Authorization: Bearer TOKEN (the cairn command: --token, CAIRN_TOKEN)",
+        )
+    caller = _holder(token, store, settings)
+    if caller is None or not (row is None or caller.counts_on(row.number)):
+        raise bad_token()
+    return caller
+
+
+def bad_token() -> DeniedError:
+    """The one answer to whoever shows a token that is worth nothing here."""
+    return DeniedError(
+        "bad_token",
+        "the token is wrong, of another map, or ended: expired, revoked, or replaced by a rotation or registration",
+    )
+
+
+def require(caller: Caller, *roles: Role) -> None:
+    """Refuse a caller without one of these roles; an admin has them all.
+
+    Raises:
+        DeniedError: kind `not_allowed`.
+    """
+    if caller.role is not Role.ADMIN and caller.role not in roles:
+        raise DeniedError(
+            "not_allowed",
+            f"this takes {' or '.join([*roles, Role.ADMIN])} rights; the token shown is of role {caller.role}",
+        )
+
+
+def require_all_maps(caller: Caller) -> None:
+    """Refuse an admin of one map what concerns the server.
+
+    Raises:
+        DeniedError: kind `not_allowed`.
+    """
+    if caller.map_number is not None:
+        raise DeniedError("not_allowed", "this takes an admin token of all maps; the token shown is of one map")
+
+
+def has_ended(token: Token, settings: Settings, *, now_s: float) -> bool:
+    """Whether a token is over its time, or its robot was silent for longer than `branch_expiry_s`."""
+    if token.expires_s is not None:
+        return now_s >= token.expires_s
+    if token.role != "robot" or settings.branch_expiry_s is None:
+        return False
+    return now_s >= max(token.created_s, token.last_used_s or 0.0) + settings.branch_expiry_s
+
+
+def _holder(token: str, store: Store, settings: Settings) -> Caller | None:
+    known = store.tokens.of_hash(token_hash(token))
+    if known is not None:
+        if has_ended(known, settings, now_s=time.time()):
+            return None
+        store.tokens.used(known.name)
+        return Caller(Role(known.role), known.robot, known.name, known.map_number)
+    if _is(token, settings.admin_token):
+        return ADMIN_FILE
+    if _is(token, settings.enrolment_token):
+        return ENROLLER_FILE
+    return None
+
+
+def _is(token: str, expected: str | None) -> bool:
+    return expected is not None and hmac.compare_digest(token.encode(), expected.encode())

@@ -1,0 +1,184 @@
+"""How much a robot may push: a faulty or hostile one must not fill the disk or blow up the map for the others.
+
+Looked at after the commit's head was read and before its evidence is decoded; taken at once, so that a robot's
+parallel pushes share one quota, and given back if the commit is refused or was known. Windows that pass (429) are
+told from what no waiting mends (400). Days are those of UTC; what a day has seen is read from the store after a start.
+"""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from cairn_map.errors import BadInputError, UnreachableError
+from cairn_map.evidence.grid import CELL_LIMIT, CellKey
+from cairn_map.kernels.morton_kernels import deinterleave
+from cairn_server.access.auth import UPSTREAM, Caller, Role
+from cairn_server.access.token_bucket import Allowance, allowance
+from cairn_server.settings import Quotas
+from cairn_server.store.quota_store import Robot, Use, relay_of
+from cairn_server.store.store import Store
+from cairn_server.store.store_rows import MapRow
+
+DAY_S = 86_400
+BOX_EVERY_S = 5.0
+"""How often a map's box is read anew while commits beyond it are refused: retracts make it smaller."""
+Corner = tuple[int, int, int]
+Box = tuple[Corner, Corner]
+"""Lowest and highest cell."""
+
+
+class Meter:
+    """What every robot has used of its quotas; may be called from any thread."""
+
+    def __init__(
+        self,
+        store: Store,
+        quotas: Quotas,
+        *,
+        wall_s: Callable[[], float] = time.time,
+        steady_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._store = store
+        self._quotas = quotas
+        self._wall_s = wall_s
+        self._steady_s = steady_s
+        self._lock = threading.Lock()
+        self._day = -1
+        self._used: dict[Robot, Use] = {}
+        self._minutes: dict[Robot, Allowance] = {}
+        self._boxes: dict[int, tuple[Box | None, float]] = {}
+
+    def is_ready(self, row: MapRow) -> bool:
+        """Whether `spending` has no need to read from the store what was pushed today, or where the map is."""
+        knows_box = self._quotas.map_extent_m is None or row.number in self._boxes
+        return knows_box and self._day == int(self._wall_s() // DAY_S)
+
+    @contextmanager
+    def spending(
+        self, row: MapRow, caller: Caller, *, size_bytes: int, cells: Collection[CellKey], via: str | None = None
+    ) -> Iterator[Callable[[], None]]:
+        """Take a commit off its robot's quotas for the length of a `with`; call what it gives to keep it taken.
+
+        What a relay hands over (`via`: by this token) is taken off the relay's. What this server fetches itself from
+        its upstream is held to what one commit may be only: it may be all of a map that grew for years.
+
+        Raises:
+            UnreachableError: kind `quota`: too much for now, with the seconds until it is not.
+            BadInputError: kind `beyond_quota`: too much at any time.
+        """
+        if caller.role is Role.ADMIN:
+            yield lambda: None
+            return
+        robot = row.number, relay_of(via) if via else caller.robot or caller.name
+        use, box, is_metered = Use(size_bytes, len(cells)), _box_of(cells), caller != UPSTREAM
+        self._check_commit(row, use, box)
+        with self._lock:
+            if is_metered:
+                self._take(robot, use)
+            day = self._day
+        is_kept = False
+
+        def keep() -> None:
+            nonlocal is_kept
+            is_kept = True
+
+        try:
+            yield keep
+        finally:
+            with self._lock:
+                if is_kept and self._quotas.map_extent_m is not None:
+                    self._boxes[row.number] = self._widened(row, box), self._boxes[row.number][1]
+                if is_metered and not is_kept:
+                    self._give_back(robot, use, day)
+
+    def _check_commit(self, row: MapRow, use: Use, box: Box | None) -> None:
+        most = self._quotas.cells_per_commit
+        if most is not None and use.cells > most:
+            raise BadInputError("beyond_quota", f"a commit may touch {most} cells here, this one touches {use.cells}")
+        most_m = self._quotas.map_extent_m
+        if most_m is None or box is None:
+            return
+        with self._lock:
+            wide_m = _edge_cells(self._widened(row, box)) * row.geometry.cell_edge_m
+            if wide_m > most_m and self._steady_s() - self._boxes[row.number][1] >= BOX_EVERY_S:
+                self._read_box(row)
+                wide_m = _edge_cells(self._widened(row, box)) * row.geometry.cell_edge_m
+        if wide_m > most_m:
+            raise BadInputError(
+                "beyond_quota",
+                f"with this commit's cells map {row.name} would span {wide_m:.0f} m, and it may span {most_m:.0f} m: "
+                "is the robot where it believes to be?",
+            )
+
+    def _take(self, robot: Robot, use: Use) -> None:
+        now_s = self._wall_s()
+        day = int(now_s // DAY_S)
+        if self._day != day:
+            self._used = dict(self._store.uses.since(day * DAY_S))
+            self._day = day
+        used = self._used.get(robot, Use()) + use
+        until_midnight_s = (self._day + 1) * DAY_S - now_s
+        for what, spent, most in (
+            ("bytes", used.size_bytes, self._quotas.bytes_per_day),
+            ("cells", used.cells, self._quotas.cells_per_day),
+        ):
+            if most is not None and spent > most:
+                raise _quota(f"{robot[1]} may push {most} {what} a day (UTC), this makes {spent}", until_midnight_s)
+        self._take_of_minute(robot)
+        self._used[robot] = used
+
+    def _take_of_minute(self, robot: Robot) -> None:
+        most = self._quotas.commits_per_minute
+        if most is None:
+            return
+        now_s = self._steady_s()
+        wait_s = self._minutes.setdefault(robot, allowance(most, most / 60, now_s=now_s)).take(now_s)
+        if wait_s:
+            raise _quota(f"{robot[1]} may push {most} commits a minute", wait_s)
+
+    def _give_back(self, robot: Robot, use: Use, day: int) -> None:
+        if day == self._day:
+            self._used[robot] -= use
+        if robot in self._minutes:
+            self._minutes[robot].left += 1
+
+    def _widened(self, row: MapRow, box: Box | None) -> Box | None:
+        """The box of a map and of a commit."""
+        if row.number not in self._boxes:
+            self._read_box(row)
+        known = self._boxes[row.number][0]
+        if known is None or box is None:
+            return known or box
+        return _corner(np.minimum(known[0], box[0])), _corner(np.maximum(known[1], box[1]))
+
+    def _read_box(self, row: MapRow) -> None:
+        """The box of the map as it is folded; the known one stays while commits wait that may be at its corners."""
+        with self._store.snapshot(row) as snapshot:
+            known, _ = self._boxes.get(row.number, (None, 0.0))
+            box = known if known and len(snapshot.pending()) else snapshot.totals().corner_cells
+            self._boxes[row.number] = box, self._steady_s()
+
+
+def _box_of(cells: Collection[CellKey]) -> Box | None:
+    if not cells:
+        return None
+    found = deinterleave(np.fromiter(cells, np.uint64, len(cells))) - CELL_LIMIT
+    return _corner(found.min(axis=0)), _corner(found.max(axis=0))
+
+
+def _corner(values: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Corner:
+    i, j, k = values.tolist()
+    return i, j, k
+
+
+def _edge_cells(box: Box | None) -> int:
+    """Cells along the longest edge."""
+    return max((high - low + 1 for low, high in zip(*box, strict=True)), default=0) if box else 0
+
+
+def _quota(message: str, wait_s: float) -> UnreachableError:
+    return UnreachableError("quota", message, retry_after_s=max(1.0, math.ceil(wait_s)))

@@ -1,0 +1,75 @@
+"""What administrators do with tokens: give, renew, revoke, list. Each is in the audit log before it is answered."""
+
+import time
+
+from cairn_map.commits.ids import robot_name
+from cairn_map.errors import BadInputError
+from cairn_map.wire.access_messages import CreateToken, NewSecret, TokenInfo
+from cairn_server.access.auth import RESERVED_TOKEN_NAMES, Caller, new_token, token_hash
+from cairn_server.store.store import Store
+from cairn_server.store.token_store import Token
+
+
+def create_token(store: Store, name: str, request: CreateToken, *, by: Caller) -> NewSecret:
+    """A new token of this name.
+
+    Raises:
+        BadInputError: kind `bad_name` or `reserved_name`.
+        ConflictError: kind `token_exists`.
+        NotFoundError: kind `no_map`.
+    """
+    if robot_name(name) in RESERVED_TOKEN_NAMES:
+        raise BadInputError("reserved_name", f"the audit log means something else by {name}; take another name")
+    now_s = time.time()
+    token = Token(
+        name=name,
+        role=request.role,
+        map_number=store.map(request.map).number if request.map else None,
+        map_name=request.map,
+        robot=request.robot,
+        created_s=now_s,
+        expires_s=now_s + request.lifetime_s if request.lifetime_s else None,
+    )
+    secret = new_token()
+    store.tokens.add(token, token_hash(secret))
+    store.audit_log.add(by.name, "create_token", f"{name}: {request.model_dump_json(exclude_none=True)}")
+    return NewSecret(token=secret, info=_info(token))
+
+
+def rotate_token(store: Store, name: str, *, by: Caller) -> NewSecret:
+    """Another secret for a token; the old one is worth nothing at once.
+
+    Raises:
+        NotFoundError: kind `no_such_token`.
+    """
+    secret = new_token()
+    token = store.tokens.renew(name, token_hash(secret))
+    store.audit_log.add(by.name, "rotate_token", name)
+    return NewSecret(token=secret, info=_info(token))
+
+
+def revoke_token(store: Store, name: str, *, by: Caller) -> None:
+    """End a token.
+
+    Raises:
+        NotFoundError: kind `no_such_token`.
+    """
+    store.tokens.remove(name)
+    store.audit_log.add(by.name, "revoke_token", name)
+
+
+def list_tokens(store: Store) -> list[TokenInfo]:
+    """All tokens, by name, without their secrets."""
+    return [_info(token) for token in store.tokens.all()]
+
+
+def _info(token: Token) -> TokenInfo:
+    return TokenInfo(
+        name=token.name,
+        role=token.role,
+        map=token.map_name,
+        robot=token.robot,
+        created_s=token.created_s,
+        expires_s=token.expires_s,
+        last_used_s=token.last_used_s,
+    )

@@ -1,0 +1,127 @@
+"""Cells under change, within a bound of memory: `BrickCell`s that add fast, the oldest encoded when they are too many.
+
+A cell that was changed and does not fit any more waits as a draft of its row; asked for again it is decoded from
+there. So one fold may touch any number of cells.
+"""
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+from cairn_map.codec.cell_code import encode_cell
+from cairn_map.commits.cursor import Cursor
+from cairn_map.evidence.blocks import Blocks
+from cairn_map.evidence.brick_cell import BrickCell
+from cairn_map.evidence.cell_order import hottest_k
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.fingerprint import fingerprint
+from cairn_map.evidence.grid import CellKey, Geometry
+from cairn_server.folding.cells_at_rest import stored_evidence, stored_stamps
+from cairn_server.store.stamps import Stamps, encode_stamps
+from cairn_server.store.store_rows import CellRow
+
+CACHE_BYTES = 512 << 20
+"""Memory for the cells under change of all maps."""
+
+Step = Callable[[BrickCell, Evidence], None]
+Load = Callable[[CellKey], tuple[BrickCell, Stamps]]
+
+
+class CellCache:
+    """The cells of one map that were changed last, as they are at one cursor; not thread-safe."""
+
+    def __init__(self, geometry: Geometry, *, limit_bytes: int = CACHE_BYTES) -> None:
+        self.limit_bytes = limit_bytes
+        self.size_bytes = 0
+        self._geometry = geometry
+        self._cursor: Cursor | None = None
+        self._cells: OrderedDict[CellKey, tuple[BrickCell, Stamps]] = OrderedDict()
+        self._sizes: dict[CellKey, int] = {}
+        self._changed: set[CellKey] = set()
+        self._drafts: dict[CellKey, CellRow] = {}
+
+    def begin(self, cursor: Cursor) -> None:
+        """Work on the map as it is at this cursor; cells of any other state are forgotten."""
+        if cursor != self._cursor:
+            self.clear()
+            self._cursor = cursor
+
+    def change(self, key: CellKey, diff: Evidence, step: Step, load: Load) -> None:
+        """Merge or unmerge (`step`) a diff into a cell, which `load` brings if it is not here.
+
+        Raises:
+            BadInputError: a sum would leave its range; nothing was changed.
+        """
+        cell, stamps = self._taken(key, load)
+        step(cell, diff)
+        self._keep(key, cell, stamps)
+
+    def stamp(self, key: CellKey, blocks: Blocks, seq: int, load: Load) -> None:
+        """Note that a log entry changed these blocks of a cell."""
+        is_here = key in self._cells and key in self._changed
+        cell, stamps = self._taken(key, load)
+        stamps[blocks] = seq
+        if not is_here:
+            self._keep(key, cell, stamps)
+
+    def rows(self, last_change: Mapping[CellKey, int]) -> tuple[CellRow, ...]:
+        """The changed cells encoded, rising in number, each with the log entry that last changed it."""
+        return tuple(
+            replace(self._drafts.get(key) or self._encoded(key), lm=last_change[key]) for key in sorted(last_change)
+        )
+
+    def finish(self, cursor: Cursor) -> None:
+        """What was changed is written: the cells here are those of this cursor now."""
+        self._cursor = cursor
+        self._changed.clear()
+        self._drafts.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._cursor = None
+        self.size_bytes = 0
+        for kept in (self._cells, self._sizes, self._changed, self._drafts):
+            kept.clear()
+
+    def trim(self) -> None:
+        """Put away the cells that were not changed for longest, all but the newest if need be."""
+        while self.size_bytes > self.limit_bytes and len(self._cells) > 1:
+            key = next(iter(self._cells))
+            if key in self._changed:
+                self._drafts[key] = self._encoded(key)
+            del self._cells[key]
+            self.size_bytes -= self._sizes.pop(key)
+
+    def _taken(self, key: CellKey, load: Load) -> tuple[BrickCell, Stamps]:
+        kept, draft = self._cells.get(key), self._drafts.get(key)
+        if kept is None and draft is not None:
+            cell = BrickCell(self._geometry)
+            cell.merge(stored_evidence(draft))
+            return cell, stored_stamps(draft, self._geometry)
+        return load(key) if kept is None else kept
+
+    def _keep(self, key: CellKey, cell: BrickCell, stamps: Stamps) -> None:
+        self._drafts.pop(key, None)
+        self._changed.add(key)
+        self._cells[key] = cell, stamps
+        self._cells.move_to_end(key)
+        size_bytes = cell.size_bytes + stamps.nbytes
+        self.size_bytes += size_bytes - self._sizes.get(key, 0)
+        self._sizes[key] = size_bytes
+        self.trim()
+
+    def _encoded(self, key: CellKey) -> CellRow:
+        cell, stamps = self._cells[key]
+        evidence = cell.packed()
+        encoded = encode_cell(key, evidence, self._geometry)
+        return CellRow(
+            key=key,
+            lm=int(stamps.max()),
+            digest=encoded.digest,
+            fingerprint=fingerprint(evidence, key),
+            voxels=len(evidence),
+            body=encoded.data,
+            size_bytes=len(encoded.data),
+            stamps=encode_stamps(stamps),
+            hottest_k=hottest_k(evidence, self._geometry),
+        )

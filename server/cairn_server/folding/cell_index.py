@@ -1,0 +1,78 @@
+"""The cell index, a page at a time."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from cairn_map.commits.cursor import ENTRY_FOLD
+from cairn_map.evidence.grid import CellKey, cell_of_key
+from cairn_map.wire.index_messages import INDEX_PAGE, CellEntry
+from cairn_server.store.store import Snapshot
+from cairn_server.store.store_rows import CellRow
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IndexPage:
+    """Which entries are asked for."""
+
+    after: CellKey | None = None
+    """Those of a higher number; None: from the first on."""
+    limit: int = INDEX_PAGE
+    inside: Callable[[tuple[int, int, int]], bool] | None = None
+    """Only cells of which it says yes."""
+    is_hottest_asked: bool = False
+    """Whether each entry says how hot its cell is."""
+    is_held_asked: bool = False
+    """Whether each entry says whose evidence is still in its cell."""
+
+
+FIRST_PAGE = IndexPage()
+TOUCHES_MAX = 32
+"""Log entries of a cell that are looked at, the newest."""
+
+
+def entries_of(snapshot: Snapshot, page: IndexPage) -> list[CellEntry]:
+    """Every cell that was ever touched, emptied ones included, rising in number; no more than the page takes."""
+    found: list[CellEntry] = []
+    after = -1 if page.after is None else page.after
+    while len(found) < page.limit:
+        rows = list(snapshot.cells(after_key=after, limit=page.limit))
+        inside = (row for row in rows if page.inside is None or page.inside(cell_of_key(row.key)))
+        found += (_asked_entry(snapshot, row, page) for row in inside)
+        if len(rows) < page.limit:
+            break
+        after = rows[-1].key
+    return found[: page.limit]
+
+
+def _entry(row: CellRow) -> CellEntry:
+    return CellEntry(
+        cell=cell_of_key(row.key),
+        size_bytes=row.size_bytes,
+        digest=row.digest.hex(),
+        lm=row.lm,
+        fingerprint=row.fingerprint.hex(),
+        voxels=row.voxels,
+    )
+
+
+def _asked_entry(snapshot: Snapshot, row: CellRow, page: IndexPage) -> CellEntry:
+    more: dict[str, float | None] = {}
+    if page.is_hottest_asked:
+        more["hottest_k"] = row.hottest_k
+    if page.is_held_asked:
+        more["held_lm"] = _held_lm(snapshot, row.key)
+    return _entry(row).model_copy(update=more)
+
+
+def _held_lm(snapshot: Snapshot, key: CellKey) -> int | None:
+    """Newest entry that brought evidence which no later one took out; None: none of the newest did."""
+    newest = snapshot.contributions(key, after_seq=0, newest=1)
+    if newest and newest[0].kind == ENTRY_FOLD:  # nearly always
+        return newest[0].seq
+    out: set[int] = set()
+    for touch in reversed(snapshot.contributions(key, after_seq=0, newest=TOUCHES_MAX)):
+        if touch.kind != ENTRY_FOLD:
+            out.add(touch.diff)
+        elif touch.diff not in out:
+            return touch.seq
+    return None

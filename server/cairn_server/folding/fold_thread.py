@@ -1,0 +1,170 @@
+"""The thread that folds: wakes up when a commit was accepted, and at start for what a crash left over."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+from cairn_map.errors import CairnError
+from cairn_server.folding.damaged_cells import DamagedCells
+from cairn_server.folding.fold_health import FoldHealth
+from cairn_server.folding.fold_in_process import Folded, FoldHere
+from cairn_server.folding.fold_process import FoldProcess, LostProcessError
+from cairn_server.store.store import Store
+from cairn_server.store.store_rows import MapRow
+
+log = logging.getLogger(__name__)
+
+REST_SHARE, REST_MAX_S = 3.0, 0.5
+"""While robots push, a fold is followed by a rest of so many times its length, at the longest this. What comes in it is
+folded together, each cell encoded once: 15 cells take 30 ms, for one scan or 200 of them; merging a scan takes 1 ms."""
+FORGET_MAX = 64
+"""Commits whose evidence is dropped at once."""
+FORGET_EVERY_S = 60.0
+"""How often it is looked for evidence that need not be kept any more."""
+RETRY_S = 5.0
+"""A fold that failed (a full disk) is tried again after this at the latest, the first time soon."""
+FIRST_RETRY_S = 0.2
+
+
+class Folder:
+    """Folds all maps of a store until closed."""
+
+    def __init__(
+        self,
+        store: Store,
+        health: FoldHealth,
+        damaged: DamagedCells,
+        *,
+        keep_evidence_s: float,
+        on_fold: Callable[[MapRow], None],
+        may_forget_s: Callable[[str], float],
+        process: FoldProcess | None = None,
+    ) -> None:
+        self._store = store
+        self._health = health
+        self._damaged = damaged
+        self._on_fold = on_fold
+        self._may_forget_s = may_forget_s
+        self._keep_evidence_s = keep_evidence_s
+        self._forget_next_s = 0.0
+        self._wake = threading.Event()
+        self._closing = threading.Event()
+        self._process = process
+        self._here = FoldHere(store, damaged)
+        self._wake.set()
+        self._thread = threading.Thread(target=self._run, name="cairn-folder", daemon=True)
+        self._thread.start()
+
+    def wake(self) -> None:
+        """Say that there may be something to fold."""
+        self._wake.set()
+
+    def is_alive(self) -> bool:
+        """Whether anybody folds."""
+        return self._thread.is_alive()
+
+    def close(self) -> None:
+        """Stop after the fold under way."""
+        self._closing.set()
+        self._wake.set()
+        self._thread.join()
+        if self._process is not None:
+            self._process.close()
+            self._process = None
+
+    def _run(self) -> None:
+        retry_s = FIRST_RETRY_S
+        while not self._closing.is_set():
+            self._wake.wait(FORGET_EVERY_S)
+            self._wake.clear()
+            if self._fold_all():
+                retry_s = FIRST_RETRY_S
+            else:
+                self._closing.wait(min(retry_s, RETRY_S))
+                retry_s = min(2 * retry_s, RETRY_S)
+                self._wake.set()
+
+    def _fold_all(self) -> bool:
+        """Fold until nothing is pending, a group of each map in turn; False if a map failed."""
+        failed: set[str] = set()
+        maps: list[MapRow] = []
+        busy = True
+        while busy and not self._closing.is_set():
+            busy = False
+            start_s = time.monotonic()
+            self._wake.clear()
+            try:
+                maps = self._store.maps()
+            except Exception:
+                log.exception("cannot list the maps")
+                return False
+            for row in maps:
+                if row.name in failed or self._closing.is_set():
+                    continue
+                try:
+                    busy |= self._fold_group(row, len(maps)) > 0
+                except Exception as exc:
+                    # Whatever it is, the other maps go on, and this thread must live: nobody else folds.
+                    # An error of ours says all in its message.
+                    log.error("map %s: fold failed, to be tried again: %s", row.name, exc, exc_info=_unexpected(exc))
+                    failed.add(row.name)
+                    self._health.failed(row.name, exc)
+            if busy:
+                self._closing.wait(rest_s(time.monotonic() - start_s, is_pushed=self._wake.is_set()))
+        return not (failed or self._forget_old(maps))
+
+    def _forget_old(self, maps: list[MapRow]) -> bool:
+        """Drop what need not be kept any more, now and then; whether that failed."""
+        if time.monotonic() < self._forget_next_s or self._closing.is_set():
+            return False
+        try:
+            counts = [self._forget_group(row) for row in maps]
+        except Exception:
+            # A full disk, or anything: dropping is no haste, and this thread must live.
+            log.exception("old evidence cannot be dropped")
+            return True
+        if max(counts, default=0) < FORGET_MAX:
+            self._forget_next_s = time.monotonic() + min(FORGET_EVERY_S, self._keep_evidence_s)
+        else:
+            self._wake.set()  # there is more; folding goes first
+        return False
+
+    def _forget_group(self, row: MapRow) -> int:
+        before_s = min(time.time() - self._keep_evidence_s, self._may_forget_s(row.name))
+        return self._store.forget_evidence(row, before_s=before_s, limit=FORGET_MAX)
+
+    def _fold_group(self, row: MapRow, maps: int) -> int:
+        start_s = time.monotonic()
+        folded = self._folded(row, maps)
+        self._health.folded(row.name, folded.commits, time.monotonic() - start_s)
+        if folded.waits_for is not None:
+            self._health.failed(row.name, folded.waits_for)
+        if folded.commits:
+            self._on_fold(row)
+            log.info(
+                "map %s: folded %d commits in %.0f ms", row.name, folded.commits, 1e3 * (time.monotonic() - start_s)
+            )
+        return folded.commits
+
+    def _folded(self, row: MapRow, maps: int) -> Folded:
+        if self._process is not None:
+            try:
+                return self._process.fold(row, self._store, self._damaged, maps=maps)
+            except LostProcessError:
+                log.error("the process that folds was killed; folding in the server's own until the next start")
+                self._process.close()
+                self._process = None
+        return self._here.fold(row, maps=maps)
+
+
+def rest_s(took_s: float, *, is_pushed: bool) -> float:
+    """How long to rest after folding for a while, if commits came meanwhile.
+
+    So whoever pushes has most of a processor, and one robot that pushes now and then is folded at once.
+    """
+    return min(REST_SHARE * took_s, REST_MAX_S) if is_pushed else 0.0
+
+
+def _unexpected(exc: Exception) -> Exception | None:
+    return None if isinstance(exc, CairnError) else exc

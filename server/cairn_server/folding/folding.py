@@ -1,0 +1,183 @@
+"""Folding: pending commits become log entries and new cells. Pure but for reading the store.
+
+    fold a commit                 entry +     its diff is added
+    retract of a folded commit    entry -     its diff is subtracted, once per target for ever
+    a commit retracted before it came   both, one after the other (SYNC.md rule 11)
+
+A group of commits is folded at once, so that a cell is decoded and encoded once for all of them. A commit whose
+bytes are damaged at rest is set aside, so that it does not hold up the others; its robot will push it again.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from cairn_map.codec.cell_code import DecodedCell
+from cairn_map.commits.commit import commit_sha
+from cairn_map.commits.cursor import ENTRY_FOLD, ENTRY_UNFOLD, Cursor, next_chain
+from cairn_map.commits.ids import CommitId
+from cairn_map.errors import BadInputError, DamagedDataError
+from cairn_map.evidence.blocks import Blocks, blocks_of
+from cairn_map.evidence.brick_cell import BrickCell
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey
+from cairn_server.folding.cell_cache import CellCache, Step
+from cairn_server.folding.cells_at_rest import cell_to_change, decode_stored
+from cairn_server.folding.fold_store import FoldStore
+from cairn_server.store.stamps import Stamps
+from cairn_server.store.store_rows import Entry, Fold, Head, MapRow, StoredCommit
+
+log = logging.getLogger(__name__)
+
+GROUP_BYTES_MAX = 64 << 20
+"""Commits folded at once have no more bytes than this, or are one."""
+
+
+class DamagedCommitError(DamagedDataError):
+    """A commit at rest is not what was pushed."""
+
+
+def fold_pending(store: FoldStore, row: MapRow, cache: CellCache, *, limit: int) -> int:
+    """Fold up to `limit` pending commits; returns how many were.
+
+    Raises:
+        DamagedDataError: a cell at rest is not sound, and cannot be made anew.
+    """
+    return fold_commits(store, row, cache, store.pending(row, limit=limit, size_bytes_max=GROUP_BYTES_MAX))
+
+
+def fold_commits(store: FoldStore, row: MapRow, cache: CellCache, commits: Sequence[StoredCommit]) -> int:
+    """Fold these pending commits; returns how many were.
+
+    Raises:
+        DamagedCellError: a cell at rest is not sound, and cannot be made anew; nothing was folded.
+    """
+    if not commits:
+        return 0
+    with store.snapshot(row) as snapshot:
+        head = snapshot.head
+    # Another folder may have taken some between these two looks: its head is our base, so nothing else would tell.
+    commits = [commit for commit in commits if commit.id not in head.vector]
+    if not commits:
+        return 0
+    cache.begin(head.cursor)
+    written = False
+    try:
+        fold = plan_fold(store, row, head, commits, cache)
+        written = store.fold(row, fold)
+    finally:
+        if not written:  # it failed, or another folder was faster, whose result is as good as ours
+            cache.clear()
+    cache.finish(fold.head)
+    for number, why in fold.damaged:
+        store.audit("damaged_commit", f"map {row.name}: commit number {number} is set aside: {why}")
+    return len(commits) if written else 0
+
+
+def plan_fold(store: FoldStore, row: MapRow, head: Head, commits: Sequence[StoredCommit], cache: CellCache) -> Fold:
+    """What folding these commits on top of `head` changes; `cache` stands at `head`."""
+    plan = _Plan(store, row, cache, head.cursor)
+    for commit in commits:
+        plan.take(commit)
+    return Fold(
+        base=head.cursor,
+        head=Cursor(head.cursor.log_id, head.cursor.seq + len(plan.entries), plan.chain),
+        vector=head.vector.with_commits(plan.folded),
+        entries=tuple(plan.entries),
+        cells=cache.rows(plan.last_change),
+        retracted=tuple(plan.retracted),
+        damaged=tuple(plan.damaged),
+    )
+
+
+@dataclass(slots=True)
+class _Plan:
+    store: FoldStore
+    row: MapRow
+    cache: CellCache
+    start: Cursor
+    chain: bytes = b""
+    entries: list[Entry] = field(default_factory=list)
+    folded: dict[CommitId, StoredCommit] = field(default_factory=dict)
+    retracted: dict[CommitId, None] = field(default_factory=dict)
+    last_change: dict[CellKey, int] = field(default_factory=dict)
+    damaged: list[tuple[int, str]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.chain = self.start.chain
+
+    def take(self, commit: StoredCommit) -> None:
+        try:
+            self._enter(ENTRY_FOLD, commit)
+        except DamagedCommitError as exc:
+            log.error("commit %s is set aside: %s", commit.id, exc.message)
+            self.damaged.append((commit.number, exc.message))
+            return
+        self.folded[commit.id] = commit
+        if self._is_retracted(commit.id):
+            self._enter(ENTRY_UNFOLD, commit)
+        for target in commit.retracts:
+            if not self._is_retracted(target):
+                self._retract(target)
+
+    def _retract(self, target: CommitId) -> None:
+        known = self.folded.get(target) or self.store.folded(self.row, target)
+        try:
+            if known is not None:
+                self._enter(ENTRY_UNFOLD, known)
+        except DamagedCommitError as exc:
+            self.store.audit("retract_failed", f"map {self.row.name}: {target} stays in the map: {exc.message}")
+            return  # and is not noted as retracted, so that a later retract may succeed
+        self.retracted[target] = None
+
+    def _is_retracted(self, commit: CommitId) -> bool:
+        return commit in self.retracted or self.store.is_retracted(self.row, commit)
+
+    def _enter(self, kind: bytes, commit: StoredCommit) -> None:
+        blocks = self._apply(kind, commit)
+        self.chain = next_chain(self.chain, kind, commit.id, commit.sha)
+        self.entries.append(Entry(kind=kind, commit=commit.number, chain=self.chain))
+        seq = self.start.seq + len(self.entries)
+        self.last_change.update(dict.fromkeys(commit.diff, seq))
+        for key, changed in blocks.items():
+            self.cache.stamp(key, changed, seq, self._load)
+
+    def _apply(self, kind: bytes, commit: StoredCommit) -> dict[CellKey, Blocks]:
+        """Add or subtract a commit's diff, all of it or nothing; the blocks that it touches."""
+        if commit.gone:
+            raise DamagedCommitError("damaged_store", f"the evidence of commit {commit.id} is not kept any more")
+        step, undo = BrickCell.merge, BrickCell.unmerge
+        if kind == ENTRY_UNFOLD:
+            step, undo = undo, step
+        done: dict[CellKey, Blocks] = {}
+        digests: list[bytes] = []
+        try:
+            for key, body in commit.diff.items():
+                decoded = _decoded(commit, key, body)
+                self._change(key, decoded.evidence, step, commit)
+                done[key] = blocks_of(decoded.evidence)
+                digests.append(decoded.digest)
+            if commit_sha(commit.text, digests) != commit.sha:
+                raise DamagedCommitError("damaged_store", f"commit {commit.id} at rest does not have its SHA-256")
+        except DamagedCommitError:
+            for key in done:
+                self.cache.change(key, _decoded(commit, key, commit.diff[key]).evidence, undo, self._load)
+            raise
+        return done
+
+    def _change(self, key: CellKey, evidence: Evidence, step: Step, commit: StoredCommit) -> None:
+        try:
+            self.cache.change(key, evidence, step, self._load)
+        except BadInputError as exc:
+            raise DamagedCommitError("damaged_store", f"commit {commit.id} at rest: {exc.message}") from exc
+
+    def _load(self, key: CellKey) -> tuple[BrickCell, Stamps]:
+        with self.store.snapshot(self.row) as snapshot:
+            return cell_to_change(snapshot, key, self.row.geometry)
+
+
+def _decoded(commit: StoredCommit, key: CellKey, body: bytes) -> DecodedCell:
+    try:
+        return decode_stored(key, body)
+    except DamagedDataError as exc:
+        raise DamagedCommitError(exc.kind, f"commit {commit.id}: {exc.message}") from exc

@@ -1,0 +1,105 @@
+"""Cells as they were read last, and what was made of them: the same few are asked for by every robot of a team.
+
+history     the newest log entries of a cell                 } of its state at one `lm`; each is made
+stamps      which entry changed which of its blocks          } once, however many ask at a time
+evidence    the whole of it, decoded: what is dear           }
+change      what who stood at an older entry needs           }
+"""
+
+from dataclasses import dataclass
+
+from cairn_map.commits.ids import Author
+from cairn_map.errors import DamagedDataError
+from cairn_map.evidence.blocks import Blocks
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
+from cairn_map.wire.frames import FrameKind
+from cairn_server.folding.cells_at_rest import stored_evidence, stored_stamps
+from cairn_server.folding.single_flight import MadeOnce
+from cairn_server.store.stamps import Stamps
+from cairn_server.store.store import Snapshot
+from cairn_server.store.store_rows import CellRow, Contribution
+
+EVIDENCE_BYTES = 256 << 20
+"""Memory for the decoded cells of all maps."""
+STAMPS_BYTES = 32 << 20
+CHANGES_BYTES = 64 << 20
+HISTORIES_BYTES = 16 << 20
+ENTRY_BYTES = 300
+"""Of one entry of a history, or one empty change, in memory."""
+State = tuple[bytes, CellKey, bytes, int, int]
+"""One state of a cell: log, cell, digest, `lm`, `gone_seq`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A frame's content, the same for all who stand between the same two entries of a cell."""
+
+    kind: FrameKind
+    payload: bytes
+    blocks: Blocks | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ChangeName:
+    """What a change depends on."""
+
+    state: State
+    after_seq: int
+    own: Author | None
+    """Whose commits are left out, if there are any."""
+    kinds: frozenset[str]
+
+
+class ReadCache:
+    """All of it for all maps; thread-safe. Nobody changes what it hands out."""
+
+    def __init__(self, *, evidence_bytes: int = EVIDENCE_BYTES) -> None:
+        self._evidence: MadeOnce[State, Evidence] = MadeOnce(
+            limit_bytes=evidence_bytes, size_of=lambda evidence: evidence.size_bytes
+        )
+        self._stamps: MadeOnce[State, Stamps] = MadeOnce(limit_bytes=STAMPS_BYTES, size_of=lambda stamps: stamps.nbytes)
+        self._histories: MadeOnce[State, list[Contribution]] = MadeOnce(
+            limit_bytes=HISTORIES_BYTES, size_of=lambda entries: ENTRY_BYTES * (1 + len(entries))
+        )
+        self.changes: MadeOnce[ChangeName, Change | None] = MadeOnce(limit_bytes=CHANGES_BYTES, size_of=_change_bytes)
+
+    def evidence(self, snapshot: Snapshot, listed: CellRow) -> Evidence:
+        """A listed cell's evidence.
+
+        Raises:
+            DamagedDataError: kind `damaged_store`: the cell at rest is not sound.
+        """
+        return self._evidence.get(state_of(snapshot, listed), lambda: stored_evidence(_stored(snapshot, listed)))
+
+    def stamps(self, snapshot: Snapshot, listed: CellRow, geometry: Geometry) -> Stamps:
+        """A listed cell's stamps.
+
+        Raises:
+            DamagedDataError: kind `damaged_store`: the cell is not there.
+        """
+        state = state_of(snapshot, listed)
+        return self._stamps.get(state, lambda: stored_stamps(_stored(snapshot, listed), geometry))
+
+    def history(self, snapshot: Snapshot, listed: CellRow, *, limit: int) -> list[Contribution]:
+        """A listed cell's newest entries, oldest first; always with the same limit."""
+        state = state_of(snapshot, listed)
+        return self._histories.get(state, lambda: snapshot.contributions(listed.key, after_seq=0, newest=limit))
+
+
+def state_of(snapshot: Snapshot, listed: CellRow) -> State:
+    """What tells the states of all cells of all maps apart."""
+    return snapshot.head.cursor.log_id, listed.key, listed.digest, listed.lm, listed.gone_seq
+
+
+def _stored(snapshot: Snapshot, listed: CellRow) -> CellRow:
+    stored = snapshot.cell(listed.key)
+    if stored is None:
+        raise DamagedDataError("damaged_store", f"cell {cell_of_key(listed.key)} is listed, but is not there")
+    return stored
+
+
+def _change_bytes(change: Change | None) -> int:
+    if change is None:
+        return ENTRY_BYTES
+    return ENTRY_BYTES + len(change.payload) + (change.blocks.nbytes if change.blocks is not None else 0)

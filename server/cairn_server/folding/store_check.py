@@ -1,0 +1,177 @@
+"""Reading a whole store and saying what is not as it should be, map by map.
+
+    log       every chain follows from the one before, the head is the last, the vector names what was folded
+    commits   every diff that is kept decodes, and all of a commit together have its SHA-256
+    cells     bytes, digest, fingerprint and size agree; and where every diff is kept, the cell is their sum
+
+Sums are compared by fingerprint, which adds as evidence does, so nothing is merged.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from cairn_map.codec.cell_code import DecodedCell
+from cairn_map.commits.commit import commit_sha
+from cairn_map.commits.cursor import ENTRY_FOLD, next_chain
+from cairn_map.commits.ids import commit_id_from_text
+from cairn_map.commits.version_vector import EMPTY
+from cairn_map.errors import CairnError, DamagedDataError
+from cairn_map.evidence.fingerprint import ZERO, Fingerprint, fingerprint
+from cairn_map.evidence.grid import CellKey, cell_of_key
+from cairn_map.wire.messages import LogEntry
+from cairn_server.folding.cells_at_rest import decode_stored, rebuilt_cell, stored_evidence
+from cairn_server.store.store import Snapshot, Store
+from cairn_server.store.store_rows import CellRow, MapRow, StoredCommit
+
+PAGE = 500
+PENDING_BYTES_MAX = 256 << 20
+"""Of commits that wait, as many as this are looked at; the folder looks at each of them anyway."""
+Report = Callable[[int, int], None]
+"""Called with steps done and all steps."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that is not sound."""
+
+    map: str
+    what: str
+    """For people."""
+    cell: CellRow | None = None
+    """The cell that it is about."""
+    sound: CellRow | None = None
+    """What it should be, where the log still tells."""
+
+    def __str__(self) -> str:
+        return f"{self.map}: {self.what}"
+
+
+@dataclass(slots=True)
+class Checked:
+    """What was read."""
+
+    commits: int = 0
+    cells: int = 0
+    not_kept: int = 0
+    """Commits of which evidence is not kept any more; nothing can be said about those."""
+    findings: list[Finding] = field(default_factory=list)
+
+
+def check_map(store: Store, row: MapRow, report: Report) -> Checked:
+    """Everything of one map."""
+    checked = Checked()
+    with store.snapshot(row) as snapshot:
+        keys = [cell.key for cell in snapshot.cells()]
+        total = snapshot.totals().commits + len(keys)
+    known: dict[bytes, Fingerprint] = {}
+    for commit in _commits(store, row, checked):
+        checked.commits += 1
+        checked.findings += _of_commit(row, commit, known, checked)
+        report(checked.commits, total)
+    for key in keys:
+        with store.snapshot(row) as snapshot:
+            checked.findings += _of_cell(snapshot, row, key, known)
+        checked.cells += 1
+        report(checked.commits + checked.cells, total)
+    return checked
+
+
+def _commits(store: Store, row: MapRow, checked: Checked) -> Iterator[StoredCommit]:
+    """Every folded commit once, in the order of the log, which is checked on the way; then those that wait."""
+    with store.snapshot(row) as snapshot:
+        head = snapshot.head
+        chain = snapshot.chain_at(0) or b""
+    vector, seq = EMPTY, 0
+    while page := _log_page(store, row, after_seq=seq):
+        for entry, stated in page:
+            commit_id = commit_id_from_text(entry.id)
+            if entry.seq > head.cursor.seq:  # folded while we read
+                continue
+            if entry.seq != seq + 1:
+                checked.findings.append(Finding(row.name, f"log: entry {seq + 1} is not there"))
+            seq = entry.seq
+            chain = next_chain(chain, entry.kind.encode(), commit_id, bytes.fromhex(entry.sha))
+            if chain != stated:
+                checked.findings.append(Finding(row.name, f"log: entry {seq} does not continue the chain"))
+                chain = stated
+            if entry.kind.encode() == ENTRY_FOLD:
+                vector = vector.with_commits([commit_id])
+                commit = store.folded(row, commit_id)
+                if commit is not None:
+                    yield commit
+        if seq >= head.cursor.seq or page[-1][0].seq > head.cursor.seq:
+            break
+    if (seq, chain) != (head.cursor.seq, head.cursor.chain):
+        checked.findings.append(Finding(row.name, f"log: it ends at {seq}, the head is {head.cursor}"))
+    if vector != head.vector:
+        checked.findings.append(Finding(row.name, "log: the vector does not name what was folded"))
+    yield from store.pending(row, limit=PAGE, size_bytes_max=PENDING_BYTES_MAX)
+
+
+def _log_page(store: Store, row: MapRow, *, after_seq: int) -> list[tuple[LogEntry, bytes]]:
+    with store.snapshot(row) as snapshot:
+        return [(entry, snapshot.chain_at(entry.seq) or b"") for entry in snapshot.log(after_seq=after_seq, limit=PAGE)]
+
+
+def _of_commit(
+    row: MapRow, commit: StoredCommit, known: dict[bytes, Fingerprint], checked: Checked
+) -> Iterator[Finding]:
+    if commit.gone:
+        checked.not_kept += 1
+        return
+    digests: list[bytes] = []
+    for key, body in commit.diff.items():
+        try:
+            decoded = decode_stored(key, body)
+        except DamagedDataError as exc:
+            yield Finding(row.name, f"commit {commit.id}: {exc.message}")
+            return
+        digests.append(decoded.digest)
+        known[hashlib.sha256(body).digest()] = _sums(decoded, key)
+    if commit_sha(commit.text, digests) != commit.sha:
+        yield Finding(row.name, f"commit {commit.id} does not have its SHA-256")
+
+
+def _of_cell(snapshot: Snapshot, row: MapRow, key: CellKey, known: dict[bytes, Fingerprint]) -> Iterator[Finding]:
+    name = cell_of_key(key)
+    try:
+        stored = snapshot.cell(key)
+    except CairnError as exc:
+        yield Finding(row.name, f"cell {name}: {exc.message}")
+        return
+    if stored is None:
+        return
+    try:
+        stored_evidence(stored)
+        expected = _sum_of_diffs(snapshot, key, known)
+        if stored.gone_seq or expected is None or expected == stored.fingerprint:
+            return
+        complaint = f"cell {name} is not the sum of its commits"
+    except DamagedDataError as exc:
+        complaint = exc.message
+    try:
+        yield Finding(row.name, complaint, stored, rebuilt_cell(snapshot, stored, row.geometry))
+    except DamagedDataError as exc:
+        yield Finding(row.name, f"{complaint}; it cannot be made anew from the log: {exc.message}", stored)
+
+
+def _sum_of_diffs(snapshot: Snapshot, key: CellKey, known: dict[bytes, Fingerprint]) -> Fingerprint | None:
+    """What the log says that a cell's fingerprint is; None if it does not say any more, or not soundly."""
+    total = ZERO
+    for entry in snapshot.contributions(key, after_seq=0):
+        body = snapshot.diff(entry.diff)
+        if body is None:
+            return None
+        sums = known.get(hashlib.sha256(body).digest())
+        if sums is None:
+            try:
+                sums = _sums(decode_stored(key, body), key)
+            except DamagedDataError:
+                return None
+        total = total + sums if entry.kind == ENTRY_FOLD else total - sums
+    return total
+
+
+def _sums(decoded: DecodedCell, key: CellKey) -> Fingerprint:
+    return fingerprint(decoded.evidence, key)

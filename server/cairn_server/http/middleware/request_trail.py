@@ -1,0 +1,127 @@
+"""What every request leaves behind: an id, a line in the log, and counts (plain ASGI, around everything else).
+
+The id is the caller's own `X-Request-Id` if it is a sensible one, else a new one; it comes back with the answer, and
+every line that is logged meanwhile carries it.
+"""
+
+import json
+import logging
+import random
+import re
+import time
+from collections.abc import MutableMapping
+from dataclasses import dataclass
+from typing import Any
+
+from cairn_server.http.middleware.body_limit import App, Message, Receive, Send
+from cairn_server.http.middleware.log_format import REQUEST_ID, Field, fields
+from cairn_server.server_figures import ServerFigures
+
+log = logging.getLogger(__name__)
+
+HEADER = b"x-request-id"
+SENSIBLE = re.compile(rb"[A-Za-z0-9._-]{1,64}")
+METHODS = frozenset({"GET", "PUT", "POST", "DELETE", "HEAD", "OPTIONS", "PATCH"})
+PUSH = "/maps/{name}/commits/{commit}"
+QUIET = frozenset({"/healthz", "/readyz", "/metrics"})
+"""Asked every few seconds by machines."""
+OUTCOMES = {201: "new", 200: "known"}
+TEXT_MAX = 96
+
+
+@dataclass(slots=True)
+class Trail:
+    """One request, as far as it has come."""
+
+    status: int = 0
+    kind: str = ""
+    received_bytes: int = 0
+    sent_bytes: int = 0
+    is_problem: bool = False
+
+
+class RequestTrail:
+    """Counts and logs each request once it is answered."""
+
+    def __init__(self, app: App, *, figures: ServerFigures) -> None:
+        self._app = app
+        self._figures = figures
+
+    async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
+        """One request."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        trail, start_s = Trail(), time.perf_counter()
+        request_id = _request_id(scope["headers"])
+        reset = REQUEST_ID.set(request_id)
+
+        async def counted() -> Message:
+            message = await receive()
+            trail.received_bytes += len(message.get("body", b""))
+            return message
+
+        async def noted(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                trail.status = message["status"]
+                headers = list(message.get("headers", ()))
+                trail.is_problem = (b"content-type", b"application/problem+json") in headers
+                message = {**message, "headers": [*headers, (HEADER, request_id.encode())]}
+            elif message["type"] == "http.response.body":
+                body = message.get("body", b"")
+                trail.sent_bytes += len(body)
+                if trail.is_problem and body:
+                    trail.kind = json.loads(body)["kind"]
+            await send(message)
+
+        try:
+            await self._app(scope, counted, noted)
+        except Exception:
+            trail.status, trail.kind = trail.status or 500, "internal"
+            raise
+        finally:
+            self._finish(scope, trail, time.perf_counter() - start_s)
+            REQUEST_ID.reset(reset)
+
+    def _finish(self, scope: MutableMapping[str, Any], trail: Trail, seconds: float) -> None:
+        figures = self._figures
+        method = scope["method"] if scope["method"] in METHODS else "other"
+        route: str = getattr(scope.get("route"), "path", "none")
+        figures.requests.add(1, method, route, str(trail.status))
+        figures.request_seconds.observe(seconds, method, route)
+        figures.received_bytes.add(trail.received_bytes, method, route)
+        figures.sent_bytes.add(trail.sent_bytes, method, route)
+        if trail.kind:
+            figures.errors.add(1, trail.kind)
+        if route == PUSH and method == "PUT":
+            self._note_push(scope["path_params"].get("name", ""), trail)
+        level = logging.WARNING if trail.status >= 500 else logging.DEBUG if route in QUIET else logging.INFO
+        if log.isEnabledFor(level):
+            log.log(level, "request", extra=fields(**_line(scope, method, route, trail, seconds)))
+
+    def _note_push(self, name: str, trail: Trail) -> None:
+        outcome = OUTCOMES.get(trail.status)
+        # Only then is it certain that there is a map of this name: names that strangers try are no labels.
+        self._figures.pushes.add(1, name if outcome else "", outcome or trail.kind or "cut_off")
+        if outcome == "new":
+            self._figures.push_bytes.add(trail.received_bytes, name)
+
+
+def _request_id(headers: list[tuple[bytes, bytes]]) -> str:
+    asked = next((value for name, value in headers if name == HEADER), b"")
+    return asked.decode() if SENSIBLE.fullmatch(asked) else f"{random.getrandbits(64):016x}"
+
+
+def _line(scope: MutableMapping[str, Any], method: str, route: str, trail: Trail, seconds: float) -> dict[str, Field]:
+    """The request's line; a path is told by its route and ids, and query and headers, where tokens are, not at all."""
+    line: dict[str, Field] = {"method": method, "route": route}
+    if route == "none":
+        line["path"] = scope["path"][:TEXT_MAX]
+    for name, value in scope.get("path_params", {}).items():
+        line["map" if name == "name" else name] = str(value)[:TEXT_MAX]
+    line |= {"status": trail.status, "received_bytes": trail.received_bytes, "sent_bytes": trail.sent_bytes}
+    line["seconds"] = round(seconds, 6)
+    if trail.kind:
+        line["kind"] = trail.kind
+    client = scope.get("client")
+    return line | ({"client": client[0]} if client else {})

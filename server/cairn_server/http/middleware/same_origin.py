@@ -1,0 +1,50 @@
+"""An open server's protection from browsers: a page elsewhere must not be able to change the maps.
+
+Without an admin token the server trusts whoever reaches it on this machine, and a browser on this machine reaches it
+on behalf of every page it shows. It says so, though: `Origin` names the page (cross-site requests), and `Host`
+the name that the page used (DNS rebinding). Plain ASGI.
+"""
+
+from collections.abc import MutableMapping
+from typing import Any
+from urllib.parse import urlsplit
+
+from cairn_server.http.middleware.body_limit import App, Receive, Send, send_problem
+from cairn_server.settings import LOOPBACK
+
+
+class OwnOrigin:
+    """Answers 403 to requests from other sites, and to those for other hosts."""
+
+    def __init__(self, app: App, *, host: str) -> None:
+        self._app = app
+        self._hosts = LOOPBACK | {host}
+
+    async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
+        """One request."""
+        if scope["type"] == "lifespan" or self._is_own(scope["scheme"], scope["headers"]):
+            await self._app(scope, receive, send)
+            return
+        await send_problem(
+            send,
+            403,
+            "foreign_origin",
+            "without --admin-token-file this server answers only requests of its own pages and of programs, sent to "
+            "127.0.0.1, [::1] or localhost",
+            answer_to=scope["type"],
+        )
+
+    def _is_own(self, scheme: str, headers: list[tuple[bytes, bytes]]) -> bool:
+        hosts = {value.decode("latin-1") for name, value in headers if name == b"host"}
+        origins = {value.decode("latin-1") for name, value in headers if name == b"origin"}
+        if len(hosts) != 1 or _name(f"//{next(iter(hosts))}") not in self._hosts:
+            return False
+        page = {"ws": "http", "wss": "https"}.get(scheme, scheme)
+        return origins <= {f"{page}://{host}" for host in hosts}
+
+
+def _name(url: str) -> str | None:
+    try:
+        return urlsplit(url).hostname
+    except ValueError:
+        return None

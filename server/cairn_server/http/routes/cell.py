@@ -1,0 +1,162 @@
+"""Routes of main's cells. Nothing is decided here."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
+
+from cairn_map.commits.cursor import cursor_from_text
+from cairn_map.commits.ids import author_from_text
+from cairn_map.commits.version_vector import vector_digest, vector_text
+from cairn_map.errors import BadInputError, NotFoundError
+from cairn_map.evidence.grid import CellKey, cell_from_text, cell_key
+from cairn_map.files.cell_files import CELL_MEDIA_TYPE, FORMS, MEDIA_TYPES, cell_file
+from cairn_map.wire.index_messages import INDEX_PAGE, INDEX_PAGE_MAX, CellIndex
+from cairn_map.wire.voxel_messages import VoxelAnswer
+from cairn_server.access.auth import Caller
+from cairn_server.folding.cell_index import IndexPage
+from cairn_server.folding.cells_at_rest import stored_evidence
+from cairn_server.http.routes.callers import READERS, Map, Operations, body_of, reader
+from cairn_server.http.routes.problems import answer_to
+from cairn_server.http.routes.ranges import part_of
+from cairn_server.store.store_rows import CellRow, Head, MapRow
+from cairn_server.sync.vector_at import box_from_text
+from cairn_server.views.cell_view import asked_cell_view, cell_etag, is_same
+from cairn_server.views.view_bundle import MEDIA_TYPE as VIEWS_MEDIA_TYPE
+from cairn_server.views.view_bundle import ready_views
+from cairn_server.views.voxel_report import asked_voxel
+
+COVERAGE_BYTES_MAX = 4096
+"""Of the header `Cairn-Coverage`: a longer one would be refused by proxies and by small HTTP libraries."""
+
+router = APIRouter()
+
+
+@router.get("/maps/{name}/main/cells", dependencies=READERS, response_model_exclude_unset=True)
+def cell_index(
+    service: Operations,
+    row: Map,
+    author: Annotated[str | None, Query(max_length=80)] = None,
+    box: Annotated[str | None, Query(max_length=80, description="i0,j0,k0,i1,j1,k1: only these, ends included")] = None,
+    after: Annotated[str | None, Query(max_length=32, description="i,j,k: the last cell of the page before")] = None,
+    limit: Annotated[int, Query(ge=1, le=INDEX_PAGE_MAX)] = INDEX_PAGE,
+    hottest: Annotated[bool, Query(description="each entry has hottest_k, too")] = False,
+    held: Annotated[bool, Query(description="each entry has held_lm, too")] = False,
+) -> CellIndex:
+    """Cells that were ever touched, all or those in a box, a page at a time."""
+    page = IndexPage(
+        after=cell_key(cell_from_text(after)) if after is not None else None,
+        limit=limit,
+        inside=box_from_text(box) if box is not None else None,
+        is_hottest_asked=hottest,
+        is_held_asked=held,
+    )
+    return service.cell_index(row, author_from_text(author) if author else None, page)
+
+
+@router.get("/maps/{name}/main/views", dependencies=READERS, response_class=Response)
+def views(service: Operations, row: Map) -> Response:
+    """What all cells look like, at a coarse depth, as far as the server has it ready: for a page's first picture."""
+    depth, found = ready_views(service.store, service.cell_views, row)
+    headers = {"Cache-Control": "no-store", "Cairn-View-Depth": str(depth)}
+    return Response(found, media_type=VIEWS_MEDIA_TYPE, headers=headers)
+
+
+@router.get("/maps/{name}/main/vector", dependencies=READERS)
+def vector(service: Operations, row: Map, at: Annotated[str, Query(max_length=128)]) -> Response:
+    """The version vector at a cursor: what `Cairn-Coverage` says where it is short enough."""
+    found = service.vector_at(row, cursor_from_text(at))
+    return Response(vector_text(found), media_type="application/json", headers={"ETag": f'"{vector_digest(found)}"'})
+
+
+@router.get("/maps/{name}/main/voxels/{voxel}", dependencies=READERS)
+def voxel(voxel: str, service: Operations, row: Map) -> VoxelAnswer:
+    """One voxel of the lattice: its exact numbers, and the commits that saw it."""
+    return asked_voxel(service.store, service.cells, row, voxel)
+
+
+@router.head("/maps/{name}/main/cells/{cell}", dependencies=READERS)
+@router.get("/maps/{name}/main/cells/{cell}", dependencies=READERS)
+def get_cell(
+    cell: str,
+    request: Request,
+    service: Operations,
+    row: Map,
+    depth: Annotated[
+        int | None, Query(ge=1, le=64, description="octree depth of a view; only without suffix or .view")
+    ] = None,
+    if_none_match: Annotated[str | None, Header()] = None,
+    if_range: Annotated[str | None, Header()] = None,
+    range_: Annotated[str | None, Header(alias="Range")] = None,
+) -> Response:
+    """One cell: the octree, or by suffix `.npz`, `.ply`, `.view`; strong ETag, cursor and coverage in the headers."""
+    number, dot, suffix = cell.partition(".")
+    key = cell_key(cell_from_text(number))
+    _check_form(dot, suffix, depth, row)
+    if depth is None:
+        (stored, head), view = service.cells.sound(row, key), b""
+    else:
+        stored, head, view = asked_cell_view(service.cells, service.cell_views, row, key, depth, known=if_none_match)
+    if stored is None:
+        raise NotFoundError("no_cell", f"nobody has seen cell {number} of map {row.name}")
+    etag = cell_etag(row, stored, suffix, depth)
+    headers = {
+        "ETag": etag,
+        "Cache-Control": "no-cache",
+        "Accept-Ranges": "bytes",
+        "Cairn-Cursor": str(head.cursor),
+        "Cairn-Fingerprint": stored.fingerprint.hex(),
+        **_coverage(head),
+    }
+    if is_same(etag, if_none_match):
+        return Response(status_code=304, headers=headers)
+    data, media_type = _file(suffix, key, stored, row) if depth is None else (view, MEDIA_TYPES["view"])
+    if suffix:
+        headers["Content-Disposition"] = f'attachment; filename="{row.name}_{number}.{suffix}"'
+    try:
+        part = part_of(len(data), range_ if request.method == "GET" else None, etag=etag, if_range=if_range)
+    except BadInputError as exc:
+        refused = answer_to(exc)
+        refused.headers["Content-Range"] = f"bytes */{len(data)}"
+        return refused
+    if part is None:
+        return Response(data, media_type=media_type, headers=headers)
+    start, stop = part
+    headers["Content-Range"] = f"bytes {start}-{stop - 1}/{len(data)}"
+    return Response(data[start:stop], 206, media_type=media_type, headers=headers)
+
+
+def _check_form(dot: str, suffix: str, depth: int | None, row: MapRow) -> None:
+    if dot and suffix not in MEDIA_TYPES:
+        raise BadInputError("unknown_format", f"cells come as {FORMS}, not as .{suffix[:16]}")
+    if depth is None:
+        return
+    if suffix not in ("", "view"):
+        raise BadInputError("unknown_format", f"only a view has a depth, a .{suffix} has none")
+    if depth > row.geometry.depth:
+        raise BadInputError("bad_style", f"a view's depth must be 1 to {row.geometry.depth}, got {depth}")
+
+
+def _file(suffix: str, key: CellKey, stored: CellRow, row: MapRow) -> tuple[bytes, str]:
+    if not suffix:
+        return stored.body, CELL_MEDIA_TYPE
+    return cell_file(suffix, key, stored_evidence(stored), row.geometry, row.sensor_model)
+
+
+def _coverage(head: Head) -> dict[str, str]:
+    """The version vector at the cursor, or, if it is long, its digest: the asker may know it, or asks for it."""
+    text = vector_text(head.vector)
+    if len(text) <= COVERAGE_BYTES_MAX:
+        return {"Cairn-Coverage": text}
+    return {"Cairn-Coverage-Digest": vector_digest(head.vector)}
+
+
+@router.put("/maps/{name}/main/cells/{cell}", status_code=204)
+def heal_cell(
+    cell: str,
+    service: Operations,
+    row: Map,
+    caller: Annotated[Caller, Depends(reader)],
+    data: Annotated[bytes, Depends(body_of)],
+) -> None:
+    """Put right a cell that the server's disk damaged: only the very bytes that it had are taken."""
+    service.heal_cell(row, cell_key(cell_from_text(cell)), data, by=caller)

@@ -1,0 +1,240 @@
+"""The live streams: Server-Sent Events for programs, a WebSocket for browsers. The only async code of the server.
+
+A stream waits until its listener is woken, takes what there is, sends it, and rests a moment, so that what happens
+meanwhile goes into one. `send` waits while the other side does not read; nothing piles up but in the listener.
+"""
+
+import asyncio
+import base64
+import binascii
+import hashlib
+import logging
+import time
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from typing import Annotated
+from urllib.parse import urlsplit
+
+from fastapi import APIRouter, Header, Query, Response, WebSocket, WebSocketDisconnect
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import StreamingResponse
+from fastapi.security import HTTPAuthorizationCredentials
+from starlette.types import Receive, Scope, Send
+
+from cairn_map.errors import BadInputError, CairnError, DeniedError
+from cairn_map.wire.live_events import Beat, LiveEvent, Seen, seen_from_text
+from cairn_server.access.auth import READING, require
+from cairn_server.http.routes.callers import READERS, Credentials, Map, Operations, caller_now, map_now
+from cairn_server.http.routes.problems import answer_to
+from cairn_server.live.hub import Listener
+from cairn_server.service import Service
+from cairn_server.store.store_rows import MapRow
+
+log = logging.getLogger(__name__)
+
+SPACING_S = 0.1
+"""Least time between two sendings of one stream."""
+RETRY_MS = 2000
+PROTOCOL = "cairn.live.v1"
+TOKEN_PREFIX = "cairn.token."  # noqa: S105 - what stands before one
+GOING_AWAY, NOT_ALLOWED = 1001, 4401
+"""Codes with which a WebSocket is closed."""
+After = Annotated[str | None, Query(description="id of the last event seen")]
+
+router = APIRouter()
+
+
+class _Stream:
+    """A listener and what wakes it, in the event loop."""
+
+    def __init__(self, service: Service, row: MapRow, credentials: HTTPAuthorizationCredentials | None) -> None:
+        self._service = service
+        self._row = row
+        self._credentials = credentials
+        self._loop = asyncio.get_running_loop()
+        self._woken = asyncio.Event()
+        self._listener: Listener | None = None
+
+    async def join(self, after: Seen | None) -> None:
+        """Begin to listen."""
+        shown = self._credentials.credentials if self._credentials else ""
+        token = hashlib.sha256(shown.encode(errors="replace")).digest()
+        self._listener = await run_in_threadpool(
+            lambda: self._service.live.join(self._row, token, self._wake, after=after)
+        )
+
+    async def pump(self, send: Callable[[LiveEvent], Awaitable[None]]) -> int:
+        """Send what happens until the server ends, or the token; the code to close with."""
+        listener = self._listener
+        assert listener is not None, "join first"  # noqa: S101 - by its callers
+        beat_at_s = time.monotonic() + listener.beat_s
+        while not listener.is_over:
+            self._woken.clear()
+            if events := listener.take():
+                for event in events:
+                    await send(event)
+                await asyncio.sleep(SPACING_S)
+            await self._wait(beat_at_s - time.monotonic())
+            if time.monotonic() >= beat_at_s:
+                if not await run_in_threadpool(self._may_listen):
+                    return NOT_ALLOWED
+                await send(listener.beat())
+                beat_at_s = time.monotonic() + listener.beat_s
+            elif not (listener.is_behind or listener.is_over):
+                # A robot was heard; what it pushed is folded in a moment, and is not to wait behind that.
+                self._woken.clear()
+                await self._wait(SPACING_S)
+        return GOING_AWAY
+
+    async def _wait(self, seconds: float) -> None:
+        """Return when woken, or after so long."""
+        with suppress(TimeoutError):
+            await asyncio.wait_for(self._woken.wait(), max(0.0, seconds))
+
+    def leave(self) -> None:
+        """Stop listening."""
+        if self._listener is not None:
+            self._listener.leave()
+
+    def _may_listen(self) -> bool:
+        """Whether the token is still good."""
+        try:
+            require(caller_now(self._service, self._row, self._credentials), *READING)
+        except DeniedError:
+            return False
+        except CairnError as exc:  # not to know is not to be refused
+            log.warning("cannot look a listener's token up: %s", exc.message)
+        return True
+
+    def _wake(self) -> None:
+        if self._woken.is_set():  # `pump` clears it before it takes what there is
+            return
+        with suppress(RuntimeError):  # the loop is closed: nobody is left to be woken
+            self._loop.call_soon_threadsafe(self._woken.set)
+
+
+class EventStream(StreamingResponse):
+    """Events in the format of Server-Sent Events (HTML, section 9.2)."""
+
+    def __init__(self, stream: _Stream) -> None:
+        headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+        super().__init__(iter(()), media_type="text/event-stream", headers=headers)
+        self._stream = stream
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer; whatever ends it, nobody listens here any more."""
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._stream.leave()
+
+    async def stream_response(self, send: Send) -> None:
+        """Send until somebody ends it; Starlette cancels this when the other side is gone."""
+
+        async def send_text(text: str) -> None:
+            await send({"type": "http.response.body", "body": text.encode(), "more_body": True})
+
+        await send({"type": "http.response.start", "status": 200, "headers": self.raw_headers})
+        await send_text(f"retry: {RETRY_MS}\n\n")
+        await self._stream.pump(lambda event: send_text(_as_text(event)))
+        await send({"type": "http.response.body", "body": b"", "more_body": False})
+
+
+@router.get("/maps/{name}/events", dependencies=READERS, response_class=Response)
+async def events(
+    service: Operations,
+    row: Map,
+    credentials: Credentials,
+    after: After = None,
+    last_event_id: Annotated[str | None, Header()] = None,
+) -> Response:
+    """Live changes as Server-Sent Events; `Last-Event-ID`, or `after`, goes on from there."""
+    stream = _Stream(service, row, credentials)
+    await stream.join(seen_from_text(last_event_id or after or ""))
+    return EventStream(stream)
+
+
+@router.get("/maps/{name}/live", dependencies=READERS)
+def live_without_upgrade() -> None:
+    """Live changes by WebSocket (RFC 6455): ask for `Upgrade: websocket`."""
+    raise BadInputError("upgrade_required", "this is a WebSocket; for plain HTTP there is .../events")
+
+
+@router.websocket("/maps/{name}/live")
+async def live(socket: WebSocket, name: str, after: After = None) -> None:
+    """The same events as JSON texts."""
+    service: Service = socket.app.state.service
+    try:
+        _check_origin(socket)
+        credentials = _credentials(socket)
+        row = await run_in_threadpool(_admitted, service, name, credentials)
+        stream = _Stream(service, row, credentials)
+        await stream.join(seen_from_text(after or ""))
+    except CairnError as exc:
+        await socket.send_denial_response(answer_to(exc))
+        return
+    try:
+        await socket.accept(subprotocol=PROTOCOL if PROTOCOL in socket.scope["subprotocols"] else None)
+        await _converse(socket, stream)
+    finally:
+        stream.leave()
+
+
+async def _converse(socket: WebSocket, stream: _Stream) -> None:
+    """Send what happens until one side ends it."""
+    pumping = asyncio.create_task(stream.pump(lambda event: socket.send_text(event.model_dump_json())))
+    leaving = asyncio.create_task(_until_left(socket))
+    try:
+        await asyncio.wait({pumping, leaving}, return_when=asyncio.FIRST_COMPLETED)
+        if pumping.done() and not pumping.cancelled() and pumping.exception() is None:
+            with suppress(RuntimeError, WebSocketDisconnect):
+                await socket.close(pumping.result())
+    finally:
+        for task in (pumping, leaving):
+            task.cancel()
+        await asyncio.gather(pumping, leaving, return_exceptions=True)
+
+
+async def _until_left(socket: WebSocket) -> None:
+    """Read until the other side is gone; it has nothing to say."""
+    while (await socket.receive())["type"] != "websocket.disconnect":
+        pass
+
+
+def _admitted(service: Service, name: str, credentials: HTTPAuthorizationCredentials | None) -> MapRow:
+    row = map_now(name, service, credentials)
+    require(caller_now(service, row, credentials), *READING)
+    return row
+
+
+def _credentials(socket: WebSocket) -> HTTPAuthorizationCredentials | None:
+    """The token: of the header, or, as browsers cannot set one, of a subprotocol `cairn.token.BASE64URL`."""
+    scheme, _, token = socket.headers.get("Authorization", "").partition(" ")
+    if scheme.lower() == "bearer":
+        return HTTPAuthorizationCredentials(scheme=scheme, credentials=token)
+    for offered in socket.scope["subprotocols"]:
+        if offered.startswith(TOKEN_PREFIX):
+            text = offered.removeprefix(TOKEN_PREFIX)
+            try:
+                token = base64.b64decode(text + "=" * (-len(text) % 4), altchars=b"-_", validate=True).decode()
+            except (binascii.Error, ValueError):
+                token = ""  # as wrong as any other
+            return HTTPAuthorizationCredentials(scheme="Bearer", credentials=token)
+    return None
+
+
+def _check_origin(socket: WebSocket) -> None:
+    """Refuse pages of other sites; browsers do not ask first for WebSockets, as they do for other requests.
+
+    Raises:
+        DeniedError: kind `foreign_origin`.
+    """
+    for origin in socket.headers.getlist("Origin"):
+        if urlsplit(origin).netloc != socket.headers.get("Host"):
+            raise DeniedError("foreign_origin", "a page of another site asks; only this server's own pages may listen")
+
+
+def _as_text(event: LiveEvent) -> str:
+    """One event; only what ends a step moves the id that a browser gives back after a cut."""
+    id_line = "" if isinstance(event, Beat) or event.type in ("cells", "log") else f"id: {event.id}\n"
+    return f"{id_line}event: {event.type}\ndata: {event.model_dump_json(exclude={'type'})}\n\n"

@@ -1,0 +1,241 @@
+"""Who listens to which map, and what each has not been told yet. Knows no network; usable from every thread.
+
+    folder, routes  --- folded, robots.heard --->  hub  --- wake() --->  listener (an SSE or WebSocket stream)
+                                                    ^                        |
+                                                    +------- take() ---------+
+
+A listener that is slow is not sent more, but later: it holds its place only (`Seen`), and what it takes is the
+newest head and the union of the cells. So it costs the same however slow it is.
+"""
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+
+from pydantic import ValidationError
+
+from cairn_map.errors import CairnError, UnreachableError
+from cairn_map.wire.live_events import CHAIN_DIGITS, Beat, Hello, LiveEvent, RobotHeard, RobotSign, Seen
+from cairn_map.wire.robot_status import RobotStatus
+from cairn_server.live.live_changes import LiveChanges
+from cairn_server.live.live_robots import LiveRobots
+from cairn_server.store.store import Store
+from cairn_server.store.store_rows import MapRow
+
+log = logging.getLogger(__name__)
+
+BEAT_S = 15.0
+LISTENERS_MAX = 512
+LISTENERS_OF_TOKEN_MAX = 16
+
+
+class _LiveMap:
+    def __init__(self, store: Store, row: MapRow) -> None:
+        self.name = row.name
+        self.changes = LiveChanges(store, row)
+        self.robots = LiveRobots(lambda: _signs(store, row))
+        self.listeners: set[Listener] = set()
+
+
+class Hub:
+    """All listeners of a server."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._lock = threading.Lock()
+        self._maps: dict[int, _LiveMap] = {}
+        self._of_token: Counter[bytes] = Counter()
+        self.is_closed = False
+        self.beat_s = BEAT_S
+
+    @property
+    def listeners(self) -> int:
+        """Streams that listen now."""
+        with self._lock:
+            return self._of_token.total()
+
+    def folded(self, row: MapRow) -> None:
+        """The map's head moved. Never fails: who is not told now is told with the next fold."""
+        live = self._maps.get(row.number)
+        if live is None or not live.listeners:
+            return
+        try:
+            live.changes.read()
+        except CairnError as exc:
+            log.warning("map %s: cannot tell listeners what was folded: %s", row.name, exc.message)
+        self._wake(live)
+
+    def robots(self, row: MapRow) -> LiveRobots:
+        """The robots of a map, to look at."""
+        return self._live(row).robots
+
+    def robot_heard(self, row: MapRow, branch: str, **news: object) -> None:
+        """A robot pushed, fetched, or said something; one that is not registered does not count."""
+        live = self._live(row)
+        if live.robots.heard(branch, **news):
+            self._wake(live)
+
+    def robot_came(self, row: MapRow, sign: RobotSign) -> None:
+        """A robot was registered."""
+        live = self._live(row)
+        live.robots.came(sign)
+        self._wake(live)
+
+    def robot_left(self, row: MapRow, branch: str) -> None:
+        """A robot was deregistered."""
+        live = self._live(row)
+        live.robots.left(branch)
+        self._wake(live)
+
+    def join(self, row: MapRow, token: bytes, wake: Callable[[], None], *, after: Seen | None) -> "Listener":
+        """Begin to listen.
+
+        Args:
+            row: the map.
+            token: what stands for who listens; one has a bounded number of listeners.
+            wake: called from any thread when there is something to take; must not fail or wait.
+            after: the id of the last event that was seen, to go on from there.
+
+        Raises:
+            UnreachableError: kind `too_many_streams`; or the server is shutting down.
+        """
+        live = self._live(row)
+        with self._lock:
+            if self.is_closed:
+                raise UnreachableError("shutting_down", "the server is shutting down", retry_after_s=5.0)
+            if self._of_token.total() >= LISTENERS_MAX or self._of_token[token] >= LISTENERS_OF_TOKEN_MAX:
+                raise UnreachableError(
+                    "too_many_streams",
+                    f"at most {LISTENERS_OF_TOKEN_MAX} streams for one token and {LISTENERS_MAX} in all; close another",
+                    retry_after_s=30.0,
+                )
+            listener = Listener(self, live, token, wake)
+            self._of_token[token] += 1
+            live.listeners.add(listener)
+        try:
+            # After the listener is in: what is folded from now on is read by `folded`, if not here.
+            live.changes.read()
+            listener.start(after)
+        except BaseException:
+            listener.leave()
+            raise
+        return listener
+
+    def close(self) -> None:
+        """Every listener is to end now."""
+        with self._lock:
+            self.is_closed = True
+            maps = list(self._maps.values())
+        for live in maps:
+            self._wake(live)
+
+    def remove(self, listener: "Listener") -> None:
+        """Of `Listener.leave`."""
+        with self._lock:
+            if listener in listener.live.listeners:
+                listener.live.listeners.remove(listener)
+                self._of_token[listener.token] -= 1
+                self._of_token += Counter()  # drops zeros: else every token ever seen would stay
+
+    def _live(self, row: MapRow) -> _LiveMap:
+        with self._lock:
+            live = self._maps.get(row.number)
+            if live is None:
+                live = self._maps[row.number] = _LiveMap(self._store, row)
+            return live
+
+    def _wake(self, live: _LiveMap) -> None:
+        with self._lock:
+            listeners = list(live.listeners)
+        for listener in listeners:
+            listener.wake()
+
+
+class Listener:
+    """One stream's place in what happens on one map."""
+
+    def __init__(self, hub: Hub, live: _LiveMap, token: bytes, wake: Callable[[], None]) -> None:
+        self.live = live
+        self.token = token
+        self.wake = wake
+        self._hub = hub
+        self._seen = Seen(0, "0" * CHAIN_DIGITS, 0)
+        self._hello: Hello | None = None
+
+    @property
+    def beat_s(self) -> float:
+        """How often it is to hear something."""
+        return self._hub.beat_s
+
+    @property
+    def is_over(self) -> bool:
+        """The server is shutting down."""
+        return self._hub.is_closed
+
+    @property
+    def is_behind(self) -> bool:
+        """The map changed since it was told last."""
+        return self._hello is not None or self.live.changes.head.seq > self._seen.seq
+
+    def start(self, after: Seen | None) -> None:
+        """Say hello, and go on behind an event that was seen, if it was one of this log."""
+        head = self.live.changes.head
+        tick, robots = self.live.robots.present()
+        resumed = after is not None and self.live.changes.has_proof(after)
+        seq, chain = head.seq, head.chain.hex()[:CHAIN_DIGITS]
+        if after is not None and resumed and after.seq <= head.seq:
+            seq, chain = after.seq, after.chain
+        self._seen = Seen(seq, chain, tick)
+        self._hello = Hello(
+            id=str(self._seen),
+            map=self.live.name,
+            cursor=str(head),
+            resumed=resumed,
+            robots=robots,
+            beat_s=self.beat_s,
+        )
+
+    def take(self) -> list[LiveEvent]:
+        """All that was not told yet, put together; never waits for a disk."""
+        events: list[LiveEvent] = []
+        if self._hello is not None:
+            events.append(self._hello)
+            self._hello = None
+        changes, self._seen = self.live.changes.since(self._seen)
+        events += changes
+        for tick, sign in self.live.robots.since(self._seen.tick):
+            self._seen = Seen(self._seen.seq, self._seen.chain, tick)
+            events.append(RobotHeard(id=str(self._seen), robot=sign))
+        return events
+
+    def beat(self) -> Beat:
+        """A sign that the link is alive."""
+        return Beat(id=str(self._seen), time_s=time.time())
+
+    def leave(self) -> None:
+        """Stop listening; may be called twice."""
+        self._hub.remove(self)
+
+
+def _signs(store: Store, row: MapRow) -> list[RobotSign]:
+    statuses = store.notes.statuses(row)
+    return [
+        RobotSign(
+            branch=branch.name,
+            mode=branch.mode,
+            time_s=branch.last_seen_s,
+            cursor=str(branch.cursor) if branch.cursor else None,
+            status=_status(statuses.get(branch.name)),
+        )
+        for branch in store.branches(row)
+    ]
+
+
+def _status(text: str | None) -> RobotStatus | None:
+    """A kept status; None if there is none, or not one of this version."""
+    try:
+        return RobotStatus.model_validate_json(text) if text else None
+    except ValidationError:
+        return None

@@ -1,0 +1,105 @@
+"""Read a server's whole store and say what is damaged.
+
+    $ cairn serve check --data ./cairn-data
+    2 maps, 1204 commits, 56 cells: all sound
+
+It looks at the pages of the file, at the chain of every log, at every diff that is kept against its commit's SHA-256,
+at every cell against its digest and fingerprint, and at whether each cell is the sum of its commits. It may run beside
+the server. The exit code is 0 if all is sound and 6 if not.
+
+    $ cairn serve check --data ./cairn-data --repair
+    lab: cell 0,-1,2 at rest does not have its digest: made anew from its commits
+
+With --repair, which needs the server stopped, damaged cells are made anew where the log still has all of their commits.
+Others stay set aside: the server answers 500 damaged_store for such a cell alone and goes on with all others; commits
+that touch it wait. What heals it: the next robot that syncs and still has the cell as it was, by itself; an export that
+has it (`cairn map heal`); or a backup from before the damage, after which robots push again what is newer.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from cairn_map.errors import DamagedDataError
+from cairn_map.exit_codes import EXIT_CODES
+from cairn_server.folding.store_check import Finding, check_map
+from cairn_server.operations.progress import Progress
+from cairn_server.settings import Settings
+from cairn_server.store.sqlite.archive import SqliteArchive
+from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
+from cairn_server.store.store import Store
+from cairn_server.store.store_rows import MapRow
+
+
+def main(argv: list[str]) -> int:
+    """Check, and repair if asked."""
+    parser = argparse.ArgumentParser(
+        "cairn serve check", description=__doc__, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help="folder of the store")
+    parser.add_argument("--repair", action="store_true", help="make damaged cells anew; the server must be stopped")
+    args = parser.parse_args(argv)
+    if args.repair:
+        store = SqliteStore(args.data)
+        try:
+            outcome = check_all(store, _complaints(args.data))
+            left = [text for row, finding in outcome.findings for text in _healed(store, row, finding)]
+        finally:
+            store.close()
+    else:
+        archive = SqliteArchive(args.data / FILE_NAME)
+        try:
+            outcome = check_all(archive, archive.complaints())
+        finally:
+            archive.close()
+        left = [str(finding) for _, finding in outcome.findings]
+        sys.stdout.writelines(f"{text}\n" for text in left)
+    if left:
+        raise DamagedDataError("damaged_store", f"{outcome.summary}: {len(left)} things are damaged")
+    sys.stdout.write(f"{outcome.summary}: all sound\n")
+    return 0
+
+
+def _complaints(folder: Path) -> list[str]:
+    archive = SqliteArchive(folder / FILE_NAME)
+    try:
+        return archive.complaints()
+    finally:
+        archive.close()
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a check found."""
+
+    findings: list[tuple[MapRow | None, Finding]]
+    summary: str
+
+
+def check_all(store: Store, complaints: Iterable[str] = ()) -> Outcome:
+    """Everything in a store; `complaints` about its file come first."""
+    findings: list[tuple[MapRow | None, Finding]] = [(None, Finding("file", text)) for text in complaints]
+    progress = Progress("check")
+    rows = store.maps()
+    commits = cells = not_kept = 0
+    for row in rows:
+        checked = check_map(store, row, progress.at)
+        findings += [(row, finding) for finding in checked.findings]
+        commits, cells, not_kept = commits + checked.commits, cells + checked.cells, not_kept + checked.not_kept
+    progress.finish()
+    summary = f"{len(rows)} maps, {commits} commits, {cells} cells"
+    if not_kept:
+        summary += f" ({not_kept} commits' evidence is not kept any more, so their cells cannot be added up)"
+    return Outcome(findings, summary)
+
+
+def _healed(store: SqliteStore, row: MapRow | None, finding: Finding) -> list[str]:
+    """Put a cell in its place if the log told what it was; what is left, if not. Says either."""
+    if row is not None and finding.sound is not None and store.health.heal(row, finding.sound):
+        store.audit("healed_cell", f"map {row.name}: {finding.what}: made anew from its commits")
+        sys.stdout.write(f"{finding}: made anew from its commits\n")
+        return []
+    sys.stdout.write(f"{finding}\n")
+    return [str(finding)]

@@ -1,0 +1,61 @@
+"""Make a server's folder out of a backup.
+
+    $ cairn serve restore nightly.cairn --data ./restored
+    ./restored: restored and checked: 2 maps, 1204 commits, 56 cells
+
+The folder must be new or empty, and no server may work on it; everything is read and checked before it gets its
+name, and nothing is left of it if it is not sound. Then start `cairn serve --data ./restored` in the old one's place.
+
+What robots do then, by themselves: those whose cursor is newer than the backup cannot prove it, compare fingerprints
+cell by cell, and fetch what differs. They push again every commit that the server lost and they still keep, which are
+all that were not `stable`. A robot that was registered after the backup must register again (401). Retracts that robots
+kept come back in the same way; those that an operator made and no robot heard of must be made again.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from cairn_map.errors import DamagedDataError
+from cairn_map.exit_codes import EXIT_CODES
+from cairn_server.operations.check import check_all
+from cairn_server.operations.progress import Progress
+from cairn_server.settings import Settings
+from cairn_server.store.sqlite.archive import SqliteArchive
+from cairn_server.store.sqlite.backup import restore
+
+NEXT = """Start `cairn serve --data {folder}`. Robots notice by themselves: they compare their cells with the server's,
+fetch what differs, and push again what is newer than the backup. Those registered after it must register again.
+"""
+
+
+def main(argv: list[str]) -> int:
+    """Restore a backup."""
+    parser = argparse.ArgumentParser(
+        "cairn serve restore", description=__doc__, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("file", type=Path, metavar="FILE", help="a file that `cairn serve backup` made")
+    parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help="a new or empty folder")
+    args = parser.parse_args(argv)
+    progress = Progress("restore")
+    summary: list[str] = []
+    restore(args.file, args.data, progress.at, lambda path: summary.append(_verified(path)))
+    progress.finish()
+    sys.stdout.write(f"{args.data}: restored and checked: {summary[0]}\n{NEXT.format(folder=args.data)}")
+    return 0
+
+
+def _verified(path: Path) -> str:
+    """What is in a copy.
+
+    Raises:
+        DamagedDataError: kind `damaged_store`: something in it is not sound.
+    """
+    archive = SqliteArchive(path)
+    try:
+        outcome = check_all(archive, archive.complaints())
+    finally:
+        archive.close()
+    if outcome.findings:
+        raise DamagedDataError("damaged_store", f"the backup is damaged, take another one: {outcome.findings[0][1]}")
+    return outcome.summary

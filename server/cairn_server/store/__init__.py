@@ -1,0 +1,4 @@
+"""Store: the protocol that a database fulfils, its rows, and the embedded SQLite store.
+
+What is stored is decided above. Start with `store`, the protocol; `sqlite/` implements it.
+"""

@@ -1,0 +1,88 @@
+"""Numbering of commits: numbers that would tear a map's version vector apart are refused."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from cairn_map.commits.ids import OPERATOR, CommitId
+from cairn_map.commits.version_vector import AUTHORS_MAX, INTERVALS_MAX
+from cairn_map.errors import BadInputError, ConflictError
+
+AUTHOR_INTERVALS_MAX = 1000
+"""Of one author's numbers. A robot pushes oldest first, so an honest one has a handful."""
+
+
+AHEAD_MAX = 10_000
+"""How far a number may run ahead of its author's highest. An author's first may be any: a robot that comes to a new
+server does not keep its oldest commits."""
+
+
+INCARNATIONS_MAX = 256
+"""Of one robot: disks lost or rolled back."""
+
+
+NAMED_MAX = 5
+"""Ids that a complaint names."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Numbering:
+    """What is known of an author's numbers, and of the map's vector, before one more commit."""
+
+    top: int | None
+    """The author's highest number; None before its first commit."""
+    intervals: int
+    neighbours: int
+    """How many of n - 1 and n + 1 are there."""
+    incarnations: int
+    """Of the same robot, this one included if it is known."""
+    authors_in_map: int
+    intervals_in_map: int
+
+
+def check_number(commit: CommitId, numbering: Numbering) -> None:
+    """Refuse a number that would tear the version vector apart.
+
+    Raises:
+        BadInputError: kind `number_gap` or `too_many_authors`.
+    """
+    known = numbering
+    if known.top is not None and commit.n > known.top + AHEAD_MAX:
+        raise BadInputError(
+            "number_gap",
+            f"{commit} runs more than {AHEAD_MAX} ahead of {known.top}, the highest of its author; push those before "
+            "it first, or take a new incarnation",
+        )
+    if known.neighbours:
+        return
+    if known.intervals >= AUTHOR_INTERVALS_MAX:
+        raise BadInputError(
+            "number_gap",
+            f"the numbers of {commit.author} have {known.intervals} gaps, {commit} would open another; fill some first",
+        )
+    is_new = known.top is None
+    too_many = known.authors_in_map >= AUTHORS_MAX // 2 or known.intervals_in_map >= INTERVALS_MAX // 2
+    # A server's own retracts have an incarnation for each of its starts.
+    spent = is_new and known.incarnations >= INCARNATIONS_MAX and commit.author.robot != OPERATOR
+    if too_many or spent:
+        raise BadInputError(
+            "too_many_authors",
+            f"{commit.author} has {known.incarnations} incarnations (at most {INCARNATIONS_MAX}), the map "
+            f"{known.authors_in_map} authors and {known.intervals_in_map} gaps",
+        )
+
+
+AGAIN_KEPT_S = 3600.0
+"""Evidence that was pushed again because a retract needs it is kept for this long, whatever the setting."""
+
+
+class EvidenceGoneError(ConflictError):
+    """What a store says to a retract of commits whose evidence it does not keep any more."""
+
+    def __init__(self, commits: Sequence[CommitId]) -> None:
+        names = ", ".join(map(str, commits[:NAMED_MAX])) + (" ..." if len(commits) > NAMED_MAX else "")
+        super().__init__(
+            "evidence_gone",
+            f"the evidence of {len(commits)} of these commits is not kept any more ({names}); robots that have their "
+            "bytes push them again when they sync, and then they can be retracted",
+        )
+        self.commits = tuple(commits)

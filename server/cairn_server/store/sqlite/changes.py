@@ -1,0 +1,168 @@
+"""What is written about commits, each function inside one transaction of the writer."""
+
+import json
+import time
+
+import apsw
+
+from cairn_map.commits.cursor import ENTRY_FOLD
+from cairn_map.commits.ids import CommitId
+from cairn_map.errors import BadInputError, ConflictError
+from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX
+from cairn_server.store.numbering import Numbering, check_number
+from cairn_server.store.sqlite.retention import check_kept, is_retracted, remember_evidence
+from cairn_server.store.sqlite.writer import first
+from cairn_server.store.store_rows import Fold, MapRow, NewCommit
+
+
+def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit) -> bool:
+    """Keep a commit; False if the same one is kept already."""
+    key = (row.number, *commit.id.author, commit.id.n)
+    query = "SELECT number, sha, damaged, gone FROM commits WHERE map = ? AND robot = ? AND incarnation = ? AND n = ?"
+    known = first(connection, query, key)
+    if known is not None:
+        number, sha, damaged, gone = known
+        if sha != commit.sha:
+            raise ConflictError("id_taken", f"commit {commit.id} is already here with other bytes")
+        if damaged is not None:
+            _repair(connection, number, commit)
+        elif gone and not is_retracted(connection, row, commit.id):
+            remember_evidence(connection, number, commit)
+            _insert_diff(connection, number, commit)
+        return damaged is not None
+    check_kept(connection, row, commit.retracts)
+    _note_number(connection, row, commit.id)
+    _note_tops(connection, row, commit.tops)
+    connection.execute(
+        "INSERT INTO commits (map, robot, incarnation, n, sha, size_bytes, cells, meta, captured_first_s,"
+        " captured_last_s, retracts, received_s, rig, signatures, via)"
+        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        (
+            *key,
+            commit.sha,
+            commit.size_bytes,
+            len(commit.diff),
+            commit.text,
+            *(commit.captured_s or (None, None)),
+            " ".join(map(str, commit.retracts)),
+            time.time(),
+            commit.rig,
+            commit.signatures,
+            commit.via,
+        ),
+    )
+    _insert_diff(connection, connection.last_insert_rowid(), commit)
+    return True
+
+
+def next_number(connection: apsw.Connection, row: MapRow, author: tuple[str, str]) -> int:
+    """The number after an author's highest."""
+    query = "SELECT top + 1 FROM author WHERE map = ? AND robot = ? AND incarnation = ?"
+    return int(first(connection, query, (row.number, *author)) or 0)
+
+
+def write_fold(connection: apsw.Connection, row: MapRow, fold: Fold) -> bool:
+    """Cells, entries and head, if the head is still the fold's base."""
+    head = first(connection, "SELECT seq, chain FROM map WHERE number = ?", (row.number,))
+    if head != (fold.base.seq, fold.base.chain):
+        return False
+    connection.execute(
+        "UPDATE map SET seq = ?, chain = ?, vector = ? WHERE number = ?",
+        (fold.head.seq, fold.head.chain, json.dumps(fold.vector.to_json()), row.number),
+    )
+    now_s = time.time()
+    for seq, entry in enumerate(fold.entries, start=fold.base.seq + 1):
+        connection.execute(
+            "INSERT INTO log (map, seq, kind, commit_number, chain) VALUES (?, ?, ?, ?, ?)",
+            (row.number, seq, entry.kind, entry.commit, entry.chain),
+        )
+        connection.execute(
+            "INSERT INTO touched (map, cell, seq) SELECT ?, cell, ? FROM diff WHERE commit_number = ?",
+            (row.number, seq, entry.commit),
+        )
+        connection.execute(
+            "UPDATE commits SET folded_seq = ?, folded_s = ? WHERE number = ? AND folded_seq IS NULL"
+            if entry.kind == ENTRY_FOLD
+            else "UPDATE commits SET unfolded_seq = ? WHERE number = ?",
+            (seq, now_s, entry.commit) if entry.kind == ENTRY_FOLD else (seq, entry.commit),
+        )
+    connection.executemany(
+        "INSERT INTO retracted (map, id) VALUES (?, ?)", [(row.number, str(target)) for target in fold.retracted]
+    )
+    connection.executemany(
+        "UPDATE commits SET damaged = ? WHERE number = ?", [(why, number) for number, why in fold.damaged]
+    )
+    _write_cells(connection, row, fold)
+    return True
+
+
+def _write_cells(connection: apsw.Connection, row: MapRow, fold: Fold) -> None:
+    connection.executemany(
+        "INSERT INTO cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, hottest_k, body, stamps)"
+        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
+        " ON CONFLICT (map, cell) DO UPDATE SET lm = excluded.lm, digest = excluded.digest,"
+        " fingerprint = excluded.fingerprint, voxels = excluded.voxels, size_bytes = excluded.size_bytes,"
+        " hottest_k = excluded.hottest_k, body = excluded.body, stamps = excluded.stamps",
+        [
+            (
+                *(row.number, c.key, c.lm, c.digest, c.fingerprint.to_bytes(), c.voxels),
+                *(c.size_bytes, c.hottest_k, c.body, c.stamps),
+            )
+            for c in fold.cells
+        ],
+    )
+
+
+def _note_number(connection: apsw.Connection, row: MapRow, commit: CommitId) -> None:
+    """Count the author's intervals as they are with this commit, if `push_policy` lets it in."""
+    author = (row.number, *commit.author)
+    known = first(
+        connection, "SELECT top, intervals FROM author WHERE map = ? AND robot = ? AND incarnation = ?", author
+    )
+    query = "SELECT count(*) FROM commits WHERE map = ? AND robot = ? AND incarnation = ? AND n IN (?, ?)"
+    neighbours: int = first(connection, query, (*author, commit.n - 1, commit.n + 1))
+    top, intervals = known or (None, 0)
+    incarnations = authors = spans = 0
+    if not neighbours:  # only then does anything grow but a number
+        of_robot = "SELECT count(*) FROM author WHERE map = ? AND robot = ?"
+        incarnations = first(connection, of_robot, (row.number, commit.author.robot))
+        totals = "SELECT count(*), coalesce(sum(intervals), 0) FROM author WHERE map = ?"
+        authors, spans = first(connection, totals, (row.number,))
+    check_number(
+        commit,
+        Numbering(
+            top=top,
+            intervals=intervals,
+            neighbours=neighbours,
+            incarnations=incarnations,
+            authors_in_map=authors,
+            intervals_in_map=spans,
+        ),
+    )
+    connection.execute(
+        "INSERT INTO author (map, robot, incarnation, top, intervals) VALUES (?, ?, ?, ?, ?)"
+        " ON CONFLICT DO UPDATE SET top = max(top, excluded.top), intervals = excluded.intervals",
+        (*author, commit.n, intervals + 1 - neighbours),
+    )
+
+
+def _note_tops(connection: apsw.Connection, row: MapRow, tops: tuple[int, ...]) -> None:
+    sums = json.loads(first(connection, "SELECT tops FROM map WHERE number = ?", (row.number,)))
+    sums = [total + top for total, top in zip(sums, tops, strict=True)]
+    if max(sums[:2]) > COUNT_MAX or max(sums[2:], default=0) > SUM_MAX:
+        raise BadInputError("evidence_overflow", "the map could not take this much evidence without an overflow")
+    connection.execute("UPDATE map SET tops = ? WHERE number = ?", (json.dumps(sums), row.number))
+
+
+def _repair(connection: apsw.Connection, number: int, commit: NewCommit) -> None:
+    """Fresh bytes for a commit that was set aside."""
+    connection.execute("DELETE FROM diff WHERE commit_number = ?", (number,))
+    connection.execute("UPDATE commits SET damaged = NULL, meta = ? WHERE number = ?", (commit.text, number))
+    _insert_diff(connection, number, commit)
+
+
+def _insert_diff(connection: apsw.Connection, number: int, commit: NewCommit) -> None:
+    connection.executemany(
+        "INSERT INTO diff (commit_number, cell, body) VALUES (?, ?, ?)",
+        [(number, cell, body) for cell, body in commit.diff.items()],
+    )

@@ -1,0 +1,100 @@
+"""What is read of a SQLite store beside what a snapshot tells: maps, and commits with their evidence."""
+
+import json
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+
+from cairn_map.commits.ids import Author, CommitId
+from cairn_map.evidence.grid import CellKey, Geometry
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_server.store.sqlite.readers import Readers
+from cairn_server.store.sqlite.snapshot import SqliteSnapshot, ids_from_text
+from cairn_server.store.sqlite.writer import Values, first, rows
+from cairn_server.store.store_rows import MapRow, StoredCommit
+
+
+class SqliteReads:
+    """The reading half of `store.Store`."""
+
+    def __init__(self, readers: Readers) -> None:
+        self._readers = readers
+
+    def maps(self) -> list[MapRow]:
+        """All maps, by name."""
+        return self.map_rows("ORDER BY name", ())
+
+    def pending(
+        self, row: MapRow, *, limit: int, size_bytes_max: int, skip: Collection[int] = ()
+    ) -> list[StoredCommit]:
+        """Commits to be folded, in order of arrival, with their diffs: at most `limit`, and one or within the size."""
+        skipped = " AND number NOT IN (SELECT value FROM json_each(?))" if skip else ""
+        clause = f"map = ? AND folded_seq IS NULL AND damaged IS NULL{skipped} ORDER BY number LIMIT ?"
+        values = (row.number, json.dumps(sorted(skip)), limit) if skip else (row.number, limit)
+        return self._commits(clause, values, size_bytes_max=size_bytes_max)
+
+    def commit(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
+        """A commit with its diff, folded or not; None if there is none."""
+        return self._commit("map = ? AND robot = ? AND incarnation = ? AND n = ?", row, commit)
+
+    def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
+        """A folded commit with its diff, or None."""
+        clause = "map = ? AND robot = ? AND incarnation = ? AND n = ? AND folded_seq IS NOT NULL"
+        return self._commit(clause, row, commit)
+
+    def is_retracted(self, row: MapRow, commit: CommitId) -> bool:
+        """Whether a retract of this id has taken effect, or waits for it to come."""
+        query = "SELECT 1 FROM retracted WHERE map = ? AND id = ?"
+        with self._readers.reading() as reader:
+            return first(reader, query, (row.number, str(commit))) is not None
+
+    @contextmanager
+    def snapshot(self, row: MapRow) -> Iterator[SqliteSnapshot]:
+        """One state of the map."""
+        with self._readers.transaction() as connection:
+            yield SqliteSnapshot(connection, row.number, row.geometry.digest())
+
+    def map_rows(self, clause: str, values: Values) -> list[MapRow]:
+        """Maps that fit a clause of ours."""
+        query = f"SELECT number, name, geometry, sensor_model, seal_key FROM map {clause}"  # noqa: S608 - our own clause
+        with self._readers.reading() as reader:
+            found = rows(reader, query, values)
+        return [
+            MapRow(
+                number=number,
+                name=name,
+                geometry=Geometry.model_validate_json(geometry),
+                sensor_model=SensorModel.model_validate_json(sensor_model),
+                seal_key=seal_key,
+            )
+            for number, name, geometry, sensor_model, seal_key in found
+        ]
+
+    def _commit(self, clause: str, row: MapRow, commit: CommitId) -> StoredCommit | None:
+        found = self._commits(clause, (row.number, *commit.author, commit.n), size_bytes_max=0)
+        return found[0] if found else None
+
+    def _commits(self, clause: str, values: Values, *, size_bytes_max: int) -> list[StoredCommit]:
+        """Commits in the order asked for, as long as their bytes stay within the size; the first in any case."""
+        columns = "number, robot, incarnation, n, sha, meta, retracts, gone, size_bytes, signatures"
+        found: list[StoredCommit] = []
+        total_bytes = 0
+        with self._readers.transaction() as reader:
+            query = f"SELECT {columns} FROM commits WHERE {clause}"  # noqa: S608 - our own clause
+            for number, *author, n, sha, text, retracts, gone, size_bytes, signed in reader.execute(query, values):
+                total_bytes += size_bytes
+                if found and total_bytes > size_bytes_max:
+                    break
+                diff = rows(reader, "SELECT cell, body FROM diff WHERE commit_number = ? ORDER BY cell", (number,))
+                found.append(
+                    StoredCommit(
+                        number=number,
+                        id=CommitId(Author(*author), n),
+                        sha=sha,
+                        text=text,
+                        retracts=ids_from_text(retracts),
+                        diff={CellKey(cell): body or b"" for cell, body in diff},
+                        gone=bool(gone),
+                        signatures=signed,
+                    )
+                )
+        return found

@@ -1,0 +1,229 @@
+"""The embedded store: one SQLite file, one writer, readers that never wait for it (`store.Store`)."""
+
+import json
+import logging
+import secrets
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from pathlib import Path
+
+import apsw
+
+from cairn_map.commits.cursor import Cursor, cursor_from_text, first_chain
+from cairn_map.commits.ids import Author, new_incarnation
+from cairn_map.errors import BadInputError, ConflictError, NotFoundError, UnreachableError
+from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_server.store.folder_lock import lock_folder
+from cairn_server.store.last_seen import LastSeen
+from cairn_server.store.sqlite.branch_notes import SqliteBranchNotes
+from cairn_server.store.sqlite.changes import append_commit, next_number, write_fold
+from cairn_server.store.sqlite.health import SqliteHealth
+from cairn_server.store.sqlite.readers import Readers
+from cairn_server.store.sqlite.reads import SqliteReads
+from cairn_server.store.sqlite.retention import forget_evidence
+from cairn_server.store.sqlite.schema import ensure_schema
+from cairn_server.store.sqlite.tokens import (
+    SqliteAuditLog,
+    SqliteTokens,
+    put_registration,
+    remove_tokens_of,
+    write_audit,
+)
+from cairn_server.store.sqlite.uses import SqliteUses
+from cairn_server.store.sqlite.writer import Writer, connect, first, rows
+from cairn_server.store.store_rows import Branch, Fold, MapRow, NewCommit
+
+log = logging.getLogger(__name__)
+
+FILE_NAME = "cairn.sqlite"
+
+
+class SqliteStore(SqliteReads):
+    """`store.Store` in a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        """Open or make the store.
+
+        Raises:
+            ConflictError: kind `store_in_use`: another server works on it.
+            BadInputError: kind `store_version` or `bad_store`: no folder, or no store of this version.
+        """
+        path = folder / FILE_NAME
+        try:
+            folder.mkdir(0o700, parents=True, exist_ok=True)  # what is in it is as secret as the maps
+            self._lock = lock_folder(folder)
+        except OSError as exc:
+            raise BadInputError("bad_store", f"cannot keep a store in {folder}: {exc.strerror}") from exc
+        try:
+            _prepare(path)
+            self._writer = Writer(path)
+        except BaseException:
+            self._lock.close()
+            raise
+        super().__init__(Readers(path))
+        self._seen = LastSeen()
+        self.tokens = SqliteTokens(self._writer, self._readers)
+        self.uses = SqliteUses(self._readers)
+        self.audit_log = SqliteAuditLog(self._writer, self._readers)
+        self.health = SqliteHealth(path, self._writer, self._readers)
+        self._maps: dict[str, MapRow] = {}  # which never change
+        self.notes = SqliteBranchNotes(self._writer, self._readers)
+
+    def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:
+        """The map and whether it is new; an equal one may exist already."""
+
+        def job(connection: apsw.Connection) -> bool:
+            found = first(connection, "SELECT geometry, sensor_model FROM map WHERE name = ?", (name,))
+            if found:
+                if found != (geometry.model_dump_json(), sensor_model.model_dump_json()):
+                    raise ConflictError("map_exists", f"map {name} exists with another geometry or sensor model")
+                return False
+            log_id = secrets.token_bytes(16)
+            tops = [0] * (2 + geometry.plane_count)
+            connection.execute(
+                "INSERT INTO map (name, geometry, sensor_model, operator, log_id, seq, chain, vector, tops, seal_key)"
+                " VALUES (?, ?, ?, ?, ?, 0, ?, '{}', ?, randomblob(32))",
+                (
+                    name,
+                    geometry.model_dump_json(),
+                    sensor_model.model_dump_json(),
+                    new_incarnation(),
+                    log_id,
+                    first_chain(log_id, geometry.digest()),
+                    json.dumps(tops),
+                ),
+            )
+            return True
+
+        is_new = self._writer.run(job)
+        return self.map(name), is_new
+
+    def map(self, name: str) -> MapRow:
+        """The map of a name."""
+        kept = self._maps.get(name)
+        if kept is not None:
+            return kept
+        found = self.map_rows("WHERE name = ?", (name,))
+        if found:
+            self._maps[name] = found[0]
+            return found[0]
+        raise NotFoundError("no_map", f"there is no map {name!r}; `cairn map ls` lists them")
+
+    def append(self, row: MapRow, commit: NewCommit) -> bool:
+        """Keep a commit; True if it is new, False if the same one is kept already. Durable on return."""
+        return self.submit(row, commit).result()
+
+    def submit(self, row: MapRow, commit: NewCommit) -> Future[bool]:
+        """Keep a commit, as `append` does; durable once the answer is there."""
+        return self._writer.submit(lambda connection: append_commit(connection, row, commit))
+
+    def append_built(self, row: MapRow, author: Author, build: Callable[[int], NewCommit]) -> NewCommit:
+        """Keep a commit that `build(n)` makes for the author's next number n."""
+
+        def job(connection: apsw.Connection) -> NewCommit:
+            commit = build(next_number(connection, row, author))
+            append_commit(connection, row, commit)
+            return commit
+
+        return self._writer.run(job)
+
+    def forget_evidence(self, row: MapRow, *, before_s: float, limit: int) -> int:
+        """Drop the evidence and the meta of up to `limit` commits folded, and last pushed, before a time; how many."""
+        return self._writer.run(lambda connection: forget_evidence(connection, row, before_s, limit))
+
+    def fold(self, row: MapRow, fold: Fold) -> bool:
+        """Write a fold if the head is still its base; False (and nothing written) otherwise."""
+        return self._writer.run(lambda connection: write_fold(connection, row, fold))
+
+    def register(self, row: MapRow, branch: Branch, token_hash: bytes) -> None:
+        """Make a branch, or give an existing one a new token."""
+        self._write_seen()  # before the row is made anew, in the order of the writer's jobs
+        self._seen.forget(row.number, branch.name)
+        sensors = json.dumps(branch.sensors)
+        values = (row.number, branch.name, branch.mode, sensors, branch.last_seen_s, branch.incarnation)
+
+        def job(connection: apsw.Connection) -> None:
+            connection.execute(
+                "INSERT INTO branch (map, name, mode, sensors, last_seen_s, incarnation) VALUES (?, ?, ?, ?, ?, ?)"
+                " ON CONFLICT (map, name) DO UPDATE SET mode = excluded.mode, sensors = excluded.sensors,"
+                " last_seen_s = excluded.last_seen_s,"
+                # A new incarnation may have lost its disk: where it stands is not known before it fetches.
+                " cursor = CASE WHEN branch.incarnation = excluded.incarnation THEN cursor END,"
+                " incarnation = excluded.incarnation",
+                values,
+            )
+            put_registration(connection, row, branch.name, token_hash)
+
+        self._writer.run(job)
+        self.tokens.forget_known()
+
+    def seen(self, row: MapRow, name: str, cursor: Cursor | None) -> None:
+        """Note that a branch was heard of, and where it stands; may be written later."""
+        if self._seen.note(row.number, name, str(cursor) if cursor else None):
+            with suppress(UnreachableError):  # it is only a note, and what it is about was done
+                self._write_seen()
+
+    def _write_seen(self) -> Future[None]:
+        """Write what was heard of branches."""
+        values = [(sign.time_s, sign.cursor, *key) for key, sign in self._seen.taken().items()]
+        query = "UPDATE branch SET last_seen_s = ?, cursor = coalesce(?, cursor) WHERE map = ? AND name = ?"
+
+        def job(connection: apsw.Connection) -> None:
+            connection.executemany(query, values).fetchall()
+
+        return self._writer.submit(job)
+
+    def deregister(self, row: MapRow, name: str) -> None:
+        """Remove a branch and its token."""
+
+        def job(connection: apsw.Connection) -> None:
+            connection.execute("DELETE FROM branch WHERE map = ? AND name = ?", (row.number, name))
+            if not connection.changes():
+                raise NotFoundError("no_branch", f"map {row.name} has no branch {name!r}")
+            remove_tokens_of(connection, row, name)
+
+        self._writer.run(job)
+        self.tokens.forget_known()
+        self._seen.forget(row.number, name)
+
+    def branches(self, row: MapRow) -> list[Branch]:
+        """All branches, by name."""
+        with suppress(UnreachableError):  # a full disk is no reason not to tell what is known
+            self._write_seen().result()
+        query = "SELECT name, mode, sensors, cursor, last_seen_s, incarnation FROM branch WHERE map = ? ORDER BY name"
+        with self._readers.reading() as reader:
+            found = rows(reader, query, (row.number,))
+        return [
+            Branch(name, mode, tuple(json.loads(sensors)), cursor_from_text(cursor) if cursor else None, seen_s, born)
+            for name, mode, sensors, cursor, seen_s, born in found
+        ]
+
+    def audit(self, what: str, detail: str) -> None:
+        """Note something that an administrator may have to look into; may be written later."""
+        log.warning("%s: %r", what, detail)
+        with suppress(UnreachableError):
+            self._writer.submit(lambda connection: write_audit(connection, "server", what, detail))
+
+    def close(self) -> None:
+        """Finish what was accepted and close."""
+        with suppress(UnreachableError):  # closed before
+            self._write_seen()
+            self.tokens.write_used()
+        try:
+            self._writer.close()
+            self._readers.close()
+        finally:
+            self._lock.close()
+
+
+def _prepare(path: Path) -> None:
+    try:
+        connection = connect(path)
+        try:
+            ensure_schema(connection)
+        finally:
+            connection.close()
+    except apsw.Error as exc:
+        raise BadInputError("bad_store", f"{path} is not a store, or cannot be opened: {exc}") from exc

@@ -1,0 +1,202 @@
+"""Tokens and the audit log in the embedded store (`token_store`)."""
+
+import logging
+import threading
+import time
+from contextlib import suppress
+from typing import Any
+
+import apsw
+
+from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
+from cairn_map.wire.access_messages import AuditEntry, audit_chain
+from cairn_server.store.sqlite.readers import Readers
+from cairn_server.store.sqlite.writer import Writer, first, rows
+from cairn_server.store.store_rows import MapRow
+from cairn_server.store.token_store import Token, registration_name
+
+log = logging.getLogger(__name__)
+
+USED_EVERY_S = 10.0
+"""How often the times of last use are written, all together."""
+KNOWN_S, KNOWN_MAX = 1.0, 4096
+"""How long a token that was found is known without another look, and how many; a robot shows it with each push."""
+AUDIT_ROWS_MAX = 100_000
+_SELECT = (
+    "SELECT t.name, t.role, t.map, m.name, t.robot, t.created_s, t.expires_s, t.last_used_s"
+    " FROM token t LEFT JOIN map m ON m.number = t.map"
+)
+
+
+class SqliteTokens:
+    """`token_store.Tokens`."""
+
+    def __init__(self, writer: Writer, readers: Readers) -> None:
+        self._writer = writer
+        self._readers = readers
+        self._lock = threading.Lock()
+        self._used: dict[str, float] = {}
+        self._written_s = float("-inf")
+        self._known: dict[bytes, tuple[Token, float]] = {}
+
+    def forget_known(self) -> None:
+        """Look at all tokens anew; called once a change is durable, before anybody is told of it."""
+        self._known = {}
+
+    def add(self, token: Token, secret_hash: bytes) -> None:
+        """Keep a new token."""
+
+        def job(connection: apsw.Connection) -> None:
+            if first(connection, "SELECT 1 FROM token WHERE name = ?", (token.name,)):
+                raise ConflictError("token_exists", f"a token {token.name!r} exists; rotate it, or take another name")
+            connection.execute(
+                "INSERT INTO token (name, role, map, robot, hash, created_s, expires_s) VALUES (?, ?, ?, ?, ?, ?, ?)",
+                (
+                    token.name,
+                    token.role,
+                    token.map_number,
+                    token.robot,
+                    secret_hash,
+                    token.created_s,
+                    token.expires_s,
+                ),
+            )
+
+        self._writer.run(job)
+
+    def renew(self, name: str, secret_hash: bytes) -> Token:
+        """Give a token another secret."""
+
+        def job(connection: apsw.Connection) -> Token:
+            connection.execute("UPDATE token SET hash = ? WHERE name = ?", (secret_hash, name))
+            _check_changed(connection, name)
+            return _token(connection.execute(f"{_SELECT} WHERE t.name = ?", (name,)).fetchall()[0])
+
+        token = self._writer.run(job)
+        self.forget_known()
+        return token
+
+    def remove(self, name: str) -> None:
+        """Forget a token."""
+
+        def job(connection: apsw.Connection) -> None:
+            connection.execute("DELETE FROM token WHERE name = ?", (name,))
+            _check_changed(connection, name)
+
+        self._writer.run(job)
+        self.forget_known()
+
+    def all(self) -> list[Token]:
+        """All tokens, by name."""
+        self.write_used()
+        with self._readers.reading() as reader:
+            return [_token(row) for row in rows(reader, f"{_SELECT} ORDER BY t.name")]
+
+    def of_hash(self, secret_hash: bytes) -> Token | None:
+        """The token of a secret, as it was at most a second ago, and not before it was changed."""
+        known = self._known  # what is read before a change must not become known after it
+        token, until_s = known.get(secret_hash, (None, 0.0))
+        if token is not None and time.monotonic() < until_s:
+            return token
+        with self._readers.reading() as reader:
+            found = rows(reader, f"{_SELECT} WHERE t.hash = ?", (secret_hash,))
+        if not found:
+            return None
+        token = _token(found[0])
+        if len(known) >= KNOWN_MAX:
+            known.clear()
+        known[secret_hash] = token, time.monotonic() + KNOWN_S
+        return token
+
+    def used(self, name: str) -> None:
+        """Note that a token was shown just now; written some seconds later."""
+        with self._lock:
+            self._used[name] = time.time()
+            if time.monotonic() - self._written_s < USED_EVERY_S:
+                return
+        with suppress(UnreachableError):  # it is only a note
+            self._submit()
+
+    def write_used(self) -> None:
+        """Write what is noted now."""
+        self._submit().result()
+
+    def _submit(self) -> Any:
+        with self._lock:
+            noted, self._used = self._used, {}
+            self._written_s = time.monotonic()
+        values = [(used_s, name) for name, used_s in noted.items()]
+        return self._writer.submit(
+            lambda connection: connection.executemany(
+                "UPDATE token SET last_used_s = ? WHERE name = ?", values
+            ).fetchall()
+        )
+
+
+class SqliteAuditLog:
+    """`token_store.AuditLog`."""
+
+    def __init__(self, writer: Writer, readers: Readers) -> None:
+        self._writer = writer
+        self._readers = readers
+
+    def add(self, who: str, what: str, detail: str) -> None:
+        """One more line; durable on return."""
+        log.info("%s: %s: %r", who, what, detail)
+        self._writer.run(lambda connection: write_audit(connection, who, what, detail))
+
+    def page(self, *, after: int, limit: int) -> list[AuditEntry]:
+        """Lines numbered above `after`, oldest first."""
+        query = "SELECT number, time_s, who, what, detail, chain FROM audit WHERE number > ? ORDER BY number LIMIT ?"
+        with self._readers.reading() as reader:
+            found = rows(reader, query, (after, limit))
+        return [
+            AuditEntry(number=number, time_s=time_s, who=who, what=what, detail=detail, chain=chain.hex())
+            for number, time_s, who, what, detail, chain in found
+        ]
+
+
+def write_audit(connection: apsw.Connection, who: str, what: str, detail: str) -> None:
+    """One more line of the audit log, chained to the last, inside a transaction; the newest lines are kept."""
+    last, before = first(connection, "SELECT number, chain FROM audit ORDER BY number DESC LIMIT 1") or (0, b"")
+    number, time_s = last + 1, time.time()
+    chain = audit_chain(before, number, time_s, who=who, what=what, detail=detail)
+    connection.execute(
+        "INSERT INTO audit (number, time_s, who, what, detail, chain) VALUES (?, ?, ?, ?, ?, ?)",
+        (number, time_s, who, what, detail, chain),
+    )
+    connection.execute("DELETE FROM audit WHERE number <= ?", (number - AUDIT_ROWS_MAX,))
+
+
+def put_registration(connection: apsw.Connection, row: MapRow, robot: str, secret_hash: bytes) -> None:
+    """The token of a registration, inside its transaction; the one of an earlier registration is worth nothing then."""
+    connection.execute(
+        "INSERT INTO token (name, role, map, robot, hash, created_s) VALUES (?, 'robot', ?, ?, ?, ?)"
+        " ON CONFLICT (name) DO UPDATE SET hash = excluded.hash, created_s = excluded.created_s,"
+        " expires_s = NULL, last_used_s = NULL",
+        (registration_name(row.name, robot), row.number, robot, secret_hash, time.time()),
+    )
+
+
+def remove_tokens_of(connection: apsw.Connection, row: MapRow, robot: str) -> None:
+    """Forget every token of a robot on a map, inside a transaction."""
+    connection.execute("DELETE FROM token WHERE map = ? AND robot = ?", (row.number, robot))
+
+
+def _token(columns: tuple[Any, ...]) -> Token:
+    name, role, number, map_name, robot, created_s, expires_s, last_used_s = columns
+    return Token(
+        name=name,
+        role=role,
+        map_number=number,
+        map_name=map_name,
+        robot=robot,
+        created_s=created_s,
+        expires_s=expires_s,
+        last_used_s=last_used_s,
+    )
+
+
+def _check_changed(connection: apsw.Connection, name: str) -> None:
+    if not connection.changes():
+        raise NotFoundError("no_such_token", f"there is no token {name[:80]!r}; `cairn token list` shows them")

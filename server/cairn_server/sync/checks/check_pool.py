@@ -1,0 +1,235 @@
+"""Worker processes that check dear commits, seen from the server: each commit within its processor time and memory.
+
+Workers are made when they are first needed, and anew when one was killed, ran over its limit or grew large. Whoever
+asks waits for a free one, within bounds: what cannot be checked soon is refused with "later", never left waiting.
+"""
+
+import json
+import logging
+import os
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+
+from cairn_map.errors import BadInputError, UnreachableError
+from cairn_server.processes import LENGTH, received, send
+from cairn_server.sync.checks.checking import Checked
+from cairn_server.sync.checks.worker_nursery import checked_from
+
+log = logging.getLogger(__name__)
+
+WAITING_MAX = 8
+"""Requests that wait for a worker, or for its answer; each holds a thread of the web server's forty."""
+WAIT_S = 10.0
+"""For a free worker."""
+START_S = 120.0
+"""For a new worker: milliseconds, but for the first one on a machine without compiled kernels."""
+LOOK_S = 0.05
+"""How often a worker's processor time is looked at."""
+STALL_FACTOR = 20.0
+"""A worker that got so little of the processor is given up after this many times its limit, by the clock."""
+TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+
+
+class _LostError(Exception):
+    """The worker ended in the middle."""
+
+
+class _Worker:
+    """One process and the socket to it."""
+
+    def __init__(self, jobs: socket.socket) -> None:
+        self.jobs = jobs
+        jobs.settimeout(START_S)
+        hello = jobs.recv(LENGTH.size)
+        if len(hello) < LENGTH.size:
+            raise _LostError
+        self.pid = int(LENGTH.unpack(hello)[0])
+
+    def answer(self, data: bytes, limit_s: float) -> dict[str, object]:
+        """What it says of a commit.
+
+        Raises:
+            BadInputError: kind `too_costly`: it took more processor time.
+            UnreachableError: kind `check_failed`: it was hardly given any.
+            _LostError: it ended in the middle.
+        """
+        start_s, end_s = self._cpu_s(), time.monotonic() + STALL_FACTOR * limit_s
+        self.jobs.settimeout(end_s - time.monotonic())
+        try:
+            send(self.jobs, data)
+            while not self._is_readable():
+                if self._cpu_s() - start_s > limit_s:
+                    raise _too_costly(f"more than {limit_s:g} s of processor time")
+                if time.monotonic() > end_s:
+                    raise UnreachableError("check_failed", "the server is too busy to check this", retry_after_s=30.0)
+            answer = received(self.jobs)
+        except OSError as exc:
+            raise _LostError from exc
+        if answer is None:
+            raise _LostError
+        found: dict[str, object] = json.loads(answer)
+        return found
+
+    def kill(self) -> None:
+        """End it; its socket tells whether it is still the process of that number."""
+        with self.jobs, suppress(OSError):
+            self.jobs.settimeout(0)
+            try:
+                is_there = bool(self.jobs.recv(1, socket.MSG_PEEK))
+            except BlockingIOError:
+                is_there = True
+            if is_there:
+                os.kill(self.pid, signal.SIGKILL)
+
+    def _is_readable(self) -> bool:
+        self.jobs.settimeout(LOOK_S)
+        try:
+            self.jobs.recv(1, socket.MSG_PEEK)
+        except TimeoutError:
+            return False
+        finally:
+            self.jobs.settimeout(START_S)
+        return True
+
+    def _cpu_s(self) -> float:
+        """Processor time so far, of a process that may have ended."""
+        try:
+            fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
+        except OSError as exc:
+            raise _LostError from exc
+        return (int(fields[11]) + int(fields[12])) / TICKS_PER_S
+
+
+class CheckPool:
+    """Checks commits in worker processes; called from many threads."""
+
+    def __init__(self, *, workers: int, limit_s: float, memory_bytes: int) -> None:
+        self._limit_s = limit_s
+        self._memory_bytes = memory_bytes
+        self._lock = threading.Lock()
+        self._closed = False
+        self._nursery: subprocess.Popen[bytes] | None = None
+        self._control: socket.socket | None = None
+        self._waiting = threading.BoundedSemaphore(workers + WAITING_MAX)
+        self._idle: queue.LifoQueue[_Worker | None] = queue.LifoQueue()
+        for _ in range(workers):
+            self._idle.put(None)  # a place where a worker may be
+
+    def check(self, data: bytes) -> Checked:
+        """What a worker found.
+
+        Raises:
+            BadInputError: kind `too_costly`, or what the worker found wrong.
+            DamagedDataError: what the worker found wrong.
+            UnreachableError: kind `busy`: too many wait; kind `check_failed`: workers were killed, or starved;
+                kind `shutting_down`.
+        """
+        if not self._waiting.acquire(blocking=False):
+            raise UnreachableError("busy", "many large commits are being checked", retry_after_s=5.0)
+        try:
+            for _ in range(2):
+                with suppress(_LostError):
+                    return self._checked(data)
+                log.warning("a worker that checked a commit of %d bytes was killed", len(data))
+            raise UnreachableError(
+                "check_failed", "the processes that check commits are being killed", retry_after_s=30.0
+            )
+        finally:
+            self._waiting.release()
+
+    def close(self) -> None:
+        """End all workers; checks under way fail. May be called twice."""
+        with self._lock:
+            self._closed = True
+            nursery, control = self._nursery, self._control
+            self._nursery = self._control = None
+        if control is not None:
+            control.close()
+        if nursery is not None:
+            nursery.kill()
+            nursery.wait()
+        with suppress(queue.Empty):
+            while True:
+                worker = self._idle.get_nowait()
+                if worker is not None:
+                    worker.jobs.close()
+
+    def _checked(self, data: bytes) -> Checked:
+        try:
+            worker = self._idle.get(timeout=WAIT_S)
+        except queue.Empty:
+            raise UnreachableError("busy", "all workers check other commits", retry_after_s=5.0) from None
+        try:
+            worker = worker or self._new_worker()
+            answer = worker.answer(data, self._limit_s)
+            if answer["retires"]:
+                worker.jobs.close()
+                worker = None
+        except BaseException:
+            if worker is not None:
+                worker.kill()
+                worker = None
+            raise
+        finally:
+            self._idle.put(worker)
+        return self._read(answer)
+
+    def _read(self, answer: dict[str, object]) -> Checked:
+        if "memory" in answer:
+            raise _too_costly(f"more than {self._memory_bytes} bytes of memory")
+        return checked_from(answer)
+
+    def _new_worker(self) -> _Worker:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            try:
+                self._ask_for_worker(theirs)
+                return _Worker(ours)
+            except (OSError, _LostError) as exc:
+                ours.close()
+                raise _LostError from exc
+            except BaseException:
+                ours.close()
+                raise
+
+    def _ask_for_worker(self, theirs: socket.socket) -> None:
+        with self._lock:
+            if self._closed:
+                raise UnreachableError("shutting_down", "the server is shutting down", retry_after_s=5.0)
+            control = self._control
+            if control is None or self._nursery is None or self._nursery.poll() is not None:
+                control = self._start_nursery()
+            socket.send_fds(control, [b"w"], [theirs.fileno()])
+
+    def _start_nursery(self) -> socket.socket:
+        if self._control is not None:
+            self._control.close()
+        self._control, far = socket.socketpair()
+        with far:
+            self._nursery = subprocess.Popen(  # noqa: S603 - our own program, and two numbers
+                [
+                    sys.executable,
+                    "-P",
+                    "-m",
+                    "cairn_server.sync.checks.worker_nursery",
+                    str(far.fileno()),
+                    str(self._memory_bytes),
+                ],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=[far.fileno()],
+                start_new_session=True,
+                env={n: v for n, v in os.environ.items() if not n.startswith("CAIRN_")} | {"OPENBLAS_NUM_THREADS": "1"},
+            )
+        return self._control
+
+
+def _too_costly(what: str) -> BadInputError:
+    return BadInputError("too_costly", f"checking this commit takes {what}; make several commits of it")

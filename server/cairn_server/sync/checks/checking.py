@@ -1,0 +1,51 @@
+"""What is checked of a commit before it is kept: all of it. Pure; runs in a thread, or in a worker process.
+
+Bytes go in; what comes out is small: the commit's SHA-256 and the largest number of each plane. Everything else that is
+kept of a commit stands in its bytes.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.commit_reading import CommitReader
+from cairn_map.evidence.evidence import largest
+from cairn_server.store.store_rows import NewCommit
+from cairn_server.sync.checks.push_policy import check_evidence
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """What is known of a commit once it was decoded, canonical and possible."""
+
+    sha: bytes
+    tops: tuple[int, ...]
+    """Largest number of each plane; none for a commit without cells."""
+
+
+def check_commit(reader: CommitReader) -> Checked:
+    """Decode a commit, and find it sound.
+
+    Raises:
+        DamagedDataError, BadInputError: as `CommitReader.read` and `push_policy.check_evidence`.
+    """
+    commit, cells = reader.read()
+    tops = {key: largest(cell.content.counts, cell.content.samples) for key, cell in cells.items()}
+    check_evidence(commit.meta, cells, tops)
+    return Checked(commit.sha, tuple(np.max(list(tops.values()), axis=0).tolist()) if tops else ())
+
+
+def new_commit(commit: Commit, tops: tuple[int, ...]) -> NewCommit:
+    """A commit that was found sound, as a store keeps it."""
+    return NewCommit(
+        id=commit.id,
+        sha=commit.sha,
+        size_bytes=len(commit.data),
+        text=commit.text,
+        captured_s=commit.meta.captured_s,
+        retracts=commit.meta.retracted_ids,
+        diff=commit.cells,
+        tops=tops,
+        rig=bytes.fromhex(commit.meta.rig) if commit.meta.rig else None,
+    )

@@ -1,0 +1,77 @@
+"""What a commit may claim, beyond being well-formed: whose it is, how much it can have seen, how it is numbered.
+
+Evidence is refused before it can spoil a map: counts that no scan could give would outvote every honest robot,
+and use up the range of the sums for everybody; ids full of gaps would grow every version vector without bound.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.codec.cell_code import CanonicalCell
+from cairn_map.codec.octree.cell_content import CellContent
+from cairn_map.commits.commit import CommitMeta
+from cairn_map.commits.ids import INITIAL
+from cairn_map.errors import BadInputError, DamagedDataError, DeniedError
+from cairn_map.evidence.channels import SAMPLE_MAX, planes_and_squares
+from cairn_map.evidence.evidence_kernels import bounds_of_counts, channel_above
+from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
+from cairn_server.access.auth import Caller
+from cairn_server.store.store_rows import MapRow
+
+WEIGHT_MAX = 1024
+"""Of one scan's sample in one voxel; cairn's own integrator gives 1."""
+
+
+def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *, cells: int) -> None:
+    """Refuse by what a commit says of itself, before its evidence is decoded.
+
+    Raises:
+        BadInputError: kind `other_id` or `other_geometry`.
+        DeniedError: kind `not_allowed`: made by, or retracting from, a robot that the caller is not.
+        DamagedDataError: kind `empty_commit`.
+    """
+    if meta.id != id_text:
+        raise BadInputError("other_id", f"the path names {id_text[:96]}, the commit calls itself {meta.id}")
+    if meta.geometry != row.geometry.digest().hex():
+        raise BadInputError("other_geometry", f"the commit was made for another grid than map {row.name} has")
+    authors = {meta.commit_id.author.robot, *(target.author.robot for target in meta.retracted_ids)}
+    foreign = sorted(author for author in authors if not caller.may_author(author))
+    if foreign:
+        raise DeniedError("not_allowed", f"this token stands for {caller.robot or caller.role}, not for {foreign[0]}")
+    if not cells and not meta.retracts:
+        raise DamagedDataError("empty_commit", "a commit must hold evidence or name commits to retract")
+
+
+def check_evidence(
+    meta: CommitMeta, cells: Mapping[CellKey, CanonicalCell], tops: Mapping[CellKey, npt.NDArray[np.int64]]
+) -> None:
+    """Refuse more evidence than the commit's scans can have given; prior data (author `initial`) had other scans.
+
+    The largest number of each plane of each cell is known.
+
+    Raises:
+        BadInputError: kind `too_much_evidence`.
+    """
+    if meta.commit_id.author.robot == INITIAL:
+        return
+    scans = max(1, len(meta.scans))
+    for key, cell in cells.items():
+        complaint = _excess(cell.content, cell.geometry, tops[key], scans)
+        if complaint:
+            raise BadInputError("too_much_evidence", f"cell {cell_of_key(key)}: {complaint} from {scans} scans")
+
+
+def _excess(content: CellContent, geometry: Geometry, tops: npt.NDArray[np.int64], scans: int) -> str | None:
+    """What is too much, or None."""
+    counts = bounds_of_counts(content.counts)[3]
+    if counts > scans:
+        return f"{counts} counts in one voxel"
+    for channel in geometry.channels:
+        weight = int(tops[1 + geometry.planes_of(channel.name).stop])
+        if weight > WEIGHT_MAX * scans:
+            return f"weight {weight} of {channel.name} in one voxel (at most {WEIGHT_MAX} a scan)"
+    # Weights are below 2^22 here and a square below 2^40, so that the products fit.
+    above = channel_above(content.samples, planes_and_squares(geometry.channels), SAMPLE_MAX)
+    return None if above < 0 else f"samples of {geometry.channels[above].name} above {SAMPLE_MAX} steps"

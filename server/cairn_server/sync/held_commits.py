@@ -1,0 +1,54 @@
+"""Which commits are here: what relays compare. Vectors say which ids, sums of SHA-256 whether they are the same."""
+
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Collection
+
+from cairn_map.commits.cursor import Cursor
+from cairn_map.commits.ids import Author, CommitId, commit_id_from_text
+from cairn_map.wire.relay_peer import SUM_BYTES, Held, sum_of_shas
+from cairn_server.store.store import Snapshot, Store
+from cairn_server.store.store_rows import MapRow
+
+PAGE = 1000
+ZERO = bytes(SUM_BYTES)
+
+
+class HeldCommits:
+    """Of all maps; the sums are kept, and only what was folded since is added to them. Thread-safe."""
+
+    def __init__(self, store: Store, wanted_of: Callable[[str], Collection[CommitId]]) -> None:
+        self._store = store
+        self._wanted_of = wanted_of
+        self._locks: dict[int, threading.Lock] = {}
+        self._sums: dict[int, tuple[Cursor, dict[Author, bytes]]] = {}
+
+    def of(self, row: MapRow) -> Held:
+        """What a map has now."""
+        with self._store.snapshot(row) as snapshot:
+            pending = snapshot.pending()
+            with self._locks.setdefault(row.number, threading.Lock()):  # one log may take long to read
+                sums = self._sums_in(row, snapshot)
+            return Held(
+                vector=snapshot.head.vector.with_commits(pending),
+                wanted=tuple(self._wanted_of(row.name)),
+                sums={author: total for author, total in sums.items() if author not in pending.intervals},
+            )
+
+    def _sums_in(self, row: MapRow, snapshot: Snapshot) -> dict[Author, bytes]:
+        head = snapshot.head.cursor
+        known, sums = self._sums.get(row.number, (None, {}))
+        # A store that was restored has another history behind the same number.
+        if known is None or known.log_id != head.log_id or snapshot.chain_at(known.seq) != known.chain:
+            known, sums = None, {}
+        after_seq = known.seq if known else 0
+        sums = dict(sums)
+        while entries := snapshot.log(after_seq=after_seq, limit=PAGE):
+            shas = defaultdict(list)
+            for entry in entries:
+                if entry.kind == "+":
+                    shas[commit_id_from_text(entry.id).author].append(bytes.fromhex(entry.sha))
+            sums |= {author: sum_of_shas(sums.get(author, ZERO), found) for author, found in shas.items()}
+            after_seq = entries[-1].seq
+        self._sums[row.number] = head, sums
+        return sums

@@ -1,0 +1,187 @@
+"""Parts of a map as files that leave: made cell by cell while they are sent, of one state of the map.
+
+Nothing is read from the store while a link is slow: the chosen cells, a few bytes a voxel, are first laid aside in a
+temporary file, and their points counted, because files begin with their number; of an octree the cells' branches are
+laid aside. The file is gone as soon as the answer is, however it ends. So an export needs the memory of one cell,
+whatever its size.
+"""
+
+import math
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import IO
+
+from cairn_map.errors import BadInputError, UnreachableError
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey
+from cairn_map.files.export_choice import cell_may_have, node_geometry
+from cairn_map.files.export_request import ExportRequest
+from cairn_map.files.octomap import TREE_FORMATS, Branch, branch_of_cell, tree_file
+from cairn_map.files.point_clouds import About, Found, found_in_cell, point_file, points_of_cell, size_of_file
+from cairn_server.folding.cells_at_rest import DamagedCellError, decode_stored, sound_cell, stored_evidence
+from cairn_server.folding.damaged_cells import DamagedCells
+from cairn_server.folding.healing import keep_healed
+from cairn_server.store.store import Snapshot, Store
+from cairn_server.store.store_rows import CellRow, Head, MapRow
+
+VOXELS_EXPORTED_MAX = 1 << 28
+"""Known voxels of the cells that are looked at."""
+COUNT_S = 60.0
+COUNTS_AT_ONCE = 2
+WAIT_S = 5.0
+"""For one that is being counted to end."""
+
+
+@dataclass(frozen=True, slots=True)
+class Export:
+    """A file on its way: the state that it is of, its size (None: not known yet), and its bytes."""
+
+    head: Head
+    count: int
+    size_bytes: int | None
+    parts: Iterator[bytes]
+    aside: IO[bytes]
+    """What they are made of, on the disk."""
+
+    def close(self) -> None:
+        """Let that go: nobody takes the file."""
+        self.aside.close()
+
+
+class MapExports:
+    """Exports of a store; thread-safe."""
+
+    def __init__(self, store: Store, damaged: DamagedCells) -> None:
+        self._store = store
+        self._damaged = damaged
+        self._room = threading.BoundedSemaphore(COUNTS_AT_ONCE)
+
+    def asked(self, row: MapRow, asked: ExportRequest) -> Export:
+        """What is asked for, of the map as it is now.
+
+        Raises:
+            BadInputError: kind `bad_box`, `bad_style`; `too_large`: the cells have too many voxels; `too_costly`.
+            UnreachableError: kind `busy`: others are being counted.
+            DamagedCellError: kind `damaged_store`: a chosen cell is damaged.
+        """
+        asked.depth_in(row.geometry)
+        asked.bounds_m()
+        healed: list[CellRow] = []
+        file = _TreeFile(row, asked) if asked.format in TREE_FORMATS else _PointFile(row, asked)
+        with self._turn(), self._store.snapshot(row) as snapshot:
+            head = snapshot.head
+            aside = tempfile.TemporaryFile()  # noqa: SIM115 - goes with its last reader
+            try:
+                sizes = _laid_aside(aside, snapshot, file, healed)
+            except BaseException as exc:
+                aside.close()
+                if isinstance(exc, DamagedCellError):
+                    self._damaged.note(row.name, [exc.key])
+                raise
+        keep_healed(self._store, row, healed)
+        return Export(head, file.count, file.size_bytes, file.parts(_bodies(aside, sizes)), aside)
+
+    @contextmanager
+    def _turn(self) -> Iterator[None]:
+        if not self._room.acquire(timeout=WAIT_S):
+            raise UnreachableError("busy", "other exports are being counted", retry_after_s=1.0)
+        try:
+            yield
+        finally:
+            self._room.release()
+
+
+class _PointFile:
+    """Cells are laid aside as they are stored, and read a second time for their points."""
+
+    def __init__(self, row: MapRow, asked: ExportRequest) -> None:
+        self.row, self.asked = row, asked
+        self._found = Found()
+        self._about = About(row.name, node_geometry(row.geometry, asked).voxel_edge_m)
+
+    def kept(self, stored: CellRow, evidence: Evidence) -> bytes:
+        """What of a cell is laid aside, if anything."""
+        found = found_in_cell(stored.key, evidence, self.row.geometry, self.row.sensor_model, self.asked)
+        self._found = self._found.joined(found)
+        return stored.body if found.count else b""
+
+    @property
+    def count(self) -> int:
+        return self._found.count
+
+    @property
+    def size_bytes(self) -> int | None:
+        return size_of_file(self.asked.format, self._found, self._about)
+
+    def parts(self, bodies: Iterator[tuple[CellKey, bytes]]) -> Iterator[bytes]:
+        geometry, model = self.row.geometry, self.row.sensor_model
+        tables = (
+            points_of_cell(key, decode_stored(key, body).evidence, geometry, model, self.asked) for key, body in bodies
+        )
+        return point_file(self.asked.format, self._found, tables, self._about)
+
+
+class _TreeFile:
+    """What is laid aside of a cell is its branch, as it will stand in the file."""
+
+    size_bytes = None
+
+    def __init__(self, row: MapRow, asked: ExportRequest) -> None:
+        self.row, self.asked = row, asked
+        self._branches: list[Branch] = []
+
+    def kept(self, stored: CellRow, evidence: Evidence) -> bytes:
+        """What of a cell is laid aside, if anything."""
+        found = branch_of_cell(stored.key, evidence, self.row.geometry, self.row.sensor_model, self.asked)
+        if found is None:
+            return b""
+        self._branches.append(found[0])
+        return found[1]
+
+    @property
+    def count(self) -> int:
+        return sum(branch.leaves for branch in self._branches)
+
+    def parts(self, bodies: Iterator[tuple[CellKey, bytes]]) -> Iterator[bytes]:
+        about = str(About(self.row.name, node_geometry(self.row.geometry, self.asked).voxel_edge_m))
+        in_turn = (body for _, body in bodies)
+        return tree_file(self.asked.format, self._branches, in_turn, self.row.geometry, about)
+
+
+def _laid_aside(
+    aside: IO[bytes], snapshot: Snapshot, file: _PointFile | _TreeFile, healed: list[CellRow]
+) -> list[tuple[CellKey, int]]:
+    """Cells that have what is asked for, rising in number, with the sizes of their bytes."""
+    until_s, row = math.inf, file.row
+    voxels, sizes = 0, list[tuple[CellKey, int]]()
+    for listed in snapshot.cells():
+        if not listed.voxels or not cell_may_have(listed.key, row.geometry, file.asked):
+            continue
+        voxels += listed.voxels
+        if voxels > VOXELS_EXPORTED_MAX:
+            raise BadInputError(
+                "too_large", f"more than {VOXELS_EXPORTED_MAX} voxels are in these cells; ask for a box"
+            )
+        if time.monotonic() > until_s:
+            raise BadInputError("too_costly", f"counting the points takes more than {COUNT_S:g} s; ask for a box")
+        stored = sound_cell(snapshot, listed.key, row.geometry, healed)
+        if stored is None:
+            raise DamagedCellError(listed.key, "a cell is listed, but is not there")
+        kept = file.kept(stored, stored_evidence(stored))
+        if until_s == math.inf:
+            until_s = time.monotonic() + COUNT_S  # not from the start: with the first cell kernels may be compiled
+        if kept:
+            aside.write(kept)
+            sizes.append((stored.key, len(kept)))
+    return sizes
+
+
+def _bodies(aside: IO[bytes], sizes: list[tuple[CellKey, int]]) -> Iterator[tuple[CellKey, bytes]]:
+    with aside:
+        aside.seek(0)
+        for key, size_bytes in sizes:
+            yield key, aside.read(size_bytes)

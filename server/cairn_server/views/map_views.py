@@ -1,0 +1,293 @@
+"""Pictures of a map from any pose, made where the map is: for operators, and for robots that have no room for it.
+
+Bounded, because anybody who may read may ask: pixels and range by the request itself, cells, voxels and time here, and
+so many pictures are made at a time. A picture depends on the request and on the map's head alone, and so does its ETag.
+"""
+
+import hashlib
+import logging
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
+from cairn_map.evidence.brick_cell import brick_cell
+from cairn_map.evidence.grid import CellKey, cell_of_key
+from cairn_map.render.camera_rays import cells_in_sight
+from cairn_map.render.map_picture import Ages, arrays_of, layer_picture, layer_values, npz_of
+from cairn_map.render.map_render import MapRenderer
+from cairn_map.render.partial_map import Drawing, ReadCell, draw_as_needed, read_cell
+from cairn_map.render.png import png_of
+from cairn_map.render.render_picture import Layer
+from cairn_map.render.render_request import RenderRequest
+from cairn_map.warm_up import warm_up_pictures
+from cairn_server.folding.cells_at_rest import DamagedCellError, row_of_cell, sound_cell, stored_evidence
+from cairn_server.folding.damaged_cells import DamagedCells
+from cairn_server.folding.healing import keep_healed
+from cairn_server.folding.read_cache import State, state_of
+from cairn_server.folding.single_flight import MadeOnce
+from cairn_server.store.stamps import Stamps, decode_stamps, no_stamps
+from cairn_server.store.store import Snapshot, Store
+from cairn_server.store.store_rows import CellRow, Head, MapRow
+
+log = logging.getLogger(__name__)
+
+VERSION = 2
+"""Of what a picture looks like: part of its ETag."""
+CELLS_IN_VIEW_MAX = 4096
+VOXELS_READ_MAX = 1 << 26
+"""Of all cells that one picture takes."""
+RENDER_S = 10.0
+RENDERS_AT_ONCE = 2
+WAIT_S = 5.0
+"""For one that is being made to end."""
+THREADS = 2
+CELLS_BYTES = 256 << 20
+"""Memory for cells that are ready to be drawn, of all maps; and"""
+LISTS_BYTES = 64 << 20
+"""for lists of cells."""
+LISTED_BYTES = 500
+TIMES_MAX = 100_000
+Listing = tuple[dict[CellKey, CellRow], npt.NDArray[np.int64]]
+
+
+@dataclass(frozen=True, slots=True)
+class AskedView:
+    """A picture's ETag, the state that it shows, and its bytes; none if the asker has them."""
+
+    etag: str
+    head: Head
+    body: bytes | None
+
+
+@dataclass(slots=True)
+class _Task:
+    """One picture under way."""
+
+    snapshot: Snapshot
+    row: MapRow
+    layer: Layer
+    """Whose values are read from cells; depths and ages need none."""
+    listed: dict[CellKey, CellRow]
+    until_s: float
+    voxels: int = 0
+    healed: list[CellRow] = field(default_factory=list)
+
+    def check_time(self) -> None:
+        """End what takes too long.
+
+        Raises:
+            BadInputError: kind `too_costly`.
+        """
+        if time.monotonic() > self.until_s:
+            raise BadInputError(
+                "too_costly", f"the picture takes more than {RENDER_S:g} s; ask for fewer pixels, or less range_m"
+            )
+
+
+class MapViews:
+    """Draws maps of a store; thread-safe."""
+
+    def __init__(self, store: Store, damaged: DamagedCells) -> None:
+        self._store = store
+        self._damaged = damaged
+        self._room = threading.BoundedSemaphore(RENDERS_AT_ONCE)
+        self._cells: MadeOnce[tuple[State, Layer], ReadCell] = MadeOnce(
+            limit_bytes=CELLS_BYTES, size_of=lambda read: read.size_bytes
+        )
+        self._lists: MadeOnce[tuple[bytes, int], Listing] = MadeOnce(
+            limit_bytes=LISTS_BYTES, size_of=lambda listing: LISTED_BYTES * (1 + len(listing[0]))
+        )
+        self._times: dict[tuple[bytes, int], float] = {}
+
+    def asked(self, row: MapRow, request: RenderRequest, *, known: str | None) -> AskedView:
+        """A picture of the map as it is now, or None for its bytes if the asker `known`s them by `If-None-Match`.
+
+        Raises:
+            BadInputError: kind `unknown_channel`: the map has no such layer; `too_large`: too many cells or voxels are
+                in sight; `too_costly`: it takes too long.
+            UnreachableError: kind `busy`: others are being made.
+            DamagedCellError: kind `damaged_store`: a cell in sight is damaged.
+        """
+        _get_ready()
+        with self._store.snapshot(row) as snapshot:
+            etag = _etag(snapshot.head, request)
+            if known is not None and etag in known:
+                return AskedView(etag, snapshot.head, None)
+            with self._turn():
+                task = _Task(snapshot, row, _read_of(request.layer), {}, time.monotonic() + RENDER_S)
+                try:
+                    body = self._body(task, request)
+                except DamagedCellError as exc:
+                    self._damaged.note(row.name, [exc.key])
+                    raise
+            head = snapshot.head
+        keep_healed(self._store, row, task.healed)
+        return AskedView(etag, head, body)
+
+    @contextmanager
+    def _turn(self) -> Iterator[None]:
+        if not self._room.acquire(timeout=WAIT_S):
+            raise UnreachableError("busy", "other pictures are being made", retry_after_s=1.0)
+        try:
+            yield
+        finally:
+            self._room.release()
+
+    def _body(self, task: _Task, request: RenderRequest) -> bytes:
+        drawing, renderer = self._drawing(task, request)
+        snapshot, seen = drawing.snapshot, drawing.seen
+        ages = self._ages(task, drawing) if request.layer is Layer.AGE else None
+        values = layer_values(renderer, snapshot, seen, request.layer, ages)
+        task.check_time()
+        if request.format == "npz":
+            return npz_of(arrays_of(values, seen, request.layer, request.spread))
+        return png_of(layer_picture(values, seen, request.scale, request.spread))
+
+    def _drawing(self, task: _Task, request: RenderRequest) -> tuple[Drawing, MapRenderer]:
+        geometry, model, sight, T = task.row.geometry, task.row.sensor_model, request.sight, request.T_map_camera
+        task.listed, cells = self._listing(task.snapshot)
+        edge_m = geometry.cell_edge_m
+        inside = cells_in_sight(cells, sight, T, edge_m=edge_m, range_max_m=request.range_m)
+        if inside.sum() > CELLS_IN_VIEW_MAX:
+            raise BadInputError(
+                "too_large", f"{inside.sum()} cells are in sight, {CELLS_IN_VIEW_MAX} at most may be; lower range_m"
+            )
+        keys = [key for key, is_inside in zip(task.listed, inside, strict=True) if is_inside]
+        kept = {key: self._cells.here((state_of(task.snapshot, task.listed[key]), task.layer)) for key in keys}
+        here = {key: read for key, read in kept.items() if read is not None}
+        renderer = MapRenderer(threads=THREADS, on_share=task.check_time)
+        drawing = draw_as_needed(
+            renderer,
+            geometry,
+            model,
+            here,
+            keys,
+            lambda wanted: self._read(task, wanted),
+            sight=sight,
+            T_map_camera=T,
+            range_max_m=request.range_m,
+        )
+        return drawing, renderer
+
+    def _listing(self, snapshot: Snapshot) -> Listing:
+        """Cells that hold something, by number, and where they are (C, 3)."""
+        cursor = snapshot.head.cursor
+
+        def make() -> Listing:
+            listed = {cell.key: cell for cell in snapshot.cells() if cell.voxels}
+            return listed, np.array([cell_of_key(key) for key in listed], np.int64).reshape(-1, 3)
+
+        return self._lists.get((cursor.log_id, cursor.seq), make)
+
+    def _read(self, task: _Task, wanted: Sequence[CellKey]) -> dict[CellKey, ReadCell]:
+        """Cells from the store, decoded side by side."""
+        task.check_time()
+        task.voxels += sum(task.listed[key].voxels for key in wanted)
+        if task.voxels > VOXELS_READ_MAX:
+            raise BadInputError(
+                "too_large", f"more than {VOXELS_READ_MAX} voxels are in the cells in sight; lower range_m"
+            )
+        stored = {key: row_of_cell(task.snapshot, key) for key in wanted}
+
+        def make(key: CellKey) -> ReadCell:
+            state = state_of(task.snapshot, task.listed[key])
+            return self._cells.get((state, task.layer), lambda: _ready(stored[key], task))
+
+        found: dict[CellKey, ReadCell] = {}
+        with ThreadPoolExecutor(THREADS) as pool:
+            tries = {key: pool.submit(make, key) for key in wanted}
+        for key, made in tries.items():
+            try:
+                found[key] = made.result()
+            except DamagedDataError:
+                sound = sound_cell(task.snapshot, key, task.row.geometry, task.healed)
+                found[key] = _ready(sound, task)
+        return found
+
+    def _ages(self, task: _Task, drawing: Drawing) -> Ages:
+        """When what is seen was measured last, UTC seconds, by the log's commits; now is when the newest one was.
+
+        So the picture depends on the map alone. Where a commit states no time, the age is unknown.
+        """
+        slots = np.unique(drawing.seen.slots[drawing.seen.hit]).tolist()
+        stamps = {key: self._stamps(task, key) for key in (drawing.snapshot.frozen.keys[slot] for slot in slots)}
+        entries = {int(seq) for each in stamps.values() for seq in np.unique(each)} - {0}
+        head = task.snapshot.head.cursor
+        times = {seq: self._time_of(task, head.log_id, seq) for seq in sorted(entries)}
+        numbers, moments = np.array([0, *times]), np.array([np.nan, *times.values()])
+        changes = {key: moments[np.searchsorted(numbers, each)] for key, each in stamps.items()}
+        return Ages(changes, now=self._time_of(task, head.log_id, head.seq))
+
+    def _stamps(self, task: _Task, key: CellKey) -> Stamps:
+        """When each block was changed last, by log entry; where that is damaged, never: its age is unknown."""
+        stored, depth = row_of_cell(task.snapshot, key), task.row.geometry.depth
+        if stored is None:
+            raise DamagedCellError(key, "a cell is listed, but is not there")
+        try:
+            return decode_stamps(stored.stamps, depth=depth, lm=stored.lm)
+        except DamagedDataError as exc:
+            log.error("cell %s: %s; its age is unknown", cell_of_key(key), exc.message)
+            return no_stamps(depth)
+
+    def _time_of(self, task: _Task, log_id: bytes, seq: int) -> float:
+        """When the last scan of an entry's commit was taken; NaN where it states no time."""
+        known = self._times.get((log_id, seq))
+        if known is not None:
+            return known
+        task.check_time()
+        entries = task.snapshot.log(after_seq=seq - 1, limit=1)
+        captured_s = entries[0].captured_s if entries else None
+        time_s = captured_s[1] if captured_s else np.nan
+        if len(self._times) >= TIMES_MAX:
+            self._times.clear()  # another picture may look at the same time
+        self._times[log_id, seq] = time_s
+        return time_s
+
+
+def _get_ready() -> None:
+    """Load the kernels that draw, or compile them, which takes a minute where nobody did: no picture's time or turn.
+
+    Raises:
+        UnreachableError: kind `busy`: another request is at it.
+    """
+    if not _loading.acquire(timeout=WAIT_S):
+        raise UnreachableError("busy", "the code that draws is being compiled", retry_after_s=5.0)
+    try:
+        _loaded()
+    finally:
+        _loading.release()
+
+
+@cache
+def _loaded() -> None:
+    warm_up_pictures()
+
+
+_loading = threading.Lock()
+
+
+def _read_of(layer: Layer) -> Layer:
+    """The layer whose values are taken from cells' sums: of depths and ages, none, as for depths."""
+    return Layer.DEPTH if layer is Layer.AGE else layer
+
+
+def _ready(stored: CellRow | None, task: _Task) -> ReadCell:
+    """A stored cell, checked and ready to be drawn."""
+    if stored is None:
+        raise DamagedDataError("damaged_store", "a cell is listed, but is not there")
+    geometry, model = task.row.geometry, task.row.sensor_model
+    return read_cell(brick_cell(geometry, [stored_evidence(stored)]), geometry, model, task.layer)
+
+
+def _etag(head: Head, request: RenderRequest) -> str:
+    """Strong: the same map and the same request give the same bytes."""
+    text = f"{VERSION} {head.cursor} {request.model_dump_json()}"
+    return f'"{hashlib.sha256(text.encode()).hexdigest()[:32]}"'

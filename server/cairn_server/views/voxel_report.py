@@ -1,0 +1,117 @@
+"""What is known of one voxel: its numbers, and the commits that they are made of.
+
+    cell at rest  -->  hits, misses, means        exact
+    diffs of the cell's newest log entries  -->  who saw the voxel, how often, when
+
+What a retract took out is not told of: it is as if it had never been.
+"""
+
+import re
+
+import numpy as np
+
+from cairn_map.errors import BadInputError, NotFoundError
+from cairn_map.evidence.channels import Channel
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey, Geometry, cell_key, centres_of_voxels, split_voxels
+from cairn_map.evidence.voxels import Reading, voxels_of_evidence
+from cairn_map.wire.messages import LogEntry
+from cairn_map.wire.voxel_messages import ChannelReading, VoxelAnswer, VoxelCommit
+from cairn_server.folding.cells import Cells
+from cairn_server.folding.cells_at_rest import decode_stored, stored_evidence
+from cairn_server.store.store import Snapshot, Store
+from cairn_server.store.store_rows import MapRow
+
+ENTRIES_MAX = 32
+"""Log entries of the cell that are looked at, the newest: to decode one takes some 10 ms."""
+VOXEL = re.compile(r"(0|-?[1-9]\d{0,9}),(0|-?[1-9]\d{0,9}),(0|-?[1-9]\d{0,9})")
+
+
+def asked_voxel(store: Store, cells: Cells, row: MapRow, text: str) -> VoxelAnswer:
+    """What is known of the voxel `i,j,k` of the map's lattice (FORMAT.md 2).
+
+    Raises:
+        BadInputError: kind `bad_cell` or `cell_range`: no voxel is numbered so.
+        NotFoundError: kind `no_cell`: nobody has seen its cell.
+    """
+    found = VOXEL.fullmatch(text)
+    if found is None:
+        raise BadInputError("bad_cell", f"a voxel is i,j,k in decimal, got {text[:40]!r}")
+    voxel = int(found[1]), int(found[2]), int(found[3])
+    depth = row.geometry.depth
+    cell = voxel[0] >> depth, voxel[1] >> depth, voxel[2] >> depth
+    key = cell_key(cell)
+    stored, head = cells.sound(row, key)
+    if stored is None:
+        raise NotFoundError("no_cell", f"nobody has seen cell {','.join(map(str, cell))} of map {row.name}")
+    place = int(split_voxels(np.array([voxel]), row.geometry)[1][0])
+    seen = _only(stored_evidence(stored), place)
+    voxels = voxels_of_evidence(key, seen, row.geometry, row.sensor_model, occupied_only=False)
+    with store.snapshot(row) as snapshot:
+        commits, more = _commits(snapshot, key, place, until=head.cursor.seq)
+    x, y, z = centres_of_voxels(np.array([voxel]), row.geometry)[0].tolist()
+    return VoxelAnswer(
+        voxel=voxel,
+        cell=cell,
+        centre_m=(x, y, z),
+        hits=int(seen.counts[:, 0].sum()),
+        misses=int(seen.counts[:, 1].sum()),
+        probability=float(voxels.probability[0]) if len(seen) and seen.counts.any() else None,
+        channels=_readings(voxels.readings, row.geometry),
+        lm=stored.lm,
+        cursor=str(head.cursor),
+        commits=commits,
+        more=more,
+        gone=stored.gone_seq > 0,
+    )
+
+
+def _only(evidence: Evidence, place: int) -> Evidence:
+    """Of one voxel alone, or of none."""
+    at = int(np.searchsorted(evidence.voxels, place))
+    rows = np.array([at]) if at < len(evidence) and evidence.voxels[at] == place else np.empty(0, np.int64)
+    mine = np.isin(evidence.sampled, rows)
+    sampled = np.zeros(int(mine.sum()), evidence.sampled.dtype)
+    return Evidence(evidence.voxels[rows], evidence.counts[rows], sampled, evidence.samples[mine])
+
+
+def _readings(readings: dict[str, Reading], geometry: Geometry) -> list[ChannelReading]:
+    return [_reading(readings[channel.name], channel) for channel in geometry.channels]
+
+
+def _reading(reading: Reading, channel: Channel) -> ChannelReading:
+    weight = int(reading.weight.sum())
+    return ChannelReading(
+        name=channel.name,
+        kind=channel.kind,
+        unit=channel.unit,
+        weight=weight,
+        mean=[float(value) for value in reading.mean.ravel()] if weight else [],
+        sigma=float(reading.spread[0]) if weight and reading.spread is not None else None,
+    )
+
+
+def _commits(snapshot: Snapshot, key: CellKey, place: int, *, until: int) -> tuple[list[VoxelCommit], bool]:
+    """Commits that saw a voxel, the newest first; and whether there are older ones of its cell."""
+    found = [c for c in snapshot.contributions(key, after_seq=0, newest=ENTRIES_MAX + 1) if c.seq <= until]
+    counts: dict[int, tuple[int, int]] = {}
+    for contribution in found[-ENTRIES_MAX:]:
+        body = snapshot.diff(contribution.diff)
+        if body is not None:
+            hits, misses = _only(decode_stored(key, body).evidence, place).counts.sum(axis=0).tolist()
+            sign = 1 if contribution.kind == b"+" else -1
+            before = counts.get(contribution.diff, (0, 0))
+            counts[contribution.diff] = (before[0] + sign * hits, before[1] + sign * misses)
+    seqs = {contribution.diff: contribution.seq for contribution in found}
+    told = sorted((seqs[diff], counted) for diff, counted in counts.items() if any(number > 0 for number in counted))
+    commits = [_commit(_entry(snapshot, seq), *counted) for seq, counted in reversed(told)]
+    return commits, len(found) > ENTRIES_MAX
+
+
+def _entry(snapshot: Snapshot, seq: int) -> LogEntry:
+    (entry,) = snapshot.log(after_seq=seq - 1, limit=1)
+    return entry
+
+
+def _commit(entry: LogEntry, hits: int, misses: int) -> VoxelCommit:
+    return VoxelCommit(id=entry.id, hits=hits, misses=misses, captured_s=entry.captured_s)

@@ -1,0 +1,110 @@
+"""What a store in memory tells of itself: its health, what robots' commits took, what is kept of branches."""
+
+from collections import defaultdict
+from collections.abc import Mapping
+from contextlib import suppress
+
+from tests.memory_store.map import MemoryMap
+from tests.memory_store.maps import MemoryMaps
+
+from cairn_map.commits.cursor import ENTRY_FOLD
+from cairn_map.errors import UnreachableError
+from cairn_server.store.branch_notes import EntrySize
+from cairn_server.store.quota_store import Robot, Use, relay_of
+from cairn_server.store.store_health import Backlog, StoreFigures
+from cairn_server.store.store_rows import CellRow, MapRow
+
+
+class MemoryHealth:
+    """`store_health.StoreHealth` without a disk: nothing waits to be written, and nothing runs full but the process."""
+
+    def __init__(self, maps: MemoryMaps) -> None:
+        self._maps = maps
+
+    def backlogs(self) -> list[Backlog]:
+        """What is not folded yet, of every map."""
+        with self._maps.locked() as maps:
+            return [_backlog(state) for state in maps.values()]
+
+    def figures(self) -> StoreFigures:
+        """Sizes and counts."""
+        with self._maps.locked() as maps:
+            size_bytes = sum(_size_bytes(state) for state in maps.values())
+            return StoreFigures(
+                size_bytes=size_bytes,
+                ahead_bytes=0,
+                free_bytes=0,
+                queued=0,
+                written=self._maps.written,
+                emptied=0,
+                failures={},
+            )
+
+    def check_space(self, free_bytes_min: int) -> None:
+        """Refuse nothing: there is no disk."""
+
+    def heal(self, row: MapRow, cell: CellRow) -> bool:
+        """Put sound bytes in the place of a damaged cell; False if it changed meanwhile."""
+        with self._maps.changing(row) as changed:
+            return changed.heal(cell)
+
+    def probe(self) -> None:
+        """Raise if the store is closed."""
+        with self._maps.locked():
+            pass
+
+
+class MemoryUses:
+    """`quota_store.Uses`."""
+
+    def __init__(self, maps: MemoryMaps) -> None:
+        self._maps = maps
+
+    def since(self, time_s: float) -> Mapping[Robot, Use]:
+        """What each robot's commits took that came after a time, and what each relay handed over."""
+        found: defaultdict[Robot, Use] = defaultdict(Use)
+        with self._maps.locked() as maps:
+            for state in maps.values():
+                for commit, kept in state.commits.items():
+                    if kept.received_s >= time_s:
+                        who = relay_of(kept.new.via) if kept.new.via else commit.author.robot
+                        found[state.row.number, who] += Use(kept.new.size_bytes, kept.cells)
+        return found
+
+
+class MemoryNotes:
+    """`branch_notes.BranchNotes`."""
+
+    def __init__(self, maps: MemoryMaps) -> None:
+        self._maps = maps
+
+    def put_status(self, row: MapRow, branch: str, status: str) -> None:
+        """Keep the last status of a branch, as JSON, if there is such a branch."""
+        with suppress(UnreachableError), self._maps.changing(row) as changed:  # the next one comes soon
+            if branch in changed.branches:
+                changed.statuses[branch] = status
+
+    def statuses(self, row: MapRow) -> dict[str, str]:
+        """The last status of each branch that ever told one."""
+        with self._maps.reading(row) as state:
+            return dict(state.statuses)
+
+    def entry_sizes(self, row: MapRow, *, after_seq: int, limit: int) -> list[EntrySize]:
+        """Log entries after one, oldest first, at most `limit`."""
+        found: list[EntrySize] = []
+        with self._maps.reading(row) as state:
+            for seq, entry in enumerate(state.entries[after_seq : after_seq + limit], start=after_seq + 1):
+                commit = state.commits[state.ids[entry.commit]].new
+                author = commit.id.author if entry.kind == ENTRY_FOLD else None
+                found.append(EntrySize(seq, author, commit.size_bytes))
+        return found
+
+
+def _backlog(state: MemoryMap) -> Backlog:
+    waiting = list(state.waiting())
+    return Backlog(state.row.name, len(waiting), waiting[0].received_s if waiting else None)
+
+
+def _size_bytes(state: MemoryMap) -> int:
+    commits = sum(kept.new.size_bytes for kept in state.commits.values() if not kept.is_gone)
+    return commits + sum(cell.size_bytes for cell in state.cells.values())

@@ -1,0 +1,233 @@
+"""One map as dictionaries: the rows of `memory_store`, and their changes."""
+
+import secrets
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+from cairn_map.commits.cursor import ENTRY_FOLD, Cursor, first_chain
+from cairn_map.commits.ids import Author, CommitId
+from cairn_map.errors import BadInputError, ConflictError
+from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX
+from cairn_map.evidence.grid import CellKey, Geometry
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_server.store.numbering import AGAIN_KEPT_S, EvidenceGoneError, Numbering, check_number
+from cairn_server.store.store_rows import Branch, CellRow, Entry, Fold, Head, MapRow, NewCommit, StoredCommit
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Kept:
+    """A commit and what became of it."""
+
+    number: int
+    new: NewCommit
+    """Without its meta and its diff once they are gone."""
+    cells: int
+    """That it touched, gone or not."""
+    received_s: float
+    folded_s: float = 0.0
+    folded_seq: int | None = None
+    unfolded_seq: int = 0
+    """Log entry that took it out again; 0 if none did."""
+    is_damaged: bool = False
+    is_gone: bool = False
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether it is to be folded."""
+        return self.folded_seq is None and not self.is_damaged
+
+    def stored(self) -> StoredCommit:
+        """As the folder reads it."""
+        return StoredCommit(
+            number=self.number,
+            id=self.new.id,
+            sha=self.new.sha,
+            text=self.new.text,
+            retracts=self.new.retracts,
+            diff=dict(sorted(self.new.diff.items())),
+            gone=self.is_gone,
+            signatures=self.new.signatures,
+        )
+
+
+@dataclass(slots=True)
+class MemoryMap:
+    """Everything about one map. Values are never changed, only put in place of others."""
+
+    row: MapRow
+    head: Head
+    tops: tuple[int, ...]
+    is_shared: bool = False
+    """A snapshot has these dictionaries: copy them before they are changed."""
+    commits: dict[CommitId, Kept] = field(default_factory=dict)
+    """In order of arrival."""
+    ids: list[CommitId] = field(default_factory=list)
+    """By number."""
+    diffs: dict[int, tuple[CommitId, CellKey]] = field(default_factory=dict)
+    """Of what is kept, by the number of the diff."""
+    diff_numbers: dict[tuple[CommitId, CellKey], int] = field(default_factory=dict)
+    diffs_made: int = 0
+    authors: dict[Author, tuple[int, int]] = field(default_factory=dict)
+    """Highest number, and intervals of the numbers."""
+    entries: list[Entry] = field(default_factory=list)
+    touched: dict[CellKey, tuple[int, ...]] = field(default_factory=dict)
+    """Log entries that concern a cell."""
+    retracted: set[CommitId] = field(default_factory=set)
+    cells: dict[CellKey, CellRow] = field(default_factory=dict)
+    branches: dict[str, Branch] = field(default_factory=dict)
+    statuses: dict[str, str] = field(default_factory=dict)
+
+    def copied(self) -> "MemoryMap":
+        """The same in other dictionaries."""
+        other = replace(self, is_shared=False)
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
+            if isinstance(value, dict | list | set):
+                setattr(other, name, value.copy())
+        return other
+
+    def append(self, commit: NewCommit) -> bool:
+        """Keep a commit; False if the same one is known already."""
+        known = self.commits.get(commit.id)
+        if known is not None:
+            return self._append_again(known, commit)
+        self._check_kept(commit.retracts)
+        intervals = self._checked_intervals(commit.id)
+        self.tops = self._checked_tops(commit.tops)
+        top, _ = self.authors.get(commit.id.author, (0, 0))
+        self.authors[commit.id.author] = max(top, commit.id.n), intervals
+        self.commits[commit.id] = Kept(number=len(self.ids), new=commit, cells=len(commit.diff), received_s=time.time())
+        self.ids.append(commit.id)
+        self._number_diff(commit)
+        return True
+
+    def next_number(self, author: Author) -> int:
+        """The number after an author's highest."""
+        return self.authors[author][0] + 1 if author in self.authors else 0
+
+    def fold(self, fold: Fold) -> bool:
+        """Cells, entries and head, if the head is still the fold's base."""
+        if fold.base != self.head.cursor:
+            return False
+        self.head = Head(cursor=fold.head, vector=fold.vector)
+        now_s = time.time()
+        for entry in fold.entries:
+            self.entries.append(entry)
+            self._note_entry(entry, len(self.entries), now_s)
+        self.retracted.update(fold.retracted)
+        for number, _ in fold.damaged:
+            aside = self.ids[number]
+            self.commits[aside] = replace(self.commits[aside], is_damaged=True)
+        for cell in fold.cells:
+            before = self.cells.get(cell.key)
+            self.cells[cell.key] = replace(cell, gone_seq=before.gone_seq if before else 0)
+        return True
+
+    def forget_evidence(self, *, before_s: float, limit: int) -> int:
+        """Drop the evidence and the meta of commits folded, and last pushed, before a time; how many.
+
+        What is left of a commit is its row in the log; see `sqlite_retention`.
+        """
+        pinned = {target for kept in self.commits.values() if kept.folded_seq is None for target in kept.new.retracts}
+        again_s = min(before_s, time.time() - AGAIN_KEPT_S)
+        old = [
+            kept
+            for commit, kept in self.commits.items()
+            if kept.folded_seq is not None
+            and kept.cells
+            and not kept.is_gone
+            and kept.folded_s < before_s
+            and kept.received_s < (again_s if kept.received_s > kept.folded_s and not kept.unfolded_seq else before_s)
+            and commit not in pinned
+        ]
+        old.sort(key=lambda kept: kept.folded_s)
+        for kept in old[:limit]:
+            self._forget(kept)
+        return len(old[:limit])
+
+    def waiting(self) -> Iterator[Kept]:
+        """Commits to be folded, in order of arrival."""
+        return (kept for kept in self.commits.values() if kept.is_waiting)
+
+    def heal(self, cell: CellRow) -> bool:
+        """Other bytes for a cell, if it is still of the same entry; its stamps stay."""
+        known = self.cells.get(cell.key)
+        if known is None or known.lm != cell.lm:
+            return False
+        self.cells[cell.key] = replace(cell, stamps=known.stamps, gone_seq=known.gone_seq)
+        return True
+
+    def _append_again(self, known: Kept, commit: NewCommit) -> bool:
+        if known.new.sha != commit.sha:
+            raise ConflictError("id_taken", f"commit {commit.id} is already here with other bytes")
+        if known.is_damaged:
+            self.commits[commit.id] = replace(known, new=commit, is_damaged=False)
+        elif known.is_gone and commit.id not in self.retracted:
+            self.commits[commit.id] = replace(known, new=commit, is_gone=False, received_s=time.time())
+            self._number_diff(commit)
+        return known.is_damaged
+
+    def _note_entry(self, entry: Entry, seq: int, now_s: float) -> None:
+        commit = self.ids[entry.commit]
+        kept = self.commits[commit]
+        for key in kept.new.diff:
+            self.touched[key] = (*self.touched.get(key, ()), seq)
+        if entry.kind != ENTRY_FOLD:
+            self.commits[commit] = replace(kept, unfolded_seq=seq)
+        elif kept.folded_seq is None:
+            self.commits[commit] = replace(kept, folded_seq=seq, folded_s=now_s)
+
+    def _forget(self, kept: Kept) -> None:
+        seqs = (kept.folded_seq or 0, kept.unfolded_seq)
+        for key in kept.new.diff:
+            if key in self.cells:
+                cell = self.cells[key]
+                self.cells[key] = replace(cell, gone_seq=max(cell.gone_seq, *seqs))
+            self.touched[key] = tuple(seq for seq in self.touched.get(key, ()) if seq not in seqs)
+            del self.diffs[self.diff_numbers.pop((kept.new.id, key))]
+        self.commits[kept.new.id] = replace(kept, new=replace(kept.new, text=b"", diff={}), is_gone=True)
+
+    def _number_diff(self, commit: NewCommit) -> None:
+        for key in commit.diff:
+            self.diffs[self.diffs_made] = (commit.id, key)
+            self.diff_numbers[commit.id, key] = self.diffs_made
+            self.diffs_made += 1
+
+    def _check_kept(self, targets: tuple[CommitId, ...]) -> None:
+        """Refuse to retract what cannot be subtracted any more."""
+        known = [t for t in targets if t in self.commits and t not in self.retracted]
+        if gone := [target for target in known if self.commits[target].is_gone]:
+            raise EvidenceGoneError(gone)
+
+    def _checked_intervals(self, commit: CommitId) -> int:
+        """Intervals of the author's numbers with this one, if `push_policy` lets it in."""
+        author = commit.author
+        top, intervals = self.authors.get(author, (None, 0))
+        neighbours = sum(CommitId(author, n) in self.commits for n in (commit.n - 1, commit.n + 1))
+        numbering = Numbering(
+            top=top,
+            intervals=intervals,
+            neighbours=neighbours,
+            incarnations=sum(known.robot == author.robot for known in self.authors),
+            authors_in_map=len(self.authors),
+            intervals_in_map=sum(count for _, count in self.authors.values()),
+        )
+        check_number(commit, numbering)
+        return intervals + 1 - neighbours
+
+    def _checked_tops(self, tops: tuple[int, ...]) -> tuple[int, ...]:
+        sums = tuple(total + top for total, top in zip(self.tops, tops, strict=True))
+        if max(sums[:2]) > COUNT_MAX or max(sums[2:], default=0) > SUM_MAX:
+            raise BadInputError("evidence_overflow", "the map could not take this much evidence without an overflow")
+        return sums
+
+
+def new_memory_map(number: int, name: str, geometry: Geometry, sensor_model: SensorModel) -> MemoryMap:
+    """A map without anything in it."""
+    row = MapRow(
+        number=number, name=name, geometry=geometry, sensor_model=sensor_model, seal_key=secrets.token_bytes(32)
+    )
+    log_id = secrets.token_bytes(16)
+    head = Head(cursor=Cursor(log_id, 0, first_chain(log_id, geometry.digest())))
+    return MemoryMap(row, head, tops=(0,) * (2 + geometry.plane_count))

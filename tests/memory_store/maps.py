@@ -1,0 +1,81 @@
+"""All maps of a store in memory under one lock.
+
+    writer     changes the dictionaries of one map under the lock
+    snapshot   gets these very dictionaries; whoever writes next copies them first
+
+So reading never waits for writing, and a map that nobody reads is not copied for each commit.
+"""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from tests.memory_store.map import MemoryMap
+
+from cairn_map.errors import NotFoundError, UnreachableError
+from cairn_server.store.store_rows import MapRow
+
+
+class MemoryMaps:
+    """Maps by name; whoever holds the lock may take it again."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self._maps: dict[str, MemoryMap] = {}
+        self._is_closed = False
+        self.written = 0
+        """Changes since the start."""
+
+    @contextmanager
+    def locked(self) -> Iterator[dict[str, MemoryMap]]:
+        """All maps, while nobody changes any.
+
+        Raises:
+            UnreachableError: kind `shutting_down`.
+        """
+        with self._lock:
+            if self._is_closed:
+                raise UnreachableError("shutting_down", "the server is shutting down", retry_after_s=5.0)
+            yield self._maps
+
+    @contextmanager
+    def reading(self, row: MapRow) -> Iterator[MemoryMap]:
+        """A map, while nobody changes it."""
+        with self.locked() as maps:
+            yield _found(maps, row.name)
+
+    @contextmanager
+    def changing(self, row: MapRow) -> Iterator[MemoryMap]:
+        """A map's dictionaries, which no snapshot has."""
+        with self.locked() as maps:
+            state = _found(maps, row.name)
+            if state.is_shared:
+                state = maps[row.name] = state.copied()
+            yield state
+            self.written += 1
+
+    def row(self, name: str) -> MapRow:
+        """The map of a name.
+
+        Raises:
+            NotFoundError: kind `no_map`.
+        """
+        with self.locked() as maps:
+            return _found(maps, name).row
+
+    def shared(self, row: MapRow) -> MemoryMap:
+        """A map's dictionaries as they are now; nobody changes them from then on."""
+        with self.reading(row) as state:
+            state.is_shared = True
+            return state
+
+    def close(self) -> None:
+        """Answer nothing any more."""
+        with self._lock:
+            self._is_closed = True
+
+
+def _found(maps: dict[str, MemoryMap], name: str) -> MemoryMap:
+    if name not in maps:
+        raise NotFoundError("no_map", f"there is no map {name!r}; `cairn map ls` lists them")
+    return maps[name]

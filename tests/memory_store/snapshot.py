@@ -1,0 +1,136 @@
+"""Reading one state of a map in memory."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import islice
+
+from tests.memory_store.map import Kept, MemoryMap
+
+from cairn_map.commits.cursor import ENTRY_FOLD, first_chain
+from cairn_map.commits.ids import Author, CommitId
+from cairn_map.commits.version_vector import EMPTY, VersionVector
+from cairn_map.evidence.grid import CellKey, cell_of_key
+from cairn_map.wire.messages import LogEntry
+from cairn_server.store.store_rows import CellRow, Contribution, Entry, Head, Selection, Totals
+
+
+class MemorySnapshot:
+    """`store.Snapshot` of dictionaries that nobody changes any more."""
+
+    def __init__(self, state: MemoryMap) -> None:
+        self._state = state
+
+    @property
+    def head(self) -> Head:
+        """The state."""
+        return self._state.head
+
+    def chain_at(self, seq: int) -> bytes | None:
+        """The chain after entry `seq` (0: of the empty log); None if there is no such entry."""
+        if seq == 0:
+            return first_chain(self.head.cursor.log_id, self._state.row.geometry.digest())
+        return self._state.entries[seq - 1].chain if 0 < seq <= len(self._state.entries) else None
+
+    def cell(self, key: CellKey) -> CellRow | None:
+        """One cell with its body."""
+        return self._state.cells.get(key)
+
+    def cells(self, *, after_seq: int = -1, after_key: int = -1, limit: int | None = None) -> Iterator[CellRow]:
+        """Cells changed after a log entry, of numbers above `after_key`, at most `limit`; without bodies, rising."""
+        found = (cell for key, cell in sorted(self._state.cells.items()) if key > after_key and cell.lm > after_seq)
+        for cell in islice(found, limit):
+            yield replace(cell, body=b"", stamps=b"")
+
+    def contributions(self, key: CellKey, *, after_seq: int, newest: int | None = None) -> list[Contribution]:
+        """Entries after `after_seq` that touch a cell, oldest first, at most so many of the newest."""
+        seqs = [seq for seq in self._state.touched.get(key, ()) if seq > after_seq]
+        return [self._contribution(key, seq) for seq in seqs[-(newest or len(seqs)) :]]
+
+    def diff(self, number: int) -> bytes | None:
+        """The bytes of a contribution; None if they are not kept any more."""
+        found = self._state.diffs.get(number)
+        return self._state.commits[found[0]].new.diff[found[1]] if found else None
+
+    def tip(self, author: Author) -> tuple[int, bytes] | None:
+        """Highest folded number of an author and its SHA-256."""
+        mine = [kept.new for kept in self._folded() if kept.new.id.author == author]
+        return max(((commit.id.n, commit.sha) for commit in mine), default=None)
+
+    def commits_where(self, selection: Selection) -> list[CommitId]:
+        """Every commit with evidence that fits and is not retracted, folded or not, in order of arrival."""
+        return [
+            commit
+            for commit, kept in self._state.commits.items()
+            if kept.cells and commit not in self._state.retracted and _fits(kept, selection)
+        ]
+
+    def pending(self) -> VersionVector:
+        """Commits that are kept but not folded, without those that are set aside as damaged."""
+        return EMPTY.with_commits(kept.new.id for kept in self._state.waiting())
+
+    def folded_before(self, time_s: float) -> VersionVector:
+        """Commits folded before a time."""
+        return EMPTY.with_commits(kept.new.id for kept in self._folded() if kept.folded_s < time_s)
+
+    def retracting(self) -> list[CommitId]:
+        """Commits that retract others."""
+        return [kept.new.id for kept in self._folded() if kept.new.retracts]
+
+    def log(self, *, after_seq: int, limit: int) -> list[LogEntry]:
+        """Log entries, oldest first."""
+        found = self._state.entries[after_seq : after_seq + limit]
+        return [self._log_entry(seq, entry) for seq, entry in enumerate(found, start=after_seq + 1)]
+
+    def totals(self) -> Totals:
+        """Sizes."""
+        cells = [cell for cell in self._state.cells.values() if cell.voxels]
+        axes = list(zip(*(cell_of_key(cell.key) for cell in cells), strict=True))
+        return Totals(
+            cells=len(cells),
+            size_bytes=sum(cell.size_bytes for cell in cells),
+            commits=len(self._state.commits),
+            branches=len(self._state.branches),
+            corner_cells=((min(axes[0]), min(axes[1]), min(axes[2])), (max(axes[0]), max(axes[1]), max(axes[2])))
+            if cells
+            else None,
+        )
+
+    def _folded(self) -> Iterator[Kept]:
+        return (kept for kept in self._state.commits.values() if kept.folded_seq is not None)
+
+    def _contribution(self, key: CellKey, seq: int) -> Contribution:
+        entry = self._state.entries[seq - 1]
+        commit = self._state.ids[entry.commit]
+        size_bytes = len(self._state.commits[commit].new.diff[key])
+        return Contribution(seq, entry.kind, commit.author, self._state.diff_numbers[commit, key], size_bytes)
+
+    def _log_entry(self, seq: int, entry: Entry) -> LogEntry:
+        kept = self._state.commits[self._state.ids[entry.commit]]
+        meta = json.loads(kept.new.text) if kept.new.text else {}
+        scans = meta.get("scans")
+        return LogEntry(
+            seq=seq,
+            kind="+" if entry.kind == ENTRY_FOLD else "-",
+            id=str(kept.new.id),
+            sha=kept.new.sha.hex(),
+            size_bytes=kept.new.size_bytes,
+            cells=kept.cells,
+            captured_s=kept.new.captured_s,
+            retracts=[str(target) for target in kept.new.retracts],
+            parent=meta.get("parent"),
+            seen=meta.get("seen"),
+            place_m=scans[-1]["t_map_rig"] if scans else None,
+            via=kept.new.via,
+        )
+
+
+def _fits(kept: Kept, selection: Selection) -> bool:
+    first_s, last_s = kept.new.captured_s or (float("inf"), float("-inf"))
+    return (
+        selection.robot in (None, kept.new.id.author.robot)
+        and selection.rig in (None, kept.new.rig)
+        and selection.pushed_s[0] <= kept.received_s <= selection.pushed_s[1]
+        and selection.captured_s[0] <= last_s
+        and first_s <= selection.captured_s[1]
+    )

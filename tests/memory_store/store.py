@@ -1,0 +1,165 @@
+"""A store in memory: dictionaries, for tests and for maps that need not survive the process (`store.Store`)."""
+
+import logging
+import time
+from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+
+from tests.memory_store.figures import MemoryHealth, MemoryNotes, MemoryUses
+from tests.memory_store.map import new_memory_map
+from tests.memory_store.maps import MemoryMaps
+from tests.memory_store.snapshot import MemorySnapshot
+from tests.memory_store.tokens import MemoryAuditLog, MemoryTokens
+
+from cairn_map.commits.cursor import Cursor
+from cairn_map.commits.ids import Author, CommitId
+from cairn_map.errors import CairnError, ConflictError, NotFoundError, UnreachableError
+from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_server.store.store import Store
+from cairn_server.store.store_rows import Branch, Fold, MapRow, NewCommit, StoredCommit
+
+log = logging.getLogger(__name__)
+
+
+class MemoryStore:
+    """`store.Store` without a disk: what it acknowledges lasts as long as the process."""
+
+    def __init__(self) -> None:
+        self._maps = MemoryMaps()
+        self.tokens = MemoryTokens(self._maps)
+        self.audit_log = MemoryAuditLog(self._maps)
+        self.health = MemoryHealth(self._maps)
+        self.uses = MemoryUses(self._maps)
+        self.notes = MemoryNotes(self._maps)
+
+    def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:
+        """The map and whether it is new; an equal one may exist already."""
+        with self._maps.locked() as maps:
+            known = maps.get(name)
+            if known is None:
+                maps[name] = new_memory_map(len(maps) + 1, name, geometry, sensor_model)
+            elif (known.row.geometry, known.row.sensor_model) != (geometry, sensor_model):
+                raise ConflictError("map_exists", f"map {name} exists with another geometry or sensor model")
+            return maps[name].row, known is None
+
+    def map(self, name: str) -> MapRow:
+        """The map of a name."""
+        return self._maps.row(name)
+
+    def maps(self) -> list[MapRow]:
+        """All maps, by name."""
+        with self._maps.locked() as maps:
+            return [maps[name].row for name in sorted(maps)]
+
+    def append(self, row: MapRow, commit: NewCommit) -> bool:
+        """Keep a commit; True if it is new, False if the same one is known already."""
+        with self._maps.changing(row) as changed:
+            return changed.append(commit)
+
+    def submit(self, row: MapRow, commit: NewCommit) -> Future[bool]:
+        """Keep a commit, at once."""
+        done: Future[bool] = Future()
+        try:
+            done.set_result(self.append(row, commit))
+        except CairnError as exc:
+            done.set_exception(exc)
+        return done
+
+    def append_built(self, row: MapRow, author: Author, build: Callable[[int], NewCommit]) -> NewCommit:
+        """Keep a commit that `build(n)` makes for the author's next number n."""
+        with self._maps.changing(row) as changed:
+            commit = build(changed.next_number(author))
+            changed.append(commit)
+            return commit
+
+    def pending(
+        self, row: MapRow, *, limit: int, size_bytes_max: int, skip: Collection[int] = ()
+    ) -> list[StoredCommit]:
+        """Commits to be folded, in order of arrival, with their diffs: at most `limit`, and one or within the size."""
+        found: list[StoredCommit] = []
+        total_bytes = 0
+        with self._maps.reading(row) as state:
+            for kept in (kept for kept in state.waiting() if kept.number not in skip):
+                total_bytes += kept.new.size_bytes
+                if len(found) >= limit or (found and total_bytes > size_bytes_max):
+                    break
+                found.append(kept.stored())
+        return found
+
+    def commit(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
+        """A commit with its diff, folded or not; None if there is none."""
+        with self._maps.reading(row) as state:
+            kept = state.commits.get(commit)
+            return kept.stored() if kept else None
+
+    def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
+        """A folded commit with its diff, or None."""
+        with self._maps.reading(row) as state:
+            kept = state.commits.get(commit)
+            return kept.stored() if kept and kept.folded_seq is not None else None
+
+    def forget_evidence(self, row: MapRow, *, before_s: float, limit: int) -> int:
+        """Drop the evidence and the meta of up to `limit` commits folded, and last pushed, before a time; how many."""
+        with self._maps.changing(row) as changed:
+            return changed.forget_evidence(before_s=before_s, limit=limit)
+
+    def is_retracted(self, row: MapRow, commit: CommitId) -> bool:
+        """Whether a retract of this id has taken effect, or waits for it to come."""
+        with self._maps.reading(row) as state:
+            return commit in state.retracted
+
+    def fold(self, row: MapRow, fold: Fold) -> bool:
+        """Write a fold if the head is still its base; False (and nothing written) otherwise."""
+        with self._maps.changing(row) as changed:
+            return changed.fold(fold)
+
+    @contextmanager
+    def snapshot(self, row: MapRow) -> Iterator[MemorySnapshot]:
+        """One state of the map."""
+        yield MemorySnapshot(self._maps.shared(row))
+
+    def register(self, row: MapRow, branch: Branch, token_hash: bytes) -> None:
+        """Make a branch and its token, or give an existing one another secret."""
+        with self._maps.changing(row) as changed:
+            known = changed.branches.get(branch.name)
+            # A new incarnation may have lost its disk: where it stands is not known before it fetches.
+            cursor = known.cursor if known and known.incarnation == branch.incarnation else None
+            changed.branches[branch.name] = replace(branch, cursor=cursor)
+            self.tokens.put_registration(row, branch.name, token_hash)
+
+    def seen(self, row: MapRow, name: str, cursor: Cursor | None) -> None:
+        """Note that a branch was heard of, and where it stands."""
+        with suppress(UnreachableError), self._maps.changing(row) as changed:  # it is only a note
+            known = changed.branches.get(name)
+            if known is not None:
+                changed.branches[name] = replace(known, cursor=cursor or known.cursor, last_seen_s=time.time())
+
+    def deregister(self, row: MapRow, name: str) -> None:
+        """Remove a branch and all tokens of its robot."""
+        with self._maps.changing(row) as changed:
+            if changed.branches.pop(name, None) is None:
+                raise NotFoundError("no_branch", f"map {row.name} has no branch {name!r}")
+            changed.statuses.pop(name, None)
+            self.tokens.remove_of(row, name)
+
+    def branches(self, row: MapRow) -> list[Branch]:
+        """All branches, by name."""
+        with self._maps.reading(row) as state:
+            return [state.branches[name] for name in sorted(state.branches)]
+
+    def audit(self, what: str, detail: str) -> None:
+        """Note something that an administrator may have to look into."""
+        log.warning("%s: %r", what, detail)
+        with suppress(UnreachableError):
+            self.audit_log.add("server", what, detail)
+
+    def close(self) -> None:
+        """Answer nothing any more."""
+        self._maps.close()
+
+
+_IS_A_STORE: type[Store] = MemoryStore
+"""Refused by the type checker if it is none."""
