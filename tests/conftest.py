@@ -7,12 +7,12 @@ SLOWEST = (
     "tests/test_commands.py",
     "tests/console/test_page.py",
     "tests/fuzz/test_fuzz.py",
-    "tests/cairn_sim/test_experiment.py",
+    "tests/cairn_sim/experiment/test_experiment.py",
     "tests/console/test_screens.py",
     "tests/console/test_access.py",
     "tests/console/test_tabs.py",
-    "tests/cairn_client/test_simulated.py",
-    "tests/cairn_calib/test_board_finding.py",
+    "tests/cairn_client/robot/test_simulated.py",
+    "tests/cairn_calib/board/test_board_finding.py",
 )
 """By their time on two cores; the others take half a minute at most."""
 

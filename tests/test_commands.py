@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.cairn_client.conftest import wait_until
-from tests.cairn_server.live.hub import free_port
 from tests.console.browsing import VIEW, browser, tab
 from tests.console.casting import occupied, picks_met_first
 from tests.console.conftest import LOOPBACK, Room, skip_without_page
+from tests.fixtures.server.live import free_port
 
 from cairn_client.cli.arguments import api_of
 from cairn_client.http.http_link import index_of

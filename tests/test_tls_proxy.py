@@ -17,9 +17,9 @@ from pathlib import Path
 import httpx
 import pytest
 import yaml
-from tests.cairn_map.made import SMALL
-from tests.cairn_server.live.hub import Process, free_port, until
-from tests.cairn_server.sync.pushes import pushed
+from tests.fixtures.map.made import SMALL
+from tests.fixtures.server.live import Process, free_port, until
+from tests.fixtures.server.pushes import pushed
 from websockets.sync.client import connect
 from websockets.typing import Origin
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from tests.bench.timing import cpu_s, wall_s
-from tests.cairn_calib.board_images import BOARD, COLOUR, THERMAL, TOF, picture, pose
-from tests.cairn_calib.simulated_views import SPECTRA, ranges_of, views_of, world
-from tests.cairn_calib.test_mrcal import mrcal_solved, reference_problem
+from tests.cairn_calib.diagnosis.test_mrcal import mrcal_solved, reference_problem
+from tests.fixtures.calib.board_images import BOARD, COLOUR, THERMAL, TOF, picture, pose
+from tests.fixtures.calib.simulated_views import SPECTRA, ranges_of, views_of, world
 
 from cairn_calib.board.corner_detection import find_chessboard
 from cairn_calib.diagnosis.examination import examined

@@ -19,8 +19,8 @@ import httpx
 from playwright.sync_api import Browser
 from tests.bench.building import building_map, wait_until_folded
 from tests.bench.pushing import Diff, meta_of
-from tests.cairn_server.live.hub import Process
 from tests.console.browsing import CHROMIUM, VIEW, Console, browser
+from tests.fixtures.server.live import Process
 
 from cairn_client.cli.maps.prior_data import push_prior_data
 from cairn_client.http.api import MapApi

@@ -13,8 +13,8 @@ from random import Random
 
 from tests.bench.git_peer import GitPeer, missing, plain_file
 from tests.bench.pushing import Server, meta_of, served
-from tests.cairn_server.live.hub import until
 from tests.crowd.building import SCANS, Survey, survey
+from tests.fixtures.server.live import until
 from tests.links.proxy import Cut, Fault, FaultProxy
 
 from cairn_client.http.api import MapApi

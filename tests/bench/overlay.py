@@ -15,7 +15,7 @@ import httpx
 import numpy as np
 import numpy.typing as npt
 from tests.bench.building import building_map, wait_until_folded
-from tests.cairn_server.live.hub import Process
+from tests.fixtures.server.live import Process
 
 from cairn_calib.rig.rig import Rig
 from cairn_client.cli.maps.overlay_drawing import MapOverlay

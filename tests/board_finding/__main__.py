@@ -20,7 +20,7 @@ import numpy as np
 from tests.board_finding.empty_images import KINDS, empty_image
 from tests.board_finding.real_boards import changed, found_as_recorded, recorded, voted
 from tests.board_finding.trials import SPECTRA, Trial, found_rightly, trial
-from tests.cairn_calib.board_images import BOARD
+from tests.fixtures.calib.board_images import BOARD
 
 from cairn_calib.board.corner_detection import find_chessboard
 

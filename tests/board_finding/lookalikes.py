@@ -5,7 +5,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import numpy.typing as npt
-from tests.cairn_calib.board_images import TOF, picture, pose, truth
+from tests.fixtures.calib.board_images import TOF, picture, pose, truth
 
 from cairn_calib.board.board import Board
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import numpy.typing as npt
-from tests.cairn_calib.board_images import BOARD
+from tests.fixtures.calib.board_images import BOARD
 
 from cairn_calib.board.board import Polarity
 from cairn_calib.board.corner_detection import find_chessboard, grey

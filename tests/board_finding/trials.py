@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from tests.cairn_calib.board_images import (
+from tests.fixtures.calib.board_images import (
     BOARD,
     COLOUR,
     DISC,

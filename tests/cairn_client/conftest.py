@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import uvicorn
 from hypothesis import HealthCheck, settings
-from tests.cairn_client.made import GEOMETRY, MAP
+from tests.fixtures.client.made import GEOMETRY, MAP
 
 from cairn_client.http.api import MapApi
 from cairn_map.wire.messages import CreateMap

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.cairn_client.made import cells_of
-from tests.cairn_client.world import MODES, PUSHES, Fault, World, quick
+from tests.fixtures.client.made import cells_of
+from tests.fixtures.client.world import MODES, PUSHES, Fault, World, quick
 
 Step = Callable[[World], None]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests import naive
-from tests.cairn_map.made import as_dict
+from tests.fixtures.map.made import as_dict
 
 from cairn_map.codec import cell_reading
 from cairn_map.codec.cell_code import encode_cell

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
-from tests.cairn_server.live.hub import Live
+from tests.fixtures.server.live import Live
 
 settings.register_profile(
     "cairn", max_examples=50, deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow]

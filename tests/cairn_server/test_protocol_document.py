@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from fastapi.routing import APIRoute
 from starlette.routing import Route, WebSocketRoute
-from tests.cairn_server.live.hub import Live
+from tests.fixtures.server.live import Live
 
 from cairn_map.commits.commit import COMMIT_BYTES_MAX, RETRACTS_MAX
 from cairn_map.render import render_request

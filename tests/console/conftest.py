@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser
-from tests.cairn_server.live.hub import Process, free_port, until
 from tests.console.browsing import CHROMIUM, VIEW, Console, browser, tab
 from tests.console.room import ADMIN_TOKEN, GEOMETRY, MAP, mapping, push_measurement
+from tests.fixtures.server.live import Process, free_port, until
 
 from cairn_client.http.api import MapApi
 from cairn_map.wire.messages import CreateMap

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.cairn_map.made import GEOMETRIES, random_evidence, surface_evidence
+from tests.fixtures.map.made import GEOMETRIES, random_evidence, surface_evidence
 
 from cairn_map.codec.view_code import decode_view, encode_view
 from cairn_map.evidence.grid import cell_key

@@ -4,12 +4,12 @@ from collections.abc import Iterator
 
 import pytest
 from playwright.sync_api import Browser
-from tests.cairn_map.made import SMALL, surface_evidence
-from tests.cairn_server.live.hub import until
-from tests.cairn_server.sync.pushes import KEYS, MOLE, WREN, pushed
 from tests.console.browsing import Console, tab
 from tests.console.conftest import Room
 from tests.console.test_tabs import SMALL_VIEW
+from tests.fixtures.map.made import SMALL, surface_evidence
+from tests.fixtures.server.live import until
+from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed
 
 from cairn_map.commits.commit import make_commit
 from cairn_map.evidence.grid import cell_of_key

@@ -6,13 +6,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from playwright.sync_api import Browser, Route
-from tests.cairn_map.made import SMALL, surface_evidence
-from tests.cairn_server.live.hub import until
-from tests.cairn_server.sync.pushes import MOLE, pushed
 from tests.console.browsing import VIEW, Console, tab
 from tests.console.casting import occupied
 from tests.console.conftest import Room
 from tests.console.room import GEOMETRY
+from tests.fixtures.map.made import SMALL, surface_evidence
+from tests.fixtures.server.live import until
+from tests.fixtures.server.pushes import MOLE, pushed
 
 from cairn_client.http.api import MapApi
 from cairn_map.evidence.grid import cell_key

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser
-from tests.cairn_server.live.hub import free_port
 from tests.console.browsing import tab
 from tests.console.conftest import LOOPBACK, Room
 from tests.console.room import GEOMETRY, MAP
 from tests.console.test_page import LOADED_MACHINE
+from tests.fixtures.server.live import free_port
 
 from cairn_map.wire.messages import CreateMap
 

@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from playwright.sync_api import Browser, FloatRect, Locator, Route
-from tests.cairn_map.made import SMALL, surface_evidence
-from tests.cairn_server.live.hub import until
-from tests.cairn_server.sync.pushes import KEYS, MOLE, WREN, pushed
 from tests.console.browsing import VIEW, Console, tab
 from tests.console.conftest import Room
 from tests.console.room import ADMIN_TOKEN
+from tests.fixtures.map.made import SMALL, surface_evidence
+from tests.fixtures.server.live import until
+from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed
 
 from cairn_client.http.api import MapApi
 from cairn_map.commits.commit import ScanPose

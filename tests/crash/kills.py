@@ -19,10 +19,10 @@ from pathlib import Path
 
 import apsw
 import httpx
-from tests.cairn_map.made import SMALL
 from tests.crash.lives import AUTHORS, NAME, commit_of
 from tests.crash.power_cut import Disk, PowerVfs
 from tests.crash.verdict import Verdict, verdict_on
+from tests.fixtures.map.made import SMALL
 
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import Author, CommitId

@@ -11,11 +11,11 @@ from functools import lru_cache
 from pathlib import Path
 
 import apsw
-from tests.cairn_map.made import SMALL
-from tests.cairn_server.store_contract import new_of
-from tests.cairn_server.sync.pushes import MOLE, WREN, pushed
 from tests.crash.power_cut import Disk, PowerVfs
 from tests.crash.verdict import Verdict, verdict_on
+from tests.fixtures.map.made import SMALL
+from tests.fixtures.server.pushes import MOLE, WREN, pushed
+from tests.fixtures.server.store_contract import new_of
 
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import Author, CommitId

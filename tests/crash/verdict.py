@@ -7,8 +7,8 @@ from pathlib import Path
 
 import apsw
 from tests import naive
-from tests.cairn_map.made import as_dict
-from tests.cairn_server.sync.pushes import Cells, read
+from tests.fixtures.map.made import as_dict
+from tests.fixtures.server.pushes import Cells, read
 
 from cairn_map.codec.cell_code import decode_cell
 from cairn_map.commits.commit import Commit

@@ -13,12 +13,12 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from tests.cairn_server.live.hub import Process
 from tests.crowd.building import Survey
 from tests.crowd.crowd import Crowd, CrowdRobot, fetch_all, listen, live_together
 from tests.crowd.figures import Seen
 from tests.crowd.watch import Sample, Watch
 from tests.crowd.whole_robots import WholeReport, live_whole
+from tests.fixtures.server.live import Process
 
 from cairn_client.http.api import MapApi
 from cairn_map.wire.messages import CreateMap, MapInfo

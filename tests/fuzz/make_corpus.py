@@ -15,9 +15,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from pydantic import BaseModel
-from tests.cairn_map.made import GEOMETRIES, KEY, MIDDLE, PLAIN, ROBOT, SMALL, made_commit, made_cursor, made_frames
-from tests.cairn_map.made import random_evidence as made_evidence
-from tests.cairn_map.stored import recoded
+from tests.fixtures.map.made import GEOMETRIES, KEY, MIDDLE, PLAIN, ROBOT, SMALL, made_commit, made_cursor, made_frames
+from tests.fixtures.map.made import random_evidence as made_evidence
+from tests.fixtures.map.stored import recoded
 from tests.fuzz.foreign_corpus import foreign_seeds
 from tests.fuzz.sections import joined
 

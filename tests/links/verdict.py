@@ -4,7 +4,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.cairn_server.live.hub import until
+from tests.fixtures.server.live import until
 from tests.links.life import LOG, MAP, Building, open_robot
 
 from cairn_client.http.api import MapApi

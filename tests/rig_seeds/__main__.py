@@ -14,7 +14,7 @@ import sys
 from dataclasses import replace
 
 import numpy as np
-from tests.cairn_calib.simulated_views import LENSES, SPECTRA, errors_of, views_of, world
+from tests.fixtures.calib.simulated_views import LENSES, SPECTRA, errors_of, views_of, world
 
 from cairn_calib.rig.camera import Camera
 from cairn_calib.solve.priors import USUAL_SIGMAS

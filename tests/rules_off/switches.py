@@ -40,7 +40,7 @@ SWITCHES = (
         MISSING,
         "return cursor.seq <= head.seq and snapshot.chain_at(cursor.seq) == cursor.chain",
         "return cursor.seq <= head.seq",
-        "cairn_server/test_missing.py::test_a_cursor_that_cannot_be_proven_is_answered_with_resets_for_every_cell",
+        "cairn_server/sync/test_missing.py::test_a_cursor_that_cannot_be_proven_is_answered_with_resets_for_every_cell",
     ),
     Switch(
         1,
@@ -48,7 +48,7 @@ SWITCHES = (
         MISSING,
         "return cursor.seq <= head.seq and snapshot.chain_at(cursor.seq) == cursor.chain",
         "return snapshot.chain_at(cursor.seq) in (cursor.chain, None)",
-        "cairn_server/test_missing.py::test_a_cursor_that_cannot_be_proven_is_answered_with_resets_for_every_cell",
+        "cairn_server/sync/test_missing.py::test_a_cursor_that_cannot_be_proven_is_answered_with_resets_for_every_cell",
     ),
     Switch(
         1,
@@ -56,7 +56,7 @@ SWITCHES = (
         MISSING,
         "if cursor.log_id != head.log_id:",
         "if False:",
-        "cairn_server/test_missing.py::test_a_cursor_of_another_log_is_gone",
+        "cairn_server/sync/test_missing.py::test_a_cursor_of_another_log_is_gone",
     ),
     Switch(
         1,
@@ -64,7 +64,7 @@ SWITCHES = (
         FOLDING,
         "next_chain(self.chain, kind, commit.id, commit.sha)",
         "next_chain(self.chain, ENTRY_FOLD, commit.id, commit.sha)",
-        "cairn_server/test_sqlite_store.py::TestSqliteStore::test_a_store_does_what_dictionaries_do",
+        "cairn_server/store/test_sqlite_store.py::TestSqliteStore::test_a_store_does_what_dictionaries_do",
     ),
     Switch(
         1,
@@ -72,7 +72,7 @@ SWITCHES = (
         CHANGES,
         "if head != (fold.base.seq, fold.base.chain):",
         "if head is None:",
-        "cairn_server/test_sqlite_store.py::TestSqliteStore::test_a_fold_on_another_base_is_refused_and_writes_nothing",
+        "cairn_server/store/test_sqlite_store.py::TestSqliteStore::test_a_fold_on_another_base_is_refused_and_writes_nothing",
     ),
     Switch(
         2,
@@ -80,7 +80,7 @@ SWITCHES = (
         FOLDING,
         "seq = self.start.seq + len(self.entries)",
         "seq = self.start.seq + 1",
-        "cairn_server/test_sqlite_store.py::TestSqliteStore::test_a_store_does_what_dictionaries_do",
+        "cairn_server/store/test_sqlite_store.py::TestSqliteStore::test_a_store_does_what_dictionaries_do",
     ),
     Switch(
         2,
@@ -88,7 +88,7 @@ SWITCHES = (
         MISSING,
         "if start is not None and row.lm <= start.seq:",
         "if False:",
-        "cairn_server/test_missing.py::test_a_small_change_of_a_large_cell_comes_as_delta_and_the_first_fetch_whole",
+        "cairn_server/sync/test_missing.py::test_a_small_change_of_a_large_cell_comes_as_delta_and_the_first_fetch_whole",
     ),
     Switch(
         3,
@@ -96,7 +96,7 @@ SWITCHES = (
         READERS,
         'connection.execute("BEGIN")',
         "pass",
-        "cairn_server/test_sqlite_store.py::TestSqliteStore::test_a_snapshot_does_not_see_what_is_written_after_it_began",
+        "cairn_server/store/test_sqlite_store.py::TestSqliteStore::test_a_snapshot_does_not_see_what_is_written_after_it_began",
     ),
     Switch(
         3,
@@ -104,7 +104,7 @@ SWITCHES = (
         APPLYING,
         "elif self._header is None:",
         "elif False:",
-        "cairn_client/test_rules.py::test_a_reply_without_header_is_refused",
+        "cairn_client/sync/test_rules.py::test_a_reply_without_header_is_refused",
     ),
     Switch(
         3,
@@ -112,7 +112,7 @@ SWITCHES = (
         APPLYING,
         "elif frame.to_cursor != self._header.to_cursor:",
         "elif False:",
-        "cairn_client/test_rules.py::test_a_frame_that_leads_to_another_state_than_its_header_is_refused",
+        "cairn_client/sync/test_rules.py::test_a_frame_that_leads_to_another_state_than_its_header_is_refused",
     ),
     Switch(
         3,
@@ -120,7 +120,7 @@ SWITCHES = (
         APPLYING,
         "self._coverage = frame.coverage",
         "self._coverage = self._coverage if len(self._coverage) else frame.coverage",
-        "cairn_client/test_rules.py::test_frames_after_a_second_header_belong_to_its_state",
+        "cairn_client/sync/test_rules.py::test_frames_after_a_second_header_belong_to_its_state",
     ),
     Switch(
         3,
@@ -128,7 +128,7 @@ SWITCHES = (
         MISSING,
         "vector=head.vector.to_json(),",
         "vector=besides.stable.to_json(),",
-        "cairn_server/test_missing.py::test_the_header_tells_what_a_robot_may_conclude",
+        "cairn_server/sync/test_missing.py::test_the_header_tells_what_a_robot_may_conclude",
     ),
     Switch(
         3,
@@ -136,7 +136,7 @@ SWITCHES = (
         MISSING,
         "tip = snapshot.tip(author) if author else None",
         "tip = None",
-        "cairn_server/test_missing.py::test_the_header_tells_what_a_robot_may_conclude",
+        "cairn_server/sync/test_missing.py::test_the_header_tells_what_a_robot_may_conclude",
     ),
     Switch(
         3,
@@ -144,7 +144,7 @@ SWITCHES = (
         MISSING,
         "[str(commit) for commit in snapshot.retracting() if commit not in besides.stable]",
         "[]",
-        "cairn_server/test_missing.py::test_the_header_tells_what_a_robot_may_conclude",
+        "cairn_server/sync/test_missing.py::test_the_header_tells_what_a_robot_may_conclude",
     ),
     Switch(
         4,
@@ -152,7 +152,7 @@ SWITCHES = (
         CELLS_CHANGED,
         "if entry.kind != ENTRY_FOLD or entry.author != asker]",
         "]",
-        "cairn_server/test_missing.py::test_own_commits_are_left_out_of_a_delta_but_not_their_retract",
+        "cairn_server/sync/test_missing.py::test_own_commits_are_left_out_of_a_delta_but_not_their_retract",
     ),
     Switch(
         4,
@@ -160,7 +160,7 @@ SWITCHES = (
         CELLS_CHANGED,
         "entry.author != asker]",
         "entry.author.robot != (asker.robot if asker else None)]",
-        "cairn_server/test_missing.py::test_the_same_robot_in_another_incarnation_gets_its_old_evidence_back",
+        "cairn_server/sync/test_missing.py::test_the_same_robot_in_another_incarnation_gets_its_old_evidence_back",
     ),
     Switch(
         4,
@@ -168,7 +168,7 @@ SWITCHES = (
         CELLS_CHANGED,
         "own_excluded=change.kind is FrameKind.DELTA and asker is not None,",
         "own_excluded=change.kind is FrameKind.DELTA,",
-        "cairn_server/test_missing.py::test_an_asker_without_an_author_is_not_told_that_anything_was_left_out",
+        "cairn_server/sync/test_missing.py::test_an_asker_without_an_author_is_not_told_that_anything_was_left_out",
     ),
     Switch(
         4,
@@ -176,7 +176,7 @@ SWITCHES = (
         CELLS_CHANGED,
         "if delta is None or len(delta) >= row.size_bytes:",
         "if delta is None:",
-        "cairn_server/test_missing.py::test_a_delta_that_is_larger_than_the_cell_gives_way_to_the_cell",
+        "cairn_server/sync/test_missing.py::test_a_delta_that_is_larger_than_the_cell_gives_way_to_the_cell",
     ),
     Switch(
         4,
@@ -184,7 +184,7 @@ SWITCHES = (
         CELLS_CHANGED,
         'if is_told and "delta" in kinds else None',
         "if is_told else None",
-        "cairn_server/test_missing.py::test_who_cannot_use_a_delta_gets_the_cell_whole",
+        "cairn_server/sync/test_missing.py::test_who_cannot_use_a_delta_gets_the_cell_whole",
     ),
     Switch(
         4,
@@ -192,7 +192,7 @@ SWITCHES = (
         CELLS_CHANGED,
         "if len(foreign) == 1 and foreign[0].kind == ENTRY_FOLD:",
         "if len(foreign) == 1:",
-        "cairn_server/test_missing.py::test_what_was_taken_out_is_subtracted_in_a_delta_even_alone",
+        "cairn_server/sync/test_missing.py::test_what_was_taken_out_is_subtracted_in_a_delta_even_alone",
     ),
     Switch(
         4,
@@ -200,7 +200,7 @@ SWITCHES = (
         MISSING,
         "if start is not None and row.lm <= start.seq:",
         "if row.lm <= (start.seq if start else 0) or start is None:",
-        "cairn_server/test_missing.py::test_a_small_change_of_a_large_cell_comes_as_delta_and_the_first_fetch_whole",
+        "cairn_server/sync/test_missing.py::test_a_small_change_of_a_large_cell_comes_as_delta_and_the_first_fetch_whole",
     ),
     Switch(
         5,
@@ -208,7 +208,7 @@ SWITCHES = (
         APPLYING,
         "if frame.from_cursor != stands_at:",
         "if False:",
-        "cairn_client/test_rules.py::test_a_frame_for_another_cursor_changes_nothing",
+        "cairn_client/sync/test_rules.py::test_a_frame_for_another_cursor_changes_nothing",
     ),
     Switch(
         5,
@@ -216,7 +216,7 @@ SWITCHES = (
         APPLYING,
         "if frame.from_cursor != stands_at:",
         "if frame.from_cursor != stands_at and frame.kind is not FrameKind.FULL:",
-        "cairn_client/test_rules.py::test_a_frame_for_another_cursor_changes_nothing",
+        "cairn_client/sync/test_rules.py::test_a_frame_for_another_cursor_changes_nothing",
     ),
     Switch(
         5,
@@ -224,7 +224,7 @@ SWITCHES = (
         APPLYING,
         "if frame.from_cursor != stands_at:",
         "if frame.from_cursor != stands_at and frame.kind is not FrameKind.RESET:",
-        "cairn_client/test_rules.py::test_a_frame_for_another_cursor_changes_nothing",
+        "cairn_client/sync/test_rules.py::test_a_frame_for_another_cursor_changes_nothing",
     ),
     Switch(
         5,
@@ -232,7 +232,7 @@ SWITCHES = (
         APPLYING,
         "if frame.from_cursor != stands_at:",
         "if (frame.from_cursor.seq if frame.from_cursor else 0) != (stands_at.seq if stands_at else 0):",
-        "cairn_client/test_rules.py::test_a_frame_for_another_cursor_changes_nothing",
+        "cairn_client/sync/test_rules.py::test_a_frame_for_another_cursor_changes_nothing",
     ),
     Switch(
         5,
@@ -240,7 +240,7 @@ SWITCHES = (
         MISSING,
         "return CellFrame(kind=kind, cell=key, from_cursor=start,",
         "return CellFrame(kind=kind, cell=key, from_cursor=None,",
-        "cairn_server/test_missing.py::test_a_cursor_that_cannot_be_proven_is_answered_with_resets_for_every_cell",
+        "cairn_server/sync/test_missing.py::test_a_cursor_that_cannot_be_proven_is_answered_with_resets_for_every_cell",
     ),
     Switch(
         6,
@@ -248,7 +248,7 @@ SWITCHES = (
         APPLYING,
         "kept = without_blocks(base, blocks)",
         "kept = base",
-        "cairn_client/test_rules.py::test_a_state_frame_overwrites_its_blocks_and_a_present_zero_means_zero",
+        "cairn_client/sync/test_rules.py::test_a_state_frame_overwrites_its_blocks_and_a_present_zero_means_zero",
     ),
     Switch(
         6,
@@ -256,7 +256,7 @@ SWITCHES = (
         APPLYING,
         "sum_evidence([base, *own, self._payload(frame)], self._replica.geometry)",
         "sum_evidence([base, self._payload(frame)], self._replica.geometry)",
-        "cairn_client/test_rules.py::test_a_delta_adds_the_own_commits_that_it_leaves_out",
+        "cairn_client/sync/test_rules.py::test_a_delta_adds_the_own_commits_that_it_leaves_out",
     ),
     Switch(
         6,
@@ -264,7 +264,7 @@ SWITCHES = (
         APPLYING,
         "news = self._coverage.minus(held.coverage) if held else self._coverage",
         "news = self._coverage",
-        "cairn_client/test_rules.py::test_a_delta_adds_only_the_own_commits_between_its_two_states",
+        "cairn_client/sync/test_rules.py::test_a_delta_adds_only_the_own_commits_between_its_two_states",
     ),
     Switch(
         6,
@@ -272,7 +272,7 @@ SWITCHES = (
         APPLYING,
         "own = self._replica.outbox.own_evidence(frame.cell, news, self._author)",
         "own = self._replica.outbox.own_evidence(frame.cell, news, self._replica.author)",
-        "cairn_client/test_rules.py::test_a_delta_speaks_of_the_incarnation_that_asked",
+        "cairn_client/sync/test_rules.py::test_a_delta_speaks_of_the_incarnation_that_asked",
     ),
     Switch(
         6,
@@ -280,7 +280,7 @@ SWITCHES = (
         OUTBOX,
         "if not all(self._commits[commit].has_data for commit in mine):\n            return None",
         "mine = [commit for commit in mine if self._commits[commit].has_data]",
-        "cairn_client/test_rules.py::test_a_delta_without_the_bytes_of_an_own_commit_asks_for_the_whole_cell",
+        "cairn_client/sync/test_rules.py::test_a_delta_without_the_bytes_of_an_own_commit_asks_for_the_whole_cell",
     ),
     Switch(
         6,
@@ -288,7 +288,7 @@ SWITCHES = (
         APPLYING,
         "self._replica.hold(frame.cell, self._at_head(frame), evidence, body=frame.payload)",
         "self._replica.hold(frame.cell, self._at_head(frame), sum_evidence([self._replica.base_evidence(frame.cell), evidence], self._replica.geometry))",
-        "cairn_client/test_rules.py::test_coverage_is_replaced_and_never_merged",
+        "cairn_client/sync/test_rules.py::test_coverage_is_replaced_and_never_merged",
     ),
     Switch(
         6,
@@ -296,7 +296,7 @@ SWITCHES = (
         REPLICA,
         "return self.cells[key].coverage if key in self.cells else EMPTY",
         "return self.header.coverage if self.header else EMPTY",
-        "cairn_client/test_rules.py::test_a_reset_to_the_same_fingerprint_takes_the_cursor_and_replaces_coverage",
+        "cairn_client/sync/test_rules.py::test_a_reset_to_the_same_fingerprint_takes_the_cursor_and_replaces_coverage",
     ),
     Switch(
         6,
@@ -304,7 +304,7 @@ SWITCHES = (
         APPLYING,
         "return BaseCell(frame.to_cursor, self._coverage, frame.fingerprint)",
         "old = self._replica.cells.get(frame.cell)\n        both = self._coverage.with_commits(old.coverage) if old else self._coverage\n        return BaseCell(frame.to_cursor, both, frame.fingerprint)",
-        "cairn_client/test_rules.py::test_coverage_is_replaced_and_never_merged",
+        "cairn_client/sync/test_rules.py::test_coverage_is_replaced_and_never_merged",
     ),
     Switch(
         6,
@@ -312,7 +312,7 @@ SWITCHES = (
         APPLYING,
         "self._coverage = frame.coverage",
         "self._coverage = EMPTY.with_commits(c for c in frame.coverage if c.author == self._author)",
-        "cairn_client/test_rules.py::test_frames_after_a_second_header_belong_to_its_state",
+        "cairn_client/sync/test_rules.py::test_frames_after_a_second_header_belong_to_its_state",
     ),
     Switch(
         6,
@@ -320,7 +320,7 @@ SWITCHES = (
         REPLICA,
         "self.store.put_cell(key, cell, body=data)",
         "self.store.put_cell(key, cell, body=self.store.body(key) or b'')",
-        "cairn_client/test_rules.py::test_a_frame_that_comes_twice_counts_once",
+        "cairn_client/sync/test_rules.py::test_a_frame_that_comes_twice_counts_once",
     ),
     Switch(
         7,
@@ -328,7 +328,7 @@ SWITCHES = (
         SHOWN,
         "    for commit in found.added:\n",
         "    for commit in ():\n",
-        "cairn_client/test_rules.py::test_the_view_is_the_base_and_the_commits_it_lacks",
+        "cairn_client/sync/test_rules.py::test_the_view_is_the_base_and_the_commits_it_lacks",
     ),
     Switch(
         7,
@@ -336,7 +336,7 @@ SWITCHES = (
         SHOWN,
         "if not _is_taken_out(outbox, kept, coverage)",
         "",
-        "cairn_client/test_shown.py::test_what_an_amend_names_is_not_shown_where_the_server_lacks_both",
+        "cairn_client/replica/test_shown.py::test_what_an_amend_names_is_not_shown_where_the_server_lacks_both",
     ),
     Switch(
         7,
@@ -344,7 +344,7 @@ SWITCHES = (
         SHOWN,
         "    for commit in found.taken:\n",
         "    for commit in ():\n",
-        "cairn_client/test_shown.py::test_what_an_amend_names_is_subtracted_where_the_server_has_it",
+        "cairn_client/replica/test_shown.py::test_what_an_amend_names_is_subtracted_where_the_server_has_it",
     ),
     Switch(
         7,
@@ -352,7 +352,7 @@ SWITCHES = (
         SHOWN,
         "by not in coverage and outbox.kept(by) is not None",
         "outbox.kept(by) is not None",
-        "cairn_client/test_shown.py::test_what_the_server_took_out_is_not_taken_out_again",
+        "cairn_client/replica/test_shown.py::test_what_the_server_took_out_is_not_taken_out_again",
     ),
     Switch(
         7,
@@ -360,7 +360,7 @@ SWITCHES = (
         SHOWN,
         "outbox.touching(key) if kept.id not in coverage]",
         "outbox.touching(key)]",
-        "cairn_client/test_rules.py::test_a_commit_in_the_coverage_of_its_cell_is_not_added_again",
+        "cairn_client/sync/test_rules.py::test_a_commit_in_the_coverage_of_its_cell_is_not_added_again",
     ),
     Switch(
         8,
@@ -368,7 +368,7 @@ SWITCHES = (
         APPLYING,
         "if stands != {key: self._asked[key] for key in unframed} or total",
         "if total",
-        "cairn_client/test_rules.py::test_the_end_moves_nothing_if_a_cell_has_moved_since_the_request",
+        "cairn_client/sync/test_rules.py::test_the_end_moves_nothing_if_a_cell_has_moved_since_the_request",
     ),
     Switch(
         8,
@@ -376,7 +376,7 @@ SWITCHES = (
         APPLYING,
         " or total != done.rest_fingerprint:",
         ":",
-        "cairn_client/test_rules.py::test_the_end_moves_nothing_if_the_sum_does_not_agree",
+        "cairn_client/sync/test_rules.py::test_the_end_moves_nothing_if_the_sum_does_not_agree",
     ),
     Switch(
         8,
@@ -384,7 +384,7 @@ SWITCHES = (
         APPLYING,
         "if self._has_dropped:",
         "if False:",
-        "cairn_client/test_rules.py::test_a_frame_for_another_cursor_changes_nothing",
+        "cairn_client/sync/test_rules.py::test_a_frame_for_another_cursor_changes_nothing",
     ),
     Switch(
         8,
@@ -392,7 +392,7 @@ SWITCHES = (
         MISSING,
         "rest += row.fingerprint",
         "pass",
-        "cairn_server/test_missing.py::test_done_sums_the_fingerprints_of_the_cells_without_a_frame",
+        "cairn_server/sync/test_missing.py::test_done_sums_the_fingerprints_of_the_cells_without_a_frame",
     ),
     Switch(
         9,
@@ -400,7 +400,7 @@ SWITCHES = (
         MISSING,
         "return _frame(FrameKind.RESET, key, start, to, ZERO)",
         "return None",
-        "cairn_server/test_missing.py::test_a_cursor_that_cannot_be_proven_is_answered_with_resets_for_every_cell",
+        "cairn_server/sync/test_missing.py::test_a_cursor_that_cannot_be_proven_is_answered_with_resets_for_every_cell",
     ),
     Switch(
         9,
@@ -408,7 +408,7 @@ SWITCHES = (
         MISSING,
         "if asker.compare or start in asker.unproven:\n        return _frame(FrameKind.RESET, row.key",
         "if asker.compare:\n        return _frame(FrameKind.RESET, row.key",
-        "cairn_server/test_missing.py::test_a_cursor_that_cannot_be_proven_is_answered_with_resets_for_every_cell",
+        "cairn_server/sync/test_missing.py::test_a_cursor_that_cannot_be_proven_is_answered_with_resets_for_every_cell",
     ),
     Switch(
         9,
@@ -416,7 +416,7 @@ SWITCHES = (
         MISSING,
         "if asker.compare or start in asker.unproven:\n        return _frame(FrameKind.RESET, row.key",
         "if asker.compare or asker.unproven:\n        return _frame(FrameKind.RESET, row.key",
-        "cairn_server/test_missing.py::test_a_single_cell_with_a_false_cursor_is_reset_alone",
+        "cairn_server/sync/test_missing.py::test_a_single_cell_with_a_false_cursor_is_reset_alone",
     ),
     Switch(
         9,
@@ -424,7 +424,7 @@ SWITCHES = (
         APPLYING,
         "self._replica.move([frame.cell], to=frame.to_cursor, coverage=self._coverage)",
         "self._replica.move([frame.cell], to=frame.to_cursor, coverage=None)",
-        "cairn_client/test_rules.py::test_a_reset_to_the_same_fingerprint_takes_the_cursor_and_replaces_coverage",
+        "cairn_client/sync/test_rules.py::test_a_reset_to_the_same_fingerprint_takes_the_cursor_and_replaces_coverage",
     ),
     Switch(
         9,
@@ -432,7 +432,7 @@ SWITCHES = (
         APPLYING,
         "if frame.fingerprint != (held.fingerprint if held else ZERO):",
         "if False:",
-        "cairn_client/test_rules.py::test_coverage_is_replaced_and_never_merged",
+        "cairn_client/sync/test_rules.py::test_coverage_is_replaced_and_never_merged",
     ),
     Switch(
         9,
@@ -440,7 +440,7 @@ SWITCHES = (
         APPLYING,
         'self._ask_whole(frame.cell, "the server has another state")',
         "self._replica.hold_nothing(frame.cell, UNPROVEN)",
-        "cairn_client/test_rules.py::test_a_reset_to_another_fingerprint_keeps_showing_the_base_and_asks_for_the_whole",
+        "cairn_client/sync/test_rules.py::test_a_reset_to_another_fingerprint_keeps_showing_the_base_and_asks_for_the_whole",
     ),
     Switch(
         9,
@@ -448,7 +448,7 @@ SWITCHES = (
         REPLICA,
         "self.store.clear_acked()",
         "pass",
-        "cairn_client/test_rules.py::test_another_log_takes_the_base_away_and_offers_every_commit_anew",
+        "cairn_client/sync/test_rules.py::test_another_log_takes_the_base_away_and_offers_every_commit_anew",
     ),
     Switch(
         10,
@@ -456,7 +456,7 @@ SWITCHES = (
         SNAPSHOT,
         "FROM cell WHERE map = ? AND lm > ? AND cell > ? ORDER BY cell",
         "FROM cell WHERE map = ? AND lm > ? AND cell > ? AND voxels > 0 ORDER BY cell",
-        "cairn_server/test_cells.py::test_the_index_lists_every_touched_cell_from_one_state",
+        "cairn_server/http/test_cells.py::test_the_index_lists_every_touched_cell_from_one_state",
     ),
     Switch(
         10,
@@ -464,7 +464,7 @@ SWITCHES = (
         CELLS,
         "if stored is None:",
         "if stored is None or not stored.voxels:",
-        "cairn_server/test_retract.py::test_an_emptied_cell_is_served_empty_and_an_unseen_one_is_not_found",
+        "cairn_server/sync/test_retract.py::test_an_emptied_cell_is_served_empty_and_an_unseen_one_is_not_found",
     ),
     Switch(
         11,
@@ -472,7 +472,7 @@ SWITCHES = (
         FOLDING,
         "if not self._is_retracted(target):",
         "if True:",
-        "cairn_server/test_retract.py",
+        "cairn_server/sync/test_retract.py",
     ),
     Switch(
         11,
@@ -480,7 +480,7 @@ SWITCHES = (
         FOLDING,
         "self.retracted[target] = None",
         "self.retracted.update({target: None} if known else {})",
-        "cairn_server/test_retract.py::test_an_amend_replaces_what_it_names",
+        "cairn_server/sync/test_retract.py::test_an_amend_replaces_what_it_names",
     ),
     Switch(
         11,
@@ -488,7 +488,7 @@ SWITCHES = (
         FOLDING,
         "if self._is_retracted(commit.id):",
         "if False:",
-        "cairn_server/test_retract.py::test_an_amend_replaces_what_it_names",
+        "cairn_server/sync/test_retract.py::test_an_amend_replaces_what_it_names",
     ),
     Switch(
         11,
@@ -496,7 +496,7 @@ SWITCHES = (
         CELLS_CHANGED,
         "if entry.kind != ENTRY_FOLD or entry.author != asker]",
         "if entry.author != asker]",
-        "cairn_server/test_missing.py::test_own_commits_are_left_out_of_a_delta_but_not_their_retract",
+        "cairn_server/sync/test_missing.py::test_own_commits_are_left_out_of_a_delta_but_not_their_retract",
     ),
     Switch(
         11,
@@ -504,7 +504,7 @@ SWITCHES = (
         RETRACTING,
         "if any(target.author.robot == OPERATOR for target in targets):",
         "if False:",
-        "cairn_server/test_retract.py::test_nothing_and_retracts_cannot_be_retracted",
+        "cairn_server/sync/test_retract.py::test_nothing_and_retracts_cannot_be_retracted",
     ),
     Switch(
         11,
@@ -512,7 +512,7 @@ SWITCHES = (
         CHANGES,
         "return damaged is not None",
         "return True",
-        "cairn_server/test_retract.py::test_a_retracted_commit_pushed_again_is_known_and_changes_nothing",
+        "cairn_server/sync/test_retract.py::test_a_retracted_commit_pushed_again_is_known_and_changes_nothing",
     ),
     Switch(
         12,
@@ -520,7 +520,7 @@ SWITCHES = (
         REPLICA,
         "kept.acked and kept.id in stable and",
         "kept.acked and",
-        "cairn_client/test_rules.py::test_another_log_takes_the_base_away_and_offers_every_commit_anew",
+        "cairn_client/sync/test_rules.py::test_another_log_takes_the_base_away_and_offers_every_commit_anew",
     ),
     Switch(
         12,
@@ -528,7 +528,7 @@ SWITCHES = (
         REPLICA,
         " and self._is_covered(kept, wanted)",
         "",
-        "cairn_client/test_rules.py::test_a_commit_that_is_not_covered_in_one_of_its_cells_stays",
+        "cairn_client/sync/test_rules.py::test_a_commit_that_is_not_covered_in_one_of_its_cells_stays",
     ),
     Switch(
         12,
@@ -536,7 +536,7 @@ SWITCHES = (
         REPLICA,
         "return all(cell is not None",
         "return any(cell is not None",
-        "cairn_client/test_rules.py::test_a_commit_that_is_not_covered_in_one_of_its_cells_stays",
+        "cairn_client/sync/test_rules.py::test_a_commit_that_is_not_covered_in_one_of_its_cells_stays",
     ),
     Switch(
         12,
@@ -544,7 +544,7 @@ SWITCHES = (
         REPLICA,
         "kept.acked and kept.id in stable and",
         "kept.id in stable and",
-        "cairn_client/test_rules.py::test_a_commit_whose_bytes_the_server_never_acknowledged_stays",
+        "cairn_client/sync/test_rules.py::test_a_commit_whose_bytes_the_server_never_acknowledged_stays",
     ),
     Switch(
         12,
@@ -552,7 +552,7 @@ SWITCHES = (
         SHOWN,
         "outbox.touching(key) if kept.id not in coverage]",
         "outbox.touching(key) if kept.id not in coverage and not kept.acked]",
-        "cairn_client/test_rules.py::test_an_acknowledged_commit_is_still_shown_and_still_kept",
+        "cairn_client/sync/test_rules.py::test_an_acknowledged_commit_is_still_shown_and_still_kept",
     ),
     Switch(
         12,
@@ -560,7 +560,7 @@ SWITCHES = (
         OUTBOX,
         "and not (kept.acked and (kept.id in covered or kept.id in pending) and str(kept.id) not in wanted)",
         "and not kept.acked",
-        "cairn_client/test_rules.py::test_what_a_newer_header_lacks_is_pushed_again",
+        "cairn_client/sync/test_rules.py::test_what_a_newer_header_lacks_is_pushed_again",
     ),
     Switch(
         12,
@@ -568,7 +568,7 @@ SWITCHES = (
         OUTBOX,
         "and not (kept.acked and (kept.id in covered or kept.id in pending) and str(kept.id) not in wanted)",
         "",
-        "cairn_client/test_rules.py::test_another_log_takes_the_base_away_and_offers_every_commit_anew",
+        "cairn_client/sync/test_rules.py::test_another_log_takes_the_base_away_and_offers_every_commit_anew",
     ),
     Switch(
         12,
@@ -576,7 +576,7 @@ SWITCHES = (
         STABLE,
         "snapshot.folded_before(now_s - self._after_s)",
         "snapshot.folded_before(now_s - self._after_s).with_commits(snapshot.pending())",
-        "cairn_server/test_missing.py::test_what_is_pending_is_not_stable",
+        "cairn_server/sync/test_missing.py::test_what_is_pending_is_not_stable",
     ),
     Switch(
         12,
@@ -584,7 +584,7 @@ SWITCHES = (
         STABLE,
         "snapshot.folded_before(now_s - self._after_s)",
         "snapshot.folded_before(now_s + self._after_s)",
-        "cairn_server/test_missing.py::test_the_header_tells_what_a_robot_may_conclude",
+        "cairn_server/sync/test_missing.py::test_the_header_tells_what_a_robot_may_conclude",
     ),
     Switch(
         13,
@@ -592,7 +592,7 @@ SWITCHES = (
         OUTBOX,
         "if n >= self._next_n() or (",
         "if (",
-        "cairn_client/test_rules.py::test_a_tip_beyond_the_last_number_means_a_new_incarnation",
+        "cairn_client/sync/test_rules.py::test_a_tip_beyond_the_last_number_means_a_new_incarnation",
     ),
     Switch(
         13,
@@ -600,7 +600,7 @@ SWITCHES = (
         OUTBOX,
         " or (known is not None and known.sha.hex() != sha):",
         ":",
-        "cairn_client/test_rules.py::test_a_tip_with_other_bytes_means_a_new_incarnation",
+        "cairn_client/sync/test_rules.py::test_a_tip_with_other_bytes_means_a_new_incarnation",
     ),
     Switch(
         13,
@@ -608,7 +608,7 @@ SWITCHES = (
         CHANGES,
         "if sha != commit.sha:",
         "if False:",
-        "cairn_server/test_push.py::test_the_same_id_with_other_bytes_is_refused_and_audited",
+        "cairn_server/sync/test_push.py::test_the_same_id_with_other_bytes_is_refused_and_audited",
     ),
     Switch(
         13,
@@ -616,7 +616,7 @@ SWITCHES = (
         SYNC,
         'if exc.kind != "id_taken" or seal is not None:',
         "if True:",
-        "cairn_client/test_rules.py::test_commits_whose_ids_are_taken_are_renamed_and_pushed_and_the_others_keep_theirs",
+        "cairn_client/sync/test_rules.py::test_commits_whose_ids_are_taken_are_renamed_and_pushed_and_the_others_keep_theirs",
     ),
     Switch(
         13,
@@ -624,7 +624,7 @@ SWITCHES = (
         OUTBOX,
         "old in meta.retracted_ids:",
         "old in meta.retracted_ids and False:",
-        "cairn_client/test_damage.py::test_after_a_roll_back_an_amend_takes_out_the_renamed_commit_and_not_the_other_of_that_id",
+        "cairn_client/replica/test_damage.py::test_after_a_roll_back_an_amend_takes_out_the_renamed_commit_and_not_the_other_of_that_id",
     ),
     Switch(
         14,
@@ -632,7 +632,7 @@ SWITCHES = (
         CELLS,
         "return Response(status_code=304, headers=headers)",
         'return Response(status_code=304, headers={"ETag": etag})',
-        "cairn_server/test_cells.py",
+        "cairn_server/http/test_cells.py",
     ),
     Switch(
         14,
@@ -640,7 +640,7 @@ SWITCHES = (
         SYNC,
         "replica.move([key], to=fetched.cursor, coverage=fetched.coverage)",
         "pass",
-        "cairn_client/test_rules.py::test_an_answer_not_modified_moves_cursor_and_coverage",
+        "cairn_client/sync/test_rules.py::test_an_answer_not_modified_moves_cursor_and_coverage",
     ),
     Switch(
         14,
@@ -648,7 +648,7 @@ SWITCHES = (
         SYNC,
         "replica.move(same, to=to, coverage=coverage)",
         "pass",
-        "cairn_client/test_rules.py::test_a_cell_that_did_not_change_is_not_asked_for_again",
+        "cairn_client/sync/test_rules.py::test_a_cell_that_did_not_change_is_not_asked_for_again",
     ),
     Switch(
         14,
@@ -656,7 +656,7 @@ SWITCHES = (
         SYNC,
         "replica.hold_nothing(key, BaseCell(to, coverage, ZERO))",
         "pass",
-        "cairn_client/test_rules.py::test_a_cell_that_a_restored_server_does_not_have_is_not_shown_for_ever",
+        "cairn_client/sync/test_rules.py::test_a_cell_that_a_restored_server_does_not_have_is_not_shown_for_ever",
     ),
     Switch(
         15,
@@ -664,7 +664,7 @@ SWITCHES = (
         APPLYING,
         "if fingerprint(evidence, frame.cell) == frame.fingerprint:",
         "if True:",
-        "cairn_client/test_rules.py::test_a_frame_that_does_not_lead_to_its_fingerprint_is_rolled_back",
+        "cairn_client/sync/test_rules.py::test_a_frame_that_does_not_lead_to_its_fingerprint_is_rolled_back",
     ),
     Switch(
         15,
@@ -672,7 +672,7 @@ SWITCHES = (
         APPLYING,
         "if fingerprint(evidence, frame.cell) != frame.fingerprint:",
         "if False:",
-        "cairn_client/test_rules.py::test_a_whole_cell_that_does_not_have_its_fingerprint_is_reported",
+        "cairn_client/sync/test_rules.py::test_a_whole_cell_that_does_not_have_its_fingerprint_is_reported",
     ),
     Switch(
         15,
@@ -680,7 +680,7 @@ SWITCHES = (
         SYNC,
         "if not is_ours or fingerprint(decoded.evidence, key) != fetched.fingerprint:",
         "if not is_ours:",
-        "cairn_client/test_rules.py::test_a_cell_that_is_not_what_the_server_says_is_refused",
+        "cairn_client/sync/test_rules.py::test_a_cell_that_is_not_what_the_server_says_is_refused",
     ),
     Switch(
         15,
@@ -688,7 +688,7 @@ SWITCHES = (
         REPLICA,
         "if fingerprint(base, key) == cell.fingerprint:",
         "if True:",
-        "cairn_client/test_rules.py::test_a_cell_that_was_damaged_at_rest_is_asked_for_anew",
+        "cairn_client/sync/test_rules.py::test_a_cell_that_was_damaged_at_rest_is_asked_for_anew",
     ),
     Switch(
         2,
@@ -696,7 +696,7 @@ SWITCHES = (
         FOLDING,
         "self.cache.stamp(key, changed, seq, self._load)",
         "self.cache.stamp(key, changed[:1], seq, self._load)",
-        "cairn_server/test_stamps.py::test_a_state_frame_names_the_changed_blocks_and_no_others",
+        "cairn_server/store/test_stamps.py::test_a_state_frame_names_the_changed_blocks_and_no_others",
     ),
     Switch(
         4,
@@ -704,7 +704,7 @@ SWITCHES = (
         CELLS_CHANGED,
         "is_told = start.seq >= row.gone_seq and len(entries)",
         "is_told = len(entries)",
-        "cairn_server/test_retention.py::test_no_delta_is_made_of_what_is_left_when_a_part_is_gone",
+        "cairn_server/store/test_retention.py::test_no_delta_is_made_of_what_is_left_when_a_part_is_gone",
     ),
     Switch(
         4,
@@ -712,7 +712,7 @@ SWITCHES = (
         CELLS_CHANGED,
         "payload = encode_cell(row.key, of_blocks(evidence, blocks), geometry).data",
         "payload = encode_cell(row.key, evidence, geometry).data",
-        "cairn_server/test_stamps.py::test_a_state_frame_names_the_changed_blocks_and_no_others",
+        "cairn_server/store/test_stamps.py::test_a_state_frame_names_the_changed_blocks_and_no_others",
     ),
     Switch(
         10,
@@ -720,7 +720,7 @@ SWITCHES = (
         "server/cairn_server/folding/cell_cache.py",
         "            stamps=encode_stamps(stamps),",
         "            stamps=encode_stamps(stamps * np.isin(np.arange(len(stamps)), blocks_of(evidence))),",
-        "cairn_server/test_stamps.py::test_voxels_that_were_taken_out_again_leave_the_asker_too",
+        "cairn_server/store/test_stamps.py::test_voxels_that_were_taken_out_again_leave_the_asker_too",
     ),
     Switch(
         11,
@@ -728,7 +728,7 @@ SWITCHES = (
         RETENTION,
         "gone = [(number, *seqs) for number, *seqs, commit in found if commit not in pinned][:limit]",
         "gone = [(number, *seqs) for number, *seqs, commit in found][:limit]",
-        "cairn_server/test_retention.py::test_evidence_that_a_waiting_commit_takes_out_is_kept",
+        "cairn_server/store/test_retention.py::test_evidence_that_a_waiting_commit_takes_out_is_kept",
     ),
     Switch(
         11,
@@ -736,7 +736,7 @@ SWITCHES = (
         RETENTION,
         "    if gone:\n        raise EvidenceGoneError(gone)",
         "    if False:\n        raise EvidenceGoneError(gone)",
-        "cairn_server/test_retention.py::test_what_is_gone_is_retracted_once_its_bytes_are_pushed_again",
+        "cairn_server/store/test_retention.py::test_what_is_gone_is_retracted_once_its_bytes_are_pushed_again",
     ),
     Switch(
         11,
@@ -752,7 +752,7 @@ SWITCHES = (
         PUSHES,
         "speaks_for = Caller(Role.ADMIN) if is_sealed(row, pushed.data, seal) else caller",
         "speaks_for = Caller(Role.ADMIN)",
-        "cairn_server/test_retract.py::test_a_retract_may_be_pushed_back_by_anybody_with_this_map_s_seal_on_it_and_by_nobody_without",
+        "cairn_server/sync/test_retract.py::test_a_retract_may_be_pushed_back_by_anybody_with_this_map_s_seal_on_it_and_by_nobody_without",
     ),
     Switch(
         11,
@@ -760,7 +760,7 @@ SWITCHES = (
         REPLICA,
         "named = self.outbox.named() if gone else set()",
         "named: set[CommitId] = set()",
-        "cairn_client/test_conversations.py::test_what_a_kept_amend_names_is_kept_though_it_is_stable_and_covered",
+        "cairn_client/sync/test_conversations.py::test_what_a_kept_amend_names_is_kept_though_it_is_stable_and_covered",
     ),
     Switch(
         11,
@@ -768,7 +768,7 @@ SWITCHES = (
         SYNC,
         "            yield from push_whole_or_in_parts(_signed(replica, commit, seal), parts)\n            return commit.id",
         "            yield from push_whole_or_in_parts(_signed(replica, commit), parts)\n            return commit.id",
-        "cairn_client/test_conversations.py::test_an_operator_s_retract_is_pushed_back_with_its_seal_after_what_it_names",
+        "cairn_client/sync/test_conversations.py::test_an_operator_s_retract_is_pushed_back_with_its_seal_after_what_it_names",
     ),
     Switch(
         11,
@@ -776,7 +776,7 @@ SWITCHES = (
         "client/cairn_client/replica/outbox.py",
         " and str(kept.id) not in wanted)",
         ")",
-        "cairn_client/test_conversations.py::test_what_a_header_wants_again_is_pushed_once_though_it_is_covered",
+        "cairn_client/sync/test_conversations.py::test_what_a_header_wants_again_is_pushed_once_though_it_is_covered",
     ),
     Switch(
         11,
@@ -784,7 +784,7 @@ SWITCHES = (
         "server/cairn_server/sync/pushes.py",
         "self._wanted.note(row.name, exc.commits)",
         "pass",
-        "cairn_server/test_retention.py::test_evidence_that_a_refused_retract_needs_is_wanted_until_it_comes",
+        "cairn_server/store/test_retention.py::test_evidence_that_a_refused_retract_needs_is_wanted_until_it_comes",
     ),
     Switch(
         16,
@@ -792,7 +792,7 @@ SWITCHES = (
         HANDING_OVER,
         "if not speaks_for(signed, spoken_for):",
         "if False:",
-        "cairn_server/test_handing_over.py::test_a_retract_is_signed_by_everybody_from_whom_it_takes_something",
+        "cairn_server/sync/test_handing_over.py::test_a_retract_is_signed_by_everybody_from_whom_it_takes_something",
     ),
     Switch(
         16,
@@ -800,7 +800,7 @@ SWITCHES = (
         PUSHES,
         "check_signatures(self._signed, self._row.name, checked.sha)",
         "pass",
-        "cairn_server/test_handing_over.py::test_no_byte_can_be_changed_on_the_way",
+        "cairn_server/sync/test_handing_over.py::test_no_byte_can_be_changed_on_the_way",
     ),
     Switch(
         16,
@@ -808,7 +808,7 @@ SWITCHES = (
         "fusion/cairn_map/commits/signature.py",
         'return b"cairn-signed-commit-1\\0" + map_name.encode() + b"\\0" + sha',
         'return b"cairn-signed-commit-1\\0" + sha',
-        "cairn_server/test_handing_over.py::test_a_commit_is_not_replayed_under_another_id_or_on_another_map",
+        "cairn_server/sync/test_handing_over.py::test_a_commit_is_not_replayed_under_another_id_or_on_another_map",
     ),
     Switch(
         16,
@@ -816,7 +816,7 @@ SWITCHES = (
         HANDING_OVER,
         "if server_key(row).public_key.hex() not in keys and not set(keys) & set(trusted.split()):",
         "if False:",
-        "cairn_server/test_handing_over.py::test_what_a_server_says_itself_is_taken_from_servers_that_are_trusted",
+        "cairn_server/sync/test_handing_over.py::test_what_a_server_says_itself_is_taken_from_servers_that_are_trusted",
     ),
     Switch(
         16,
@@ -824,7 +824,7 @@ SWITCHES = (
         "client/cairn_client/replica/robot_keys.py",
         "dict.fromkeys([commit.id.author, *(target.author for target in commit.meta.retracted_ids)])",
         "dict.fromkeys([commit.id.author])",
-        "cairn_client/test_relay.py::test_a_robot_takes_back_what_an_older_incarnation_of_it_said_on_every_server",
+        "cairn_client/relay/test_relay.py::test_a_robot_takes_back_what_an_older_incarnation_of_it_said_on_every_server",
     ),
     Switch(
         16,
@@ -832,7 +832,7 @@ SWITCHES = (
         "server/cairn_server/folding/fold_thread.py",
         "before_s = min(time.time() - self._keep_evidence_s, self._may_forget_s(row.name))",
         "before_s = time.time() - self._keep_evidence_s",
-        "cairn_client/test_relay.py::test_a_field_server_forgets_nothing_that_its_upstream_has_not_got",
+        "cairn_client/relay/test_relay.py::test_a_field_server_forgets_nothing_that_its_upstream_has_not_got",
     ),
     Switch(
         16,
@@ -840,6 +840,6 @@ SWITCHES = (
         "client/cairn_client/relay/round.py",
         "report.split = _split(held[Side.HERE], held[Side.THERE])",
         "pass",
-        "cairn_client/test_relay.py::test_two_servers_with_other_bytes_under_one_id_are_told_apart_and_a_retract_makes_them_equal",
+        "cairn_client/relay/test_relay.py::test_two_servers_with_other_bytes_under_one_id_are_told_apart_and_a_retract_makes_them_equal",
     ),
 )

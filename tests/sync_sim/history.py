@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from random import Random
 
 import pytest
-from tests.cairn_client.made import cells_of
+from tests.fixtures.client.made import cells_of
 from tests.memory_store import map as memory_map
 from tests.sync_sim.events import Events
 from tests.sync_sim.joined import JoinedHistory

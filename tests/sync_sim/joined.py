@@ -7,7 +7,7 @@ map, byte for byte, with nothing lost, whatever way everything went.
 from collections.abc import Callable
 from random import Random
 
-from tests.cairn_client.made import cells_of
+from tests.fixtures.client.made import cells_of
 from tests.sync_sim.events import Events
 from tests.sync_sim.network import Network, Weather
 from tests.sync_sim.relay import Bag, SimEnd, SimRelay

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import apsw
-from tests.cairn_client.made import GEOMETRY, MAP, B, random_diff
+from tests.fixtures.client.made import GEOMETRY, MAP, B, random_diff
 from tests.sync_sim.server import meta_of
 
 from cairn_client.replica.outbox import UNNUMBERED

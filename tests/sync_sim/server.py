@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from tests.cairn_client.made import GEOMETRY, MAP
+from tests.fixtures.client.made import GEOMETRY, MAP
 from tests.memory_store.map import MemoryMap
 from tests.memory_store.store import MemoryStore
 

@@ -9,7 +9,7 @@ Two centroids. `paper`: of the filled outline's pixels. `grey`: each pixel weigh
 the ground's and the target's. A time-of-flight camera's full pixels flood their neighbours, outwards and into the dark
 middle alike; where the outline bulges out on one side, the middle is dented on the same side. So there the grey
 centroid is a mean of the outline's and the dark middle's. In the simulator that halves the error of the outline alone:
-0.08 px against 0.16 px over targets of 20 and 30 cm at 1.1 to 5.7 m (tests/cairn_sim/test_study.py).
+0.08 px against 0.16 px over targets of 20 and 30 cm at 1.1 to 5.7 m (tests/cairn_sim/study/test_study.py).
 """
 
 from dataclasses import dataclass

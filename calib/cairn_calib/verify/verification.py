@@ -35,7 +35,7 @@ CENTROID_SIGMA_PX: Mapping[Method, Mapping[Spectrum, float]] = {
     "paper": {Spectrum.RANGE: 0.19, Spectrum.COLOUR: 0.14, Spectrum.THERMAL: 0.085},
     "grey": {Spectrum.RANGE: 0.088, Spectrum.COLOUR: 0.15, Spectrum.THERMAL: 0.085},
 }
-"""One axis, of its own pixels: as measured on simulated targets (tests/cairn_sim/test_study.py)."""
+"""One axis, of its own pixels: as measured on simulated targets (tests/cairn_sim/study/test_study.py)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,7 +3,7 @@
     add_solid_into       blocks of 8^3 voxels, then voxels, then their 4^3 samples; each only where the surface may be
     mark_seen_into       the voxels along a ray (Amanatides and Woo 1987), cut at the box
 
-`truth_grid` is the caller that checks; the slow twins stand in tests/cairn_sim/test_truth_grid.py.
+`truth_grid` is the caller that checks; the slow twins stand in tests/cairn_sim/evaluation/test_truth_grid.py.
 """
 
 import math

@@ -109,7 +109,7 @@ class RangeSensor:
 
     Electrons leave a full pixel for the next, drains take the rest, and the lens scatters. With 0.2 the binary centroid
     of targets of 20 and 30 cm at 3 m has a sigma of 0.27 and 0.24 px (fixed: about 0.25), with 0 of 0.10 and 0.07 px;
-    tests/cairn_sim/test_targets.py.
+    tests/cairn_sim/robots/test_targets.py.
     """
     blooming_spread: float = 1.5
     """Sigma of that light's logarithm, from pixel to pixel and from image to image: what returns too much light is

@@ -8,7 +8,7 @@ range lies between its neighbours', and far from both; beyond them the surfaces 
              o---o                far surface; the steps beyond are small
 
 On a floor seen at a slant steps are large too, but all of them alike. `samples` is the caller;
-tests/cairn_fusion/test_flying.py has the slow twin.
+tests/cairn_fusion/mapping/test_flying.py has the slow twin.
 """
 
 import numba as nb

@@ -1,0 +1,53 @@
+"""Grids of discs: found in order, centroids where the projected discs have theirs."""
+
+import numpy as np
+from tests.fixtures.calib.board_images import DISC, THERMAL, TOF, Floats, Spectrum, picture, pose
+
+from cairn_calib.board.board import Board
+from cairn_calib.board.circle_grid import find_circles
+
+DISCS = Board(pattern="asymmetric-circles", columns=4, rows=11, pitch_m=0.05)
+
+
+def disc_centroids(spectrum: Spectrum, T_camera_board: Floats, board: Board) -> Floats:
+    """(N, 2) centroids of the polygons that 64 points of each rim project to."""
+    angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    rim = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1) * DISC * board.pitch_m
+    points = board.points()[:, None] + rim
+    at = spectrum.camera.project(points @ T_camera_board[:3, :3].T + T_camera_board[:3, 3])
+    after = np.roll(at, -1, axis=1)
+    cross = at[..., 0] * after[..., 1] - after[..., 0] * at[..., 1]
+    return np.asarray(((at + after) * cross[..., None]).sum(axis=1) / (3 * cross.sum(axis=1, keepdims=True)))
+
+
+def test_discs_are_found_in_order_with_the_errors_that_are_stated() -> None:
+    errors = []
+    for seed in (1, 2, 3):
+        rng = np.random.default_rng(seed)
+        T = pose(rng, TOF, board=DISCS, tilt_deg=35)
+        detection = find_circles(picture(TOF, T, rng, board=DISCS), DISCS)
+        assert detection.corners is not None, [str(attempt) for attempt in detection.attempts]
+        seen = detection.corners.seen
+        error = (detection.corners.pixels - disc_centroids(TOF, T, DISCS))[seen]
+        assert np.abs(error).max() < 0.4
+        root = np.linalg.cholesky(detection.corners.covariance_px2[seen])
+        errors.append(np.linalg.solve(root, error[..., None])[..., 0])
+    assert 0.7 < np.concatenate(errors).std() < 1.3
+
+
+def test_a_heated_board_is_found_far_off_and_beside_weak_strays() -> None:
+    # 11: the board's corners look like faint discs. 35: discs nearer to each other than what they are compared with.
+    for seed in (11, 35):
+        rng = np.random.default_rng(seed)
+        T = pose(rng, THERMAL, board=DISCS, tilt_deg=45)
+        detection = find_circles(picture(THERMAL, T, rng, board=DISCS), DISCS, polarity="reversed")
+        assert detection.corners is not None, [str(attempt) for attempt in detection.attempts]
+        error = detection.corners.pixels - disc_centroids(THERMAL, T, DISCS)
+        assert np.nanmax(np.abs(error)) < 1
+
+
+def test_a_chessboard_is_no_grid_of_discs() -> None:
+    rng = np.random.default_rng(1)
+    detection = find_circles(picture(TOF, pose(rng, TOF), rng), DISCS)
+    assert detection.corners is None
+    assert all(attempt.reason for attempt in detection.attempts)

@@ -1,0 +1,148 @@
+"""`cairn calib solve`: from folders of corner documents to rig.json, a report and its JSON."""
+
+import json
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tests.fixtures.calib.simulated_views import BOARD, ranges_of, views_of, world
+
+from cairn_calib.board.corner_file import corner_file
+from cairn_calib.board.corners import Attempt, Detection
+from cairn_calib.cli.main import main
+from cairn_calib.rig.rig import Spectrum, load_rig
+from cairn_calib.solve.board_views import BoardViews, frame_of, read_board_views
+from cairn_map.errors import BadInputError
+
+PAIR = ("tof", "left")
+
+
+def written(views: BoardViews, folder: Path) -> dict[str, Path]:
+    """The views as corner documents, a folder for each camera."""
+    for view in views.views:
+        (folder / view.camera).mkdir(exist_ok=True)
+        found = Detection(view.corners, (Attempt("saddles", 1, "found", ""),))
+        size = views.sizes_px[view.camera]
+        document = corner_file(found, BOARD, image=view.image, sha256="0" * 64, size=size, polarity="normal")
+        name = f"{Path(view.image).stem}.json"
+        (folder / view.camera / name).write_text(document.model_dump_json(), encoding="utf-8")
+    return {name: folder / name for name in views.cameras}
+
+
+def test_folders_of_corners_become_a_rig_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pattern_m = 0.006 * np.random.default_rng(0).normal(size=(144, 176))
+    truth = world(8, seed=6, names=PAIR, bias=(0.02, 0.0, 0.0, 0.0), pattern_m=pattern_m, has_amplitude=True)
+    folders = written(views_of(truth, seed=6), tmp_path)
+    for name in ("range", "amplitude"):
+        (tmp_path / name).mkdir()
+    for each in ranges_of(truth, "tof", seed=6, sigma_m=0.006):
+        counts = np.nan_to_num(1000 * each.range_m).round().astype(np.uint16)
+        cv2.imwrite(str(tmp_path / "range" / f"tof{each.frame}.png"), counts)
+        assert each.amplitude is not None
+        cv2.imwrite(str(tmp_path / "amplitude" / f"tof{each.frame}.png"), each.amplitude)
+    report = tmp_path / "report.html"
+    paths = [str(folder) for folder in folders.values()]
+    options = ["--spectrum", "tof=range,left=colour", "--output", str(tmp_path / "rig.json"), "--report", str(report)]
+    options += ["--range", str(tmp_path / "range"), "--amplitude", str(tmp_path / "amplitude")]
+    assert main(["solve", *paths, *options, "--modulation-mhz", "15", "--name", "head"]) == 0
+    told = capsys.readouterr()
+    assert re.search(r"left +8 images +\d+ points +0 outliers +noise 0\.1", told.out)
+    assert re.search(r"tof ranges: 8 images +\d+ pixels.*, amplitude; pixels differ by \d\.\d mm", told.out)
+    assert "warning: tof: no corner lies near the image's corners" in told.err
+    assert re.search(r"warning: tof: board pixels from .* of wave 4 of its circular error, left out", told.err)
+    rig = load_rig(tmp_path / "rig.json")
+    assert rig["tof"].spectrum is Spectrum.RANGE
+    assert rig["left"].transform[:3, 3] == pytest.approx(truth.T_rig_camera("left")[:3, 3], abs=0.02)
+    assert rig.calibration is not None
+    assert rig.calibration.gauge == "tof"
+    named = [each.name.partition("/")[0] for each in rig.calibration.inputs]
+    assert [named.count(what) for what in ("tof", "left", "range", "amplitude")] == [8, 8, 8, 8]
+    bias = rig["tof"].range_bias
+    assert bias is not None and bias.by_amplitude is not None and bias.wiggle is None
+    assert bias.pixel_offsets is not None
+    files = [str(tmp_path / name) for name in ("rig.json", "tof.cameramodel")] + ["--camera", "tof"]
+    with pytest.raises(BadInputError, match=r"cameras\.tof\.range_bias"):
+        main(["convert", *files])
+    assert main(["convert", *files, "--drop", "range_bias,calibration"]) == 0
+    page = report.read_text(encoding="utf-8")
+    assert "Ranges of tof" in page and "more at half the usual amplitude, mm" in page
+    assert "Left out, for the images do not determine it: circular error." in page
+    assert "Offsets of the pixels" in page
+    assert not re.search(r"(src|href)=", page)
+    document = json.loads(report.with_suffix(".json").read_text())
+    offset = next(each for each in document["parameters"] if each["name"] == "offset_m")
+    assert bias.offset_m == pytest.approx(offset["value"])
+    units = {each["name"]: each["unit"] for each in document["parameters"]}
+    named = ("fx", "k1", "rx", "tx", "warp_x", "scale", "offset_m", "faint_m")
+    assert [units[name] for name in named] == ["px", "1", "rad", "m", "m", "1", "m", "m"]
+    assert bias.covariance[0, 0] == pytest.approx(offset["sigma"] ** 2)
+    assert abs(offset["value"] - 0.02) < 4 * offset["sigma"] < 0.02
+    assert {each["kind"] for each in document["warnings"]} >= {"tof_edge", "range_wiggle"}
+    assert document["ranges"]["pixels"]["pattern_sigma_m"] == pytest.approx(0.006, rel=0.1)
+    assert document["ranges"]["harmonics"] == [] and document["ranges"]["modulation_hz"] == 15e6
+    assert document["cameras"]["left"]["images"][0]["rms_px"] < 0.3
+    again = ["report", str(tmp_path / "rig.json"), *paths, "--output", str(tmp_path / "again.html")]
+    told_with = f"--range {tmp_path}/range --amplitude {tmp_path}/amplitude --modulation-mhz 15"
+    assert main([*again, "--solved-with", told_with]) == 0
+    assert json.loads((tmp_path / "again.json").read_text())["ranges"] == document["ranges"]
+    with pytest.raises(BadInputError, match=r"not solved from these corners: (amplitude|range)/"):
+        main(again)
+    # Of a rig of before range images had digests, its range bias tells.
+    older = json.loads((tmp_path / "rig.json").read_text())
+    older["calibration"]["inputs"] = older["calibration"]["inputs"][:16]
+    (tmp_path / "rig.json").write_text(json.dumps(older))
+    with pytest.raises(BadInputError, match=r"give another rig than .*rig.json, inf sigma off.*--range DIR"):
+        main(again)
+
+
+def test_two_range_images_of_one_frame_are_refused(tmp_path: Path) -> None:
+    folders = written(views_of(world(3, seed=6, names=PAIR), seed=6), tmp_path)
+    (tmp_path / "range").mkdir()
+    for name in ("tof001", "confidence1"):
+        cv2.imwrite(str(tmp_path / "range" / f"{name}.png"), np.full((144, 176), 1500, np.uint16))
+    options = ["--spectrum", "tof=range,left=colour", "--output", str(tmp_path / "rig.json")]
+    with pytest.raises(BadInputError, match=r"confidence1.png and .*tof001.png are range images of one frame"):
+        main(["solve", *map(str, folders.values()), *options, "--range", str(tmp_path / "range")])
+
+
+def test_what_belongs_to_range_images_is_not_asked_without_them(tmp_path: Path) -> None:
+    folders = written(views_of(world(3, seed=6, names=PAIR), seed=6), tmp_path)
+    options = [
+        *map(str, folders.values()),
+        "--spectrum",
+        "tof=range,left=colour",
+        "--output",
+        str(tmp_path / "rig.json"),
+    ]
+    with pytest.raises(BadInputError, match="add --range"):
+        main(["solve", *options, "--modulation-mhz", "15"])
+    with pytest.raises(BadInputError, match=r"0\.1 to 10000 MHz, got 15e\+06|got 1\.5e\+07"):
+        main(["solve", *options, "--range", str(tmp_path), "--modulation-mhz", "15000000"])
+    with pytest.raises(BadInputError, match="no range images"):
+        main(["solve", *options, "--range", str(tmp_path), "--modulation-mhz", "15"])
+
+
+def test_frames_go_by_the_last_number_in_a_name() -> None:
+    assert frame_of("left03") == frame_of("2026-11-21_tof_3") == "000003"
+    assert frame_of("corner") == "corner"
+
+
+def test_what_does_not_belong_together_is_refused(tmp_path: Path) -> None:
+    views = views_of(world(3, seed=6, names=PAIR), seed=6)
+    folders = written(views, tmp_path)
+    assert len(read_board_views(folders).views) == 6
+    with pytest.raises(BadInputError, match=r"--spectrum does not say what left sees"):
+        main(["solve", *map(str, folders.values()), "--spectrum", "tof=range", "--output", str(tmp_path / "rig.json")])
+    with pytest.raises(BadInputError, match="no corner documents"):
+        read_board_views({"tof": tmp_path})
+    extra = folders["tof"] / "again-001.json"
+    extra.write_bytes((folders["tof"] / "tof001.json").read_bytes())
+    with pytest.raises(BadInputError, match="are of one frame"):
+        read_board_views(folders)
+    extra.unlink()
+    other = folders["left"] / "left002.json"
+    other.write_text(other.read_text().replace('"columns":7', '"columns":8'))
+    with pytest.raises(BadInputError, match="are of two boards"):
+        read_board_views(folders)

@@ -1,0 +1,248 @@
+"""What is said of a solution is true: influence, next image, certainty of pixels, halves, warnings."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from tests.fixtures.calib.simulated_views import SPECTRA, exact_pixels, views_of, world
+
+from cairn_calib.board.corners import Corners
+from cairn_calib.diagnosis.cross_validation import cross_validated
+from cairn_calib.diagnosis.examination import Examination, examined
+from cairn_calib.diagnosis.next_image import NextImage
+from cairn_calib.diagnosis.probe_points import probes_of
+from cairn_calib.diagnosis.solve_warnings import Warned, refuse_undetermined, warnings_of
+from cairn_calib.diagnosis.view_coverage import coverage
+from cairn_calib.diagnosis.world_uncertainty import pixel_covariance, world_covariance
+from cairn_calib.rig.projection_uncertainty import project_certain, transfer_certain
+from cairn_calib.solve.board_views import BoardView
+from cairn_calib.solve.rig_state import moved
+from cairn_calib.solve.solve import Solution, solve_from, solve_rig
+from cairn_calib.solve.solve_plan import STATED, usual_plan
+from cairn_calib.solve.solved_rig import solved_rig
+from cairn_map.errors import BadInputError
+
+Floats = npt.NDArray[np.float64]
+PAIR = ("tof", "left")
+PLAN = replace(usual_plan({name: SPECTRA[name] for name in PAIR}), noise=STATED)
+
+
+@pytest.fixture(scope="module")
+def solution() -> Solution:
+    return solve_rig(views_of(world(8, seed=6, names=PAIR), seed=6), PLAN)
+
+
+@pytest.fixture(scope="module")
+def seen(solution: Solution) -> Examination:
+    return examined(solution, solved_rig(solution, made_s=0.0))
+
+
+def test_influence_foretells_what_a_solve_without_the_frame_finds(solution: Solution, seen: Examination) -> None:
+    strongest = seen.influences[0]
+    others = [frame for frame in solution.views.frames if frame != strongest.frame]
+    without = solve_rig(solution.views.of_frames(others), PLAN)
+    there = {each.camera: each for each in seen.probes}[strongest.camera]
+    if strongest.camera == PLAN.gauge:
+        pixels = without.state.lenses[0].project(solution.state.lenses[0].unproject(there.pixels))
+    else:
+        source = transfer_back(solution, there.pixels, there.range_m)
+        before, pixels = (
+            transfer_certain(each, "tof", strongest.camera, source, there.range_m).pixels
+            for each in (seen.rig, solved_rig(without, made_s=0.0))
+        )
+        assert before == pytest.approx(there.pixels)
+    moves = np.linalg.norm(pixels - there.pixels, axis=1)
+    assert strongest.moves_px == pytest.approx(moves.max(), rel=0.25)
+    assert [each.sigmas for each in seen.influences] == sorted((each.sigmas for each in seen.influences), reverse=True)
+
+
+def transfer_back(solution: Solution, pixels: Floats, range_m: Floats) -> Floats:
+    """Pixels of the gauge at which lie points that the other camera sees, that far from the gauge."""
+    T = solution.state.T_rig_camera[1]
+    rays = solution.state.lenses[1].unproject(pixels) @ T[:3, :3].T
+    # |t + s ray| = range
+    along = rays @ T[:3, 3]
+    s = -along + np.sqrt(along**2 + range_m**2 - T[:3, 3] @ T[:3, 3])
+    return solution.state.lenses[0].project(T[:3, 3] + s[:, None] * rays)
+
+
+def test_the_next_image_sharpens_the_rig_as_foretold(solution: Solution, seen: Examination) -> None:
+    place = seen.next_images[0]
+    assert 0 < place.gain < 1
+    truth = world(8, seed=6, names=PAIR)
+    boards = np.concatenate([truth.boards, board_at(solution, place)[None]])
+    views = views_of(replace(truth, boards=boards), seed=6)
+    after = solve_rig(views, PLAN)
+    variance = [variance_of(each, solution) for each in (solution, after)]
+    assert 1 - variance[1] / variance[0] == pytest.approx(place.gain, abs=0.15)
+
+
+def board_at(solution: Solution, place: NextImage) -> Floats:
+    """T_rig_board of a proposal, from its words alone."""
+    n = list(solution.plan.cameras).index(place.camera)
+    turn = {"right": (0, -1), "left": (0, 1), "lower": (1, 0), "upper": (-1, 0)}[place.edge]
+    axis, angle = np.array([*turn, 0.0]), np.radians(35)
+    K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    T = np.eye(4)
+    T[:3, :3] += np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+    middle = solution.views.board.points().mean(axis=0)
+    ray = solution.state.lenses[n].unproject(np.array(place.pixel))
+    T[:3, 3] = place.range_m * ray - T[:3, :3] @ middle
+    # The edge that is said to be further away is.
+    points = solution.views.board.points()
+    depth = (points @ T[:3, :3].T + T[:3, 3])[:, 2]
+    far = points[depth.argmax(), :2] - middle[:2]
+    assert {"right": far[0], "left": -far[0], "lower": far[1], "upper": -far[1]}[place.edge] > 0
+    return np.asarray(solution.state.T_rig_camera[n] @ T)
+
+
+def variance_of(solution: Solution, at: Solution) -> float:
+    """Of the probe points, in units of each camera's noise."""
+    noise = {"tof": 0.1, "left": 0.15}
+    probes = probes_of(solved_rig(at, made_s=0.0), "tof", at.layout)
+    return float(sum(np.mean(each.sigmas_px(solution.covariance) ** 2) / noise[each.camera] ** 2 for each in probes))
+
+
+def test_certainty_of_a_pixel_is_the_spread_over_many_noises(solution: Solution) -> None:
+    truth = world(8, seed=6, names=PAIR)
+    rig = solved_rig(solution, made_s=0.0)
+    pixels, range_m = np.array([[60.0, 50.0], [88.0, 71.0], [110.0, 90.0]]), np.array([1.5, 2.0, 2.5])
+    stated = transfer_certain(rig, "tof", "left", pixels, range_m)
+    found = []
+    for seed in range(32):
+        # The pitch is no noise: it is the same in all of them.
+        again = solve_from(views_of(truth, seed=100 + seed), replace(PLAN, pitch_sigma=0.0), solution.state, {})
+        found.append(transfer_certain(solved_rig(again, made_s=0.0), "tof", "left", pixels, range_m).pixels)
+    spread = np.std(found, axis=0)
+    sigmas = np.sqrt(np.einsum("rii->ri", stated.calibration_px2))
+    assert np.median(spread / sigmas) == pytest.approx(1, abs=0.2)
+    assert stated.covariance_px2 == pytest.approx(stated.calibration_px2)
+
+
+def test_centroid_and_range_add_their_shares(solution: Solution) -> None:
+    rig = solved_rig(solution, made_s=0.0)
+    pixel, range_m = np.array([70.0, 60.0]), np.array(1.5)
+    sure = transfer_certain(rig, "tof", "left", pixel, range_m, pixel_sigma_px=0.25, range_sigma_m=0.01)
+    h = 1e-4
+    by_range = transfer_certain(rig, "tof", "left", pixel, range_m + h).pixels - sure.pixels
+    assert sure.range_px2 == pytest.approx(np.outer(by_range, by_range) / h**2 * 0.01**2, rel=1e-2)
+    moves = np.stack(
+        [transfer_certain(rig, "tof", "left", pixel + h * e, range_m).pixels - sure.pixels for e in np.eye(2)]
+    )
+    assert sure.centroid_px2 == pytest.approx(moves.T @ moves / h**2 * 0.25**2, rel=1e-2)
+    near = project_certain(rig, "left", np.array([0.1, 0.1, 1.5]))
+    assert np.all(np.linalg.eigvalsh(near.covariance_px2) > 0)
+    with pytest.raises(BadInputError, match="does not say how certain"):
+        project_certain(rig.model_copy(update={"calibration": None}), "left", np.array([0.1, 0.1, 1.5]))
+
+
+def test_certainty_of_the_world_does_not_depend_on_the_gauge(solution: Solution) -> None:
+    other = solve_rig(solution.views, replace(PLAN, gauge="left"))
+    pixels = np.array([[20.0, 20.0], [88.0, 71.0], [150.0, 120.0]])
+    covariances = [
+        pixel_covariance(each, solved_rig(each, made_s=0.0), world_covariance(each), "tof", pixels, 2.0)
+        for each in (solution, other)
+    ]
+    np.testing.assert_allclose(covariances[0], covariances[1], rtol=1e-4)
+
+
+def test_halves_agree_when_the_model_is_right_and_not_when_a_board_moved(solution: Solution, seen: Examination) -> None:
+    assert seen.halves is not None
+    assert max(each.ratio for each in seen.halves.cameras) < 3
+    assert seen.halves.chi2 < 3 * seen.halves.parameters
+    # The head was knocked every other time: the colour camera then sees all 3 px aside.
+    odd = set(solution.views.frames[1::2])
+    knocked = {("left", frame) for frame in odd}
+    views = tuple(shifted(view, 3.0) if (view.camera, view.frame) in knocked else view for view in solution.views.views)
+    wrong = solve_rig(replace(solution.views, views=views), usual_plan({name: SPECTRA[name] for name in PAIR}))
+    probes = probes_of(solved_rig(wrong, made_s=0.0), "tof", wrong.layout)
+    halves = cross_validated(wrong, probes)
+    assert halves is not None
+    assert halves.chi2 > 5 * halves.parameters
+    told = examined(wrong, solved_rig(wrong, made_s=0.0)).warnings
+    assert "model_error" in {each.kind for each in told}
+
+
+def shifted(view: BoardView, px: float) -> BoardView:
+    corners = Corners(view.corners.board, view.corners.pixels + px, view.corners.covariance_px2)
+    return replace(view, corners=corners)
+
+
+def kinds(found: Sequence[Warned]) -> set[tuple[str, str]]:
+    return {(each.kind, each.camera) for each in found}
+
+
+def test_warnings_name_what_the_images_lack() -> None:
+    poor = world(3, seed=1, names=PAIR, tilt_deg=12.0)
+    solution = solve_rig(views_of(poor, seed=1), PLAN)
+    told = examined(solution, solved_rig(solution, made_s=0.0)).warnings
+    assert {
+        ("few_images", "tof"),
+        ("tilt_range", "tof"),
+        ("range_span", "tof"),
+        ("coverage", "tof"),
+        ("edge", "left"),
+        ("tof_edge", "tof"),
+        ("range_bias", "tof"),
+        ("halves", ""),
+    } <= kinds(told)
+    assert all(np.isfinite(each.threshold) and each.text for each in told)
+    tilt = next(each for each in told if each.kind == "tilt_range")
+    assert tilt.measured < tilt.threshold == 30
+    assert "prior" in {each.kind for each in told}
+    weak = next(each for each in told if each.kind == "weak_mode" and each.camera == "tof")
+    assert weak.measured > weak.threshold == 1
+    assert re.match(r".*fx.* of tof.* are open together: a longer lens looks like a farther board", weak.text)
+    few = world(4, seed=1, names=PAIR, tilt_deg=25.0)
+    solution = solve_rig(views_of(few, seed=1), PLAN)
+    told = examined(solution, solved_rig(solution, made_s=0.0)).warnings
+    alone = next(each for each in told if each.kind == "influence")
+    assert alone.measured > alone.threshold == 3 and "without frame 002 points would move by" in alone.text
+
+
+def test_warnings_name_corners_that_do_not_fit(solution: Solution) -> None:
+    assert not {"noise", "outliers", "image_outliers"} & {each.kind for each in told_of(solution)}
+    spoilt = solution.adjusted.problem.sensors[1]
+    kept = spoilt.kept.copy()
+    kept[2] = False
+    sensors = (solution.adjusted.problem.sensors[0], replace(spoilt, kept=kept, scale=40.0))
+    problem = replace(solution.adjusted.problem, sensors=sensors)
+    told = told_of(replace(solution, adjusted=replace(solution.adjusted, problem=problem)))
+    assert {("noise", "left"), ("outliers", "left"), ("image_outliers", "left")} <= kinds(told)
+    image = solution.views.of_camera("left")[2].image
+    assert next(each for each in told if each.kind == "image_outliers").text.startswith(f"{image} does not fit")
+
+
+def told_of(solution: Solution) -> Sequence[Warned]:
+    return warnings_of(solution, [], [], None, [])
+
+
+def test_coverage_counts_corners_by_part_of_the_image(solution: Solution) -> None:
+    found = coverage(solution, "tof")
+    pixels = exact_pixels(world(8, seed=6, names=PAIR), "tof")
+    assert found.counts.sum() == np.isfinite(pixels[..., 0]).sum()
+    assert found.counts[:, :4].sum() == pytest.approx(np.sum(pixels[..., 0] < 87.5), abs=5)
+    assert 1.2 < found.nearest_m < found.farthest_m < 3
+
+
+def test_a_focal_length_that_is_open_is_refused(solution: Solution) -> None:
+    refuse_undetermined(solution)
+    at = solution.layout.index("left", "fx")
+    assert at is not None
+    covariance = solution.covariance.copy()
+    covariance[at, at] = (0.3 * 1330) ** 2
+    open_ = replace(solution, known=replace(solution.known, shared=covariance))
+    with pytest.raises(BadInputError, match=r"focal length of left open: 13.. px, give or take 30%"):
+        refuse_undetermined(open_)
+
+
+def test_a_step_moves_the_state_by_it(solution: Solution) -> None:
+    step = np.zeros(solution.layout.size)
+    at = solution.layout.index("left", "ty")
+    assert at is not None
+    step[at] = 0.01
+    there = moved(solution.state, solution.layout, step, np.zeros((8, 6)))
+    assert there.T_rig_camera[1, 1, 3] - solution.state.T_rig_camera[1, 1, 3] == pytest.approx(0.01)

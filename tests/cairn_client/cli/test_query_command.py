@@ -1,0 +1,146 @@
+"""`cairn map query` as a user types it: cells or a robot's state, words for people and JSON for programs."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.fixtures.client.made import GEOMETRY, A, opened
+
+from cairn_client.cli.maps.command import main
+from cairn_client.folders.map_folder import snapshot_of_folder
+from cairn_client.replica.map_model import store_model
+from cairn_map.codec.cell_code import encode_cell
+from cairn_map.errors import BadInputError, ConflictError, DamagedDataError
+from cairn_map.evidence.evidence import Evidence, packed_evidence
+from cairn_map.evidence.grid import cell_of_key
+from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.files.cell_folder import FolderHead, write_cell, write_head
+
+# Voxels of 5 cm: 0 is at the origin, 7 is the upper corner of its 2^3 block.
+HOT_K = 330.0
+
+
+def evidence() -> Evidence:
+    """Voxel (0, 0, 0) free, (1, 1, 1) occupied and hot, (0, 0, 1) occupied."""
+    steps = int(GEOMETRY.channels[0].quantise(np.array([HOT_K]))[0])
+    samples = np.array([[0, 0, 0], [0, 0, 0], [2 * steps, 2 * steps**2, 2]])
+    counts = np.array([[0, 3], [4, 0], [2, 0]])
+    return packed_evidence(np.array([0, 4, 7], np.uint32), counts, samples, GEOMETRY)
+
+
+@pytest.fixture(params=["cells", "robot"])
+def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    path = tmp_path / "lab"
+    if request.param == "robot":
+        replica = opened(path)
+        replica.commit({A: evidence()})
+        replica.close()
+    else:
+        write_head(path, FolderHead(geometry=GEOMETRY))
+        write_cell(path, cell_of_key(A), encode_cell(A, evidence(), GEOMETRY).data)
+    return path
+
+
+def asked(capsys: pytest.CaptureFixture[str], folder: Path, *words: str) -> str:
+    assert main(["query", str(folder), *words]) == 0
+    return capsys.readouterr().out
+
+
+def answered(capsys: pytest.CaptureFixture[str], folder: Path, *words: str) -> Any:
+    return json.loads(asked(capsys, folder, *words, "--json"))
+
+
+def test_points_tell_state_probability_and_readings(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points = ["0.01,0.01,0.01", "0.06,0.06,0.06", "-0.3,0,0"]
+    free, hot, unknown = answered(capsys, folder, "points", *points)
+    assert (free["state"], hot["state"], unknown["state"]) == ("free", "occupied", "unknown")
+    assert hot["probability"] == pytest.approx(0.845, abs=0.001)
+    assert hot["readings"]["temperature"]["mean"] == pytest.approx(HOT_K, abs=0.1)
+    assert hot["readings"]["temperature"]["unit"] == "K"
+    assert unknown == {
+        "point_m": [-0.3, 0, 0], "state": "unknown", "probability": None, "readings": {"temperature": None}
+    }  # fmt: skip
+    head, *lines = asked(capsys, folder, "points", *points).splitlines()
+    assert "x m" in head
+    assert "temperature" in head
+    assert "occupied" in lines[1]
+    assert "56.9 C +- 0.0" in lines[1] or "56.8 C" in lines[1]
+    assert lines[2].split() == ["-0.300", "0.000", "0.000", "unknown", "-", "-"]
+
+
+def test_a_ray_tells_how_far_it_comes(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = answered(capsys, folder, "ray", "0.02,0.02,-1", "0,0,1")
+    assert found == {"hit": True, "distance_m": pytest.approx(1.05), "voxel": [0, 0, 1]}
+    assert asked(capsys, folder, "ray", "0.02,0.02,-1", "0,0,2") == "occupied after 1.050 m\n"
+    assert asked(capsys, folder, "ray", "0,0,-1", "0,0,-1") == "nothing is in the way as far as the map goes\n"
+    assert asked(capsys, folder, "ray", "0,0,-1", "0,0,1", "--range", "0.5") == "nothing is in the way within 0.5 m\n"
+
+
+def test_the_nearest_occupied_and_unknown_voxels(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (found,) = answered(capsys, folder, "nearest", "0.025,0.025,-0.1")
+    assert found["distance_m"] == pytest.approx(0.15)
+    assert answered(capsys, folder, "nearest", "9,9,9")[0]["distance_m"] is None
+    assert "none within 5 m" in asked(capsys, folder, "nearest", "9,9,9")
+    assert "0.000 m to unknown space" in asked(capsys, folder, "nearest", "9,9,9", "--unknown")
+
+
+def test_the_hottest_voxels_in_kelvin_for_programs_and_celsius_for_people(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (found,) = answered(capsys, folder, "hottest")
+    assert found["point_m"] == pytest.approx([0.075] * 3)
+    assert found["mean"] == pytest.approx(HOT_K, abs=0.1)
+    assert " C " in asked(capsys, folder, "hottest")
+    elsewhere = asked(capsys, folder, "hottest", "--box", "-5,-5,-5,0,0,0")
+    assert elsewhere == "no occupied voxel has a temperature\n"
+
+
+def test_a_slice_is_drawn_for_people_and_listed_for_programs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = answered(capsys, folder, "slice", "0.01")
+    assert found["values"][0][:2] == [1, 0]
+    assert found["edge_m"] == 0.05
+    assert found["origin_m"] == [0.025, 0.025]
+    head, *rows = asked(capsys, folder, "slice", "0.06").splitlines()
+    assert head == "x 0.00 to 0.40 m, y 0.00 to 0.40 m"
+    assert rows[-1] == "##"
+    assert "0.4 to 0.4" not in head
+    assert "probability: 0.2" in asked(capsys, folder, "slice", "0.01", "--what", "probability")
+    assert answered(capsys, folder, "slice", "0.01", "--what", "probability")["values"][0][1] is None
+
+
+def test_a_height_map_tells_the_highest_surfaces(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = answered(capsys, folder, "height", "--box=0,0,0,1,1,1")
+    assert found["values"][0][0] == pytest.approx(0.1)
+    assert found["values"][0][1] is None
+    assert "height in m: 0.1 to 0.1 (2 of 64 values known" in asked(capsys, folder, "height")
+
+
+def test_a_robot_s_state_is_read_under_the_map_s_own_sensor_model(tmp_path: Path) -> None:
+    replica = opened(tmp_path)
+    replica.commit({A: evidence()})
+    store_model(replica.store, SensorModel(p_occupied=0.9))
+    with pytest.raises(ConflictError):
+        snapshot_of_folder(tmp_path)
+    replica.close()
+    assert snapshot_of_folder(tmp_path).model.p_occupied == 0.9
+    assert len(snapshot_of_folder(tmp_path).occupied_in()) == 1
+
+
+def test_what_is_no_map_is_refused_and_named(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="cairn map export"):
+        main(["query", str(tmp_path), "height"])
+    write_head(tmp_path, FolderHead(geometry=GEOMETRY))
+    (tmp_path / "0_0_0.cell").write_bytes(b"no cell")
+    with pytest.raises(DamagedDataError, match=r"0_0_0\.cell"):
+        main(["query", str(tmp_path), "height"])
+
+
+@pytest.mark.parametrize(
+    "words", [["points", "1,2"], ["ray", "0,0,0"], [], ["slice", "high"], ["height", "--box", "1,2"]]
+)
+def test_a_question_that_is_none_is_a_wrong_usage(tmp_path: Path, words: list[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["query", str(tmp_path), *words])
+    assert ended.value.code == 2

@@ -1,0 +1,89 @@
+import json
+import threading
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from tests.cairn_client.conftest import LiveServer
+from tests.fixtures.client.made import MAP, A, seen
+
+from cairn_client.cli.maps import watch as watch_command
+from cairn_client.cli.maps.watch import lines_of
+from cairn_client.http.api import MapApi
+from cairn_client.http.backoff import Backoff
+from cairn_client.http.live_listener import LINE_BYTES_MAX, Lost, listen, messages_of
+from cairn_client.robot.robot import Robot
+from cairn_map.errors import DamagedDataError, NotFoundError
+from cairn_map.wire.live_events import Hello, LiveEvent, LogGrew
+
+STREAM = b"retry: 500\n\nevent: head\nid: 5.aa\ndata: {\ndata: }\n\n: a comment\r\n\r\nevent: beat\r\ndata: {}\r\n\r\n"
+MESSAGES = [("head", "5.aa", "{\n}"), ("beat", "5.aa", "{}")]
+
+
+@pytest.mark.parametrize("size", range(1, 20))
+def test_events_are_the_same_however_their_bytes_are_cut(size: int) -> None:
+    cuts = range(0, len(STREAM) + size, size)
+    assert list(messages_of(STREAM[a:b] for a, b in pairwise(cuts))) == MESSAGES
+
+
+def test_an_event_without_an_end_is_refused() -> None:
+    def endless() -> Iterator[bytes]:
+        yield b"data: "
+        while True:
+            yield bytes(1 << 20)
+
+    with pytest.raises(DamagedDataError, match=str(LINE_BYTES_MAX)):
+        list(messages_of(endless()))
+
+
+def commit(server: LiveServer, folder: Path) -> None:
+    with Robot(None, server.map_url, directory=folder, name="mole") as robot:
+        robot.replica.commit({A: seen(1)})
+        robot.sync()
+    server.wait_for_fold()
+
+
+def stop(server: LiveServer) -> None:
+    """Stop a server that somebody listens to."""
+    server.service.live.close()
+    server.stop()
+
+
+def test_listening_goes_on_after_a_cut_from_where_it_was(server: LiveServer, tmp_path: Path) -> None:
+    found: list[LiveEvent | Lost] = []
+    with MapApi(server.url) as api:
+        stream = listen(api, MAP, backoff=Backoff(first_s=0.01, last_s=0.05))
+        found.append(next(stream))
+        stop(server)
+        found.append(next(stream))
+        server.start()
+        commit(server, tmp_path / "mole")
+        while not isinstance(found[-1], LogGrew):
+            found.append(next(stream))
+        stream.close()
+    first, lost, *rest = found
+    assert isinstance(first, Hello)
+    assert isinstance(lost, Lost)
+    assert any(isinstance(event, Hello) and event.resumed for event in rest)
+    assert [entry.cells for entry in found[-1].entries] == [1]
+    shown = [line for event in found for line in lines_of(event)]
+    assert shown[0] == "lab is at 0, robots: none"
+    assert any(line.startswith("folded  mole.") and "1 cells" in line for line in shown)
+
+
+def test_watch_prints_events_as_lines_of_json(
+    server: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pusher = threading.Thread(target=commit, args=(server, tmp_path / "mole"))
+    pusher.start()
+    assert watch_command.main([server.map_url, "--json", "--events", "3"]) == 0
+    pusher.join()
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert len(events) == 3
+    assert (events[0]["type"], events[0]["map"]) == ("hello", MAP)
+
+
+def test_a_map_that_is_not_there_cannot_be_watched(server: LiveServer) -> None:
+    with pytest.raises(NotFoundError):
+        watch_command.main([f"{server.url}/maps/nothing"])

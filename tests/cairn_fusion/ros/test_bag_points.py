@@ -1,0 +1,128 @@
+"""Clouds of a spinning lidar, in bags."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.fixtures.fusion.bags import KINDS, ROS2, Messages, Timed, pose_of, write_bag
+
+from cairn_calib.rig.lidar import SpinningLidar
+from cairn_fusion.importers import open_source
+from cairn_fusion.ros.bag import Wire
+from cairn_fusion.ros.bag_survey import survey
+from cairn_fusion.ros.point_clouds import R_LIDAR_CAMERA, RosPoints, elevations_of, read_points, sweep_image
+from cairn_map.errors import DamagedDataError
+
+ELEVATIONS = (10.0, 4.0, 0.0, -3.5)
+LIDAR = SpinningLidar(width=90, height=4, elevations_deg=ELEVATIONS)
+START_S = 1_700_000_000.0
+POINT = np.dtype(
+    {
+        "names": ["x", "y", "z", "ring"],
+        "formats": ["<f4", "<f4", "<f4", "<u2"],
+        "offsets": [0, 4, 8, 16],
+        "itemsize": 20,
+    }
+)
+
+
+def swept(seed: int) -> np.ndarray[Any, np.dtype[np.float32]]:
+    """(4, 90) ranges, a tenth of them without a return."""
+    rng = np.random.default_rng(seed)
+    range_m = rng.uniform(1, 8, (4, 90)).astype(np.float32)
+    range_m[rng.random((4, 90)) < 0.1] = np.nan
+    return range_m
+
+
+def cloud(make: Messages, time_s: float, range_m: np.ndarray[Any, np.dtype[np.float32]], *, flat: bool = False) -> Any:
+    """The message that a driver makes of a sweep."""
+    points = np.zeros((4, 90), POINT)
+    xyz = (LIDAR.rays() * range_m[..., None]) @ R_LIDAR_CAMERA.T
+    for n, axis in enumerate("xyz"):
+        points[axis] = xyz[..., n]
+    points["ring"] = np.arange(4)[:, None]
+    types = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("ring", 16, 4)]
+    return make.make(
+        "sensor_msgs/PointCloud2",
+        header=make.header(time_s, "lidar"),
+        height=1 if flat else 4,
+        width=360 if flat else 90,
+        fields=[make.make("sensor_msgs/PointField", name=n, offset=o, datatype=t, count=1) for n, o, t in types],
+        is_bigendian=False,
+        point_step=20,
+        row_step=20 * (360 if flat else 90),
+        data=np.frombuffer(points.tobytes(), np.uint8),
+        is_dense=False,
+    )
+
+
+def drive(make: Messages) -> Iterator[Timed]:
+    """Three sweeps of a robot that goes forward, its lidar half a metre above its base."""
+    T_base_lidar, T_odom_base = np.eye(4), np.eye(4)
+    T_base_lidar[2, 3] = 0.5
+    yield START_S, "/tf_static", make.tf(make.transform(START_S, "base_link", "lidar", pose_of(T_base_lidar)))
+    for n in range(3):
+        T_odom_base[0, 3] = n
+        time_s = START_S + 0.125 * n
+        yield time_s, "/tf", make.tf(make.transform(time_s, "odom", "base_link", pose_of(T_odom_base)))
+        yield time_s, "/points", cloud(make, time_s, swept(n), flat=n == 2)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_sweeps_come_out_of_a_bag_as_the_range_images_they_were(kind: str, tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "drive", kind, drive)
+    assert survey(path).proposal.questions == ()
+    bag = open_source(path)
+    camera = bag.rig["lidar"].camera
+    assert isinstance(camera, SpinningLidar)
+    assert camera.width == 90
+    assert camera.elevations_deg == pytest.approx(ELEVATIONS, abs=1e-3)
+    np.testing.assert_allclose(bag.rig["lidar"].transform[:3, 3], (0, 0, 0.5))
+    for n, scan in enumerate(bag):
+        np.testing.assert_allclose(scan.range_m, swept(n), rtol=1e-6)
+        np.testing.assert_allclose(scan.T_map_rig[:3, 3], (n, 0, 0))
+
+
+def points_of(**changes: Any) -> RosPoints:
+    make = Messages(ROS2)
+    message = cloud(make, START_S, swept(0))
+    for name, value in changes.items():
+        object.__setattr__(message, name, value)
+    return read_points(bytes(ROS2.serialize_cdr(message, "sensor_msgs/msg/PointCloud2")), Wire.CDR)
+
+
+def test_beams_are_told_apart_by_rings_or_rows_or_not_at_all() -> None:
+    whole = points_of()
+    without_ring = {name: field for name, field in whole.fields.items() if name != "ring"}
+    by_rows = RosPoints(whole.header, 90, 4, without_ring, 20, 1800, whole.data)
+    assert elevations_of(whole) == elevations_of(by_rows) == pytest.approx(ELEVATIONS, abs=1e-3)
+    assert elevations_of(RosPoints(whole.header, 360, 1, without_ring, 20, 7200, whole.data)) is None
+    assert elevations_of(RosPoints(whole.header, 90, 4, {}, 20, 1800, whole.data)) is None
+
+
+def test_of_points_in_one_pixel_the_nearest_counts() -> None:
+    xyz = np.array([[5.0, 0, 0], [3.0, 0, 0], [np.nan, 0, 0], [0, 0, 0], [0, 0, 9.0]])
+    image = sweep_image(xyz, LIDAR)
+    assert image[np.isfinite(image)].tolist() == [3.0]
+    assert np.argwhere(np.isfinite(image)).tolist() in ([[2, 44]], [[2, 45]])  # straight ahead, between two columns
+
+
+@pytest.mark.parametrize(
+    "changes", [{"width": 91}, {"height": 5}, {"point_step": 10}, {"row_step": 5000}, {"width": 1 << 31}]
+)
+def test_a_cloud_that_claims_more_than_it_has_is_refused(changes: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match=r"announced|outside"):
+        points_of(**changes)
+
+
+def test_a_damaged_cloud_is_told_with_its_topic(tmp_path: Path) -> None:
+    def messages(make: Messages) -> Iterator[Timed]:
+        for time_s, topic, message in drive(make):
+            if topic == "/points":
+                object.__setattr__(message, "width", 1000)
+            yield time_s, topic, message
+
+    with pytest.raises(DamagedDataError, match="/points at 1700000000"):
+        open_source(write_bag(tmp_path / "bad", "mcap", messages))

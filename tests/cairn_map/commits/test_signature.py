@@ -1,0 +1,82 @@
+"""Signatures: who made a commit can be told by anybody, and nobody else can make it."""
+
+import hashlib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.fixtures.map.made import SMALL
+
+from cairn_map.commits.ids import Author, RobotName
+from cairn_map.commits.signature import (
+    SIGNATURES_MAX,
+    Signature,
+    SigningKey,
+    check_signatures,
+    incarnation_of,
+    signatures_from_text,
+    signatures_to_text,
+    speaks_for,
+)
+from cairn_map.errors import BadInputError
+
+KEY, OTHER = SigningKey(bytes(32)), SigningKey(bytes([1] * 32))
+SHA = hashlib.sha256(b"a commit").digest()
+MOLE = RobotName("mole")
+
+
+def test_the_numbers_of_a_key_are_those_of_the_document() -> None:
+    assert KEY.public_key.hex() == "3b6a27bcceb6a42d62a3a8d02a6f0d73653215771de243a63ac048a18b59da29"  # RFC 8032's way
+    assert KEY.incarnation == hashlib.sha256(b"cairn-key-1" + KEY.public_key).hexdigest()[:16]
+
+
+def test_a_signature_is_good_for_its_commit_its_map_and_its_key_alone() -> None:
+    signature = KEY.sign("lab", SHA)
+    check_signatures([signature], "lab", SHA)
+    for wrong, name, sha in (
+        (signature, "yard", SHA),
+        (signature, "lab", SMALL.digest()),
+        (Signature(OTHER.public_key, signature.mark), "lab", SHA),
+        (Signature(bytes(31) + b"\xff", signature.mark), "lab", SHA),
+    ):
+        with pytest.raises(BadInputError) as refused:
+            check_signatures([KEY.sign(name, sha), wrong], name, sha)
+        assert refused.value.kind == "bad_signature"
+
+
+@given(st.integers(0, 511))
+def test_no_bit_of_a_mark_can_change(bit: int) -> None:
+    key, mark = KEY.sign("lab", SHA)
+    changed = bytearray(mark)
+    changed[bit // 8] ^= 1 << bit % 8
+    with pytest.raises(BadInputError):
+        check_signatures([Signature(key, bytes(changed))], "lab", SHA)
+
+
+def test_a_key_speaks_for_its_own_incarnation_of_any_robot() -> None:
+    signed = [KEY.sign("lab", SHA)]
+    assert speaks_for(signed, Author(MOLE, KEY.incarnation))
+    assert not speaks_for(signed, Author(MOLE, OTHER.incarnation))
+    assert incarnation_of(OTHER.public_key) == OTHER.incarnation
+
+
+def test_signatures_are_read_as_they_are_written() -> None:
+    signed = (KEY.sign("lab", SHA), OTHER.sign("lab", SHA))
+    assert signatures_from_text(signatures_to_text(signed)) == signed
+    assert signatures_from_text(signatures_to_text(signed[:1] * SIGNATURES_MAX)) == signed[:1] * SIGNATURES_MAX
+
+
+@pytest.mark.parametrize("text", ["", "a.b", "zz", "00" * 32, f"{'00' * 32}.{'00' * 63}", "." * 500, "ü.ü"])
+def test_other_texts_are_no_signatures(text: str) -> None:
+    with pytest.raises(BadInputError) as refused:
+        signatures_from_text(text)
+    assert refused.value.kind == "bad_signature"
+
+
+def test_too_many_signatures_are_not_looked_at() -> None:
+    with pytest.raises(BadInputError):
+        signatures_from_text(signatures_to_text([KEY.sign("lab", SHA)] * (SIGNATURES_MAX + 1)))
+
+
+def test_a_key_is_not_shown_by_accident() -> None:
+    assert KEY.seed.hex() not in repr(KEY)

@@ -1,0 +1,78 @@
+"""The nearest voxels against the twins, and at the radius itself."""
+
+import math
+
+import numpy as np
+import pytest
+from tests import naive_queries as naive
+from tests.fixtures.map.made import PLAIN
+from tests.fixtures.map.worlds import random_map, random_points, snapshot_with, world_of
+
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import Geometry
+from cairn_map.queries.map_snapshot import snapshot_of
+from cairn_map.queries.occupancy_states import State
+
+EDGE_M = 0.05
+DEEPER = Geometry(voxel_edge_um=50_000, depth=4, channels=())
+
+
+@pytest.mark.parametrize("geometry", [PLAIN, DEEPER])
+@pytest.mark.parametrize("state", [State.OCCUPIED, State.UNKNOWN])
+@pytest.mark.parametrize("radius_m", [0.0, 0.07, 0.3])
+def test_nearest_voxels_are_as_far_as_the_twin_says(geometry: Geometry, state: State, radius_m: float) -> None:
+    whole = random_map(1, geometry)
+    world, snapshot = world_of(whole), snapshot_of(whole)
+    points = random_points(1, whole, 60)
+    ask = snapshot.nearest_occupied if state is State.OCCUPIED else snapshot.nearest_unknown
+    found = ask(points, radius_m=radius_m)
+    positions = [naive.position(point, 50_000_000) for point in points]
+    expected = [naive.nearest(world, position, state, radius_m / EDGE_M) for position in positions]
+    np.testing.assert_allclose(found.distance_m / EDGE_M, expected, atol=1e-6)
+    assert found.found.any() or radius_m == 0
+    for position, voxel, distance_m in zip(positions, found.voxels.tolist(), found.distance_m, strict=True):
+        if np.isfinite(distance_m):
+            assert naive.state(world, tuple(voxel)) == state
+            assert naive.gap(position, tuple(voxel)) == pytest.approx(distance_m / EDGE_M, abs=1e-6)
+        else:
+            assert tuple(voxel) == tuple(math.floor(p) for p in position)
+
+
+def test_what_lies_at_the_radius_is_found_and_beyond_is_not() -> None:
+    snapshot = snapshot_with(PLAIN, {(20, 0, 0): (1, 0), (0, 0, -90): (1, 0)})
+    at = [[0.0, 0.01, 0.01]]
+    found = snapshot.nearest_occupied(at, radius_m=1)
+    assert (found.distance_m.tolist(), found.voxels.tolist()) == ([1], [[20, 0, 0]])
+    assert not snapshot.nearest_occupied(at, radius_m=0.999).found.any()
+    assert snapshot.nearest_occupied([[0, 0, 1e5]], radius_m=1e6).distance_m[0] == pytest.approx(1e5 - 0.05)
+
+
+def test_in_an_empty_map_all_is_unknown_and_nothing_occupied() -> None:
+    snapshot = snapshot_of(EvidenceMap(DEEPER))
+    assert snapshot.nearest_unknown([[0.3, 0, 0], [-1e5, 0, 0]], radius_m=0).distance_m.tolist() == [0, 0]
+    assert not snapshot.nearest_occupied([[0.3, 0, 0]], radius_m=1e6).found.any()
+    assert len(snapshot.nearest_occupied(np.empty((0, 3)), radius_m=1).voxels) == 0
+
+
+def test_around_a_known_cell_the_unknown_begins_at_its_faces() -> None:
+    snapshot = snapshot_with(PLAIN, {(x, y, z): (0, 1) for x in range(8) for y in range(8) for z in range(8)})
+    found = snapshot.nearest_unknown([[0.2, 0.2, 0.39], [0.2, 0.01, 0.2], [-0.1, 0.2, 0.2]], radius_m=1)
+    np.testing.assert_allclose(found.distance_m, [0.01, 0.01, 0], atol=1e-12)
+    assert found.voxels.tolist() == [[4, 4, 8], [4, -1, 4], [-2, 4, 4]]
+
+
+@pytest.mark.parametrize(
+    ("point", "radius_m", "kind"),
+    [
+        ([0, 0, math.nan], 1, "point_range"),
+        ([0, math.inf, 0], 1, "point_range"),
+        ([0, 0, 0], math.inf, "bad_range"),
+        ([0, 0, 0], math.nan, "bad_range"),
+        ([0, 0, 0], -1, "bad_range"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused(point: list[float], radius_m: float, kind: str) -> None:
+    with pytest.raises(BadInputError) as refused:
+        snapshot_of(random_map(1, PLAIN)).nearest_unknown([[0, 0, 0], point], radius_m=radius_m)
+    assert refused.value.kind == kind

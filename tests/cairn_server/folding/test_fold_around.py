@@ -1,0 +1,158 @@
+"""While a cell is damaged for good, what does not touch it is folded; healed, all is as if nothing had happened."""
+
+import random
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from tests.cairn_server.folding.test_broken_cell import BROKEN, damage, url
+from tests.fixtures.server.live import Live, until
+from tests.fixtures.server.pushes import KEYS, WREN, pushed, read, sum_of
+
+from cairn_map.commits.commit import Commit
+from cairn_server.folding import fold_around as module
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.damaged_cells import DamagedCells
+from cairn_server.folding.fold_around import Waiting, fold_around
+from cairn_server.store.store_rows import MapRow
+
+FIRST, SECOND = pushed(0, 0), pushed(0, 0, WREN)
+"""In the damaged cell, and in another."""
+BASE = [FIRST, SECOND]
+
+
+def broken_map(live: Live) -> tuple[MapRow, bytes]:
+    """A map of these, its cell damaged, and of the first one what it says of that cell, too; and the cell as it was."""
+    row = live.new_map()
+    for commit in BASE:
+        live.push(row, commit)
+    whole = live.cells(row)[BROKEN]
+    damage(live, "UPDATE cell SET body = x'00' WHERE map = ? AND cell = ?", row.number, BROKEN)
+    damage(
+        live,
+        "UPDATE diff SET body = NULL WHERE cell = ? AND commit_number ="
+        " (SELECT number FROM commits WHERE map = ? AND robot = 'mole' AND n = 0)",
+        BROKEN,
+        row.number,
+    )
+    live.service._folder._here._caches.clear()  # the folder still knows the cell, and would write it anew
+    return row, whole
+
+
+def touches(commit: Commit) -> bool:
+    return BROKEN in commit.cells
+
+
+def ids_pending(live: Live, row: MapRow) -> set[str]:
+    with live.service.store.snapshot(row) as snapshot:
+        return {str(commit) for commit in snapshot.pending()}
+
+
+def heal(live: Live, row: MapRow, whole: bytes) -> None:
+    assert live.http.put(url(row, BROKEN), content=whole).status_code == 204
+    live.folded(row)
+
+
+def cells_of_a_sound_map(live: Live, commits: Sequence[Commit]) -> dict[int, bytes]:
+    row = live.new_map()
+    for commit in commits:
+        live.push(row, commit)
+    return live.cells(row)
+
+
+def test_commits_elsewhere_are_folded_and_those_in_the_damaged_cell_wait_until_it_is_healed(live: Live) -> None:
+    row, whole = broken_map(live)
+    commits = [pushed(n, n) for n in range(1, 7)]
+    for commit in commits:
+        assert live.push(row, commit).status_code == 201
+    waiting = {str(commit.id) for commit in commits if touches(commit)}
+    assert 0 < len(waiting) < len(commits)
+    until(lambda: ids_pending(live, row) == waiting, "all others are folded")
+    elsewhere = sum_of([*BASE, *(commit for commit in commits if not touches(commit))])
+    assert read({KEYS[2]: live.http.get(url(row, KEYS[2])).content}) == {KEYS[2]: elsewhere[KEYS[2]]}
+    assert live.http.get(url(row, BROKEN)).status_code == 500
+    assert live.service.folds.damaged() == {row.name}
+    damage(live, "UPDATE commits SET received_s = 0 WHERE folded_seq IS NULL")
+    assert live.http.get("/readyz").status_code == 200  # however long they wait
+    heal(live, row, whole)
+    assert live.cells(row) == cells_of_a_sound_map(live, [*BASE, *commits])
+    until(lambda: live.service.folds.damaged() == frozenset(), "the map is well")
+
+
+def test_a_retract_of_what_is_in_the_damaged_cell_waits_and_one_of_what_waits_does_not(live: Live) -> None:
+    row, whole = broken_map(live)
+    waits, elsewhere = pushed(1, 2), pushed(2, 1)
+    live.push(row, waits)
+    live.push(row, elsewhere)
+    live.retract(row, waits)
+    until(lambda: ids_pending(live, row) == {str(waits.id)}, "the retract is folded")
+    live.retract(row, SECOND)
+    live.push(row, pushed(3, 1))
+    until(lambda: len(ids_pending(live, row)) == 2, "the commit after it is folded")
+    assert any(text.startswith("operator.") for text in ids_pending(live, row))
+    heal(live, row, whole)
+    assert read(live.cells(row)) == sum_of([FIRST, elsewhere, pushed(3, 1)])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_any_history_around_damage_ends_as_without_it(live: Live, seed: int) -> None:
+    rng = random.Random(seed)
+    (row, whole), commits = broken_map(live), list(BASE)
+    for n in range(1, 12):
+        targets = rng.sample(commits[1:], min(2, len(commits) - 1)) if rng.random() < 0.4 else []
+        targets = [commit for commit in targets if not commit.meta.retracts]
+        if targets and rng.random() < 0.5:
+            commits.append(pushed(n, rng.randrange(9), cells={}, retracts=targets))
+        else:
+            commits.append(pushed(n, rng.randrange(9), retracts=targets))
+    rest = commits[2:]
+    rng.shuffle(rest)
+    for commit in rest:
+        assert live.push(row, commit).status_code == 201
+    heal(live, row, whole)
+    assert read(live.cells(row)) == sum_of(commits)
+
+
+def test_many_that_wait_do_not_stop_those_behind_them(tmp_path: Path) -> None:
+    with Live(tmp_path) as live:
+        _folds_what_comes_last(live)
+
+
+def _folds_what_comes_last(live: Live) -> None:
+    row, _ = broken_map(live)
+    live.service._folder.close()
+    commits = [pushed(n, 0) for n in range(1, 8)] + [pushed(8, 1)]
+    for commit in commits:
+        live.push(row, commit)
+    waiting, cache, damaged = Waiting(), CellCache(row.geometry), DamagedCells()
+    assert fold_around(live.service.store, row, cache, waiting, damaged, limit=2) == 1
+    assert ids_pending(live, row) == {str(commit.id) for commit in commits[:-1]}
+    assert len(waiting.commits) == 7
+    assert fold_around(live.service.store, row, cache, waiting, damaged, limit=2) == 0
+
+
+def test_a_cell_that_the_log_tells_again_is_found_out_without_a_word(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row, _ = broken_map(live)
+    live.push(row, pushed(1, 0))
+    until(lambda: live.service.folds.damaged() == {row.name}, "the cell is found damaged")
+    damage(live, "UPDATE diff SET body = ? WHERE cell = ? AND body IS NULL", FIRST.cells[BROKEN], BROKEN)
+    live.push(row, pushed(2, 1))
+    until(lambda: len(ids_pending(live, row)) == 1, "what is elsewhere is folded")
+    monkeypatch.setattr(module, "PROBE_S", 0.0)
+    live.push(row, pushed(3, 1))
+    live.folded(row)
+    assert read(live.cells(row)) == sum_of([*BASE, pushed(1, 0), pushed(2, 1), pushed(3, 1)])
+
+
+def test_a_server_that_is_started_anew_folds_around_the_cell_again(tmp_path: Path) -> None:
+    with Live(tmp_path) as live:
+        row, whole = broken_map(live)
+        live.push(row, pushed(1, 0))
+        live.push(row, pushed(2, 1))
+    with Live(tmp_path) as live:
+        row = live.service.store.map(row.name)
+        until(lambda: ids_pending(live, row) == {str(pushed(1, 0).id)}, "what is elsewhere is folded")
+        heal(live, row, whole)
+        assert read(live.cells(row)) == sum_of([*BASE, pushed(1, 0), pushed(2, 1)])

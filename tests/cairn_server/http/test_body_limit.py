@@ -1,0 +1,87 @@
+"""Bodies are bounded before they are read."""
+
+import socket
+import zlib
+
+import pytest
+from tests.cairn_server.sync.test_push import kind_of
+from tests.fixtures.server.live import Live
+from tests.fixtures.server.pushes import pushed
+
+from cairn_map.wire.messages import Problem
+from cairn_server.http.middleware import body_limit
+from cairn_server.http.middleware.body_limit import limit_of
+
+
+def raw(live: Live, request: bytes) -> bytes:
+    """What the server answers to bytes, until it closes."""
+    with socket.create_connection(("127.0.0.1", live.port), timeout=30) as link:
+        link.sendall(request)
+        link.shutdown(socket.SHUT_WR)
+        answer = bytearray()
+        while part := link.recv(1 << 16):
+            answer += part
+    return bytes(answer)
+
+
+def head(live: Live, method: str, path: str, *headers: str) -> bytes:
+    lines = [f"{method} {path} HTTP/1.1", f"Host: 127.0.0.1:{live.port}", *headers, "", ""]
+    return "\r\n".join(lines).encode()
+
+
+@pytest.mark.parametrize("claim", ["67108865", "9" * 18, "9" * 30])
+def test_a_body_that_claims_too_much_is_refused_before_it_comes(live: Live, claim: str) -> None:
+    row = live.new_map()
+    path = f"/maps/{row.name}/commits/{pushed(0, 0).id}"
+    answer = raw(live, head(live, "PUT", path, f"Content-Length: {claim}"))
+    assert answer.startswith((b"HTTP/1.1 413", b"HTTP/1.1 400"))
+    assert live.http.get("/healthz").status_code == 200
+
+
+@pytest.mark.parametrize("claim", ["-1", "1x", "1,2", "\xb2"])
+def test_a_length_that_is_none_is_refused(live: Live, claim: str) -> None:
+    answer = raw(live, head(live, "POST", "/maps/x/retracts", f"Content-Length: {claim}"))
+    assert answer.startswith((b"HTTP/1.1 413", b"HTTP/1.1 400"))
+
+
+@pytest.mark.parametrize("route", ["PUT commits/mole.0123456789abcdef.0", "POST retracts", "POST branches"])
+@pytest.mark.parametrize("media_type", ["application/json", "application/octet-stream"])
+def test_a_body_that_grows_beyond_its_limit_in_chunks_is_413(
+    live: Live, route: str, media_type: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(body_limit, "LIMITS", ())
+    monkeypatch.setattr(body_limit, "JSON_BYTES_MAX", 100_000)
+    method, path = route.split()
+    answer = live.http.request(
+        method,
+        f"/maps/{live.new_map().name}/{path}",
+        content=(b" " * 4096 for _ in range(40)),
+        headers={"Content-Type": media_type},
+    )
+    assert (answer.status_code, kind_of(answer)) == (413, "too_large")
+    assert Problem.model_validate_json(answer.content).status == 413
+
+
+def test_a_body_that_ends_early_is_forgotten_and_the_server_goes_on(
+    live: Live, caplog: pytest.LogCaptureFixture
+) -> None:
+    row = live.new_map()
+    commit = pushed(0, 0)
+    path = f"/maps/{row.name}/commits/{commit.id}"
+    raw(live, head(live, "PUT", path, f"Content-Length: {len(commit.data)}") + commit.data[:100])
+    raw(live, head(live, "POST", f"/maps/{row.name}/retracts", "Content-Length: 100") + b"{")
+    assert live.push(row, commit).status_code == 201
+    assert not [record for record in caplog.records if record.levelname == "ERROR"]
+
+
+def test_each_path_has_the_limit_that_it_needs() -> None:
+    assert limit_of("/maps/lab/commits/mole.0123456789abcdef.0") == 1 << 26
+    assert limit_of("/maps/lab/branches/mole/missing") == 1 << 24
+    for path in ("/maps/commits/branches", "/maps/lab/commits/x/y", "/maps/lab/retracts", "/x/maps/lab/commits/y"):
+        assert limit_of(path) == 1 << 20
+
+
+def test_a_small_body_cannot_stand_for_much_evidence(live: Live) -> None:
+    bomb = zlib.compress(b"\0" * (1 << 24))
+    answer = live.http.put(f"/maps/{live.new_map().name}/commits/{pushed(0, 0).id}", content=b"CRCM\x01" + bomb)
+    assert answer.status_code in (400, 413)

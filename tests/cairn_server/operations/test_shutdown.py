@@ -1,0 +1,86 @@
+"""SIGTERM under load: what is under way is answered, all that was acknowledged is there afterwards."""
+
+import signal
+import socket
+import threading
+import time
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import httpx
+from tests.cairn_server.operations.test_serve_process import all_folded, client, make_map
+from tests.fixtures.server.live import DEADLINE_S, Process
+from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
+
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName
+from cairn_map.evidence.grid import cell_of_key
+
+STOP_S = 10.0
+AUTHORS = [MOLE, WREN, *(Author(RobotName("fox"), Incarnation(f"{n:016x}")) for n in range(2))]
+
+
+def push_until_stopped(process: Process, author: Author, acked: list[Commit], enough: threading.Event) -> None:
+    """As a robot does; a refusal must be one that says to come back later."""
+    with client(process) as http:
+        for n in range(1000):
+            commit = pushed(n, n % 5, author)
+            try:
+                answer = http.put(f"/maps/lab/commits/{commit.id}", content=commit.data)
+            except httpx.TransportError:
+                return
+            if answer.status_code != 201:
+                assert answer.status_code == 503, answer.text
+                return
+            acked.append(commit)
+            if len(acked) >= 8:
+                enough.set()
+
+
+def begun_push(process: Process, commit: Commit) -> socket.socket:
+    """A push of which the server has all but the last byte."""
+    assert process.url
+    link = socket.create_connection(("127.0.0.1", urlsplit(process.url).port or 0), timeout=DEADLINE_S)
+    head = (
+        f"PUT /maps/lab/commits/{commit.id} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: {len(commit.data)}\r\n\r\n"
+    )
+    link.sendall(head.encode() + commit.data[:-1])
+    return link
+
+
+def test_sigterm_under_load_loses_nothing_answers_what_is_under_way_and_ends_in_time(tmp_path: Path) -> None:
+    process = Process(tmp_path)
+    with client(process) as http:
+        make_map(http)
+    last = pushed(0, 2, Author(RobotName("late"), MOLE.incarnation))
+    with begun_push(process, last) as link:
+        acked: list[list[Commit]] = [[] for _ in AUTHORS]
+        enough = [threading.Event() for _ in AUTHORS]
+        threads = [
+            threading.Thread(target=push_until_stopped, args=(process, *of_robot))
+            for of_robot in zip(AUTHORS, acked, enough, strict=True)
+        ]
+        for thread in threads:
+            thread.start()
+        assert all(event.wait(DEADLINE_S) for event in enough)
+        begin_s = time.monotonic()
+        process.send(signal.SIGTERM)
+        link.sendall(last.data[-1:])
+        assert link.recv(100).startswith(b"HTTP/1.1 201 ")
+    code, complaints = process.end()
+    stopped_s = time.monotonic() - begin_s
+    for thread in threads:
+        thread.join()
+    assert (code, complaints) == (0, "")
+    assert stopped_s < STOP_S
+    assert not (tmp_path / "cairn.sqlite-wal").exists()
+    again = Process(tmp_path)
+    with client(again) as http:
+        vector = all_folded(http).coverage
+        known = [pushed(n, n % 5, author) for author in AUTHORS for n in range(1000) if CommitId(author, n) in vector]
+        assert {commit.id for commits in acked for commit in commits} <= {commit.id for commit in known}
+        assert last.id in vector
+        bodies = {key: http.get(f"/maps/lab/main/cells/{cell_of_key(key)}").content for key in KEYS}
+        assert read(bodies) == sum_of([*known, last])
+    again.send(signal.SIGTERM)
+    assert again.end() == (0, "")

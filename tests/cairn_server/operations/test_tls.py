@@ -1,0 +1,92 @@
+"""The server speaks https with a certificate that it is given, and the client asks for the right one."""
+
+import gc
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tests.fixtures.server.live import Process
+
+from cairn_client.http.api import MapApi
+from cairn_map.errors import UnreachableError
+from cairn_map.wire.messages import CreateMap
+from cairn_server.operations.health_probe import why_not
+
+pytestmark = pytest.mark.skipif(not shutil.which("openssl"), reason="the openssl command makes the certificate")
+
+
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with `cert.pem` of 127.0.0.1, signed by itself, and `key.pem`."""
+    folder: Path = tmp_path_factory.mktemp("tls")
+    subprocess.run(
+        [
+            *("openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"),
+            *("-days", "2", "-subj", "/CN=cairn", "-addext", "subjectAltName=IP:127.0.0.1"),
+            *("-keyout", "key.pem", "-out", "cert.pem"),
+        ],
+        cwd=folder,
+        check=True,
+        capture_output=True,
+        timeout=60,
+    )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def url(certificate: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A server with it."""
+    files = ("--tls-cert", str(certificate / "cert.pem"), "--tls-key", str(certificate / "key.pem"))
+    process = Process(tmp_path_factory.mktemp("data"), *files)
+    assert process.url
+    yield process.url
+    process.send(signal.SIGTERM)
+    assert process.end() == (0, "")
+
+
+def test_a_client_that_knows_the_certificate_works_over_https(url: str, certificate: Path) -> None:
+    assert url.startswith("https://")
+    with MapApi(url, ca_file=certificate / "cert.pem") as api:
+        assert api.create_map("lab", CreateMap()).name == "lab"
+
+
+def test_the_health_probe_finds_it_alive(url: str) -> None:
+    assert why_not(int(url.rpartition(":")[2])) is None
+
+
+def test_the_environment_names_the_certificate_for_every_command(url: str, certificate: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "cairn_client.main", "map", "create", f"{url}/maps/desk"],
+        env={**os.environ, "SSL_CERT_FILE": str(certificate / "cert.pem")},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert "map desk" in done.stdout
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_client_that_does_not_know_the_certificate_says_what_to_do(url: str) -> None:
+    with MapApi(url) as api, pytest.raises(UnreachableError, match="SSL_CERT_FILE"):
+        api.maps()
+    gc.collect()  # the HTTP library leaves the socket of a failed handshake to it
+
+
+def test_what_is_no_tls_is_not_served(url: str) -> None:
+    with MapApi(url.replace("https", "http")) as api, pytest.raises(UnreachableError):
+        api.maps()
+
+
+def test_a_certificate_that_is_none_or_of_another_key_is_refused(certificate: Path, tmp_path: Path) -> None:
+    (tmp_path / "none.pem").write_text("no certificate")
+    for cert in (tmp_path / "none.pem", tmp_path / "missing.pem"):
+        process = Process(tmp_path / "data", "--tls-cert", str(cert), "--tls-key", str(certificate / "key.pem"))
+        assert process.url is None
+        code, complaint = process.end()
+        assert (code, "[bad_setting]" in complaint) == (1, True), complaint

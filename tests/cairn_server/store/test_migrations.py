@@ -1,0 +1,91 @@
+"""Stores of older versions, as they were written then, open and go on."""
+
+from pathlib import Path
+
+import apsw
+import pytest
+import zstandard
+from tests.fixtures.server.live import Live
+from tests.fixtures.server.pushes import MOLE, WREN, pushed, read, sum_of
+
+from cairn_map.errors import BadInputError
+from cairn_server.store.sqlite.schema import STEPS, ensure_schema
+from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
+from cairn_server.store.store_rows import CellRow
+
+FORMATS = Path(__file__).parents[2] / "formats"
+HEADS = {"v1.sqlite.zst": "4243ca94aa4e5ac2bca4157d97a5ba33.10.0c13ae5711ebe0d9d9c007e2badf0262"}
+COMMITS = [pushed(n, n + shift, author) for shift, author in enumerate((MOLE, WREN)) for n in range(3)]
+RETRACTS = [
+    pushed(3, 0, MOLE, cells={}, retracts=[COMMITS[0]]),
+    pushed(3, 0, WREN, cells={}, retracts=[COMMITS[4], COMMITS[0]]),
+]
+
+
+def unpacked(name: str, folder: Path) -> Path:
+    path = folder / FILE_NAME
+    path.write_bytes(zstandard.decompress((FORMATS / name).read_bytes(), max_output_size=1 << 24))
+    return path
+
+
+def rows_of(live: Live) -> list[CellRow]:
+    with live.service.store.snapshot(live.service.store.map("lab")) as snapshot:
+        return list(snapshot.cells())
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in FORMATS.glob("*.sqlite.zst")))
+def test_an_older_store_opens_with_all_that_it_held_and_goes_on(name: str, tmp_path: Path) -> None:
+    unpacked(name, tmp_path)
+    more = pushed(4, 2, MOLE, retracts=[COMMITS[1], COMMITS[3]])
+    with Live(tmp_path) as live:
+        row = live.service.store.map("lab")
+        with live.service.store.snapshot(row) as snapshot:
+            assert str(snapshot.head.cursor) == HEADS[name]
+            seq = snapshot.head.cursor.seq
+        assert read(live.cells(row)) == sum_of([*COMMITS, *RETRACTS])
+        assert {cell.hottest_k for cell in rows_of(live)} == {None}  # nobody wrote down how hot they are
+        assert [branch.name for branch in live.service.store.branches(row)] == ["mole"]
+        assert live.push(row, COMMITS[2]).status_code == 200
+        assert live.push(row, more).status_code == 201
+        live.folded(row)
+        told = [cell.key for cell in rows_of(live) if cell.hottest_k is not None]
+        assert told == [cell.key for cell in rows_of(live) if cell.lm > seq] != []
+        assert read(live.cells(row)) == sum_of([*COMMITS, *RETRACTS, more])
+    with Live(tmp_path) as live:  # and once more, now as a store of this version
+        assert read(live.cells(live.service.store.map("lab"))) == sum_of([*COMMITS, *RETRACTS, more])
+
+
+@pytest.mark.parametrize("version", range(len(STEPS)))
+def test_a_store_of_any_version_gets_the_tables_of_a_new_one(version: int, tmp_path: Path) -> None:
+    new, old = (apsw.Connection(str(tmp_path / name)) for name in ("new", "old"))
+    ensure_schema(new)
+    for step in STEPS[:version]:
+        old.execute(step)
+    old.execute(f"PRAGMA user_version = {version}" if version else "")
+    ensure_schema(old)
+    schemas = [list(c.execute("SELECT type, name, sql FROM sqlite_master ORDER BY name")) for c in (new, old)]
+    assert schemas[0] == schemas[1] and schemas[0]
+
+
+def test_a_store_of_a_newer_version_is_refused_and_left_alone(tmp_path: Path) -> None:
+    path = unpacked("v1.sqlite.zst", tmp_path)
+    connection = apsw.Connection(str(path))
+    connection.execute(f"PRAGMA user_version = {len(STEPS) + 1}")
+    connection.close()
+    before = path.read_bytes()
+    with pytest.raises(BadInputError, match="update it"):
+        SqliteStore(tmp_path)
+    assert path.read_bytes() == before
+
+
+def test_a_robot_of_an_older_store_keeps_its_token(tmp_path: Path) -> None:
+    connection = apsw.Connection(str(unpacked("v1.sqlite.zst", tmp_path)))
+    [(kept,)] = connection.execute("SELECT token_hash FROM branch")
+    connection.close()
+    store = SqliteStore(tmp_path)
+    token = store.tokens.of_hash(kept)
+    assert token is not None
+    assert (token.name, token.role, token.map_name, token.robot) == ("lab:mole", "robot", "lab", "mole")
+    store.deregister(store.map("lab"), "mole")
+    assert store.tokens.of_hash(kept) is None
+    store.close()
