@@ -28,7 +28,7 @@ FOLDERS = {
 
 MAY_IMPORT = {
     "cairn_map/*": set(),
-    "cairn_calib/*": {"cairn_map.errors"},
+    "cairn_calib/*": {"cairn_map.errors", "cairn_map.arrays"},
     "cairn_fusion/*": {"cairn_map", "cairn_calib"},
     "cairn_client/*": {"cairn_fusion", "cairn_map", "cairn_calib"},
     "cairn_sim/*": {"cairn_client", "cairn_fusion", "cairn_map", "cairn_calib"},
@@ -95,7 +95,7 @@ MAY_NAME = {
 
 ROOMS = {
     "cairn_map": """
-        errors exit_codes
+        errors exit_codes arrays
         kernels evidence codec.octree codec.entropy codec commits wire files queries render
         warm_up
     """,

@@ -14,12 +14,11 @@ import re
 from typing import Annotated, Literal, Self
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 
-Floats = npt.NDArray[np.float64]
 Pattern = Literal["chessboard", "circles", "asymmetric-circles"]
 Polarity = Literal["normal", "reversed"]
 """normal: what is printed dark looks dark."""

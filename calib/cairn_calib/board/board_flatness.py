@@ -3,11 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.board.homography import fit_homography, mapped
-
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
 
 FLAT_RMS_PX = 0.5
 FLAT_RMS_CELLS = 0.01

@@ -18,9 +18,9 @@ from cairn_calib.board.board_flatness import flat_limit_px, flat_rms_px
 from cairn_calib.board.corner_detection import grey, stretched
 from cairn_calib.board.corners import FOUND, Attempt, Corners, Detection
 from cairn_calib.board.homography import fit_homography, mapped, steps_between
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 
-Floats = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 
 BLOCKS = (0.06, 0.03, 0.15, 0.4)

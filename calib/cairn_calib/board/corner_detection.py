@@ -21,9 +21,9 @@ from cairn_calib.board.fitted_grid import Judged, checker_signs
 from cairn_calib.board.homography import fit_homography, mapped, steps_between
 from cairn_calib.board.saddle_grid import NoGrid, saddle_grid
 from cairn_calib.board.saddle_points import saddle_points
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 
-Floats = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 
 SCALES: tuple[tuple[int, tuple[float, ...]], ...] = (

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from cairn_calib.board.board import Board, Polarity
 from cairn_calib.board.corners import Attempt, Corners, Detection
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError, DamagedDataError, first_error
 
-Floats = npt.NDArray[np.float64]
 Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e6, le=1e6)]
 Pair = tuple[Number, Number]
 Side = Annotated[int, Field(ge=1, le=16384)]

@@ -12,8 +12,7 @@ from cairn_calib.board.corner_refinement import FittedCorners
 from cairn_calib.board.fitted_grid import Gate, Judged, checker_signs
 from cairn_calib.board.grid_ends import goes_on, starts_and_ends
 from cairn_calib.board.homography import mapped
-
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
 
 CELL_MIN_PX = 3.5
 """Shortest step from corner to corner. Below, the fit has fewer pixels than it needs."""

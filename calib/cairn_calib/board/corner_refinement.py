@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Flags, Floats
+
 Image = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
 
 STEPS = 12
 RADIUS_PX = (2, 8)

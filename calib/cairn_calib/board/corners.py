@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.board.board import Board
+from cairn_map.arrays import Floats
 
-Floats = npt.NDArray[np.float64]
 FOUND = "found"
 
 

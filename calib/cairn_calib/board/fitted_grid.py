@@ -9,8 +9,8 @@ import numpy.typing as npt
 from cairn_calib.board.board import Board
 from cairn_calib.board.corner_refinement import FittedCorners
 from cairn_calib.board.homography import steps_between
+from cairn_map.arrays import Floats
 
-Floats = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 
 

@@ -1,15 +1,12 @@
 """Whether a board ends where its grid does: neither before, where strays stand for a row, nor after, if it goes on."""
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.board.board_flatness import flat_view
 from cairn_calib.board.corner_refinement import FittedCorners, fit_corners
 from cairn_calib.board.fitted_grid import Judged, checker_signs
 from cairn_calib.board.homography import steps_between
-
-Floats = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
+from cairn_map.arrays import Flags, Floats
 
 RIM_SHARE = 0.5
 """Of an outer row or column of which more is seen, no proof is asked. Otherwise the others predict its places."""

@@ -1,9 +1,8 @@
 """Maps between planes: how a flat board's points lie in an image without distortion."""
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
 
 
 def fit_homography(plane: Floats, pixels: Floats) -> Floats | None:

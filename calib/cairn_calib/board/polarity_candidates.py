@@ -12,8 +12,8 @@ from cairn_calib.board.circle_grid import find_circles
 from cairn_calib.board.corner_detection import find_chessboard, fit_pointed_at
 from cairn_calib.board.corners import Detection
 from cairn_calib.board.polarity_vote import margin_polarity, turned
+from cairn_map.arrays import Floats
 
-Floats = npt.NDArray[np.float64]
 Grey = npt.NDArray[np.float32]
 
 

@@ -19,8 +19,7 @@ import numpy.typing as npt
 from cairn_calib.board.board import Board, Polarity
 from cairn_calib.board.corners import Corners
 from cairn_calib.board.homography import fit_homography, mapped
-
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
 
 INSIDE = 0.25
 """Cells from the outer corners outwards to where a cell's brightness is read: outer cells may be cut to half."""

@@ -15,8 +15,8 @@ import numpy.typing as npt
 from cairn_calib.board.board import Board
 from cairn_calib.board.homography import fit_homography, mapped
 from cairn_calib.board.saddle_points import SaddlePoints
+from cairn_map.arrays import Floats
 
-Floats = npt.NDArray[np.float64]
 Lattice = dict[tuple[int, int], int]
 
 ANGLE_COS = np.cos(np.radians(22.0))

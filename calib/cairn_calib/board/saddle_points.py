@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
+
 Image = npt.NDArray[np.float32]
 
 SMOOTH_PX = 1.5

@@ -43,7 +43,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import ValidationError
 
 from cairn_calib.board.board import Board, Polarity, board_size
@@ -55,9 +54,9 @@ from cairn_calib.board.polarity_candidates import Looked, looked_for_corners, lo
 from cairn_calib.board.polarity_vote import vote_of
 from cairn_calib.board.still_frames import StillImage, if_still, read_still
 from cairn_calib.cli.progress import with_progress
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError, NotFoundError, first_error
 
-Floats = npt.NDArray[np.float64]
 NAMED_MAX = 8
 """Images without a board that the last line names."""
 

@@ -9,13 +9,11 @@ by how much they would sharpen the rig (`next_image.py`).
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.diagnosis.probe_points import Probes
 from cairn_calib.solve.normal_equations import Block, solved_scaled
 from cairn_calib.solve.solve import Solution
-
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.diagnosis.frame_influence import frame_shares
 from cairn_calib.diagnosis.probe_points import Probes, image_grid
@@ -17,8 +16,7 @@ from cairn_calib.solve.corner_residuals import CornerData, board_points, corner_
 from cairn_calib.solve.normal_equations import Loss
 from cairn_calib.solve.rig_state import warp_shape
 from cairn_calib.solve.solve import Solution
-
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
 
 COLUMNS, ROWS = 3, 3
 SHARES = (0.3, 0.55)

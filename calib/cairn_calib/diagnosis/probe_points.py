@@ -13,8 +13,7 @@ import numpy.typing as npt
 from cairn_calib.rig.projection_uncertainty import mounted_lens, projection_moves, transfer_moves
 from cairn_calib.rig.rig import Rig
 from cairn_calib.solve.rig_state import Layout
-
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
 
 RANGES_M = (1.0, 2.0, 5.0)
 COLUMNS, ROWS = 9, 7

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.diagnosis.cross_validation import Halves
 from cairn_calib.diagnosis.frame_influence import Influence
@@ -21,8 +20,6 @@ from cairn_calib.solve.rig_state import SCALE
 from cairn_calib.solve.solve import Solution
 from cairn_calib.solve.solve_plan import SHARED
 from cairn_map.errors import BadInputError
-
-Floats = npt.NDArray[np.float64]
 
 TILT_DEG = 30.0
 RANGE_RATIO = 1.3

@@ -9,8 +9,6 @@ from cairn_calib.rig.poses import inverse
 from cairn_calib.solve.camera_alone import tilt_range_deg
 from cairn_calib.solve.solve import Solution
 
-Floats = npt.NDArray[np.float64]
-
 CELLS = (8, 6)
 """Columns and rows that an image is divided into."""
 

@@ -10,13 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.diagnosis.probe_points import Probes
 from cairn_calib.solve.solve import Solution
 from cairn_calib.solve.solve_plan import SHARED
-
-Floats = npt.NDArray[np.float64]
 
 STRONG = 0.5
 """Correlation of a parameter with a mode from which on it is named."""

@@ -11,7 +11,6 @@ Kogan, mrcal: "projection uncertainty", the mean-frames method. It does not depe
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.diagnosis.probe_points import image_grid
 from cairn_calib.rig.pose_vectors import cross_matrix
@@ -19,8 +18,7 @@ from cairn_calib.rig.poses import inverse, transform_points
 from cairn_calib.rig.projection_uncertainty import mounted_lens, projection_moves, transfer_certain
 from cairn_calib.rig.rig import Rig
 from cairn_calib.solve.solve import Solution
-
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,12 +1,10 @@
 """Pictures of a range bias as SVG: by range, and pixel by pixel."""
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.report.solve_plots import mixed, opened
 from cairn_calib.rig.range_bias import RangeBias
-
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
 
 COLUMNS_MAX = 200
 """Of a map; larger images are averaged in blocks."""

@@ -3,7 +3,6 @@
 from html import escape
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.diagnosis.examination import Examination
 from cairn_calib.report.range_plots import bias_curve, offset_map, sigma_map_mm
@@ -12,8 +11,6 @@ from cairn_calib.rig.pixel_offsets import PixelOffsets
 from cairn_calib.rig.range_terms import wave_period_m
 from cairn_calib.solve.range_choice import RangeSpans
 from cairn_calib.solve.solve import Solution
-
-Floats = npt.NDArray[np.float64]
 
 WORDS = {
     "offset_m": "offset, mm",

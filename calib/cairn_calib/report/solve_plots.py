@@ -5,13 +5,10 @@ from html import escape
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.diagnosis.next_image import NextImage
 from cairn_calib.diagnosis.view_coverage import Coverage
-
-Floats = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
+from cairn_map.arrays import Flags, Floats
 
 WIDTH = 420
 LOW_PX, HIGH_PX = 0.01, 10.0

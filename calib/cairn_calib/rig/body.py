@@ -10,11 +10,10 @@ range camera's noise may add.
 from typing import Annotated, Self
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-Floats = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
+from cairn_map.arrays import Flags, Floats
+
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 Place = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
 Corner = tuple[Place, Place, Place]

@@ -18,10 +18,9 @@ from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import AfterValidator, Field
 
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
 
 COEFFICIENT_MAX = 1e12
 """Far above any lens's (k3 of a 2 degree one may reach 1e8), far below an overflow."""

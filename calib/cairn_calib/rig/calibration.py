@@ -22,8 +22,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cairn_calib.rig.lens import Lens
 from cairn_calib.rig.raster import Raster
+from cairn_map.arrays import Floats
 
-Floats = npt.NDArray[np.float64]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 Count = Annotated[int, Field(ge=0, le=1 << 40)]
 Positive = Annotated[float, Field(ge=0, allow_inf_nan=False)]

@@ -13,8 +13,7 @@ import numpy.typing as npt
 
 from cairn_calib.rig.brown import Coefficients, coefficient_gradients, distorted, jacobian, undistorted
 from cairn_calib.rig.lens import Lens
-
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
 
 NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 

@@ -20,8 +20,8 @@ from pydantic import Field
 
 from cairn_calib.rig.brown import Coefficient, first_root
 from cairn_calib.rig.lens import Lens
+from cairn_map.arrays import Floats
 
-Floats = npt.NDArray[np.float64]
 Coefficients = Annotated[tuple[Coefficient, ...], Field(min_length=4, max_length=4)]
 
 TABLE_SIZE = 4096

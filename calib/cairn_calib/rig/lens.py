@@ -16,8 +16,8 @@ import numpy.typing as npt
 from pydantic import Field
 
 from cairn_calib.rig.raster import Raster
+from cairn_map.arrays import Floats
 
-Floats = npt.NDArray[np.float64]
 Focal = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Place = Annotated[float, Field(allow_inf_nan=False)]
 

@@ -20,8 +20,7 @@ from pydantic import Field, model_validator
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_calib.rig.raster import MAX_SIDE_PX, Raster
-
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
 
 SINGLE_BEAM_DEG = 1.0
 """Height of the one row of a lidar with one beam; a spinning line scanner's divergence is less."""

@@ -18,8 +18,8 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cairn_calib.rig.raster import Side
+from cairn_map.arrays import Floats
 
-Floats = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.uint8]
 
 UNIT_M = 1e-4

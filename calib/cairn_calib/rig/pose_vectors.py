@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.rig.poses import Transform, quaternion_from_transform
-
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
 
 SERIES_BELOW_RAD = 0.1
 """Under this angle the closed forms lose digits, and four terms of their series are exact."""

@@ -16,10 +16,8 @@ from cairn_calib.rig.calibration import POSE_UNITS
 from cairn_calib.rig.lens import Lens
 from cairn_calib.rig.pose_vectors import cross_matrix
 from cairn_calib.rig.rig import Rig
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
-
-Floats = npt.NDArray[np.float64]
-
 
 Moves = dict[tuple[str, str], Floats]
 """(..., 2) pixels a unit of a parameter, by camera and name."""

@@ -28,8 +28,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from cairn_calib.rig.pixel_offsets import PixelOffsets
 from cairn_calib.rig.range_terms import BIAS_NAMES, RangeTerms, off_middle, off_middle_image
 from cairn_calib.rig.raster import Raster
+from cairn_map.arrays import Floats
 
-Floats = npt.NDArray[np.float64]
 Real = TypeVar("Real", bound=np.floating)
 
 MEAN_OFF_MIDDLE = 1 / 3

@@ -17,11 +17,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.raster import Raster
-
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
 
 LIGHT_M_S = 299_792_458.0
 BIAS_NAMES = ("offset_m", "scale", "radial_m", "radial4_m")

@@ -12,9 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
-
-Floats = npt.NDArray[np.float64]
 
 MAX_SIDE_PX = 16384
 Side = Annotated[int, Field(ge=1, le=MAX_SIDE_PX)]

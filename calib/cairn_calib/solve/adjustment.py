@@ -11,7 +11,6 @@ colour camera cannot be compared otherwise.
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.board.board import Board
 from cairn_calib.solve.corner_residuals import CornerData, corner_block
@@ -19,9 +18,7 @@ from cairn_calib.solve.normal_equations import Block, Loss, NormalEquations, Unc
 from cairn_calib.solve.range_residuals import RangeData, range_block
 from cairn_calib.solve.rig_state import Layout, RigState, moved, value_of, warp_shape
 from cairn_calib.solve.solve_plan import Noise, Prior
-
-Floats = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
+from cairn_map.arrays import Flags, Floats
 
 STEPS_MAX = 100
 DAMPING, DAMPING_MIN, DAMPING_MAX = 1e-4, 1e-12, 1e10

@@ -22,7 +22,6 @@ from cairn_calib.board.corners import Corners
 from cairn_calib.rig.calibration import InputFile
 from cairn_map.errors import BadInputError
 
-Floats = npt.NDArray[np.float64]
 KIND = "bad_board_views"
 SEEN_MIN = 6
 """Points of a board in one image: fewer, and its place is hardly more than the noise's."""

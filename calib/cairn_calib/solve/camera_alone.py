@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.fisheye import FisheyeCamera
@@ -20,9 +19,8 @@ from cairn_calib.solve.priors import usual_priors
 from cairn_calib.solve.rig_state import RigState, layout_of
 from cairn_calib.solve.solve_plan import CameraPlan, Noise, SolvePlan
 from cairn_calib.solve.zhang import first_camera_matrix, homography_of, pose_from_homography
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
-
-Floats = npt.NDArray[np.float64]
 
 VIEWS_MIN = 2
 TILT_MIN_DEG = 3.0

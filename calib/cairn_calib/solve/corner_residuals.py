@@ -15,15 +15,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.solve.board_views import BoardView
 from cairn_calib.solve.disc_shift import disc_shift
 from cairn_calib.solve.normal_equations import Block, Indices, Loss
 from cairn_calib.solve.rig_state import Layout, RigState
-
-Floats = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
+from cairn_map.arrays import Flags, Floats
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,11 +6,9 @@ the centroid of that polygon taken, which holds for any.
 """
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.lens import Lens
-
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
 
 RIM_POINTS = 48
 """Of a regular polygon, whose centroid is the disc's; only its foreshortening and bending err, by 1 / 48^2 of them."""

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
+
 Indices = npt.NDArray[np.intp]
 
 

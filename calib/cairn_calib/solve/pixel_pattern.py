@@ -24,8 +24,8 @@ from cairn_calib.solve.adjustment import Adjusted
 from cairn_calib.solve.board_views import BoardViews
 from cairn_calib.solve.range_nodes import image_nodes
 from cairn_calib.solve.range_residuals import RangeData, plane_ranges, range_data
+from cairn_map.arrays import Floats
 
-Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
 FOUND_SIGMAS = 4.0

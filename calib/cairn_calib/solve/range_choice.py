@@ -7,15 +7,12 @@ changed like an offset: both then fit, and both are wrong a metre further on. Th
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.board.board import Board
 from cairn_calib.rig.range_terms import RangeTerms, wave_period_m
 from cairn_calib.solve.range_residuals import RangeData, plane_ranges
 from cairn_calib.solve.rig_state import RigState
 from cairn_map.errors import BadInputError
-
-Floats = npt.NDArray[np.float64]
 
 HARMONICS = (1, 2, 4)
 """Waves that are looked for: `range_terms.py`."""

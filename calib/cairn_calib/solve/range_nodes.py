@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.rig.raster import Raster
+from cairn_map.arrays import Floats
 
-Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
 NODES = (12, 9)

@@ -20,9 +20,7 @@ from cairn_calib.solve.board_views import RangeView
 from cairn_calib.solve.normal_equations import Block, Indices, Loss
 from cairn_calib.solve.range_nodes import PixelNodes, pixel_nodes
 from cairn_calib.solve.rig_state import Layout, RigState, warp_at_places
-
-Floats = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
+from cairn_map.arrays import Flags, Floats
 
 PIXELS_MAX = 400
 """Of one image, evenly spread: more would only say the same again."""

@@ -12,14 +12,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.board.board import Board
 from cairn_calib.rig.poses import Transform, inverse
 from cairn_calib.solve.zhang import mirrored_pose
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 
-Floats = npt.NDArray[np.float64]
 Poses = Mapping[str, Transform]
 """T_camera_board of one camera, by frame."""
 

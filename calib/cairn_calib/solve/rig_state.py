@@ -18,8 +18,8 @@ from cairn_calib.rig.calibration import POSE_UNITS
 from cairn_calib.rig.lens import Lens
 from cairn_calib.rig.pose_vectors import rotation_from_vector
 from cairn_calib.solve.solve_plan import SHARED, SolvePlan
+from cairn_map.arrays import Floats
 
-Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
 WARP = ("warp_x", "warp_y")

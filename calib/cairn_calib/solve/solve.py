@@ -14,7 +14,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.poses import Transform
 from cairn_calib.rig.range_terms import NODE_SIGMA_M
@@ -32,9 +31,8 @@ from cairn_calib.solve.rig_start import rig_start
 from cairn_calib.solve.rig_state import Layout, RigState, layout_of, value_of, warp_shape
 from cairn_calib.solve.solve_plan import SolvePlan
 from cairn_calib.solve.zhang import mirrored_pose
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
-
-Floats = npt.NDArray[np.float64]
 
 SMOOTH_M = 5e-4
 """Of what blocks of pixels add: from there on nodes are solved for."""

@@ -4,7 +4,6 @@ import importlib.metadata
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.calibration import Calibration, CameraStatistics, Statistics, covariance_from_matrix
 from cairn_calib.rig.range_bias import RangeBias, bias_from_matrix
@@ -12,8 +11,6 @@ from cairn_calib.rig.rig import Rig, mounted
 from cairn_calib.solve.corner_residuals import CornerData, corner_misses
 from cairn_calib.solve.rig_state import warp_shape
 from cairn_calib.solve.solve import Solution
-
-Floats = npt.NDArray[np.float64]
 
 
 def solved_rig(solution: Solution, *, made_s: float) -> Rig:

@@ -9,13 +9,11 @@ one is taken that meets the corners best.
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.board.corners import Corners
 from cairn_calib.board.homography import fit_homography
 from cairn_calib.rig.poses import Transform
-
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
 
 FOCAL_SHARES = tuple(np.geomspace(0.35, 8.0, 14))
 """Focal lengths of the width that are tried: fields of view from 110 to 7 degrees."""

@@ -22,10 +22,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.rig.radiometry import MapsFile
+from cairn_map.arrays import Floats, Singles
 from cairn_map.errors import BadInputError, DamagedDataError
 
-Floats = npt.NDArray[np.float64]
-Singles = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 SHADING_ORDER = 4

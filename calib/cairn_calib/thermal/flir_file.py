@@ -14,13 +14,12 @@ from typing import Literal
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.radiometry import PlanckResponse, Radiometry
 from cairn_calib.thermal.object_temperature import Viewing, air_transmission
+from cairn_map.arrays import Counts
 from cairn_map.errors import BadInputError, DamagedDataError
 
-Counts = npt.NDArray[np.uint16]
 Endian = Literal["<", ">"]
 
 FILE_BYTES_MAX = 64 << 20

@@ -14,10 +14,8 @@ import numpy.typing as npt
 
 from cairn_calib.rig.radiometry import ZERO_C_K, Radiometry
 from cairn_calib.thermal.flat_field import FlatField
+from cairn_map.arrays import Floats, Singles
 from cairn_map.errors import BadInputError
-
-Floats = npt.NDArray[np.float64]
-Singles = npt.NDArray[np.float32]
 
 EMISSIVITY_MIN = 0.3
 """Of less, more than two thirds of the light are the surroundings': bare metal shows them, not its temperature."""

@@ -14,12 +14,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.radiometry import Housing, PlanckResponse, PolynomialResponse, Radiometry
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 
-Floats = npt.NDArray[np.float64]
 Law = Literal["planck", "polynomial"]
 
 BAND_K = 1428.0

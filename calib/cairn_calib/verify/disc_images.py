@@ -20,11 +20,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.rig.rig import Spectrum
+from cairn_map.arrays import Bytes, Floats, Singles
 from cairn_map.errors import BadInputError
 
-Floats = npt.NDArray[np.float64]
-Singles = npt.NDArray[np.float32]
-Bytes = npt.NDArray[np.uint8]
 Method = Literal["grey", "paper"]
 
 SPECK = 1.6e-4

@@ -14,8 +14,6 @@ import numpy.typing as npt
 from cairn_calib.rig.rig import MountedCamera
 from cairn_calib.verify.disc_images import Disc
 
-Floats = npt.NDArray[np.float64]
-
 PIXELS_MIN = 3
 SLANT_SIGMA = 0.6
 """Of the tangent of the target's tilt: 31 degrees."""

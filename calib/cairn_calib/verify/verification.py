@@ -21,9 +21,9 @@ from cairn_calib.rig.raster import Raster
 from cairn_calib.rig.rig import Rig, Spectrum
 from cairn_calib.verify.disc_images import Disc, Method, brightness_of, find_discs
 from cairn_calib.verify.disc_range import disc_range
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 
-Floats = npt.NDArray[np.float64]
 Image = npt.NDArray[np.generic]
 
 GATE_SIGMAS = 3.0

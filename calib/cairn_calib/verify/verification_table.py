@@ -11,11 +11,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.verify.verification import Sight, Sightings, source_pixel_in
-
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
 
 RESAMPLES = 2000
 SOURCES = ("calibration", "centroid", "range")

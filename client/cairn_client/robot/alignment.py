@@ -25,11 +25,10 @@ from cairn_client.robot.alignment_verdict import Alignment, Matches, Minimum, Ve
 from cairn_fusion.mapping.beam_returns import returns_of
 from cairn_fusion.mapping.integrate import Integrator
 from cairn_fusion.recording.scan import Scan
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.queries.occupancy_states import State
-
-Floats = npt.NDArray[np.float64]
 
 STEP_M, STEP_RAD = 0.5, math.radians(15)
 """Of the search: from half of it, and more, GICP comes home where there is anything to hold on to."""

@@ -6,11 +6,9 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.poses import Transform, inverse, transform_points
-
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats
 
 FIT_MIN = 0.75
 """Share of the points in known space that must lie on surfaces; 0.98 in a simulated building, 0.91 in a real yard."""

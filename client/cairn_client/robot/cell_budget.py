@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterable
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict
 
 from cairn_client.replica.replica import UNPROVEN, Replica
@@ -18,6 +17,7 @@ from cairn_client.robot.limits import Limits
 from cairn_client.robot.robot_events import CellsDropped, Events, OutboxNearlyFull
 from cairn_client.sync.cell_index import whole_index
 from cairn_client.sync.requests import Box, Conversation
+from cairn_map.arrays import Ints
 from cairn_map.errors import UnreachableError
 from cairn_map.evidence.grid import CELL_LIMIT, Cell, CellKey, cell_of_key
 
@@ -41,7 +41,6 @@ CELL_BYTES = 8192
 SLACK_BYTES = 1 << 16
 """Pages that a transaction may need beyond what it writes."""
 
-Ints = npt.NDArray[np.int64]
 Place = Callable[[], tuple[float, float, float] | None]
 """Where the robot is, metres, map frame; None if nobody knows."""
 

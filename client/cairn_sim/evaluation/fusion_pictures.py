@@ -5,7 +5,6 @@ errors.png     the fused image, what each pixel is labelled, the error of temper
 """
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.rig import Rig, Spectrum, mounted
 from cairn_fusion.image_fusion.across import Across
@@ -14,10 +13,9 @@ from cairn_fusion.transfer.transfer import Label
 from cairn_fusion.view.painting import Emphasis, draw_legend_into, painted, painted_alone, write_into
 from cairn_fusion.view.telepresence import fuse
 from cairn_fusion.view.temperature_scale import TemperatureScale
+from cairn_map.arrays import Rgb
 from cairn_sim.evaluation.fusion_truth import FusionTruth
 from cairn_sim.robots.heads import full_head
-
-Rgb = npt.NDArray[np.uint8]
 
 LABEL_COLOURS = {
     Label.OK: (40, 60, 80),

@@ -16,15 +16,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_fusion.image_fusion.across import Across
 from cairn_fusion.image_fusion.eye_depth import Origin
 from cairn_fusion.transfer.transfer import Label
+from cairn_map.arrays import Singles
 from cairn_sim.evaluation.fusion_truth import FusionTruth, grown
-
-Singles = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
 
 LARGE: Mapping[str, float] = {"K": 2.0, "of 255": 20.0}
 """From which on an error shows."""

@@ -15,13 +15,11 @@ import numpy.typing as npt
 
 from cairn_calib.rig.poses import Transform, inverse, transform_points
 from cairn_calib.rig.rig import Rig, Spectrum
+from cairn_map.arrays import Flags, Floats
 from cairn_sim.render.rays import POINTS_OF_BUNDLE, cast, cast_directions
 from cairn_sim.render.render import View, colour_image, thermal_image
 from cairn_sim.render.sensors import ColourSensor, ThermalSensor
 from cairn_sim.scene.scene import Scene
-
-Floats = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 
 HIDDEN_M = 0.1
 """What hides stands so much before what it hides: the bend of a surface seen at a glance hides nothing else."""

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.rig import Rig
 from cairn_fusion.image_fusion.across import Across
@@ -18,9 +17,8 @@ from cairn_fusion.importers import open_source
 from cairn_fusion.recording.images import read_colour
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.view.telepresence import fuse
+from cairn_map.arrays import Flags
 from cairn_sim.evaluation.overlay_scores import intersection_over_union
-
-Flags = npt.NDArray[np.bool_]
 
 HOT_CUP = 13
 """Of `label_mapping.json`."""

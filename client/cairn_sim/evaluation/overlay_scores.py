@@ -18,6 +18,7 @@ import numpy.typing as npt
 from cairn_calib.rig.lidar import AnyCamera
 from cairn_calib.rig.poses import Transform, inverse
 from cairn_fusion.view.overlay import Live, Mode, OverlayStyle, draw_overlay
+from cairn_map.arrays import Flags, Floats, Ints
 from cairn_map.evidence.channels import TEMPERATURE
 from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
@@ -25,10 +26,6 @@ from cairn_map.evidence.grid import CellKey, Geometry, split_voxels
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
 from cairn_map.render.camera_rays import Sight, look_at
 from cairn_map.render.map_render import MapRenderer
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 GEOMETRY = Geometry(voxel_edge_um=50_000, depth=5, channels=(TEMPERATURE,))
 CUBES, REACH_VOXELS = 40, 6

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-import numpy.typing as npt
 
+from cairn_map.arrays import Flags, Floats, Int32s
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence_map import Diff
 from cairn_map.evidence.grid import Geometry, voxels_in_cell
@@ -26,10 +26,6 @@ from cairn_sim.render.sensors import ThermalSensor
 from cairn_sim.scene.distance_kernels import nearest_solids
 from cairn_sim.scene.scene import Scene
 from cairn_sim.scene.solid_kernels import second_at
-
-Floats = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
-Ints = npt.NDArray[np.int32]
 
 BODIES = ("person", "technician", "operator", "chemist", "casualty", "fire fighter")
 PIPES = ("pipe", "riser")
@@ -120,7 +116,7 @@ def temperature_scores(
     }
 
 
-def apparent_k(scene: Scene, points: Floats, solids: Ints) -> Floats:
+def apparent_k(scene: Scene, points: Floats, solids: Int32s) -> Floats:
     """(N,) what a thermal camera reads of solids' surfaces at (N, 3) points: their own, and what they mirror."""
     sensor, surfaces = ThermalSensor(), scene.surfaces
     second = second_at(np.ascontiguousarray(points), solids, scene.shapes)

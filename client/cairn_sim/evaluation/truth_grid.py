@@ -20,16 +20,15 @@ import numpy.typing as npt
 
 from cairn_calib.rig.lidar import AnyCamera
 from cairn_calib.rig.poses import Transform, checked_transform
+from cairn_map.arrays import Flags, Floats
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import NANOMETRES, CellKey, Geometry, cell_of_key
 from cairn_sim.evaluation.truth_grid_kernels import HIT, PASSED, TOUCH_M, add_solid_into, mark_seen_into
 from cairn_sim.render.rays import cast_directions
 from cairn_sim.scene.scene import Scene
 
-Floats = npt.NDArray[np.float64]
 Masks = npt.NDArray[np.uint64]
 Marks = npt.NDArray[np.uint8]
-Flags = npt.NDArray[np.bool_]
 Triple = tuple[int, int, int]
 
 VOXELS_MAX = 1 << 28

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from cairn_map.arrays import Floats
 from cairn_sim.scene.solid_kernels import BOX, CYLINDER, SPHERE, inverse_of
 
-Floats = npt.NDArray[np.float64]
 Longs = npt.NDArray[np.int64]
 Masks = npt.NDArray[np.uint64]
 Marks = npt.NDArray[np.uint8]

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from cairn_calib.rig.poses import Transform
 from cairn_fusion.recording.images import write_colour
+from cairn_map.arrays import Rgb, Singles
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
@@ -23,9 +24,6 @@ from cairn_map.evidence.sensor_model import SensorModel
 from cairn_map.evidence.voxels import voxels_of_evidence
 from cairn_map.files.cell_files import colours
 from cairn_sim.scene.scene import AMBIENT_K
-
-Rgb = npt.NDArray[np.uint8]
-Singles = npt.NDArray[np.float32]
 
 PAPER_WHITE = (255, 255, 255)
 NO_TEMPERATURE = (214, 214, 214)

@@ -13,11 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from cairn_map.arrays import Floats, Int32s, Singles
 from cairn_sim.render.raycast_kernels import Hits
 
-Floats = npt.NDArray[np.float64]
-Singles = npt.NDArray[np.float32]
-Ints = npt.NDArray[np.int32]
 Longs = npt.NDArray[np.int64]
 
 LIGHT_STEP = 0.02
@@ -31,7 +29,7 @@ PASS_LEFT = 0.85
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def edge_pixels(hits: Hits, width: int, height: int, order: Ints) -> Longs:
+def edge_pixels(hits: Hits, width: int, height: int, order: Int32s) -> Longs:
     """(E,) numbers, in the given order of all pixels, of those beside, above or below one that shows something else."""
     _, _, _, seen, second, _, _, incidence, way, passes, _ = hits
     mark = np.zeros(width * height, np.uint8)

@@ -11,13 +11,11 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from cairn_map.arrays import Floats, Int32s, Singles
 from cairn_sim.scene.solid_kernels import FAR, SIDE, Shapes, enter, grain_at, surface_at, turn_at
 from cairn_sim.scene.surfaces import Optics
 from cairn_sim.scene.tree_kernels import STACK, candidates_into, first_entry, spread_into
 
-Floats = npt.NDArray[np.float64]
-Singles = npt.NDArray[np.float32]
-Ints = npt.NDArray[np.int32]
 Marks = npt.NDArray[np.uint8]
 
 GLASS, MIRROR = int(Optics.GLASS), int(Optics.MIRROR)
@@ -31,11 +29,11 @@ class Hits(NamedTuple):
 
     range_m: Floats
     """(N,) metres to the first surface, infinite for none."""
-    solid: Ints
+    solid: Int32s
     """(N,) number of the first solid; -1 for none."""
     path_m: Floats
     """(N,) metres of the light's way to what is seen: through glass, round a mirror; infinite for nothing."""
-    seen: Ints
+    seen: Int32s
     """(N,) number of the solid that is seen; -1 for none."""
     second: Marks
     """(N,) 1 where the texture shows the second material."""
@@ -54,7 +52,7 @@ class Hits(NamedTuple):
 
 
 def cast_rays(
-    origin: Floats, R_map_camera: Floats, rays: Floats, order: Ints, starts: Ints, shapes: Shapes, opaque: bool
+    origin: Floats, R_map_camera: Floats, rays: Floats, order: Int32s, starts: Int32s, shapes: Shapes, opaque: bool
 ) -> Hits:
     """What each ray from one origin meets first, and what it shows.
 
@@ -95,8 +93,8 @@ def _cast_into(
     origin: Floats,
     R_map_camera: Floats,
     rays: Floats,
-    order: Ints,
-    starts: Ints,
+    order: Int32s,
+    starts: Int32s,
     shapes: Shapes,
     opaque: bool,
 ) -> None:
@@ -166,7 +164,7 @@ def _cast_into(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def cast_each(origins: Floats, directions: Floats, shapes: Shapes) -> tuple[Floats, Ints, Floats]:
+def cast_each(origins: Floats, directions: Floats, shapes: Shapes) -> tuple[Floats, Int32s, Floats]:
     """The first surface that each of N rays meets, every ray from an origin of its own.
 
     Returns:

@@ -8,12 +8,10 @@ import numpy.typing as npt
 from cairn_calib.rig.lidar import AnyCamera
 from cairn_calib.rig.poses import Transform, checked_transform, inverse, transform_points
 from cairn_calib.rig.rig import Rig, Spectrum
+from cairn_map.arrays import Floats, Int32s
 from cairn_map.errors import BadInputError
 from cairn_sim.render.raycast_kernels import Hits, cast_rays
 from cairn_sim.scene.scene import Scene
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int32]
 
 TILE_PX = 8
 """Side of the squares of pixels that share a bundle; 8 and 16 are equally fast at 1280 x 960, 8 at 176 x 144."""
@@ -48,7 +46,7 @@ def cast(scene: Scene, camera: AnyCamera, T_map_camera: Transform, *, opaque: bo
 
 
 @lru_cache(maxsize=32)
-def tiles(width: int, height: int) -> tuple[Ints, Ints]:
+def tiles(width: int, height: int) -> tuple[Int32s, Int32s]:
     """The pixels of an image by squares of `TILE_PX`, as `cast_rays` wants its bundles; read-only."""
     y, x = np.divmod(np.arange(width * height, dtype=np.int32), np.int32(width))
     tile = (y // TILE_PX) * -(-width // TILE_PX) + x // TILE_PX

@@ -22,6 +22,7 @@ from cairn_calib.rig.lidar import AnyCamera
 from cairn_calib.rig.poses import Transform
 from cairn_calib.rig.rig import Rig, Spectrum
 from cairn_fusion.recording.scan import Scan
+from cairn_map.arrays import Counts, Singles
 from cairn_map.errors import BadInputError
 from cairn_sim.render.image_kernels import (
     bloomed,
@@ -37,8 +38,6 @@ from cairn_sim.render.rays import cast, cast_directions, tiles
 from cairn_sim.render.sensors import COUNT_MAX, ColourSensor, Noise, RangeSensor, Sensor, ThermalSensor
 from cairn_sim.scene.scene import Scene
 
-Singles = npt.NDArray[np.float32]
-Counts = npt.NDArray[np.uint16]
 Shade = Callable[[Hits], Singles]
 """What N hits send: (N,) or (N, 3)."""
 

@@ -18,9 +18,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-Singles = npt.NDArray[np.float32]
-Floats = npt.NDArray[np.float64]
-Counts = npt.NDArray[np.uint16]
+from cairn_map.arrays import Counts, Floats, Singles
 
 COUNT_MAX = 65535
 

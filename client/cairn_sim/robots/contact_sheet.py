@@ -8,11 +8,10 @@ import numpy.typing as npt
 
 from cairn_calib.rig.poses import Transform
 from cairn_fusion.recording.scan import Scan
+from cairn_map.arrays import Rgb
 from cairn_sim.render.raycast_kernels import cast_each
 from cairn_sim.scene.scene import Scene
 from cairn_sim.scene.scene_format import ZERO_C_K
-
-Rgb = npt.NDArray[np.uint8]
 
 TILE_PX = (480, 384)
 """Width and height of one picture on the sheet."""

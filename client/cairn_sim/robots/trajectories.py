@@ -13,15 +13,14 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.poses import Transform
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 from cairn_sim.render.raycast_kernels import cast_each
 from cairn_sim.scene.scene import Scene
 from cairn_sim.scene.solids import placed
 
-Floats = npt.NDArray[np.float64]
 Xy = tuple[float, float]
 
 EXPERIMENT = "experiment"

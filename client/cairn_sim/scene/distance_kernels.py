@@ -6,14 +6,12 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from cairn_map.arrays import Floats, Int32s
 from cairn_sim.scene.solid_kernels import BOX, CYLINDER, SPHERE, Shapes
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int32]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def nearest_solids(points: Floats, shapes: Shapes) -> tuple[Floats, Ints]:
+def nearest_solids(points: Floats, shapes: Shapes) -> tuple[Floats, Int32s]:
     """Metres from each (N, 3) point to the nearest solid, negative inside, and its number; NaN and -1 for NaN.
 
     Inside of several solids it is the one in which the point lies deepest; of equals, the first.

@@ -10,16 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Floats, Int32s, Singles
 from cairn_map.errors import BadInputError
 from cairn_sim.scene.distance_kernels import nearest_solids
 from cairn_sim.scene.solid_kernels import Shapes, second_at
 from cairn_sim.scene.solids import Box, Cylinder, Plane, Solid, Sphere
 from cairn_sim.scene.surfaces import TEMPERATURE_K, Material, Rgb
 from cairn_sim.scene.tree import tree_of
-
-Floats = npt.NDArray[np.float64]
-Singles = npt.NDArray[np.float32]
-Ints = npt.NDArray[np.int32]
 
 AMBIENT_K = 293.15
 SOLIDS_MAX = 20_000
@@ -62,7 +59,7 @@ class Scene:
     """Apparent temperature where nothing is met."""
     sky_srgb: Rgb
 
-    def solid_at(self, points: npt.NDArray[np.floating]) -> Ints:
+    def solid_at(self, points: npt.NDArray[np.floating]) -> Int32s:
         """(...) int32, number of the solid at each (..., 3) point; -1 in free space, and for NaN."""
         distance, nearest = self._nearest(points)
         return np.where(distance <= 0, nearest, np.int32(-1)).astype(np.int32)
@@ -71,11 +68,11 @@ class Scene:
         """(...) metres from each (..., 3) point to the nearest solid, negative inside; NaN for NaN."""
         return self._nearest(points)[0]
 
-    def nearest_solid(self, points: npt.NDArray[np.floating]) -> Ints:
+    def nearest_solid(self, points: npt.NDArray[np.floating]) -> Int32s:
         """(...) int32, number of the solid nearest to each (..., 3) point, or that it lies deepest in; -1 for NaN."""
         return self._nearest(points)[1]
 
-    def temperature_k_at(self, points: npt.NDArray[np.floating], solids: Ints | None = None) -> Floats:
+    def temperature_k_at(self, points: npt.NDArray[np.floating], solids: Int32s | None = None) -> Floats:
         """(...) kelvin of the surface nearest to each (..., 3) point: true, not apparent; NaN for NaN.
 
         Args:
@@ -99,7 +96,7 @@ class Scene:
                 return number
         raise BadInputError("unknown_solid", f"scene {self.name} has no solid named {name!r}")
 
-    def _nearest(self, points: npt.NDArray[np.floating]) -> tuple[Floats, Ints]:
+    def _nearest(self, points: npt.NDArray[np.floating]) -> tuple[Floats, Int32s]:
         p = np.asarray(points, dtype=np.float64)
         distance, nearest = nearest_solids(np.ascontiguousarray(p.reshape(-1, 3)), self.shapes)
         return distance.reshape(p.shape[:-1]), nearest.reshape(p.shape[:-1])

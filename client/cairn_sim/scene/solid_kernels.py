@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int32]
+from cairn_map.arrays import Floats, Int32s
+
 Bytes = npt.NDArray[np.int8]
 Marks = npt.NDArray[np.uint8]
 
@@ -45,12 +45,12 @@ class Shapes(NamedTuple):
     """(P, 6) changes a metre along u and v, phase in u and v, grain, spots a metre."""
     bounds: Floats
     """(P, 6) lowest and highest corner of each solid, with a margin."""
-    endless: Ints
+    endless: Int32s
     """Numbers of the planes, which no tree can hold."""
     nodes: Floats
     """`tree.tree_of`, as `links` and `leaves`, which holds numbers of solids."""
-    links: Ints
-    leaves: Ints
+    links: Int32s
+    leaves: Int32s
 
 
 @njit(nogil=True, error_model="numpy")
@@ -184,7 +184,7 @@ def surface_at(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def second_at(points: Floats, solids: Ints, shapes: Shapes) -> Marks:
+def second_at(points: Floats, solids: Int32s, shapes: Shapes) -> Marks:
     """(N,) 1 where the surface of the given solid nearest to each (N, 3) point shows the second material."""
     kind, f, half_m, _, texture, _, _, _, _, _ = shapes
     second = np.zeros(len(points), np.uint8)

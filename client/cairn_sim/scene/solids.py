@@ -8,13 +8,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.poses import Transform, checked_transform
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 from cairn_sim.scene.surfaces import Surface
 
-Floats = npt.NDArray[np.float64]
 Metres3 = tuple[float, float, float]
 Angles3 = tuple[float, float, float]
 

@@ -12,8 +12,7 @@ solids, not millions.
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int32]
+from cairn_map.arrays import Floats, Int32s
 
 LEAF_MAX = 2
 """Solids of a leaf. 1, 2 and 4 differ by less than 5 % in the building; 2 has half the nodes of 1."""
@@ -23,7 +22,7 @@ DEPTH_MAX = 48
 """Of branches; below it a node is a leaf, whatever it holds, so that the kernel's stack is bounded."""
 
 
-def tree_of(bounds_m: Floats) -> tuple[Floats, Ints, Ints]:
+def tree_of(bounds_m: Floats) -> tuple[Floats, Int32s, Int32s]:
     """Nodes, links and order of the tree over (N, 6) bounds; with no bounds, one empty leaf that no ray meets."""
     nodes: list[Floats] = []
     links: list[list[int]] = []

@@ -4,10 +4,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from cairn_map.arrays import Floats, Int32s
 from cairn_sim.scene.solid_kernels import FAR, SIDE, enter, inverse_of
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int32]
 Bytes = npt.NDArray[np.int8]
 
 STACK = 64
@@ -26,11 +25,11 @@ def first_entry(
     kind: Bytes,
     frame: Floats,
     half_m: Floats,
-    endless: Ints,
+    endless: Int32s,
     nodes: Floats,
-    links: Ints,
-    leaves: Ints,
-    stack: Ints,
+    links: Int32s,
+    leaves: Int32s,
+    stack: Int32s,
     nears: Floats,
 ) -> tuple[float, int, int]:
     """Range, solid and face where the ray first enters a solid farther than `behind`; FAR and -1 for none.
@@ -90,7 +89,9 @@ def _near(
 
 
 @njit(nogil=True, error_model="numpy")
-def spread_into(spread: Floats, directions: Floats, R: Floats, rays: Floats, order: Ints, start: int, end: int) -> None:
+def spread_into(
+    spread: Floats, directions: Floats, R: Floats, rays: Floats, order: Int32s, start: int, end: int
+) -> None:
     """A bundle's rays in the map frame, and (3, 2) their lowest and highest component along each axis but for NaN."""
     for a in range(3):
         low, high = np.inf, -np.inf
@@ -105,16 +106,16 @@ def spread_into(spread: Floats, directions: Floats, R: Floats, rays: Floats, ord
 
 @njit(nogil=True, error_model="numpy")
 def candidates_into(
-    candidates: Ints,
+    candidates: Int32s,
     nears: Floats,
     origin: Floats,
     spread: Floats,
     bounds: Floats,
-    endless: Ints,
+    endless: Int32s,
     nodes: Floats,
-    links: Ints,
-    leaves: Ints,
-    stack: Ints,
+    links: Int32s,
+    leaves: Int32s,
+    stack: Int32s,
 ) -> int:
     """Solids that a bundle may meet, and a range before which it meets none of them, rising; returns how many."""
     count = 0

@@ -7,15 +7,13 @@ the bare laboratory and looks along x. Seeded; the same numbers give the same sc
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.poses import Transform, transform_points
 from cairn_calib.rig.rig import Rig
+from cairn_map.arrays import Floats
 from cairn_sim.robots.heads import RANGE_CAMERA
 from cairn_sim.robots.kinematics import T_FORWARD_CAMERA
 from cairn_sim.scene.solids import placed
-
-Floats = npt.NDArray[np.float64]
 
 T_MAP_HEAD: Transform = placed((0.0, 0.0, 1.4)) @ T_FORWARD_CAMERA
 """In the middle of the laboratory's height."""

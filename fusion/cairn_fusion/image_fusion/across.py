@@ -20,9 +20,7 @@ from cairn_fusion.image_fusion.eye_depth import EyeDepth, Origin
 from cairn_fusion.image_fusion.row_bands import in_bands
 from cairn_fusion.image_fusion.surface import JOIN_SIGMAS, Drawn, beams, places
 from cairn_fusion.transfer.transfer import Label
-
-Singles = npt.NDArray[np.float32]
-Labels = npt.NDArray[np.uint8]
+from cairn_map.arrays import Labels, Singles
 
 HIDDEN_BEHIND = 0.03
 """How much deeper, as a share, a point must be than what hides it, besides slant and `JOIN_SIGMAS` of its noise."""

@@ -6,9 +6,7 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-Singles = npt.NDArray[np.float32]
-Floats = npt.NDArray[np.float64]
-Labels = npt.NDArray[np.uint8]
+from cairn_map.arrays import Floats, Labels, Singles
 
 OK, OCCLUDED, OUT_OF_VIEW, NO_RANGE, NO_READING = 0, 1, 2, 3, 6
 """`transfer.Label`."""

@@ -19,16 +19,14 @@ found. Too little, and too often wrong, for evidence: a label BEYOND is for the 
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.rig import Rig
 from cairn_fusion.image_fusion.surface import sight_of
 from cairn_fusion.recording.scan import Scan
+from cairn_map.arrays import Flags
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.render.camera_rays import middles
 from cairn_map.render.map_render import MapRenderer
-
-Flags = npt.NDArray[np.bool_]
 
 SURE = 0.7
 """Probability of what a beam went through: less is grazed, or was seen to be gone."""

@@ -23,10 +23,8 @@ from cairn_fusion.image_fusion.eye_depth_kernels import REACH, densify_into
 from cairn_fusion.image_fusion.row_bands import in_bands
 from cairn_fusion.image_fusion.surface import Drawn
 from cairn_fusion.recording.scan import Scan
+from cairn_map.arrays import Bytes, Singles
 from cairn_map.errors import BadInputError
-
-Singles = npt.NDArray[np.float32]
-Bytes = npt.NDArray[np.uint8]
 
 ALIKE_SIGMA = 24.0
 """Of the sum of three differences of 8-bit colours: noise and shading; the edges of things are larger."""

@@ -4,10 +4,8 @@ import math
 
 import numba as nb
 import numpy as np
-import numpy.typing as npt
 
-Singles = npt.NDArray[np.float32]
-Bytes = npt.NDArray[np.uint8]
+from cairn_map.arrays import Bytes, Singles
 
 NOTHING, MEASURED, FILLED = 0, 1, 2
 """`eye_depth.Origin`."""

@@ -1,15 +1,13 @@
 """How certain each pixel of a fused image is: the covariance of where in its source the value was taken from."""
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.rig import Rig
 from cairn_fusion.image_fusion.across import Across
 from cairn_fusion.image_fusion.eye_depth import Origin
 from cairn_fusion.image_fusion.eye_depth_kernels import STEP_SHARE
 from cairn_fusion.transfer.place_covariance import PlaceCovariance
-
-Singles = npt.NDArray[np.float32]
+from cairn_map.arrays import Singles
 
 
 def fused_covariance(fused: Across, rig: Rig, *, range_camera: str) -> Singles:

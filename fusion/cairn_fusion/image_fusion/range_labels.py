@@ -10,15 +10,13 @@ Where a map is at hand it may tell (`beyond_labels`).
 """
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.rig import Rig
 from cairn_fusion.mapping.beam_returns import full_pixels
 from cairn_fusion.mapping.flying_kernels import flying_pixels
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.transfer import Label
-
-Labels = npt.NDArray[np.uint8]
+from cairn_map.arrays import Labels
 
 MIN_RANGE_M = 0.1
 MAX_RANGE_M = 10.0

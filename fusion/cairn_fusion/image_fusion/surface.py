@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.brown import radius_limit
 from cairn_calib.rig.camera import Camera
@@ -32,11 +31,8 @@ from cairn_fusion.image_fusion.surface_kernels import (
 )
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.transfer import KERNEL_COEFFICIENTS, Label
+from cairn_map.arrays import Flags, Labels, Singles
 from cairn_map.render.camera_rays import Sight
-
-Singles = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
-Labels = npt.NDArray[np.uint8]
 
 JOIN_SIGMAS = 3 * math.sqrt(2)
 """Of the range: what a step between two pixels of one surface may have from noise."""

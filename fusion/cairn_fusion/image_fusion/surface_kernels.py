@@ -9,12 +9,8 @@ import math
 
 import numba as nb
 import numpy as np
-import numpy.typing as npt
 
-Singles = npt.NDArray[np.float32]
-Floats = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
-Labels = npt.NDArray[np.uint8]
+from cairn_map.arrays import Flags, Floats, Labels, Singles
 
 SLANT_SHARE = 2.0
 """How many times the steps beside it, of the same sign, a step between two pixels of one surface may have."""

@@ -19,10 +19,7 @@ from cairn_calib.rig.rig import MountedCamera, Rig
 from cairn_fusion.mapping.flying_kernels import flying_pixels
 from cairn_fusion.mapping.tally_kernels import returned_points
 from cairn_fusion.recording.scan import Scan, check_scan
-
-Floats = npt.NDArray[np.float64]
-Singles = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
+from cairn_map.arrays import Flags, Floats, Singles
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,11 +11,7 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-Ints = npt.NDArray[np.int64]
-Index = npt.NDArray[np.int32]
-Counts = npt.NDArray[np.uint16]
-Floats = npt.NDArray[np.float64]
-Singles = npt.NDArray[np.float32]
+from cairn_map.arrays import Counts, Int32s, Singles
 
 ALL_FREE = 0xFF
 """Mask of a brick of which all octants are free; see `cull_kernels`."""
@@ -24,15 +20,15 @@ ALL_FREE = 0xFF
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def carve_into(
     misses: Counts,
-    slots: Index,
-    masks: Index,
+    slots: Int32s,
+    masks: Int32s,
     corners_view: Singles,
     offsets_view: Singles,
     squares: Singles,
     lens: Singles,
     min_square: float,
-    tables: Index,
-    struck: Index,
+    tables: Int32s,
+    struck: Int32s,
 ) -> None:
     """Count a miss in each voxel that is looked through and was not hit.
 

@@ -8,9 +8,8 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-Ints = npt.NDArray[np.int64]
-Floats = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int32]
+from cairn_map.arrays import Floats, Int32s, Ints
+
 Marks = npt.NDArray[np.uint8]
 
 MISS = 1
@@ -32,7 +31,7 @@ def _inner(x: int, y: int, z: int) -> int:
 
 
 @nb.njit(nogil=True)
-def _add_brick(b: int, brick_of: Index, bricks: Ints, marks: Marks, used: int) -> int:
+def _add_brick(b: int, brick_of: Int32s, bricks: Ints, marks: Marks, used: int) -> int:
     """Give a brick of the box the next place in the pool; returns bricks used."""
     brick_of[b] = used
     bricks[used] = b
@@ -53,7 +52,7 @@ def _crossings(origin: float, target: float, at: int, end: int) -> tuple[float, 
 
 
 @nb.njit(cache=True, nogil=True)
-def mark_hits_into(ends: Ints, dims: Ints, brick_of: Index, bricks: Ints, marks: Marks, used: int) -> int:
+def mark_hits_into(ends: Ints, dims: Ints, brick_of: Int32s, bricks: Ints, marks: Marks, used: int) -> int:
     """Mark the end voxels (box coordinates) as HIT; the pool has room for one brick each. Returns bricks used."""
     for n in range(ends.shape[0]):
         b = _brick(ends[n, 0], ends[n, 1], ends[n, 2], dims)
@@ -70,7 +69,7 @@ def mark_misses_into(
     ends: Ints,
     first: int,
     dims: Ints,
-    brick_of: Index,
+    brick_of: Int32s,
     bricks: Ints,
     marks: Marks,
     used: int,

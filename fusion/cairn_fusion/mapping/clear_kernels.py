@@ -15,11 +15,9 @@ import math
 
 import numba as nb
 import numpy as np
-import numpy.typing as npt
 
 from cairn_fusion.transfer.transfer_kernels import step_beside
-
-Singles = npt.NDArray[np.float32]
+from cairn_map.arrays import Singles
 
 RINGS = 2
 EDGE_STEP_M = 0.1

@@ -6,14 +6,11 @@ silence          `no_return_clears_m`, where the rig states it  else a beam to w
 """
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.rig import MountedCamera
 from cairn_fusion.mapping.beam_returns import Returns
 from cairn_fusion.mapping.clear_kernels import nearest_around
-
-Floats = npt.NDArray[np.float64]
-Singles = npt.NDArray[np.float32]
+from cairn_map.arrays import Floats, Singles
 
 MARGIN_VOXELS = 1.0
 """How far before a surface a voxel's centre must be to be free: a little more than half a voxel's diagonal, 0.87."""

@@ -9,12 +9,8 @@ Farach-Colton 2000). An answer is certain or mixed, so where cubes begin changes
 
 import numba as nb
 import numpy as np
-import numpy.typing as npt
 
-Ints = npt.NDArray[np.int64]
-Index = npt.NDArray[np.int32]
-Floats = npt.NDArray[np.float64]
-Singles = npt.NDArray[np.float32]
+from cairn_map.arrays import Floats, Int32s, Ints, Singles
 
 NOT_SEEN, FREE, MIXED = 0.0, 1.0, 2.0
 BRICK_VOXELS = 8
@@ -60,7 +56,7 @@ def window_extremes_into(extremes: Singles, clear: Singles) -> None:
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def cull_bricks_into(
-    found: Index,
+    found: Int32s,
     low: Ints,
     high: Ints,
     dims: Ints,
@@ -127,7 +123,7 @@ def cull_bricks_into(
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def split_bricks_into(
-    found: Index,
+    found: Int32s,
     corners_view: Singles,
     dims: Ints,
     corner: Ints,
@@ -234,7 +230,7 @@ def _rects_into(
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _sights_into(parts: Floats, min_range_m: float, levels: Index, extremes: Singles) -> None:
+def _sights_into(parts: Floats, min_range_m: float, levels: Int32s, extremes: Singles) -> None:
     """Decide on the parts that `_rects_into` left FREE: none of their pixels sees as far, all see farther, or neither.
 
     Four windows cover a rectangle and, if it is long and narrow, what is around it. No branches: of eight parts each
@@ -269,7 +265,7 @@ def _sights_into(parts: Floats, min_range_m: float, levels: Index, extremes: Sin
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _levels(side_max: int, count: int) -> Index:
+def _levels(side_max: int, count: int) -> Int32s:
     """(side_max,) by a rectangle's longer side, less one, the level of the windows to cover it with."""
     levels = np.empty(side_max, np.int32)
     level = 0

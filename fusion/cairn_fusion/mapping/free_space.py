@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.lidar import AnyCamera
 from cairn_calib.rig.poses import Transform
@@ -19,11 +18,7 @@ from cairn_fusion.mapping.cull_kernels import (
     split_bricks_into,
     window_extremes_into,
 )
-
-Floats = npt.NDArray[np.float64]
-Singles = npt.NDArray[np.float32]
-Ints = npt.NDArray[np.int64]
-Index = npt.NDArray[np.int32]
+from cairn_map.arrays import Floats, Int32s, Ints, Singles
 
 DEPTH_SHARE_MIN = 0.2
 """Least cosine of a ray to the optical axis, 78 degrees, that a pinhole window can hold; wider lenses are cast."""
@@ -37,7 +32,7 @@ class Window:
     height: int
     lens: Floats
     """(4,) fx, fy, cx, cy of the padded window, with half a pixel added, so that rounding down finds the pixel."""
-    pixel_of: Index
+    pixel_of: Int32s
     """(height width,) number of the camera's pixel that each of the window's shows; one past the last for none."""
 
     def shown(self, clear_m: Singles) -> Singles:
@@ -73,7 +68,7 @@ class Carving:
     """What a view looks through: numbers of bricks of a box, which octants of each, and what kernels need."""
 
     bricks: Ints
-    masks: Index
+    masks: Int32s
     """(K,) of `cull_kernels`."""
     squares: Singles
     """Padded image of how far each pixel is clear, squared."""
@@ -94,7 +89,7 @@ class Scratch:
 
     def __init__(self) -> None:
         self._extremes: Singles = np.empty((0, 0, 0), np.float32)
-        self._found: Index = np.empty((1 << 14, 2), np.int32)
+        self._found: Int32s = np.empty((1 << 14, 2), np.int32)
 
     def extremes(self, clear_m: Singles) -> Singles:
         """Of `window_extremes_into`, for an image of this size."""
@@ -105,7 +100,7 @@ class Scratch:
         window_extremes_into(self._extremes, clear_m)
         return self._extremes
 
-    def found(self, count: int) -> Index:
+    def found(self, count: int) -> Int32s:
         """At least (count, 2)."""
         if count > len(self._found):
             self._found = np.empty((2 * count, 2), np.int32)

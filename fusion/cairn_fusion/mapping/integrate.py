@@ -32,13 +32,11 @@ from cairn_fusion.mapping.tallies import Tallies
 from cairn_fusion.mapping.tally import Each
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.transfer import DEPTH_TOLERANCE_M
+from cairn_map.arrays import Floats, Ints
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence import Evidence, packed_evidence
 from cairn_map.evidence.grid import CellKey, Geometry, split_voxels, voxels_of_points
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 
 class Method(StrEnum):

@@ -7,16 +7,14 @@ clear    where each beam is certainly free so far: misses on the way there, but 
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_fusion.mapping.beam_returns import Returns
 from cairn_fusion.mapping.clear_range import margins_m
 from cairn_fusion.mapping.ray_casting import SeenVoxels, seen_voxels
+from cairn_map.arrays import Floats, Ints
 from cairn_map.evidence.evidence import Evidence, packed_evidence
 from cairn_map.evidence.grid import CellKey, Geometry, split_voxels, voxels_of_points
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 Sums = Callable[[Ints, int], Ints]
 """From the number of each point's voxel (N,) and the count of voxels to (count, P) sums of samples."""
 

@@ -11,12 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_fusion.mapping.cast_kernels import HIT, mark_hits_into, mark_misses_into
+from cairn_map.arrays import Floats, Ints
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import BRICK_DEPTH, CELL_LIMIT, Geometry, voxels_of_points
 from cairn_map.kernels.morton_kernels import interleave
-
-Ints = npt.NDArray[np.int64]
-Floats = npt.NDArray[np.float64]
 
 BOX_BRICKS_MAX = 1 << 27
 """Bricks in the box around one scan: 512 MB of index. 40 m at 1 cm."""

@@ -5,18 +5,15 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_fusion.transfer.transfer_kernels import OK, UNCERTAIN
+from cairn_map.arrays import Floats, Int32s, Ints
 from cairn_map.evidence.channels import SAMPLE_MAX
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Index = npt.NDArray[np.int32]
 
 
 @nb.njit(cache=True, nogil=True)
 def doubt_edges_into(
     labels: npt.NDArray[np.uint8],
     pixels: Ints,
-    reach_px: Index,
+    reach_px: Int32s,
     image: npt.NDArray[np.float32],
     step_max: float,
 ) -> None:
@@ -52,7 +49,7 @@ def add_pixels_into(
     image: npt.NDArray[np.generic],
     pixels: Ints,
     labels: npt.NDArray[np.uint8],
-    voxel_of: Index,
+    voxel_of: Int32s,
 ) -> None:
     """Add each point's pixel to its voxel, but for points that are taken already, and take those that had a value.
 

@@ -28,13 +28,11 @@ from cairn_fusion.transfer.transfer import (
     points_from_range,
     transfer_points,
 )
+from cairn_map.arrays import Floats, Ints, Labels
 from cairn_map.evidence.channels import Channel, ChannelKind
 from cairn_map.evidence.grid import Geometry
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 Numbers = npt.NDArray[np.integer]
-Labels = npt.NDArray[np.uint8]
 
 
 def sample_sums(

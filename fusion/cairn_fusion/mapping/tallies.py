@@ -7,15 +7,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import Lock
 
-import numpy as np
-import numpy.typing as npt
-
 from cairn_fusion.mapping.tally import Each, ScanHits, Tally, tally_around
+from cairn_map.arrays import Floats
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import CellKey, Geometry
 
-Floats = npt.NDArray[np.float64]
 Diff = dict[CellKey, Evidence]
 
 

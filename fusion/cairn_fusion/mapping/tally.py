@@ -21,15 +21,12 @@ import numpy.typing as npt
 from cairn_fusion.mapping import tally_kernels as kernels
 from cairn_fusion.mapping.carve_kernels import carve_into
 from cairn_fusion.mapping.free_space import Carving, Scratch
+from cairn_map.arrays import Counts, Floats, Int32s, Ints
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import BRICK_DEPTH, CELL_LIMIT, CellKey, Geometry, voxels_of_points
 from cairn_map.kernels.morton_kernels import interleave
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Index = npt.NDArray[np.int32]
-Counts = npt.NDArray[np.uint16]
 Scalar = TypeVar("Scalar", bound=np.generic)
 Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
@@ -47,16 +44,16 @@ class ScanHits:
     """The voxels that one scan hit: numbered, and found by brick. Of one thread; used again for scan after scan."""
 
     def __init__(self) -> None:
-        self._table_of: Index = np.empty(0, np.int32)
-        self._bricks: Index = np.empty(0, np.int32)
-        self._struck: Index = np.empty((0, 512), np.int32)
+        self._table_of: Int32s = np.empty(0, np.int32)
+        self._bricks: Int32s = np.empty(0, np.int32)
+        self._struck: Int32s = np.empty((0, 512), np.int32)
         self._used = 0
         self.scratch = Scratch()
         """For the views of the same thread."""
         self.voxels: Ints = np.empty(0, np.int64)
         """(U,) brick number of the box times 512 plus place, by number."""
 
-    def number(self, points_m: Floats, tally: "Tally") -> tuple[Index, int]:
+    def number(self, points_m: Floats, tally: "Tally") -> tuple[Int32s, int]:
         """Number the different voxels of a tally's box that (N, 3) points hit: (N,) each point's, and how many.
 
         Raises:
@@ -75,7 +72,7 @@ class ScanHits:
         self.voxels = touched[:count]
         return numbers, count
 
-    def tables_of(self, bricks: Ints) -> tuple[Index, Index]:
+    def tables_of(self, bricks: Ints) -> tuple[Int32s, Int32s]:
         """(K,) each brick's row of a (T, 512) array that is 0 where no voxel is hit, -1 for none; and that array."""
         return self._table_of[bricks] - np.int32(1), self._struck
 
@@ -100,10 +97,10 @@ class Tally:
         bricks = int(np.prod(self.dims))
         self._misses_lock, self._hits_lock = Lock(), Lock()
         self._slot_of, self._table_of = np.zeros(bricks, np.int32), np.zeros(bricks, np.int32)
-        self._seen_bricks: Index = np.empty(0, np.int32)
+        self._seen_bricks: Int32s = np.empty(0, np.int32)
         self._misses: Counts = np.empty((0, 512), np.uint16)
-        self._hit_bricks: Index = np.empty(0, np.int32)
-        self._row_of: Index = np.empty((0, 512), np.int32)
+        self._hit_bricks: Int32s = np.empty(0, np.int32)
+        self._row_of: Int32s = np.empty((0, 512), np.int32)
         self._sums: Ints = np.empty((0, 1 + geometry.plane_count), np.int64)
         self._slots = self._tables = self._rows = 0
 

@@ -4,17 +4,14 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-Ints = npt.NDArray[np.int64]
-Index = npt.NDArray[np.int32]
-Counts = npt.NDArray[np.uint16]
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Counts, Floats, Int32s, Ints
 
 NANOMETRES = 1e9
 BRICK_VOXELS = 8
 
 
 @nb.njit(cache=True, nogil=True)
-def returned_points(range_m: npt.NDArray[np.float32], rays: Floats, T_map_camera: Floats) -> tuple[Index, Floats]:
+def returned_points(range_m: npt.NDArray[np.float32], rays: Floats, T_map_camera: Floats) -> tuple[Int32s, Floats]:
     """(N,) numbers of the pixels with a range and a ray, and (N, 3) their points, map frame (Eq. 1-5)."""
     pixels = np.empty(range_m.size, np.int32)
     points = np.empty((range_m.size, 3))
@@ -66,7 +63,7 @@ def hit_voxels(points_m: Floats, voxel_edge_nm: int, corner: Ints, dims: Ints) -
 
 
 @nb.njit(cache=True, nogil=True)
-def claim_into(numbers: Ints, shift: int, place_of: Index, bricks: Index, used: int) -> int:
+def claim_into(numbers: Ints, shift: int, place_of: Int32s, bricks: Int32s, used: int) -> int:
     """Give each brick that has no place the next one; returns places used.
 
     `place_of` (bricks of the box,) is one more than a brick's place, 0 for none; `bricks` has room for all.
@@ -81,7 +78,7 @@ def claim_into(numbers: Ints, shift: int, place_of: Index, bricks: Index, used: 
 
 
 @nb.njit(cache=True, nogil=True)
-def number_hits_into(voxels: Ints, table_of: Index, struck: Index, touched: Ints) -> tuple[Index, int]:
+def number_hits_into(voxels: Ints, table_of: Int32s, struck: Int32s, touched: Ints) -> tuple[Int32s, int]:
     """Number the different voxels of a scan's hits as they come; (N,) the number of each point's voxel, and how many.
 
     Args:
@@ -104,7 +101,7 @@ def number_hits_into(voxels: Ints, table_of: Index, struck: Index, touched: Ints
 
 
 @nb.njit(cache=True, nogil=True)
-def forget_hits_into(bricks: Index, table_of: Index, struck: Index, touched: Ints) -> None:
+def forget_hits_into(bricks: Int32s, table_of: Int32s, struck: Int32s, touched: Ints) -> None:
     """Undo `number_hits_into` and `claim_into`."""
     for n in range(len(touched)):
         struck[table_of[touched[n] >> 9] - 1, touched[n] & 511] = 0
@@ -113,7 +110,7 @@ def forget_hits_into(bricks: Index, table_of: Index, struck: Index, touched: Int
 
 
 @nb.njit(cache=True, nogil=True)
-def claim_rows_into(voxels: Ints, table_of: Index, row_of: Index, rows: Index, used: int) -> int:
+def claim_rows_into(voxels: Ints, table_of: Int32s, row_of: Int32s, rows: Int32s, used: int) -> int:
     """Give each voxel that has no row the next one; returns rows used.
 
     `row_of` (T, 512) is one more than a voxel's row, 0 for none; `rows` (N,) takes the row of each.
@@ -129,7 +126,7 @@ def claim_rows_into(voxels: Ints, table_of: Index, row_of: Index, rows: Index, u
 
 
 @nb.njit(cache=True, nogil=True)
-def add_hits_into(sums: Ints, rows: Index, added: Ints) -> None:
+def add_hits_into(sums: Ints, rows: Int32s, added: Ints) -> None:
     """Count a hit in some rows of (R, 1 + P) sums, all different, and add their (N, P) samples."""
     for n in range(len(rows)):
         row = rows[n]
@@ -139,7 +136,7 @@ def add_hits_into(sums: Ints, rows: Index, added: Ints) -> None:
 
 
 @nb.njit(cache=True, nogil=True)
-def count_known(slots: Index, tables: Index, misses: Counts, row_of: Index) -> tuple[int, int]:
+def count_known(slots: Int32s, tables: Int32s, misses: Counts, row_of: Int32s) -> tuple[int, int]:
     """Voxels with a count, and those of them with a hit, in bricks with these slots and tables, -1 for none."""
     known, hit = np.int64(0), np.int64(0)
     for b in range(len(slots)):
@@ -160,14 +157,14 @@ def count_known(slots: Index, tables: Index, misses: Counts, row_of: Index) -> t
 
 @nb.njit(cache=True, nogil=True)
 def pack_known_into(
-    slots: Index,
-    tables: Index,
-    numbers: Index,
+    slots: Int32s,
+    tables: Int32s,
+    numbers: Int32s,
     misses: Counts,
-    row_of: Index,
+    row_of: Int32s,
     sums: Ints,
     places: npt.NDArray[np.uint32],
-    counts: Index,
+    counts: Int32s,
     sampled: npt.NDArray[np.uint32],
     samples: Ints,
 ) -> int:

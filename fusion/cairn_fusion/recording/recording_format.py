@@ -18,6 +18,7 @@ from cairn_calib.rig.lidar import AnyCamera, SpinningLidar
 from cairn_calib.rig.rig import Rig, Spectrum
 from cairn_fusion.recording.adapters import kelvin_from_counts, range_from_radial, range_from_z_depth
 from cairn_fusion.recording.timed_lists import read_text
+from cairn_map.arrays import Counts
 from cairn_map.errors import BadInputError, first_error
 
 HEADER_FILE = "recording.json"
@@ -37,7 +38,6 @@ PATH_LENGTH_MAX = 1024
 NAME_BYTES_MAX = 255
 """Of one part of a path, on every common file system; beyond it the system's own error would come."""
 
-Counts = npt.NDArray[np.uint16]
 Metres = npt.NDArray[np.float32]
 Kelvin = npt.NDArray[np.float32]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]

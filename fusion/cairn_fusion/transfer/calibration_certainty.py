@@ -11,16 +11,14 @@ one number a camera, `calibration_sigma_px`.
 """
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.calibration import POSE_UNITS
 from cairn_calib.rig.lens import Lens
 from cairn_calib.rig.pose_vectors import cross_matrix
 from cairn_calib.rig.poses import inverse, transform_points
 from cairn_calib.rig.rig import Rig
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
-
-Floats = npt.NDArray[np.float64]
 
 
 def calibration_covariance(points_src: Floats, rig: Rig, *, src: str, dst: str) -> Floats:

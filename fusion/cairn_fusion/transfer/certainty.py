@@ -20,9 +20,7 @@ from cairn_calib.rig.poses import inverse, transform_points
 from cairn_calib.rig.rig import Rig
 from cairn_fusion.transfer.calibration_certainty import calibration_covariance, lens_of, pixel_gradients
 from cairn_fusion.transfer.place_covariance import calibration_bound_px
-
-Floats = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
+from cairn_map.arrays import Flags, Floats
 
 REACH_MAX_PX = 16
 """A bound on the work of looking around."""

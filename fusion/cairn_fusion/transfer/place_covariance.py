@@ -20,9 +20,7 @@ from cairn_calib.rig.poses import inverse, transform_points
 from cairn_calib.rig.rig import MountedCamera, Rig
 from cairn_fusion.transfer.calibration_certainty import calibration_covariance, lens_of, pixel_gradients
 from cairn_fusion.transfer.place_covariance_kernels import covariances_into
-
-Floats = npt.NDArray[np.float64]
-Singles = npt.NDArray[np.float32]
+from cairn_map.arrays import Floats, Singles
 
 COLUMNS, ROWS = 12, 9
 NODES = np.geomspace(1 / 20.0, 1 / 0.2, 12)

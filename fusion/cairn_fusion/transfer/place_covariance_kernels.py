@@ -2,10 +2,8 @@
 
 import numba as nb
 import numpy as np
-import numpy.typing as npt
 
-Singles = npt.NDArray[np.float32]
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats, Singles
 
 PLANES = 8
 """Of a node: xx, xy, yy of calibration; x, y by range; xx, xy, yy of the pixel's own."""

@@ -20,8 +20,8 @@ from cairn_calib.rig.lidar import AnyCamera
 from cairn_calib.rig.poses import Transform, inverse, transform_points
 from cairn_calib.rig.rig import Rig
 from cairn_fusion.transfer.transfer_kernels import hide_into, project_into, steps_of
+from cairn_map.arrays import Floats
 
-Floats = npt.NDArray[np.float64]
 Pixels = npt.NDArray[np.int64]
 
 BIN_MARGIN = 1.5

@@ -6,9 +6,9 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from cairn_map.arrays import Floats, Labels
+
 Pixels = npt.NDArray[np.int64]
-Labels = npt.NDArray[np.uint8]
 
 OK, OCCLUDED, OUT_OF_VIEW, NO_RANGE = 0, 1, 2, 3
 UNCERTAIN = 7

@@ -13,12 +13,9 @@ from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import cv2
-import numpy as np
-import numpy.typing as npt
 
+from cairn_map.arrays import Rgb
 from cairn_map.errors import BadInputError
-
-Rgb = npt.NDArray[np.uint8]
 
 CLIENTS_MAX = 8
 """Streams at once; who comes then is told to come later."""

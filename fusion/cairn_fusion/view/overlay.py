@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_fusion.view import overlay_kernels as kernels
+from cairn_map.arrays import Flags, Rgb
 from cairn_map.errors import BadInputError
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.render.bitmap_font import write_text_into
@@ -31,9 +32,7 @@ from cairn_map.render.map_render import MapRenderer, Seen
 from cairn_map.render.pose_spread import BLUR_MAX_PX, PoseSpread, spread_ink, why_withheld
 from cairn_map.render.render_picture import SCALES, WARNING, Layer, Scale, painted
 
-Rgb = npt.NDArray[np.uint8]
 Values = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 TOLERANCE_VOXELS = 2.0

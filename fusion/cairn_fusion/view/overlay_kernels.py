@@ -7,7 +7,8 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-Rgb = npt.NDArray[np.uint8]
+from cairn_map.arrays import Rgb
+
 Covers = npt.NDArray[np.float32]
 NOTHING, VISIBLE, SEE_THROUGH, MAP_ONLY = 0, 1, 2, 3
 STRIPE_PX, STRIPES_PX = 3, 8

@@ -8,16 +8,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from cairn_fusion.image_fusion.row_bands import in_bands
 from cairn_fusion.view.paint_kernels import hottest_square, paint_into
 from cairn_fusion.view.temperature_scale import PALETTE, ZERO_CELSIUS_K, TemperatureScale
+from cairn_map.arrays import Labels, Rgb, Singles
 from cairn_map.errors import BadInputError
-
-Rgb = npt.NDArray[np.uint8]
-Labels = npt.NDArray[np.uint8]
-Singles = npt.NDArray[np.float32]
 
 TEXT = (240, 240, 240)
 SHADOW = (0, 0, 0)

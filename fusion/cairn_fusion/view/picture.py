@@ -12,12 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_fusion.recording.images import write_colour
+from cairn_map.arrays import Floats, Rgb
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.voxels import Voxels
 from cairn_map.files.cell_files import colours
-
-Floats = npt.NDArray[np.float64]
-Rgb = npt.NDArray[np.uint8]
 
 PANEL_PX = (800, 520)
 """Width and height of one view."""

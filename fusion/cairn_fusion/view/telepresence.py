@@ -36,11 +36,11 @@ from cairn_fusion.view.painting import (
     write_into,
 )
 from cairn_fusion.view.temperature_scale import TemperatureScale, locked_scale
+from cairn_map.arrays import Rgb
 from cairn_map.errors import BadInputError
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.render.map_render import MapRenderer
 
-Rgb = npt.NDArray[np.uint8]
 Image = npt.NDArray[np.generic]
 
 SAME_SHARE = 0.05

@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Bytes
 from cairn_map.errors import BadInputError
-
-Bytes = npt.NDArray[np.uint8]
 
 ZERO_CELSIUS_K = 273.15
 PERCENTILES = (1.0, 99.5)

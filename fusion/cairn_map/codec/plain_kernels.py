@@ -9,15 +9,10 @@ One pass of many columns at once takes a fraction of a pass for each: most cells
 
 import numba as nb
 import numpy as np
-import numpy.typing as npt
 
+from cairn_map.arrays import Bytes, Int32s, Ints, Words32
 from cairn_map.codec.octree.octree_kernels import list_leaves_into, measure_masks, ones
 from cairn_map.codec.octree.sum_kernels import square_guess, unzigzag
-
-Bytes = npt.NDArray[np.uint8]
-Words = npt.NDArray[np.uint32]
-Counts = npt.NDArray[np.int32]
-Ints = npt.NDArray[np.int64]
 
 SOUND, BAD_MASKS, BAD_LEAVES, BAD_COLUMN, BAD_PRESENCE, BAD_NUMBER = range(6)
 """What is wrong with streams."""
@@ -90,9 +85,9 @@ def read_plain_into(
     spec: Ints,
     firsts: Ints,
     limits: tuple[int, int],
-    starts: Words,
+    starts: Words32,
     sizes: Ints,
-    counts: Counts,
+    counts: Int32s,
     sampled: Ints,
     samples: Ints,
 ) -> int:
@@ -126,7 +121,7 @@ def read_plain_into(
 
 
 @nb.njit(nogil=True)
-def _numbers_into(data: Bytes, at: int, size: int, limit: int, out: Counts, column: int) -> bool:
+def _numbers_into(data: Bytes, at: int, size: int, limit: int, out: Int32s, column: int) -> bool:
     """A column of numbers; False if one is beyond the limit."""
     rows = out.shape[0]
     planes = np.int64(data[at])

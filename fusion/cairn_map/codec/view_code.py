@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Bytes, Flags, Ints
 from cairn_map.codec.entropy.mask_model_kernels import code_masks
-from cairn_map.codec.entropy.modelled_stream import Bytes, Code, Coder, read_modelled, write_modelled
+from cairn_map.codec.entropy.modelled_stream import Code, Coder, read_modelled, write_modelled
 from cairn_map.codec.entropy.neighbour_kernels import earlier_rows
 from cairn_map.codec.entropy.sample_model_kernels import code_presence, code_ranks, code_sums
 from cairn_map.codec.entropy.small_profile import Ground, ground_of
@@ -23,9 +24,6 @@ from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CELL_LIMIT, DEPTH_MAX, CellKey, Geometry, cell_key, cell_of_key
 from cairn_map.evidence.sensor_model import SensorModel
 from cairn_map.evidence.view import LOG_ODDS_ZERO, TOPS, Chance, Colours, Extent, View, ViewStyle, view_of
-
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 MAGIC = b"CRNV"
 VERSION = 1

@@ -9,13 +9,13 @@ raise it while they are added, and only when it passes the limit are they taken 
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Int32s
 from cairn_map.errors import BadInputError
 from cairn_map.evidence import brick_kernels as kernels
 from cairn_map.evidence.evidence import COUNT_MAX
 from cairn_map.evidence.grid import BRICK_DEPTH
 
 Voxels = npt.NDArray[np.uint32]
-Counts = npt.NDArray[np.int32]
 BrickNumbers = npt.NDArray[np.int16]
 Pool = npt.NDArray[np.int16] | npt.NDArray[np.int32]
 
@@ -30,7 +30,7 @@ class BrickCounts:
         self._pool: Pool = np.zeros((0, 512, 2), np.int16)
         self._bound = 0
 
-    def add(self, voxels: Voxels, counts: Counts, sign: int) -> None:
+    def add(self, voxels: Voxels, counts: Int32s, sign: int) -> None:
         """Add sign * counts.
 
         Raises:
@@ -50,7 +50,7 @@ class BrickCounts:
         self._bound = self._bound_after(voxels, counts, sign)
         kernels.add_counts_into(voxels, counts, sign, self._brick_of, self._pool)
 
-    def packed(self, sampled: Voxels) -> tuple[Voxels, Counts, Voxels]:
+    def packed(self, sampled: Voxels) -> tuple[Voxels, Int32s, Voxels]:
         """Voxels with a count or listed in `sampled`, rising; their counts; and in which rows the listed ones are."""
         V = kernels.count_packed(self._brick_of, self._pool, sampled)
         out = np.empty(V, np.uint32), np.empty((V, 2), np.int32), np.empty(len(sampled), np.uint32)
@@ -89,7 +89,7 @@ class BrickCounts:
     def _limit(self) -> int:
         return int(np.iinfo(self._pool.dtype).max)
 
-    def _bound_after(self, voxels: Voxels, counts: Counts, sign: int) -> int:
+    def _bound_after(self, voxels: Voxels, counts: Int32s, sign: int) -> int:
         """No magnitude will be larger than this after adding sign * counts, for which there are bits enough now.
 
         Raises:

@@ -7,9 +7,10 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Int32s
+
 Voxels = npt.NDArray[np.uint32]
 BrickNumbers = npt.NDArray[np.int16]
-Counts = npt.NDArray[np.int32]
 Pool = npt.NDArray[np.int16] | npt.NDArray[np.int32]
 
 U = np.uint64
@@ -69,7 +70,7 @@ def largest_count(counts: Pool) -> int:
 
 
 @nb.njit(cache=True, nogil=True)
-def counts_fit(voxels: Voxels, counts: Counts, sign: int, brick_of: BrickNumbers, pool: Pool, limit: int) -> bool:
+def counts_fit(voxels: Voxels, counts: Int32s, sign: int, brick_of: BrickNumbers, pool: Pool, limit: int) -> bool:
     """Whether adding sign * counts keeps every sum in [-limit, limit]; bricks that do not exist count as zero."""
     for n in range(voxels.shape[0]):
         brick = brick_of[voxels[n] >> np.uint32(9)]
@@ -83,7 +84,7 @@ def counts_fit(voxels: Voxels, counts: Counts, sign: int, brick_of: BrickNumbers
 
 
 @nb.njit(cache=True, nogil=True)
-def add_counts_into(voxels: Voxels, counts: Counts, sign: int, brick_of: BrickNumbers, pool: Pool) -> int:
+def add_counts_into(voxels: Voxels, counts: Int32s, sign: int, brick_of: BrickNumbers, pool: Pool) -> int:
     """Add sign * counts to the pool, where sums may wrap around; every brick exists.
 
     Returns all counts or'ed together: negative if one is, else no less than the largest.
@@ -130,7 +131,7 @@ def count_packed(brick_of: BrickNumbers, pool: Pool, sampled: Voxels) -> int:
 
 @nb.njit(cache=True, nogil=True)
 def pack_into(
-    brick_of: BrickNumbers, pool: Pool, sampled: Voxels, out_voxels: Voxels, out_counts: Counts, out_rows: Voxels
+    brick_of: BrickNumbers, pool: Pool, sampled: Voxels, out_voxels: Voxels, out_counts: Int32s, out_rows: Voxels
 ) -> None:
     """Write the voxels that `count_packed` counted, rising, their counts, and in which rows those of `sampled` are."""
     V = U(0)

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, FailFast, Field, model_validator
 
+from cairn_map.arrays import Ints
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import STANDARD_CHANNELS, Channel
 from cairn_map.kernels.morton_kernels import deinterleave, interleave
@@ -25,7 +26,6 @@ from cairn_map.kernels.morton_kernels import deinterleave, interleave
 CellKey = NewType("CellKey", int)
 """63-bit Morton number of a cell."""
 
-Ints = npt.NDArray[np.int64]
 
 CELL_LIMIT = 1 << 20
 """Cell indices run from -CELL_LIMIT to CELL_LIMIT - 1: 5 368 km to each side at 5.12 m."""

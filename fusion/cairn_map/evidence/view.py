@@ -14,14 +14,12 @@ from enum import StrEnum
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Floats, Ints
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import Channel, ChannelKind
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.sensor_model import SensorModel, log_odds
-
-Ints = npt.NDArray[np.int64]
-Floats = npt.NDArray[np.float64]
 
 LOG_ODDS_STEP = 0.001
 LOG_ODDS_ZERO = 1 << 15

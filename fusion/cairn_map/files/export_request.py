@@ -3,13 +3,12 @@
 from typing import Annotated, Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import Geometry
 
-Floats = npt.NDArray[np.float64]
 Kelvin = Annotated[float, Field(ge=0, le=1e5)]
 Height = Annotated[float, Field(ge=-1e7, le=1e7)]
 BOX_CHARS_MAX = 160

@@ -22,9 +22,9 @@ import numpy as np
 import numpy.typing as npt
 from laspy.vlrs.known import LasZipVlr, WktCoordinateSystemVlr
 
+from cairn_map.arrays import Floats
 from cairn_map.files.forward_only_file import OneWay
 
-Floats = npt.NDArray[np.float64]
 Table = npt.NDArray[np.void]
 
 lazrs: Any = untyped_lazrs

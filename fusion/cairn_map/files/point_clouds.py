@@ -12,6 +12,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Floats
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.sensor_model import SensorModel
@@ -20,7 +21,6 @@ from cairn_map.files.export_choice import chosen_in_cell, chosen_places
 from cairn_map.files.export_request import ExportRequest
 from cairn_map.files.forward_only_file import OneWay
 
-Floats = npt.NDArray[np.float64]
 Table = npt.NDArray[np.void]
 
 POINT = np.dtype(

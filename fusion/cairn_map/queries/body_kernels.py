@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
+from cairn_map.arrays import Bytes, Floats, Ints
 from cairn_map.codec.entropy.arithmetic_kernels import signed
 from cairn_map.queries.occupancy_kernels import (
     FREE,
@@ -16,10 +17,7 @@ from cairn_map.queries.occupancy_kernels import (
     OCCUPIED,
     OCCUPIED_BITS,
     UNKNOWN,
-    Bytes,
-    Floats,
     Grid,
-    Ints,
     U,
     place_of,
     slot_of,

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Floats, Ints
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.brick_cell import BrickCell
 from cairn_map.evidence.evidence_map import EvidenceMap
@@ -18,8 +19,6 @@ from cairn_map.evidence.sensor_model import SensorModel
 from cairn_map.queries.occupancy_kernels import Grid, brick_corners_into
 from cairn_map.queries.occupancy_states import CellStates, state_grid, states_of_counts
 
-Ints = npt.NDArray[np.int64]
-Floats = npt.NDArray[np.float64]
 Box = Sequence[Sequence[float]] | npt.NDArray[np.floating]
 """(2, 3) lowest and highest corner, metres, map frame; infinite where a side is open."""
 

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import centres_of_voxels
 from cairn_map.queries import layer_kernels as kernels
 from cairn_map.queries import point_queries
-from cairn_map.queries.frozen_map import Box, Floats, FrozenMap
+from cairn_map.queries.frozen_map import Box, FrozenMap
 
 PIXELS_MAX = 1 << 26
 """Of an image; cells may lie anywhere, and the box of all of them may be as large as a country."""

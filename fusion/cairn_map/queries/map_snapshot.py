@@ -21,6 +21,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Floats
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Cell, Geometry
@@ -36,7 +37,7 @@ from cairn_map.queries import (
     voxel_queries,
 )
 from cairn_map.queries.body_queries import PathStates
-from cairn_map.queries.frozen_map import Box, Floats, FrozenMap, freeze
+from cairn_map.queries.frozen_map import Box, FrozenMap, freeze
 from cairn_map.queries.layer_queries import MapImage
 from cairn_map.queries.nearest_queries import Nearest
 from cairn_map.queries.occupancy_states import State

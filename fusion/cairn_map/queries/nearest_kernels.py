@@ -6,18 +6,9 @@ Bricks are looked at in growing cubes around the point's own, until the next cub
 import numba as nb
 import numpy as np
 
+from cairn_map.arrays import Floats, Ints
 from cairn_map.evidence.grid import NANOMETRES
-from cairn_map.queries.occupancy_kernels import (
-    KNOWN_BITS,
-    OCCUPIED_BITS,
-    Floats,
-    Grid,
-    Ints,
-    U,
-    brick_of,
-    voxel_of,
-    x_in_block,
-)
+from cairn_map.queries.occupancy_kernels import KNOWN_BITS, OCCUPIED_BITS, Grid, U, brick_of, voxel_of, x_in_block
 from cairn_map.queries.point_kernels import is_within
 
 

@@ -12,15 +12,11 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Floats, Int32s, Ints, Words
 from cairn_map.codec.entropy.arithmetic_kernels import signed
 from cairn_map.evidence.grid import CELL_LIMIT, NANOMETRES
 from cairn_map.kernels.morton_kernels import squeeze
 
-Ints = npt.NDArray[np.int64]
-Index = npt.NDArray[np.int32]
-Words = npt.NDArray[np.uint64]
-Floats = npt.NDArray[np.float64]
-Bytes = npt.NDArray[np.uint8]
 Pool = npt.NDArray[np.int16] | npt.NDArray[np.int32]
 
 U = np.uint64
@@ -41,7 +37,7 @@ class Grid(NamedTuple):
     depth: int
     numbers: Ints
     """(H,) numbers of cells in a hash table with linear probing, a power of two long and never full; -1 is free."""
-    slots: Index
+    slots: Int32s
     """(H,) rows of `bricks`."""
     hash_shift: int
     """64 less the bits of H."""
@@ -51,7 +47,7 @@ class Grid(NamedTuple):
     """(3,) first voxel of the box of all cells."""
     high: Ints
     """(3,) one beyond its last voxel."""
-    bricks: Index
+    bricks: Int32s
     """(C, 8^(depth - 3)) rows of the words below, or -1."""
     words: Words
     """(B, 8, 2): OCCUPIED_BITS and KNOWN_BITS beside each other, because who asks for one asks for the other."""
@@ -64,7 +60,7 @@ def _number_of(i: int, j: int, k: int) -> int:
 
 
 @nb.njit(cache=True, nogil=True)
-def fill_table_into(cells: Ints, numbers: Ints, slots: Index, hash_shift: int) -> None:
+def fill_table_into(cells: Ints, numbers: Ints, slots: Int32s, hash_shift: int) -> None:
     """Enter (C, 3) cells into a free hash table."""
     for c in range(cells.shape[0]):
         number = _number_of(cells[c, 0], cells[c, 1], cells[c, 2])

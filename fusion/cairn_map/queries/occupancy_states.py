@@ -9,16 +9,14 @@ from enum import IntEnum
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
+from cairn_map.arrays import Floats, Words
 from cairn_map.evidence.brick_counts import BrickCounts
 from cairn_map.evidence.grid import Cell, Geometry
 from cairn_map.evidence.sensor_model import SensorModel, known, log_odds
 from cairn_map.queries import occupancy_kernels as kernels
 from cairn_map.queries.occupancy_kernels import Grid
 
-Words = npt.NDArray[np.uint64]
-Floats = npt.NDArray[np.float64]
 HASH_BITS_MIN = 4
 
 

@@ -10,10 +10,11 @@ body that is larger by that to all sides misses nothing.
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 from cairn_map.queries import body_queries
 from cairn_map.queries.body_queries import PathStates
-from cairn_map.queries.frozen_map import Floats, FrozenMap, as_points
+from cairn_map.queries.frozen_map import FrozenMap, as_points
 from cairn_map.queries.occupancy_states import State
 
 SAMPLES_MAX = 1 << 20

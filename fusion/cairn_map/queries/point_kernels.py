@@ -8,24 +8,10 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from cairn_map.queries.occupancy_kernels import (
-    NONE,
-    UNKNOWN,
-    Bytes,
-    Floats,
-    Grid,
-    Index,
-    Ints,
-    Pool,
-    U,
-    place_of,
-    slot_of,
-    state_in,
-    voxel_of,
-)
+from cairn_map.arrays import Bytes, Floats, Int32s, Ints
+from cairn_map.queries.occupancy_kernels import NONE, UNKNOWN, Grid, Pool, U, place_of, slot_of, state_in, voxel_of
 
 Places = npt.NDArray[np.uint32]
-Counts = npt.NDArray[np.int32]
 BLOCK = 256
 
 
@@ -59,7 +45,7 @@ def states_into(grid: Grid, points: Floats, reach_m: float, out: Bytes) -> bool:
 
 
 @nb.njit(cache=True, nogil=True)
-def locate_into(grid: Grid, points: Floats, reach_m: float, slots: Index, places: Places) -> bool:
+def locate_into(grid: Grid, points: Floats, reach_m: float, slots: Int32s, places: Places) -> bool:
     """Slots of the cells that hold (N, 3) points, -1 where there is no brick, and Morton codes inside the cell.
 
     Returns whether all points are finite and within reach.
@@ -79,7 +65,7 @@ def locate_into(grid: Grid, points: Floats, reach_m: float, slots: Index, places
 
 
 @nb.njit(cache=True, nogil=True)
-def group_into(slots: Index, starts: Ints, order: Index) -> None:
+def group_into(slots: Int32s, starts: Ints, order: Int32s) -> None:
     """List the points of each slot: those of slot c are order[starts[c] : starts[c + 1]], of (C + 1,) starts."""
     starts[:] = 0
     for n in range(U(slots.shape[0])):
@@ -95,7 +81,7 @@ def group_into(slots: Index, starts: Ints, order: Index) -> None:
 
 
 @nb.njit(cache=True, nogil=True)
-def counts_into(rows: Index, places: Places, bricks: npt.NDArray[np.int16], pool: Pool, out: Counts) -> None:
+def counts_into(rows: Int32s, places: Places, bricks: npt.NDArray[np.int16], pool: Pool, out: Int32s) -> None:
     """Hits and misses of the listed points of one cell, all in its bricks."""
     for n in range(U(rows.shape[0])):
         row = U(rows[n])
@@ -107,7 +93,7 @@ def counts_into(rows: Index, places: Places, bricks: npt.NDArray[np.int16], pool
 
 @nb.njit(cache=True, nogil=True)
 def log_odds_into(
-    rows: Index,
+    rows: Int32s,
     places: Places,
     bricks: npt.NDArray[np.int16],
     pool: Pool,
@@ -132,10 +118,10 @@ def log_odds_into(
 
 @nb.njit(cache=True, nogil=True)
 def samples_into(
-    rows: Index,
+    rows: Int32s,
     places: Places,
     known: Places,
-    row_of: Index,
+    row_of: Int32s,
     narrow: npt.NDArray[np.int32],
     wide_planes: Ints,
     wide: Ints,

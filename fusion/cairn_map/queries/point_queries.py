@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.brick_cell import BrickCell
 from cairn_map.evidence.channels import Channel, ChannelKind
@@ -15,7 +16,7 @@ from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.sensor_model import known, log_odds
 from cairn_map.evidence.voxels import Reading, reading_of_sums
 from cairn_map.queries import point_kernels as kernels
-from cairn_map.queries.frozen_map import Floats, FrozenMap, as_points, check_within
+from cairn_map.queries.frozen_map import FrozenMap, as_points, check_within
 from cairn_map.queries.occupancy_states import odds_of_counts
 
 CHUNK = 1 << 17

@@ -7,6 +7,7 @@ voxels without one that ends the ray are crossed in one step. Lengths are in vox
 import numba as nb
 import numpy as np
 
+from cairn_map.arrays import Bytes, Floats, Ints
 from cairn_map.codec.entropy.arithmetic_kernels import signed
 from cairn_map.evidence.grid import NANOMETRES
 from cairn_map.queries.occupancy_kernels import (
@@ -16,10 +17,7 @@ from cairn_map.queries.occupancy_kernels import (
     OCCUPIED,
     OCCUPIED_BITS,
     UNKNOWN,
-    Bytes,
-    Floats,
     Grid,
-    Ints,
     U,
     place_of,
     slot_of,

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 from cairn_map.queries import ray_kernels as kernels
-from cairn_map.queries.frozen_map import Floats, FrozenMap, as_points, check_within
+from cairn_map.queries.frozen_map import FrozenMap, as_points, check_within
 from cairn_map.queries.occupancy_states import State
 
 ONES = ~np.uint64(0)

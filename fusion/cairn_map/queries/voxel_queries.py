@@ -3,6 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Ints
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence import Evidence, empty_evidence
@@ -12,8 +13,6 @@ from cairn_map.queries import layer_kernels
 from cairn_map.queries.frozen_map import Box, FrozenMap
 from cairn_map.queries.occupancy_kernels import list_bits_into
 from cairn_map.queries.point_queries import first_of_kind
-
-Ints = npt.NDArray[np.int64]
 
 
 def frontier(frozen: FrozenMap, box_m: Box | None) -> Ints:

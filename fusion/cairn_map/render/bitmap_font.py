@@ -1,9 +1,8 @@
 """A few words on an image, in letters of 5 x 7 pixels: legends, without an imaging library."""
 
 import numpy as np
-import numpy.typing as npt
 
-Rgb = npt.NDArray[np.uint8]
+from cairn_map.arrays import Rgb
 
 GLYPH_PX = (6, 8)
 """Width and height of a letter with its margin."""

@@ -4,7 +4,8 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-Rgb = npt.NDArray[np.uint8]
+from cairn_map.arrays import Rgb
+
 Values = npt.NDArray[np.float32]
 
 

@@ -6,12 +6,10 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from cairn_map.arrays import Rgb
 from cairn_map.render.bitmap_font import GLYPH_PX, text_width_px, write_text_into
 from cairn_map.render.render_picture import NO_VALUE, NOTHING, TEXT, Layer, Scale, palette
-
-Rgb = npt.NDArray[np.uint8]
 
 MARGIN_PX, GAP_PX = 8, 16
 """At both ends of a row, and between what is in it."""

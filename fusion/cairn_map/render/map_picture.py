@@ -6,12 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Rgb
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.render.bitmap_font import write_text_into
 from cairn_map.render.legend import with_legend
 from cairn_map.render.map_render import Changes, MapRenderer, Seen
 from cairn_map.render.pose_spread import PoseSpread, spread_picture, why_withheld
-from cairn_map.render.render_picture import NOTHING, WARNING, ZERO_CELSIUS_K, Layer, Rgb, Scale, painted
+from cairn_map.render.render_picture import NOTHING, WARNING, ZERO_CELSIUS_K, Layer, Scale, painted
 
 Values = npt.NDArray[np.floating]
 

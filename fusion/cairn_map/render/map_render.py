@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.brick_cell import BrickCell
 from cairn_map.evidence.brick_counts import BrickCounts
@@ -32,7 +33,6 @@ from cairn_map.render.camera_rays import Sight, checked_pose
 from cairn_map.render.node_kernels import read_nodes_into
 from cairn_map.render.node_tables import Table, mean_table, probability_table
 
-Floats = npt.NDArray[np.float64]
 Values = npt.NDArray[np.float32]
 Changes = Mapping[CellKey, Floats]
 """When each 4^3 block of a cell last changed, (8^(depth - 2),) in Morton order; NaN where that is unknown."""

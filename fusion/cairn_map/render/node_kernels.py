@@ -4,7 +4,8 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from cairn_map.queries.occupancy_kernels import Bytes, Index, U
+from cairn_map.arrays import Bytes, Int32s
+from cairn_map.queries.occupancy_kernels import U
 
 Places = npt.NDArray[np.uint32]
 Table = npt.NDArray[np.float32]
@@ -12,7 +13,7 @@ Table = npt.NDArray[np.float32]
 
 @nb.njit(cache=True, nogil=True)
 def read_nodes_into(
-    rows: Index, places: Places, nodes: Bytes, bricks: npt.NDArray[np.int16], table: Table, out: Table
+    rows: Int32s, places: Places, nodes: Bytes, bricks: npt.NDArray[np.int16], table: Table, out: Table
 ) -> None:
     """Of the listed pixels of one cell: (N, P) what `node_tables` say of their nodes, all in its bricks."""
     firsts = (0, 512, 576, 584)

@@ -13,12 +13,12 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Floats
 from cairn_map.evidence.brick_cell import BrickCell
 from cairn_map.evidence.channels import Channel
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.sensor_model import SensorModel, known
 
-Floats = npt.NDArray[np.float64]
 Table = npt.NDArray[np.float32]
 """(B, 585, planes) float32; NaN where nothing is known."""
 

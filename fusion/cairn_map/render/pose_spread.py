@@ -15,11 +15,11 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 from cairn_map.render.camera_rays import Sight
 from cairn_map.render.spread_kernels import covariances_into, motions_into, scatter_into
 
-Floats = npt.NDArray[np.float64]
 Ink = npt.NDArray[np.uint8]
 Values = npt.NDArray[np.float32]
 

@@ -10,21 +10,10 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Bytes, Floats, Int32s, Ints
 from cairn_map.codec.entropy.arithmetic_kernels import signed
 from cairn_map.evidence.grid import NANOMETRES
-from cairn_map.queries.occupancy_kernels import (
-    KNOWN_BITS,
-    NONE,
-    OCCUPIED_BITS,
-    Bytes,
-    Floats,
-    Grid,
-    Index,
-    Ints,
-    U,
-    place_of,
-    slot_of,
-)
+from cairn_map.queries.occupancy_kernels import KNOWN_BITS, NONE, OCCUPIED_BITS, Grid, U, place_of, slot_of
 from cairn_map.queries.ray_kernels import NOWHERE, along, beyond, is_in_box
 
 Ranges = npt.NDArray[np.float32]
@@ -70,7 +59,7 @@ def see_into(
     ends: Ranges,
     is_beyond: bool,
     ranges: Ranges,
-    slots: Index,
+    slots: Int32s,
     places: Places,
     nodes: Bytes,
 ) -> None:

@@ -10,10 +10,10 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Rgb
 from cairn_map.errors import BadInputError
 from cairn_map.render.colour_kernels import paint_into
 
-Rgb = npt.NDArray[np.uint8]
 Values = npt.NDArray[np.floating]
 
 ZERO_CELSIUS_K = 273.15

@@ -4,15 +4,13 @@ from functools import lru_cache
 from typing import Annotated, Literal, Self
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError, first_error
 from cairn_map.render.camera_rays import Sight, look_at, pinhole
 from cairn_map.render.pose_spread import SIGMA_MAX_M, SIGMA_MAX_RAD, PoseSpread
 from cairn_map.render.render_picture import SCALES, Layer, Scale
-
-Floats = npt.NDArray[np.float64]
 
 SIDE_MAX = 4096
 REQUEST_PIXELS_MAX = 1280 * 960

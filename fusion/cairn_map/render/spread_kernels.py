@@ -6,9 +6,7 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
-Singles = npt.NDArray[np.float32]
-Bytes = npt.NDArray[np.uint8]
+from cairn_map.arrays import Bytes, Floats, Singles
 
 NEAREST_M = 0.01
 """What is nearer counts as this."""

@@ -20,7 +20,7 @@ from cairn_fusion.importers import open_source
 from cairn_fusion.recording.images import read_colour
 from cairn_fusion.recording.recording import ScanSource
 from cairn_fusion.recording.scan import Scan
-from cairn_fusion.view.mjpeg import Rgb
+from cairn_map.arrays import Rgb
 from cairn_map.commits.ids import new_incarnation, robot_name
 from cairn_map.errors import BadInputError, NotFoundError, UnreachableError
 from cairn_map.wire.messages import Register

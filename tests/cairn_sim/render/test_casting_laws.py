@@ -6,10 +6,11 @@ import math
 import numpy as np
 import pytest
 
+from cairn_map.arrays import Floats
 from cairn_sim.render.raycast_kernels import Hits, cast_each, cast_rays
 from cairn_sim.scene.scene import Scene, scene_of
 from cairn_sim.scene.solid_kernels import enter
-from cairn_sim.scene.solids import Box, Cylinder, Floats, Plane, Shape, Solid, Sphere, placed
+from cairn_sim.scene.solids import Box, Cylinder, Plane, Shape, Solid, Sphere, placed
 from cairn_sim.scene.surfaces import Material, Surface
 
 GREY = Surface(Material())

@@ -16,6 +16,7 @@ from tests.fixtures.sim.naive_images import (
 
 from cairn_calib.rig.camera import Camera, camera_from_field_of_view
 from cairn_calib.rig.poses import Transform, look_at
+from cairn_map.arrays import Floats
 from cairn_sim.render.image_kernels import (
     bloomed,
     colours,
@@ -32,7 +33,7 @@ from cairn_sim.robots.heads import RANGE_CAMERA, full_head, tof_head
 from cairn_sim.robots.trajectories import path_names, stops
 from cairn_sim.scene.scene import Scene, scene_of
 from cairn_sim.scene.scene_file import SHIPPED, load_scene
-from cairn_sim.scene.solids import Box, Floats, Solid, Sphere, placed
+from cairn_sim.scene.solids import Box, Solid, Sphere, placed
 from cairn_sim.scene.surfaces import Material, Optics, Surface
 
 SKY = np.array([10, 200, 30], np.float32)

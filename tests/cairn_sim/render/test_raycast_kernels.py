@@ -8,11 +8,12 @@ import pytest
 from tests.fixtures.sim.naive_raycast import naive_cast, naive_sight
 
 from cairn_calib.rig.poses import look_at
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 from cairn_sim.render.raycast_kernels import Hits, cast_each, cast_rays
 from cairn_sim.scene.scene import Scene, scene_of
 from cairn_sim.scene.scene_file import load_scene
-from cairn_sim.scene.solids import Box, Cylinder, Floats, Plane, Shape, Solid, Sphere, placed
+from cairn_sim.scene.solids import Box, Cylinder, Plane, Shape, Solid, Sphere, placed
 from cairn_sim.scene.surfaces import Material, Optics, Surface
 
 GREY = Surface(Material())

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from cairn_calib.rig.poses import Transform, checked_transform, inverse
+from cairn_map.arrays import Floats
 from cairn_sim.robots.trajectories import CORNER_M, PATHS, PoseErrors, believed, on_ground
 from cairn_sim.scene.scene import scene_of
-from cairn_sim.scene.solids import Floats, Plane, Solid, placed
+from cairn_sim.scene.solids import Plane, Solid, placed
 from cairn_sim.scene.surfaces import Material, Surface
 
 GROUND = scene_of([Solid("ground", Plane(), Surface(Material()), placed((0, 0, 0)))])

@@ -13,13 +13,14 @@ import pytest
 from cairn_calib.rig.poses import Transform, look_at, transform_points
 from cairn_fusion.recording.recording import open_recording
 from cairn_fusion.recording.trajectory import read_trajectory
+from cairn_map.arrays import Floats
 from cairn_sim.render.truth import camera_truth
 from cairn_sim.robots.heads import RANGE_CAMERA, full_head, tof_head
 from cairn_sim.robots.record import CLOCK_START_S, Plan, record, shots_of
 from cairn_sim.robots.robots import LIDAR, ROBOTS
 from cairn_sim.scene.scene import scene_of
 from cairn_sim.scene.scene_file import load_scene, shipped_text
-from cairn_sim.scene.solids import Box, Floats, Solid, placed
+from cairn_sim.scene.solids import Box, Solid, placed
 from cairn_sim.scene.surfaces import Material, Optics, Surface
 from cairn_sim.sim_command import main
 

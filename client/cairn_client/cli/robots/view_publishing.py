@@ -11,7 +11,8 @@ import time
 from collections.abc import Iterable
 
 from cairn_client.http.api import MapApi
-from cairn_fusion.view.mjpeg import Latest, Rgb
+from cairn_fusion.view.mjpeg import Latest
+from cairn_map.arrays import Rgb
 from cairn_map.errors import UnreachableError
 
 log = logging.getLogger(__name__)

@@ -10,11 +10,10 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Int32s, Ints, Words32
 from cairn_map.codec.entropy.arithmetic_kernels import EVEN, Coder, Data, Live, resumed, signed, suspend_into
 from cairn_map.codec.entropy.mixing_kernels import SLOTS, TAILS, code_mixed, code_number, start_weights
-from cairn_map.codec.entropy.neighbour_kernels import LOWER, NONE, Index, Ints, Words, beside, leaf_at, stepped
-
-Counts = npt.NDArray[np.int32]
+from cairn_map.codec.entropy.neighbour_kernels import LOWER, NONE, beside, leaf_at, stepped
 
 COUNT_MAX = (1 << 31) - 1
 HIT_TABLE = 1 << 14
@@ -26,7 +25,14 @@ MISS_TABLE = 1 << 14
 
 @nb.njit(cache=True, nogil=True)
 def code_counts(
-    coder: Coder, data: Data, counts: Counts, starts: Words, sizes: Ints, brick_of: Index, leaf_of: Index, depth: int
+    coder: Coder,
+    data: Data,
+    counts: Int32s,
+    starts: Words32,
+    sizes: Ints,
+    brick_of: Int32s,
+    leaf_of: Int32s,
+    depth: int,
 ) -> bool:
     """Code (N, 2) hits and misses of the leaves; False if one that was read is out of range."""
     live = resumed(coder)
@@ -65,15 +71,15 @@ def code_counts(
 def _code_hits(
     live: Live,
     data: Data,
-    counts: Counts,
+    counts: Int32s,
     n: int,
     near: Ints,
     above: int,
     size: int,
-    odds: Words,
+    odds: Words32,
     contexts: Ints,
     weights: Ints,
-    tails: Words,
+    tails: Words32,
 ) -> tuple[int, Live]:
     """Code leaf n's hits."""
     faces = edges = total = struck = seen = misses = 0
@@ -111,7 +117,7 @@ def _code_hits(
 
 @nb.njit(nogil=True)
 def _miss_contexts_into(
-    contexts: Ints, counts: Counts, n: int, near: Ints, above: int, size: int, errors: npt.NDArray[np.uint8]
+    contexts: Ints, counts: Int32s, n: int, near: Ints, above: int, size: int, errors: npt.NDArray[np.uint8]
 ) -> tuple[int, int]:
     """Contexts of leaf n's misses; the guess, and which row of weights."""
     known = error = faces = 0
@@ -151,7 +157,7 @@ def _miss_contexts_into(
 
 
 @nb.njit(nogil=True)
-def _against(counts: Counts, leaf: int, guess: int, most: int) -> int:
+def _against(counts: Int32s, leaf: int, guess: int, most: int) -> int:
     """By how much a neighbour's misses differ from the guess, 0 to 2 most; 2 most + 1 if there is none."""
     if leaf == NONE:
         return 2 * most + 1

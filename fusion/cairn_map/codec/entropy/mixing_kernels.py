@@ -10,9 +10,8 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Ints
 from cairn_map.codec.entropy.arithmetic_kernels import Data, Live, Odds, code_bit, learn, signed, split
-
-Ints = npt.NDArray[np.int64]
 
 KNOTS = np.array(
     [

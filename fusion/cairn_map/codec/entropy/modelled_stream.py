@@ -5,10 +5,10 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Bytes
 from cairn_map.codec.entropy.arithmetic_kernels import finish_decoding, finish_encoding, start_decoding, start_encoding
 from cairn_map.errors import DamagedDataError
 
-Bytes = npt.NDArray[np.uint8]
 Coder = npt.NDArray[np.int64]
 Code = Callable[[Coder, Bytes], bool]
 """Runs kernels, which read or write the numbers that it has; False if one that was read is out of range."""

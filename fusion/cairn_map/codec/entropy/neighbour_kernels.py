@@ -6,13 +6,9 @@ is lower along every axis, or equal, comes before.
 
 import numba as nb
 import numpy as np
-import numpy.typing as npt
 
+from cairn_map.arrays import Int32s, Ints, Words32
 from cairn_map.codec.entropy.arithmetic_kernels import signed
-
-Words = npt.NDArray[np.uint32]
-Index = npt.NDArray[np.int32]
-Ints = npt.NDArray[np.int64]
 
 AXIS = 0x09249249
 """Every third bit of a place: x; shifted by 1 y, by 2 z."""
@@ -32,7 +28,7 @@ LOWER = np.array([0, 1, 2, 3, 4, 5, 12], np.int64)
 
 
 @nb.njit(cache=True, nogil=True)
-def index_leaves(starts: Words, sizes: Ints, depth: int) -> tuple[Index, Index]:
+def index_leaves(starts: Words32, sizes: Ints, depth: int) -> tuple[Int32s, Int32s]:
     """From places to leaves: for each brick of 8^3 its table, or -2 - its only leaf, or -1; and (T, 512) tables."""
     brick_of = np.full(8 ** max(depth - 3, 0), NONE, np.int32)
     tables = 0
@@ -52,7 +48,7 @@ def index_leaves(starts: Words, sizes: Ints, depth: int) -> tuple[Index, Index]:
 
 
 @nb.njit(nogil=True)
-def leaf_at(brick_of: Index, leaf_of: Index, place: int) -> int:
+def leaf_at(brick_of: Int32s, leaf_of: Int32s, place: int) -> int:
     """The leaf that holds a place, or NONE."""
     if place < 0:
         return NONE
@@ -83,7 +79,7 @@ def beside(place: int, step: int, depth: int) -> int:
 
 
 @nb.njit(cache=True, nogil=True)
-def earlier_rows(starts: Words, leaves: Ints, brick_of: Index, leaf_of: Index, depth: int) -> Index:
+def earlier_rows(starts: Words32, leaves: Ints, brick_of: Int32s, leaf_of: Int32s, depth: int) -> Int32s:
     """(S, 13) for each of the listed leaves the numbers in the list of those beside it that come before, or NONE.
 
     In the order of `STEPS`; `leaves` rises.

@@ -7,15 +7,12 @@ the neighbours differ.
 
 import numba as nb
 import numpy as np
-import numpy.typing as npt
 
+from cairn_map.arrays import Flags, Int32s, Ints, Words32
 from cairn_map.codec.entropy.arithmetic_kernels import EVEN, Coder, Data, code_bit, resumed, signed, suspend_into
 from cairn_map.codec.entropy.mixing_kernels import SLOTS, TAILS, code_number, start_weights
-from cairn_map.codec.entropy.neighbour_kernels import LOWER, NONE, Index, Ints, Words, beside, leaf_at
+from cairn_map.codec.entropy.neighbour_kernels import LOWER, NONE, beside, leaf_at
 from cairn_map.codec.octree.sum_kernels import square_guess
-
-Flags = npt.NDArray[np.bool_]
-Counts = npt.NDArray[np.int32]
 
 NEARNESS = np.array([4, 4, 4, 2, 2, 2, 2, 2, 2, 2, 2, 2, 1], np.int64)
 """What a neighbour counts, by `neighbour_kernels.STEPS`: faces, edges, the corner."""
@@ -34,12 +31,12 @@ def code_presence(
     coder: Coder,
     data: Data,
     present: Flags,
-    starts: Words,
+    starts: Words32,
     sizes: Ints,
     references: Ints,
-    hits: Counts,
-    brick_of: Index,
-    leaf_of: Index,
+    hits: Int32s,
+    brick_of: Int32s,
+    leaf_of: Int32s,
     depth: int,
 ) -> None:
     """Code which leaves have a row; only voxels may. `references` are the weights of the channel before, by leaf."""
@@ -60,7 +57,7 @@ def code_presence(
 
 
 @nb.njit(cache=True, nogil=True)
-def code_weights(coder: Coder, data: Data, weights: Ints, references: Ints, near: Index) -> bool:
+def code_weights(coder: Coder, data: Data, weights: Ints, references: Ints, near: Int32s) -> bool:
     """Code (S,) weights, each near its reference; False if one that was read is out of range."""
     live = resumed(coder)
     odds, loud = np.full(3 * TABLE * SLOTS, EVEN, np.uint32), start_weights(SLOTS, 3)
@@ -88,7 +85,7 @@ def code_weights(coder: Coder, data: Data, weights: Ints, references: Ints, near
 
 
 @nb.njit(cache=True, nogil=True)
-def code_sums(coder: Coder, data: Data, sums: Ints, rests: Ints, weights: Ints, near: Index) -> bool:
+def code_sums(coder: Coder, data: Data, sums: Ints, rests: Ints, weights: Ints, near: Int32s) -> bool:
     """Code (S, C) sums; `rests` takes what the guesses left; False if a sum that was read is out of range."""
     planes = sums.shape[1]
     live = resumed(coder)
@@ -115,7 +112,7 @@ def code_sums(coder: Coder, data: Data, sums: Ints, rests: Ints, weights: Ints, 
 
 
 @nb.njit(nogil=True)
-def _guess(sums: Ints, rests: Ints, weights: Ints, near: Index, s: int, c: int) -> tuple[int, int, int, int]:
+def _guess(sums: Ints, rests: Ints, weights: Ints, near: Int32s, s: int, c: int) -> tuple[int, int, int, int]:
     """Of row s and plane c: the guess, how far off the neighbours' were, how they differ, and how many there are."""
     total = worth = error = count = 0
     low, high = SUM_MAX, 0
@@ -141,7 +138,7 @@ def _guess(sums: Ints, rests: Ints, weights: Ints, near: Index, s: int, c: int) 
 
 
 @nb.njit(cache=True, nogil=True)
-def code_squares(coder: Coder, data: Data, squares: Ints, sums: Ints, rests: Ints, weights: Ints, near: Index) -> bool:
+def code_squares(coder: Coder, data: Data, squares: Ints, sums: Ints, rests: Ints, weights: Ints, near: Int32s) -> bool:
     """Code (S,) sums of squares; False if one that was read is out of range.
 
     What is coded is how much they exceed the squares of equal samples: the spread; opinions of the neighbours' spread,
@@ -180,7 +177,7 @@ def code_squares(coder: Coder, data: Data, squares: Ints, sums: Ints, rests: Int
 
 
 @nb.njit(cache=True, nogil=True)
-def code_ranks(coder: Coder, data: Data, ranks: Ints, near: Index) -> bool:
+def code_ranks(coder: Coder, data: Data, ranks: Ints, near: Int32s) -> bool:
     """Code (S,) ranks, most of them low; False if one that was read is out of range.
 
     Opinions: the mean of the neighbours' ranks; those across the faces; how many of them are the first.

@@ -15,17 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Bytes, Ints
 from cairn_map.codec.entropy.arithmetic_kernels import finish_decoding, start_decoding
 from cairn_map.codec.entropy.count_model_kernels import code_counts
 from cairn_map.codec.entropy.mask_model_kernels import code_masks
-from cairn_map.codec.entropy.modelled_stream import (
-    NUMBERS_PER_BYTE,
-    Bytes,
-    Code,
-    Coder,
-    read_modelled,
-    write_modelled,
-)
+from cairn_map.codec.entropy.modelled_stream import NUMBERS_PER_BYTE, Code, Coder, read_modelled, write_modelled
 from cairn_map.codec.entropy.neighbour_kernels import earlier_rows, index_leaves
 from cairn_map.codec.entropy.sample_model_kernels import code_presence, code_squares, code_sums, code_weights
 from cairn_map.codec.octree.cell_content import CellContent
@@ -33,8 +27,6 @@ from cairn_map.codec.octree.channel_streams import ChannelRows
 from cairn_map.codec.octree.octree import Octree
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.channels import Channel
-
-Ints = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Ints, Words
 from cairn_map.codec.octree.streams import column_planes, encode_column, required, words_of_planes
 from cairn_map.codec.octree.sum_kernels import (
     place_sums_into,
@@ -24,9 +25,6 @@ from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence.channels import Channel
 from cairn_map.evidence.evidence import SUM_MAX
 from cairn_map.evidence.grid import Geometry
-
-Ints = npt.NDArray[np.int64]
-Words = npt.NDArray[np.uint64]
 
 Planes = npt.NDArray[np.uint8]
 

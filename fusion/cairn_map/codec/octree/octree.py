@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Bytes
 from cairn_map.codec.octree import octree_kernels as kernels
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.evidence import Evidence
-
-Bytes = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,19 +9,21 @@ leaves of a node that collapses are the last eight that were found. One pass doe
 
 import numba as nb
 import numpy as np
-import numpy.typing as npt
 
-Bytes = npt.NDArray[np.uint8]
-Words = npt.NDArray[np.uint32]
-Counts = npt.NDArray[np.int32]
-Ints = npt.NDArray[np.int64]
+from cairn_map.arrays import Bytes, Int32s, Ints, Words32
 
 NO_ROW = -1
 
 
 @nb.njit(cache=True, nogil=True)
 def build_into(
-    voxels: Words, counts: Counts, sampled: Words, child_masks: Bytes, leaf_masks: Bytes, masks: Ints, leaf_rows: Ints
+    voxels: Words32,
+    counts: Int32s,
+    sampled: Words32,
+    child_masks: Bytes,
+    leaf_masks: Bytes,
+    masks: Ints,
+    leaf_rows: Ints,
 ) -> int:
     """Masks and leaves of the octree of V rows; returns how many leaves there are.
 
@@ -81,7 +83,7 @@ def build_into(
 
 
 @nb.njit(nogil=True)
-def _equal_counts(counts: Counts, n: int) -> bool:
+def _equal_counts(counts: Int32s, n: int) -> bool:
     """Whether eight rows from n on have equal counts."""
     different = 0
     for m in range(n + 1, n + 8):
@@ -91,7 +93,7 @@ def _equal_counts(counts: Counts, n: int) -> bool:
 
 @nb.njit(nogil=True)
 def _add_child(
-    children: Bytes, leaves: Bytes, alike: Ints, counts: Counts, d: int, c: int | np.int64, row: int | np.int64
+    children: Bytes, leaves: Bytes, alike: Ints, counts: Int32s, d: int, c: int | np.int64, row: int | np.int64
 ) -> None:
     """Add child c to the open node of depth d: a leaf that stands for a row, or an inner node (NO_ROW)."""
     if children[d] == 0:
@@ -147,7 +149,7 @@ def measure_masks(child_masks: Bytes, leaf_masks: Bytes, firsts: Ints, stop: int
 
 @nb.njit(cache=True, nogil=True)
 def list_leaves_into(
-    child_masks: Bytes, leaf_masks: Bytes, firsts: Ints, stop: int, starts: Words, sizes: Ints
+    child_masks: Bytes, leaf_masks: Bytes, firsts: Ints, stop: int, starts: Words32, sizes: Ints
 ) -> None:
     """First voxel and size of each leaf, in Morton order; inner nodes at depth `stop` count as leaves there.
 
@@ -199,7 +201,7 @@ def list_leaves_into(
 
 
 @nb.njit(cache=True, nogil=True)
-def expand_into(starts: Words, sizes: Ints, leaf_counts: Counts, voxels: Words, counts: Counts) -> None:
+def expand_into(starts: Words32, sizes: Ints, leaf_counts: Int32s, voxels: Words32, counts: Int32s) -> None:
     """Write one row per voxel of every leaf; the outputs have room for the sum of the sizes."""
     V = 0
     for n in range(starts.shape[0]):
@@ -213,7 +215,7 @@ def expand_into(starts: Words, sizes: Ints, leaf_counts: Counts, voxels: Words, 
 
 @nb.njit(cache=True, nogil=True)
 def expand_content_into(
-    starts: Words, sizes: Ints, leaf_counts: Counts, sampled: Ints, voxels: Words, counts: Counts, rows: Words
+    starts: Words32, sizes: Ints, leaf_counts: Int32s, sampled: Ints, voxels: Words32, counts: Int32s, rows: Words32
 ) -> bool:
     """`expand_into`, and the row of each of the (S,) leaves `sampled`, which rise.
 
@@ -239,7 +241,7 @@ def expand_content_into(
 
 
 @nb.njit(cache=True, nogil=True)
-def check_leaves(starts: Words, sizes: Ints, counts: Counts, sampled: Ints, whole: int) -> tuple[bool, bool]:
+def check_leaves(starts: Words32, sizes: Ints, counts: Int32s, sampled: Ints, whole: int) -> tuple[bool, bool]:
     """Whether each leaf says something, none of several voxels has samples, and all that can be are collapsed.
 
     The second is told apart from the first two. The cell has `whole` voxels.
@@ -262,7 +264,7 @@ def check_leaves(starts: Words, sizes: Ints, counts: Counts, sampled: Ints, whol
 
 
 @nb.njit(cache=True, nogil=True)
-def bricks_of_leaves(starts: Words, sizes: Ints) -> int:
+def bricks_of_leaves(starts: Words32, sizes: Ints) -> int:
     """Bricks of 8^3 voxels that leaves, rising, touch."""
     bricks = 0
     after = np.int64(0)
@@ -274,7 +276,7 @@ def bricks_of_leaves(starts: Words, sizes: Ints) -> int:
 
 
 @nb.njit(cache=True, nogil=True)
-def leaves_of_rows(leaf_rows: Ints, rows: Words) -> Ints:
+def leaves_of_rows(leaf_rows: Ints, rows: Words32) -> Ints:
     """(S,) the leaf at which each of the rows, rising, begins; every one of them begins a leaf."""
     out = np.empty(rows.shape[0], np.int64)
     leaf = 0

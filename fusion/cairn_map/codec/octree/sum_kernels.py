@@ -4,8 +4,8 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-Ints = npt.NDArray[np.int64]
-Words = npt.NDArray[np.uint64]
+from cairn_map.arrays import Ints, Words
+
 Planes = npt.NDArray[np.uint8]
 
 
