@@ -19,6 +19,7 @@ from cairn_server.http.routes import problems
 from cairn_server.live import hub as live
 from cairn_server.live import robot_reports
 from cairn_server.settings import Quotas, Settings
+from cairn_server.store import numbering
 from cairn_server.store.sqlite import tokens as sqlite_tokens
 from cairn_server.sync import cell_changes, missing, uploads
 from cairn_server.sync.checks import check_pool, commit_checks, commit_cost, push_policy
@@ -53,7 +54,7 @@ def _flat(routes: object) -> list[Route | APIRoute]:
 def kinds_in(folder: str) -> set[str]:
     """Text constants that errors and problems are made with."""
     found: set[str] = set()
-    for path in (ROOT / folder).glob("*.py"):
+    for path in (ROOT / folder).rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call):
                 name = getattr(node.func, "id", getattr(node.func, "attr", ""))
@@ -154,10 +155,10 @@ def test_the_limits_of_push_in_the_document_are_those_of_the_code() -> None:
     policy = DOCUMENT.split("### 4.1 Push")[1].split("**Folding**")[0]
     for text in (
         f"<= {push_policy.WEIGHT_MAX} S",
-        f"n at most {push_policy.AHEAD_MAX:_} above".replace("_", " "),
-        f"at most {push_policy.AUTHOR_INTERVALS_MAX} gaps",
-        f"{push_policy.INCARNATIONS_MAX} incarnations",
-        f"{push_policy.AUTHORS_MAX // 2:_} authors".replace("_", " "),
+        f"n at most {numbering.AHEAD_MAX:_} above".replace("_", " "),
+        f"at most {numbering.AUTHOR_INTERVALS_MAX} gaps",
+        f"{numbering.INCARNATIONS_MAX} incarnations",
+        f"{numbering.AUTHORS_MAX // 2:_} authors".replace("_", " "),
         f"at most {cell_changes.DELTA_ENTRIES_MAX} entries",
     ):
         assert text in policy + DOCUMENT, text

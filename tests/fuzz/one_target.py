@@ -52,8 +52,9 @@ def instrumented_targets() -> "dict[str, Target]":
     from atheris.import_hook import HookManager
 
     for package in PACKAGES:
-        for path in sorted(Path(import_module(package).__path__[0]).glob("*_kernels.py")):
-            import_module(f"{package}.{path.stem}")  # first, since Numba compiles no instrumented code
+        folder = Path(import_module(package).__path__[0])
+        for path in sorted(folder.rglob("*_kernels.py")):  # first, since Numba compiles no instrumented code
+            import_module(".".join(path.relative_to(folder.parent).with_suffix("").parts))
     # As `instrument_imports`, but comparisons are left alone: their hook keeps every array that one gives, for ever.
     with HookManager(set(PACKAGES), set(), enable_loader_override=True, trace_dataflow=False):
         from tests.fuzz.targets import TARGETS

@@ -201,7 +201,7 @@ class MemoryMap:
             raise EvidenceGoneError(gone)
 
     def _checked_intervals(self, commit: CommitId) -> int:
-        """Intervals of the author's numbers with this one, if `push_policy` lets it in."""
+        """Intervals of the author's numbers with this one, if `numbering` lets it in."""
         author = commit.author
         top, intervals = self.authors.get(author, (None, 0))
         neighbours = sum(CommitId(author, n) in self.commits for n in (commit.n - 1, commit.n + 1))

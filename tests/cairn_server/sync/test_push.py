@@ -13,6 +13,7 @@ from cairn_map.commits.ids import INITIAL, Author, Incarnation
 from cairn_map.evidence.channels import SAMPLE_MAX
 from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.grid import Geometry
+from cairn_server.store import numbering
 from cairn_server.sync.checks import push_policy
 
 
@@ -105,7 +106,7 @@ def test_prior_data_may_hold_the_counts_of_many_scans(live: Live) -> None:
 
 
 def test_numbers_may_come_in_any_order_but_not_full_of_gaps(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(push_policy, "AUTHOR_INTERVALS_MAX", 3)
+    monkeypatch.setattr(numbering, "AUTHOR_INTERVALS_MAX", 3)
     row = live.new_map()
     assert [live.push(row, pushed(n, 1)).status_code for n in (8, 0, 4)] == [201] * 3
     refused = live.push(row, pushed(2, 1))
@@ -117,14 +118,14 @@ def test_a_number_may_not_run_far_ahead_of_what_is_known_but_the_first_may_be_an
     row = live.new_map()
     first = 50_000
     assert live.push(row, pushed(first, 1)).status_code == 201
-    assert kind_of(live.push(row, pushed(first + push_policy.AHEAD_MAX + 1, 1))) == "number_gap"
-    assert live.push(row, pushed(first + push_policy.AHEAD_MAX, 1)).status_code == 201
+    assert kind_of(live.push(row, pushed(first + numbering.AHEAD_MAX + 1, 1))) == "number_gap"
+    assert live.push(row, pushed(first + numbering.AHEAD_MAX, 1)).status_code == 201
 
 
 def test_one_robot_cannot_fill_the_version_vector_with_incarnations(
     live: Live, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(push_policy, "INCARNATIONS_MAX", 2)
+    monkeypatch.setattr(numbering, "INCARNATIONS_MAX", 2)
     row = live.new_map()
     authors = [Author(MOLE.robot, Incarnation(f"{n:016x}")) for n in range(3)]
     assert [live.push(row, pushed(0, 1, author)).status_code for author in authors] == [201, 201, 400]
