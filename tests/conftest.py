@@ -2,6 +2,9 @@
 
 import pytest
 
+# What fixtures assert is told as fully as what tests assert.
+pytest.register_assert_rewrite("tests.fixtures")
+
 SLOWEST = (
     "tests/test_image.py",
     "tests/test_commands.py",

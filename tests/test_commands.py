@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.cairn_client.conftest import wait_until
-from tests.console.browsing import VIEW, browser, tab
+from tests.console.browsing import VIEW, browser, skip_without_page, tab
 from tests.console.casting import occupied, picks_met_first
-from tests.console.conftest import LOOPBACK, Room, skip_without_page
+from tests.console.room import LOOPBACK, Room
+from tests.fixtures.client.live_server import wait_until
 from tests.fixtures.server.live import free_port
 
 from cairn_client.cli.arguments import api_of

@@ -10,8 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 from tests.bench.timing import cpu_s, wall_s
-from tests.cairn_calib.diagnosis.test_mrcal import mrcal_solved, reference_problem
 from tests.fixtures.calib.board_images import BOARD, COLOUR, THERMAL, TOF, picture, pose
+from tests.fixtures.calib.mrcal_reference import mrcal_solved, reference_problem
 from tests.fixtures.calib.simulated_views import SPECTRA, ranges_of, views_of, world
 
 from cairn_calib.board.corner_detection import find_chessboard

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.cairn_server.test_protocol_document import DOCUMENT, ROOT
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.prometheus_text import families_of, value
+from tests.fixtures.server.protocol_document import DOCUMENT, ROOT
 from tests.fixtures.server.pushes import MOLE, pushed
 
 from cairn_server import metrics

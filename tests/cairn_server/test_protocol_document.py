@@ -2,12 +2,10 @@
 
 import ast
 import re
-from pathlib import Path
 
 import pytest
-from fastapi.routing import APIRoute
-from starlette.routing import Route, WebSocketRoute
 from tests.fixtures.server.live import Live
+from tests.fixtures.server.protocol_document import DOCUMENT, ROOT, ROUTE, documented_kinds, routes_of
 
 from cairn_map.commits.commit import COMMIT_BYTES_MAX, RETRACTS_MAX
 from cairn_map.render import render_request
@@ -25,30 +23,8 @@ from cairn_server.sync import cell_changes, missing, uploads
 from cairn_server.sync.checks import check_pool, commit_checks, commit_cost, push_policy
 from cairn_server.views import export_tickets, map_exports, map_views
 
-ROOT = Path(__file__).parents[2]
-DOCUMENT = (ROOT / "server" / "PROTOCOL.md").read_text()
-ROUTE = re.compile(r"^\| ([A-Z]+) \| `(/[^`]*)` \| ([a-z, ]+) \| (.*) \|$", re.MULTILINE)
 KIND = re.compile(r"[a-z]+(_[a-z]+)*")
 RAISERS = ("_problem", "send_problem")
-
-
-def routes_of(live: Live) -> set[tuple[str, str]]:
-    """Of the app: the framework hides included routers, so they are found where they lie."""
-    found: set[tuple[str, str]] = set()
-    for route in _flat(live.app.routes):
-        methods = route.methods or set()
-        found |= {(method, route.path) for method in methods if method != "HEAD" or "GET" not in methods}
-    return found
-
-
-def _flat(routes: object) -> list[Route | APIRoute]:
-    found: list[Route | APIRoute] = []
-    for route in routes:  # type: ignore[attr-defined]
-        if isinstance(route, Route | APIRoute):
-            found.append(route)
-        elif not isinstance(route, WebSocketRoute):  # one for plain HTTP stands beside it
-            found += _flat(getattr(route, "original_router", route).routes)
-    return found
 
 
 def kinds_in(folder: str) -> set[str]:
@@ -62,13 +38,6 @@ def kinds_in(folder: str) -> set[str]:
                     texts = [a.value for a in node.args if isinstance(a, ast.Constant) and isinstance(a.value, str)]
                     found |= {text for text in texts if KIND.fullmatch(text)}
     return found
-
-
-def documented_kinds() -> set[str]:
-    section = DOCUMENT.split("## 5. Problems")[1].split("## 6. Limits")[0]
-    rows = [line.split("|")[1] for line in section.splitlines() if line.startswith("| `")]
-    beside = section.split("Of the same family")[1]
-    return set(re.findall(r"`([a-z_]+)`", " ".join(rows) + beside))
 
 
 def test_the_route_table_is_that_of_the_app(live: Live) -> None:

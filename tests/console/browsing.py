@@ -1,19 +1,20 @@
 """The console in a browser, and what its test door (`?test=1`) tells of it."""
 
+import os
 import shutil
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
-from tests.console.room import ADMIN_TOKEN
+from tests.console.room import ADMIN_TOKEN, Room
 
-if TYPE_CHECKING:
-    from tests.console.conftest import Room
+from cairn_server.http.routes.console_files import STATIC
 
 CHROMIUM = shutil.which("chromium")
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
@@ -21,7 +22,10 @@ FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader
 SETTLED = """c && c.cells.all.size > 0 && c.cells.waiting === 0 && c.cells.running === 0
   && !c.cells.needsPlan && !c.moved"""
 DEADLINE_S = 60.0
+LOADED_MACHINE = 10
+"""Factor on the console's time limits: a machine that runs other tests at the same time is so much slower."""
 VIEW = {"width": 1280, "height": 720}
+SMALL_VIEW = {"width": 480, "height": 360}
 TABLET = {"width": 1024, "height": 768}
 UPRIGHT = {"width": 768, "height": 1024}
 
@@ -29,7 +33,7 @@ UPRIGHT = {"width": 768, "height": 1024}
 class Console:
     """One tab."""
 
-    def __init__(self, page: Page, room: "Room | None") -> None:
+    def __init__(self, page: Page, room: Room | None) -> None:
         self.page = page
         page.set_default_timeout(1000 * DEADLINE_S)
         self.room = room
@@ -98,5 +102,13 @@ def browser() -> Iterator[Browser]:
         made.close()
 
 
-def tab(context: BrowserContext, room: "Room") -> Console:
+def tab(context: BrowserContext, room: Room) -> Console:
     return Console(context.new_page(), room)
+
+
+def skip_without_page() -> None:
+    """Skip a test where there is no page or no browser to show it."""
+    if not (STATIC / "index.html").exists():
+        pytest.skip("the console is not built: `make console` where npm's packages can be had")
+    if CHROMIUM is None and not os.environ.get("CAIRN_REQUIRE_BROWSER"):
+        pytest.skip("no chromium here: apt-get install chromium")

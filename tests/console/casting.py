@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from tests.console.browsing import Console
-from tests.console.conftest import Room
+from tests.console.room import Room
 
 from cairn_client.cli.maps.map_export import fetch_map
 from cairn_map.evidence.grid import Geometry

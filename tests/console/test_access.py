@@ -7,8 +7,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Route
 from tests.console.browsing import TABLET, UPRIGHT, VIEW, Console, tab
-from tests.console.conftest import Room
-from tests.console.room import ADMIN_TOKEN, MAP
+from tests.console.room import ADMIN_TOKEN, MAP, Room
 
 FIELDS = ("colour", "temperature", "probability", "height", "age", "robot")
 OFFLINE_S = 100

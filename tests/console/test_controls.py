@@ -7,8 +7,7 @@ import numpy.typing as npt
 import pytest
 from tests.console.browsing import Console
 from tests.console.casting import first_met, occupied
-from tests.console.conftest import Room
-from tests.console.room import GEOMETRY
+from tests.console.room import GEOMETRY, Room
 
 EYES_M = 1.6
 NEAREST_M, BEFORE_M, FAR_M = 0.3, 0.1, float(np.hypot(3, 2.2))

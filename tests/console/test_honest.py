@@ -8,8 +8,7 @@ import numpy.typing as npt
 import pytest
 from tests.console.browsing import Console
 from tests.console.casting import occupied
-from tests.console.conftest import Room
-from tests.console.room import GEOMETRY, MAP
+from tests.console.room import GEOMETRY, MAP, Room
 
 WARM = 2
 """Flag of a voxel whose temperature was measured: decode/pack.ts."""

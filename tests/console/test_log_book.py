@@ -4,9 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 from playwright.sync_api import Browser
-from tests.console.browsing import Console, tab
-from tests.console.conftest import Room
-from tests.console.test_tabs import SMALL_VIEW
+from tests.console.browsing import SMALL_VIEW, Console, tab
+from tests.console.room import Room
 from tests.fixtures.map.made import SMALL, surface_evidence
 from tests.fixtures.server.live import until
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed

@@ -8,8 +8,7 @@ import pytest
 from playwright.sync_api import Browser, Route
 from tests.console.browsing import VIEW, Console, tab
 from tests.console.casting import occupied
-from tests.console.conftest import Room
-from tests.console.room import GEOMETRY
+from tests.console.room import GEOMETRY, Room
 from tests.fixtures.map.made import SMALL, surface_evidence
 from tests.fixtures.server.live import until
 from tests.fixtures.server.pushes import MOLE, pushed

@@ -12,10 +12,9 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import Browser
-from tests.console.browsing import VIEW, Console, tab
+from tests.console.browsing import LOADED_MACHINE, VIEW, Console, tab
 from tests.console.casting import occupied, picks_met_first
-from tests.console.conftest import Room
-from tests.console.room import GEOMETRY, MAP
+from tests.console.room import GEOMETRY, MAP, Room
 
 from cairn_server.http.routes.console_files import STATIC
 
@@ -42,8 +41,6 @@ UPDATE = """async ([times]) => {
   const { memory, programs } = stage.renderer.info;
   return [memory.geometries, memory.textures, programs.length, document.querySelectorAll("*").length];
 }"""
-LOADED_MACHINE = 10
-"""Machines that run other tests beside this one are so much slower than the figures of the console are for."""
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import cv2
 import pytest
 from playwright.sync_api import Browser
 from tests.console.browsing import VIEW, tab
-from tests.console.conftest import Room
+from tests.console.room import Room
 from tests.console.screens import take_screens
 
 

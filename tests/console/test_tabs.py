@@ -10,17 +10,14 @@ from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser
-from tests.console.browsing import tab
-from tests.console.conftest import LOOPBACK, Room
-from tests.console.room import GEOMETRY, MAP
-from tests.console.test_page import LOADED_MACHINE
+from tests.console.browsing import LOADED_MACHINE, SMALL_VIEW, tab
+from tests.console.room import GEOMETRY, LOOPBACK, MAP, Room
 from tests.fixtures.server.live import free_port
 
 from cairn_map.wire.messages import CreateMap
 
 TABS = 8
 DRAWN_S = 3
-SMALL_VIEW = {"width": 480, "height": 360}
 
 
 def test_eight_tabs_hear_of_a_commit_and_draw_it(chromium: Browser, room: Room) -> None:

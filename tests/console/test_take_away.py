@@ -10,8 +10,7 @@ import numpy as np
 from playwright.sync_api import Browser, Download
 from tests.console.browsing import VIEW, Console, tab
 from tests.console.casting import occupied
-from tests.console.conftest import Room
-from tests.console.room import ADMIN_TOKEN, MAP
+from tests.console.room import ADMIN_TOKEN, MAP, Room
 
 from cairn_server.views.export_tickets import TICKETS_OF_TOKEN_MAX
 

@@ -10,8 +10,7 @@ import numpy.typing as npt
 import pytest
 from playwright.sync_api import Browser, FloatRect, Locator, Route
 from tests.console.browsing import VIEW, Console, tab
-from tests.console.conftest import Room
-from tests.console.room import ADMIN_TOKEN
+from tests.console.room import ADMIN_TOKEN, Room
 from tests.fixtures.map.made import SMALL, surface_evidence
 from tests.fixtures.server.live import until
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed

@@ -12,15 +12,18 @@ from pathlib import Path
 import numpy as np
 from tests.naive import interleave
 
-from cairn_map.codec.cell_code import Profile, encode_cell
+from cairn_map.codec.cell_code import Profile, decode_cell, encode_cell
 from cairn_map.commits.commit import CommitMeta, ScanPose, make_commit
+from cairn_map.commits.commit_reading import open_commit
 from cairn_map.commits.cursor import Cursor
 from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
 from cairn_map.evidence.evidence import Evidence, empty_evidence, packed_evidence
 from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import Geometry, cell_key
-from cairn_map.wire.frames import CellFrame, FrameKind, encode_frame, start_of_reply
+from cairn_map.wire.frames import CellFrame, FrameKind, encode_frame, frames_of, start_of_reply
 from cairn_map.wire.messages import Done, More, ReplyHeader
+
+CELLS = ("v1-all-channels.cell", "v1-signed.cell", "v1-empty.cell", "v1-small.cell")
 
 FOLDER = Path(__file__).parent
 DOSE = Channel(kind=ChannelKind.SCALAR, name="dose", unit="µSv/h", step=0.01, zero=-1.5)
@@ -120,14 +123,28 @@ def made() -> dict[str, bytes]:
     }
 
 
+def found() -> dict[str, object]:
+    """What the stored bytes say today."""
+    cells = {name: decode_cell((FOLDER / name).read_bytes()) for name in CELLS}
+    commit, _ = open_commit((FOLDER / "v1.commit").read_bytes())
+    frames = frames_of((FOLDER / "v1.reply").read_bytes())
+    payloads = [frame for frame in frames if isinstance(frame, CellFrame) and frame.payload]
+    return {
+        "geometry": GEOMETRY.digest().hex(),
+        "digests": {name: cell.digest.hex() for name, cell in cells.items()},
+        "fingerprints": {name: fingerprint(cell.evidence, cell.key).hex() for name, cell in cells.items()},
+        "commit": {"sha": commit.sha.hex(), "meta": json.loads(commit.meta.model_dump_json())},
+        "reply": [type(frame).__name__ + getattr(getattr(frame, "kind", None), "name", "") for frame in frames],
+        "payloads": [decode_cell(frame.payload).digest.hex() for frame in payloads],
+    }
+
+
 def main() -> None:
     """Write what is missing."""
     for name, data in made().items():
         if not (FOLDER / name).exists():
             (FOLDER / name).write_bytes(data)
     if not (FOLDER / "v1.json").exists():
-        from tests.formats.test_stored_bytes import found
-
         (FOLDER / "v1.json").write_text(json.dumps(found(), indent=1, sort_keys=True) + "\n")
 
 

@@ -1,37 +1,14 @@
 """Bytes that were once written must decode for ever to what they meant; `make_formats.py` made them."""
 
 import json
-from pathlib import Path
 
 import pytest
 from tests import naive
-from tests.formats.make_formats import GEOMETRY, KEY, evidence, wall
+from tests.formats.make_formats import CELLS, FOLDER, GEOMETRY, KEY, evidence, found, wall
 
 from cairn_map.codec.cell_code import decode_canonical_cell, decode_cell, encode_cell
 from cairn_map.codec.cell_reading import cell_reader
 from cairn_map.codec.octree.streams import MODELLED
-from cairn_map.commits.commit_reading import open_commit
-from cairn_map.evidence.fingerprint import fingerprint
-from cairn_map.wire.frames import CellFrame, frames_of
-
-FOLDER = Path(__file__).parent
-CELLS = ("v1-all-channels.cell", "v1-signed.cell", "v1-empty.cell", "v1-small.cell")
-
-
-def found() -> dict[str, object]:
-    """What the stored bytes say today."""
-    cells = {name: decode_cell((FOLDER / name).read_bytes()) for name in CELLS}
-    commit, _ = open_commit((FOLDER / "v1.commit").read_bytes())
-    frames = frames_of((FOLDER / "v1.reply").read_bytes())
-    payloads = [frame for frame in frames if isinstance(frame, CellFrame) and frame.payload]
-    return {
-        "geometry": GEOMETRY.digest().hex(),
-        "digests": {name: cell.digest.hex() for name, cell in cells.items()},
-        "fingerprints": {name: fingerprint(cell.evidence, cell.key).hex() for name, cell in cells.items()},
-        "commit": {"sha": commit.sha.hex(), "meta": json.loads(commit.meta.model_dump_json())},
-        "reply": [type(frame).__name__ + getattr(getattr(frame, "kind", None), "name", "") for frame in frames],
-        "payloads": [decode_cell(frame.payload).digest.hex() for frame in payloads],
-    }
 
 
 def test_stored_bytes_still_mean_what_they_meant() -> None:

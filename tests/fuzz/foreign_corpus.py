@@ -11,7 +11,7 @@ import numpy as np
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Writer1
-from tests.cairn_calib.exchange.test_rig_exchange import KALIBR, ROS
+from tests.fixtures.calib.foreign_rigs import KALIBR, ROS
 from tests.fixtures.fusion.bags import ROS1, ROS2, Messages, Timed, optical, png, write_bag
 from tests.fuzz.sections import joined
 

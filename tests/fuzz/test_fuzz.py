@@ -4,7 +4,6 @@ import os
 import random
 import subprocess
 import sys
-from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from tests.fuzz.make_corpus import seeds
 from tests.fuzz.one_target import CORPUS, FOUND
 from tests.fuzz.soak import FINDINGS, ROOT, SoakReport, soak
 from tests.fuzz.targets import TARGETS, survives
+from tests.fuzz.wrapping_mutator import bytewise
 
 SECONDS = 60 // len(TARGETS) - 2
 """Of each target, after some two seconds for starting and ending."""
@@ -37,20 +37,6 @@ needs_atheris = pytest.mark.skipif(
     find_spec("atheris") is None, reason="atheris is not installed: it has wheels for Linux on x86-64 only"
 )
 every_target = pytest.mark.parametrize("name", TARGETS)
-
-
-def bytewise(rng: random.Random) -> Callable[[bytes], bytes]:
-    """A few other bytes: what stands in for libFuzzer's own changes."""
-
-    def changed(data: bytes) -> bytes:
-        made = bytearray(data)
-        for _ in range(rng.randrange(1, 4)):
-            made[rng.randrange(len(made) + 1) :][: rng.randrange(2)] = b""
-            at = rng.randrange(len(made) + 1)
-            made[at : at + rng.randrange(3)] = rng.randbytes(rng.randrange(3))
-        return bytes(made)
-
-    return changed
 
 
 @pytest.mark.parametrize("path", INPUTS, ids=lambda path: f"{path.parent.name}-{path.stem}")

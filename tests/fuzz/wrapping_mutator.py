@@ -83,3 +83,17 @@ def _frames(data: bytes) -> list[tuple[int, bytes]]:
         found.append((kind, data[at + FRAME_HEAD.size : at + FRAME_HEAD.size + size]))
         at += FRAME_HEAD.size + size + 4
     return found
+
+
+def bytewise(rng: random.Random) -> Callable[[bytes], bytes]:
+    """A few other bytes: what stands in for libFuzzer's own changes."""
+
+    def changed(data: bytes) -> bytes:
+        made = bytearray(data)
+        for _ in range(rng.randrange(1, 4)):
+            made[rng.randrange(len(made) + 1) :][: rng.randrange(2)] = b""
+            at = rng.randrange(len(made) + 1)
+            made[at : at + rng.randrange(3)] = rng.randbytes(rng.randrange(3))
+        return bytes(made)
+
+    return changed

@@ -1,23 +1,9 @@
 """Grids of discs: found in order, centroids where the projected discs have theirs."""
 
 import numpy as np
-from tests.fixtures.calib.board_images import DISC, THERMAL, TOF, Floats, Spectrum, picture, pose
+from tests.fixtures.calib.board_images import DISCS, THERMAL, TOF, disc_centroids, picture, pose
 
-from cairn_calib.board.board import Board
 from cairn_calib.board.circle_grid import find_circles
-
-DISCS = Board(pattern="asymmetric-circles", columns=4, rows=11, pitch_m=0.05)
-
-
-def disc_centroids(spectrum: Spectrum, T_camera_board: Floats, board: Board) -> Floats:
-    """(N, 2) centroids of the polygons that 64 points of each rim project to."""
-    angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
-    rim = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1) * DISC * board.pitch_m
-    points = board.points()[:, None] + rim
-    at = spectrum.camera.project(points @ T_camera_board[:3, :3].T + T_camera_board[:3, 3])
-    after = np.roll(at, -1, axis=1)
-    cross = at[..., 0] * after[..., 1] - after[..., 0] * at[..., 1]
-    return np.asarray(((at + after) * cross[..., None]).sum(axis=1) / (3 * cross.sum(axis=1, keepdims=True)))
 
 
 def test_discs_are_found_in_order_with_the_errors_that_are_stated() -> None:

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from tests.board_finding.trials import SPECTRA, trial
-from tests.cairn_calib.board.test_circle_grid import DISCS
-from tests.fixtures.calib.board_images import BOARD, THERMAL, TOF, picture, pose, truth
+from tests.fixtures.calib.board_images import BOARD, DISCS, THERMAL, TOF, picture, pose, truth
 
 from cairn_calib.board.corner_detection import find_chessboard, grey
 from cairn_calib.board.corner_file import read_corner_file

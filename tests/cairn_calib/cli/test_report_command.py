@@ -7,8 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tests.cairn_calib.cli.test_solve_command import written
-from tests.fixtures.calib.simulated_views import views_of, world
+from tests.fixtures.calib.simulated_views import views_of, world, write_corner_files
 
 from cairn_calib.cli.main import main
 from cairn_calib.rig.radiometry import PlanckResponse, Radiometry
@@ -22,7 +21,7 @@ NAMES = ("tof", "thermal-left")
 def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     """A folder with rig.json, and the folders of its corners, with a picture beside each document."""
     folder = tmp_path_factory.mktemp("solved")
-    folders = written(views_of(world(6, seed=6, names=NAMES), seed=6), folder)
+    folders = write_corner_files(views_of(world(6, seed=6, names=NAMES), seed=6), folder)
     for documents in folders.values():
         for document in documents.glob("*.json"):
             cv2.imwrite(str(document.with_suffix(".png")), np.full((96, 128, 3), 90, np.uint8))

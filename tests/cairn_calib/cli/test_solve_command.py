@@ -7,34 +7,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tests.fixtures.calib.simulated_views import BOARD, ranges_of, views_of, world
+from tests.fixtures.calib.simulated_views import ranges_of, views_of, world, write_corner_files
 
-from cairn_calib.board.corner_file import corner_file
-from cairn_calib.board.corners import Attempt, Detection
 from cairn_calib.cli.main import main
 from cairn_calib.rig.rig import Spectrum, load_rig
-from cairn_calib.solve.board_views import BoardViews, frame_of, read_board_views
+from cairn_calib.solve.board_views import frame_of, read_board_views
 from cairn_map.errors import BadInputError
 
 PAIR = ("tof", "left")
 
 
-def written(views: BoardViews, folder: Path) -> dict[str, Path]:
-    """The views as corner documents, a folder for each camera."""
-    for view in views.views:
-        (folder / view.camera).mkdir(exist_ok=True)
-        found = Detection(view.corners, (Attempt("saddles", 1, "found", ""),))
-        size = views.sizes_px[view.camera]
-        document = corner_file(found, BOARD, image=view.image, sha256="0" * 64, size=size, polarity="normal")
-        name = f"{Path(view.image).stem}.json"
-        (folder / view.camera / name).write_text(document.model_dump_json(), encoding="utf-8")
-    return {name: folder / name for name in views.cameras}
-
-
 def test_folders_of_corners_become_a_rig_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pattern_m = 0.006 * np.random.default_rng(0).normal(size=(144, 176))
     truth = world(8, seed=6, names=PAIR, bias=(0.02, 0.0, 0.0, 0.0), pattern_m=pattern_m, has_amplitude=True)
-    folders = written(views_of(truth, seed=6), tmp_path)
+    folders = write_corner_files(views_of(truth, seed=6), tmp_path)
     for name in ("range", "amplitude"):
         (tmp_path / name).mkdir()
     for each in ranges_of(truth, "tof", seed=6, sigma_m=0.006):
@@ -98,7 +84,7 @@ def test_folders_of_corners_become_a_rig_and_a_report(tmp_path: Path, capsys: py
 
 
 def test_two_range_images_of_one_frame_are_refused(tmp_path: Path) -> None:
-    folders = written(views_of(world(3, seed=6, names=PAIR), seed=6), tmp_path)
+    folders = write_corner_files(views_of(world(3, seed=6, names=PAIR), seed=6), tmp_path)
     (tmp_path / "range").mkdir()
     for name in ("tof001", "confidence1"):
         cv2.imwrite(str(tmp_path / "range" / f"{name}.png"), np.full((144, 176), 1500, np.uint16))
@@ -108,7 +94,7 @@ def test_two_range_images_of_one_frame_are_refused(tmp_path: Path) -> None:
 
 
 def test_what_belongs_to_range_images_is_not_asked_without_them(tmp_path: Path) -> None:
-    folders = written(views_of(world(3, seed=6, names=PAIR), seed=6), tmp_path)
+    folders = write_corner_files(views_of(world(3, seed=6, names=PAIR), seed=6), tmp_path)
     options = [
         *map(str, folders.values()),
         "--spectrum",
@@ -131,7 +117,7 @@ def test_frames_go_by_the_last_number_in_a_name() -> None:
 
 def test_what_does_not_belong_together_is_refused(tmp_path: Path) -> None:
     views = views_of(world(3, seed=6, names=PAIR), seed=6)
-    folders = written(views, tmp_path)
+    folders = write_corner_files(views, tmp_path)
     assert len(read_board_views(folders).views) == 6
     with pytest.raises(BadInputError, match=r"--spectrum does not say what left sees"):
         main(["solve", *map(str, folders.values()), "--spectrum", "tof=range", "--output", str(tmp_path / "rig.json")])

@@ -4,68 +4,21 @@ mrcal is a Debian package for Debian's own Python, so what it gave is kept besid
 the package is installed (`apt-get install python3-mrcal`), it solves them again.
 """
 
-import json
-import subprocess
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
+from tests.fixtures.calib.mrcal_reference import NAMES, REFERENCE, mrcal_solved, reference_problem
 
-from cairn_calib.board.board import Board
-from cairn_calib.board.corners import Corners
 from cairn_calib.diagnosis.probe_points import image_grid
 from cairn_calib.diagnosis.world_uncertainty import pixel_covariance, world_covariance
 from cairn_calib.rig.pose_vectors import vector_from_transform
 from cairn_calib.rig.poses import inverse
-from cairn_calib.rig.rig import Spectrum
-from cairn_calib.solve.board_views import BoardView, BoardViews
 from cairn_calib.solve.solve import Solution, solve_rig
-from cairn_calib.solve.solve_plan import STATED, CameraPlan, SolvePlan
 from cairn_calib.solve.solved_rig import solved_rig
-
-PEER = Path(__file__).parents[2] / "fixtures" / "calib" / "mrcal_peer.py"
-REFERENCE_FILE = PEER.with_name("mrcal_reference.json")
-REFERENCE = json.loads(REFERENCE_FILE.read_text())
-DEBIAN_PYTHON = "/usr/bin/python3"
-NAMES = ("left", "right")
-
-
-def reference_problem() -> tuple[BoardViews, SolvePlan]:
-    """The corners that mrcal was given, and what it was asked for."""
-    board = Board(columns=9, rows=6, pitch_m=0.025)
-    views = [
-        BoardView(
-            image[:-2], image[-2:], image, Corners(board, np.reshape(pixels, (54, 2)), np.tile(np.eye(2), (54, 1, 1)))
-        )
-        for image, pixels in zip(REFERENCE["images"], REFERENCE["corners_px"], strict=True)
-    ]
-    plan = SolvePlan(
-        cameras={name: CameraPlan(spectrum=Spectrum.COLOUR) for name in NAMES},
-        gauge="left",
-        pitch_sigma=0.0,
-        usual_priors=False,
-        noise=STATED,
-    )
-    return BoardViews(board, dict.fromkeys(NAMES, (640, 480)), tuple(views)), plan
 
 
 @pytest.fixture(scope="module")
 def solution() -> Solution:
     return solve_rig(*reference_problem())
-
-
-def mrcal_solved() -> dict[str, Any] | None:
-    """What mrcal says of these corners here and now; None: it is not installed."""
-    if not Path(DEBIAN_PYTHON).exists():
-        return None
-    if subprocess.run([DEBIAN_PYTHON, "-c", "import mrcal"], capture_output=True, check=False).returncode:
-        return None
-    command = [DEBIAN_PYTHON, str(PEER)]
-    solved: dict[str, Any] = json.loads(
-        subprocess.check_output(command, input=REFERENCE_FILE.read_bytes(), timeout=120)
-    )
-    return solved
 
 
 @pytest.mark.parametrize("made", ["kept", "now"])

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import yaml
+from tests.fixtures.calib.foreign_rigs import KALIBR, ROS
 
 from cairn_calib.cli.main import main
 from cairn_calib.exchange.placed_camera import PlacedCamera
@@ -126,26 +127,6 @@ def test_a_cameramodel_is_a_dictionary_that_places_the_camera_from_the_reference
     back = FORMATS["mrcal"].read(theirs, name="cam.cameramodel")
     assert back.cameras[0].camera.distortion == (0.4, 0.02, 4e-05, -1e-05, 0)
     assert back.left_out == ("valid_intrinsics_region", "optimization_inputs")
-
-
-KALIBR = """%YAML:1.0
-cam0:
-  T_cam_imu: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-  camera_model: pinhole
-  distortion_coeffs: [0.27, 0.69, -1.7, 1e-5]
-  distortion_model: equidistant
-  intrinsics: [464.4, 465.3, 345.1, 229.4]
-  resolution: [640, 480]
-  rostopic: /left
-"""
-ROS = """image_width: 640
-image_height: 480
-camera_name: mono
-camera_matrix: {rows: 3, cols: 3, data: [500, 0, 320, 0, 500, 240, 0, 0, 1]}
-distortion_model: plumb_bob
-distortion_coefficients: {rows: 1, cols: 5, data: [0.1, 0, 0, 0, 0]}
-rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
-"""
 
 
 def test_files_as_others_write_them_are_read() -> None:

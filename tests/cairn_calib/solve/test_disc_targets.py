@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.cairn_calib.board.test_circle_grid import disc_centroids
-from tests.fixtures.calib.board_images import DISC, THERMAL, Floats, pose
+from tests.fixtures.calib.board_images import DISC, THERMAL, Floats, disc_centroids, pose
 
 from cairn_calib.board.board import Board
 from cairn_calib.board.corners import Corners

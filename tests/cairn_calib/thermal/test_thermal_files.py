@@ -6,8 +6,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import pytest
+from tests.fixtures.calib.thermal_images import RESPONSE, SIZE, images, scene
 
 from cairn_calib.cli.main import main
 from cairn_calib.rig.camera import camera_from_field_of_view
@@ -17,10 +17,6 @@ from cairn_calib.thermal.flat_field import FlatField, fit_flat_field, read_flat_
 from cairn_calib.thermal.flir_file import read_flir
 from cairn_calib.thermal.object_temperature import Temperatures, temperatures
 from cairn_map.errors import BadInputError, DamagedDataError
-
-Floats = npt.NDArray[np.float64]
-SIZE = 96, 128
-RESPONSE = PlanckResponse(r=300_000.0, b_k=1428.0)
 
 
 @pytest.fixture(scope="module")
@@ -84,27 +80,6 @@ def test_damaged_and_plain_pictures_are_refused(flir: Path, tmp_path: Path) -> N
     cv2.imwrite(str(path), np.zeros((9, 9), np.uint8))
     with pytest.raises(BadInputError, match="not radiometric"):
         read_flir(path)
-
-
-def scene(rng: np.random.Generator, *, bad: int = 5) -> FlatField:
-    """A camera whose pixels differ: what must be found."""
-    y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in SIZE), indexing="ij")
-    shading = 40 * (x**2 + y**2) + 5 * x
-    gain = 1 + 0.02 * rng.standard_normal(SIZE)
-    mask = np.zeros(SIZE, np.bool_)
-    mask.ravel()[rng.choice(mask.size, bad, replace=False)] = True
-    return FlatField(
-        gain.astype(np.float32),
-        (10 * rng.standard_normal(SIZE)).astype(np.float32),
-        (shading - shading.mean()).astype(np.float32),
-        mask,
-    )
-
-
-def images(true: FlatField, level: float, count: int, rng: np.random.Generator, noise: float = 2.0) -> Floats:
-    """(K, H, W) counts of an even surface; bad pixels say 7."""
-    counts = (level - true.offset - true.shading) / true.gain
-    return np.where(true.bad, 7.0, counts + noise * rng.standard_normal((count, *SIZE)))
 
 
 def test_maps_level_the_pixels_of_images_that_they_were_not_made_of() -> None:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests.cairn_calib.thermal.test_thermal_files import RESPONSE, SIZE, images, scene
+from tests.fixtures.calib.thermal_images import RESPONSE, SIZE, images, scene
 
 from cairn_calib.cli.main import main
 from cairn_calib.rig.radiometry import PlanckResponse, PolynomialResponse, Radiometry, Response, radiometry_from_json

@@ -2,8 +2,7 @@ import json
 from pathlib import Path
 
 import pytest
-from tests.cairn_fusion.ros.test_bags import GEOMETRY, small_recording
-from tests.fixtures.fusion.bags import mapping_text, recorded, write_bag
+from tests.fixtures.fusion.bags import ALL_CHANNELS, mapping_text, recorded, small_recording, write_bag
 
 from cairn_client.cli.robots.command import main
 from cairn_client.robot.robot import Robot
@@ -27,7 +26,7 @@ def bag(source: Recording, tmp_path: Path) -> Path:
 
 def replayed(recording: Path, state: Path, *options: str) -> dict[int, bytes]:
     """The canonical cells that a replay leaves in the robot's folder."""
-    voxel = str(GEOMETRY.voxel_edge_m)
+    voxel = str(ALL_CHANNELS.voxel_edge_m)
     assert main(["replay", str(recording), "--map", NOBODY, "--state", str(state), "--voxel", voxel, *options]) == 0
     name = "bagged" if options else "room"
     with Robot(None, NOBODY, directory=state, name=name) as robot:

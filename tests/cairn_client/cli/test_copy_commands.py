@@ -2,8 +2,9 @@ import json
 from pathlib import Path
 
 import pytest
-from tests.cairn_client.conftest import LiveServer
+from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import GEOMETRY, A, B, cells_of, seen
+from tests.fixtures.client.robots import push_diffs
 from tests.fixtures.map.made import SMALL
 
 from cairn_client.cli.maps import clone as clone_command
@@ -15,19 +16,7 @@ from cairn_client.folders.state_folder import opened_replica
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
 from cairn_map.errors import BadInputError, ConflictError, UnreachableError
-from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.grid import CellKey
 from cairn_map.wire.messages import CreateMap
-
-
-def push(server: LiveServer, folder: Path, *diffs: dict[CellKey, Evidence]) -> None:
-    """A robot commits, pushes, and fetches what the server made of it."""
-    with Robot(None, server.map_url, directory=folder, name="mole") as robot:
-        for diff in diffs:
-            robot.replica.commit(diff)
-        robot.sync()
-        server.wait_for_fold()
-        robot.sync()
 
 
 def shown(capsys: pytest.CaptureFixture[str]) -> str:
@@ -37,13 +26,13 @@ def shown(capsys: pytest.CaptureFixture[str]) -> str:
 def test_a_clone_has_the_map_and_a_pull_what_changed(
     server: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    push(server, tmp_path / "mole", {A: seen(1, 2, 3)}, {B: seen(5)})
+    push_diffs(server, tmp_path / "mole", {A: seen(1, 2, 3)}, {B: seen(5)})
     copy = tmp_path / "copy"
     assert clone_command.main([server.map_url, str(copy)]) == 0
     assert f"{copy}: 2 cells, 4 known voxels, 2 commits" in shown(capsys)
     assert pull_copy_command.main([str(copy)]) == 0
     assert shown(capsys) == f"{copy}: up to date\n"
-    push(server, tmp_path / "mole", {A: seen(7, 8)})
+    push_diffs(server, tmp_path / "mole", {A: seen(7, 8)})
     assert pull_copy_command.main([str(copy)]) == 0
     assert f"{copy}: 1 of 2 cells changed by 1 commits" in shown(capsys)
     with opened_replica(copy) as pulled, opened_replica(tmp_path / "mole") as mole:
@@ -53,12 +42,12 @@ def test_a_clone_has_the_map_and_a_pull_what_changed(
 def test_diff_tells_a_copy_that_is_behind_from_one_that_is_not(
     server: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    push(server, tmp_path / "mole", {A: seen(1, 2, 3)})
+    push_diffs(server, tmp_path / "mole", {A: seen(1, 2, 3)})
     copy = tmp_path / "copy"
     clone(server.map_url, copy, token=None)
     assert diff_command.main([str(copy)]) == 0
     assert shown(capsys) == "equal: 1 cells, 3 voxels\n"
-    push(server, tmp_path / "mole", {A: seen(9), B: seen(5)})
+    push_diffs(server, tmp_path / "mole", {A: seen(9), B: seen(5)})
     assert diff_command.main([str(copy)]) == 1
     text = shown(capsys)
     assert "only in B       1 cell: -1,0,2" in text
@@ -75,7 +64,7 @@ def test_diff_tells_a_copy_that_is_behind_from_one_that_is_not(
 def test_commits_that_wait_are_part_of_a_robots_map(
     server: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    push(server, tmp_path / "mole", {A: seen(1)})
+    push_diffs(server, tmp_path / "mole", {A: seen(1)})
     with opened_replica(tmp_path / "mole") as replica:
         replica.commit({B: seen(4)})
     assert diff_command.main([str(tmp_path / "mole"), server.map_url]) == 1
@@ -87,7 +76,7 @@ def test_commits_that_wait_are_part_of_a_robots_map(
 def test_a_folder_of_cells_can_be_compared_but_knows_no_commits(
     server: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    push(server, tmp_path / "mole", {A: seen(1, 2)}, {B: seen(3)})
+    push_diffs(server, tmp_path / "mole", {A: seen(1, 2)}, {B: seen(3)})
     map_command.main(["export", server.map_url, "--cells", str(tmp_path / "cells")])
     capsys.readouterr()
     assert diff_command.main([str(tmp_path / "cells"), server.map_url, "--json"]) == 0
@@ -111,7 +100,7 @@ def test_a_copy_is_not_made_over_something_else(server: LiveServer, tmp_path: Pa
     clone(server.map_url, copy, token=None)
     with pytest.raises(ConflictError, match="cairn pull"):
         clone(server.map_url, copy, token=None)
-    push(server, tmp_path / "mole", {A: seen(1)})
+    push_diffs(server, tmp_path / "mole", {A: seen(1)})
     with pytest.raises(BadInputError, match="cairn robot sync"):
         pull(tmp_path / "mole")
     with pytest.raises(BadInputError) as caught:
@@ -122,7 +111,7 @@ def test_a_copy_is_not_made_over_something_else(server: LiveServer, tmp_path: Pa
 
 def test_a_clone_that_lost_its_link_is_finished_by_a_pull(server: LiveServer, tmp_path: Path) -> None:
     """The server goes after it said what the map's grid is, and comes back later."""
-    push(server, tmp_path / "mole", {A: seen(1, 2)})
+    push_diffs(server, tmp_path / "mole", {A: seen(1, 2)})
     copy = tmp_path / "copy"
     with Robot(None, server.map_url, directory=copy, name="copy-1", mode="viewer"):
         pass  # the folder of a clone of which nothing came yet, but for its URL

@@ -2,7 +2,7 @@ import json
 from pathlib import Path
 
 import pytest
-from tests.cairn_client.conftest import LiveServer
+from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import A, opened, seen
 from tests.fixtures.server.live import Live
 

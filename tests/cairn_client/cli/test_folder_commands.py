@@ -10,10 +10,10 @@ import time
 from pathlib import Path
 
 import pytest
-from tests.cairn_client.conftest import LiveServer
-from tests.cairn_client.robot.test_robot import NOWHERE, map_commit, robot_in
+from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import MAP
 from tests.fixtures.client.robot_program import scan_of
+from tests.fixtures.client.robots import NOWHERE, map_commit, robot_in
 from tests.fixtures.client.world import stored_commits
 
 from cairn_client import main as cairn

@@ -5,9 +5,9 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
-from tests.cairn_client.cli.test_copy_commands import push
-from tests.cairn_client.conftest import LiveServer
+from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import A, B, seen
+from tests.fixtures.client.robots import push_diffs
 
 from cairn_client.cli.maps.command import main
 from cairn_map.errors import BadInputError, NotFoundError
@@ -16,7 +16,7 @@ from cairn_map.errors import BadInputError, NotFoundError
 def test_a_part_comes_as_every_kind_of_file(
     server: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    push(server, tmp_path / "mole", {A: seen(1, 2, 300, kelvin_steps=9)}, {B: seen(5, kelvin_steps=9)})
+    push_diffs(server, tmp_path / "mole", {A: seen(1, 2, 300, kelvin_steps=9)}, {B: seen(5, kelvin_steps=9)})
     files = [tmp_path / f"lab.{form}" for form in ("ply", "pcd", "npz", "laz", "ot", "bt")]
     words = [word for path in files for word in (f"--{path.suffix[1:]}", str(path))]
     assert main(["export", server.map_url, *words, "--floor=-100"]) == 0
@@ -37,7 +37,7 @@ def test_a_part_comes_as_every_kind_of_file(
 
 
 def test_a_band_of_temperatures_is_given_in_degrees_celsius(server: LiveServer, tmp_path: Path) -> None:
-    push(server, tmp_path / "mole", {A: seen(1, 2, 300, kelvin_steps=9)}, {B: seen(5, kelvin_steps=5000)})
+    push_diffs(server, tmp_path / "mole", {A: seen(1, 2, 300, kelvin_steps=9)}, {B: seen(5, kelvin_steps=5000)})
     path = tmp_path / "lab.npz"
     kelvin = []
     for words in (["--floor=-100"], ["--hotter=-270"], ["--colder=-270"], ["--hotter=-20", "--colder=50"]):

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tests.cairn_client.conftest import LiveServer
+from tests.fixtures.client.live_server import LiveServer
 
 from cairn_client.cli.maps.command import main
 from cairn_client.cli.robots.telepresence import main as telepresence

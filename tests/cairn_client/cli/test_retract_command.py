@@ -3,8 +3,7 @@
 from datetime import UTC, datetime
 
 import pytest
-from tests.cairn_server.conftest import live
-from tests.fixtures.server.live import Live
+from tests.fixtures.server.live import Live, live
 from tests.fixtures.server.pushes import MOLE, WREN, pushed, read, sum_of
 
 from cairn_client.cli.maps.retract import seconds_of

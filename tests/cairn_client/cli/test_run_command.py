@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.cairn_client.conftest import LiveServer
-from tests.cairn_client.robot.test_robot import robot_in
+from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import GEOMETRY, cells_of
 from tests.fixtures.client.robot_program import INTEGRATOR, RIG, scan_of
+from tests.fixtures.client.robots import robot_in
 from tests.fixtures.client.world import stored_commits
 
 from cairn_client import main as cairn

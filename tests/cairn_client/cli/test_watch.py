@@ -5,7 +5,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from tests.cairn_client.conftest import LiveServer
+from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import MAP, A, seen
 
 from cairn_client.cli.maps import watch as watch_command

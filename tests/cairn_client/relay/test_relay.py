@@ -5,9 +5,8 @@ from pathlib import Path
 from random import Random
 
 import pytest
-from tests.cairn_client.sync.test_uploads import HEAD_BYTES, large_commit
 from tests.fixtures.client.joined import ADMIN, Server, mapped, opened, settled
-from tests.fixtures.client.made import GEOMETRY, MAP, cells_of, random_diff
+from tests.fixtures.client.made import GEOMETRY, HEAD_BYTES, MAP, cells_of, large_commit, random_diff
 from tests.fixtures.server.live import until
 from tests.links.proxy import Cut, Fault, FaultProxy
 

@@ -1,14 +1,13 @@
 """Flipped bits on either disk, and commits that must not be made: what is sound goes on."""
 
 import shutil
-import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.cairn_client.conftest import LiveServer
-from tests.cairn_client.sync.test_sync import Team
-from tests.fixtures.client.made import GEOMETRY, A, B, added, cells_of, seen
+from tests.fixtures.client.live_server import LiveServer
+from tests.fixtures.client.made import GEOMETRY, A, B, added, cells_of, flip_a_bit, seen
+from tests.fixtures.client.team import Team
 
 from cairn_map.commits.commit import CommitMeta
 from cairn_map.commits.ids import CommitId
@@ -33,17 +32,6 @@ def meta_that_retracts(target: CommitId) -> CommitMeta:
 def shut(team: Team, name: str) -> None:
     team[name].close()
     team.robots.pop(name)[1].close()
-
-
-def flip_a_bit(database: Path, table: str, column: str, where: str, values: tuple[object, ...]) -> None:
-    """Damage one blob near its end, so that its head still reads well."""
-    connection = sqlite3.connect(database)
-    number, body = connection.execute(f"SELECT rowid, {column} FROM {table} WHERE {where}", values).fetchone()
-    damaged = bytearray(body)
-    damaged[-3] ^= 0x40
-    connection.execute(f"UPDATE {table} SET {column} = ? WHERE rowid = ?", (bytes(damaged), number))
-    connection.commit()
-    connection.close()
 
 
 def test_after_a_roll_back_an_amend_takes_out_the_renamed_commit_and_not_the_other_of_that_id(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.cairn_client.conftest import LiveServer
+from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import GEOMETRY, cells_of
 from tests.fixtures.client.robot_program import INTEGRATOR, RIG, scan_of
 from tests.fixtures.client.world import stored_commits

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from tests.cairn_client.conftest import LiveServer
-from tests.cairn_client.robot.test_robot import ADMIN, NOWHERE, TOKEN, map_commit, robot_in
+from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import MAP
 from tests.fixtures.client.robot_program import scan_of
+from tests.fixtures.client.robots import ADMIN, NOWHERE, TOKEN, map_commit, robot_in
 from tests.fixtures.client.world import stored_commits
 
 from cairn_client.http.api import MapApi

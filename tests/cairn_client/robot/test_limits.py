@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.cairn_client.conftest import LiveServer
-from tests.cairn_client.robot.test_robot import evidence_of, map_commit, robot_in
+from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import GEOMETRY, MAP, cells_of
 from tests.fixtures.client.robot_program import scan_of
+from tests.fixtures.client.robots import evidence_of, map_commit, robot_in
 
 from cairn_client.replica import replica_store
 from cairn_client.robot.cell_budget import Kept

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 import pytest
-from tests.cairn_client.conftest import LiveServer
-from tests.cairn_client.robot.test_robot import map_commit, robot_in
+from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import MAP
 from tests.fixtures.client.robot_program import scan_of
+from tests.fixtures.client.robots import map_commit, robot_in
 
 from cairn_client.cli.maps.branch_table import branch_table, shown_age
 from cairn_client.http.api import MapApi

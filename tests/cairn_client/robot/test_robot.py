@@ -12,49 +12,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.cairn_client.conftest import LiveServer
+from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import GEOMETRY, MAP, cells_of, opened
-from tests.fixtures.client.robot_program import INTEGRATOR, RIG, scan_of
+from tests.fixtures.client.robot_program import RIG, scan_of
+from tests.fixtures.client.robots import ADMIN, NOWHERE, TOKEN, evidence_of, map_commit, robot_in
 from tests.fixtures.client.world import stored_commits
 
 from cairn_client.http.api import MapApi
 from cairn_client.http.backoff import RETRY_AFTER_MAX_S, Backoff
 from cairn_client.http.map_url import split_map_url
 from cairn_client.robot.robot import Robot
-from cairn_fusion.mapping.integrate import integrate_scan
 from cairn_map.codec.cell_code import Profile
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, DeniedError, UnreachableError
-from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.sensor_model import SensorModel
 from cairn_map.queries.occupancy_states import State
 from cairn_map.wire.access_messages import CreateToken
 from cairn_map.wire.messages import CreateMap, Register
 
 Until = Callable[[Callable[[], bool]], None]
-NOWHERE = "http://127.0.0.1:9/maps/lab"
-TOKEN = "enrolment-token-of-the-tests"
-ADMIN = "admin-token-of-the-tests"
-
-
-def robot_in(folder: Path, url: str = NOWHERE, *, name: str = "mole", **options: object) -> Robot:
-    options = {"geometry": GEOMETRY, "integrator": INTEGRATOR} | options
-    return Robot(RIG, url, directory=folder / name, name=name, **options)  # type: ignore[arg-type]
-
-
-def evidence_of(*seeds: int) -> EvidenceMap:
-    """The sum of some scans."""
-    total = EvidenceMap(GEOMETRY)
-    for seed in seeds:
-        total.merge(integrate_scan(scan_of(seed), RIG, GEOMETRY, integrator=INTEGRATOR))
-    return total
-
-
-def map_commit(robot: Robot, *seeds: int) -> str:
-    for seed in seeds:
-        robot.observe(scan_of(seed))
-    commit = robot.commit(note=" ".join(map(str, seeds)))
-    assert commit is not None
-    return str(commit.id)
 
 
 def test_without_a_server_a_robot_maps_on_and_forgets_nothing(tmp_path: Path) -> None:

@@ -5,9 +5,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from tests.cairn_client.conftest import LiveServer
-from tests.cairn_client.robot.test_robot import map_commit, robot_in
+from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.robot_program import scan_of
+from tests.fixtures.client.robots import map_commit, robot_in
 
 from cairn_client.http.backoff import Backoff
 from cairn_client.robot.robot_events import (

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.cairn_client.conftest import LiveServer
-from tests.cairn_client.sync.test_sync import Team
+from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import MAP, cells_of, cursor, header, seen
+from tests.fixtures.client.team import Team
 
 from cairn_client.http import api as api_module
 from cairn_client.http.api import MapApi

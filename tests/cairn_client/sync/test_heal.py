@@ -5,11 +5,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.cairn_client.conftest import LiveServer
-from tests.cairn_client.replica.test_damage import flip_a_bit
-from tests.cairn_client.robot.test_robot import evidence_of, map_commit, robot_in
-from tests.cairn_client.sync.test_sync import Team
-from tests.fixtures.client.made import A, B, cells_of, seen
+from tests.fixtures.client.live_server import LiveServer
+from tests.fixtures.client.made import A, B, cells_of, flip_a_bit, seen
+from tests.fixtures.client.robots import evidence_of, map_commit, robot_in
+from tests.fixtures.client.team import Team
 
 from cairn_client.cli.maps import command as map_command
 from cairn_client.cli.robots import replay as replay_command

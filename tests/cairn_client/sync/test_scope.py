@@ -4,10 +4,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.cairn_client.conftest import LiveServer
-from tests.cairn_client.robot.test_robot import evidence_of, map_commit, robot_in
-from tests.cairn_client.sync.test_sync import Team
+from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import GEOMETRY, MAP, cells_of, seen
+from tests.fixtures.client.robots import evidence_of, map_commit, robot_in
+from tests.fixtures.client.team import Team
 
 from cairn_client.cli.robots import command as robot_command
 from cairn_client.http.api import MapApi

@@ -7,10 +7,10 @@ from random import Random
 
 import numpy as np
 import pytest
-from tests.cairn_client.conftest import LiveServer
-from tests.cairn_client.robot.test_robot import robot_in
+from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import GEOMETRY, MAP, cells_of, opened
 from tests.fixtures.client.robot_program import INTEGRATOR, RIG, scan_of
+from tests.fixtures.client.robots import robot_in
 from tests.links.proxy import Cut, Fault, FaultProxy
 
 from cairn_client.cli.robots import command as robot_command

@@ -9,14 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.cairn_client.conftest import LiveServer
-from tests.fixtures.client.made import GEOMETRY, MAP, A, B, added, cells_of, cursor, header, opened, random_diff, seen
+from tests.fixtures.client.live_server import LiveServer
+from tests.fixtures.client.made import GEOMETRY, MAP, A, B, added, cells_of, cursor, header, random_diff, seen
+from tests.fixtures.client.team import Team
 
 from cairn_client.http.api import MapApi
-from cairn_client.http.http_link import Link
-from cairn_client.replica.replica import Replica
-from cairn_client.sync.near_cells import Wanted, within
-from cairn_client.sync.sync import fetch_cells, fetch_missing, push_commits
+from cairn_client.sync.near_cells import within
 from cairn_map.codec.cell_code import decode_cell
 from cairn_map.commits.commit import make_commit
 from cairn_map.errors import (
@@ -30,49 +28,9 @@ from cairn_map.errors import (
 )
 from cairn_map.evidence.grid import Cell, cell_of_key
 from cairn_map.wire.frames import encode_frame, start_of_reply
-from cairn_map.wire.messages import CreateMap, MissingRequest, Register, Retract
+from cairn_map.wire.messages import CreateMap, MissingRequest, Retract
 
 X, Y = seen(1, 2, kelvin_steps=7), seen(2, 100)
-
-
-class Team:
-    """Some robots of one server."""
-
-    def __init__(self, server: LiveServer, folder: Path) -> None:
-        self.server = server
-        self.folder = folder
-        self.robots: dict[str, tuple[Replica, MapApi]] = {}
-
-    def __getitem__(self, name: str) -> Replica:
-        if name not in self.robots:
-            replica, api = opened(self.folder / name, name), MapApi(self.server.url)
-            api.register(MAP, Register(robot=name, incarnation=replica.author.incarnation))
-            self.robots[name] = (replica, api)
-        return self.robots[name][0]
-
-    def push(self, name: str) -> None:
-        self._link(name).hold(push_commits(self[name]))
-        self.server.wait_for_fold()
-
-    def fetch(self, name: str) -> int:
-        return self._link(name).hold(fetch_missing(self[name])).frames
-
-    def fetch_cells(self, name: str, *, wanted: Wanted | None = None) -> int:
-        return self._link(name).hold(fetch_cells(self[name], wanted=wanted)).cells_fetched
-
-    def register_anew(self) -> None:
-        for name, (replica, api) in self.robots.items():
-            api.token = None
-            api.register(MAP, Register(robot=name, incarnation=replica.author.incarnation))
-
-    def _link(self, name: str) -> Link:
-        self[name]
-        return Link(self.robots[name][1], MAP, branch=name)
-
-    def close(self) -> None:
-        for replica, api in self.robots.values():
-            replica.close()
-            api.close()
 
 
 @pytest.fixture

@@ -2,13 +2,12 @@
 
 from collections.abc import Iterator
 from contextlib import suppress
-from math import sin
 from pathlib import Path
 from random import Random
 
 import pytest
-from tests.cairn_client.conftest import LiveServer
-from tests.fixtures.client.made import GEOMETRY, MAP, A, opened, seen
+from tests.fixtures.client.live_server import LiveServer
+from tests.fixtures.client.made import GEOMETRY, HEAD_BYTES, MAP, A, large_commit, opened, seen
 from tests.links.proxy import Cut, Fault, FaultProxy
 
 from cairn_client.http.api import MapApi
@@ -17,13 +16,11 @@ from cairn_client.replica.replica import Replica
 from cairn_client.robot.robot import Robot
 from cairn_client.sync.sync import push_commits
 from cairn_client.sync.uploads import Parts
-from cairn_map.commits.commit import Commit, CommitMeta, ScanPose, make_commit
+from cairn_map.commits.commit import make_commit
 from cairn_map.errors import UnreachableError
 from cairn_map.wire.messages import Register
 
 PARTS = Parts(above_bytes=4000, part_bytes=2000)
-HEAD_BYTES = 600
-"""Of a request and its answer."""
 
 
 @pytest.fixture
@@ -31,16 +28,6 @@ def mole(tmp_path: Path) -> Iterator[Replica]:
     replica = opened(tmp_path / "mole")
     yield replica
     replica.close()
-
-
-def large_commit(replica: Replica) -> Commit:
-    """Of some 20 kB: most of them are the poses of its scans."""
-    poses = tuple(
-        ScanPose(time_s=1.7e9 + n, t_map_rig=(sin(n), sin(2 * n), sin(3 * n)), q_map_rig=(0.0, 0.0, 0.0, 1.0))
-        for n in range(150)
-    )
-    meta = CommitMeta(id=f"mole.{'0' * 16}.0", geometry=GEOMETRY.digest().hex(), scans=poses)
-    return replica.commit({A: seen(1, 2, kelvin_steps=7)}, meta)
 
 
 def push(replica: Replica, link: FaultProxy, server: LiveServer, *, parts: Parts = PARTS) -> int:

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
+from tests.fixtures.fusion.scans import BARREL, GEOMETRY, PINHOLE, random_scan, rig_of
 
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.lidar import SpinningLidar
 from cairn_calib.rig.poses import Transform, inverse, look_at, transform_points
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
 from cairn_fusion.mapping.beam_returns import returns_of
 from cairn_fusion.mapping.clear_range import clear_image
 from cairn_fusion.mapping.free_space import Window, carving_of, window_of
@@ -18,7 +18,6 @@ from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scan, i
 from cairn_fusion.mapping.tally import ScanHits, Tally, tally_around
 from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.channels import INTENSITY
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry, centres_of_voxels, geometry_for, voxels_in_cell
 from cairn_sim.evaluation.scores import scores_of
@@ -31,31 +30,9 @@ from cairn_sim.scene.scene_file import load_scene
 Floats = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]
 
-PINHOLE = Camera(width=40, height=30, focal_px=(30.0, 31.0), centre_px=(19.0, 14.2))
-BARREL = PINHOLE.model_copy(update={"distortion": (-0.25, 0.1, 1e-3, -2e-3, -0.02)})
 FOLDING = PINHOLE.model_copy(update={"focal_px": (18.0, 18.0), "distortion": (-0.35, 0.0, 0.0, 0.0, 0.0)})
 CAMERAS = {"pinhole": PINHOLE, "barrel": BARREL, "folding": FOLDING}
-GEOMETRY = Geometry(voxel_edge_um=50_000, depth=4, channels=(INTENSITY,))
 LIMITS = Integrator(min_range_m=0.3, max_range_m=3.0, flying_step_m=math.inf)
-
-
-def rig_of(camera: Camera | SpinningLidar) -> Rig:
-    return Rig(name="eye", cameras={"tof": mounted(Spectrum.RANGE, camera, np.eye(4))})
-
-
-def random_scan(camera: Camera, seed: int) -> Scan:
-    """A bumpy surface with steps and holes, seen from anywhere."""
-    rng = np.random.default_rng(seed)
-    y, x = np.mgrid[: camera.height, : camera.width]
-    range_m = 1.5 + 0.5 * np.sin(x / 7 + seed) + 0.3 * np.cos(y / 5) + (x > 25) * 0.8
-    range_m[rng.random(range_m.shape) < 0.1] = np.nan
-    eye = rng.uniform(-3, 3, 3)
-    return Scan(
-        time_s=float(seed),
-        T_map_rig=look_at(eye, eye + rng.standard_normal(3)),
-        range_camera="tof",
-        range_m=range_m.astype(np.float32),
-    )
 
 
 def misses(diff: dict[CellKey, Evidence], geometry: Geometry = GEOMETRY) -> set[tuple[int, ...]]:

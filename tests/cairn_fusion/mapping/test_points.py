@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests.cairn_fusion.mapping.test_carve import BARREL, GEOMETRY, random_scan, rig_of
+from tests.fixtures.fusion.scans import BARREL, GEOMETRY, random_scan, rig_of
 
 from cairn_calib.rig.pixel_offsets import pixel_offsets
 from cairn_calib.rig.poses import Transform, inverse

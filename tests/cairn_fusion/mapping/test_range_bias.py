@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests.cairn_fusion.mapping.test_carve import BARREL, GEOMETRY, random_scan, rig_of
 from tests.fixtures.calib.simulated_views import BOARD, SPECTRA, TOF, World, ranges_of, views_of, world
+from tests.fixtures.fusion.scans import BARREL, GEOMETRY, random_scan, rig_of
 
 from cairn_calib.diagnosis.solve_warnings import warnings_of
 from cairn_calib.exchange.rig_exchange import cameras_of_rig

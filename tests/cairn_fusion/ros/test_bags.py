@@ -14,6 +14,7 @@ import pytest
 import zstandard
 from mcap.writer import Writer as McapWriter
 from tests.fixtures.fusion.bags import (
+    ALL_CHANNELS,
     KINDS,
     ROS1,
     ROS2,
@@ -24,13 +25,13 @@ from tests.fixtures.fusion.bags import (
     png,
     poses_of,
     recorded,
+    small_recording,
     write_bag,
 )
 
 from cairn_fusion.importers import Layout, detect_layout, open_source
 from cairn_fusion.mapping.measurement import Measurement
-from cairn_fusion.recording.recording import Recording, ScanSource, open_recording
-from cairn_fusion.recording.recording_writer import RecordingWriter
+from cairn_fusion.recording.recording import Recording, ScanSource
 from cairn_fusion.recording.trajectory import interpolated
 from cairn_fusion.ros import bag_index, tf_tree
 from cairn_fusion.ros.bag import BoundedFile, Wire
@@ -42,23 +43,7 @@ from cairn_fusion.ros.open_bag import open_bag
 from cairn_fusion.ros.topic_mapping import camera_of_info, mapping_from_yaml
 from cairn_map.codec.cell_code import encode_cell
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError, NotFoundError
-from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE
-from cairn_map.evidence.grid import Geometry, geometry_for
-from cairn_sim.robots.record import Plan, scans_of, shots_of
-from cairn_sim.robots.robots import ROBOTS
-from cairn_sim.scene.scene_file import load_scene
-
-GEOMETRY = geometry_for(voxel_edge_m=0.05, channels=(COLOUR, INTENSITY, TEMPERATURE))
-
-
-def small_recording(folder: Path) -> Recording:
-    """Four scans of the simulated room with the whole head, small images."""
-    robot = replace(ROBOTS["orpheus"], scans=(4, 1))
-    plan = Plan(scene=load_scene("small-room"), robot=robot, path="west", scale=0.1, truth="none", last_stop=1)
-    with RecordingWriter(folder, robot.rig_of(plan.scale), name="room") as writer:
-        for _, scan, _ in scans_of(plan, shots_of(plan), writer.rig):
-            writer.add(scan)
-    return open_recording(folder)
+from cairn_map.evidence.grid import Geometry
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +51,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return small_recording(tmp_path_factory.mktemp("recording") / "room")
 
 
-def map_bytes(source: ScanSource, geometry: Geometry = GEOMETRY) -> dict[int, bytes]:
+def map_bytes(source: ScanSource, geometry: Geometry = ALL_CHANNELS) -> dict[int, bytes]:
     """The canonical cells of all scans."""
     one = Measurement(source.rig, geometry)
     for scan in source:

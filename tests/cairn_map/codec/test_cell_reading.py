@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests import naive
-from tests.cairn_map.codec.test_small_code import RANDOM, SMOOTH, Made
 from tests.fixtures.map.made import KEY, MIDDLE, SMALL, as_dict, surface_evidence
 from tests.fixtures.map.stored import GROUPS, bodies_of, garbled, recoded, with_streams
+from tests.fixtures.map.strategies import RANDOM, SMOOTH, Made
 
 from cairn_map.codec.cell_code import Profile, decode_cell, encode_cell
 from cairn_map.codec.cell_reading import cell_reader

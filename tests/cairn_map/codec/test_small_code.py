@@ -15,36 +15,22 @@ from tests.fixtures.map.made import (
     any_evidence,
     as_dict,
     header_of,
-    random_evidence,
     surface_evidence,
 )
 from tests.fixtures.map.stored import GROUPS, bodies_of, recoded, with_streams
+from tests.fixtures.map.strategies import RANDOM, SIXTEEN, SMOOTH, WARM, Made
 
 from cairn_map.codec.cell_code import Profile, decode_canonical_cell, decode_cell, encode_cell, recompressed_cell
 from cairn_map.codec.octree.streams import MODELLED
 from cairn_map.errors import DamagedDataError
-from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
+from cairn_map.evidence.channels import INTENSITY
 from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX, Evidence, empty_evidence, packed_evidence
 from cairn_map.evidence.grid import Geometry
 
 CELL = (-1, 0, 2)
-SIXTEEN = Geometry(depth=4, channels=tuple(Channel(kind=ChannelKind.INTENSITY, name=f"i{n}") for n in range(16)))
-WARM = Geometry(depth=4, channels=(TEMPERATURE, COLOUR))
 DEEP = Geometry(depth=8, channels=(INTENSITY, DOSE))
 ALL = (*GEOMETRIES, SIXTEEN, WARM, DEEP)
-RANDOM = st.builds(
-    lambda seed, geometry, voxels: (random_evidence(seed, geometry, voxels=voxels, air=min(voxels, 2)), geometry),
-    st.integers(0, 10**6),
-    st.sampled_from((*GEOMETRIES, SIXTEEN, WARM)),
-    st.sampled_from([0, 1, 40, 300]),
-)
-SMOOTH = st.builds(
-    lambda seed, geometry: (surface_evidence(seed, geometry), geometry),
-    st.integers(0, 10**6),
-    st.sampled_from((SMALL, PLAIN, WARM)),
-)
 EXTREME = st.sampled_from(ALL).flatmap(lambda geometry: st.tuples(any_evidence(geometry), st.just(geometry)))
-Made = tuple[Evidence, Geometry]
 
 
 def full_evidence(geometry: Geometry) -> Evidence:

@@ -1,7 +1,6 @@
 """Commits to bytes and back."""
 
 import json
-import struct
 
 import pytest
 from hypothesis import given
@@ -15,6 +14,7 @@ from tests.fixtures.map.made import (
     PLAIN,
     ROBOT,
     SMALL,
+    commit_bytes,
     made_commit,
     made_meta,
     random_evidence,
@@ -28,12 +28,6 @@ from cairn_map.errors import BadInputError, CairnError, DamagedDataError
 from cairn_map.evidence.brick_cell import difference
 from cairn_map.evidence.evidence import Evidence, empty_evidence
 from cairn_map.evidence.grid import cell_key
-
-
-def commit_bytes(meta: bytes, cells: list[bytes], *, count: int | None = None) -> bytes:
-    """A commit as an attacker writes it."""
-    body = b"".join(struct.pack("<I", len(cell)) + cell for cell in cells)
-    return HEAD.pack(b"CRCM", 1, len(meta)) + meta + struct.pack("<I", len(cells) if count is None else count) + body
 
 
 def refusal(data: bytes) -> str:

@@ -8,7 +8,7 @@ import numpy.typing as npt
 import pytest
 from tests import naive_queries as naive
 from tests.fixtures.map.made import PLAIN
-from tests.fixtures.map.worlds import random_map, random_points, snapshot_with, world_of
+from tests.fixtures.map.worlds import ROOM, poses, random_map, random_points, random_rotations, snapshot_with, world_of
 
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence_map import EvidenceMap
@@ -18,24 +18,6 @@ from cairn_map.queries.occupancy_states import State
 
 EDGE_M = 0.05
 DEEPER = Geometry(voxel_edge_um=50_000, depth=4, channels=())
-ROOM = dict.fromkeys(itertools.product(range(-8, 24), range(-8, 8), range(0, 8)), (0, 1)) | {
-    (20, y, 4): (5, 0) for y in range(-8, 8)
-}
-"""Free, with a bar across at x = 1 m."""
-
-
-def random_rotations(rng: np.random.Generator, count: int) -> npt.NDArray[np.float64]:
-    q, r = np.linalg.qr(rng.normal(size=(count, 3, 3)))
-    q = q * np.sign(np.diagonal(r, axis1=1, axis2=2))[:, None, :]
-    q[:, :, 0] *= np.linalg.det(q)[:, None]
-    q[::5] = np.eye(3)
-    return np.asarray(q)
-
-
-def poses(R: npt.NDArray[np.float64], t_m: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    T = np.tile(np.eye(4), (len(R), 1, 1))
-    T[:, :3, :3], T[:, :3, 3] = R, t_m
-    return T
 
 
 @pytest.mark.parametrize("geometry", [PLAIN, DEEPER])

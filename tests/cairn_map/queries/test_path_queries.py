@@ -6,9 +6,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests.cairn_map.queries.test_body_queries import ROOM, poses, random_rotations
 from tests.fixtures.map.made import PLAIN
-from tests.fixtures.map.worlds import random_map, random_points, snapshot_with
+from tests.fixtures.map.worlds import ROOM, poses, random_map, random_points, random_rotations, snapshot_with
 
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import Geometry

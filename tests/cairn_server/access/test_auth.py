@@ -6,19 +6,16 @@ from pathlib import Path
 
 import httpx
 import pytest
-from tests.cairn_server.http.test_access_matrix import TABLE
-from tests.cairn_server.http.test_body_limit import raw
-from tests.cairn_server.sync.test_push import kind_of
+from tests.fixtures.server.access import ADMIN, ENROLLER, bearer, robot_token
+from tests.fixtures.server.answers import kind_of, raw
 from tests.fixtures.server.live import Live
+from tests.fixtures.server.protocol_document import ROLES_OF
 from tests.fixtures.server.pushes import MOLE, WREN, pushed
 
 from cairn_map.commits.ids import INITIAL, Author, Incarnation
 from cairn_map.errors import BadInputError
 from cairn_server.operations.serve import main
 from cairn_server.settings import Settings
-from cairn_server.store.store_rows import MapRow
-
-ADMIN, ENROLLER = "a" * 20, "e" * 20
 
 
 @pytest.fixture(scope="module")
@@ -29,17 +26,7 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
         yield server
 
 
-def bearer(token: str) -> dict[str, str]:
-    return {"Authorization": f"Bearer {token}"}
-
-
-def robot_token(live: Live, row: MapRow, name: str) -> str:
-    body = {"robot": name, "incarnation": MOLE.incarnation}
-    answer = live.http.post(f"/maps/{row.name}/branches", json=body, headers=bearer(ENROLLER))
-    return str(answer.json()["token"])
-
-
-@pytest.mark.parametrize("route", TABLE, ids=lambda route: " ".join(route))
+@pytest.mark.parametrize("route", ROLES_OF, ids=lambda route: " ".join(route))
 def test_an_open_server_lets_everybody_without_a_token_do_everything(live: Live, route: tuple[str, str]) -> None:
     method, path = route
     place = {"branch": "mole", "commit": "x", "cell": "0,0,0", "voxel": "0,0,0", "token": "nobody", "file": "x.js"}

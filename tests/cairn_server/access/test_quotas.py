@@ -1,87 +1,31 @@
 """What a robot may push, and that what was refused, known or an administrator's costs nothing."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 
-import httpx
 import pytest
-from tests.cairn_server.access.test_auth import ADMIN, ENROLLER, bearer, robot_token
-from tests.cairn_server.sync import test_handing_over as handing_over
-from tests.cairn_server.sync.test_push import kind_of
 from tests.fixtures.map.made import SMALL, random_evidence
-from tests.fixtures.server.live import Live
+from tests.fixtures.server import signatures
+from tests.fixtures.server.access import ADMIN, bearer, robot_token
+from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.pushes import KEYS, WREN, pushed
+from tests.fixtures.server.quotas import MOLE_CALLER, SIZE, Clock, assert_waits, guarded, metered, spend
 
 from cairn_client.http.api import MapApi
 from cairn_map.commits.commit import Commit
 from cairn_map.errors import BadInputError, UnreachableError
 from cairn_map.evidence.grid import cell_key
-from cairn_map.evidence.sensor_model import SensorModel
 from cairn_map.wire.access_messages import CreateToken
 from cairn_server.access import quotas
 from cairn_server.access.auth import ADMIN_FILE, UPSTREAM, Caller, Role
-from cairn_server.access.quotas import DAY_S, Meter
+from cairn_server.access.quotas import DAY_S
 from cairn_server.access.tokens import create_token
 from cairn_server.operations.serve import main
-from cairn_server.settings import Quotas
-from cairn_server.store.sqlite.store import SqliteStore
-from cairn_server.store.store_rows import MapRow
-
-OFF = dict.fromkeys(Quotas.model_fields)
-MOLE = Caller(Role.ROBOT, "mole")
-SIZE = len(pushed(0, 0).data)
-
-
-@contextmanager
-def guarded(folder: Path, **given: float) -> Iterator[Live]:
-    """A server with tokens and these quotas only."""
-    made = Quotas.model_validate({**OFF, **given})
-    with Live(folder, admin_token=ADMIN, enrolment_token=ENROLLER, quotas=made) as live:
-        yield live
-
-
-class Clock:
-    """Days and minutes as a test wants them."""
-
-    def __init__(self) -> None:
-        self.now_s = 20_000.0 * DAY_S + 3600
-
-    def __call__(self) -> float:
-        return self.now_s
-
-
-@contextmanager
-def metered(folder: Path, clock: Clock, **given: float) -> Iterator[tuple[Meter, MapRow]]:
-    """Quotas without a server."""
-    store = SqliteStore(folder)
-    row, _ = store.create_map("lab", SMALL, SensorModel())
-    yield Meter(store, Quotas.model_validate({**OFF, **given}), wall_s=clock, steady_s=clock), row
-    store.close()
-
-
-def spend(meter: Meter, row: MapRow, *, size_bytes: int = 1, cells: int = 1, keep: bool = True) -> float | None:
-    """Push something; None if it was taken, else the seconds to wait."""
-    try:
-        with meter.spending(
-            row, MOLE, size_bytes=size_bytes, cells=[cell_key((n, 0, 0)) for n in range(cells)]
-        ) as kept:
-            if keep:
-                kept()
-    except UnreachableError as exc:
-        assert exc.kind == "quota"
-        return exc.retry_after_s
-    return None
 
 
 def far(n: int, distance: int) -> Commit:
     cells = {cell_key((distance, 0, 0)): random_evidence(n, SMALL, voxels=3, air=1)}
     return pushed(n, n, cells=cells)
-
-
-def assert_waits(answer: httpx.Response, least_s: int, most_s: int) -> None:
-    assert (answer.status_code, kind_of(answer)) == (429, "quota")
-    assert least_s <= int(answer.headers["Retry-After"]) <= most_s
 
 
 def test_commits_a_minute_come_back_by_and_by(tmp_path: Path) -> None:
@@ -113,7 +57,7 @@ def test_what_was_not_accepted_is_given_back(tmp_path: Path) -> None:
     with metered(tmp_path, Clock(), commits_per_minute=1, bytes_per_day=10, cells_per_day=10) as (meter, row):
         for _ in range(20):
             assert spend(meter, row, size_bytes=10, cells=10, keep=False) is None
-        with pytest.raises(ZeroDivisionError), meter.spending(row, MOLE, size_bytes=10, cells=KEYS):
+        with pytest.raises(ZeroDivisionError), meter.spending(row, MOLE_CALLER, size_bytes=10, cells=KEYS):
             raise ZeroDivisionError
         assert spend(meter, row, size_bytes=10, cells=10) is None
         assert spend(meter, row, size_bytes=1) is not None
@@ -122,7 +66,7 @@ def test_what_was_not_accepted_is_given_back(tmp_path: Path) -> None:
 def test_parallel_pushes_share_one_quota(tmp_path: Path) -> None:
     with (
         metered(tmp_path, Clock(), bytes_per_day=10) as (meter, row),
-        meter.spending(row, MOLE, size_bytes=6, cells=KEYS),
+        meter.spending(row, MOLE_CALLER, size_bytes=6, cells=KEYS),
     ):
         assert spend(meter, row, size_bytes=5) is not None
         assert spend(meter, row, size_bytes=4) is None
@@ -181,9 +125,7 @@ def test_a_days_quota_survives_a_new_start(tmp_path: Path) -> None:
 
 
 def test_a_relay_has_quotas_of_its_own_by_its_token_after_a_new_start_too(tmp_path: Path) -> None:
-    commits = [
-        pushed(n, n, author) for n, author in enumerate((handing_over.MOLE, handing_over.WREN, handing_over.MOLE))
-    ]
+    commits = [pushed(n, n, author) for n, author in enumerate((signatures.MOLE, signatures.WREN, signatures.MOLE))]
     for start in range(2):
         with guarded(tmp_path, bytes_per_day=SIZE * 3 // 2) as live:
             if not start:
@@ -192,7 +134,7 @@ def test_a_relay_has_quotas_of_its_own_by_its_token_after_a_new_start_too(tmp_pa
                 made = [create_token(live.service.store, n, CreateToken(role="relay"), by=ADMIN_FILE) for n in names]
                 mole = bearer(robot_token(live, row, "mole"))
             field, other = (bearer(token.token) for token in made)
-            signed = [handing_over.signed(row, commit) for commit in commits]
+            signed = [signatures.signed(row, commit) for commit in commits]
             if not start:
                 assert live.push(row, commits[0], headers=signed[0] | field).status_code == 201
                 assert live.push(row, pushed(0, 0), headers=mole).status_code == 201, "nothing of the robot's"
@@ -209,8 +151,8 @@ def test_what_a_relay_brings_is_not_larger_or_farther_than_what_a_robot_may(tmp_
         far_away = {cell_key((900, 0, 0)): random_evidence(1, SMALL, voxels=3, air=1)}
         answers = []
         for n, cells in enumerate((near, far_away, None)):
-            commit = pushed(n, n, handing_over.MOLE, cells=cells)
-            signed = handing_over.signed(row, commit)
+            commit = pushed(n, n, signatures.MOLE, cells=cells)
+            signed = signatures.signed(row, commit)
             answers.append(live.push(row, commit, headers=signed | relay))
             with pytest.raises(BadInputError) if n else nullcontext():
                 live.service.push(row, UPSTREAM, str(commit.id), commit.data, signatures=signed["Cairn-Signature"])

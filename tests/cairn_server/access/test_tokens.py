@@ -7,8 +7,8 @@ from pathlib import Path
 
 import httpx
 import pytest
-from tests.cairn_server.access.test_auth import ADMIN, ENROLLER, bearer, robot_token
-from tests.cairn_server.sync.test_push import kind_of
+from tests.fixtures.server.access import ADMIN, ENROLLER, bearer, robot_token
+from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import MOLE, WREN, pushed
 

@@ -9,8 +9,8 @@ import httpx
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
-from tests.cairn_server.sync.test_push import kind_of
 from tests.fixtures.map.made import PLAIN, SMALL
+from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.naive_asker import NaiveAsker
 from tests.fixtures.server.pushes import MOLE, WREN, pushed, read

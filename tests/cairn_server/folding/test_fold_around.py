@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from tests.cairn_server.folding.test_broken_cell import BROKEN, damage, url
+from tests.fixtures.server.answers import cell_path
+from tests.fixtures.server.damage import BROKEN, damage
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import KEYS, WREN, pushed, read, sum_of
 
@@ -49,7 +50,7 @@ def ids_pending(live: Live, row: MapRow) -> set[str]:
 
 
 def heal(live: Live, row: MapRow, whole: bytes) -> None:
-    assert live.http.put(url(row, BROKEN), content=whole).status_code == 204
+    assert live.http.put(cell_path(row, BROKEN), content=whole).status_code == 204
     live.folded(row)
 
 
@@ -69,8 +70,8 @@ def test_commits_elsewhere_are_folded_and_those_in_the_damaged_cell_wait_until_i
     assert 0 < len(waiting) < len(commits)
     until(lambda: ids_pending(live, row) == waiting, "all others are folded")
     elsewhere = sum_of([*BASE, *(commit for commit in commits if not touches(commit))])
-    assert read({KEYS[2]: live.http.get(url(row, KEYS[2])).content}) == {KEYS[2]: elsewhere[KEYS[2]]}
-    assert live.http.get(url(row, BROKEN)).status_code == 500
+    assert read({KEYS[2]: live.http.get(cell_path(row, KEYS[2])).content}) == {KEYS[2]: elsewhere[KEYS[2]]}
+    assert live.http.get(cell_path(row, BROKEN)).status_code == 500
     assert live.service.folds.damaged() == {row.name}
     damage(live, "UPDATE commits SET received_s = 0 WHERE folded_seq IS NULL")
     assert live.http.get("/readyz").status_code == 200  # however long they wait

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import apsw
 import pytest
-from tests.cairn_server.sync.test_push import kind_of
+from tests.fixtures.server.answers import kind_of
+from tests.fixtures.server.damage import raising
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import pushed
 
@@ -37,13 +38,6 @@ def reasons(live: Live) -> str:
 def store_of(live: Live) -> SqliteStore:
     assert isinstance(live.service.store, SqliteStore)
     return live.service.store
-
-
-def raising(error: Exception) -> object:
-    def fold(*arguments: object, **options: object) -> int:
-        raise error
-
-    return fold
 
 
 def test_it_writes_durably_and_changes_nothing(live: Live) -> None:

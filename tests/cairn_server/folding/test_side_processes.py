@@ -14,11 +14,10 @@ from pathlib import Path
 
 import httpx
 import pytest
-from tests.cairn_server.folding.test_broken_cell import BROKEN, damage
-from tests.cairn_server.folding.test_readyz import raising
-from tests.cairn_server.sync.test_costly_commits import children_of
 from tests.fixtures.map.made import SMALL
+from tests.fixtures.server.damage import BROKEN, damage, raising
 from tests.fixtures.server.live import DEADLINE_S, Live, Process, until
+from tests.fixtures.server.processes import children_of
 from tests.fixtures.server.pushes import KEYS, pushed
 
 from cairn_map.commits.commit import Commit

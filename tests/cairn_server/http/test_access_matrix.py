@@ -14,8 +14,8 @@ from typing import Literal
 import httpx
 import pytest
 from starlette.routing import WebSocketRoute
-from tests.cairn_server.test_protocol_document import DOCUMENT, ROUTE
 from tests.fixtures.server.live import DEADLINE_S, Live
+from tests.fixtures.server.protocol_document import ROLES_OF
 from tests.fixtures.server.pushes import MOLE, WREN, pushed
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
@@ -28,7 +28,6 @@ from cairn_server.http.routes.live import PROTOCOL, TOKEN_PREFIX
 from cairn_server.store.store_rows import MapRow
 from cairn_server.store.token_store import Token
 
-TABLE = {(found[1], found[2]): found[3].split(", ") for found in ROUTE.finditer(DOCUMENT)}
 READING = {"reader", "robot", "operator", "relay"}
 ADMIN, ENROLLER = "a" * 20, "e" * 20
 AUTHORS = {"mole": MOLE, "wren": WREN}
@@ -121,7 +120,7 @@ def holders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Holders]:
 
 def statuses(route: tuple[str, str], holder: Holder, place: str, robot: str) -> set[int] | None:
     """What the document lets the answer be; None: whatever the route itself says, as the holder is let in."""
-    roles, is_of_a_map = set(TABLE[route]), "{name}" in route[1] and route != CREATION
+    roles, is_of_a_map = set(ROLES_OF[route]), "{name}" in route[1] and route != CREATION
     if "anybody" in roles:
         return None
     if holder.worth != "good":
@@ -155,7 +154,7 @@ def ask(holders: Holders, route: tuple[str, str], holder: Holder, place: str, ro
     return holders.live.ask(method, path.format_map(parts), content=content, headers=headers)
 
 
-@pytest.mark.parametrize("route", TABLE, ids=" ".join)
+@pytest.mark.parametrize("route", ROLES_OF, ids=" ".join)
 def test_each_token_may_do_what_the_document_says_and_no_more(holders: Holders, route: tuple[str, str]) -> None:
     method, path = route
     holders.renew()
@@ -207,7 +206,7 @@ def shake_hands(holders: Holders, path: str, holder: Holder, place: str, *, offe
 def sockets() -> list[str]:
     """The app's WebSockets, each of which the document has as a GET."""
     found = [part.path for router in ROUTERS for part in router.routes if isinstance(part, WebSocketRoute)]
-    assert all(("GET", path) in TABLE for path in found)
+    assert all(("GET", path) in ROLES_OF for path in found)
     return found
 
 
@@ -233,7 +232,7 @@ def test_each_token_opens_the_websockets_that_the_document_lets_it_read(holders:
 
 def test_the_matrix_has_routes_of_each_kind_of_right() -> None:
     assert {"anybody", "admin", "operator", "reader", "own robot", "relay", "enroller"} == {
-        role for roles in TABLE.values() for role in roles
+        role for roles in ROLES_OF.values() for role in roles
     }
 
 

@@ -1,32 +1,15 @@
 """Bodies are bounded before they are read."""
 
-import socket
 import zlib
 
 import pytest
-from tests.cairn_server.sync.test_push import kind_of
+from tests.fixtures.server.answers import head, kind_of, raw
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import pushed
 
 from cairn_map.wire.messages import Problem
 from cairn_server.http.middleware import body_limit
 from cairn_server.http.middleware.body_limit import limit_of
-
-
-def raw(live: Live, request: bytes) -> bytes:
-    """What the server answers to bytes, until it closes."""
-    with socket.create_connection(("127.0.0.1", live.port), timeout=30) as link:
-        link.sendall(request)
-        link.shutdown(socket.SHUT_WR)
-        answer = bytearray()
-        while part := link.recv(1 << 16):
-            answer += part
-    return bytes(answer)
-
-
-def head(live: Live, method: str, path: str, *headers: str) -> bytes:
-    lines = [f"{method} {path} HTTP/1.1", f"Host: 127.0.0.1:{live.port}", *headers, "", ""]
-    return "\r\n".join(lines).encode()
 
 
 @pytest.mark.parametrize("claim", ["67108865", "9" * 18, "9" * 30])

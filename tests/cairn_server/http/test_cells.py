@@ -6,8 +6,8 @@ import re
 
 import numpy as np
 import pytest
-from tests.cairn_server.sync.test_push import kind_of
 from tests.fixtures.map.made import as_dict
+from tests.fixtures.server.answers import first_cell_path, kind_of
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import MOLE, pushed, sum_of
 
@@ -16,7 +16,6 @@ from cairn_map.commits.commit import make_commit
 from cairn_map.commits.cursor import cursor_from_text
 from cairn_map.commits.version_vector import version_vector_from_json
 from cairn_map.evidence.fingerprint import fingerprint
-from cairn_map.evidence.grid import cell_of_key
 from cairn_map.evidence.sensor_model import SensorModel
 from cairn_map.files.cell_files import CELL_MEDIA_TYPE
 from cairn_map.wire.index_messages import CellIndex
@@ -32,12 +31,8 @@ def row(live: Live) -> MapRow:
     return made
 
 
-def path_of(row: MapRow, suffix: str = "") -> str:
-    return f"/maps/{row.name}/main/cells/{cell_of_key(next(iter(pushed(0, 0).cells)))}{suffix}"
-
-
 def test_a_cell_comes_with_its_cursor_coverage_and_fingerprint(live: Live, row: MapRow) -> None:
-    answer = live.http.get(path_of(row))
+    answer = live.http.get(first_cell_path(row))
     decoded = decode_cell(answer.content)
     assert as_dict(decoded.evidence) == sum_of([pushed(0, 0)])[decoded.key]
     assert answer.headers["ETag"] == f'"{decoded.digest.hex()}"'
@@ -50,18 +45,18 @@ def test_a_cell_comes_with_its_cursor_coverage_and_fingerprint(live: Live, row: 
 @pytest.mark.parametrize("suffix", ["", ".npz", ".ply"])
 @pytest.mark.parametrize("form", ["{}", '"x", {}', "*"])
 def test_304_says_by_its_headers_what_200_would(live: Live, row: MapRow, suffix: str, form: str) -> None:
-    whole = live.http.get(path_of(row, suffix))
+    whole = live.http.get(first_cell_path(row, suffix))
     etag = whole.headers["ETag"]
-    same = live.http.get(path_of(row, suffix), headers={"If-None-Match": form.format(etag)})
+    same = live.http.get(first_cell_path(row, suffix), headers={"If-None-Match": form.format(etag)})
     assert (same.status_code, same.content) == (304, b"")
     for name in ("ETag", "Cairn-Cursor", "Cairn-Coverage", "Cairn-Fingerprint"):
         assert same.headers[name] == whole.headers[name]
 
 
 def test_each_form_of_a_cell_has_its_own_etag(live: Live, row: MapRow) -> None:
-    etags = [live.http.get(path_of(row, suffix)).headers["ETag"] for suffix in ("", ".npz", ".ply")]
+    etags = [live.http.get(first_cell_path(row, suffix)).headers["ETag"] for suffix in ("", ".npz", ".ply")]
     assert len(set(etags)) == 3
-    assert live.http.get(path_of(row, ".ply"), headers={"If-None-Match": etags[0]}).status_code == 200
+    assert live.http.get(first_cell_path(row, ".ply"), headers={"If-None-Match": etags[0]}).status_code == 200
 
 
 @pytest.mark.parametrize("suffix", ["", ".npz", ".ply", ".view?depth=2", ".view?depth=3"])
@@ -70,29 +65,29 @@ def test_what_another_sensor_model_makes_of_a_cell_has_another_etag(live: Live, 
     other = live.new_map(sensor_model=SensorModel(p_hit=0.6))
     live.push(other, pushed(0, 0))
     live.folded(other)
-    etag = live.http.get(path_of(row, suffix)).headers["ETag"]
-    assert live.http.get(path_of(row, suffix), headers={"If-None-Match": etag}).status_code == 304
-    elsewhere = live.http.get(path_of(other, suffix), headers={"If-None-Match": etag})
+    etag = live.http.get(first_cell_path(row, suffix)).headers["ETag"]
+    assert live.http.get(first_cell_path(row, suffix), headers={"If-None-Match": etag}).status_code == 304
+    elsewhere = live.http.get(first_cell_path(other, suffix), headers={"If-None-Match": etag})
     assert elsewhere.status_code == (200 if suffix else 304)
     assert (elsewhere.headers["ETag"] == etag) == (not suffix)
 
 
 def test_a_changed_cell_has_another_etag(live: Live, row: MapRow) -> None:
-    etag = live.http.get(path_of(row)).headers["ETag"]
+    etag = live.http.get(first_cell_path(row)).headers["ETag"]
     live.push(row, pushed(1, 0))
     live.folded(row)
-    assert live.http.get(path_of(row), headers={"If-None-Match": etag}).status_code == 200
+    assert live.http.get(first_cell_path(row), headers={"If-None-Match": etag}).status_code == 200
 
 
 def test_npz_is_read_by_numpy(live: Live, row: MapRow) -> None:
-    decoded = decode_cell(live.http.get(path_of(row)).content)
-    with np.load(io.BytesIO(live.http.get(path_of(row, ".npz")).content), allow_pickle=False) as arrays:
+    decoded = decode_cell(live.http.get(first_cell_path(row)).content)
+    with np.load(io.BytesIO(live.http.get(first_cell_path(row, ".npz")).content), allow_pickle=False) as arrays:
         assert np.array_equal(arrays["counts"], decoded.evidence.counts)
         assert arrays["centres_m"].shape == (len(decoded.evidence), 3)
 
 
 def test_ply_holds_the_vertices_that_its_header_says(live: Live, row: MapRow) -> None:
-    answer = live.http.get(path_of(row, ".ply"))
+    answer = live.http.get(first_cell_path(row, ".ply"))
     head, _, body = answer.content.partition(b"end_header\n")
     count = re.search(rb"element vertex (\d+)", head)
     sizes = {b"float": 4, b"uchar": 1, b"int": 4}
@@ -108,7 +103,7 @@ def test_ply_holds_the_vertices_that_its_header_says(live: Live, row: MapRow) ->
 def test_an_unknown_suffix_is_refused_whatever_is_asked_with_it(
     live: Live, row: MapRow, suffix: str, headers: dict[str, str]
 ) -> None:
-    answer = live.http.get(path_of(row, suffix), headers=headers)
+    answer = live.http.get(first_cell_path(row, suffix), headers=headers)
     assert (answer.status_code, kind_of(answer)) == (400, "unknown_format")
 
 

@@ -9,8 +9,7 @@ import httpx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.cairn_server.http.test_cells import path_of
-from tests.cairn_server.sync.test_push import kind_of
+from tests.fixtures.server.answers import first_cell_path, kind_of
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed
 
@@ -45,10 +44,10 @@ def row(live: Live) -> MapRow:
 
 @pytest.mark.parametrize("suffix", ["", ".view"])
 def test_a_depth_answers_the_view_of_that_depth(live: Live, row: MapRow, suffix: str) -> None:
-    whole = decode_cell(live.http.get(path_of(row)).content)
-    etags = {live.http.get(path_of(row, suffix)).headers["ETag"]}
+    whole = decode_cell(live.http.get(first_cell_path(row)).content)
+    etags = {live.http.get(first_cell_path(row, suffix)).headers["ETag"]}
     for depth in range(1, row.geometry.depth + 1):
-        answer = live.http.get(path_of(row, suffix), params={"depth": depth})
+        answer = live.http.get(first_cell_path(row, suffix), params={"depth": depth})
         style = ViewStyle(depth=depth)
         expected = encode_view(whole.key, whole.evidence, row.geometry, row.sensor_model, style=style)
         assert answer.content == expected
@@ -56,7 +55,7 @@ def test_a_depth_answers_the_view_of_that_depth(live: Live, row: MapRow, suffix:
         assert all(name in answer.headers for name in SAID)
         etags.add(answer.headers["ETag"])
         same = {"If-None-Match": answer.headers["ETag"]}
-        assert live.http.get(path_of(row, suffix), params={"depth": depth}, headers=same).status_code == 304
+        assert live.http.get(first_cell_path(row, suffix), params={"depth": depth}, headers=same).status_code == 304
     assert len(etags) == row.geometry.depth + 1
 
 
@@ -73,13 +72,13 @@ def test_a_depth_answers_the_view_of_that_depth(live: Live, row: MapRow, suffix:
 def test_a_depth_that_cannot_be_is_refused(
     live: Live, row: MapRow, suffix: str, depth: int, status: int, kind: str
 ) -> None:
-    answer = live.http.get(path_of(row, suffix), params={"depth": depth})
+    answer = live.http.get(first_cell_path(row, suffix), params={"depth": depth})
     assert (answer.status_code, kind_of(answer)) == (status, kind)
 
 
 @pytest.mark.parametrize("suffix", ["", ".npz", ".view"])
 def test_a_cell_in_two_ranges_is_the_cell(live: Live, row: MapRow, suffix: str) -> None:
-    whole = live.http.get(path_of(row, suffix))
+    whole = live.http.get(first_cell_path(row, suffix))
     middle = len(whole.content) // 2
     parts = b""
     for asked, said in (
@@ -87,7 +86,7 @@ def test_a_cell_in_two_ranges_is_the_cell(live: Live, row: MapRow, suffix: str) 
         (f"bytes={middle}-", f"bytes {middle}-{len(whole.content) - 1}/{len(whole.content)}"),
     ):
         headers = {"Range": asked, "If-Range": whole.headers["ETag"]}
-        answer = live.http.get(path_of(row, suffix), headers=headers)
+        answer = live.http.get(first_cell_path(row, suffix), headers=headers)
         assert (answer.status_code, answer.headers["Content-Range"]) == (206, said)
         assert {name: answer.headers[name] for name in SAID} == {name: whole.headers[name] for name in SAID}
         parts += answer.content
@@ -110,18 +109,18 @@ def test_a_cell_in_two_ranges_is_the_cell(live: Live, row: MapRow, suffix: str) 
 def test_what_is_no_single_range_of_this_cell_is_answered_whole(
     live: Live, row: MapRow, headers: dict[str, str]
 ) -> None:
-    answer = live.http.get(path_of(row), headers=headers)
-    assert (answer.status_code, answer.content) == (200, live.http.get(path_of(row)).content)
+    answer = live.http.get(first_cell_path(row), headers=headers)
+    assert (answer.status_code, answer.content) == (200, live.http.get(first_cell_path(row)).content)
     assert "Content-Range" not in answer.headers
 
 
 def test_a_range_behind_the_end_is_416_and_a_known_cell_304(live: Live, row: MapRow) -> None:
-    whole = live.http.get(path_of(row))
-    answer = live.http.get(path_of(row), headers={"Range": f"bytes={len(whole.content)}-"})
+    whole = live.http.get(first_cell_path(row))
+    answer = live.http.get(first_cell_path(row), headers={"Range": f"bytes={len(whole.content)}-"})
     assert (answer.status_code, kind_of(answer)) == (416, "bad_range")
     assert answer.headers["Content-Range"] == f"bytes */{len(whole.content)}"
     known = {"Range": "bytes=0-1", "If-None-Match": whole.headers["ETag"]}
-    assert live.http.get(path_of(row), headers=known).status_code == 304
+    assert live.http.get(first_cell_path(row), headers=known).status_code == 304
 
 
 @given(size=st.integers(1, 40), first=st.integers(0, 50), last=st.integers(0, 50))
@@ -142,12 +141,12 @@ def test_ranges_are_those_of_a_slice(size: int, first: int, last: int) -> None:
 
 @pytest.mark.parametrize("suffix", ["", ".ply", "?depth=2"])
 def test_head_says_what_get_does_without_the_body(live: Live, row: MapRow, suffix: str) -> None:
-    whole, head = (live.http.request(method, path_of(row, suffix)) for method in ("GET", "HEAD"))
+    whole, head = (live.http.request(method, first_cell_path(row, suffix)) for method in ("GET", "HEAD"))
     assert (head.status_code, head.content) == (200, b"")
     for name in (*SAID, "Content-Length", "Content-Type"):
         assert head.headers[name] == whole.headers[name]
     assert live.http.head(f"/maps/{row.name}/main/cells/9,9,9").status_code == 404
-    assert live.http.head(path_of(row), headers={"Range": "bytes=0-1"}).status_code == 200
+    assert live.http.head(first_cell_path(row), headers={"Range": "bytes=0-1"}).status_code == 200
 
 
 def test_a_box_is_the_index_without_what_lies_outside(live: Live, row: MapRow) -> None:
@@ -266,11 +265,11 @@ def crowded(live: Live) -> MapRow:
 
 
 def test_a_thousand_authors_do_not_fit_into_a_header_and_come_by_digest(live: Live, crowded: MapRow) -> None:
-    answer = live.http.get(path_of(crowded))
+    answer = live.http.get(first_cell_path(crowded))
     assert answer.status_code == 200
     assert "Cairn-Coverage" not in answer.headers
     assert sum(len(name) + len(value) + 4 for name, value in answer.headers.raw) < COVERAGE_BYTES_MAX
-    same = live.http.get(path_of(crowded), headers={"If-None-Match": answer.headers["ETag"]})
+    same = live.http.get(first_cell_path(crowded), headers={"If-None-Match": answer.headers["ETag"]})
     assert same.headers["Cairn-Coverage-Digest"] == answer.headers["Cairn-Coverage-Digest"]
     vector = live.http.get(vector_url(crowded), params={"at": answer.headers["Cairn-Cursor"]})
     assert hashlib.sha256(vector.content).hexdigest() == answer.headers["Cairn-Coverage-Digest"]
@@ -311,7 +310,7 @@ def test_a_vector_that_does_not_have_its_digest_is_not_taken(
 
 
 def test_a_short_coverage_stays_in_its_header(live: Live, row: MapRow) -> None:
-    answer: httpx.Response = live.http.get(path_of(row))
+    answer: httpx.Response = live.http.get(first_cell_path(row))
     assert "Cairn-Coverage-Digest" not in answer.headers
     assert answer.headers["Content-Type"] == CELL_MEDIA_TYPE
     at = live.http.get(vector_url(row), params={"at": answer.headers["Cairn-Cursor"]})

@@ -12,8 +12,7 @@ from tests.fixtures.map.made import ROBOT, SMALL
 from tests.fixtures.server.live import DEADLINE_S, Process
 from tests.fixtures.server.pushes import pushed
 from tests.fuzz.json_mutator import mutated_json
-from tests.fuzz.test_fuzz import bytewise
-from tests.fuzz.wrapping_mutator import mutated_commit
+from tests.fuzz.wrapping_mutator import bytewise, mutated_commit
 
 from cairn_map.wire.messages import CreateMap, MissingRequest, Problem
 

@@ -7,14 +7,13 @@ import httpx
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.cairn_server.test_protocol_document import DOCUMENT, ROUTE, documented_kinds
 from tests.fixtures.server.live import Live
+from tests.fixtures.server.protocol_document import ROUTES, documented_kinds
 from tests.fixtures.server.pushes import pushed
 
 from cairn_map.wire.messages import MissingRequest, Problem
 
 KINDS = documented_kinds()
-ROUTES = [(found[1], found[2]) for found in ROUTE.finditer(DOCUMENT)]
 COMMIT = pushed(0, 0)
 CURSOR = f"{'0' * 32}.1.{'0' * 32}"
 SOUND: dict[str, list[bytes]] = {

@@ -6,8 +6,8 @@ import signal
 import sys
 from pathlib import Path
 
-from tests.cairn_server.operations.test_serve_process import client, make_map
 from tests.fixtures.server.live import Live, Process
+from tests.fixtures.server.processes import client, make_map
 from tests.fixtures.server.pushes import MOLE, pushed
 
 from cairn_server.http.middleware.log_format import REQUEST_ID, JsonFormatter, TextFormatter, fields

@@ -6,11 +6,11 @@ from typing import Any
 
 import httpx
 import pytest
-from tests.cairn_server.http.test_cells import path_of
-from tests.cairn_server.live.test_robot_reports import JPEG, PNG, register
-from tests.cairn_server.test_protocol_document import routes_of
+from tests.fixtures.server.access import register
+from tests.fixtures.server.answers import first_cell_path
 from tests.fixtures.server.live import Live
-from tests.fixtures.server.pushes import pushed
+from tests.fixtures.server.protocol_document import routes_of
+from tests.fixtures.server.pushes import JPEG, PNG, pushed
 
 from cairn_server.http.openapi import ANSWERS, BODIES, operations
 from cairn_server.http.openapi_examples import EXAMPLES
@@ -88,7 +88,7 @@ def test_whatever_a_route_answers_to_a_bare_request_is_documented(live: Live, do
 
 
 def test_answers_of_bytes_are_what_the_document_says(live: Live, row: MapRow, document: dict[str, Any]) -> None:
-    cell, cells = "/maps/{name}/main/cells/{cell}", path_of(row)
+    cell, cells = "/maps/{name}/main/cells/{cell}", first_cell_path(row)
     etag = live.http.get(cells).headers["ETag"]
     for suffix in ("", ".npz", ".ply", ".view", "?depth=1"):
         check(document, "GET", cell, live.http.get(cells + suffix))

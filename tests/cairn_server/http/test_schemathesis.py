@@ -13,13 +13,11 @@ from schemathesis.checks import (
     response_schema_conformance,
     status_code_conformance,
 )
-from tests.cairn_server.http.test_hostile_requests import ROUTES
-from tests.cairn_server.test_protocol_document import documented_kinds
 from tests.fixtures.map.made import SMALL
 from tests.fixtures.server.live import Live
+from tests.fixtures.server.protocol_document import ROUTES, documented_kinds
 from tests.fixtures.server.pushes import pushed
-from tests.fuzz.test_fuzz import bytewise
-from tests.fuzz.wrapping_mutator import mutated_commit
+from tests.fuzz.wrapping_mutator import bytewise, mutated_commit
 
 from cairn_map.wire.messages import CreateMap, Problem, Register
 from cairn_server.http.openapi import BODIES

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.cairn_server.access.test_auth import ADMIN, ENROLLER, bearer, robot_token
-from tests.cairn_server.sync.test_push import kind_of
+from tests.fixtures.server.access import ADMIN, ENROLLER, bearer, robot_token
+from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.listening import by_socket, by_sse, hello_of, socket_url, up_to_head
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import MOLE, WREN, pushed

@@ -5,17 +5,17 @@ from typing import Any
 
 import httpx
 import pytest
-from tests.cairn_server.sync.test_push import kind_of
+from tests.fixtures.server.access import register
+from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.listening import by_socket, hello_of
 from tests.fixtures.server.live import Live, until
-from tests.fixtures.server.pushes import MOLE, WREN, pushed
+from tests.fixtures.server.pushes import JPEG, MOLE, PNG, WREN, pushed
 
 from cairn_map.wire.live_events import RobotHeard
 from cairn_map.wire.robot_status import RobotStatus
 from cairn_server.live import branch_list, robot_reports
 from cairn_server.store.store_rows import MapRow
 
-JPEG, PNG = b"\xff\xd8\xff\xe0 a jpeg", b"\x89PNG\r\n\x1a\n a png"
 STATUS = RobotStatus.model_validate(
     {
         "time_s": 1.5e9,
@@ -33,11 +33,6 @@ STATUS = RobotStatus.model_validate(
         "note": "stairs",
     }
 )
-
-
-def register(live: Live, row: MapRow, robot: str = "mole", incarnation: str = MOLE.incarnation) -> None:
-    body = {"robot": robot, "incarnation": incarnation}
-    live.http.post(f"/maps/{row.name}/branches", json=body).raise_for_status()
 
 
 def put_status(live: Live, row: MapRow, status: RobotStatus = STATUS, branch: str = "mole") -> httpx.Response:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from tests.cairn_server.http.test_body_limit import head
+from tests.fixtures.server.answers import head
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import pushed
 

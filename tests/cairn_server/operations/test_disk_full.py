@@ -7,9 +7,9 @@ from pathlib import Path
 
 import httpx
 import pytest
-from tests.cairn_server.operations.test_serve_process import all_folded, client, make_map
-from tests.cairn_server.sync.test_push import kind_of
+from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.live import Process, until
+from tests.fixtures.server.processes import all_folded, client, make_map
 from tests.fixtures.server.pushes import KEYS, pushed, read, sum_of
 from tests.fixtures.server.tiny_disk import TinyDisk, tiny_disk
 

@@ -6,39 +6,15 @@ import threading
 from pathlib import Path
 
 import httpx
-from tests.fixtures.map.made import SMALL
-from tests.fixtures.server.live import DEADLINE_S, Process, until
+from tests.fixtures.server.live import DEADLINE_S, Process
+from tests.fixtures.server.processes import all_folded, client, make_map
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.evidence.grid import cell_of_key
-from cairn_map.wire.frames import frames_of
-from cairn_map.wire.messages import CreateMap, ReplyHeader
 from cairn_server.operations.health_probe import why_not
 from cairn_server.store.folder_lock import told_port
-
-
-def client(process: Process) -> httpx.Client:
-    assert process.url
-    return httpx.Client(base_url=process.url, timeout=DEADLINE_S)
-
-
-def make_map(http: httpx.Client) -> None:
-    body = CreateMap(geometry=SMALL).model_dump_json().encode()
-    http.put("/maps/lab", content=body, headers={"Content-Type": "application/json"}).raise_for_status()
-
-
-def header(http: httpx.Client) -> ReplyHeader:
-    answer = http.post("/maps/lab/branches/mole/missing", json={})
-    found = frames_of(answer.content)[0]
-    assert isinstance(found, ReplyHeader)
-    return found
-
-
-def all_folded(http: httpx.Client) -> ReplyHeader:
-    until(lambda: not header(http).pending, "everything is folded")
-    return header(http)
 
 
 def push_until_killed(

@@ -8,8 +8,8 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import httpx
-from tests.cairn_server.operations.test_serve_process import all_folded, client, make_map
 from tests.fixtures.server.live import DEADLINE_S, Process
+from tests.fixtures.server.processes import all_folded, client, make_map
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 
 from cairn_map.commits.commit import Commit

@@ -7,6 +7,7 @@ from pathlib import Path
 import apsw
 import pytest
 from tests.fixtures.server.live import Live
+from tests.fixtures.server.old_stores import OLD_COMMITS, OLD_RETRACTS, unpacked
 from tests.fixtures.server.pushes import WREN, pushed, read, sum_of
 from tests.fixtures.server.tiny_disk import tiny_disk
 
@@ -189,10 +190,7 @@ def test_a_backup_of_a_disk_that_is_full_leaves_nothing(live: Live, row: MapRow,
 
 
 def test_a_store_of_an_older_version_is_brought_up_to_date_on_the_way(tmp_path: Path) -> None:
-    from tests.cairn_server.store.test_migrations import COMMITS as OLD
-    from tests.cairn_server.store.test_migrations import RETRACTS, unpacked
-
     path = unpacked("v1.sqlite.zst", tmp_path)
     assert main(["restore", str(path), "--data", str(tmp_path / "new")]) == 0
     with Live(tmp_path / "new") as other:
-        assert read(other.cells(other.service.store.map("lab"))) == sum_of([*OLD, *RETRACTS])
+        assert read(other.cells(other.service.store.map("lab"))) == sum_of([*OLD_COMMITS, *OLD_RETRACTS])

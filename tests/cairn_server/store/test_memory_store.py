@@ -5,15 +5,15 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from tests.cairn_server.access.test_auth import ADMIN, ENROLLER, bearer, robot_token
-from tests.cairn_server.sync.test_missing import fetch
-from tests.cairn_server.sync.test_push import kind_of
 from tests.fixtures.map.made import SMALL
+from tests.fixtures.server.access import ADMIN, ENROLLER, bearer, robot_token
 from tests.fixtures.server.access_contract import AccessContract
+from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.branch_contract import BranchContract
 from tests.fixtures.server.commit_contract import CommitContract
 from tests.fixtures.server.crowd_contract import CrowdContract
 from tests.fixtures.server.evidence_contract import EvidenceContract
+from tests.fixtures.server.fetching import fetch
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.naive_asker import NaiveAsker
 from tests.fixtures.server.pushes import MOLE, WREN, pushed, read, sum_of

@@ -4,28 +4,16 @@ from pathlib import Path
 
 import apsw
 import pytest
-import zstandard
 from tests.fixtures.server.live import Live
-from tests.fixtures.server.pushes import MOLE, WREN, pushed, read, sum_of
+from tests.fixtures.server.old_stores import FORMATS, OLD_COMMITS, OLD_RETRACTS, unpacked
+from tests.fixtures.server.pushes import MOLE, pushed, read, sum_of
 
 from cairn_map.errors import BadInputError
 from cairn_server.store.sqlite.schema import STEPS, ensure_schema
-from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
+from cairn_server.store.sqlite.store import SqliteStore
 from cairn_server.store.store_rows import CellRow
 
-FORMATS = Path(__file__).parents[2] / "formats"
 HEADS = {"v1.sqlite.zst": "4243ca94aa4e5ac2bca4157d97a5ba33.10.0c13ae5711ebe0d9d9c007e2badf0262"}
-COMMITS = [pushed(n, n + shift, author) for shift, author in enumerate((MOLE, WREN)) for n in range(3)]
-RETRACTS = [
-    pushed(3, 0, MOLE, cells={}, retracts=[COMMITS[0]]),
-    pushed(3, 0, WREN, cells={}, retracts=[COMMITS[4], COMMITS[0]]),
-]
-
-
-def unpacked(name: str, folder: Path) -> Path:
-    path = folder / FILE_NAME
-    path.write_bytes(zstandard.decompress((FORMATS / name).read_bytes(), max_output_size=1 << 24))
-    return path
 
 
 def rows_of(live: Live) -> list[CellRow]:
@@ -36,23 +24,23 @@ def rows_of(live: Live) -> list[CellRow]:
 @pytest.mark.parametrize("name", sorted(path.name for path in FORMATS.glob("*.sqlite.zst")))
 def test_an_older_store_opens_with_all_that_it_held_and_goes_on(name: str, tmp_path: Path) -> None:
     unpacked(name, tmp_path)
-    more = pushed(4, 2, MOLE, retracts=[COMMITS[1], COMMITS[3]])
+    more = pushed(4, 2, MOLE, retracts=[OLD_COMMITS[1], OLD_COMMITS[3]])
     with Live(tmp_path) as live:
         row = live.service.store.map("lab")
         with live.service.store.snapshot(row) as snapshot:
             assert str(snapshot.head.cursor) == HEADS[name]
             seq = snapshot.head.cursor.seq
-        assert read(live.cells(row)) == sum_of([*COMMITS, *RETRACTS])
+        assert read(live.cells(row)) == sum_of([*OLD_COMMITS, *OLD_RETRACTS])
         assert {cell.hottest_k for cell in rows_of(live)} == {None}  # nobody wrote down how hot they are
         assert [branch.name for branch in live.service.store.branches(row)] == ["mole"]
-        assert live.push(row, COMMITS[2]).status_code == 200
+        assert live.push(row, OLD_COMMITS[2]).status_code == 200
         assert live.push(row, more).status_code == 201
         live.folded(row)
         told = [cell.key for cell in rows_of(live) if cell.hottest_k is not None]
         assert told == [cell.key for cell in rows_of(live) if cell.lm > seq] != []
-        assert read(live.cells(row)) == sum_of([*COMMITS, *RETRACTS, more])
+        assert read(live.cells(row)) == sum_of([*OLD_COMMITS, *OLD_RETRACTS, more])
     with Live(tmp_path) as live:  # and once more, now as a store of this version
-        assert read(live.cells(live.service.store.map("lab"))) == sum_of([*COMMITS, *RETRACTS, more])
+        assert read(live.cells(live.service.store.map("lab"))) == sum_of([*OLD_COMMITS, *OLD_RETRACTS, more])
 
 
 @pytest.mark.parametrize("version", range(len(STEPS)))

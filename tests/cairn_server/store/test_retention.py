@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.cairn_server.sync.test_missing import fetch
-from tests.cairn_server.sync.test_push import kind_of
+from tests.fixtures.server.answers import kind_of
+from tests.fixtures.server.fetching import fetch
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.naive_asker import NaiveAsker, cell_frames
 from tests.fixtures.server.pushes import MOLE, WREN, pushed, read, sum_of

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.cairn_server.sync.test_missing import fetch
 from tests.fixtures.map.made import SMALL, random_evidence
+from tests.fixtures.server.fetching import fetch
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.naive_asker import NaiveAsker, cell_frames
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import zstandard
 from tests.fixtures.server.live import DEADLINE_S, Live, Process, until
+from tests.fixtures.server.processes import children_of
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed
 
 from cairn_map.codec.cell_code import Profile
@@ -242,10 +243,6 @@ def workers_of(live: Live) -> list[int]:
     """Numbers of the processes that check commits."""
     nursery = pool_of(live)._nursery
     return children_of(nursery.pid) if nursery else []
-
-
-def children_of(pid: int) -> list[int]:
-    return [int(child) for path in Path(f"/proc/{pid}/task").glob("*/children") for child in path.read_text().split()]
 
 
 def is_alive(pid: int) -> bool:

@@ -1,9 +1,9 @@
 """What comes first in a reply, and what need not come at all."""
 
 import numpy as np
-from tests.cairn_server.sync.test_missing import ask, fetch
-from tests.cairn_server.sync.test_push import kind_of
 from tests.fixtures.map.made import SMALL, random_evidence
+from tests.fixtures.server.answers import kind_of
+from tests.fixtures.server.fetching import ask_missing, fetch
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.naive_asker import NaiveAsker
 from tests.fixtures.server.pushes import MOLE, SCANS, WREN, pushed
@@ -29,7 +29,7 @@ def seen(live: Live) -> MapRow:
 
 
 def order(live: Live, row: MapRow, request: MissingRequest) -> list[tuple[int, int, int]]:
-    frames = frames_of(ask(live, row, request).content)
+    frames = frames_of(ask_missing(live, row, request).content)
     return [tuple(cell_of_key(frame.cell)) for frame in frames if isinstance(frame, CellFrame)]  # type: ignore[misc]
 
 
@@ -70,17 +70,17 @@ def test_a_small_reply_has_the_nearest_cell(live: Live) -> None:
 def test_a_place_outside_the_grid_is_refused(live: Live) -> None:
     row = live.new_map()
     for near in ((1 << 70, 0, 0), (0, 0, -(1 << 21))):
-        assert kind_of(ask(live, row, MissingRequest(near=near))) == "cell_range"
+        assert kind_of(ask_missing(live, row, MissingRequest(near=near))) == "cell_range"
 
 
 def test_a_reply_that_is_known_is_not_sent_again(live: Live) -> None:
     row = seen(live)
     asker = NaiveAsker(MOLE)
     fetch(live, row, asker)
-    first = ask(live, row, asker.request())
+    first = ask_missing(live, row, asker.request())
     again = asker.request().model_copy(update={"known": reply_digest(first.content)})
-    answer = ask(live, row, again)
+    answer = ask_missing(live, row, again)
     assert (answer.status_code, answer.content) == (204, b"")
     live.push(row, pushed(9, 3, WREN))
     live.folded(row)
-    assert ask(live, row, again).status_code == 200
+    assert ask_missing(live, row, again).status_code == 200

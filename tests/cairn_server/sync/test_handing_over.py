@@ -4,31 +4,24 @@ from collections.abc import Iterator
 
 import httpx
 import pytest
-from tests.cairn_server.access.test_auth import ADMIN, bearer
-from tests.cairn_server.sync.test_push import kind_of
-from tests.cairn_server.sync.test_uploads import add, state
 from tests.fixtures.map.made import SMALL
+from tests.fixtures.server.access import ADMIN, bearer
+from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import pushed, read, sum_of
+from tests.fixtures.server.signatures import FRIEND, KEYS, MOLE, OLD_MOLE, WREN, signed
+from tests.fixtures.server.uploads import add, state
 
 from cairn_map.commits.commit import Commit, renamed_commit
 from cairn_map.commits.commit_reading import open_commit
 from cairn_map.commits.ids import INITIAL, OPERATOR, Author, CommitId, RobotName
-from cairn_map.commits.signature import SigningKey, signatures_to_text
+from cairn_map.commits.signature import SigningKey
 from cairn_map.wire.access_messages import CreateToken
 from cairn_map.wire.messages import Retract
 from cairn_server.access.auth import ADMIN_FILE
 from cairn_server.access.tokens import create_token
 from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.handing_over import server_key
-
-KEYS = [SigningKey(bytes([n] * 32)) for n in range(4)]
-MOLE, OLD_MOLE, WREN = (
-    Author(RobotName(name), key.incarnation) for name, key in zip(("mole", "mole", "wren"), KEYS, strict=False)
-)
-KEY_OF = {MOLE: KEYS[0], OLD_MOLE: KEYS[1], WREN: KEYS[2]}
-FRIEND = KEYS[3]
-"""The key of a server that this one trusts."""
 
 
 @pytest.fixture(scope="module")
@@ -44,12 +37,6 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
 @pytest.fixture
 def row(live: Live) -> MapRow:
     return live.new_map()
-
-
-def signed(row: MapRow, commit: Commit, *keys: SigningKey) -> dict[str, str]:
-    """The header that a commit travels with; its author's own, unless others are named."""
-    by = keys or (KEY_OF[commit.id.author],)
-    return {"Cairn-Signature": signatures_to_text([key.sign(row.name, commit.sha) for key in by])}
 
 
 def hand_over(live: Live, row: MapRow, commit: Commit, *keys: SigningKey) -> httpx.Response:

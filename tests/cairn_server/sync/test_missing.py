@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-import httpx
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.cairn_server.sync.test_push import kind_of
+from tests.fixtures.server.answers import kind_of
+from tests.fixtures.server.fetching import ask_missing, fetch
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.naive_asker import KEY_FAR, NaiveAsker, cell_frames, fingerprint_sum
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
@@ -14,25 +14,9 @@ from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.evidence.fingerprint import ZERO
 from cairn_map.evidence.grid import cell_of_key
-from cairn_map.wire.frames import Frame, FrameKind, frames_of
+from cairn_map.wire.frames import FrameKind, frames_of
 from cairn_map.wire.messages import Done, MissingRequest, More, ReplyHeader
-from cairn_server.store.store_rows import MapRow
 from cairn_server.sync import cell_changes, missing
-
-
-def ask(live: Live, row: MapRow, request: MissingRequest) -> httpx.Response:
-    return live.http.post(
-        f"/maps/{row.name}/branches/mole/missing",
-        content=request.model_dump_json().encode(),
-        headers={"Content-Type": "application/json"},
-    )
-
-
-def fetch(live: Live, row: MapRow, asker: NaiveAsker) -> list[Frame]:
-    live.folded(row)
-    frames = frames_of(ask(live, row, asker.request()).content)
-    asker.take(frames)
-    return frames
 
 
 @settings(max_examples=9)
@@ -107,7 +91,7 @@ def test_what_is_pending_is_not_stable(tmp_path: Path, monkeypatch: pytest.Monke
         own.folded(row)
         monkeypatch.setattr(own.service._folder, "_fold_group", lambda *arguments: 0)
         own.push(row, pushed(1, 1))
-        header = frames_of(ask(own, row, NaiveAsker(MOLE).request()).content)[0]
+        header = frames_of(ask_missing(own, row, NaiveAsker(MOLE).request()).content)[0]
         assert isinstance(header, ReplyHeader)
         assert header.stable == {str(MOLE): [[0, 0]]}
 
@@ -155,7 +139,7 @@ def test_who_cannot_use_a_delta_gets_the_cell_whole(live: Live) -> None:
     fetch(live, row, asker)
     live.push(row, pushed(6, 1, WREN))
     live.folded(row)
-    frames = cell_frames(frames_of(ask(live, row, asker.request(kinds=["full"])).content))
+    frames = cell_frames(frames_of(ask_missing(live, row, asker.request(kinds=["full"])).content))
     assert {frame.kind for frame in frames.values()} == {FrameKind.FULL}
 
 
@@ -170,7 +154,7 @@ def test_a_cursor_that_cannot_be_proven_is_answered_with_resets_for_every_cell(l
     request = MissingRequest.model_validate(
         {"cursor": str(false), "cells": [{"cell": cell_of_key(KEY_FAR), "cursor": str(false)}]}
     )
-    frames = frames_of(ask(live, row, request).content)
+    frames = frames_of(ask_missing(live, row, request).content)
     found = cell_frames(frames)
     assert {frame.kind for frame in found.values()} == {FrameKind.RESET}
     assert found.keys() == {*pushed(0, 0).cells, KEY_FAR}
@@ -186,7 +170,7 @@ def test_a_single_cell_with_a_false_cursor_is_reset_alone(live: Live) -> None:
     key = next(iter(pushed(0, 0).cells))
     true = cursor_from_text(str(asker.cursor))
     asker.cursors[key] = str(Cursor(true.log_id, true.seq, bytes(16)))
-    found = cell_frames(frames_of(ask(live, row, asker.request()).content))
+    found = cell_frames(frames_of(ask_missing(live, row, asker.request()).content))
     assert {k: frame.kind for k, frame in found.items()} == {key: FrameKind.RESET}
 
 
@@ -197,7 +181,7 @@ def test_a_cursor_of_another_log_is_gone(live: Live) -> None:
         MissingRequest(cursor=cursor),
         MissingRequest.model_validate({"cells": [{"cell": (0, 0, 0), "cursor": cursor}]}),
     ):
-        answer = ask(live, row, request)
+        answer = ask_missing(live, row, request)
         assert (answer.status_code, kind_of(answer)) == (410, "other_log")
 
 
@@ -206,7 +190,7 @@ def test_compare_answers_every_cell_with_its_fingerprint_and_no_bytes(live: Live
     asker = NaiveAsker(MOLE)
     live.push(row, pushed(0, 0, WREN))
     fetch(live, row, asker)
-    frames = frames_of(ask(live, row, asker.request(compare=True)).content)
+    frames = frames_of(ask_missing(live, row, asker.request(compare=True)).content)
     found = cell_frames(frames)
     assert {(frame.kind, frame.payload) for frame in found.values()} == {(FrameKind.RESET, b"")}
     index = live.http.get(f"/maps/{row.name}/main/cells").json()["cells"]
@@ -216,7 +200,7 @@ def test_compare_answers_every_cell_with_its_fingerprint_and_no_bytes(live: Live
 def test_a_listed_cell_that_nobody_saw_comes_as_an_empty_one(live: Live) -> None:
     row = live.new_map()
     request = MissingRequest.model_validate({"cells": [{"cell": cell_of_key(KEY_FAR), "cursor": None}]})
-    frames = frames_of(ask(live, row, request).content)
+    frames = frames_of(ask_missing(live, row, request).content)
     asker = NaiveAsker(None)
     asker.cursors[KEY_FAR] = None
     assert asker.take(frames)
@@ -242,7 +226,7 @@ def test_a_long_reply_ends_with_more_and_the_next_request_goes_on(live: Live, mo
         live.push(row, commit)
     live.folded(row)
     replies = 1
-    while not asker.take(frames := frames_of(ask(live, row, asker.request()).content)):
+    while not asker.take(frames := frames_of(ask_missing(live, row, asker.request()).content)):
         assert isinstance(frames[-1], More)
         assert len(frames) == 3
         replies += 1
@@ -269,7 +253,7 @@ def test_the_header_tells_what_a_robot_may_conclude(live: Live, monkeypatch: pyt
         live.push(row, commit)
     live.retract(row, commits[0])
     live.folded(row)
-    header = frames_of(ask(live, row, NaiveAsker(MOLE).request()).content)[0]
+    header = frames_of(ask_missing(live, row, NaiveAsker(MOLE).request()).content)[0]
     assert isinstance(header, ReplyHeader)
     assert header.vector[str(MOLE)] == [[0, 1]]
     assert header.tip == (1, commits[1].sha.hex())
@@ -277,7 +261,7 @@ def test_the_header_tells_what_a_robot_may_conclude(live: Live, monkeypatch: pyt
     assert header.retracts == [f"operator.{live.service.operator}.0"]
     monkeypatch.setattr(live.service._folder, "_fold_group", lambda *arguments: 0)
     live.push(row, pushed(2, 2))
-    header = frames_of(ask(live, row, NaiveAsker(MOLE).request()).content)[0]
+    header = frames_of(ask_missing(live, row, NaiveAsker(MOLE).request()).content)[0]
     assert isinstance(header, ReplyHeader)
     assert header.pending == {str(MOLE): [[2, 2]]}
     assert header.vector[str(MOLE)] == [[0, 1]]
@@ -288,7 +272,7 @@ def test_the_header_tells_what_a_robot_may_conclude(live: Live, monkeypatch: pyt
 def test_a_cell_named_twice_is_refused(live: Live) -> None:
     row = live.new_map()
     cells = [{"cell": (0, 0, 0), "cursor": None}] * 2
-    assert kind_of(ask(live, row, MissingRequest.model_validate({"cells": cells}))) == "bad_message"
+    assert kind_of(ask_missing(live, row, MissingRequest.model_validate({"cells": cells}))) == "bad_message"
 
 
 def test_a_box_limits_frames_and_what_done_speaks_of(live: Live) -> None:
@@ -298,11 +282,11 @@ def test_a_box_limits_frames_and_what_done_speaks_of(live: Live) -> None:
     live.folded(row)
     inside = [key for key in KEYS if cell_of_key(key).i >= 0]
     box = ((0, -1, -1), (1, 0, 9))
-    frames = frames_of(ask(live, row, asker.request(box=box)).content)
+    frames = frames_of(ask_missing(live, row, asker.request(box=box)).content)
     assert cell_frames(frames).keys() == set(inside) < set(KEYS)
     head = cursor_from_text(frames[0].to)  # type: ignore[union-attr]
     assert isinstance(frames[-1], Done) and frames[-1].rest_fingerprint == ZERO
-    frames = frames_of(ask(live, row, asker.request(cursor=str(head), box=box)).content)
+    frames = frames_of(ask_missing(live, row, asker.request(cursor=str(head), box=box)).content)
     with live.service.store.snapshot(row) as snapshot:
         total = sum((cell.fingerprint for cell in snapshot.cells() if cell.key in inside), ZERO)
     assert cell_frames(frames) == {}
@@ -316,7 +300,7 @@ def test_an_asker_with_a_byte_budget_gets_the_cells_one_after_the_other(live: Li
         live.push(row, commit)
     live.folded(row)
     sizes = []
-    while not asker.take(frames := frames_of(ask(live, row, asker.request(size_bytes_max=1)).content)):
+    while not asker.take(frames := frames_of(ask_missing(live, row, asker.request(size_bytes_max=1)).content)):
         sizes.append(len(cell_frames(frames)))
     assert sizes == [1, 1, 1]
     assert asker.map() == sum_of(commits)

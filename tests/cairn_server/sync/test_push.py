@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.fixtures.map.made import MIDDLE, PLAIN, SMALL
+from tests.fixtures.map.made import MIDDLE, PLAIN, SMALL, commit_bytes
+from tests.fixtures.map.stored import recoded
+from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 
@@ -15,10 +17,6 @@ from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.grid import Geometry
 from cairn_server.store import numbering
 from cairn_server.sync.checks import push_policy
-
-
-def kind_of(response: object) -> str:
-    return str(response.json()["kind"])  # type: ignore[attr-defined]
 
 
 def test_push_twice_changes_nothing(live: Live) -> None:
@@ -43,9 +41,6 @@ def test_the_same_id_with_other_bytes_is_refused_and_audited(live: Live) -> None
 
 
 def test_a_recompressed_commit_is_the_same_commit(live: Live) -> None:
-    from tests.cairn_map.commits.test_commit import commit_bytes
-    from tests.fixtures.map.stored import recoded
-
     row = live.new_map()
     commit = pushed(0, 1)
     live.push(row, commit)

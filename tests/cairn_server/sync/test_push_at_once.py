@@ -6,11 +6,11 @@ from pathlib import Path
 
 import apsw
 import pytest
-from tests.cairn_server.access.test_auth import bearer
-from tests.cairn_server.access.test_quotas import MOLE, Clock, guarded, metered, robot_token, spend
 from tests.fixtures.map.made import SMALL
+from tests.fixtures.server.access import bearer, robot_token
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import pushed
+from tests.fixtures.server.quotas import MOLE_CALLER, Clock, guarded, metered, spend
 
 from cairn_map.commits.commit_reading import CommitReader
 from cairn_server.access.quotas import DAY_S
@@ -75,7 +75,7 @@ def test_a_server_that_has_just_started_reads_quotas_in_a_thread(
 
         monkeypatch.setattr(live.service.pushes.meter, "spending", noted)
         row = live.new_map(SMALL)
-        mole = bearer(robot_token(live, row, MOLE.robot or ""))
+        mole = bearer(robot_token(live, row, MOLE_CALLER.robot or ""))
         assert [live.push(row, pushed(n, n), headers=mole).status_code for n in range(2)] == [201, 201]
     assert on_loop == [False, True]
 

@@ -5,7 +5,7 @@ import time
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.cairn_server.sync.test_push import kind_of
+from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 

@@ -1,56 +1,22 @@
 """Commits that come in parts: where they go on, what is refused before it comes, how little a hostile robot holds."""
 
-import hashlib
 from pathlib import Path
 from random import Random
 
-import httpx
 import pytest
-from tests.cairn_server.access.test_auth import ADMIN, bearer, robot_token
-from tests.cairn_server.access.test_quotas import SIZE, assert_waits, guarded
-from tests.cairn_server.sync.test_push import kind_of
+from tests.fixtures.server.access import ADMIN, bearer, robot_token
+from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import MOLE, WREN, pushed
+from tests.fixtures.server.quotas import SIZE, assert_waits, guarded
+from tests.fixtures.server.uploads import COMMIT, add, state
 
-from cairn_map.commits.commit import COMMIT_BYTES_MAX, Commit
+from cairn_map.commits.commit import COMMIT_BYTES_MAX
 from cairn_map.errors import BadInputError, UnreachableError
 from cairn_map.wire.messages import CreateMap
 from cairn_server.access.auth import Caller, Role
-from cairn_server.store.store_rows import MapRow
 from cairn_server.sync import uploads
 from cairn_server.sync.uploads import Part, Uploads
-
-COMMIT = pushed(0, 0)
-
-
-def digest_of(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
-
-
-def state(live: Live, row: MapRow, commit: Commit = COMMIT, **options: object) -> dict[str, object]:
-    path = f"/maps/{row.name}/commits/{commit.id}/upload"
-    answer = live.http.get(path, params={"digest": digest_of(commit.data)}, **options)  # type: ignore[arg-type]
-    assert answer.status_code == 200, answer.text
-    return dict(answer.json())
-
-
-def add(
-    live: Live,
-    row: MapRow,
-    data: bytes,
-    offset: int,
-    *,
-    commit: Commit = COMMIT,
-    total: int | None = None,
-    **options: object,
-) -> httpx.Response:
-    params = {
-        "digest": digest_of(commit.data),
-        "total": len(commit.data) if total is None else total,
-        "offset": offset,
-    }
-    path = f"/maps/{row.name}/commits/{commit.id}/upload"
-    return live.http.patch(path, params=params, content=data, **options)  # type: ignore[arg-type]
 
 
 def test_a_commit_comes_in_parts_and_is_pushed_with_the_last(live: Live) -> None:

@@ -1,19 +1,17 @@
 """`GET .../main/export`: exactly the nodes that are asked for, in files that others read, made while they are sent."""
 
-import io
 import tracemalloc
 from types import SimpleNamespace
 from typing import Any
 
-import httpx
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests.cairn_server.folding.test_broken_cell import new_map as broken_map
-from tests.cairn_server.sync.test_push import kind_of
-from tests.fixtures.map.made import PLAIN, SMALL, surface_evidence
+from tests.fixtures.map.made import PLAIN
+from tests.fixtures.server.answers import kind_of
+from tests.fixtures.server.damage import broken_map
+from tests.fixtures.server.exports import ask_export, mapped, places, points
 from tests.fixtures.server.live import Live
-from tests.fixtures.server.pushes import KEYS, pushed
 
 from cairn_map.codec.cell_code import decode_cell
 from cairn_map.evidence.grid import CellKey
@@ -22,30 +20,6 @@ from cairn_map.files.export_request import ExportRequest
 from cairn_map.files.point_clouds import PCD_POINT, POINT, found_in_cell
 from cairn_server.store.store_rows import MapRow
 from cairn_server.views import map_exports
-
-
-def mapped(live: Live) -> MapRow:
-    row = live.new_map()
-    cells = {key: surface_evidence(seed, SMALL) for seed, key in enumerate(KEYS)}
-    assert live.push(row, pushed(0, 0, cells=cells, scans=1000)).status_code == 201
-    live.folded(row)
-    return row
-
-
-def ask(live: Live, row: MapRow, **query: Any) -> httpx.Response:
-    return live.http.get(f"/maps/{row.name}/main/export", params=query)
-
-
-def points(answer: httpx.Response) -> npt.NDArray[np.void]:
-    assert answer.status_code == 200, answer.text
-    with np.load(io.BytesIO(answer.content)) as found:
-        table: npt.NDArray[np.void] = found["points"]
-    assert int(answer.headers["Cairn-Points"]) == len(table)
-    return table
-
-
-def places(table: npt.NDArray[np.void]) -> npt.NDArray[np.float64]:
-    return np.stack([table[name].astype(float) for name in "xyz"], axis=1)
 
 
 def expected(live: Live, row: MapRow) -> Any:
@@ -58,7 +32,7 @@ def expected(live: Live, row: MapRow) -> Any:
 
 def test_all_of_it_is_every_occupied_voxel(live: Live) -> None:
     row = mapped(live)
-    table, voxels = points(ask(live, row, format="npz")), expected(live, row)
+    table, voxels = points(ask_export(live, row, format="npz")), expected(live, row)
     order, other = np.lexsort(places(table).T), np.lexsort(voxels.centres_m.T)
     np.testing.assert_allclose(places(table)[order], voxels.centres_m[other], atol=1e-5)
     np.testing.assert_allclose(table["probability"][order], voxels.probability[other], atol=5e-4)
@@ -75,7 +49,7 @@ def test_a_box_two_heights_and_a_probability_leave_what_lies_within(live: Live) 
     floor_m, ceiling_m = (float(end) for end in np.quantile(voxels.centres_m[:, 2], [0.3, 0.6]).round(2))
     box = ",".join(map(str, [*low, *high]))
     p = 0.8
-    asked = ask(live, row, format="npz", box=box, floor_m=floor_m, ceiling_m=ceiling_m, p=p)
+    asked = ask_export(live, row, format="npz", box=box, floor_m=floor_m, ceiling_m=ceiling_m, p=p)
     z = voxels.centres_m[:, 2]
     inside = ((voxels.centres_m >= low) & (voxels.centres_m <= high)).all(axis=1) & (z >= floor_m) & (z <= ceiling_m)
     inside &= np.rint(voxels.probability * 255) / 255 >= p
@@ -86,7 +60,7 @@ def test_a_box_two_heights_and_a_probability_leave_what_lies_within(live: Live) 
 def test_a_coarser_level_covers_the_same_space(live: Live) -> None:
     row = mapped(live)
     voxels, depth = expected(live, row), row.geometry.depth - 1
-    table = points(ask(live, row, format="npz", depth=depth))
+    table = points(ask_export(live, row, format="npz", depth=depth))
     edge_m = 2 * row.geometry.voxel_edge_m
     found = {tuple(place) for place in np.floor(places(table) / edge_m).astype(int).tolist()}
     assert found == {tuple(place) for place in np.floor_divide(voxels.numbers, 2).tolist()}
@@ -95,8 +69,8 @@ def test_a_coarser_level_covers_the_same_space(live: Live) -> None:
 
 def test_ply_and_pcd_say_the_same_as_the_arrays(live: Live) -> None:
     row = mapped(live)
-    table = points(ask(live, row, format="npz"))
-    ply, pcd = ask(live, row, format="ply"), ask(live, row, format="pcd")
+    table = points(ask_export(live, row, format="npz"))
+    ply, pcd = ask_export(live, row, format="ply"), ask_export(live, row, format="pcd")
     for answer in (ply, pcd):
         assert int(answer.headers["Content-Length"]) == len(answer.content)
         assert f'filename="{row.name}.' in answer.headers["Content-Disposition"]
@@ -115,8 +89,8 @@ def test_ply_and_pcd_say_the_same_as_the_arrays(live: Live) -> None:
 def test_nothing_there_is_an_empty_file(live: Live) -> None:
     row = live.new_map(PLAIN)
     for form in ("ply", "pcd"):
-        assert ask(live, row, format=form).status_code == 200
-    assert len(points(ask(live, row, format="npz"))) == 0
+        assert ask_export(live, row, format=form).status_code == 200
+    assert len(points(ask_export(live, row, format="npz"))) == 0
 
 
 @pytest.mark.parametrize(
@@ -132,12 +106,12 @@ def test_nothing_there_is_an_empty_file(live: Live) -> None:
     ],
 )
 def test_what_cannot_be_asked_is_refused(live: Live, query: dict[str, Any], kind: str) -> None:
-    assert kind_of(ask(live, mapped(live), **query)) == kind
+    assert kind_of(ask_export(live, mapped(live), **query)) == kind
 
 
 def test_a_damaged_cell_is_not_left_out(live: Live) -> None:
     row = broken_map(live, keep_diffs=False)
-    assert kind_of(ask(live, row)) == "damaged_store"
+    assert kind_of(ask_export(live, row)) == "damaged_store"
 
 
 def test_an_export_holds_one_cell_at_a_time(live: Live) -> None:
@@ -168,7 +142,7 @@ def test_compiling_kernels_is_no_part_of_an_exports_time(live: Live, monkeypatch
 
     monkeypatch.setattr(map_exports, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
     slow_on(1)
-    assert ask(live, row, format="npz").status_code == 200 and len(looked) > 2
+    assert ask_export(live, row, format="npz").status_code == 200 and len(looked) > 2
     slow_on(2)
-    answer = ask(live, row, format="npz")
+    answer = ask_export(live, row, format="npz")
     assert (answer.status_code, kind_of(answer)) == (400, "too_costly")

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from laspy import LazBackend
-from tests.cairn_server.sync.test_push import kind_of
-from tests.cairn_server.views.test_export import ask, mapped, places, points
 from tests.fixtures.map.made import SMALL, surface_evidence
+from tests.fixtures.server.answers import kind_of
+from tests.fixtures.server.exports import ask_export, mapped, places, points
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import pushed
 from tests.naive_octomap import Node, read_tree
@@ -49,7 +49,7 @@ def parts_of(count: int) -> Iterator[npt.NDArray[np.void]]:
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_laz_says_the_same_as_the_arrays(live: Live, backend: LazBackend) -> None:
     row = mapped(live)
-    table, answer = points(ask(live, row, format="npz")), ask(live, row, format="laz")
+    table, answer = points(ask_export(live, row, format="npz")), ask_export(live, row, format="laz")
     assert answer.headers["Content-Type"] == "application/vnd.laszip"
     found = read_laz(answer.content, backend)
     assert len(found) == int(answer.headers["Cairn-Points"]) == len(table)
@@ -99,7 +99,10 @@ def test_a_laz_is_made_with_the_memory_of_a_chunk() -> None:
 def test_an_octree_has_the_nodes_of_the_arrays_and_what_they_hold(live: Live, form: str, up: int) -> None:
     row = mapped(live)
     depth = row.geometry.depth - up
-    table, answer = points(ask(live, row, format="npz", depth=depth)), ask(live, row, format=form, depth=depth)
+    table, answer = (
+        points(ask_export(live, row, format="npz", depth=depth)),
+        ask_export(live, row, format=form, depth=depth),
+    )
     tree = read_tree(answer.content)
     assert tree.edge_m == row.geometry.voxel_edge_m
     assert tree.size == len(tree.nodes)
@@ -119,7 +122,7 @@ def test_an_octree_has_the_nodes_of_the_arrays_and_what_they_hold(live: Live, fo
 
 
 def test_inner_nodes_of_an_octree_are_as_octomap_makes_them(live: Live) -> None:
-    tree = read_tree(ask(live, mapped(live), format="ot").content)
+    tree = read_tree(ask_export(live, mapped(live), format="ot").content)
     inner = [node for node in tree.nodes if node.children]
     assert len(inner) > len(tree.leaves) / 8
     for node in inner:
@@ -146,7 +149,7 @@ def test_white_is_told_from_no_colour() -> None:
 def test_octomaps_own_tools_take_both_and_find_the_same_in_them(live: Live, tmp_path: Path) -> None:
     row = mapped(live)
     for form in ("ot", "bt"):
-        (tmp_path / f"lab.{form}").write_bytes(ask(live, row, format=form).content)
+        (tmp_path / f"lab.{form}").write_bytes(ask_export(live, row, format=form).content)
     said = subprocess.run(
         ["convert_octree", "lab.ot", "own.bt"], cwd=tmp_path, capture_output=True, text=True, check=True
     )
@@ -170,16 +173,16 @@ def test_an_octree_ends_where_octomaps_ends(live: Live) -> None:
     cells = {key: surface_evidence(1, SMALL) for key in (near, far)}
     assert live.push(row, pushed(0, 0, cells=cells, scans=1000)).status_code == 201
     live.folded(row)
-    answer = ask(live, row, format="bt")
+    answer = ask_export(live, row, format="bt")
     assert kind_of(answer) == "bad_box"
     assert "1638.4 m" in answer.json()["detail"]
-    box = ask(live, row, format="bt", box="0,-10,-10,1638.3,10,10")
+    box = ask_export(live, row, format="bt", box="0,-10,-10,1638.3,10,10")
     assert len(read_tree(box.content).leaves) == int(box.headers["Cairn-Points"]) > 0
 
 
 @pytest.mark.parametrize("form", ["laz", "ot", "bt"])
 def test_nothing_there_is_an_empty_file(live: Live, form: str) -> None:
-    answer = ask(live, live.new_map(), format=form)
+    answer = ask_export(live, live.new_map(), format=form)
     assert answer.status_code == 200
     if form == "laz":
         assert len(read_laz(answer.content)) == 0
@@ -191,7 +194,7 @@ def test_nothing_there_is_an_empty_file(live: Live, form: str) -> None:
 def test_a_band_leaves_what_is_as_hot_and_as_cold(live: Live, up: int) -> None:
     row = mapped(live)
     depth = row.geometry.depth - up
-    table = points(ask(live, row, format="npz", depth=depth))
+    table = points(ask_export(live, row, format="npz", depth=depth))
     warm = table[np.isfinite(table["temperature"])]
     least, most = (float(end) for end in np.quantile(warm["temperature"], [0.3, 0.7]).round(2))
     for asked, stays in (
@@ -202,6 +205,6 @@ def test_a_band_leaves_what_is_as_hot_and_as_cold(live: Live, up: int) -> None:
             (warm["hottest"] >= least - 1e-3) & (warm["temperature"] <= most + 1e-3),
         ),
     ):
-        found = points(ask(live, row, format="npz", depth=depth, **asked))
+        found = points(ask_export(live, row, format="npz", depth=depth, **asked))
         np.testing.assert_array_equal(found, warm[stays])
         assert 0 < len(found) < len(warm) <= len(table)

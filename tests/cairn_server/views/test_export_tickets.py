@@ -8,10 +8,10 @@ from typing import Any
 
 import httpx
 import pytest
-from tests.cairn_server.access.test_auth import ADMIN, bearer
-from tests.cairn_server.folding.test_broken_cell import new_map as broken_map
-from tests.cairn_server.sync.test_push import kind_of
-from tests.cairn_server.views.test_export import mapped
+from tests.fixtures.server.access import ADMIN, bearer
+from tests.fixtures.server.answers import kind_of
+from tests.fixtures.server.damage import broken_map
+from tests.fixtures.server.exports import mapped
 from tests.fixtures.server.live import Live, until
 
 from cairn_map.files.export_request import EXPORT_TYPES

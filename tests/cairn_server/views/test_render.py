@@ -11,10 +11,9 @@ import httpx
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests.cairn_server.folding.test_broken_cell import damage
-from tests.cairn_server.folding.test_broken_cell import new_map as broken_map
-from tests.cairn_server.sync.test_push import kind_of
 from tests.fixtures.map.made import PLAIN, SMALL
+from tests.fixtures.server.answers import kind_of
+from tests.fixtures.server.damage import broken_map, damage
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import pushed
 

@@ -6,7 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from tests.cairn_server.folding.test_broken_cell import BROKEN, SOUND, new_map, url
+from tests.fixtures.server.answers import cell_path
+from tests.fixtures.server.damage import BROKEN, SOUND, broken_map
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import KEYS, pushed
 from tests.fixtures.server.tiny_disk import tiny_disk
@@ -156,18 +157,18 @@ def test_a_map_made_anew_with_another_sensor_model_has_other_views(live: Live) -
 
 @pytest.mark.parametrize("depth", [1, 3])
 def test_a_view_of_a_cell_damaged_at_rest_is_made_from_the_log_or_refused(live: Live, depth: int) -> None:
-    healed, sound = new_map(live, keep_diffs=True), live.new_map()
+    healed, sound = broken_map(live, keep_diffs=True), live.new_map()
     live.push(sound, pushed(0, 0))
     live.folded(sound)
     query = f".view?depth={depth}"
-    want = live.http.get(url(sound, BROKEN, query))
-    got = live.http.get(url(healed, BROKEN, query))
+    want = live.http.get(cell_path(sound, BROKEN, query))
+    got = live.http.get(cell_path(healed, BROKEN, query))
     assert (got.status_code, got.content) == (200, want.content)
     assert got.headers["ETag"] == want.headers["ETag"]
-    lost = new_map(live, keep_diffs=False)
-    assert live.http.get(url(lost, BROKEN, query)).status_code == 500
-    assert live.http.get(url(lost, SOUND, query)).status_code == 200
-    assert live.http.get(url(lost, KEYS[2], query)).status_code == 404
+    lost = broken_map(live, keep_diffs=False)
+    assert live.http.get(cell_path(lost, BROKEN, query)).status_code == 500
+    assert live.http.get(cell_path(lost, SOUND, query)).status_code == 200
+    assert live.http.get(cell_path(lost, KEYS[2], query)).status_code == 404
 
 
 def parts_of(body: bytes) -> list[bytes]:

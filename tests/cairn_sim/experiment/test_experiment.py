@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.cairn_sim.experiment.test_experiment_report import read_page
 from tests.fixtures.map.made import KEY, MIDDLE, random_evidence
+from tests.fixtures.sim.pages import read_page
 
 from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scans
 from cairn_map.codec.cell_code import DecodedCell, encode_cell

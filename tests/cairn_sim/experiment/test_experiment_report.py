@@ -1,9 +1,8 @@
 """The report of made-up figures: sums and ratios known by hand, sound HTML, the paper's numbers beside ours."""
 
-from html.parser import HTMLParser
-
 import numpy as np
 import pytest
+from tests.fixtures.sim.pages import read_page
 
 from cairn_map.evidence.grid import geometry_for
 from cairn_sim.evaluation.scores import Scores
@@ -21,42 +20,7 @@ from cairn_sim.experiment.report import report_page
 from cairn_sim.experiment.table_three import table_three
 from cairn_sim.experiment.tables import percent, shown
 
-VOID = {"meta", "br", "img", "input", "link", "hr"}
 SCORES = Scores(surface=100, surface_occupied=90, surface_free=3, free=50, free_free=50, map_free=50, map_occupied=95)
-
-
-class Page(HTMLParser):
-    """Checks that what opens is closed, in order; keeps all words and all attributes."""
-
-    def __init__(self) -> None:
-        super().__init__(convert_charrefs=True)
-        self.open: list[str] = []
-        self.words: list[str] = []
-        self.attributes: list[tuple[str, str]] = []
-        self.tags: set[str] = set()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.add(tag)
-        self.attributes += [(name, value or "") for name, value in attrs]
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.attributes += [(name, value or "") for name, value in attrs]
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open and self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.words.append(data)
-
-
-def read_page(text: str) -> Page:
-    page = Page()
-    page.feed(text)
-    page.close()
-    assert page.open == []
-    return page
 
 
 def resolution(edge_m: float, *, truth: bool = True) -> ResolutionFigures:
