@@ -68,6 +68,7 @@ MAY_NAME = {
     ],
     "uvicorn": ["cairn_server/operations/serve.py", "cairn_server/http/middleware/deadlines.py"],
     "httpx": ["cairn_client/http/api.py"],
+    "prometheus_client": ["cairn_server/metrics.py"],
     "apsw": [
         "cairn_server/store/sqlite/*.py",
         "cairn_client/folders/sqlite_glance.py",
@@ -104,8 +105,8 @@ ROOMS = {
     "cairn_client": "replica sync http relay robot folders cli cli.maps cli.robots main",
     "cairn_sim": "scene render robots evaluation experiment study demo sim_command warm_up",
     "cairn_server": """
-        settings metrics processes
-        store store.sqlite server_figures access live folding sync.checks sync views
+        settings processes
+        store store.sqlite metrics access live folding sync.checks sync views
         service
         http.middleware http.routes http operations
     """,

@@ -1,104 +1,168 @@
-"""Counters and histograms with labels, and their text for Prometheus (exposition format 0.0.4).
+"""Server metrics for Prometheus, under the names that dashboards know them by (PROTOCOL.md, `GET /metrics`).
 
-Counting is one dictionary under a lock, about a microsecond, so that it may stand on the path of a push.
+Counters and histograms live in a registry of the service's own; what the store, the process and the upstream know is
+looked up when the page is asked for. The page is the text format 0.0.4.
 """
 
+import os
 import threading
-from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Generic, TypeVar
 
-MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+from prometheus_client import CONTENT_TYPE_PLAIN_0_0_4, CollectorRegistry, Counter, Histogram, Metric, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+from prometheus_client.metrics import MetricWrapperBase
+from prometheus_client.registry import Collector
+
+from cairn_map.wire.frames import CELL_HEAD, CellFrame, Frame
+from cairn_server.store.store_health import Backlog, StoreFigures
+
+MEDIA_TYPE = CONTENT_TYPE_PLAIN_0_0_4
 SERIES_MAX = 2000
-"""Of one counter or histogram; what comes beyond is counted under the label values `other`."""
+"""Most combinations of label values of one metric; further ones are counted under the label values `other`."""
 SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 """Upper ends of the buckets of a duration."""
-ESCAPES = str.maketrans({"\\": "\\\\", '"': '\\"', "\n": "\\n"})
 
-Labels = tuple[str, ...]
+M = TypeVar("M", bound=MetricWrapperBase)
 
 
-class Counter:
-    """A sum for each combination of label values, that only grows."""
+class Bounded(Generic[M]):
+    """Metric with labels whose number of series is bounded, because names in labels may come from clients."""
 
-    def __init__(self, name: str, help_text: str, labels: Labels = ()) -> None:
-        self.name = name
-        self.labels = labels
-        self._help = help_text
+    def __init__(self, metric: M) -> None:
+        self._metric = metric
         self._lock = threading.Lock()
-        self._sums: dict[Labels, float] = {} if labels else {(): 0}
+        self._series: dict[tuple[str, ...], M] = {}
 
-    def add(self, amount: float, *values: str) -> None:
-        """Count something, under these label values."""
+    def labels(self, *values: str) -> M:
+        """Series of these label values, or of `other` once there are `SERIES_MAX`."""
         with self._lock:
-            values = _bounded(self._sums, values)
-            self._sums[values] = self._sums.get(values, 0) + amount
-
-    def lines(self) -> Iterator[str]:
-        """Its text."""
-        with self._lock:
-            found = sorted(self._sums.items())
-        yield from _head(self.name, "counter", self._help)
-        for values, total in found:
-            yield _sample(self.name, zip(self.labels, values, strict=True), total)
+            if values not in self._series:
+                if len(self._series) >= SERIES_MAX:
+                    values = ("other",) * len(values)
+                self._series[values] = self._metric.labels(*values)
+            return self._series[values]
 
 
-class Histogram:
-    """How often something took how long, for each combination of label values."""
+class ServerFigures:
+    """Counters and histograms of one service, shared by all its threads; about 2 us for each count."""
 
-    def __init__(self, name: str, help_text: str, labels: Labels = (), *, ends: Sequence[float] = SECONDS) -> None:
-        self.name = name
-        self.labels = labels
-        self._help = help_text
-        self._ends = ends
-        self._lock = threading.Lock()
-        self._counts: dict[Labels, list[int]] = {}
-        self._sums: dict[Labels, float] = {}
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        by_route = ("method", "route")
+        self.requests = self._counter(
+            "cairn_http_requests_total", "Requests answered, by route and status.", *by_route, "status"
+        )
+        self.request_seconds = self._histogram(
+            "cairn_http_request_duration_seconds", "Time from a request's head to the end of its answer.", *by_route
+        )
+        self.received_bytes = self._counter("cairn_http_received_bytes_total", "Bytes of request bodies.", *by_route)
+        self.sent_bytes = self._counter("cairn_http_sent_bytes_total", "Bytes of answers' bodies.", *by_route)
+        self.errors = self._counter("cairn_errors_total", "Problems answered, by their kind.", "kind")
+        self.pushes = self._counter(
+            "cairn_pushes_total",
+            "Pushes by outcome: new, known, or the kind of the problem (then without a map).",
+            "map",
+            "outcome",
+        )
+        self.push_bytes = self._counter("cairn_push_bytes_total", "Bytes of commits that were new.", "map")
+        self.frames = self._counter("cairn_fetch_frames_total", "Cell frames made for fetches, by kind.", "kind")
+        self.frame_bytes = self._counter("cairn_fetch_frame_bytes_total", "Bytes of cell frames, by kind.", "kind")
+        self.fold_seconds = self._histogram(
+            "cairn_fold_duration_seconds", "Time of one fold of a group of commits.", "map"
+        )
+        self.folded = self._counter("cairn_folded_commits_total", "Commits folded into cells.", "map")
+        self.fold_failures = self._counter("cairn_fold_failures_total", "Folds that failed and are tried again.", "map")
 
-    def observe(self, value: float, *values: str) -> None:
-        """Count one that took so long."""
-        bucket = bisect_left(self._ends, value)
-        with self._lock:
-            values = _bounded(self._sums, values)
-            counts = self._counts.setdefault(values, [0] * (len(self._ends) + 1))
-            counts[bucket] += 1
-            self._sums[values] = self._sums.get(values, 0.0) + value
+    def _counter(self, name: str, help_text: str, *labels: str) -> Bounded[Counter]:
+        return Bounded(Counter(name, help_text, labels, registry=self.registry))
 
-    def lines(self) -> Iterator[str]:
-        """Its text: buckets hold all that is at most their end."""
-        with self._lock:
-            found = [(values, list(counts), self._sums[values]) for values, counts in sorted(self._counts.items())]
-        yield from _head(self.name, "histogram", self._help)
-        for values, counts, total in found:
-            labels = list(zip(self.labels, values, strict=True))
-            count = 0
-            for end, here in zip([*map(str, self._ends), "+Inf"], counts, strict=True):
-                count += here
-                yield _sample(f"{self.name}_bucket", [*labels, ("le", end)], count)
-            yield _sample(f"{self.name}_sum", labels, total)
-            yield _sample(f"{self.name}_count", labels, count)
+    def _histogram(self, name: str, help_text: str, *labels: str) -> Bounded[Histogram]:
+        return Bounded(Histogram(name, help_text, labels, registry=self.registry, buckets=SECONDS))
 
-
-def gauge_lines(
-    name: str, help_text: str, values: float | Mapping[str, float], *, label: str = "", kind: str = "gauge"
-) -> Iterator[str]:
-    """The text of something that is looked up when it is asked for: one value, or one for each value of a label."""
-    yield from _head(name, kind, help_text)
-    if isinstance(values, Mapping):
-        for key, value in values.items():
-            yield _sample(name, [(label, key)], value)
-    else:
-        yield _sample(name, [], values)
+    def counted(self, frames: Iterator[Frame]) -> Iterator[Frame]:
+        """The same frames, counted by kind."""
+        for frame in frames:
+            if isinstance(frame, CellFrame):
+                kind = frame.kind.name.lower()
+                self.frames.labels(kind).inc()
+                self.frame_bytes.labels(kind).inc(CELL_HEAD.size + len(frame.payload))
+            yield frame
 
 
-def _bounded(known: Mapping[Labels, object], values: Labels) -> Labels:
-    return values if values in known or len(known) < SERIES_MAX else ("other",) * len(values)
+@dataclass(frozen=True, slots=True)
+class _Page(Collector):
+    """Metrics of one page, without the times of creation that the library adds as series of their own."""
+
+    metrics: Iterable[Metric]
+
+    def collect(self) -> Iterator[Metric]:
+        for metric in self.metrics:
+            metric.samples = [sample for sample in metric.samples if not sample.name.endswith("_created")]
+            yield metric
 
 
-def _head(name: str, kind: str, help_text: str) -> Iterator[str]:
-    yield f"# HELP {name} {help_text}"
-    yield f"# TYPE {name} {kind}"
+def metrics_text(metrics: Iterable[Metric]) -> str:
+    """Page of these metrics, in their order."""
+    return generate_latest(_Page(metrics)).decode()
 
 
-def _sample(name: str, labels: Iterable[tuple[str, str]], value: float) -> str:
-    inner = ",".join(f'{label}="{text.translate(ESCAPES)}"' for label, text in labels)
-    return f"{name}{{{inner}}} {value}" if inner else f"{name} {value}"
+def store_metrics(found: StoreFigures, backlogs: list[Backlog]) -> Iterator[Metric]:
+    """Sizes, writes and backlogs of the store."""
+    yield GaugeMetricFamily("cairn_store_size_bytes", "Size of the store at rest.", found.size_bytes)
+    yield GaugeMetricFamily("cairn_wal_size_bytes", "Size of what the store wrote ahead.", found.ahead_bytes)
+    yield GaugeMetricFamily("cairn_disk_free_bytes", "Free space on the store's disk.", found.free_bytes)
+    yield GaugeMetricFamily("cairn_writer_queue_length", "Jobs that wait to be written.", found.queued)
+    yield CounterMetricFamily("cairn_writer_transactions_total", "Transactions made durable.", found.written)
+    yield CounterMetricFamily(
+        "cairn_wal_truncations_total", "Times that the write-ahead log was emptied.", found.emptied
+    )
+    failures = CounterMetricFamily(
+        "cairn_writer_failures_total", "Transactions that were not written, by kind of error.", labels=["kind"]
+    )
+    for kind, count in (dict.fromkeys(("disk_full", "store_failed"), 0) | found.failures).items():
+        failures.add_metric([kind], count)
+    yield failures
+    now_s = time.time()
+    ages_s = {b.map: 0.0 if b.oldest_s is None else max(0.0, now_s - b.oldest_s) for b in backlogs}
+    yield _gauge_by_map(
+        "cairn_pending_commits", "Commits that are durable but not folded.", {b.map: b.commits for b in backlogs}
+    )
+    yield _gauge_by_map("cairn_pending_oldest_age_seconds", "Age of the oldest of them; 0 without any.", ages_s)
+
+
+def upstream_metrics(ages_s: Mapping[str, float]) -> Iterator[Metric]:
+    """Age of the last complete hand-over of each map to the upstream server."""
+    yield _gauge_by_map("cairn_upstream_age_seconds", "Since all of a map was handed to the upstream server.", ages_s)
+
+
+def _gauge_by_map(name: str, help_text: str, values: Mapping[str, float]) -> GaugeMetricFamily:
+    """Gauge with one value for each map."""
+    gauge = GaugeMetricFamily(name, help_text, labels=["map"])
+    for map_name, value in values.items():
+        gauge.add_metric([map_name], value)
+    return gauge
+
+
+def process_metrics() -> Iterator[Metric]:
+    """Version, processor time, memory and open files of this process, under the names that all exporters use."""
+    try:
+        text = version("cairn-robotics")
+    except PackageNotFoundError:
+        text = "unknown"
+    build = GaugeMetricFamily("cairn_build_info", "Always 1; the version is the label.", labels=["version"])
+    build.add_metric([text], 1)
+    yield build
+    times = os.times()
+    yield CounterMetricFamily("process_cpu_seconds_total", "Processor time used.", round(times.user + times.system, 2))
+    statm, descriptors = Path("/proc/self/statm"), Path("/proc/self/fd")
+    if statm.exists():
+        pages = int(statm.read_text().split()[1])
+        resident_bytes = pages * os.sysconf("SC_PAGE_SIZE")
+        yield GaugeMetricFamily("process_resident_memory_bytes", "Memory in use.", resident_bytes)
+        count = sum(1 for _ in descriptors.iterdir())
+        yield GaugeMetricFamily("process_open_fds", "Open files and sockets.", count)

@@ -40,7 +40,7 @@ from cairn_server.folding.readiness import Readiness
 from cairn_server.live.branch_list import branch_infos
 from cairn_server.live.hub import Hub
 from cairn_server.live.robot_reports import RobotReports
-from cairn_server.server_figures import ServerFigures, process_lines, store_lines
+from cairn_server.metrics import ServerFigures, metrics_text, process_metrics, store_metrics, upstream_metrics
 from cairn_server.settings import Settings
 from cairn_server.store.numbering import EvidenceGoneError
 from cairn_server.store.store import Snapshot, Store
@@ -246,8 +246,9 @@ class Service:
 
     def metrics_text(self) -> str:
         """All figures for Prometheus."""
-        parts = [self.figures.lines(), store_lines(self.store.health.figures(), self.store.health.backlogs())]
-        return "\n".join([*chain(*parts, self.joining.lines(), process_lines()), ""])
+        store = store_metrics(self.store.health.figures(), self.store.health.backlogs())
+        upstream = upstream_metrics(self.joining.ages_s())
+        return metrics_text(chain(self.figures.registry.collect(), store, upstream, process_metrics()))
 
     def close(self) -> None:
         """Stop folding and close the store; what was acknowledged is folded after the next start."""

@@ -3,7 +3,7 @@
 import threading
 
 from cairn_map.errors import CairnError, DamagedDataError
-from cairn_server.server_figures import ServerFigures
+from cairn_server.metrics import ServerFigures
 
 
 class FoldHealth:
@@ -19,14 +19,14 @@ class FoldHealth:
         with self._lock:
             self._failing.pop(name, None)
         if commits:
-            self._figures.fold_seconds.observe(seconds, name)
-            self._figures.folded.add(commits, name)
+            self._figures.fold_seconds.labels(name).observe(seconds)
+            self._figures.folded.labels(name).inc(commits)
 
     def failed(self, name: str, error: BaseException) -> None:
         """A map could not be folded."""
         with self._lock:
             self._failing[name] = error
-        self._figures.fold_failures.add(1, name)
+        self._figures.fold_failures.labels(name).inc()
 
     def damaged(self) -> frozenset[str]:
         """Maps of which something waits for a damaged cell to be healed: their own trouble, not the server's."""

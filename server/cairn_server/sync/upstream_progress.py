@@ -2,9 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator
-
-from cairn_server.metrics import gauge_lines
+from collections.abc import Callable
 
 
 def _nobody() -> None:
@@ -24,13 +22,10 @@ class Joining:
         """All that was in a map at this time (UTC seconds since 1970) was given to the upstream, if it can travel."""
         self._handed_over_s[map_name] = begun_s
 
-    def lines(self) -> Iterator[str]:
-        """How long ago that was, as text for Prometheus."""
+    def ages_s(self) -> dict[str, float]:
+        """Seconds since all of a map was handed to the upstream server, by the map's name."""
         now_s = time.time()
-        ages_s = {name: max(0.0, now_s - begun_s) for name, begun_s in list(self._handed_over_s.items())}
-        yield from gauge_lines(
-            "cairn_upstream_age_seconds", "Since all of a map was handed to the upstream server.", ages_s, label="map"
-        )
+        return {name: max(0.0, now_s - begun_s) for name, begun_s in list(self._handed_over_s.items())}
 
     def may_forget_s(self, map_name: str) -> float:
         """Evidence that was folded before this time is on the upstream, too; infinite without one."""

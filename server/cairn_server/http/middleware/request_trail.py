@@ -15,7 +15,7 @@ from typing import Any
 
 from cairn_server.http.middleware.body_limit import App, Message, Receive, Send
 from cairn_server.http.middleware.log_format import REQUEST_ID, Field, fields
-from cairn_server.server_figures import ServerFigures
+from cairn_server.metrics import ServerFigures
 
 log = logging.getLogger(__name__)
 
@@ -87,12 +87,12 @@ class RequestTrail:
         figures = self._figures
         method = scope["method"] if scope["method"] in METHODS else "other"
         route: str = getattr(scope.get("route"), "path", "none")
-        figures.requests.add(1, method, route, str(trail.status))
-        figures.request_seconds.observe(seconds, method, route)
-        figures.received_bytes.add(trail.received_bytes, method, route)
-        figures.sent_bytes.add(trail.sent_bytes, method, route)
+        figures.requests.labels(method, route, str(trail.status)).inc()
+        figures.request_seconds.labels(method, route).observe(seconds)
+        figures.received_bytes.labels(method, route).inc(trail.received_bytes)
+        figures.sent_bytes.labels(method, route).inc(trail.sent_bytes)
         if trail.kind:
-            figures.errors.add(1, trail.kind)
+            figures.errors.labels(trail.kind).inc()
         if route == PUSH and method == "PUT":
             self._note_push(scope["path_params"].get("name", ""), trail)
         level = logging.WARNING if trail.status >= 500 else logging.DEBUG if route in QUIET else logging.INFO
@@ -102,9 +102,9 @@ class RequestTrail:
     def _note_push(self, name: str, trail: Trail) -> None:
         outcome = OUTCOMES.get(trail.status)
         # Only then is it certain that there is a map of this name: names that strangers try are no labels.
-        self._figures.pushes.add(1, name if outcome else "", outcome or trail.kind or "cut_off")
+        self._figures.pushes.labels(name if outcome else "", outcome or trail.kind or "cut_off").inc()
         if outcome == "new":
-            self._figures.push_bytes.add(trail.received_bytes, name)
+            self._figures.push_bytes.labels(name).inc(trail.received_bytes)
 
 
 def _request_id(headers: list[tuple[bytes, bytes]]) -> str:
