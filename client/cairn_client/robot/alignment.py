@@ -12,7 +12,7 @@ nearly as well (rooms that are alike), or a motion that nothing holds (along a b
 import dataclasses
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import product
 from typing import Any
 
@@ -49,54 +49,23 @@ NEIGHBOURS = 20
 """Voxels that make a surface's normal: a patch of 4 x 5."""
 
 
-class Aligning:
-    """Alignments of one robot; its method is the robot's."""
+def points_of_scans(scans: Sequence[Scan], rig: Rig, integrator: Integrator) -> Floats:
+    """(N, 3) points that the scans of a rig saw, metres, in the frame of their poses, within the integrator's ranges.
 
-    def __init__(
-        self, snapshot: Callable[[], MapSnapshot], rig: Callable[[], Rig | None], integrator: Integrator
-    ) -> None:
-        """Args: snapshot: the map as it is now. rig: the head as it is now. integrator: range limits."""
-        self._snapshot = snapshot
-        self._rig = rig
-        self._integrator = integrator
-
-    def align(
-        self,
-        scans: Sequence[Scan],
-        *,
-        T_map_robot: npt.ArrayLike,
-        reach_m: float = STEP_M,
-        reach_rad: float = STEP_RAD,
-    ) -> Alignment:
-        """Where this robot's own frame lies in the map as it is here: before anything is observed from that frame.
-
-        Args:
-            scans: a look around, whose poses are in the robot's own frame: their `T_map_rig` is meant as `T_robot_rig`.
-            T_map_robot: a guess, (4, 4), metres; its roll and pitch to some 10 degrees, its height to half a metre.
-            reach_m: how far off the guess may be along x and along y of the map. Farther off, a room that looks alike
-                may be accepted.
-            reach_rad: how far off its heading may be; pi: any heading. The search takes some 0.1 s for each of nine
-                starts (reach_m up to 0.5) every 15 degrees.
-
-        Raises:
-            BadInputError: a scan does not fit the rig, the guess is no rigid transform, the reach asks for too many
-                starts, there is no rig, or small_gicp is not installed.
-        """
-        rig, limits = self._rig(), self._integrator
-        if rig is None:
-            raise BadInputError("no_rig", "this robot was opened without a rig, so it cannot read scans")
-        seen = (
-            returns_of(
-                scan,
-                rig,
-                min_range_m=limits.min_range_m,
-                max_range_m=limits.max_range_m,
-                flying_step_m=limits.flying_step_m,
-            )
-            for scan in scans
+    Raises:
+        BadInputError: a scan does not fit the rig.
+    """
+    seen = (
+        returns_of(
+            scan,
+            rig,
+            min_range_m=integrator.min_range_m,
+            max_range_m=integrator.max_range_m,
+            flying_step_m=integrator.flying_step_m,
         )
-        points = np.concatenate([np.empty((0, 3)), *(returns.points_map for returns in seen)])
-        return align_points(self._snapshot(), points, T_map_robot=T_map_robot, reach_m=reach_m, reach_rad=reach_rad)
+        for scan in scans
+    )
+    return np.concatenate([np.empty((0, 3)), *(returns.points_map for returns in seen)])
 
 
 def align_points(
@@ -107,7 +76,7 @@ def align_points(
     reach_m: float = STEP_M,
     reach_rad: float = STEP_RAD,
 ) -> Alignment:
-    """Lay (N, 3) points of a robot's own frame, metres, onto the map, as `Aligning.align`; NaN is left out."""
+    """Lay (N, 3) points of a robot's own frame, metres, onto the map, as `Robot.align`; NaN is left out."""
     guess = checked_transform(T_map_robot, name="T_map_robot")
     edge_m = snapshot.geometry.voxel_edge_m
     finite = np.asarray(points_robot, np.float64)[np.isfinite(points_robot).all(axis=1)]

@@ -1,4 +1,4 @@
-"""Measurements integrated anew when a pose graph corrects where their scans were taken.
+"""Amends: measurements integrated again when a pose graph corrects the poses of their scans.
 
     C  the measurement's commit             scans kept under C
     M  names C, with the new evidence       scans kept under M from here on: the next amend names M
@@ -31,77 +31,46 @@ MetaOf = Callable[[Measurement, str, tuple[CommitId, ...]], CommitMeta]
 
 
 class Amending:
-    """Amends of one robot's commits; its methods are the robot's. By the thread that observes."""
+    """Amends of one robot's commits, by the thread that observes; documented at `Robot.amend`."""
 
     def __init__(
         self,
         replica: Replica,
         kept: KeptScans,
-        usual: Profile,
         *,
-        fresh: Callable[[], Measurement | None],
+        new_measurement: Callable[[], Measurement | None],
         meta_of: MetaOf,
         on_commit: Callable[[Commit], None],
     ) -> None:
-        """Args: usual: the profile unless one is asked for. fresh: an empty measurement; None without a rig."""
+        """Args: new_measurement: returns an empty measurement; None without a rig."""
         self._replica = replica
         self._kept = kept
-        self._usual = usual
-        self._fresh = fresh
+        self._new_measurement = new_measurement
         self._meta_of = meta_of
         self._on_commit = on_commit
 
     def amend(
         self,
         measurement: AnyCommit,
-        T_map_rig: npt.ArrayLike | None = None,
+        T_map_rig: npt.ArrayLike | None,
         *,
-        T_map_observed: npt.ArrayLike | None = None,
-        note: str = "",
-        profile: Profile | None = None,
+        T_map_observed: npt.ArrayLike | None,
+        note: str,
+        profile: Profile,
     ) -> Commit:
-        """A measurement's scans, integrated anew from other poses, as the commit that takes the first one's place.
-
-        This robot shows it at once, also where the first one was never pushed; everybody else once they sync. The map
-        is then the one that these poses would have given from the start, byte for byte. The rig and the integrator
-        are those of this robot now.
-
-        Args:
-            measurement: what `commit` returned, or any amend of it: the latest one is replaced.
-            T_map_rig: (N, 4, 4) the pose of each of its N scans, in their order, metres; the body moves with the rig.
-            T_map_observed: or (4, 4), one correction of the poses that were observed: `T_map_observed @ T_observed`,
-                counted from what was given to `observe`, also if the measurement was amended before.
-            note: up to 1024 characters for the map's log.
-            profile: as for `commit`.
-
-        Raises:
-            NotFoundError: kind `no_scans`: the scans are not kept (any more); the message says how to keep more.
-            ConflictError: kind `taken_back`: the measurement was taken back, and not by an amend.
-            BadInputError: no rigid poses, or not one for each scan; or the scans do not fit the rig any more.
-            DamagedDataError: the disk damaged the scans.
-            UnreachableError: kind `store_failed`: the disk is full or broken. In all cases nothing was changed.
-        """
+        """Commit one measurement again from other poses, in the place of its commit; as `Robot.amend`."""
         found = self._scans_of(measurement)
         return self._amend(found, _move(T_map_rig, T_map_observed), note=note, profile=profile)
 
     def amend_all(
-        self, T_map_rig: Mapping[CommitId | str, npt.ArrayLike], *, note: str = "", profile: Profile | None = None
+        self, T_map_rig: Mapping[CommitId | str, npt.ArrayLike], *, note: str, profile: Profile
     ) -> list[Commit]:
-        """Amends of many measurements, as after a loop closure: none if the scans of one of them are not kept.
-
-        Args:
-            T_map_rig: for the id of each measurement's commit (N, 4, 4), the pose of each of its N scans.
-            note: as for `amend`.
-            profile: as for `commit`.
-
-        Raises:
-            CairnError: as `amend`; but for `no_scans` and `taken_back`, the amends before it have been made.
-        """
+        """Amend many measurements, none if the scans of one are not kept; as `Robot.amend_all`."""
         found = [(self._scans_of(measurement), _move(poses, None)) for measurement, poses in T_map_rig.items()]
         return [self._amend(commit, move, note=note, profile=profile) for commit, move in found]
 
-    def _amend(self, found: CommitId, move: Move, *, note: str, profile: Profile | None) -> Commit:
-        measurement = self._fresh()
+    def _amend(self, found: CommitId, move: Move, *, note: str, profile: Profile) -> Commit:
+        measurement = self._new_measurement()
         if measurement is None:
             raise BadInputError("no_rig", "this robot was opened without a rig, so it cannot read scans")
         for scan in move(self._kept.scans(found)):
@@ -110,7 +79,7 @@ class Amending:
         with self._replica.lock:  # the sync may give the commit another id, but not meanwhile
             latest = self._replica.outbox.successors.latest(found)
             meta = self._meta_of(measurement, note, (latest,))
-            commit = self._replica.commit(diff, meta, profile=profile or self._usual)
+            commit = self._replica.commit(diff, meta, profile=profile)
         self._kept.rename(found, commit.id)
         self._on_commit(commit)
         return commit

@@ -10,19 +10,22 @@ It maps on without a link: commits wait in the directory, and power may be cut a
 """
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Self
 
+import numpy.typing as npt
+
 from cairn_calib.rig.rig import Rig
 from cairn_client.http.map_url import split_map_url
-from cairn_client.relay.carrying import carrier_in
+from cairn_client.relay.carrying import Carrier, carrier_in
 from cairn_client.relay.link import RelayApi
 from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_identity import note_use
-from cairn_client.robot.alignment import Aligning
-from cairn_client.robot.amending import Amending
+from cairn_client.robot.alignment import STEP_M, STEP_RAD, align_points, points_of_scans
+from cairn_client.robot.alignment_verdict import Alignment
+from cairn_client.robot.amending import Amending, AnyCommit
 from cairn_client.robot.commit_meta import own_meta
 from cairn_client.robot.kept_scans import KeptScans
 from cairn_client.robot.limits import NO_LIMITS, Limits, limits_in
@@ -44,7 +47,9 @@ from cairn_map.commits.ids import CommitId, robot_name
 from cairn_map.errors import BadInputError, CairnError
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Geometry, cell_of_key
+from cairn_map.evidence.sensor_model import SensorModel
 from cairn_map.kernels.compile_progress import show_compiling
+from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.wire.robot_status import Mode
 
 log = logging.getLogger(__name__)
@@ -54,7 +59,27 @@ FLUSH_S = 60.0
 
 
 class Robot:
-    """One robot's map, kept in `directory` and shared through one server."""
+    """One robot's map, kept in `directory` and shared through one server.
+
+    Args:
+        rig: head whose scans will come; None for a robot that only reads.
+        map_url: `http://HOST:PORT/maps/NAME`.
+        directory: folder of this robot alone; everything durable is in it.
+        name: the robot's name on the map.
+        token: enrolment (or admin) token, or the robot's own; not needed where the server trusts this machine.
+        mode: high-end keeps the whole map and fetches differences; low-end fetches whole cells; a viewer pushes
+            nothing.
+        geometry: grid of the map, to start without a link; otherwise the server is asked once.
+        integrator: range limits.
+        scope: cells to fetch, and the size of one reply.
+        limits: how much to keep on the disk and in memory, and what is dropped first when that is full; None: the
+            limits of the robot that had this directory open last.
+        link: "small" for a link of some ten to some hundred kbit/s (`link_profile`).
+        stay: True for a robot that only pauses: `close` does not deregister it.
+        carry_bytes_max: bytes on the disk for others' signed commits, carried from server to server; it needs a
+            token of role relay that names this robot. 0: none are carried.
+        keep_scans_bytes: bytes of the newest scans, kept in `directory/scans` for `amend`; their cost: `kept_scans`.
+    """
 
     def __init__(
         self,
@@ -74,39 +99,25 @@ class Robot:
         carry_bytes_max: int = 0,
         keep_scans_bytes: int = 0,
     ) -> None:
-        """Open or make the robot's directory; no network unless the map's geometry is not known yet.
-
-        Args:
-            rig: the head whose scans will come; None for a robot that only reads.
-            map_url: `http://HOST:PORT/maps/NAME`.
-            directory: of this robot alone; everything durable is in it.
-            name: the robot's name on the map.
-            token: enrolment (or admin) token, or the robot's own; not needed where the server trusts this machine.
-            mode: high-end keeps the whole map and fetches differences; low-end fetches whole cells; a viewer pushes
-                nothing.
-            geometry: of the map, to start without a link; else the server is asked once.
-            integrator: range limits.
-            scope: which cells to fetch, and how much in one reply.
-            limits: how much to keep on the disk and in memory, and what goes when that is full; None: as before.
-            link: small for a link of some ten to some hundred kbit/s (`link_profile`).
-            stay: a robot that only pauses: `close` does not deregister it.
-            carry_bytes_max: room on the disk for others' signed commits, taken along from server to server; it needs
-                a token of role relay that names this robot. 0: none are.
-            keep_scans_bytes: of the newest scans, kept in `directory/scans` for `amend`; what they cost: `kept_scans`.
+        """Open or make the robot's directory; no network unless the map's geometry is unknown.
 
         Raises:
             BadInputError: bad URL or name, or the directory belongs to another robot or map.
             ConflictError: another process has the directory open.
-            UnreachableError: the geometry is not known and the server cannot be asked.
+            UnreachableError: the geometry is unknown and the server cannot be asked.
         """
         show_compiling()
         server_url, self._map_name = split_map_url(map_url)
         self.name = robot_name(name)
         self.mode: Mode = mode
         self._rig = rig
+        self._integrator = integrator or Integrator()
         self._profile = LINKS[link]
+        self._stay, self._is_closed = stay, False
+        self._status = OwnStatus(every_s=self._profile.tell_every_s)
+        self._events = Events()
         self._api = RelayApi(server_url, token=token)
-        with ExitStack() as opened:
+        with ExitStack() as opened:  # what was opened is closed again if a later step fails
             opened.callback(self._api.close)
             self._kept_scans = KeptScans(Path(directory) / "scans", bytes_max=keep_scans_bytes)
             self._replica = open_replica(
@@ -114,42 +125,36 @@ class Robot:
             )
             opened.callback(self._replica.close)
             note_use(self._replica.store, url=map_url, mode=mode)
-            limits = limits_in(self._replica.store, limits)
-            sensors = list(rig.cameras) if rig else []
-            membership = Membership(
-                self._api, self._replica, map_name=self._map_name, mode=mode, sensors=sensors, enrolment_token=token
-            )
-            self.status = OwnStatus(every_s=self._profile.tell_every_s)
-            self._events = Events()
-            self._rounds = Rounds(
-                *(self._api, self._replica, membership, self._events),
-                map_name=self._map_name,
-                mode=mode,
-                scope=scope,
-                profile=self._profile,
-                limits=limits,
-                status=self.status,
-                carrier=carrier_in(Path(directory), self._api, self._map_name, size_bytes_max=carry_bytes_max),
-            )
-            self.deregister = self._rounds.leave
-            """Leave the map; the evidence stays there, and this directory keeps its own. Ends the background sync."""
-            self._stay, self._is_closed = stay, False
-            self._integrator = integrator or Integrator()
-            self._measurement = self._new_measurement()
-            self.snapshot = self._replica.snapshot
-            """`robot.snapshot()`: the map as it is now, under its own sensor model (`map_snapshot`); by any thread."""
-            if limits == NO_LIMITS:  # else commits that the server has for good go first
+            kept_limits = limits_in(self._replica.store, limits)
+            if kept_limits == NO_LIMITS:  # with limits, commits that the server has for good go first
                 self._replica.outbox.amendable = lambda: self._kept_scans.commits
-            amending = Amending(
-                *(self._replica, self._kept_scans, self._profile.commits),
-                fresh=self._new_measurement,
-                meta_of=self._meta,
-                on_commit=self._made,
-            )
-            self.align = Aligning(self.snapshot, lambda: self._rig, self._integrator).align
-            """Where this robot's own frame lies in the map (`alignment.Aligning`); below: past measurements, moved."""
-            self.amend, self.amend_all = amending.amend, amending.amend_all
-            opened.pop_all()  # for `close`
+            carrier = carrier_in(Path(directory), self._api, self._map_name, size_bytes_max=carry_bytes_max)
+            self._rounds = self._make_rounds(token, scope, kept_limits, carrier)
+            self._measurement = self._new_measurement()
+            opened.pop_all()  # from here on `close` does it
+
+    def _make_rounds(self, token: str | None, scope: Scope, limits: Limits, carrier: Carrier | None) -> Rounds:
+        membership = Membership(
+            self._api,
+            self._replica,
+            map_name=self._map_name,
+            mode=self.mode,
+            sensors=list(self._rig.cameras) if self._rig else [],
+            enrolment_token=token,
+        )
+        return Rounds(
+            self._api,
+            self._replica,
+            membership,
+            self._events,
+            map_name=self._map_name,
+            mode=self.mode,
+            scope=scope,
+            profile=self._profile,
+            limits=limits,
+            status=self._status,
+            carrier=carrier,
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -158,10 +163,18 @@ class Robot:
         self.close()
 
     @property
-    def map(self) -> EvidenceMap:
-        """What the robot sees: the server's map as far as it is here, and its own commits.
+    def status(self) -> OwnStatus:
+        """The robot's report of itself; set its fields at any time, and the next sync sends it if it changed.
 
-        The thread that commits may read it at any time; another one only while it holds `replica.lock`.
+        `robot.status.note = "at the stairs"`, `robot.status.battery = 0.5`; the pose is set by `observe`.
+        """
+        return self._status
+
+    @property
+    def map(self) -> EvidenceMap:
+        """The robot's view: the server's map as far as it is here, and its own commits.
+
+        The thread that commits may read it at any time; any other thread takes a `snapshot`.
         """
         return self._replica.view
 
@@ -180,9 +193,48 @@ class Robot:
         """Commits that the server has not yet acknowledged."""
         return len(self._replica.push_set())
 
+    def snapshot(self, model: SensorModel | None = None) -> MapSnapshot:
+        """The map as it is now, unchanged by what comes later; by any thread.
+
+        Args:
+            model: sensor model to read the evidence under; None: the map's own, which the server states.
+        """
+        return self._replica.snapshot(model)
+
     def events(self, *, size: int = SIZE) -> EventStream:
-        """What happens from here on (`robot_events`), for one reader; who is too slow loses the oldest of `size`."""
+        """Stream of the events from here on (`robot_events`), for one reader.
+
+        Args:
+            size: events that wait for the reader; one that is too slow loses the oldest.
+        """
         return self._events.open(size)
+
+    def align(
+        self,
+        scans: Sequence[Scan],
+        *,
+        T_map_robot: npt.ArrayLike,
+        reach_m: float = STEP_M,
+        reach_rad: float = STEP_RAD,
+    ) -> Alignment:
+        """Place of the robot's own frame in the map as it is here, before anything is observed from that frame.
+
+        Args:
+            scans: a look around, whose poses are in the robot's own frame: their `T_map_rig` is read as `T_robot_rig`.
+            T_map_robot: (4, 4) guess, metres; its roll and pitch to some 10 degrees, its height to half a metre.
+            reach_m: largest error of the guess along x and along y of the map, metres. Farther off, a room that looks
+                alike may be accepted.
+            reach_rad: largest error of its heading, radians; pi: any heading. The search takes some 0.1 s for each of
+                nine starts (reach_m up to 0.5) every 15 degrees.
+
+        Raises:
+            BadInputError: a scan does not fit the rig, the guess is no rigid transform, the reach asks for too many
+                starts, there is no rig, or small_gicp is not installed.
+        """
+        if self._rig is None:
+            raise BadInputError("no_rig", "this robot was opened without a rig, so it cannot read scans")
+        points = points_of_scans(scans, self._rig, self._integrator)
+        return align_points(self.snapshot(), points, T_map_robot=T_map_robot, reach_m=reach_m, reach_rad=reach_rad)
 
     def observe(self, scan: Scan) -> None:
         """Add a scan to the open measurement.
@@ -194,7 +246,7 @@ class Robot:
             raise BadInputError("no_rig", "this robot was opened without a rig, so it cannot read scans")
         self._measurement.add(scan)
         self._kept_scans.add(scan)
-        self.status.pose = self._measurement.poses[-1]
+        self._status.place_at(self._measurement.poses[-1])
 
     def mount(self, rig: Rig) -> None:
         """Take another head, whose scans come from here on.
@@ -240,6 +292,55 @@ class Robot:
         self._made(commit)
         return commit
 
+    def amend(
+        self,
+        measurement: AnyCommit,
+        T_map_rig: npt.ArrayLike | None = None,
+        *,
+        T_map_observed: npt.ArrayLike | None = None,
+        note: str = "",
+        profile: Profile | None = None,
+    ) -> Commit:
+        """Correct the poses of a past measurement: integrate its scans again, and commit that in its place.
+
+        This robot shows the new evidence at once, also where the first commit was never pushed; all others after they
+        sync. The map is then the one that these poses would have given from the start, byte for byte. The rig and the
+        integrator are those of this robot now.
+
+        Args:
+            measurement: commit of the measurement, or any amend of it: the latest one is replaced.
+            T_map_rig: (N, 4, 4) poses of its N scans, in their order, metres; the body moves with the rig.
+            T_map_observed: or (4, 4), one correction of the observed poses: `T_map_observed @ T_observed`, counted
+                from the poses given to `observe`, also if the measurement was amended since.
+            note: up to 1024 characters for the map's log.
+            profile: as for `commit`.
+
+        Raises:
+            NotFoundError: kind `no_scans`: the scans are not kept (any more); the message says how to keep more.
+            ConflictError: kind `taken_back`: the measurement was taken back, and not by an amend.
+            BadInputError: no rigid poses, or not one for each scan; or the scans do not fit the rig any more.
+            DamagedDataError: the disk damaged the scans.
+            UnreachableError: kind `store_failed`: the disk is full or broken. In all cases nothing was changed.
+        """
+        return self._amending().amend(
+            measurement, T_map_rig, T_map_observed=T_map_observed, note=note, profile=profile or self._profile.commits
+        )
+
+    def amend_all(
+        self, T_map_rig: Mapping[CommitId | str, npt.ArrayLike], *, note: str = "", profile: Profile | None = None
+    ) -> list[Commit]:
+        """Amend many measurements, as after a loop closure; none if the scans of one of them are not kept.
+
+        Args:
+            T_map_rig: for the id of each measurement's commit (N, 4, 4), the poses of its N scans, metres.
+            note: as for `amend`.
+            profile: as for `commit`.
+
+        Raises:
+            CairnError: as `amend`; except for `no_scans` and `taken_back`, the amends before the failed one were made.
+        """
+        return self._amending().amend_all(T_map_rig, note=note, profile=profile or self._profile.commits)
+
     def sync(self, *, on_push: Callable[[CommitId], None] | None = None) -> RoundReport:
         """One round with the server: push, then fetch what is missing.
 
@@ -252,6 +353,15 @@ class Robot:
     def start_sync(self, *, every_s: float = 5.0) -> None:
         """Sync in the background: after each commit, and at least every so many seconds while there is a link."""
         self._rounds.start(every_s=every_s)
+
+    def deregister(self) -> None:
+        """Leave the map; the evidence stays there, and this directory keeps its own. Ends the background sync.
+
+        Raises:
+            UnreachableError: no link; the robot stays on the map.
+            CairnError: the server refuses.
+        """
+        self._rounds.leave()
 
     def close(self, *, stay: bool = False, flush_s: float = FLUSH_S) -> None:
         """Commit what is open, push what waits if there is a link, deregister if nothing is left, and close.
@@ -282,6 +392,15 @@ class Robot:
 
     def _new_measurement(self) -> Measurement | None:
         return Measurement(self._rig, self._replica.geometry, self._integrator) if self._rig else None
+
+    def _amending(self) -> Amending:
+        return Amending(
+            self._replica,
+            self._kept_scans,
+            new_measurement=self._new_measurement,
+            meta_of=self._meta,
+            on_commit=self._made,
+        )
 
     def _made(self, commit: Commit) -> None:
         cells = tuple(cell_of_key(key) for key in sorted(commit.cells))

@@ -58,9 +58,8 @@ class Rounds:
         self._carrier = carrier
         self._branch = replica.author.robot
         self._link = Link(api, map_name, branch=self._branch)
-        self._room = Room(
-            *(replica, limits, events), place=status.place, scope_box=scope.box(replica.geometry.cell_edge_m)
-        )
+        scope_box = scope.box(replica.geometry.cell_edge_m)
+        self._room = Room(replica, limits, events, place=status.place, scope_box=scope_box)
         self._watch = RoundWatch(replica, events)
         self._lock = threading.Lock()
         self._thread: SyncThread | None = None

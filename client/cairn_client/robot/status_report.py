@@ -35,6 +35,10 @@ class OwnStatus:
     """Not told more often than this, whatever is new."""
     _told: RobotStatus | None = None
 
+    def place_at(self, pose: ScanPose) -> None:
+        """Note the pose of the newest scan."""
+        self.pose = pose
+
     def place(self) -> tuple[float, float, float] | None:
         """Where the robot is, metres, map frame; None if it did not say."""
         return self.pose.t_map_rig if self.pose else None

@@ -14,7 +14,7 @@ from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.poses import Transform, checked_transform, inverse, transform_points
 from cairn_calib.rig.rig import Rig, Spectrum, mounted
 from cairn_client.robot import alignment
-from cairn_client.robot.alignment import Aligning, align_points, one_a_voxel, starts_around
+from cairn_client.robot.alignment import align_points, one_a_voxel, points_of_scans, starts_around
 from cairn_client.robot.alignment_verdict import Alignment, Verdict
 from cairn_client.robot.robot import Robot
 from cairn_fusion.mapping.integrate import Integrator, integrate_scans
@@ -106,23 +106,28 @@ def test_a_robot_in_the_building_finds_its_place_from_half_a_metre_and_ten_degre
         assert found.fit > 0.9
 
 
-def test_scans_of_another_place_are_not_found_on_the_map(building: EvidenceMap) -> None:
+def test_scans_of_another_place_are_not_found_on_the_map(building: EvidenceMap, tmp_path: Path) -> None:
     scene, robot = load_scene("small-room"), ROBOTS["tof"]
     rig, T_true = robot.rig_of(1.0), stops(scene, "west")[0]
     scans = [
         render_scan(scene, rig, T_map_rig=T, range_camera=RANGE_CAMERA, time_s=0.0, noise=Noise(seed=1), number=n)
         for n, T in enumerate(robot.head_poses(T_true)[::3])
     ]
-    aligning = Aligning(lambda: snapshot_of(building), lambda: rig, Integrator())
+    here = snapshot_of(building)
     guess = stops(load_scene("building"), "labs")[2]
-    found = aligning.align(in_own_frame(scans, T_true), T_map_robot=guess)
+    found = align_points(here, points_of_scans(in_own_frame(scans, T_true), rig, Integrator()), T_map_robot=guess)
     assert found.verdict is not Verdict.ACCEPTED, found.reason
-    far = aligning.align(scans, T_map_robot=off_by((500, 0, 0), 0))
+    points = points_of_scans(scans, rig, Integrator())
+    far = align_points(here, points, T_map_robot=off_by((500, 0, 0), 0))
     assert far.verdict is Verdict.FAILED
     assert "0 occupied voxels" in far.reason
     assert np.isinf(np.diag(far.covariance)).all()
-    with pytest.raises(BadInputError):
-        Aligning(lambda: snapshot_of(building), lambda: None, Integrator()).align(scans, T_map_robot=guess)
+    nowhere = "http://127.0.0.1:9/maps/lab"
+    with (
+        Robot(None, nowhere, directory=tmp_path, name="mole", geometry=building.geometry) as blind,
+        pytest.raises(BadInputError),
+    ):
+        blind.align(scans, T_map_robot=guess)
 
 
 # In rooms and corridors of planes
