@@ -65,8 +65,13 @@ MAY_NAME = {
     "starlette": [
         "cairn_server/http/*.py",
         "cairn_server/operations/serve.py",
+        "cairn_fusion/view/mjpeg_server.py",
     ],
-    "uvicorn": ["cairn_server/operations/serve.py", "cairn_server/http/middleware/deadlines.py"],
+    "uvicorn": [
+        "cairn_server/operations/serve.py",
+        "cairn_server/http/middleware/deadlines.py",
+        "cairn_fusion/view/mjpeg_server.py",
+    ],
     "httpx": ["cairn_client/http/api.py"],
     "prometheus_client": ["cairn_server/metrics.py"],
     "apsw": [

@@ -17,8 +17,10 @@ from cairn_calib.rig.poses import inverse
 from cairn_calib.rig.rig import MountedCamera, Rig
 from cairn_fusion.image_fusion.across_kernels import fill_into, label_into, sample_into
 from cairn_fusion.image_fusion.eye_depth import EyeDepth, Origin
+from cairn_fusion.image_fusion.eye_depth_kernels import STEP_SHARE
 from cairn_fusion.image_fusion.row_bands import in_bands
 from cairn_fusion.image_fusion.surface import JOIN_SIGMAS, Drawn, beams, places
+from cairn_fusion.transfer.place_covariance import PlaceCovariance
 from cairn_fusion.transfer.transfer import Label
 from cairn_map.arrays import Labels, Singles
 
@@ -143,3 +145,28 @@ def _least_nearness(drawn: Drawn, range_camera: MountedCamera) -> Singles:
     range_m = 1 / np.where(hides, drawn.hiding, np.float32(1.0))
     tolerance = HIDDEN_BEHIND + JOIN_SIGMAS * range_camera.range_sigma_m(range_m) / range_m
     return np.where(hides, drawn.hiding / (1 + tolerance) - drawn.slack, 0.0).astype(np.float32)
+
+
+def fused_covariance(fused: Across, rig: Rig, *, range_camera: str) -> Singles:
+    """(H, W, 3) float32 xx, xy, yy, px^2 of each pixel's source; NaN where the label is not OK.
+
+    Range noise is the range camera's; where depth was filled in, what may differ in a window and still be taken for one
+    surface.
+
+    Args:
+        fused: of `across`.
+        rig: its rig; with a calibration's covariance if it has one.
+        range_camera: that measured.
+
+    Raises:
+        BadInputError: a camera is a lidar.
+    """
+    out = np.full((*fused.labels.shape, 3), np.nan, np.float32)
+    range_m = fused.depth.shown_m
+    sigma_m = rig[range_camera].range_sigma_m(range_m).astype(np.float32)
+    sigma_m = np.where(fused.depth.origins == Origin.FILLED, STEP_SHARE * range_m, sigma_m)
+    for number, name in enumerate(fused.sources):
+        y, x = np.nonzero(fused.ok & (fused.source == number))
+        certainty = PlaceCovariance.of(rig, src=fused.camera, dst=name)
+        out[y, x] = certainty.at(np.stack([x, y], axis=1), range_m[y, x], sigma_m[y, x])
+    return out

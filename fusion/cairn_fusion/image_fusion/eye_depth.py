@@ -7,12 +7,12 @@ depth is carried to pixels of the same colour (joint bilateral upsampling, Kopf 
 more the more certain the range is, and of two surfaces in a window only one has a say, so that nothing is put between
 them.
 
-What comes out is a guess at edges. `EyeDepth` is no array and becomes none: neither mypy nor `Scan` lets it into a map.
+The result is a guess at edges. `EyeDepth` is no array and becomes none: neither mypy nor `Scan` lets it into a map.
 """
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Never
+from typing import Never
 
 import cv2
 import numpy as np
@@ -22,7 +22,6 @@ from cairn_calib.rig.rig import Rig
 from cairn_fusion.image_fusion.eye_depth_kernels import REACH, densify_into
 from cairn_fusion.image_fusion.row_bands import in_bands
 from cairn_fusion.image_fusion.surface import Drawn
-from cairn_fusion.recording.scan import Scan
 from cairn_map.arrays import Bytes, Singles
 from cairn_map.errors import BadInputError
 
@@ -60,13 +59,6 @@ class EyeDepth:
         raise BadInputError(
             "filled_depth", "an EyeDepth is partly guessed, and no range image: give the map the scan's"
         )
-
-
-if TYPE_CHECKING:
-
-    def _no_map_takes_it(depth: EyeDepth) -> Scan:
-        """Refused by mypy; the day it were not, mypy would call the comment unused, which is an error, too."""
-        return Scan(time_s=0.0, T_map_rig=np.eye(4), range_camera="tof", range_m=depth)  # type: ignore[arg-type]
 
 
 def eye_depth(drawn: Drawn, rig: Rig, camera: str, picture: npt.NDArray[np.generic], *, range_camera: str) -> EyeDepth:

@@ -13,9 +13,8 @@ from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_calib.rig.poses import inverse, look_at, transform_points
 from cairn_calib.rig.rig import Rig, Spectrum, mounted
-from cairn_fusion.image_fusion.across import across
+from cairn_fusion.image_fusion.across import across, fused_covariance
 from cairn_fusion.image_fusion.across_kernels import label_into, sample_into
-from cairn_fusion.image_fusion.fused_covariance import fused_covariance
 from cairn_fusion.image_fusion.surface import beams, drawn_surface, places, surface_of
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.certainty import pixel_covariance

@@ -15,7 +15,8 @@ from cairn_calib.rig.poses import look_at
 from cairn_calib.rig.rig import Rig
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.transfer import Label
-from cairn_fusion.view.mjpeg import Latest, streaming
+from cairn_fusion.view.mjpeg import Latest
+from cairn_fusion.view.mjpeg_server import streaming
 from cairn_fusion.view.paint_kernels import HATCH_PERIOD, HATCH_WIDTH
 from cairn_fusion.view.painting import (
     CROSS_PX,

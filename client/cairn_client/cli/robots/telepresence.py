@@ -40,7 +40,7 @@ from cairn_client.folders.map_folder import map_of_folder
 from cairn_fusion.importers import open_source
 from cairn_fusion.recording.images import write_colour
 from cairn_fusion.recording.recording import ScanSource
-from cairn_fusion.view.mjpeg import Latest, streaming
+from cairn_fusion.view.mjpeg import Latest
 from cairn_fusion.view.overlay import OverlayStyle
 from cairn_fusion.view.painting import Emphasis
 from cairn_fusion.view.telepresence import Mode, Telepresence, ViewOptions
@@ -162,6 +162,10 @@ def _write(picture: npt.NDArray[np.uint8], path: Path) -> None:
 
 def _serve(source: ScanSource, telepresence: Telepresence | MapOverlay, args: argparse.Namespace) -> None:
     """Show the scans one after the other, again and again, or one for good, until interrupted."""
+    try:
+        from cairn_fusion.view.mjpeg_server import streaming
+    except ModuleNotFoundError as exc:
+        raise BadInputError("missing_extra", f'--serve needs {exc.name}: pip install "cairn-robotics[server]"') from exc
     host, port = args.serve
     latest = Latest()
     numbers = range(len(source)) if args.scan is None else [args.scan]
