@@ -115,7 +115,7 @@ def open_source(
     if frames is not None:
         raise BadInputError("unknown_frame", f"a {layout} has no frame ids to choose by")
     if layout is Layout.BAG:
-        from cairn_fusion.ros.bag_survey import open_any_bag
+        from cairn_fusion.ros.bag_recording import open_any_bag
 
         return open_any_bag(Path(folder), mapping, scans_per_measurement=scans_per_measurement)
     return open_recording(folder, scans_per_measurement=scans_per_measurement)

@@ -23,7 +23,7 @@ from cairn_client.cli.maps.prior_data import push_prior_data
 from cairn_client.folders.map_folder import FolderMap, map_of_folder
 from cairn_client.http.api import MapApi
 from cairn_fusion.image_fusion.beyond_labels import beyond_pixels
-from cairn_fusion.image_fusion.live_range import live_range
+from cairn_fusion.image_fusion.surface import live_range
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.view.overlay import Live, OverlayStyle, draw_overlay
 from cairn_map.queries.map_snapshot import MapSnapshot

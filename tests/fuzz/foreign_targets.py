@@ -11,7 +11,7 @@ from tests.fuzz.sections import in_folder, sections_of
 from cairn_calib.exchange.rig_exchange import FORMATS, format_of_text
 from cairn_calib.rig.lidar import SpinningLidar
 from cairn_fusion.ros.bag import Wire
-from cairn_fusion.ros.bag_survey import open_any_bag, survey
+from cairn_fusion.ros.bag_recording import open_any_bag, survey
 from cairn_fusion.ros.images import amplitude_of, colour_of, depth_of, thermal_counts_of
 from cairn_fusion.ros.messages import (
     CAMERA_INFO,

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
 from cairn_calib.rig.brown import radius_limit
 from cairn_calib.rig.camera import Camera
@@ -18,7 +19,6 @@ from cairn_calib.rig.lidar import AnyCamera
 from cairn_calib.rig.poses import Transform, inverse, transform_points
 from cairn_calib.rig.rig import Rig
 from cairn_fusion.image_fusion.across_kernels import places_into
-from cairn_fusion.image_fusion.range_labels import range_labels
 from cairn_fusion.image_fusion.row_bands import in_bands
 from cairn_fusion.image_fusion.surface_kernels import (
     borrowed_ranges,
@@ -29,10 +29,22 @@ from cairn_fusion.image_fusion.surface_kernels import (
     joined,
     nearest_of_nine,
 )
+from cairn_fusion.mapping.beam_returns import full_pixels
+from cairn_fusion.mapping.flying_kernels import flying_pixels
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.transfer import KERNEL_COEFFICIENTS, Label
 from cairn_map.arrays import Flags, Labels, Singles
 from cairn_map.render.camera_rays import Sight
+
+Values = npt.NDArray[np.float32]
+COVER = 1.5
+"""Width of what a range pixel covers, over the distance to the next one: slanted surfaces are sampled more widely."""
+
+MIN_RANGE_M = 0.1
+MAX_RANGE_M = 10.0
+FLYING_STEP_M = 0.05
+"""As `integrate.Integrator` has them."""
+AMPLITUDE_MAX = 65535
 
 JOIN_SIGMAS = 3 * math.sqrt(2)
 """Of the range: what a step between two pixels of one surface may have from noise."""
@@ -44,6 +56,34 @@ EDGE_REACH = 0.6
 """How far around a range pixel something may hide what is behind it, in range pixels: its half, and a little."""
 BORROW_PX = 6
 """How far from a pixel with a range one without is shown, range pixels."""
+
+
+def range_labels(
+    scan: Scan,
+    rig: Rig,
+    *,
+    min_range_m: float = MIN_RANGE_M,
+    max_range_m: float = MAX_RANGE_M,
+    flying_step_m: float = FLYING_STEP_M,
+) -> Labels:
+    """(H, W) uint8 `Label` of each pixel of the scan's range camera: OK, NO_RANGE, SATURATED or FLYING.
+
+    Args:
+        scan: its range and, to know saturated pixels, amplitude are looked at.
+        rig: with the range camera.
+        min_range_m: nearer returns are not believed.
+        max_range_m: nor farther ones.
+        flying_step_m: how far a flying pixel must be from both its neighbours; infinite: none flies.
+    """
+    range_m = rig[scan.range_camera].true_ranges(scan.range_m, scan.amplitude)
+    labels = np.full(range_m.shape, Label.OK, np.uint8)
+    labels[flying_pixels(range_m, flying_step_m)] = Label.FLYING
+    # A comparison with NaN is false.
+    labels[~((range_m >= min_range_m) & (range_m <= max_range_m))] = Label.NO_RANGE
+    labels[full_pixels(scan, rig[scan.range_camera])] = Label.SATURATED
+    if scan.amplitude is not None:  # no count is higher: full, whatever the rig says
+        labels[scan.amplitude == AMPLITUDE_MAX] = Label.SATURATED
+    return labels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,3 +229,38 @@ def _slack(nearness: Singles, hiding: Singles) -> Singles:
         steps += np.minimum(ahead, behind)
     steps[~np.isfinite(steps)] = 0
     return np.minimum(2 * steps, hiding).astype(np.float32)
+
+
+def live_range(scan: Scan, rig: Rig, *, camera: str, beyond: npt.NDArray[np.bool_] | None = None) -> Values:
+    """(H, W) float32, metres along the rays of a camera; NaN where the range camera says nothing.
+
+    Nor does it where too much light came back or two surfaces are mixed (`range_labels`), or where it shows what is in
+    a mirror: `beyond`, (H, W) of the range camera, from `beyond_pixels`.
+
+    Raises:
+        BadInputError: kind `unknown_camera`, or images of another size.
+    """
+    seen_by, source = rig[camera], rig[scan.range_camera]
+    labels = range_labels(scan, rig)
+    trusted = (labels != Label.SATURATED) & (labels != Label.FLYING)
+    if beyond is not None:
+        trusted &= ~beyond
+    true_m = source.true_ranges(scan.range_m, scan.amplitude)
+    range_m = np.where(trusted, true_m, np.float32(np.nan)).astype(np.float32, copy=False)
+    if camera == scan.range_camera:
+        return range_m
+    at = places(range_m, beams(source.camera), seen_by.camera, inverse(seen_by.transform) @ source.transform)
+    u, v, q = (each.astype(np.float64) for each in at)
+    gap_px = _pixel_rad(source.camera.rays()) / _pixel_rad(seen_by.camera.rays())
+    half_px = int(COVER * max(gap_px, 1.0) / 2) + 0.5
+    nearness = np.zeros((seen_by.camera.height, seen_by.camera.width), np.float32)
+    draw_squares_into(nearness, trusted, u, v, q, half_px)
+    with np.errstate(divide="ignore"):
+        return np.where(nearness > 0, 1 / nearness, np.float32(np.nan))
+
+
+def _pixel_rad(rays: npt.NDArray[np.float64]) -> float:
+    """Angle between neighbouring pixels in the middle of an image."""
+    row = rays[rays.shape[0] // 2]
+    middle = len(row) // 2
+    return float(np.linalg.norm(row[middle] - row[middle - 1]))

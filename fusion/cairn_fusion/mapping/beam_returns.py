@@ -16,10 +16,14 @@ import numpy.typing as npt
 from cairn_calib.rig.body import Body
 from cairn_calib.rig.poses import Transform, inverse, transform_points
 from cairn_calib.rig.rig import MountedCamera, Rig
+from cairn_fusion.mapping.clear_kernels import nearest_around
 from cairn_fusion.mapping.flying_kernels import flying_pixels
 from cairn_fusion.mapping.tally_kernels import returned_points
 from cairn_fusion.recording.scan import Scan, check_scan
 from cairn_map.arrays import Flags, Floats, Singles
+
+MARGIN_VOXELS = 1.0
+"""How far before a surface a voxel's centre must be to be free: a little more than half a voxel's diagonal, 0.87."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,3 +94,22 @@ def _on_body(body: Body, range_m: Singles, mounted: MountedCamera, T_body_tof: T
     with np.errstate(invalid="ignore"):  # an endless range along an axis: 0 times infinity
         points_tof = mounted.camera.rays() * range_m[..., None].astype(np.float64)
     return body.holds(transform_points(T_body_tof, points_tof))
+
+
+def margins_m(sigma_m: Floats, *, voxel_edge_m: float, noise_sigmas: float) -> Floats:
+    """(...) what to keep before a surface whose range has a standard deviation, metres; NaN for NaN."""
+    return np.asarray(np.maximum(MARGIN_VOXELS * voxel_edge_m, noise_sigmas * sigma_m))
+
+
+def clear_image(returns: Returns, mounted: MountedCamera, *, voxel_edge_m: float, noise_sigmas: float) -> Singles:
+    """(H, W) how far each pixel of an image without gaps between its pixels is clear, metres; 0 for not known."""
+    nearest_m, share = nearest_around(
+        np.where(returns.silent, np.float32(np.inf), returns.range_m),
+        returns.shield_m,
+        returns.silent_m,
+        float(max(mounted.camera.focal_px)),
+        voxel_edge_m,
+    )
+    sigma_m = mounted.range_sigma_image(nearest_m)
+    kept_m = share * margins_m(sigma_m, voxel_edge_m=voxel_edge_m, noise_sigmas=noise_sigmas).astype(np.float32)
+    return np.asarray(np.maximum(nearest_m - kept_m, np.float32(0.0)))

@@ -23,13 +23,11 @@ import numpy.typing as npt
 from cairn_calib.rig.poses import Transform, checked_transform, inverse, transform_points
 from cairn_calib.rig.rig import Rig
 from cairn_calib.rig.sensing import LIDAR
-from cairn_fusion.mapping.beam_returns import Returns, returns_of
-from cairn_fusion.mapping.clear_range import clear_image
+from cairn_fusion.mapping.beam_returns import Returns, clear_image, returns_of
 from cairn_fusion.mapping.free_space import Window, carving_of, window_of
-from cairn_fusion.mapping.lidar_beams import beam_evidence, clear_ends, silent_ends
+from cairn_fusion.mapping.ray_casting import beam_evidence, clear_ends, silent_ends
 from cairn_fusion.mapping.samples import sample_sums
-from cairn_fusion.mapping.tallies import Tallies
-from cairn_fusion.mapping.tally import Each
+from cairn_fusion.mapping.tally import Each, Tallies
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.transfer import DEPTH_TOLERANCE_M
 from cairn_map.arrays import Floats, Ints

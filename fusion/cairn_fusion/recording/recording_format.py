@@ -16,10 +16,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_calib.rig.lidar import AnyCamera, SpinningLidar
 from cairn_calib.rig.rig import Rig, Spectrum
-from cairn_fusion.recording.adapters import kelvin_from_counts, range_from_radial, range_from_z_depth
 from cairn_fusion.recording.timed_lists import read_text
 from cairn_map.arrays import Counts
 from cairn_map.errors import BadInputError, first_error
+
+Image = npt.NDArray[np.generic]
+Ranges = npt.NDArray[np.float32]
 
 HEADER_FILE = "recording.json"
 RIG_FILE = "rig.json"
@@ -222,3 +224,42 @@ def _counts(scaled: npt.NDArray[np.float64], what: str) -> Counts:
     # A real reading must not round to 0, which means none; and 65535.5 rounds to even, beyond the type.
     rounded = np.clip(np.rint(scaled), 1, COUNT_MAX)
     return np.where(np.isnan(scaled), 0, rounded).astype(np.uint16)
+
+
+def range_from_z_depth(depth: Image, camera: AnyCamera, *, units_per_m: float) -> Ranges:
+    """Ranges along the beam from a z-depth image.
+
+    Eq. 4 of Kocmanova et al. backwards: d = z / (z component of the pixel's unit ray).
+
+    Args:
+        depth: (H, W) any number type, distance along the optical axis; 0 or NaN where nothing came back.
+        camera: the depth camera.
+        units_per_m: depth units in one metre: 1000 for millimetres, 1 for metres.
+
+    Returns:
+        (H, W) float32, metres along each beam; NaN where nothing came back.
+
+    Raises:
+        BadInputError: wrong image size, or `units_per_m` not positive.
+    """
+    z_m = _metres(depth, camera, units_per_m)
+    return (z_m / camera.rays()[..., 2]).astype(np.float32)
+
+
+def range_from_radial(radial: Image, camera: AnyCamera, *, units_per_m: float) -> Ranges:
+    """Ranges from an image that already holds distance along the beam; arguments as `range_from_z_depth`."""
+    return _metres(radial, camera, units_per_m).astype(np.float32)
+
+
+def kelvin_from_counts(counts: Image, *, kelvin_per_count: float, kelvin_at_zero: float = 0.0) -> Ranges:
+    """Apparent temperature from linear radiometric counts: (H, W) float32 kelvin; count 0 means no reading (NaN)."""
+    values = counts.astype(np.float64)
+    return np.where(values > 0, values * kelvin_per_count + kelvin_at_zero, np.nan).astype(np.float32)
+
+
+def _metres(image: Image, camera: AnyCamera, units_per_m: float) -> npt.NDArray[np.float64]:
+    if not units_per_m > 0:
+        raise BadInputError("bad_scale", f"units_per_m must be positive, got {units_per_m}")
+    camera.check_image(image, name="depth image")
+    metres = image.astype(np.float64) / units_per_m
+    return np.where(np.isfinite(metres) & (metres > 0), metres, np.nan)

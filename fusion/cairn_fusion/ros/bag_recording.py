@@ -16,9 +16,14 @@ import numpy.typing as npt
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.lidar import AnyCamera, SpinningLidar
 from cairn_calib.rig.rig import Rig, Spectrum, mounted
-from cairn_fusion.recording.adapters import range_from_radial, range_from_z_depth
 from cairn_fusion.recording.recording import measurements_of
-from cairn_fusion.recording.recording_format import Convention, decode_kelvin, decode_range
+from cairn_fusion.recording.recording_format import (
+    Convention,
+    decode_kelvin,
+    decode_range,
+    range_from_radial,
+    range_from_z_depth,
+)
 from cairn_fusion.recording.scan import Scan, check_scan
 from cairn_fusion.ros.bag import Bag, BagMessage, Wire
 from cairn_fusion.ros.bag_index import BagIndex, TopicIndex, index_bag, message_told, wire_of
@@ -27,7 +32,8 @@ from cairn_fusion.ros.images import AnyImage, Pixels, amplitude_of, colour_of, d
 from cairn_fusion.ros.messages import COMPRESSED, IMAGE, POINTS, TRANSFORMS, read_compressed_image, read_image
 from cairn_fusion.ros.open_bag import open_bag
 from cairn_fusion.ros.point_clouds import T_LIDAR_CAMERA, read_points, sweep_image
-from cairn_fusion.ros.topic_mapping import BagMapping, MappedCamera, camera_of_info
+from cairn_fusion.ros.topic_mapping import BagMapping, MappedCamera, camera_of_info, mapping_from_yaml
+from cairn_fusion.ros.topic_proposal import Proposal, propose
 from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError
 
 PixelsT = TypeVar("PixelsT", bound=Pixels)
@@ -238,3 +244,47 @@ def _range_of(pixels: Pixels, camera: AnyCamera, mapped: MappedCamera) -> npt.ND
         return decode_range(pixels.astype(np.uint16, copy=False), camera, mapped.range_encoding)
     convert = range_from_z_depth if mapped.convention is Convention.Z else range_from_radial
     return convert(pixels, camera, units_per_m=1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """All topics of a bag, and the mapping proposed for it."""
+
+    path: Path
+    index: BagIndex
+    proposal: Proposal
+
+
+def survey(path: Path, *, on_message: Callable[[], object] | None = None) -> Survey:
+    """Look through a whole bag.
+
+    Raises:
+        BadInputError: no bag, or the libraries that read bags are not installed.
+        DamagedDataError: it is damaged.
+    """
+    bag = open_bag(path)
+    try:
+        index = index_bag(bag, on_message=on_message)
+        return Survey(path, index, propose(index, path))
+    finally:
+        bag.close()
+
+
+def open_any_bag(path: Path, mapping: BagMapping | None, *, scans_per_measurement: int | None = None) -> BagRecording:
+    """The scans of a bag by a mapping, or by the proposed one where nothing is left to decide.
+
+    Raises:
+        BadInputError: `undecided`: the message lists the questions; else as `open_bag_recording`.
+        DamagedDataError: it is damaged.
+    """
+    if mapping is None:
+        proposal = survey(path).proposal
+        if proposal.questions:
+            asked = "; ".join(proposal.questions)
+            raise BadInputError(
+                "undecided",
+                f"{path} leaves something to decide: {asked}. Write a file by `cairn robot inspect {path} --output "
+                "bag.yaml`, edit it, and give it with --topics bag.yaml",
+            )
+        mapping = mapping_from_yaml(proposal.text, f"the topics proposed for {path}")
+    return open_bag_recording(path, mapping, scans_per_measurement=scans_per_measurement)

@@ -13,8 +13,7 @@ import numpy.typing as npt
 from cairn_calib.rig.lidar import SpinningLidar
 from cairn_calib.rig.raster import MAX_SIDE_PX
 from cairn_fusion.ros.bag import Wire
-from cairn_fusion.ros.messages import RosHeader, header_of
-from cairn_fusion.ros.wire import WireReader
+from cairn_fusion.ros.messages import RosHeader, WireReader, header_of
 
 FIELD_BYTES_MIN = 13
 FIELDS_MAX = 64

@@ -14,7 +14,7 @@ from cairn_client.cli.robots.telepresence import main as telepresence
 from cairn_client.folders.local_ages import ages_of
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
-from cairn_fusion.image_fusion.live_range import live_range
+from cairn_fusion.image_fusion.surface import live_range
 from cairn_fusion.view.overlay import Live, Mode, OverlayStyle, draw_overlay
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import geometry_for

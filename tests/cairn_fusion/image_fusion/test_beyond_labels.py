@@ -9,8 +9,7 @@ from tests.fixtures.map.worlds import map_of
 from cairn_calib.rig.poses import look_at
 from cairn_fusion.image_fusion import beyond_labels
 from cairn_fusion.image_fusion.beyond_labels import beyond_pixels
-from cairn_fusion.image_fusion.live_range import live_range
-from cairn_fusion.image_fusion.surface import surface_of
+from cairn_fusion.image_fusion.surface import live_range, surface_of
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.transfer import Label
 from cairn_fusion.view.telepresence import Telepresence, ViewOptions, fuse

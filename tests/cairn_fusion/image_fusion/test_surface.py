@@ -9,8 +9,7 @@ from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.poses import look_at
 from cairn_calib.rig.rig import Rig, Spectrum, mounted
 from cairn_calib.rig.sensing import RangeSensing
-from cairn_fusion.image_fusion.range_labels import range_labels
-from cairn_fusion.image_fusion.surface import drawn_surface, surface_of
+from cairn_fusion.image_fusion.surface import drawn_surface, range_labels, surface_of
 from cairn_fusion.image_fusion.surface_kernels import (
     borrowed_ranges,
     draw_labels_into,

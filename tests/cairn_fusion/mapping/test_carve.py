@@ -11,8 +11,7 @@ from tests.fixtures.fusion.scans import BARREL, GEOMETRY, PINHOLE, random_scan, 
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.lidar import SpinningLidar
 from cairn_calib.rig.poses import Transform, inverse, look_at, transform_points
-from cairn_fusion.mapping.beam_returns import returns_of
-from cairn_fusion.mapping.clear_range import clear_image
+from cairn_fusion.mapping.beam_returns import clear_image, returns_of
 from cairn_fusion.mapping.free_space import Window, carving_of, window_of
 from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scan, integrate_scans
 from cairn_fusion.mapping.tally import ScanHits, Tally, tally_around

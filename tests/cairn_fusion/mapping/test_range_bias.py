@@ -19,8 +19,7 @@ from cairn_calib.solve.board_views import RangeView
 from cairn_calib.solve.solve import solve_rig
 from cairn_calib.solve.solve_plan import usual_plan
 from cairn_calib.solve.solved_rig import solved_rig
-from cairn_fusion.image_fusion.live_range import live_range
-from cairn_fusion.image_fusion.surface import surface_of
+from cairn_fusion.image_fusion.surface import live_range, surface_of
 from cairn_fusion.mapping.beam_returns import returns_of
 from cairn_fusion.mapping.integrate import Integrator, integrate_scan
 from cairn_fusion.recording.scan import Scan

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cairn_calib.rig.camera import Camera
-from cairn_fusion.recording.adapters import kelvin_from_counts, range_from_radial, range_from_z_depth
+from cairn_fusion.recording.recording_format import kelvin_from_counts, range_from_radial, range_from_z_depth
 from cairn_fusion.transfer.transfer import points_from_range
 from cairn_map.errors import BadInputError
 

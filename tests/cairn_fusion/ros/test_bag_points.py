@@ -11,7 +11,7 @@ from tests.fixtures.fusion.bags import KINDS, ROS2, Messages, Timed, pose_of, wr
 from cairn_calib.rig.lidar import SpinningLidar
 from cairn_fusion.importers import open_source
 from cairn_fusion.ros.bag import Wire
-from cairn_fusion.ros.bag_survey import survey
+from cairn_fusion.ros.bag_recording import survey
 from cairn_fusion.ros.point_clouds import R_LIDAR_CAMERA, RosPoints, elevations_of, read_points, sweep_image
 from cairn_map.errors import DamagedDataError
 

@@ -35,7 +35,7 @@ from cairn_fusion.recording.recording import Recording, ScanSource
 from cairn_fusion.recording.trajectory import interpolated
 from cairn_fusion.ros import bag_index, tf_tree
 from cairn_fusion.ros.bag import BoundedFile, Wire
-from cairn_fusion.ros.bag_survey import survey
+from cairn_fusion.ros.bag_recording import survey
 from cairn_fusion.ros.images import colour_of, depth_of
 from cairn_fusion.ros.mcap_bag import unpacked
 from cairn_fusion.ros.messages import RosCameraInfo, RosCompressedImage, RosHeader, RosImage, read_image

@@ -15,8 +15,7 @@ from tests.fixtures.map.worlds import map_of
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.pose_vectors import transform_from_vector
 from cairn_calib.rig.rig import Rig, Spectrum, mounted
-from cairn_fusion.image_fusion.live_range import live_range
-from cairn_fusion.image_fusion.range_labels import AMPLITUDE_MAX
+from cairn_fusion.image_fusion.surface import AMPLITUDE_MAX, live_range
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.view import overlay_kernels as kernels
 from cairn_fusion.view.overlay import Live, Mode, OverlayStyle, draw_overlay, with_overlay_legend

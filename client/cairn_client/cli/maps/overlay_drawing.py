@@ -8,8 +8,7 @@ import numpy.typing as npt
 from cairn_calib.rig.rig import Rig, Spectrum
 from cairn_client.folders.map_folder import FolderMap
 from cairn_fusion.image_fusion.beyond_labels import beyond_pixels
-from cairn_fusion.image_fusion.live_range import live_range
-from cairn_fusion.image_fusion.surface import sight_of
+from cairn_fusion.image_fusion.surface import live_range, sight_of
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.view.overlay import EXACT, Live, Mode, Overlay, OverlayStyle, draw_overlay, with_overlay_legend
 from cairn_map.errors import BadInputError

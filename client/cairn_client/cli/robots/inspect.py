@@ -15,7 +15,7 @@ from cairn_map.errors import ConflictError
 
 if TYPE_CHECKING:
     from cairn_fusion.ros.bag_index import TopicIndex
-    from cairn_fusion.ros.bag_survey import Survey
+    from cairn_fusion.ros.bag_recording import Survey
 
 TEXT = """List the topics of a bag (FILE.bag, FILE.mcap, FILE.db3, or a folder of rosbag2), and propose the YAML file
 that says which of them are depth, colour, thermal images and poses. It needs no ROS.
@@ -28,7 +28,7 @@ decide."""
 
 
 def _inspect(args: argparse.Namespace) -> int:
-    from cairn_fusion.ros.bag_survey import survey
+    from cairn_fusion.ros.bag_recording import survey
 
     if args.output is not None and args.output.exists() and not args.force:
         raise ConflictError("file_exists", f"{args.output} exists; --force writes over it")
