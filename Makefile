@@ -42,7 +42,7 @@ soak: .venv/dev.stamp .venv/kernels.stamp  ## crash, crowd, simulate sync, fuzz 
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.links --minutes 30)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.links --minutes 15 --kill)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.rig_seeds --seeds 200)
-	$(if $(SOAK_ARGS),,OVERLAY_POSES=1000 CAIRN_FUSION_POSES=1000 $(BIN)/python -m pytest tests/cairn_fusion/test_{overlay,across}.py)
+	$(if $(SOAK_ARGS),,OVERLAY_POSES=1000 CAIRN_FUSION_POSES=1000 $(BIN)/python -m pytest tests/cairn_fusion/{view/test_overlay,image_fusion/test_cross_view}.py)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.board_finding --boards 1000 --discs 300 --real 500 --empty 10000)
 	$(if $(SOAK_ARGS),,$(BIN)/cairn calib study --output build/study)
 	$(if $(SOAK_ARGS),,! grep MISSED build/study/study.html && grep -q "Best: c" build/study/study.html)

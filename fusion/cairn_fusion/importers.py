@@ -50,7 +50,7 @@ def import_mm5(folder: str | Path, frames: Sequence[str] | None = None, *, scans
     return import_frames(folder, MM5, frames=frames, scans_per_measurement=scans_per_measurement)
 
 
-class Layout(StrEnum):
+class SourceLayout(StrEnum):
     """The layouts that are recognised by the files in them."""
 
     RECORDING = "recording"
@@ -59,14 +59,14 @@ class Layout(StrEnum):
     BAG = "bag"
 
 
-LAYOUT_FILES: dict[Layout, tuple[str, ...]] = {
-    Layout.RECORDING: (HEADER_FILE,),
-    Layout.APC_SHELF: ("K_color.txt", "frames"),
-    Layout.MM5: ("K_approx.txt", "T_world_cam_A.txt", "frames/A"),
+LAYOUT_FILES: dict[SourceLayout, tuple[str, ...]] = {
+    SourceLayout.RECORDING: (HEADER_FILE,),
+    SourceLayout.APC_SHELF: ("K_color.txt", "frames"),
+    SourceLayout.MM5: ("K_approx.txt", "T_world_cam_A.txt", "frames/A"),
 }
 
 
-def detect_layout(folder: str | Path) -> Layout:
+def detect_layout(folder: str | Path) -> SourceLayout:
     """Which layout a folder has.
 
     Raises:
@@ -77,9 +77,9 @@ def detect_layout(folder: str | Path) -> Layout:
         if all((root / name).exists() for name in names):
             return layout
     if (root / RIG_FILE).exists():  # an unfinished recording; opening it says so
-        return Layout.RECORDING
+        return SourceLayout.RECORDING
     if is_bag(root):
-        return Layout.BAG
+        return SourceLayout.BAG
     looked_for = "; ".join(f"{layout}: {' and '.join(names)}" for layout, names in LAYOUT_FILES.items())
     looked_for += f"; bag: {', '.join(SUFFIXES)}"
     if not root.is_dir():
@@ -106,15 +106,15 @@ def open_source(
             the importer that fits.
     """
     layout = None if options else detect_layout(folder)
-    if mapping is not None and layout is not Layout.BAG:
+    if mapping is not None and layout is not SourceLayout.BAG:
         raise BadInputError("bad_mapping", f"{folder} is no bag, so topics cannot be named")
-    preset = options or {Layout.APC_SHELF: APC_SHELF, Layout.MM5: MM5}.get(layout or Layout.RECORDING)
+    preset = options or {SourceLayout.APC_SHELF: APC_SHELF, SourceLayout.MM5: MM5}.get(layout or SourceLayout.RECORDING)
     if preset is not None:
         group = 1 if scans_per_measurement is None else scans_per_measurement
         return import_frames(folder, preset, frames=frames, scans_per_measurement=group)
     if frames is not None:
         raise BadInputError("unknown_frame", f"a {layout} has no frame ids to choose by")
-    if layout is Layout.BAG:
+    if layout is SourceLayout.BAG:
         from cairn_fusion.ros.bag_recording import open_any_bag
 
         return open_any_bag(Path(folder), mapping, scans_per_measurement=scans_per_measurement)

@@ -9,7 +9,7 @@ from cairn_calib.rig.camera import camera_from_field_of_view
 from cairn_calib.rig.rig import Rig, Spectrum, mounted
 from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scan, integrate_scans
 from cairn_fusion.recording.scan import Scan
-from cairn_fusion.transfer.place_covariance import PlaceCovariance
+from cairn_fusion.transfer.covariance_grid import CovarianceGrid
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Geometry
 from cairn_map.queries.map_snapshot import snapshot_of
@@ -38,7 +38,7 @@ def warm_up() -> None:
     )
     integrate_scans([scan, scan], rig, Geometry(), integrator=Integrator(), threads=2)
     integrate_scan(scan, rig, Geometry(), integrator=Integrator(method=Method.CAST))
-    covariance = PlaceCovariance.of(rig, src="tof", dst="colour")
+    covariance = CovarianceGrid.of(rig, src="tof", dst="colour")
     covariance.at(np.zeros((1, 2)), np.ones(1, np.float32), np.ones(1, np.float32))
     if find_spec("cv2") is not None:
         _look(rig, scan)

@@ -22,7 +22,7 @@ from cairn_client.cli.maps.overlay_drawing import MapOverlay
 from cairn_client.cli.maps.prior_data import push_prior_data
 from cairn_client.folders.map_folder import FolderMap, map_of_folder
 from cairn_client.http.api import MapApi
-from cairn_fusion.image_fusion.beyond_labels import beyond_pixels
+from cairn_fusion.image_fusion.mirror_labels import mirror_pixels
 from cairn_fusion.image_fusion.surface import live_range
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.view.overlay import Live, OverlayStyle, draw_overlay
@@ -106,7 +106,7 @@ def _stream_rows(known: FolderMap, rig: Rig, scans: Sequence[Scan], least: str, 
     goal = f"; at least {least} are asked for" if least else ""
     yield "  from scan to picture", f"{1 / seconds:.1f}", f"frames/s, {THREADS} threads{goal}"
     renderer, snapshot = overlay.renderer, known.snapshot
-    seconds = _mean_s(lambda scan: beyond_pixels(scan, rig, snapshot, renderer=renderer), scans, repeats=repeats)
+    seconds = _mean_s(lambda scan: mirror_pixels(scan, rig, snapshot, renderer=renderer), scans, repeats=repeats)
     yield "    what mirrors show", f"{1e3 * seconds:.1f}", "ms of it"
     seconds = _mean_s(lambda scan: live_range(scan, rig, camera=CAMERA), scans, repeats=repeats)
     yield "    the colour camera's depth", f"{1e3 * seconds:.1f}", "ms of it"

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from cairn_fusion.mapping.integrate import Integrator, integrate_scans
 from cairn_fusion.recording.scan import Scan
-from cairn_fusion.view.telepresence import Mode, Telepresence, ViewOptions
+from cairn_fusion.view.telepresence import Telepresence, ViewMode, ViewOptions
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import geometry_for
 from cairn_map.queries.map_snapshot import snapshot_of
@@ -38,11 +38,11 @@ def telepresence_rows(smoke: bool) -> Iterator[Row]:
     mapped.merge(integrate_scans(both, rig, geometry, integrator=Integrator()))
     snapshot = snapshot_of(mapped)
     for name, mode, scans, known in (
-        ("fused 640 x 512 view, colour on thermal", Mode.COLOUR_ON_THERMAL, single, None),
-        ("fused 1280 x 960 view, thermal on colour", Mode.THERMAL_ON_COLOUR, single, None),
-        (f"  with a map of {VOXEL_M * 100:g} cm for its mirrors", Mode.THERMAL_ON_COLOUR, single, snapshot),
-        ("  with the second thermal camera", Mode.THERMAL_ON_COLOUR, both, None),
-        ("stereo pair, 2 x 1280 x 960", Mode.STEREO, both, None),
+        ("fused 640 x 512 view, colour on thermal", ViewMode.COLOUR_ON_THERMAL, single, None),
+        ("fused 1280 x 960 view, thermal on colour", ViewMode.THERMAL_ON_COLOUR, single, None),
+        (f"  with a map of {VOXEL_M * 100:g} cm for its mirrors", ViewMode.THERMAL_ON_COLOUR, single, snapshot),
+        ("  with the second thermal camera", ViewMode.THERMAL_ON_COLOUR, both, None),
+        ("stereo pair, 2 x 1280 x 960", ViewMode.STEREO, both, None),
     ):
         look = Telepresence(rig, ViewOptions(mode=mode), known)
         look.view(scans[0])

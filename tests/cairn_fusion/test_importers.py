@@ -5,7 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 from cairn_calib.rig.poses import inverse, transform_from_quaternion, transform_points
-from cairn_fusion.importers import Layout, detect_layout, import_apc_shelf, import_mm5, open_source
+from cairn_fusion.importers import SourceLayout, detect_layout, import_apc_shelf, import_mm5, open_source
 from cairn_fusion.recording.frame_folder import FrameFolderOptions, PoseConvention, import_frames
 from cairn_fusion.recording.images import write_colour, write_grey16
 from cairn_fusion.recording.recording import Recording, open_recording
@@ -257,7 +257,7 @@ def rewritten(source: Recording, folder: Path) -> Recording:
 def test_an_imported_folder_can_be_written_as_a_recording_and_nothing_is_lost(folder: Path, tmp_path: Path) -> None:
     source = import_frames(folder, OPTIONS)
     copy = rewritten(source, tmp_path / "copy")
-    assert detect_layout(tmp_path / "copy") is Layout.RECORDING
+    assert detect_layout(tmp_path / "copy") is SourceLayout.RECORDING
     assert len(open_source(tmp_path / "copy")) == len(source)
     with pytest.raises(BadInputError):
         open_source(tmp_path / "copy", frames=["000002"])
@@ -279,7 +279,7 @@ def points_in_map(recording: Recording, index: int) -> np.ndarray:
 @pytest.mark.recording
 def test_the_shelf_has_fifteen_scans_with_colour(test_data: Path) -> None:
     source = open_source(test_data / "apc_shelf_rgbd")
-    assert detect_layout(test_data / "apc_shelf_rgbd") is Layout.APC_SHELF
+    assert detect_layout(test_data / "apc_shelf_rgbd") is SourceLayout.APC_SHELF
     assert (source.name, len(source), list(source.rig.cameras)) == ("apc_shelf", 15, ["depth", "colour"])
     for scan in source:
         seen = scan.range_m[np.isfinite(scan.range_m)]
@@ -308,7 +308,7 @@ def test_neighbouring_views_of_the_shelf_agree_in_the_map(test_data: Path) -> No
 @pytest.mark.recording
 def test_the_turntable_of_mm5_lies_at_height_zero(test_data: Path) -> None:
     source = open_source(test_data / "mm5_rgbdt")
-    assert detect_layout(test_data / "mm5_rgbdt") is Layout.MM5
+    assert detect_layout(test_data / "mm5_rgbdt") is SourceLayout.MM5
     assert (len(source), list(source.rig.cameras)) == (30, ["depth", "colour", "thermal"])
     points = points_in_map(source, 0)
     on_disc = np.hypot(points[..., 0], points[..., 1]) < 0.27  # its radius is 0.28 m; the table around lies 6 cm lower

@@ -25,7 +25,7 @@ from cairn_fusion.importers import detect_layout
 from cairn_fusion.recording.frame_folder import FrameFolderOptions, import_frames
 from cairn_fusion.recording.images import image_header, read_colour, read_grey16
 from cairn_fusion.recording.recording import open_recording
-from cairn_fusion.recording.trajectory import interpolated, read_trajectory, trajectory_line
+from cairn_fusion.recording.trajectory import interpolate_pose, read_trajectory, trajectory_line
 from cairn_map.codec.cell_code import Profile, decode_canonical_cell, decode_cell, encode_cell
 from cairn_map.codec.cell_reading import cell_reader
 from cairn_map.codec.view_code import decode_view
@@ -232,7 +232,7 @@ def read_trajectory_text(data: bytes) -> None:
         poses = read_trajectory(folder / "trajectory.txt").poses
     with np.errstate(all="ignore"):
         for start, end in zip(poses.values[:20], poses.values[1:21], strict=False):
-            assert interpolated(start, end, 0.5).shape == (4, 4)
+            assert interpolate_pose(start, end, 0.5).shape == (4, 4)
         for time_s, T_map_rig in zip(poses.times_s.tolist()[:20], poses.values, strict=False):
             trajectory_line(time_s, T_map_rig)
 

@@ -16,7 +16,7 @@ from cairn_client.replica.replica import Replica
 from cairn_client.robot.kept_scans import KeptScans
 from cairn_fusion.mapping.measurement import Measurement
 from cairn_fusion.recording.scan import Scan
-from cairn_fusion.recording.scan_bytes import moved_scan
+from cairn_fusion.recording.scan_bytes import move_scan
 from cairn_map.codec.cell_code import Profile
 from cairn_map.commits.commit import Commit, CommitMeta
 from cairn_map.commits.ids import CommitId, commit_id_from_text
@@ -117,7 +117,7 @@ def _move(T_map_rig: npt.ArrayLike | None, T_map_observed: npt.ArrayLike | None)
         raise BadInputError("bad_option", "amend needs either T_map_rig, a pose for each scan, or T_map_observed")
     if T_map_observed is not None:
         correction = checked_transform(T_map_observed, name="T_map_observed")
-        return lambda scans: (moved_scan(scan, correction @ scan.T_map_rig) for scan in scans)
+        return lambda scans: (move_scan(scan, correction @ scan.T_map_rig) for scan in scans)
     poses = np.asarray(T_map_rig, np.float64)
     if poses.ndim != 3 or poses.shape[1:] != (4, 4):
         raise BadInputError("bad_transform", f"T_map_rig must be (N, 4, 4), a pose for each scan, got {poses.shape}")
@@ -126,7 +126,7 @@ def _move(T_map_rig: npt.ArrayLike | None, T_map_observed: npt.ArrayLike | None)
         count = 0
         for count, scan in enumerate(scans, 1):
             if count <= len(poses):
-                yield moved_scan(scan, poses[count - 1])
+                yield move_scan(scan, poses[count - 1])
         if count != len(poses):
             raise BadInputError("bad_transform", f"the measurement has {count} scans, got {len(poses)} poses for them")
 

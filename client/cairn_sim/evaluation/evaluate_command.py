@@ -26,7 +26,7 @@ from pathlib import Path
 from cairn_calib.rig.rig import Spectrum
 from cairn_client.cli.arguments import say, with_progress
 from cairn_fusion.recording.images import write_colour
-from cairn_fusion.view.telepresence import Mode, Telepresence, ViewOptions
+from cairn_fusion.view.telepresence import Telepresence, ViewMode, ViewOptions
 from cairn_fusion.view.temperature_scale import locked_scale
 from cairn_map.errors import BadInputError
 from cairn_sim.evaluation.fusion_evaluation import WAYS, mapped_scores, plan_scans, scored_view
@@ -155,7 +155,7 @@ def _frames(args: argparse.Namespace) -> None:
     for number, frame in enumerate(labelled_frames(args.mm5)):
         say(f"  {frame.frame:<32}{int(frame.label.sum()):>12}{frame.given_iou:>12.3f}{frame.fused_iou:>12.3f}")
         if number == 0:
-            picture = Telepresence(frame.rig, ViewOptions(mode=Mode.SIDE_BY_SIDE)).view(frame.scan)
+            picture = Telepresence(frame.rig, ViewOptions(mode=ViewMode.SIDE_BY_SIDE)).view(frame.scan)
             write_colour(args.output / "mm5.png", picture)
             say(f"  wrote {args.output / 'mm5.png'}")
 

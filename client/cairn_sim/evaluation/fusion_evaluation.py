@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from cairn_calib.rig.rig import Rig, Spectrum
-from cairn_fusion.image_fusion.across import Across, across
+from cairn_fusion.image_fusion.cross_view import CrossView, cross_view
 from cairn_fusion.image_fusion.surface import drawn_surface, surface_of
 from cairn_fusion.mapping.integrate import Integrator, integrate_scans
 from cairn_fusion.recording.scan import Scan
@@ -40,7 +40,7 @@ class ScoredView:
     """One camera of one scan."""
 
     scan: Scan
-    fused: Across
+    fused: CrossView
     truth: FusionTruth
     scores: Mapping[str, FusionScores]
     """By way."""
@@ -63,9 +63,9 @@ def scored_view(scene: Scene, rig: Rig, scan: Scan, camera: str) -> ScoredView:
     depth = view_depth(scan, rig, camera, drawn[camera])
     first = dict(list(images.items())[:1])
     fused = {
-        WAYS[0]: across(depth, rig, images, drawn=drawn, range_camera=scan.range_camera),
-        WAYS[1]: across(depth, rig, first, drawn=drawn, range_camera=scan.range_camera),
-        WAYS[2]: across(depth, rig, first, drawn={}, range_camera=scan.range_camera),
+        WAYS[0]: cross_view(depth, rig, images, drawn=drawn, range_camera=scan.range_camera),
+        WAYS[1]: cross_view(depth, rig, first, drawn=drawn, range_camera=scan.range_camera),
+        WAYS[2]: cross_view(depth, rig, first, drawn={}, range_camera=scan.range_camera),
         WAYS[3]: fuse(scan, uncalibrated(rig), camera),
     }
     scores = {way: fusion_scores(each, truth, unit=unit) for way, each in fused.items()}

@@ -7,10 +7,10 @@ errors.png     the fused image, what each pixel is labelled, the error of temper
 import numpy as np
 
 from cairn_calib.rig.rig import Rig, Spectrum, mounted
-from cairn_fusion.image_fusion.across import Across
+from cairn_fusion.image_fusion.cross_view import CrossView
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.transfer import Label
-from cairn_fusion.view.painting import Emphasis, draw_legend_into, painted, painted_alone, write_into
+from cairn_fusion.view.painting import Emphasis, draw_legend_into, paint_alone, paint_over, write_into
 from cairn_fusion.view.telepresence import fuse
 from cairn_fusion.view.temperature_scale import TemperatureScale
 from cairn_map.arrays import Rgb
@@ -63,14 +63,14 @@ def figure_24(scan: Scan, rig: Rig, camera: str, scale: TemperatureScale) -> Rgb
     base, half = scan.colour[camera], Emphasis(alpha=0.55)
     thermal = rig.of_spectrum(Spectrum.THERMAL)[0]
     kelvin = scan.thermal[thermal]
-    warm = painted_alone(kelvin, np.where(np.isfinite(kelvin), Label.OK, Label.NO_READING).astype(np.uint8), scale)
+    warm = paint_alone(kelvin, np.where(np.isfinite(kelvin), Label.OK, Label.NO_READING).astype(np.uint8), scale)
     fused = {
         "fused, not calibrated": fuse(scan, uncalibrated(rig), camera),
         "fused, calibrated": fuse(scan, rig, camera),
     }
     panels = {"colour": base.copy(), "thermal": _fitted(warm, base.shape[0], base.shape[1])}
     for name, each in fused.items():
-        panels[f"{name}; hatched: no temperature"] = painted(base, each.values[..., 0], each.labels, scale, half)
+        panels[f"{name}; hatched: no temperature"] = paint_over(base, each.values[..., 0], each.labels, scale, half)
     (H, W), out = base.shape[:2], np.full((2 * base.shape[0] + GAP_PX, 2 * base.shape[1] + GAP_PX, 3), 255, np.uint8)
     for n, (name, panel) in enumerate(panels.items()):
         if n:
@@ -81,10 +81,10 @@ def figure_24(scan: Scan, rig: Rig, camera: str, scale: TemperatureScale) -> Rgb
     return out
 
 
-def error_picture(scan: Scan, fused: Across, truth: FusionTruth, scale: TemperatureScale) -> Rgb:
+def error_picture(scan: Scan, fused: CrossView, truth: FusionTruth, scale: TemperatureScale) -> Rgb:
     """(H, 3 W, 3) the fused image; labels by colour; the error from black, none, to white, 5 K; hatched if unknown."""
     kelvin = fused.values[..., 0]
-    picture = painted(scan.colour[fused.camera], kelvin, fused.labels, scale, Emphasis())
+    picture = paint_over(scan.colour[fused.camera], kelvin, fused.labels, scale, Emphasis())
     draw_legend_into(picture, scale)
     labels = np.zeros_like(picture)
     for label, ink in LABEL_COLOURS.items():
@@ -93,7 +93,7 @@ def error_picture(scan: Scan, fused: Across, truth: FusionTruth, scale: Temperat
         write_into(labels, label.name.lower().replace("_", " "), (34, 30 + 26 * n))
         labels[14 + 26 * n : 30 + 26 * n, 10:28] = LABEL_COLOURS[label]
     error = np.abs(kelvin - truth.values[..., 0])
-    wrong = painted_alone(error, fused.labels, TemperatureScale(0.0, ERROR_SPAN_K))
+    wrong = paint_alone(error, fused.labels, TemperatureScale(0.0, ERROR_SPAN_K))
     write_into(wrong, f"error, 0 to {ERROR_SPAN_K:g} K", (10, 30))
     return np.hstack([picture, labels, wrong])
 

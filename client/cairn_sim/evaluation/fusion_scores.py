@@ -17,8 +17,8 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
-from cairn_fusion.image_fusion.across import Across
-from cairn_fusion.image_fusion.eye_depth import Origin
+from cairn_fusion.image_fusion.cross_view import CrossView
+from cairn_fusion.image_fusion.dense_depth import Origin
 from cairn_fusion.transfer.transfer import Label
 from cairn_map.arrays import Singles
 from cairn_sim.evaluation.fusion_truth import FusionTruth, grown
@@ -119,7 +119,7 @@ COLUMNS = (
 )
 
 
-def fusion_scores(fused: Across, truth: FusionTruth, *, unit: str) -> FusionScores:
+def fusion_scores(fused: CrossView, truth: FusionTruth, *, unit: str) -> FusionScores:
     """The scores of one fused image.
 
     Args:

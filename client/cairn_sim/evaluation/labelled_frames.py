@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from cairn_calib.rig.rig import Rig
-from cairn_fusion.image_fusion.across import Across
+from cairn_fusion.image_fusion.cross_view import CrossView
 from cairn_fusion.importers import open_source
 from cairn_fusion.recording.images import read_colour
 from cairn_fusion.recording.scan import Scan
@@ -37,7 +37,7 @@ class LabelledFrame:
     frame: str
     scan: Scan
     rig: Rig
-    fused: Across
+    fused: CrossView
     label: Flags
     given_iou: float
     """Of the set's own registration."""

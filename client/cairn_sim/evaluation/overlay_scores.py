@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from cairn_calib.rig.lidar import AnyCamera
 from cairn_calib.rig.poses import Transform, inverse
-from cairn_fusion.view.overlay import Live, Mode, OverlayStyle, draw_overlay
+from cairn_fusion.view.overlay import Live, OverlayMode, OverlayStyle, draw_overlay
 from cairn_map.arrays import Flags, Floats, Ints
 from cairn_map.evidence.channels import TEMPERATURE
 from cairn_map.evidence.evidence import packed_evidence
@@ -65,7 +65,7 @@ def overlay_scores(
         expected, range_m = cubes_seen(cubes, camera, T)
         snapshot = map_of_cubes(cubes)
         drawn = []
-        for live_m, mode in ((range_m, Mode.VISIBLE), (np.full_like(range_m, np.nan), Mode.MAP_ONLY)):
+        for live_m, mode in ((range_m, OverlayMode.VISIBLE), (np.full_like(range_m, np.nan), OverlayMode.MAP_ONLY)):
             live = Live(rgb=rgb, range_m=live_m, sight=sight, T_map_camera=T)
             drawn.append(draw_overlay(renderer, snapshot, live, style).front_modes == mode)
         visible, map_only = (intersection_over_union(each, expected) for each in drawn)

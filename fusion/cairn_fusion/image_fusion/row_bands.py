@@ -9,7 +9,7 @@ BANDS_PER_CORE = 2
 """Some bands are harder than others."""
 
 
-def in_bands(work: Callable[[int, int], None], rows: int) -> None:
+def run_in_bands(work: Callable[[int, int], None], rows: int) -> None:
     """Call `work(first, last)` for bands that make up all rows, at once; what it raises is raised."""
     cores = os.cpu_count() or 1
     count = max(1, min(BANDS_PER_CORE * cores, rows)) if cores > 1 else 1

@@ -1,6 +1,6 @@
 """The surface that a scan's range image shows, and how it looks from the rig's other cameras.
 
-    range image --labels, steps--> pixels joined to a surface --Eq. 1-6--> 1 / range, drawn coarsely in each camera
+    range image --labels, steps--> pixels joints to a surface --Eq. 1-6--> 1 / range, drawn coarsely in each camera
 
 It is drawn about twice as fine as the range camera sees: there is no more in it. Drawn are triangles between pixels
 of one surface, and the nearest wins; across a step in depth nothing is drawn, because nobody knows what is there.
@@ -18,15 +18,15 @@ from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.lidar import AnyCamera
 from cairn_calib.rig.poses import Transform, inverse, transform_points
 from cairn_calib.rig.rig import Rig
-from cairn_fusion.image_fusion.across_kernels import places_into
-from cairn_fusion.image_fusion.row_bands import in_bands
+from cairn_fusion.image_fusion.cross_view_kernels import places_into
+from cairn_fusion.image_fusion.row_bands import run_in_bands
 from cairn_fusion.image_fusion.surface_kernels import (
     borrowed_ranges,
     draw_labels_into,
     draw_squares_into,
     draw_triangles_into,
     fronts,
-    joined,
+    joints,
     nearest_of_nine,
 )
 from cairn_fusion.mapping.beam_returns import full_pixels
@@ -122,7 +122,7 @@ class Drawn:
 
 
 def surface_of(scan: Scan, rig: Rig, beyond: Flags | None = None) -> RangeSurface:
-    """The surface of a scan's range image, but for what a map says that a mirror shows: (H, W) `beyond_pixels`."""
+    """The surface of a scan's range image, but for what a map says that a mirror shows: (H, W) `mirror_pixels`."""
     labels, mounted = range_labels(scan, rig), rig[scan.range_camera]
     if beyond is not None:
         labels[beyond & (labels == Label.OK)] = Label.BEYOND
@@ -131,7 +131,7 @@ def surface_of(scan: Scan, rig: Rig, beyond: Flags | None = None) -> RangeSurfac
     shown_m = borrowed_ranges(range_m, labels, BORROW_PX)
     # A mirror may be large; what it shows is about where the mirror is, for cameras so near to each other.
     shown_m = np.where(np.isnan(shown_m) & (labels == Label.BEYOND), range_m, shown_m)
-    across, down = (joined(range_m, labels, noise_m, *step) for step in ((1, 0), (0, 1)))
+    across, down = (joints(range_m, labels, noise_m, *step) for step in ((1, 0), (0, 1)))
     return RangeSurface(
         range_camera=scan.range_camera,
         range_m=shown_m,
@@ -198,7 +198,7 @@ def places(range_m: Singles, rays: Singles, dst: AnyCamera, T_dst_src: Transform
             coefficients,
             radius_limit(dst.distortion),
         )
-        in_bands(lambda first, last: places_into(u, v, q, range_m, *numbers, first, last), len(range_m))
+        run_in_bands(lambda first, last: places_into(u, v, q, range_m, *numbers, first, last), len(range_m))
         return u, v, q
     points = transform_points(T_dst_src, np.moveaxis(rays, 0, -1).astype(np.float64) * range_m[..., None])
     pixels = dst.project(points).astype(np.float32)
@@ -235,7 +235,7 @@ def live_range(scan: Scan, rig: Rig, *, camera: str, beyond: npt.NDArray[np.bool
     """(H, W) float32, metres along the rays of a camera; NaN where the range camera says nothing.
 
     Nor does it where too much light came back or two surfaces are mixed (`range_labels`), or where it shows what is in
-    a mirror: `beyond`, (H, W) of the range camera, from `beyond_pixels`.
+    a mirror: `beyond`, (H, W) of the range camera, from `mirror_pixels`.
 
     Raises:
         BadInputError: kind `unknown_camera`, or images of another size.

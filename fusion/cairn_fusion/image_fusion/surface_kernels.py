@@ -1,6 +1,6 @@
 """The surface that a range image shows, as triangles between its pixels, drawn into other cameras: loops of `surface`.
 
-o---o---o      neighbours on one surface are joined; across a step in depth they are not
+o---o---o      neighbours on one surface are joints; across a step in depth they are not
 | / | / |
 o---o   o  o   a pixel with no triangle is drawn as a small square
 """
@@ -25,12 +25,12 @@ GAP_SHARE = 0.04
 
 
 @nb.njit(cache=True, nogil=True)
-def joined(range_m: Singles, labels: Labels, noise_m: Singles, dx: int, dy: int) -> Flags:
+def joints(range_m: Singles, labels: Labels, noise_m: Singles, dx: int, dy: int) -> Flags:
     """(H, W) whether a pixel and its next, (dx, dy) away, are of one surface.
 
     Args:
         range_m: (H, W) metres along the beam.
-        labels: (H, W) only what is OK is joined.
+        labels: (H, W) only what is OK is joints.
         noise_m: (H, W) what a step may have from noise alone.
         dx: 1 for the next in the row, else 0.
         dy: 1 for the next in the column, else 0.
@@ -56,7 +56,7 @@ def joined(range_m: Singles, labels: Labels, noise_m: Singles, dx: int, dy: int)
 def draw_triangles_into(
     nearness: Singles, drawn: Flags, u: Floats, v: Floats, q: Floats, across: Flags, down: Flags
 ) -> None:
-    """Draw the triangles between joined pixels; the nearest wins.
+    """Draw the triangles between joints pixels; the nearest wins.
 
     Args:
         nearness: (h, w) 1 / metres; 0 for nothing.
@@ -64,7 +64,7 @@ def draw_triangles_into(
         u: (H, W) where the pixels appear, in pixels of `nearness`; NaN where they do not.
         v: (H, W)
         q: (H, W) 1 / range from there.
-        across: (H, W) joined to the next in the row.
+        across: (H, W) joints to the next in the row.
         down: (H, W) to the next in the column.
     """
     height, width = u.shape
@@ -124,7 +124,7 @@ def fronts(range_m: Singles, labels: Labels, across: Flags, down: Flags, noise_m
     Args:
         range_m: (H, W) metres.
         labels: (H, W)
-        across: (H, W) of `joined`.
+        across: (H, W) of `joints`.
         down: (H, W)
         noise_m: (H, W) what a step may have from noise; over a gap of untrusted pixels twice that and `GAP_SHARE`.
     """

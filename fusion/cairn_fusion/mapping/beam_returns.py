@@ -16,9 +16,9 @@ import numpy.typing as npt
 from cairn_calib.rig.body import Body
 from cairn_calib.rig.poses import Transform, inverse, transform_points
 from cairn_calib.rig.rig import MountedCamera, Rig
+from cairn_fusion.mapping.brick_tally_kernels import returned_points
 from cairn_fusion.mapping.clear_kernels import nearest_around
 from cairn_fusion.mapping.flying_kernels import flying_pixels
-from cairn_fusion.mapping.tally_kernels import returned_points
 from cairn_fusion.recording.scan import Scan, check_scan
 from cairn_map.arrays import Flags, Floats, Singles
 

@@ -24,10 +24,10 @@ from cairn_calib.rig.poses import Transform, checked_transform, inverse, transfo
 from cairn_calib.rig.rig import Rig
 from cairn_calib.rig.sensing import LIDAR
 from cairn_fusion.mapping.beam_returns import Returns, clear_image, returns_of
+from cairn_fusion.mapping.brick_tally import Each, TallyPool
 from cairn_fusion.mapping.free_space import Window, carving_of, window_of
 from cairn_fusion.mapping.ray_casting import beam_evidence, clear_ends, silent_ends
 from cairn_fusion.mapping.samples import sample_sums
-from cairn_fusion.mapping.tally import Each, Tallies
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.transfer import DEPTH_TOLERANCE_M
 from cairn_map.arrays import Floats, Ints
@@ -100,7 +100,7 @@ class Integration:
         self._rig = rig
         self._geometry = geometry
         self._integrator = integrator
-        self._tallies = Tallies(geometry, max_range_m=integrator.max_range_m, around_m=around_m)
+        self._tallies = TallyPool(geometry, max_range_m=integrator.max_range_m, around_m=around_m)
 
     def add(self, scan: Scan) -> None:
         """Add a scan.

@@ -19,7 +19,7 @@ from cairn_calib.rig.rig import Rig
 from cairn_fusion.mapping.beam_returns import Returns
 from cairn_fusion.mapping.sample_kernels import add_pixels_into, doubt_edges_into, write_means_into
 from cairn_fusion.recording.scan import Scan
-from cairn_fusion.transfer.certainty import is_certain, reach_px_of, spread_m
+from cairn_fusion.transfer.pixel_covariance import is_certain, reach_px_of, spread_m
 from cairn_fusion.transfer.transfer import (
     DEPTH_TOLERANCE_M,
     Label,
@@ -55,8 +55,8 @@ def sample_sums(
     `transfer_points`.
     """
     sums = np.zeros((count, geometry.plane_count), np.int64)
-    limits = SightLimits(spread_max_m, step_max_k, hidden_behind_m)
-    sight, numbers = Sight(scan, rig, returns, limits), voxel_of.astype(np.int32, copy=False)
+    limits = SampleLimits(spread_max_m, step_max_k, hidden_behind_m)
+    sight, numbers = ImageTransfers(scan, rig, returns, limits), voxel_of.astype(np.int32, copy=False)
     for channel in geometry.channels:
         taken = np.zeros(len(returns.pixels), np.bool_)
         # The first camera speaks for what it sees; the next ones only fill what was hidden from those before.
@@ -81,7 +81,7 @@ class _Points:
 
 
 @dataclass(frozen=True, slots=True)
-class SightLimits:
+class SampleLimits:
     """What is taken for seen; arguments of `sample_sums`."""
 
     spread_max_m: float
@@ -89,10 +89,10 @@ class SightLimits:
     hidden_behind_m: float
 
 
-class Sight:
+class ImageTransfers:
     """Where the points of a scan appear in its images, each found when it is asked for."""
 
-    def __init__(self, scan: Scan, rig: Rig, returns: Returns, limits: SightLimits) -> None:
+    def __init__(self, scan: Scan, rig: Rig, returns: Returns, limits: SampleLimits) -> None:
         self._scan = scan
         self._rig = rig
         self._returns = returns

@@ -30,7 +30,7 @@ from cairn_fusion.recording.recording_format import (
     Positive,
     RangeEncoding,
     ThermalEncoding,
-    contained,
+    path_inside,
 )
 from cairn_fusion.recording.timed_lists import read_text
 from cairn_map.errors import BadInputError
@@ -134,7 +134,7 @@ def import_frames(
 
 def _frame_ids(root: Path, pattern: str) -> list[str]:
     """The ids that a pattern finds, numbers by value."""
-    contained(root, pattern)
+    path_inside(root, pattern)
     pattern = PurePosixPath(pattern).as_posix()
     wanted = re.escape(pattern).replace(re.escape(FRAME_ID), r"(?P<id>[^/]+)", 1)
     wanted = wanted.replace(re.escape(FRAME_ID), r"(?P=id)")
@@ -150,7 +150,7 @@ def _scan_files(
     root: Path, options: FrameFolderOptions, frame_id: str, *, time_s: float, pose: Callable[[str], Transform]
 ) -> ScanFiles:
     def image(pattern: str) -> Path:
-        path = contained(root, pattern.replace(FRAME_ID, frame_id))
+        path = path_inside(root, pattern.replace(FRAME_ID, frame_id))
         if not path.is_file():
             raise BadInputError(
                 "missing_image", f"frame {frame_id} of {root} lacks {pattern.replace(FRAME_ID, frame_id)}"
@@ -176,7 +176,7 @@ def _pose_reader(root: Path, options: FrameFolderOptions) -> Callable[[str], Tra
 
 
 def _pose(root: Path, relative: str, convention: PoseConvention) -> Transform:
-    values = _numbers(contained(root, relative))
+    values = _numbers(path_inside(root, relative))
     if values.size == 12:
         values = np.append(values, (0, 0, 0, 1))
     if values.size != 16:
@@ -209,7 +209,7 @@ def _registered_rig(root: Path, options: FrameFolderOptions, first_depth: Path) 
 def _intrinsics(root: Path, options: FrameFolderOptions) -> tuple[tuple[float, float], tuple[float, float]]:
     if options.focal_px is not None and options.centre_px is not None:
         return options.focal_px, options.centre_px
-    path = contained(root, options.intrinsics_file or "")
+    path = path_inside(root, options.intrinsics_file or "")
     K = _numbers(path)
     if K.size != 9 or not np.array_equal(K[[1, 3, 6, 7, 8]], (0, 0, 0, 0, 1)) or K[0] <= 0 or K[4] <= 0:
         raise BadInputError("bad_intrinsics", f"{path} must hold fx 0 cx, 0 fy cy, 0 0 1; got {K.tolist()[:9]}")

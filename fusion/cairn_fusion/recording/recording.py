@@ -31,9 +31,9 @@ from cairn_fusion.recording.recording_format import (
     RecordingHeader,
     ThermalEncoding,
     check_cameras,
-    contained,
     decode_kelvin,
     decode_range,
+    path_inside,
     read_header,
 )
 from cairn_fusion.recording.scan import Scan, check_scan
@@ -152,7 +152,7 @@ def open_recording(path: str | Path, *, scans_per_measurement: int | None = None
     """
     folder = Path(path).resolve()
     header = read_header(folder)
-    rig = rig_from_json(read_text(contained(folder, RIG_FILE), RIG_BYTES_MAX).encode())
+    rig = rig_from_json(read_text(path_inside(folder, RIG_FILE), RIG_BYTES_MAX).encode())
     check_cameras(header, rig)
     files = _scan_files(folder, header)
     return Recording(
@@ -180,8 +180,8 @@ def measurements_of(scan_count: int, scans_per_measurement: int) -> tuple[range,
 
 def _scan_files(folder: Path, header: RecordingHeader) -> tuple[ScanFiles, ...]:
     """One entry per range image, in order of time; other cameras' images by nearest time within `max_gap_s`."""
-    trajectory = read_trajectory(contained(folder, TRAJECTORY_FILE))
-    body_path = contained(folder, BODY_FILE)
+    trajectory = read_trajectory(path_inside(folder, TRAJECTORY_FILE))
+    body_path = path_inside(folder, BODY_FILE)
     body = read_trajectory(body_path) if body_path.exists() else None
     ranges = {name: _image_list(folder, f"{name}.txt") for name in header.range}
     amplitudes = {name: _image_list(folder, f"{name}.amplitude.txt") for name in header.amplitude}
@@ -215,19 +215,19 @@ def _near(lists: Mapping[str, TimedList[Value]], time_s: float, max_gap_s: float
 def _image_list(folder: Path, name: str) -> TimedList[Path]:
     def image(line: Line, text: str) -> Path:
         try:
-            path = contained(folder, text)
+            path = path_inside(folder, text)
         except BadInputError as exc:
             raise line.error(exc.message, exc.kind) from exc
         if not path.is_file():
             raise line.error(f"{text[:200]} is missing, or is no file", "missing_image")
         return path
 
-    return timed_list(contained(folder, name), image)
+    return timed_list(path_inside(folder, name), image)
 
 
 def _scalar_lists(folder: Path) -> dict[str, TimedList[float]]:
     """The readings of `scalars.txt` by channel; times increase strictly within a channel, and never go back."""
-    path = contained(folder, SCALARS_FILE)
+    path = path_inside(folder, SCALARS_FILE)
     readings: dict[str, list[tuple[float, float]]] = {}
     for line in lines(path) if path.exists() else ():
         time_s, rest = time_and_rest(line)
@@ -247,7 +247,7 @@ def _scalar_lists(folder: Path) -> dict[str, TimedList[float]]:
 
 def _measurements(folder: Path, files: Sequence[ScanFiles], size: int | None) -> tuple[range, ...]:
     """Groups by count if asked for, else by the intervals of `measurements.txt`, else every scan alone."""
-    path = contained(folder, MEASUREMENTS_FILE)
+    path = path_inside(folder, MEASUREMENTS_FILE)
     if size is not None or not path.exists():
         return measurements_of(len(files), 1 if size is None else size)
     times_s = np.array([entry.time_s for entry in files])

@@ -121,7 +121,7 @@ def read_header(folder: Path) -> RecordingHeader:
         raise BadInputError(
             "unfinished_recording", f"{folder} has {RIG_FILE} but no {HEADER_FILE}: it was never finished"
         )
-    return header_from_json(read_text(contained(folder, HEADER_FILE), HEADER_BYTES_MAX))
+    return header_from_json(read_text(path_inside(folder, HEADER_FILE), HEADER_BYTES_MAX))
 
 
 def check_cameras(header: RecordingHeader, rig: Rig) -> None:
@@ -160,7 +160,7 @@ def check_camera_name(name: str) -> None:
         )
 
 
-def contained(folder: Path, relative: str) -> Path:
+def path_inside(folder: Path, relative: str) -> Path:
     """The real path of a file that a recording names, certain to be inside the recording's folder.
 
     Raises:

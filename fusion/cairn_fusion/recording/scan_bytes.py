@@ -74,7 +74,7 @@ def decode_scan(data: bytes) -> Scan:
     return _with_poses(scan, arrays["pose", "rig"], arrays.get(("pose", "body")))
 
 
-def moved_scan(scan: Scan, T_map_rig: Transform) -> Scan:
+def move_scan(scan: Scan, T_map_rig: Transform) -> Scan:
     """The same scan, taken from another pose; the robot's body moves with the rig.
 
     Raises:

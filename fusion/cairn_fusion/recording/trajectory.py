@@ -29,7 +29,7 @@ class Trajectory:
     poses: TimedList[Transform]
 
     def pose_at(self, time_s: float, *, max_gap_s: float) -> Transform:
-        """`T_map_rig` at a time: the pose of that very time stamp, else interpolated between its neighbours.
+        """`T_map_rig` at a time: the pose of that very time stamp, else interpolate_pose between its neighbours.
 
         Args:
             time_s: seconds, on the trajectory's clock.
@@ -52,7 +52,7 @@ class Trajectory:
                 f"{max_gap_s:.6g} s are allowed",
             )
         fraction = (time_s - start_s) / (end_s - start_s)
-        return interpolated(self.poses.values[after - 1], self.poses.values[after], fraction)
+        return interpolate_pose(self.poses.values[after - 1], self.poses.values[after], fraction)
 
 
 def read_trajectory(path: Path) -> Trajectory:
@@ -70,7 +70,7 @@ def trajectory_line(time_s: float, T_map_rig: Transform) -> str:
     return " ".join(repr(float(number)) for number in numbers) + "\n"
 
 
-def interpolated(T_map_start: Transform, T_map_end: Transform, fraction: float) -> Transform:
+def interpolate_pose(T_map_start: Transform, T_map_end: Transform, fraction: float) -> Transform:
     """The pose at `fraction` (0 to 1) of the way: position on the line, rotation by slerp (Shoemake 1985)."""
     q_start, q_end = quaternion_from_transform(T_map_start), quaternion_from_transform(T_map_end)
     if q_start @ q_end < 0:  # q and -q are one rotation; take the nearer of the two

@@ -105,7 +105,7 @@ class BoundedFile(BufferedReader):
 
 
 @contextmanager
-def damage_told(path: Path, *foreign: type[Exception], advice: str) -> Iterator[None]:
+def translate_damage(path: Path, *foreign: type[Exception], advice: str) -> Iterator[None]:
     """Turn whatever a library raises on a damaged bag into `DamagedDataError` with the next step."""
     try:
         yield

@@ -116,7 +116,7 @@ def index_bag(
 
 
 @contextmanager
-def message_told(bag: Bag, message: BagMessage) -> Iterator[None]:
+def translate_message_damage(bag: Bag, message: BagMessage) -> Iterator[None]:
     """Turn what is wrong in a message's bytes into an error with topic and time."""
     try:
         yield
@@ -150,7 +150,7 @@ def _add(index: BagIndex, message: BagMessage, bag: Bag) -> None:
     time_s = message.log_ns / 1e9
     topic = entry.topic
     if topic.wire is not None:
-        with message_told(bag, message):
+        with translate_message_damage(bag, message):
             if topic.type in STAMPED:
                 header = read_header(message.data, topic.wire)
                 time_s, is_first = header.time_s, not entry.log_ns

@@ -26,7 +26,7 @@ from cairn_fusion.recording.recording_format import (
 )
 from cairn_fusion.recording.scan import Scan, check_scan
 from cairn_fusion.ros.bag import Bag, BagMessage, Wire
-from cairn_fusion.ros.bag_index import BagIndex, TopicIndex, index_bag, message_told, wire_of
+from cairn_fusion.ros.bag_index import BagIndex, TopicIndex, index_bag, translate_message_damage, wire_of
 from cairn_fusion.ros.bag_scans import BagScan, scans_of
 from cairn_fusion.ros.images import AnyImage, Pixels, amplitude_of, colour_of, depth_of, thermal_counts_of
 from cairn_fusion.ros.messages import COMPRESSED, IMAGE, POINTS, TRANSFORMS, read_compressed_image, read_image
@@ -141,7 +141,7 @@ class BagRecording:
         """The same of a lidar's cloud."""
         lidar = self.rig[found.camera].camera
         message = self._readers[camera.topic].message(found.images[camera.topic])
-        with message_told(self._bag, message):
+        with translate_message_damage(self._bag, message):
             points = read_points(message.data, wire_of(self._topics[camera.topic].topic))
             assert isinstance(lidar, SpinningLidar)  # noqa: S101 - `_camera_of` made it so
             return sweep_image(points.xyz(), lidar)
@@ -154,7 +154,7 @@ class BagRecording:
         """The pixels of a scan's image of one topic."""
         message = self._readers[topic].message(found.images[topic])
         entry = self._topics[topic]
-        with message_told(self._bag, message):
+        with translate_message_damage(self._bag, message):
             read: Callable[[bytes | memoryview, Wire], AnyImage]
             read = read_image if entry.topic.type == IMAGE else read_compressed_image
             image = read(message.data, wire_of(entry.topic))

@@ -1,6 +1,6 @@
 """Bags in MCAP files (mcap.dev), with messages of ROS 1 or ROS 2.
 
-Found by the index at the file's end, chunk by chunk; a chunk is unpacked into no more than it states. A file whose
+Found by the index at the file's end, chunk by chunk; a chunk is unpack into no more than it states. A file whose
 writer died has no index: `mcap recover` makes one.
 """
 
@@ -19,7 +19,7 @@ from mcap.exceptions import McapError
 from mcap.records import Channel, Chunk, ChunkIndex, Footer, Header, Schema, Statistics
 from mcap.stream_reader import StreamReader
 
-from cairn_fusion.ros.bag import CHUNK_BYTES_MAX, BagMessage, BoundedFile, Topic, Wire, damage_told
+from cairn_fusion.ros.bag import CHUNK_BYTES_MAX, BagMessage, BoundedFile, Topic, Wire, translate_damage
 from cairn_fusion.ros.messages import plain_type
 from cairn_map.errors import DamagedDataError
 
@@ -44,7 +44,7 @@ class McapBag:
         self._topic_of: dict[int, str] = {}
         self._chunks: list[ChunkIndex] = []
         self._unpacked = lru_cache(maxsize=2)(self._unpack)
-        with damage_told(path, McapError, advice=ADVICE):
+        with translate_damage(path, McapError, advice=ADVICE):
             self._file = BoundedFile(path)
             try:
                 self._read_index()
@@ -64,7 +64,7 @@ class McapBag:
                 message = heapq.heappop(waiting)[2]
                 waiting_bytes -= len(message.data)
                 yield message
-            with damage_told(self.path, McapError, advice=ADVICE):
+            with translate_damage(self.path, McapError, advice=ADVICE):
                 for message in self._messages_of(chunk, ids, start_ns):
                     heapq.heappush(waiting, (message.log_ns, n, message))
                     waiting_bytes += len(message.data)
@@ -146,13 +146,13 @@ class McapBag:
         size = chunk.uncompressed_size
         if size > CHUNK_BYTES_MAX:
             raise ValueError(f"a chunk of {size} bytes, at most {CHUNK_BYTES_MAX} are read")
-        data = unpacked(chunk.data, chunk.compression, size)
+        data = unpack(chunk.data, chunk.compression, size)
         if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
             raise ValueError(f"the checksum of the chunk at byte {at} does not match")
         return memoryview(data)
 
 
-def unpacked(data: bytes, packing: str, size_bytes: int) -> bytes:
+def unpack(data: bytes, packing: str, size_bytes: int) -> bytes:
     """A chunk's own bytes, exactly as many as it states, and never more than that in memory.
 
     Raises:
@@ -163,7 +163,7 @@ def unpacked(data: bytes, packing: str, size_bytes: int) -> bytes:
             with zstandard.ZstdDecompressor().stream_reader(BytesIO(data)) as stream:
                 whole = stream.read(size_bytes + 1)
         except zstandard.ZstdError as exc:
-            raise ValueError(f"a chunk cannot be unpacked: {exc}") from exc
+            raise ValueError(f"a chunk cannot be unpack: {exc}") from exc
     elif packing == "lz4":
         whole = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size_bytes + 1)
     elif packing == "":

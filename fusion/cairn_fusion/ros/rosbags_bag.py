@@ -17,8 +17,8 @@ from rosbags.rosbag1.reader import Chunk, decompressors
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import ReaderError as Error2
 
-from cairn_fusion.ros.bag import CHUNK_BYTES_MAX, BagMessage, BoundedFile, Topic, Wire, damage_told
-from cairn_fusion.ros.mcap_bag import unpacked
+from cairn_fusion.ros.bag import CHUNK_BYTES_MAX, BagMessage, BoundedFile, Topic, Wire, translate_damage
+from cairn_fusion.ros.mcap_bag import unpack
 from cairn_fusion.ros.messages import plain_type
 
 ADVICE = "`rosbag reindex FILE` (ROS 1) or `ros2 bag reindex DIR` saves what is whole"
@@ -57,7 +57,7 @@ class RosbagsBag:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._reader: Reader1 | Reader2
-        with damage_told(path, Error1, Error2, apsw.Error, advice=ADVICE):
+        with translate_damage(path, Error1, Error2, apsw.Error, advice=ADVICE):
             if path.suffix == ".bag":
                 self._reader = BoundedReader1(cast(RPath, BoundedPath(path)))
             else:
@@ -75,7 +75,7 @@ class RosbagsBag:
         connections = [connection for connection in self._reader.connections if connection.topic in topics]
         if not connections:
             return
-        with damage_told(self.path, Error1, Error2, apsw.Error, advice=ADVICE):
+        with translate_damage(self.path, Error1, Error2, apsw.Error, advice=ADVICE):
             for connection, log_ns, data in self._reader.messages(connections, start=start_ns):
                 yield BagMessage(connection.topic, log_ns, _plain(data))
 
@@ -102,7 +102,7 @@ def _plain(data: bytes) -> bytes:
     size = zstandard.get_frame_parameters(data).content_size
     if size > CHUNK_BYTES_MAX:
         raise ValueError(f"a message of {size} bytes, at most {CHUNK_BYTES_MAX} are read")
-    return unpacked(data, "zstd", size)
+    return unpack(data, "zstd", size)
 
 
 def _from_bz2(data: bytes) -> bytes:

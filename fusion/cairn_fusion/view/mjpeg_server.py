@@ -38,7 +38,7 @@ PAGE = b"""<!doctype html><html lang="en"><meta charset="utf-8"><title>cairn tel
 
 
 @contextmanager
-def streaming(
+def stream_pictures(
     latest: Latest, *, host: str = "127.0.0.1", port: int = 0, clients_max: int = CLIENTS_MAX
 ) -> Iterator[str]:
     """Serve a stream of pictures while the context is open; gives its address.

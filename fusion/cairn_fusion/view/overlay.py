@@ -44,7 +44,7 @@ MEANINGS = ("solid: visible", "stripes: behind that", "dots: from the map alone"
 EXACT = PoseSpread.of_sigmas()
 
 
-class Mode(IntEnum):
+class OverlayMode(IntEnum):
     """What a pixel of an overlay shows of the map in front."""
 
     NOTHING = kernels.NOTHING
@@ -127,9 +127,9 @@ class Overlay:
 
     @property
     def modes(self) -> npt.NDArray[np.uint8]:
-        """(H, W) `Mode` of each pixel; SEE_THROUGH where nothing is in front, but something is behind."""
-        is_behind = (self.front_modes == Mode.NOTHING) & self.through
-        return np.where(is_behind, np.uint8(Mode.SEE_THROUGH), self.front_modes)
+        """(H, W) `OverlayMode` of each pixel; SEE_THROUGH where nothing is in front, but something is behind."""
+        is_behind = (self.front_modes == OverlayMode.NOTHING) & self.through
+        return np.where(is_behind, np.uint8(OverlayMode.SEE_THROUGH), self.front_modes)
 
 
 def draw_overlay(
@@ -151,8 +151,8 @@ def draw_overlay(
     range_m, step = np.asarray(live.range_m, np.float32), style.step_px
     coarse_m = middles(range_m, step)
     rest = _rest(renderer, snapshot, live, coarse_m, tolerance_m, style)
-    rest_modes = np.where(np.isnan(coarse_m), np.uint8(Mode.MAP_ONLY), np.uint8(Mode.SEE_THROUGH))
-    rest_modes[~rest.hit] = Mode.NOTHING
+    rest_modes = np.where(np.isnan(coarse_m), np.uint8(OverlayMode.MAP_ONLY), np.uint8(OverlayMode.SEE_THROUGH))
+    rest_modes[~rest.hit] = OverlayMode.NOTHING
     H, W = range_m.shape
     everywhere = _wide(rest_modes, step, (H, W))
     is_alone = np.isnan(range_m)
@@ -163,16 +163,20 @@ def draw_overlay(
         np.where(is_fine, np.float32(style.range_max_m), range_m + tolerance_m),
     )
     front = renderer.nearest(snapshot, live.sight, live.T_map_camera, range_max_m=style.range_max_m, between_m=around)
-    modes = np.where(front.hit, np.where(is_alone, np.uint8(Mode.MAP_ONLY), np.uint8(Mode.VISIBLE)), Mode.NOTHING)
+    modes = np.where(
+        front.hit,
+        np.where(is_alone, np.uint8(OverlayMode.MAP_ONLY), np.uint8(OverlayMode.VISIBLE)),
+        OverlayMode.NOTHING,
+    )
     modes = modes.astype(np.uint8)
-    modes[is_alone & ~is_fine & (everywhere == Mode.MAP_ONLY)] = Mode.MAP_ONLY
+    modes[is_alone & ~is_fine & (everywhere == OverlayMode.MAP_ONLY)] = OverlayMode.MAP_ONLY
     values = layer_values(renderer, snapshot, front, style.layer, ages)
     values_of_rest = layer_values(renderer, snapshot, rest, style.layer, ages)
     spreads, why = None, None
     if not live.spread.is_exact:
         rest_m = _wide(rest.range_m, step, (H, W))
         spreads = live.spread.at(live.sight, front.range_m), live.spread.at(live.sight, rest_m)
-        drawn = front.hit | (everywhere != Mode.NOTHING)
+        drawn = front.hit | (everywhere != OverlayMode.NOTHING)
         likely = np.where(front.hit[..., None], *spreads)
         why = why_withheld(likely[drawn], blur_max_px=style.blur_max_px)
     if why is not None:
@@ -206,7 +210,7 @@ def draw_overlay(
         rest=rest,
         values_of_rest=values_of_rest,
         front_modes=modes,
-        through=everywhere == Mode.SEE_THROUGH,
+        through=everywhere == OverlayMode.SEE_THROUGH,
         withheld=why,
     )
 
@@ -242,7 +246,7 @@ def _rest(
 
 def _outlines(modes: Rgb, coarse_m: Values) -> Flags:
     """(h, w) where the map has something, and has nothing, in the 3 x 3 around, without any live depth in both."""
-    return _spread(modes == Mode.MAP_ONLY) & _spread(np.isnan(coarse_m) & (modes == Mode.NOTHING))
+    return _spread(modes == OverlayMode.MAP_ONLY) & _spread(np.isnan(coarse_m) & (modes == OverlayMode.NOTHING))
 
 
 def _spread(flags: Flags) -> Flags:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from cairn_fusion.image_fusion.row_bands import in_bands
+from cairn_fusion.image_fusion.row_bands import run_in_bands
 from cairn_fusion.view.paint_kernels import hottest_square, paint_into
 from cairn_fusion.view.temperature_scale import PALETTE, ZERO_CELSIUS_K, TemperatureScale
 from cairn_map.arrays import Labels, Rgb, Singles
@@ -30,7 +30,7 @@ READABLE_PX = 240
 
 @dataclass(frozen=True, slots=True)
 class Emphasis:
-    """Which temperatures are painted, and how strongly."""
+    """Which temperatures are paint_over, and how strongly."""
 
     alpha: float = 0.5
     """0: nothing of the palette is seen, 1: nothing else."""
@@ -58,7 +58,7 @@ class Hottest:
     kelvin: float
 
 
-def painted(base: Rgb, kelvin: Singles, labels: Labels, scale: TemperatureScale, emphasis: Emphasis) -> Rgb:
+def paint_over(base: Rgb, kelvin: Singles, labels: Labels, scale: TemperatureScale, emphasis: Emphasis) -> Rgb:
     """A picture with temperatures blended over it; hatched where the label is not OK or there is no temperature.
 
     Args:
@@ -66,7 +66,7 @@ def painted(base: Rgb, kelvin: Singles, labels: Labels, scale: TemperatureScale,
         kelvin: (H, W)
         labels: (H, W) `Label`.
         scale: of the palette.
-        emphasis: what is painted.
+        emphasis: what is paint_over.
     """
     out = np.empty_like(base)
     limits = (scale.low_k, scale.high_k, emphasis.from_k, emphasis.to_k, emphasis.alpha)
@@ -75,23 +75,23 @@ def painted(base: Rgb, kelvin: Singles, labels: Labels, scale: TemperatureScale,
         rows = slice(first, last)
         paint_into(out[rows], base[rows], kelvin[rows], labels[rows], PALETTE, *limits, first)
 
-    in_bands(paint, len(base))
+    run_in_bands(paint, len(base))
     return out
 
 
-def painted_alone(kelvin: Singles, labels: Labels, scale: TemperatureScale) -> Rgb:
+def paint_alone(kelvin: Singles, labels: Labels, scale: TemperatureScale) -> Rgb:
     """Temperatures by the palette alone; hatched on dark grey where there is none."""
-    return painted(np.full((*kelvin.shape, 3), 40, np.uint8), kelvin, labels, scale, Emphasis(alpha=1.0))
+    return paint_over(np.full((*kelvin.shape, 3), 40, np.uint8), kelvin, labels, scale, Emphasis(alpha=1.0))
 
 
-def enlarging(picture: Rgb) -> int:
+def enlargement(picture: Rgb) -> int:
     """By which whole number a picture is shown larger, so that there is room for words on it."""
     return -(-READABLE_PX // len(picture))
 
 
-def enlarged(picture: Rgb) -> Rgb:
-    """A copy of a picture, `enlarging` times as large, each pixel a square."""
-    times = enlarging(picture)
+def enlarge(picture: Rgb) -> Rgb:
+    """A copy of a picture, `enlargement` times as large, each pixel a square."""
+    times = enlargement(picture)
     return picture.repeat(times, axis=0).repeat(times, axis=1)
 
 

@@ -1,6 +1,6 @@
 """Telepresence: what an operator sees of a robot's cameras, scan by scan.
 
-scan --surface--> drawn in each camera --the picture as guide--> depth of every pixel --across--> fused --> picture
+scan --surface--> drawn in each camera --the picture as guide--> depth of every pixel --cross_view--> fused --> picture
 
 thermal-on-colour    colour, with temperatures blended over it
 colour-on-thermal    the thermal camera's view, with colour in it
@@ -17,9 +17,9 @@ import numpy.typing as npt
 
 from cairn_calib.rig.poses import inverse, transform_points
 from cairn_calib.rig.rig import Rig, Spectrum
-from cairn_fusion.image_fusion.across import Across, across
-from cairn_fusion.image_fusion.beyond_labels import beyond_pixels
-from cairn_fusion.image_fusion.eye_depth import EyeDepth, Origin, eye_depth
+from cairn_fusion.image_fusion.cross_view import CrossView, cross_view
+from cairn_fusion.image_fusion.dense_depth import DenseDepth, Origin, dense_depth
+from cairn_fusion.image_fusion.mirror_labels import mirror_pixels
 from cairn_fusion.image_fusion.surface import Drawn, drawn_surface, surface_of
 from cairn_fusion.recording.scan import Scan, check_scan
 from cairn_fusion.transfer.transfer import Label
@@ -27,12 +27,12 @@ from cairn_fusion.view.painting import (
     Emphasis,
     Hottest,
     draw_legend_into,
-    enlarged,
-    enlarging,
+    enlarge,
+    enlargement,
     hottest,
     mark_hottest_into,
-    painted,
-    painted_alone,
+    paint_alone,
+    paint_over,
     write_into,
 )
 from cairn_fusion.view.temperature_scale import TemperatureScale, locked_scale
@@ -47,7 +47,7 @@ SAME_SHARE = 0.05
 """Of a range: what differs by less is one place."""
 
 
-class Mode(StrEnum):
+class ViewMode(StrEnum):
     """What a picture shows."""
 
     THERMAL_ON_COLOUR = "thermal-on-colour"
@@ -60,7 +60,7 @@ class Mode(StrEnum):
 class ViewOptions:
     """What an operator chooses."""
 
-    mode: Mode = Mode.THERMAL_ON_COLOUR
+    mode: ViewMode = ViewMode.THERMAL_ON_COLOUR
     camera: str | None = None
     """To look through; None: the first that fits the mode."""
     emphasis: Emphasis = field(default_factory=Emphasis)
@@ -73,7 +73,7 @@ class Telepresence:
     """Pictures of one rig; the temperature scale is kept from one to the next."""
 
     def __init__(self, rig: Rig, options: ViewOptions, snapshot: MapSnapshot | None = None) -> None:
-        """With a map, what that says is in a mirror is not painted.
+        """With a map, what that says is in a mirror is not paint_over.
 
         Raises:
             BadInputError: the rig lacks a camera that the mode needs.
@@ -96,36 +96,36 @@ class Telepresence:
         """
         beyond = None
         if self._snapshot is not None:
-            beyond = beyond_pixels(scan, self._rig, self._snapshot, renderer=self._renderer)
+            beyond = mirror_pixels(scan, self._rig, self._snapshot, renderer=self._renderer)
         fused = [fuse(scan, self._rig, camera, beyond) for camera in self._eyes]
-        if self._options.mode is Mode.COLOUR_ON_THERMAL:
+        if self._options.mode is ViewMode.COLOUR_ON_THERMAL:
             return self._colour_on_thermal(scan, fused[0])
         pictures, places = [], self._hottest(fused)
         for each, place in zip(fused, places, strict=True):
             base, kelvin = scan.colour[each.camera], each.values[..., 0]
             scale = self._locked(np.where(each.ok, kelvin, np.float32(np.nan))[::4, ::4])
-            if self._options.mode is Mode.SIDE_BY_SIDE:
-                pictures += [enlarged(base), self._finished(painted_alone(kelvin, each.labels, scale), place)]
+            if self._options.mode is ViewMode.SIDE_BY_SIDE:
+                pictures += [enlarge(base), self._finished(paint_alone(kelvin, each.labels, scale), place)]
             else:
-                picture = painted(base, kelvin, each.labels, scale, self._options.emphasis)
+                picture = paint_over(base, kelvin, each.labels, scale, self._options.emphasis)
                 pictures.append(self._finished(picture, place))
             if not each.sources:
                 write_into(pictures[-1], "no thermal image", (12, len(pictures[-1]) - 12))
         return pictures[0] if len(pictures) == 1 else np.hstack(pictures)
 
-    def _hottest(self, fused: Sequence[Across]) -> list[Hottest | None]:
+    def _hottest(self, fused: Sequence[CrossView]) -> list[Hottest | None]:
         """What is marked for each eye: the same place for both, or they could not be seen as one."""
         first = hottest(fused[0].values[..., 0], fused[0].labels)
-        return [first, *(first and seen_in(first, fused[0], each, self._rig) for each in fused[1:])]
+        return [first, *(first and find_in(first, fused[0], each, self._rig) for each in fused[1:])]
 
-    def _colour_on_thermal(self, scan: Scan, fused: Across) -> Rgb:
+    def _colour_on_thermal(self, scan: Scan, fused: CrossView) -> Rgb:
         kelvin = scan.thermal[fused.camera]
         scale, known = self._locked(kelvin[::4, ::4]), np.where(np.isfinite(kelvin), Label.OK, Label.NO_READING)
         labels, alone = known.astype(np.uint8), Emphasis(alpha=1.0)
-        warm = painted(np.full((*kelvin.shape, 3), 40, np.uint8), kelvin, labels, scale, alone)
+        warm = paint_over(np.full((*kelvin.shape, 3), 40, np.uint8), kelvin, labels, scale, alone)
         # Where no colour is known the palette is left alone: the temperature is.
         base = np.where(fused.ok[..., None], np.nan_to_num(fused.values).clip(0, 255).astype(np.uint8), warm)
-        picture = painted(base, kelvin, labels, scale, self._options.emphasis)
+        picture = paint_over(base, kelvin, labels, scale, self._options.emphasis)
         return self._finished(picture, hottest(kelvin, labels))
 
     def _locked(self, kelvin: npt.NDArray[np.float32]) -> TemperatureScale:
@@ -134,8 +134,8 @@ class Telepresence:
         return self._scale or TemperatureScale(273.15, 323.15, "no temperature yet")
 
     def _finished(self, picture: Rgb, place: Hottest | None) -> Rgb:
-        """With legend and marker; a small one enlarged."""
-        times, larger = enlarging(picture), enlarged(picture)
+        """With legend and marker; a small one enlarge."""
+        times, larger = enlargement(picture), enlarge(picture)
         end = draw_legend_into(larger, self._scale or self._locked(np.empty(0, np.float32)))
         if place is not None and self._options.marks_hottest:
             middle = (times - 1) // 2
@@ -144,7 +144,7 @@ class Telepresence:
         return larger
 
 
-def fuse(scan: Scan, rig: Rig, camera: str, beyond: npt.NDArray[np.bool_] | None = None) -> Across:
+def fuse(scan: Scan, rig: Rig, camera: str, beyond: npt.NDArray[np.bool_] | None = None) -> CrossView:
     """What the cameras of the other spectrum see at each pixel of a colour or thermal camera, with its depth.
 
     Several cameras of that spectrum are asked, the nearest first.
@@ -153,7 +153,7 @@ def fuse(scan: Scan, rig: Rig, camera: str, beyond: npt.NDArray[np.bool_] | None
         scan: with the camera's image; of images of the other spectrum what there is.
         rig: of the scan.
         camera: whose pixels.
-        beyond: (H, W) range pixels that show what is in a mirror, `beyond_pixels`: nothing is painted there.
+        beyond: (H, W) range pixels that show what is in a mirror, `mirror_pixels`: nothing is paint_over there.
 
     Raises:
         BadInputError: an image does not fit its camera, the camera's own is missing, or it has none.
@@ -163,11 +163,11 @@ def fuse(scan: Scan, rig: Rig, camera: str, beyond: npt.NDArray[np.bool_] | None
     surface = surface_of(scan, rig, beyond)
     drawn = {name: drawn_surface(surface, rig, name) for name in (camera, *images)}
     depth = view_depth(scan, rig, camera, drawn[camera])
-    fused = across(depth, rig, images, drawn=drawn, range_camera=scan.range_camera)
-    return fused if beyond is None else without_beyond(fused)
+    fused = cross_view(depth, rig, images, drawn=drawn, range_camera=scan.range_camera)
+    return fused if beyond is None else mask_mirrors(fused)
 
 
-def without_beyond(fused: Across) -> Across:
+def mask_mirrors(fused: CrossView) -> CrossView:
     """The same, with nothing where a depth was filled in over what a mirror shows."""
     step, (height, width) = fused.depth.drawn.step_px, fused.labels.shape
     marked = (fused.depth.drawn.marks == Label.BEYOND).repeat(step, axis=0).repeat(step, axis=1)[:height, :width]
@@ -184,7 +184,7 @@ def source_order(scan: Scan, rig: Rig, camera: str) -> dict[str, Image]:
     return {name: images[name] for name in order}
 
 
-def seen_in(place: Hottest, one: Across, other: Across, rig: Rig) -> Hottest | None:
+def find_in(place: Hottest, one: CrossView, other: CrossView, rig: Rig) -> Hottest | None:
     """A place of one camera's picture in another's, at the same temperature; None where that does not see it."""
     src, dst, range_m = rig[one.camera], rig[other.camera], one.depth.shown_m[place.y, place.x]
     point = src.camera.rays()[place.y, place.x] * float(range_m)
@@ -198,7 +198,7 @@ def seen_in(place: Hottest, one: Across, other: Across, rig: Rig) -> Hottest | N
     return replace(place, x=x, y=y) if is_seen else None
 
 
-def view_depth(scan: Scan, rig: Rig, camera: str, drawn: Drawn) -> EyeDepth:
+def view_depth(scan: Scan, rig: Rig, camera: str, drawn: Drawn) -> DenseDepth:
     """The depth of a colour or thermal camera's pixels, its own image as guide.
 
     Raises:
@@ -208,13 +208,13 @@ def view_depth(scan: Scan, rig: Rig, camera: str, drawn: Drawn) -> EyeDepth:
     if camera not in own:
         there = ", ".join(own) or "none"
         raise BadInputError("missing_image", f"the scan has no image of {camera!r}; it has {there}")
-    return eye_depth(drawn, rig, camera, own[camera], range_camera=scan.range_camera)
+    return dense_depth(drawn, rig, camera, own[camera], range_camera=scan.range_camera)
 
 
 def _eyes(rig: Rig, options: ViewOptions) -> list[str]:
     """The cameras to look through."""
-    wanted = Spectrum.THERMAL if options.mode is Mode.COLOUR_ON_THERMAL else Spectrum.COLOUR
-    names, count = rig.of_spectrum(wanted), 2 if options.mode is Mode.STEREO else 1
+    wanted = Spectrum.THERMAL if options.mode is ViewMode.COLOUR_ON_THERMAL else Spectrum.COLOUR
+    names, count = rig.of_spectrum(wanted), 2 if options.mode is ViewMode.STEREO else 1
     if len(names) < count:
         raise BadInputError(
             "missing_camera", f"{options.mode} needs {count} {wanted} camera(s), {rig.name} has {len(names)}"

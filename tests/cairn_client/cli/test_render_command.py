@@ -15,7 +15,7 @@ from cairn_client.folders.local_ages import ages_of
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
 from cairn_fusion.image_fusion.surface import live_range
-from cairn_fusion.view.overlay import Live, Mode, OverlayStyle, draw_overlay
+from cairn_fusion.view.overlay import Live, OverlayMode, OverlayStyle, draw_overlay
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import geometry_for
 from cairn_map.render.camera_rays import Sight
@@ -78,7 +78,7 @@ def test_a_robot_without_a_thermal_camera_shows_what_another_measured(world: Wor
         T_map_camera=scan.T_map_rig @ rig[CAMERA].transform,
     )
     drawn = draw_overlay(MapRenderer(), snapshot, live, OverlayStyle())
-    visible = drawn.front_modes == Mode.VISIBLE
+    visible = drawn.front_modes == OverlayMode.VISIBLE
     celsius = drawn.values[visible]
     assert visible.mean() > 0.3
     assert np.isfinite(celsius).mean() > 0.5
@@ -120,7 +120,7 @@ def test_the_command_draws_over_a_recorded_image(
     out = capsys.readouterr().out
     assert "temperature over colour, scan 0: visible" in out
     told = np.load(tmp_path / "overlay.npz")
-    assert (told["modes"] == Mode.VISIBLE).mean() > 0.3
+    assert (told["modes"] == OverlayMode.VISIBLE).mean() > 0.3
     assert rendered(picture).shape[0] > told["modes"].shape[0]
     assert main([*words, "--sigma", "2,20"]) == 0
     assert "withheld, the pose is uncertain" in capsys.readouterr().out

@@ -195,7 +195,9 @@ def test_a_stream_goes_on_without_the_scans_that_have_no_image(
 
     gaps.append(0)
     monkeypatch.setattr(telepresence_command, "Latest", lambda: SimpleNamespace(show=show))
-    monkeypatch.setattr("cairn_fusion.view.mjpeg_server.streaming", lambda *_, **__: nullcontext("http://127.0.0.1:0/"))
+    monkeypatch.setattr(
+        "cairn_fusion.view.mjpeg_server.stream_pictures", lambda *_, **__: nullcontext("http://127.0.0.1:0/")
+    )
     with pytest.raises(KeyboardInterrupt):
         main([str(recording), "--serve", "0", "--rate", "1000"])
     assert capsys.readouterr().out.count("left out scan") == 1

@@ -1,4 +1,4 @@
-"""The surface of a range image: what is joined, how it is drawn in other cameras, and its kernels' slow twins."""
+"""The surface of a range image: what is joints, how it is drawn in other cameras, and its kernels' slow twins."""
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ from cairn_fusion.image_fusion.surface_kernels import (
     draw_labels_into,
     draw_squares_into,
     draw_triangles_into,
-    joined,
+    joints,
     nearest_of_nine,
 )
 from cairn_fusion.recording.scan import Scan
@@ -64,7 +64,7 @@ def test_every_range_pixel_has_a_label() -> None:
 def test_what_is_joined_agrees_with_its_slow_twin(seed: int, step: tuple[int, int]) -> None:
     range_m, labels = ragged(seed)
     noise_m = np.full(range_m.shape, 0.03, np.float32)
-    found = joined(range_m, labels, noise_m, *step)
+    found = joints(range_m, labels, noise_m, *step)
     np.testing.assert_array_equal(found, naive_views.joined(range_m, labels, noise_m, *step))
     assert 0.2 < found.mean() < 0.9
 
@@ -73,7 +73,7 @@ def test_what_is_joined_agrees_with_its_slow_twin(seed: int, step: tuple[int, in
 def test_triangles_and_squares_agree_with_their_slow_twins(seed: int) -> None:
     range_m, labels = ragged(seed)
     rng, noise_m = np.random.default_rng(seed), np.full(range_m.shape, 0.03, np.float32)
-    across, down = (joined(range_m, labels, noise_m, *step) for step in ((1, 0), (0, 1)))
+    across, down = (joints(range_m, labels, noise_m, *step) for step in ((1, 0), (0, 1)))
     y, x = np.indices(range_m.shape)
     u, v = 1.9 * x + rng.uniform(-0.3, 0.3, x.shape) - 2, 1.7 * y + rng.uniform(-0.3, 0.3, x.shape) - 1
     u[2, 3], q = np.nan, 1 / range_m.astype(np.float64)

@@ -12,9 +12,9 @@ from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.lidar import SpinningLidar
 from cairn_calib.rig.poses import Transform, inverse, look_at, transform_points
 from cairn_fusion.mapping.beam_returns import clear_image, returns_of
+from cairn_fusion.mapping.brick_tally import BrickTally, ScanHits, tally_around
 from cairn_fusion.mapping.free_space import Window, carving_of, window_of
 from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scan, integrate_scans
-from cairn_fusion.mapping.tally import ScanHits, Tally, tally_around
 from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence import Evidence
@@ -135,7 +135,7 @@ def test_a_scan_means_the_same_in_whatever_box_it_is_counted(seed: int) -> None:
         clear = window.shown(clear_of(scan, BARREL))
         packed = []
         for shift_m in (0.0, 0.123, 0.777):
-            tally = Tally(GEOMETRY, scan.T_map_rig[:3, 3] + shift_m, reach_m=4.0 + shift_m)
+            tally = BrickTally(GEOMETRY, scan.T_map_rig[:3, 3] + shift_m, reach_m=4.0 + shift_m)
             hits = ScanHits()
             hits.number(np.empty((0, 3)), tally)
             tally.add_misses(

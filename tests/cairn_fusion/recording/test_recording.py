@@ -14,7 +14,7 @@ from cairn_calib.rig.poses import transform_from_quaternion
 from cairn_calib.rig.rig import Rig, Spectrum, mounted
 from cairn_fusion.recording.images import write_colour, write_grey16
 from cairn_fusion.recording.recording import Recording, ScanSource, open_recording
-from cairn_fusion.recording.recording_format import Convention, RangeEncoding, ThermalEncoding, contained
+from cairn_fusion.recording.recording_format import Convention, RangeEncoding, ThermalEncoding, path_inside
 from cairn_fusion.recording.recording_writer import RecordingWriter
 from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import BadInputError, CairnError, ConflictError, DamagedDataError, NotFoundError
@@ -350,7 +350,7 @@ def test_a_pipe_is_no_image_and_blocks_nobody(folder: Path) -> None:
 @pytest.mark.parametrize("relative", ["a" * 300, "a/" * 600 + "b", "é" * 200])
 def test_a_path_too_long_for_a_file_system_is_refused(tmp_path: Path, relative: str) -> None:
     with pytest.raises(BadInputError) as caught:
-        contained(tmp_path, relative)
+        path_inside(tmp_path, relative)
     assert caught.value.kind == "unsafe_path"
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from cairn_calib.rig.poses import look_at
 from cairn_fusion.recording.scan import Scan
-from cairn_fusion.recording.scan_bytes import decode_scan, encode_scan, moved_scan
+from cairn_fusion.recording.scan_bytes import decode_scan, encode_scan, move_scan
 from cairn_map.errors import DamagedDataError
 
 
@@ -50,8 +50,8 @@ def test_a_scan_comes_back_bit_for_bit(seed: int) -> None:
 def test_a_scan_that_moves_nowhere_is_the_same(seed: int) -> None:
     scan = random_scan(seed)
     turned = look_at([1, 2, 3], [3, 1, 1])
-    assert bits_of(moved_scan(scan, turned)) == bits_of(moved_scan(moved_scan(scan, turned), turned)) or seed
-    moved = moved_scan(scan, turned)
+    assert bits_of(move_scan(scan, turned)) == bits_of(move_scan(move_scan(scan, turned), turned)) or seed
+    moved = move_scan(scan, turned)
     if scan.T_map_body is not None and moved.T_map_body is not None:  # the body moved with the rig
         before, after = (np.linalg.inv(s.T_map_rig) @ s.T_map_body for s in (scan, moved) if s.T_map_body is not None)
         assert np.allclose(before, after, atol=1e-12)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cairn_calib.rig.poses import Transform, transform_from_quaternion
-from cairn_fusion.recording.trajectory import interpolated, read_trajectory, trajectory_line
+from cairn_fusion.recording.trajectory import interpolate_pose, read_trajectory, trajectory_line
 from cairn_map.errors import BadInputError
 
 QUARTER = np.sqrt(0.5)
@@ -42,7 +42,7 @@ def test_a_written_pose_reads_back(tmp_path_factory: pytest.TempPathFactory, see
 @given(seed=seeds, fraction=st.floats(0, 1))
 def test_interpolation_turns_at_constant_speed(seed: int, fraction: float) -> None:
     start, end = random_pose(seed), random_pose(seed + 1)
-    part = interpolated(start, end, fraction)
+    part = interpolate_pose(start, end, fraction)
 
     def angle_rad(T: Transform) -> float:
         return float(np.arccos(np.clip((np.trace(start[:3, :3].T @ T[:3, :3]) - 1) / 2, -1, 1)))
@@ -56,13 +56,13 @@ def test_interpolation_turns_at_constant_speed(seed: int, fraction: float) -> No
 def test_interpolation_is_the_same_from_either_end(seed: int, fraction: float) -> None:
     start, end = random_pose(seed), random_pose(seed + 1)
     np.testing.assert_allclose(
-        interpolated(start, end, fraction), interpolated(end, start, 1 - fraction), atol=1e-9, rtol=0
+        interpolate_pose(start, end, fraction), interpolate_pose(end, start, 1 - fraction), atol=1e-9, rtol=0
     )
 
 
 def test_interpolation_between_equal_poses_is_that_pose() -> None:
     T = random_pose(3)
-    np.testing.assert_allclose(interpolated(T, T, 0.3), T, atol=1e-12)
+    np.testing.assert_allclose(interpolate_pose(T, T, 0.3), T, atol=1e-12)
 
 
 def test_a_pose_between_two_lines_is_halfway(tmp_path: Path) -> None:

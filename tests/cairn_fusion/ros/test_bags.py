@@ -29,15 +29,15 @@ from tests.fixtures.fusion.bags import (
     write_bag,
 )
 
-from cairn_fusion.importers import Layout, detect_layout, open_source
+from cairn_fusion.importers import SourceLayout, detect_layout, open_source
 from cairn_fusion.mapping.measurement import Measurement
 from cairn_fusion.recording.recording import Recording, ScanSource
-from cairn_fusion.recording.trajectory import interpolated
+from cairn_fusion.recording.trajectory import interpolate_pose
 from cairn_fusion.ros import bag_index, tf_tree
 from cairn_fusion.ros.bag import BoundedFile, Wire
 from cairn_fusion.ros.bag_recording import survey
 from cairn_fusion.ros.images import colour_of, depth_of
-from cairn_fusion.ros.mcap_bag import unpacked
+from cairn_fusion.ros.mcap_bag import unpack
 from cairn_fusion.ros.messages import RosCameraInfo, RosCompressedImage, RosHeader, RosImage, read_image
 from cairn_fusion.ros.open_bag import open_bag
 from cairn_fusion.ros.topic_mapping import camera_of_info, mapping_from_yaml
@@ -81,7 +81,7 @@ def test_a_bag_gives_the_map_of_the_recording_it_was_made_of_byte_for_byte(
     kind: str, source: Recording, tmp_path: Path
 ) -> None:
     path = write_bag(tmp_path / "lab", kind, lambda make: recorded(source, make))
-    assert detect_layout(path) is Layout.BAG
+    assert detect_layout(path) is SourceLayout.BAG
     bag = open_source(path, mapping=mapping_from_yaml(mapping_text(source), "here"))
     assert len(bag) == len(source) == 4
     scan, expected = bag.scan(1), source.scan(1)
@@ -159,7 +159,7 @@ def test_a_pose_between_two_is_interpolated_and_not_over_a_long_gap(source: Reco
     gap_s = ends[1].time_s - ends[0].time_s
     T = opened(path, source, poses={"topic": "/tf", "max_gap_s": gap_s}).scan(1).T_map_rig
     fraction = (middle - ends[0].time_s) / gap_s
-    np.testing.assert_allclose(T, interpolated(ends[0].T_map_rig, ends[1].T_map_rig, fraction), atol=1e-9)
+    np.testing.assert_allclose(T, interpolate_pose(ends[0].T_map_rig, ends[1].T_map_rig, fraction), atol=1e-9)
     error = refused(path, mapping_text(source, poses={"topic": "/tf", "max_gap_s": gap_s / 2}))
     assert error.kind == "no_pose"
     assert "odom -> base_link" in error.message
@@ -263,9 +263,9 @@ def test_flipped_bytes_give_a_map_or_an_error_of_ours(kind: str, source: Recordi
 def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused_before_it_does() -> None:
     bomb = zstandard.compress(bytes(1 << 24))
     with pytest.raises(ValueError, match="unpacks to 1025 or more"):
-        unpacked(bomb, "zstd", 1024)
+        unpack(bomb, "zstd", 1024)
     with pytest.raises(ValueError, match="unpacks to 1025 or more"):
-        unpacked(lz4.frame.compress(bytes(1 << 24)), "lz4", 1024)
+        unpack(lz4.frame.compress(bytes(1 << 24)), "lz4", 1024)
 
 
 @pytest.mark.parametrize("wire", list(Wire))

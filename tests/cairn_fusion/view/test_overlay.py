@@ -18,7 +18,7 @@ from cairn_calib.rig.rig import Rig, Spectrum, mounted
 from cairn_fusion.image_fusion.surface import AMPLITUDE_MAX, live_range
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.view import overlay_kernels as kernels
-from cairn_fusion.view.overlay import Live, Mode, OverlayStyle, draw_overlay, with_overlay_legend
+from cairn_fusion.view.overlay import Live, OverlayMode, OverlayStyle, draw_overlay, with_overlay_legend
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import TEMPERATURE
 from cairn_map.evidence.evidence import packed_evidence
@@ -90,7 +90,7 @@ def test_inside_an_outline_the_middle_of_each_block_is_looked_up() -> None:
     fine, coarse = (draw_overlay(MapRenderer(), snapshot, live, OverlayStyle(step_px=step)) for step in (1, 3))
     np.testing.assert_array_equal(coarse.front_modes, fine.front_modes)
     np.testing.assert_array_equal(coarse.picture, fine.picture)
-    is_alone = fine.front_modes == Mode.MAP_ONLY
+    is_alone = fine.front_modes == OverlayMode.MAP_ONLY
     assert 0 < (coarse.front.hit & is_alone).sum() < is_alone.sum() / 2
     rows, columns = (np.minimum(np.arange(size) // 3 * 3 + 1, size - 1) for size in is_alone.shape)
     middles = fine.rest.range_m[np.ix_(rows, columns)]
@@ -137,16 +137,16 @@ def test_what_is_hidden_is_never_drawn_as_visible() -> None:
         for ray, range_m, mode in zip(rays, live_m.ravel(), drawn.front_modes.ravel(), strict=True):
             if np.isnan(range_m):
                 row = naive_sight.first_cut(origin, ray, in_map, 0, 400)[1]
-                assert mode == (Mode.MAP_ONLY if row >= 0 else Mode.NOTHING)
+                assert mode == (OverlayMode.MAP_ONLY if row >= 0 else OverlayMode.NOTHING)
                 continue
             start = max(float(np.float32(range_m - np.float32(0.06))), 0) / EDGE_M
             end = float(np.float32(range_m + np.float32(0.06))) / EDGE_M
             agrees = naive_sight.first_cut(origin, ray, in_map, start, end)[1] >= 0
-            assert mode == (Mode.VISIBLE if agrees else Mode.NOTHING)
+            assert mode == (OverlayMode.VISIBLE if agrees else OverlayMode.NOTHING)
         counted += np.bincount(drawn.modes.ravel(), minlength=4)
-    assert counted[Mode.VISIBLE] > 5 * POSES
-    assert counted[Mode.NOTHING] > POSES
-    assert counted[Mode.MAP_ONLY] > 0
+    assert counted[OverlayMode.VISIBLE] > 5 * POSES
+    assert counted[OverlayMode.NOTHING] > POSES
+    assert counted[OverlayMode.MAP_ONLY] > 0
 
 
 def test_a_thing_behind_a_wall_shines_through_it_in_stripes() -> None:
@@ -156,7 +156,7 @@ def test_a_thing_behind_a_wall_shines_through_it_in_stripes() -> None:
     T = look_at((0, 0, 0), (1, 0, 0))
     live = Live(rgb=image_of(sight), range_m=(1 / sight.rays[..., 2]).astype(np.float32), sight=sight, T_map_camera=T)
     drawn = draw_overlay(MapRenderer(), snapshot, live, OverlayStyle())
-    assert (drawn.front_modes == Mode.VISIBLE).mean() > 0.9
+    assert (drawn.front_modes == OverlayMode.VISIBLE).mean() > 0.9
     middle, edge = (30, 40), (5, 5)
     assert drawn.through[middle]
     assert not drawn.through[edge]
@@ -295,8 +295,10 @@ def test_the_other_cameras_depth_is_that_of_the_surface() -> None:
 def test_ink_is_what_the_modes_say() -> None:
     rng = np.random.default_rng(3)
     front, rest = (rng.integers(0, 256, (*size, 3)).astype(np.uint8) for size in ((12, 17), (6, 9)))
-    modes = rng.choice([Mode.NOTHING, Mode.VISIBLE, Mode.MAP_ONLY], (12, 17)).astype(np.uint8)
-    rest_modes = rng.choice([Mode.NOTHING, Mode.SEE_THROUGH, Mode.MAP_ONLY], (6, 9)).astype(np.uint8)
+    modes = rng.choice([OverlayMode.NOTHING, OverlayMode.VISIBLE, OverlayMode.MAP_ONLY], (12, 17)).astype(np.uint8)
+    rest_modes = rng.choice([OverlayMode.NOTHING, OverlayMode.SEE_THROUGH, OverlayMode.MAP_ONLY], (6, 9)).astype(
+        np.uint8
+    )
     covers, rest_covers = (rng.random(size).astype(np.float32) for size in ((12, 17), (6, 9)))
     covers[rng.random(covers.shape) < 0.5] = 0
     ink = np.empty((12, 17, 4), np.uint8)
@@ -306,12 +308,12 @@ def test_ink_is_what_the_modes_say() -> None:
             is_dot = x % kernels.DOTS_PX < kernels.DOT_PX and y % kernels.DOTS_PX < kernels.DOT_PX
             there = y // 2, x // 2
             cover, colour = 0.0, front[y, x]
-            if rest_modes[there] == Mode.SEE_THROUGH and (x + y) % kernels.STRIPES_PX < kernels.STRIPE_PX:
+            if rest_modes[there] == OverlayMode.SEE_THROUGH and (x + y) % kernels.STRIPES_PX < kernels.STRIPE_PX:
                 cover, colour = rest_covers[there], rest[there]
-            elif modes[y, x] == Mode.MAP_ONLY:
+            elif modes[y, x] == OverlayMode.MAP_ONLY:
                 cover, colour = (covers[y, x], front[y, x]) if covers[y, x] else (rest_covers[there], rest[there])
                 cover *= kernels.DOT_COVER if is_dot else kernels.BETWEEN_COVER
-            elif modes[y, x] == Mode.VISIBLE:
+            elif modes[y, x] == OverlayMode.VISIBLE:
                 cover = covers[y, x] * kernels.VISIBLE_COVER
             assert np.abs(ink[y, x] - np.array([*(colour * cover), 255 * cover])).max() <= 0.51
 

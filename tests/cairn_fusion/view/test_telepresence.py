@@ -1,4 +1,4 @@
-"""Pictures for the operator: what is painted, hatched, marked and written; and the stream that browsers get."""
+"""Pictures for the operator: what is paint_over, hatched, marked and written; and the stream that browsers get."""
 
 import math
 import socket
@@ -16,20 +16,20 @@ from cairn_calib.rig.rig import Rig
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.transfer import Label
 from cairn_fusion.view.mjpeg import Latest
-from cairn_fusion.view.mjpeg_server import streaming
+from cairn_fusion.view.mjpeg_server import stream_pictures
 from cairn_fusion.view.paint_kernels import HATCH_PERIOD, HATCH_WIDTH
 from cairn_fusion.view.painting import (
     CROSS_PX,
     Emphasis,
     Hottest,
     draw_legend_into,
-    enlarged,
+    enlarge,
     hottest,
     mark_hottest_into,
-    painted,
-    painted_alone,
+    paint_alone,
+    paint_over,
 )
-from cairn_fusion.view.telepresence import Mode, Telepresence, ViewOptions, fuse, seen_in
+from cairn_fusion.view.telepresence import Telepresence, ViewMode, ViewOptions, find_in, fuse
 from cairn_fusion.view.temperature_scale import PALETTE, TemperatureScale, locked_scale
 from cairn_map.errors import BadInputError
 from cairn_sim.render.render import render_scan
@@ -56,7 +56,7 @@ def test_temperatures_are_blended_and_where_there_is_none_the_picture_is_hatched
     labels = rng.choice([0, 0, 0, 1, 3, 4, 5], size=(33, 40)).astype(np.uint8)
     base = rng.integers(0, 256, (33, 40, 3)).astype(np.uint8)
     band = Emphasis(alpha=0.25, from_k=285.0, to_k=315.0)
-    out = painted(base, kelvin, labels, SCALE, band)
+    out = paint_over(base, kelvin, labels, SCALE, band)
     for y, x in np.ndindex(33, 40):
         grey = base[y, x].astype(int)
         if labels[y, x] != Label.OK or math.isnan(kelvin[y, x]):
@@ -68,7 +68,7 @@ def test_temperatures_are_blended_and_where_there_is_none_the_picture_is_hatched
         else:
             expected = grey
         assert np.abs(out[y, x].astype(int) - expected).max() <= 1
-    alone = painted_alone(kelvin, labels, SCALE)
+    alone = paint_alone(kelvin, labels, SCALE)
     unknown = alone[labels != Label.OK]
     assert (unknown[:, :1] == unknown).all()  # greys; the palette's cold end is black, and not hatched
 
@@ -107,18 +107,18 @@ def test_a_scale_is_locked_on_the_first_picture_and_a_given_one_stays(scan: Scan
 @pytest.mark.parametrize(
     ("mode", "shape"),
     [
-        (Mode.THERMAL_ON_COLOUR, (240, 320, 3)),
-        (Mode.COLOUR_ON_THERMAL, (256, 320, 3)),
-        (Mode.SIDE_BY_SIDE, (240, 640, 3)),
-        (Mode.STEREO, (240, 640, 3)),
+        (ViewMode.THERMAL_ON_COLOUR, (240, 320, 3)),
+        (ViewMode.COLOUR_ON_THERMAL, (256, 320, 3)),
+        (ViewMode.SIDE_BY_SIDE, (240, 640, 3)),
+        (ViewMode.STEREO, (240, 640, 3)),
     ],
 )
-def test_every_mode_gives_its_picture(scan: Scan, mode: Mode, shape: tuple[int, ...]) -> None:
+def test_every_mode_gives_its_picture(scan: Scan, mode: ViewMode, shape: tuple[int, ...]) -> None:
     picture = Telepresence(HEAD, ViewOptions(mode=mode)).view(scan)
     assert picture.shape == shape and picture.dtype == np.uint8
-    if mode is Mode.SIDE_BY_SIDE:
+    if mode is ViewMode.SIDE_BY_SIDE:
         np.testing.assert_array_equal(picture[:, :320], scan.colour["colour_left"])
-    if mode is Mode.STEREO:
+    if mode is ViewMode.STEREO:
         assert not np.array_equal(picture[:, :320], picture[:, 320:])
 
 
@@ -126,7 +126,7 @@ def test_a_small_picture_is_shown_larger_so_that_there_is_room_for_words(scan: S
     rng = np.random.default_rng(0)
     for height, times in ((30, 8), (64, 4), (120, 2), (239, 2), (240, 1), (960, 1)):
         base = rng.integers(0, 256, (height, 10, 3)).astype(np.uint8)
-        larger = enlarged(base)
+        larger = enlarge(base)
         assert larger.shape == (times * height, times * 10, 3) and larger is not base
         np.testing.assert_array_equal(larger[times // 2 :: times, times // 2 :: times], base)
 
@@ -149,7 +149,7 @@ def test_both_eyes_have_the_hottest_marked_at_the_same_place(scan: Scan) -> None
     left, right = (fuse(scan, HEAD, name) for name in ("colour_left", "colour_right"))
     place = hottest(left.values[..., 0], left.labels)
     assert place is not None
-    found = seen_in(place, left, right, HEAD)
+    found = find_in(place, left, right, HEAD)
     assert found is not None and found.kelvin == place.kelvin
     points = []
     for name, each, at in (("colour_left", left, place), ("colour_right", right, found)):
@@ -157,8 +157,8 @@ def test_both_eyes_have_the_hottest_marked_at_the_same_place(scan: Scan) -> None
         points.append(HEAD[name].transform[:3, :3] @ point + HEAD[name].transform[:3, 3])
     assert np.linalg.norm(points[0] - points[1]) < 0.03 * float(left.depth.shown_m[place.y, place.x])
     hidden = replace(right, depth=replace(right.depth, shown_m=0.5 * right.depth.shown_m))
-    assert seen_in(place, left, hidden, HEAD) is None
-    assert seen_in(replace(place, x=319, y=239), left, right, HEAD) is None  # beyond its image
+    assert find_in(place, left, hidden, HEAD) is None
+    assert find_in(replace(place, x=319, y=239), left, right, HEAD) is None  # beyond its image
 
 
 def test_only_what_is_hot_is_painted_when_asked(scan: Scan) -> None:
@@ -188,7 +188,7 @@ def test_what_a_rig_or_scan_lacks_is_named(scan: Scan) -> None:
         Telepresence(HEAD, ViewOptions()).view(replace(scan, colour={}))
     with pytest.raises(BadInputError, match="needs 2"):
         one = Rig(name="one", cameras={n: HEAD[n] for n in ("tof", "colour_left", "thermal_left")})
-        Telepresence(one, ViewOptions(mode=Mode.STEREO))
+        Telepresence(one, ViewOptions(mode=ViewMode.STEREO))
     with pytest.raises(BadInputError, match="alpha"):
         Emphasis(alpha=1.5)
 
@@ -199,7 +199,7 @@ def picture(level: int) -> npt.NDArray[np.uint8]:
 
 def test_a_browser_gets_the_page_the_last_picture_and_each_new_one() -> None:
     latest = Latest()
-    with streaming(latest) as url:
+    with stream_pictures(latest) as url:
         assert url.startswith("http://127.0.0.1:")
         with pytest.raises(HTTPError, match="503"):
             urllib.request.urlopen(url + "view.jpg", timeout=5)
@@ -222,7 +222,7 @@ def test_a_browser_gets_the_page_the_last_picture_and_each_new_one() -> None:
 def test_more_viewers_than_allowed_are_told_to_come_later_and_one_that_goes_makes_room() -> None:
     latest = Latest()
     latest.show(picture(1))
-    with streaming(latest, clients_max=1) as url:
+    with stream_pictures(latest, clients_max=1) as url:
         with urllib.request.urlopen(url + "stream.mjpg", timeout=5) as stream:
             stream.readline()
             with pytest.raises(HTTPError, match="503"):
@@ -244,5 +244,8 @@ def test_an_address_that_is_taken_is_refused_in_words() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        with pytest.raises(BadInputError, match="cannot listen"), streaming(Latest(), port=taken.getsockname()[1]):
+        with (
+            pytest.raises(BadInputError, match="cannot listen"),
+            stream_pictures(Latest(), port=taken.getsockname()[1]),
+        ):
             pass

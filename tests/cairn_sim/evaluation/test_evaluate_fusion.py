@@ -10,8 +10,8 @@ import pytest
 
 from cairn_calib.rig.poses import look_at
 from cairn_calib.rig.rig import Spectrum
-from cairn_fusion.image_fusion.across import Across
-from cairn_fusion.image_fusion.eye_depth import EyeDepth
+from cairn_fusion.image_fusion.cross_view import CrossView
+from cairn_fusion.image_fusion.dense_depth import DenseDepth
 from cairn_fusion.image_fusion.surface import Drawn
 from cairn_fusion.recording.images import read_colour
 from cairn_fusion.transfer.transfer import Label
@@ -36,10 +36,10 @@ def test_scores_count_what_their_names_say() -> None:
     none = np.zeros((1, 1), np.float32)
     origins = np.array([[1, 1, 2, 1, 0, 1]], np.uint8)
     drawn = Drawn(step_px=1, per_pixel=1.0, nearness=none, marks=none.astype(np.uint8), hiding=none, slack=none)
-    depth = EyeDepth("colour", np.ones((1, 6), np.float32), origins, drawn)
+    depth = DenseDepth("colour", np.ones((1, 6), np.float32), origins, drawn)
     labels = np.array([[Label.OK, Label.OK, Label.OK, Label.OCCLUDED, Label.NO_RANGE, Label.OK]], np.uint8)
     values = np.array([[300, 303, 300.5, np.nan, np.nan, 290]], np.float32)[..., None]
-    fused = Across("colour", ("warm",), values, labels, np.zeros((1, 6), np.uint8), depth)
+    fused = CrossView("colour", ("warm",), values, labels, np.zeros((1, 6), np.uint8), depth)
     sees = np.array([[True, False, True, False, True, True]])
     truth = FusionTruth(
         values=np.full((1, 6, 1), 300, np.float32),

@@ -7,10 +7,10 @@ import numpy.typing as npt
 
 from cairn_calib.rig.rig import Rig, Spectrum
 from cairn_client.folders.map_folder import FolderMap
-from cairn_fusion.image_fusion.beyond_labels import beyond_pixels
+from cairn_fusion.image_fusion.mirror_labels import mirror_pixels
 from cairn_fusion.image_fusion.surface import live_range, sight_of
 from cairn_fusion.recording.scan import Scan
-from cairn_fusion.view.overlay import EXACT, Live, Mode, Overlay, OverlayStyle, draw_overlay, with_overlay_legend
+from cairn_fusion.view.overlay import EXACT, Live, Overlay, OverlayMode, OverlayStyle, draw_overlay, with_overlay_legend
 from cairn_map.errors import BadInputError
 from cairn_map.render.map_render import MapRenderer
 from cairn_map.render.pose_spread import PoseSpread
@@ -39,7 +39,7 @@ class MapOverlay:
         """
         name = self.camera_of(scan)
         mounted, ages = self.rig[name], self.map.ages
-        beyond = beyond_pixels(scan, self.rig, self.map.snapshot, renderer=self.renderer)
+        beyond = mirror_pixels(scan, self.rig, self.map.snapshot, renderer=self.renderer)
         live = Live(
             rgb=np.asarray(scan.colour[name]),
             range_m=live_range(scan, self.rig, camera=name, beyond=beyond),
@@ -73,7 +73,7 @@ def about(drawn: Overlay) -> str:
     """What was drawn, in a few words."""
     if drawn.withheld is not None:
         return f"withheld, {drawn.withheld}"
-    visible, alone = ((drawn.front_modes == mode).mean() for mode in (Mode.VISIBLE, Mode.MAP_ONLY))
+    visible, alone = ((drawn.front_modes == mode).mean() for mode in (OverlayMode.VISIBLE, OverlayMode.MAP_ONLY))
     return f"visible {visible:.0%}, see-through {drawn.through.mean():.0%}, map only {alone:.0%}"
 
 

@@ -43,7 +43,7 @@ from cairn_fusion.recording.recording import ScanSource
 from cairn_fusion.view.mjpeg import Latest
 from cairn_fusion.view.overlay import OverlayStyle
 from cairn_fusion.view.painting import Emphasis
-from cairn_fusion.view.telepresence import Mode, Telepresence, ViewOptions
+from cairn_fusion.view.telepresence import Telepresence, ViewMode, ViewOptions
 from cairn_fusion.view.temperature_scale import ZERO_CELSIUS_K, TemperatureScale
 from cairn_map.errors import BadInputError
 from cairn_map.render.render_picture import Layer, Scale
@@ -55,7 +55,7 @@ NO_IMAGE = ("missing_image", "unknown_camera")
 View = tuple[int, npt.NDArray[np.uint8]]
 """A scan's number and its picture."""
 MAP = "map"
-"""Mode: the map over the live image."""
+"""ViewMode: the map over the live image."""
 
 
 def main(argv: list[str]) -> int:
@@ -108,8 +108,8 @@ def _check_options(args: argparse.Namespace) -> None:
     of_map = spread if args.layer is None else spread | {f"--layer (of --mode {MAP})"}
     unused = {
         MAP: painted | marker,
-        Mode.SIDE_BY_SIDE: painted | of_map,
-        Mode.STEREO: of_map if args.camera is None else of_map | {"--camera"},
+        ViewMode.SIDE_BY_SIDE: painted | of_map,
+        ViewMode.STEREO: of_map if args.camera is None else of_map | {"--camera"},
     }.get(args.mode, of_map)
     if unused:
         raise BadInputError(
@@ -163,7 +163,7 @@ def _write(picture: npt.NDArray[np.uint8], path: Path) -> None:
 def _serve(source: ScanSource, telepresence: Telepresence | MapOverlay, args: argparse.Namespace) -> None:
     """Show the scans one after the other, again and again, or one for good, until interrupted."""
     try:
-        from cairn_fusion.view.mjpeg_server import streaming
+        from cairn_fusion.view.mjpeg_server import stream_pictures
     except ModuleNotFoundError as exc:
         raise BadInputError("missing_extra", f'--serve needs {exc.name}: pip install "cairn-robotics[server]"') from exc
     host, port = args.serve
@@ -173,7 +173,7 @@ def _serve(source: ScanSource, telepresence: Telepresence | MapOverlay, args: ar
     pictures = _views(source, telepresence, numbers)
     first, picture = next(pictures)
     latest.show(picture)
-    with streaming(latest, host=host, port=port) as url:
+    with stream_pictures(latest, host=host, port=port) as url:
         say(f"{args.mode} of {source.name} at {url} ; end with Ctrl-C")
         there = [first]
         for number, picture in _paced(pictures, args.rate):
@@ -215,7 +215,7 @@ def _options(args: argparse.Namespace) -> ViewOptions:
     scale = None
     if args.scale is not None:
         scale = TemperatureScale(args.scale[0] + ZERO_CELSIUS_K, args.scale[1] + ZERO_CELSIUS_K)
-    mode = Mode(args.mode)
+    mode = ViewMode(args.mode)
     return ViewOptions(mode=mode, camera=args.camera, emphasis=emphasis, scale=scale, marks_hottest=not args.no_marker)
 
 
@@ -260,7 +260,9 @@ def _parser() -> argparse.ArgumentParser:
     options.add_argument("--robot", metavar="NAME", help="whose view is published")
     add_token(options)
     options.add_argument("--scan", type=int, metavar="N", help="only this scan, from 0")
-    options.add_argument("--mode", choices=[*(mode.value for mode in Mode), MAP], default=Mode.THERMAL_ON_COLOUR.value)
+    options.add_argument(
+        "--mode", choices=[*(mode.value for mode in ViewMode), MAP], default=ViewMode.THERMAL_ON_COLOUR.value
+    )
     options.add_argument("--map", metavar="FOLDER", help="a robot's state, a clone, or exported cells")
     options.add_argument("--layer", type=Layer, choices=list(Layer), help="of the map (temperature)")
     add_spread_arguments(options)

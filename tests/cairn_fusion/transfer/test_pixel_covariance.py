@@ -15,7 +15,7 @@ from cairn_calib.rig.rig import Rig, Spectrum, mounted
 from cairn_calib.rig.sensing import RangeSensing
 from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scan
 from cairn_fusion.recording.scan import Scan
-from cairn_fusion.transfer.certainty import is_certain, pixel_covariance, spread_m, spread_px
+from cairn_fusion.transfer.pixel_covariance import is_certain, pixel_covariance, spread_m, spread_px
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import TEMPERATURE
 from cairn_map.evidence.grid import Geometry

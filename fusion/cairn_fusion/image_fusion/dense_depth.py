@@ -7,7 +7,7 @@ depth is carried to pixels of the same colour (joint bilateral upsampling, Kopf 
 more the more certain the range is, and of two surfaces in a window only one has a say, so that nothing is put between
 them.
 
-The result is a guess at edges. `EyeDepth` is no array and becomes none: neither mypy nor `Scan` lets it into a map.
+The result is a guess at edges. `DenseDepth` is no array and becomes none: neither mypy nor `Scan` lets it into a map.
 """
 
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.rig.rig import Rig
-from cairn_fusion.image_fusion.eye_depth_kernels import REACH, densify_into
-from cairn_fusion.image_fusion.row_bands import in_bands
+from cairn_fusion.image_fusion.dense_depth_kernels import REACH, densify_into
+from cairn_fusion.image_fusion.row_bands import run_in_bands
 from cairn_fusion.image_fusion.surface import Drawn
 from cairn_map.arrays import Bytes, Singles
 from cairn_map.errors import BadInputError
@@ -43,7 +43,7 @@ class Origin(IntEnum):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class EyeDepth:
+class DenseDepth:
     """Ranges of all pixels of a camera, to look at."""
 
     camera: str
@@ -57,11 +57,13 @@ class EyeDepth:
     def __array__(self, *_: object, **__: object) -> Never:
         """Refused: as an array it could get into a map."""
         raise BadInputError(
-            "filled_depth", "an EyeDepth is partly guessed, and no range image: give the map the scan's"
+            "filled_depth", "an DenseDepth is partly guessed, and no range image: give the map the scan's"
         )
 
 
-def eye_depth(drawn: Drawn, rig: Rig, camera: str, picture: npt.NDArray[np.generic], *, range_camera: str) -> EyeDepth:
+def dense_depth(
+    drawn: Drawn, rig: Rig, camera: str, picture: npt.NDArray[np.generic], *, range_camera: str
+) -> DenseDepth:
     """The depth of a camera's pixels.
 
     Args:
@@ -89,8 +91,8 @@ def eye_depth(drawn: Drawn, rig: Rig, camera: str, picture: npt.NDArray[np.gener
             *(drawn.per_pixel, drawn.step_px, first, last),
         )
 
-    in_bands(densify, height)
-    return EyeDepth(camera, shown_m, origins, drawn)
+    run_in_bands(densify, height)
+    return DenseDepth(camera, shown_m, origins, drawn)
 
 
 def _guide(picture: npt.NDArray[np.generic]) -> Bytes:

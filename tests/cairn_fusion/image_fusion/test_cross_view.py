@@ -13,11 +13,11 @@ from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_calib.rig.poses import inverse, look_at, transform_points
 from cairn_calib.rig.rig import Rig, Spectrum, mounted
-from cairn_fusion.image_fusion.across import across, fused_covariance
-from cairn_fusion.image_fusion.across_kernels import label_into, sample_into
+from cairn_fusion.image_fusion.cross_view import cross_view, fused_covariance
+from cairn_fusion.image_fusion.cross_view_kernels import label_into, sample_into
 from cairn_fusion.image_fusion.surface import beams, drawn_surface, places, surface_of
 from cairn_fusion.recording.scan import Scan
-from cairn_fusion.transfer.certainty import pixel_covariance
+from cairn_fusion.transfer.pixel_covariance import pixel_covariance
 from cairn_fusion.transfer.transfer import Label
 from cairn_fusion.view.telepresence import fuse, view_depth
 from cairn_sim.evaluation.fusion_scores import fusion_scores
@@ -222,7 +222,7 @@ def test_cameras_with_one_centre_hide_nothing_from_each_other() -> None:
     assert fused.ok.mean() > 0.95
     np.testing.assert_allclose(fused.values[..., 0][fused.ok], kelvin[fused.ok], rtol=1e-4)
     drawn = drawn_surface(surface_of(scan, rig), rig, "colour")
-    none = across(view_depth(scan, rig, "colour", drawn), rig, {}, drawn={}, range_camera="tof")
+    none = cross_view(view_depth(scan, rig, "colour", drawn), rig, {}, drawn={}, range_camera="tof")
     assert not none.ok.any() and none.sources == ()
 
 

@@ -15,12 +15,12 @@ import numpy.typing as npt
 
 from cairn_calib.rig.poses import inverse
 from cairn_calib.rig.rig import MountedCamera, Rig
-from cairn_fusion.image_fusion.across_kernels import fill_into, label_into, sample_into
-from cairn_fusion.image_fusion.eye_depth import EyeDepth, Origin
-from cairn_fusion.image_fusion.eye_depth_kernels import STEP_SHARE
-from cairn_fusion.image_fusion.row_bands import in_bands
+from cairn_fusion.image_fusion.cross_view_kernels import fill_into, label_into, sample_into
+from cairn_fusion.image_fusion.dense_depth import DenseDepth, Origin
+from cairn_fusion.image_fusion.dense_depth_kernels import STEP_SHARE
+from cairn_fusion.image_fusion.row_bands import run_in_bands
 from cairn_fusion.image_fusion.surface import JOIN_SIGMAS, Drawn, beams, places
-from cairn_fusion.transfer.place_covariance import PlaceCovariance
+from cairn_fusion.transfer.covariance_grid import CovarianceGrid
 from cairn_fusion.transfer.transfer import Label
 from cairn_map.arrays import Labels, Singles
 
@@ -29,7 +29,7 @@ HIDDEN_BEHIND = 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Across:
+class CrossView:
     """Values of other cameras on the pixels of one."""
 
     camera: str
@@ -42,7 +42,7 @@ class Across:
     """(H, W) `Label`; where no source has a value, why the first has none."""
     source: Labels
     """(H, W) number of the source that the value comes from."""
-    depth: EyeDepth
+    depth: DenseDepth
 
     @property
     def ok(self) -> npt.NDArray[np.bool_]:
@@ -50,14 +50,14 @@ class Across:
         return np.asarray(self.labels == Label.OK)
 
 
-def across(
-    depth: EyeDepth,
+def cross_view(
+    depth: DenseDepth,
     rig: Rig,
     images: Mapping[str, npt.NDArray[np.generic]],
     *,
     drawn: Mapping[str, Drawn],
     range_camera: str,
-) -> Across:
+) -> CrossView:
     """What other cameras see at the pixels of the camera that a depth is of.
 
     Args:
@@ -71,7 +71,7 @@ def across(
     names, known, rays = tuple(images), _known(depth), beams(rig[depth.camera].camera)
     if not names:
         labels = np.where(known == Label.OK, np.uint8(Label.NO_READING), known)
-        return Across(
+        return CrossView(
             depth.camera, (), np.full((*known.shape, 1), np.nan, np.float32), labels, np.zeros_like(known), depth
         )
     values, labels = seen.by(names[0], images[names[0]], depth.shown_m, rays, known)
@@ -82,7 +82,7 @@ def across(
         range_m, picked = depth.shown_m.ravel()[left][None], rays.reshape(3, -1)[:, left][:, None]
         others, other_labels = seen.by(name, images[name], range_m, picked, known.ravel()[left][None])
         fill_into(values, labels, source, left, others[0], other_labels[0], number)
-    return Across(depth.camera, names, values, labels, source, depth)
+    return CrossView(depth.camera, names, values, labels, source, depth)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,11 +114,11 @@ class _Seen:
             label_into(labels[rows], u[rows], v[rows], q[rows], least, step, width, height)
             sample_into(values[rows], labels[rows], u[rows], v[rows], smooth)
 
-        in_bands(look, len(known))
+        run_in_bands(look, len(known))
         return values, labels
 
 
-def _known(depth: EyeDepth) -> Labels:
+def _known(depth: DenseDepth) -> Labels:
     """(H, W) OK where there is a depth, else why there is none."""
     height, width = depth.origins.shape
     marks = np.asarray(
@@ -147,14 +147,14 @@ def _least_nearness(drawn: Drawn, range_camera: MountedCamera) -> Singles:
     return np.where(hides, drawn.hiding / (1 + tolerance) - drawn.slack, 0.0).astype(np.float32)
 
 
-def fused_covariance(fused: Across, rig: Rig, *, range_camera: str) -> Singles:
+def fused_covariance(fused: CrossView, rig: Rig, *, range_camera: str) -> Singles:
     """(H, W, 3) float32 xx, xy, yy, px^2 of each pixel's source; NaN where the label is not OK.
 
     Range noise is the range camera's; where depth was filled in, what may differ in a window and still be taken for one
     surface.
 
     Args:
-        fused: of `across`.
+        fused: of `cross_view`.
         rig: its rig; with a calibration's covariance if it has one.
         range_camera: that measured.
 
@@ -167,6 +167,6 @@ def fused_covariance(fused: Across, rig: Rig, *, range_camera: str) -> Singles:
     sigma_m = np.where(fused.depth.origins == Origin.FILLED, STEP_SHARE * range_m, sigma_m)
     for number, name in enumerate(fused.sources):
         y, x = np.nonzero(fused.ok & (fused.source == number))
-        certainty = PlaceCovariance.of(rig, src=fused.camera, dst=name)
+        certainty = CovarianceGrid.of(rig, src=fused.camera, dst=name)
         out[y, x] = certainty.at(np.stack([x, y], axis=1), range_m[y, x], sigma_m[y, x])
     return out

@@ -10,9 +10,9 @@ from cairn_calib.rig.lidar import SpinningLidar
 from cairn_calib.rig.pose_vectors import rotation_from_vector
 from cairn_calib.rig.poses import inverse, transform_points
 from cairn_calib.rig.rig import MountedCamera, Rig, Spectrum, mounted
-from cairn_fusion.transfer.calibration_certainty import place_gradients
-from cairn_fusion.transfer.certainty import pixel_covariance, reach_px_of
-from cairn_fusion.transfer.place_covariance import PlaceCovariance, calibration_bound_px
+from cairn_fusion.transfer.calibration_covariance import place_gradients
+from cairn_fusion.transfer.covariance_grid import CovarianceGrid, calibration_bound_px
+from cairn_fusion.transfer.pixel_covariance import pixel_covariance, reach_px_of
 from cairn_map.errors import BadInputError
 from cairn_sim.robots.heads import full_head
 
@@ -96,7 +96,7 @@ def test_fused_positions_are_off_by_what_their_covariance_says(src: str, dst: st
     sigma_m, pixel_sigma_px, distances = 0.01 * np.ones(12), 0.2, []
     points = RIG[src].camera.unproject(pixels) * range_m[:, None]
     S = pixel_covariance(points, sigma_m, RIG, src=src, dst=dst, pixel_sigma_px=pixel_sigma_px)
-    grid = PlaceCovariance.of(RIG, src=src, dst=dst).at(pixels, range_m, sigma_m, pixel_sigma_px=pixel_sigma_px)
+    grid = CovarianceGrid.of(RIG, src=src, dst=dst).at(pixels, range_m, sigma_m, pixel_sigma_px=pixel_sigma_px)
     stated = carried(RIG, pixels, range_m, src=src, dst=dst)
     for _ in range(300):
         truth = moved(RIG, dict(zip(keys, (root @ rng.standard_normal(len(keys))).tolist(), strict=True)))
@@ -116,7 +116,7 @@ def test_fused_positions_are_off_by_what_their_covariance_says(src: str, dst: st
 def test_without_a_covariance_the_rigs_one_number_counts() -> None:
     seen: MountedCamera = RIG["colour_left"].model_copy(update={"calibration_sigma_px": 0.7})
     rig = Rig(name="one", cameras={"tof": RIG["tof"], "colour_left": seen})
-    at = PlaceCovariance.of(rig, src="tof", dst="colour_left").at(
+    at = CovarianceGrid.of(rig, src="tof", dst="colour_left").at(
         np.array([[80.0, 70.0], [3.0, 4.0]]), np.array([2, np.nan], np.float32), np.zeros(2, np.float32)
     )
     np.testing.assert_allclose(at[0], [0.49, 0.0, 0.49], atol=1e-6)
@@ -128,7 +128,7 @@ def test_without_a_covariance_the_rigs_one_number_counts() -> None:
 def test_a_lidar_has_no_lens_to_look_from() -> None:
     lidar = mounted(Spectrum.RANGE, SpinningLidar(width=8, height=1, elevations_deg=(0.0,)), np.eye(4))
     with pytest.raises(BadInputError, match="lens"):
-        PlaceCovariance.of(Rig(name="r", cameras={"lidar": lidar, "tof": RIG["tof"]}), src="lidar", dst="tof")
+        CovarianceGrid.of(Rig(name="r", cameras={"lidar": lidar, "tof": RIG["tof"]}), src="lidar", dst="tof")
 
 
 def test_a_range_pixel_covers_half_of_itself_to_each_side_and_what_is_uncertain() -> None:

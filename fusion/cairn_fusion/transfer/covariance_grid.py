@@ -18,8 +18,8 @@ from cairn_calib.rig.calibration import Calibration
 from cairn_calib.rig.lens import Lens
 from cairn_calib.rig.poses import inverse, transform_points
 from cairn_calib.rig.rig import MountedCamera, Rig
-from cairn_fusion.transfer.calibration_certainty import calibration_covariance, lens_of, pixel_gradients
-from cairn_fusion.transfer.place_covariance_kernels import covariances_into
+from cairn_fusion.transfer.calibration_covariance import calibration_covariance, lens_of, pixel_gradients
+from cairn_fusion.transfer.covariance_grid_kernels import covariances_into
 from cairn_map.arrays import Floats, Singles
 
 COLUMNS, ROWS = 12, 9
@@ -28,7 +28,7 @@ NODES = np.geomspace(1 / 20.0, 1 / 0.2, 12)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PlaceCovariance:
+class CovarianceGrid:
     """How uncertain the place in one camera's image is of what another camera's pixels show."""
 
     grid: Floats
@@ -76,7 +76,7 @@ def calibration_bound_px(rig: Rig, *, src: str, dst: str) -> float:
         return rig[dst].calibration_sigma_px or 0.0
     if not isinstance(rig[src].camera, Lens):
         return np.inf
-    a, b, c = (PlaceCovariance.of(rig, src=src, dst=dst).grid[..., n] for n in range(3))
+    a, b, c = (CovarianceGrid.of(rig, src=src, dst=dst).grid[..., n] for n in range(3))
     return float(np.sqrt(np.nanmax((a + c) / 2 + np.hypot((a - c) / 2, b))))
 
 

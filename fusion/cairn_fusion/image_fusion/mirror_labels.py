@@ -41,7 +41,7 @@ SHARE = 0.8
 """Of the pixels with a range in a window around one, that say the same: a mirror is larger than a fleck."""
 
 
-def beyond_pixels(scan: Scan, rig: Rig, snapshot: MapSnapshot, *, renderer: MapRenderer | None = None) -> Flags:
+def mirror_pixels(scan: Scan, rig: Rig, snapshot: MapSnapshot, *, renderer: MapRenderer | None = None) -> Flags:
     """(H, W) whether a pixel of the scan's range camera shows what is round a mirror, as far as a map can tell.
 
     Args:

@@ -7,8 +7,8 @@ from tests.fixtures.fusion import naive_views
 
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.rig import Rig, Spectrum, mounted
-from cairn_fusion.image_fusion.eye_depth import ALIKE, CLOSE, EyeDepth, Origin, eye_depth
-from cairn_fusion.image_fusion.eye_depth_kernels import REACH, densify_into
+from cairn_fusion.image_fusion.dense_depth import ALIKE, CLOSE, DenseDepth, Origin, dense_depth
+from cairn_fusion.image_fusion.dense_depth_kernels import REACH, densify_into
 from cairn_fusion.image_fusion.surface import drawn_surface, surface_of
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.transfer import Label
@@ -37,10 +37,10 @@ def two_walls() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
 
 def depth_of(
     range_m: npt.NDArray[np.float32], picture: npt.NDArray[np.uint8], amplitude: npt.NDArray[np.uint16] | None = None
-) -> EyeDepth:
+) -> DenseDepth:
     scan = Scan(time_s=0.0, T_map_rig=np.eye(4), range_camera="tof", range_m=range_m, amplitude=amplitude)
     drawn = drawn_surface(surface_of(scan, HEAD), HEAD, "colour")
-    return eye_depth(drawn, HEAD, "colour", picture, range_camera="tof")
+    return dense_depth(drawn, HEAD, "colour", picture, range_camera="tof")
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -87,7 +87,7 @@ def test_what_has_nothing_beside_it_ends_a_range_pixel_beyond_its_last_on_all_si
     scan = Scan(time_s=0.0, T_map_rig=np.eye(4), range_camera="tof", range_m=range_m)
     drawn = drawn_surface(surface_of(scan, rig), rig, "colour")
     picture = np.zeros((lens.height, lens.width, 3), np.uint8)
-    known = eye_depth(drawn, rig, "colour", picture, range_camera="tof").origins != Origin.NOTHING
+    known = dense_depth(drawn, rig, "colour", picture, range_camera="tof").origins != Origin.NOTHING
     y, x = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
     ends = np.array([[x[0] - lens.centre_px[0], x[-1] - lens.centre_px[0]], [y[0] - lens.centre_px[1], y[-1]]])
     ends[1, 1] -= lens.centre_px[1]
@@ -115,7 +115,7 @@ def test_where_too_much_light_returned_or_nothing_near_did_nothing_is_filled() -
 
 def test_a_map_cannot_take_depth_that_was_filled_in() -> None:
     depth = depth_of(*two_walls())
-    with pytest.raises(BadInputError, match="EyeDepth"):
+    with pytest.raises(BadInputError, match="DenseDepth"):
         Scan(time_s=0.0, T_map_rig=np.eye(4), range_camera="tof", range_m=depth)  # type: ignore[arg-type]
     with pytest.raises(BadInputError, match="partly guessed"):
         np.asarray(depth)

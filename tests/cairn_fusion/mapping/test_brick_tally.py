@@ -12,10 +12,10 @@ from tests import naive
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.poses import look_at
 from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_fusion.mapping.brick_tally import BrickTally, ScanHits, tally_around
+from cairn_fusion.mapping.brick_tally_kernels import hit_voxels
 from cairn_fusion.mapping.free_space import Carving, Scratch, carving_of, window_of
 from cairn_fusion.mapping.integrate import Integrator, integrate_scan, integrate_scans
-from cairn_fusion.mapping.tally import ScanHits, Tally, tally_around
-from cairn_fusion.mapping.tally_kernels import hit_voxels
 from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import INTENSITY
@@ -67,7 +67,7 @@ def test_a_point_is_in_the_voxel_that_the_format_says_even_on_a_border(edge_um: 
         assert number & 511 == naive.interleave(*(voxel % 8).tolist())
 
 
-def carving_of_octants(tally: Tally, voxels: npt.NDArray[np.int64], masks: npt.NDArray[np.int32]) -> Carving:
+def carving_of_octants(tally: BrickTally, voxels: npt.NDArray[np.int64], masks: npt.NDArray[np.int32]) -> Carving:
     """Free octants of the bricks that begin at some voxels; nothing is looked at voxel by voxel."""
     brick = (voxels - tally.corner) // 8
     return Carving(
@@ -84,7 +84,7 @@ def carving_of_octants(tally: Tally, voxels: npt.NDArray[np.int64], masks: npt.N
 @pytest.mark.parametrize("seed", range(3))
 def test_a_tally_counts_as_a_dict_does(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    tally, hits = Tally(GEOMETRY, np.zeros(3), reach_m=2.0), ScanHits()
+    tally, hits = BrickTally(GEOMETRY, np.zeros(3), reach_m=2.0), ScanHits()
     struck: Counter[Voxel] = Counter()
     missed: Counter[Voxel] = Counter()
     sums: Counter[Voxel] = Counter()
@@ -164,7 +164,7 @@ def test_scans_too_far_apart_for_one_tally_add_up_all_the_same(threads: int) -> 
 
 
 def test_a_point_outside_the_box_is_refused_and_leaves_nothing_behind() -> None:
-    tally, hits = Tally(GEOMETRY, np.zeros(3), reach_m=1.0), ScanHits()
+    tally, hits = BrickTally(GEOMETRY, np.zeros(3), reach_m=1.0), ScanHits()
     with pytest.raises(BadInputError, match="outside the tally's box"):
         hits.number(np.array([[0.1, 0.1, 0.1], [9.0, 0.0, 0.0]]), tally)
     hits.forget()

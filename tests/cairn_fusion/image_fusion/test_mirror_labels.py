@@ -7,8 +7,8 @@ import pytest
 from tests.fixtures.map.worlds import map_of
 
 from cairn_calib.rig.poses import look_at
-from cairn_fusion.image_fusion import beyond_labels
-from cairn_fusion.image_fusion.beyond_labels import beyond_pixels
+from cairn_fusion.image_fusion import mirror_labels
+from cairn_fusion.image_fusion.mirror_labels import mirror_pixels
 from cairn_fusion.image_fusion.surface import live_range, surface_of
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.transfer import Label
@@ -61,21 +61,21 @@ def wall() -> MapSnapshot:
 def test_what_a_mirror_shows_is_labelled_and_nothing_else(noise: Noise | None, wall: MapSnapshot) -> None:
     scan, mirrored = scanned(noise)
     known = np.isfinite(scan.range_m)
-    found = beyond_pixels(scan, HEAD, wall)
+    found = mirror_pixels(scan, HEAD, wall)
     assert (found & mirrored).sum() > 0.75 * (mirrored & known).sum() > 1000
     assert (found & ~mirrored).sum() <= 0.002 * (known & ~mirrored).sum()
     labels = surface_of(scan, HEAD, found).labels
     assert (labels[found] != Label.OK).all() and (labels[found] == Label.BEYOND).mean() > 0.95  # or flying
     empty = snapshot_of(map_of(GRID, {(0, 0, 40): (3, 0)}))
-    assert not beyond_pixels(scan, HEAD, empty).any()
-    assert not beyond_pixels(replace(scan, range_m=np.full_like(scan.range_m, np.nan)), HEAD, wall).any()
+    assert not mirror_pixels(scan, HEAD, empty).any()
+    assert not mirror_pixels(replace(scan, range_m=np.full_like(scan.range_m, np.nan)), HEAD, wall).any()
 
 
 def test_of_a_fine_image_every_second_pixel_is_enough(wall: MapSnapshot, monkeypatch: pytest.MonkeyPatch) -> None:
     scan, mirrored = scanned(None)
-    whole, known = beyond_pixels(scan, HEAD, wall), np.isfinite(scan.range_m)
-    monkeypatch.setattr(beyond_labels, "ROWS_MAX", scan.range_m.shape[0] // 2)
-    found = beyond_pixels(scan, HEAD, wall)
+    whole, known = mirror_pixels(scan, HEAD, wall), np.isfinite(scan.range_m)
+    monkeypatch.setattr(mirror_labels, "ROWS_MAX", scan.range_m.shape[0] // 2)
+    found = mirror_pixels(scan, HEAD, wall)
     assert found.shape == whole.shape and (found != whole).any()
     assert (found & mirrored).sum() > 0.75 * (mirrored & known).sum() > 1000
     assert (found & ~mirrored).sum() <= 0.005 * (known & ~mirrored).sum() and not (found & ~known).any()
@@ -83,7 +83,7 @@ def test_of_a_fine_image_every_second_pixel_is_enough(wall: MapSnapshot, monkeyp
 
 def test_what_a_mirror_shows_is_never_painted(wall: MapSnapshot) -> None:
     scan, _ = scanned(None)
-    found = beyond_pixels(scan, HEAD, wall)
+    found = mirror_pixels(scan, HEAD, wall)
     truth = fusion_truth(room(), HEAD, "colour_left", ["thermal_left"], T_map_rig=T_MAP_RIG, range_camera=RANGE_CAMERA)
     plain, kept = fuse(scan, HEAD, "colour_left"), fuse(scan, HEAD, "colour_left", found)
     assert (plain.ok & truth.beyond).sum() > 5000
@@ -100,4 +100,4 @@ def test_what_a_mirror_shows_is_never_painted(wall: MapSnapshot) -> None:
 def test_a_new_thing_before_a_wall_and_one_that_the_map_has_are_not_labelled(wall: MapSnapshot) -> None:
     scan, mirrored = scanned(None)
     near = replace(scan, range_m=np.where(mirrored, np.float32(1.2), scan.range_m))
-    assert not beyond_pixels(near, HEAD, wall).any()
+    assert not mirror_pixels(near, HEAD, wall).any()

@@ -18,8 +18,8 @@ import numpy.typing as npt
 from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_calib.rig.poses import inverse, transform_points
 from cairn_calib.rig.rig import Rig
-from cairn_fusion.transfer.calibration_certainty import calibration_covariance, lens_of, pixel_gradients
-from cairn_fusion.transfer.place_covariance import calibration_bound_px
+from cairn_fusion.transfer.calibration_covariance import calibration_covariance, lens_of, pixel_gradients
+from cairn_fusion.transfer.covariance_grid import calibration_bound_px
 from cairn_map.arrays import Flags, Floats
 
 REACH_MAX_PX = 16

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from cairn_fusion.mapping import tally_kernels as kernels
+from cairn_fusion.mapping import brick_tally_kernels as kernels
 from cairn_fusion.mapping.carve_kernels import carve_into
 from cairn_fusion.mapping.free_space import Carving, Scratch
 from cairn_map.arrays import Counts, Floats, Int32s, Ints
@@ -57,7 +57,7 @@ class ScanHits:
         self.voxels: Ints = np.empty(0, np.int64)
         """(U,) brick number of the box times 512 plus place, by number."""
 
-    def number(self, points_m: Floats, tally: "Tally") -> tuple[Int32s, int]:
+    def number(self, points_m: Floats, tally: "BrickTally") -> tuple[Int32s, int]:
         """Number the different voxels of a tally's box that (N, 3) points hit: (N,) each point's, and how many.
 
         Raises:
@@ -86,7 +86,7 @@ class ScanHits:
         self._used, self.voxels = 0, self.voxels[:0]
 
 
-class Tally:
+class BrickTally:
     """Counts and sums of some scans; thread-safe: one thread may add hits while another adds misses."""
 
     def __init__(self, geometry: Geometry, centre_m: Floats, *, reach_m: float) -> None:
@@ -191,7 +191,7 @@ class Tally:
         return {keys[n]: part for n, part in sorted(packed, key=lambda cell: keys[cell[0]])}
 
 
-def tally_around(origin_m: Floats, farthest_m: float, geometry: Geometry, *, max_range_m: float) -> Tally:
+def tally_around(origin_m: Floats, farthest_m: float, geometry: Geometry, *, max_range_m: float) -> BrickTally:
     """A tally for a scan from there that reaches so far, and for those that follow if memory allows.
 
     Raises:
@@ -200,7 +200,7 @@ def tally_around(origin_m: Floats, farthest_m: float, geometry: Geometry, *, max
     brick_m = 8 * geometry.voxel_edge_m
     for reach_m, bricks_max in ((max_range_m + MOVE_M, BOX_BRICKS), (1.01 * farthest_m + brick_m, BOX_BRICKS_MAX)):
         if (2 * reach_m / brick_m + 2) ** 3 <= bricks_max:
-            return Tally(geometry, origin_m, reach_m=reach_m)
+            return BrickTally(geometry, origin_m, reach_m=reach_m)
     raise BadInputError(
         "scan_too_large",
         f"one scan reaches {farthest_m:.1f} m, too far at {geometry.voxel_edge_m} m voxels; "
@@ -221,7 +221,7 @@ def _grown(array: npt.NDArray[Scalar], needed: int, used: int) -> npt.NDArray[Sc
     return grown
 
 
-class Tallies:
+class TallyPool:
     """Evidence of many scans; thread-safe but for `packed`. Memory: see `tally`."""
 
     def __init__(self, geometry: Geometry, *, max_range_m: float, around_m: Floats | None = None) -> None:
@@ -231,7 +231,7 @@ class Tallies:
         self._around_m = around_m
         self._lock = Lock()
         self._closed = EvidenceMap(geometry)
-        self._users: dict[Tally, int] = {}
+        self._users: dict[BrickTally, int] = {}
         """How many threads are adding to each open tally."""
         self._idle: list[ScanHits] = []
 
@@ -241,7 +241,7 @@ class Tallies:
             self._closed.merge(diff)
 
     @contextmanager
-    def around(self, origin_m: Floats, farthest_m: float) -> Iterator[tuple[Tally, ScanHits]]:
+    def around(self, origin_m: Floats, farthest_m: float) -> Iterator[tuple[BrickTally, ScanHits]]:
         """A tally that holds a scan from there that reaches so far, and a scratch that no other thread uses meanwhile.
 
         Raises:
@@ -263,14 +263,14 @@ class Tallies:
                 self._idle.append(hits)
 
     def packed(self, each: Each = map) -> Diff:
-        """Packed evidence of all cells that hold any, rising in number; `each` as for `Tally.packed`."""
+        """Packed evidence of all cells that hold any, rising in number; `each` as for `BrickTally.packed`."""
         if len(self._users) == 1 and not len(self._closed):
             # Most measurements end here: all scans in one tally, nothing to add up.
             return next(iter(self._users)).packed(each)
         self._close_idle(each)
         return self._closed.packed()
 
-    def _new_tally(self, origin_m: Floats, farthest_m: float) -> Tally:
+    def _new_tally(self, origin_m: Floats, farthest_m: float) -> BrickTally:
         if self._around_m is not None:
             tally = tally_around(self._around_m, farthest_m, self._geometry, max_range_m=self._max_range_m)
             self._around_m = None
