@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests import naive
 from tests.fixtures.map.made import as_dict
+from tests.naive import cell_code as naive_cell_code
 
 from cairn_map.codec import cell_reading
 from cairn_map.codec.cell_code import encode_cell
@@ -36,7 +36,7 @@ def example() -> Evidence:
 def test_the_bytes_in_the_document_are_what_the_code_writes() -> None:
     written = bytes.fromhex("".join(found[2] for found in LINE.finditer(DOCUMENT)))
     assert written == encode_cell(KEY, example(), GEOMETRY).data
-    assert naive.decode_cell(written)[1] == as_dict(example())
+    assert naive_cell_code.decode_cell(written)[1] == as_dict(example())
 
 
 def test_the_offsets_in_the_document_are_those_of_its_bytes() -> None:

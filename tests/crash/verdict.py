@@ -6,9 +6,9 @@ from functools import lru_cache
 from pathlib import Path
 
 import apsw
-from tests import naive
 from tests.fixtures.map.made import as_dict
 from tests.fixtures.server.pushes import Cells, read
+from tests.naive import evidence as naive_evidence
 
 from cairn_map.codec.cell_code import decode_cell
 from cairn_map.commits.commit import Commit
@@ -131,11 +131,11 @@ def sum_of(commits: Iterable[Commit]) -> Cells:
     total: Cells = {}
     for commit in kept:
         for key, body in commit.cells.items() if commit.id not in retracted else ():
-            total[key] = naive.merged(total.get(key, {}), evidence_of(body))
+            total[key] = naive_evidence.merged(total.get(key, {}), evidence_of(body))
     return {key: evidence for key, evidence in total.items() if evidence}
 
 
 @lru_cache(maxsize=1024)
-def evidence_of(body: bytes) -> naive.Evidence:
+def evidence_of(body: bytes) -> naive_evidence.Evidence:
     """A cell of a commit as a dictionary."""
     return as_dict(decode_cell(body).evidence)

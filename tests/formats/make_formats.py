@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 
 import numpy as np
-from tests.naive import interleave
+from tests.naive.evidence import interleave
 
 from cairn_map.codec.cell_code import Profile, decode_cell, encode_cell
 from cairn_map.commits.commit import CommitMeta, ScanPose, make_commit

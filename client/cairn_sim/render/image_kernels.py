@@ -4,7 +4,7 @@ An image is cast once through its pixels' centres. Where neighbours show differe
 on a grid of finer rays, and what these receive is added up: light in the visible and far infrared, waves in the near
 infrared. The mixed ranges at edges, `flying pixels`, follow from the waves and are nobody's formula.
 
-`render` is the caller that checks; tests/fixtures/sim/naive_images.py holds the slow twins.
+`render` is the caller that checks; tests/naive/images.py holds the slow twins.
 """
 
 import math

@@ -1,7 +1,7 @@
 """What rays meet in a scene. A solid is seen from outside only; the nearest that a ray enters is its hit.
 
 Light that meets glass goes on, and light that meets a mirror turns; so each ray has a first hit, which is the geometry,
-and a last one, which is what is seen. `rays` is the caller that checks; tests/fixtures/sim/naive_raycast.py is the slow
+and a last one, which is what is seen. `rays` is the caller that checks; tests/naive/raycast.py is the slow
 twin.
 """
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests.fixtures.fusion import naive_views
+from tests.naive import views as naive_views
 
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.fisheye import FisheyeCamera

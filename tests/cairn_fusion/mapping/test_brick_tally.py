@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests import naive
+from tests.naive import evidence as naive_evidence
 
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.poses import look_at
@@ -64,7 +64,7 @@ def test_a_point_is_in_the_voxel_that_the_format_says_even_on_a_border(edge_um: 
             assert number == -1
             continue
         assert number >> 9 == (brick[2] * dims[1] + brick[1]) * dims[0] + brick[0]
-        assert number & 511 == naive.interleave(*(voxel % 8).tolist())
+        assert number & 511 == naive_evidence.interleave(*(voxel % 8).tolist())
 
 
 def carving_of_octants(tally: BrickTally, voxels: npt.NDArray[np.int64], masks: npt.NDArray[np.int32]) -> Carving:

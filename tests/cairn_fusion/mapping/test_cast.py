@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests import naive
+from tests.naive import rays as naive_rays
 
 from cairn_fusion.mapping.ray_casting import SeenVoxels, seen_voxels
 from cairn_map.errors import BadInputError
@@ -48,8 +48,8 @@ def check_against_twin(origin: tuple[float, ...], targets: list[tuple[float, ...
     start = tuple(float(v) for v in origin)
     rays = [tuple((end / EDGE_M).tolist()) for end in ends_m]
     assert hits == {tuple(voxel) for voxel in voxels.tolist()}
-    surely = {voxel for ray in rays for voxel in naive.voxels_passed(start, ray, grown=-CLOSE)} - hits
-    perhaps = {voxel for ray in rays for voxel in naive.voxels_passed(start, ray, grown=CLOSE)} - hits
+    surely = {voxel for ray in rays for voxel in naive_rays.voxels_passed(start, ray, grown=-CLOSE)} - hits
+    perhaps = {voxel for ray in rays for voxel in naive_rays.voxels_passed(start, ray, grown=CLOSE)} - hits
     assert surely <= misses <= perhaps
 
 
@@ -135,7 +135,7 @@ def test_many_long_rays_make_the_pool_grow_and_agree_with_the_twin() -> None:
     hits, misses = as_sets(cast((0.5, 0.5, 0.5), [tuple(t) for t in targets])[0])
     assert len(hits) == len(targets)
     for voxel in list(misses)[:: len(misses) // 100]:
-        assert any(naive.passes((0.5, 0.5, 0.5), tuple(t), voxel, grown=CLOSE) for t in targets.tolist())
+        assert any(naive_rays.passes((0.5, 0.5, 0.5), tuple(t), voxel, grown=CLOSE) for t in targets.tolist())
 
 
 def test_a_scan_that_would_not_fit_in_memory_is_refused() -> None:

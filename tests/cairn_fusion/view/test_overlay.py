@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests import naive_sight
 from tests.fixtures.map.worlds import map_of
+from tests.naive import sight as naive_sight
 
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.pose_vectors import transform_from_vector

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests import naive
 from tests.fixtures.map.made import (
     GEOMETRIES,
     KEY,
@@ -19,6 +18,7 @@ from tests.fixtures.map.made import (
     random_evidence,
 )
 from tests.fixtures.map.stored import recoded
+from tests.naive import cell_code as naive_cell_code
 
 from cairn_map.codec.cell_code import decode_canonical_cell, decode_cell, decode_met, encode_cell
 from cairn_map.codec.octree.octree import build_octree
@@ -75,7 +75,7 @@ def test_differences_come_back(a: int, b: int) -> None:
 def test_the_second_decoder_agrees(made: tuple[Evidence, Geometry]) -> None:
     evidence, geometry = made
     encoded = encode_cell(KEY, evidence, geometry)
-    header, voxels = naive.decode_cell(encoded.data)
+    header, voxels = naive_cell_code.decode_cell(encoded.data)
     assert voxels == as_dict(evidence)
     assert header["digest"] == encoded.digest
     assert header | header_of(geometry, (-1, 0, 2)) == header
@@ -85,7 +85,7 @@ def test_the_second_decoder_agrees(made: tuple[Evidence, Geometry]) -> None:
 @given(st.one_of(MADE, st.tuples(SIGNED, st.just(SMALL))))
 def test_the_second_encoder_agrees(made: tuple[Evidence, Geometry]) -> None:
     evidence, geometry = made
-    data, digest = naive.encode_cell(header_of(geometry, (-1, 0, 2)), as_dict(evidence))
+    data, digest = naive_cell_code.encode_cell(header_of(geometry, (-1, 0, 2)), as_dict(evidence))
     assert digest == encode_cell(KEY, evidence, geometry).digest
     assert data == recoded(encode_cell(KEY, evidence, geometry).data, level=None)
 

@@ -3,10 +3,10 @@
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests import naive
 from tests.fixtures.map.made import KEY, MIDDLE, SMALL, as_dict, surface_evidence
 from tests.fixtures.map.stored import GROUPS, bodies_of, garbled, recoded, with_streams
 from tests.fixtures.map.strategies import RANDOM, SMOOTH, Made
+from tests.naive import octree as naive_octree
 
 from cairn_map.codec.cell_code import Profile, decode_cell, encode_cell
 from cairn_map.codec.cell_reading import cell_reader
@@ -27,10 +27,10 @@ def topology(data: bytes, depth: int) -> list[tuple[int, int]]:
 @given(st.one_of(RANDOM, SMOOTH), st.sampled_from(Profile))
 def test_topology_is_what_the_evidence_says_whatever_the_other_streams_do(made: Made, profile: Profile) -> None:
     evidence, geometry = made
-    root = naive.tree_of(as_dict(evidence), geometry.depth)
+    root = naive_octree.tree_of(as_dict(evidence), geometry.depth)
     data = encode_cell(KEY, evidence, geometry, profile=profile).data
     for depth in range(1, geometry.depth + 1):
-        expected = naive.leaves_above(root, geometry.depth, depth)
+        expected = naive_octree.leaves_above(root, geometry.depth, depth)
         assert topology(data, depth) == expected
         assert topology(garbled(data, lambda number: number <= 2), depth) == expected
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests import naive
 from tests.fixtures.map.made import MIDDLE, PLAIN, SMALL, as_dict, random_evidence, surface_evidence
+from tests.naive import evidence as naive_evidence
+from tests.naive import octree as naive_octree
 
 from cairn_map.codec.entropy.neighbour_kernels import NONE, STEPS, earlier_rows, index_leaves
 from cairn_map.codec.octree.cell_content import content_of
@@ -42,9 +43,9 @@ def test_leaves_down_to_any_depth_are_those_of_the_slow_tree(made: Made) -> None
     evidence, geometry = made
     depth = geometry.depth
     octree, _ = build_octree(evidence, depth=depth)
-    root = naive.tree_of(as_dict(evidence), depth)
+    root = naive_octree.tree_of(as_dict(evidence), depth)
     for stop in range(1, depth + 1):
-        expected = naive.leaves_above(root, depth, stop)
+        expected = naive_octree.leaves_above(root, depth, stop)
         firsts = np.zeros(depth + 1, np.int64)
         masks, _, leaves = measure_masks(octree.child_masks, octree.leaf_masks, firsts, stop)
         sizes_above = [size for _, size in expected if size > 8 ** (depth - stop)]
@@ -63,7 +64,7 @@ def test_a_collapsed_leaf_and_an_inner_node_of_one_size_are_told_apart() -> None
     firsts = np.zeros(4, np.int64)
     _, _, leaves = measure_masks(octree.child_masks, octree.leaf_masks, firsts, 2)
     assert leaves == int((octree.sizes >= 8).sum())
-    assert 0 < leaves < len(naive.leaves_above(naive.tree_of(as_dict(evidence), 3), 3, 2))
+    assert 0 < leaves < len(naive_octree.leaves_above(naive_octree.tree_of(as_dict(evidence), 3), 3, 2))
 
 
 @given(MADE)
@@ -73,7 +74,9 @@ def test_the_index_of_leaves_finds_who_holds_each_place(made: Made) -> None:
     octree, _ = build_octree(evidence, depth=depth)
     brick_of, leaf_of = index_leaves(octree.starts, octree.sizes, depth)
     holders: dict[int, int] = {}
-    for n, (start, _, _) in enumerate(leaves := naive.leaves_of(naive.tree_of(as_dict(evidence), depth), depth)):
+    for n, (start, _, _) in enumerate(
+        leaves := naive_octree.leaves_of(naive_octree.tree_of(as_dict(evidence), depth), depth)
+    ):
         holders |= dict.fromkeys(range(start, start + leaves[n][1]), n)
     found: dict[int, int] = {}
     for brick, table in enumerate(brick_of.tolist()):
@@ -94,7 +97,7 @@ def test_earlier_rows_are_those_beside_that_come_before(made: Made, data: st.Dat
     voxels = np.nonzero(octree.sizes == 1)[0]
     leaves = voxels[np.random.default_rng(data.draw(st.integers(0, 99))).random(len(voxels)) < 0.7]
     found = earlier_rows(octree.starts, leaves, *index_leaves(octree.starts, octree.sizes, depth), depth)
-    row_at = {naive.deinterleave(start): s for s, start in enumerate(octree.starts[leaves].tolist())}
+    row_at = {naive_evidence.deinterleave(start): s for s, start in enumerate(octree.starts[leaves].tolist())}
     for (x, y, z), s in row_at.items():
         rows = [row_at.get((x + i, y + j, z + k), NONE) for i, j, k in STEPS.tolist()]
         assert found[s].tolist() == [row if row < s else NONE for row in rows]
@@ -106,7 +109,7 @@ def test_the_steps_are_all_that_can_come_before() -> None:
     for corner in product((1, 2, 3, 4), repeat=3):
         for step in product((-1, 0, 1), repeat=3):
             place = tuple(v + d for v, d in zip(corner, step, strict=True))
-            if naive.interleave(*place) < naive.interleave(*corner):
+            if naive_evidence.interleave(*place) < naive_evidence.interleave(*corner):
                 lower.add(step)
     assert set(map(tuple, STEPS.tolist())) <= lower
     assert all(sum(abs(d) for d in step) == 3 for step in lower - set(map(tuple, STEPS.tolist())))

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests import naive
 from tests.fixtures.map.made import (
     DOSE,
     GEOMETRIES,
@@ -19,6 +18,7 @@ from tests.fixtures.map.made import (
 )
 from tests.fixtures.map.stored import GROUPS, bodies_of, recoded, with_streams
 from tests.fixtures.map.strategies import RANDOM, SIXTEEN, SMOOTH, WARM, Made
+from tests.naive import cell_code as naive_cell_code
 
 from cairn_map.codec.cell_code import Profile, decode_canonical_cell, decode_cell, encode_cell, recompressed_cell
 from cairn_map.codec.octree.streams import MODELLED
@@ -48,10 +48,10 @@ def full_evidence(geometry: Geometry) -> Evidence:
 def test_the_twin_reads_and_writes_the_same_bytes(made: Made) -> None:
     evidence, geometry = made
     encoded = encode_cell(KEY, evidence, geometry, profile=Profile.SMALL)
-    header, voxels = naive.decode_cell(encoded.data)
+    header, voxels = naive_cell_code.decode_cell(encoded.data)
     assert voxels == as_dict(evidence)
     assert header["digest"] == encoded.digest
-    groups = naive.modelled_groups(header_of(geometry, CELL), as_dict(evidence))
+    groups = naive_cell_code.modelled_groups(header_of(geometry, CELL), as_dict(evidence))
     for number, stream in bodies_of(encoded.data).items():
         if stream.coding == MODELLED:
             assert stream.body == groups.get(number, b"")
@@ -61,18 +61,21 @@ def test_the_twin_reads_and_writes_the_same_bytes(made: Made) -> None:
 def test_what_the_twin_writes_of_anything_is_read(made: Made) -> None:
     """Of extremes, too, which the real encoder finds no shorter than they are and leaves raw."""
     evidence, geometry = made
-    data, digest = naive.encode_modelled_cell(header_of(geometry, CELL), as_dict(evidence))
+    data, digest = naive_cell_code.encode_modelled_cell(header_of(geometry, CELL), as_dict(evidence))
     decoded = decode_canonical_cell(data)
     assert decoded.evidence == evidence
     assert decoded.digest == digest == encode_cell(KEY, evidence, geometry).digest
-    assert naive.decode_cell(data)[1] == as_dict(evidence)
+    assert naive_cell_code.decode_cell(data)[1] == as_dict(evidence)
 
 
 def test_the_twin_agrees_on_a_larger_surface() -> None:
     evidence = surface_evidence(5, MIDDLE)
     encoded = encode_cell(KEY, evidence, MIDDLE, profile=Profile.SMALL)
-    assert naive.encode_modelled_cell(header_of(MIDDLE, CELL), as_dict(evidence)) == (encoded.data, encoded.digest)
-    assert naive.decode_cell(encoded.data)[1] == as_dict(evidence)
+    assert naive_cell_code.encode_modelled_cell(header_of(MIDDLE, CELL), as_dict(evidence)) == (
+        encoded.data,
+        encoded.digest,
+    )
+    assert naive_cell_code.decode_cell(encoded.data)[1] == as_dict(evidence)
 
 
 @pytest.mark.parametrize("large", [1, 300, (1 << 16) - 1, 1 << 16, (1 << 40) - 1, 1 << 40, SUM_MAX - 1, SUM_MAX])
@@ -88,10 +91,10 @@ def test_the_twin_agrees_beside_large_numbers(large: int) -> None:
     full = np.zeros((len(places), SMALL.plane_count), np.int64)
     full[evidence.sampled] = samples
     changed = packed_evidence(places, counts, full, SMALL)
-    data, digest = naive.encode_modelled_cell(header_of(SMALL, CELL), as_dict(changed))
+    data, digest = naive_cell_code.encode_modelled_cell(header_of(SMALL, CELL), as_dict(changed))
     decoded = decode_canonical_cell(data)
     assert (decoded.evidence, decoded.digest) == (changed, digest)
-    groups = naive.modelled_groups(header_of(SMALL, CELL), as_dict(changed))
+    groups = naive_cell_code.modelled_groups(header_of(SMALL, CELL), as_dict(changed))
     modelled = [s for s in bodies_of(encode_cell(KEY, changed, SMALL, profile=Profile.SMALL).data).values() if s.body]
     assert all(stream.body == groups[stream.number] for stream in modelled if stream.coding == MODELLED)
 
@@ -143,7 +146,7 @@ def test_a_full_cell_comes_back(geometry: Geometry) -> None:
 def test_one_voxel_comes_back(geometry: Geometry, place: str) -> None:
     at = np.array([0 if place == "first" else 8**geometry.depth - 1], np.uint32)
     evidence = packed_evidence(at, np.array([[1, 2]]), np.full((1, geometry.plane_count), 7), geometry)
-    data, _ = naive.encode_modelled_cell(header_of(geometry, CELL), as_dict(evidence))
+    data, _ = naive_cell_code.encode_modelled_cell(header_of(geometry, CELL), as_dict(evidence))
     for cell in (data, encode_cell(KEY, evidence, geometry, profile=Profile.SMALL).data):
         assert decode_canonical_cell(cell).evidence == evidence
 
@@ -151,7 +154,7 @@ def test_one_voxel_comes_back(geometry: Geometry, place: str) -> None:
 @pytest.mark.parametrize("geometry", ALL)
 def test_an_empty_cell_comes_back(geometry: Geometry) -> None:
     nothing = empty_evidence(geometry)
-    modelled, _ = naive.encode_modelled_cell(header_of(geometry, CELL), {})
+    modelled, _ = naive_cell_code.encode_modelled_cell(header_of(geometry, CELL), {})
     for cell in (modelled, encode_cell(KEY, nothing, geometry, profile=Profile.SMALL).data):
         assert decode_canonical_cell(cell).evidence == nothing
 

@@ -5,7 +5,6 @@ import json
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests import naive
 from tests.fixtures.map.made import (
     DOSE,
     GEOMETRIES,
@@ -20,6 +19,7 @@ from tests.fixtures.map.made import (
     random_evidence,
 )
 from tests.fixtures.map.stored import recoded
+from tests.naive import wire as naive_wire
 
 from cairn_map.codec.cell_code import encode_cell
 from cairn_map.commits.commit import CELLS_MAX, HEAD, META_BYTES_MAX, Commit, CommitMeta, make_commit
@@ -50,13 +50,13 @@ def test_opening_undoes_making(seed: int, geometry: object) -> None:
 def test_the_sha_is_what_its_twin_says() -> None:
     made = made_commit()
     text = made.meta.model_dump_json(exclude_defaults=True).encode()
-    assert naive.commit_parts(made.data) == (text, [*made.cells.values()], made.sha)
+    assert naive_wire.commit_parts(made.data) == (text, [*made.cells.values()], made.sha)
 
 
 @pytest.mark.parametrize("level", [None, 1, 19])
 def test_the_sha_does_not_depend_on_compression(level: int | None) -> None:
     made = made_commit(geometry=MIDDLE)
-    meta, cells, _ = naive.commit_parts(made.data)
+    meta, cells, _ = naive_wire.commit_parts(made.data)
     other = commit_bytes(meta, [recoded(cell, level=level) for cell in cells])
     assert other != made.data
     assert open_commit(other)[0].sha == made.sha
@@ -112,13 +112,13 @@ def test_evidence_of_another_geometry_is_refused_by_maker_and_reader() -> None:
     with pytest.raises(BadInputError) as refused:
         make_commit(made_meta(PLAIN), {KEY: random_evidence(1, SMALL)}, SMALL)
     assert refused.value.kind == "other_geometry"
-    meta, _, _ = naive.commit_parts(made_commit(geometry=PLAIN).data)
-    _, cells, _ = naive.commit_parts(made_commit(geometry=SMALL).data)
+    meta, _, _ = naive_wire.commit_parts(made_commit(geometry=PLAIN).data)
+    _, cells, _ = naive_wire.commit_parts(made_commit(geometry=SMALL).data)
     assert refusal(commit_bytes(meta, cells)) == "other_geometry"
 
 
 def test_cells_must_rise_be_canonical_and_hold_evidence() -> None:
-    meta, cells, _ = naive.commit_parts(made_commit(geometry=PLAIN).data)
+    meta, cells, _ = naive_wire.commit_parts(made_commit(geometry=PLAIN).data)
     assert refusal(commit_bytes(meta, cells[::-1])) == "bad_commit"
     assert refusal(commit_bytes(meta, [cells[0], cells[0]])) == "bad_commit"
     assert refusal(commit_bytes(meta, [encode_cell(KEY, empty_evidence(PLAIN), PLAIN).data])) == "bad_commit"

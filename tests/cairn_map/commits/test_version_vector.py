@@ -3,7 +3,7 @@
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests import naive
+from tests.naive import wire as naive_wire
 
 from cairn_map.commits.ids import NUMBER_LIMIT, Author, CommitId, author_from_text, commit_id_from_text
 from cairn_map.commits.version_vector import (
@@ -51,8 +51,8 @@ def test_minus_is_that_of_sets(a: set[tuple[str, int]], b: set[tuple[str, int]])
 @given(IDS)
 def test_json_is_what_its_twin_says_and_comes_back(ids: set[tuple[str, int]]) -> None:
     value = vector_of(ids).to_json()
-    assert value == naive.vector_of_ids(ids)
-    assert naive.ids_of_vector(value) == ids
+    assert value == naive_wire.vector_of_ids(ids)
+    assert naive_wire.ids_of_vector(value) == ids
     assert version_vector_from_json(value) == vector_of(ids)
 
 

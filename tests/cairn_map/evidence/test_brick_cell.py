@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests import naive
 from tests.fixtures.map.made import DOSE, GEOMETRIES, KEY, MIDDLE, PLAIN, SMALL, any_evidence, as_dict, random_evidence
+from tests.naive import evidence as naive_evidence
 
 from cairn_map.codec.cell_code import encode_cell
 from cairn_map.errors import BadInputError
@@ -78,11 +78,11 @@ def test_a_copy_and_its_cell_do_not_see_what_the_other_merges(
 
 @given(st.lists(st.tuples(edge_evidence(), st.sampled_from([1, -1])), min_size=1, max_size=6))
 def test_numbers_of_any_size_are_summed_or_refused_as_the_twin_says(steps: list[tuple[Evidence, int]]) -> None:
-    cell, total = BrickCell(TWO_CHANNELS), naive.Evidence()
+    cell, total = BrickCell(TWO_CHANNELS), naive_evidence.Evidence()
     for diff, sign in steps:
-        expected = naive.merged(total, as_dict(diff), sign=sign)
+        expected = naive_evidence.merged(total, as_dict(diff), sign=sign)
         change = cell.merge if sign == 1 else cell.unmerge
-        if naive.fits(expected):
+        if naive_evidence.fits(expected):
             change(diff)
             total = expected
         else:
@@ -94,11 +94,11 @@ def test_numbers_of_any_size_are_summed_or_refused_as_the_twin_says(steps: list[
 
 @given(st.lists(st.tuples(st.integers(0, 1000), st.sampled_from([1, -1])), max_size=5))
 def test_bricks_and_runs_and_rows_are_summed_as_the_twin_says(steps: list[tuple[int, int]]) -> None:
-    cell, total = BrickCell(MIDDLE), naive.Evidence()
+    cell, total = BrickCell(MIDDLE), naive_evidence.Evidence()
     for seed, sign in steps:
         diff = random_evidence(seed, MIDDLE, voxels=400, air=4)
         (cell.merge if sign == 1 else cell.unmerge)(diff)
-        total = naive.merged(total, as_dict(diff), sign=sign)
+        total = naive_evidence.merged(total, as_dict(diff), sign=sign)
     assert as_dict(cell.packed()) == total
 
 
@@ -118,14 +118,14 @@ def test_planes_take_the_bits_that_they_need(sums: tuple[int, ...], wide: int) -
 
 @given(SIGNED, SIGNED)
 def test_merging_is_what_its_twin_says(a: Evidence, b: Evidence) -> None:
-    expected = naive.merged(as_dict(a), as_dict(b))
+    expected = naive_evidence.merged(as_dict(a), as_dict(b))
     if all(abs(hits) <= COUNT_MAX and abs(misses) <= COUNT_MAX for hits, misses, _ in expected.values()):
         assert as_dict(sum_evidence([a, b], SMALL)) == expected
 
 
 @given(SIGNED, SIGNED)
 def test_differences_are_what_their_twin_says(a: Evidence, b: Evidence) -> None:
-    expected = naive.merged(as_dict(a), as_dict(b), sign=-1)
+    expected = naive_evidence.merged(as_dict(a), as_dict(b), sign=-1)
     if all(abs(hits) <= COUNT_MAX and abs(misses) <= COUNT_MAX for hits, misses, _ in expected.values()):
         assert as_dict(difference(a, b, SMALL)) == expected
 

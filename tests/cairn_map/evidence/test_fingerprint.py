@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests import naive
 from tests.fixtures.map.made import KEY, MIDDLE, SMALL, any_evidence, as_dict, random_evidence
+from tests.naive import evidence as naive_evidence
 
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.brick_cell import difference, sum_evidence
@@ -27,7 +27,7 @@ def test_the_fingerprint_of_a_sum_is_the_sum_of_fingerprints(a: int, b: int) -> 
 @given(any_evidence(SMALL, low=-(1 << 62)), st.integers(0, (1 << 63) - 1))
 def test_the_fingerprint_is_what_its_twin_says(evidence: Evidence, key: int) -> None:
     found = fingerprint(evidence, CellKey(key))
-    assert (found.first, found.second) == naive.fingerprint(as_dict(evidence), key)
+    assert (found.first, found.second) == naive_evidence.fingerprint(as_dict(evidence), key)
 
 
 @given(SEEDS, st.data())

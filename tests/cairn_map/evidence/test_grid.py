@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests import naive
+from tests.naive import evidence as naive_evidence
 
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import COLOUR, INTENSITY, Channel, ChannelKind
@@ -77,7 +77,10 @@ def test_joining_undoes_splitting(voxels: list[tuple[int, int, int]]) -> None:
 def test_splitting_is_what_its_twin_says(voxel: tuple[int, int, int]) -> None:
     cells, places = split_voxels(np.array([voxel]), FIVE_CM)
     i, j, k = (v // 16 for v in voxel)
-    assert (int(cells[0]), int(places[0])) == (naive.cell_number((i, j, k)), naive.interleave(*(v % 16 for v in voxel)))
+    assert (int(cells[0]), int(places[0])) == (
+        naive_evidence.cell_number((i, j, k)),
+        naive_evidence.interleave(*(v % 16 for v in voxel)),
+    )
 
 
 @given(CELLS)

@@ -6,9 +6,9 @@ import math
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests import naive_queries as naive
 from tests.fixtures.map.made import PLAIN
 from tests.fixtures.map.worlds import ROOM, poses, random_map, random_points, random_rotations, snapshot_with, world_of
+from tests.naive import queries as naive
 
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence_map import EvidenceMap

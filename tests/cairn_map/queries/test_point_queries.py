@@ -5,9 +5,9 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from tests import naive_queries as naive
 from tests.fixtures.map.made import DOSE, GEOMETRIES, MIDDLE, PLAIN, SMALL, random_evidence
 from tests.fixtures.map.worlds import map_of, random_map, random_points, snapshot_with, world_of
+from tests.naive import queries as naive
 
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel

@@ -5,9 +5,9 @@ import math
 
 import numpy as np
 import pytest
-from tests import naive_queries as naive
 from tests.fixtures.map.made import MIDDLE, PLAIN
 from tests.fixtures.map.worlds import random_map, random_points, snapshot_with, world_of
+from tests.naive import queries as naive
 
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence_map import EvidenceMap

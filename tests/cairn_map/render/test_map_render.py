@@ -3,9 +3,9 @@
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests import naive_sight
 from tests.fixtures.map.made import PLAIN, SMALL
 from tests.fixtures.map.worlds import map_of, random_map, snapshot_with
+from tests.naive import sight as naive_sight
 
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence_map import EvidenceMap

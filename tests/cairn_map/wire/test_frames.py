@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests import naive
 from tests.fixtures.map.made import KEY, made_cursor, made_frames
+from tests.naive import wire as naive_wire
 
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError
 from cairn_map.wire.frames import (
@@ -55,7 +55,7 @@ def test_a_frame_of_every_kind_comes_back(frame: Frame) -> None:
 
 
 def test_the_second_reader_agrees() -> None:
-    assert naive.frame_bodies(REPLY) == [(n + 1, body_of(frame)) for n, frame in enumerate(FRAMES)]
+    assert naive_wire.frame_bodies(REPLY) == [(n + 1, body_of(frame)) for n, frame in enumerate(FRAMES)]
 
 
 @given(st.lists(st.integers(0, len(REPLY)), max_size=30))

@@ -13,7 +13,6 @@ from collections.abc import Callable
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests import naive
 from tests.fixtures.map.bombs import BOMBS, DEEP, cell_of_air, commit_of, largest_commit, reply
 from tests.fixtures.map.made import (
     KEY,
@@ -26,6 +25,8 @@ from tests.fixtures.map.made import (
     voxels_below,
 )
 from tests.fixtures.map.stored import GROUPS, bodies_of, recoded, with_streams
+from tests.naive import cell_code as naive_cell_code
+from tests.naive import wire as naive_wire
 
 from cairn_map.codec.cell_code import Profile, decode_cell, encode_cell
 from cairn_map.commits.commit_reading import open_commit
@@ -58,21 +59,21 @@ def read_cell(data: bytes) -> None:
     """Decode; what comes out must be sound, and what the second decoder says."""
     decoded = decode_cell(data, evidence_bytes_max=MB)
     check_evidence(decoded.evidence, decoded.geometry)
-    header, voxels = naive.decode_cell(data)
+    header, voxels = naive_cell_code.decode_cell(data)
     assert voxels == as_dict(decoded.evidence)
     assert header["digest"] == decoded.digest
 
 
 def read_commit(data: bytes) -> None:
     commit, cells = open_commit(data, evidence_bytes_max=MB)
-    assert naive.commit_parts(data)[2] == commit.sha
+    assert naive_wire.commit_parts(data)[2] == commit.sha
     for cell in cells.values():
         check_evidence(cell.evidence, cell.geometry)
 
 
 def read_reply(data: bytes) -> None:
     frames = frames_of(data)
-    assert len(naive.frame_bodies(data)) == len(frames)
+    assert len(naive_wire.frame_bodies(data)) == len(frames)
 
 
 Reader = Callable[[bytes], None]

@@ -12,9 +12,9 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from tests.fixtures.map.made import PLAIN, SMALL
 from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.live import Live
-from tests.fixtures.server.naive_asker import NaiveAsker
 from tests.fixtures.server.pushes import MOLE, WREN, pushed, read
 from tests.fixtures.server.store_contract import Model
+from tests.naive.asker import NaiveAsker
 
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import Author, CommitId, Incarnation

@@ -6,8 +6,8 @@ import pytest
 from tests.fixtures.server.answers import cell_path, kind_of
 from tests.fixtures.server.damage import BROKEN, SOUND, broken_map, damage
 from tests.fixtures.server.live import Live, until
-from tests.fixtures.server.naive_asker import NaiveAsker
 from tests.fixtures.server.pushes import KEYS, MOLE, pushed, read, sum_of
+from tests.naive.asker import NaiveAsker
 
 from cairn_map.evidence.grid import CellKey
 from cairn_map.wire.frames import CellFrame, FrameKind, frames_of

@@ -15,11 +15,11 @@ from tests.fixtures.server.crowd_contract import CrowdContract
 from tests.fixtures.server.evidence_contract import EvidenceContract
 from tests.fixtures.server.fetching import fetch
 from tests.fixtures.server.live import Live
-from tests.fixtures.server.naive_asker import NaiveAsker
 from tests.fixtures.server.pushes import MOLE, WREN, pushed, read, sum_of
 from tests.fixtures.server.store_contract import StoreContract
 from tests.memory_store import tokens as memory_tokens
 from tests.memory_store.store import MemoryStore
+from tests.naive.asker import NaiveAsker
 
 from cairn_client.http.api import MapApi
 from cairn_map.errors import UnreachableError

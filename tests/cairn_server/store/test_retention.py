@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.fetching import fetch
 from tests.fixtures.server.live import Live, until
-from tests.fixtures.server.naive_asker import NaiveAsker, cell_frames
 from tests.fixtures.server.pushes import MOLE, WREN, pushed, read, sum_of
+from tests.naive.asker import NaiveAsker, cell_frames
 
 from cairn_map.commits.commit import Commit
 from cairn_map.wire.frames import FrameKind

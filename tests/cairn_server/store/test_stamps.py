@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from tests.fixtures.map.made import SMALL, random_evidence
 from tests.fixtures.server.fetching import fetch
 from tests.fixtures.server.live import Live
-from tests.fixtures.server.naive_asker import NaiveAsker, cell_frames
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
+from tests.naive.asker import NaiveAsker, cell_frames
 
 from cairn_map.codec.cell_code import decode_cell
 from cairn_map.commits.commit import Commit

@@ -5,8 +5,8 @@ from tests.fixtures.map.made import SMALL, random_evidence
 from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.fetching import ask_missing, fetch
 from tests.fixtures.server.live import Live
-from tests.fixtures.server.naive_asker import NaiveAsker
 from tests.fixtures.server.pushes import MOLE, SCANS, WREN, pushed
+from tests.naive.asker import NaiveAsker
 
 from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.grid import cell_key, cell_of_key

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.fetching import ask_missing, fetch
 from tests.fixtures.server.live import Live
-from tests.fixtures.server.naive_asker import KEY_FAR, NaiveAsker, cell_frames, fingerprint_sum
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
+from tests.naive.asker import KEY_FAR, NaiveAsker, cell_frames, fingerprint_sum
 
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.evidence.fingerprint import ZERO

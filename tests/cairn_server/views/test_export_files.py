@@ -17,7 +17,7 @@ from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.exports import ask_export, mapped, places, points
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import pushed
-from tests.naive_octomap import Node, read_tree
+from tests.naive.octomap import Node, read_tree
 
 from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.grid import cell_key

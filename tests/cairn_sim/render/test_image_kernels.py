@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from tests.fixtures.sim.naive_images import (
+from tests.naive.images import (
     naive_colours,
     naive_edge_pixels,
     naive_finer_rays,

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.fixtures.sim.naive_raycast import naive_cast, naive_sight
+from tests.naive.raycast import naive_cast, naive_sight
 
 from cairn_calib.rig.poses import look_at
 from cairn_map.arrays import Floats

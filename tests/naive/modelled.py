@@ -1,12 +1,12 @@
 """The slow, obvious twin of modelled streams: FORMAT.md 14 in plain integers, from the page and not from the code.
 
-Like `naive_coding` in both directions: what to write is an argument, None when reading.
+Like `entropy` in both directions: what to write is an argument, None when reading.
 
 Leaves are (corner, edge): the first voxel and the number of voxels along an edge. Trees, in and out, are lists of
 (child mask, leaf mask), one of each inner node, in the order of FORMAT.md 4.
 """
 
-from tests.naive_coding import Coder, Model, clip, digits, half_log
+from tests.naive.entropy import Coder, Model, clip, digits, half_log
 
 Corner = tuple[int, int, int]
 Leaf = tuple[Corner, int]
