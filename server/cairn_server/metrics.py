@@ -19,7 +19,7 @@ from prometheus_client.metrics import MetricWrapperBase
 from prometheus_client.registry import Collector
 
 from cairn_map.wire.frames import CELL_HEAD, CellFrame, Frame
-from cairn_server.store.store_health import Backlog, StoreFigures
+from cairn_server.store.store_rows import Backlog, StoreFigures
 
 MEDIA_TYPE = CONTENT_TYPE_PLAIN_0_0_4
 SERIES_MAX = 2000

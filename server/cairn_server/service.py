@@ -30,13 +30,11 @@ from cairn_map.wire.resumed_replies import reply_digest, without_begun
 from cairn_server.access.auth import Caller, new_token, token_hash
 from cairn_server.folding.cell_index import FIRST_PAGE, IndexPage, entries_of
 from cairn_server.folding.cells import Cells
-from cairn_server.folding.damaged_cells import DamagedCells
-from cairn_server.folding.fold_health import FoldHealth
+from cairn_server.folding.damaged_cells import DamagedCells, heal_cell, keep_healed
 from cairn_server.folding.fold_process import FoldProcess
-from cairn_server.folding.fold_thread import Folder
-from cairn_server.folding.healing import heal_cell, keep_healed
+from cairn_server.folding.fold_thread import FoldThread
 from cairn_server.folding.read_cache import ReadCache
-from cairn_server.folding.readiness import Readiness
+from cairn_server.folding.readiness import FoldHealth, Readiness
 from cairn_server.live.branch_list import branch_infos
 from cairn_server.live.hub import Hub
 from cairn_server.live.robot_reports import RobotReports
@@ -46,16 +44,13 @@ from cairn_server.store.numbering import EvidenceGoneError
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import Branch, MapRow
 from cairn_server.sync.checks.check_process import CheckProcess
-from cairn_server.sync.handing_over import server_key
-from cairn_server.sync.held_commits import HeldCommits
+from cairn_server.sync.handing_over import Joining, server_key
+from cairn_server.sync.held_commits import HeldCommits, WantedCommits
 from cairn_server.sync.missing import Besides, asker_from_request, header_of, reply_frames
 from cairn_server.sync.pushes import Pushes
+from cairn_server.sync.replies import StableVectors, vector_at
 from cairn_server.sync.retracting import retract_builders, targets_of
-from cairn_server.sync.stable_commits import StableVectors
 from cairn_server.sync.uploads import Uploads
-from cairn_server.sync.upstream_progress import Joining
-from cairn_server.sync.vector_at import vector_at
-from cairn_server.sync.wanted_commits import WantedCommits
 from cairn_server.views.export_tickets import ExportTickets
 from cairn_server.views.map_exports import MapExports
 from cairn_server.views.map_views import MapViews
@@ -85,7 +80,7 @@ class Service:
         self.reports = RobotReports(store, self.live)
         self.joining = Joining(is_joined=settings.upstream is not None)
         self.cells = Cells(store, self.damaged)
-        self._folder = Folder(
+        self._folder = FoldThread(
             store,
             self.folds,
             self.damaged,

@@ -13,7 +13,7 @@ from tests.fixtures.server.protocol_document import DOCUMENT, ROOT
 from tests.fixtures.server.pushes import MOLE, pushed
 
 from cairn_server import metrics
-from cairn_server.folding import fold_in_process, fold_thread
+from cairn_server.folding import fold_thread, group_folding
 from cairn_server.metrics import Bounded, metrics_text
 
 PUSH = "/maps/{name}/commits/{commit}"
@@ -78,7 +78,7 @@ def test_what_waits_to_be_folded_shows_until_it_is(fresh: Live, monkeypatch: pyt
     row = fresh.new_map()
     monkeypatch.setattr(fold_thread, "RETRY_S", 0.01)
     with monkeypatch.context() as broken:
-        broken.setattr(fold_in_process, "fold_around", _no_memory)
+        broken.setattr(group_folding, "fold_around", _no_memory)
         fresh.push(row, pushed(0, 0))
         begin_s = time.monotonic()
         while not value(text := text_of(fresh), "cairn_fold_failures_total", map=row.name):

@@ -20,7 +20,7 @@ from cairn_server.settings import Quotas, Settings
 from cairn_server.store import numbering
 from cairn_server.store.sqlite import tokens as sqlite_tokens
 from cairn_server.sync import cell_changes, missing, uploads
-from cairn_server.sync.checks import check_pool, commit_checks, commit_cost, push_policy
+from cairn_server.sync.checks import check_pool, commit_checks, push_policy
 from cairn_server.views import export_tickets, map_exports, map_views
 
 KIND = re.compile(r"[a-z]+(_[a-z]+)*")
@@ -72,9 +72,9 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("cells listed in `missing`", CURSORS_MAX),
         ("commits named in one retract request", RETRACTS_MAX),
         ("reply to `missing`", missing.REPLY_BYTES_MAX),
-        ("raw bytes of all streams of a commit", commit_cost.ALLOWANCE_BYTES),
-        ("modelled numbers of a commit (masks; leaves once for each modelled group)", commit_cost.ALLOWANCE_NUMBERS),
-        ("both, of any commit", commit_cost.RAW_BYTES_MAX),
+        ("raw bytes of all streams of a commit", commit_checks.ALLOWANCE_BYTES),
+        ("modelled numbers of a commit (masks; leaves once for each modelled group)", commit_checks.ALLOWANCE_NUMBERS),
+        ("both, of any commit", commit_checks.RAW_BYTES_MAX),
         ("ordinary commits checked at once", commit_checks.THREADS_MAX),
         ("dear commits that wait for a worker", check_pool.WAITING_MAX),
         ("live streams of one token", live.LISTENERS_OF_TOKEN_MAX),
@@ -113,9 +113,9 @@ def test_the_limits_in_the_document_are_those_of_the_code(row: str, number: floa
 
 def test_the_bounds_of_cost_in_the_document_are_those_of_the_code() -> None:
     defaults = Settings()
-    assert f"and {commit_cost.PER_BYTE} for each byte of its body" in DOCUMENT
+    assert f"and {commit_checks.PER_BYTE} for each byte of its body" in DOCUMENT
     assert f"| {defaults.check_cpu_s:.0f} s; 3 * 2^29 bytes (settings) |" in DOCUMENT
-    assert commit_cost.NUMBERS_MAX == 2**25
+    assert commit_checks.NUMBERS_MAX == 2**25
     assert "; 2^25 modelled numbers |" in DOCUMENT
     assert defaults.check_memory_bytes == 3 * 2**29
 

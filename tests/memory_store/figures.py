@@ -9,14 +9,11 @@ from tests.memory_store.maps import MemoryMaps
 
 from cairn_map.commits.cursor import ENTRY_FOLD
 from cairn_map.errors import UnreachableError
-from cairn_server.store.branch_notes import EntrySize
-from cairn_server.store.quota_store import Robot, Use, relay_of
-from cairn_server.store.store_health import Backlog, StoreFigures
-from cairn_server.store.store_rows import CellRow, MapRow
+from cairn_server.store.store_rows import Backlog, CellRow, EntrySize, MapRow, Robot, StoreFigures, Use, relay_of
 
 
 class MemoryHealth:
-    """`store_health.StoreHealth` without a disk: nothing waits to be written, and nothing runs full but the process."""
+    """`store.StoreHealth` without a disk: nothing waits to be written, and nothing runs full but the process."""
 
     def __init__(self, maps: MemoryMaps) -> None:
         self._maps = maps
@@ -55,7 +52,7 @@ class MemoryHealth:
 
 
 class MemoryUses:
-    """`quota_store.Uses`."""
+    """`store.Uses`."""
 
     def __init__(self, maps: MemoryMaps) -> None:
         self._maps = maps
@@ -73,7 +70,7 @@ class MemoryUses:
 
 
 class MemoryNotes:
-    """`branch_notes.BranchNotes`."""
+    """`store.BranchNotes`."""
 
     def __init__(self, maps: MemoryMaps) -> None:
         self._maps = maps

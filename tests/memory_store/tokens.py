@@ -1,4 +1,4 @@
-"""Tokens and the audit log in memory (`token_store`)."""
+"""Tokens and the audit log in memory (`store.Tokens`)."""
 
 import logging
 import time
@@ -10,8 +10,7 @@ from tests.memory_store.maps import MemoryMaps
 
 from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
 from cairn_map.wire.access_messages import AuditEntry, audit_chain
-from cairn_server.store.store_rows import MapRow
-from cairn_server.store.token_store import Token, registration_name
+from cairn_server.store.store_rows import MapRow, Token, registration_name
 
 log = logging.getLogger(__name__)
 
@@ -19,7 +18,7 @@ AUDIT_LINES_MAX = 100_000
 
 
 class MemoryTokens:
-    """`token_store.Tokens`, under the lock of the maps."""
+    """`store.Tokens`, under the lock of the maps."""
 
     def __init__(self, maps: MemoryMaps) -> None:
         self._maps = maps
@@ -100,7 +99,7 @@ class MemoryTokens:
 
 
 class MemoryAuditLog:
-    """`token_store.AuditLog`, under the lock of the maps."""
+    """`store.AuditLog`, under the lock of the maps."""
 
     def __init__(self, maps: MemoryMaps) -> None:
         self._maps = maps

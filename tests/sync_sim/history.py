@@ -291,5 +291,5 @@ def _seeded(seed: int) -> Iterator[pytest.MonkeyPatch]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ids.secrets, "token_hex", lambda size: random.randbytes(size).hex())
         patch.setattr(memory_map.secrets, "token_bytes", random.randbytes)
-        patch.setattr(service_module, "Folder", FoldOnRequest)
+        patch.setattr(service_module, "FoldThread", FoldOnRequest)
         yield patch

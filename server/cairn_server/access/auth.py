@@ -7,7 +7,7 @@ reader    read
 relay     read, hand over what robots signed   a robot's, too, if it names one
 enroller  register robots                      `enrolment_token`
 
-Whoever may read may do it with any of the first four. Tokens are kept as SHA-256 only (`token_store`); the two secrets
+Whoever may read may do it with any of the first four. Tokens are kept as SHA-256 only (`store.Tokens`); the two secrets
 of the settings are kept by whoever starts the server.
 """
 
@@ -21,8 +21,7 @@ from enum import StrEnum
 from cairn_map.errors import DeniedError
 from cairn_server.settings import Settings
 from cairn_server.store.store import Store
-from cairn_server.store.store_rows import MapRow
-from cairn_server.store.token_store import Token
+from cairn_server.store.store_rows import MapRow, Token
 
 
 class Role(StrEnum):

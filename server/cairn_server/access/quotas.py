@@ -17,11 +17,10 @@ from cairn_map.errors import BadInputError, UnreachableError
 from cairn_map.evidence.grid import CELL_LIMIT, CellKey
 from cairn_map.kernels.morton_kernels import deinterleave
 from cairn_server.access.auth import UPSTREAM, Caller, Role
-from cairn_server.access.token_bucket import Allowance, allowance
+from cairn_server.access.rate_limits import Allowance, allowance
 from cairn_server.settings import Quotas
-from cairn_server.store.quota_store import Robot, Use, relay_of
 from cairn_server.store.store import Store
-from cairn_server.store.store_rows import MapRow
+from cairn_server.store.store_rows import MapRow, Robot, Use, relay_of
 
 DAY_S = 86_400
 BOX_EVERY_S = 5.0

@@ -7,7 +7,7 @@ from cairn_map.errors import BadInputError
 from cairn_map.wire.access_messages import CreateToken, NewSecret, TokenInfo
 from cairn_server.access.auth import RESERVED_TOKEN_NAMES, Caller, new_token, token_hash
 from cairn_server.store.store import Store
-from cairn_server.store.token_store import Token
+from cairn_server.store.store_rows import Token
 
 
 def create_token(store: Store, name: str, request: CreateToken, *, by: Caller) -> NewSecret:

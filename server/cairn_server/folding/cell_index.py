@@ -4,7 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from cairn_map.commits.cursor import ENTRY_FOLD
-from cairn_map.evidence.grid import CellKey, cell_of_key
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.grid import CellKey, cell_from_text, cell_key, cell_of_key
 from cairn_map.wire.index_messages import INDEX_PAGE, CellEntry
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import CellRow
@@ -76,3 +77,18 @@ def _held_lm(snapshot: Snapshot, key: CellKey) -> int | None:
         elif touch.diff not in out:
             return touch.seq
     return None
+
+
+def box_from_text(text: str) -> Callable[[tuple[int, int, int]], bool]:
+    """Whether a cell lies in the box written `i0,j0,k0,i1,j1,k1`, both corners included.
+
+    Raises:
+        BadInputError: kind `bad_box`, or of a cell that cannot be.
+    """
+    parts = text.split(",")
+    low, high = cell_from_text(",".join(parts[:3])), cell_from_text(",".join(parts[3:]))
+    for corner in (low, high):
+        cell_key(corner)
+    if any(first > last for first, last in zip(low, high, strict=True)):
+        raise BadInputError("bad_box", f"a box is i0,j0,k0,i1,j1,k1 with the lower corner first, got {text!r}")
+    return lambda cell: all(a <= n <= b for a, n, b in zip(low, cell, high, strict=True))

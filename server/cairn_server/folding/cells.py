@@ -2,8 +2,7 @@
 
 from cairn_map.evidence.grid import CellKey
 from cairn_server.folding.cells_at_rest import DamagedCellError, sound_cell
-from cairn_server.folding.damaged_cells import DamagedCells
-from cairn_server.folding.healing import keep_healed
+from cairn_server.folding.damaged_cells import DamagedCells, keep_healed
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import CellRow, Head, MapRow
 

@@ -3,13 +3,24 @@
 It is not written anywhere: after a start a cell is found damaged again as soon as it is read or folded into.
 """
 
+import logging
 import threading
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import islice
 
+from cairn_map.codec.cell_code import decode_canonical_cell
+from cairn_map.codec.cell_limits import VOXEL_BYTES
+from cairn_map.errors import BadInputError, CairnError, ConflictError, DamagedDataError, NotFoundError
+from cairn_map.evidence.cell_order import hottest_k
+from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.wire.messages import DAMAGED_MAX
-from cairn_server.store.store import Snapshot
+from cairn_server.folding.cells_at_rest import sound_cell
+from cairn_server.store.store import Snapshot, Store
+from cairn_server.store.store_rows import CellRow, MapRow
+
+log = logging.getLogger(__name__)
 
 Damaged = list[tuple[tuple[int, int, int], str]]
 """As a header names them: the cell, and the fingerprint of what it was."""
@@ -51,3 +62,62 @@ def as_named(snapshot: Snapshot, keys: frozenset[CellKey]) -> Damaged:
         return []
     found = ((cell_of_key(cell.key), cell.fingerprint.hex()) for cell in snapshot.cells() if cell.key in keys)
     return list(islice(found, DAMAGED_MAX))
+
+
+def keep_healed(store: Store, row: MapRow, cells: Iterable[CellRow]) -> None:
+    """Write cells that were made anew from the log in the place of damaged ones; a note only, if that fails."""
+    for cell in cells:
+        try:
+            if store.health.heal(row, cell):
+                store.audit("healed_cell", f"map {row.name}: {cell_of_key(cell.key)} made anew from its commits")
+        except CairnError as exc:
+            log.error("cell %s could not be written anew: %s", cell_of_key(cell.key), exc.message)
+
+
+def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes, *, by: str) -> bool:
+    """Put these bytes in the place of a damaged cell; False if the cell is sound, and nothing is to be done.
+
+    Raises:
+        NotFoundError: kind `no_cell`: nobody has seen the cell.
+        ConflictError: kind `other_cell`: they are not the cell as it was when it was damaged.
+        DamagedDataError, BadInputError: they are no cell of this map.
+    """
+    with store.snapshot(row) as snapshot:
+        healed: list[CellRow] = []
+        try:
+            if sound_cell(snapshot, key, row.geometry, healed) is None:
+                raise NotFoundError("no_cell", f"nobody has seen cell {cell_of_key(key)} of map {row.name}")
+            stored = None
+        except DamagedDataError:
+            stored = _row_of(snapshot, key)
+    if stored is None:
+        keep_healed(store, row, healed)
+        return False
+    # No cell of as many voxels needs more: what claims more is another one.
+    limit_bytes = stored.voxels * (VOXEL_BYTES + 4 + 8 * row.geometry.plane_count)
+    decoded = decode_canonical_cell(data, evidence_bytes_max=limit_bytes)
+    if decoded.key != key or decoded.geometry != row.geometry:
+        raise BadInputError("bad_cell", f"the body is no cell {cell_of_key(key)} of map {row.name}")
+    if decoded.digest != stored.digest:
+        raise ConflictError(
+            "other_cell",
+            f"cell {cell_of_key(key)} had digest {stored.digest.hex()} at entry {stored.lm}, the body has "
+            f"{decoded.digest.hex()}",
+        )
+    sound = replace(
+        stored,
+        fingerprint=fingerprint(decoded.evidence, key),
+        voxels=len(decoded.evidence),
+        body=data,
+        size_bytes=len(data),
+        hottest_k=hottest_k(decoded.evidence, row.geometry),
+    )
+    if not store.health.heal(row, sound):
+        return False
+    store.audit_log.add(by, "healed_cell", f"map {row.name}: {cell_of_key(key)} from {len(data)} bytes that were sent")
+    return True
+
+
+def _row_of(snapshot: Snapshot, key: CellKey) -> CellRow | None:
+    """What is known of a cell beside its bytes, which may not even be readable."""
+    return next((cell for cell in snapshot.cells() if cell.key == key), None)

@@ -24,8 +24,8 @@ from pathlib import Path
 
 from cairn_map.errors import CairnError
 from cairn_map.evidence.grid import CellKey
-from cairn_server.folding.fold_in_process import Folded, FoldHere
-from cairn_server.folding.fold_store import Damage, FoldStore
+from cairn_server.folding.folding import Damage, FoldStore
+from cairn_server.folding.group_folding import Folded, LocalFolding
 from cairn_server.processes import die_with_parent
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.reads import SqliteReads
@@ -95,7 +95,7 @@ class FoldProcess:
         self._link = link
 
     def fold(self, row: MapRow, store: FoldStore, damaged: Damage, *, maps: int) -> Folded:
-        """As `FoldHere.fold`; what it makes is written to the store here.
+        """As `LocalFolding.fold`; what it makes is written to the store here.
 
         Raises:
             CairnError: nothing was folded.
@@ -165,7 +165,7 @@ def _be_folder(link: Connection, store_file: Path) -> None:
 def answer_folds(link: Connection, readers: Readers) -> None:
     """Plan what the other end asks for, until it is gone."""
     far = _FarStore(readers, link)
-    here = FoldHere(far, far.damaged)
+    here = LocalFolding(far, far.damaged)
     with suppress(EOFError, OSError):
         while True:
             ask: _Ask = link.recv()
@@ -173,7 +173,7 @@ def answer_folds(link: Connection, readers: Readers) -> None:
             link.send(_answer(here, ask))
 
 
-def _answer(here: FoldHere, ask: _Ask) -> Folded | _Failed:
+def _answer(here: LocalFolding, ask: _Ask) -> Folded | _Failed:
     try:
         return here.fold(ask.row, maps=ask.maps)
     except _NotWrittenError:

@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 from cairn_map.errors import CairnError
 from cairn_server.folding.damaged_cells import DamagedCells
-from cairn_server.folding.fold_health import FoldHealth
-from cairn_server.folding.fold_in_process import Folded, FoldHere
 from cairn_server.folding.fold_process import FoldProcess, LostProcessError
+from cairn_server.folding.group_folding import Folded, LocalFolding
+from cairn_server.folding.readiness import FoldHealth
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow
 
@@ -27,7 +27,7 @@ RETRY_S = 5.0
 FIRST_RETRY_S = 0.2
 
 
-class Folder:
+class FoldThread:
     """Folds all maps of a store until closed."""
 
     def __init__(
@@ -51,7 +51,7 @@ class Folder:
         self._wake = threading.Event()
         self._closing = threading.Event()
         self._process = process
-        self._here = FoldHere(store, damaged)
+        self._here = LocalFolding(store, damaged)
         self._wake.set()
         self._thread = threading.Thread(target=self._run, name="cairn-folder", daemon=True)
         self._thread.start()

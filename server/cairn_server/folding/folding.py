@@ -9,8 +9,10 @@ bytes are damaged at rest is set aside, so that it does not hold up the others; 
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from typing import Protocol
 
 from cairn_map.codec.cell_code import DecodedCell
 from cairn_map.commits.commit import commit_sha
@@ -23,14 +25,60 @@ from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey
 from cairn_server.folding.cell_cache import CellCache, Step
 from cairn_server.folding.cells_at_rest import cell_to_change, decode_stored
-from cairn_server.folding.fold_store import FoldStore
 from cairn_server.store.stamps import Stamps
+from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import Entry, Fold, Head, MapRow, StoredCommit
 
 log = logging.getLogger(__name__)
 
 GROUP_BYTES_MAX = 64 << 20
 """Commits folded at once have no more bytes than this, or are one."""
+
+
+class FoldStore(Protocol):
+    """The part of `store.Store` that folds are planned with, and written to."""
+
+    def pending(
+        self, row: MapRow, *, limit: int, size_bytes_max: int, skip: Collection[int] = ()
+    ) -> list[StoredCommit]:
+        """As `Store.pending`."""
+        ...
+
+    def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
+        """As `Store.folded`."""
+        ...
+
+    def is_retracted(self, row: MapRow, commit: CommitId) -> bool:
+        """As `Store.is_retracted`."""
+        ...
+
+    def snapshot(self, row: MapRow) -> AbstractContextManager[Snapshot]:
+        """As `Store.snapshot`."""
+        ...
+
+    def fold(self, row: MapRow, fold: Fold) -> bool:
+        """As `Store.fold`."""
+        ...
+
+    def audit(self, what: str, detail: str) -> None:
+        """As `Store.audit`."""
+        ...
+
+
+class Damage(Protocol):
+    """The part of `damaged_cells.DamagedCells` that folding speaks to."""
+
+    def note(self, map_name: str, keys: Iterable[CellKey]) -> None:
+        """These cells could not be read, nor made anew."""
+        ...
+
+    def forget(self, map_name: str, key: CellKey) -> None:
+        """The cell is sound."""
+        ...
+
+    def healed(self, map_name: str) -> int:
+        """How often a cell of a map was said to be sound."""
+        ...
 
 
 class DamagedCommitError(DamagedDataError):

@@ -10,10 +10,9 @@ from itertools import accumulate
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.wire.messages import BranchInfo
-from cairn_server.live.live_robots import LiveRobots
-from cairn_server.store.branch_notes import EntrySize
+from cairn_server.live.live_map import LiveRobots
 from cairn_server.store.store import Store
-from cairn_server.store.store_rows import Branch, MapRow
+from cairn_server.store.store_rows import Branch, EntrySize, MapRow
 
 LAG_ENTRIES_MAX = 10_000
 

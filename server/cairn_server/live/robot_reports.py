@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from cairn_map.errors import BadInputError, NotFoundError, UnreachableError
 from cairn_map.wire.robot_status import RobotStatus
-from cairn_server.access.token_bucket import Allowance, allowance
+from cairn_server.access.rate_limits import Allowance, allowance
 from cairn_server.live.hub import Hub
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow

@@ -6,7 +6,7 @@ fold      cells, log entries and the new head, all or nothing, only on top of th
 snapshot  a view of one state of the map: header and frames of a reply come from one of these
 """
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from typing import Protocol
@@ -16,23 +16,26 @@ from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import VersionVector
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.wire.access_messages import AuditEntry
 from cairn_map.wire.messages import LogEntry
-from cairn_server.store.branch_notes import BranchNotes
-from cairn_server.store.quota_store import Uses
-from cairn_server.store.store_health import StoreHealth
 from cairn_server.store.store_rows import (
+    Backlog,
     Branch,
     CellRow,
     Contribution,
+    EntrySize,
     Fold,
     Head,
     MapRow,
     NewCommit,
+    Robot,
     Selection,
     StoredCommit,
+    StoreFigures,
+    Token,
     Totals,
+    Use,
 )
-from cairn_server.store.token_store import AuditLog, Tokens
 
 
 class Snapshot(Protocol):
@@ -92,6 +95,117 @@ class Snapshot(Protocol):
 
     def totals(self) -> Totals:
         """Sizes."""
+        ...
+
+
+class BranchNotes(Protocol):
+    """Reached as `Store.notes`; every method may be called from any thread."""
+
+    def put_status(self, row: MapRow, branch: str, status: str) -> None:
+        """Keep the last status of a branch, as JSON, if there is such a branch; may be written later.
+
+        It goes with the branch.
+        """
+        ...
+
+    def statuses(self, row: MapRow) -> dict[str, str]:
+        """The last status of each branch that ever told one."""
+        ...
+
+    def entry_sizes(self, row: MapRow, *, after_seq: int, limit: int) -> list[EntrySize]:
+        """Log entries after one, oldest first, at most `limit`."""
+        ...
+
+
+class Uses(Protocol):
+    """What was accepted, as the commits themselves tell: nothing is counted twice or lost with the process."""
+
+    def since(self, time_s: float) -> Mapping[Robot, Use]:
+        """What each robot's commits took that came after a time, and what each relay handed over."""
+        ...
+
+
+class StoreHealth(Protocol):
+    """How a store does."""
+
+    def backlogs(self) -> list[Backlog]:
+        """What is not folded yet, of every map."""
+        ...
+
+    def figures(self) -> StoreFigures:
+        """Sizes and counts."""
+        ...
+
+    def check_space(self, free_bytes_min: int) -> None:
+        """Refuse to take more while less than this is free: folding what was taken needs room, too.
+
+        Raises:
+            UnreachableError: kind `disk_full`.
+        """
+        ...
+
+    def heal(self, row: MapRow, cell: CellRow) -> bool:
+        """Put sound bytes in the place of a damaged cell; False if it changed meanwhile. Durable on return."""
+        ...
+
+    def probe(self) -> None:
+        """Write something that changes nothing, as durably as a commit.
+
+        Raises:
+            UnreachableError: it could not be written: `disk_full`, `store_failed`, `shutting_down`, `busy`.
+        """
+        ...
+
+
+class Tokens(Protocol):
+    """All tokens, by name and by the SHA-256 of their secrets."""
+
+    def add(self, token: Token, secret_hash: bytes) -> None:
+        """Keep a new token.
+
+        Raises:
+            ConflictError: kind `token_exists`.
+        """
+        ...
+
+    def renew(self, name: str, secret_hash: bytes) -> Token:
+        """Give a token another secret; the old one is worth nothing from then on.
+
+        Raises:
+            NotFoundError: kind `no_such_token`.
+        """
+        ...
+
+    def remove(self, name: str) -> None:
+        """Forget a token.
+
+        Raises:
+            NotFoundError: kind `no_such_token`.
+        """
+        ...
+
+    def all(self) -> list[Token]:
+        """All tokens, by name, ended ones included."""
+        ...
+
+    def of_hash(self, secret_hash: bytes) -> Token | None:
+        """The token of a secret, ended or not."""
+        ...
+
+    def used(self, name: str) -> None:
+        """Note that a token was shown just now; written some seconds later."""
+        ...
+
+
+class AuditLog(Protocol):
+    """Lines that are added and never changed, each with a hash over the one before; the newest are kept."""
+
+    def add(self, who: str, what: str, detail: str) -> None:
+        """One more line; durable on return."""
+        ...
+
+    def page(self, *, after: int, limit: int) -> list[AuditEntry]:
+        """Lines numbered above `after`, oldest first."""
         ...
 
 

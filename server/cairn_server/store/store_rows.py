@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId
@@ -10,6 +11,10 @@ from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.wire.access_messages import RoleText
+
+Robot = tuple[int, str]
+"""Number of the map, and the robot's name, or `relay_of` a token."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -162,3 +167,81 @@ class Head:
 
     cursor: Cursor
     vector: VersionVector = field(default=EMPTY)
+
+
+class EntrySize(NamedTuple):
+    """What one log entry weighs."""
+
+    seq: int
+    author: Author | None
+    """Whose evidence came; None: some was taken out, which is news to its author, too."""
+    size_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Use:
+    """What a robot's commits took."""
+
+    size_bytes: int = 0
+    cells: int = 0
+
+    def __add__(self, more: "Use") -> "Use":
+        return Use(self.size_bytes + more.size_bytes, self.cells + more.cells)
+
+    def __sub__(self, less: "Use") -> "Use":
+        return Use(self.size_bytes - less.size_bytes, self.cells - less.cells)
+
+
+def relay_of(token: str) -> str:
+    """What stands for a robot's name where a relay's token is meant; no robot has a space in its name."""
+    return f"relay {token}"
+
+
+@dataclass(frozen=True, slots=True)
+class Backlog:
+    """Commits of one map that are durable but not folded."""
+
+    map: str
+    commits: int
+    oldest_s: float | None
+    """When the oldest of them came, as a time; None without any."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoreFigures:
+    """Sizes now, and counts since the start."""
+
+    size_bytes: int
+    """Of everything at rest, without what is written ahead."""
+    ahead_bytes: int
+    """Written ahead, to be moved to its place."""
+    free_bytes: int
+    """On the disk."""
+    queued: int
+    """Jobs that wait to be written."""
+    written: int
+    """Transactions."""
+    emptied: int
+    """Times that the write-ahead log was emptied."""
+    failures: dict[str, int]
+    """Transactions that were not written, by kind of error."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Token:
+    """A token as it is kept: everything but its secret."""
+
+    name: str
+    role: RoleText
+    map_number: int | None
+    """None: all maps."""
+    map_name: str | None
+    robot: str | None
+    created_s: float
+    expires_s: float | None
+    last_used_s: float | None = None
+
+
+def registration_name(map_name: str, robot: str) -> str:
+    """Name of the token that a registration gives; no administrator can choose it, for its colon."""
+    return f"{map_name}:{robot}"

@@ -2,10 +2,11 @@
 
 import threading
 from collections import defaultdict
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId, commit_id_from_text
+from cairn_map.wire.messages import WANTED_MAX
 from cairn_map.wire.relay_peer import SUM_BYTES, Held, sum_of_shas
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import MapRow
@@ -52,3 +53,29 @@ class HeldCommits:
             after_seq = entries[-1].seq
         self._sums[row.number] = head, sums
         return sums
+
+
+class WantedCommits:
+    """Wanted commits of all maps, the newest `WANTED_MAX` of each; thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._wanted: dict[str, dict[CommitId, None]] = {}
+
+    def note(self, map_name: str, commits: Iterable[CommitId]) -> None:
+        """A retract of these was refused."""
+        with self._lock:
+            wanted = self._wanted.setdefault(map_name, {})
+            wanted.update(dict.fromkeys(commits))
+            for commit in list(wanted)[:-WANTED_MAX]:
+                del wanted[commit]
+
+    def forget(self, map_name: str, commit: CommitId) -> None:
+        """It came."""
+        with self._lock:
+            self._wanted.get(map_name, {}).pop(commit, None)
+
+    def of(self, map_name: str) -> tuple[CommitId, ...]:
+        """Those of a map."""
+        with self._lock:
+            return tuple(self._wanted.get(map_name, ()))

@@ -5,17 +5,21 @@ proves it, and `lm` of each cell says whether it changed since. Per cell the sma
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+
+import numpy as np
 
 from cairn_map.codec.cell_code import encode_cell
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.commits.ids import Author, CommitId, author_from_text
 from cairn_map.commits.version_vector import VersionVector
 from cairn_map.errors import BadInputError, ConflictError
+from cairn_map.evidence.cell_order import first_to_last
 from cairn_map.evidence.evidence import empty_evidence
 from cairn_map.evidence.fingerprint import ZERO, Fingerprint
-from cairn_map.evidence.grid import Cell, CellKey, Geometry, cell_key, cell_of_key
+from cairn_map.evidence.grid import CELL_LIMIT, Cell, CellKey, Geometry, cell_key, cell_of_key
+from cairn_map.kernels.morton_kernels import deinterleave
 from cairn_map.wire.frames import CELL_HEAD, CellFrame, Frame, FrameKind
 from cairn_map.wire.messages import CURSORS_MAX, Done, MissingRequest, More, ReplyHeader
 from cairn_server.folding.cells_at_rest import DamagedCellError, sound_cell
@@ -24,7 +28,6 @@ from cairn_server.folding.read_cache import ReadCache
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import CellRow
 from cairn_server.sync.cell_changes import change_since
-from cairn_server.sync.frame_order import in_order
 
 log = logging.getLogger(__name__)
 
@@ -203,3 +206,14 @@ def _cursor(text: str | None) -> Cursor | None:
 def _is_proven(cursor: Cursor, snapshot: Snapshot) -> bool:
     head = snapshot.head.cursor
     return cursor.seq <= head.seq and snapshot.chain_at(cursor.seq) == cursor.chain
+
+
+def in_order(rows: Sequence[CellRow], near: Cell | None) -> list[CellRow]:
+    """The cells around a cell first, and hot ones before others (`cell_order`)."""
+    order = first_to_last(
+        deinterleave(np.fromiter((row.key for row in rows), np.uint64, len(rows))) - CELL_LIMIT,
+        near=near,
+        changed=np.fromiter((row.lm for row in rows), np.int64, len(rows)),
+        hottest_k=np.array([row.hottest_k for row in rows], np.float64),
+    )
+    return [rows[n] for n in order]

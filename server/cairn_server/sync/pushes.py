@@ -15,9 +15,9 @@ from cairn_map.commits.commit_reading import CommitReader, commit_reader
 from cairn_map.commits.signature import Signature, check_signatures, signatures_from_text, signatures_to_text
 from cairn_map.errors import ConflictError
 from cairn_map.evidence.grid import CellKey
-from cairn_server.access.audit_limit import Refusals
 from cairn_server.access.auth import Caller, Role
 from cairn_server.access.quotas import Meter
+from cairn_server.access.rate_limits import Refusals
 from cairn_server.live.hub import Hub
 from cairn_server.settings import Settings
 from cairn_server.store.numbering import EvidenceGoneError
@@ -28,8 +28,8 @@ from cairn_server.sync.checks.checking import Checked, new_commit
 from cairn_server.sync.checks.commit_checks import CommitChecks
 from cairn_server.sync.checks.push_policy import check_claims
 from cairn_server.sync.handing_over import speaker_of
+from cairn_server.sync.held_commits import WantedCommits
 from cairn_server.sync.retracting import is_sealed
-from cairn_server.sync.wanted_commits import WantedCommits
 
 
 class Pushes:

@@ -23,8 +23,7 @@ from cairn_map.files.export_request import ExportRequest
 from cairn_map.files.octomap import TREE_FORMATS, Branch, branch_of_cell, tree_file
 from cairn_map.files.point_clouds import About, Found, found_in_cell, point_file, points_of_cell, size_of_file
 from cairn_server.folding.cells_at_rest import DamagedCellError, decode_stored, sound_cell, stored_evidence
-from cairn_server.folding.damaged_cells import DamagedCells
-from cairn_server.folding.healing import keep_healed
+from cairn_server.folding.damaged_cells import DamagedCells, keep_healed
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import CellRow, Head, MapRow
 

@@ -29,8 +29,7 @@ from cairn_map.render.render_picture import Layer
 from cairn_map.render.render_request import RenderRequest
 from cairn_map.warm_up import warm_up_pictures
 from cairn_server.folding.cells_at_rest import DamagedCellError, row_of_cell, sound_cell, stored_evidence
-from cairn_server.folding.damaged_cells import DamagedCells
-from cairn_server.folding.healing import keep_healed
+from cairn_server.folding.damaged_cells import DamagedCells, keep_healed
 from cairn_server.folding.read_cache import State, state_of
 from cairn_server.folding.single_flight import MadeOnce
 from cairn_server.store.stamps import Stamps, decode_stamps, no_stamps

@@ -16,11 +16,11 @@ from cairn_client.cli import token as token_command
 from cairn_client.http.api import MapApi
 from cairn_map.errors import BadInputError, ConflictError, DeniedError, NotFoundError
 from cairn_map.wire.access_messages import AuditEntry, CreateToken
-from cairn_server.access import audit_limit, auth
+from cairn_server.access import auth, rate_limits
 from cairn_server.settings import Settings
 from cairn_server.store.sqlite import tokens as sqlite_tokens
 from cairn_server.store.sqlite.store import SqliteStore
-from cairn_server.store.token_store import Token
+from cairn_server.store.store_rows import Token
 
 GUARDED = {"admin_token": ADMIN, "enrolment_token": ENROLLER}
 
@@ -290,7 +290,7 @@ def test_no_route_changes_the_audit_log(guarded: Live) -> None:
 def test_a_robot_cannot_push_others_lines_out_of_the_audit_log_by_refusals(
     guarded: Live, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(audit_limit, "NOTED_PER_HOUR", 3)
+    monkeypatch.setattr(rate_limits, "NOTED_PER_HOUR", 3)
     row = guarded.new_map()
     mole, wren = (bearer(robot_token(guarded, row, name)) for name in ("mole", "wren"))
     guarded.push(row, pushed(0, 0), headers=mole)
@@ -303,8 +303,8 @@ def test_a_robot_cannot_push_others_lines_out_of_the_audit_log_by_refusals(
 
 
 def test_refusals_are_noted_again_in_the_next_hour() -> None:
-    now_s = [7.0 * audit_limit.HOUR_S]
-    counter = audit_limit.Refusals(steady_s=lambda: now_s[0])
+    now_s = [7.0 * rate_limits.HOUR_S]
+    counter = rate_limits.Refusals(steady_s=lambda: now_s[0])
     assert [counter.is_worth_a_line("x") for _ in range(100)] == [True] * 60 + [False] * 40
-    now_s[0] += audit_limit.HOUR_S
+    now_s[0] += rate_limits.HOUR_S
     assert counter.is_worth_a_line("x")

@@ -6,7 +6,7 @@ import pytest
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import pushed
 
-from cairn_server.folding import fold_in_process, fold_thread
+from cairn_server.folding import fold_thread, group_folding
 from cairn_server.folding.fold_thread import REST_MAX_S, REST_SHARE, rest_s
 
 
@@ -19,7 +19,7 @@ def test_a_fold_is_followed_by_a_rest_only_if_commits_came_meanwhile() -> None:
 def test_what_comes_while_the_folder_rests_is_folded_together(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     """The rest lasts until all is there; then one fold takes it."""
     all_there, row, groups = threading.Event(), live.new_map(), []
-    fold_around = fold_in_process.fold_around
+    fold_around = group_folding.fold_around
 
     def noted(*args: object, **kwargs: object) -> int:
         count: int = fold_around(*args, **kwargs)  # type: ignore[arg-type]
@@ -35,7 +35,7 @@ def test_what_comes_while_the_folder_rests_is_folded_together(live: Live, monkey
             all_there.set()
         return 0.0
 
-    monkeypatch.setattr(fold_in_process, "fold_around", noted)
+    monkeypatch.setattr(group_folding, "fold_around", noted)
     monkeypatch.setattr(fold_thread, "rest_s", rest)
     live.push(row, pushed(0, 0))
     assert all_there.wait(20)

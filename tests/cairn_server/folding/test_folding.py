@@ -16,7 +16,7 @@ from tests.fixtures.server.store_contract import NAMES, new_of
 from cairn_map.commits.commit import Commit
 from cairn_map.evidence.grid import cell_of_key
 from cairn_map.evidence.sensor_model import SensorModel
-from cairn_server.folding import fold_in_process, fold_thread
+from cairn_server.folding import fold_thread, group_folding
 from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.folding import fold_pending
 from cairn_server.store.sqlite.store import SqliteStore
@@ -164,7 +164,7 @@ def test_a_map_that_cannot_be_folded_holds_up_no_other_and_is_tried_again(
             raise MemoryError
         return fold_pending(store, row, cache, limit=limit)
 
-    monkeypatch.setattr(fold_in_process, "fold_around", fold)
+    monkeypatch.setattr(group_folding, "fold_around", fold)
     monkeypatch.setattr(fold_thread, "RETRY_S", 0.01)
     with Live(tmp_path) as live:
         first, second = live.new_map(), live.new_map()

@@ -11,8 +11,8 @@ from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import pushed
 
 from cairn_map.errors import DamagedDataError
-from cairn_server.folding import fold_in_process, fold_thread, readiness
-from cairn_server.store.sqlite import health as sqlite_health
+from cairn_server.folding import fold_thread, group_folding, readiness
+from cairn_server.store.sqlite import store as sqlite_store
 from cairn_server.store.sqlite.store import SqliteStore
 
 
@@ -65,7 +65,7 @@ def test_an_answer_is_kept_for_a_while_so_that_strangers_cannot_wear_out_the_dis
 def test_folding_that_fails_makes_it_not_ready_until_it_goes_again(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     row = live.new_map()
     with monkeypatch.context() as broken:
-        broken.setattr(fold_in_process, "fold_around", raising(MemoryError()))
+        broken.setattr(group_folding, "fold_around", raising(MemoryError()))
         live.push(row, pushed(0, 0))
         until(lambda: reasons(live) == "fold_failing: MemoryError", "it says that folding fails")
     until(lambda: reasons(live) == "", "it is ready again")
@@ -75,7 +75,7 @@ def test_a_map_with_a_damaged_cell_does_not_take_the_server_away_from_the_others
     live: Live, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     row = live.new_map()
-    monkeypatch.setattr(fold_in_process, "fold_around", raising(DamagedDataError("damaged_store", "one cell")))
+    monkeypatch.setattr(group_folding, "fold_around", raising(DamagedDataError("damaged_store", "one cell")))
     live.push(row, pushed(0, 0))
     until(lambda: row.name in live.service.folds.damaged(), "the fold failed")
     store_of(live)._writer.run(lambda c: c.execute("UPDATE commits SET received_s = 0").fetchall())
@@ -84,7 +84,7 @@ def test_a_map_with_a_damaged_cell_does_not_take_the_server_away_from_the_others
 
 def test_a_commit_that_waits_too_long_makes_it_not_ready(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     row = live.new_map()
-    monkeypatch.setattr(fold_in_process, "fold_around", lambda *arguments, **options: 0)  # as if it hung
+    monkeypatch.setattr(group_folding, "fold_around", lambda *arguments, **options: 0)  # as if it hung
     live.push(row, pushed(0, 0))
     assert reasons(live) == ""
     store_of(live)._writer.run(
@@ -98,7 +98,7 @@ def test_a_disk_that_takes_nothing_makes_it_not_ready(live: Live, monkeypatch: p
         raise apsw.FullError("database or disk is full")
 
     with monkeypatch.context() as broken:
-        broken.setattr(sqlite_health, "_rewrite_version", full)
+        broken.setattr(sqlite_store, "_rewrite_version", full)
         assert reasons(live).startswith("disk_full: ")
     assert reasons(live) == ""
     assert store_of(live).health.figures().failures == {"disk_full": 1}

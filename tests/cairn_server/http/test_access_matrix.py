@@ -25,8 +25,7 @@ from cairn_map.wire.messages import Register
 from cairn_server.access.auth import new_token, token_hash
 from cairn_server.http.app import ROUTERS
 from cairn_server.http.routes.live import PROTOCOL, TOKEN_PREFIX
-from cairn_server.store.store_rows import MapRow
-from cairn_server.store.token_store import Token
+from cairn_server.store.store_rows import MapRow, Token
 
 READING = {"reader", "robot", "operator", "relay"}
 ADMIN, ENROLLER = "a" * 20, "e" * 20

@@ -27,7 +27,7 @@ from cairn_map.wire.index_messages import CellIndex
 from cairn_server.http.routes.cell import COVERAGE_BYTES_MAX
 from cairn_server.http.routes.ranges import part_of
 from cairn_server.store.store_rows import MapRow
-from cairn_server.sync.vector_at import ENTRIES_MAX
+from cairn_server.sync.replies import ENTRIES_MAX
 
 SAID = ("ETag", "Cairn-Cursor", "Cairn-Coverage", "Cairn-Fingerprint", "Accept-Ranges")
 

@@ -25,7 +25,7 @@ from cairn_map.wire.live_events import CellsChanged, HeadMoved, LiveEvent, LogGr
 from cairn_map.wire.messages import MissingRequest, Register
 from cairn_server.http.routes import live as live_routes
 from cairn_server.http.routes.live import NOT_ALLOWED, SPACING_S
-from cairn_server.live import live_changes
+from cairn_server.live import live_map
 from cairn_server.live.hub import LISTENERS_OF_TOKEN_MAX, Listener
 from cairn_server.store.store_rows import MapRow
 
@@ -193,7 +193,7 @@ def test_who_does_not_read_is_told_once_and_costs_no_more(live: Live, monkeypatc
 
 
 def test_more_cells_than_are_remembered_are_many(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live_changes, "CELLS_KEPT", 2)
+    monkeypatch.setattr(live_map, "CELLS_KEPT", 2)
     row = live.new_map()
     listener, late = joined(live, row), joined(live, row)
     listener.take()
@@ -207,7 +207,7 @@ def test_more_cells_than_are_remembered_are_many(live: Live, monkeypatch: pytest
 def test_who_was_away_for_too_many_entries_is_told_many_and_how_many(
     live: Live, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live_changes, "PAST_ENTRIES", 1)
+    monkeypatch.setattr(live_map, "PAST_ENTRIES", 1)
     row = live.new_map()
     listener = joined(live, row)
     start = listener.take()[0].id

@@ -12,7 +12,7 @@ from tests.fixtures.server.pushes import pushed
 from tests.fixtures.server.store_contract import new_of
 
 from cairn_map.evidence.sensor_model import SensorModel
-from cairn_server.store.sqlite import checkpoint as sqlite_checkpoint
+from cairn_server.store.sqlite import writer as sqlite_writer
 from cairn_server.store.sqlite.store import SqliteStore
 from cairn_server.store.store_rows import MapRow
 
@@ -72,8 +72,8 @@ def test_a_log_that_became_long_is_emptied_though_somebody_always_reads(
 ) -> None:
     with readers(store, row):
         unbounded_bytes = longest_bytes(store, row)
-    monkeypatch.setattr(sqlite_checkpoint, "LONG_BYTES", 400_000)
-    monkeypatch.setattr(sqlite_checkpoint, "RETRY_S", -1.0)
+    monkeypatch.setattr(sqlite_writer, "LONG_BYTES", 400_000)
+    monkeypatch.setattr(sqlite_writer, "RETRY_S", -1.0)
     again = SqliteStore(store.health._path.parent / "again")
     other = again.create_map("lab", SMALL, SensorModel())[0]
     with readers(again, other):
@@ -87,7 +87,7 @@ def test_a_log_that_became_long_is_emptied_though_somebody_always_reads(
 
 
 def test_an_idle_store_empties_its_log(store: SqliteStore, row: MapRow, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sqlite_checkpoint, "IDLE_BYTES", 100_000)
+    monkeypatch.setattr(sqlite_writer, "IDLE_BYTES", 100_000)
     assert longest_bytes(store, row) > 100_000
     until(lambda: store.health.figures().ahead_bytes == 0, "the log is emptied")
     assert len(store.pending(row, limit=99, size_bytes_max=1 << 30)) == len(COMMITS)
@@ -96,8 +96,8 @@ def test_an_idle_store_empties_its_log(store: SqliteStore, row: MapRow, monkeypa
 def test_a_reader_who_stays_does_not_stop_the_writer(
     store: SqliteStore, row: MapRow, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sqlite_checkpoint, "LONG_BYTES", 100_000)
-    monkeypatch.setattr(sqlite_checkpoint, "TOO_LONG_FACTOR", 1 << 30)
+    monkeypatch.setattr(sqlite_writer, "LONG_BYTES", 100_000)
+    monkeypatch.setattr(sqlite_writer, "TOO_LONG_FACTOR", 1 << 30)
     with store.snapshot(row) as snapshot:
         assert longest_bytes(store, row) > 400_000
         assert len(snapshot.pending()) == 0

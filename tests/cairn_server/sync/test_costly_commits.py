@@ -103,7 +103,7 @@ def pushed_evidence(geometry: Geometry) -> Evidence:
 def test_modelled_numbers_are_bounded_by_the_bytes_pushed(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     row = live.new_map(LARGE)
     commit = of_cells(1, profile=Profile.SMALL)
-    monkeypatch.setattr("cairn_server.sync.checks.commit_cost.NUMBERS_MAX", 1000)
+    monkeypatch.setattr("cairn_server.sync.checks.commit_checks.NUMBERS_MAX", 1000)
     assert kind_of(live.push(row, commit)) == (400, "too_costly")
     assert live.push(row, of_cells(1)).status_code == 201
 

@@ -13,13 +13,12 @@ from cairn_map.files.cell_files import CELL_MEDIA_TYPE, FORMS, MEDIA_TYPES, cell
 from cairn_map.wire.index_messages import INDEX_PAGE, INDEX_PAGE_MAX, CellIndex
 from cairn_map.wire.voxel_messages import VoxelAnswer
 from cairn_server.access.auth import Caller
-from cairn_server.folding.cell_index import IndexPage
+from cairn_server.folding.cell_index import IndexPage, box_from_text
 from cairn_server.folding.cells_at_rest import stored_evidence
 from cairn_server.http.routes.callers import READERS, Map, Operations, body_of, reader
 from cairn_server.http.routes.problems import answer_to
 from cairn_server.http.routes.ranges import part_of
 from cairn_server.store.store_rows import CellRow, Head, MapRow
-from cairn_server.sync.vector_at import box_from_text
 from cairn_server.views.cell_view import asked_cell_view, cell_etag, is_same
 from cairn_server.views.view_bundle import MEDIA_TYPE as VIEWS_MEDIA_TYPE
 from cairn_server.views.view_bundle import ready_views

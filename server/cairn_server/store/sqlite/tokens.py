@@ -1,4 +1,4 @@
-"""Tokens and the audit log in the embedded store (`token_store`)."""
+"""Tokens and the audit log in the embedded store (`store.Tokens`)."""
 
 import logging
 import threading
@@ -12,8 +12,7 @@ from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
 from cairn_map.wire.access_messages import AuditEntry, audit_chain
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.writer import Writer, first, rows
-from cairn_server.store.store_rows import MapRow
-from cairn_server.store.token_store import Token, registration_name
+from cairn_server.store.store_rows import MapRow, Token, registration_name
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +28,7 @@ _SELECT = (
 
 
 class SqliteTokens:
-    """`token_store.Tokens`."""
+    """`store.Tokens`."""
 
     def __init__(self, writer: Writer, readers: Readers) -> None:
         self._writer = writer
@@ -134,7 +133,7 @@ class SqliteTokens:
 
 
 class SqliteAuditLog:
-    """`token_store.AuditLog`."""
+    """`store.AuditLog`."""
 
     def __init__(self, writer: Writer, readers: Readers) -> None:
         self._writer = writer

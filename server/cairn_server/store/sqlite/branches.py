@@ -1,8 +1,16 @@
-"""When each branch was last heard of, and where it stood: gathered, so that a crowd's signs of life are one write."""
+"""Branches in SQLite: their notes, and when each was last heard of."""
 
 import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass
+
+from cairn_map.commits.cursor import ENTRY_FOLD
+from cairn_map.commits.ids import Author
+from cairn_map.errors import UnreachableError
+from cairn_server.store.sqlite.readers import Readers
+from cairn_server.store.sqlite.writer import Writer, rows
+from cairn_server.store.store_rows import EntrySize, MapRow
 
 KEEP_S = 10.0
 """A branch that only gives signs of life is written so often."""
@@ -11,6 +19,42 @@ WRITE_EVERY_S = 1.0
 ENTRIES_MAX = 10_000
 Key = tuple[int, str]
 """Number of the map, and name."""
+
+
+class SqliteBranchNotes:
+    """Notes over a store's connections."""
+
+    def __init__(self, writer: Writer, readers: Readers) -> None:
+        self._writer = writer
+        self._readers = readers
+
+    def put_status(self, row: MapRow, branch: str, status: str) -> None:
+        """Keep the last status of a branch, as JSON, if there is such a branch; may be written later."""
+        query = (
+            "INSERT INTO branch_status (map, name, status) SELECT map, name, ? FROM branch WHERE map = ? AND name = ?"
+            " ON CONFLICT (map, name) DO UPDATE SET status = excluded.status"
+        )
+        with suppress(UnreachableError):  # the next one comes soon
+            self._writer.submit(lambda connection: rows(connection, query, (status, row.number, branch)))
+
+    def statuses(self, row: MapRow) -> dict[str, str]:
+        """The last status of each branch that ever told one."""
+        with self._readers.reading() as reader:
+            return dict(rows(reader, "SELECT name, status FROM branch_status WHERE map = ?", (row.number,)))
+
+    def entry_sizes(self, row: MapRow, *, after_seq: int, limit: int) -> list[EntrySize]:
+        """Log entries after one, oldest first, at most `limit`."""
+        query = (
+            "SELECT seq, kind, robot, incarnation, size_bytes"
+            " FROM log JOIN commits ON commits.number = log.commit_number"
+            " WHERE log.map = ? AND seq > ? ORDER BY seq LIMIT ?"
+        )
+        with self._readers.reading() as reader:
+            found = rows(reader, query, (row.number, after_seq, limit))
+        return [
+            EntrySize(seq, Author(robot, incarnation) if kind == ENTRY_FOLD else None, size)
+            for seq, kind, robot, incarnation, size in found
+        ]
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,10 +11,10 @@ from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import KEYS, WREN, pushed, read, sum_of
 
 from cairn_map.commits.commit import Commit
-from cairn_server.folding import fold_around as module
+from cairn_server.folding import group_folding as module
 from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.damaged_cells import DamagedCells
-from cairn_server.folding.fold_around import Waiting, fold_around
+from cairn_server.folding.group_folding import Waiting, fold_around
 from cairn_server.store.store_rows import MapRow
 
 FIRST, SECOND = pushed(0, 0), pushed(0, 0, WREN)

@@ -9,12 +9,15 @@ import logging
 import time
 from dataclasses import dataclass, field
 
+from cairn_map.errors import CairnError
 from cairn_map.evidence.grid import CellKey, cell_of_key
-from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.cell_cache import CACHE_BYTES, CellCache
 from cairn_server.folding.cells_at_rest import DamagedCellError, cell_to_change
-from cairn_server.folding.fold_store import Damage, FoldStore
-from cairn_server.folding.folding import GROUP_BYTES_MAX, fold_commits
+from cairn_server.folding.folding import GROUP_BYTES_MAX, Damage, FoldStore, fold_commits
 from cairn_server.store.store_rows import MapRow, StoredCommit
+
+GROUP_MAX = 256
+"""Commits folded at once."""
 
 log = logging.getLogger(__name__)
 
@@ -98,3 +101,35 @@ def _can_be_read(store: FoldStore, row: MapRow, key: CellKey) -> bool:
     except DamagedCellError:
         return False
     return True
+
+
+@dataclass(frozen=True, slots=True)
+class Folded:
+    """What became of one group."""
+
+    commits: int
+    waits_for: CairnError | None
+    """Why some have to wait: a damaged cell."""
+
+
+class LocalFolding:
+    """Folds in the thread that asks; one thread at a time."""
+
+    def __init__(self, store: FoldStore, damaged: Damage) -> None:
+        self._store = store
+        self._damaged = damaged
+        self._caches: dict[str, CellCache] = {}
+        self._waiting: dict[str, Waiting] = {}
+
+    def fold(self, row: MapRow, *, maps: int) -> Folded:
+        """Fold a group of what is pending on a map, one of so many maps that share the memory.
+
+        Raises:
+            CairnError: nothing was folded.
+        """
+        cache = self._caches.setdefault(row.name, CellCache(row.geometry))
+        cache.limit_bytes = CACHE_BYTES // maps
+        waiting = self._waiting.setdefault(row.name, Waiting())
+        count = fold_around(self._store, row, cache, waiting, self._damaged, limit=GROUP_MAX)
+        cache.trim()
+        return Folded(count, waiting.why)
