@@ -238,10 +238,10 @@ def test_a_server_refuses_tokens_that_protect_nothing(tmp_path: Path) -> None:
     assert "[weak_tokens]" in cairn(*only, "--admin-token-file", "one", folder=tmp_path, code=1)
 
 
-def test_the_example_robot_shares_what_it_sees(server: str, tmp_path: Path) -> None:
+def test_the_example_robot_shares_what_it_sees(server: str, room_recording: Path, tmp_path: Path) -> None:
     cairn("map", "create", f"{server}/maps/example", folder=tmp_path)
     script = Path(__file__).parent.parent / "docs" / "examples" / "simulated_robot.py"
-    command = [sys.executable, str(script), f"{server}/maps/example"]
+    command = [sys.executable, str(script), f"{server}/maps/example", str(room_recording)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=COMMAND_S, check=True)
     assert re.search(r"commit walle\.[0-9a-f]{16}\.1: \d+ cells, \d+ bytes", done.stdout)
     assert " 0 commits wait" in done.stdout

@@ -1,12 +1,13 @@
-"""A map that lies in a folder, to be asked without a server: cells as `cairn map export --cells` writes them, or a
-robot's own state.
-"""
+"""Maps to ask without a robot: on a server, in a folder of cells (`cairn map export --cells`), in a robot's state."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 from cairn_client.folders.local_ages import ages_of
 from cairn_client.folders.state_folder import is_state_folder, opened_replica
+from cairn_client.http.api import MapApi
+from cairn_client.http.http_link import cells_with_evidence, download_cell
+from cairn_client.http.map_url import split_map_url
 from cairn_client.replica.map_model import stored_model
 from cairn_client.replica.replica_store import FILE_NAME
 from cairn_map.errors import BadInputError
@@ -25,9 +26,29 @@ class FolderMap:
     """Of what a robot measured itself; None: cells say nothing about when."""
 
 
-def snapshot_of_folder(folder: Path) -> MapSnapshot:
-    """The map in a folder, under its own sensor model; raises as `map_of_folder`."""
-    return map_of_folder(folder).snapshot
+def open_map(place: Path | str, *, token: str | None = None) -> MapSnapshot:
+    """A map as a snapshot to ask, from a server or a folder, without a robot.
+
+        open_map("http://base:8750/maps/lab").probability_at([[1.0, 2.0, 0.4]])
+
+    From a server every cell is downloaded and checked; `cairn clone URL DIR` keeps a copy that is brought up to date
+    by what changed alone.
+
+    Args:
+        place: `http://HOST:PORT/maps/NAME`, a folder of cells that `cairn map export --cells` wrote, or the state
+            folder of a robot or copy that is not running.
+        token: for a server that wants one.
+
+    Raises:
+        BadInputError: kind `no_map_folder`: the folder holds neither cells nor a robot's state; a bad URL; no token.
+        ConflictError: a robot has its state open.
+        DamagedDataError: a cell or the state is not sound.
+        NotFoundError: the server has no such map.
+        UnreachableError: the server does not answer.
+    """
+    if isinstance(place, str) and "://" in place:
+        return _downloaded_map(place, token)
+    return map_of_folder(Path(place)).snapshot
 
 
 def map_of_folder(folder: Path) -> FolderMap:
@@ -50,5 +71,16 @@ def map_of_folder(folder: Path) -> FolderMap:
     raise BadInputError(
         "no_map_folder",
         f"{folder} holds no map: neither {MAP_FILE} and cells (`cairn map export URL --cells DIR`) nor a robot's "
-        f"{FILE_NAME} (`cairn robot pull --map URL --state DIR`)",
+        f"{FILE_NAME} (`cairn clone URL DIR`, `cairn robot sync DIR --map URL`)",
     )
+
+
+def _downloaded_map(map_url: str, token: str | None) -> MapSnapshot:
+    server_url, name = split_map_url(map_url)
+    with MapApi(server_url, token=token) as api:
+        info = api.map_info(name)
+        whole = EvidenceMap(info.geometry)
+        for cell in cells_with_evidence(api, name):
+            _, decoded = download_cell(api, name, cell)
+            whole.replace(decoded.key, decoded.evidence)
+    return snapshot_of(whole, info.sensor_model)

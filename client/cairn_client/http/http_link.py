@@ -18,7 +18,10 @@ from cairn_client.sync.requests import (
     PutCell,
     PutPart,
 )
-from cairn_map.errors import CairnError
+from cairn_map.codec.cell_code import DecodedCell, decode_cell
+from cairn_map.errors import CairnError, DamagedDataError
+from cairn_map.evidence.fingerprint import fingerprint
+from cairn_map.evidence.grid import Cell, cell_key
 from cairn_map.wire.frames import Frame
 from cairn_map.wire.index_messages import CellIndex
 from cairn_map.wire.resumed_replies import Replies
@@ -90,5 +93,25 @@ class Link:
 
 
 def index_of(api: MapApi, map_name: str) -> CellIndex:
-    """All cells of a map, without their bytes, for who is no robot."""
+    """Index of all cells of a map, without their bytes, for programs that are no robots."""
     return Link(api, map_name, branch="").hold(whole_index())
+
+
+def cells_with_evidence(api: MapApi, map_name: str) -> list[Cell]:
+    """Cells of a map that hold evidence, in order of their numbers."""
+    found = [Cell(*entry.cell) for entry in index_of(api, map_name).cells if entry.voxels]
+    return sorted(found, key=cell_key)
+
+
+def download_cell(api: MapApi, map_name: str, cell: Cell) -> tuple[bytes, DecodedCell]:
+    """Bytes of one cell, and the evidence that they decode to.
+
+    Raises:
+        DamagedDataError: kind `fingerprint_mismatch`: it is not the cell that the server says it is.
+    """
+    fetched = api.cell(map_name, cell)
+    body = fetched.body or b""
+    decoded = decode_cell(body)
+    if decoded.key != cell_key(cell) or fingerprint(decoded.evidence, decoded.key) != fetched.fingerprint:
+        raise DamagedDataError("fingerprint_mismatch", f"cell {cell} is not what the server says it is")
+    return body, decoded

@@ -9,7 +9,7 @@ import pytest
 from tests.fixtures.client.made import GEOMETRY, A, opened
 
 from cairn_client.cli.maps.command import main
-from cairn_client.folders.map_folder import snapshot_of_folder
+from cairn_client.folders.map_folder import open_map
 from cairn_client.replica.map_model import store_model
 from cairn_map.codec.cell_code import encode_cell
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError
@@ -122,10 +122,10 @@ def test_a_robot_s_state_is_read_under_the_map_s_own_sensor_model(tmp_path: Path
     replica.commit({A: evidence()})
     store_model(replica.store, SensorModel(p_occupied=0.9))
     with pytest.raises(ConflictError):
-        snapshot_of_folder(tmp_path)
+        open_map(tmp_path)
     replica.close()
-    assert snapshot_of_folder(tmp_path).model.p_occupied == 0.9
-    assert len(snapshot_of_folder(tmp_path).occupied_in()) == 1
+    assert open_map(tmp_path).model.p_occupied == 0.9
+    assert len(open_map(tmp_path).occupied_in()) == 1
 
 
 def test_what_is_no_map_is_refused_and_named(tmp_path: Path) -> None:

@@ -8,11 +8,10 @@ from pathlib import Path
 from cairn_client.cli.arguments import api_of, say, shown_bytes, with_progress
 from cairn_client.cli.maps.part_export import FORMATS, export_part, is_part
 from cairn_client.http.api import MapApi
-from cairn_client.http.http_link import index_of
-from cairn_map.codec.cell_code import DecodedCell, decode_cell
-from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError
-from cairn_map.evidence.fingerprint import fingerprint
-from cairn_map.evidence.grid import Cell, cell_from_text, cell_key, cell_of_key
+from cairn_client.http.http_link import cells_with_evidence, download_cell
+from cairn_map.codec.cell_code import DecodedCell
+from cairn_map.errors import BadInputError, NotFoundError
+from cairn_map.evidence.grid import cell_from_text, cell_key, cell_of_key
 from cairn_map.evidence.voxels import Voxels, joined_voxels, voxels_of_evidence
 from cairn_map.files.cell_files import cell_file, npz_file, ply_file
 from cairn_map.files.cell_folder import FolderHead, write_cell, write_head
@@ -30,7 +29,7 @@ def get_cell(args: argparse.Namespace) -> None:
     with api:
         info = api.map_info(name)
         cell = cell_from_text(args.cell)
-        body, decoded = fetch_cell(api, name, cell)
+        body, decoded = download_cell(api, name, cell)
     if suffix == ".cell":
         data = body
     else:
@@ -80,24 +79,9 @@ def export_map(args: argparse.Namespace) -> None:
 
 def fetch_map(api: MapApi, name: str) -> Iterator[tuple[bytes, DecodedCell]]:
     """All cells that hold evidence, each with its bytes, in order of their numbers."""
-    entries = [entry for entry in index_of(api, name).cells if entry.voxels]
-    entries.sort(key=lambda entry: cell_key(entry.cell))
-    for entry in with_progress(entries, "cells", total=len(entries)):
-        yield fetch_cell(api, name, Cell(*entry.cell))
-
-
-def fetch_cell(api: MapApi, name: str, cell: Cell) -> tuple[bytes, DecodedCell]:
-    """One cell's bytes, and what they say.
-
-    Raises:
-        DamagedDataError: it is not the cell that the server says it is.
-    """
-    fetched = api.cell(name, cell)
-    body = fetched.body or b""
-    decoded = decode_cell(body)
-    if decoded.key != cell_key(cell) or fingerprint(decoded.evidence, decoded.key) != fetched.fingerprint:
-        raise DamagedDataError("fingerprint_mismatch", f"cell {cell} is not what the server says it is")
-    return body, decoded
+    cells = cells_with_evidence(api, name)
+    for cell in with_progress(cells, "cells", total=len(cells)):
+        yield download_cell(api, name, cell)
 
 
 def _check_outputs(*paths: Path | None) -> None:

@@ -28,7 +28,7 @@ import numpy.typing as npt
 
 from cairn_client.cli.arguments import allow_negative_lists, say
 from cairn_client.cli.robot_arguments import box, place
-from cairn_client.folders.map_folder import snapshot_of_folder
+from cairn_client.folders.map_folder import open_map
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.voxels import Reading
 from cairn_map.queries.layer_queries import MapImage
@@ -79,7 +79,7 @@ def add_query_arguments(query: argparse.ArgumentParser) -> None:
 
 def _run(args: argparse.Namespace) -> None:
     answer: Answer = args.answer
-    found, lines = answer(snapshot_of_folder(args.folder), args)
+    found, lines = answer(open_map(args.folder), args)
     for line in [json.dumps(found)] if args.json else lines:
         say(line)
 

@@ -1,0 +1,129 @@
+"""The public door of cairn: the names that programs use, each at home in another package.
+
+    from cairn import Robot, load_rig, open_map
+
+A name's module is imported when the name is first used, so that `import cairn` costs nothing. These names stay where
+they are; modules behind them may move. docs/python-api.md lists them.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from cairn_calib.rig.rig import Rig, load_rig
+    from cairn_client.folders.map_folder import open_map
+    from cairn_client.robot.limits import Limits
+    from cairn_client.robot.robot import Robot
+    from cairn_client.robot.robot_events import (
+        CellsChanged,
+        CellsDropped,
+        Committed,
+        Event,
+        LinkBack,
+        LinkLost,
+        OutboxNearlyFull,
+        Pushed,
+        Refused,
+        SyncFailed,
+    )
+    from cairn_client.sync.scope import Scope
+    from cairn_fusion.recording.recording import Recording, open_recording
+    from cairn_fusion.recording.scan import Scan
+    from cairn_map.codec.cell_code import Profile
+    from cairn_map.errors import (
+        BadInputError,
+        CairnError,
+        ConflictError,
+        DamagedDataError,
+        DeniedError,
+        NotFoundError,
+        UnreachableError,
+    )
+    from cairn_map.evidence.grid import Geometry, geometry_for
+    from cairn_map.evidence.sensor_model import SensorModel
+    from cairn_map.queries.map_snapshot import MapSnapshot
+    from cairn_map.queries.occupancy_states import State
+
+    __version__: str
+
+__all__ = [
+    "BadInputError",
+    "CairnError",
+    "CellsChanged",
+    "CellsDropped",
+    "Committed",
+    "ConflictError",
+    "DamagedDataError",
+    "DeniedError",
+    "Event",
+    "Geometry",
+    "Limits",
+    "LinkBack",
+    "LinkLost",
+    "MapSnapshot",
+    "NotFoundError",
+    "OutboxNearlyFull",
+    "Profile",
+    "Pushed",
+    "Recording",
+    "Refused",
+    "Rig",
+    "Robot",
+    "Scan",
+    "Scope",
+    "SensorModel",
+    "State",
+    "SyncFailed",
+    "UnreachableError",
+    "geometry_for",
+    "load_rig",
+    "open_map",
+    "open_recording",
+]
+
+_MODULES = {
+    "cairn_calib.rig.rig": "Rig load_rig",
+    "cairn_client.folders.map_folder": "open_map",
+    "cairn_client.robot.limits": "Limits",
+    "cairn_client.robot.robot": "Robot",
+    "cairn_client.robot.robot_events": """
+        Event Committed Pushed Refused CellsChanged CellsDropped OutboxNearlyFull LinkLost LinkBack SyncFailed
+    """,
+    "cairn_client.sync.scope": "Scope",
+    "cairn_fusion.recording.recording": "Recording open_recording",
+    "cairn_fusion.recording.scan": "Scan",
+    "cairn_map.codec.cell_code": "Profile",
+    "cairn_map.errors": """
+        CairnError BadInputError DeniedError NotFoundError ConflictError DamagedDataError UnreachableError
+    """,
+    "cairn_map.evidence.grid": "Geometry geometry_for",
+    "cairn_map.evidence.sensor_model": "SensorModel",
+    "cairn_map.queries.map_snapshot": "MapSnapshot",
+    "cairn_map.queries.occupancy_states": "State",
+}
+"""Names by the module that defines them; the same as the imports above, which only type checkers read."""
+
+_HOME = {name: module for module, names in _MODULES.items() for name in names.split()}
+
+
+def __getattr__(name: str) -> object:
+    """Value of a name on its first use (PEP 562); from then on it is an ordinary attribute.
+
+    Raises:
+        AttributeError: the door has no such name.
+    """
+    if name == "__version__":
+        from importlib.metadata import version
+
+        value: object = version("cairn-robotics")
+    elif name in _HOME:
+        value = getattr(import_module(_HOME[name]), name)
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; its names are in docs/python-api.md")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """All names, used or not."""
+    return sorted({*globals(), *__all__, "__version__"})

@@ -1,0 +1,66 @@
+"""The pages of docs/: their commands are accepted as written, their programs import the public door and run."""
+
+import argparse
+import ast
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import cairn
+from cairn_client.main import main
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+PAGES = sorted([*DOCS.glob("*.md"), *(DOCS / "examples").glob("*.py")])
+COMMAND = re.compile(r"^ *(?:\$ )?(cairn (?:[^\\\n]|\\\n|\\.)*)$", re.MULTILINE)
+"""A line of a block that runs cairn, with the lines that a backslash adds."""
+PROGRAM = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+CODES = {"--version"}
+"""What is no command."""
+
+
+class AcceptedError(Exception):
+    """Raised where a command has understood its arguments and would begin to work."""
+
+
+def commands_of(page: Path) -> Iterator[list[str]]:
+    """Arguments of every command on a page, as a shell would split them."""
+    text = page.read_text(encoding="utf-8")
+    for found in COMMAND.findall(re.sub(r"^```python\n.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)):
+        line = found.replace("\\\n", " ")
+        for word in ("$CAIRN_TOKEN", "$(date +%F)"):
+            line = line.replace(word, "word")
+        words = [word for word in shlex.split(line, comments=True) if word != "..."]
+        yield words[1 : next((n for n, word in enumerate(words) if word in ("&", "|", ">", "&&", ";")), None)]
+
+
+def programs_of(page: Path) -> list[str]:
+    return PROGRAM.findall(page.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_command_of_a_page_is_accepted_as_it_is_written(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parse = argparse.ArgumentParser.parse_args
+
+    def parse_alone(parser: argparse.ArgumentParser, *given: Any) -> None:
+        parse(parser, *given)
+        raise AcceptedError
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse_alone)
+    for arguments in commands_of(page):
+        if arguments[0] in CODES or "--help" in arguments:
+            continue
+        with pytest.raises(AcceptedError):
+            main(arguments)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.suffix == ".md"], ids=lambda page: page.name)
+def test_programs_of_a_page_import_only_names_of_the_public_door(page: Path) -> None:
+    for program in programs_of(page):
+        for node in ast.walk(ast.parse(program)):
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("cairn"):
+                assert node.module == "cairn", f"{page.name}: from {node.module} import ..."
+                assert {alias.name for alias in node.names} <= set(cairn.__all__)
