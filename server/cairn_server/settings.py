@@ -1,67 +1,104 @@
-"""The server's settings, all in one place, each with its unit and meaning."""
+"""Server settings: each with its unit, bounds, default and meaning, said once.
+
+The sentence below a field is also its help in `cairn serve --help`; the flags, the settings file and the environment
+(`cairn_server.operations.serve_options`) take names, types and bounds from here.
+"""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from cairn_map.errors import BadInputError
 
 LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 
 
-Count = Annotated[int, Field(ge=1)]
+def _none_if_zero(value: Any) -> Any:
+    return None if value in (0, "0") else value
+
+
+Count = Annotated[Annotated[int, Field(ge=1)] | None, BeforeValidator(_none_if_zero)]
+Metres = Annotated[Annotated[float, Field(gt=0)] | None, BeforeValidator(_none_if_zero)]
+Token = Annotated[str, Field(min_length=16)]
 
 
 class Quotas(BaseModel):
-    """How much each robot may push to a map; None: as much as it likes. Administrators may everything."""
+    """Bounds on what each robot may push to a map; None, or 0 in a settings file, is no bound. Admins have none."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
-    commits_per_minute: Count | None = 6000
-    """A hundred a second: a robot that was offline for long may catch up."""
-    bytes_per_day: Count | None = 64_000_000_000
-    cells_per_day: Count | None = 4_000_000
-    cells_per_commit: Count | None = None
-    """FORMAT.md allows 4096 in any case."""
-    map_extent_m: Annotated[float, Field(gt=0)] | None = 100_000.0
-    """Longest edge of the box of all cells of a map: a robot that lost its way must not put cells far away."""
+    commits_per_minute: Count = 6000
+    """Commits that a robot may push in a minute; a hundred a second lets one catch up that was offline for long."""
+    bytes_per_day: Count = 64_000_000_000
+    """Bytes that a robot may push in a day (UTC)."""
+    cells_per_day: Count = 4_000_000
+    """Cells that a robot's commits may touch in a day, together."""
+    cells_per_commit: Count = None
+    """Cells that one commit may touch; FORMAT.md allows 4096 in any case."""
+    map_extent_m: Metres = 100_000.0
+    """Longest edge of the box of all cells of a map, metres: a robot that lost its way must not put cells far away."""
 
 
 class Settings(BaseModel):
-    """What `cairn serve` can be told."""
+    """Everything that can be set on a map server."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     folder: Path = Path("cairn-data")
-    """Where the store is; made if missing."""
+    """Folder of the store; made if missing."""
     host: str = "127.0.0.1"
+    """Address to listen on."""
     port: Annotated[int, Field(ge=0, le=65535)] = 8750
-    """0: any free one."""
-    admin_token: Annotated[str, Field(min_length=16)] | None = None
-    """Who has it may do everything. Without it the server trusts everybody, and so only listens on loopback."""
-    enrolment_token: Annotated[str, Field(min_length=16)] | None = None
-    """Who has it may register robots; without it only the admin token may."""
-    stable_after_s: Annotated[float, Field(ge=0)] = 86_400.0
-    """A commit folded longer ago is in every backup that may still be restored, so robots may drop it."""
-    branch_expiry_s: Annotated[float, Field(ge=60)] | None = None
-    """A robot's token ends when nobody showed it for so long; None: never. The robot registers again."""
-    quotas: Quotas = Quotas()
+    """Port to listen on, 0 for any free one."""
+    admin_token: Token | None = None
+    """Secret whose bearer may do everything; without it any client is trusted, and only loopback is listened on."""
+    enrolment_token: Token | None = None
+    """Secret whose bearer may register robots; without it only the admin token may."""
     tls_cert: Path | None = None
-    """Certificate chain, PEM; with it (and `tls_key`) the server speaks https only."""
+    """Certificate chain, PEM: with it and its key the server speaks https only."""
     tls_key: Path | None = None
-    """Its private key, PEM."""
+    """Private key of the certificate, PEM."""
+    stable_after_s: Annotated[float, Field(ge=0)] = 86_400.0
+    """Seconds after folding at which a commit is in every backup that may still be restored, so that robots may drop
+    it."""
+    keep_evidence_s: Annotated[float, Field(ge=0)] = 30 * 86_400.0
+    """Seconds after folding for which a commit's evidence is kept, so that it can be retracted and differences be
+    sent; 0 stores only the last version of the map."""
+    branch_expiry_s: Annotated[float, Field(ge=60)] | None = None
+    """Seconds without use after which a robot's token ends and the robot registers again; default: never."""
+    metrics_open: bool = False
+    """Any client may read /metrics, which names the maps; else admins only."""
+    upstream: str | None = None
+    """URL of a server to hold the same commits as (http://BASE:8750)"""
+    upstream_token: str | None = None
+    """Token of role relay, given by the upstream server."""
+    trusted_servers: Annotated[str, Field(pattern=r"^([0-9a-f]{64}( [0-9a-f]{64})*)?$")] = ""
+    """Public keys (hex, separated by spaces) of servers whose operators' retracts and prior data count here."""
+    quotas: Quotas = Quotas()
+    """Bounds on what each robot may push."""
     limit_concurrency: Annotated[int, Field(ge=2, le=100_000)] = 500
     """Connections that are served at once; some more are answered 503."""
     head_s: Annotated[float, Field(gt=0)] = 15.0
-    """A request's head must have come so soon after the connection, or after the answer before."""
+    """Seconds from the connection, or from the answer before, until a request's head must be whole."""
     body_grace_s: Annotated[float, Field(gt=0)] = 30.0
-    """So long a body may take, and an answer to be taken, and"""
+    """Seconds that any body may take to come, and any answer to be taken."""
     body_bytes_per_s: Annotated[float, Field(gt=0)] = 1000.0
-    """beyond it no slower than this."""
+    """Slowest link that is not cut once the grace has passed, bytes a second."""
+    disk_free_min_bytes: Annotated[int, Field(ge=0)] = 64 << 20
+    """Free space on the store's disk below which pushes are answered 507 and the server is not ready; what was
+    acknowledged is folded into it."""
+    fold_lag_max_s: Annotated[float, Field(gt=0)] = 600.0
+    """Seconds that a commit may wait to be folded while the server counts as ready."""
+    check_workers: Annotated[int, Field(ge=1)] = 2
+    """Processes that check expensive commits, started when the first one comes."""
+    check_cpu_s: Annotated[float, Field(gt=0)] = 60.0
+    """Processor time that the check of one commit may take, seconds; what its heads may claim takes some 20 s."""
+    check_memory_bytes: Annotated[int, Field(ge=1 << 24)] = 3 << 29
+    """Memory that the check of one commit may take; 2^29 bytes of evidence need twice their size."""
 
     def check_tls(self) -> None:
-        """Refuse half of what TLS needs.
+        """Refuse a certificate without its key, and a key without its certificate.
 
         Raises:
             BadInputError: kind `bad_setting`.
@@ -69,45 +106,22 @@ class Settings(BaseModel):
         if (self.tls_cert is None) != (self.tls_key is None):
             raise BadInputError("bad_setting", "TLS takes both a certificate (--tls-cert) and its key (--tls-key)")
 
-    keep_evidence_s: Annotated[float, Field(ge=0)] = 30 * 86_400.0
-    """How long after it was folded a commit's evidence is kept, so that it can be retracted, and differences be sent;
-    0: only the last version of the map is stored."""
-    disk_free_min_bytes: Annotated[int, Field(ge=0)] = 64 << 20
-    """With less than this free on the store's disk, pushes are refused (507), and the server is not ready. What was
-    acknowledged is folded into the rest."""
-    fold_lag_max_s: Annotated[float, Field(gt=0)] = 600.0
-    """While a commit waits longer to be folded, the server is not ready."""
-    metrics_open: bool = False
-    """Whether anybody may read `/metrics`, which names the maps; else an admin only."""
-    upstream: str | None = None
-    """URL of the server that this one is joined to: both then hold the same commits."""
-    upstream_token: str | None = None
-    """Of role relay, given by that server."""
-    trusted_servers: Annotated[str, Field(pattern=r"^([0-9a-f]{64}( [0-9a-f]{64})*)?$")] = ""
-    """Public keys of servers whose operators' retracts and prior data count here, in hex, separated by spaces."""
-    check_workers: Annotated[int, Field(ge=1)] = 2
-    """Processes that check dear commits, made when the first one comes."""
-    check_cpu_s: Annotated[float, Field(gt=0)] = 60.0
-    """Processor time that one commit may take there; what its heads may claim takes some 20 s at most."""
-    check_memory_bytes: Annotated[int, Field(ge=1 << 24)] = 3 << 29
-    """Memory that it may take there; 2^29 bytes of evidence need twice their size."""
-
     def check_reach(self) -> None:
-        """Refuse to serve strangers without a token, and tokens that protect nothing.
+        """Refuse to serve other machines without a token, and tokens that protect nothing.
 
         Raises:
-            BadInputError: the host is not loopback and there is no admin token; or an enrolment token without an admin
-                token, or equal to it.
+            BadInputError: kind `open_server`: the host is not loopback and there is no admin token. Kind
+                `weak_tokens`: an enrolment token without an admin token, or equal to it.
         """
         if self.enrolment_token is not None and self.admin_token in (None, self.enrolment_token):
             raise BadInputError(
                 "weak_tokens",
-                "an enrolment token needs another admin token beside it (--admin-token-file): without one everybody "
-                "may do everything, and with the same one every robot may",
+                "an enrolment token needs a different admin token (--admin-token-file): without one any client may do "
+                "everything, and with the same one every robot may",
             )
         if self.admin_token is None and self.host not in LOOPBACK:
             raise BadInputError(
                 "open_server",
-                f"without a token everybody who reaches {self.host} could change the maps; "
+                f"without a token every client that reaches {self.host} could change the maps; "
                 "give --admin-token-file, or listen on 127.0.0.1",
             )

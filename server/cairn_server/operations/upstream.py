@@ -1,10 +1,8 @@
 """Joining this server to another: the relay is a robot's program, found as `cairn` finds its commands."""
 
-import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import entry_points
-from pathlib import Path
 from typing import Protocol
 
 from cairn_map.errors import BadInputError
@@ -12,22 +10,6 @@ from cairn_server.operations.local_peer import OwnMaps
 from cairn_server.service import Service
 
 GROUP = "cairn.upstream"
-UPSTREAM_VARIABLE = "CAIRN_UPSTREAM_TOKEN"
-
-
-def add_upstream_arguments(parser: argparse.ArgumentParser) -> None:
-    """`--upstream` and what belongs to it."""
-    parser.add_argument("--upstream", metavar="URL", help="server to hold the same commits as (http://BASE:8750)")
-    parser.add_argument(
-        "--upstream-token-file", type=Path, metavar="FILE", help=f"its token of role relay (or ${UPSTREAM_VARIABLE})"
-    )
-    parser.add_argument(
-        "--trust-server",
-        action="append",
-        default=[],
-        metavar="KEY",
-        help="key of a server whose operators' retracts, brought by a relay, count here; may be repeated",
-    )
 
 
 class Relay(Protocol):

@@ -12,7 +12,7 @@ from tests.fixtures.server.live import Process, until
 
 from cairn_client.http.api import MapApi
 from cairn_map.errors import BadInputError
-from cairn_server.operations import serve as serve_command
+from cairn_server.operations.serve_options import serve_parser, settings_of
 from cairn_server.settings import Settings
 
 ROOT = Path(__file__).parents[3]
@@ -60,11 +60,13 @@ def test_the_options_become_settings(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setenv("CAIRN_UPSTREAM_TOKEN", "t" * 20)
     keys = ["0" * 64, "f" * 64]
     trust = [part for key in keys for part in ("--trust-server", key)]
-    found: Settings = serve_command._settings(["--data", str(tmp_path), "--upstream", "http://base:8750", *trust])
+    found: Settings = settings_of(
+        serve_parser("").parse_args(["--data", str(tmp_path), "--upstream", "http://base:8750", *trust])
+    )
     assert (found.upstream, found.upstream_token) == ("http://base:8750", "t" * 20)
     assert found.trusted_servers.split() == keys
 
 
 def test_a_key_that_is_none_is_refused_by_its_option() -> None:
     with pytest.raises(BadInputError, match="--trust-server"):
-        serve_command._settings(["--trust-server", "abc"])
+        settings_of(serve_parser("").parse_args(["--trust-server", "abc"]))

@@ -203,7 +203,8 @@ def test_the_box_of_a_map_is_not_read_anew_for_every_refusal(tmp_path: Path) -> 
         assert len(reads) == 1
 
 
-@pytest.mark.parametrize("option", ["--quota-commits", "--quota-bytes", "--map-extent"])
-def test_a_quota_below_nothing_is_refused_and_names_its_option(option: str, tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match=option):
-        main(["--data", str(tmp_path / "data"), "--port", "0", option, "-1"])
+@pytest.mark.parametrize("quota", ["commits_per_minute", "bytes_per_day", "map_extent_m"])
+def test_a_quota_below_nothing_is_refused_and_names_its_setting(quota: str, tmp_path: Path) -> None:
+    (tmp_path / "settings.toml").write_text(f"quotas.{quota} = -1\n")
+    with pytest.raises(BadInputError, match=f"settings.toml: quotas.{quota}"):
+        main(["--data", str(tmp_path / "data"), "--port", "0", "--settings", str(tmp_path / "settings.toml")])

@@ -130,8 +130,9 @@ def test_beyond_its_places_a_server_says_so_and_then_nothing(tmp_path: Path) -> 
         assert httpx.get(live.http.base_url.join("/healthz")).status_code == 200
 
 
-@pytest.mark.parametrize("option", [("--limit-concurrency", "0"), ("--min-rate", "0"), ("--tls-cert", "only.pem")])
-def test_settings_that_serve_nobody_are_refused(option: tuple[str, str]) -> None:
+@pytest.mark.parametrize("line", ["limit_concurrency = 0", "body_bytes_per_s = 0", "tls_cert = 'only.pem'"])
+def test_settings_that_serve_nobody_are_refused(line: str, tmp_path: Path) -> None:
+    (tmp_path / "settings.toml").write_text(line)
     with pytest.raises(BadInputError) as refused:
-        main(["--port", "0", *option])
+        main(["--port", "0", "--settings", str(tmp_path / "settings.toml")])
     assert refused.value.kind == "bad_setting"

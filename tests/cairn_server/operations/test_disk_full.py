@@ -27,10 +27,17 @@ def disk(tmp_path: Path) -> Iterator[TinyDisk]:
         yield found
 
 
-@pytest.mark.parametrize("option", ["--disk-free-min=-1", "--disk-free-min=nan", "--fold-lag-max=0"])
-def test_a_bound_that_is_none_is_refused(option: str, tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match=option.split("=")[0]) as refused:
-        main(["--data", str(tmp_path), option])
+def settings_file(folder: Path, line: str) -> Path:
+    """A settings file of one line."""
+    path = folder / "settings.toml"
+    path.write_text(line)
+    return path
+
+
+@pytest.mark.parametrize("line", ["disk_free_min_bytes = -1", "disk_free_min_bytes = nan", "fold_lag_max_s = 0"])
+def test_a_bound_that_is_none_is_refused(line: str, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=line.split(" = ")[0]) as refused:
+        main(["--data", str(tmp_path), "--settings", str(settings_file(tmp_path, line))])
     assert refused.value.kind == "bad_setting"
 
 
@@ -62,8 +69,9 @@ def assert_map_is(http: httpx.Client, commits: list[Commit]) -> None:
     assert read(bodies) == sum_of(commits)
 
 
-def test_a_full_disk_refuses_pushes_keeps_what_was_acknowledged_and_recovers(disk: TinyDisk) -> None:
-    process = Process(disk.folder / "data", "--disk-free-min", "0")
+def test_a_full_disk_refuses_pushes_keeps_what_was_acknowledged_and_recovers(disk: TinyDisk, tmp_path: Path) -> None:
+    settings = settings_file(tmp_path, "disk_free_min_bytes = 0")
+    process = Process(disk.folder / "data", "--settings", str(settings))
     with client(process) as http:
         make_map(http)
         kept = [pushed(n, n) for n in range(5)]
@@ -98,8 +106,9 @@ def ready_reasons(http: httpx.Client) -> str:
     return str(answer.json()["detail"])
 
 
-def test_space_is_kept_free_in_which_what_was_acknowledged_is_folded(disk: TinyDisk) -> None:
-    process = Process(disk.folder / "data", "--disk-free-min", "4.5")
+def test_space_is_kept_free_in_which_what_was_acknowledged_is_folded(disk: TinyDisk, tmp_path: Path) -> None:
+    settings = settings_file(tmp_path, "disk_free_min_bytes = 4_718_592")
+    process = Process(disk.folder / "data", "--settings", str(settings))
     with client(process) as http:
         make_map(http)
         assert http.get("/readyz").json() == {"status": "ready"}

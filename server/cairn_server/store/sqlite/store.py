@@ -303,7 +303,7 @@ class SqliteHealth:
         if free_bytes < free_bytes_min:
             raise disk_full(
                 f"{free_bytes} bytes are free on the server's disk, it keeps {free_bytes_min}; make room, or lower "
-                "--disk-free-min"
+                "the setting disk_free_min_bytes"
             )
 
     def heal(self, row: MapRow, cell: CellRow) -> bool:
