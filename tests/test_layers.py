@@ -91,6 +91,8 @@ MAY_NAME = {
     "small_gicp": ["cairn_client/robot/alignment.py"],
     "mcap": ["cairn_fusion/ros/mcap_bag.py"],
     "rosbags": ["cairn_fusion/ros/rosbags_bag.py"],
+    "matplotlib": ["cairn_calib/report/charts.py"],
+    "jinja2": ["cairn_calib/report/page.py"],
     "lz4": ["cairn_fusion/ros/mcap_bag.py", "cairn_fusion/ros/rosbags_bag.py"],
     "ruamel": ["cairn_calib/exchange/yaml_text.py"],
     "numba": [

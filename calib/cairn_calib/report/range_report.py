@@ -1,13 +1,14 @@
-"""What a calibration found of its ranges, for people: a line, a table, a curve and maps of the pixels."""
-
-from html import escape
+"""Ranges of a calibration, for people: a line, a table, a curve of the bias and maps of the pixels' offsets."""
 
 import numpy as np
 
 from cairn_calib.diagnosis.examination import Examination
-from cairn_calib.report.range_plots import bias_curve, offset_map, sigma_map_mm
-from cairn_calib.report.solve_tables import plus_minus, table
+from cairn_calib.report.charts import bias_curve
+from cairn_calib.report.image_overlays import offset_map, sigma_map_mm
+from cairn_calib.report.page import Figure, Table
+from cairn_calib.report.solve_tables import plus_minus
 from cairn_calib.rig.pixel_offsets import PixelOffsets
+from cairn_calib.rig.range_bias import RangeBias
 from cairn_calib.rig.range_terms import wave_period_m
 from cairn_calib.solve.range_choice import RangeSpans
 from cairn_calib.solve.solve import Solution
@@ -33,7 +34,7 @@ def told_ranges(solution: Solution) -> str:
     return (
         f"{name} ranges: {len(used.frames)} images  {int(used.measured.sum())} pixels  "
         f"{int((sensor.there & ~sensor.kept).sum())} outliers  noise {1000 * sensor.scale * used.sigma_m:.1f} mm  "
-        f"offset {1000 * values[name, 'offset_m']:.1f} mm{''.join(more)}; {_pixels_told(solution)}\n"
+        f"offset {1000 * values[name, 'offset_m']:.1f} mm{''.join(more)}; {_pixels_text(solution)}\n"
     )
 
 
@@ -63,12 +64,12 @@ def ranges_json(solution: Solution) -> dict[str, object] | None:
     }
 
 
-def range_section(seen: Examination) -> str:
-    """The report's part about ranges, HTML; empty where there are none."""
+def range_facts(seen: Examination) -> dict[str, object] | None:
+    """Facts of the report's part about ranges; None where the calibration used no range images."""
     solution, spans = seen.solution, seen.solution.spans
     used = solution.ranges
     if used is None or spans is None:
-        return ""
+        return None
     name = solution.views.cameras[used.camera]
     bias = seen.rig[name].range_bias
     values, sigmas = solution.values(), solution.sigmas()
@@ -76,38 +77,46 @@ def range_section(seen: Examination) -> str:
         [_words(each, solution), plus_minus(values[name, each], sigmas[name, each], factor=1000)]
         for each in used.terms.document_names
     ]
-    curve = (
-        ""
-        if bias is None
-        else _figure(
-            bias_curve(bias, (spans.nearest_m, spans.farthest_m)),
-            "What the middle of the image adds to a range, at the usual amplitude, with its standard deviation; "
-            "tinted: where boards were, beyond them it is extrapolated",
-        )
-    )
-    offsets = None if bias is None else bias.pixel_offsets
-    return (
-        f"<h2>Ranges of {escape(name)}</h2><p>{escape(_spans_told(spans, solution))}</p>"
-        f'<div class="row"><div>{table(["what it adds to a range", "estimate"], rows)}</div>{curve}</div>'
-        f"<p>Pixel by pixel: {escape(_pixels_told(solution))}.</p>{'' if offsets is None else _maps(offsets)}"
+    return {
+        "camera": name,
+        "spans": _spans_text(spans, solution),
+        "table": Table(["what it adds to a range", "estimate"], rows),
+        "curve": None if bias is None else _curve(bias, (spans.nearest_m, spans.farthest_m)),
+        "pixels": _pixels_text(solution),
+        "maps": [] if bias is None or bias.pixel_offsets is None else _maps(bias.pixel_offsets),
+    }
+
+
+def _curve(bias: RangeBias, seen_m: tuple[float, float]) -> Figure:
+    """Bias of the middle of the image by range, with its standard deviation from the covariance of its terms."""
+    range_m = np.linspace(0, float(np.ceil(1.25 * seen_m[1])), 160)
+    nothing = np.zeros_like(range_m)
+    shapes = bias.terms.shapes(range_m, nothing, nothing)
+    variance = np.einsum("ni,ij,nj->n", shapes, bias.covariance, shapes)
+    return Figure(
+        bias_curve(range_m, 1000 * shapes @ bias.values, 1000 * np.sqrt(np.maximum(variance, 0)), seen_m),
+        "What the middle of the image adds to a range, at the usual amplitude, with its standard deviation; "
+        "tinted: where boards were, beyond them it is extrapolated",
     )
 
 
-def _maps(offsets: PixelOffsets) -> str:
+def _maps(offsets: PixelOffsets) -> list[Figure]:
     counts = offsets.counts
     many = int(np.median(counts[counts > 0])) if counts.any() else 0
     limit_mm, unseen_mm = 3000 * offsets.pattern_sigma_m, 1000 * offsets.unseen_sigma_m
-    first = _figure(
-        offset_map(1000 * np.where(counts > 0, offsets.offset_m, np.nan), limit_mm),
-        f"What each pixel adds beside what all do: blue {-limit_mm:.1f} mm and below, red {limit_mm:.1f} mm and above, "
-        f"grey: no board was there, 0 +- {unseen_mm:.1f} mm; {many} boards a pixel (median)",
-    )
     low, high = 1000 * float(offsets.sigma_m.min()), 1000 * float(offsets.sigma_m.max())
-    second = _figure(
-        sigma_map_mm(1000 * offsets.sigma_m, low, high),
-        f"Its standard deviation: dark {low:.1f} mm, yellow {high:.1f} mm",
-    )
-    return f'<div class="row">{first}{second}</div>'
+    return [
+        Figure(
+            offset_map(1000 * np.where(counts > 0, offsets.offset_m, np.nan), limit_mm),
+            f"What each pixel adds on top of all pixels' share: blue {-limit_mm:.1f} mm and below, red "
+            f"{limit_mm:.1f} mm and above, grey: no board was there, 0 +- {unseen_mm:.1f} mm; {many} boards a pixel "
+            "(median)",
+        ),
+        Figure(
+            sigma_map_mm(1000 * offsets.sigma_m, low, high),
+            f"Its standard deviation: dark {low:.1f} mm, yellow {high:.1f} mm",
+        ),
+    ]
 
 
 def _words(name: str, solution: Solution) -> str:
@@ -121,21 +130,21 @@ def _words(name: str, solution: Solution) -> str:
     return f"wave {k}{period}, {'cosine' if part == 'cos' else 'sine'}, mm"
 
 
-def _spans_told(spans: RangeSpans, solution: Solution) -> str:
+def _spans_text(spans: RangeSpans, solution: Solution) -> str:
     used = solution.ranges
-    told = f"Board pixels from {spans.nearest_m:.2f} to {spans.farthest_m:.2f} m"
+    text = f"Board pixels from {spans.nearest_m:.2f} to {spans.farthest_m:.2f} m"
     if spans.amplitudes is not None:
         low, middle, high = spans.amplitudes
-        told += f", of amplitudes {low:.0f} to {high:.0f}, usually {middle:.0f}"
+        text += f", of amplitudes {low:.0f} to {high:.0f}, usually {middle:.0f}"
     left_out = []
     if used is not None and not used.terms.harmonics:
         left_out.append("circular error")
     if used is not None and used.terms.amplitude_at is None:
         left_out.append("dependence on the amplitude")
-    return told + (f". Left out, for the images do not determine it: {' and '.join(left_out)}." if left_out else ".")
+    return text + (f". Left out, for the images do not determine it: {' and '.join(left_out)}." if left_out else ".")
 
 
-def _pixels_told(solution: Solution) -> str:
+def _pixels_text(solution: Solution) -> str:
     found = solution.pattern
     if found is None or found.pairs < 2:
         return "no pixel saw the board twice, so that nothing is known of single pixels"
@@ -143,7 +152,3 @@ def _pixels_told(solution: Solution) -> str:
     if found.offsets is None:
         return f"pixels differ by no more than noise makes ({1000 * found.at_most_m:.1f} mm would show), {share}"
     return f"pixels differ by {1000 * found.offsets.pattern_sigma_m:.1f} mm (standard deviation), {share}"
-
-
-def _figure(svg: str, caption: str) -> str:
-    return f"<figure>{svg}<figcaption>{escape(caption)}</figcaption></figure>"

@@ -37,35 +37,32 @@ def report_images(folders: Mapping[str, Path]) -> dict[str, list[ReportImage]]:
     }
 
 
-def images_section(images: Mapping[str, Sequence[ReportImage]], residuals: Sequence[ViewResiduals]) -> str:
-    """HTML: every image with its corners; nothing where there are no pictures."""
-    met = {(each.camera, each.image): each for each in residuals}
-    parts = []
-    for camera, own in images.items():
-        drawn = [each for each in own if each.picture is not None]
-        figures = "".join(_figure(each, met.get((camera, each.document.image))) for each in drawn)
-        parts.append(f'<h3>{escape(camera)}</h3><div class="shots">{figures}</div>' if figures else "")
-    told = (
-        "<p>Corners joined in their order, the first one ringed. Look at these when something is wrong: what was taken "
-        "for the board and is none, or named from the other end, shows here.</p>"
-    )
-    return f"<h2>Images and their corners</h2>{told}{''.join(parts)}" if any(parts) else ""
+def image_figures(
+    images: Mapping[str, Sequence[ReportImage]], residuals: Sequence[ViewResiduals]
+) -> list[tuple[str, list[dict[str, str]]]]:
+    """Figures of all images that have a picture, by camera: `svg`, the image's `name` and a `caption`."""
+    used = {(each.camera, each.image): each for each in residuals}
+    return [
+        (camera, [_figure(each, used.get((camera, each.document.image))) for each in drawn])
+        for camera, own in images.items()
+        if (drawn := [each for each in own if each.picture is not None])
+    ]
 
 
-def _figure(image: ReportImage, met: ViewResiduals | None) -> str:
+def _figure(image: ReportImage, used: ViewResiduals | None) -> dict[str, str]:
     document = image.document
     if not document.corners:
         last = document.attempts[-1] if document.attempts else None
-        told = f"no board ({last.stage}: {last.reason})" if last else "no board"
-    elif met is None:
-        told = f"{len(document.corners)} corners, not used"
+        caption = f"no board ({last.stage}: {last.reason})" if last else "no board"
+    elif used is None:
+        caption = f"{len(document.corners)} corners, not used"
     else:
-        out = f", {met.outliers} left out" if met.outliers else ""
-        told = f"{len(document.corners)} corners{out}, rms {met.rms_px:.2f} px"
-    return f"<figure>{_drawn(image)}<figcaption><b>{escape(document.image)}</b> {escape(told)}</figcaption></figure>"
+        out = f", {used.outliers} left out" if used.outliers else ""
+        caption = f"{len(document.corners)} corners{out}, rms {used.rms_px:.2f} px"
+    return {"svg": _overlay(image), "name": document.image, "caption": caption}
 
 
-def _drawn(image: ReportImage) -> str:
+def _overlay(image: ReportImage) -> str:
     """The picture with its corners over it, as SVG: fine lines stay fine where it is printed."""
     document = image.document
     width, height = document.width or 1, document.height or 1  # only of images without a picture are there none

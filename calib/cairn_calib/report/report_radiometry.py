@@ -1,30 +1,20 @@
-"""What a report says of thermal cameras: what their counts mean, and how certain that is; or that nobody knows."""
+"""Thermal cameras of a report: the temperatures that their counts stand for, with standard deviations."""
 
 from collections.abc import Sequence
-from html import escape
 
 import numpy as np
 
-from cairn_calib.report.solve_tables import table
+from cairn_calib.report.page import Table
 from cairn_calib.rig.radiometry import ZERO_C_K, Radiometry
 from cairn_calib.rig.rig import Rig, Spectrum
 
-NOT_RADIOMETRIC = (
-    "<b>not radiometric</b>: no reference was measured, so its counts have no temperature; black bodies would give "
-    "them one (cairn calib thermal fit)"
-)
 
-
-def radiometry_section(rig: Rig) -> str:
-    """HTML; nothing for a rig without thermal cameras."""
-    names = list(rig.of_spectrum(Spectrum.THERMAL))
-    if not names:
-        return ""
-    told = "".join(
-        f"<p>{escape(name)}: {NOT_RADIOMETRIC}.</p>" if (known := rig[name].radiometry) is None else _known(name, known)
-        for name in names
-    )
-    return f"<h2>Radiometry</h2>{told}"
+def radiometry_facts(rig: Rig) -> list[tuple[str, dict[str, object] | None]]:
+    """Facts of each thermal camera, by name; None for a camera whose counts have no temperature."""
+    return [
+        (name, None if (known := rig[name].radiometry) is None else _facts(known))
+        for name in rig.of_spectrum(Spectrum.THERMAL)
+    ]
 
 
 def radiometry_json(rig: Rig) -> dict[str, object]:
@@ -35,7 +25,7 @@ def radiometry_json(rig: Rig) -> dict[str, object]:
     }
 
 
-def _known(name: str, known: Radiometry) -> str:
+def _facts(known: Radiometry) -> dict[str, object]:
     low, high = (k - ZERO_C_K for k in known.range_k)
     lines = [f"{known.response.law} law, {low:.1f} to {high:.1f} °C; {known.source}"]
     if known.maps is not None:
@@ -47,11 +37,10 @@ def _known(name: str, known: Radiometry) -> str:
         lines.append(
             f"housing: {housing.counts_per_k:.3g} ± {sigma:.2g} counts a kelvin, known from {cold:.1f} to {warm:.1f} °C"
         )
-    told = "".join(f"<li>{escape(line)}</li>" for line in lines)
-    return f"<h3>{escape(name)}</h3><ul>{told}</ul>{_sigma_table(known)}"
+    return {"lines": lines, "sigmas": _sigma_table(known)}
 
 
-def _sigma_table(known: Radiometry) -> str:
+def _sigma_table(known: Radiometry) -> Table:
     """Standard deviations of a black body's temperature, at five temperatures of the range."""
     kelvin = np.linspace(*known.range_k, 5)
     slope, J = known.response.slope(kelvin), known.response.by_parameters(kelvin)
@@ -65,4 +54,4 @@ def _sigma_table(known: Radiometry) -> str:
         ("together, K", np.sqrt(common**2 + noise**2 + pattern**2)),
     )
     head = ["sigma of a black body at", *(f"{k - ZERO_C_K:.0f} °C" for k in kelvin)]
-    return table(head, [[name, *(f"{v:.3f}" for v in values)] for name, values in rows])
+    return Table(head, [[name, *(f"{v:.3f}" for v in values)] for name, values in rows])

@@ -1,23 +1,14 @@
-"""Tables of a calibration's report: what was found, how certain it is, and how well each image was met."""
+"""Tables of a calibration's report: estimates with standard deviations, and the residuals of each image."""
 
 from collections.abc import Sequence
-from html import escape
 
 import numpy as np
 
 from cairn_calib.diagnosis.examination import Examination
 from cairn_calib.diagnosis.view_residuals import ViewResiduals
+from cairn_calib.report.page import Marked, Table
 from cairn_calib.rig.calibration import PIXEL_NAMES, Statistics
 from cairn_calib.solve.solve_plan import SHARED
-
-Cells = Sequence[str]
-
-
-def table(head: Cells, rows: Sequence[Cells]) -> str:
-    """An HTML table; the first cell of a row is its name. Cells are HTML."""
-    top = "".join(f"<th>{cell}</th>" for cell in head)
-    body = "".join(f"<tr><th>{row[0]}</th>{''.join(f'<td>{cell}</td>' for cell in row[1:])}</tr>" for row in rows)
-    return f'<div class="wide"><table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def plus_minus(value: float, sigma: float, *, factor: float = 1.0) -> str:
@@ -30,11 +21,11 @@ def plus_minus(value: float, sigma: float, *, factor: float = 1.0) -> str:
     return f"{round(value, places) + 0.0:.{places}f} ± {sigma:.{places}f}"
 
 
-def statistics_table(statistics: Statistics) -> str:
-    """A row for each camera."""
+def statistics_table(statistics: Statistics) -> Table:
+    """Images, corners and noise of each camera."""
     rows = [
         [
-            escape(name),
+            name,
             str(each.images),
             str(each.points),
             str(each.outliers),
@@ -43,10 +34,10 @@ def statistics_table(statistics: Statistics) -> str:
         ]
         for name, each in statistics.cameras.items()
     ]
-    return table(["camera", "images", "corners", "left out", "rms, px", "noise, px"], rows)
+    return Table(["camera", "images", "corners", "left out", "rms, px", "noise, px"], rows)
 
 
-def lens_table(seen: Examination) -> str:
+def lens_table(seen: Examination) -> Table:
     """Intrinsics with standard deviations."""
     solution = seen.solution
     sigmas = solution.sigmas()
@@ -59,36 +50,36 @@ def lens_table(seen: Examination) -> str:
     }
     rows = []
     for name in names:
-        cells = [name + (", px" if name in PIXEL_NAMES else "")]
+        cells: list[str | Marked] = [name + (", px" if name in PIXEL_NAMES else "")]
         for camera in cameras:
             if (camera, name) in sigmas:
                 cells.append(plus_minus(values[camera, name], sigmas[camera, name]))
             else:
-                held = f'<span class="held">{values[camera, name]:g} held</span>'
-                cells.append(held if (camera, name) in values else "")
+                known = (camera, name) in values
+                cells.append(Marked("", f"{values[camera, name]:g} held", "held") if known else "")
         rows.append(cells)
-    return table(["", *(escape(camera) for camera in cameras)], rows)
+    return Table(["", *cameras], rows)
 
 
-def place_table(seen: Examination) -> str:
-    """Places of the cameras in the gauge's frame, millimetres, and what is uncertain about them."""
+def place_table(seen: Examination) -> Table:
+    """Poses of the cameras in the gauge camera's frame, millimetres and degrees, with standard deviations."""
     solution = seen.solution
     sigmas = solution.sigmas()
     rows = []
     for camera, T in zip(solution.plan.cameras, solution.state.T_rig_camera, strict=True):
         if camera == solution.plan.gauge:
-            rows.append([escape(camera), "0", "0", "0", "0", "the rig's frame"])
+            rows.append([camera, "0", "0", "0", "0", "the rig's frame"])
             continue
         turn = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
         at = [plus_minus(T[n, 3], sigmas[camera, name], factor=1000) for n, name in enumerate(("tx", "ty", "tz"))]
         spread = ", ".join(f"{np.degrees(sigmas[camera, name]):.3f}" for name in ("rx", "ry", "rz"))
-        rows.append([escape(camera), *at, f"{turn:.3f}", spread])
+        rows.append([camera, *at, f"{turn:.3f}", spread])
     head = ["camera", "x, mm", "y, mm", "z, mm", "turned by, degrees", "sigma about x, y, z, degrees"]
-    return table(head, rows)
+    return Table(head, rows)
 
 
-def board_table(seen: Examination) -> str:
-    """The board."""
+def board_table(seen: Examination) -> Table:
+    """Estimated shape and size of the board; no rows where both were held."""
     values, sigmas = seen.solution.values(), seen.solution.sigmas()
     rows = []
     for name, text in (("warp_x", "bent along x, mm"), ("warp_y", "bent along y, mm")):
@@ -96,20 +87,19 @@ def board_table(seen: Examination) -> str:
             rows.append([text, plus_minus(values[SHARED, name], sigmas[SHARED, name], factor=1000)])
     if (SHARED, "scale") in sigmas:
         rows.append(["pitch over the stated one", plus_minus(values[SHARED, "scale"], sigmas[SHARED, "scale"])])
-    return table(["", "estimate"], rows) if rows else ""
+    return Table(["", "estimate"], rows)
 
 
-def image_table(residuals: Sequence[ViewResiduals], cameras: Sequence[str], frames: Sequence[str]) -> str:
-    """How each image was met: rms in pixels, and how many corners were left out."""
+def image_table(residuals: Sequence[ViewResiduals], cameras: Sequence[str], frames: Sequence[str]) -> Table:
+    """Residuals of each image: rms in pixels, and the number of corners that were left out."""
     found = {(each.camera, each.frame): each for each in residuals}
     rows = []
     for frame in frames:
-        cells = [escape(frame)]
+        cells: list[str | Marked] = [frame]
         for camera in cameras:
             view = found.get((camera, frame))
             out = 0 if view is None else view.outliers
-            cells.append(
-                "" if view is None else f"{view.rms_px:.3f}" + (f' <b class="out">{out} out</b>' if out else "")
-            )
+            rms = "" if view is None else f"{view.rms_px:.3f}"
+            cells.append(Marked(rms, f"{out} out", "out") if out else rms)
         rows.append(cells)
-    return table(["frame", *(escape(camera) for camera in cameras)], rows)
+    return Table(["frame", *cameras], rows)

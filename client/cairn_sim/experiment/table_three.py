@@ -1,10 +1,8 @@
-"""Table 3: how small the map is in each coding, with what the paper prints beside it."""
+"""Table 3: how small the map is in each coding, with the numbers that the paper prints."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from html import escape
 
-from cairn_sim.experiment.codings import CODINGS
 from cairn_sim.experiment.figures import CodingTotals, ResolutionFigures
 from cairn_sim.experiment.tables import MIB, MISSING, shown
 
@@ -33,24 +31,51 @@ INCONSISTENT = (
 )
 
 
-def table_three(resolutions: Sequence[ResolutionFigures]) -> str:
-    """Table 3, the paper's columns beside ours."""
+@dataclass(frozen=True, slots=True)
+class TableColumn:
+    """One resolution of Table 3: our column, and the paper's where it printed one."""
+
+    title: str
+    has_paper: bool
+
+
+@dataclass(frozen=True, slots=True)
+class TableRow:
+    """One line of Table 3."""
+
+    name: str
+    cells: Sequence[tuple[str, str]] = ()
+    """Text of each cell, and `paper` or nothing: whose it is."""
+    kind: str = ""
+    """`group`: a headline, without cells; `strong`: the line to compare."""
+
+
+@dataclass(frozen=True, slots=True)
+class TableThree:
+    """Table 3 with the paper's columns next to ours."""
+
+    columns: Sequence[TableColumn]
+    rows: Sequence[TableRow]
+
+    @property
+    def width(self) -> int:
+        """Columns of cells, that of the names included."""
+        return 1 + len(self.columns) + sum(column.has_paper for column in self.columns)
+
+
+def table_three(resolutions: Sequence[ResolutionFigures]) -> TableThree:
+    """Table 3, the paper's columns next to ours."""
     papers = [PAPER_TABLE_3.get(round(one.voxel_edge_m * 1e6)) for one in resolutions]
-    heads = "".join(
-        f'<th colspan="{2 if paper else 1}">{escape(one.title)}</th>'
-        for one, paper in zip(resolutions, papers, strict=True)
-    )
-    whose = "".join("<th>ours</th>" + ("<th>paper</th>" if paper else "") for paper in papers)
-    columns = list(zip(resolutions, papers, strict=True))
 
     def row(
         name: str, ours: Callable[[ResolutionFigures], str], theirs: Callable[[PaperColumn], str], kind: str = ""
-    ) -> str:
-        cells = "".join(
-            f"<td>{ours(one)}</td>" + (f'<td class="paper">{theirs(paper)}</td>' if paper else "")
-            for one, paper in columns
-        )
-        return f'<tr class="{kind}"><th scope="row">{escape(name)}</th>{cells}</tr>'
+    ) -> TableRow:
+        cells = []
+        for one, paper in zip(resolutions, papers, strict=True):
+            cells.append((ours(one), ""))
+            if paper:
+                cells.append((theirs(paper), "paper"))
+        return TableRow(name, cells, kind)
 
     rows = [
         row("non-empty cells", lambda one: str(len(one.cells)), lambda _: "56 or 40"),
@@ -62,17 +87,16 @@ def table_three(resolutions: Sequence[ResolutionFigures]) -> str:
             lambda paper: paper.uncompressed_map,
         ),
     ]
-    width = 1 + len(resolutions) + sum(paper is not None for paper in papers)
     for name in resolutions[0].coding_names:
-        rows.append(f'<tr class="group"><th colspan="{width}">{escape(name)}</th></tr>')
         rows += [
+            TableRow(name, kind="group"),
             row("compressed cube, average, MB", _of(name, _mean_cell), lambda paper: paper.compressed_cube),
             row("compressed map, MB", _of(name, _map_size), lambda paper: paper.compressed_map),
             row("ratio", _of(name, _ratio), lambda paper: paper.ratio, "strong"),
             row("bits per occupied voxel", _of(name, _bits), lambda _: MISSING),
         ]
-    head = f"<thead><tr><td></td>{heads}</tr><tr><td></td>{whose}</tr></thead>"
-    return f"<table>{head}<tbody>{''.join(rows)}</tbody></table>"
+    columns = [TableColumn(one.title, paper is not None) for one, paper in zip(resolutions, papers, strict=True)]
+    return TableThree(columns, rows)
 
 
 def _of(coding: str, read: Callable[[CodingTotals], str]) -> Callable[[ResolutionFigures], str]:
@@ -93,11 +117,3 @@ def _ratio(total: CodingTotals) -> str:
 
 def _bits(total: CodingTotals) -> str:
     return MISSING if total.bits_per_occupied is None else shown(total.bits_per_occupied)
-
-
-def codings_list(names: Sequence[str]) -> str:
-    """What each coding holds, as HTML."""
-    items = "".join(
-        f"<dt>{escape(coding.name)}</dt><dd>{escape(coding.holds)}</dd>" for coding in CODINGS if coding.name in names
-    )
-    return f"<dl>{items}</dl>"

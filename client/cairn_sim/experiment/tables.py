@@ -1,7 +1,7 @@
 """The report's tables: rows of figures by resolution, each with its unit and one sentence of what it means."""
 
 from collections.abc import Callable, Sequence
-from html import escape
+from dataclasses import dataclass
 from statistics import median
 
 from cairn_sim.experiment.figures import ResolutionFigures, quartiles
@@ -31,16 +31,32 @@ def percent(value: float | None) -> str:
 Read = Callable[[ResolutionFigures], str]
 
 
-def figure_table(resolutions: Sequence[ResolutionFigures], rows: Sequence[tuple[str, Read, str]]) -> str:
-    """A row for each figure: its name with the unit, its value at each resolution, what it means."""
-    heads = "".join(f"<th>{escape(one.title)}</th>" for one in resolutions)
-    body = "".join(
-        f'<tr><th scope="row">{escape(name)}</th>'
-        + "".join(f"<td>{escape(read(one))}</td>" for one in resolutions)
-        + f'<td class="means">{escape(means)}</td></tr>'
-        for name, read, means in rows
+@dataclass(frozen=True, slots=True)
+class FigureRow:
+    """One figure at each resolution."""
+
+    name: str
+    """With its unit."""
+    cells: Sequence[str]
+    meaning: str
+    """One sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class FigureTable:
+    """Figures by resolution."""
+
+    titles: Sequence[str]
+    """Of the resolutions: `4 cm`."""
+    rows: Sequence[FigureRow]
+
+
+def figure_table(resolutions: Sequence[ResolutionFigures], rows: Sequence[tuple[str, Read, str]]) -> FigureTable:
+    """A row for each figure: its name with the unit, its value at each resolution, its meaning."""
+    return FigureTable(
+        [one.title for one in resolutions],
+        [FigureRow(name, [read(one) for one in resolutions], meaning) for name, read, meaning in rows],
     )
-    return f"<table><thead><tr><td></td>{heads}<td></td></tr></thead><tbody>{body}</tbody></table>"
 
 
 def fill_rows() -> list[tuple[str, Read, str]]:

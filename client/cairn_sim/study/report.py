@@ -1,12 +1,12 @@
-"""The study's results: our Table 2 beside the paper's, the best configuration and whether it does what it must."""
+"""Report of the calibration study: our Table 2 next to the paper's, the best configuration and its bars."""
 
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 
+from cairn_calib.report.page import page
 from cairn_calib.verify.disc_images import Method
-from cairn_calib.verify.verification_report import camera_table, figures, page
+from cairn_calib.verify.verification_report import camera_table, difference_plots
 from cairn_calib.verify.verification_table import CameraRow
 from cairn_sim.study.run import METHODS, Outcome
 
@@ -84,29 +84,20 @@ def judged(rows: Sequence[CameraRow], method: Method, *, scale: float = 1.0) -> 
 def study_page(study: Study) -> str:
     """The whole page."""
     best = study.best
-    parts = [
-        "<h1>Which board images calibrate best</h1>",
-        '<p class="lead">Sets of 2 to 9 images of a heated checkerboard, each solved by itself, then verified with '
-        f"circle targets in {study.images} images; simulated head of Orpheus-X4, standard noise, colour and thermal "
-        f"images at {study.scale:g} of their size, seed {study.seed}.</p>",
-    ]
-    parts += [
-        f"<h2>Table 2, centroids by method {method}</h2>{_page_table(study.outcomes, method, best)}"
-        for method in METHODS
-    ]
-    parts.append(
-        "<p>sigma = sqrt((sigma_x² + sigma_y²) / 2), pixels of each camera; after the slash what the calibration, the "
-        f"centroids and the range let expect; tinted: the paper's. {escape(NOT_THE_SAME)}</p>"
+    return page(
+        "study.html",
+        package="cairn_sim.study",
+        study=study,
+        best=best,
+        cameras=CAMERAS,
+        tables=[(method, [_page_row(outcome, method) for outcome in study.outcomes]) for method in METHODS],
+        not_the_same=NOT_THE_SAME,
+        judgements=[
+            line for method in METHODS if best for line in judged(best.tables[method], method, scale=study.scale)
+        ],
+        table=camera_table(best.tables["grey"]) if best else None,
+        figures=difference_plots(best.sightings["grey"]) if best else None,
     )
-    if best is not None:
-        lines = "".join(
-            f"<li>{escape(line)}</li>"
-            for method in METHODS
-            for line in judged(best.tables[method], method, scale=study.scale)
-        )
-        parts.append(f"<h2>Best: {best.name}, {escape(best.configuration.about)}</h2><ul>{lines}</ul>")
-        parts += [camera_table(best.tables["grey"]), figures(best.sightings["grey"])]
-    return page("Image configurations", "".join(parts))
 
 
 def study_json(study: Study) -> str:
@@ -144,28 +135,21 @@ def _text_line(outcome: Outcome, method: Method) -> str:
     return f"{outcome.name:4} " + " ".join(cells)
 
 
-def _page_table(outcomes: Sequence[Outcome], method: Method, best: Outcome | None) -> str:
-    head = "".join(f'<th colspan="2">{camera}</th>' for camera in CAMERAS)
-    lines = []
-    for outcome in outcomes:
-        kind = ' class="best"' if outcome is best else ""
-        start = (
-            f'<tr{kind}><th scope="row">{outcome.name}</th><td class="words">{escape(outcome.configuration.about)}</td>'
-        )
-        if outcome.rig is None:
-            lines.append(f'{start}<td class="words" colspan="8">refused: {escape(outcome.refusal)}</td></tr>')
-            continue
-        rows = {row.camera: row for row in outcome.tables[method]}
-        cells = [
-            _cell(rows.get(camera)) + f'<td class="paper">{"" if printed is None else printed}</td>'
-            for camera, printed in zip(CAMERAS, PAPER.get(outcome.name, (None,) * 4), strict=True)
-        ]
-        lines.append(f"{start}{''.join(cells)}</tr>")
-    return f"<table><thead><tr><th></th><th></th>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
+def _page_row(outcome: Outcome, method: Method) -> dict[str, object]:
+    """A configuration's line of Table 2: of each camera our sigma, the expected total, and the paper's sigma."""
+    rows = {row.camera: row for row in outcome.tables[method]} if outcome.rig is not None else {}
+    printed = PAPER.get(outcome.name, (None,) * 4)
+    return {
+        "name": outcome.name,
+        "about": outcome.configuration.about,
+        "refusal": "" if outcome.rig is not None else outcome.refusal,
+        "outcome": outcome,
+        "cells": [(*_cell(rows.get(camera)), paper) for camera, paper in zip(CAMERAS, printed, strict=True)],
+    }
 
 
-def _cell(row: CameraRow | None) -> str:
+def _cell(row: CameraRow | None) -> tuple[str, str]:
+    """Sigma, and the total that calibration, centroids and range let expect; as text."""
     if row is None:
-        return "<td>-</td>"
-    total = "?" if row.total_px is None else f"{row.total_px:.2f}"
-    return f"<td><b>{row.sigma_px:.2f}</b> / {total}</td>"
+        return "-", ""
+    return f"{row.sigma_px:.2f}", " / ?" if row.total_px is None else f" / {row.total_px:.2f}"

@@ -85,8 +85,10 @@ def test_the_page_is_sound_html_with_nothing_from_outside() -> None:
     page = read_page(page_of(0.08, 0.04, 0.02, asked=("8 cm", "4 cm", "2 cm")))
     assert not page.tags & {"script", "link", "iframe", "img"}
     references = [value for name, value in page.attributes if name in ("href", "src", "xlink:href")]
-    assert references and all(value.startswith("data:image/png;base64,") for value in references)
+    # A chart refers to its own marks (`#...`), a plan to the picture in it.
+    assert references and all(value.startswith(("data:image/png;base64,", "#")) for value in references)
     assert "url(" not in " ".join(page.words)
+    assert all(value.startswith("url(#") for _, value in page.attributes if "url(" in value)
     assert "<orpheus>" in page.words
 
 
@@ -100,8 +102,8 @@ def test_the_page_has_the_papers_table_beside_ours() -> None:
 
 
 def test_a_resolution_that_the_paper_has_not_stands_alone() -> None:
-    assert "paper" not in read_page(table_three([resolution(0.08)])).words
-    words = read_page(table_three([resolution(0.08), resolution(0.04)])).words
+    assert "paper" not in read_page(page_of(0.08)).words
+    words = read_page(page_of(0.08, 0.04)).words
     assert words.count("ours") == 2 and words.count("paper") == 1
 
 

@@ -1,4 +1,7 @@
-"""Pictures of a calibration as SVG: residuals over the image, what the boards covered, heat maps of sigmas."""
+"""Pictures over a camera's image, as SVG: residuals, coverage, heat maps of sigmas, offsets of a range camera's pixels.
+
+They are SVG elements by hand and no charts of matplotlib: a picture's unit is the image's pixel, and there are no axes.
+"""
 
 from collections.abc import Sequence
 from html import escape
@@ -15,6 +18,14 @@ LOW_PX, HIGH_PX = 0.01, 10.0
 """Ends of the heat maps' logarithmic scale."""
 HEAT = ((0.0, (68, 1, 84)), (0.25, (59, 82, 139)), (0.5, (33, 145, 140)), (0.75, (94, 201, 98)), (1.0, (253, 231, 37)))
 """Sure to unsure: five colours of viridis, sRGB."""
+COLUMNS_MAX = 200
+"""Columns of a pixel map at most; larger images are averaged in blocks."""
+LEVELS = 21
+"""Colours of a pixel map."""
+COLD, NONE, WARM = (33, 86, 168), (247, 247, 247), (178, 24, 43)
+"""Range too short, right, too long; sRGB."""
+SURE, UNSURE = (38, 30, 80), (246, 222, 90)
+UNSEEN = "#c9cdd3"
 ARROW_SHARE = 0.04
 """Of the image's width: how long a residual of twice the noise is drawn."""
 
@@ -87,13 +98,10 @@ def heat(sigma_px: float) -> str:
     return "#fde725"
 
 
-def heat_legend() -> str:
-    """The heat maps' scale, as HTML."""
+def heat_legend() -> dict[str, str]:
+    """The heat maps' scale: its ends in pixels, and its colours as the stops of a CSS gradient."""
     stops = ",".join(f"rgb({mixed(colour, colour, 0)})" for _, colour in HEAT)
-    return (
-        f'<p class="legend">{LOW_PX:g} px <i class="ramp" style="background:linear-gradient(90deg,{stops})"></i> '
-        f"{HIGH_PX:g} px, logarithmic; sigma of one axis, in the camera's own pixels; grey: not seen</p>"
-    )
+    return {"low": f"{LOW_PX:g}", "high": f"{HIGH_PX:g}", "stops": stops}
 
 
 def opened(size_px: tuple[int, int], what: str) -> str:
@@ -108,3 +116,45 @@ def opened(size_px: tuple[int, int], what: str) -> str:
 def mixed(one: tuple[int, int, int], other: tuple[int, int, int], share: float) -> str:
     """A colour between two, as `r,g,b`."""
     return ",".join(str(round(a + (b - a) * share)) for a, b in zip(one, other, strict=True))
+
+
+def offset_map(offsets_mm: Floats, limit_mm: float) -> str:
+    """(H, W) offsets, blue for too short and red for too long; grey where NaN."""
+    shares = np.clip(0.5 + offsets_mm / (2 * limit_mm), 0, 1)
+    colours = [
+        mixed(COLD, NONE, 2 * share) if share < 0.5 else mixed(NONE, WARM, 2 * share - 1)
+        for share in np.linspace(0, 1, LEVELS)
+    ]
+    return _map(shares, colours, "Offsets of the pixels")
+
+
+def sigma_map_mm(sigmas_mm: Floats, low_mm: float, high_mm: float) -> str:
+    """(H, W) standard deviations, dark to yellow."""
+    shares = np.clip((sigmas_mm - low_mm) / max(high_mm - low_mm, 1e-9), 0, 1)
+    colours = [mixed(SURE, UNSURE, share) for share in np.linspace(0, 1, LEVELS)]
+    return _map(shares, colours, "Standard deviations of the pixels' offsets")
+
+
+def _map(shares: Floats, colours: list[str], what: str) -> str:
+    """(H, W) shares of 0 to 1: a path for each colour, of runs of pixels in a row."""
+    step = -(-shares.shape[1] // COLUMNS_MAX)
+    height, width = (side // step for side in shares.shape)
+    blocks = shares[: height * step, : width * step].reshape(height, step, width, step)
+    known = np.isfinite(blocks)
+    counts = known.sum(axis=(1, 3))
+    means = np.where(known, blocks, 0.0).sum(axis=(1, 3)) / np.maximum(counts, 1)
+    levels = np.where(counts > 0, np.rint(means * (len(colours) - 1)), -1).astype(np.intp)
+    runs: dict[int, list[str]] = {}
+    for y, row in enumerate(levels):
+        starts = np.flatnonzero(np.diff(row, prepend=-2))
+        for x, length in zip(starts, np.diff(starts, append=width), strict=True):
+            runs.setdefault(int(row[x]), []).append(f"M{x - 0.5:g} {y}h{length}")
+    paths = (
+        f'<path shape-rendering="crispEdges" style="stroke-width:1;stroke:{_stroke(colours, level)}" d="{"".join(d)}"/>'
+        for level, d in sorted(runs.items())
+    )
+    return "".join([opened((width, height), what), *paths, "</svg>"])
+
+
+def _stroke(colours: list[str], level: int) -> str:
+    return UNSEEN if level < 0 else f"rgb({colours[level]})"
