@@ -17,7 +17,6 @@ from cairn_sim.experiment.figures import (
 )
 from cairn_sim.experiment.plan import PlanView
 from cairn_sim.experiment.report import report_page
-from cairn_sim.experiment.table_three import table_three
 from cairn_sim.experiment.tables import percent, shown
 
 SCORES = Scores(surface=100, surface_occupied=90, surface_free=3, free=50, free_free=50, map_free=50, map_occupied=95)
