@@ -58,7 +58,7 @@ OTHER_FLAGS = {"metrics_open": "--metrics-open", "trusted_servers": "--trust-ser
 MOVED = {
     "--limit-concurrency": ("limit_concurrency", 1),
     "--min-rate": ("body_bytes_per_s", 1),
-    "the setting disk_free_min_bytes": ("disk_free_min_bytes", MEGABYTE),
+    "--disk-free-min": ("disk_free_min_bytes", MEGABYTE),
     "--fold-lag-max": ("fold_lag_max_s", 1),
     "--quota-commits": ("quotas.commits_per_minute", 1),
     "--quota-bytes": ("quotas.bytes_per_day", 1),
