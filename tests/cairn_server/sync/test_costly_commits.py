@@ -24,7 +24,7 @@ from cairn_map.commits.ids import Author, CommitId
 from cairn_map.evidence.evidence import Evidence, packed_evidence
 from cairn_map.evidence.grid import Geometry, cell_key
 from cairn_map.wire.messages import CreateMap
-from cairn_server.sync.checks import check_pool
+from cairn_server.sync.checks import check_pool, worker_nursery
 
 LARGE = Geometry(depth=6, channels=())
 LIMIT_S = 2.0
@@ -227,7 +227,8 @@ def test_workers_end_with_a_server_that_was_killed(tmp_path: Path) -> None:
         commit = of_cells(4, profile=Profile.SMALL)
         assert http.put(f"/maps/lab/commits/{commit.id}", content=commit.data).status_code == 201
     children = children_of(process.pid)
-    (nursery,) = (pid for pid in children if b"check_nursery" in Path(f"/proc/{pid}/cmdline").read_bytes())
+    name = worker_nursery.__name__.encode()
+    (nursery,) = (pid for pid in children if name in Path(f"/proc/{pid}/cmdline").read_bytes())
     workers = children_of(nursery)
     assert len(workers) == 1
     process.send(signal.SIGKILL)
