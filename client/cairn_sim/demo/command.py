@@ -43,7 +43,7 @@ from cairn_sim.demo.check import (
     server_identity,
     wait_for_fold,
 )
-from cairn_sim.demo.robot import DemoRobot, Plan
+from cairn_sim.demo.robot import DemoDrive, DemoRobot
 from cairn_sim.robots.heads import colour_and_tof_head, full_head, thermal_and_tof_head
 from cairn_sim.robots.trajectories import stops
 from cairn_sim.scene.scene import Scene
@@ -60,17 +60,17 @@ SERVER_START_S = 60.0
 MARKER = "cairn-demo"
 
 
-def plans(scene: Scene) -> list[Plan]:
+def plans(scene: Scene) -> list[DemoDrive]:
     """The team: the first maps everything, the second goes offline, the third is low-end and joins late."""
     return [
-        Plan(
+        DemoDrive(
             name="scout",
             head="2 colour, 2 thermal, ToF",
             rig=full_head(scale=IMAGE_SCALE),
             stops=stops(scene, "labs")[1:24:3],
             mode="high-end",
         ),
-        Plan(
+        DemoDrive(
             name="mole",
             head="thermal, ToF",
             rig=thermal_and_tof_head(scale=IMAGE_SCALE),
@@ -79,7 +79,7 @@ def plans(scene: Scene) -> list[Plan]:
             starts_after=1,
             offline=(2, 3, 4),
         ),
-        Plan(
+        DemoDrive(
             name="late",
             head="colour, ToF",
             rig=colour_and_tof_head(scale=IMAGE_SCALE),

@@ -20,7 +20,7 @@ from cairn_sim.scene.scene import Scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
+class DemoDrive:
     """What one robot of the demo does."""
 
     name: str
@@ -38,7 +38,7 @@ class Plan:
 
 
 @dataclass(slots=True)
-class Progress:
+class DemoProgress:
     """How far a robot is, for the table."""
 
     state: str = "waits"
@@ -53,10 +53,10 @@ class Progress:
 class DemoRobot:
     """One robot with its thread; `robot` is open until `close`."""
 
-    def __init__(self, plan: Plan, scene: Scene, map_url: str, folder: Path, seed: int) -> None:
+    def __init__(self, plan: DemoDrive, scene: Scene, map_url: str, folder: Path, seed: int) -> None:
         self.plan = plan
         self.stop_count = len(plan.stops)
-        self.progress = Progress()
+        self.progress = DemoProgress()
         self.error: BaseException | None = None
         self._scene = scene
         self._noise = Noise(seed)

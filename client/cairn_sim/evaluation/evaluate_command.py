@@ -29,10 +29,9 @@ from cairn_fusion.recording.images import write_colour
 from cairn_fusion.view.telepresence import Telepresence, ViewMode, ViewOptions
 from cairn_fusion.view.temperature_scale import locked_scale
 from cairn_map.errors import BadInputError
-from cairn_sim.evaluation.fusion_evaluation import WAYS, mapped_scores, plan_scans, scored_view
+from cairn_sim.evaluation.fusion_evaluation import WAYS, labelled_frames, mapped_scores, plan_scans, scored_view
 from cairn_sim.evaluation.fusion_pictures import error_picture, figure_24
 from cairn_sim.evaluation.fusion_scores import COLUMNS, FusionScores
-from cairn_sim.evaluation.labelled_frames import labelled_frames
 from cairn_sim.evaluation.overlay_scores import overlay_scores
 from cairn_sim.render.sensors import ColourSensor
 from cairn_sim.robots.record import Plan, scans_of, shots_of

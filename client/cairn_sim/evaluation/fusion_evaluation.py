@@ -11,21 +11,37 @@ Images are scored in several ways from the same depth, so that each row says wha
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
 
 from cairn_calib.rig.rig import Rig, Spectrum
 from cairn_fusion.image_fusion.cross_view import CrossView, cross_view
 from cairn_fusion.image_fusion.surface import drawn_surface, surface_of
+from cairn_fusion.importers import open_source
 from cairn_fusion.mapping.integrate import Integrator, integrate_scans
+from cairn_fusion.recording.images import read_colour
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.view.telepresence import fuse, source_order, view_depth
+from cairn_map.arrays import Flags
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import geometry_for
 from cairn_sim.evaluation.fusion_pictures import uncalibrated
 from cairn_sim.evaluation.fusion_scores import FusionScores, fusion_scores
 from cairn_sim.evaluation.fusion_truth import FusionTruth, fusion_truth
+from cairn_sim.evaluation.overlay_scores import intersection_over_union
 from cairn_sim.evaluation.temperature_scores import TemperatureScores, is_body, is_pipe, temperature_scores
 from cairn_sim.robots.record import Plan, scans_of, shots_of
 from cairn_sim.scene.scene import Scene
+
+HOT_CUP = 13
+"""Of `label_mapping.json`."""
+HOT_SHARE = 0.5
+"""A pixel is hot from half the way up from the frame's median to the label's hottest; ambient is 13 deg C, cups 75."""
+HOT_AT_LEAST_K = 5.0
+"""Above the median: a label whose thing has cooled down says nothing."""
+AROUND_PX = 40
+"""How far from the label hot pixels belong to it; other hot things have labels of their own."""
 
 WAYS = ("both cameras", "one camera", "nothing hides", "not calibrated")
 MAPPINGS: Mapping[str, Integrator] = {
@@ -86,3 +102,52 @@ def mapped_scores(
         groups = {"bodies": is_body, "pipes": is_pipe}
         found[name] = temperature_scores(scene, total.packed(), geometry, groups=groups, eyes_m=eyes_m)
     return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelledFrame:
+    """One frame with a hot cup."""
+
+    frame: str
+    scan: Scan
+    rig: Rig
+    fused: CrossView
+    label: Flags
+    given_iou: float
+    """Of the set's own registration."""
+    fused_iou: float
+
+
+def labelled_frames(folder: Path) -> Iterator[LabelledFrame]:
+    """The frames of an MM5 folder that show a hot cup.
+
+    Raises:
+        BadInputError: it is no such folder, or an image is damaged.
+    """
+    source = open_source(folder)
+    names = sorted(path.name.partition(".")[0] for path in (folder / "frames" / "A").glob("*.label.png"))
+    frames = {name: index for index, name in enumerate(names)}
+    for name, index in frames.items():
+        label = read_colour(folder / "frames" / "A" / f"{name}.label.png")[..., 0] == HOT_CUP
+        if not label.any():
+            continue
+        scan = source.scan(index)
+        kelvin = scan.thermal["thermal"]
+        ambient, hottest = float(np.nanmedian(kelvin)), float(np.nanmax(kelvin[label]))
+        if hottest - ambient < HOT_AT_LEAST_K:
+            continue
+        from_k = ambient + HOT_SHARE * (hottest - ambient)
+        fused, near = fuse(scan, source.rig, "colour"), _around(label)
+        given = near & (kelvin > from_k)
+        ours = near & fused.ok & (fused.values[..., 0] > from_k)
+        ious = (intersection_over_union(each, label) for each in (given, ours))
+        yield LabelledFrame(name, scan, source.rig, fused, label, *ious)
+
+
+def _around(label: Flags) -> Flags:
+    """(H, W) the label's box, wider by `AROUND_PX`."""
+    rows, columns = np.flatnonzero(label.any(axis=1)), np.flatnonzero(label.any(axis=0))
+    near = np.zeros_like(label)
+    top, left = max(rows[0] - AROUND_PX, 0), max(columns[0] - AROUND_PX, 0)
+    near[top : rows[-1] + AROUND_PX + 1, left : columns[-1] + AROUND_PX + 1] = True
+    return near

@@ -17,7 +17,7 @@ from cairn_calib.rig.poses import Transform, inverse, transform_points
 from cairn_calib.rig.rig import Rig, Spectrum
 from cairn_map.arrays import Flags, Floats
 from cairn_sim.render.rays import POINTS_OF_BUNDLE, cast, cast_directions
-from cairn_sim.render.render import View, colour_image, thermal_image
+from cairn_sim.render.render import CameraView, colour_image, thermal_image
 from cairn_sim.render.sensors import ColourSensor, ThermalSensor
 from cairn_sim.scene.scene import Scene
 
@@ -55,7 +55,7 @@ def fusion_truth(
     T_map_camera = T_map_rig @ seen_in.transform
     own = cast(scene, seen_in.camera, T_map_camera, opaque=seen_in.spectrum is Spectrum.THERMAL)
     other = cast(scene, seen_in.camera, T_map_camera, opaque=spectrum is Spectrum.THERMAL)
-    view = View(scene=scene, camera=seen_in.camera, T_map_camera=T_map_camera, hits=other)
+    view = CameraView(scene=scene, camera=seen_in.camera, T_map_camera=T_map_camera, hits=other)
     if spectrum is Spectrum.THERMAL:
         values = thermal_image(view, ThermalSensor(), None)[..., None]
     else:

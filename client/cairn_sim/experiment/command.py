@@ -27,7 +27,7 @@ from cairn_client.cli.arguments import parser, say
 from cairn_map.errors import BadInputError
 from cairn_sim.experiment.figures import Json, ResolutionFigures
 from cairn_sim.experiment.robots import ExperimentRobot, recorded_robot, simulated_robots
-from cairn_sim.experiment.run import Settings, run_experiment
+from cairn_sim.experiment.run import ExperimentSettings, run_experiment
 from cairn_sim.experiment.tables import MIB, shown
 from cairn_sim.robots.robots import ROBOTS, robot_named
 from cairn_sim.scene.scene_file import load_scene
@@ -38,7 +38,7 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     threads = args.threads or os.cpu_count() or 1
     robots = _robots(args, threads)
-    settings = Settings(
+    settings = ExperimentSettings(
         voxel_edges_m=[cm / 100 for cm in args.resolutions], threads=threads, ceiling_m=args.ceiling, about=_about(args)
     )
     stops, scans = sum(len(robot.stops) for robot in robots), sum(robot.scan_count for robot in robots)

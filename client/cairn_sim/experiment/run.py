@@ -37,7 +37,7 @@ LIBRARIES = ("cairn-robotics", "numpy", "numba", "zstandard")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
+class ExperimentSettings:
     """What is to be done, besides the robots."""
 
     voxel_edges_m: Sequence[float]
@@ -48,7 +48,7 @@ class Settings:
     """Parameters for the report."""
 
 
-def run_experiment(robots: Sequence[ExperimentRobot], folder: Path, settings: Settings) -> RunFigures:
+def run_experiment(robots: Sequence[ExperimentRobot], folder: Path, settings: ExperimentSettings) -> RunFigures:
     """Drive, map, measure; the report is in `folder`, which is new or empty, and grows with each resolution.
 
     Raises:

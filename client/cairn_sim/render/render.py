@@ -55,7 +55,7 @@ SENSORS: Mapping[Spectrum, Sensor] = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class View:
+class CameraView:
     """One camera in a scene: what is needed to render an image of it."""
 
     scene: Scene
@@ -78,7 +78,7 @@ class ImageNoise:
     pattern: Singles
 
 
-def view_of(scene: Scene, rig: Rig, name: str, *, T_map_rig: Transform) -> View:
+def view_of(scene: Scene, rig: Rig, name: str, *, T_map_rig: Transform) -> CameraView:
     """A camera of a rig in a scene.
 
     Raises:
@@ -87,7 +87,7 @@ def view_of(scene: Scene, rig: Rig, name: str, *, T_map_rig: Transform) -> View:
     mounted = rig[name]
     T_map_camera = T_map_rig @ mounted.transform
     hits = cast(scene, mounted.camera, T_map_camera, opaque=mounted.spectrum is Spectrum.THERMAL)
-    return View(scene=scene, camera=mounted.camera, T_map_camera=T_map_camera, hits=hits)
+    return CameraView(scene=scene, camera=mounted.camera, T_map_camera=T_map_camera, hits=hits)
 
 
 def render_scan(
@@ -154,7 +154,7 @@ def render_scan(
     )
 
 
-def colour_image(view: View, sensor: ColourSensor, noise: ImageNoise | None) -> npt.NDArray[np.uint8]:
+def colour_image(view: CameraView, sensor: ColourSensor, noise: ImageNoise | None) -> npt.NDArray[np.uint8]:
     """(H, W, 3) sRGB. The light multiplies sRGB values: nobody measures radiance here."""
     srgb, grains = view.scene.surfaces.colours_srgb, view.scene.shapes.texture[:, 4].copy()
     sky = np.array(view.scene.sky_srgb, dtype=np.float32)
@@ -172,7 +172,7 @@ def colour_image(view: View, sensor: ColourSensor, noise: ImageNoise | None) -> 
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-def thermal_image(view: View, sensor: ThermalSensor, noise: ImageNoise | None) -> Singles:
+def thermal_image(view: CameraView, sensor: ThermalSensor, noise: ImageNoise | None) -> Singles:
     """(H, W) float32 kelvin, apparent: what the counts of `thermal_counts` mean."""
     if noise is not None:
         return sensor.kelvin_of(thermal_counts(view, sensor, noise).astype(np.float64)).astype(np.float32)
@@ -180,7 +180,7 @@ def thermal_image(view: View, sensor: ThermalSensor, noise: ImageNoise | None) -
     return sensor.kelvin_of(radiance.astype(np.float64)).astype(np.float32).reshape(view.shape)
 
 
-def thermal_counts(view: View, sensor: ThermalSensor, noise: ImageNoise) -> Counts:
+def thermal_counts(view: CameraView, sensor: ThermalSensor, noise: ImageNoise) -> Counts:
     """(H, W) uint16 raw counts; 1 to 65535."""
     shade = _radiance(view.scene, sensor)
     counts = _blurred(_shaded(view, shade, sensor.fineness, opaque=True).reshape(view.shape), sensor.blur_px)
@@ -190,7 +190,7 @@ def thermal_counts(view: View, sensor: ThermalSensor, noise: ImageNoise) -> Coun
     return np.clip(np.rint(counts), 1, COUNT_MAX).astype(np.uint16)
 
 
-def range_images(view: View, sensor: RangeSensor, noise: ImageNoise | None) -> tuple[Singles, Counts]:
+def range_images(view: CameraView, sensor: RangeSensor, noise: ImageNoise | None) -> tuple[Singles, Counts]:
     """Range, (H, W) float32 metres along the beam, NaN where there is none; amplitude, (H, W) uint16 counts."""
     received = _returned(view, sensor, view.hits)
     range_m = view.hits.path_m.copy()
@@ -213,7 +213,7 @@ def range_images(view: View, sensor: RangeSensor, noise: ImageNoise | None) -> t
     return range_m.astype(np.float32).reshape(view.shape), amplitude.reshape(view.shape)
 
 
-def _mix_into(range_m: npt.NDArray[np.float64], received: Singles, view: View, sensor: RangeSensor) -> None:
+def _mix_into(range_m: npt.NDArray[np.float64], received: Singles, view: CameraView, sensor: RangeSensor) -> None:
     """Replace the pixels at edges by what the waves from all of their area add up to."""
     n = sensor.fineness
     edges, fine = _fine_hits(view, n, opaque=False)
@@ -221,7 +221,7 @@ def _mix_into(range_m: npt.NDArray[np.float64], received: Singles, view: View, s
         range_m[edges], received[edges] = mixed_waves(fine.path_m, _returned(view, sensor, fine), n * n, sensor.wrap_m)
 
 
-def _returned(view: View, sensor: RangeSensor, hits: Hits) -> Singles:
+def _returned(view: CameraView, sensor: RangeSensor, hits: Hits) -> Singles:
     """(N,) amplitude before noise and saturation."""
     s = view.scene.surfaces
     light = returns(hits, s.reflectivity_nir, s.gloss_nir, s.retroreflection)
@@ -239,7 +239,7 @@ def _radiance(scene: Scene, sensor: ThermalSensor) -> Shade:
     return lambda hits: surface_values(hits, sent, sky)
 
 
-def _shaded(view: View, shade: Shade, fineness: int, *, opaque: bool) -> Singles:
+def _shaded(view: CameraView, shade: Shade, fineness: int, *, opaque: bool) -> Singles:
     """(N, ...) values of all pixels: of the ray through the centre, or the area's mean where it shows an edge."""
     values = shade(view.hits)
     edges, hits = _fine_hits(view, fineness, opaque=opaque)
@@ -249,7 +249,7 @@ def _shaded(view: View, shade: Shade, fineness: int, *, opaque: bool) -> Singles
     return values
 
 
-def _fine_hits(view: View, fineness: int, *, opaque: bool) -> tuple[npt.NDArray[np.int64], Hits]:
+def _fine_hits(view: CameraView, fineness: int, *, opaque: bool) -> tuple[npt.NDArray[np.int64], Hits]:
     """(E,) pixels that show an edge, none for a fineness of 1; and what finer rays through their area meet."""
     order, _ = tiles(view.camera.width, view.camera.height)
     edges = edge_pixels(view.hits, view.camera.width, view.camera.height, order if fineness > 1 else order[:0])

@@ -30,7 +30,7 @@ AIM_M = 3.0
 Distortion = tuple[float, float, float, float, float]
 
 
-class Lens(NamedTuple):
+class HeadLens(NamedTuple):
     """An image size, the angle along its rows, and how a real lens of the kind departs from a pinhole."""
 
     size_px: tuple[int, int]
@@ -58,10 +58,10 @@ class Lens(NamedTuple):
         )
 
 
-COLOUR = Lens((1280, 960), 51.0, (-0.11, 0.09, 4e-4, -3e-4, 0.0), (0.006, -0.004))
-THERMAL = Lens((640, 512), 69.0, (-0.24, 0.10, -6e-4, 5e-4, -0.02), (-0.008, 0.005))
-TOF = Lens((176, 144), 69.0, (-0.28, 0.13, 5e-4, 8e-4, -0.03), (0.007, 0.009))
-HANDHELD = Lens((640, 480), 60.0, (0.04, -0.08, 2e-4, 3e-4, 0.0), (0.004, 0.003))
+COLOUR = HeadLens((1280, 960), 51.0, (-0.11, 0.09, 4e-4, -3e-4, 0.0), (0.006, -0.004))
+THERMAL = HeadLens((640, 512), 69.0, (-0.24, 0.10, -6e-4, 5e-4, -0.02), (-0.008, 0.005))
+TOF = HeadLens((176, 144), 69.0, (-0.28, 0.13, 5e-4, 8e-4, -0.03), (0.007, 0.009))
+HANDHELD = HeadLens((640, 480), 60.0, (0.04, -0.08, 2e-4, 3e-4, 0.0), (0.004, 0.003))
 
 
 def full_head(*, scale: float = 1.0, ideal: bool = False) -> Rig:

@@ -67,7 +67,7 @@ def aluminium(visible: Look = Look.BRIGHT, near_infrared: Look = Look.BRIGHT) ->
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Board:
+class SimulatedBoard:
     """A checkerboard: numbers of squares, their side, the aluminium frame around them, and how aluminium looks.
 
     Columns and rows are one even and one odd: turned by half a turn the colours have changed places, so one image tells
@@ -108,17 +108,19 @@ class Board:
         return transform_points(T_map_board, self.corners)
 
 
-def heated_checkerboard(T_map_board: Transform, board: Board | None = None, *, name: str = "board") -> list[Solid]:
+def heated_checkerboard(
+    T_map_board: Transform, board: SimulatedBoard | None = None, *, name: str = "board"
+) -> list[Solid]:
     """A sheet of heated aluminium with square holes, before chipboard with matt black foil.
 
     The top left square is aluminium. Aluminium and foil are one face, as if the sheet had no thickness.
 
     Args:
         T_map_board: where the first inner corner is; x right, y down, z into the board.
-        board: None for a `Board()`.
+        board: None for a `SimulatedBoard()`.
         name: its solids' names begin with it.
     """
-    board = board or Board()
+    board = board or SimulatedBoard()
     metal = aluminium(board.visible, board.near_infrared)
     x, y = board.centre
     width, height = board.columns * board.square_m, board.rows * board.square_m
@@ -164,7 +166,7 @@ def target_centre(T_map_target: Transform) -> Points:
     return np.array(T_map_target[:3, 3])
 
 
-def calibration_scene(T_map_board: Transform, board: Board | None = None) -> Scene:
+def calibration_scene(T_map_board: Transform, board: SimulatedBoard | None = None) -> Scene:
     """The laboratory with a board in it."""
     return scene_of([*laboratory(), *heated_checkerboard(T_map_board, board)], name="calibration", ambient_k=ROOM_K)
 
@@ -201,7 +203,7 @@ def _facing_the_robot(x_m: float, y_m: float, z_m: float) -> Transform:
 
 def _example_calibration() -> Scene:
     """The board upright in the bare room, 2.2 m ahead."""
-    board = Board()
+    board = SimulatedBoard()
     middle = _facing_the_robot(2.2, 0.0, 1.15)
     return calibration_scene(middle @ placed((-board.centre[0], -board.centre[1], 0.0)), board)
 

@@ -18,7 +18,7 @@ from cairn_calib.rig.lens import Lens
 from cairn_calib.rig.poses import Transform
 from cairn_calib.rig.rig import Rig
 from cairn_sim.robots.heads import RANGE_CAMERA
-from cairn_sim.robots.targets import Board
+from cairn_sim.robots.targets import SimulatedBoard
 
 EDGE_M = 0.42
 """From the board's middle to where its corners must still be seen, with a tenth of a square to spare."""
@@ -43,7 +43,7 @@ class Configuration:
     places: tuple[Place, ...]
 
 
-def pose_of(place: Place, board: Board, rig: Rig) -> Transform:
+def pose_of(place: Place, board: SimulatedBoard, rig: Rig) -> Transform:
     """`T_rig_board` of a board whose middle is at the place."""
     lens = rig[RANGE_CAMERA].camera
     if not isinstance(lens, Lens):

@@ -8,7 +8,7 @@ from cairn_calib.report.page import page
 from cairn_calib.verify.disc_images import Method
 from cairn_calib.verify.verification_report import camera_table, difference_plots
 from cairn_calib.verify.verification_table import CameraRow
-from cairn_sim.study.run import METHODS, Outcome
+from cairn_sim.study.run import METHODS, StudyOutcome
 
 PAPER: Mapping[str, tuple[float, float, float, float]] = {
     "c4": (5.8, 6.2, 2.3, 3.0),
@@ -35,7 +35,7 @@ NOT_THE_SAME = (
 class Study:
     """What was done, and what came of it."""
 
-    outcomes: Sequence[Outcome]
+    outcomes: Sequence[StudyOutcome]
     images: int
     """Of targets."""
     seed: int
@@ -43,7 +43,7 @@ class Study:
     """Of colour and thermal images."""
 
     @property
-    def best(self) -> Outcome | None:
+    def best(self) -> StudyOutcome | None:
         """The configuration with the least error by grey centroids, None if all are refused."""
         solved = [outcome for outcome in self.outcomes if outcome.rig is not None]
         return min(solved, key=lambda outcome: outcome.score("grey"), default=None)
@@ -124,7 +124,7 @@ def study_json(study: Study) -> str:
     return json.dumps(document, indent=1) + "\n"
 
 
-def _text_line(outcome: Outcome, method: Method) -> str:
+def _text_line(outcome: StudyOutcome, method: Method) -> str:
     if outcome.rig is None:
         return f"{outcome.name:4} refused: {outcome.refusal}"
     rows = {row.camera: row for row in outcome.tables[method]}
@@ -135,7 +135,7 @@ def _text_line(outcome: Outcome, method: Method) -> str:
     return f"{outcome.name:4} " + " ".join(cells)
 
 
-def _page_row(outcome: Outcome, method: Method) -> dict[str, object]:
+def _page_row(outcome: StudyOutcome, method: Method) -> dict[str, object]:
     """A configuration's line of Table 2: of each camera our sigma, the expected total, and the paper's sigma."""
     rows = {row.camera: row for row in outcome.tables[method]} if outcome.rig is not None else {}
     printed = PAPER.get(outcome.name, (None,) * 4)

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from cairn_calib.board.board import Board as CornerBoard
 from cairn_calib.board.corner_detection import find_chessboard
 from cairn_calib.board.corners import Corners
+from cairn_calib.rig.poses import Transform, transform_points
 from cairn_calib.rig.rig import Rig
 from cairn_calib.solve.board_views import BoardView, BoardViews
 from cairn_calib.solve.solve import solve_rig
@@ -28,14 +29,31 @@ from cairn_calib.verify.disc_images import Method
 from cairn_calib.verify.verification import Found, Sightings, add_sights, found_targets
 from cairn_calib.verify.verification_table import CameraRow, table_of
 from cairn_fusion.recording.scan import Scan
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 from cairn_sim.render.render import render_scan
 from cairn_sim.render.sensors import Noise
 from cairn_sim.robots.heads import RANGE_CAMERA
-from cairn_sim.robots.targets import Board, calibration_scene, target_scene
+from cairn_sim.robots.kinematics import T_FORWARD_CAMERA
+from cairn_sim.robots.targets import SimulatedBoard, calibration_scene, target_scene
 from cairn_sim.scene.scene import Scene
+from cairn_sim.scene.solids import placed
 from cairn_sim.study.configurations import CONFIGURATIONS, Configuration, Place, pose_of
-from cairn_sim.study.scenes import T_MAP_HEAD, targets_in_view
+
+T_MAP_HEAD: Transform = placed((0.0, 0.0, 1.4)) @ T_FORWARD_CAMERA
+"""In the middle of the laboratory's height."""
+RANGES_M = (1.1, 5.7)
+"""Of the paper's 211 objects."""
+RADIUS_MAX_PX = 67.0
+"""Of the range camera's image, from its principal point; the paper's."""
+TILT_MAX_RAD = 0.5
+DIAMETERS_M = (0.20, 0.30, 0.30)
+"""Three targets, of 20 and 30 cm."""
+ROOM_LOW, ROOM_HIGH = np.array([-0.5, -2.7, 0.2]), np.array([6.6, 2.7, 2.6])
+APART = 1.25
+"""Between two targets, times what would make them touch in the image."""
+MARGIN_PX = 4
+TRIES = 10_000
 
 METHODS: tuple[Method, ...] = ("paper", "grey")
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
@@ -48,7 +66,7 @@ Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class StudyOutcome:
     """One configuration: its rig and Table 2 of it, or why there is none."""
 
     name: str
@@ -77,7 +95,7 @@ def places_of(names: Sequence[str]) -> list[Place]:
 
 def photographed(head: Rig, places: Sequence[Place], *, seed: int) -> Iterator[tuple[Place, BoardCorners]]:
     """The corners that each camera found of the board at each place, in order."""
-    board = Board()
+    board = SimulatedBoard()
     corner_board = corner_board_of(board)
 
     def take(numbered: tuple[int, Place]) -> tuple[Place, BoardCorners]:
@@ -114,19 +132,19 @@ def driven(head: Rig, images: int, *, seed: int) -> Iterator[dict[Method, Found]
 
 def outcome_of(
     name: str, corners: Mapping[Place, BoardCorners], drive: Sequence[Mapping[Method, Found]], head: Rig
-) -> Outcome:
+) -> StudyOutcome:
     """One configuration, solved from its images alone, and verified."""
     configuration = CONFIGURATIONS[name]
     try:
         rig = calibrated(configuration, corners, head, name=name)
     except BadInputError as exc:
-        return Outcome(name, configuration, None, exc.message)
+        return StudyOutcome(name, configuration, None, exc.message)
     sightings: dict[Method, Sightings] = {}
     for method in METHODS:
         sightings[method] = Sightings(rig, RANGE_CAMERA, method)
         for found in drive:
             add_sights(sightings[method], found[method])
-    return Outcome(name, configuration, rig, "", sightings, {m: table_of(each) for m, each in sightings.items()})
+    return StudyOutcome(name, configuration, rig, "", sightings, {m: table_of(each) for m, each in sightings.items()})
 
 
 def calibrated(configuration: Configuration, corners: Mapping[Place, BoardCorners], head: Rig, *, name: str) -> Rig:
@@ -142,11 +160,11 @@ def calibrated(configuration: Configuration, corners: Mapping[Place, BoardCorner
     )
     sizes = {camera: (each.camera.width, each.camera.height) for camera, each in head.cameras.items()}
     plan = usual_plan({camera: each.spectrum for camera, each in head.cameras.items()}, rig_name=name)
-    solution = solve_rig(BoardViews(corner_board_of(Board()), sizes, views), plan)
+    solution = solve_rig(BoardViews(corner_board_of(SimulatedBoard()), sizes, views), plan)
     return solved_rig(solution, made_s=0.0)
 
 
-def corner_board_of(board: Board) -> CornerBoard:
+def corner_board_of(board: SimulatedBoard) -> CornerBoard:
     """The simulator's board as the corner finder knows it."""
     return CornerBoard(columns=board.columns - 1, rows=board.rows - 1, pitch_m=board.square_m)
 
@@ -173,3 +191,37 @@ def _side_by_side(take: Callable[[Item], Result], items: Sequence[Item]) -> Iter
     """Results in order, computed on all cores."""
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         yield from pool.map(take, items)
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """One disc: where it is, and how wide."""
+
+    T_map_target: Transform
+    diameter_m: float
+
+
+def targets_in_view(rig: Rig, rng: np.random.Generator) -> list[Target]:
+    """Three discs at random places of the range camera's image and random ranges, none before another."""
+    lens = rig[RANGE_CAMERA].camera
+    placed_at: list[tuple[Floats, float]] = []
+    targets: list[Target] = []
+    for diameter_m in DIAMETERS_M:
+        for _ in range(TRIES):
+            pixel = rng.uniform([0, 0], [lens.width - 1, lens.height - 1])
+            range_m = float(rng.uniform(*RANGES_M))
+            beam = lens.unproject(pixel)
+            at = transform_points(T_MAP_HEAD @ rig[RANGE_CAMERA].transform, (beam * range_m)[None])[0]
+            reach_px = diameter_m / 2 / range_m * lens.width / 1.2 + MARGIN_PX
+            size = np.array([lens.width, lens.height])
+            inside = (pixel > reach_px).all() and (pixel < size - reach_px).all()
+            away = np.linalg.norm(pixel - (size - 1) / 2) < RADIUS_MAX_PX
+            free = all(np.linalg.norm(pixel - other) > APART * (reach_px + reach) for other, reach in placed_at)
+            if inside and away and free and (at > ROOM_LOW).all() and (at < ROOM_HIGH).all():
+                rx, ry, rz = (float(v) for v in rng.uniform(-TILT_MAX_RAD, TILT_MAX_RAD, 3))
+                x, y, z = (float(v) for v in at)
+                T = placed((x, y, z)) @ T_FORWARD_CAMERA @ placed((0, 0, 0), (rx, ry, rz))
+                targets.append(Target(T, diameter_m))
+                placed_at.append((pixel, reach_px))
+                break
+    return targets

@@ -18,7 +18,7 @@ from cairn_sim.robots.heads import RANGE_CAMERA, full_head
 from cairn_sim.robots.targets import laboratory, target_scene
 from cairn_sim.scene.scene import scene_of
 from cairn_sim.scene.solids import placed
-from cairn_sim.study.scenes import T_MAP_HEAD, targets_in_view
+from cairn_sim.study.run import T_MAP_HEAD, targets_in_view
 
 RIG = full_head(scale=0.5)
 SCANS = 4

@@ -17,11 +17,10 @@ from cairn_fusion.recording.images import read_colour
 from cairn_fusion.transfer.transfer import Label
 from cairn_fusion.view.temperature_scale import TemperatureScale
 from cairn_map.errors import BadInputError
-from cairn_sim.evaluation.fusion_evaluation import WAYS, mapped_scores, scored_view
+from cairn_sim.evaluation.fusion_evaluation import WAYS, labelled_frames, mapped_scores, scored_view
 from cairn_sim.evaluation.fusion_pictures import error_picture, figure_24
 from cairn_sim.evaluation.fusion_scores import COLUMNS, fusion_scores
 from cairn_sim.evaluation.fusion_truth import FusionTruth
-from cairn_sim.evaluation.labelled_frames import labelled_frames
 from cairn_sim.evaluation.temperature_scores import OTHERS
 from cairn_sim.render.render import render_scan
 from cairn_sim.robots.heads import RANGE_CAMERA, full_head

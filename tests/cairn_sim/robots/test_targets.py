@@ -27,8 +27,8 @@ from cairn_sim.robots.targets import (
     HEATED_K,
     ROOM_K,
     TAPE_M,
-    Board,
     Look,
+    SimulatedBoard,
     calibration_scene,
     circle_target,
     heated_checkerboard,
@@ -64,7 +64,7 @@ def ahead(x_m: float, y_m: float, z_m: float, turn_rad: tuple[float, float, floa
     return HEAD @ placed((x_m, y_m, z_m), turn_rad)
 
 
-def board_at(board: Board, z_m: float, turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Transform:
+def board_at(board: SimulatedBoard, z_m: float, turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Transform:
     """A pose of which the checker's middle is straight ahead."""
     x, y = board.centre
     return ahead(0, 0, z_m, turn_rad) @ placed((-x, -y, 0))
@@ -102,7 +102,7 @@ def pixels_of(points_map: Floats, rig: Rig, name: str) -> Floats:
     return mounted.camera.project(transform_points(inverse(HEAD @ mounted.transform), points_map))
 
 
-def squares(board: Board) -> tuple[Floats, npt.NDArray[np.bool_]]:
+def squares(board: SimulatedBoard) -> tuple[Floats, npt.NDArray[np.bool_]]:
     """(N, 3) the squares' middles, board frame, and whether each is aluminium: the top left is."""
     j, i = np.divmod(np.arange(board.columns * board.rows), board.columns)
     middles = np.stack([i - 0.5, j - 0.5, 0 * i], axis=-1) * board.square_m
@@ -113,7 +113,7 @@ def squares(board: Board) -> tuple[Floats, npt.NDArray[np.bool_]]:
 
 
 def test_corners_are_numbered_row_by_row_from_the_first_at_the_origin() -> None:
-    board = Board(columns=5, rows=4, square_m=0.2)
+    board = SimulatedBoard(columns=5, rows=4, square_m=0.2)
     assert board.corners.shape == (12, 3)
     np.testing.assert_allclose(board.corners[[0, 1, 4, 11]], [(0, 0, 0), (0.2, 0, 0), (0, 0.2, 0), (0.6, 0.4, 0)])
     T = ahead(0.3, -0.1, 2.0, (0.2, 0.1, 0.4))
@@ -125,7 +125,7 @@ TURNS = [(0.0, 0.0, 0.0), (0.4, -0.3, 0.2)]
 
 @pytest.mark.parametrize("turn_rad", TURNS)
 def test_each_pixel_of_each_camera_shows_the_square_that_its_ray_meets(turn_rad: tuple[float, float, float]) -> None:
-    board, rig = Board(), full_head(scale=0.5)
+    board, rig = SimulatedBoard(), full_head(scale=0.5)
     T = board_at(board, 1.7, turn_rad)
     scan = render_scan(
         calibration_scene(T, board), rig, T_map_rig=HEAD, range_camera=RANGE_CAMERA, time_s=0.0, threads=1
@@ -147,7 +147,7 @@ def test_each_pixel_of_each_camera_shows_the_square_that_its_ray_meets(turn_rad:
 def test_true_corners_are_where_a_detector_finds_the_squares_meet(
     name: str, turn_rad: tuple[float, float, float]
 ) -> None:
-    board, rig = Board(), full_head()
+    board, rig = SimulatedBoard(), full_head()
     T = board_at(board, 1.7, turn_rad)
     rig = Rig(name="pair", cameras={RANGE_CAMERA: rig[RANGE_CAMERA], name: rig[name]})
     image = brightness(render(calibration_scene(T, board), rig, sensors=quiet(fineness=16)), name).astype(np.float32)
@@ -166,7 +166,7 @@ def test_true_corners_are_where_a_detector_finds_the_squares_meet(
 
 @pytest.mark.parametrize(("visible", "near_infrared"), LOOKS)
 def test_aluminium_is_hot_and_looks_as_told_in_the_other_spectra(visible: Look, near_infrared: Look) -> None:
-    board = Board(visible=visible, near_infrared=near_infrared)
+    board = SimulatedBoard(visible=visible, near_infrared=near_infrared)
     T, rig = board_at(board, 1.7, (0.15, 0.1, 0.05)), full_head(scale=0.5)
     scan = render(calibration_scene(T, board), rig)
     middles, metal = squares(board)
@@ -179,7 +179,7 @@ def test_aluminium_is_hot_and_looks_as_told_in_the_other_spectra(visible: Look, 
 
 
 def test_the_board_is_at_fifty_degrees_and_at_room_temperature_by_turns() -> None:
-    board = Board()
+    board = SimulatedBoard()
     T, rig, sensor = board_at(board, 1.7), full_head(), ThermalSensor()
     scene = calibration_scene(T, board)
     middles, metal = squares(board)
@@ -194,7 +194,7 @@ def test_the_board_is_at_fifty_degrees_and_at_room_temperature_by_turns() -> Non
 
 
 def test_every_corner_of_a_board_in_view_is_visible_and_lies_on_its_face() -> None:
-    board = Board()
+    board = SimulatedBoard()
     T = board_at(board, 1.7, (0.4, -0.3, 0.2))
     scene = calibration_scene(T, board)
     corners = board.corners_at(T)
@@ -206,7 +206,7 @@ def test_every_corner_of_a_board_in_view_is_visible_and_lies_on_its_face() -> No
 @pytest.mark.parametrize("changes", [{"columns": 1}, {"rows": 0}, {"square_m": 0.0}, {"border_m": math.nan}])
 def test_a_board_without_corners_or_size_is_refused(changes: dict[str, float]) -> None:
     with pytest.raises(BadInputError, match="a board needs"):
-        replace(Board(), **changes)  # type: ignore[arg-type]
+        replace(SimulatedBoard(), **changes)  # type: ignore[arg-type]
 
 
 def test_names_tell_two_boards_apart() -> None:

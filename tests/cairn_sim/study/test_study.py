@@ -14,12 +14,11 @@ from cairn_calib.verify.verification import CENTROID_SIGMA_PX
 from cairn_calib.verify.verification_table import CameraRow
 from cairn_map.errors import BadInputError
 from cairn_sim.robots.heads import RANGE_CAMERA, full_head, tof_head
-from cairn_sim.robots.targets import Board
+from cairn_sim.robots.targets import SimulatedBoard
 from cairn_sim.study.command import main
 from cairn_sim.study.configurations import CONFIGURATIONS, pose_of
 from cairn_sim.study.report import BARS, CAMERAS, PAPER, judged
-from cairn_sim.study.run import METHODS, driven, places_of
-from cairn_sim.study.scenes import RANGES_M, T_MAP_HEAD, Target, targets_in_view
+from cairn_sim.study.run import METHODS, RANGES_M, T_MAP_HEAD, Target, driven, places_of, targets_in_view
 
 Floats = npt.NDArray[np.float64]
 HEAD = full_head(scale=0.5)
@@ -32,7 +31,7 @@ def seen(points: Floats, head: Rig, camera: str) -> Floats:
 
 
 def test_ten_configurations_have_two_to_nine_images_and_the_range_camera_sees_every_corner() -> None:
-    board = Board()
+    board = SimulatedBoard()
     assert list(CONFIGURATIONS) == [f"c{n}" for n in range(1, 11)]
     counts = [len(each.places) for each in CONFIGURATIONS.values()]
     assert min(counts) == 2 and max(counts) == 9 and sorted(counts) == counts
