@@ -43,6 +43,7 @@ MAY_NAME = {
         "cairn_calib/board/circle_grid.py",
         "cairn_calib/board/corner_detection.py",
         "cairn_calib/board/corner_pictures.py",
+        "cairn_calib/rig/image_files.py",
         "cairn_calib/verify/disc_images.py",
         "cairn_calib/thermal/flir_file.py",
         "cairn_calib/board/saddle_points.py",

@@ -1,4 +1,4 @@
-"""Image files that corners are looked for in, and pictures of what was found, to look at."""
+"""Pictures of the corners found in an image: overlays for inspection, and their thumbnails for the report."""
 
 from pathlib import Path
 
@@ -7,14 +7,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.board.corners import Corners
-from cairn_map.errors import BadInputError, DamagedDataError
+from cairn_calib.rig.image_files import Grey
 
-Grey = npt.NDArray[np.float32]
 Picture = npt.NDArray[np.uint8]
 
-FILE_BYTES_MAX = 256 << 20
-LUMA_BGR = (0.114, 0.587, 0.299)
-"""ITU-R BT.601."""
 LONGEST_PX = 1000
 """At least this long is a picture, so that the corners of a small image can be told apart."""
 SIGMAS = 150.0
@@ -24,37 +20,6 @@ BAND_PX = 28
 """Above the image, for the title."""
 THUMBNAIL_PX, JPEG_QUALITY = 320, 82
 FIRST, LAST, TEXT = (60, 60, 255), (255, 160, 40), (80, 255, 80)
-
-
-def read_grey(path: Path) -> tuple[Grey, bytes]:
-    """The counts of an image file, and its bytes.
-
-    Args:
-        path: PNG, JPEG or TIFF; 8 or 16 bits, grey or colour (then its luma). An EXIF orientation is not applied.
-
-    Returns:
-        (H, W) float32 counts, and the bytes of the file.
-
-    Raises:
-        BadInputError: missing, or larger than 256 MiB.
-        DamagedDataError: it cannot be decoded.
-    """
-    try:
-        with path.open("rb") as file:
-            data = file.read(FILE_BYTES_MAX + 1)
-    except OSError as exc:
-        raise BadInputError("missing_image", f"cannot read {path}: {exc.strerror}") from exc
-    if len(data) > FILE_BYTES_MAX:
-        raise BadInputError("image_too_large", f"{path} must be at most {FILE_BYTES_MAX} bytes, and is larger")
-    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    except cv2.error as exc:
-        raise DamagedDataError("bad_image", f"{path} cannot be decoded: {exc}") from exc
-    if image is None:
-        raise DamagedDataError("bad_image", f"{path} cannot be decoded: it is no PNG, JPEG or TIFF, or is damaged")
-    counts = np.asarray(image, np.float32)
-    return np.asarray(counts @ np.array(LUMA_BGR, np.float32) if counts.ndim == 3 else counts, np.float32), data
 
 
 def overlay(counts: Grey, corners: Corners | None, *, title: str) -> Picture:
@@ -92,11 +57,6 @@ def thumbnail(path: Path) -> bytes | None:
     height = max(1, round(image.shape[0] * THUMBNAIL_PX / image.shape[1]))
     small = cv2.resize(image, (THUMBNAIL_PX, height), interpolation=cv2.INTER_AREA)
     return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
-
-
-def write_grey16(path: Path, counts: npt.NDArray[np.uint16]) -> None:
-    """A 16-bit PNG file of (H, W) counts."""
-    path.write_bytes(bytes(cv2.imencode(".png", counts)[1]))
 
 
 def _draw(picture: Picture, corners: Corners, scale: int) -> None:

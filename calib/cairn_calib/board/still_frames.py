@@ -11,8 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from cairn_calib.board.corner_pictures import Grey, read_grey
 from cairn_calib.board.corners import Attempt, Corners, Detection
+from cairn_calib.rig.image_files import Grey, read_grey
 from cairn_map.errors import BadInputError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")

@@ -21,16 +21,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cairn_calib.cli.solve import add_parser as add_solve
-from cairn_calib.cli.solve import refuse_overwriting, solved, write_report
+from cairn_calib.cli.solve_options import add_solve_options, solve_as_asked
 from cairn_calib.diagnosis.examination import examined
+from cairn_calib.report.report_files import refuse_overwriting, write_report
 from cairn_calib.report.report_images import report_images
 from cairn_calib.rig.calibration import PIXEL_NAMES, POSE_UNITS
 from cairn_calib.rig.lens import Lens
 from cairn_calib.rig.range_bias import RangeBias
 from cairn_calib.rig.rig import Rig, load_rig
 from cairn_calib.solve.board_views import BoardViews
-from cairn_calib.solve.solve import Solution
+from cairn_calib.solve.solution import Solution
 from cairn_calib.solve.solved_rig import solved_rig
 from cairn_map.errors import BadInputError
 
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> None:
     """Solve again, compare, and write the report."""
     refuse_overwriting(args.output, args.rig)
     rig = load_rig(args.rig)
-    again = solved(solve_arguments(rig, args.folders, shlex.split(args.solved_with), args.rig))
+    again = solve_as_asked(solve_arguments(rig, args.folders, shlex.split(args.solved_with), args.rig))
     _refuse_other_inputs(rig, again.views, args.rig)
     off = sigmas_apart(rig, again)
     if not off < SAME_SIGMAS:
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> None:
         )
     sys.stdout.write(f"{args.rig} comes from these corners: the same to {max(off, 1e-4):.1g} sigma\n")
     folders = dict(zip(again.plan.cameras, args.folders, strict=True))
-    write_report(args.output, examined(again, rig), report_images(folders))
+    sys.stdout.write(write_report(args.output, examined(again, rig), report_images(folders)))
 
 
 def solve_arguments(rig: Rig, folders: list[Path], more: list[str], path: Path) -> argparse.Namespace:
@@ -95,8 +95,8 @@ def solve_arguments(rig: Rig, folders: list[Path], more: list[str], path: Path) 
     fisheyes = [name for name in names if getattr(rig[name].camera, "model", "") == "kb4"]
     arguments += ["--fisheye", ",".join(fisheyes), "--name", rig.name, "--output", str(path), *more]
     parser = argparse.ArgumentParser("cairn calib report --solved-with")
-    add_solve(parser.add_subparsers())
-    return parser.parse_args(["solve", *map(str, folders), *arguments])
+    add_solve_options(parser)
+    return parser.parse_args([*map(str, folders), *arguments])
 
 
 def sigmas_apart(rig: Rig, again: Solution) -> float:

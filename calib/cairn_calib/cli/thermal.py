@@ -35,7 +35,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cairn_calib.board.corner_pictures import overlay, read_grey, write_grey16, write_picture
+from cairn_calib.board.corner_pictures import overlay, write_picture
+from cairn_calib.rig.image_files import read_grey, write_grey16
 from cairn_calib.rig.radiometry import ZERO_C_K, Radiometry, radiometry_from_json
 from cairn_calib.rig.rig import RIG_BYTES_MAX, load_rig, rig_from_json
 from cairn_calib.thermal.flat_field import FlatField, FlatFieldFit, fit_flat_field, read_flat_field, write_flat_field

@@ -15,7 +15,8 @@ from cairn_calib.diagnosis.probe_points import Probes
 from cairn_calib.rig.pose_vectors import vector_from_transform
 from cairn_calib.solve.corner_residuals import CornerData
 from cairn_calib.solve.rig_state import value_of
-from cairn_calib.solve.solve import Solution, solve_from
+from cairn_calib.solve.solution import Solution
+from cairn_calib.solve.solve import solve_from
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 

@@ -11,7 +11,7 @@ from cairn_calib.diagnosis.solve_warnings import Warned, refuse_undetermined, wa
 from cairn_calib.diagnosis.view_coverage import Coverage, coverage
 from cairn_calib.diagnosis.weak_modes import WeakMode, weak_modes
 from cairn_calib.rig.rig import Rig
-from cairn_calib.solve.solve import Solution
+from cairn_calib.solve.solution import Solution
 
 
 @dataclass(frozen=True, slots=True)

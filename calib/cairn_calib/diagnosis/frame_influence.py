@@ -12,7 +12,7 @@ import numpy as np
 
 from cairn_calib.diagnosis.probe_points import Probes
 from cairn_calib.solve.normal_equations import Block, solved_scaled
-from cairn_calib.solve.solve import Solution
+from cairn_calib.solve.solution import Solution
 from cairn_map.arrays import Floats
 
 

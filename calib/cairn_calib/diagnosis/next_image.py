@@ -15,7 +15,7 @@ from cairn_calib.rig.pose_vectors import rotation_from_vector
 from cairn_calib.solve.corner_residuals import CornerData, board_points, corner_block
 from cairn_calib.solve.normal_equations import Loss
 from cairn_calib.solve.rig_state import warp_shape
-from cairn_calib.solve.solve import Solution
+from cairn_calib.solve.solution import Solution
 from cairn_map.arrays import Floats
 
 COLUMNS, ROWS = 3, 3

@@ -6,7 +6,7 @@ from cairn_calib.diagnosis.solve_warnings import Warned
 from cairn_calib.rig.range_terms import wave_period_m
 from cairn_calib.rig.rig import Spectrum
 from cairn_calib.solve.range_choice import AMPLITUDE_RATIO, HARMONICS, PERIOD_SHARE
-from cairn_calib.solve.solve import Solution
+from cairn_calib.solve.solution import Solution
 
 UNSEEN_SHARE = 0.1
 """Of the pixels of an image, without any board on them, from which on it is told."""

@@ -17,7 +17,7 @@ from cairn_calib.rig.rig import Spectrum
 from cairn_calib.solve.corner_residuals import CornerData
 from cairn_calib.solve.priors import FEW_VIEWS
 from cairn_calib.solve.rig_state import SCALE
-from cairn_calib.solve.solve import Solution
+from cairn_calib.solve.solution import Solution
 from cairn_calib.solve.solve_plan import SHARED
 from cairn_map.errors import BadInputError
 

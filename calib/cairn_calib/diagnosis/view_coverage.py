@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from cairn_calib.rig.poses import inverse
 from cairn_calib.solve.camera_alone import tilt_range_deg
-from cairn_calib.solve.solve import Solution
+from cairn_calib.solve.solution import Solution
 
 CELLS = (8, 6)
 """Columns and rows that an image is divided into."""

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from cairn_calib.solve.corner_residuals import CornerData, corner_misses
 from cairn_calib.solve.rig_state import warp_shape
-from cairn_calib.solve.solve import Solution
+from cairn_calib.solve.solution import Solution
 from cairn_map.arrays import Floats
 
 

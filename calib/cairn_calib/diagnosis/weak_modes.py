@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cairn_calib.diagnosis.probe_points import Probes
-from cairn_calib.solve.solve import Solution
+from cairn_calib.solve.solution import Solution
 from cairn_calib.solve.solve_plan import SHARED
 
 STRONG = 0.5

@@ -17,7 +17,7 @@ from cairn_calib.rig.pose_vectors import cross_matrix
 from cairn_calib.rig.poses import inverse, transform_points
 from cairn_calib.rig.projection_uncertainty import mounted_lens, projection_moves, transfer_certain
 from cairn_calib.rig.rig import Rig
-from cairn_calib.solve.solve import Solution
+from cairn_calib.solve.solution import Solution
 from cairn_map.arrays import Floats
 
 

@@ -11,7 +11,7 @@ from cairn_calib.rig.pixel_offsets import PixelOffsets
 from cairn_calib.rig.range_bias import RangeBias
 from cairn_calib.rig.range_terms import wave_period_m
 from cairn_calib.solve.range_choice import RangeSpans
-from cairn_calib.solve.solve import Solution
+from cairn_calib.solve.solution import Solution
 
 WORDS = {
     "offset_m": "offset, mm",

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cairn_calib.board.corner_pictures import Grey, read_grey
 from cairn_calib.rig.calibration import InputFile
+from cairn_calib.rig.image_files import Grey, read_grey
 from cairn_calib.rig.rig import Spectrum
 from cairn_calib.solve.board_views import BoardViews, RangeView, frame_of
 from cairn_calib.solve.solve_plan import SolvePlan

@@ -1,20 +1,26 @@
-"""Where the cameras of a rig are, from where each saw the boards: the start of the joint solve.
+"""Start of the joint solve: poses of cameras and boards, from the board poses that each camera found alone.
 
     T_gauge_camera = T_gauge_board T_camera_board^-1       once for each frame that both saw
 
-They agree, up to noise, but for boards that were mistaken: a small board's tilt may be mirrored, and a board whose
+These agree up to noise, except for boards that were mistaken: a small board's tilt may be mirrored, and a board whose
 corners were named from the wrong end is turned by half a turn. So each frame votes with all readings of its two poses,
-the reading is taken that most frames agree on, and what agrees is averaged: rotations by the chordal mean (Hartley et
-al. 2013), translations by the median. Cameras hang together along a maximum spanning tree of what they saw in common.
+the reading that most frames agree on is taken, and the poses that agree with it are averaged: rotations by the chordal
+mean (Hartley et al., Rotation averaging, 2013), translations by the median. Cameras are connected along a maximum
+spanning tree, weighted by the corners that two cameras saw in common. Then each frame's board takes the reading that
+all its cameras meet best.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from cairn_calib.board.board import Board
 from cairn_calib.rig.poses import Transform, inverse
+from cairn_calib.solve.board_views import BoardViews
+from cairn_calib.solve.camera_alone import CameraAlone
+from cairn_calib.solve.corner_residuals import CornerData, corner_data, corner_misses
+from cairn_calib.solve.rig_state import RigState, warp_shape
 from cairn_calib.solve.zhang import mirrored_pose
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
@@ -87,6 +93,55 @@ def rig_start(
     return RigStart(
         T_rig_camera, tuple((name, frame) for name, found in turned.items() for edge in found for frame in edge.turned)
     )
+
+
+def first_state(views: BoardViews, alone: Mapping[str, CameraAlone], T_rig_camera: Mapping[str, Transform]) -> RigState:
+    """The rig with each frame's board where it is met best in all cameras, of the poses that any of them found.
+
+    Args:
+        views: all of the cameras of `alone`.
+        alone: each camera by itself, in the rig's order.
+        T_rig_camera: from `rig_start`.
+
+    Returns:
+        A state with a flat board of the stated pitch, without range bias.
+    """
+    lenses = tuple(each.lens for each in alone.values())
+    cameras = np.stack([T_rig_camera[name] for name in alone])
+    blank = RigState(lenses, cameras, np.zeros((len(views.frames), 4, 4)), np.zeros(2), 1.0, np.zeros(0))
+    # Readings of each frame's board in the rig's frame: as each camera found it, then mirrored.
+    middle = views.board.points().mean(axis=0)
+    readings: list[list[Transform]] = [[] for _ in views.frames]
+    for name, camera in alone.items():
+        for view in views.of_camera(name):
+            T = camera.T_camera_board[view.frame]
+            readings[views.frames.index(view.frame)] += [
+                T_rig_camera[name] @ each for each in (T, mirrored_pose(T, middle))
+            ]
+    # Each round tries the next reading of every frame at once; a frame that has no more tries its last one again.
+    board = (views.board.points(), warp_shape(views.board))
+    data = [corner_data(n, views.of_camera(name), views.frames) for n, name in enumerate(alone)]
+    best, least = blank, np.full(len(views.frames), np.inf)
+    for turn in range(max(map(len, readings))):
+        poses = np.stack([each[min(turn, len(each) - 1)] for each in readings])
+        misses = _board_misses(data, replace(blank, T_rig_board=poses), board)
+        better = misses < least
+        best = replace(best, T_rig_board=np.where(better[:, None, None], poses, best.T_rig_board))
+        least = np.where(better, misses, least)
+    return best
+
+
+def _board_misses(data: Sequence[CornerData], state: RigState, board: tuple[Floats, Floats]) -> Floats:
+    """(F,) sum over all cameras of how far corners miss, in image widths, each at most 1.
+
+    The bound keeps a single camera, whose lens bends far points without limit, from outvoting the others.
+    """
+    missed = np.zeros(len(state.T_rig_board))
+    for each in data:
+        width = state.lenses[each.camera].width
+        off = np.linalg.norm(corner_misses(each, state, *board), axis=2) / width
+        missed[each.frames] += np.minimum(np.nan_to_num(off, nan=1.0), 1.0).sum(axis=1)
+    return missed
 
 
 def chordal_mean(rotations: Floats) -> Floats:

@@ -1,9 +1,16 @@
-"""A rig from the corners that its cameras found, in the stages of Kocmanova et al., III.
+"""Rig calibration from the corners that its cameras found, in the stages of Kocmanova et al., section III.
 
-corners -> homographies -> Zhang -> each camera alone, with distortion        camera_alone.py
--> relative poses, spanning tree                                      rig_start.py
--> all cameras, all boards (and ranges) together                      adjustment.py
--> rig.json with covariance
+1. corners -> homographies -> Zhang -> each camera alone, with distortion            camera_alone.py
+2. relative poses of the cameras along a spanning tree; views named from the wrong end are left out   rig_start.py
+3. board poses: of every frame's readings, mirrored ones too, the one that all cameras meet best      rig_start.py
+4. all cameras and all boards together, by corners alone                             adjustment.py
+5. where there are range images: the shapes of the range bias that they determine    range_choice.py
+6. corners and ranges together, with that range bias                                 range_residuals.py
+7. if the plan asks for it: a grid of nodes in the range bias                        range_nodes.py
+8. each pixel's own offset; where these are smooth, stage 7 and this one again       pixel_pattern.py
+
+`solve_rig` runs all of them, `solve_from` stages 4 to 7 from a known state. Each of 4, 6 and 7 begins at the minimum of
+the one before; 7 keeps its outliers and noise. `solved_rig.py` makes rig.json, with its covariance, of the solution.
 
 views = read_board_views({"tof": Path("corners/tof"), "left": Path("corners/left")})
 solution = solve_rig(views, usual_plan({"tof": Spectrum.RANGE, "left": Spectrum.COLOUR}))
@@ -11,83 +18,35 @@ solution.rig, solution.sigmas()
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from cairn_calib.rig.poses import Transform
-from cairn_calib.rig.range_terms import NODE_SIGMA_M
+from cairn_calib.rig.range_terms import NODE_SIGMA_M, RangeTerms
 from cairn_calib.solve.adjustment import Adjusted, Problem, Sensor, adjust, resumed
 from cairn_calib.solve.board_views import BoardViews
-from cairn_calib.solve.camera_alone import CameraAlone, camera_alone
-from cairn_calib.solve.corner_residuals import CornerData, corner_data, corner_misses
-from cairn_calib.solve.normal_equations import Uncertainty, uncertainty
-from cairn_calib.solve.pixel_pattern import Pattern, pixel_pattern
+from cairn_calib.solve.camera_alone import camera_alone
+from cairn_calib.solve.corner_residuals import corner_data
+from cairn_calib.solve.normal_equations import uncertainty
+from cairn_calib.solve.pixel_pattern import pixel_pattern
 from cairn_calib.solve.priors import one, usual_priors
-from cairn_calib.solve.range_choice import RangeSpans, chosen_terms, range_spans
+from cairn_calib.solve.range_choice import chosen_terms, range_spans
 from cairn_calib.solve.range_nodes import NODES
 from cairn_calib.solve.range_residuals import RangeData, range_data
-from cairn_calib.solve.rig_start import rig_start
-from cairn_calib.solve.rig_state import Layout, RigState, layout_of, value_of, warp_shape
-from cairn_calib.solve.solve_plan import SolvePlan
-from cairn_calib.solve.zhang import mirrored_pose
-from cairn_map.arrays import Floats
+from cairn_calib.solve.rig_start import first_state, rig_start
+from cairn_calib.solve.rig_state import RigState, layout_of
+from cairn_calib.solve.solution import Solution
+from cairn_calib.solve.solve_plan import Prior, SolvePlan
 from cairn_map.errors import BadInputError
 
 SMOOTH_M = 5e-4
-"""Of what blocks of pixels add: from there on nodes are solved for."""
+"""Smooth part of the pixels' own offsets, metres, from which a grid of nodes is solved for: half a millimetre."""
 RANGE_SIGMA_M = 0.01
-"""Stated noise of a range; what it really is, is estimated."""
-
-
-@dataclass(frozen=True, slots=True)
-class Solution:
-    """A rig, all that was estimated with it, and how certain it is."""
-
-    views: BoardViews
-    """Those that were used."""
-    plan: SolvePlan
-    adjusted: Adjusted
-    known: Uncertainty
-    turned: tuple[tuple[str, str], ...] = ()
-    """(camera, frame) of views left out, for their corners were named from the wrong end."""
-    spans: RangeSpans | None = None
-    """What the range images covered; None: there are none."""
-    pattern: Pattern | None = None
-    """What the range camera's pixels add of their own; None: it was not looked for."""
-
-    @property
-    def ranges(self) -> RangeData | None:
-        """Those of the boards that were used; None: there are none."""
-        last = self.adjusted.problem.sensors[-1].data
-        return last if isinstance(last, RangeData) else None
-
-    @property
-    def layout(self) -> Layout:
-        """Which parameter is which."""
-        return self.adjusted.problem.layout
-
-    @property
-    def state(self) -> RigState:
-        """The estimate."""
-        return self.adjusted.state
-
-    @property
-    def covariance(self) -> Floats:
-        """(P, P) of the shared parameters, in the order of `layout.names`."""
-        return self.known.shared
-
-    def sigmas(self) -> dict[tuple[str, str], float]:
-        """Standard deviation of each shared parameter, by owner and name; poses: of the error, rad and m."""
-        return dict(zip(self.layout.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
-
-    def values(self) -> dict[tuple[str, str], float]:
-        """The shared parameters, by owner and name; those of poses, which are errors, 0."""
-        return dict(zip(self.layout.names, value_of(self.state, self.layout).tolist(), strict=True))
+"""Stated noise of a range, metres; the scale of noise that is estimated with the rig corrects it."""
 
 
 def solve_rig(views: BoardViews, plan: SolvePlan) -> Solution:
-    """The rig that meets the corners best.
+    """The rig that meets the corners, and ranges, best.
 
     Raises:
         BadInputError: the views do not determine it; the message says what to shoot.
@@ -96,75 +55,99 @@ def solve_rig(views: BoardViews, plan: SolvePlan) -> Solution:
         raise BadInputError(
             "unknown_camera", f"the plan is of {', '.join(plan.cameras)}, the views of {', '.join(views.cameras)}"
         )
+    # 1. Each camera alone.
     alone = {name: camera_alone(name, views, plan) for name in plan.cameras}
+    # 2. Cameras in the gauge's frame; a view counts by its corners.
     weights = {(view.camera, view.frame): float(view.corners.seen.sum()) for view in views.views}
     start = rig_start({name: each.T_camera_board for name, each in alone.items()}, views.board, plan.gauge, weights)
     views = views.without(start.turned)
-    state = _first_state(views, plan, alone, start.T_rig_camera)
+    # 3. Boards in the gauge's frame.
+    state = first_state(views, alone, start.T_rig_camera)
+    # 4 to 7. Everything together.
     solution = solve_from(views, plan, state, {name: each.scale for name, each in alone.items()})
+    # 8. Each pixel's own offset.
     return replace(_with_pixels(solution), turned=start.turned)
-
-
-def _with_pixels(solution: Solution) -> Solution:
-    """The solution with what the range camera's pixels add, solved on with nodes where that is smooth."""
-    found = pixel_pattern(solution.views, solution.adjusted, solution.covariance)
-    if found is not None and found.smooth_m >= SMOOTH_M:
-        done = _with_nodes(solution.adjusted, solution.views, solution.plan)
-        solution = replace(solution, adjusted=done, known=uncertainty(done.normal))
-        found = pixel_pattern(solution.views, done, solution.covariance)
-    return replace(solution, pattern=found)
-
-
-def _with_nodes(done: Adjusted, views: BoardViews, plan: SolvePlan) -> Adjusted:
-    """The minimum with a grid of nodes in the range bias, too, from one without."""
-    *corners, last = done.problem.sensors
-    if not isinstance(last.data, RangeData):
-        return done
-    owner, lens = list(plan.cameras)[last.data.camera], done.state.lenses[last.data.camera]
-    terms = replace(last.data.terms, nodes=NODES)
-    more = terms.names[len(terms.document_names) :]
-    layout = layout_of(plan, dict(zip(plan.cameras, done.state.lenses, strict=True)), [(owner, n) for n in terms.names])
-    priors = (*done.problem.priors, *(one(owner, name, 0.0, NODE_SIGMA_M) for name in more))
-    sensors = (*corners, replace(last, data=last.data.with_terms(terms, lens)))
-    state = replace(done.state, bias=np.append(done.state.bias, np.zeros(len(more))))
-    try:
-        return resumed(Problem(views.board, layout, sensors, priors), state, plan.noise)
-    except np.linalg.LinAlgError as exc:
-        raise BadInputError("not_observable", f"the images do not determine the range bias ({exc}): take more") from exc
 
 
 def solve_from(views: BoardViews, plan: SolvePlan, state: RigState, scales: Mapping[str, float]) -> Solution:
     """The joint solve alone: from a state of the plan's cameras and the views' frames, and first scales of noise.
 
+    The range bias of `state` is dropped: no range takes part in stage 4, and stage 6 begins with a bias of 0, whose
+    shapes are chosen from these views and may be others than those of `state`.
+
     Raises:
         BadInputError: the views do not determine it.
     """
-    names = list(plan.cameras)
-    lenses = dict(zip(names, state.lenses, strict=True))
-    counts = {name: len(views.of_camera(name)) for name in names}
-    state = replace(state, bias=np.zeros(0))
-    layout = layout_of(plan, lenses, [])
-    sensors = tuple(
-        _corner_sensor(n, views, scales[name] if plan.noise.rounds else 1.0) for n, name in enumerate(names)
-    )
-    priors = usual_priors(plan, lenses, counts, views.board, ranges=None)
-    done = _adjusted(Problem(views.board, layout, sensors, priors), state, plan)
-    ranged = _range_data(views, plan, done.state)
+    # 4. Corners alone.
+    by_corners = _solve_corners(views, plan, state, scales)
+    ranged = _range_data(views, plan, by_corners.state)
     if ranged is None:
-        return Solution(views, plan, done, uncertainty(done.normal))
-    spans = range_spans(ranged, done.state, views.board)
-    wanted = plan.range_terms or chosen_terms(spans, plan.modulation_hz)
-    terms = replace(wanted, nodes=None)
-    owner = names[ranged.camera]
-    priors = usual_priors(plan, lenses, counts, views.board, ranges=(owner, terms))
+        return Solution(views, plan, by_corners, uncertainty(by_corners.normal))
+    # 5. Shapes of the range bias: the plan's, or those that the images determine.
+    spans = range_spans(ranged, by_corners.state, views.board)
+    terms = plan.range_terms or chosen_terms(spans, plan.modulation_hz)
+    # 6. Corners and ranges; nodes, if any, begin at this minimum.
+    priors = _priors(views, plan, state, ranges=(list(plan.cameras)[ranged.camera], replace(terms, nodes=None)))
+    adjusted = _solve_ranges(by_corners, ranged, plan, replace(terms, nodes=None), priors)
+    # 7. Nodes.
+    if terms.nodes is not None:
+        adjusted = _solve_nodes(adjusted, plan)
+    return Solution(views, plan, adjusted, uncertainty(adjusted.normal), spans=spans)
+
+
+def _solve_corners(views: BoardViews, plan: SolvePlan, state: RigState, scales: Mapping[str, float]) -> Adjusted:
+    """Stage 4: the minimum over cameras and boards, without any range."""
+    sensors = []
+    for camera, name in enumerate(plan.cameras):
+        data = corner_data(camera, views.of_camera(name), views.frames)
+        # Without rounds of estimating noise the stated covariances count as they are.
+        sensors.append(Sensor(data, scales[name] if plan.noise.rounds else 1.0, data.seen))
+    layout = layout_of(plan, dict(zip(plan.cameras, state.lenses, strict=True)), [])
+    priors = _priors(views, plan, state, ranges=None)
+    return _adjusted(Problem(views.board, layout, tuple(sensors), priors), replace(state, bias=np.zeros(0)), plan)
+
+
+def _solve_ranges(
+    by_corners: Adjusted, ranged: RangeData, plan: SolvePlan, terms: RangeTerms, priors: tuple[Prior, ...]
+) -> Adjusted:
+    """Stage 6: the minimum over corners and ranges, from the one over corners, with the range bias from 0."""
+    state, board = by_corners.state, by_corners.problem.board
+    owner = list(plan.cameras)[ranged.camera]
+    lenses = dict(zip(plan.cameras, state.lenses, strict=True))
     layout = layout_of(plan, lenses, [(owner, name) for name in terms.names])
-    ranged = ranged.with_terms(terms, done.state.lenses[ranged.camera])
-    sensors = (*done.problem.sensors, Sensor(ranged, 1.0, ranged.measured))
-    problem = Problem(views.board, layout, sensors, priors)
-    done = _adjusted(problem, replace(done.state, bias=np.zeros(len(terms.names))), plan)
-    if wanted.nodes is not None:
-        done = _with_nodes(done, views, plan)
-    return Solution(views, plan, done, uncertainty(done.normal), spans=spans)
+    ranged = ranged.with_terms(terms, state.lenses[ranged.camera])
+    sensors = (*by_corners.problem.sensors, Sensor(ranged, 1.0, ranged.measured))
+    problem = Problem(board, layout, sensors, priors)
+    return _adjusted(problem, replace(state, bias=np.zeros(len(terms.names))), plan)
+
+
+def _solve_nodes(adjusted: Adjusted, plan: SolvePlan) -> Adjusted:
+    """Stage 7: the minimum with a grid of nodes in the range bias, too, from one without; the same without ranges."""
+    *corners, last = adjusted.problem.sensors
+    if not isinstance(last.data, RangeData):
+        return adjusted
+    lenses = adjusted.state.lenses
+    owner, lens = list(plan.cameras)[last.data.camera], lenses[last.data.camera]
+    terms = replace(last.data.terms, nodes=NODES)
+    added = terms.names[len(terms.document_names) :]
+    layout = layout_of(plan, dict(zip(plan.cameras, lenses, strict=True)), [(owner, name) for name in terms.names])
+    priors = (*adjusted.problem.priors, *(one(owner, name, 0.0, NODE_SIGMA_M) for name in added))
+    sensors = (*corners, replace(last, data=last.data.with_terms(terms, lens)))
+    state = replace(adjusted.state, bias=np.append(adjusted.state.bias, np.zeros(len(added))))
+    try:
+        return resumed(Problem(adjusted.problem.board, layout, sensors, priors), state, plan.noise)
+    except np.linalg.LinAlgError as exc:
+        raise BadInputError("not_observable", f"the images do not determine the range bias ({exc}): take more") from exc
+
+
+def _with_pixels(solution: Solution) -> Solution:
+    """Stage 8: the solution with each range pixel's own offset, solved on with nodes where these are smooth."""
+    pattern = pixel_pattern(solution.views, solution.adjusted, solution.covariance)
+    if pattern is not None and pattern.smooth_m >= SMOOTH_M:
+        adjusted = _solve_nodes(solution.adjusted, solution.plan)
+        solution = replace(solution, adjusted=adjusted, known=uncertainty(adjusted.normal))
+        pattern = pixel_pattern(solution.views, adjusted, solution.covariance)
+    return replace(solution, pattern=pattern)
 
 
 def _adjusted(problem: Problem, state: RigState, plan: SolvePlan) -> Adjusted:
@@ -176,9 +159,13 @@ def _adjusted(problem: Problem, state: RigState, plan: SolvePlan) -> Adjusted:
         ) from exc
 
 
-def _corner_sensor(camera: int, views: BoardViews, scale: float) -> Sensor:
-    data = corner_data(camera, views.of_camera(views.cameras[camera]), views.frames)
-    return Sensor(data, scale, data.seen)
+def _priors(
+    views: BoardViews, plan: SolvePlan, start: RigState, *, ranges: tuple[str, RangeTerms] | None
+) -> tuple[Prior, ...]:
+    """Priors by the lenses of the start, so that all stages assume the same."""
+    lenses = dict(zip(plan.cameras, start.lenses, strict=True))
+    counts = {name: len(views.of_camera(name)) for name in plan.cameras}
+    return usual_priors(plan, lenses, counts, views.board, ranges=ranges)
 
 
 def _range_data(views: BoardViews, plan: SolvePlan, state: RigState) -> RangeData | None:
@@ -189,41 +176,3 @@ def _range_data(views: BoardViews, plan: SolvePlan, state: RigState) -> RangeDat
         return None
     camera = list(plan.cameras).index(owners.pop())
     return range_data(camera, views.ranges, views.frames, state, views.board, sigma_m=RANGE_SIGMA_M)
-
-
-def _first_state(
-    views: BoardViews, plan: SolvePlan, alone: Mapping[str, CameraAlone], T_rig_camera: Mapping[str, Transform]
-) -> RigState:
-    names = list(plan.cameras)
-    lenses = tuple(alone[name].lens for name in names)
-    placed = np.stack([T_rig_camera[name] for name in names])
-    blank = RigState(lenses, placed, np.zeros((len(views.frames), 4, 4)), np.zeros(2), 1.0, np.zeros(0))
-    board = (views.board.points(), warp_shape(views.board))
-    data = [corner_data(n, views.of_camera(name), views.frames) for n, name in enumerate(names)]
-    middle = views.board.points().mean(axis=0)
-    candidates: list[list[Transform]] = [[] for _ in views.frames]
-    for name in names:
-        for view in views.of_camera(name):
-            T = alone[name].T_camera_board[view.frame]
-            candidates[views.frames.index(view.frame)] += [
-                T_rig_camera[name] @ each for each in (T, mirrored_pose(T, middle))
-            ]
-    # Each round tries one more reading of every frame's board in all cameras.
-    best, least = blank, np.full(len(views.frames), np.inf)
-    for turn in range(max(map(len, candidates))):
-        poses = np.stack([each[min(turn, len(each) - 1)] for each in candidates])
-        misses = _missed(data, replace(blank, T_rig_board=poses), board)
-        better = misses < least
-        best = replace(best, T_rig_board=np.where(better[:, None, None], poses, best.T_rig_board))
-        least = np.where(better, misses, least)
-    return best
-
-
-def _missed(data: list[CornerData], state: RigState, board: tuple[Floats, Floats]) -> Floats:
-    """(F,) by how much corners miss in all cameras: a sum that no single camera can blow up."""
-    missed = np.zeros(len(state.T_rig_board))
-    for each in data:
-        width = state.lenses[each.camera].width
-        off = np.linalg.norm(corner_misses(each, state, *board), axis=2) / width
-        missed[each.frames] += np.minimum(np.nan_to_num(off, nan=1.0), 1.0).sum(axis=1)
-    return missed

@@ -10,7 +10,7 @@ from cairn_calib.rig.range_bias import RangeBias, bias_from_matrix
 from cairn_calib.rig.rig import Rig, mounted
 from cairn_calib.solve.corner_residuals import CornerData, corner_misses
 from cairn_calib.solve.rig_state import warp_shape
-from cairn_calib.solve.solve import Solution
+from cairn_calib.solve.solution import Solution
 
 
 def solved_rig(solution: Solution, *, made_s: float) -> Rig:

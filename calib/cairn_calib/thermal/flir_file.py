@@ -15,6 +15,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from cairn_calib.rig.image_files import read_bounded
 from cairn_calib.rig.radiometry import PlanckResponse, Radiometry
 from cairn_calib.thermal.object_temperature import Viewing, air_transmission
 from cairn_map.arrays import Counts
@@ -51,13 +52,7 @@ def read_flir(path: Path) -> FlirImage:
         BadInputError: missing, too large, or a picture without counts: it was never radiometric, or was edited.
         DamagedDataError: it breaks off, or its numbers cannot be.
     """
-    try:
-        with path.open("rb") as file:
-            data = file.read(FILE_BYTES_MAX + 1)
-    except OSError as exc:
-        raise BadInputError("missing_image", f"cannot read {path}: {exc.strerror}") from exc
-    if len(data) > FILE_BYTES_MAX:
-        raise BadInputError("image_too_large", f"{path} must be at most {FILE_BYTES_MAX} bytes, and is larger")
+    data = read_bounded(path, FILE_BYTES_MAX)
     try:
         records = _records(_stream(data))
         if RAW_DATA not in records or CAMERA_INFO not in records:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.board.corner_pictures import read_grey
+from cairn_calib.rig.image_files import read_grey
 from cairn_calib.rig.radiometry import ZERO_C_K
 from cairn_map.errors import BadInputError
 

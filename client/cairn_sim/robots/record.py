@@ -22,9 +22,9 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from cairn_calib.rig.image_files import write_grey16
 from cairn_calib.rig.poses import Transform
 from cairn_calib.rig.rig import Rig, Spectrum
-from cairn_fusion.recording.images import write_grey16
 from cairn_fusion.recording.recording_format import RangeEncoding
 from cairn_fusion.recording.recording_writer import RecordingWriter
 from cairn_fusion.recording.scan import Scan

@@ -16,10 +16,10 @@ from types import ModuleType
 import numpy as np
 import numpy.typing as npt
 
+from cairn_calib.rig.image_files import FILE_BYTES_MAX, Grey16, encode_png, opencv, read_bounded
 from cairn_calib.rig.raster import MAX_SIDE_PX
 from cairn_map.errors import BadInputError, DamagedDataError
 
-FILE_BYTES_MAX = 256 << 20
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_SIGNATURE = b"\xff\xd8\xff"
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -28,7 +28,6 @@ JPEG_BARE = frozenset([0x01, *range(0xD0, 0xD8)])
 """Markers without a length: TEM and the restarts."""
 
 Colour = npt.NDArray[np.uint8]
-Grey16 = npt.NDArray[np.uint16]
 Size = tuple[int, int]
 
 
@@ -49,7 +48,7 @@ def image_header(path: Path) -> ImageHeader:
         BadInputError: missing, larger than 256 MiB, or a side over 16384 pixels.
         DamagedDataError: neither a sound PNG nor a JPEG.
     """
-    return _header(_read_bounded(path), path)
+    return _header(_read_regular(path), path)
 
 
 def read_colour(path: Path, size: Size | None = None) -> Colour:
@@ -68,13 +67,13 @@ def read_colour(path: Path, size: Size | None = None) -> Colour:
         BadInputError: as `image_header`, another size than expected, or OpenCV is not installed.
         DamagedDataError: the file cannot be decoded.
     """
-    return colour_of_bytes(_read_bounded(path), path, size)
+    return colour_of_bytes(_read_regular(path), path, size)
 
 
 def colour_of_bytes(data: bytes, path: Path | str, size: Size | None = None) -> Colour:
     """The picture in the bytes of a PNG or JPEG file, as `read_colour`; `path` names them in errors."""
     _check_size(_header(data, path), size, path)
-    cv2 = _opencv()
+    cv2 = opencv()
     bgr = _decode(cv2, data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, path)
     if bgr.dtype != np.uint8 or bgr.ndim != 3 or bgr.shape[2] != 3:
         raise DamagedDataError("bad_image", f"{path}: a colour image decoded to {bgr.dtype} of shape {bgr.shape}")
@@ -87,7 +86,7 @@ def read_grey16(path: Path, size: Size | None = None) -> Grey16:
     Raises:
         BadInputError: also when the file holds 8 bits or colour, which is a picture *of* depth and not depth.
     """
-    return grey16_of_bytes(_read_bounded(path), path, size)
+    return grey16_of_bytes(_read_regular(path), path, size)
 
 
 def grey16_of_bytes(data: bytes, path: Path | str, size: Size | None = None) -> Grey16:
@@ -96,7 +95,7 @@ def grey16_of_bytes(data: bytes, path: Path | str, size: Size | None = None) -> 
     if not header.grey16:
         raise BadInputError("image_type", f"{path} must be a PNG with one channel of 16 bits, and is not")
     _check_size(header, size, path)
-    cv2 = _opencv()
+    cv2 = opencv()
     counts = _decode(cv2, data, cv2.IMREAD_UNCHANGED, path)
     if counts.dtype != np.uint16 or counts.ndim != 2:
         raise DamagedDataError("bad_image", f"{path}: a 16-bit image decoded to {counts.dtype} of {counts.shape}")
@@ -107,24 +106,7 @@ def write_colour(path: Path, image: Colour) -> None:
     """A PNG file of an (H, W, 3) uint8 R, G, B image; lossless mirror of `read_colour`."""
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         raise BadInputError("image_type", f"colour must be uint8 (H, W, 3), got {image.dtype} {image.shape}")
-    path.write_bytes(_encode(np.ascontiguousarray(image[..., ::-1]), path))
-
-
-def write_grey16(path: Path, image: Grey16) -> None:
-    """A 16-bit grey PNG file of an (H, W) uint16 array; the mirror of `read_grey16`."""
-    if image.dtype != np.uint16 or image.ndim != 2:
-        raise BadInputError("image_type", f"counts must be uint16 (H, W), got {image.dtype} {image.shape}")
-    path.write_bytes(_encode(np.ascontiguousarray(image), path))
-
-
-def _opencv() -> ModuleType:
-    try:
-        import cv2
-    except ImportError as exc:
-        raise BadInputError(
-            "missing_extra", f'images need OpenCV: pip install "cairn-robotics[robot]" ({exc})'
-        ) from exc
-    return cv2
+    path.write_bytes(encode_png(np.ascontiguousarray(image[..., ::-1]), path))
 
 
 def _decode(cv2: ModuleType, data: bytes, flags: int, path: Path | str) -> npt.NDArray[np.generic]:
@@ -137,24 +119,14 @@ def _decode(cv2: ModuleType, data: bytes, flags: int, path: Path | str) -> npt.N
     return image
 
 
-def _encode(image: npt.NDArray[np.generic], path: Path) -> bytes:
-    done, data = _opencv().imencode(".png", image)
-    if not done:
-        raise BadInputError("image_type", f"{path}: an image of shape {image.shape} cannot be written as PNG")
-    return bytes(data)
-
-
-def _read_bounded(path: Path) -> bytes:
+def _read_regular(path: Path) -> bytes:
+    # A named pipe in an image's place would block the reader.
     try:
         if not path.is_file():
             raise BadInputError("missing_image", f"{path} is missing, or is no file")
-        with path.open("rb") as file:
-            data = file.read(FILE_BYTES_MAX + 1)
     except OSError as exc:
         raise BadInputError("missing_image", f"cannot read {path}: {exc.strerror}") from exc
-    if len(data) > FILE_BYTES_MAX:
-        raise BadInputError("image_too_large", f"{path} must be at most {FILE_BYTES_MAX} bytes, and is larger")
-    return data
+    return read_bounded(path, FILE_BYTES_MAX)
 
 
 def _header(data: bytes, path: Path | str) -> ImageHeader:

@@ -14,8 +14,9 @@ from typing import Self, TextIO
 
 import numpy as np
 
+from cairn_calib.rig.image_files import write_grey16
 from cairn_calib.rig.rig import Rig
-from cairn_fusion.recording.images import write_colour, write_grey16
+from cairn_fusion.recording.images import write_colour
 from cairn_fusion.recording.recording_format import (
     BODY_FILE,
     CHANNEL,

@@ -20,7 +20,8 @@ from cairn_calib.diagnosis.world_uncertainty import pixel_covariance, world_cova
 from cairn_calib.rig.projection_uncertainty import project_certain, transfer_certain
 from cairn_calib.solve.board_views import BoardView
 from cairn_calib.solve.rig_state import moved
-from cairn_calib.solve.solve import Solution, solve_from, solve_rig
+from cairn_calib.solve.solution import Solution
+from cairn_calib.solve.solve import solve_from, solve_rig
 from cairn_calib.solve.solve_plan import STATED, usual_plan
 from cairn_calib.solve.solved_rig import solved_rig
 from cairn_map.errors import BadInputError

@@ -12,7 +12,8 @@ from cairn_calib.diagnosis.probe_points import image_grid
 from cairn_calib.diagnosis.world_uncertainty import pixel_covariance, world_covariance
 from cairn_calib.rig.pose_vectors import vector_from_transform
 from cairn_calib.rig.poses import inverse
-from cairn_calib.solve.solve import Solution, solve_rig
+from cairn_calib.solve.solution import Solution
+from cairn_calib.solve.solve import solve_rig
 from cairn_calib.solve.solved_rig import solved_rig
 
 

@@ -13,7 +13,8 @@ from cairn_calib.rig.range_bias import ByAmplitude, RangeBias, Wave, Wiggle
 from cairn_calib.rig.range_terms import BIAS_NAMES, RangeTerms, off_middle_image, wave_period_m
 from cairn_calib.rig.rig import Spectrum
 from cairn_calib.solve.range_choice import AMPLITUDE_RATIO, PERIOD_SHARE, RangeSpans, chosen_terms
-from cairn_calib.solve.solve import Solution, solve_rig
+from cairn_calib.solve.solution import Solution
+from cairn_calib.solve.solve import solve_rig
 from cairn_calib.solve.solve_plan import usual_plan
 from cairn_calib.solve.solved_rig import solved_rig
 

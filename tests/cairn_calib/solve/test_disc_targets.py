@@ -12,7 +12,8 @@ from cairn_calib.diagnosis.examination import examined
 from cairn_calib.rig.rig import Spectrum
 from cairn_calib.solve.board_views import BoardView, BoardViews
 from cairn_calib.solve.disc_shift import disc_shift
-from cairn_calib.solve.solve import Solution, solve_rig
+from cairn_calib.solve.solution import Solution
+from cairn_calib.solve.solve import solve_rig
 from cairn_calib.solve.solve_plan import STATED, usual_plan
 from cairn_calib.solve.solved_rig import solved_rig
 

@@ -11,7 +11,8 @@ from cairn_calib.solve.adjustment import Problem, Sensor
 from cairn_calib.solve.corner_residuals import CornerData
 from cairn_calib.solve.normal_equations import Loss, NormalEquations, uncertainty
 from cairn_calib.solve.rig_state import RigState, moved
-from cairn_calib.solve.solve import Solution, solve_rig
+from cairn_calib.solve.solution import Solution
+from cairn_calib.solve.solve import solve_rig
 from cairn_calib.solve.solve_plan import usual_plan
 
 Floats = npt.NDArray[np.float64]

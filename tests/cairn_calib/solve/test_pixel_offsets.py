@@ -17,7 +17,8 @@ from cairn_calib.solve.normal_equations import Loss
 from cairn_calib.solve.range_nodes import NODES, pixel_nodes
 from cairn_calib.solve.range_residuals import range_block
 from cairn_calib.solve.rig_state import moved
-from cairn_calib.solve.solve import SMOOTH_M, Solution, solve_rig
+from cairn_calib.solve.solution import Solution
+from cairn_calib.solve.solve import SMOOTH_M, solve_rig
 from cairn_calib.solve.solve_plan import usual_plan
 from cairn_calib.solve.solved_rig import solved_rig
 from cairn_map.errors import BadInputError

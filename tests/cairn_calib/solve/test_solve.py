@@ -21,7 +21,8 @@ from cairn_calib.rig.rig import Spectrum
 from cairn_calib.solve.adjustment import adjust
 from cairn_calib.solve.board_views import BoardView, BoardViews
 from cairn_calib.solve.rig_start import half_turn
-from cairn_calib.solve.solve import Solution, solve_rig
+from cairn_calib.solve.solution import Solution
+from cairn_calib.solve.solve import solve_rig
 from cairn_calib.solve.solve_plan import STATED, CameraPlan, Noise, SolvePlan, usual_plan
 from cairn_calib.solve.solved_rig import solved_rig, statistics_of
 from cairn_map.errors import BadInputError

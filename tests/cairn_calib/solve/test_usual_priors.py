@@ -9,7 +9,8 @@ from cairn_calib.diagnosis.examination import examined
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.rig import Rig, Spectrum, mounted
 from cairn_calib.solve.priors import USUAL_SIGMAS
-from cairn_calib.solve.solve import Solution, solve_rig
+from cairn_calib.solve.solution import Solution
+from cairn_calib.solve.solve import solve_rig
 from cairn_calib.solve.solve_plan import STATED, CameraPlan, SolvePlan, usual_plan
 from cairn_calib.solve.solved_rig import solved_rig
 from cairn_calib.verify.verification import carried_pixels

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cairn_fusion.recording.images import image_header, read_colour, read_grey16, write_colour, write_grey16
+from cairn_calib.rig.image_files import write_grey16
+from cairn_fusion.recording.images import image_header, read_colour, read_grey16, write_colour
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError
 
 SEED = 7

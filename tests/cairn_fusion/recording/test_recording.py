@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cairn_calib.rig.camera import Camera, camera_from_field_of_view
+from cairn_calib.rig.image_files import write_grey16
 from cairn_calib.rig.poses import transform_from_quaternion
 from cairn_calib.rig.rig import Rig, Spectrum, mounted
-from cairn_fusion.recording.images import write_colour, write_grey16
+from cairn_fusion.recording.images import write_colour
 from cairn_fusion.recording.recording import Recording, ScanSource, open_recording
 from cairn_fusion.recording.recording_format import Convention, RangeEncoding, ThermalEncoding, path_inside
 from cairn_fusion.recording.recording_writer import RecordingWriter
