@@ -28,7 +28,7 @@ import numpy as np
 import pytest
 
 from cairn_calib.rig.camera import camera_from_field_of_view
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
 from cairn_fusion.recording.scan import Scan
@@ -213,7 +213,7 @@ def pushed_cell(url: str, folder: Path) -> tuple[CellKey, Evidence]:
     with MapApi(url, token=ADMIN_TOKEN) as api:
         api.create_map("lab", CreateMap(geometry=Geometry()))
     camera = camera_from_field_of_view(16, 12, horizontal_deg=60.0)
-    rig = Rig(name="tof", cameras={"tof": mounted(Spectrum.RANGE, camera, np.eye(4))})
+    rig = Rig(name="tof", cameras={"tof": mount_camera(Spectrum.RANGE, camera, np.eye(4))})
     scan = Scan(
         time_s=1.0,
         T_map_rig=np.eye(4),

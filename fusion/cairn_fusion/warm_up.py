@@ -6,7 +6,7 @@ from importlib.util import find_spec
 import numpy as np
 
 from cairn_calib.rig.camera import camera_from_field_of_view
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scan, integrate_scans
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.covariance_grid import CovarianceGrid
@@ -24,8 +24,8 @@ def warm_up() -> None:
     beside = np.eye(4)
     beside[0, 3] = 0.01
     spectra = {"tof": Spectrum.RANGE, "colour": Spectrum.COLOUR, "thermal": Spectrum.THERMAL}
-    cameras = {name: mounted(spectrum, camera, beside) for name, spectrum in spectra.items()}
-    rig = Rig(name="warm-up", cameras=cameras | {"tof": mounted(Spectrum.RANGE, camera, np.eye(4))})
+    cameras = {name: mount_camera(spectrum, camera, beside) for name, spectrum in spectra.items()}
+    rig = Rig(name="warm-up", cameras=cameras | {"tof": mount_camera(Spectrum.RANGE, camera, np.eye(4))})
     image = np.ones((2, 2), np.float32)
     scan = Scan(
         time_s=0.0,

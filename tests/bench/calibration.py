@@ -15,7 +15,7 @@ from tests.fixtures.calib.mrcal_reference import mrcal_solved, reference_problem
 from tests.fixtures.calib.simulated_views import SPECTRA, ranges_of, views_of, world
 
 from cairn_calib.board.corner_detection import find_chessboard
-from cairn_calib.diagnosis.examination import examined
+from cairn_calib.diagnosis.examination import examine
 from cairn_calib.solve.pixel_pattern import pixel_pattern
 from cairn_calib.solve.solve import solve_from, solve_rig
 from cairn_calib.solve.solve_plan import usual_plan
@@ -58,7 +58,7 @@ def calibration_rows(smoke: bool) -> Iterator[Row]:
     whole = cpu_s(lambda: solve_rig(views, plan), repeats)
     yield "all stages, 5 cameras x 40 frames, from corners alone", f"{whole:.2f}", "s of processor time"
     rig = solved_rig(solution, made_s=0.0)
-    asked = cpu_s(lambda: examined(solution, rig), 1 if smoke else 3)
+    asked = cpu_s(lambda: examine(solution, rig), 1 if smoke else 3)
     yield "its examination", f"{asked:.2f}", "s of processor time"
     yield from _beside_opencv(repeats)
     views, plan = reference_problem()

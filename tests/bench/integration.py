@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from tests.bench.timing import cpu_s, wall_s
 
-from cairn_calib.rig.rig import Rig
-from cairn_calib.rig.sensing import RangeSensing
+from cairn_calib.rig.rig import RangeSensing, Rig
 from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scans
 from cairn_fusion.recording.scan import Scan
 from cairn_map.evidence.evidence import Evidence

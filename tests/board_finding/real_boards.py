@@ -12,7 +12,7 @@ from tests.fixtures.calib.board_images import BOARD
 
 from cairn_calib.board.board import Polarity
 from cairn_calib.board.corner_detection import find_chessboard, grey
-from cairn_calib.board.polarity_vote import margin_polarity
+from cairn_calib.board.polarity import margin_polarity
 
 Floats = npt.NDArray[np.float64]
 Bytes = npt.NDArray[np.uint8]

@@ -20,7 +20,7 @@ from tests.fixtures.calib.board_images import (
 from cairn_calib.board.board import Board, Polarity
 from cairn_calib.board.circle_grid import find_circles
 from cairn_calib.board.corner_detection import find_chessboard
-from cairn_calib.solve.disc_shift import disc_shift
+from cairn_calib.solve.corner_residuals import disc_shift
 
 SPECTRA = {"tof": TOF, "thermal": THERMAL, "colour": COLOUR}
 BLUR_PX = {"tof": (0.3, 0.7), "thermal": (0.5, 1.5), "colour": (0.4, 1.5)}

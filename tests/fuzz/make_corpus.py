@@ -23,7 +23,7 @@ from tests.fuzz.sections import joined
 
 from cairn_calib.rig.camera import camera_from_field_of_view
 from cairn_calib.rig.lidar import SpinningLidar
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.recording.recording_writer import RecordingWriter
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.recording.trajectory import trajectory_line
@@ -58,17 +58,17 @@ TOF = camera_from_field_of_view(8, 6, horizontal_deg=60.0)
 RIG = Rig(
     name="head",
     cameras={
-        "tof": mounted(Spectrum.RANGE, TOF, np.eye(4)),
-        "left": mounted(
+        "tof": mount_camera(Spectrum.RANGE, TOF, np.eye(4)),
+        "left": mount_camera(
             Spectrum.COLOUR, TOF.model_copy(update={"distortion": (-0.2, 0.05, 1e-3, -1e-3, 0.01)}), np.eye(4)
         ),
-        "warm": mounted(Spectrum.THERMAL, TOF, np.eye(4)),
+        "warm": mount_camera(Spectrum.THERMAL, TOF, np.eye(4)),
     },
 )
 LIDAR = Rig(
     name="drum",
     cameras={
-        "lidar": mounted(
+        "lidar": mount_camera(
             Spectrum.RANGE, SpinningLidar(width=16, height=3, elevations_deg=(10.0, 0.0, -30.0)), np.eye(4)
         )
     },

@@ -1,4 +1,4 @@
-"""Finding a chessboard in an image of any spectrum, and refusing what only looks like one.
+"""Detection of a chessboard in an image of any spectrum, which refuses what only looks like one.
 
     stretch -> for each method and scale: proposal -> edges fitted on the image as recorded -> order -> gates
 
@@ -14,11 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.board.board import Board, Polarity
-from cairn_calib.board.corner_gates import refusal, sound_corners
+from cairn_calib.board.corner_gates import FittedGrid, checker_signs, refusal, sound_corners
 from cairn_calib.board.corner_refinement import FittedCorners, fit_corners
 from cairn_calib.board.corners import FOUND, Attempt, Corners, Detection
-from cairn_calib.board.fitted_grid import Judged, checker_signs
-from cairn_calib.board.homography import fit_homography, mapped, steps_between
+from cairn_calib.board.homography import fit_homography, map_points, steps_between
 from cairn_calib.board.saddle_grid import NoGrid, saddle_grid
 from cairn_calib.board.saddle_points import saddle_points
 from cairn_map.arrays import Floats
@@ -31,19 +30,21 @@ SCALES: tuple[tuple[int, tuple[float, ...]], ...] = (
     (800, (1.0, 0.5, 0.7, 2.0)),
     (1 << 30, (0.5, 1.0, 0.25)),
 )
-"""Of images of up to so many pixels' longest side: time-of-flight, thermal, colour."""
+"""Scales at which saddles are searched, by the longest side up to which they apply, pixels: time-of-flight and thermal
+images are enlarged, large colour images reduced."""
 RADON_SCALES = (4.0, 2.0, 1.0, 0.5, 0.25)
+"""Scales at which OpenCV's detector is run: of these, the one that makes cells nearest to `RADON_CELL_PX`."""
 RADON_CELL_PX = 24.0
-"""Cells of about this size suit OpenCV's detector."""
+"""Size of cells that suits OpenCV's detector, pixels."""
 STRETCH = (1.0, 99.7)
 """Percentiles that become 0 and 1."""
-HOPE = (0.3, 1.3)
-"""Corners of the largest lattice of saddles, over the board's, at which OpenCV's detector is asked. It takes most of
+RADON_LATTICE_SHARE = (0.3, 1.3)
+"""Corners of the largest lattice of saddles, over the board's, at which OpenCV's detector is run. It takes most of
 the time, and found 1 of 142 boards that were too blurred or noisy for saddles, none of 4 000 others. Its older one,
 findChessboardCorners, found none of them."""
 PASSES = 4
-"""At most, over corners that are predicted from those that were fitted before."""
-SHADE = 0.15
+"""Fits of the whole grid, at most; each predicts the corners that are lost from those that the one before kept."""
+SHADE_SHARE = 0.15
 """Standard deviation of the Gaussian that takes shading out of 16-bit images, share of the longest side."""
 
 
@@ -60,7 +61,7 @@ def find_chessboard(
             first corner where colours cannot.
 
     Returns:
-        What was found. Corners that are hidden are NaN.
+        The corners, NaN where hidden, or None; and every attempt.
 
     Raises:
         BadInputError: colours do not tell the first corner of this board, and it is not said to be upright; or the
@@ -75,20 +76,22 @@ def find_chessboard(
         )
     counts = grey(image)
     attempts: list[Attempt] = []
-    even = stretched(counts)
+    even = normalise_contrast(counts)
+    # Saddles at each scale; the first that passes all gates is the answer.
     largest, cell_px = 0, 0.0
     for scale in next(scales for longest, scales in SCALES if max(counts.shape) <= longest):
-        proposal = saddle_grid(saddle_points(_scaled(even, scale)), board)
-        attempt, corners = _judged(proposal, "saddles", scale, counts, board, polarity, upright)
+        proposal = saddle_grid(saddle_points(_resize(even, scale)), board)
+        attempt, corners = _judge(proposal, "saddles", scale, counts, board, polarity, upright)
         attempts.append(attempt)
         if corners is not None:
             return Detection(corners, tuple(attempts))
         if isinstance(proposal, NoGrid) and proposal.largest > largest:
             largest, cell_px = proposal.largest, proposal.step_px / scale
-    if not HOPE[0] * board.count <= largest <= HOPE[1] * board.count or cell_px == 0:
+    # OpenCV's detector, where saddles made about a board of corners, at the scale that suits it.
+    if not RADON_LATTICE_SHARE[0] * board.count <= largest <= RADON_LATTICE_SHARE[1] * board.count or cell_px == 0:
         return Detection(None, tuple(attempts))
     scale = min(RADON_SCALES, key=lambda scale: abs(np.log(scale * cell_px / RADON_CELL_PX)))
-    attempt, corners = _judged(_by_radon(_scaled(even, scale), board), "radon", scale, counts, board, polarity, upright)
+    attempt, corners = _judge(_by_radon(_resize(even, scale), board), "radon", scale, counts, board, polarity, upright)
     return Detection(corners, (*attempts, attempt))
 
 
@@ -103,24 +106,24 @@ def grey(image: npt.NDArray[np.generic]) -> Image:
     return np.nan_to_num(image.astype(np.float32))
 
 
-def stretched(counts: Image) -> Image:
-    """Contrast of about 1, without the slow change of brightness over the image."""
+def normalise_contrast(counts: Image) -> Image:
+    """(H, W) image with a contrast of about 1, without the slow change of brightness over it."""
     low, high = np.percentile(counts, STRETCH)
     flat = np.clip((counts - low) / max(float(high - low), 1e-9), -0.5, 1.5).astype(np.float32)
     small = cv2.resize(flat, (32, 32), interpolation=cv2.INTER_AREA)
-    shade = cv2.GaussianBlur(small, (0, 0), SHADE * 32)
+    shade = cv2.GaussianBlur(small, (0, 0), SHADE_SHARE * 32)
     shade = cv2.resize(shade, flat.shape[::-1], interpolation=cv2.INTER_LINEAR)
     return np.asarray(flat - shade, np.float32)
 
 
-def _scaled(even: Image, scale: float) -> Image:
+def _resize(even: Image, scale: float) -> Image:
     if scale == 1:
         return even
     way = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
     return np.asarray(cv2.resize(even, None, fx=scale, fy=scale, interpolation=way), np.float32)
 
 
-def _judged(
+def _judge(
     proposal: Floats | NoGrid,
     method: str,
     scale: float,
@@ -129,23 +132,33 @@ def _judged(
     polarity: Polarity,
     upright: bool,
 ) -> tuple[Attempt, Corners | None]:
-    """How it ends with a proposal in an image that was enlarged by `scale`."""
+    """Outcome of a proposal in an image that was enlarged by `scale`: refine, order, and pass the gates."""
     if isinstance(proposal, NoGrid):
         return Attempt(method, scale, "candidates", proposal.reason), None
-    judged = fitted_grid((proposal + 0.5) / scale - 0.5, counts, board)
-    if judged is None:
+    # Pixel centres are at whole numbers, so an image's edge is at -0.5 at every scale.
+    grid_found = fit_grid((proposal + 0.5) / scale - 0.5, counts, board)
+    if grid_found is None:
         reason = "the edges that cross at the proposed corners cannot be fitted"
         return Attempt(method, scale, "refinement", reason), None
-    judged = _ordered(judged, polarity=polarity, upright=upright)
-    refused = refusal(judged)
+    grid_found = _order_as_board(grid_found, polarity=polarity, upright=upright)
+    refused = refusal(grid_found)
     if refused is not None:
         return Attempt(method, scale, *refused), None
-    corners = Corners(board, judged.fitted.pixels, judged.fitted.covariance_px2)
-    return Attempt(method, scale, FOUND, f"{judged.kept.sum()} corners"), corners
+    corners = Corners(board, grid_found.fitted.pixels, grid_found.fitted.covariance_px2)
+    return Attempt(method, scale, FOUND, f"{grid_found.kept.sum()} corners"), corners
 
 
-def fitted_grid(grid: Floats, counts: Image, board: Board) -> Judged | None:
-    """Proposed corners, fitted; those that are hidden or wrong are looked for where the others predict them."""
+def fit_grid(grid: Floats, counts: Image, board: Board) -> FittedGrid | None:
+    """Grid of fitted corners from proposed ones; hidden or wrong ones are searched where the others predict them.
+
+    Args:
+        grid: (rows, columns, 2) or (N, 2) proposed pixels, NaN where unknown.
+        counts: (H, W) image as recorded.
+        board: the chessboard.
+
+    Returns:
+        The grid; None where fewer than 8 corners are left, or they determine no homography.
+    """
     lattice, signs = board.lattice(), checker_signs(board)
     guesses = grid.reshape(-1, 2).copy()
     fitted = None
@@ -154,33 +167,34 @@ def fitted_grid(grid: Floats, counts: Image, board: Board) -> Judged | None:
         homography = fit_homography(lattice[known], guesses[known]) if known.sum() >= 8 else None
         if homography is None:
             return None
-        guesses = np.where(known[:, None], guesses, _predicted(homography, lattice, guesses, known))
+        # Predict what is missing, fit everything, and drop what is no corner of this board.
+        guesses = np.where(known[:, None], guesses, _predict(homography, lattice, guesses, known))
         steps = steps_between(homography, lattice)
-        fitted = _only(fit_corners(counts, guesses, steps), signs, apart_px=0.5 * _shortest(steps))
+        fitted = _drop_unsound(fit_corners(counts, guesses, steps), signs, apart_px=0.5 * _shortest_px(steps))
         guesses = fitted.pixels
         if not np.isnan(guesses).any():
             break
     known = np.isfinite(guesses[:, 0])
     homography = fit_homography(lattice[known], guesses[known]) if known.sum() >= 8 else None
-    return None if homography is None or fitted is None else Judged(counts, board, fitted, homography)
+    return None if homography is None or fitted is None else FittedGrid(counts, board, fitted, homography)
 
 
-def _predicted(homography: Floats, lattice: Floats, guesses: Floats, known: npt.NDArray[np.bool_]) -> Floats:
-    """Where corners should be: the homography, with what it misses at the nearest known corner."""
-    plain = mapped(homography, lattice)
+def _predict(homography: Floats, lattice: Floats, guesses: Floats, known: npt.NDArray[np.bool_]) -> Floats:
+    """(N, 2) predicted corners: the homography, plus its miss at the nearest known corner."""
+    plain = map_points(homography, lattice)
     off = np.where(known[:, None], guesses - plain, 0)
     away = np.where(known, np.linalg.norm(lattice[:, None] - lattice[None], axis=2), np.inf)
     return np.asarray(plain + off[away.argmin(axis=1)])
 
 
-def _shortest(steps: Floats) -> float:
+def _shortest_px(steps: Floats) -> float:
     return float(np.nan_to_num(np.linalg.norm(steps, axis=2), nan=np.inf).min())
 
 
-def _only(fitted: FittedCorners, signs: Floats, *, apart_px: float) -> FittedCorners:
-    """The fitted corners, NaN for those that are no corners of this board.
+def _drop_unsound(fitted: FittedCorners, signs: Floats, *, apart_px: float) -> FittedCorners:
+    """Fitted corners, NaN for those that are no corners of this board.
 
-    Where two names have come to one place, either may be wrong, so neither is kept: the others predict both anew.
+    Where two names have come to one place, either may be wrong, so neither is kept: the others predict both again.
     """
     lost = ~sound_corners(fitted, signs)
     apart = np.linalg.norm(fitted.pixels[:, None] - fitted.pixels[None], axis=2)
@@ -196,25 +210,28 @@ def _only(fitted: FittedCorners, signs: Floats, *, apart_px: float) -> FittedCor
     )
 
 
-def _ordered(judged: Judged, *, polarity: Polarity, upright: bool) -> Judged:
-    """The same grid, with the board's first corner first."""
-    board = judged.board
+def _order_as_board(grid_found: FittedGrid, *, polarity: Polarity, upright: bool) -> FittedGrid:
+    """Grid with the board's first corner first, by the image's rows (`upright`) or by the colours of its cells."""
+    board = grid_found.board
     index = np.arange(board.count).reshape(board.rows, board.columns)
     if upright:
+        # Of the turns that keep the board's shape, the one whose rows run most to the right.
         turns = (0, 1, 2, 3) if board.columns == board.rows else (0, 2)
-        grids = [judged.fitted.pixels[np.rot90(index, turn)] for turn in turns]
+        grids = [grid_found.fitted.pixels[np.rot90(index, turn)] for turn in turns]
         turn = turns[int(np.argmax([np.nanmean(np.diff(grid[..., 0], axis=1)) for grid in grids]))]
     else:
-        bright_first = np.nansum(judged.fitted.contrast * checker_signs(board)) > 0
+        # The board's first cell is printed dark; half a turn swaps the colours.
+        bright_first = np.nansum(grid_found.fitted.contrast * checker_signs(board)) > 0
         turn = 2 if bright_first == (polarity == "normal") else 0
     order = np.rot90(index, turn).ravel()
-    f = judged.fitted
+    f = grid_found.fitted
+    # A quarter turn swaps the cells that the sign of a contrast speaks of.
     turned_contrast = f.contrast[order] * (1 if turn % 2 == 0 else -1)
     fitted = FittedCorners(f.pixels[order], f.covariance_px2[order], turned_contrast, f.misfit[order], f.moved[order])
     lattice = board.lattice()
     known = np.isfinite(fitted.pixels[:, 0])
     homography = fit_homography(lattice[known], fitted.pixels[known])
-    return Judged(judged.image, board, fitted, judged.homography if homography is None else homography)
+    return FittedGrid(grid_found.image, board, fitted, grid_found.homography if homography is None else homography)
 
 
 def _by_radon(even: Image, board: Board) -> Floats | NoGrid:
@@ -237,7 +254,7 @@ def _eight_bits(even: Image) -> npt.NDArray[np.uint8]:
 
 
 def fit_pointed_at(image: npt.NDArray[np.generic], board: Board, pointed: Floats) -> Detection:
-    """The corners of a chessboard that a person pointed at, whose order is the person's.
+    """The corners of a chessboard that a person pointed at, in the person's order.
 
     Args:
         image: (H, W) counts.
@@ -252,12 +269,12 @@ def fit_pointed_at(image: npt.NDArray[np.generic], board: Board, pointed: Floats
     homography = fit_homography(places, pointed)
     if homography is None:
         return Detection(None, (Attempt("by hand", 1.0, "candidates", "the corners pointed at lie on a line"),))
-    grid = mapped(homography, lattice) if len(pointed) == 4 else pointed
-    judged = fitted_grid(grid, counts, board)
-    if judged is None:
+    grid = map_points(homography, lattice) if len(pointed) == 4 else pointed
+    grid_found = fit_grid(grid, counts, board)
+    if grid_found is None:
         return Detection(None, (Attempt("by hand", 1.0, "refinement", "no edges cross near the corners pointed at"),))
-    refused = refusal(judged)
+    refused = refusal(grid_found)
     if refused is not None:
         return Detection(None, (Attempt("by hand", 1.0, *refused),))
-    found = Attempt("by hand", 1.0, FOUND, f"{judged.kept.sum()} corners")
-    return Detection(Corners(board, judged.fitted.pixels, judged.fitted.covariance_px2), (found,))
+    found = Attempt("by hand", 1.0, FOUND, f"{grid_found.kept.sum()} corners")
+    return Detection(Corners(board, grid_found.fitted.pixels, grid_found.fitted.covariance_px2), (found,))

@@ -1,43 +1,94 @@
-"""What a grid of corners must pass to be believed: windows, tiles and brick walls have lattices too.
+"""Gates that a grid of corners must pass to count as the board: windows, tiles and brick walls have lattices too.
 
-Each gate returns why it refuses, or None. They look at the fitted corners and at the image as recorded, so whichever
-detector proposed the grid, it is judged alike.
+Each gate returns the reason for which it refuses, or None. Gates look at the fitted corners and at the image as
+recorded, so that every detector's proposal is judged alike.
 """
+
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.board.board_flatness import flat_limit_px, flat_rms_px
-from cairn_calib.board.corner_refinement import FittedCorners
-from cairn_calib.board.fitted_grid import Gate, Judged, checker_signs
-from cairn_calib.board.grid_ends import goes_on, starts_and_ends
-from cairn_calib.board.homography import mapped
-from cairn_map.arrays import Floats
+from cairn_calib.board.board import Board
+from cairn_calib.board.board_flatness import flat_limit_px, flat_rms_px, flat_view
+from cairn_calib.board.corner_refinement import FittedCorners, fit_corners
+from cairn_calib.board.homography import map_points, steps_between
+from cairn_map.arrays import Flags, Floats
+
+Image = npt.NDArray[np.float32]
 
 CELL_MIN_PX = 3.5
-"""Shortest step from corner to corner. Below, the fit has fewer pixels than it needs."""
+"""Shortest step from corner to corner, pixels. Below, the fit of a corner has fewer pixels than it needs."""
 SEEN_MIN = 0.6
+"""Share of the board's corners that must be seen."""
 MISFIT_MAX = 0.45
 """Residuals of one corner, share of its contrast: noise of a tenth of the step from dark to bright is 0.2."""
 MISFIT_RATIO, MISFIT_SPARE = 3.0, 0.05
-"""Of the board's usual misfit, and beside it: something that hides a corner in part pulls it by a third of a pixel."""
+"""Residuals of one corner are at most this many times the board's median, plus the second number (share of contrast):
+an object that hides a corner in part pulls it by a third of a pixel."""
 MISFIT_USUAL_MAX = 0.3
+"""Median residuals of a board's corners, share of the contrast."""
 MOVED_MAX = 0.4
 """Cells between a proposed corner and the fitted one."""
 CONTRAST_RATIO = 4.0
-"""Between a corner's contrast and the board's usual one."""
+"""Largest ratio between a corner's contrast and the board's usual one."""
 UNEVEN_PX, UNEVEN_CELLS = 0.15, 0.03
-"""Every other line of corners to one side: of 240 boards at most 0.09 px or 0.018 cells, of a fence 0.42 of 3.8 px."""
+"""Shift of every other line of corners to one side, pixels plus cells: of 240 boards at most 0.09 px or 0.018 cells,
+of a fence 0.42 of 3.8 px."""
 ALTERNATING_MIN = 0.9
+"""Share of the pairs of neighbouring cells that must be one dark and one bright."""
 EVEN = (0.7, 1.6)
 """Contrast of the corners over that of the cells between them: 0.95 to 1.25 of 300 boards, simulated and real ones.
 Where dark and bright patches are of unequal size, as between the wires of a fence, it was 5.7."""
 CELL_MIDDLE = 0.25
 """Half width of the middle of a cell, cells."""
+RIM_SHARE = 0.5
+"""Share of an outer row or column above which it is accepted as seen; below, the other corners predict its places."""
+RIM_MIN = 2
+"""Number of these places that must look like corners. Where no corner of the line was fitted, as where outer cells are
+cut, it is `RIM_SHARE` of them."""
+PREDICTING_MIN = 8
+"""Corners without which no place is predicted."""
+BEYOND_MAX = 0.6
+"""Share of the places beyond a rim that may look like corners too."""
+LIKE_CONTRAST = 0.6
+"""Contrast of what looks like a corner, at least, over the board's usual contrast."""
+LIKE_MOVED = 0.15
+"""Cells between where the others predict a corner and where one is: 0.00 to 0.05 of boards of which parts were hidden.
+Where a smaller board's outer cells are cut, or its margin ends, what looks like corners is 0.32 to 0.54 off."""
+
+
+@dataclass(frozen=True, slots=True)
+class FittedGrid:
+    """A grid of fitted corners and the image in which it was found; arrays in the board's order."""
+
+    image: Image
+    board: Board
+    fitted: FittedCorners
+    homography: Floats
+
+    @property
+    def kept(self) -> Flags:
+        """(N,) True for each corner that is there."""
+        return np.isfinite(self.fitted.pixels[:, 0])
+
+    @property
+    def steps(self) -> Floats:
+        """(N, 2, 2) pixels to the next column and row."""
+        return steps_between(self.homography, self.board.lattice())
+
+
+Gate = Callable[[FittedGrid], str | None]
+
+
+def checker_signs(board: Board) -> Floats:
+    """(N,) 1 where the cell towards the next column and row has the colour of the first cell, else -1."""
+    return np.where(board.lattice().sum(axis=1) % 2 == 0, 1.0, -1.0)
 
 
 def sound_corners(fitted: FittedCorners, signs: Floats) -> npt.NDArray[np.bool_]:
-    """(N,) which fitted corners look like the corners of one chessboard.
+    """(N,) True for each fitted corner that looks like a corner of one chessboard.
 
     Args:
         fitted: the corners.
@@ -47,6 +98,7 @@ def sound_corners(fitted: FittedCorners, signs: Floats) -> npt.NDArray[np.bool_]
     signed = np.where(there, fitted.contrast, 0) * signs
     if not there.any():
         return there
+    # Contrasts follow the checker, or its negative: the board's order is not settled yet.
     way = 1.0 if np.median(signed[there]) > 0 else -1.0
     signed = signed * way
     usual = float(np.median(signed[there]))
@@ -56,71 +108,101 @@ def sound_corners(fitted: FittedCorners, signs: Floats) -> npt.NDArray[np.bool_]
     return np.asarray(there & alike & crisp & (np.nan_to_num(fitted.moved, nan=9.0) < MOVED_MAX))
 
 
-def refusal(judged: Judged) -> tuple[str, str] | None:
+def refusal(grid: FittedGrid) -> tuple[str, str] | None:
     """The first gate that refuses, and why; None where all let it pass."""
     for name, gate in GATES:
-        reason = gate(judged)
+        reason = gate(grid)
         if reason is not None:
             return name, reason
     return None
 
 
-def _seen(judged: Judged) -> str | None:
-    count = int(judged.kept.sum())
-    if count < SEEN_MIN * judged.board.count:
-        total = judged.board.count
+def _enough_corners(grid: FittedGrid) -> str | None:
+    count = int(grid.kept.sum())
+    if count < SEEN_MIN * grid.board.count:
+        total = grid.board.count
         return f"{count} of {total} corners are crossings of two sharp edges, at least {SEEN_MIN:.0%} are needed"
     return None
 
 
-def _cell_size(judged: Judged) -> str | None:
-    shortest = float(np.linalg.norm(judged.steps[judged.kept], axis=2).min())
+def _outer_lines(grid: FittedGrid) -> str | None:
+    """Gate of the outer rows and columns: each must be the board's own.
+
+    A single stray next to a smaller board would shift the names of all its rows.
+    """
+    board, kept, lattice = grid.board, grid.kept, grid.board.lattice()
+    index = np.arange(board.count).reshape(board.rows, board.columns)
+    lines = {
+        "first row": index[0],
+        "last row": index[-1],
+        "first column": index[:, 0],
+        "last column": index[:, -1],
+    }
+    for name, line in lines.items():
+        seen = int(kept[line].sum())
+        # Without the line itself the other corners predict where its corners are.
+        others = kept.copy()
+        others[line] = False
+        if seen > RIM_SHARE * len(line) or (seen > 0 and others.sum() < PREDICTING_MIN):
+            continue
+        like = int(_look_like_corners(grid, lattice[line], by=others)[0].sum()) if others.sum() >= PREDICTING_MIN else 0
+        if like < (RIM_MIN if seen else RIM_SHARE * len(line)):
+            return (
+                f"{seen} of the {len(line)} corners of the {name} are there, and at {like} of their places something "
+                "like one: they may be the next one's"
+            )
+    return None
+
+
+def _orientation(grid: FittedGrid) -> str | None:
+    return None if np.linalg.det(grid.steps[grid.kept]).min() > 0 else "the grid is mirrored or folded"
+
+
+def _cell_size(grid: FittedGrid) -> str | None:
+    shortest = float(np.linalg.norm(grid.steps[grid.kept], axis=2).min())
     if shortest < CELL_MIN_PX:
         return f"cells are {shortest:.1f} px small, at least {CELL_MIN_PX} px are needed: come nearer or tilt less"
     return None
 
 
-def _distinct(judged: Judged) -> str | None:
-    pixels = judged.fitted.pixels[judged.kept]
+def _separation(grid: FittedGrid) -> str | None:
+    pixels = grid.fitted.pixels[grid.kept]
     apart = np.linalg.norm(pixels[:, None] - pixels[None], axis=2)
     apart[np.diag_indices(len(pixels))] = np.inf
-    shortest = np.linalg.norm(judged.steps[judged.kept], axis=2).min()
+    shortest = np.linalg.norm(grid.steps[grid.kept], axis=2).min()
     return None if apart.min() > 0.5 * shortest else f"two corners lie {apart.min():.1f} px from each other"
 
 
-def _not_mirrored(judged: Judged) -> str | None:
-    return None if np.linalg.det(judged.steps[judged.kept]).min() > 0 else "the grid is mirrored or folded"
-
-
-def _flat(judged: Judged) -> str | None:
-    rms = flat_rms_px(judged.board.lattice()[judged.kept], judged.fitted.pixels[judged.kept], judged.image.shape)
-    cell = float(np.linalg.norm(judged.steps[judged.kept], axis=2).mean())
+def _flatness(grid: FittedGrid) -> str | None:
+    rms = flat_rms_px(grid.board.lattice()[grid.kept], grid.fitted.pixels[grid.kept], grid.image.shape)
+    cell = float(np.linalg.norm(grid.steps[grid.kept], axis=2).mean())
     limit = flat_limit_px(cell)
     return None if rms < limit else f"the corners lie {rms:.2f} px (rms) off a plane behind a lens, at most {limit:.2f}"
 
 
-def _evenly_spaced(judged: Judged) -> str | None:
-    """Whether wide and narrow cells take turns along the rows or the columns."""
-    lattice, pixels = judged.board.lattice()[judged.kept], judged.fitted.pixels[judged.kept]
-    off = pixels - mapped(judged.homography, lattice)
+def _spacing(grid: FittedGrid) -> str | None:
+    """Gate of the spacing: wide and narrow cells must not take turns along the rows or the columns."""
+    lattice, pixels = grid.board.lattice()[grid.kept], grid.fitted.pixels[grid.kept]
+    off = pixels - map_points(grid.homography, lattice)
     turns = np.where(lattice % 2 == 0, 1.0, -1.0)
+    # Least squares: the share of +1, -1, +1, ... along either axis in the misses of the homography.
     turns -= turns.mean(axis=0)
     uneven = float(np.linalg.norm(turns.T @ off / (turns**2).sum(axis=0)[:, None], axis=1).max())
-    limit = UNEVEN_PX + UNEVEN_CELLS * float(np.linalg.norm(judged.steps[judged.kept], axis=2).mean())
+    limit = UNEVEN_PX + UNEVEN_CELLS * float(np.linalg.norm(grid.steps[grid.kept], axis=2).mean())
     return None if uneven < limit else f"every other line of corners is {uneven:.2f} px off, at most {limit:.2f}"
 
 
-def _crisp(judged: Judged) -> str | None:
-    usual = float(np.median(judged.fitted.misfit[judged.kept]))
+def _crispness(grid: FittedGrid) -> str | None:
+    usual = float(np.median(grid.fitted.misfit[grid.kept]))
     if usual > MISFIT_USUAL_MAX:
         return f"what is no chessboard or noise is {usual:.2f} of the contrast, at most {MISFIT_USUAL_MAX}"
     return None
 
 
-def _alternating(judged: Judged) -> str | None:
-    """Means of the middles of cells whose four corners are there, each against its neighbours."""
-    board = judged.board
-    whole, middles, signs = _cells(judged)
+def _alternation(grid: FittedGrid) -> str | None:
+    """Gate of the checker: of two neighbouring cells whose corners are all there, one is dark and one is bright."""
+    board = grid.board
+    whole, middles, signs = _cells(grid)
     row, column = np.nonzero(whole)
     signed = middles * signs
     right = total = 0
@@ -138,41 +220,82 @@ def _alternating(judged: Judged) -> str | None:
     return None
 
 
-def _even(judged: Judged) -> str | None:
-    """Whether corners have the contrast that the cells between them have."""
-    whole, middles, signs = _cells(judged)
+def _evenness(grid: FittedGrid) -> str | None:
+    """Gate of the contrast: corners have that of the cells between them."""
+    whole, middles, signs = _cells(grid)
     bright, dark = middles[whole & (signs > 0)], middles[whole & (signs < 0)]
     if not len(bright) or not len(dark):
         return "no four corners that enclose a bright cell, or a dark one, are there"
     half = float(np.median(bright) - np.median(dark)) / 2
-    corners = float(np.median(np.abs(judged.fitted.contrast[judged.kept])))
+    corners = float(np.median(np.abs(grid.fitted.contrast[grid.kept])))
     if not EVEN[0] * half < corners < EVEN[1] * half:
         ratio = corners / half if half > 0 else np.inf
         return f"corners have {ratio:.1f} times the contrast of cells, a chessboard's {EVEN[0]} to {EVEN[1]} times"
     return None
 
 
-def _cells(judged: Judged) -> tuple[npt.NDArray[np.bool_], Floats, Floats]:
-    """Of the (rows - 1, columns - 1) cells: whose four corners are there, brightness, and 1 for bright, -1 for dark."""
-    board = judged.board
-    kept = judged.kept.reshape(board.rows, board.columns)
+def _border(grid: FittedGrid) -> str | None:
+    """Gate of the places beyond each rim: if the pattern goes on there, these corners may be any part of it."""
+    board = grid.board
+    columns, rows = np.arange(board.columns, dtype=float), np.arange(board.rows, dtype=float)
+    rims = {
+        "left": np.column_stack([np.full(board.rows, -1.0), rows]),
+        "right": np.column_stack([np.full(board.rows, float(board.columns)), rows]),
+        "top": np.column_stack([columns, np.full(board.columns, -1.0)]),
+        "bottom": np.column_stack([columns, np.full(board.columns, float(board.rows))]),
+    }
+    misfit = float(np.median(grid.fitted.misfit[grid.kept]))
+    for name, rim in rims.items():
+        like, fitted = _look_like_corners(grid, rim, by=grid.kept)
+        with np.errstate(invalid="ignore"):
+            alike = like & (fitted.misfit < 1.5 * misfit + 0.03)
+        if alike.mean() > BEYOND_MAX:
+            return f"the pattern goes on {name} of the board: {int(alike.sum())} of {len(rim)} places there are corners"
+    return None
+
+
+def _look_like_corners(grid: FittedGrid, places: Floats, *, by: Flags) -> tuple[Flags, FittedCorners]:
+    """(M,) True for each place of the lattice with a corner where those flagged in `by` predict it; and the fits."""
+    fitted = fit_corners(grid.image, _predict(grid, places, by), steps_between(grid.homography, places))
+    usual = float(np.median(np.abs(grid.fitted.contrast[by])))
+    way = 1.0 if np.nansum(grid.fitted.contrast * checker_signs(grid.board)) > 0 else -1.0
+    signs = np.where(places.sum(axis=1) % 2 == 0, way, -way)
+    with np.errstate(invalid="ignore"):
+        like = (fitted.contrast * signs > LIKE_CONTRAST * usual) & (fitted.moved < LIKE_MOVED)
+    return np.asarray(like), fitted
+
+
+def _predict(grid: FittedGrid, places: Floats, by: Flags) -> Floats:
+    """(M, 2) pixels of places of the lattice: a flat board behind a lens, plus its miss at the nearest corner."""
+    lattice, pixels = grid.board.lattice()[by], grid.fitted.pixels[by]
+    view = flat_view(lattice, pixels, grid.image.shape)
+    if view is None:
+        return np.full_like(places, np.nan)
+    nearest = np.argmin(np.linalg.norm(places[:, None] - lattice[None], axis=2), axis=1)
+    return np.asarray(view.pixels(places) + (pixels - view.pixels(lattice))[nearest])
+
+
+def _cells(grid: FittedGrid) -> tuple[npt.NDArray[np.bool_], Floats, Floats]:
+    """(rows - 1, columns - 1) cells: True where all four corners are there, brightness, 1 for bright or -1 for dark."""
+    board = grid.board
+    kept = grid.kept.reshape(board.rows, board.columns)
     whole = kept[1:, 1:] & kept[1:, :-1] & kept[:-1, 1:] & kept[:-1, :-1]
-    middles = _cell_means(judged).reshape(board.rows - 1, board.columns - 1)
+    middles = _cell_means(grid).reshape(board.rows - 1, board.columns - 1)
     signs = np.where((np.arange(board.rows - 1)[:, None] + np.arange(board.columns - 1)) % 2 == 0, 1.0, -1.0)
-    way = 1.0 if np.nansum(judged.fitted.contrast * checker_signs(board)) > 0 else -1.0
+    way = 1.0 if np.nansum(grid.fitted.contrast * checker_signs(board)) > 0 else -1.0
     return whole, middles, signs * way
 
 
-def _cell_means(judged: Judged) -> Floats:
+def _cell_means(grid: FittedGrid) -> Floats:
     """((rows - 1) * (columns - 1),) mean brightness of the middle of each cell, bilinear."""
-    board, image = judged.board, judged.image
-    grid = np.where(judged.kept[:, None], judged.fitted.pixels, mapped(judged.homography, board.lattice()))
-    grid = grid.reshape(board.rows, board.columns, 2)
+    board, image = grid.board, grid.image
+    places = np.where(grid.kept[:, None], grid.fitted.pixels, map_points(grid.homography, board.lattice()))
+    places = places.reshape(board.rows, board.columns, 2)
     samples = []
     for v in (0.5 - CELL_MIDDLE, 0.5, 0.5 + CELL_MIDDLE):
         for u in (0.5 - CELL_MIDDLE, 0.5, 0.5 + CELL_MIDDLE):
-            at = (1 - v) * ((1 - u) * grid[:-1, :-1] + u * grid[:-1, 1:]) + v * (
-                (1 - u) * grid[1:, :-1] + u * grid[1:, 1:]
+            at = (1 - v) * ((1 - u) * places[:-1, :-1] + u * places[:-1, 1:]) + v * (
+                (1 - u) * places[1:, :-1] + u * places[1:, 1:]
             )
             x, y = np.clip(at[..., 0], 0, image.shape[1] - 1.001), np.clip(at[..., 1], 0, image.shape[0] - 1.001)
             left, top = x.astype(np.intp), y.astype(np.intp)
@@ -183,16 +306,16 @@ def _cell_means(judged: Judged) -> Floats:
 
 
 GATES: tuple[tuple[str, Gate], ...] = (
-    ("corners", _seen),
-    ("rims", starts_and_ends),
-    ("orientation", _not_mirrored),
+    ("corners", _enough_corners),
+    ("rims", _outer_lines),
+    ("orientation", _orientation),
     ("cell size", _cell_size),
-    ("distinct", _distinct),
-    ("flatness", _flat),
-    ("spacing", _evenly_spaced),
-    ("crispness", _crisp),
-    ("alternation", _alternating),
-    ("evenness", _even),
-    ("border", goes_on),
+    ("distinct", _separation),
+    ("flatness", _flatness),
+    ("spacing", _spacing),
+    ("crispness", _crispness),
+    ("alternation", _alternation),
+    ("evenness", _evenness),
+    ("border", _border),
 )
-"""In the order in which they are asked: cheap ones first."""
+"""Gates in the order in which they are asked, cheap ones first; each name is the stage of a refused attempt."""

@@ -12,12 +12,13 @@ from cairn_calib.rig.image_files import Grey
 Picture = npt.NDArray[np.uint8]
 
 LONGEST_PX = 1000
-"""At least this long is a picture, so that the corners of a small image can be told apart."""
+"""Longest side of a picture, at least, pixels: small images are enlarged so that single corners can be seen."""
 SIGMAS = 150.0
 """Ellipses are drawn this many standard deviations large: corners are good to hundredths of a pixel."""
 STRETCH = (0.5, 99.8)
+"""Percentiles of the counts that become black and white."""
 BAND_PX = 28
-"""Above the image, for the title."""
+"""Height of the band above the image that holds the title, pixels."""
 THUMBNAIL_PX, JPEG_QUALITY = 320, 82
 FIRST, LAST, TEXT = (60, 60, 255), (255, 160, 40), (80, 255, 80)
 
@@ -40,7 +41,7 @@ def overlay(counts: Grey, corners: Corners | None, *, title: str) -> Picture:
 
 
 def write_picture(path: Path, picture: Picture) -> None:
-    """A PNG file of a picture."""
+    """Write a PNG file of a picture."""
     path.write_bytes(bytes(cv2.imencode(".png", picture)[1]))
 
 

@@ -1,4 +1,4 @@
-"""What was found of a board in an image, and, where nothing was, at which stage each attempt ended."""
+"""Detection of a board in an image: its points with covariance, and the stage at which each attempt ended."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ FOUND = "found"
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """One method at one scale, and how it ended."""
+    """One method at one scale, and its outcome."""
 
     method: str
     scale: float
@@ -31,19 +31,19 @@ class Corners:
 
     board: Board
     pixels: Floats
-    """(N, 2) x, y; NaN where a point is hidden. Of discs, the centroid of the disc's image."""
+    """(N, 2) x, y; NaN where a point is hidden. For discs: the centroid of the disc's image."""
     covariance_px2: Floats
     """(N, 2, 2) pixels squared; NaN where a point is hidden."""
 
     @property
     def seen(self) -> npt.NDArray[np.bool_]:
-        """(N,) which points are there."""
+        """(N,) True for each point that is there."""
         return np.isfinite(self.pixels[:, 0])
 
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """The corners, or None, and what was tried."""
+    """Corners, or None where none were found, and every attempt."""
 
     corners: Corners | None
     attempts: tuple[Attempt, ...]

@@ -64,7 +64,7 @@ def read_still(path: Path) -> StillImage:
     return StillImage(mean, digest.hexdigest(), len(paths), halves)
 
 
-def if_still(image: StillImage, detection: Detection) -> Detection:
+def refuse_movement(image: StillImage, detection: Detection) -> Detection:
     """What was found, or nothing and why if the board moved between the frames."""
     if image.halves is None or detection.corners is None:
         return detection

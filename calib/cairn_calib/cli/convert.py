@@ -27,13 +27,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cairn_calib.exchange.placed_camera import KIND, Foreign, PlacedCamera
+from cairn_calib.exchange.placed_camera import KIND, CameraFile, PlacedCamera
 from cairn_calib.exchange.rig_exchange import (
     DROPPABLE,
     FORMATS,
     RIG,
     cameras_of_rig,
-    chosen,
+    choose_cameras,
     format_of_text,
     read_text,
     rig_of_cameras,
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> None:
     if unknown := [field for field in drop if field not in DROPPABLE]:
         raise BadInputError("bad_arguments", f"--drop takes {', '.join(DROPPABLE)}, got {unknown[0][:80]!r}")
     found = [_read(path, target, args.camera, drop) for path in args.files]
-    cameras = chosen([each for foreign in found for each in foreign.cameras], args.camera)
+    cameras = choose_cameras([each for foreign in found for each in foreign.cameras], args.camera)
     if target == RIG:
         rig = rig_of_cameras(cameras, name=args.name or args.files[0].stem, spectra=_spectra(args.spectrum, cameras))
         _write(out, rig.to_json().decode(), cameras)
@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> None:
         sys.stderr.write(f"left out: {', '.join(left_out)}\n")
 
 
-def _read(path: Path, target: str, names: Sequence[str], drop: Sequence[str]) -> Foreign:
+def _read(path: Path, target: str, names: Sequence[str], drop: Sequence[str]) -> CameraFile:
     text = read_text(path)
     source = format_of_text(path, text)
     if source != RIG:

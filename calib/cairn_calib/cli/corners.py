@@ -50,9 +50,8 @@ from cairn_calib.board.corner_detection import grey
 from cairn_calib.board.corner_file import CornerFile, corner_file, read_outer_corners
 from cairn_calib.board.corner_pictures import overlay, write_picture
 from cairn_calib.board.corners import Attempt, Detection
-from cairn_calib.board.polarity_candidates import Looked, looked_for_corners, looked_for_discs
-from cairn_calib.board.polarity_vote import vote_of
-from cairn_calib.board.still_frames import StillImage, if_still, read_still
+from cairn_calib.board.polarity import PolarityCandidates, chessboard_candidates, count_votes, disc_candidates
+from cairn_calib.board.still_frames import StillImage, read_still, refuse_movement
 from cairn_calib.cli.progress import with_progress
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError, NotFoundError, first_error
@@ -135,16 +134,17 @@ def _run(args: argparse.Namespace) -> int:
         )
     args.output.mkdir(parents=True, exist_ok=True)
     seen_before: dict[bytes, str] = {}
-    shown = [
-        _shown(path, board, args, pointed.get(path.name), seen_before) for path in with_progress(args.images, "images")
+    results = [
+        _find_and_draw(path, board, args, pointed.get(path.name), seen_before)
+        for path in with_progress(args.images, "images")
     ]
-    polarity = _polarity([each.looked for each in shown], args)
-    for each in shown:
-        if each.looked.named(polarity).corners is not each.looked.likely.corners:
-            _draw(each.path, read_still(each.path), each.looked.named(polarity), args.output)
+    polarity = _polarity([each.candidates for each in results], args)
+    for each in results:
+        if each.candidates.detection(polarity).corners is not each.candidates.likely.corners:
+            _draw(each.path, read_still(each.path), each.candidates.detection(polarity), args.output)
         document = each.document(board, polarity).model_dump_json(indent=1)
         (args.output / f"{_name(each.path)}.json").write_text(document + "\n", encoding="utf-8")
-    lost = [each.path.name for each in shown if each.looked.named(polarity).corners is None]
+    lost = [each.path.name for each in results if each.candidates.detection(polarity).corners is None]
     found = len(args.images) - len(lost)
     more = f" and {len(lost) - NAMED_MAX} more" if len(lost) > NAMED_MAX else ""
     others = f"; the others: {', '.join(lost[:NAMED_MAX])}{more}" if lost else ""
@@ -173,19 +173,19 @@ def _name(path: Path) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class _Shown:
-    """What was found in one image; of one that cannot be read there is neither digest nor size."""
+class _ImageResult:
+    """Detections in one image; without digest and size where it cannot be read."""
 
     path: Path
-    looked: Looked
+    candidates: PolarityCandidates
     sha256: str | None
     size: tuple[int, int] | None
     frames: int
 
     def document(self, board: Board, polarity: Polarity) -> CornerFile:
-        """To be written once all images have voted."""
+        """Document of its corners, to be written once all images have voted."""
         return corner_file(
-            self.looked.named(polarity),
+            self.candidates.detection(polarity),
             board,
             image=self.path.name,
             sha256=self.sha256,
@@ -195,41 +195,41 @@ class _Shown:
         )
 
 
-def _shown(
+def _find_and_draw(
     path: Path, board: Board, args: argparse.Namespace, pointed: Floats | None, seen_before: dict[bytes, str]
-) -> _Shown:
-    """What an image shows, told and drawn at once; `seen_before` names an image by the digest of its counts."""
+) -> _ImageResult:
+    """Find the board in one image, report and draw it; `seen_before` names images by the digest of their counts."""
     try:
         image = read_still(path)
         grey(image.counts)
     except (BadInputError, DamagedDataError) as exc:
-        unread = _nothing("reading", exc.message)
+        unread = _no_detection("reading", exc.message)
         (args.output / f"{_name(path)}.png").unlink(missing_ok=True)  # of another image of this name
         _say(_line(path, unread.likely))
-        return _Shown(path, unread, None, None, 1)
-    looked = _looked(image, path, board, args, pointed, seen_before)
-    _say(_line(path, looked.likely))
-    _draw(path, image, looked.likely, args.output)
+        return _ImageResult(path, unread, None, None, 1)
+    candidates = _find(image, path, board, args, pointed, seen_before)
+    _say(_line(path, candidates.likely))
+    _draw(path, image, candidates.likely, args.output)
     height, width = image.counts.shape
-    return _Shown(path, looked, image.sha256, (width, height), image.frames)
+    return _ImageResult(path, candidates, image.sha256, (width, height), image.frames)
 
 
-def _looked(
+def _find(
     image: StillImage,
     path: Path,
     board: Board,
     args: argparse.Namespace,
     pointed: Floats | None,
     seen_before: dict[bytes, str],
-) -> Looked:
+) -> PolarityCandidates:
     twin = seen_before.setdefault(hashlib.sha256(image.counts.tobytes()).digest(), path.name)
     if twin != path.name:
         # The board has moved since, and its place is not in it.
         why = f"the same counts as {twin}; cameras repeat an image when they lose one, or level themselves"
-        return _nothing("repeated", why)
-    look = looked_for_discs if board.pattern != "chessboard" else looked_for_corners
+        return _no_detection("repeated", why)
+    look = disc_candidates if board.pattern != "chessboard" else chessboard_candidates
     found = look(image.counts, board, polarity=args.polarity, upright=args.upright, pointed=pointed)
-    return found.checked(lambda detection: if_still(image, detection))
+    return found.filter(lambda detection: refuse_movement(image, detection))
 
 
 def _draw(path: Path, image: StillImage, detection: Detection, folder: Path) -> None:
@@ -237,32 +237,32 @@ def _draw(path: Path, image: StillImage, detection: Detection, folder: Path) -> 
 
 
 def _line(path: Path, detection: Detection) -> str:
-    return f"{path.name}: {_told(detection)}"
+    return f"{path.name}: {_outcome(detection)}"
 
 
-def _polarity(looked: Sequence[Looked], args: argparse.Namespace) -> Polarity:
-    told: Polarity | Literal["vote"] = args.polarity
-    if told != "vote":
-        return told
-    vote = vote_of([each.vote for each in looked])
+def _polarity(candidates: Sequence[PolarityCandidates], args: argparse.Namespace) -> Polarity:
+    chosen: Polarity | Literal["vote"] = args.polarity
+    if chosen != "vote":
+        return chosen
+    vote = count_votes([each.vote for each in candidates])
     if vote.polarity is not None:
-        _say(f"polarity {vote.polarity}: {vote} of {len(looked)} images")
+        _say(f"polarity {vote.polarity}: {vote} of {len(candidates)} images")
         return vote.polarity
-    if any(each.likely.corners is not None for each in looked):
+    if any(each.likely.corners is not None for each in candidates):
         _say(
-            f"polarity unknown, taken for normal: {vote} of {len(looked)} images; if this camera sees what is printed "
-            "dark as bright, say --polarity reversed"
+            f"polarity unknown, taken for normal: {vote} of {len(candidates)} images; if this camera sees what is "
+            "printed dark as bright, say --polarity reversed"
         )
     return "normal"
 
 
-def _nothing(stage: str, reason: str) -> Looked:
-    """Of an image that corners were not even looked for in."""
+def _no_detection(stage: str, reason: str) -> PolarityCandidates:
+    """Candidates of an image in which no corners were searched, with the reason."""
     nothing = Detection(None, (Attempt("image", 1.0, stage, reason),))
-    return Looked(nothing, nothing, None)
+    return PolarityCandidates(nothing, nothing, None)
 
 
-def _told(detection: Detection) -> str:
+def _outcome(detection: Detection) -> str:
     last = detection.attempts[-1]
     if detection.corners is None:
         furthest = max(detection.attempts, key=lambda attempt: attempt.stage != "candidates")

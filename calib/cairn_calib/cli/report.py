@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cairn_calib.cli.solve_options import add_solve_options, solve_as_asked
-from cairn_calib.diagnosis.examination import examined
+from cairn_calib.diagnosis.examination import examine
 from cairn_calib.report.report_files import refuse_overwriting, write_report
 from cairn_calib.report.report_images import report_images
 from cairn_calib.rig.calibration import PIXEL_NAMES, POSE_UNITS
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> None:
         )
     sys.stdout.write(f"{args.rig} comes from these corners: the same to {max(off, 1e-4):.1g} sigma\n")
     folders = dict(zip(again.plan.cameras, args.folders, strict=True))
-    sys.stdout.write(write_report(args.output, examined(again, rig), report_images(folders)))
+    sys.stdout.write(write_report(args.output, examine(again, rig), report_images(folders)))
 
 
 def solve_arguments(rig: Rig, folders: list[Path], more: list[str], path: Path) -> argparse.Namespace:

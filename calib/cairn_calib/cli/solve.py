@@ -39,7 +39,7 @@ from typing import TYPE_CHECKING
 
 from cairn_calib.cli.progress import while_working
 from cairn_calib.cli.solve_options import add_solve_options, solve_as_asked
-from cairn_calib.diagnosis.examination import examined
+from cairn_calib.diagnosis.examination import examine
 from cairn_calib.report.range_report import told_ranges
 from cairn_calib.report.report_files import refuse_overwriting, write_file, write_report
 from cairn_calib.report.report_images import report_images
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> None:
         solution = solve_as_asked(args)
         rig = solved_rig(solution, made_s=time.time())
     with while_working("comparing halves of the images, and without each of them"):
-        seen = examined(solution, rig)
+        seen = examine(solution, rig)
     write_file(args.output, rig.to_json())
     sys.stdout.write(told(statistics_of(solution)) + told_ranges(solution))
     for each in seen.warnings:

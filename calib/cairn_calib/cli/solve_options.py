@@ -4,8 +4,7 @@ import argparse
 from pathlib import Path
 
 from cairn_calib.rig.rig import Spectrum
-from cairn_calib.solve.board_views import read_board_views
-from cairn_calib.solve.range_images import with_ranges
+from cairn_calib.solve.board_views import add_ranges, read_board_views
 from cairn_calib.solve.solution import Solution
 from cairn_calib.solve.solve import solve_rig
 from cairn_calib.solve.solve_plan import PITCH_SIGMA, CameraPlan, SolvePlan, usual_plan
@@ -52,7 +51,7 @@ def solve_as_asked(args: argparse.Namespace) -> Solution:
     if args.range is None and (args.amplitude is not None or args.modulation_mhz is not None):
         raise BadInputError("bad_arguments", "--amplitude and --modulation-mhz are of range images: add --range")
     if args.range is not None:
-        views = with_ranges(views, plan, args.range, args.range_units_per_m, amplitudes=args.amplitude)
+        views = add_ranges(views, plan, args.range, args.range_units_per_m, amplitudes=args.amplitude)
     return solve_rig(views, plan)
 
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from cairn_calib.diagnosis.probe_points import Probes
 from cairn_calib.rig.pose_vectors import vector_from_transform
 from cairn_calib.solve.corner_residuals import CornerData
-from cairn_calib.solve.rig_state import value_of
+from cairn_calib.solve.rig_state import shared_values
 from cairn_calib.solve.solution import Solution
 from cairn_calib.solve.solve import solve_from
 from cairn_map.arrays import Floats
@@ -50,7 +50,7 @@ class Halves:
     parameters: int
 
 
-def cross_validated(solution: Solution, probes: Sequence[Probes]) -> Halves | None:
+def cross_validate(solution: Solution, probes: Sequence[Probes]) -> Halves | None:
     """Every second frame against the others; None where a half does not determine the rig."""
     frames = solution.views.frames
     try:
@@ -95,7 +95,7 @@ def _camera_rows(solution: Solution) -> npt.NDArray[np.intp]:
 
 def _step(solution: Solution, half: Solution) -> Floats:
     """(P,) from the solution to a half's: differences of parameters, errors of poses."""
-    step = value_of(half.state, half.layout) - value_of(solution.state, solution.layout)
+    step = shared_values(half.state, half.layout) - shared_values(solution.state, solution.layout)
     for n, at in enumerate(solution.layout.pose_at):
         if len(at):
             T, T_half = solution.state.T_rig_camera[n], half.state.T_rig_camera[n]

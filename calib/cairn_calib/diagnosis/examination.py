@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 
-from cairn_calib.diagnosis.cross_validation import Halves, cross_validated
+from cairn_calib.diagnosis.cross_validation import Halves, cross_validate
 from cairn_calib.diagnosis.frame_influence import Influence, influences
 from cairn_calib.diagnosis.next_image import NextImage, next_images
 from cairn_calib.diagnosis.probe_points import Probes, probes_of
 from cairn_calib.diagnosis.range_warnings import range_warnings
-from cairn_calib.diagnosis.solve_warnings import Warned, refuse_undetermined, warnings_of
+from cairn_calib.diagnosis.solve_warnings import SolveWarning, refuse_undetermined, warnings_of
 from cairn_calib.diagnosis.view_coverage import Coverage, coverage
 from cairn_calib.diagnosis.weak_modes import WeakMode, weak_modes
 from cairn_calib.rig.rig import Rig
@@ -29,10 +29,10 @@ class Examination:
     modes: tuple[WeakMode, ...]
     next_images: tuple[NextImage, ...]
     """The best first."""
-    warnings: tuple[Warned, ...]
+    warnings: tuple[SolveWarning, ...]
 
 
-def examined(solution: Solution, rig: Rig) -> Examination:
+def examine(solution: Solution, rig: Rig) -> Examination:
     """The examination of a solution and its rig.
 
     Raises:
@@ -42,7 +42,7 @@ def examined(solution: Solution, rig: Rig) -> Examination:
     probes = probes_of(rig, solution.plan.gauge, solution.layout)
     covered = [coverage(solution, name) for name in solution.plan.cameras]
     moved = influences(solution, probes)
-    halves = cross_validated(solution, probes)
+    halves = cross_validate(solution, probes)
     modes = weak_modes(solution, probes)
     return Examination(
         solution,

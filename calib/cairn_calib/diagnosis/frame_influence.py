@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cairn_calib.diagnosis.probe_points import Probes
-from cairn_calib.solve.normal_equations import Block, solved_scaled
+from cairn_calib.solve.normal_equations import Block, solve_scaled
 from cairn_calib.solve.solution import Solution
 from cairn_map.arrays import Floats
 
@@ -56,7 +56,7 @@ def influences(solution: Solution, probes: list[Probes]) -> list[Influence]:
     result = []
     for frame, share, pull in zip(solution.views.frames, shares, pulls, strict=True):
         try:
-            step = solved_scaled(S - share, -pull)
+            step = solve_scaled(S - share, -pull)
         except np.linalg.LinAlgError:
             result.append(Influence(frame, np.inf, probes[0].camera, np.inf))
             continue

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from cairn_calib.rig.projection_uncertainty import mounted_lens, projection_moves, transfer_moves
 from cairn_calib.rig.rig import Rig
-from cairn_calib.solve.rig_state import Layout
+from cairn_calib.solve.rig_state import ParameterLayout
 from cairn_map.arrays import Floats
 
 RANGES_M = (1.0, 2.0, 5.0)
@@ -37,7 +37,7 @@ class Probes:
         return np.sqrt(variances)
 
 
-def probes_of(rig: Rig, gauge: str, layout: Layout) -> list[Probes]:
+def probes_of(rig: Rig, gauge: str, layout: ParameterLayout) -> list[Probes]:
     """The points of each camera that lie in its image."""
     lens = mounted_lens(rig, gauge)
     grid = image_grid(lens.width, lens.height, COLUMNS, ROWS)
@@ -66,7 +66,7 @@ def _probes(
     pixels: Floats,
     range_m: Floats,
     moves: dict[tuple[str, str], Floats],
-    layout: Layout,
+    layout: ParameterLayout,
     inside: npt.NDArray[np.bool_],
 ) -> Probes:
     rows = np.zeros((*pixels.shape, layout.size))

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from cairn_calib.diagnosis.solve_warnings import Warned
+from cairn_calib.diagnosis.solve_warnings import SolveWarning
 from cairn_calib.rig.range_terms import wave_period_m
 from cairn_calib.rig.rig import Spectrum
 from cairn_calib.solve.range_choice import AMPLITUDE_RATIO, HARMONICS, PERIOD_SHARE
@@ -19,7 +19,7 @@ USUAL_TIMES = 4.0
 """Of what is assumed of each number of the bias."""
 
 
-def range_warnings(solution: Solution) -> Iterator[Warned]:
+def range_warnings(solution: Solution) -> Iterator[SolveWarning]:
     """All that is to be said of them, and of range cameras without any."""
     used, given = solution.ranges, solution.views.ranges
     count = 0 if used is None else len(used.frames)
@@ -28,7 +28,7 @@ def range_warnings(solution: Solution) -> Iterator[Warned]:
             f"{len(given) - count} of {len(given)} range images show no board whose corners were found: look at the "
             "numbers in their names"
         )
-        yield Warned("range_images", given[0].camera, count, len(given), "range images with a board", text)
+        yield SolveWarning("range_images", given[0].camera, count, len(given), "range images with a board", text)
     if used is not None:
         name = solution.views.cameras[used.camera]
         yield from _of_other_ranges(name, solution)
@@ -38,7 +38,7 @@ def range_warnings(solution: Solution) -> Iterator[Warned]:
     yield from _of_none(solution)
 
 
-def _of_none(solution: Solution) -> Iterator[Warned]:
+def _of_none(solution: Solution) -> Iterator[SolveWarning]:
     """Of range cameras whose ranges nothing is known of."""
     names = list(solution.plan.cameras)
     shown = None if solution.ranges is None else names[solution.ranges.camera]
@@ -47,17 +47,17 @@ def _of_none(solution: Solution) -> Iterator[Warned]:
             text = "no range image shows what it adds to its ranges: give those of the same boards (--range)"
             if shown is not None:
                 text = f"what it adds to its ranges is not known: --range is of {shown}; solve this camera alone for it"
-            yield Warned("range_bias", name, 0, 1, "range images", text)
+            yield SolveWarning("range_bias", name, 0, 1, "range images", text)
 
 
-def _of_other_ranges(name: str, solution: Solution) -> Iterator[Warned]:
+def _of_other_ranges(name: str, solution: Solution) -> Iterator[SolveWarning]:
     used, values = solution.ranges, solution.values()
     if used is None:
         return
     noise_m = solution.adjusted.problem.sensors[-1].scale * used.sigma_m
     if noise_m > NOISE_M:
         text = "ranges miss the boards by far more than noise: are their images of other places of the board?"
-        yield Warned("range_noise", name, noise_m, NOISE_M, "m", text)
+        yield SolveWarning("range_noise", name, noise_m, NOISE_M, "m", text)
         return  # and its bias means nothing
     known = zip(used.terms.document_names, used.terms.sigmas, strict=False)  # nodes come last
     sigmas, worst = max((abs(values[name, each]) / sigma, each) for each, sigma in known)
@@ -66,10 +66,10 @@ def _of_other_ranges(name: str, solution: Solution) -> Iterator[Warned]:
             f"{worst} = {values[name, worst]:.3g} is more than range cameras add: are the images depth along the axis, "
             "not range along the beam, or of other units (--range-units-per-m)?"
         )
-        yield Warned("range_kind", name, sigmas, USUAL_TIMES, "of what is usual", text)
+        yield SolveWarning("range_kind", name, sigmas, USUAL_TIMES, "of what is usual", text)
 
 
-def _of_waves(name: str, solution: Solution) -> Iterator[Warned]:
+def _of_waves(name: str, solution: Solution) -> Iterator[SolveWarning]:
     used, spans, modulation_hz = solution.ranges, solution.spans, solution.plan.modulation_hz
     if used is None or spans is None:
         return
@@ -78,7 +78,7 @@ def _of_waves(name: str, solution: Solution) -> Iterator[Warned]:
             "the circular error of its ranges is left out, for its modulation frequency was not stated "
             "(--modulation-mhz)"
         )
-        yield Warned("range_wiggle", name, 0, 1, "modulation frequencies", text)
+        yield SolveWarning("range_wiggle", name, 0, 1, "modulation frequencies", text)
         return
     lost = [k for k in HARMONICS if k not in used.terms.harmonics]
     if lost:
@@ -91,32 +91,34 @@ def _of_waves(name: str, solution: Solution) -> Iterator[Warned]:
             "left out: take boards from nearer to farther"
         )
         best = max(spans.period_share(modulation_hz, k) for k in lost)
-        yield Warned("range_wiggle", name, best, PERIOD_SHARE, "of a wave's period", text)
+        yield SolveWarning("range_wiggle", name, best, PERIOD_SHARE, "of a wave's period", text)
 
 
-def _of_amplitude(name: str, solution: Solution) -> Iterator[Warned]:
+def _of_amplitude(name: str, solution: Solution) -> Iterator[SolveWarning]:
     used, spans = solution.ranges, solution.spans
     if used is None or spans is None or used.terms.amplitude_at is not None:
         return
     if spans.amplitudes is None:
         text = "how its ranges depend on the amplitude is left out, for not all have an amplitude image (--amplitude)"
-        yield Warned("range_amplitude", name, 0, 1, "amplitude images a range image", text)
+        yield SolveWarning("range_amplitude", name, 0, 1, "amplitude images a range image", text)
         return
     low, _, high = spans.amplitudes
     text = f"board pixels have amplitudes of {low:.0f} to {high:.0f} only: how ranges depend on them is left out"
-    yield Warned("range_amplitude", name, spans.amplitude_ratio, AMPLITUDE_RATIO, "highest over lowest", text)
+    yield SolveWarning("range_amplitude", name, spans.amplitude_ratio, AMPLITUDE_RATIO, "highest over lowest", text)
 
 
-def _of_pixels(name: str, solution: Solution) -> Iterator[Warned]:
+def _of_pixels(name: str, solution: Solution) -> Iterator[SolveWarning]:
     found = solution.pattern
     if found is None:
         return
     if found.pairs < PAIRS_MIN:
         text = "hardly a pixel saw the board in two images: what each adds to its ranges of its own is not known"
-        yield Warned("range_pixels", name, found.pairs, PAIRS_MIN, "pairs of ranges of one pixel", text)
+        yield SolveWarning("range_pixels", name, found.pairs, PAIRS_MIN, "pairs of ranges of one pixel", text)
     if found.offsets is not None and 1 - found.seen_share > UNSEEN_SHARE:
         text = (
             "the pixels differ in what they add to their ranges, and on many there never was a board: theirs is 0 +- "
             f"{1000 * found.offsets.unseen_sigma_m:.1f} mm; take boards all over its image"
         )
-        yield Warned("range_pixels", name, 1 - found.seen_share, UNSEEN_SHARE, "of the pixels without board", text)
+        yield SolveWarning(
+            "range_pixels", name, 1 - found.seen_share, UNSEEN_SHARE, "of the pixels without board", text
+        )

@@ -40,7 +40,7 @@ FOCAL_SHARE_MAX = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Warned:
+class SolveWarning:
     """One thing that the data cannot tell, or that contradicts itself."""
 
     kind: str
@@ -81,7 +81,7 @@ def warnings_of(
     influences: Sequence[Influence],
     halves: Halves | None,
     modes: Sequence[WeakMode],
-) -> list[Warned]:
+) -> list[SolveWarning]:
     """All that is to be said, cameras first."""
     found = [each for camera in covered for each in _of_coverage(camera, solution)]
     found += [*_of_priors(solution), *_of_coefficients(solution), *_of_noise(solution)]
@@ -90,28 +90,28 @@ def warnings_of(
     return found
 
 
-def _of_coverage(seen: Coverage, solution: Solution) -> Iterator[Warned]:
+def _of_coverage(seen: Coverage, solution: Solution) -> Iterator[SolveWarning]:
     name = seen.camera
     if seen.images < FEW_VIEWS:
         text = f"{seen.images} images: principal point and lens are held near what is usual; take ten or more"
-        yield Warned("few_images", name, seen.images, FEW_VIEWS, "", text)
+        yield SolveWarning("few_images", name, seen.images, FEW_VIEWS, "", text)
     if seen.tilt_deg < TILT_DEG:
         text = "the boards are nearly parallel: focal length and distance are hard to tell apart; tilt to all sides"
-        yield Warned("tilt_range", name, seen.tilt_deg, TILT_DEG, "degrees", text)
+        yield SolveWarning("tilt_range", name, seen.tilt_deg, TILT_DEG, "degrees", text)
     ratio = seen.farthest_m / seen.nearest_m
     if ratio < RANGE_RATIO:
         text = f"all boards are {seen.nearest_m:.2f} to {seen.farthest_m:.2f} m away: take some nearer and farther"
-        yield Warned("range_span", name, ratio, RANGE_RATIO, "", text)
+        yield SolveWarning("range_span", name, ratio, RANGE_RATIO, "", text)
     edge = "tof_edge" if solution.plan.cameras[name].spectrum is Spectrum.RANGE else "edge"
     if seen.radius_share < RADIUS_SHARE:
         text = "no corner lies near the image's corners, where the lens bends most: what is there is extrapolated"
-        yield Warned(edge, name, seen.radius_share, RADIUS_SHARE, "of the half diagonal", text)
+        yield SolveWarning(edge, name, seen.radius_share, RADIUS_SHARE, "of the half diagonal", text)
     if seen.cell_share < CELL_SHARE:
         text = "the boards covered little of the image: move them through all of it"
-        yield Warned("coverage", name, seen.cell_share, CELL_SHARE, "of the parts of its image", text)
+        yield SolveWarning("coverage", name, seen.cell_share, CELL_SHARE, "of the parts of its image", text)
 
 
-def _of_priors(solution: Solution) -> Iterator[Warned]:
+def _of_priors(solution: Solution) -> Iterator[SolveWarning]:
     sigmas = solution.sigmas()
     ruled: dict[str, list[tuple[float, str]]] = {}
     for prior in solution.adjusted.problem.priors:
@@ -127,10 +127,10 @@ def _of_priors(solution: Solution) -> Iterator[Warned]:
     for owner, each in ruled.items():
         are = "is" if len(each) == 1 else "are"
         text = f"{', '.join(told for _, told in each)} {are} what was assumed before, not what was measured"
-        yield Warned("prior", owner, max(each)[0], PRIOR_SHARE, "of the assumed sigma is left", text)
+        yield SolveWarning("prior", owner, max(each)[0], PRIOR_SHARE, "of the assumed sigma is left", text)
 
 
-def _of_coefficients(solution: Solution) -> Iterator[Warned]:
+def _of_coefficients(solution: Solution) -> Iterator[SolveWarning]:
     values, sigmas = solution.values(), solution.sigmas()
     assumed = {prior.terms[0][:2] for prior in solution.adjusted.problem.priors}
     for name, camera in solution.plan.cameras.items():
@@ -141,51 +141,53 @@ def _of_coefficients(solution: Solution) -> Iterator[Warned]:
         if unknown:
             told = ", ".join(f"{each} = {values[name, each]:.2g} +- {sigmas[name, each]:.2g}" for each in unknown)
             text = f"{told}: no different from 0; corners further out would tell, or hold it at 0 (--distortion)"
-            yield Warned("distortion", name, max(lost[each] for each in unknown), 1.0, "sigma over value", text)
+            yield SolveWarning("distortion", name, max(lost[each] for each in unknown), 1.0, "sigma over value", text)
 
 
-def _of_noise(solution: Solution) -> Iterator[Warned]:
+def _of_noise(solution: Solution) -> Iterator[SolveWarning]:
     for sensor in solution.adjusted.problem.sensors:
         if not isinstance(sensor.data, CornerData):
             continue
         name = solution.views.cameras[sensor.data.camera]
         if sensor.scale > NOISE_SCALE and sensor.scale * sensor.data.sigma_px > NOISE_PX:
             text = "corners miss by far more than they may: a lens model that does not fit, a bent board, motion"
-            yield Warned("noise", name, sensor.scale, NOISE_SCALE, "times the stated noise", text)
+            yield SolveWarning("noise", name, sensor.scale, NOISE_SCALE, "times the stated noise", text)
         lost = (sensor.there & ~sensor.kept).sum(axis=1) / np.maximum(sensor.there.sum(axis=1), 1)
         share = 1 - sensor.kept.sum() / max(sensor.there.sum(), 1)
         if share > OUTLIER_SHARE:
             text = "many corners are outliers and were left out"
-            yield Warned("outliers", name, float(share), OUTLIER_SHARE, "of its corners", text)
+            yield SolveWarning("outliers", name, float(share), OUTLIER_SHARE, "of its corners", text)
         for n in np.flatnonzero(lost > IMAGE_OUTLIER_SHARE):
             image = solution.views.of_camera(name)[n].image
             text = f"{image} does not fit the others: look at its corners"
-            yield Warned("image_outliers", name, float(lost[n]), IMAGE_OUTLIER_SHARE, "of its corners left out", text)
+            yield SolveWarning(
+                "image_outliers", name, float(lost[n]), IMAGE_OUTLIER_SHARE, "of its corners left out", text
+            )
 
 
-def _of_discs(solution: Solution) -> Iterator[Warned]:
+def _of_discs(solution: Solution) -> Iterator[SolveWarning]:
     board = solution.views.board
     if board.pattern != "chessboard" and board.disc_m is None:
         text = (
             "the diameter of the discs is unknown: a tilted disc's image has its centroid beside its centre, which "
             "biases the focal length; find the discs again and say it (cairn calib corners --disc)"
         )
-        yield Warned("disc_diameter", "", 0, 1, "known diameters", text)
+        yield SolveWarning("disc_diameter", "", 0, 1, "known diameters", text)
 
 
-def _of_mode(mode: WeakMode) -> Iterator[Warned]:
+def _of_mode(mode: WeakMode) -> Iterator[SolveWarning]:
     if mode.sigma_px > MODE_PX:
         text = f"{mode.words} are open together: {mode.advice}"
-        yield Warned("weak_mode", mode.camera, mode.sigma_px, MODE_PX, "px where the gauge's pixels appear", text)
+        yield SolveWarning("weak_mode", mode.camera, mode.sigma_px, MODE_PX, "px where the gauge's pixels appear", text)
 
 
-def _of_turned(solution: Solution) -> Iterator[Warned]:
+def _of_turned(solution: Solution) -> Iterator[SolveWarning]:
     for name, frame in solution.turned:
         text = f"frame {frame} names the corners from the other end and was left out: look at its polarity"
-        yield Warned("reversed_order", name, 1, 0, "images", text)
+        yield SolveWarning("reversed_order", name, 1, 0, "images", text)
 
 
-def _of_influence(influences: Sequence[Influence]) -> Iterator[Warned]:
+def _of_influence(influences: Sequence[Influence]) -> Iterator[SolveWarning]:
     for each in influences:
         if each.sigmas > INFLUENCE_SIGMAS:
             text = (
@@ -193,13 +195,13 @@ def _of_influence(influences: Sequence[Influence]) -> Iterator[Warned]:
                 if not np.isfinite(each.moves_px)
                 else f"without frame {each.frame} points would move by {each.moves_px:.2f} px: much hangs on it alone"
             )
-            yield Warned("influence", each.camera, each.sigmas, INFLUENCE_SIGMAS, "sigma", text)
+            yield SolveWarning("influence", each.camera, each.sigmas, INFLUENCE_SIGMAS, "sigma", text)
 
 
-def _of_halves(halves: Halves | None) -> Iterator[Warned]:
+def _of_halves(halves: Halves | None) -> Iterator[SolveWarning]:
     if halves is None:
         text = "too few images for two halves to be compared: nothing shows whether the model is right"
-        yield Warned("halves", "", 0, 2, "halves", text)
+        yield SolveWarning("halves", "", 0, 2, "halves", text)
         return
     for each in halves.cameras:
         if each.ratio > HALVES_RATIO:
@@ -207,7 +209,7 @@ def _of_halves(halves: Halves | None) -> Iterator[Warned]:
                 f"two halves of the images differ by {each.difference_px:.2f} px where {each.predicted_px:.2f} px were "
                 "expected: model error (lens model, moved board, images not of one moment)"
             )
-            yield Warned("model_error", each.camera, each.ratio, HALVES_RATIO, "times the expected", text)
+            yield SolveWarning("model_error", each.camera, each.ratio, HALVES_RATIO, "times the expected", text)
     threshold = 1 + HALVES_CHI2_SIGMAS * float(np.sqrt(2 / halves.parameters))
     share = halves.chi2 / halves.parameters
     if share > threshold:
@@ -215,4 +217,4 @@ def _of_halves(halves: Halves | None) -> Iterator[Warned]:
             "two halves of the images differ by far more than their covariances allow: model error (lens model, moved "
             "board or camera, images not of one moment)"
         )
-        yield Warned("model_error", "", share, threshold, "chi2 a parameter", text)
+        yield SolveWarning("model_error", "", share, threshold, "chi2 a parameter", text)

@@ -15,12 +15,12 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from cairn_calib.exchange.placed_camera import KIND, Foreign, PlacedCamera, checked, not_held
+from cairn_calib.exchange.placed_camera import KIND, CameraFile, PlacedCamera, not_held, validate
 from cairn_calib.exchange.yaml_text import number, numbers, read_yaml
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_calib.rig.lens import Lens
-from cairn_calib.rig.poses import checked_transform, inverse
+from cairn_calib.rig.poses import check_transform, inverse
 from cairn_map.errors import BadInputError
 
 RADTAN_COEFFICIENTS = 4
@@ -44,7 +44,7 @@ class _CamchainCamera(BaseModel):
     T_cn_cnm1: tuple[Row, Row, Row, Row] | None = None
 
 
-def read_kalibr(text: str, *, name: str) -> Foreign:
+def read_kalibr(text: str, *, name: str) -> CameraFile:
     """The cameras of a camchain.
 
     Raises:
@@ -54,7 +54,7 @@ def read_kalibr(text: str, *, name: str) -> Foreign:
     keys = [f"cam{n}" for n in range(sum(CAMERA_KEY.fullmatch(key) is not None for key in document))]
     if not keys or any(key not in document for key in keys):
         raise BadInputError(KIND, f"{name} must have the cameras cam0, cam1, ... without a gap")
-    entries = [checked(_CamchainCamera, document[key], name=f"{name}: {key}") for key in keys]
+    entries = [validate(_CamchainCamera, document[key], name=f"{name}: {key}") for key in keys]
     topics = [TOPIC.fullmatch(entry.rostopic or "") for entry in entries]
     names = [topic.group(1) for topic in topics if topic is not None]
     if len(set(names)) < len(entries):
@@ -64,11 +64,11 @@ def read_kalibr(text: str, *, name: str) -> Foreign:
         if n:
             if entry.T_cn_cnm1 is None:
                 raise BadInputError(KIND, f"{name}: {key}.T_cn_cnm1 is missing: it says where the camera is")
-            T_rig_before = T_rig_before @ inverse(checked_transform(entry.T_cn_cnm1, name=f"{name}: {key}.T_cn_cnm1"))
+            T_rig_before = T_rig_before @ inverse(check_transform(entry.T_cn_cnm1, name=f"{name}: {key}.T_cn_cnm1"))
         cameras.append(PlacedCamera(names[n], _lens_of(entry, name=f"{name}: {key}"), T_rig_before))
     left = [f"{key}.{extra}" for key, entry in zip(keys, entries, strict=True) for extra in entry.model_extra or {}]
     left += [key for key in document if key not in keys]
-    return Foreign(tuple(cameras), tuple(field for field in left if not field.endswith(".cam_overlaps")))
+    return CameraFile(tuple(cameras), tuple(field for field in left if not field.endswith(".cam_overlaps")))
 
 
 def write_kalibr(cameras: Sequence[PlacedCamera]) -> str:
@@ -118,7 +118,7 @@ def _lens_of(entry: _CamchainCamera, *, name: str) -> Lens:
         "centre_px": entry.intrinsics[2:],
         "distortion": given if len(given) == RADTAN_COEFFICIENTS else (0.0,) * 4,
     }
-    return checked(FisheyeCamera if entry.distortion_model == "equidistant" else Camera, numbers_of_lens, name=name)
+    return validate(FisheyeCamera if entry.distortion_model == "equidistant" else Camera, numbers_of_lens, name=name)
 
 
 def _distortion_of(each: PlacedCamera) -> tuple[str, tuple[float, ...]]:

@@ -18,11 +18,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from cairn_calib.exchange.placed_camera import (
     KIND,
     TEXT_BYTES_MAX,
-    Foreign,
+    CameraFile,
     PlacedCamera,
-    checked,
     not_held,
     only_camera,
+    validate,
 )
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.pose_vectors import transform_from_vector, vector_from_transform
@@ -52,7 +52,7 @@ class _Cameramodel(BaseModel):
     imagersize: tuple[int, int]
 
 
-def read_mrcal(text: str, *, name: str) -> Foreign:
+def read_mrcal(text: str, *, name: str) -> CameraFile:
     """The camera of a file, named as the file is.
 
     Raises:
@@ -64,7 +64,7 @@ def read_mrcal(text: str, *, name: str) -> Foreign:
         document = ast.literal_eval(text)
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError) as exc:
         raise BadInputError(KIND, f"{name} is no .cameramodel: not a Python dictionary") from exc
-    found = checked(_Cameramodel, document, name=name)
+    found = validate(_Cameramodel, document, name=name)
     if found.lensmodel not in COEFFICIENTS:
         raise BadInputError(
             KIND,
@@ -85,8 +85,8 @@ def read_mrcal(text: str, *, name: str) -> Foreign:
         "distortion": distortion[:HELD] or (0.0,) * 5,
     }
     T_rig_camera = inverse(transform_from_vector(found.extrinsics))
-    camera = PlacedCamera(PurePath(name).stem, checked(Camera, lens, name=name), T_rig_camera)
-    return Foreign((camera,), tuple(found.model_extra or ()))
+    camera = PlacedCamera(PurePath(name).stem, validate(Camera, lens, name=name), T_rig_camera)
+    return CameraFile((camera,), tuple(found.model_extra or ()))
 
 
 def write_mrcal(cameras: Sequence[PlacedCamera]) -> str:

@@ -2,7 +2,7 @@
 
     rig.json  <->  (PlacedCamera, ...)  <->  Kalibr, OpenCV, ROS, mrcal           a module each
 
-Each format's module reads text into `Foreign` and writes a sequence of placed cameras. A number that changes where a
+Each format's module reads text into `CameraFile` and writes a sequence of placed cameras. A number that changes where a
 pixel looks and has no counterpart on the other side is an error that names it; what a file says besides, which no rig
 holds, is listed, so that whoever converts can tell the user.
 """
@@ -41,14 +41,14 @@ class PlacedCamera:
 
 
 @dataclass(frozen=True, slots=True)
-class Foreign:
+class CameraFile:
     """The cameras of a file, and the fields of it that a rig does not hold."""
 
     cameras: tuple[PlacedCamera, ...]
     left_out: tuple[str, ...] = ()
 
 
-def checked(model: type[Model], document: object, *, name: str) -> Model:
+def validate(model: type[Model], document: object, *, name: str) -> Model:
     """What a file says, as a model.
 
     Raises:

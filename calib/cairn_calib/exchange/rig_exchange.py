@@ -13,13 +13,12 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
+from cairn_calib.exchange.camera_matrix_files import read_opencv, read_ros, write_opencv, write_ros
 from cairn_calib.exchange.kalibr_camchain import read_kalibr, write_kalibr
 from cairn_calib.exchange.mrcal_cameramodel import read_mrcal, write_mrcal
-from cairn_calib.exchange.opencv_yaml import read_opencv, write_opencv
-from cairn_calib.exchange.placed_camera import KIND, TEXT_BYTES_MAX, Foreign, PlacedCamera
-from cairn_calib.exchange.ros_camera_info import read_ros, write_ros
+from cairn_calib.exchange.placed_camera import KIND, TEXT_BYTES_MAX, CameraFile, PlacedCamera
 from cairn_calib.rig.lens import Lens
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_map.errors import BadInputError, first_error
 
 RIG = "rig"
@@ -28,19 +27,19 @@ DROPPABLE = ("T_rig_camera", "sensing", "calibration_sigma_px", "radiometry", "r
 
 
 @dataclass(frozen=True, slots=True)
-class Format:
+class ExchangeFormat:
     """How a format's text is read and written, and whether it says where a camera is."""
 
-    read: Callable[..., Foreign]
+    read: Callable[..., CameraFile]
     write: Callable[[Sequence[PlacedCamera]], str]
     holds_place: bool
 
 
 FORMATS = {
-    "kalibr": Format(read_kalibr, write_kalibr, holds_place=True),
-    "opencv": Format(read_opencv, write_opencv, holds_place=True),
-    "ros": Format(read_ros, write_ros, holds_place=False),
-    "mrcal": Format(read_mrcal, write_mrcal, holds_place=True),
+    "kalibr": ExchangeFormat(read_kalibr, write_kalibr, holds_place=True),
+    "opencv": ExchangeFormat(read_opencv, write_opencv, holds_place=True),
+    "ros": ExchangeFormat(read_ros, write_ros, holds_place=False),
+    "mrcal": ExchangeFormat(read_mrcal, write_mrcal, holds_place=True),
 }
 
 
@@ -83,7 +82,7 @@ def read_text(path: Path) -> str:
         raise BadInputError(KIND, f"{path} is no text: {exc.reason} at byte {exc.start}") from exc
 
 
-def cameras_of_rig(rig: Rig, *, format_name: str, drop: Sequence[str] = ()) -> Foreign:
+def cameras_of_rig(rig: Rig, *, format_name: str, drop: Sequence[str] = ()) -> CameraFile:
     """The cameras of a rig for a format; what it cannot say must be dropped.
 
     Raises:
@@ -110,10 +109,10 @@ def cameras_of_rig(rig: Rig, *, format_name: str, drop: Sequence[str] = ()) -> F
         raise BadInputError(
             KIND, f"{format_name} cannot say {', '.join(refused)}; to leave that out, add --drop {','.join(fields)}"
         )
-    return Foreign(tuple(placed), (*said, *(f"cameras.{name}.spectrum" for name in rig.cameras)))
+    return CameraFile(tuple(placed), (*said, *(f"cameras.{name}.spectrum" for name in rig.cameras)))
 
 
-def chosen(cameras: Sequence[PlacedCamera], names: Sequence[str]) -> tuple[PlacedCamera, ...]:
+def choose_cameras(cameras: Sequence[PlacedCamera], names: Sequence[str]) -> tuple[PlacedCamera, ...]:
     """The cameras with these names, in this order; all of them where no name is given.
 
     Raises:
@@ -149,7 +148,7 @@ def rig_of_cameras(cameras: Sequence[PlacedCamera], *, name: str, spectra: Mappi
     for each in cameras:
         if each.T_rig_camera is None:
             raise BadInputError(KIND, f"where {each.name} is on the rig is not in the file (T_rig_camera)")
-        parts[each.name] = mounted(spectra[each.name], each.camera, each.T_rig_camera)
+        parts[each.name] = mount_camera(spectra[each.name], each.camera, each.T_rig_camera)
     try:
         return Rig(name=name, cameras=parts)
     except ValidationError as exc:

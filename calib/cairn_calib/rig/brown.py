@@ -1,7 +1,7 @@
 r"""Brown's distortion of the normalised image plane, and its inverse by Newton's method.
 
-    (x, y)  --distorted-->  (x', y')      five coefficients k1, k2, p1, p2, k3, in OpenCV's order,
-    (x, y) <--undistorted-- (x', y')      or eight, with the denominator's k4, k5, k6: the rational model
+    (x, y)  --distort-->  (x', y')      five coefficients k1, k2, p1, p2, k3, in OpenCV's order,
+    (x, y) <--undistort-- (x', y')      or eight, with the denominator's k4, k5, k6: the rational model
 
                                                     1 + k1 r^2 + k2 r^4 + k3 r^6
       r'   __              The radial part  r' = r ------------------------------  rises up to a turning point and
@@ -52,7 +52,7 @@ PULL_BACK = 0.98
 """Of the radius of a guess that went over the fold."""
 
 
-def distorted(plane: Floats, coefficients: Coefficients) -> Floats:
+def distort(plane: Floats, coefficients: Coefficients) -> Floats:
     """(..., 2) normalised image plane without distortion to the plane with it; NaN beyond the fold."""
     if not any(coefficients):
         return plane
@@ -64,8 +64,8 @@ def distorted(plane: Floats, coefficients: Coefficients) -> Floats:
     return np.where(unfolded[..., None], np.stack(_brown(x, y, coefficients), axis=-1), np.nan)
 
 
-def undistorted(plane: Floats, coefficients: Coefficients) -> Floats:
-    """The mirror of `distorted`: (..., 2) the plane without distortion; NaN where no point before the fold goes."""
+def undistort(plane: Floats, coefficients: Coefficients) -> Floats:
+    """The mirror of `distort`: (..., 2) the plane without distortion; NaN where no point before the fold goes."""
     if not any(coefficients):
         return plane
     flat = plane.reshape(-1, 2)

@@ -11,7 +11,7 @@ cameras with lenses share, derivatives above all, is in `lens.py`.
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.rig.brown import Coefficients, coefficient_gradients, distorted, jacobian, undistorted
+from cairn_calib.rig.brown import Coefficients, coefficient_gradients, distort, jacobian, undistort
 from cairn_calib.rig.lens import Lens
 from cairn_map.arrays import Floats
 
@@ -31,7 +31,7 @@ class Camera(Lens, frozen=True):
     def plane(self, points: Floats) -> Floats:
         """(..., 2) of (..., 3) points; NaN at or behind the camera's plane, and beyond the fold."""
         z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
-        return distorted(points[..., :2] / z[..., None], self.distortion)
+        return distort(points[..., :2] / z[..., None], self.distortion)
 
     def plane_gradients(self, points: Floats) -> tuple[Floats, Floats]:
         """(..., 2, 3) by the point and (..., 2, 5 or 8) by the coefficients; NaN at or behind the camera's plane."""
@@ -53,7 +53,7 @@ class Camera(Lens, frozen=True):
             (..., 3) float64 unit vectors, camera frame; NaN for pixels that the distortion never reaches.
         """
         plane = (np.asarray(pixels, dtype=np.float64) - np.array(self.centre_px)) / np.array(self.focal_px)
-        plane = undistorted(plane, self.distortion)
+        plane = undistort(plane, self.distortion)
         rays = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
         unit: Floats = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
         return unit

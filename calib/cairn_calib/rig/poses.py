@@ -2,7 +2,7 @@
 
     p_map = T_map_rig @ T_rig_tof @ p_tof          neighbouring letters cancel
 
-A pose is checked once, where it enters (`checked_transform`), and trusted afterwards.
+A pose is checked once, where it enters (`check_transform`), and trusted afterwards.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ ROTATION_TOLERANCE = 1e-4
 """Largest deviation of R^T R from the identity that is taken for rounding in a text file."""
 
 
-def checked_transform(values: npt.ArrayLike, *, name: str = "transform") -> Transform:
+def check_transform(values: npt.ArrayLike, *, name: str = "transform") -> Transform:
     """A (4, 4) float64 rigid transform, its rotation made orthonormal to float precision.
 
     Raises:

@@ -13,6 +13,7 @@ in the document either: `sensing` and `range_bias` of a range camera, `calibrati
 import hashlib
 from enum import StrEnum
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -25,17 +26,53 @@ from cairn_calib.rig.calibration import Calibration
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_calib.rig.lidar import SpinningLidar
-from cairn_calib.rig.poses import Transform, checked_transform
+from cairn_calib.rig.poses import Transform, check_transform
 from cairn_calib.rig.radiometry import Radiometry
 from cairn_calib.rig.range_bias import RangeBias, Real
 from cairn_calib.rig.raster import Raster
-from cairn_calib.rig.sensing import LIDAR, TIME_OF_FLIGHT, RangeSensing
 from cairn_map.errors import BadInputError, first_error
+
+Node = tuple[
+    Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)],
+    Annotated[float, Field(gt=0, le=1e3, allow_inf_nan=False)],
+]
 
 RIG_BYTES_MAX = 4 << 20
 """A covariance of all parameters is 0.9 MB, a map of 640 x 480 pixels' offsets as much."""
 VERSION = 1
 Row = tuple[float, float, float, float]
+
+
+class RangeSensing(BaseModel):
+    """What a range camera's manufacturer, or a measurement, says of it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    sigma_m: Annotated[tuple[Node, ...], Field(min_length=1, max_length=64)] | None = None
+    """Range and standard deviation there, metres, by rising range: linear between two, constant beyond the ends."""
+    saturated_amplitude: Annotated[int, Field(ge=1, le=65535)] | None = None
+    """From this amplitude on too much light returned, and the range is worth nothing."""
+    no_return_clears_m: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)] | None = None
+    """A beam to which nothing comes back has met nothing so far. Only of a sensor whose every surface within this
+    range returns something: to a time-of-flight camera black, tilted or mirroring things return nothing."""
+
+    @model_validator(mode="after")
+    def _nodes_rise(self) -> Self:
+        ranges_m = [range_m for range_m, _ in self.sigma_m or ()]
+        if any(b <= a for a, b in pairwise(ranges_m)):
+            raise ValueError(f"the ranges of sigma_m must rise, got {ranges_m}")
+        return self
+
+    def sigma_at(self, range_m: npt.NDArray[np.floating], *, usual: "RangeSensing") -> npt.NDArray[np.float64]:
+        """(...) standard deviation at ranges, metres; by `usual` where this one does not say; NaN for NaN."""
+        nodes = np.array(self.sigma_m or usual.sigma_m or ((0.0, 0.0),), dtype=np.float64)
+        return np.asarray(np.interp(range_m, nodes[:, 0], nodes[:, 1]))
+
+
+TIME_OF_FLIGHT = RangeSensing(sigma_m=((0.0, 0.005), (3.0, 0.01), (6.0, 0.03)))
+"""5 mm at best, 1 cm at 3 m from a grey surface, growing with the square of the range: MESA SR4000 and its kind."""
+LIDAR = RangeSensing(sigma_m=((0.0, 0.02),))
+"""2 cm at every range, as data sheets of spinning lidars say."""
 
 
 class Spectrum(StrEnum):
@@ -88,7 +125,7 @@ class MountedCamera(BaseModel, frozen=True):
     @model_validator(mode="after")
     def _rigid(self) -> Self:
         try:
-            checked_transform(self.T_rig_camera, name="T_rig_camera")
+            check_transform(self.T_rig_camera, name="T_rig_camera")
         except BadInputError as exc:
             raise ValueError(exc.message) from exc
         return self
@@ -196,7 +233,7 @@ class MountedCamera(BaseModel, frozen=True):
 @lru_cache(maxsize=256)
 def _transform_of(rows: tuple[Row, Row, Row, Row]) -> Transform:
     # Kept: to make a rotation orthonormal takes 0.2 ms, as long as all the rest that is asked of a rig for a scan.
-    T = checked_transform(rows, name="T_rig_camera")
+    T = check_transform(rows, name="T_rig_camera")
     T.setflags(write=False)
     return T
 
@@ -252,7 +289,7 @@ class Rig(BaseModel):
         return hashlib.sha256(self.to_json()).hexdigest()
 
 
-def mounted(spectrum: Spectrum, camera: Raster, T_rig_camera: Transform) -> MountedCamera:
+def mount_camera(spectrum: Spectrum, camera: Raster, T_rig_camera: Transform) -> MountedCamera:
     """A camera at a place given as an array."""
     rows = [tuple(float(v) for v in row) for row in np.asarray(T_rig_camera)]
     return MountedCamera.model_validate({"spectrum": spectrum, "camera": camera, "T_rig_camera": rows})

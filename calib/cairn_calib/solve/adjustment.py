@@ -14,10 +14,10 @@ import numpy as np
 
 from cairn_calib.board.board import Board
 from cairn_calib.solve.corner_residuals import CornerData, corner_block
-from cairn_calib.solve.normal_equations import Block, Loss, NormalEquations, Uncertainty, gathered, uncertainty
+from cairn_calib.solve.normal_equations import Block, Loss, NormalEquations, Uncertainty, sum_blocks, uncertainty
 from cairn_calib.solve.range_residuals import RangeData, range_block
-from cairn_calib.solve.rig_state import Layout, RigState, moved, value_of, warp_shape
-from cairn_calib.solve.solve_plan import Noise, Prior
+from cairn_calib.solve.rig_state import ParameterLayout, RigState, shared_values, step_state, warp_shape
+from cairn_calib.solve.solve_plan import NoisePlan, Prior
 from cairn_map.arrays import Flags, Floats
 
 STEPS_MAX = 100
@@ -58,11 +58,11 @@ class Sensor:
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class AdjustmentProblem:
     """All that is to be met."""
 
     board: Board
-    layout: Layout
+    layout: ParameterLayout
     sensors: tuple[Sensor, ...]
     priors: tuple[Prior, ...]
 
@@ -80,9 +80,9 @@ class Problem:
 
     def normal(self, state: RigState, blocks: list[Block]) -> NormalEquations:
         """The sum of all, and of the priors."""
-        normal = gathered(blocks, self.layout.size, len(state.T_rig_board))
+        normal = sum_blocks(blocks, self.layout.size, len(state.T_rig_board))
         A, a, cost = normal.A.copy(), normal.a.copy(), normal.cost
-        values = value_of(state, self.layout)
+        values = shared_values(state, self.layout)
         for prior in self.priors:
             row = self.prior_row(prior)
             miss = float(row @ values - prior.value) / prior.sigma
@@ -102,17 +102,17 @@ class Problem:
 
 
 @dataclass(frozen=True, slots=True)
-class Adjusted:
+class Adjustment:
     """Where it ended."""
 
-    problem: Problem
+    problem: AdjustmentProblem
     state: RigState
     blocks: list[Block]
     normal: NormalEquations
     steps: int
 
 
-def adjust(problem: Problem, state: RigState, noise: Noise) -> Adjusted:
+def adjust(problem: AdjustmentProblem, state: RigState, noise: NoisePlan) -> Adjustment:
     """The minimum, with outliers left out and the noise of each sensor estimated as `noise` says.
 
     Raises:
@@ -137,7 +137,7 @@ def adjust(problem: Problem, state: RigState, noise: Noise) -> Adjusted:
     return descend(result.problem, result.state, damping=WARM)
 
 
-def resumed(problem: Problem, state: RigState, noise: Noise) -> Adjusted:
+def resume(problem: AdjustmentProblem, state: RigState, noise: NoisePlan) -> Adjustment:
     """The minimum of a problem with more parameters than the one whose outliers, noise and state it begins with.
 
     Raises:
@@ -150,13 +150,13 @@ def resumed(problem: Problem, state: RigState, noise: Noise) -> Adjusted:
 
 
 def descend(
-    problem: Problem,
+    problem: AdjustmentProblem,
     state: RigState,
     *,
     huber_sigmas: float = np.inf,
     settled: float = SETTLED,
     damping: float = DAMPING,
-) -> Adjusted:
+) -> Adjustment:
     """The minimum for known noise and outliers, to a fall of the cost of `settled`.
 
     Raises:
@@ -169,8 +169,8 @@ def descend(
     for step in range(STEPS_MAX):
         shared, boards, expected = normal.step(damping)
         if expected < settled:
-            return Adjusted(problem, state, blocks, normal, step)
-        trial = moved(state, problem.layout, shared, boards)
+            return Adjustment(problem, state, blocks, normal, step)
+        trial = step_state(state, problem.layout, shared, boards)
         trial_blocks = problem.blocks(trial, huber_sigmas=huber_sigmas)
         trial_normal = problem.normal(trial, trial_blocks)
         if trial_normal.cost < normal.cost:
@@ -178,10 +178,10 @@ def descend(
             damping = max(damping / 10, DAMPING_MIN)
         elif damping >= DAMPING_MAX or trial_normal.cost - normal.cost < ROUNDING * normal.cost:
             # Rounding is all that is left to gain.
-            return Adjusted(problem, state, blocks, normal, step)
+            return Adjustment(problem, state, blocks, normal, step)
         else:
             damping *= 10
-    return Adjusted(problem, state, blocks, normal, STEPS_MAX)
+    return Adjustment(problem, state, blocks, normal, STEPS_MAX)
 
 
 def redundancies(blocks: list[Block], known: Uncertainty, sensors: tuple[Sensor, ...]) -> list[float]:
@@ -197,7 +197,7 @@ def _culled(sensor: Sensor, block: Block, sigmas: float) -> Sensor:
     return replace(sensor, kept=sensor.there & (squares <= sigmas**2))
 
 
-def _scaled(result: Adjusted) -> tuple[Sensor, ...]:
+def _scaled(result: Adjustment) -> tuple[Sensor, ...]:
     """Sensors whose noise is what their residuals show, given how many of them are free."""
     sensors = result.problem.sensors
     free = redundancies(result.blocks, uncertainty(result.normal), sensors)
@@ -208,7 +208,7 @@ def _scaled(result: Adjusted) -> tuple[Sensor, ...]:
     return tuple(scaled)
 
 
-def _median_scaled(problem: Problem, state: RigState) -> Problem:
+def _median_scaled(problem: AdjustmentProblem, state: RigState) -> AdjustmentProblem:
     scaled = []
     for sensor, block in zip(problem.sensors, problem.blocks(state), strict=True):
         squares = np.sum(block.residuals**2, axis=-1)[sensor.kept]

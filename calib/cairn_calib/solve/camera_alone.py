@@ -12,12 +12,12 @@ from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_calib.rig.lens import Lens
 from cairn_calib.rig.poses import Transform
-from cairn_calib.solve.adjustment import Problem, Sensor, adjust
+from cairn_calib.solve.adjustment import AdjustmentProblem, Sensor, adjust
 from cairn_calib.solve.board_views import BoardViews
 from cairn_calib.solve.corner_residuals import corner_data
 from cairn_calib.solve.priors import usual_priors
-from cairn_calib.solve.rig_state import RigState, layout_of
-from cairn_calib.solve.solve_plan import CameraPlan, Noise, SolvePlan
+from cairn_calib.solve.rig_state import RigState, parameter_layout
+from cairn_calib.solve.solve_plan import CameraPlan, NoisePlan, SolvePlan
 from cairn_calib.solve.zhang import first_camera_matrix, homography_of, pose_from_homography
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
@@ -25,7 +25,7 @@ from cairn_map.errors import BadInputError
 VIEWS_MIN = 2
 TILT_MIN_DEG = 3.0
 """Between the boards of a camera's views: under this they are as good as parallel."""
-FIRST = Noise(huber_sigmas=1.5, cull_sigmas=4.0, rounds=1)
+FIRST = NoisePlan(huber_sigmas=1.5, cull_sigmas=4.0, rounds=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +62,8 @@ def camera_alone(name: str, views: BoardViews, plan: SolvePlan) -> CameraAlone:
     )
     priors = usual_priors(own, {name: lens}, {name: len(seen.views)}, seen.board, ranges=None)
     data = corner_data(0, seen.of_camera(name), frames)
-    layout = layout_of(own, {name: lens}, [])
-    problem = Problem(seen.board, layout, (Sensor(data, 1.0, data.seen),), priors)
+    layout = parameter_layout(own, {name: lens}, [])
+    problem = AdjustmentProblem(seen.board, layout, (Sensor(data, 1.0, data.seen),), priors)
     try:
         done = adjust(problem, state, FIRST)
     except np.linalg.LinAlgError as exc:

@@ -6,7 +6,7 @@
 A board's point moves with its pose by dt + dr x (R p); the rig's camera moves the other way. So one matrix, pixels by
 a point of the rig, makes all columns.
 
-Of a disc, the predicted pixel is the centroid of its image (disc_shift.py). How that shift from the centre's image
+Of a disc, the predicted pixel is the centroid of its image (`disc_shift`). How that shift from the centre's image
 changes with the parameters is left out of the derivatives: it is a few thousandths of how the centre's image changes,
 and steps converge to the same place but for such a share of a standard deviation.
 """
@@ -16,11 +16,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cairn_calib.rig.lens import Lens
 from cairn_calib.solve.board_views import BoardView
-from cairn_calib.solve.disc_shift import disc_shift
 from cairn_calib.solve.normal_equations import Block, Indices, Loss
-from cairn_calib.solve.rig_state import Layout, RigState
+from cairn_calib.solve.rig_state import ParameterLayout, RigState
 from cairn_map.arrays import Flags, Floats
+
+RIM_POINTS = 48
+"""Of a regular polygon, whose centroid is the disc's; only its foreshortening and bending err, by 1 / 48^2 of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +92,7 @@ def _disc_shift(data: CornerData, state: RigState, p_camera: Floats) -> Floats:
 
 
 def corner_derivatives(
-    data: CornerData, state: RigState, layout: Layout, lattice: Floats, shape: Floats
+    data: CornerData, state: RigState, layout: ParameterLayout, lattice: Floats, shape: Floats
 ) -> tuple[Floats, Floats, Indices]:
     """Misses (V, N, 2) as above, their derivatives (V, N, 2, K + 6), and (K,) where the shared columns stand."""
     c = data.camera
@@ -123,7 +126,7 @@ def corner_derivatives(
 def corner_block(
     data: CornerData,
     state: RigState,
-    layout: Layout,
+    layout: ParameterLayout,
     board: tuple[Floats, Floats],
     loss: Loss,
 ) -> Block:
@@ -155,3 +158,25 @@ def _crossed_into(out: Floats, G: Floats, points: Floats) -> None:
     out[..., 0] = G[..., 1] * pz - G[..., 2] * py
     out[..., 1] = G[..., 2] * px - G[..., 0] * pz
     out[..., 2] = G[..., 0] * py - G[..., 1] * px
+
+
+def disc_shift(lens: Lens, p_camera: Floats, R_camera_board: Floats, radius_m: float) -> Floats:
+    """(V, N, 2) pixels from the images of centres to the centroids of the discs' images.
+
+    Args:
+        lens: the camera.
+        p_camera: (V, N, 3) centres, metres.
+        R_camera_board: (V, 3, 3) of the boards they lie on, whose z is the discs' axis.
+        radius_m: of the discs.
+
+    Returns:
+        Centroid minus centre; NaN where the lens cannot see all of a disc.
+    """
+    angle = np.linspace(0, 2 * np.pi, RIM_POINTS, endpoint=False)
+    rim = radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1) @ np.swapaxes(R_camera_board[..., :2], 1, 2)
+    # About the centre's image, so that nothing large cancels.
+    at = lens.project(p_camera[:, :, None] + rim[:, None]) - lens.project(p_camera)[:, :, None]
+    after = np.roll(at, -1, axis=2)
+    cross = at[..., 0] * after[..., 1] - after[..., 0] * at[..., 1]
+    weighted = ((at + after) * cross[..., None]).sum(axis=2)
+    return np.asarray(weighted / (3 * cross.sum(axis=2)[..., None]))

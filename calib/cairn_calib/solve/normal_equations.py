@@ -101,7 +101,7 @@ class NormalEquations:
             numpy.linalg.LinAlgError: it is singular.
         """
         S, s, by_shared, alone = self.reduced(damping)
-        shared = solved_scaled(S, s)
+        shared = solve_scaled(S, s)
         boards = alone - by_shared @ shared
         # 2 g.d - d.H.d with (H + damping D) d = g.
         held = shared @ (np.diag(self.A) * shared) + np.sum(np.einsum("fkk->fk", self.C) * boards**2)
@@ -109,7 +109,7 @@ class NormalEquations:
         return shared, boards, expected
 
 
-def gathered(blocks: list[Block], size: int, frame_count: int) -> NormalEquations:
+def sum_blocks(blocks: list[Block], size: int, frame_count: int) -> NormalEquations:
     """The sum of blocks, for P = `size` shared parameters and F = `frame_count` boards."""
     A, a = np.zeros((size, size)), np.zeros(size)
     B, C, b = np.zeros((frame_count, size, 6)), np.zeros((frame_count, 6, 6)), np.zeros((frame_count, 6))
@@ -123,7 +123,7 @@ def gathered(blocks: list[Block], size: int, frame_count: int) -> NormalEquation
     return NormalEquations(A, B, C, a, b, sum(block.cost for block in blocks))
 
 
-def solved_scaled(S: Floats, right: Floats) -> Floats:
+def solve_scaled(S: Floats, right: Floats) -> Floats:
     """S^-1 right, with S scaled to a diagonal of 1: pixels, metres and coefficients differ by a million.
 
     Raises:
@@ -175,6 +175,6 @@ def uncertainty(normal: NormalEquations) -> Uncertainty:
         numpy.linalg.LinAlgError: something is not determined.
     """
     S, _, by_shared, _ = normal.reduced()
-    shared = solved_scaled(S, np.eye(len(S)))
+    shared = solve_scaled(S, np.eye(len(S)))
     own = np.asarray(np.linalg.inv(normal.C), np.float64)
     return Uncertainty((shared + shared.T) / 2, by_shared, own)

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from cairn_calib.rig.pixel_offsets import PixelOffsets, pixel_offsets
 from cairn_calib.rig.range_terms import NODE_SIGMA_M
-from cairn_calib.solve.adjustment import Adjusted
+from cairn_calib.solve.adjustment import Adjustment
 from cairn_calib.solve.board_views import BoardViews
 from cairn_calib.solve.range_nodes import image_nodes
 from cairn_calib.solve.range_residuals import RangeData, plane_ranges, range_data
@@ -40,7 +40,7 @@ BLOCK_SHARE = 0.25
 
 
 @dataclass(frozen=True, slots=True)
-class Pattern:
+class PixelPattern:
     """What was found of the pixels' own offsets."""
 
     pairs: int
@@ -62,7 +62,7 @@ class Pattern:
         return float(np.sqrt(FOUND_SIGMAS * self.variance_sigma_m2))
 
 
-def pixel_pattern(views: BoardViews, done: Adjusted, covariance: Floats) -> Pattern | None:
+def pixel_pattern(views: BoardViews, done: Adjustment, covariance: Floats) -> PixelPattern | None:
     """The pixels' own offsets, by what a solve left, and those of its nodes; None without range images in it.
 
     `covariance` is (P, P), of the solve's shared parameters.
@@ -117,7 +117,7 @@ def _sound(data: RangeData, left_m: Floats, width: int, stray_m: float) -> _Soun
     return _Sound(views[kept], pixels[kept], left[kept])
 
 
-def _pattern_of(sound: _Sound, shape: tuple[int, int]) -> Pattern:
+def _pattern_of(sound: _Sound, shape: tuple[int, int]) -> PixelPattern:
     size, pixels, left_m = shape[0] * shape[1], sound.pixels, sound.left_m
     counts = np.bincount(pixels, minlength=size)
     sums, squares = (
@@ -129,7 +129,7 @@ def _pattern_of(sound: _Sound, shape: tuple[int, int]) -> Pattern:
     smooth_m = _smooth(sound, usual, shape, variance)
     seen_share = float(np.mean(counts > 0))
     if not variance > FOUND_SIGMAS * by_chance:
-        return Pattern(pairs, variance, by_chance, seen_share, smooth_m, None)
+        return PixelPattern(pairs, variance, by_chance, seen_share, smooth_m, None)
     noise = max(float(np.sum(squares[usual]) / np.sum(counts[usual])) - variance, 1e-3 * total)
     offset_m = sums / (counts + noise / variance)
     sigma_m = np.sqrt(variance * noise / (counts * variance + noise))
@@ -140,10 +140,10 @@ def _pattern_of(sound: _Sound, shape: tuple[int, int]) -> Pattern:
         pattern_sigma_m=float(np.sqrt(variance)),
         noise_sigma_m=float(np.sqrt(noise)),
     )
-    return Pattern(pairs, variance, by_chance, seen_share, smooth_m, offsets)
+    return PixelPattern(pairs, variance, by_chance, seen_share, smooth_m, offsets)
 
 
-def _with_nodes(found: Pattern, sound: _Sound, smooth_m: Floats, variance_m2: Floats) -> PixelOffsets:
+def _with_nodes(found: PixelPattern, sound: _Sound, smooth_m: Floats, variance_m2: Floats) -> PixelOffsets:
     """The map with (H, W) metres and variances of the nodes, besides what is the pixels' own."""
     fine = found.offsets
     counts = np.bincount(sound.pixels, minlength=smooth_m.size).reshape(smooth_m.shape)

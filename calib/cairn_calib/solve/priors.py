@@ -48,19 +48,19 @@ def usual_priors(
             if view_counts[name] < FEW_VIEWS:
                 priors += _of_few_views(name, lenses[name])
                 known = {each: known.get(each, FEW_SIGMAS.get(each)) for each in camera.coefficients}
-            priors += [one(name, each, 0.0, sigma) for each, sigma in known.items() if sigma is not None]
+            priors += [single_prior(name, each, 0.0, sigma) for each, sigma in known.items() if sigma is not None]
         if plan.warp:
             side = float(np.ptp(board.points(), axis=0).max())
-            priors += [one(SHARED, axis, 0.0, WARP_SIGMA * side) for axis in WARP]
+            priors += [single_prior(SHARED, axis, 0.0, WARP_SIGMA * side) for axis in WARP]
     if plan.pitch_sigma > 0:
-        priors.append(one(SHARED, SCALE, 1.0, plan.pitch_sigma))
+        priors.append(single_prior(SHARED, SCALE, 1.0, plan.pitch_sigma))
     if ranges is not None:
         owner, terms = ranges
-        priors += [one(owner, name, 0.0, sigma) for name, sigma in zip(terms.names, terms.sigmas, strict=True)]
+        priors += [single_prior(owner, name, 0.0, sigma) for name, sigma in zip(terms.names, terms.sigmas, strict=True)]
     return (*priors, *plan.priors)
 
 
-def one(owner: str, name: str, value: float, sigma: float) -> Prior:
+def single_prior(owner: str, name: str, value: float, sigma: float) -> Prior:
     """A prior of a single number."""
     return Prior(((owner, name, 1.0),), value, sigma)
 
@@ -81,4 +81,4 @@ def _of_few_views(name: str, lens: Lens) -> list[Prior]:
     cx, cy = (lens.width - 1) / 2, (lens.height - 1) / 2
     sigma = CENTRE_SIGMA * lens.width
     aspect = Prior(((name, "fx", 1.0), (name, "fy", -1.0)), 0.0, ASPECT_SIGMA * lens.focal_px[0])
-    return [one(name, "cx", cx, sigma), one(name, "cy", cy, sigma), aspect]
+    return [single_prior(name, "cx", cx, sigma), single_prior(name, "cy", cy, sigma), aspect]

@@ -73,7 +73,7 @@ def range_spans(data: RangeData, state: RigState, board: Board) -> RangeSpans:
     return RangeSpans(float(near), float(far), (float(low), float(middle), float(high)))
 
 
-def chosen_terms(spans: RangeSpans, modulation_hz: float | None) -> RangeTerms:
+def choose_terms(spans: RangeSpans, modulation_hz: float | None) -> RangeTerms:
     """The shapes that they determine."""
     waves = () if modulation_hz is None else HARMONICS
     harmonics = tuple(k for k in waves if spans.period_share(modulation_hz or 0.0, k) >= PERIOD_SHARE)

@@ -19,7 +19,7 @@ from cairn_calib.rig.raster import Raster
 from cairn_calib.solve.board_views import RangeView
 from cairn_calib.solve.normal_equations import Block, Indices, Loss
 from cairn_calib.solve.range_nodes import PixelNodes, pixel_nodes
-from cairn_calib.solve.rig_state import Layout, RigState, warp_at_places
+from cairn_calib.solve.rig_state import ParameterLayout, RigState, warp_at_places
 from cairn_map.arrays import Flags, Floats
 
 PIXELS_MAX = 400
@@ -118,7 +118,7 @@ def plane_ranges(data: RangeData, state: RigState, board: Board) -> Floats:
     return _met(data, state, board, state.lenses[data.camera].unproject(data.pixels)).range_m
 
 
-def range_block(data: RangeData, state: RigState, layout: Layout, board: Board, loss: Loss) -> Block:
+def range_block(data: RangeData, state: RigState, layout: ParameterLayout, board: Board, loss: Loss) -> Block:
     """The camera's share; its noise is `sigma_m` times the loss's scale."""
     c = data.camera
     seen = state.lenses[c].unprojection(data.pixels)

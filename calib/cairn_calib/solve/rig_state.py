@@ -44,7 +44,7 @@ class RigState:
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class ParameterLayout:
     """Where each parameter stands in the shared part of a step."""
 
     names: tuple[tuple[str, str], ...]
@@ -70,7 +70,9 @@ class Layout:
         return self.names.index(wanted) if wanted in self.names else None
 
 
-def layout_of(plan: SolvePlan, lenses: Mapping[str, Lens], bias_names: Sequence[tuple[str, str]]) -> Layout:
+def parameter_layout(
+    plan: SolvePlan, lenses: Mapping[str, Lens], bias_names: Sequence[tuple[str, str]]
+) -> ParameterLayout:
     """The places of all free parameters; `bias_names` are owner and name of the range bias's."""
     names: list[tuple[str, str]] = []
 
@@ -89,7 +91,7 @@ def layout_of(plan: SolvePlan, lenses: Mapping[str, Lens], bias_names: Sequence[
     scale_at = placed(SHARED, (SCALE,) if plan.pitch_sigma > 0 else ())
     start = len(names)
     names.extend(bias_names)
-    return Layout(
+    return ParameterLayout(
         tuple(names),
         tuple(columns),
         tuple(intrinsic_at),
@@ -100,7 +102,7 @@ def layout_of(plan: SolvePlan, lenses: Mapping[str, Lens], bias_names: Sequence[
     )
 
 
-def value_of(state: RigState, layout: Layout) -> Floats:
+def shared_values(state: RigState, layout: ParameterLayout) -> Floats:
     """(P,) the shared parameters as they are; those of poses, which are errors, 0."""
     values = np.zeros(layout.size)
     for lens, columns, at in zip(state.lenses, layout.intrinsic_columns, layout.intrinsic_at, strict=True):
@@ -111,7 +113,7 @@ def value_of(state: RigState, layout: Layout) -> Floats:
     return values
 
 
-def moved(state: RigState, layout: Layout, shared: Floats, boards: Floats) -> RigState:
+def step_state(state: RigState, layout: ParameterLayout, shared: Floats, boards: Floats) -> RigState:
     """The state after a step: (P,) shared and (F, 6) of the boards."""
     lenses, poses = [], state.T_rig_camera.copy()
     for n, lens in enumerate(state.lenses):
@@ -119,21 +121,21 @@ def moved(state: RigState, layout: Layout, shared: Floats, boards: Floats) -> Ri
         intrinsics[layout.intrinsic_columns[n]] += shared[layout.intrinsic_at[n]]
         lenses.append(lens.with_intrinsics(intrinsics))
         if len(layout.pose_at[n]):
-            poses[n] = stepped(poses[n], shared[layout.pose_at[n]])
+            poses[n] = step_poses(poses[n], shared[layout.pose_at[n]])
     warp, bias = state.warp_m.copy(), state.bias + shared[layout.bias_at]
     warp[: len(layout.warp_at)] += shared[layout.warp_at]
     return replace(
         state,
         lenses=tuple(lenses),
         T_rig_camera=poses,
-        T_rig_board=stepped(state.T_rig_board, boards),
+        T_rig_board=step_poses(state.T_rig_board, boards),
         warp_m=warp,
         scale=state.scale + float(shared[layout.scale_at].sum()),
         bias=bias,
     )
 
 
-def stepped(T: Floats, step: Floats) -> Floats:
+def step_poses(T: Floats, step: Floats) -> Floats:
     """(..., 4, 4) transforms after (..., 6) steps: [exp(r) R | t + dt]."""
     result = T.copy()
     result[..., :3, :3] = rotation_from_vector(step[..., :3]) @ T[..., :3, :3]

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cairn_calib.solve.adjustment import Adjusted
+from cairn_calib.solve.adjustment import Adjustment
 from cairn_calib.solve.board_views import BoardViews
 from cairn_calib.solve.normal_equations import Uncertainty
-from cairn_calib.solve.pixel_pattern import Pattern
+from cairn_calib.solve.pixel_pattern import PixelPattern
 from cairn_calib.solve.range_choice import RangeSpans
 from cairn_calib.solve.range_residuals import RangeData
-from cairn_calib.solve.rig_state import Layout, RigState, value_of
+from cairn_calib.solve.rig_state import ParameterLayout, RigState, shared_values
 from cairn_calib.solve.solve_plan import SolvePlan
 from cairn_map.arrays import Floats
 
@@ -25,13 +25,13 @@ class Solution:
     views: BoardViews
     """The views that were used."""
     plan: SolvePlan
-    adjusted: Adjusted
+    adjusted: Adjustment
     known: Uncertainty
     turned: tuple[tuple[str, str], ...] = ()
     """(camera, frame) of each view that was left out because its corners were named from the wrong end."""
     spans: RangeSpans | None = None
     """Distances and amplitudes that the range images covered; None without range images."""
-    pattern: Pattern | None = None
+    pattern: PixelPattern | None = None
     """Range offset of each pixel of the range camera; None where it was not looked for."""
 
     @property
@@ -41,7 +41,7 @@ class Solution:
         return last if isinstance(last, RangeData) else None
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> ParameterLayout:
         """Position of each shared parameter in a step and in `covariance`."""
         return self.adjusted.problem.layout
 
@@ -61,4 +61,4 @@ class Solution:
 
     def values(self) -> dict[tuple[str, str], float]:
         """Value of each shared parameter, by owner and name; 0 for poses, whose parameters are errors."""
-        return dict(zip(self.layout.names, value_of(self.state, self.layout).tolist(), strict=True))
+        return dict(zip(self.layout.names, shared_values(self.state, self.layout).tolist(), strict=True))

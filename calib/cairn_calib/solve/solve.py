@@ -23,18 +23,18 @@ from dataclasses import replace
 import numpy as np
 
 from cairn_calib.rig.range_terms import NODE_SIGMA_M, RangeTerms
-from cairn_calib.solve.adjustment import Adjusted, Problem, Sensor, adjust, resumed
+from cairn_calib.solve.adjustment import Adjustment, AdjustmentProblem, Sensor, adjust, resume
 from cairn_calib.solve.board_views import BoardViews
 from cairn_calib.solve.camera_alone import camera_alone
 from cairn_calib.solve.corner_residuals import corner_data
 from cairn_calib.solve.normal_equations import uncertainty
 from cairn_calib.solve.pixel_pattern import pixel_pattern
-from cairn_calib.solve.priors import one, usual_priors
-from cairn_calib.solve.range_choice import chosen_terms, range_spans
+from cairn_calib.solve.priors import single_prior, usual_priors
+from cairn_calib.solve.range_choice import choose_terms, range_spans
 from cairn_calib.solve.range_nodes import NODES
 from cairn_calib.solve.range_residuals import RangeData, range_data
 from cairn_calib.solve.rig_start import first_state, rig_start
-from cairn_calib.solve.rig_state import RigState, layout_of
+from cairn_calib.solve.rig_state import RigState, parameter_layout
 from cairn_calib.solve.solution import Solution
 from cairn_calib.solve.solve_plan import Prior, SolvePlan
 from cairn_map.errors import BadInputError
@@ -85,7 +85,7 @@ def solve_from(views: BoardViews, plan: SolvePlan, state: RigState, scales: Mapp
         return Solution(views, plan, by_corners, uncertainty(by_corners.normal))
     # 5. Shapes of the range bias: the plan's, or those that the images determine.
     spans = range_spans(ranged, by_corners.state, views.board)
-    terms = plan.range_terms or chosen_terms(spans, plan.modulation_hz)
+    terms = plan.range_terms or choose_terms(spans, plan.modulation_hz)
     # 6. Corners and ranges; nodes, if any, begin at this minimum.
     priors = _priors(views, plan, state, ranges=(list(plan.cameras)[ranged.camera], replace(terms, nodes=None)))
     adjusted = _solve_ranges(by_corners, ranged, plan, replace(terms, nodes=None), priors)
@@ -95,33 +95,35 @@ def solve_from(views: BoardViews, plan: SolvePlan, state: RigState, scales: Mapp
     return Solution(views, plan, adjusted, uncertainty(adjusted.normal), spans=spans)
 
 
-def _solve_corners(views: BoardViews, plan: SolvePlan, state: RigState, scales: Mapping[str, float]) -> Adjusted:
+def _solve_corners(views: BoardViews, plan: SolvePlan, state: RigState, scales: Mapping[str, float]) -> Adjustment:
     """Stage 4: the minimum over cameras and boards, without any range."""
     sensors = []
     for camera, name in enumerate(plan.cameras):
         data = corner_data(camera, views.of_camera(name), views.frames)
         # Without rounds of estimating noise the stated covariances count as they are.
         sensors.append(Sensor(data, scales[name] if plan.noise.rounds else 1.0, data.seen))
-    layout = layout_of(plan, dict(zip(plan.cameras, state.lenses, strict=True)), [])
+    layout = parameter_layout(plan, dict(zip(plan.cameras, state.lenses, strict=True)), [])
     priors = _priors(views, plan, state, ranges=None)
-    return _adjusted(Problem(views.board, layout, tuple(sensors), priors), replace(state, bias=np.zeros(0)), plan)
+    return _adjusted(
+        AdjustmentProblem(views.board, layout, tuple(sensors), priors), replace(state, bias=np.zeros(0)), plan
+    )
 
 
 def _solve_ranges(
-    by_corners: Adjusted, ranged: RangeData, plan: SolvePlan, terms: RangeTerms, priors: tuple[Prior, ...]
-) -> Adjusted:
+    by_corners: Adjustment, ranged: RangeData, plan: SolvePlan, terms: RangeTerms, priors: tuple[Prior, ...]
+) -> Adjustment:
     """Stage 6: the minimum over corners and ranges, from the one over corners, with the range bias from 0."""
     state, board = by_corners.state, by_corners.problem.board
     owner = list(plan.cameras)[ranged.camera]
     lenses = dict(zip(plan.cameras, state.lenses, strict=True))
-    layout = layout_of(plan, lenses, [(owner, name) for name in terms.names])
+    layout = parameter_layout(plan, lenses, [(owner, name) for name in terms.names])
     ranged = ranged.with_terms(terms, state.lenses[ranged.camera])
     sensors = (*by_corners.problem.sensors, Sensor(ranged, 1.0, ranged.measured))
-    problem = Problem(board, layout, sensors, priors)
+    problem = AdjustmentProblem(board, layout, sensors, priors)
     return _adjusted(problem, replace(state, bias=np.zeros(len(terms.names))), plan)
 
 
-def _solve_nodes(adjusted: Adjusted, plan: SolvePlan) -> Adjusted:
+def _solve_nodes(adjusted: Adjustment, plan: SolvePlan) -> Adjustment:
     """Stage 7: the minimum with a grid of nodes in the range bias, too, from one without; the same without ranges."""
     *corners, last = adjusted.problem.sensors
     if not isinstance(last.data, RangeData):
@@ -130,12 +132,14 @@ def _solve_nodes(adjusted: Adjusted, plan: SolvePlan) -> Adjusted:
     owner, lens = list(plan.cameras)[last.data.camera], lenses[last.data.camera]
     terms = replace(last.data.terms, nodes=NODES)
     added = terms.names[len(terms.document_names) :]
-    layout = layout_of(plan, dict(zip(plan.cameras, lenses, strict=True)), [(owner, name) for name in terms.names])
-    priors = (*adjusted.problem.priors, *(one(owner, name, 0.0, NODE_SIGMA_M) for name in added))
+    layout = parameter_layout(
+        plan, dict(zip(plan.cameras, lenses, strict=True)), [(owner, name) for name in terms.names]
+    )
+    priors = (*adjusted.problem.priors, *(single_prior(owner, name, 0.0, NODE_SIGMA_M) for name in added))
     sensors = (*corners, replace(last, data=last.data.with_terms(terms, lens)))
     state = replace(adjusted.state, bias=np.append(adjusted.state.bias, np.zeros(len(added))))
     try:
-        return resumed(Problem(adjusted.problem.board, layout, sensors, priors), state, plan.noise)
+        return resume(AdjustmentProblem(adjusted.problem.board, layout, sensors, priors), state, plan.noise)
     except np.linalg.LinAlgError as exc:
         raise BadInputError("not_observable", f"the images do not determine the range bias ({exc}): take more") from exc
 
@@ -150,7 +154,7 @@ def _with_pixels(solution: Solution) -> Solution:
     return replace(solution, pattern=pattern)
 
 
-def _adjusted(problem: Problem, state: RigState, plan: SolvePlan) -> Adjusted:
+def _adjusted(problem: AdjustmentProblem, state: RigState, plan: SolvePlan) -> Adjustment:
     try:
         return adjust(problem, state, plan.noise)
     except np.linalg.LinAlgError as exc:

@@ -66,7 +66,7 @@ class CameraPlan:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Noise:
+class NoisePlan:
     """How noise is met: a robust loss, culling with re-admission, and a scale of noise for each sensor."""
 
     huber_sigmas: float = 1.5
@@ -77,7 +77,7 @@ class Noise:
     """Of estimating noise and culling, at most; 0: the corners' covariances are taken as stated."""
 
 
-STATED = Noise(huber_sigmas=np.inf, cull_sigmas=np.inf, rounds=0)
+STATED = NoisePlan(huber_sigmas=np.inf, cull_sigmas=np.inf, rounds=0)
 """Plain least squares with the corners' own covariances."""
 
 
@@ -97,7 +97,7 @@ class SolvePlan:
     """Besides those that this module gives by itself."""
     usual_priors: bool = True
     """Whether those that few views or a coarse sensor need are added."""
-    noise: Noise = field(default_factory=Noise)
+    noise: NoisePlan = field(default_factory=NoisePlan)
     modulation_hz: float | None = None
     """Of the range camera's light; None: not known, and so no circular error is looked for."""
     range_terms: RangeTerms | None = None

@@ -7,7 +7,7 @@ import numpy as np
 
 from cairn_calib.rig.calibration import Calibration, CameraStatistics, Statistics, covariance_from_matrix
 from cairn_calib.rig.range_bias import RangeBias, bias_from_matrix
-from cairn_calib.rig.rig import Rig, mounted
+from cairn_calib.rig.rig import Rig, mount_camera
 from cairn_calib.solve.corner_residuals import CornerData, corner_misses
 from cairn_calib.solve.rig_state import warp_shape
 from cairn_calib.solve.solution import Solution
@@ -17,7 +17,7 @@ def solved_rig(solution: Solution, *, made_s: float) -> Rig:
     """The rig of a solution, `made_s` seconds since 1970; the covariance is of its cameras, all else eliminated."""
     plan, state = solution.plan, solution.state
     cameras = {
-        name: mounted(camera.spectrum, lens, T)
+        name: mount_camera(camera.spectrum, lens, T)
         for (name, camera), lens, T in zip(plan.cameras.items(), state.lenses, state.T_rig_camera, strict=True)
     }
     bias_at = solution.layout.bias_at

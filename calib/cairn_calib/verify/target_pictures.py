@@ -5,7 +5,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.board.corner_pictures import Picture
-from cairn_calib.verify.verification import Sight
+from cairn_calib.verify.verification import TargetSighting
 
 TILE_PX = 160
 REACH = 1.6
@@ -16,7 +16,7 @@ TILES_MAX = 96
 FOUND, PREDICTED, TEXT, EDGE = (80, 255, 80), (0, 150, 255), (255, 255, 255), (0, 0, 0)
 
 
-def target_tile(image: npt.NDArray[np.generic], sight: Sight) -> Picture:
+def target_tile(image: npt.NDArray[np.generic], sight: TargetSighting) -> Picture:
     """(160, 160, 3) uint8, B, G, R: the target enlarged; green cross: found there, orange: predicted.
 
     Args:

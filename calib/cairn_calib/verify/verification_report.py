@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from cairn_calib.report.charts import scatter_plot
 from cairn_calib.report.page import Table, page
-from cairn_calib.verify.verification import Sight, Sightings, source_pixel_in
+from cairn_calib.verify.verification import Sightings, TargetSighting, source_pixel_in
 from cairn_calib.verify.verification_table import SOURCES, CameraRow
 
 AXES = ("x", "y")
@@ -91,7 +91,7 @@ def verification_json(sightings: Sightings, rows: Sequence[CameraRow]) -> str:
     return json.dumps(document, indent=1) + "\n"
 
 
-def _entry(sight: Sight) -> dict[str, object]:
+def _entry(sight: TargetSighting) -> dict[str, object]:
     return {
         "image": sight.image,
         "camera": sight.camera,

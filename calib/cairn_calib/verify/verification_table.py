@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from cairn_calib.verify.verification import Sight, Sightings, source_pixel_in
+from cairn_calib.verify.verification import Sightings, TargetSighting, source_pixel_in
 from cairn_map.arrays import Floats
 
 RESAMPLES = 2000
@@ -57,7 +57,7 @@ def table_of(sightings: Sightings, *, seed: int = 0) -> list[CameraRow]:
     return rows
 
 
-def _row(sightings: Sightings, camera: str, sights: Sequence[Sight], rng: np.random.Generator) -> CameraRow:
+def _row(sightings: Sightings, camera: str, sights: Sequence[TargetSighting], rng: np.random.Generator) -> CameraRow:
     differences = np.array([sight.difference_px for sight in sights])
     sigma_x, sigma_y = (float(v) for v in differences.std(axis=0, ddof=1))
     low, high = _interval(differences, [sight.image for sight in sights], rng)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.rig.poses import Transform, checked_transform, transform_points
+from cairn_calib.rig.poses import Transform, check_transform, transform_points
 from cairn_calib.rig.rig import Rig
 from cairn_client.robot.alignment_verdict import Alignment, Matches, Minimum, Verdict, apart_m, failed, judged
 from cairn_fusion.mapping.beam_returns import returns_of
@@ -77,7 +77,7 @@ def align_points(
     reach_rad: float = STEP_RAD,
 ) -> Alignment:
     """Lay (N, 3) points of a robot's own frame, metres, onto the map, as `Robot.align`; NaN is left out."""
-    guess = checked_transform(T_map_robot, name="T_map_robot")
+    guess = check_transform(T_map_robot, name="T_map_robot")
     edge_m = snapshot.geometry.voxel_edge_m
     finite = np.asarray(points_robot, np.float64)[np.isfinite(points_robot).all(axis=1)]
     points = some(one_a_voxel(finite, edge_m), FINE_POINTS)
@@ -165,7 +165,7 @@ class Surfaces:
 
         On one thread: more would add up in another order each time.
         """
-        return checked_transform(
+        return check_transform(
             self._gicp.align(
                 self._cloud,
                 cloud,

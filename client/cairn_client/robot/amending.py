@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.rig.poses import checked_transform
+from cairn_calib.rig.poses import check_transform
 from cairn_client.replica.replica import Replica
 from cairn_client.robot.kept_scans import KeptScans
 from cairn_fusion.mapping.measurement import Measurement
@@ -116,7 +116,7 @@ def _move(T_map_rig: npt.ArrayLike | None, T_map_observed: npt.ArrayLike | None)
     if (T_map_rig is None) == (T_map_observed is None):
         raise BadInputError("bad_option", "amend needs either T_map_rig, a pose for each scan, or T_map_observed")
     if T_map_observed is not None:
-        correction = checked_transform(T_map_observed, name="T_map_observed")
+        correction = check_transform(T_map_observed, name="T_map_observed")
         return lambda scans: (move_scan(scan, correction @ scan.T_map_rig) for scan in scans)
     poses = np.asarray(T_map_rig, np.float64)
     if poses.ndim != 3 or poses.shape[1:] != (4, 4):

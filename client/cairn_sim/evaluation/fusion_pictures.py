@@ -6,7 +6,7 @@ errors.png     the fused image, what each pixel is labelled, the error of temper
 
 import numpy as np
 
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.image_fusion.cross_view import CrossView
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.transfer import Label
@@ -45,7 +45,7 @@ def uncalibrated(rig: Rig) -> Rig:
         same = each.camera.model_copy(
             update={"focal_px": (focal, focal), "centre_px": centre, "distortion": (0.0, 0.0, 0.0, 0.0, 0.0)}
         )
-        cameras[name] = mounted(each.spectrum, same, here)
+        cameras[name] = mount_camera(each.spectrum, same, here)
     return Rig(name=f"{rig.name}-nominal", cameras=cameras)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.rig.lidar import AnyCamera
-from cairn_calib.rig.poses import Transform, checked_transform
+from cairn_calib.rig.poses import Transform, check_transform
 from cairn_map.arrays import Flags, Floats
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import NANOMETRES, CellKey, Geometry, cell_of_key
@@ -199,7 +199,7 @@ def seen_marks(
     finer = _finer_rays(camera, fineness)
     marks = [np.zeros(box.shape, np.uint8) for box in boxes]
     for given in T_map_cameras:
-        T = checked_transform(given, name="T_map_camera")
+        T = check_transform(given, name="T_map_camera")
         origin = np.ascontiguousarray(T[:3, 3])
         inside = int(scene.solid_at(origin))
         if inside >= 0:

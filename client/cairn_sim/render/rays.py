@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.rig.lidar import AnyCamera
-from cairn_calib.rig.poses import Transform, checked_transform, inverse, transform_points
+from cairn_calib.rig.poses import Transform, check_transform, inverse, transform_points
 from cairn_calib.rig.rig import Rig, Spectrum
 from cairn_map.arrays import Floats, Int32s
 from cairn_map.errors import BadInputError
@@ -32,7 +32,7 @@ def cast(scene: Scene, camera: AnyCamera, T_map_camera: Transform, *, opaque: bo
     Raises:
         BadInputError: the camera stands inside a solid.
     """
-    T = checked_transform(T_map_camera, name="T_map_camera")
+    T = check_transform(T_map_camera, name="T_map_camera")
     inside = int(scene.solid_at(T[:3, 3]))
     if inside >= 0:
         raise BadInputError(

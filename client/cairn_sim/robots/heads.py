@@ -19,7 +19,7 @@ from typing import NamedTuple
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.lidar import SpinningLidar
 from cairn_calib.rig.poses import look_at
-from cairn_calib.rig.rig import MountedCamera, Rig, Spectrum, mounted
+from cairn_calib.rig.rig import MountedCamera, Rig, Spectrum, mount_camera
 from cairn_map.errors import BadInputError
 
 RANGE_CAMERA = "tof"
@@ -100,13 +100,13 @@ def tof_head(*, ideal: bool = False) -> Rig:
 
 def handheld_head(*, scale: float = 1.0) -> Rig:
     """A colour camera 2.5 cm beside a depth camera of the same size, as hand-held depth cameras have them."""
-    depth = mounted(Spectrum.RANGE, HANDHELD.camera(mirrored=True), look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0)))
+    depth = mount_camera(Spectrum.RANGE, HANDHELD.camera(mirrored=True), look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0)))
     colour = HANDHELD.camera(scale=scale)
     return Rig(
         name="handheld",
         cameras={
             RANGE_CAMERA: depth,
-            "colour": mounted(Spectrum.COLOUR, colour, look_at((0.025, 0, 0), (0.025, 0, 1), up=(0, -1, 0))),
+            "colour": mount_camera(Spectrum.COLOUR, colour, look_at((0.025, 0, 0), (0.025, 0, 1), up=(0, -1, 0))),
         },
     )
 
@@ -117,22 +117,22 @@ def lidar_head() -> Rig:
     lidar = SpinningLidar(width=1024, height=32, elevations_deg=elevations_deg)
     return Rig(
         name="lidar",
-        cameras={RANGE_CAMERA: mounted(Spectrum.RANGE, lidar, look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0)))},
+        cameras={RANGE_CAMERA: mount_camera(Spectrum.RANGE, lidar, look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0)))},
     )
 
 
 def _tof(ideal: bool) -> MountedCamera:
     # Looks along z from the origin: the identity.
-    return mounted(Spectrum.RANGE, TOF.camera(ideal=ideal), look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0)))
+    return mount_camera(Spectrum.RANGE, TOF.camera(ideal=ideal), look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0)))
 
 
 def _colour(side: int, scale: float, ideal: bool) -> MountedCamera:
     camera = COLOUR.camera(scale=scale, ideal=ideal, mirrored=side > 0)
     pose = look_at((side * COLOUR_X_M, COLOUR_Y_M, 0), (0, 0, AIM_M), up=(0, -1, 0))
-    return mounted(Spectrum.COLOUR, camera, pose)
+    return mount_camera(Spectrum.COLOUR, camera, pose)
 
 
 def _thermal(side: int, scale: float, ideal: bool) -> MountedCamera:
     camera = THERMAL.camera(scale=scale, ideal=ideal, mirrored=side > 0)
     pose = look_at((side * THERMAL_X_M, THERMAL_Y_M, 0), (0, 0, AIM_M), up=(0, -1, 0))
-    return mounted(Spectrum.THERMAL, camera, pose)
+    return mount_camera(Spectrum.THERMAL, camera, pose)

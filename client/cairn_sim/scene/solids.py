@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cairn_calib.rig.poses import Transform, checked_transform
+from cairn_calib.rig.poses import Transform, check_transform
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 from cairn_sim.scene.surfaces import Surface
@@ -97,7 +97,7 @@ class Solid:
     T_map_solid: Transform
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "T_map_solid", checked_transform(self.T_map_solid, name=f"pose of {self.name}"))
+        object.__setattr__(self, "T_map_solid", check_transform(self.T_map_solid, name=f"pose of {self.name}"))
         if not all(size > 0 for size in self.shape.half_m) or (
             not isinstance(self.shape, Plane) and not all(map(math.isfinite, self.shape.half_m))
         ):

@@ -26,7 +26,7 @@ from cairn_calib.solve.solve import solve_rig
 from cairn_calib.solve.solve_plan import usual_plan
 from cairn_calib.solve.solved_rig import solved_rig
 from cairn_calib.verify.disc_images import Method
-from cairn_calib.verify.verification import Found, Sightings, add_sights, found_targets
+from cairn_calib.verify.verification import PoseTargets, Sightings, add_sights, find_targets
 from cairn_calib.verify.verification_table import CameraRow, table_of
 from cairn_fusion.recording.scan import Scan
 from cairn_map.arrays import Floats
@@ -115,23 +115,23 @@ def photographed(head: Rig, places: Sequence[Place], *, seed: int) -> Iterator[t
     yield from _side_by_side(take, list(enumerate(places)))
 
 
-def driven(head: Rig, images: int, *, seed: int) -> Iterator[dict[Method, Found]]:
+def driven(head: Rig, images: int, *, seed: int) -> Iterator[dict[Method, PoseTargets]]:
     """The targets that each camera found along a drive, by each method."""
     rng = np.random.default_rng(seed + DRIVE_SEED)
     views = [targets_in_view(head, rng) for _ in range(images)]
 
-    def take(number: int) -> dict[Method, Found]:
+    def take(number: int) -> dict[Method, PoseTargets]:
         scene = target_scene([(each.T_map_target, each.diameter_m) for each in views[number]])
         scan = _scan(scene, head, number=number, seed=seed + DRIVE_SEED)
         found = _images(scan)
         name = f"{number:06d}"
-        return {m: found_targets(head, found, scan.range_m, name=name, method=m) for m in METHODS}
+        return {m: find_targets(head, found, scan.range_m, name=name, method=m) for m in METHODS}
 
     yield from _side_by_side(take, range(images))
 
 
 def outcome_of(
-    name: str, corners: Mapping[Place, BoardCorners], drive: Sequence[Mapping[Method, Found]], head: Rig
+    name: str, corners: Mapping[Place, BoardCorners], drive: Sequence[Mapping[Method, PoseTargets]], head: Rig
 ) -> StudyOutcome:
     """One configuration, solved from its images alone, and verified."""
     configuration = CONFIGURATIONS[name]

@@ -20,9 +20,8 @@ from enum import StrEnum
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.rig.poses import Transform, checked_transform, inverse, transform_points
-from cairn_calib.rig.rig import Rig
-from cairn_calib.rig.sensing import LIDAR
+from cairn_calib.rig.poses import Transform, check_transform, inverse, transform_points
+from cairn_calib.rig.rig import LIDAR, Rig
 from cairn_fusion.mapping.beam_returns import Returns, clear_image, returns_of
 from cairn_fusion.mapping.brick_tally import Each, TallyPool
 from cairn_fusion.mapping.free_space import Window, carving_of, window_of
@@ -149,13 +148,13 @@ class Integration:
         """
         if points.ndim != 2 or points.shape[1] != 3:
             raise BadInputError("bad_points", f"points must be (N, 3), got {points.shape}")
-        T = checked_transform(T_map_sensor, name="T_map_sensor")
+        T = check_transform(T_map_sensor, name="T_map_sensor")
         of = None if range_camera is None else self._rig[range_camera]
         own = (points if of is None else of.true_points(points)).astype(np.float64)
         range_m = np.linalg.norm(own, axis=1)
         kept = (range_m >= self._integrator.min_range_m) & (range_m <= self._integrator.max_range_m)
         if self._rig.body is not None and T_map_body is not None:
-            T_body_sensor = inverse(checked_transform(T_map_body, name="T_map_body")) @ T
+            T_body_sensor = inverse(check_transform(T_map_body, name="T_map_body")) @ T
             kept &= ~self._rig.body.holds(transform_points(T_body_sensor, own))
         sigma_m = LIDAR.sigma_at(range_m[kept], usual=LIDAR) if of is None else of.range_sigma_m(range_m[kept])
         points_map = transform_points(T, own[kept])

@@ -20,8 +20,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cairn_calib.rig.brown import Coefficients
 from cairn_calib.rig.camera import Camera
-from cairn_calib.rig.poses import Transform, checked_transform, inverse
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.poses import Transform, check_transform, inverse
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.recording.images import image_header
 from cairn_fusion.recording.recording import Recording, ScanFiles, measurements_of
 from cairn_fusion.recording.recording_format import (
@@ -181,7 +181,7 @@ def _pose(root: Path, relative: str, convention: PoseConvention) -> Transform:
         values = np.append(values, (0, 0, 0, 1))
     if values.size != 16:
         raise BadInputError("bad_transform", f"{root / relative} must hold 16 or 12 numbers, got {values.size}")
-    T = checked_transform(values.reshape(4, 4), name=str(root / relative))
+    T = check_transform(values.reshape(4, 4), name=str(root / relative))
     return inverse(T) if convention is PoseConvention.MAP_TO_CAMERA else T
 
 
@@ -202,7 +202,8 @@ def _registered_rig(root: Path, options: FrameFolderOptions, first_depth: Path) 
     if options.thermal:
         spectra["thermal"] = Spectrum.THERMAL
     return Rig(
-        name=options.name, cameras={name: mounted(spectrum, camera, np.eye(4)) for name, spectrum in spectra.items()}
+        name=options.name,
+        cameras={name: mount_camera(spectrum, camera, np.eye(4)) for name, spectrum in spectra.items()},
     )
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.rig.poses import Transform, checked_transform
+from cairn_calib.rig.poses import Transform, check_transform
 from cairn_calib.rig.rig import Rig, Spectrum
 from cairn_map.errors import BadInputError
 
@@ -40,9 +40,9 @@ class Scan:
     """Where the frame of the rig's body is; None: the body's boxes are in the rig's frame."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "T_map_rig", checked_transform(self.T_map_rig, name="T_map_rig"))
+        object.__setattr__(self, "T_map_rig", check_transform(self.T_map_rig, name="T_map_rig"))
         if self.T_map_body is not None:
-            object.__setattr__(self, "T_map_body", checked_transform(self.T_map_body, name="T_map_body"))
+            object.__setattr__(self, "T_map_body", check_transform(self.T_map_body, name="T_map_body"))
         if not isinstance(self.range_m, np.ndarray):
             # Above all no `EyeDepth`: what was filled in for the eye is no measurement.
             raise BadInputError("bad_scan", f"range_m must be an array of ranges, got {type(self.range_m).__name__}")

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.lidar import AnyCamera, SpinningLidar
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.recording.recording import measurements_of
 from cairn_fusion.recording.recording_format import (
     Convention,
@@ -221,7 +221,7 @@ def _rig_of(index: BagIndex, mapping: BagMapping, topics: Mapping[str, TopicInde
             T_base_camera = index.tree.fixed_pose(mapping.frames.base, frame)
         if camera.lidar is not None:
             T_base_camera = T_base_camera @ T_LIDAR_CAMERA
-        cameras[name] = mounted(camera.spectrum, _camera_of(index, name, camera), T_base_camera)
+        cameras[name] = mount_camera(camera.spectrum, _camera_of(index, name, camera), T_base_camera)
     return Rig(name=mapping.name, cameras=cameras)
 
 

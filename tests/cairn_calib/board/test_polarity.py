@@ -11,7 +11,7 @@ from tests.fixtures.calib.board_images import BOARD, DISCS, THERMAL, TOF, pictur
 from cairn_calib.board.corner_detection import find_chessboard, grey
 from cairn_calib.board.corner_file import read_corner_file
 from cairn_calib.board.corner_pictures import BAND_PX, overlay
-from cairn_calib.board.polarity_vote import Vote, margin_polarity, turned, vote_of
+from cairn_calib.board.polarity import Vote, count_votes, margin_polarity, reverse_corners
 from cairn_calib.cli.corners import main
 
 
@@ -23,7 +23,7 @@ def test_margins_vote_for_the_polarity_whichever_way_the_board_is_held(name: str
         corners = find_chessboard(each.image, BOARD).corners
         assert corners is not None
         assert margin_polarity(grey(each.image), corners) == each.polarity
-        assert margin_polarity(grey(each.image), turned(corners)) == each.polarity
+        assert margin_polarity(grey(each.image), reverse_corners(corners)) == each.polarity
 
 
 def test_corners_named_from_the_other_end_are_those_of_the_other_polarity() -> None:
@@ -31,12 +31,12 @@ def test_corners_named_from_the_other_end_are_those_of_the_other_polarity() -> N
     normal, other = (find_chessboard(each.image, BOARD, polarity=way).corners for way in ("normal", "reversed"))
     assert normal is not None
     assert other is not None
-    assert np.array_equal(turned(normal).pixels, other.pixels)
-    assert np.array_equal(turned(normal).covariance_px2, other.covariance_px2)
+    assert np.array_equal(reverse_corners(normal).pixels, other.pixels)
+    assert np.array_equal(reverse_corners(normal).covariance_px2, other.covariance_px2)
 
 
 def test_a_vote_needs_a_clear_majority() -> None:
-    assert vote_of(["normal", None, "normal", "normal", "reversed"]) == Vote(3, 1)
+    assert count_votes(["normal", None, "normal", "normal", "reversed"]) == Vote(3, 1)
     assert Vote(3, 1).polarity == "normal"
     assert Vote(0, 1).polarity == "reversed"
     assert Vote(2, 1).polarity is None

@@ -10,16 +10,16 @@ import pytest
 from tests.fixtures.calib.simulated_views import SPECTRA, exact_pixels, views_of, world
 
 from cairn_calib.board.corners import Corners
-from cairn_calib.diagnosis.cross_validation import cross_validated
-from cairn_calib.diagnosis.examination import Examination, examined
+from cairn_calib.diagnosis.cross_validation import cross_validate
+from cairn_calib.diagnosis.examination import Examination, examine
 from cairn_calib.diagnosis.next_image import NextImage
 from cairn_calib.diagnosis.probe_points import probes_of
-from cairn_calib.diagnosis.solve_warnings import Warned, refuse_undetermined, warnings_of
+from cairn_calib.diagnosis.solve_warnings import SolveWarning, refuse_undetermined, warnings_of
 from cairn_calib.diagnosis.view_coverage import coverage
 from cairn_calib.diagnosis.world_uncertainty import pixel_covariance, world_covariance
 from cairn_calib.rig.projection_uncertainty import project_certain, transfer_certain
 from cairn_calib.solve.board_views import BoardView
-from cairn_calib.solve.rig_state import moved
+from cairn_calib.solve.rig_state import step_state
 from cairn_calib.solve.solution import Solution
 from cairn_calib.solve.solve import solve_from, solve_rig
 from cairn_calib.solve.solve_plan import STATED, usual_plan
@@ -38,7 +38,7 @@ def solution() -> Solution:
 
 @pytest.fixture(scope="module")
 def seen(solution: Solution) -> Examination:
-    return examined(solution, solved_rig(solution, made_s=0.0))
+    return examine(solution, solved_rig(solution, made_s=0.0))
 
 
 def test_influence_foretells_what_a_solve_without_the_frame_finds(solution: Solution, seen: Examination) -> None:
@@ -160,10 +160,10 @@ def test_halves_agree_when_the_model_is_right_and_not_when_a_board_moved(solutio
     views = tuple(shifted(view, 3.0) if (view.camera, view.frame) in knocked else view for view in solution.views.views)
     wrong = solve_rig(replace(solution.views, views=views), usual_plan({name: SPECTRA[name] for name in PAIR}))
     probes = probes_of(solved_rig(wrong, made_s=0.0), "tof", wrong.layout)
-    halves = cross_validated(wrong, probes)
+    halves = cross_validate(wrong, probes)
     assert halves is not None
     assert halves.chi2 > 5 * halves.parameters
-    told = examined(wrong, solved_rig(wrong, made_s=0.0)).warnings
+    told = examine(wrong, solved_rig(wrong, made_s=0.0)).warnings
     assert "model_error" in {each.kind for each in told}
 
 
@@ -172,14 +172,14 @@ def shifted(view: BoardView, px: float) -> BoardView:
     return replace(view, corners=corners)
 
 
-def kinds(found: Sequence[Warned]) -> set[tuple[str, str]]:
+def kinds(found: Sequence[SolveWarning]) -> set[tuple[str, str]]:
     return {(each.kind, each.camera) for each in found}
 
 
 def test_warnings_name_what_the_images_lack() -> None:
     poor = world(3, seed=1, names=PAIR, tilt_deg=12.0)
     solution = solve_rig(views_of(poor, seed=1), PLAN)
-    told = examined(solution, solved_rig(solution, made_s=0.0)).warnings
+    told = examine(solution, solved_rig(solution, made_s=0.0)).warnings
     assert {
         ("few_images", "tof"),
         ("tilt_range", "tof"),
@@ -199,7 +199,7 @@ def test_warnings_name_what_the_images_lack() -> None:
     assert re.match(r".*fx.* of tof.* are open together: a longer lens looks like a farther board", weak.text)
     few = world(4, seed=1, names=PAIR, tilt_deg=25.0)
     solution = solve_rig(views_of(few, seed=1), PLAN)
-    told = examined(solution, solved_rig(solution, made_s=0.0)).warnings
+    told = examine(solution, solved_rig(solution, made_s=0.0)).warnings
     alone = next(each for each in told if each.kind == "influence")
     assert alone.measured > alone.threshold == 3 and "without frame 002 points would move by" in alone.text
 
@@ -217,7 +217,7 @@ def test_warnings_name_corners_that_do_not_fit(solution: Solution) -> None:
     assert next(each for each in told if each.kind == "image_outliers").text.startswith(f"{image} does not fit")
 
 
-def told_of(solution: Solution) -> Sequence[Warned]:
+def told_of(solution: Solution) -> Sequence[SolveWarning]:
     return warnings_of(solution, [], [], None, [])
 
 
@@ -245,5 +245,5 @@ def test_a_step_moves_the_state_by_it(solution: Solution) -> None:
     at = solution.layout.index("left", "ty")
     assert at is not None
     step[at] = 0.01
-    there = moved(solution.state, solution.layout, step, np.zeros((8, 6)))
+    there = step_state(solution.state, solution.layout, step, np.zeros((8, 6)))
     assert there.T_rig_camera[1, 1, 3] - solution.state.T_rig_camera[1, 1, 3] == pytest.approx(0.01)

@@ -17,8 +17,7 @@ from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_calib.rig.lens import Lens
 from cairn_calib.rig.pose_vectors import transform_from_vector
-from cairn_calib.rig.rig import Rig, Spectrum, load_rig, mounted
-from cairn_calib.rig.sensing import RangeSensing
+from cairn_calib.rig.rig import RangeSensing, Rig, Spectrum, load_rig, mount_camera
 from cairn_map.errors import BadInputError
 
 # Numbers that no decimal of few digits is, and some that are written with an exponent.
@@ -43,7 +42,7 @@ def rig_of(*cameras: Lens) -> Rig:
     names = ("tof", "left", "right")
     spectra = (Spectrum.RANGE, Spectrum.COLOUR, Spectrum.THERMAL)
     every = zip(names, spectra, cameras, PLACES, strict=False)
-    return Rig(name="head", cameras={name: mounted(spectrum, camera, T) for name, spectrum, camera, T in every})
+    return Rig(name="head", cameras={name: mount_camera(spectrum, camera, T) for name, spectrum, camera, T in every})
 
 
 def assert_same(found: PlacedCamera, name: str, camera: Lens, T: npt.NDArray[np.float64] | None) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from cairn_calib.rig.body import Body, BodyBox
 from cairn_calib.rig.camera import camera_from_field_of_view
-from cairn_calib.rig.rig import Rig, Spectrum, mounted, rig_from_json
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera, rig_from_json
 from cairn_map.errors import BadInputError
 
 BODY = Body(
@@ -19,7 +19,7 @@ BODY = Body(
 )
 RIG = Rig(
     name="head",
-    cameras={"tof": mounted(Spectrum.RANGE, camera_from_field_of_view(4, 3, horizontal_deg=60), np.eye(4))},
+    cameras={"tof": mount_camera(Spectrum.RANGE, camera_from_field_of_view(4, 3, horizontal_deg=60), np.eye(4))},
     body=BODY,
 )
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cairn_calib.rig.brown import RADIUS_MAX, Coefficients, distorted, jacobian, radius_limit, undistorted
+from cairn_calib.rig.brown import RADIUS_MAX, Coefficients, distort, jacobian, radius_limit, undistort
 from cairn_calib.rig.camera import Camera
 
 law = settings(max_examples=100, deadline=None, database=None)
@@ -41,8 +41,8 @@ def test_project_undoes_unproject_at_every_pixel(distortion: Coefficients) -> No
 @law
 @given(lenses)
 def test_project_undoes_unproject_wherever_there_is_a_ray(distortion: Coefficients) -> None:
-    plane = undistorted(grid(1.5), distortion)
-    again = distorted(plane, distortion)
+    plane = undistort(grid(1.5), distortion)
+    again = distort(plane, distortion)
     seen = ~np.isnan(plane[..., 0])
     assert seen[50, 50]
     np.testing.assert_array_equal(seen, ~np.isnan(again[..., 0]))
@@ -55,7 +55,7 @@ def test_unproject_undoes_project_before_the_fold(distortion: Coefficients) -> N
     # Near the turn the tangential part decides where the fold is: take as much as is well before it.
     sides = (side for side in np.linspace(1.5, 0.1, 15) if side < 0.6 * radius_limit(distortion))
     plane = next(grid(s) for s in sides if jacobian(*np.moveaxis(grid(s), -1, 0), distortion)[3].min() > 0.02)
-    np.testing.assert_allclose(undistorted(distorted(plane, distortion), distortion), plane, atol=1e-9)
+    np.testing.assert_allclose(undistort(distort(plane, distortion), distortion), plane, atol=1e-9)
 
 
 @pytest.mark.parametrize("distortion", WHOLE)
@@ -82,7 +82,7 @@ def test_the_jacobian_agrees_with_differences(distortion: Coefficients, x: float
     limit = radius_limit(lens)
     at, h = np.array([x, y]) * min(0.5 * limit, 1.0), 1e-6
     steps = np.array([[h, 0], [-h, 0], [0, h], [0, -h]])
-    right, left, down, up = distorted(at + steps, lens)
+    right, left, down, up = distort(at + steps, lens)
     xx, xy, yy, det = jacobian(at[:1], at[1:], lens)
     np.testing.assert_allclose((right - left) / (2 * h), [xx[0], xy[0]], atol=1e-8)
     np.testing.assert_allclose((down - up) / (2 * h), [xy[0], yy[0]], atol=1e-8)
@@ -110,10 +110,10 @@ def test_what_lies_behind_the_fold_is_neither_seen_nor_found(
     distortion: Coefficients, turn: float, reach: float
 ) -> None:
     radii = np.array([0.99 * turn, 1.01 * turn, 2 * turn, 1e9, np.inf])
-    seen = ~np.isnan(distorted(np.stack([radii, 0 * radii[:1].repeat(5)], axis=-1), distortion))
+    seen = ~np.isnan(distort(np.stack([radii, 0 * radii[:1].repeat(5)], axis=-1), distortion))
     assert seen.all(axis=-1).tolist() == [True, False, False, False, False]
     places = np.array([[0, 0.999 * reach], [0, 1.001 * reach], [0.8, 0.8], [1e9, 0]])
-    found = undistorted(places, distortion)
+    found = undistort(places, distortion)
     assert np.isnan(found).all(axis=-1).tolist() == [False, True, True, True]
     assert 0.9 * turn < found[0, 1] < turn
 
@@ -121,7 +121,7 @@ def test_what_lies_behind_the_fold_is_neither_seen_nor_found(
 @law
 @given(lenses)
 def test_no_ray_comes_from_behind_the_fold(distortion: Coefficients) -> None:
-    plane = undistorted(grid(3.0), distortion)
+    plane = undistort(grid(3.0), distortion)
     radius = np.hypot(plane[..., 0], plane[..., 1])
     assert np.nanmax(radius) < radius_limit(distortion) or not any(distortion)
 
@@ -129,7 +129,7 @@ def test_no_ray_comes_from_behind_the_fold(distortion: Coefficients) -> None:
 def test_up_to_the_fold_every_place_is_found() -> None:
     radii = np.linspace(0, np.sqrt(2 / 3), 2000, endpoint=False)
     plane = np.stack([radii * 0.6, radii * 0.8], axis=-1)
-    np.testing.assert_allclose(undistorted(distorted(plane, FOLDING), FOLDING), plane, atol=1e-7)
+    np.testing.assert_allclose(undistort(distort(plane, FOLDING), FOLDING), plane, atol=1e-7)
 
 
 @pytest.mark.parametrize("distortion", [(0.0,) * 5, *WHOLE, FOLDING])
@@ -142,20 +142,20 @@ def test_none_stays_none(distortion: Coefficients, place: tuple[float, float]) -
 
 @pytest.mark.parametrize("shape", [(2,), (0, 2), (5, 0, 2), (3, 4, 5, 2)])
 def test_any_shape_of_points_keeps_its_shape(shape: tuple[int, ...]) -> None:
-    assert undistorted(np.full(shape, 0.1), BARREL).shape == distorted(np.full(shape, 0.1), BARREL).shape == shape
+    assert undistort(np.full(shape, 0.1), BARREL).shape == distort(np.full(shape, 0.1), BARREL).shape == shape
 
 
 def test_the_given_plane_is_not_changed() -> None:
     plane = grid(2.0)
-    undistorted(plane, FOLDING)
-    distorted(plane, FOLDING)
+    undistort(plane, FOLDING)
+    distort(plane, FOLDING)
     np.testing.assert_array_equal(plane, grid(2.0))
 
 
 @pytest.mark.parametrize("extreme", [(1e12,) * 5, (-1e12,) * 5, (1e-300, 0, 0, 0, 0), (0, 0, 0, 0, -1e-300)])
 def test_extreme_coefficients_overflow_nothing(extreme: Coefficients) -> None:
     places = np.array([[0, 0], [1e-9, 1], [1e300, 1], [-np.inf, 0], [np.inf, np.nan]])
-    found = undistorted(places, extreme)
+    found = undistort(places, extreme)
     assert found[0].tolist() == [0, 0]
     assert np.isnan(found[2:]).all()
-    assert np.isnan(distorted(places, extreme)[2:]).all()
+    assert np.isnan(distort(places, extreme)[2:]).all()

@@ -10,7 +10,7 @@ from cairn_calib.rig.calibration import Calibration, covariance_from_matrix
 from cairn_calib.rig.camera import camera_from_field_of_view
 from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_calib.rig.pose_vectors import transform_from_vector
-from cairn_calib.rig.rig import RIG_BYTES_MAX, Rig, Spectrum, mounted, rig_from_json
+from cairn_calib.rig.rig import RIG_BYTES_MAX, Rig, Spectrum, mount_camera, rig_from_json
 from cairn_map.errors import BadInputError
 
 FISHEYE = FisheyeCamera(
@@ -35,8 +35,8 @@ CALIBRATION = Calibration.model_validate(
 RIG = Rig(
     name="head",
     cameras={
-        "tof": mounted(Spectrum.RANGE, camera_from_field_of_view(176, 144, horizontal_deg=69), np.eye(4)),
-        "left": mounted(Spectrum.COLOUR, FISHEYE, transform_from_vector([0.1, 0.2, 0.3, 1, 2, 3])),
+        "tof": mount_camera(Spectrum.RANGE, camera_from_field_of_view(176, 144, horizontal_deg=69), np.eye(4)),
+        "left": mount_camera(Spectrum.COLOUR, FISHEYE, transform_from_vector([0.1, 0.2, 0.3, 1, 2, 3])),
     },
     calibration=CALIBRATION,
 )
@@ -96,7 +96,7 @@ def test_the_gauge_must_be_where_the_rig_is() -> None:
 
 
 def test_the_largest_covariance_fits_the_document() -> None:
-    cameras = {f"c{n}": mounted(Spectrum.COLOUR, FISHEYE, np.eye(4)) for n in range(18)}
+    cameras = {f"c{n}": mount_camera(Spectrum.COLOUR, FISHEYE, np.eye(4)) for n in range(18)}
     names = [(name, parameter) for name in list(cameras)[1:] for parameter in FISHEYE.intrinsic_names]
     names += [(name, part) for name in list(cameras)[1:] for part in ("rx", "ry", "rz", "tx", "ty", "tz")]
     rng = np.random.default_rng(5)

@@ -5,7 +5,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.rig.brown import Coefficients, distorted, radius_limit, undistorted
+from cairn_calib.rig.brown import Coefficients, distort, radius_limit, undistort
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.fisheye import FisheyeCamera, angle_limit
 from cairn_calib.rig.lens import Lens
@@ -109,10 +109,10 @@ def test_a_rational_lens_ends_where_it_turns_or_where_its_denominator_is_zero() 
     assert radius_limit(turning) == pytest.approx(1, rel=1e-9)
     assert radius_limit(pole) == pytest.approx(2, rel=1e-5)
     for lens, last in ((turning, 1.0), (pole, 2.0)):
-        seen = ~np.isnan(distorted(np.array([[0.99 * last, 0], [1.01 * last, 0], [3, 3]]), lens)[:, 0])
+        seen = ~np.isnan(distort(np.array([[0.99 * last, 0], [1.01 * last, 0], [3, 3]]), lens)[:, 0])
         assert seen.tolist() == [True, False, False]
-    np.testing.assert_allclose(undistorted(np.array([[0.0, 0.4]]), turning), [[0, 0.5]], atol=1e-12)
-    assert np.isnan(undistorted(np.array([[0.6, 0.0]]), turning)).all()
+    np.testing.assert_allclose(undistort(np.array([[0.0, 0.4]]), turning), [[0, 0.5]], atol=1e-12)
+    assert np.isnan(undistort(np.array([[0.6, 0.0]]), turning)).all()
 
 
 def test_a_fisheye_looks_back_over_its_shoulder_but_not_straight_back() -> None:

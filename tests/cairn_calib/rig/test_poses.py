@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from cairn_calib.rig.poses import (
     Transform,
-    checked_transform,
+    check_transform,
     inverse,
     look_at,
     quaternion_from_transform,
@@ -65,7 +65,7 @@ def test_a_point_that_is_none_stays_none() -> None:
 
 def test_rounding_in_a_text_file_is_taken_out_of_a_rotation() -> None:
     exact = transform_from_quaternion((1, 2, 3), np.array([0.1, 0.2, 0.3, 0.9]))
-    checked = checked_transform(exact.round(5))
+    checked = check_transform(exact.round(5))
     np.testing.assert_allclose(checked[:3, :3] @ checked[:3, :3].T, np.eye(3), atol=1e-14)
     np.testing.assert_allclose(checked, exact, atol=2e-5)
 
@@ -87,7 +87,7 @@ def test_rounding_in_a_text_file_is_taken_out_of_a_rotation() -> None:
 )
 def test_what_is_not_rigid_is_refused(wrong: np.ndarray) -> None:  # type: ignore[type-arg]
     with pytest.raises(BadInputError):
-        checked_transform(wrong)
+        check_transform(wrong)
 
 
 @pytest.mark.parametrize("wrong", [(0, 0, 0, 0), (0, 0, 0, 2), (0, 0, 1), (np.nan, 0, 0, 1)])
@@ -101,4 +101,4 @@ def test_a_camera_looks_where_it_is_told_with_its_top_up() -> None:
     np.testing.assert_allclose(transform_points(inverse(T), np.array([4.0, 6, 3])), [0, 0, 5], atol=1e-12)
     above = transform_points(inverse(T), np.array([4.0, 6, 4]))
     assert above[1] < 0  # y is down
-    np.testing.assert_allclose(checked_transform(T), T, atol=1e-12)
+    np.testing.assert_allclose(check_transform(T), T, atol=1e-12)

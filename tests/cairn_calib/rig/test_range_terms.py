@@ -8,11 +8,11 @@ import pytest
 from tests.fixtures.calib.simulated_views import BOARD, SPECTRA, TOF, World, ranges_of, views_of, world
 
 from cairn_calib.diagnosis.range_warnings import range_warnings
-from cairn_calib.diagnosis.solve_warnings import Warned
+from cairn_calib.diagnosis.solve_warnings import SolveWarning
 from cairn_calib.rig.range_bias import ByAmplitude, RangeBias, Wave, Wiggle
 from cairn_calib.rig.range_terms import BIAS_NAMES, RangeTerms, off_middle_image, wave_period_m
 from cairn_calib.rig.rig import Spectrum
-from cairn_calib.solve.range_choice import AMPLITUDE_RATIO, PERIOD_SHARE, RangeSpans, chosen_terms
+from cairn_calib.solve.range_choice import AMPLITUDE_RATIO, PERIOD_SHARE, RangeSpans, choose_terms
 from cairn_calib.solve.solution import Solution
 from cairn_calib.solve.solve import solve_rig
 from cairn_calib.solve.solve_plan import usual_plan
@@ -43,7 +43,7 @@ def solved(truth: World, *, modulation_hz: float | None) -> Solution:
     return solve_rig(views, replace(plan, modulation_hz=modulation_hz))
 
 
-def told(solution: Solution) -> dict[str, Warned]:
+def told(solution: Solution) -> dict[str, SolveWarning]:
     return {each.kind: each for each in range_warnings(solution)}
 
 
@@ -111,9 +111,9 @@ def test_spans_choose_the_shapes() -> None:
         (1.6 * period_m, 2.1, (2, 4), True),
         (4.0 * period_m, 2.1, (1, 2, 4), True),
     ):
-        terms = chosen_terms(RangeSpans(1.0, 1.0 + span, (100.0, 150.0, 100.0 * ratio)), MODULATION_HZ)
+        terms = choose_terms(RangeSpans(1.0, 1.0 + span, (100.0, 150.0, 100.0 * ratio)), MODULATION_HZ)
         assert terms.harmonics == harmonics and (terms.amplitude_at == 150.0) is is_known
-    assert chosen_terms(RangeSpans(1.0, 9.0, None), None).names == BIAS_NAMES
+    assert choose_terms(RangeSpans(1.0, 9.0, None), None).names == BIAS_NAMES
 
 
 STATED = RangeBias(

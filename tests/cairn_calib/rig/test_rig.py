@@ -9,14 +9,14 @@ import pytest
 from cairn_calib.rig.camera import Camera, camera_from_field_of_view
 from cairn_calib.rig.lidar import SpinningLidar
 from cairn_calib.rig.poses import look_at
-from cairn_calib.rig.rig import Rig, Spectrum, load_rig, mounted, rig_from_json
+from cairn_calib.rig.rig import Rig, Spectrum, load_rig, mount_camera, rig_from_json
 from cairn_map.errors import BadInputError
 
 RIG = Rig(
     name="orpheus-head",
     cameras={
-        "tof": mounted(Spectrum.RANGE, camera_from_field_of_view(176, 144, horizontal_deg=69), np.eye(4)),
-        "left": mounted(
+        "tof": mount_camera(Spectrum.RANGE, camera_from_field_of_view(176, 144, horizontal_deg=69), np.eye(4)),
+        "left": mount_camera(
             Spectrum.THERMAL, camera_from_field_of_view(640, 512, horizontal_deg=45), look_at((0.1, 0, 0), (1, 2, 0))
         ),
     },
@@ -24,7 +24,7 @@ RIG = Rig(
 PLAIN = Rig(
     name="head",
     cameras={
-        "tof": mounted(
+        "tof": mount_camera(
             Spectrum.RANGE, Camera(width=176, height=144, focal_px=(130, 131.5), centre_px=(87.5, 71.5)), np.eye(4)
         )
     },
@@ -90,8 +90,8 @@ LIDAR = SpinningLidar(width=1800, height=3, elevations_deg=(15, 0, -20.5))
 LIDAR_RIG = Rig(
     name="mast",
     cameras={
-        "lidar": mounted(Spectrum.RANGE, LIDAR, np.eye(4)),
-        "left": mounted(Spectrum.COLOUR, camera_from_field_of_view(64, 48, horizontal_deg=60), np.eye(4)),
+        "lidar": mount_camera(Spectrum.RANGE, LIDAR, np.eye(4)),
+        "left": mount_camera(Spectrum.COLOUR, camera_from_field_of_view(64, 48, horizontal_deg=60), np.eye(4)),
     },
 )
 

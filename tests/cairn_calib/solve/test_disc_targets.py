@@ -8,10 +8,10 @@ from tests.fixtures.calib.board_images import DISC, THERMAL, Floats, disc_centro
 
 from cairn_calib.board.board import Board
 from cairn_calib.board.corners import Corners
-from cairn_calib.diagnosis.examination import examined
+from cairn_calib.diagnosis.examination import examine
 from cairn_calib.rig.rig import Spectrum
 from cairn_calib.solve.board_views import BoardView, BoardViews
-from cairn_calib.solve.disc_shift import disc_shift
+from cairn_calib.solve.corner_residuals import disc_shift
 from cairn_calib.solve.solution import Solution
 from cairn_calib.solve.solve import solve_rig
 from cairn_calib.solve.solve_plan import STATED, usual_plan
@@ -61,7 +61,7 @@ def focal_off(solution: Solution) -> tuple[float, float]:
 
 
 def warned(solution: Solution) -> bool:
-    told = examined(solution, solved_rig(solution, made_s=0.0)).warnings
+    told = examine(solution, solved_rig(solution, made_s=0.0)).warnings
     return any(each.kind == "disc_diameter" for each in told)
 
 

@@ -7,10 +7,10 @@ import numpy.typing as npt
 import pytest
 from tests.fixtures.calib.simulated_views import SPECTRA, ranges_of, views_of, world
 
-from cairn_calib.solve.adjustment import Problem, Sensor
+from cairn_calib.solve.adjustment import AdjustmentProblem, Sensor
 from cairn_calib.solve.corner_residuals import CornerData
 from cairn_calib.solve.normal_equations import Loss, NormalEquations, uncertainty
-from cairn_calib.solve.rig_state import RigState, moved
+from cairn_calib.solve.rig_state import RigState, step_state
 from cairn_calib.solve.solution import Solution
 from cairn_calib.solve.solve import solve_rig
 from cairn_calib.solve.solve_plan import usual_plan
@@ -38,14 +38,14 @@ def dense(normal: NormalEquations) -> tuple[Floats, Floats]:
     return H, g
 
 
-def residuals(sensor: Sensor, problem: Problem, state: RigState) -> Floats:
+def residuals(sensor: Sensor, problem: AdjustmentProblem, state: RigState) -> Floats:
     alone = replace(problem, sensors=(sensor,))
     return alone.blocks(state)[0].residuals
 
 
 def test_the_schur_complement_solves_the_whole_system(solution: Solution) -> None:
     problem = solution.adjusted.problem
-    away = moved(solution.state, solution.layout, 1e-4 * np.ones(solution.layout.size), np.full((5, 6), 1e-4))
+    away = step_state(solution.state, solution.layout, 1e-4 * np.ones(solution.layout.size), np.full((5, 6), 1e-4))
     normal = problem.normal(away, problem.blocks(away))
     H, g = dense(normal)
     scale = 1 / np.sqrt(np.diag(H))
@@ -91,8 +91,8 @@ def test_every_derivative_agrees_with_differences(solution: Solution) -> None:
                 shared[block.at[column]] = h
             else:
                 boards[:, column - k] = h
-            ahead = residuals(everything, problem, moved(state, layout, shared, boards))
-            behind = residuals(everything, problem, moved(state, layout, -shared, -boards))
+            ahead = residuals(everything, problem, step_state(state, layout, shared, boards))
+            behind = residuals(everything, problem, step_state(state, layout, -shared, -boards))
             numeric = ((ahead - behind) / (2 * h)).reshape(len(block.frames), -1)
             square = np.sum(numeric**2, axis=1)
             np.testing.assert_allclose(block.square[:, column, column], square, rtol=2e-4, atol=1e-6 * square.max())

@@ -16,7 +16,7 @@ from cairn_calib.rig.rig import Rig, rig_from_json
 from cairn_calib.solve.normal_equations import Loss
 from cairn_calib.solve.range_nodes import NODES, pixel_nodes
 from cairn_calib.solve.range_residuals import range_block
-from cairn_calib.solve.rig_state import moved
+from cairn_calib.solve.rig_state import step_state
 from cairn_calib.solve.solution import Solution
 from cairn_calib.solve.solve import SMOOTH_M, solve_rig
 from cairn_calib.solve.solve_plan import usual_plan
@@ -130,12 +130,12 @@ def test_a_range_image_s_share_is_the_slope_of_its_cost(with_nodes: Solution) ->
     rng = np.random.default_rng(0)
     scale = with_nodes.covariance.diagonal() ** 0.5
     frames = len(with_nodes.state.T_rig_board)
-    start = moved(with_nodes.state, layout, 0.3 * scale * rng.normal(size=layout.size), np.zeros((frames, 6)))
+    start = step_state(with_nodes.state, layout, 0.3 * scale * rng.normal(size=layout.size), np.zeros((frames, 6)))
     block = range_block(used, start, layout, problem.board, loss)
     for _ in range(3):
         shared, boards = 1e-3 * scale * rng.normal(size=layout.size), 1e-6 * rng.normal(size=(frames, 6))
         up, down = (
-            range_block(used, moved(start, layout, sign * shared, sign * boards), layout, problem.board, loss).cost
+            range_block(used, step_state(start, layout, sign * shared, sign * boards), layout, problem.board, loss).cost
             for sign in (1, -1)
         )
         step = np.concatenate([np.tile(shared[block.at], (len(block.frames), 1)), boards[block.frames]], axis=1)

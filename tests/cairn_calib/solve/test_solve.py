@@ -23,7 +23,7 @@ from cairn_calib.solve.board_views import BoardView, BoardViews
 from cairn_calib.solve.rig_start import half_turn
 from cairn_calib.solve.solution import Solution
 from cairn_calib.solve.solve import solve_rig
-from cairn_calib.solve.solve_plan import STATED, CameraPlan, Noise, SolvePlan, usual_plan
+from cairn_calib.solve.solve_plan import STATED, CameraPlan, NoisePlan, SolvePlan, usual_plan
 from cairn_calib.solve.solved_rig import solved_rig, statistics_of
 from cairn_map.errors import BadInputError
 
@@ -160,7 +160,7 @@ def test_points_that_fit_again_are_let_in_again() -> None:
     problem = solution.adjusted.problem
     # As if a bad start had thrown out every second corner.
     fewer = tuple(replace(sensor, kept=sensor.kept & (np.arange(42) % 2 == 0)) for sensor in problem.sensors)
-    done = adjust(replace(problem, sensors=fewer), solution.state, Noise())
+    done = adjust(replace(problem, sensors=fewer), solution.state, NoisePlan())
     for found, right in zip(done.problem.sensors, problem.sensors, strict=True):
         np.testing.assert_array_equal(found.kept, right.kept)
 

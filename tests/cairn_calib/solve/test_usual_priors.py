@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 from tests.fixtures.calib.simulated_views import LENSES, SPECTRA, views_of, world
 
-from cairn_calib.diagnosis.examination import examined
+from cairn_calib.diagnosis.examination import examine
 from cairn_calib.rig.camera import Camera
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_calib.solve.priors import USUAL_SIGMAS
 from cairn_calib.solve.solution import Solution
 from cairn_calib.solve.solve import solve_rig
 from cairn_calib.solve.solve_plan import STATED, CameraPlan, SolvePlan, usual_plan
 from cairn_calib.solve.solved_rig import solved_rig
-from cairn_calib.verify.verification import carried_pixels
+from cairn_calib.verify.verification import transfer_pixels
 
 TILTED: dict[str, Camera] = {
     name: lens.model_copy(update={"distortion": (*lens.distortion[:2], 8e-4, -6e-4, -0.03)})
@@ -33,13 +33,13 @@ def worst_carried_px(rig: Rig) -> float:
     truth = world(1, lenses=TILTED)
     true = Rig(
         name="x",
-        cameras={name: mounted(SPECTRA[name], TILTED[name], truth.T_rig_camera(name)) for name in truth.names},
+        cameras={name: mount_camera(SPECTRA[name], TILTED[name], truth.T_rig_camera(name)) for name in truth.names},
     )
     rng = np.random.default_rng(2)
     pixels, range_m = rng.uniform([40, 30], [136, 114], (500, 2)), rng.uniform(1.1, 5.7, 500)
     worst = 0.0
     for name in ("left", "right", "thermal-left"):
-        apart = carried_pixels(rig, "tof", name, pixels, range_m) - carried_pixels(true, "tof", name, pixels, range_m)
+        apart = transfer_pixels(rig, "tof", name, pixels, range_m) - transfer_pixels(true, "tof", name, pixels, range_m)
         worst = max(worst, float(np.sqrt(np.nanmean(apart**2))))
     return worst
 
@@ -59,7 +59,7 @@ def test_what_is_held_at_zero_and_is_not_is_paid_for_in_the_other_cameras() -> N
 
 def test_what_images_leave_to_the_priors_is_told_in_one_line_a_camera() -> None:
     few = solve_rig(views_of(world(4, seed=11, lenses=TILTED), seed=1, noise=2.0), usual_plan(SPECTRA))
-    told = {each.camera: each for each in examined(few, solved_rig(few, made_s=0.0)).warnings if each.kind == "prior"}
+    told = {each.camera: each for each in examine(few, solved_rig(few, made_s=0.0)).warnings if each.kind == "prior"}
     sigmas = few.sigmas()
     for camera in SPECTRA:
         open_ = [name for name, sigma in USUAL_SIGMAS.items() if sigmas[camera, name] / sigma > 0.7]

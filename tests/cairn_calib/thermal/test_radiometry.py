@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from cairn_calib.rig.camera import camera_from_field_of_view
 from cairn_calib.rig.radiometry import PlanckResponse, PolynomialResponse, Radiometry, Response, radiometry_from_json
-from cairn_calib.rig.rig import Spectrum, mounted
+from cairn_calib.rig.rig import Spectrum, mount_camera
 from cairn_calib.thermal.object_temperature import (
     NotRadiometric,
     Temperatures,
@@ -84,10 +84,10 @@ def test_a_radiometry_comes_back_from_its_file_and_only_thermal_cameras_have_one
     with pytest.raises(BadInputError, match="radiometry: "):
         radiometry_from_json(b'{"format": "cairn-radiometry", "version": 1}')
     camera = camera_from_field_of_view(64, 51, horizontal_deg=69)
-    rows = mounted(Spectrum.THERMAL, camera, np.eye(4)).model_dump() | {"radiometry": whole}
-    assert type(mounted(Spectrum.THERMAL, camera, np.eye(4))).model_validate(rows).radiometry == whole
+    rows = mount_camera(Spectrum.THERMAL, camera, np.eye(4)).model_dump() | {"radiometry": whole}
+    assert type(mount_camera(Spectrum.THERMAL, camera, np.eye(4))).model_validate(rows).radiometry == whole
     with pytest.raises(ValidationError, match="radiometry is of thermal cameras"):
-        type(mounted(Spectrum.THERMAL, camera, np.eye(4))).model_validate(rows | {"spectrum": "colour"})
+        type(mount_camera(Spectrum.THERMAL, camera, np.eye(4))).model_validate(rows | {"spectrum": "colour"})
 
 
 def read(counts: Floats, known: Radiometry | None, viewing: Viewing | None = None) -> Temperatures:

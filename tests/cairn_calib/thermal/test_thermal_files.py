@@ -12,7 +12,7 @@ from tests.fixtures.calib.thermal_images import RESPONSE, SIZE, images, scene
 from cairn_calib.cli.main import main
 from cairn_calib.rig.camera import camera_from_field_of_view
 from cairn_calib.rig.radiometry import PlanckResponse
-from cairn_calib.rig.rig import Rig, Spectrum, load_rig, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, load_rig, mount_camera
 from cairn_calib.thermal.flat_field import FlatField, fit_flat_field, read_flat_field, write_flat_field
 from cairn_calib.thermal.flir_file import read_flir
 from cairn_calib.thermal.object_temperature import Temperatures, temperatures
@@ -147,7 +147,7 @@ def test_the_command_goes_from_black_bodies_to_temperatures(tmp_path: Path, caps
     table = black_bodies(tmp_path, np.random.default_rng(3), celsius=(10.0, 35.0, 60.0, 90.0))
     rig = Rig(
         name="head",
-        cameras={"t": mounted(Spectrum.THERMAL, camera_from_field_of_view(128, 96, horizontal_deg=60), np.eye(4))},
+        cameras={"t": mount_camera(Spectrum.THERMAL, camera_from_field_of_view(128, 96, horizontal_deg=60), np.eye(4))},
     )
     (tmp_path / "rig.json").write_bytes(rig.to_json())
     out = tmp_path / "done.json"

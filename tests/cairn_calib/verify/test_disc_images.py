@@ -6,9 +6,9 @@ import pytest
 
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.range_bias import RangeBias
-from cairn_calib.rig.rig import MountedCamera, Spectrum, mounted
+from cairn_calib.rig.rig import MountedCamera, Spectrum, mount_camera
 from cairn_calib.verify.disc_images import Disc, Method, brightness_of, find_discs
-from cairn_calib.verify.disc_range import RELIEF_SIGMA_M, disc_range
+from cairn_calib.verify.verification import RELIEF_SIGMA_M, disc_range
 from cairn_map.arrays import Singles
 from cairn_map.errors import BadInputError
 
@@ -16,7 +16,7 @@ Floats = npt.NDArray[np.float64]
 SIZE = 120, 160
 FINE = 8
 """Samples along a pixel's side."""
-TOF = mounted(
+TOF = mount_camera(
     Spectrum.RANGE,
     Camera(
         width=160,

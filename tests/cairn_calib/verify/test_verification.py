@@ -12,9 +12,16 @@ from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.pose_vectors import transform_from_vector
 from cairn_calib.rig.poses import inverse
 from cairn_calib.rig.range_bias import RangeBias
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_calib.verify.disc_images import Disc
-from cairn_calib.verify.verification import Found, Sight, Sightings, add_sights, carried_pixels, range_camera_of
+from cairn_calib.verify.verification import (
+    PoseTargets,
+    Sightings,
+    TargetSighting,
+    add_sights,
+    range_camera_of,
+    transfer_pixels,
+)
 from cairn_calib.verify.verification_report import verification_json, verification_page
 from cairn_calib.verify.verification_table import table_of, table_text
 from cairn_map.errors import BadInputError
@@ -26,8 +33,8 @@ T_RIG_LEFT = transform_from_vector([0.01, -0.03, 0.005, -0.11, -0.05, 0.01])
 RIG = Rig(
     name="head",
     cameras={
-        "tof": mounted(Spectrum.RANGE, TOF, np.eye(4)),
-        "left": mounted(Spectrum.COLOUR, COLOUR, T_RIG_LEFT),
+        "tof": mount_camera(Spectrum.RANGE, TOF, np.eye(4)),
+        "left": mount_camera(Spectrum.COLOUR, COLOUR, T_RIG_LEFT),
     },
 )
 SIGMA_PX = {Spectrum.RANGE: 0.1, Spectrum.COLOUR: 0.2, Spectrum.THERMAL: 0.1}
@@ -50,18 +57,18 @@ def test_carried_pixels_are_those_of_the_papers_equations() -> None:
     np.testing.assert_allclose(Z, d * f / np.sqrt(x**2 + y**2 + f**2), rtol=1e-12)
     there = inverse(T_RIG_LEFT) @ np.stack([Z * x / f, Z * y / f, Z, np.ones(50)])
     expected = np.array(COLOUR.centre_px)[:, None] + COLOUR.focal_px[0] * there[:2] / there[2]
-    np.testing.assert_allclose(carried_pixels(RIG, "tof", "left", pixels, d), expected.T, atol=1e-8)
+    np.testing.assert_allclose(transfer_pixels(RIG, "tof", "left", pixels, d), expected.T, atol=1e-8)
 
 
-def seen(rig: Rig, pixel: Floats, range_m: float, *, off_px: tuple[float, float] = (0, 0)) -> Found:
+def seen(rig: Rig, pixel: Floats, range_m: float, *, off_px: tuple[float, float] = (0, 0)) -> PoseTargets:
     """A target of 30 cm that faces the range camera, and where another camera sees it."""
     radius_px = 0.15 / range_m * TOF.focal_px[0]
     y, x = np.mgrid[: TOF.height, : TOF.width]
     inside = np.argwhere(np.hypot(x - pixel[0], y - pixel[1]) < max(radius_px - 1, 1.6))[:, ::-1]
-    at = carried_pixels(rig, "tof", "left", pixel, np.array(range_m)) + off_px
+    at = transfer_pixels(rig, "tof", "left", pixel, np.array(range_m)) + off_px
     other = Disc(at, radius_px * COLOUR.focal_px[0] / TOF.focal_px[0], np.zeros((0, 2), np.int64))
     axis = TOF.unproject(pixel)
-    return Found("000", range_m / (TOF.rays() @ axis), {"tof": [Disc(pixel, radius_px, inside)], "left": [other]})
+    return PoseTargets("000", range_m / (TOF.rays() @ axis), {"tof": [Disc(pixel, radius_px, inside)], "left": [other]})
 
 
 def test_differences_are_predicted_minus_found_and_far_or_small_discs_are_not_taken() -> None:
@@ -75,10 +82,10 @@ def test_differences_are_predicted_minus_found_and_far_or_small_discs_are_not_ta
     far = seen(RIG, np.array([90.0, 70.0]), 3.0, off_px=(120.0, 0.0)).discs["left"][0]
     for wrong in (small, far):
         again = Sightings(RIG, "tof", "grey")
-        add_sights(again, Found("000", found.range_m, {"tof": found.discs["tof"], "left": [wrong]}))
+        add_sights(again, PoseTargets("000", found.range_m, {"tof": found.discs["tof"], "left": [wrong]}))
         assert again.sights == [] and again.left_out == {"left: not found where predicted": 1}
     none = Sightings(RIG, "tof", "grey")
-    add_sights(none, Found("000", np.full((144, 176), np.nan), found.discs))
+    add_sights(none, PoseTargets("000", np.full((144, 176), np.nan), found.discs))
     assert none.sights == [] and none.left_out == {"tof: no range on its middle": 1}
     side = Sightings(RIG, "tof", "grey")
     add_sights(side, seen(RIG, np.array([20.0, 70.0]), 3.0))
@@ -104,10 +111,10 @@ def test_shares_are_what_centroid_range_and_calibration_scatter_by() -> None:
     add_sights(sightings, seen(rig, pixel, range_m), centroid_sigma_px=SIGMA_PX)
     shares = sightings.sights[0].shares_px
     N = 4000
-    centroid = carried_pixels(rig, "tof", "left", pixel + 0.1 * rng.standard_normal((N, 2)), np.array(range_m))
+    centroid = transfer_pixels(rig, "tof", "left", pixel + 0.1 * rng.standard_normal((N, 2)), np.array(range_m))
     np.testing.assert_allclose(shares["centroid"], np.hypot(centroid.std(axis=0), 0.2), rtol=0.05)
     range_sigma_m = 1e-3
-    near = carried_pixels(rig, "tof", "left", pixel, range_m + range_sigma_m * rng.standard_normal(N))
+    near = transfer_pixels(rig, "tof", "left", pixel, range_m + range_sigma_m * rng.standard_normal(N))
     ratio = shares["range"] / near.std(axis=0)
     assert ratio[0] == pytest.approx(ratio[1], rel=0.1) and 0.1 < ratio[0] < 10
     moved = []
@@ -119,9 +126,12 @@ def test_shares_are_what_centroid_range_and_calibration_scatter_by() -> None:
         T[0, 3] += tx
         drawn = Rig(
             name="x",
-            cameras={"tof": mounted(Spectrum.RANGE, tof, np.eye(4)), "left": mounted(Spectrum.COLOUR, left, T)},
+            cameras={
+                "tof": mount_camera(Spectrum.RANGE, tof, np.eye(4)),
+                "left": mount_camera(Spectrum.COLOUR, left, T),
+            },
         )
-        moved.append(carried_pixels(drawn, "tof", "left", pixel, np.array(range_m)))
+        moved.append(transfer_pixels(drawn, "tof", "left", pixel, np.array(range_m)))
     np.testing.assert_allclose(shares["calibration"], np.std(moved, axis=0), rtol=0.1)
 
 
@@ -130,7 +140,7 @@ def sightings_of(differences: Floats, *, rig: Rig = RIG) -> Sightings:
     made = Sightings(rig, "tof", "grey", images=-(-len(differences) // 3), targets=len(differences))
     for n, difference in enumerate(differences):
         made.sights.append(
-            Sight(
+            TargetSighting(
                 image=f"{n // 3:03}",
                 camera="left",
                 source_px=np.array([88.0, 71.0]),

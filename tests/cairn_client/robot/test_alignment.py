@@ -11,8 +11,8 @@ import numpy.typing as npt
 import pytest
 
 from cairn_calib.rig.camera import Camera
-from cairn_calib.rig.poses import Transform, checked_transform, inverse, transform_points
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.poses import Transform, check_transform, inverse, transform_points
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_client.robot import alignment
 from cairn_client.robot.alignment import align_points, one_a_voxel, points_of_scans, starts_around
 from cairn_client.robot.alignment_verdict import Alignment, Verdict
@@ -34,7 +34,7 @@ from cairn_sim.scene.scene_file import load_scene
 Floats = npt.NDArray[np.float64]
 DATA = os.environ.get("CAIRN_TEST_DATA")
 TOF = Camera(width=4, height=3, focal_px=(4.0, 4.0), centre_px=(1.5, 1.0))
-RIG = Rig(name="head", cameras={"tof": mounted(Spectrum.RANGE, TOF, np.eye(4))})
+RIG = Rig(name="head", cameras={"tof": mount_camera(Spectrum.RANGE, TOF, np.eye(4))})
 EDGE_M = 0.05
 
 
@@ -202,7 +202,7 @@ def test_a_real_lidar_sweep_finds_its_place_on_the_map_of_another(shift_m: float
     first = np.loadtxt(folder / "car_cloud400.csv", delimiter=",", skiprows=1)[:, :3]
     second = np.loadtxt(folder / "car_cloud401.csv")
     line = (folder / "carCloudList.csv").read_text().splitlines()[2]
-    T_true = checked_transform(np.array([float(v) for v in line.split(",")[1:]]).reshape(4, 4))
+    T_true = check_transform(np.array([float(v) for v in line.split(",")[1:]]).reshape(4, 4))
     geometry = geometry_for(voxel_edge_m=0.1, channels=())
     measurement = Measurement(RIG, geometry, Integrator(max_range_m=50))
     measurement.add_points(first, np.eye(4), T_map_rig=np.eye(4), time_s=0)

@@ -12,7 +12,7 @@ from tests.naive import views as naive_views
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_calib.rig.poses import inverse, look_at, transform_points
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.image_fusion.cross_view import cross_view, fused_covariance
 from cairn_fusion.image_fusion.cross_view_kernels import label_into, sample_into
 from cairn_fusion.image_fusion.surface import beams, drawn_surface, places, surface_of
@@ -205,7 +205,7 @@ def test_colour_is_carried_to_the_thermal_image_too() -> None:
 def test_cameras_with_one_centre_hide_nothing_from_each_other() -> None:
     lens = Camera(width=44, height=36, focal_px=(40.0, 40.0), centre_px=(21.5, 17.5))
     spectra = {"tof": Spectrum.RANGE, "colour": Spectrum.COLOUR, "thermal": Spectrum.THERMAL}
-    rig = Rig(name="one", cameras={name: mounted(each, lens, np.eye(4)) for name, each in spectra.items()})
+    rig = Rig(name="one", cameras={name: mount_camera(each, lens, np.eye(4)) for name, each in spectra.items()})
     range_m = np.full((36, 44), 3.0, np.float32)
     range_m[10:20, 10:20] = 1.0
     kelvin = np.random.default_rng(0).uniform(280, 300, (36, 44)).astype(np.float32)

@@ -6,7 +6,7 @@ import pytest
 from tests.naive import views as naive_views
 
 from cairn_calib.rig.camera import Camera
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.image_fusion.dense_depth import ALIKE, CLOSE, DenseDepth, Origin, dense_depth
 from cairn_fusion.image_fusion.dense_depth_kernels import REACH, densify_into
 from cairn_fusion.image_fusion.surface import drawn_surface, surface_of
@@ -18,7 +18,10 @@ TOF = Camera(width=44, height=36, focal_px=(40.0, 40.0), centre_px=(21.5, 17.5))
 COLOUR = Camera(width=220, height=180, focal_px=(200.0, 200.0), centre_px=(109.5, 89.5))
 HEAD = Rig(
     name="head",
-    cameras={"tof": mounted(Spectrum.RANGE, TOF, np.eye(4)), "colour": mounted(Spectrum.COLOUR, COLOUR, np.eye(4))},
+    cameras={
+        "tof": mount_camera(Spectrum.RANGE, TOF, np.eye(4)),
+        "colour": mount_camera(Spectrum.COLOUR, COLOUR, np.eye(4)),
+    },
 )
 
 
@@ -81,7 +84,7 @@ def test_the_picture_says_on_which_side_of_an_edge_a_pixel_is_and_nothing_is_bet
 @pytest.mark.parametrize("times", [1, 5])
 def test_what_has_nothing_beside_it_ends_a_range_pixel_beyond_its_last_on_all_sides(times: int) -> None:
     lens = COLOUR if times == 5 else TOF
-    rig = Rig(name="one", cameras={**HEAD.cameras, "colour": mounted(Spectrum.COLOUR, lens, np.eye(4))})
+    rig = Rig(name="one", cameras={**HEAD.cameras, "colour": mount_camera(Spectrum.COLOUR, lens, np.eye(4))})
     range_m = np.full((36, 44), np.nan, np.float32)
     range_m[10:20, 12:30] = 2.0
     scan = Scan(time_s=0.0, T_map_rig=np.eye(4), range_camera="tof", range_m=range_m)

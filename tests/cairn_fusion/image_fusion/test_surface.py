@@ -7,8 +7,7 @@ from tests.naive import views as naive_views
 
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.poses import look_at
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
-from cairn_calib.rig.sensing import RangeSensing
+from cairn_calib.rig.rig import RangeSensing, Rig, Spectrum, mount_camera
 from cairn_fusion.image_fusion.surface import drawn_surface, range_labels, surface_of
 from cairn_fusion.image_fusion.surface_kernels import (
     borrowed_ranges,
@@ -31,8 +30,8 @@ def scan_of(range_m: Singles, amplitude: npt.NDArray[np.uint16] | None = None) -
 
 
 def rig_of(x_m: float = 0.1, sensing: RangeSensing | None = None) -> Rig:
-    tof = mounted(Spectrum.RANGE, TOF, np.eye(4)).model_copy(update={"sensing": sensing})
-    colour = mounted(Spectrum.COLOUR, COLOUR, look_at((x_m, 0, 0), (x_m, 0, 1), up=(0, -1, 0)))
+    tof = mount_camera(Spectrum.RANGE, TOF, np.eye(4)).model_copy(update={"sensing": sensing})
+    colour = mount_camera(Spectrum.COLOUR, COLOUR, look_at((x_m, 0, 0), (x_m, 0, 1), up=(0, -1, 0)))
     return Rig(name="head", cameras={"tof": tof, "colour": colour})
 
 

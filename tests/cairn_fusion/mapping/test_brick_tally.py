@@ -11,7 +11,7 @@ from tests.naive import evidence as naive_evidence
 
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.poses import look_at
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.mapping.brick_tally import BrickTally, ScanHits, tally_around
 from cairn_fusion.mapping.brick_tally_kernels import hit_voxels
 from cairn_fusion.mapping.free_space import Carving, Scratch, carving_of, window_of
@@ -26,7 +26,7 @@ from cairn_map.evidence.grid import CellKey, Geometry, voxels_in_cell, voxels_of
 Voxel = tuple[int, int, int]
 GEOMETRY = Geometry(voxel_edge_um=50_000, depth=4, channels=(INTENSITY,))
 CAMERA = Camera(width=60, height=44, focal_px=(40.0, 41.0), centre_px=(29.0, 21.2), distortion=(-0.2, 0.05, 1e-3, 0, 0))
-RIG = Rig(name="eye", cameras={"tof": mounted(Spectrum.RANGE, CAMERA, np.eye(4))})
+RIG = Rig(name="eye", cameras={"tof": mount_camera(Spectrum.RANGE, CAMERA, np.eye(4))})
 LIMITS = Integrator(min_range_m=0.3, max_range_m=4.0, flying_step_m=math.inf)
 
 

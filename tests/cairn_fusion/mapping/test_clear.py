@@ -11,8 +11,7 @@ from cairn_calib.rig.body import Body, BodyBox
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.lidar import SpinningLidar
 from cairn_calib.rig.poses import look_at
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
-from cairn_calib.rig.sensing import RangeSensing
+from cairn_calib.rig.rig import RangeSensing, Rig, Spectrum, mount_camera
 from cairn_fusion.mapping.clear_kernels import EDGE_STEP_M, GRAZING_MAX, GRAZING_SHARE, SLANT_SHARE, nearest_around
 from cairn_fusion.mapping.integrate import Integration, Integrator, Method, integrate_scan
 from cairn_fusion.recording.scan import Scan
@@ -34,7 +33,7 @@ Diff = dict[CellKey, Evidence]
 
 
 def rig_of(camera: Camera | SpinningLidar = CAMERA, body: Body | None = None, **sensing: object) -> Rig:
-    tof = mounted(Spectrum.RANGE, camera, np.eye(4))
+    tof = mount_camera(Spectrum.RANGE, camera, np.eye(4))
     return Rig(
         name="eye", cameras={"tof": tof.model_copy(update={"sensing": RangeSensing.model_validate(sensing)})}, body=body
     )

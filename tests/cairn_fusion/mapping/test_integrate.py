@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.poses import Transform, inverse, look_at, transform_points
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.importers import open_source
 from cairn_fusion.mapping.integrate import Integrator, integrate_scan
 from cairn_fusion.mapping.measurement import Measurement
@@ -55,10 +55,10 @@ def at(x_m: float, *, camera: str = "thermal") -> Transform:
 RIG = Rig(
     name="head",
     cameras={
-        "tof": mounted(Spectrum.RANGE, TOF, np.eye(4)),
-        "left": mounted(Spectrum.THERMAL, THERMAL, at(-0.25)),
-        "right": mounted(Spectrum.THERMAL, THERMAL, at(0.25)),
-        "colour": mounted(Spectrum.COLOUR, THERMAL, np.eye(4)),
+        "tof": mount_camera(Spectrum.RANGE, TOF, np.eye(4)),
+        "left": mount_camera(Spectrum.THERMAL, THERMAL, at(-0.25)),
+        "right": mount_camera(Spectrum.THERMAL, THERMAL, at(0.25)),
+        "colour": mount_camera(Spectrum.COLOUR, THERMAL, np.eye(4)),
     },
 )
 HOME = look_at((0.33, -0.41, 0.77), (1.4, 0.3, 0.9))

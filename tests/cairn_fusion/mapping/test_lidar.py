@@ -8,7 +8,7 @@ from cairn_calib.rig.camera import camera_from_field_of_view
 from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_calib.rig.lidar import SpinningLidar
 from cairn_calib.rig.poses import look_at
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.mapping.integrate import Integrator
 from cairn_fusion.mapping.measurement import Measurement
 from cairn_fusion.recording.recording_format import (
@@ -34,8 +34,8 @@ HOME = look_at(EYE, (1.31, -0.42, 1.13))  # forward is the map's x
 RIG = Rig(
     name="mast",
     cameras={
-        "lidar": mounted(Spectrum.RANGE, LIDAR, np.eye(4)),
-        "front": mounted(Spectrum.COLOUR, camera_from_field_of_view(64, 48, horizontal_deg=60), np.eye(4)),
+        "lidar": mount_camera(Spectrum.RANGE, LIDAR, np.eye(4)),
+        "front": mount_camera(Spectrum.COLOUR, camera_from_field_of_view(64, 48, horizontal_deg=60), np.eye(4)),
     },
 )
 
@@ -102,7 +102,7 @@ def test_a_sweep_is_recorded_as_other_range_images_are() -> None:
 
 def test_depth_along_an_axis_that_a_lidar_does_not_have_is_refused() -> None:
     fisheye = FisheyeCamera(width=8, height=6, focal_px=(3.0, 3.0), centre_px=(3.5, 2.5))
-    rig = Rig(name="wide", cameras={"tof": mounted(Spectrum.RANGE, fisheye, np.eye(4))})
+    rig = Rig(name="wide", cameras={"tof": mount_camera(Spectrum.RANGE, fisheye, np.eye(4))})
     header = RecordingHeader(name="wide", range={"tof": RangeEncoding(convention=Convention.Z)})
     with pytest.raises(BadInputError, match="must be along the beam"):
         check_cameras(header, rig)

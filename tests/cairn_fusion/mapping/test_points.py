@@ -10,7 +10,7 @@ from tests.fixtures.fusion.scans import BARREL, GEOMETRY, random_scan, rig_of
 from cairn_calib.rig.pixel_offsets import pixel_offsets
 from cairn_calib.rig.poses import Transform, inverse
 from cairn_calib.rig.range_bias import RangeBias
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.mapping.beam_returns import returns_of
 from cairn_fusion.mapping.integrate import Integration, Integrator, Method, integrate_scan
 from cairn_fusion.mapping.measurement import Measurement
@@ -107,7 +107,7 @@ def sweeps(folder: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float6
 @pytest.mark.recording
 def test_two_real_sweeps_agree_with_the_true_pose_and_not_with_its_inverse(test_data: Path) -> None:
     first, second, T = sweeps(test_data / "lpm_lidar")
-    rig = Rig(name="car", cameras={"lidar": mounted(Spectrum.RANGE, lidar_head()["tof"].camera, np.eye(4))})
+    rig = Rig(name="car", cameras={"lidar": mount_camera(Spectrum.RANGE, lidar_head()["tof"].camera, np.eye(4))})
 
     def map_of(points: npt.NDArray[np.float64], T_map_sensor: Transform) -> npt.NDArray[np.int64]:
         cloud = Integration(rig, TENTH, FAR)

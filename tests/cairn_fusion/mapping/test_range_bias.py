@@ -14,7 +14,7 @@ from cairn_calib.exchange.rig_exchange import cameras_of_rig
 from cairn_calib.rig.lidar import SpinningLidar
 from cairn_calib.rig.range_bias import RangeBias
 from cairn_calib.rig.range_terms import off_middle_image
-from cairn_calib.rig.rig import MountedCamera, Rig, Spectrum, mounted, rig_from_json
+from cairn_calib.rig.rig import MountedCamera, Rig, Spectrum, mount_camera, rig_from_json
 from cairn_calib.solve.board_views import RangeView
 from cairn_calib.solve.solve import solve_rig
 from cairn_calib.solve.solve_plan import usual_plan
@@ -159,8 +159,8 @@ def test_a_bias_that_makes_no_sense_is_refused(wrong: dict[str, object]) -> None
 
 
 def test_only_range_cameras_with_a_lens_have_a_bias() -> None:
-    lidar = mounted(Spectrum.RANGE, SpinningLidar(width=8, height=1, elevations_deg=(0.0,)), np.eye(4))
-    for each, told in ((lidar, "lidars"), (mounted(Spectrum.COLOUR, BARREL, np.eye(4)), "colour")):
+    lidar = mount_camera(Spectrum.RANGE, SpinningLidar(width=8, height=1, elevations_deg=(0.0,)), np.eye(4))
+    for each, told in ((lidar, "lidars"), (mount_camera(Spectrum.COLOUR, BARREL, np.eye(4)), "colour")):
         document = each.model_dump() | {"range_bias": STATED.model_dump()}
         with pytest.raises(ValueError, match=f"not of {told}"):
             MountedCamera.model_validate(document)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from cairn_calib.rig.camera import Camera, camera_from_field_of_view
 from cairn_calib.rig.image_files import write_grey16
 from cairn_calib.rig.poses import transform_from_quaternion
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.recording.images import write_colour
 from cairn_fusion.recording.recording import Recording, ScanSource, open_recording
 from cairn_fusion.recording.recording_format import Convention, RangeEncoding, ThermalEncoding, path_inside
@@ -26,9 +26,9 @@ CCD = camera_from_field_of_view(10, 7, horizontal_deg=70)
 RIG = Rig(
     name="head",
     cameras={
-        "tof": mounted(Spectrum.RANGE, TOF, np.eye(4)),
-        "left": mounted(Spectrum.COLOUR, CCD, np.eye(4)),
-        "ir": mounted(Spectrum.THERMAL, TOF, np.eye(4)),
+        "tof": mount_camera(Spectrum.RANGE, TOF, np.eye(4)),
+        "left": mount_camera(Spectrum.COLOUR, CCD, np.eye(4)),
+        "ir": mount_camera(Spectrum.THERMAL, TOF, np.eye(4)),
     },
 )
 
@@ -129,7 +129,7 @@ def test_only_some_scans_with_a_bodys_pose_are_refused(tmp_path: Path, first: ob
 
 
 def test_a_camera_may_be_called_body(tmp_path: Path) -> None:
-    rig = Rig(name="head", cameras={"body": mounted(Spectrum.RANGE, TOF, np.eye(4))})
+    rig = Rig(name="head", cameras={"body": mount_camera(Spectrum.RANGE, TOF, np.eye(4))})
     scan = replace(random_scan(0), range_camera="body", colour={}, thermal={}, T_map_body=np.eye(4))
     with RecordingWriter(tmp_path / "r", rig, name="r") as recording:
         recording.add(scan)
@@ -558,7 +558,7 @@ def test_a_reading_that_is_no_number_is_not_written(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("camera", ["a/b", "trajectory", "a.amplitude", "..", ""])
 def test_a_camera_whose_name_is_no_file_name_cannot_be_recorded(tmp_path: Path, camera: str) -> None:
-    rig = Rig(name="r", cameras={camera: mounted(Spectrum.RANGE, TOF, np.eye(4))})
+    rig = Rig(name="r", cameras={camera: mount_camera(Spectrum.RANGE, TOF, np.eye(4))})
     with pytest.raises(BadInputError):
         RecordingWriter(tmp_path / "lab", rig, name="lab")
     assert not (tmp_path / "lab").exists()
@@ -566,7 +566,7 @@ def test_a_camera_whose_name_is_no_file_name_cannot_be_recorded(tmp_path: Path, 
 
 def test_a_distorted_camera_round_trips_z_depth(tmp_path: Path) -> None:
     camera = Camera(width=8, height=6, focal_px=(7, 7), centre_px=(3.5, 2.5), distortion=(-0.1, 0.01, 0.001, 0, 0))
-    rig = Rig(name="r", cameras={"tof": mounted(Spectrum.RANGE, camera, np.eye(4))})
+    rig = Rig(name="r", cameras={"tof": mount_camera(Spectrum.RANGE, camera, np.eye(4))})
     range_m = np.linspace(0.5, 5, 48, dtype=np.float32).reshape(6, 8)
     encoding = RangeEncoding(units_per_m=10_000, convention=Convention.Z)
     with RecordingWriter(tmp_path / "lab", rig, name="lab", range_encoding=encoding) as recording:

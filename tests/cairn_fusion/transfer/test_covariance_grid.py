@@ -9,7 +9,7 @@ from cairn_calib.rig.lens import Lens
 from cairn_calib.rig.lidar import SpinningLidar
 from cairn_calib.rig.pose_vectors import rotation_from_vector
 from cairn_calib.rig.poses import inverse, transform_points
-from cairn_calib.rig.rig import MountedCamera, Rig, Spectrum, mounted
+from cairn_calib.rig.rig import MountedCamera, Rig, Spectrum, mount_camera
 from cairn_fusion.transfer.calibration_covariance import place_gradients
 from cairn_fusion.transfer.covariance_grid import CovarianceGrid, calibration_bound_px
 from cairn_fusion.transfer.pixel_covariance import pixel_covariance, reach_px_of
@@ -53,7 +53,7 @@ def moved(rig: Rig, shifts: dict[tuple[str, str], float]) -> Rig:
         values = lens.intrinsics + [mine.get(parameter, 0.0) for parameter in lens.intrinsic_names]
         T[:3, :3] = rotation_from_vector(np.array([mine.get(axis, 0.0) for axis in ("rx", "ry", "rz")])) @ T[:3, :3]
         T[:3, 3] += [mine.get(axis, 0.0) for axis in ("tx", "ty", "tz")]
-        cameras[name] = mounted(each.spectrum, lens.with_intrinsics(values), T)
+        cameras[name] = mount_camera(each.spectrum, lens.with_intrinsics(values), T)
     return Rig(name="true", cameras=cameras)
 
 
@@ -126,7 +126,7 @@ def test_without_a_covariance_the_rigs_one_number_counts() -> None:
 
 
 def test_a_lidar_has_no_lens_to_look_from() -> None:
-    lidar = mounted(Spectrum.RANGE, SpinningLidar(width=8, height=1, elevations_deg=(0.0,)), np.eye(4))
+    lidar = mount_camera(Spectrum.RANGE, SpinningLidar(width=8, height=1, elevations_deg=(0.0,)), np.eye(4))
     with pytest.raises(BadInputError, match="lens"):
         CovarianceGrid.of(Rig(name="r", cameras={"lidar": lidar, "tof": RIG["tof"]}), src="lidar", dst="tof")
 

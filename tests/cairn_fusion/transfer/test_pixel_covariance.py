@@ -11,8 +11,7 @@ from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_calib.rig.lidar import SpinningLidar
 from cairn_calib.rig.poses import inverse, look_at, transform_points
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
-from cairn_calib.rig.sensing import RangeSensing
+from cairn_calib.rig.rig import RangeSensing, Rig, Spectrum, mount_camera
 from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scan
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.pixel_covariance import is_certain, pixel_covariance, spread_m, spread_px
@@ -81,15 +80,15 @@ def test_beside_a_fisheye_a_point_is_as_uncertain_as_its_angle_and_range_say() -
     fisheye = FisheyeCamera(width=640, height=480, focal_px=(200.0, 200.0), centre_px=(320.0, 240.0))
     ahead = np.eye(4)
     ahead[:3, 3] = (0.0, 0.0, 0.1)  # across a line of sight along x
-    seen = mounted(Spectrum.COLOUR, fisheye, ahead)
-    rig = Rig(name="two", cameras={"tof": mounted(Spectrum.RANGE, fisheye, np.eye(4)), "colour": seen})
+    seen = mount_camera(Spectrum.COLOUR, fisheye, ahead)
+    rig = Rig(name="two", cameras={"tof": mount_camera(Spectrum.RANGE, fisheye, np.eye(4)), "colour": seen})
     found = spread_m(np.array([[2.0, 0.0, 0.1]]), np.array([0.5]), rig, src="tof", dst="colour")
     # 0.5 m along a line that is 0.05 rad off the other camera's.
     np.testing.assert_allclose(found, 0.5 * 0.05, rtol=0.01)
 
 
 def test_a_lidar_has_no_pixel_covariance() -> None:
-    lidar = mounted(Spectrum.RANGE, SpinningLidar(width=8, height=1, elevations_deg=(0.0,)), np.eye(4))
+    lidar = mount_camera(Spectrum.RANGE, SpinningLidar(width=8, height=1, elevations_deg=(0.0,)), np.eye(4))
     rig = Rig(name="two", cameras={"tof": HEAD["tof"], "lidar": lidar})
     with pytest.raises(BadInputError, match="must have a lens"):
         pixel_covariance(points(), np.ones(200), rig, src="tof", dst="lidar")
@@ -101,8 +100,10 @@ GEOMETRY = Geometry(voxel_edge_um=50_000, depth=4, channels=(TEMPERATURE,))
 @pytest.mark.parametrize("method", list(Method))
 def test_samples_whose_place_is_too_uncertain_are_left_out_and_hits_stay(method: Method) -> None:
     camera = Camera(width=40, height=30, focal_px=(40.0, 40.0), centre_px=(19.5, 14.5))
-    tof = mounted(Spectrum.RANGE, camera, np.eye(4)).model_copy(update={"sensing": RangeSensing(sigma_m=((0.0, 0.5),))})
-    thermal = mounted(Spectrum.THERMAL, camera, look_at((0.2, 0, 0), (0.2, 0, 1), up=(0, -1, 0)))
+    tof = mount_camera(Spectrum.RANGE, camera, np.eye(4)).model_copy(
+        update={"sensing": RangeSensing(sigma_m=((0.0, 0.5),))}
+    )
+    thermal = mount_camera(Spectrum.THERMAL, camera, look_at((0.2, 0, 0), (0.2, 0, 1), up=(0, -1, 0)))
     rig = Rig(name="head", cameras={"tof": tof, "ir": thermal})
     # A wall with its left half at 1 m and its right half at 4 m.
     z_m = np.where(np.arange(40) < 20, 1.0, 4.0)

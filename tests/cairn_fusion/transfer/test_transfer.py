@@ -8,7 +8,7 @@ from cairn_calib.rig.camera import Camera, camera_from_field_of_view
 from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_calib.rig.lens import Lens
 from cairn_calib.rig.poses import look_at
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.transfer.transfer import Label, depth_steps, points_from_range, transfer_points
 from cairn_map.errors import BadInputError
 
@@ -24,8 +24,8 @@ def rig(src: Camera = TOF, dst: Camera = COLOUR, *, shift_m: tuple[float, float,
     T_rig_colour = np.eye(4)
     T_rig_colour[:3, 3] = shift_m
     cameras = {
-        "tof": mounted(Spectrum.RANGE, src, np.eye(4)),
-        "colour": mounted(Spectrum.COLOUR, dst, T_rig_colour),
+        "tof": mount_camera(Spectrum.RANGE, src, np.eye(4)),
+        "colour": mount_camera(Spectrum.COLOUR, dst, T_rig_colour),
     }
     return Rig(name="head", cameras=cameras)
 
@@ -125,8 +125,8 @@ def test_cameras_with_one_centre_hide_nothing_from_each_other() -> None:
     points = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 4.0], [0.02, 0.0, 4.0]])
     turned = look_at((0, 0, 0), (0.1, 0.05, 1.0), up=(0, -1, 0))
     cameras = {
-        "tof": mounted(Spectrum.RANGE, TOF, np.eye(4)),
-        "thermal": mounted(Spectrum.THERMAL, COLOUR, turned),
+        "tof": mount_camera(Spectrum.RANGE, TOF, np.eye(4)),
+        "thermal": mount_camera(Spectrum.THERMAL, COLOUR, turned),
     }
     transfer = transfer_points(points, Rig(name="head", cameras=cameras), src="tof", dst="thermal")
     assert transfer.ok.all()
@@ -189,7 +189,10 @@ def test_points_appear_where_the_camera_says(camera: Lens) -> None:
     beside = np.eye(4)
     beside[0, 3] = 0.1
     tof = Camera(width=8, height=6, focal_px=(6.0, 6.0), centre_px=(3.5, 2.5))
-    cameras = {"tof": mounted(Spectrum.RANGE, tof, np.eye(4)), "seen": mounted(Spectrum.COLOUR, camera, beside)}
+    cameras = {
+        "tof": mount_camera(Spectrum.RANGE, tof, np.eye(4)),
+        "seen": mount_camera(Spectrum.COLOUR, camera, beside),
+    }
     rig = Rig(name="two", cameras=cameras)
     points = np.random.default_rng(4).uniform(-3, 3, (4000, 3))
     points[:50] = np.nan

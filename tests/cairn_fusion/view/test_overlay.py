@@ -14,7 +14,7 @@ from tests.naive import sight as naive_sight
 
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.pose_vectors import transform_from_vector
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.image_fusion.surface import AMPLITUDE_MAX, live_range
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.view import overlay_kernels as kernels
@@ -266,8 +266,8 @@ def test_the_other_cameras_depth_is_that_of_the_surface() -> None:
     rig = Rig(
         name="two",
         cameras={
-            "tof": mounted(Spectrum.RANGE, tof, np.eye(4)),
-            "colour": mounted(Spectrum.COLOUR, DISTORTED, T),
+            "tof": mount_camera(Spectrum.RANGE, tof, np.eye(4)),
+            "colour": mount_camera(Spectrum.COLOUR, DISTORTED, T),
         },
     )
     wall_m = 2.0

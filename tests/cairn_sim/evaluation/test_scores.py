@@ -7,7 +7,7 @@ import pytest
 
 from cairn_calib.rig.camera import camera_from_field_of_view
 from cairn_calib.rig.poses import look_at
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.mapping.measurement import Measurement
 from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import BadInputError
@@ -154,7 +154,7 @@ def test_a_map_of_other_voxels_is_refused() -> None:
 
 def measured(noise_m: float) -> Measurement:
     """The room, seen by a range camera and integrated at 8 cm."""
-    eye = mounted(Spectrum.RANGE, CAMERA, look_at((0.05, 0, 0), (0.05, 0, 1), up=(0, -1, 0)))
+    eye = mount_camera(Spectrum.RANGE, CAMERA, look_at((0.05, 0, 0), (0.05, 0, 1), up=(0, -1, 0)))
     rig = Rig(name="eye", cameras={"tof": eye})
     measurement = Measurement(rig, GEOMETRY)
     rng = np.random.default_rng(2)

@@ -9,7 +9,7 @@ import pytest
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.lidar import SpinningLidar
 from cairn_calib.rig.poses import Transform, inverse, look_at, transform_points
-from cairn_calib.rig.rig import Rig, Spectrum, mounted
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.recording.scan import Scan, check_scan
 from cairn_fusion.transfer.transfer import points_from_range
 from cairn_map.errors import BadInputError
@@ -238,7 +238,7 @@ def test_pixels_without_a_ray_hold_nothing_and_do_not_touch_their_neighbours() -
     rig = Rig(
         name="folding",
         cameras={
-            name: mounted(spectrum, FOLDING, look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0)))
+            name: mount_camera(spectrum, FOLDING, look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0)))
             for name, spectrum in (("tof", Spectrum.RANGE), ("c", Spectrum.COLOUR), ("t", Spectrum.THERMAL))
         },
     )

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from cairn_calib.rig.poses import Transform, checked_transform, inverse
+from cairn_calib.rig.poses import Transform, check_transform, inverse
 from cairn_map.arrays import Floats
 from cairn_sim.robots.trajectories import CORNER_M, PATHS, PoseErrors, believed, on_ground
 from cairn_sim.scene.scene import scene_of
@@ -45,7 +45,7 @@ def test_heading_drift_is_about_the_maps_vertical(seed: int) -> None:
     own = believed(true, PoseErrors(drift_rad=0.2), rng)
     # Height, and where up is in the robot's own axes.
     np.testing.assert_allclose([T[2] for T in own], [T[2] for T in true], rtol=0, atol=1e-9)
-    turned = [checked_transform(b)[:3, :3] @ a[:3, :3].T for a, b in zip(true, own, strict=True)]
+    turned = [check_transform(b)[:3, :3] @ a[:3, :3].T for a, b in zip(true, own, strict=True)]
     turns_rad = np.unwrap([math.atan2(R[1, 0], R[0, 0]) for R in turned])
     assert np.ptp(turns_rad) > 0.2
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from cairn_calib.rig.poses import checked_transform
+from cairn_calib.rig.poses import check_transform
 from cairn_calib.rig.rig import Spectrum, rig_from_json
 from cairn_map.errors import BadInputError
 from cairn_sim.robots.heads import RANGE_CAMERA, full_head, handheld_head, lidar_head, thermal_and_tof_head, tof_head
@@ -84,7 +84,7 @@ def test_thirty_six_poses_look_all_around_and_move_as_little_as_a_head_can() -> 
     assert len(set(joints)) == len(joints) == 36
     poses = [Manipulator().T_robot_rig(j) for j in joints]
     rays = tof_head()[RANGE_CAMERA].camera.rays().reshape(-1, 3)
-    around = np.concatenate([rays @ checked_transform(T)[:3, :3].T for T in poses])
+    around = np.concatenate([rays @ check_transform(T)[:3, :3].T for T in poses])
     assert around[:, 2].max() > 0.95 and around[:, 2].min() < -0.95
     azimuths = np.degrees(np.arctan2(around[:, 1], around[:, 0]))
     assert np.unique(azimuths // 5).size == 72
@@ -117,7 +117,7 @@ def test_stops_and_drives_are_clear_of_everything_but_the_ground(scene_name: str
             at = np.array([(T @ [0, 0, height_m, 1])[:3] for T in [*standing, *driving]])
             assert scene.distance_m(at).min() > BODY_M, (path, height_m)
         for T in standing:
-            checked_transform(T)
+            check_transform(T)
             assert scene.distance_m(T[:3, 3]) == pytest.approx(0, abs=1e-9)
 
 
@@ -171,4 +171,4 @@ def test_pose_errors_have_their_sigmas_and_drift_grows_with_the_way() -> None:
     turned = np.array([believed(line, PoseErrors(drift_rad=0.01), np.random.default_rng(n))[-1] for n in range(400)])
     assert np.arctan2(turned[:, 1, 0], turned[:, 0, 0]).std() == pytest.approx(0.05, rel=0.15)
     for T in turned[:5]:
-        checked_transform(T)
+        check_transform(T)

@@ -32,7 +32,7 @@ from cairn_calib.board.corner_pictures import Picture, write_picture
 from cairn_calib.rig.rig import Rig, Spectrum, load_rig
 from cairn_calib.verify.disc_images import Method
 from cairn_calib.verify.target_pictures import TILES_MAX, target_tile, tile_sheet
-from cairn_calib.verify.verification import CENTROID_SIGMA_PX, Sightings, add_sights, found_targets, range_camera_of
+from cairn_calib.verify.verification import CENTROID_SIGMA_PX, Sightings, add_sights, find_targets, range_camera_of
 from cairn_calib.verify.verification_report import verification_json, verification_page
 from cairn_calib.verify.verification_table import table_of, table_text
 from cairn_client.cli.arguments import parser, say, with_progress
@@ -61,7 +61,7 @@ def main(argv: list[str]) -> int:
     sigmas = _sigmas(method, args.centroid_sigma)
     for number, scan in enumerate(with_progress(recording, "images", total=len(recording))):
         images = images_of(scan, rig, sightings.source)
-        found = found_targets(rig, images, scan.range_m, name=f"{number:06d}", method=method)
+        found = find_targets(rig, images, scan.range_m, name=f"{number:06d}", method=method)
         before = len(sightings.sights)
         add_sights(sightings, found, centroid_sigma_px=sigmas)
         for sight in sightings.sights[before:]:
