@@ -1,11 +1,11 @@
-# Everything starts here, on a machine that has only Python 3.11 or newer: `make demo`, `make test`.
+# Everything starts here, on a machine that has only Python 3.11 or newer: `make demo`, `make check`, `make test`.
 # Each target makes what it needs, once, in .venv; `make clean` takes it all away again.
 
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help demo test soak lint bench console clean system
+.PHONY: help demo check test soak lint bench console clean system
 # Installing comes before compiling, in the order in which the targets name them.
 .NOTPARALLEL:
 
@@ -32,7 +32,10 @@ help:  ## show this list
 demo: .venv/run.stamp .venv/kernels.stamp .venv/console.stamp  ## three robots, one server, one map (DEMO_ARGS="...")
 	$(BIN)/cairn demo $(DEMO_ARGS)
 
-test: .venv/dev.stamp .venv/kernels.stamp .venv/console.stamp | system  ## all tests (PYTEST_ARGS="...")
+check: .venv/dev.stamp .venv/kernels.stamp  ## laws and units only, in minutes: no image, browser, process, fuzz (PYTEST_ARGS="...")
+	$(BIN)/python -m pytest $(WORKERS) -m 'not (browser or fuzz or image or processes or slow)' $(PYTEST_ARGS)
+
+test: .venv/dev.stamp .venv/kernels.stamp .venv/console.stamp | system  ## all tests, which CI runs (PYTEST_ARGS="...")
 	$(BIN)/python -m pytest $(WORKERS) $(PYTEST_ARGS)
 
 soak: .venv/dev.stamp .venv/kernels.stamp  ## crash, crowd, simulate sync, fuzz (SOAK_SECONDS=600 of each, SOAK_ARGS="cell"), bad links, kills, calibrations

@@ -28,6 +28,8 @@ from cairn_sim.robots.record import Plan, record
 from cairn_sim.robots.robots import ROBOTS
 from cairn_sim.scene.scene_file import load_scene
 
+pytestmark = pytest.mark.processes
+
 COMMAND_S = 300
 PLACES, PICKS = 100, 50
 """That are asked for, and voxels that are found there at least."""

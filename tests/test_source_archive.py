@@ -11,10 +11,13 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 STATIC = "server/cairn_server/static"
-pytestmark = pytest.mark.skipif(
-    not (ROOT / STATIC / "index.html").exists(),
-    reason="the console is not built: `make console` where npm's packages can be had",
-)
+pytestmark = [
+    pytest.mark.processes,
+    pytest.mark.skipif(
+        not (ROOT / STATIC / "index.html").exists(),
+        reason="the console is not built: `make console` where npm's packages can be had",
+    ),
+]
 WITHOUT_NODE = {
     **{"PATH": "/nowhere", "HOME": "/nowhere", "NODE_OPTIONS": "--no-such-option"},
     **{"npm_config_registry": "http://127.0.0.1:9/"},

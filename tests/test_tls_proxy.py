@@ -27,6 +27,8 @@ from cairn_client.http.api import MapApi
 from cairn_map.errors import UnreachableError
 from cairn_map.wire.messages import CreateMap
 
+pytestmark = pytest.mark.processes
+
 ROOT = Path(__file__).parents[1]
 CADDYFILE = ROOT / "docker" / "Caddyfile"
 COMPOSE = ROOT / "docker" / "compose.yaml"

@@ -9,6 +9,8 @@ from playwright.sync_api import Browser, Route
 from tests.console.browsing import TABLET, UPRIGHT, VIEW, Console, tab
 from tests.console.room import ADMIN_TOKEN, MAP, Room
 
+pytestmark = pytest.mark.browser
+
 FIELDS = ("colour", "temperature", "probability", "height", "age", "robot")
 OFFLINE_S = 100
 PNG = b"\x89PNG\r\n\x1a\n"

@@ -9,6 +9,8 @@ from tests.console.browsing import Console
 from tests.console.casting import first_met, occupied
 from tests.console.room import GEOMETRY, Room
 
+pytestmark = pytest.mark.browser
+
 EYES_M = 1.6
 NEAREST_M, BEFORE_M, FAR_M = 0.3, 0.1, float(np.hypot(3, 2.2))
 """Of the eye from who is followed, and from what would be in between."""

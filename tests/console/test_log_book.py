@@ -14,6 +14,8 @@ from cairn_map.commits.commit import make_commit
 from cairn_map.evidence.grid import cell_of_key
 from cairn_map.wire.messages import CreateMap
 
+pytestmark = pytest.mark.browser
+
 LONG = "long"
 COMMITS = 300
 """More than the strip of commits shows."""

@@ -17,6 +17,8 @@ from cairn_client.http.api import MapApi
 from cairn_map.evidence.grid import cell_key
 from cairn_map.wire.messages import CreateMap
 
+pytestmark = pytest.mark.browser
+
 KELVIN = 273.15
 PLACES = [[x, y] for x in range(150, 560, 15) for y in range(80, 420, 15)]
 """Of the canvas, with nothing written over it."""

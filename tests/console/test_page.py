@@ -18,6 +18,8 @@ from tests.console.room import GEOMETRY, MAP, Room
 
 from cairn_server.http.routes.console_files import STATIC
 
+pytestmark = pytest.mark.browser
+
 PAGE_GZIP_BYTES_MAX = 250_000
 FIRST_PICTURE_BYTES_MAX = 500_000
 BYTES_PER_VOXEL_MAX = 5

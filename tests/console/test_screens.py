@@ -10,6 +10,8 @@ from tests.console.browsing import VIEW, tab
 from tests.console.room import Room
 from tests.console.screens import take_screens
 
+pytestmark = pytest.mark.browser
+
 
 @pytest.mark.parametrize("theme", ["dark", "light"])
 def test_every_mode_has_its_picture(chromium: Browser, room: Room, tmp_path: Path, theme: str) -> None:

@@ -16,6 +16,8 @@ from tests.fixtures.server.live import free_port
 
 from cairn_map.wire.messages import CreateMap
 
+pytestmark = pytest.mark.browser
+
 TABS = 8
 DRAWN_S = 3
 

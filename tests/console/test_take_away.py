@@ -7,12 +7,15 @@ from pathlib import Path
 
 import httpx
 import numpy as np
+import pytest
 from playwright.sync_api import Browser, Download
 from tests.console.browsing import VIEW, Console, tab
 from tests.console.casting import occupied
 from tests.console.room import ADMIN_TOKEN, MAP, Room
 
 from cairn_server.views.export_tickets import TICKETS_OF_TOKEN_MAX
+
+pytestmark = pytest.mark.browser
 
 BEGINNINGS = {
     "PLY": b"ply\n",

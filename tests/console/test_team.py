@@ -21,6 +21,8 @@ from cairn_map.commits.cursor import cursor_from_text
 from cairn_map.wire.messages import BranchInfo, CreateMap, MissingRequest, Register, Retract
 from cairn_map.wire.robot_status import RobotStatus
 
+pytestmark = pytest.mark.browser
+
 CREW = "crew"
 FINCH, MAPLESS = "finch", "low-end"
 PLACE = (0.1, 0.0, 0.5)

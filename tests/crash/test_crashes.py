@@ -31,6 +31,7 @@ def test_these_trials_notice_a_store_that_does_not_flush(level: str) -> None:
     assert any(trial(seed, level=level).verdict.lost for seed in range(OTHER_LEVELS_TRIALS))
 
 
+@pytest.mark.processes
 def test_no_kill_loses_what_was_acknowledged() -> None:
     done = killed_servers(1, kills=KILLS)
     assert [verdict for verdict in done.verdicts if not verdict.is_sound] == []

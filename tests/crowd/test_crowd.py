@@ -21,6 +21,7 @@ HEADER = encode_frame(ReplyHeader(to=CURSOR, vector={}, stable={}))
 DONE = encode_frame(Done(to=CURSOR, rest=ZERO.hex()))
 
 
+@pytest.mark.processes
 def test_a_small_crowd_is_served_without_an_error_and_ends_with_the_servers_map(tmp_path: Path) -> None:
     crowd = Crowd(robots=6, listeners=2, seconds=3.0, sync_s=0.5, push_s=1.0)
     seen_by = survey(robot="tof", voxel_m=0.08, stops=2)

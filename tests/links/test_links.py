@@ -7,6 +7,8 @@ from tests.crowd.building import SCANS, survey
 from tests.links.life import Building
 from tests.links.soak import Plan, Soak
 
+pytestmark = pytest.mark.processes
+
 SECONDS = 5.0
 
 

@@ -22,6 +22,7 @@ def solution() -> Solution:
     return solve_rig(*reference_problem())
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("made", ["kept", "now"])
 def test_mrcal_finds_the_same_cameras(solution: Solution, made: str) -> None:
     reference = REFERENCE if made == "kept" else mrcal_solved()

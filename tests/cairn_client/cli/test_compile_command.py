@@ -35,6 +35,7 @@ for package in ("cairn_map", "cairn_fusion", "cairn_sim"):
 """
 
 
+@pytest.mark.processes
 def test_every_kernel_is_compiled_and_none_crashes_when_interrupted() -> None:
     done = subprocess.run([sys.executable, "-c", LOOK_AT_KERNELS], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -161,6 +161,7 @@ def test_wrong_options_are_refused(tmp_path: Path) -> None:
     assert ended.value.code == 2
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_rounds_go_on_until_a_signal(server: LiveServer, tmp_path: Path, number: int) -> None:
     with robot_in(tmp_path, NOWHERE) as mole:

@@ -72,6 +72,7 @@ def spool(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.processes
 def test_what_comes_is_mapped_once_and_pushed_until_a_signal(
     server: LiveServer, spool: Path, tmp_path: Path, until: Until
 ) -> None:
@@ -92,6 +93,7 @@ def test_what_comes_is_mapped_once_and_pushed_until_a_signal(
         assert cells_of(bat.map) == cells_of(evidence_in(spool))
 
 
+@pytest.mark.processes
 def test_kills_lose_nothing_and_count_nothing_twice(
     server: LiveServer, spool: Path, tmp_path: Path, until: Until
 ) -> None:
@@ -114,6 +116,7 @@ def test_kills_lose_nothing_and_count_nothing_twice(
         assert cells_of(bat.map) == cells_of(evidence_in(spool))
 
 
+@pytest.mark.processes
 def test_a_recording_that_begins_with_a_damaged_scan_does_not_say_what_there_is_to_map(
     server: LiveServer, spool: Path, tmp_path: Path, until: Until
 ) -> None:
@@ -127,6 +130,7 @@ def test_a_recording_that_begins_with_a_damaged_scan_does_not_say_what_there_is_
         assert "mapped 2 scans as 2 commits" in ended(running)
 
 
+@pytest.mark.processes
 def test_scans_are_kept_and_others_commits_are_carried_if_one_wants_that(
     server: LiveServer, spool: Path, tmp_path: Path, until: Until
 ) -> None:
@@ -141,6 +145,7 @@ def test_scans_are_kept_and_others_commits_are_carried_if_one_wants_that(
         ended(running)
 
 
+@pytest.mark.processes
 def test_mapped_recordings_are_deleted_if_one_wants_that(
     server: LiveServer, spool: Path, tmp_path: Path, until: Until
 ) -> None:

@@ -30,6 +30,7 @@ def entry_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", f"{folder.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
 
 
+@pytest.mark.processes
 @pytest.mark.usefixtures("entry_points")
 def test_a_field_server_joins_a_base_by_its_options_and_goes_on_without_it(tmp_path: Path) -> None:
     with Server(tmp_path / "base") as base:

@@ -420,6 +420,7 @@ def test_the_server_is_not_asked_before_it_wishes_but_within_an_hour() -> None:
 # Power cuts
 
 
+@pytest.mark.processes
 def test_a_killed_robot_loses_nothing_that_it_committed_and_counts_nothing_twice(
     server: LiveServer, tmp_path: Path
 ) -> None:

@@ -53,6 +53,7 @@ def test_a_log_gets_a_line_now_and_then(seconds: list[float], said: list[str]) -
     assert [line.split(": ")[1].split(",")[0] for line in log.getvalue().splitlines()] == said
 
 
+@pytest.mark.processes
 def test_kernels_are_spoken_of_once_and_not_when_they_are_kept(tmp_path: Path) -> None:
     paths = os.pathsep.join(path for path in sys.path if path)
     environment = os.environ | {"PYTHONPATH": paths, "NUMBA_CACHE_DIR": str(tmp_path)}

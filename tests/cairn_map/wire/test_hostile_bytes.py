@@ -195,6 +195,7 @@ def test_a_bomb_is_refused_within_bounds(name: str) -> None:
     assert peak < 300 * MB
 
 
+@pytest.mark.processes
 def test_all_bombs_together_stay_within_bounds_as_the_system_counts() -> None:
     """What zstd and the JSON parser allocate, tracemalloc does not see."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}

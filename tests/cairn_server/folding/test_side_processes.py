@@ -31,6 +31,8 @@ from cairn_server.store.sqlite.store import SqliteStore
 from cairn_server.sync.checks import check_process
 from cairn_server.sync.checks.check_process import CheckProcess, LostCheckError
 
+pytestmark = pytest.mark.processes
+
 COMMITS = [pushed(n, n) for n in range(12)]
 JSON = {"Content-Type": "application/json"}
 

@@ -16,6 +16,8 @@ from tests.fuzz.wrapping_mutator import bytewise, mutated_commit
 
 from cairn_map.wire.messages import CreateMap, MissingRequest, Problem
 
+pytestmark = pytest.mark.fuzz
+
 BODIES = 150
 """For each route."""
 GROWTH_MB_MAX = 128

@@ -6,6 +6,7 @@ import signal
 import sys
 from pathlib import Path
 
+import pytest
 from tests.fixtures.server.live import Live, Process
 from tests.fixtures.server.processes import client, make_map
 from tests.fixtures.server.pushes import MOLE, pushed
@@ -52,6 +53,7 @@ def run(tmp_path: Path, *options: str) -> tuple[list[str], set[str]]:
     return log.splitlines(), {ADMIN, ENROLLER, WRONG, token, ticket}
 
 
+@pytest.mark.processes
 def test_every_request_is_one_line_with_its_ids_and_no_line_has_a_token(tmp_path: Path) -> None:
     lines, tokens = run(tmp_path, "-v", "--log-format", "json")
     assert [line for line in lines for token in tokens if token in line] == []

@@ -19,6 +19,8 @@ from cairn_map.errors import BadInputError, UnreachableError
 from cairn_map.evidence.grid import cell_of_key
 from cairn_server.operations.serve import main
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[TinyDisk]:

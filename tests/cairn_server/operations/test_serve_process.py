@@ -6,6 +6,7 @@ import threading
 from pathlib import Path
 
 import httpx
+import pytest
 from tests.fixtures.server.live import DEADLINE_S, Process
 from tests.fixtures.server.processes import all_folded, client, make_map
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
@@ -15,6 +16,8 @@ from cairn_map.commits.ids import Author, CommitId
 from cairn_map.evidence.grid import cell_of_key
 from cairn_server.operations.health_probe import why_not
 from cairn_server.store.folder_lock import told_port
+
+pytestmark = pytest.mark.processes
 
 
 def push_until_killed(

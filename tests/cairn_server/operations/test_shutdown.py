@@ -8,6 +8,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import httpx
+import pytest
 from tests.fixtures.server.live import DEADLINE_S, Process
 from tests.fixtures.server.processes import all_folded, client, make_map
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
@@ -15,6 +16,8 @@ from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName
 from cairn_map.evidence.grid import cell_of_key
+
+pytestmark = pytest.mark.processes
 
 STOP_S = 10.0
 AUTHORS = [MOLE, WREN, *(Author(RobotName("fox"), Incarnation(f"{n:016x}")) for n in range(2))]

@@ -17,7 +17,10 @@ from cairn_map.errors import UnreachableError
 from cairn_map.wire.messages import CreateMap
 from cairn_server.operations.health_probe import why_not
 
-pytestmark = pytest.mark.skipif(not shutil.which("openssl"), reason="the openssl command makes the certificate")
+pytestmark = [
+    pytest.mark.processes,
+    pytest.mark.skipif(not shutil.which("openssl"), reason="the openssl command makes the certificate"),
+]
 
 
 @pytest.fixture(scope="module")

@@ -180,6 +180,7 @@ def test_a_damaged_backup_is_not_restored_and_leaves_nothing(live: Live, row: Ma
     assert {path.name for path in (tmp_path / "new").iterdir()} == {"cairn.lock"}
 
 
+@pytest.mark.processes
 def test_a_backup_of_a_disk_that_is_full_leaves_nothing(live: Live, row: MapRow, tmp_path: Path) -> None:
     with tiny_disk(tmp_path / "disk", size_mb=1) as disk:
         disk.fill()

@@ -218,6 +218,7 @@ def test_a_nursery_that_was_killed_is_made_anew(strict: Live) -> None:
     assert strict.push(row, pushed(1, 1)).status_code == 201
 
 
+@pytest.mark.processes
 def test_workers_end_with_a_server_that_was_killed(tmp_path: Path) -> None:
     process = Process(tmp_path)
     assert process.url

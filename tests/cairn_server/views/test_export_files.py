@@ -145,6 +145,7 @@ def test_white_is_told_from_no_colour() -> None:
     assert {low: leaf.rgb for (low, _), leaf in tree.leaves.items()} == {(1, 1, 0): (254,) * 3, (0, 0, 1): (255,) * 3}
 
 
+@pytest.mark.processes
 @pytest.mark.skipif(shutil.which("convert_octree") is None, reason="needs Debian's octomap-tools")
 def test_octomaps_own_tools_take_both_and_find_the_same_in_them(live: Live, tmp_path: Path) -> None:
     row = mapped(live)

@@ -123,6 +123,7 @@ def test_the_views_used_last_are_kept_within_a_bound() -> None:
     assert list(cache.newest(20)) == ["c", "a"]
 
 
+@pytest.mark.processes
 def test_a_full_disk_keeps_the_views_of_before_and_is_no_fuller(tmp_path: Path) -> None:
     with tiny_disk(tmp_path / "disk", size_mb=1) as disk:
         write_views(disk.folder, {"a": b"1"})

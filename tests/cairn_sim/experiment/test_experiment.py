@@ -211,6 +211,7 @@ def test_cells_that_are_not_all_taken_leave_no_folder(tmp_path: Path) -> None:
     assert encode_cell(first.key, first.evidence, MIDDLE).digest == first.digest
 
 
+@pytest.mark.processes
 def test_an_interrupted_run_keeps_finished_resolutions_and_nothing_half(recording: Path, tmp_path: Path) -> None:
     output = tmp_path / "out"
     command = [sys.executable, "-m", "cairn_client.main", "experiment", "--recording", str(recording)]
