@@ -40,7 +40,7 @@ if TYPE_CHECKING:
         UnreachableError,
     )
     from cairn_map.evidence.grid import Geometry, geometry_for
-    from cairn_map.evidence.sensor_model import SensorModel
+    from cairn_map.evidence.inverse_sensor_model import SensorModel
     from cairn_map.queries.map_snapshot import MapSnapshot
     from cairn_map.queries.occupancy_states import State
 
@@ -97,7 +97,7 @@ _MODULES = {
         CairnError BadInputError DeniedError NotFoundError ConflictError DamagedDataError UnreachableError
     """,
     "cairn_map.evidence.grid": "Geometry geometry_for",
-    "cairn_map.evidence.sensor_model": "SensorModel",
+    "cairn_map.evidence.inverse_sensor_model": "SensorModel",
     "cairn_map.queries.map_snapshot": "MapSnapshot",
     "cairn_map.queries.occupancy_states": "State",
 }

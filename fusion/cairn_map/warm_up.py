@@ -26,7 +26,7 @@ from cairn_map.evidence.evidence_kernels import channel_above
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import BRICK_DEPTH, Geometry, cell_key, voxels_in_cell
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.queries.map_snapshot import snapshot_of
 from cairn_map.render.camera_rays import look_at, pinhole
 from cairn_map.render.colour_kernels import blend_into

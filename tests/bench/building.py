@@ -11,7 +11,7 @@ from pathlib import Path
 from cairn_client.http.api import MapApi
 from cairn_map.codec.cell_code import encode_cell
 from cairn_map.evidence.grid import cell_of_key, geometry_for
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.files.cell_folder import FolderHead, write_cell, write_head
 from cairn_sim.experiment.mapping import GrowingMap, map_all
 from cairn_sim.experiment.robots import simulated_robots

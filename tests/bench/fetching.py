@@ -12,7 +12,7 @@ from tests.bench.timing import cpu_s
 from cairn_map.commits.cursor import Cursor
 from cairn_map.evidence.blocks import of_blocks
 from cairn_map.evidence.grid import Geometry
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.frames import CellFrame, frames_of
 from cairn_map.wire.messages import MissingRequest
 from cairn_server.folding.cell_cache import CellCache

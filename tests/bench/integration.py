@@ -14,7 +14,7 @@ from cairn_fusion.recording.scan import Scan
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import CellKey, Geometry, geometry_for
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_sim.evaluation.scores import FREE, Scores, map_states, scores_of
 from cairn_sim.evaluation.truth_grid import Truth, box_of_cell, truths_of
 from cairn_sim.render.sensors import RangeSensor

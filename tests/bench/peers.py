@@ -28,7 +28,7 @@ from cairn_map.codec.octree.cell_head import decode_head
 from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry, geometry_for
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.voxels import Voxels, joined_voxels, voxels_of_evidence
 from cairn_sim.robots.record import Plan, scans_of, shots_of
 from cairn_sim.robots.robots import ROBOTS

@@ -18,7 +18,7 @@ from tests.bench.pushing import BOMB_BYTES, Bodies, Diff, Robot, bomb, meta_of, 
 from cairn_fusion.mapping.integrate import Integrator, integrate_scans
 from cairn_map.commits.commit import make_commit
 from cairn_map.evidence.grid import Geometry, geometry_for
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.frames import CellFrame, frames_of
 from cairn_map.wire.messages import ReplyHeader
 from cairn_server.store.sqlite.store import SqliteStore

@@ -11,7 +11,7 @@ from tests.fixtures.map.made import GEOMETRIES, random_evidence, surface_evidenc
 
 from cairn_map.codec.view_code import decode_view, encode_view
 from cairn_map.evidence.grid import cell_key
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.view import Chance, Colours, Extent, ViewStyle
 
 pytestmark = pytest.mark.browser

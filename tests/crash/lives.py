@@ -20,7 +20,7 @@ from tests.fixtures.server.store_contract import new_of
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.errors import CairnError
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.folding import fold_pending
 from cairn_server.store.sqlite.store import SqliteStore

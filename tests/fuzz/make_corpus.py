@@ -32,7 +32,7 @@ from cairn_map.codec.view_code import encode_view
 from cairn_map.commits.signature import Signature, signatures_to_text
 from cairn_map.evidence.evidence import Evidence, empty_evidence
 from cairn_map.evidence.fingerprint import ZERO, fingerprint
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.view import Chance, Extent, ViewStyle
 from cairn_map.files.cell_folder import FolderHead
 from cairn_map.wire.frames import CellFrame, FrameKind, encode_frame, start_of_reply

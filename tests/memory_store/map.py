@@ -10,7 +10,7 @@ from cairn_map.commits.ids import Author, CommitId
 from cairn_map.errors import BadInputError, ConflictError
 from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX
 from cairn_map.evidence.grid import CellKey, Geometry
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.numbering import AGAIN_KEPT_S, EvidenceGoneError, Numbering, check_number
 from cairn_server.store.store_rows import Branch, CellRow, Entry, Fold, Head, MapRow, NewCommit, StoredCommit
 

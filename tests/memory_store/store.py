@@ -17,7 +17,7 @@ from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.errors import CairnError, ConflictError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import Branch, Fold, MapRow, NewCommit, StoredCommit
 

@@ -1,7 +1,7 @@
 """The map's own sensor model, as the server told it, kept with the map for when there is no link."""
 
 from cairn_client.replica.replica_store import ReplicaStore
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 
 KEY = "sensor_model"
 

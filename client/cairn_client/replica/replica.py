@@ -28,7 +28,7 @@ from cairn_map.evidence.evidence import Evidence, empty_evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.fingerprint import ZERO, fingerprint
 from cairn_map.evidence.grid import Cell, CellKey, Geometry, cell_of_key
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
 from cairn_map.wire.messages import ReplyHeader, message_from_json
 

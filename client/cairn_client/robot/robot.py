@@ -47,7 +47,7 @@ from cairn_map.commits.ids import CommitId, robot_name
 from cairn_map.errors import BadInputError, CairnError
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Geometry, cell_of_key
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.kernels.compile_progress import show_compiling
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.wire.robot_status import Mode

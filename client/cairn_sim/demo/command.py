@@ -31,7 +31,7 @@ from cairn_client.http.api import MapApi
 from cairn_fusion.view.picture import write_map_picture
 from cairn_map.errors import BadInputError, UnreachableError
 from cairn_map.evidence.grid import geometry_for
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.voxels import joined_voxels, voxels_of_evidence
 from cairn_map.files.cell_files import ply_file
 from cairn_map.wire.messages import BranchInfo, CreateMap, Retract

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence_map import Diff
 from cairn_map.evidence.grid import Geometry, cell_key, voxels_in_cell
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_sim.evaluation.truth_grid import HALF_SOLID, Truth, TruthClass, VoxelBox
 
 States = npt.NDArray[np.int8]

@@ -19,7 +19,7 @@ from cairn_map.arrays import Flags, Floats, Int32s
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence_map import Diff
 from cairn_map.evidence.grid import Geometry, voxels_in_cell
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_sim.evaluation.fusion_truth import HIDDEN_M
 from cairn_sim.render.rays import POINTS_OF_BUNDLE, cast_directions
 from cairn_sim.render.sensors import ThermalSensor

@@ -18,7 +18,7 @@ from cairn_map.evidence.brick_cell import brick_cell
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import CellKey, cell_of_key
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.files.cell_folder import FolderHead, write_cell, write_head
 from cairn_sim.experiment.codings import CODINGS, EXACT_FAST
 from cairn_sim.experiment.figures import CellFigures, CodedCell

@@ -7,7 +7,7 @@ from cairn_map.codec.cell_code import Profile, decode_cell, encode_cell
 from cairn_map.codec.view_code import decode_view, encode_view
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.view import FULL_STYLE, Colours, ViewStyle
 from cairn_sim.experiment.pointer_octree import decode_pointer_octree, encode_pointer_octree, occupied_voxels
 

@@ -20,7 +20,7 @@ from cairn_map.arrays import Rgb, Singles
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.voxels import voxels_of_evidence
 from cairn_map.files.cell_files import colours
 from cairn_sim.scene.scene import AMBIENT_K

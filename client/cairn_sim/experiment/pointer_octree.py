@@ -20,7 +20,7 @@ from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import DEPTH_MAX, CellKey, Geometry
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.voxels import voxels_of_evidence
 
 FIELDS = np.dtype([("log_odds", "<i2"), ("rgb", "u1", (3,)), ("pad", "u1"), ("temperature", "<i2")])

@@ -10,7 +10,7 @@ import numpy as np
 
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_sim.evaluation.scores import Scores, scores_of
 from cairn_sim.evaluation.truth_grid import box_of_cell, seen_marks, solid_masks, truth_from
 from cairn_sim.experiment.figures import TruthFigures

@@ -22,7 +22,7 @@ from cairn_map.codec.octree.octree_kernels import expand_into, leaves_of_rows
 from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CELL_LIMIT, DEPTH_MAX, CellKey, Geometry, cell_key, cell_of_key
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.view import LOG_ODDS_ZERO, TOPS, Chance, Colours, Extent, View, ViewStyle, view_of
 
 MAGIC = b"CRNV"

@@ -19,7 +19,7 @@ from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import Channel, ChannelKind
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import Geometry
-from cairn_map.evidence.sensor_model import SensorModel, log_odds
+from cairn_map.evidence.inverse_sensor_model import SensorModel, log_odds
 
 LOG_ODDS_STEP = 0.001
 LOG_ODDS_ZERO = 1 << 15

@@ -12,7 +12,7 @@ from cairn_map.arrays import Floats
 from cairn_map.evidence.channels import Channel, ChannelKind
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry, centres_of_voxels, voxels_in_cell
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 
 
 @dataclass(frozen=True, slots=True)

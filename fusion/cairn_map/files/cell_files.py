@@ -10,7 +10,7 @@ from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.voxels import Voxels, voxels_of_evidence
 
 CELL_MEDIA_TYPE = "application/vnd.cairn.cell"

@@ -17,7 +17,7 @@ from cairn_map.codec.cell_code import DecodedCell, decode_canonical_cell
 from cairn_map.codec.cell_reading import CELL_BYTES_MAX
 from cairn_map.errors import BadInputError, DamagedDataError, first_error
 from cairn_map.evidence.grid import Cell, Geometry, cell_key
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 
 MAP_FILE = "map.json"
 MAP_BYTES_MAX = 1 << 20

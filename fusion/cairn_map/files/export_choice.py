@@ -8,7 +8,7 @@ import numpy.typing as npt
 from cairn_map.arrays import Floats
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key, centres_of_voxels, voxels_in_cell
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.view import Chance, Colours, View, ViewStyle, view_of
 from cairn_map.files.export_request import ExportRequest
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.view import LOG_ODDS_STEP, LOG_ODDS_ZERO
 from cairn_map.files.export_choice import chosen_in_cell
 from cairn_map.files.export_request import ExportRequest

@@ -15,7 +15,7 @@ from cairn_map.errors import BadInputError
 from cairn_map.evidence.brick_cell import BrickCell
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import CELL_LIMIT, NANOMETRES, CellKey, Geometry, cell_of_key
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.queries.occupancy_kernels import Grid, brick_corners_into
 from cairn_map.queries.occupancy_states import CellStates, state_grid, states_of_counts
 

@@ -1,4 +1,7 @@
-"""Sets of voxels of a whole map: the frontier, and the highest of each column; no checks."""
+"""Sets of voxels of a whole map: the frontier between free and unknown, and the highest voxel of each column.
+
+Each brick is read as eight blocks of 4^3 voxels, one word of 64 bits each. These kernels check nothing.
+"""
 
 import numba as nb
 import numpy as np
@@ -7,14 +10,16 @@ from cairn_map.arrays import Ints, Words
 from cairn_map.queries.occupancy_kernels import KNOWN_BITS, OCCUPIED_BITS, Grid, U, brick_of, place_of, x_in_block
 
 ALL = ~U(0)
+"""The word of a block whose voxels are all in the set."""
 
 
 @nb.njit(cache=True, nogil=True)
 def frontier_into(grid: Grid, corners: Ints, frontier: Words) -> int:
-    """Set (B, 8) bits of the free voxels with an unknown one beside one of their faces; returns how many there are."""
+    """Write (B, 8) bits of the free voxels of which a face borders on an unknown voxel; returns their number."""
     count = 0
     beside = np.empty(6, np.int64)
     for b in range(grid.words.shape[0]):
+        # The six bricks across the faces, or NONE: side 2 * axis is below, side 2 * axis + 1 above.
         for side in range(6):
             step = 8 if side & 1 else -8
             x = corners[b, 0] + (step if side >> 1 == 0 else 0)
@@ -25,6 +30,7 @@ def frontier_into(grid: Grid, corners: Ints, frontier: Words) -> int:
             known = grid.words[b, w, KNOWN_BITS]
             free = known & ~grid.words[b, w, OCCUPIED_BITS]
             frontier[b, w] = 0
+            # Most blocks lie within known space: seven words tell, and no voxel is looked at.
             if free == U(0) or (known == ALL and are_known_beside(grid, beside, b, w)):
                 continue
             for n in range(64):
@@ -36,8 +42,9 @@ def frontier_into(grid: Grid, corners: Ints, frontier: Words) -> int:
 
 @nb.njit(nogil=True)
 def are_known_beside(grid: Grid, beside: Ints, b: int, w: int) -> bool:
-    """Whether all voxels of the six blocks beside a block of a brick are known."""
+    """True if all voxels of the six blocks next to block w of brick b are known."""
     for axis in range(3):
+        # A brick has two blocks along an axis: one neighbour is the other block, one lies in the next brick.
         other = w ^ (1 << axis)
         if grid.words[b, other, KNOWN_BITS] != ALL:
             return False
@@ -49,14 +56,14 @@ def are_known_beside(grid: Grid, beside: Ints, b: int, w: int) -> bool:
 
 @nb.njit(nogil=True)
 def has_unknown_beside(grid: Grid, beside: Ints, b: int, w: int, n: int) -> bool:
-    """Whether one of the six voxels beside voxel n of a block of a brick is unknown."""
+    """True if one of the six voxels next to voxel n of block w of brick b is unknown."""
     x, y, z = 4 * (w & 1) + x_in_block(n), 2 * (w & 2) + x_in_block(n >> 1), (w & 4) + x_in_block(n >> 2)
     for side in range(6):
         step = 1 if side & 1 else -1
         vx = x + (step if side >> 1 == 0 else 0)
         vy = y + (step if side >> 1 == 1 else 0)
         vz = z + (step if side >> 1 == 2 else 0)
-        brick = b if (vx | vy | vz) & -8 == 0 else beside[side]
+        brick = b if (vx | vy | vz) & -8 == 0 else beside[side]  # any of them is -1 or 8: outside of the brick
         if brick < 0:
             return True
         place = place_of(vx, vy, vz, 7)
@@ -67,7 +74,7 @@ def has_unknown_beside(grid: Grid, beside: Ints, b: int, w: int, n: int) -> bool
 
 @nb.njit(cache=True, nogil=True)
 def tops_into(grid: Grid, corners: Ints, low: Ints, high: Ints, tops: Ints) -> None:
-    """Raise (H, W) numbers along z to those of the occupied voxels in a box, from `low` up to before `high`."""
+    """Raise (H, W) z numbers to those of the occupied voxels in the box from `low` up to, but without, `high`."""
     for b in range(grid.words.shape[0]):
         for w in range(8):
             occupied = grid.words[b, w, OCCUPIED_BITS]

@@ -25,7 +25,7 @@ from cairn_map.arrays import Floats
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Cell, Geometry
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.voxels import Reading, Voxels
 from cairn_map.queries import (
     body_queries,

@@ -1,6 +1,7 @@
-"""The nearest occupied or unknown voxel; no checks. Lengths are in voxel edges, to the nearest point of the voxel.
+"""Search for the nearest occupied or unknown voxel. Lengths are in voxel edges, to the nearest point of the voxel.
 
-Bricks are looked at in growing cubes around the point's own, until the next cube is farther than what was found.
+Bricks are searched in shells, the surfaces of growing cubes around the point's own brick, until the next shell is
+farther away than the voxel found. These kernels check nothing.
 """
 
 import numba as nb
@@ -16,9 +17,10 @@ from cairn_map.queries.point_kernels import is_within
 def nearest_into(
     grid: Grid, points: Floats, reach_m: float, radius: float, unknown: bool, distances: Floats, voxels: Ints
 ) -> bool:
-    """Distances (N,) from (N, 3) points (metres) to the nearest voxel, unknown or else occupied, and (N, 3) its number.
+    """Write (N,) distances from (N, 3) points (metres) to the nearest voxel, unknown or else occupied, and its number.
 
-    Infinite, and the point's own voxel, where none is within `radius`. Returns whether all points were within reach.
+    Where none is within `radius`, the distance is infinite and the number that of the point's own voxel. Returns True
+    if all points are finite and within reach.
     """
     inside = True
     start, own = np.empty(3), np.empty(3, np.int64)
@@ -36,15 +38,17 @@ def nearest_into(
 
 @nb.njit(nogil=True)
 def search_into(grid: Grid, start: Floats, own: Ints, radius: float, unknown: bool, voxel: Ints) -> float:
-    """Distance from one point; writes the voxel found."""
+    """Distance from one point to the nearest voxel, infinite if there is none; writes the voxel found."""
     best = np.nextafter(radius * radius, np.inf)  # squared; what lies at the radius itself still counts
     found = False
+    # Bounds of the search, in bricks: the box of all cells.
     bx, by, bz = own[0] >> 3, own[1] >> 3, own[2] >> 3
     low_x, low_y, low_z = grid.low[0] >> 3, grid.low[1] >> 3, grid.low[2] >> 3
     high_x, high_y, high_z = (grid.high[0] >> 3) - 1, (grid.high[1] >> 3) - 1, (grid.high[2] >> 3) - 1
     if unknown:  # all around the map as well
         low_x, low_y, low_z = min(low_x, bx) - 1, min(low_y, by) - 1, min(low_z, bz) - 1
         high_x, high_y, high_z = max(high_x, bx) + 1, max(high_y, by) + 1, max(high_z, bz) + 1
+    # Invariant: no brick of an earlier shell holds a voxel nearer than `best`.
     first = max(low_x - bx, bx - high_x, low_y - by, by - high_y, low_z - bz, bz - high_z, 0)
     last = max(high_x - bx, bx - low_x, high_y - by, by - low_y, high_z - bz, bz - low_z)
     for shell in range(first, last + 1):
@@ -53,6 +57,7 @@ def search_into(grid: Grid, start: Floats, own: Ints, radius: float, unknown: bo
             break
         for x in range(max(bx - shell, low_x), min(bx + shell, high_x) + 1):
             for y in range(max(by - shell, low_y), min(by + shell, high_y) + 1):
+                # A column of the shell: all of it on the cube's sides, else only its two ends.
                 step = 1 if abs(x - bx) == shell or abs(y - by) == shell else max(2 * shell, 1)
                 from_z = bz - shell
                 if step == 1:
@@ -70,9 +75,10 @@ def search_into(grid: Grid, start: Floats, own: Ints, radius: float, unknown: bo
 def search_brick_into(
     grid: Grid, start: Floats, bx: int, by: int, bz: int, best: float, unknown: bool, voxel: Ints
 ) -> float:
-    """Least squared distance to a voxel of a brick, if it is below `best`, and that voxel; else `best`."""
+    """Least squared distance to a voxel of a brick, if it is below `best`, else `best`; writes that voxel."""
     brick = brick_of(grid, 8 * bx, 8 * by, 8 * bz)
     if brick < 0:
+        # All of an absent brick is unknown: its nearest point counts.
         if not unknown:
             return best
         corner = (8 * bx, 8 * by, 8 * bz)
@@ -97,7 +103,7 @@ def search_brick_into(
 
 @nb.njit(nogil=True, forceinline=True)
 def shell_distance(start: Floats, bx: int, by: int, bz: int, shell: int) -> float:
-    """A bound of the distance to the bricks that are `shell` bricks away from (bx, by, bz); 0 for its own."""
+    """Lower bound of the distance to the bricks that are `shell` bricks away from (bx, by, bz); 0 for that brick."""
     least = np.inf
     for axis, brick in enumerate((bx, by, bz)):
         least = min(least, start[axis] - 8 * (brick - shell + 1), 8 * (brick + shell) - start[axis])
@@ -106,7 +112,7 @@ def shell_distance(start: Floats, bx: int, by: int, bz: int, shell: int) -> floa
 
 @nb.njit(nogil=True, forceinline=True)
 def box_distance_squared(start: Floats, x: int, y: int, z: int, size: int) -> float:
-    """Squared distance from a point to the cube from (x, y, z) on; 0 inside."""
+    """Squared distance from a point to the cube of `size` whose lowest corner is (x, y, z); 0 inside."""
     gx = max(x - start[0], start[0] - (x + size), 0.0)
     gy = max(y - start[1], start[1] - (y + size), 0.0)
     gz = max(z - start[2], start[2] - (z + size), 0.0)

@@ -1,9 +1,9 @@
-"""What every voxel of a map is, two bits each, found by its number: the ground that queries walk on; no checks.
+"""Occupancy states of a map's voxels, two bits each, found by the voxel's number: the grid that queries read.
 
     cell (i, j, k)  --hash-->  slot  --bricks[slot, Morton number of a brick]-->  b or -1
     words [b, 8, 2]            64 bits for each 4^3 block of a brick: which voxels are occupied, which are known
 
-Voxels are in Morton order. Unknown is what is not known: also all that lies in no brick, and in no cell.
+Voxels are in Morton order. All that lies in no brick, or in no cell, is unknown. These kernels check nothing.
 """
 
 from typing import NamedTuple
@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_map.arrays import Floats, Int32s, Ints, Words
-from cairn_map.codec.entropy.arithmetic_kernels import signed
 from cairn_map.evidence.grid import CELL_LIMIT, NANOMETRES
+from cairn_map.kernels.integer_kernels import signed
 from cairn_map.kernels.morton_kernels import squeeze
 
 Pool = npt.NDArray[np.int16] | npt.NDArray[np.int32]
@@ -25,22 +25,24 @@ UNKNOWN, FREE, OCCUPIED = np.uint8(0), np.uint8(1), np.uint8(2)
 OCCUPIED_BITS, KNOWN_BITS = U(0), U(1)
 NONE = -1
 SPREAD = np.array([sum(((v >> b) & 1) << (3 * b) for b in range(8)) for v in range(256)], np.uint32)
-"""The eight bits of a voxel's place along one axis, two zero bits between neighbours."""
+"""By the eight bits of a voxel's place along one axis: the same bits with two zero bits between neighbours."""
 HASH = np.uint64(0x9E3779B97F4A7C15)
-"""2^64 over the golden ratio: what differs little is spread far."""
+"""2^64 over the golden ratio (Fibonacci hashing): numbers that differ little are spread far."""
 
 
 class Grid(NamedTuple):
-    """A map's states as arrays."""
+    """Occupancy states of a map as arrays."""
 
     edge_nm: int
+    """Edge of a voxel, nanometres."""
     depth: int
+    """Octree depth of a cell: it has 2^depth voxels along an edge."""
     numbers: Ints
     """(H,) numbers of cells in a hash table with linear probing, a power of two long and never full; -1 is free."""
     slots: Int32s
-    """(H,) rows of `bricks`."""
+    """(H,) slots, which are rows of `bricks`, of the cells in `numbers`."""
     hash_shift: int
-    """64 less the bits of H."""
+    """64 less the bits of H: the highest bits of a hash are its place."""
     cells: Ints
     """(C, 3) numbers of the cells by slot, rising in Morton order."""
     low: Ints
@@ -50,18 +52,18 @@ class Grid(NamedTuple):
     bricks: Int32s
     """(C, 8^(depth - 3)) rows of the words below, or -1."""
     words: Words
-    """(B, 8, 2): OCCUPIED_BITS and KNOWN_BITS beside each other, because who asks for one asks for the other."""
+    """(B, 8, 2): OCCUPIED_BITS and KNOWN_BITS next to each other, because who reads one reads the other."""
 
 
 @nb.njit(inline="always")
 def _number_of(i: int, j: int, k: int) -> int:
-    """Of a cell inside the numbered space, as a key of the hash table."""
+    """Key in the hash table of a cell inside the numbered space: 21 bits for each axis."""
     return ((i + CELL_LIMIT) << 42) | ((j + CELL_LIMIT) << 21) | (k + CELL_LIMIT)
 
 
 @nb.njit(cache=True, nogil=True)
 def fill_table_into(cells: Ints, numbers: Ints, slots: Int32s, hash_shift: int) -> None:
-    """Enter (C, 3) cells into a free hash table."""
+    """Enter (C, 3) cells into an empty hash table."""
     for c in range(cells.shape[0]):
         number = _number_of(cells[c, 0], cells[c, 1], cells[c, 2])
         at = (U(number) * HASH) >> U(hash_shift)
@@ -73,11 +75,13 @@ def fill_table_into(cells: Ints, numbers: Ints, slots: Int32s, hash_shift: int) 
 
 @nb.njit(nogil=True)
 def slot_of(grid: Grid, i: int, j: int, k: int) -> int:
-    """The slot of a cell, or NONE; any integers will do."""
+    """The slot of a cell, or NONE; i, j and k are any integers."""
+    # Outside of the numbered space: some number needs more than 21 bits, or is negative.
     if ((i + CELL_LIMIT) | (j + CELL_LIMIT) | (k + CELL_LIMIT)) >> 21 != 0:
         return NONE
     number = _number_of(i, j, k)
     at = (U(number) * HASH) >> U(grid.hash_shift)
+    # Linear probing; the table is never full, so a free place ends the search.
     while True:
         found = grid.numbers[at]
         if found == number:
@@ -96,7 +100,7 @@ def place_of(x: int, y: int, z: int, mask: int) -> int:
 
 @nb.njit(nogil=True)
 def brick_of(grid: Grid, x: int, y: int, z: int) -> int:
-    """The brick that holds a voxel, or NONE."""
+    """The brick that holds a voxel, or NONE if it is in no brick or no cell."""
     slot = slot_of(grid, x >> grid.depth, y >> grid.depth, z >> grid.depth)
     if slot < 0:
         return NONE
@@ -106,15 +110,15 @@ def brick_of(grid: Grid, x: int, y: int, z: int) -> int:
 
 @nb.njit(inline="always")
 def state_in(words: Words, brick: int, place: int) -> np.uint8:
-    """What the voxel at a place of a brick is; bits of the place above the nine are left out."""
+    """State of the voxel at a place of a brick; bits of the place above the lowest nine are ignored."""
     b, w, bit = U(brick), U((place >> 6) & 7), U(place & 63)
     occupied, known = words[b, w, OCCUPIED_BITS] >> bit, words[b, w, KNOWN_BITS] >> bit
-    return np.uint8(occupied & U(1)) + np.uint8(known & U(1))
+    return np.uint8(occupied & U(1)) + np.uint8(known & U(1))  # UNKNOWN 0, FREE 1, OCCUPIED 2
 
 
 @nb.njit(nogil=True)
 def state_of(grid: Grid, x: int, y: int, z: int) -> np.uint8:
-    """What a voxel is."""
+    """State of a voxel, by its number."""
     brick = brick_of(grid, x, y, z)
     if brick < 0:
         return UNKNOWN
@@ -123,7 +127,10 @@ def state_of(grid: Grid, x: int, y: int, z: int) -> np.uint8:
 
 @nb.njit(nogil=True)
 def voxel_of(position_m: float, edge_nm: int) -> int:
-    """The voxel's number along one axis: nanometres, rounded half to even, then the floor in integers."""
+    """Number, along one axis, of the voxel that holds a position.
+
+    The position is rounded to whole nanometres, half to even; then the floor is exact, in integers.
+    """
     nanometres = int(np.rint(position_m * NANOMETRES))
     voxel = int(np.floor(nanometres * (1.0 / edge_nm)))  # off by one at most; a division takes longer
     rest = nanometres - voxel * edge_nm
@@ -132,10 +139,11 @@ def voxel_of(position_m: float, edge_nm: int) -> int:
 
 @nb.njit(cache=True, nogil=True)
 def states_of_counts_into(pool: Pool, of_hits: Floats, of_misses: Floats, least: float, words: Words) -> None:
-    """Set the (B, 8, 2) words of a pool (B, 512, 2) of 16 bits.
+    """Write the (B, 8, 2) words of a pool (B, 512, 2) of hits and misses, 16 bits each.
 
-    `of_hits` and `of_misses` are what as many say, (65536,) by the count's bits, so that the sum is the very one that
-    `SensorModel` makes: multiplying here could round otherwise, and a tie would fall to the other side.
+    `of_hits` and `of_misses` are the log-odds of as many, (65536,) by the count's bits, so that the sum is the very
+    one of `SensorModel`: a product made here could round otherwise, and a tie would fall to the other side. A voxel is
+    occupied if its log-odds are above `least`.
     """
     for b in range(U(pool.shape[0])):
         for w in range(U(8)):
@@ -152,24 +160,25 @@ def states_of_counts_into(pool: Pool, of_hits: Floats, of_misses: Floats, least:
 
 @nb.njit(inline="always")
 def x_in_block(n: int) -> int:
-    """Of voxel n of a 4^3 block: its place along x; y and z are those of n >> 1 and n >> 2."""
+    """Place along x of voxel n of a 4^3 block; along y and z pass n >> 1 and n >> 2."""
     return (n & 1) | ((n >> 2) & 2)
 
 
 @nb.njit(cache=True, nogil=True)
 def brick_corners_into(grid: Grid, corners: Ints) -> None:
-    """First voxels (B, 3) of all bricks."""
+    """Write (B, 3) first voxels of all bricks."""
     for slot in range(grid.bricks.shape[0]):
         for b in range(grid.bricks.shape[1]):
             brick = grid.bricks[slot, b]
             if brick >= 0:
+                # b is the brick's Morton code in the cell; a brick has 8 voxels along an edge.
                 for axis in range(3):
                     corners[brick, axis] = (grid.cells[slot, axis] << grid.depth) + 8 * signed(squeeze(U(b >> axis)))
 
 
 @nb.njit(cache=True, nogil=True)
 def list_bits_into(words: Words, corners: Ints, out: Ints) -> None:
-    """Numbers (M, 3) of the M voxels of a set (B, 8), brick by brick in Morton order."""
+    """Write (M, 3) numbers of the M voxels of a set (B, 8), brick by brick in Morton order."""
     m = 0
     for b in range(words.shape[0]):
         for w in range(8):

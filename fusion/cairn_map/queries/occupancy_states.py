@@ -13,7 +13,7 @@ import numpy as np
 from cairn_map.arrays import Floats, Words
 from cairn_map.evidence.brick_counts import BrickCounts
 from cairn_map.evidence.grid import Cell, Geometry
-from cairn_map.evidence.sensor_model import SensorModel, known, log_odds
+from cairn_map.evidence.inverse_sensor_model import SensorModel, known, log_odds
 from cairn_map.queries import occupancy_kernels as kernels
 from cairn_map.queries.occupancy_kernels import Grid
 

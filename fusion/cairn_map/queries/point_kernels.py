@@ -1,7 +1,8 @@
-"""States and sums at points; no checks, but they say whether a point was inside the numbered space.
+"""States and sums of the voxels that hold given points.
 
 Sums are read in three steps: `locate_into` finds each point's cell and voxel, `group_into` lists the points cell by
-cell, and one call for each cell gathers, with all it needs in the processor's cache.
+cell, and one call for each cell gathers its sums, with all it needs in the processor's cache. These kernels check
+nothing, but return whether all points were inside the numbered space.
 """
 
 import numba as nb
@@ -13,24 +14,23 @@ from cairn_map.queries.occupancy_kernels import NONE, UNKNOWN, Grid, Pool, U, pl
 
 Places = npt.NDArray[np.uint32]
 BLOCK = 256
+"""Points that `states_into` looks up at a time: 4 KiB of bricks and places stay in the processor's first cache."""
 
 
 @nb.njit(nogil=True, forceinline=True)
 def is_within(points: Floats, n: int | np.uint64, reach_m: float) -> bool:
-    """Whether a point is finite and within reach along every axis."""
+    """True if point n is finite and within reach along every axis."""
     return bool((abs(points[n, 0]) < reach_m) & (abs(points[n, 1]) < reach_m) & (abs(points[n, 2]) < reach_m))
 
 
 @nb.njit(cache=True, nogil=True)
 def states_into(grid: Grid, points: Floats, reach_m: float, out: Bytes) -> bool:
-    """States of the voxels that hold (N, 3) points; returns whether all are finite and within reach.
-
-    All bricks of a block of points first, then all their bits: so that the processor fetches many at a time.
-    """
+    """Write (N,) states of the voxels that hold (N, 3) points; returns True if all are finite and within reach."""
     inside = True
     bricks, places = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
     for start in range(U(0), U(points.shape[0]), U(BLOCK)):
         count = min(U(BLOCK), U(points.shape[0]) - start)
+        # All bricks of a block of points first, then all their bits: so the processor fetches many at a time.
         for n in range(count):
             inside &= is_within(points, start + n, reach_m)
             x = voxel_of(points[start + n, 0], grid.edge_nm)
@@ -46,9 +46,9 @@ def states_into(grid: Grid, points: Floats, reach_m: float, out: Bytes) -> bool:
 
 @nb.njit(cache=True, nogil=True)
 def locate_into(grid: Grid, points: Floats, reach_m: float, slots: Int32s, places: Places) -> bool:
-    """Slots of the cells that hold (N, 3) points, -1 where there is no brick, and Morton codes inside the cell.
+    """Write (N,) slots of the cells that hold (N, 3) points, -1 where there is no brick, and Morton codes in the cell.
 
-    Returns whether all points are finite and within reach.
+    Returns True if all points are finite and within reach.
     """
     inside = True
     for n in range(U(points.shape[0])):
@@ -67,12 +67,15 @@ def locate_into(grid: Grid, points: Floats, reach_m: float, slots: Int32s, place
 @nb.njit(cache=True, nogil=True)
 def group_into(slots: Int32s, starts: Ints, order: Int32s) -> None:
     """List the points of each slot: those of slot c are order[starts[c] : starts[c + 1]], of (C + 1,) starts."""
+    # A counting sort: how many points each slot has, in the place after its own,
     starts[:] = 0
     for n in range(U(slots.shape[0])):
         if slots[n] >= 0:
             starts[U(slots[n]) + U(1)] += 1
+    # then where each slot's run begins,
     for c in range(1, starts.shape[0]):
         starts[c] += starts[c - 1]
+    # then each point to the next free place of its run.
     at = starts.copy()
     for n in range(U(slots.shape[0])):
         if slots[n] >= 0:
@@ -82,7 +85,7 @@ def group_into(slots: Int32s, starts: Ints, order: Int32s) -> None:
 
 @nb.njit(cache=True, nogil=True)
 def counts_into(rows: Int32s, places: Places, bricks: npt.NDArray[np.int16], pool: Pool, out: Int32s) -> None:
-    """Hits and misses of the listed points of one cell, all in its bricks."""
+    """Write (N, 2) hits and misses of the listed points of one cell, all in its bricks."""
     for n in range(U(rows.shape[0])):
         row = U(rows[n])
         place = U(places[row])
@@ -103,15 +106,16 @@ def log_odds_into(
     most: float,
     out: Floats,
 ) -> None:
-    """Clamped log-odds of the listed points of one cell, with a pool of 16 bits; NaN where unknown.
+    """Write (N,) clamped log-odds of the listed points of one cell, with a pool of 16 bits; NaN where unknown.
 
-    `of_hits` and `of_misses` as `state_kernels.states_of_counts_into` has them.
+    `of_hits` and `of_misses` are the tables of `occupancy_kernels.states_of_counts_into`.
     """
     for n in range(U(rows.shape[0])):
         row = U(rows[n])
         place = U(places[row])
         brick = U(bricks[place >> U(9)])
         hits, misses = pool[brick, place & U(511), 0], pool[brick, place & U(511), 1]
+        # L(n) = hits l_hit + misses l_miss, clamped (OctoMap, Eq. 2 and 4), both products from tables.
         odds = of_hits[np.uint16(hits)] + of_misses[np.uint16(misses)]
         out[row] = min(max(odds, least), most) if hits | misses != 0 else np.nan
 
@@ -128,9 +132,13 @@ def samples_into(
     first_plane: int,
     out: Ints,
 ) -> None:
-    """Sums (N, P) of P planes from the first on, of the listed points of one cell; those without stay as they are."""
+    """Write (N, P) sums of P planes from `first_plane` on, of the listed points of one cell.
+
+    Rows of points without samples stay unchanged.
+    """
     P = out.shape[1]
     for n in range(rows.shape[0]):
+        # Binary search: `known` rises, and all before `at` is below `place`, nothing from `end` on is.
         place = places[rows[n]]
         at, end = 0, known.shape[0]
         while at < end:
@@ -141,6 +149,7 @@ def samples_into(
                 end = middle
         if at == known.shape[0] or known[at] != place:
             continue
+        # Planes of 32 bits; then those few that need 64.
         row = row_of[at]
         for p in range(P):
             out[rows[n], p] = narrow[row, first_plane + p]

@@ -13,7 +13,7 @@ from cairn_map.errors import BadInputError
 from cairn_map.evidence.brick_cell import BrickCell
 from cairn_map.evidence.channels import Channel, ChannelKind
 from cairn_map.evidence.grid import Geometry
-from cairn_map.evidence.sensor_model import known, log_odds
+from cairn_map.evidence.inverse_sensor_model import known, log_odds
 from cairn_map.evidence.voxels import Reading, reading_of_sums
 from cairn_map.queries import point_kernels as kernels
 from cairn_map.queries.frozen_map import FrozenMap, as_points, check_within

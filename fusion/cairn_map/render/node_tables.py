@@ -17,7 +17,7 @@ from cairn_map.arrays import Floats
 from cairn_map.evidence.brick_cell import BrickCell
 from cairn_map.evidence.channels import Channel
 from cairn_map.evidence.grid import Geometry
-from cairn_map.evidence.sensor_model import SensorModel, known
+from cairn_map.evidence.inverse_sensor_model import SensorModel, known
 
 Table = npt.NDArray[np.float32]
 """(B, 585, planes) float32; NaN where nothing is known."""

@@ -13,7 +13,7 @@ from cairn_map.arrays import Floats
 from cairn_map.evidence.brick_cell import BrickCell
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.queries.frozen_map import FrozenMap
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.queries.occupancy_states import CellStates, state_grid, states_of_counts

@@ -1,9 +1,9 @@
-"""What a camera sees of a map: for each pixel's ray the first occupied node that is no smaller than the pixel.
+"""Rays of a camera through a map: for each pixel the first occupied node that is no smaller than the pixel.
 
-A ray walks as in `ray_kernels`, but only stops where something is: `skips` says for every brick how large a cube around
-it holds nothing occupied, so that a room is crossed in a few steps. Far away, where a voxel is smaller than a pixel,
-nodes of 2, 4 or 8 voxels stand for it, the finest that no pixel's ray can miss: an obstacle never slips through.
-Lengths are in voxel edges.
+A ray walks as in `ray_kernels`, but only stops at occupied voxels: `skips` gives for every brick how large a cube
+around it holds nothing occupied, so that a room is crossed in a few steps. Far away, where a voxel is smaller than a
+pixel, nodes of 2, 4 or 8 voxels along an edge stand for it, the finest that no pixel's ray can miss: an obstacle never
+slips through. Lengths are in voxel edges.
 """
 
 import numba as nb
@@ -11,26 +11,29 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_map.arrays import Bytes, Floats, Int32s, Ints
-from cairn_map.codec.entropy.arithmetic_kernels import signed
 from cairn_map.evidence.grid import NANOMETRES
+from cairn_map.kernels.integer_kernels import signed
 from cairn_map.queries.occupancy_kernels import KNOWN_BITS, NONE, OCCUPIED_BITS, Grid, U, place_of, slot_of
-from cairn_map.queries.ray_kernels import NOWHERE, along, beyond, is_in_box
+from cairn_map.queries.ray_kernels import NOWHERE, enter_box_into, is_in_box, leave_block, ray_through, walk_block
 
 Ranges = npt.NDArray[np.float32]
 Places = npt.NDArray[np.uint32]
 NODE_DEPTH = 3
 """Nodes have 2^3 voxels along an edge at most: a brick."""
 FIRST_OF_8 = U(0x0101010101010101)
+"""Bit 0 of each byte: in Morton order, the first of each 2^3 voxels of a block."""
 
 
 @nb.njit(cache=True, nogil=True)
 def skips_into(grid: Grid, skips: Bytes) -> None:
-    """(C, 8^(depth - 3)): 2^n voxels along an edge, aligned, hold nothing occupied around a brick; 0 if it holds some.
+    """Write (C, 8^(depth - 3)): n of the largest aligned cube, 2^n voxels along an edge, around each brick that holds
+    nothing occupied; 0 where the brick itself holds an occupied voxel.
 
     Bricks are in Morton order, so that those of one larger cube follow each other.
     """
     bricks = skips.shape[1]
     for slot in range(skips.shape[0]):
+        # Bricks alone.
         for b in range(bricks):
             row = grid.bricks[slot, b]
             some = U(0)
@@ -38,6 +41,7 @@ def skips_into(grid: Grid, skips: Bytes) -> None:
                 for w in range(8):
                     some |= grid.words[row, w, OCCUPIED_BITS]
             skips[slot, b] = 0 if some else NODE_DEPTH
+        # Then cubes of 8, 64, ... bricks: empty if their eight parts are.
         for up in range(1, grid.depth - NODE_DEPTH + 1):
             group = 8**up
             for first in range(0, bricks, group):
@@ -63,7 +67,7 @@ def see_into(
     places: Places,
     nodes: Bytes,
 ) -> None:
-    """The first occupied node along each of (N, 3) unit rays of a camera at a place in the map.
+    """Find the first occupied node along each of (N, 3) unit rays of a camera in the map.
 
     Args:
         grid: the map's states.
@@ -73,7 +77,7 @@ def see_into(
         pixel_rad: angle that a node must span to be met by some ray.
         starts: (N,) where each walk begins; NaN for nowhere.
         ends: (N,) where it ends; NaN for nowhere.
-        is_beyond: walk through whatever is there until a free voxel is met, and only then look: for what lies beyond a
+        is_beyond: walk through everything until a free voxel is met, and only then look: for what lies beyond a
             surface, and is not its own other side.
         ranges: (N,) out: where the node is entered; NaN where there is none.
         slots: (N,) out: its cell, NONE where there is none.
@@ -87,45 +91,21 @@ def see_into(
         ranges[n], slots[n], places[n], nodes[n] = np.nan, NONE, 0, 0
         if not starts[n] <= ends[n]:  # NaN, too
             continue
+        # d_map = R_map_camera d_camera
         for axis in range(3):
             direction[axis] = (
                 T_map_camera[axis, 0] * rays[n, 0]
                 + T_map_camera[axis, 1] * rays[n, 1]
                 + T_map_camera[axis, 2] * rays[n, 2]
             )
-        at = begin_into(grid, start, direction, starts[n], voxel)
-        if at <= ends[n]:  # False for NaN
+        at = float(starts[n])
+        for axis in range(3):
+            voxel[axis] = int(np.floor(start[axis] + at * direction[axis]))
+        at = enter_box_into(grid, start, direction, at, voxel)
+        if at <= ends[n]:
             ranges[n], slots[n], places[n], nodes[n] = look(
                 grid, skips, start, direction, at, float(ends[n]), pixel_rad, is_beyond, voxel
             )
-
-
-@nb.njit(nogil=True)
-def begin_into(grid: Grid, start: Floats, direction: Floats, at: float, voxel: Ints) -> float:
-    """Where in the box of all cells a walk from `at` on begins, and in which voxel; NaN if it does not."""
-    enters, leaves = float(at), np.inf
-    inside = True
-    for axis in range(3):
-        reached = start[axis] + enters * direction[axis]
-        inside &= (reached >= grid.low[axis]) & (reached < grid.high[axis])
-        if inside:
-            voxel[axis] = int(np.floor(reached))
-    if inside:
-        return enters
-    for axis in range(3):
-        if direction[axis] == 0:
-            if not grid.low[axis] <= start[axis] < grid.high[axis]:
-                return np.nan
-            continue
-        a = (grid.low[axis] - start[axis]) / direction[axis]
-        b = (grid.high[axis] - start[axis]) / direction[axis]
-        enters, leaves = max(enters, min(a, b)), min(leaves, max(a, b))
-    if not enters < leaves:
-        return np.nan
-    for axis in range(3):
-        reached = int(np.floor(start[axis] + enters * direction[axis]))
-        voxel[axis] = min(max(reached, grid.low[axis]), grid.high[axis] - 1)
-    return enters
 
 
 @nb.njit(nogil=True)
@@ -140,21 +120,22 @@ def look(
     is_beyond: bool,
     voxel: Ints,
 ) -> tuple[float, int, int, int]:
-    """Range, cell, place and node of the first that is occupied, from a voxel on that is entered at `at`."""
+    """Range, cell, place and node of the first occupied node along a ray that enters `voxel` at `at`."""
     depth, mask = grid.depth, (1 << grid.depth) - 1
     x, y, z = voxel[0], voxel[1], voxel[2]
-    start_x, inverse_x, up_x = along(start[0], direction[0], x)
-    start_y, inverse_y, up_y = along(start[1], direction[1], y)
-    start_z, inverse_z, up_z = along(start[2], direction[2], z)
+    ray = ray_through(start, direction, x, y, z)
     cell_x, cell_y, cell_z, slot = NOWHERE, NOWHERE, NOWHERE, NONE
     waits = is_beyond
+    # Invariant: the ray enters voxel (x, y, z) at range `at`; while it `waits`, it has met no free voxel yet.
     while at <= range_max:
+        # The cell: looked up only when another one is entered.
         if (x >> depth != cell_x) | (y >> depth != cell_y) | (z >> depth != cell_z):
             voxel[0], voxel[1], voxel[2] = x, y, z
             if not is_in_box(grid, voxel):
                 break
             cell_x, cell_y, cell_z = x >> depth, y >> depth, z >> depth
             slot = slot_of(grid, cell_x, cell_y, cell_z)
+        # The block that can be crossed in one step: an absent cell, or the largest cube without anything occupied.
         size = 1 << depth
         if slot >= 0:
             place = place_of(x, y, z, mask)
@@ -164,6 +145,7 @@ def look(
                 size = 8
                 brick = signed(grid.bricks[U(slot), U(place >> 9)])
                 if brick >= 0:
+                    # 4^3 voxels, enlarged to the nodes that a pixel cannot miss at this range.
                     size = 4
                     b, w = U(brick), U((place >> 6) & 7)
                     occupied = grid.words[b, w, OCCUPIED_BITS]
@@ -172,36 +154,15 @@ def look(
                         occupied = U(0) if skip else in_nodes(occupied, node)
                     ends = ~occupied & grid.words[b, w, KNOWN_BITS] if waits else occupied
                     if ends != U(0):
-                        # Voxel by voxel, until one ends it or the block is left.
-                        block_x, block_y, block_z = x & -4, y & -4, z & -4
-                        bit = U(place & 63)
-                        while (ends >> bit) & U(1) == U(0):
-                            to_x = (x + (up_x & 1) - start_x) * inverse_x
-                            to_y = (y + (up_y & 1) - start_y) * inverse_y
-                            to_z = (z + (up_z & 1) - start_z) * inverse_z
-                            leaves = min(to_x, to_y, to_z)
-                            at = max(at, leaves)
-                            x += (up_x | 1) * -int(to_x == leaves)
-                            y += (up_y | 1) * -int(to_y == leaves)
-                            z += (up_z | 1) * -int(to_z == leaves)
-                            if ((x ^ block_x) | (y ^ block_y) | (z ^ block_z)) & -4 != 0:
-                                break
-                            bit = U(place_of(x, y, z, 3))
-                        else:
-                            if waits:
-                                waits = False
-                                continue
+                        x, y, z, at, _, is_met = walk_block(ray, x, y, z, at, ends, U(place & 63))
+                        if is_met and not waits:
                             if at <= range_max:
                                 return at, slot, place_of(x, y, z, mask), node
                             break
+                        # Either the block is left, or its first free voxel is met: from here on the ray looks.
+                        waits = waits and not is_met
                         continue
-        to_x = ((x & -size) + (up_x & size) - start_x) * inverse_x
-        to_y = ((y & -size) + (up_y & size) - start_y) * inverse_y
-        to_z = ((z & -size) + (up_z & size) - start_z) * inverse_z
-        at = max(at, min(to_x, to_y, to_z))
-        x = beyond(x, size, up_x, start_x + at * direction[0], to_x <= at)
-        y = beyond(y, size, up_y, start_y + at * direction[1], to_y <= at)
-        z = beyond(z, size, up_z, start_z + at * direction[2], to_z <= at)
+        x, y, z, at = leave_block(ray, x, y, z, at, size)
     return np.nan, NONE, 0, 0
 
 
@@ -213,8 +174,9 @@ def node_at(pixel: float) -> int:
 
 @nb.njit(nogil=True, forceinline=True)
 def in_nodes(occupied: np.uint64, node: int) -> np.uint64:
-    """Of 4^3 voxels, in a brick with some occupied: those in an occupied node, n from 1."""
+    """Bits of those of 4^3 voxels, in a brick with some occupied, that lie in an occupied node; `node` is n from 1."""
     if node == 1:
+        # Any bit of a byte, gathered in its bit 0, and spread to all eight.
         some = occupied | (occupied >> U(4))
         some |= some >> U(2)
         some |= some >> U(1)

@@ -13,7 +13,7 @@ from cairn_map.commits.version_vector import AUTHORS_MAX, VersionVector, version
 from cairn_map.errors import DamagedDataError, first_error
 from cairn_map.evidence.fingerprint import Fingerprint, fingerprint_from_hex
 from cairn_map.evidence.grid import Geometry
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.robot_status import RobotStatus
 
 Message = TypeVar("Message", bound=BaseModel)

@@ -15,7 +15,7 @@ from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import VersionVector
 from cairn_map.evidence.grid import CellKey, Geometry
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.access_messages import AuditEntry
 from cairn_map.wire.messages import LogEntry
 from cairn_server.store.store_rows import (

@@ -10,7 +10,7 @@ from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.access_messages import RoleText
 
 Robot = tuple[int, str]

@@ -12,7 +12,7 @@ from functools import lru_cache
 
 from cairn_map.codec.view_code import VERSION
 from cairn_map.evidence.grid import Geometry
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.store_rows import CellRow, MapRow
 
 BYTES_MAX = 1 << 26

@@ -15,7 +15,7 @@ from cairn_map.codec.cell_code import encode_cell
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError
 from cairn_map.evidence.evidence import Evidence, packed_evidence
 from cairn_map.evidence.grid import cell_of_key
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.files.cell_folder import FolderHead, write_cell, write_head
 
 # Voxels of 5 cm: 0 is at the origin, 7 is the upper corner of its 2^3 block.

@@ -24,7 +24,7 @@ from cairn_client.http.map_url import split_map_url
 from cairn_client.robot.robot import Robot
 from cairn_map.codec.cell_code import Profile
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, DeniedError, UnreachableError
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.queries.occupancy_states import State
 from cairn_map.wire.access_messages import CreateToken
 from cairn_map.wire.messages import CreateMap, Register

@@ -13,7 +13,7 @@ from cairn_map.errors import BadInputError, CairnError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence import Evidence, empty_evidence
 from cairn_map.evidence.grid import Geometry
-from cairn_map.evidence.sensor_model import SensorModel, log_odds
+from cairn_map.evidence.inverse_sensor_model import SensorModel, log_odds
 from cairn_map.evidence.view import FULL_STYLE, LOG_ODDS_ZERO, TOPS, Chance, Colours, Extent, View, ViewStyle, view_of
 
 MODEL = SensorModel()

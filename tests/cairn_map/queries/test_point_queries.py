@@ -14,7 +14,7 @@ from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel
 from cairn_map.evidence.evidence import COUNT_MAX, packed_evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import CELL_LIMIT, Geometry, cell_key
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.queries import point_queries
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
 from cairn_map.queries.occupancy_states import State

@@ -10,7 +10,7 @@ from tests.naive import sight as naive_sight
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import CellKey, Geometry, cell_key
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.queries import occupancy_kernels
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
 from cairn_map.queries.occupancy_states import State

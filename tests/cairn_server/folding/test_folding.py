@@ -15,7 +15,7 @@ from tests.fixtures.server.store_contract import NAMES, new_of
 
 from cairn_map.commits.commit import Commit
 from cairn_map.evidence.grid import cell_of_key
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.folding import fold_thread, group_folding
 from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.folding import fold_pending

@@ -23,7 +23,7 @@ from tests.fixtures.server.pushes import KEYS, pushed
 from cairn_map.commits.commit import Commit
 from cairn_map.errors import UnreachableError
 from cairn_map.evidence.grid import cell_of_key
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.messages import CreateMap, MapInfo
 from cairn_server.folding.damaged_cells import DamagedCells
 from cairn_server.folding.fold_process import FoldProcess, LostProcessError, answer_folds

@@ -23,7 +23,7 @@ from tests.naive.asker import NaiveAsker
 
 from cairn_client.http.api import MapApi
 from cairn_map.errors import UnreachableError
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.access_messages import CreateToken
 
 

@@ -17,7 +17,7 @@ from tests.fixtures.server.pushes import pushed
 from tests.fixtures.server.store_contract import StoreContract, new_of
 
 from cairn_map.errors import BadInputError, ConflictError, UnreachableError
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.sqlite import readers as sqlite_readers
 from cairn_server.store.sqlite import tokens as sqlite_tokens
 from cairn_server.store.sqlite.changes import append_commit

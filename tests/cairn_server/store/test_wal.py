@@ -11,7 +11,7 @@ from tests.fixtures.server.live import until
 from tests.fixtures.server.pushes import pushed
 from tests.fixtures.server.store_contract import new_of
 
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.sqlite import writer as sqlite_writer
 from cairn_server.store.sqlite.store import SqliteStore
 from cairn_server.store.store_rows import MapRow

@@ -21,7 +21,7 @@ from tests.naive.octomap import Node, read_tree
 
 from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.grid import cell_key
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.files.export_request import ExportRequest
 from cairn_map.files.laz import LazHead, laz_parts
 from cairn_map.files.octomap import branch_of_cell, tree_file

@@ -14,7 +14,7 @@ from tests.fixtures.server.tiny_disk import tiny_disk
 
 from cairn_map.codec.view_code import decode_view
 from cairn_map.evidence.grid import cell_of_key
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.store_rows import MapRow
 from cairn_server.views import view_bundle
 from cairn_server.views.cell_view import view_of_stored

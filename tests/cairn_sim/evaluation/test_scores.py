@@ -14,7 +14,7 @@ from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import CellKey, Geometry, geometry_for, split_voxels
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_sim.evaluation.scores import FREE, OCCUPIED, UNKNOWN, Scores, States, map_states, scores_from, scores_of
 from cairn_sim.evaluation.truth_grid import Truth, TruthClass, VoxelBox, box_of_metres, truth_from, truths_of
 from cairn_sim.evaluation.truth_grid_kernels import HIT, PASSED

@@ -22,7 +22,7 @@ from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scans
 from cairn_map.codec.cell_code import DecodedCell, encode_cell
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence_map import EvidenceMap
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.files.cell_folder import read_cells, read_head
 from cairn_sim.evaluation.scores import Scores, scores_of
 from cairn_sim.evaluation.truth_grid import box_of_cell, truths_of

@@ -12,7 +12,7 @@ import pytest
 from cairn_map.evidence.channels import STANDARD_CHANNELS
 from cairn_map.evidence.evidence import Evidence, packed_evidence
 from cairn_map.evidence.grid import Geometry, cell_key, split_voxels
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_sim.experiment.plan import HEAT, NO_TEMPERATURE, STRAY, PlanView
 
 GEOMETRY = Geometry(voxel_edge_um=500_000, depth=3)

@@ -12,7 +12,7 @@ from tests.fixtures.map.made import KEY, MIDDLE, PLAIN, SMALL, as_dict, random_e
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.evidence import empty_evidence
 from cairn_map.evidence.grid import Geometry
-from cairn_map.evidence.sensor_model import SensorModel, log_odds
+from cairn_map.evidence.inverse_sensor_model import SensorModel, log_odds
 from cairn_sim.experiment.pointer_octree import (
     FIELDS,
     HEAD,

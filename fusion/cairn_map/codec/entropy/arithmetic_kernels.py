@@ -16,6 +16,8 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.kernels.integer_kernels import signed
+
 Coder = npt.NDArray[np.int64]
 Live = tuple[int, int, int, int, bool]
 """A coder at work."""
@@ -29,12 +31,6 @@ EVEN = np.uint32(1 << 31)
 SEEN_MAX = 255
 STEPS = np.array([(1 << 17) // (2 * n + 3) for n in range(SEEN_MAX + 1)], np.int64)
 """By times seen: how far a probability moves towards the bit, in 1/65536: 2/3, 2/5, 2/7, ... a mean, then a memory."""
-
-
-@nb.njit(nogil=True, forceinline=True)
-def signed(number: np.integer) -> int:
-    """Any integer as int64: what is unsigned would make sums with what is not floats."""
-    return np.int64(number)  # type: ignore[return-value]
 
 
 @nb.njit(cache=True, nogil=True)

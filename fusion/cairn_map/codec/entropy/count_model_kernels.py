@@ -11,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_map.arrays import Int32s, Ints, Words32
-from cairn_map.codec.entropy.arithmetic_kernels import EVEN, Coder, Data, Live, resumed, signed, suspend_into
+from cairn_map.codec.entropy.arithmetic_kernels import EVEN, Coder, Data, Live, resumed, suspend_into
 from cairn_map.codec.entropy.mixing_kernels import SLOTS, TAILS, code_mixed, code_number, start_weights
 from cairn_map.codec.entropy.neighbour_kernels import LOWER, NONE, beside, leaf_at, stepped
+from cairn_map.kernels.integer_kernels import signed
 
 COUNT_MAX = (1 << 31) - 1
 HIT_TABLE = 1 << 14

@@ -13,9 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_map.arrays import Bytes
-from cairn_map.codec.entropy.arithmetic_kernels import EVEN, Coder, Data, resumed, signed, suspend_into
+from cairn_map.codec.entropy.arithmetic_kernels import EVEN, Coder, Data, resumed, suspend_into
 from cairn_map.codec.entropy.mixing_kernels import code_mixed, start_weights
 from cairn_map.codec.entropy.neighbour_kernels import LOWER, NONE, beside, stepped
+from cairn_map.kernels.integer_kernels import signed
 
 ABSENT, INNER, LEAF, SIBLING = 0, 1, 2, 3
 """States; SIBLING: an upper neighbour inside the same parent, of which nothing is known yet."""

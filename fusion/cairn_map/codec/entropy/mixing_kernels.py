@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_map.arrays import Ints
-from cairn_map.codec.entropy.arithmetic_kernels import Data, Live, Odds, code_bit, learn, signed, split
+from cairn_map.codec.entropy.arithmetic_kernels import Data, Live, Odds, code_bit, learn, split
+from cairn_map.kernels.integer_kernels import signed
 
 KNOTS = np.array(
     [

@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 
 from cairn_map.arrays import Int32s, Ints, Words32
-from cairn_map.codec.entropy.arithmetic_kernels import signed
+from cairn_map.kernels.integer_kernels import signed
 
 AXIS = 0x09249249
 """Every third bit of a place: x; shifted by 1 y, by 2 z."""

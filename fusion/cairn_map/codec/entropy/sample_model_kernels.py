@@ -9,10 +9,11 @@ import numba as nb
 import numpy as np
 
 from cairn_map.arrays import Flags, Int32s, Ints, Words32
-from cairn_map.codec.entropy.arithmetic_kernels import EVEN, Coder, Data, code_bit, resumed, signed, suspend_into
+from cairn_map.codec.entropy.arithmetic_kernels import EVEN, Coder, Data, code_bit, resumed, suspend_into
 from cairn_map.codec.entropy.mixing_kernels import SLOTS, TAILS, code_number, start_weights
 from cairn_map.codec.entropy.neighbour_kernels import LOWER, NONE, beside, leaf_at
 from cairn_map.codec.octree.sum_kernels import square_guess
+from cairn_map.kernels.integer_kernels import signed
 
 NEARNESS = np.array([4, 4, 4, 2, 2, 2, 2, 2, 2, 2, 2, 2, 1], np.int64)
 """What a neighbour counts, by `neighbour_kernels.STEPS`: faces, edges, the corner."""

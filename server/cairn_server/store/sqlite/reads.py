@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.evidence.grid import CellKey, Geometry
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.snapshot import SqliteSnapshot, ids_from_text
 from cairn_server.store.sqlite.writer import Values, first, rows

@@ -17,7 +17,7 @@ from cairn_map.commits.cursor import Cursor, cursor_from_text, first_chain
 from cairn_map.commits.ids import Author, new_incarnation
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
-from cairn_map.evidence.sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.folder_lock import lock_folder
 from cairn_server.store.sqlite.branches import LastSeen, SqliteBranchNotes
 from cairn_server.store.sqlite.changes import append_commit, next_number, write_fold

@@ -10,7 +10,7 @@ from tests.fixtures.map.made import PLAIN
 
 from cairn_map.evidence.brick_cell import sum_evidence
 from cairn_map.evidence.evidence import COUNT_MAX, packed_evidence
-from cairn_map.evidence.sensor_model import SensorModel, known, log_odds
+from cairn_map.evidence.inverse_sensor_model import SensorModel, known, log_odds
 
 NAN = math.nan
 MODEL = SensorModel()

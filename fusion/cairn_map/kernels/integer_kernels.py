@@ -1,0 +1,10 @@
+"""Integer casts inside kernels, where Numba's rules of mixed arithmetic differ from what a reader expects."""
+
+import numba as nb
+import numpy as np
+
+
+@nb.njit(nogil=True, forceinline=True)
+def signed(number: np.integer) -> int:
+    """Any integer as int64: Numba makes the sum of an unsigned and a signed integer a float."""
+    return np.int64(number)  # type: ignore[return-value]
