@@ -13,7 +13,7 @@ from cairn_fusion.transfer.covariance_grid import CovarianceGrid
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Geometry
 from cairn_map.queries.map_snapshot import snapshot_of
-from cairn_map.render.camera_rays import Sight
+from cairn_map.render.camera_rays import CameraRays
 from cairn_map.render.map_render import MapRenderer
 from cairn_map.render.pose_spread import PoseSpread
 
@@ -55,7 +55,7 @@ def _look(rig: Rig, scan: Scan) -> None:
         live = Live(
             rgb=scan.colour["colour"],
             range_m=scan.range_m,
-            sight=Sight(rig["colour"].camera.rays()),
+            sight=CameraRays(rig["colour"].camera.rays()),
             T_map_camera=np.eye(4),
             spread=spread,
         )

@@ -27,7 +27,7 @@ from cairn_fusion.image_fusion.surface import live_range
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.view.overlay import Live, OverlayStyle, draw_overlay
 from cairn_map.queries.map_snapshot import MapSnapshot
-from cairn_map.render.camera_rays import Sight
+from cairn_map.render.camera_rays import CameraRays
 from cairn_map.render.map_render import MapRenderer
 from cairn_map.render.render_request import RenderRequest, request_from
 from cairn_sim.robots.record import Plan, scans_of, shots_of
@@ -71,7 +71,7 @@ def _frames(count: int) -> tuple[Rig, list[Scan]]:
 
 def _overlay_rows(snapshot: MapSnapshot, rig: Rig, scans: Sequence[Scan], least: str, *, repeats: int) -> Iterator[Row]:
     renderer, style = MapRenderer(threads=THREADS), OverlayStyle()
-    sight = Sight(rig[CAMERA].camera.rays())
+    sight = CameraRays(rig[CAMERA].camera.rays())
     lives = [
         Live(
             rgb=scan.colour[CAMERA],

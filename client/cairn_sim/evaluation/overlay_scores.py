@@ -24,7 +24,7 @@ from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import CellKey, Geometry, split_voxels
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
-from cairn_map.render.camera_rays import Sight, look_at
+from cairn_map.render.camera_rays import CameraRays, look_at
 from cairn_map.render.map_render import MapRenderer
 
 GEOMETRY = Geometry(voxel_edge_um=50_000, depth=5, channels=(TEMPERATURE,))
@@ -56,7 +56,7 @@ def overlay_scores(
         seed: of both.
         style: what is drawn; None: as usual.
     """
-    sight, renderer, style = Sight(camera.rays()), MapRenderer(), style or OverlayStyle()
+    sight, renderer, style = CameraRays(camera.rays()), MapRenderer(), style or OverlayStyle()
     rgb = np.zeros((camera.height, camera.width, 3), np.uint8)
     for rng in map(np.random.default_rng, np.random.SeedSequence(seed).spawn(poses)):
         cubes = np.unique(rng.integers(-REACH_VOXELS, REACH_VOXELS, (CUBES, 3)), axis=0)

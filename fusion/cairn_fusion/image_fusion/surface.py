@@ -34,7 +34,7 @@ from cairn_fusion.mapping.flying_kernels import flying_pixels
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.transfer import KERNEL_COEFFICIENTS, Label
 from cairn_map.arrays import Flags, Labels, Singles
-from cairn_map.render.camera_rays import Sight
+from cairn_map.render.camera_rays import CameraRays
 
 Values = npt.NDArray[np.float32]
 COVER = 1.5
@@ -215,9 +215,9 @@ def beams(camera: AnyCamera) -> Singles:
 
 
 @lru_cache(maxsize=16)
-def sight_of(camera: AnyCamera) -> Sight:
+def sight_of(camera: AnyCamera) -> CameraRays:
     """A camera's rays as a map is drawn for them; kept, for what is worked out of them is."""
-    return Sight(camera.rays())
+    return CameraRays(camera.rays())
 
 
 def _slack(nearness: Singles, hiding: Singles) -> Singles:

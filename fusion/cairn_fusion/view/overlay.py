@@ -24,11 +24,11 @@ from cairn_map.arrays import Flags, Rgb
 from cairn_map.errors import BadInputError
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.render.bitmap_font import write_text_into
-from cairn_map.render.camera_rays import Sight, middles
+from cairn_map.render.camera_rays import CameraRays, middles
 from cairn_map.render.colour_kernels import blend_into
 from cairn_map.render.legend import with_legend
 from cairn_map.render.map_picture import Ages, layer_values
-from cairn_map.render.map_render import MapRenderer, Seen
+from cairn_map.render.map_render import MapRenderer, SurfaceImage
 from cairn_map.render.pose_spread import BLUR_MAX_PX, PoseSpread, spread_ink, why_withheld
 from cairn_map.render.render_picture import SCALES, WARNING, Layer, Scale, painted
 
@@ -61,7 +61,7 @@ class Live:
     """(H, W, 3) sRGB."""
     range_m: Values
     """(H, W) metres along each pixel's ray; NaN where there is none."""
-    sight: Sight
+    sight: CameraRays
     T_map_camera: npt.NDArray[np.float64]
     spread: PoseSpread = EXACT
     """How certain `T_map_camera` is."""
@@ -110,11 +110,11 @@ class Overlay:
 
     picture: Rgb
     """(H, W, 3)"""
-    front: Seen
+    front: SurfaceImage
     """What the map has where the live surface is, and, where there is no live depth, along the outlines of `rest`."""
     values: npt.NDArray[np.floating]
     """Of the layer, in front; (H, W), of colours (H, W, 3)."""
-    rest: Seen
+    rest: SurfaceImage
     """What lies behind the live surface, or, where there is no live depth, the nearest on the map; for the middle of
     each `step_px` rows and columns."""
     values_of_rest: npt.NDArray[np.floating]
@@ -222,7 +222,7 @@ def _rest(
     coarse_m: Values,
     tolerance_m: np.float32,
     style: OverlayStyle,
-) -> Seen:
+) -> SurfaceImage:
     """What is beyond the live surface, and the nearest where there is none."""
     sight, far = live.sight.every(style.step_px), np.full_like(coarse_m, style.range_max_m)
     is_alone = np.isnan(coarse_m)
@@ -235,7 +235,7 @@ def _rest(
     alone = renderer.nearest(
         snapshot, sight, live.T_map_camera, between_m=(np.where(is_alone, np.float32(0), nowhere), far), **asked
     )
-    return Seen(
+    return SurfaceImage(
         sight,
         np.where(is_alone, alone.range_m, behind.range_m),
         np.where(is_alone, alone.slots, behind.slots),
@@ -262,7 +262,12 @@ def with_overlay_legend(picture: Rgb, scale: Scale) -> Rgb:
 
 
 def _covers(
-    renderer: MapRenderer, snapshot: MapSnapshot, rest: Seen, live_m: Values, style: OverlayStyle, ages: Ages | None
+    renderer: MapRenderer,
+    snapshot: MapSnapshot,
+    rest: SurfaceImage,
+    live_m: Values,
+    style: OverlayStyle,
+    ages: Ages | None,
 ) -> Values:
     """(h, w) of the rest: less the farther behind the live surface it is, and the older."""
     fade = np.nan_to_num((rest.range_m - live_m) / np.float32(style.fade_m))

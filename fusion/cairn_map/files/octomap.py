@@ -40,7 +40,7 @@ IDS = {"ot": ("OcTree file", "ColorOcTree"), "bt": ("OcTree binary file", "OcTre
 
 
 @dataclass(frozen=True, slots=True)
-class Branch:
+class Subtree:
     """One cell in a tree: its place, its root, and how many nodes and leaves it has."""
 
     key: CellKey
@@ -52,7 +52,7 @@ class Branch:
 
 def branch_of_cell(
     key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel, asked: ExportRequest
-) -> tuple[Branch, bytes] | None:
+) -> tuple[Subtree, bytes] | None:
     """A cell's occupied nodes that are asked for, and the bytes that they are in a file; None: there are none.
 
     Raises:
@@ -72,11 +72,11 @@ def branch_of_cell(
     leaves["level"] = view.depth
     nodes = _depth_first(leaves, LEAF)
     r, g, b = nodes[0]["rgb"].tolist()
-    return Branch(key, float(nodes[0]["odds"]), (r, g, b), len(nodes), len(leaves)), _bytes_of(nodes, asked.format)
+    return Subtree(key, float(nodes[0]["odds"]), (r, g, b), len(nodes), len(leaves)), _bytes_of(nodes, asked.format)
 
 
 def tree_file(
-    form: str, branches: Sequence[Branch], bodies: Iterable[bytes], geometry: Geometry, about: str
+    form: str, branches: Sequence[Subtree], bodies: Iterable[bytes], geometry: Geometry, about: str
 ) -> Iterator[bytes]:
     """A tree, part by part; `branches` and their bytes rise in cell number."""
     nodes = _above(branches, geometry)
@@ -102,7 +102,7 @@ def tree_file(
         yield begun
 
 
-def _above(branches: Sequence[Branch], geometry: Geometry) -> Nodes:
+def _above(branches: Sequence[Subtree], geometry: Geometry) -> Nodes:
     """The nodes from the root down to the cells."""
     cells = np.zeros(len(branches), NODE)
     if not branches:

@@ -43,7 +43,7 @@ NPZ_MEMBER = "points.npy"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class PointBounds:
     """What a file of points begins with: how many there are, and where."""
 
     count: int = 0
@@ -70,10 +70,10 @@ class About:
 
 def found_in_cell(
     key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel, asked: ExportRequest
-) -> Found:
+) -> PointBounds:
     """How many points `points_of_cell` gives, and where, without their colours."""
     places = chosen_places(key, evidence, geometry, model, asked)
-    return Found(len(places), places.min(axis=0), places.max(axis=0)) if len(places) else Found()
+    return PointBounds(len(places), places.min(axis=0), places.max(axis=0)) if len(places) else PointBounds()
 
 
 def points_of_cell(
@@ -98,7 +98,7 @@ def points_of_cell(
     return table[chosen.rows]
 
 
-def point_file(form: str, found: Found, tables: Iterable[Table], about: About) -> Iterator[bytes]:
+def point_file(form: str, found: PointBounds, tables: Iterable[Table], about: About) -> Iterator[bytes]:
     """A file of points, part by part: PLY, PCD (both binary), LAZ, or NPZ with one array `points`."""
     if form == "npz":
         return _npz_parts(found.count, tables)
@@ -110,7 +110,7 @@ def point_file(form: str, found: Found, tables: Iterable[Table], about: About) -
     return _plain_parts(form, found.count, tables, about)
 
 
-def size_of_file(form: str, found: Found, about: About) -> int | None:
+def size_of_file(form: str, found: PointBounds, about: About) -> int | None:
     """Of a PLY or PCD, bytes; None: not known before an NPZ or LAZ is made."""
     if form not in ("ply", "pcd"):
         return None

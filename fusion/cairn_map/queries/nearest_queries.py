@@ -7,8 +7,8 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
-from cairn_map.queries import nearest_kernels as kernels
 from cairn_map.queries.frozen_map import FrozenMap, as_points, check_within
+from cairn_map.queries.nearest_kernels import nearest_into
 from cairn_map.queries.occupancy_states import State
 
 
@@ -34,7 +34,7 @@ def nearest(frozen: FrozenMap, points_m: npt.ArrayLike, state: State, *, radius_
         raise BadInputError("bad_range", f"a radius must be finite and 0 or more, got {radius_m}")
     N, edge_m = len(points), frozen.geometry.voxel_edge_m
     found = Nearest(np.empty(N), np.empty((N, 3), np.int64))
-    inside = kernels.nearest_into(
+    inside = nearest_into(
         frozen.grid,
         points,
         frozen.reach_m,

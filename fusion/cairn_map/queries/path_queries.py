@@ -12,8 +12,7 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
-from cairn_map.queries import body_queries
-from cairn_map.queries.body_queries import PathStates
+from cairn_map.queries.body_queries import PathStates, check_box, check_sphere
 from cairn_map.queries.frozen_map import FrozenMap, as_points
 from cairn_map.queries.occupancy_states import State
 
@@ -29,7 +28,7 @@ STATES = np.array([State.FREE, State.UNKNOWN, State.OCCUPIED], np.uint8)
 def sweep_box(frozen: FrozenMap, T_map_body: npt.ArrayLike, box_m: npt.ArrayLike) -> PathStates:
     """What a box, (2, 3) low and high corner in the body's frame, meets on its way to each of (N, 4, 4) poses."""
     T, box = np.asarray(T_map_body, np.float64), np.asarray(box_m, np.float64)
-    at_poses = body_queries.check_box(frozen, T, box)  # refuses what is no path, or no box
+    at_poses = check_box(frozen, T, box)  # refuses what is no path, or no box
     if len(T) < 2:
         return at_poses
     turns = _turns(T[:-1, :3, :3], T[1:, :3, :3])
@@ -39,18 +38,18 @@ def sweep_box(frozen: FrozenMap, T_map_body: npt.ArrayLike, box_m: npt.ArrayLike
     samples = np.tile(np.eye(4), (len(segment), 1, 1))
     samples[:, :3, :3] = T[segment, :3, :3] @ _rotations(turns[segment] * fraction[:, None])
     samples[:, :3, 3] = _between(T[:, :3, 3], segment, fraction)
-    return _worst(at_poses, body_queries.check_box(frozen, samples, box), segment)
+    return _worst(at_poses, check_box(frozen, samples, box), segment)
 
 
 def sweep_sphere(frozen: FrozenMap, centres_m: npt.ArrayLike, *, radius_m: float) -> PathStates:
     """What a sphere meets on its way to each of (N, 3) centres."""
     centres = as_points(centres_m, "centres")
-    at_poses = body_queries.check_sphere(frozen, centres, radius_m=radius_m)
+    at_poses = check_sphere(frozen, centres, radius_m=radius_m)
     if len(centres) < 2:
         return at_poses
     segment, fraction = _samples(frozen, np.linalg.norm(np.diff(centres, axis=0), axis=1))
     samples = _between(centres, segment, fraction)
-    return _worst(at_poses, body_queries.check_sphere(frozen, samples, radius_m=radius_m), segment)
+    return _worst(at_poses, check_sphere(frozen, samples, radius_m=radius_m), segment)
 
 
 def _samples(frozen: FrozenMap, moved_m: Floats) -> tuple[npt.NDArray[np.int64], Floats]:

@@ -8,9 +8,9 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
-from cairn_map.queries import ray_kernels as kernels
 from cairn_map.queries.frozen_map import FrozenMap, as_points, check_within
 from cairn_map.queries.occupancy_states import State
+from cairn_map.queries.ray_kernels import cast_into
 
 ONES = ~np.uint64(0)
 CHUNK = 1 << 14
@@ -52,7 +52,7 @@ def cast(
     ends = RayEnds(np.empty(N), np.empty(N, np.uint8), np.empty((N, 3), np.int64))
     for start in range(0, N, CHUNK):
         part = slice(start, start + CHUNK)
-        inside = kernels.cast_into(
+        inside = cast_into(
             frozen.grid,
             origins[part],
             _units(directions[part]),

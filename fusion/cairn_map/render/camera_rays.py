@@ -1,6 +1,6 @@
 """Where a camera looks: one ray for each pixel, and how fine the pixels are. Any lens: who has the rays has a camera.
 
-    Sight(rig["colour"].camera.rays())                     a calibrated camera, distortion and all
+    CameraRays(rig["colour"].camera.rays())                     a calibrated camera, distortion and all
     pinhole(640, 480, focal_px=500)                        an ideal one, to look from anywhere
     look_at((1, 2, 1.2), (4, 2, 1.0))                      T_map_camera of an eye and what it looks at
 
@@ -26,7 +26,7 @@ RIGID_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class CameraRays:
     """The rays of a camera's pixels."""
 
     rays: Floats
@@ -48,7 +48,7 @@ class Sight:
         known = [gap[gap > 0] for gap in gaps]  # NaN is not
         object.__setattr__(self, "pixel_rad", max((float(gap.max()) for gap in known if gap.size), default=1.0))
 
-    def every(self, step: int) -> "Sight":
+    def every(self, step: int) -> "CameraRays":
         """The camera with only the middle row and column of each `step`: those of `middles`."""
         return self if step == 1 else _every(self, step)
 
@@ -64,8 +64,8 @@ class Sight:
 
 
 @lru_cache(maxsize=8)
-def _every(sight: Sight, step: int) -> Sight:
-    return Sight(middles(sight.rays, step))
+def _every(sight: CameraRays, step: int) -> CameraRays:
+    return CameraRays(middles(sight.rays, step))
 
 
 def middles(image: npt.NDArray[Scalar], step: int) -> npt.NDArray[Scalar]:
@@ -74,7 +74,7 @@ def middles(image: npt.NDArray[Scalar], step: int) -> npt.NDArray[Scalar]:
     return image[np.ix_(rows, columns)]
 
 
-def pinhole(width: int, height: int, *, focal_px: float, centre_px: tuple[float, float] | None = None) -> Sight:
+def pinhole(width: int, height: int, *, focal_px: float, centre_px: tuple[float, float] | None = None) -> CameraRays:
     """An ideal camera, with the principal point in the middle or at `centre_px` (x, y).
 
     Raises:
@@ -88,7 +88,7 @@ def pinhole(width: int, height: int, *, focal_px: float, centre_px: tuple[float,
     if not np.isfinite(rays).all():
         raise BadInputError("bad_camera", f"the principal point must be finite, got {centre_px}")
     rays /= np.sqrt((rays * rays).sum(axis=2, keepdims=True))
-    return Sight(rays)
+    return CameraRays(rays)
 
 
 def look_at(eye_m: Sequence[float], target_m: Sequence[float]) -> Floats:
@@ -137,7 +137,7 @@ def checked_pose(T_map_camera: npt.ArrayLike, *, reach_m: float) -> Floats:
 
 
 def cells_in_sight(
-    cells: npt.NDArray[np.int64], sight: Sight, T_map_camera: Floats, *, edge_m: float, range_max_m: float
+    cells: npt.NDArray[np.int64], sight: CameraRays, T_map_camera: Floats, *, edge_m: float, range_max_m: float
 ) -> npt.NDArray[np.bool_]:
     """(C,) which of (C, 3) cells, of an edge, may be seen: those outside of what all rays span certainly are not."""
     half_m = edge_m * np.sqrt(3) / 2  # of the sphere around a cell
@@ -154,7 +154,7 @@ def cells_in_sight(
 
 
 @lru_cache(maxsize=2)
-def _span(sight: Sight) -> tuple[Floats, float]:
+def _span(sight: CameraRays) -> tuple[Floats, float]:
     """The middle of all rays, and the widest angle of one from it; pi: all around, NaN: no ray looks anywhere."""
     rays = sight.rays.reshape(-1, 3)
     rays = rays[~np.isnan(rays[:, 0])]

@@ -10,7 +10,7 @@ from cairn_map.arrays import Rgb
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.render.bitmap_font import write_text_into
 from cairn_map.render.legend import with_legend
-from cairn_map.render.map_render import Changes, MapRenderer, Seen
+from cairn_map.render.map_render import Changes, MapRenderer, SurfaceImage
 from cairn_map.render.pose_spread import PoseSpread, spread_picture, why_withheld
 from cairn_map.render.render_picture import NOTHING, WARNING, ZERO_CELSIUS_K, Layer, Scale, painted
 
@@ -26,7 +26,7 @@ class Ages:
 
 
 def layer_values(
-    renderer: MapRenderer, snapshot: MapSnapshot, seen: Seen, layer: Layer, ages: Ages | None = None
+    renderer: MapRenderer, snapshot: MapSnapshot, seen: SurfaceImage, layer: Layer, ages: Ages | None = None
 ) -> Values:
     """(H, W) in the layer's unit: degrees Celsius, 1, metres, seconds (or what `ages` has); colours (H, W, 3).
 
@@ -50,7 +50,7 @@ def layer_values(
             return ages.now - renderer.changed(snapshot, seen, ages.changes)
 
 
-def layer_picture(values: Values, seen: Seen, scale: Scale, spread: PoseSpread | None = None) -> Rgb:
+def layer_picture(values: Values, seen: SurfaceImage, scale: Scale, spread: PoseSpread | None = None) -> Rgb:
     """(H + legend, W, 3) sRGB: values painted, grey where something is seen that has none, dark where nothing is.
 
     With a pose's spread all is blurred as far as it may be off, or withheld where that says nothing any more.
@@ -69,7 +69,7 @@ def layer_picture(values: Values, seen: Seen, scale: Scale, spread: PoseSpread |
 
 
 def arrays_of(
-    values: Values, seen: Seen, layer: Layer, spread: PoseSpread | None = None
+    values: Values, seen: SurfaceImage, layer: Layer, spread: PoseSpread | None = None
 ) -> dict[str, npt.NDArray[np.generic]]:
     """By name: `range_m`, `depth_m`, and the layer's values (`temperature_k`, `age_s`, `probability`, `colour`).
 

@@ -29,7 +29,7 @@ from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.queries.point_kernels import group_into
 from cairn_map.queries.point_queries import first_of_kind
 from cairn_map.render import render_kernels as kernels
-from cairn_map.render.camera_rays import Sight, checked_pose
+from cairn_map.render.camera_rays import CameraRays, checked_pose
 from cairn_map.render.node_kernels import read_nodes_into
 from cairn_map.render.node_tables import Table, mean_table, probability_table
 
@@ -41,10 +41,10 @@ ROWS_MIN = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class SurfaceImage:
     """What each pixel of a camera sees of a map: an occupied node, or nothing."""
 
-    sight: Sight
+    sight: CameraRays
     range_m: Values
     """(H, W) metres along the pixel's ray to where it enters the node; NaN where it sees nothing."""
     slots: npt.NDArray[np.int32]
@@ -89,12 +89,12 @@ class MapRenderer:
     def nearest(
         self,
         snapshot: MapSnapshot,
-        sight: Sight,
+        sight: CameraRays,
         T_map_camera: npt.ArrayLike,
         *,
         range_max_m: float,
         between_m: tuple[Values, Values] | None = None,
-    ) -> Seen:
+    ) -> SurfaceImage:
         """The first occupied node along each ray.
 
         Args:
@@ -113,12 +113,12 @@ class MapRenderer:
     def beyond(
         self,
         snapshot: MapSnapshot,
-        sight: Sight,
+        sight: CameraRays,
         T_map_camera: npt.ArrayLike,
         *,
         range_max_m: float,
         between_m: tuple[Values, Values],
-    ) -> Seen:
+    ) -> SurfaceImage:
         """What lies behind surfaces: each ray goes on through what is there until it comes out into a voxel that is
         known to be free, and what it meets from there on is seen. So a wall's other side is not taken for a thing
         behind the wall, and where nobody ever looked behind a surface nothing is shown.
@@ -127,20 +127,20 @@ class MapRenderer:
         """
         return self._seen(snapshot.frozen, sight, T_map_camera, range_max_m, between_m, is_beyond=True)
 
-    def probability(self, snapshot: MapSnapshot, seen: Seen) -> Values:
+    def probability(self, snapshot: MapSnapshot, seen: SurfaceImage) -> Values:
         """(H, W) that the node is occupied, its likeliest voxel's; NaN where nothing is seen."""
         model = snapshot.model
         return self._read(snapshot, seen, model, 1, lambda key, cell: probability_table(cell, model))[..., 0]
 
-    def temperature(self, snapshot: MapSnapshot, seen: Seen) -> Values:
+    def temperature(self, snapshot: MapSnapshot, seen: SurfaceImage) -> Values:
         """(H, W) kelvin, of the map's first temperature channel; NaN where no temperature is known."""
         return self._mean(snapshot, seen, ChannelKind.TEMPERATURE, 1)[..., 0]
 
-    def colour(self, snapshot: MapSnapshot, seen: Seen) -> Values:
+    def colour(self, snapshot: MapSnapshot, seen: SurfaceImage) -> Values:
         """(H, W, 3) sRGB 0 to 255, of the map's first colour channel; NaN where no colour is known."""
         return self._mean(snapshot, seen, ChannelKind.COLOUR, 3)
 
-    def changed(self, snapshot: MapSnapshot, seen: Seen, changes: Changes) -> Floats:
+    def changed(self, snapshot: MapSnapshot, seen: SurfaceImage, changes: Changes) -> Floats:
         """(H, W) when the node last changed, in the unit of `changes`; NaN where that is unknown."""
         H, W = seen.slots.shape
         found, flat = np.full(H * W, np.nan), seen.slots.reshape(-1)
@@ -153,7 +153,7 @@ class MapRenderer:
                 found[rows] = np.where(is_brick, newest, changes[key][blocks])
         return found.reshape(H, W)
 
-    def _mean(self, snapshot: MapSnapshot, seen: Seen, kind: ChannelKind, planes: int) -> Values:
+    def _mean(self, snapshot: MapSnapshot, seen: SurfaceImage, kind: ChannelKind, planes: int) -> Values:
         channel, geometry = first_of_kind(snapshot.geometry, kind), snapshot.geometry
         return self._read(
             snapshot,
@@ -166,13 +166,13 @@ class MapRenderer:
     def _seen(
         self,
         frozen: FrozenMap,
-        sight: Sight,
+        sight: CameraRays,
         T_map_camera: npt.ArrayLike,
         range_max_m: float,
         between_m: tuple[Values, Values] | None,
         *,
         is_beyond: bool,
-    ) -> Seen:
+    ) -> SurfaceImage:
         T = checked_pose(T_map_camera, reach_m=frozen.reach_m)
         H, W, edge_m = sight.height, sight.width, frozen.geometry.voxel_edge_m
         if not 0 < range_max_m < np.inf:
@@ -184,7 +184,7 @@ class MapRenderer:
         starts = np.asarray(np.maximum(starts, 0) / edge_m, np.float32)
         ends = np.asarray(np.minimum(ends, reach_m) / edge_m, np.float32)
         skips = self._skips_of(frozen)
-        seen = Seen(
+        seen = SurfaceImage(
             sight,
             np.empty((H, W), np.float32),
             np.empty((H, W), np.int32),
@@ -215,7 +215,7 @@ class MapRenderer:
     def _read(
         self,
         snapshot: MapSnapshot,
-        seen: Seen,
+        seen: SurfaceImage,
         name: Hashable,
         planes: int,
         make: Callable[[CellKey, BrickCell], Table],

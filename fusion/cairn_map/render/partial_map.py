@@ -18,8 +18,8 @@ from cairn_map.queries.frozen_map import FrozenMap
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.queries.occupancy_states import CellStates, state_grid, states_of_counts
 from cairn_map.queries.point_queries import first_of_kind
-from cairn_map.render.camera_rays import Sight
-from cairn_map.render.map_render import CellTables, MapRenderer, Seen
+from cairn_map.render.camera_rays import CameraRays
+from cairn_map.render.map_render import CellTables, MapRenderer, SurfaceImage
 from cairn_map.render.node_tables import Table, mean_table, probability_table
 from cairn_map.render.render_picture import Layer
 
@@ -50,7 +50,7 @@ class Drawing:
     """What a camera sees of a map, and the map of the cells that it took to know."""
 
     snapshot: MapSnapshot
-    seen: Seen
+    seen: SurfaceImage
 
 
 def read_cell(cell: BrickCell, geometry: Geometry, model: SensorModel, layer: Layer) -> ReadCell:
@@ -79,7 +79,7 @@ def draw_as_needed(
     unread: Collection[CellKey],
     read: Callable[[Sequence[CellKey]], Mapping[CellKey, ReadCell]],
     *,
-    sight: Sight,
+    sight: CameraRays,
     T_map_camera: Floats,
     range_max_m: float,
 ) -> Drawing:

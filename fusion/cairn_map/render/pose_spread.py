@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
-from cairn_map.render.camera_rays import Sight
+from cairn_map.render.camera_rays import CameraRays
 from cairn_map.render.spread_kernels import covariances_into, motions_into, scatter_into
 
 Ink = npt.NDArray[np.uint8]
@@ -105,14 +105,14 @@ class PoseSpread:
         """Whether nothing is off."""
         return not self.covariance.any()
 
-    def at(self, sight: Sight, range_m: Values) -> Values:
+    def at(self, sight: CameraRays, range_m: Values) -> Values:
         """(H, W, 3) float32: covariance xx, xy, yy, px^2, of where what lies at a range appears; NaN where it does."""
         out = np.empty((sight.height, sight.width, 3), np.float32)
         covariances_into(out, motions(sight, range_m), self.covariance)
         return out
 
 
-def motions(sight: Sight, range_m: Values) -> Floats:
+def motions(sight: CameraRays, range_m: Values) -> Floats:
     """(H, W, 2, 6): by how many pixels what lies at a range moves in the image, per rad and per metre of the camera's
     own motion; NaN where there is no range or ray.
     """

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError, first_error
-from cairn_map.render.camera_rays import Sight, look_at, pinhole
+from cairn_map.render.camera_rays import CameraRays, look_at, pinhole
 from cairn_map.render.pose_spread import SIGMA_MAX_M, SIGMA_MAX_RAD, PoseSpread
 from cairn_map.render.render_picture import SCALES, Layer, Scale
 
@@ -98,7 +98,7 @@ class RenderRequest(BaseModel):
         return None if found.is_exact else found
 
     @property
-    def sight(self) -> Sight:
+    def sight(self) -> CameraRays:
         """The camera."""
         middle = (self.width - 1) / 2, (self.height - 1) / 2
         centre = middle[0] if self.cx is None else self.cx, middle[1] if self.cy is None else self.cy
@@ -135,7 +135,7 @@ def request_from(
 
 
 @lru_cache(maxsize=2)
-def _camera(width: int, height: int, focal_px: float, centre_px: tuple[float, float]) -> Sight:
+def _camera(width: int, height: int, focal_px: float, centre_px: tuple[float, float]) -> CameraRays:
     """An ideal camera; 30 MB at most each. Who looks around asks for the same one again."""
     return pinhole(width, height, focal_px=focal_px, centre_px=centre_px)
 

@@ -109,7 +109,7 @@ LIVE_EVENT: TypeAdapter[LiveEvent] = TypeAdapter(Annotated[LiveEvent, Field(disc
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class EventPosition:
     """How far a listener is: the parts of an event's id."""
 
     seq: int
@@ -120,11 +120,11 @@ class Seen:
         return f"{self.seq}.{self.chain}.{self.tick}"
 
 
-def seen_from_text(text: str) -> Seen | None:
+def position_from_text(text: str) -> EventPosition | None:
     """An event's id, parsed; None for anything else."""
     parts = text.split(".")
     if len(text) > 64 or len(parts) != 3 or not all(part.isascii() and part.isalnum() for part in parts):
         return None
     if not (parts[0].isdigit() and parts[2].isdigit()) or len(parts[1]) != CHAIN_DIGITS:
         return None
-    return Seen(int(parts[0]), parts[1], int(parts[2]))
+    return EventPosition(int(parts[0]), parts[1], int(parts[2]))

@@ -4,7 +4,7 @@
                                                     ^                        |
                                                     +------- take() ---------+
 
-A listener that is slow is not sent more, but later: it holds its place only (`Seen`), and what it takes is the
+A listener that is slow is not sent more, but later: it holds its place only (`EventPosition`), and what it takes is the
 newest head and the union of the cells. So it costs the same however slow it is.
 """
 
@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pydantic import ValidationError
 
 from cairn_map.errors import CairnError, UnreachableError
-from cairn_map.wire.live_events import CHAIN_DIGITS, Beat, Hello, LiveEvent, RobotHeard, RobotSign, Seen
+from cairn_map.wire.live_events import CHAIN_DIGITS, Beat, EventPosition, Hello, LiveEvent, RobotHeard, RobotSign
 from cairn_map.wire.robot_status import RobotStatus
 from cairn_server.live.live_map import LiveChanges, LiveRobots
 from cairn_server.store.store import Store
@@ -88,7 +88,7 @@ class Hub:
         live.robots.left(branch)
         self._wake(live)
 
-    def join(self, row: MapRow, token: bytes, wake: Callable[[], None], *, after: Seen | None) -> "Listener":
+    def join(self, row: MapRow, token: bytes, wake: Callable[[], None], *, after: EventPosition | None) -> "Listener":
         """Begin to listen.
 
         Args:
@@ -160,7 +160,7 @@ class Listener:
         self.token = token
         self.wake = wake
         self._hub = hub
-        self._seen = Seen(0, "0" * CHAIN_DIGITS, 0)
+        self._seen = EventPosition(0, "0" * CHAIN_DIGITS, 0)
         self._hello: Hello | None = None
 
     @property
@@ -178,7 +178,7 @@ class Listener:
         """The map changed since it was told last."""
         return self._hello is not None or self.live.changes.head.seq > self._seen.seq
 
-    def start(self, after: Seen | None) -> None:
+    def start(self, after: EventPosition | None) -> None:
         """Say hello, and go on behind an event that was seen, if it was one of this log."""
         head = self.live.changes.head
         tick, robots = self.live.robots.present()
@@ -186,7 +186,7 @@ class Listener:
         seq, chain = head.seq, head.chain.hex()[:CHAIN_DIGITS]
         if after is not None and resumed and after.seq <= head.seq:
             seq, chain = after.seq, after.chain
-        self._seen = Seen(seq, chain, tick)
+        self._seen = EventPosition(seq, chain, tick)
         self._hello = Hello(
             id=str(self._seen),
             map=self.live.name,
@@ -205,7 +205,7 @@ class Listener:
         changes, self._seen = self.live.changes.since(self._seen)
         events += changes
         for tick, sign in self.live.robots.since(self._seen.tick):
-            self._seen = Seen(self._seen.seq, self._seen.chain, tick)
+            self._seen = EventPosition(self._seen.seq, self._seen.chain, tick)
             events.append(RobotHeard(id=str(self._seen), robot=sign))
         return events
 

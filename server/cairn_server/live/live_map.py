@@ -15,11 +15,11 @@ from cairn_map.wire.live_events import (
     CHAIN_DIGITS,
     ENTRIES_MAX,
     CellsChanged,
+    EventPosition,
     HeadMoved,
     LiveEvent,
     LogGrew,
     RobotSign,
-    Seen,
 )
 from cairn_map.wire.messages import LogEntry
 from cairn_server.store.store import Store
@@ -74,13 +74,13 @@ class LiveChanges:
             while len(self._cells) > CELLS_KEPT:
                 self._floor = self._cells.popitem(last=False)[1]
 
-    def has_proof(self, seen: Seen) -> bool:
+    def has_proof(self, seen: EventPosition) -> bool:
         """Whether a listener's place is one of this log: no other server's, and not lost in a restore."""
         with self._store.snapshot(self._row) as snapshot:
             chain = snapshot.chain_at(seen.seq) if seen.seq <= snapshot.head.cursor.seq else None
         return chain is not None and chain.hex()[:CHAIN_DIGITS] == seen.chain
 
-    def since(self, seen: Seen) -> tuple[list[LiveEvent], Seen]:
+    def since(self, seen: EventPosition) -> tuple[list[LiveEvent], EventPosition]:
         """What a listener at this place has not been told, and where it is once it was."""
         with self._lock:
             head = self._head
@@ -94,7 +94,7 @@ class LiveChanges:
                 i, j, k = cell_of_key(key)
                 cells.append((i, j, k, lm))
         is_many = seen.seq < self._floor or len(cells) > CELLS_MAX
-        moved = Seen(head.seq, head.chain.hex()[:CHAIN_DIGITS], seen.tick)
+        moved = EventPosition(head.seq, head.chain.hex()[:CHAIN_DIGITS], seen.tick)
         events: list[LiveEvent] = []
         if cells or is_many:  # a retract of what never came changes no cell
             events.append(CellsChanged(id=str(seen), cells="many" if is_many else cells))

@@ -20,8 +20,8 @@ from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey
 from cairn_map.files.export_choice import cell_may_have, node_geometry
 from cairn_map.files.export_request import ExportRequest
-from cairn_map.files.octomap import TREE_FORMATS, Branch, branch_of_cell, tree_file
-from cairn_map.files.point_clouds import About, Found, found_in_cell, point_file, points_of_cell, size_of_file
+from cairn_map.files.octomap import TREE_FORMATS, Subtree, branch_of_cell, tree_file
+from cairn_map.files.point_clouds import About, PointBounds, found_in_cell, point_file, points_of_cell, size_of_file
 from cairn_server.folding.cells_at_rest import DamagedCellError, decode_stored, sound_cell, stored_evidence
 from cairn_server.folding.damaged_cells import DamagedCells, keep_healed
 from cairn_server.store.store import Snapshot, Store
@@ -99,7 +99,7 @@ class _PointFile:
 
     def __init__(self, row: MapRow, asked: ExportRequest) -> None:
         self.row, self.asked = row, asked
-        self._found = Found()
+        self._found = PointBounds()
         self._about = About(row.name, node_geometry(row.geometry, asked).voxel_edge_m)
 
     def kept(self, stored: CellRow, evidence: Evidence) -> bytes:
@@ -131,7 +131,7 @@ class _TreeFile:
 
     def __init__(self, row: MapRow, asked: ExportRequest) -> None:
         self.row, self.asked = row, asked
-        self._branches: list[Branch] = []
+        self._branches: list[Subtree] = []
 
     def kept(self, stored: CellRow, evidence: Evidence) -> bytes:
         """What of a cell is laid aside, if anything."""

@@ -18,7 +18,7 @@ from cairn_fusion.image_fusion.surface import live_range
 from cairn_fusion.view.overlay import Live, OverlayMode, OverlayStyle, draw_overlay
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import geometry_for
-from cairn_map.render.camera_rays import Sight
+from cairn_map.render.camera_rays import CameraRays
 from cairn_map.render.map_picture import layer_values
 from cairn_map.render.map_render import MapRenderer
 from cairn_map.render.render_picture import ZERO_CELSIUS_K, Layer
@@ -74,7 +74,7 @@ def test_a_robot_without_a_thermal_camera_shows_what_another_measured(world: Wor
     live = Live(
         rgb=scan.colour[CAMERA],
         range_m=live_range(scan, rig, camera=CAMERA),
-        sight=Sight(rig[CAMERA].camera.rays()),
+        sight=CameraRays(rig[CAMERA].camera.rays()),
         T_map_camera=scan.T_map_rig @ rig[CAMERA].transform,
     )
     drawn = draw_overlay(MapRenderer(), snapshot, live, OverlayStyle())
@@ -180,7 +180,7 @@ def test_a_robots_own_map_has_the_ages_of_its_own_commits(tmp_path: Path) -> Non
     told = np.unique(np.concatenate([each[np.isfinite(each)] for each in found.changes.values()]))
     assert told.tolist() == [1.5e9, 1.5e9 + 3600]
     T = scans[0].T_map_rig @ rig["colour_left"].transform
-    sight, renderer = Sight(rig["colour_left"].camera.rays()), MapRenderer()
+    sight, renderer = CameraRays(rig["colour_left"].camera.rays()), MapRenderer()
     seen = renderer.nearest(snapshot, sight, T, range_max_m=8)
     age_s = layer_values(renderer, snapshot, seen, Layer.AGE, found)
     assert np.isfinite(age_s[seen.hit]).mean() > 0.99

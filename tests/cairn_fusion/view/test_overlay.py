@@ -24,7 +24,7 @@ from cairn_map.evidence.channels import TEMPERATURE
 from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.grid import Geometry
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
-from cairn_map.render.camera_rays import Sight, look_at, pinhole
+from cairn_map.render.camera_rays import CameraRays, look_at, pinhole
 from cairn_map.render.map_picture import Ages
 from cairn_map.render.map_render import MapRenderer
 from cairn_map.render.pose_spread import PoseSpread, motions
@@ -62,11 +62,11 @@ def box(
     return {(x, y, z): counts for x in spans[0] for y in spans[1] for z in spans[2]}
 
 
-def image_of(sight: Sight, grey: int = 100) -> npt.NDArray[np.uint8]:
+def image_of(sight: CameraRays, grey: int = 100) -> npt.NDArray[np.uint8]:
     return np.full((sight.height, sight.width, 3), grey, np.uint8)
 
 
-def no_depth(sight: Sight) -> npt.NDArray[np.float32]:
+def no_depth(sight: CameraRays) -> npt.NDArray[np.float32]:
     return np.full((sight.height, sight.width), np.nan, np.float32)
 
 
@@ -191,7 +191,7 @@ def test_no_temperature_is_grey_and_never_cold(kelvin: float | None) -> None:
 def test_an_error_of_the_pose_moves_the_overlay_as_far_as_predicted() -> None:
     """1 degree and 2 cm, about and along random axes, of plates seen from random places through a lens."""
     rng, renderer, snapshot = np.random.default_rng(5), MapRenderer(), snapshot_with(box((-1, -3, -3), (0, 3, 3)))
-    sight, off, moves = Sight(DISTORTED.rays()), [], []
+    sight, off, moves = CameraRays(DISTORTED.rays()), [], []
     for _ in range(POSES):
         eye = rng.normal(size=3) * np.array([0.1, 0.4, 0.4]) + np.array([-2.0, 0, 0])
         T = look_at(eye.tolist(), rng.uniform(-0.05, 0.05, 3).tolist())

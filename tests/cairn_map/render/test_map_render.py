@@ -14,9 +14,9 @@ from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.queries import occupancy_kernels
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
 from cairn_map.queries.occupancy_states import State
-from cairn_map.render.camera_rays import Sight, cells_in_sight, look_at, pinhole
+from cairn_map.render.camera_rays import CameraRays, cells_in_sight, look_at, pinhole
 from cairn_map.render.map_picture import layer_values
-from cairn_map.render.map_render import MapRenderer, Seen
+from cairn_map.render.map_render import MapRenderer, SurfaceImage
 from cairn_map.render.partial_map import ReadCell, draw_as_needed, read_cell
 from cairn_map.render.render_picture import Layer
 
@@ -38,7 +38,7 @@ def voxels_by_state(snapshot: MapSnapshot) -> tuple[npt.NDArray[np.int64], npt.N
     return known.numbers[states == State.OCCUPIED], known.numbers[states == State.FREE]
 
 
-def voxels_seen(snapshot: MapSnapshot, seen: Seen) -> npt.NDArray[np.int64]:
+def voxels_seen(snapshot: MapSnapshot, seen: SurfaceImage) -> npt.NDArray[np.int64]:
     """(N, 3) numbers of the voxels at which what is seen is entered."""
     corners = snapshot.frozen.grid.cells[seen.slots[seen.hit]] * snapshot.geometry.side
     inside = occupancy_kernels.squeeze
@@ -56,7 +56,7 @@ def test_each_pixel_sees_what_cutting_all_voxels_finds(geometry: Geometry, seed:
     target = (occupied[rng.integers(len(occupied))] + 0.5) * EDGE_M
     T = look_at((target + rng.uniform(-0.5, 0.5, 3)).tolist(), target.tolist())
     # The rays of a coarse camera under the angles of a fine one: so that none sees nodes.
-    sight = Sight(SIGHT.rays[::2, ::2])
+    sight = CameraRays(SIGHT.rays[::2, ::2])
     object.__setattr__(sight, "pixel_rad", FINE.pixel_rad)
     starts = rng.uniform(-0.2, 0.3, (7, 10)).astype(np.float32)
     starts[rng.random(starts.shape) < 0.1] = np.nan
@@ -87,7 +87,7 @@ def test_each_pixel_sees_what_cutting_all_voxels_finds(geometry: Geometry, seed:
 def test_what_is_seen_reads_as_the_map_at_that_place() -> None:
     rng = np.random.default_rng(5)
     snapshot, renderer = snapshot_of(random_map(5, SMALL)), MapRenderer()
-    sight = Sight(SIGHT.rays)
+    sight = CameraRays(SIGHT.rays)
     object.__setattr__(sight, "pixel_rad", FINE.pixel_rad)
     for _ in range(3):
         seen = renderer.nearest(snapshot, sight, random_pose(rng), range_max_m=3)

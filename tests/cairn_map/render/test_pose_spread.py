@@ -8,7 +8,7 @@ from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.pose_vectors import transform_from_vector
 from cairn_calib.rig.poses import inverse, look_at, transform_points
 from cairn_map.errors import BadInputError
-from cairn_map.render.camera_rays import Sight
+from cairn_map.render.camera_rays import CameraRays
 from cairn_map.render.pose_spread import PoseSpread, motions, sigma_px, spread_ink, spread_picture, why_withheld
 from cairn_map.render.spread_kernels import scatter_into
 
@@ -16,7 +16,7 @@ Floats = npt.NDArray[np.float64]
 CAMERA = Camera(
     width=60, height=44, focal_px=(52.0, 50.0), centre_px=(28.0, 23.0), distortion=(-0.2, 0.05, 0.002, -0.001, 0.0)
 )
-SIGHT = Sight(CAMERA.rays())
+SIGHT = CameraRays(CAMERA.rays())
 MIXED = np.random.default_rng(7).standard_normal((6, 9)) * np.array([[0.004], [0.01], [0.02], [0.01], [0.03], [0.02]])
 SPREAD = PoseSpread(MIXED @ MIXED.T / 9)
 
@@ -78,7 +78,7 @@ def test_a_mounted_camera_has_the_spread_of_its_rig() -> None:
 def test_equal_sigmas_are_what_they_were() -> None:
     """In the middle of an ideal camera: (f sigma_rad)^2 + (f sigma_m / range)^2 along both axes."""
     ideal = Camera(width=61, height=45, focal_px=(50.0, 50.0), centre_px=(30.0, 22.0))
-    found = PoseSpread.of_sigmas(0.02, 0.01).at(Sight(ideal.rays()), np.full((45, 61), 2, np.float32))[22, 30]
+    found = PoseSpread.of_sigmas(0.02, 0.01).at(CameraRays(ideal.rays()), np.full((45, 61), 2, np.float32))[22, 30]
     np.testing.assert_allclose(found, [0.5**2 + 0.5**2, 0, 0.5**2 + 0.5**2], rtol=2e-3, atol=1e-6)
 
 

@@ -21,7 +21,7 @@ from websockets.sync.client import connect
 from cairn_map.commits.cursor import cursor_from_text
 from cairn_map.errors import UnreachableError
 from cairn_map.evidence.grid import cell_key, cell_of_key
-from cairn_map.wire.live_events import CellsChanged, HeadMoved, LiveEvent, LogGrew, RobotHeard, seen_from_text
+from cairn_map.wire.live_events import CellsChanged, HeadMoved, LiveEvent, LogGrew, RobotHeard, position_from_text
 from cairn_map.wire.messages import MissingRequest, Register
 from cairn_server.http.routes import live as live_routes
 from cairn_server.http.routes.live import NOT_ALLOWED, SPACING_S
@@ -46,7 +46,7 @@ JOINED: list[Listener] = []
 
 
 def joined(live: Live, row: MapRow, *, after: str = "", token: bytes = b"t") -> Listener:
-    JOINED.append(live.service.live.join(row, token, lambda: None, after=seen_from_text(after)))
+    JOINED.append(live.service.live.join(row, token, lambda: None, after=position_from_text(after)))
     return JOINED[-1]
 
 
@@ -79,7 +79,7 @@ def logged(events: list[LiveEvent]) -> list[str]:
 
 
 def rank(event: LiveEvent) -> tuple[int, int]:
-    seen = seen_from_text(event.id)
+    seen = position_from_text(event.id)
     assert seen is not None
     return seen.seq, seen.tick
 

@@ -22,7 +22,7 @@ from fastapi.security import HTTPAuthorizationCredentials
 from starlette.types import Receive, Scope, Send
 
 from cairn_map.errors import BadInputError, CairnError, DeniedError
-from cairn_map.wire.live_events import Beat, LiveEvent, Seen, seen_from_text
+from cairn_map.wire.live_events import Beat, EventPosition, LiveEvent, position_from_text
 from cairn_server.access.auth import READING, require
 from cairn_server.http.routes.callers import READERS, Credentials, Map, Operations, caller_now, map_now
 from cairn_server.http.routes.problems import answer_to
@@ -55,7 +55,7 @@ class _Stream:
         self._woken = asyncio.Event()
         self._listener: Listener | None = None
 
-    async def join(self, after: Seen | None) -> None:
+    async def join(self, after: EventPosition | None) -> None:
         """Begin to listen."""
         shown = self._credentials.credentials if self._credentials else ""
         token = hashlib.sha256(shown.encode(errors="replace")).digest()
@@ -150,7 +150,7 @@ async def events(
 ) -> Response:
     """Live changes as Server-Sent Events; `Last-Event-ID`, or `after`, goes on from there."""
     stream = _Stream(service, row, credentials)
-    await stream.join(seen_from_text(last_event_id or after or ""))
+    await stream.join(position_from_text(last_event_id or after or ""))
     return EventStream(stream)
 
 
@@ -169,7 +169,7 @@ async def live(socket: WebSocket, name: str, after: After = None) -> None:
         credentials = _credentials(socket)
         row = await run_in_threadpool(_admitted, service, name, credentials)
         stream = _Stream(service, row, credentials)
-        await stream.join(seen_from_text(after or ""))
+        await stream.join(position_from_text(after or ""))
     except CairnError as exc:
         await socket.send_denial_response(answer_to(exc))
         return
