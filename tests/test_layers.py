@@ -98,8 +98,7 @@ MAY_NAME = {
     "ruamel": ["cairn_calib/exchange/yaml_text.py"],
     "numba": [
         "cairn_map/*_kernels.py",
-        "cairn_map/kernels/compile_progress.py",
-        "cairn_map/kernels/kernel_interrupts.py",
+        "cairn_map/kernels/numba_runtime.py",
         "cairn_fusion/*_kernels.py",
         "cairn_sim/*_kernels.py",
     ],
@@ -107,7 +106,7 @@ MAY_NAME = {
 
 ROOMS = {
     "cairn_map": """
-        errors exit_codes arrays
+        errors arrays
         kernels evidence codec.octree codec.entropy codec commits wire files queries render
         warm_up
     """,

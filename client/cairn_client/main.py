@@ -10,10 +10,8 @@ from importlib.metadata import EntryPoint, entry_points, version
 from importlib.util import find_spec
 from pathlib import Path
 
-from cairn_map.errors import CairnError
-from cairn_map.exit_codes import DONE, EXIT_CODES, FAILED, INTERRUPTED, USAGE, exit_code_of
-from cairn_map.kernels.compile_progress import show_compiling
-from cairn_map.kernels.kernel_interrupts import keep_interrupts_out_of_kernels
+from cairn_map.errors import DONE, EXIT_CODES, FAILED, INTERRUPTED, USAGE, CairnError, exit_code_of
+from cairn_map.kernels.numba_runtime import keep_interrupts_out_of_kernels, show_compiling
 
 GROUP = "cairn.commands"
 

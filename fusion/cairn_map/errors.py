@@ -1,16 +1,16 @@
 """Every error that cairn raises on purpose, grouped by what a handler would do about it.
 
     CairnError
-    ├── BadInputError      the caller must change what it asks: bad geometry, bad bytes, too large
+    ├── BadInputError      the caller must change its request: bad geometry, bad bytes, too large
     │   └── DeniedError    the caller must show another token
     ├── NotFoundError      nothing is there, and that is certain
     ├── ConflictError      it contradicts what is already kept; asking again will not help
-    ├── DamagedDataError   bytes that should be sound are not; fetch them anew or restore
+    ├── DamagedDataError   bytes that should be sound are not; fetch them again or restore
     └── UnreachableError   the other side does not answer (now); try again later
 
 `kind` is a stable code in snake case. The same code travels in the server's RFC 9457 problem
 body and comes out of the client, so that `except ConflictError as exc: exc.kind` reads alike on
-both sides of the wire. Codes are added, never renamed.
+both sides of the wire. Codes are added, never renamed. The exit codes of commands follow the same families.
 """
 
 from pydantic import ValidationError
@@ -69,3 +69,22 @@ def first_error(exc: ValidationError) -> str:
     first = exc.errors(include_url=False, include_context=False, include_input=False)[0]
     where = ".".join(str(part) for part in first["loc"]) or "document"
     return f"{where[:200]}: {first['msg'][:200]}"
+
+
+def exit_code_of(exc: CairnError) -> int:
+    """The code of a command that ends with this error."""
+    return next((code for family, code in OF_FAMILY if isinstance(exc, family)), FAILED)
+
+
+DONE, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
+OF_FAMILY: tuple[tuple[type[CairnError], int], ...] = (
+    (NotFoundError, 3),
+    (ConflictError, 4),
+    (UnreachableError, 5),
+    (DamagedDataError, 6),
+)
+EXIT_CODES = (
+    "exit codes: 0 done, 1 refused or impossible as asked, 2 wrong usage, 3 not found, 4 conflict, 5 no link,\n"
+    "  6 damaged data, 130 interrupted; the cause and its [kind] are on standard error"
+)
+"""Last lines of every --help."""

@@ -29,11 +29,11 @@ from cairn_map.evidence.grid import BRICK_DEPTH, Geometry, cell_key, voxels_in_c
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.queries.map_snapshot import snapshot_of
 from cairn_map.render.camera_rays import look_at, pinhole
-from cairn_map.render.colour_kernels import blend_into
 from cairn_map.render.map_picture import layer_picture, layer_values
 from cairn_map.render.map_render import MapRenderer
 from cairn_map.render.partial_map import draw_as_needed, read_cell
 from cairn_map.render.pose_spread import PoseSpread
+from cairn_map.render.render_kernels import blend_into
 from cairn_map.render.render_picture import SCALES, Layer
 
 

@@ -14,10 +14,10 @@ from cairn_map.commits.version_vector import VersionVector
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import CellKey
 from cairn_map.wire.frames import encode_frame, start_of_reply
-from cairn_map.wire.index_messages import CellIndex
 from cairn_map.wire.live_events import RobotSign
 from cairn_map.wire.messages import (
     BranchInfo,
+    CellIndex,
     CreateMap,
     MapInfo,
     MissingRequest,

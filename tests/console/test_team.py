@@ -18,8 +18,7 @@ from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed
 from cairn_client.http.api import MapApi
 from cairn_map.commits.commit import ScanPose
 from cairn_map.commits.cursor import cursor_from_text
-from cairn_map.wire.messages import BranchInfo, CreateMap, MissingRequest, Register, Retract
-from cairn_map.wire.robot_status import RobotStatus
+from cairn_map.wire.messages import BranchInfo, CreateMap, MissingRequest, Register, Retract, RobotStatus
 
 pytestmark = pytest.mark.browser
 

@@ -36,9 +36,10 @@ from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.view import Chance, Extent, ViewStyle
 from cairn_map.files.cell_folder import FolderHead
 from cairn_map.wire.frames import CellFrame, FrameKind, encode_frame, start_of_reply
-from cairn_map.wire.index_messages import CellEntry, CellIndex
 from cairn_map.wire.messages import (
     CellCursor,
+    CellEntry,
+    CellIndex,
     CreateMap,
     Done,
     LogEntry,

@@ -6,15 +6,12 @@ from tests.fuzz.sections import sections_of
 from cairn_map.errors import BadInputError
 from cairn_map.wire import (
     access_messages,
-    index_messages,
     live_events,
     messages,
-    relay_messages,
-    robot_status,
-    upload_messages,
+    relay_peer,
 )
 
-MODULES = (access_messages, index_messages, live_events, messages, relay_messages, robot_status, upload_messages)
+MODULES = (access_messages, live_events, messages, relay_peer)
 MODELS: dict[str, type[BaseModel]] = {
     name: model
     for module in MODULES

@@ -16,8 +16,7 @@ from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import CellKey, cell_key
-from cairn_map.wire.index_messages import CellIndex
-from cairn_map.wire.messages import CreateMap, MissingRequest, Retract
+from cairn_map.wire.messages import CellIndex, CreateMap, MissingRequest, Retract
 from cairn_map.wire.relay_peer import SignedCommit
 from cairn_server.access.auth import Caller, Role
 from cairn_server.folding.cell_cache import CellCache

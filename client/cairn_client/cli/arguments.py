@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from cairn_client.http.api import MapApi
 from cairn_client.http.map_url import split_map_url
-from cairn_map.exit_codes import EXIT_CODES
+from cairn_map.errors import EXIT_CODES
 
 Item = TypeVar("Item")
 TOKEN_VARIABLE = "CAIRN_TOKEN"  # noqa: S105 - the variable's name

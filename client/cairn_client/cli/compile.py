@@ -18,7 +18,7 @@ from collections.abc import Callable, Collection, Iterator
 from importlib.metadata import entry_points
 
 from cairn_client.cli.arguments import parser
-from cairn_map.kernels.compile_progress import show_compiling
+from cairn_map.kernels.numba_runtime import show_compiling
 
 GROUP = "cairn.warm_up"
 

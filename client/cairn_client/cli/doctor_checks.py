@@ -12,7 +12,7 @@ from pathlib import Path
 
 from cairn_client.cli.arguments import shown_bytes
 from cairn_client.cli.compile import GROUP as WARM_UPS
-from cairn_map.kernels.compile_progress import is_compiled, known_kernels
+from cairn_map.kernels.numba_runtime import is_compiled, known_kernels
 
 PACKAGE = "cairn-robotics"
 PYTHON_MIN = (3, 11)

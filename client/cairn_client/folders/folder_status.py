@@ -11,7 +11,7 @@ from cairn_client.robot.round_watch import CONTACT_KEY, Contact
 from cairn_map.commits.commit import split_commit
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.grid import Geometry
-from cairn_map.wire.robot_status import Mode
+from cairn_map.wire.messages import Mode
 
 
 class FolderStatus(BaseModel):

@@ -26,9 +26,10 @@ from cairn_map.evidence.fingerprint import fingerprint_from_hex
 from cairn_map.evidence.grid import Cell
 from cairn_map.wire.access_messages import CreateToken, NewSecret, TokenInfo
 from cairn_map.wire.frames import Frame
-from cairn_map.wire.index_messages import INDEX_PAGE, CellIndex
 from cairn_map.wire.messages import (
+    INDEX_PAGE,
     BranchInfo,
+    CellIndex,
     CreateMap,
     LogEntry,
     MapInfo,
@@ -38,12 +39,12 @@ from cairn_map.wire.messages import (
     Registered,
     Retract,
     Retracted,
+    RobotStatus,
+    Upload,
     VectorJson,
     message_from_json,
 )
 from cairn_map.wire.resumed_replies import Replies
-from cairn_map.wire.robot_status import RobotStatus
-from cairn_map.wire.upload_messages import Upload
 
 if TYPE_CHECKING:
     import httpx

@@ -23,7 +23,7 @@ from cairn_map.errors import CairnError, DamagedDataError
 from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import Cell, cell_key
 from cairn_map.wire.frames import Frame
-from cairn_map.wire.index_messages import CellIndex
+from cairn_map.wire.messages import CellIndex
 from cairn_map.wire.resumed_replies import Replies
 
 T = TypeVar("T")

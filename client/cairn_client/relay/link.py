@@ -12,8 +12,7 @@ from cairn_client.sync.uploads import Body, push_rest
 from cairn_map.commits.ids import CommitId
 from cairn_map.errors import CairnError
 from cairn_map.wire.messages import message_from_json
-from cairn_map.wire.relay_messages import CommitList, held_from_list
-from cairn_map.wire.relay_peer import Held, MapEnd, SignedCommit
+from cairn_map.wire.relay_peer import CommitList, Held, MapEnd, SignedCommit, held_from_list
 
 T = TypeVar("T")
 PARTS = LARGER_PARTS.after_a_cut()

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from cairn_client.replica.replica_store import ReplicaStore
 from cairn_map.errors import BadInputError
-from cairn_map.wire.robot_status import Mode
+from cairn_map.wire.messages import Mode
 
 URL_KEY, MODE_KEY = "url", "mode"
 """Of the server's map, and how the robot was opened last."""

@@ -7,8 +7,7 @@ from cairn_client.http.api import MapApi
 from cairn_client.replica.map_model import store_model
 from cairn_client.replica.replica import Replica
 from cairn_map.errors import BadInputError, DeniedError
-from cairn_map.wire.messages import Register
-from cairn_map.wire.robot_status import Mode
+from cairn_map.wire.messages import Mode, Register
 
 T = TypeVar("T")
 

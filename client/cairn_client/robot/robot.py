@@ -48,9 +48,9 @@ from cairn_map.errors import BadInputError, CairnError
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Geometry, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
-from cairn_map.kernels.compile_progress import show_compiling
+from cairn_map.kernels.numba_runtime import show_compiling
 from cairn_map.queries.map_snapshot import MapSnapshot
-from cairn_map.wire.robot_status import Mode
+from cairn_map.wire.messages import Mode
 
 log = logging.getLogger(__name__)
 

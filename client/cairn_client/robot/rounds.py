@@ -21,7 +21,7 @@ from cairn_client.sync.scope import Scope, fetch
 from cairn_client.sync.sync import RoundReport, push_commits
 from cairn_map.commits.ids import CommitId
 from cairn_map.errors import BadInputError, CairnError, UnreachableError
-from cairn_map.wire.robot_status import Mode
+from cairn_map.wire.messages import Mode
 
 log = logging.getLogger(__name__)
 

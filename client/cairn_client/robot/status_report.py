@@ -13,7 +13,7 @@ from cairn_client.http.api import MapApi
 from cairn_client.replica.replica import Replica
 from cairn_map.commits.commit import ScanPose
 from cairn_map.errors import CairnError, first_error
-from cairn_map.wire.robot_status import Mode, RobotStatus
+from cairn_map.wire.messages import Mode, RobotStatus
 
 log = logging.getLogger(__name__)
 

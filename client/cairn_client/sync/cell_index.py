@@ -4,7 +4,7 @@ from cairn_client.sync.requests import Box, Conversation, GetIndex
 from cairn_map.commits.ids import Author
 from cairn_map.errors import UnreachableError
 from cairn_map.evidence.grid import Cell
-from cairn_map.wire.index_messages import INDEX_PAGE, CellIndex
+from cairn_map.wire.messages import INDEX_PAGE, CellIndex
 
 
 def whole_index(author: Author | None = None, *, box: Box | None = None) -> Conversation[CellIndex]:

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from cairn_map.evidence.cell_order import first_to_last
 from cairn_map.evidence.grid import CELL_LIMIT, Cell
-from cairn_map.wire.index_messages import CellEntry
+from cairn_map.wire.messages import CellEntry
 
 Wanted = Callable[[Cell], bool]
 """Which cells a low-end robot keeps."""

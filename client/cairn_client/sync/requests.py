@@ -17,9 +17,7 @@ from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.evidence.grid import Cell
 from cairn_map.wire.frames import Frame
-from cairn_map.wire.index_messages import CellIndex
-from cairn_map.wire.messages import MissingRequest
-from cairn_map.wire.upload_messages import Upload
+from cairn_map.wire.messages import CellIndex, MissingRequest, Upload
 
 A = TypeVar("A")
 T = TypeVar("T")

@@ -10,7 +10,7 @@ from cairn_calib.rig.poses import Transform
 from cairn_calib.rig.rig import Rig
 from cairn_client.robot.robot import Robot
 from cairn_map.errors import CairnError, UnreachableError
-from cairn_map.wire.robot_status import Mode
+from cairn_map.wire.messages import Mode
 from cairn_sim.render.render import render_scan
 from cairn_sim.render.sensors import Noise
 from cairn_sim.robots.heads import RANGE_CAMERA

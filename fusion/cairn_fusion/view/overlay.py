@@ -23,13 +23,12 @@ from cairn_fusion.view import overlay_kernels as kernels
 from cairn_map.arrays import Flags, Rgb
 from cairn_map.errors import BadInputError
 from cairn_map.queries.map_snapshot import MapSnapshot
-from cairn_map.render.bitmap_font import write_text_into
 from cairn_map.render.camera_rays import CameraRays, middles
-from cairn_map.render.colour_kernels import blend_into
-from cairn_map.render.legend import with_legend
+from cairn_map.render.legend import with_legend, write_text_into
 from cairn_map.render.map_picture import Ages, layer_values
 from cairn_map.render.map_render import MapRenderer, SurfaceImage
 from cairn_map.render.pose_spread import BLUR_MAX_PX, PoseSpread, spread_ink, why_withheld
+from cairn_map.render.render_kernels import blend_into
 from cairn_map.render.render_picture import SCALES, WARNING, Layer, Scale, painted
 
 Values = npt.NDArray[np.float32]

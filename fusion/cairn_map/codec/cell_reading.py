@@ -10,9 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from cairn_map.codec.cell_limits import check_efforts, sampled_max_of
 from cairn_map.codec.entropy import small_profile
-from cairn_map.codec.entropy.small_profile import Ground
+from cairn_map.codec.entropy.small_profile import Ground, check_effort
 from cairn_map.codec.octree import channel_streams
 from cairn_map.codec.octree.cell_content import (
     CHILD_MASKS,
@@ -26,7 +25,7 @@ from cairn_map.codec.octree.cell_content import (
     topology_streams,
 )
 from cairn_map.codec.octree.cell_head import CellHead, decode_head, is_canonical_head
-from cairn_map.codec.octree.channel_streams import ChannelRows
+from cairn_map.codec.octree.channel_streams import ChannelRows, stream_of_channel
 from cairn_map.codec.octree.octree import Octree, parse_octree
 from cairn_map.codec.octree.streams import (
     MODELLED,
@@ -40,6 +39,9 @@ from cairn_map.codec.octree.streams import (
 from cairn_map.codec.plain_cell import PlainCell, is_plain, plain_content
 from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence.grid import BRICK_DEPTH
+
+VOXEL_BYTES = 12
+"""Of packed evidence: a voxel's number and two counts."""
 
 CELL_BYTES_MAX = 1 << 28
 """Bytes of one encoded cell that a reader accepts."""
@@ -307,3 +309,30 @@ def _prefix(stream: StoredStream, most: int) -> bytes:
     if stream.raw_bytes <= most or stream.coding not in (STORED, ZSTD):
         return stream.raw()
     return zstd_prefix(stream.body, size_bytes=most) if stream.coding == ZSTD else stream.body[:most]
+
+
+def sampled_max_of(head: CellHead, evidence_bytes_max: int) -> int:
+    """How many leaves of a cell may have samples, so that its evidence stays within a bound.
+
+    Raises:
+        BadInputError: kind `too_large`: its voxels alone are too many.
+    """
+    sampled_max = (evidence_bytes_max - VOXEL_BYTES * head.voxels) // (4 + 8 * head.geometry.plane_count)
+    if sampled_max < 0:
+        raise BadInputError("too_large", f"{head.voxels} voxels are more than {evidence_bytes_max} bytes of evidence")
+    return sampled_max
+
+
+def check_efforts(head: CellHead, stored: dict[int, StoredStream]) -> None:
+    """Refuse modelled groups of too few bytes on the head's word, before a leaf is looked for.
+
+    Raises:
+        BadInputError: kind `too_large`.
+    """
+    if all(stream.coding != MODELLED for stream in stored.values()):
+        return
+    masks = sum(stored[number].raw_bytes for number in (CHILD_MASKS, LEAF_MASKS) if number in stored)
+    firsts = [HITS, *(stream_of_channel(c) for c in range(len(head.geometry.channels)))]
+    for first, numbers in {CHILD_MASKS: masks, **dict.fromkeys(firsts, head.leaves)}.items():
+        if first in stored and stored[first].coding == MODELLED:
+            check_effort(numbers, stored[first].body)

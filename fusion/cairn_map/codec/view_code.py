@@ -13,10 +13,9 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Bytes, Flags, Ints
 from cairn_map.codec.entropy.mask_model_kernels import code_masks
-from cairn_map.codec.entropy.modelled_stream import Code, Coder, read_modelled, write_modelled
 from cairn_map.codec.entropy.neighbour_kernels import earlier_rows
 from cairn_map.codec.entropy.sample_model_kernels import code_presence, code_ranks, code_sums
-from cairn_map.codec.entropy.small_profile import Ground, ground_of
+from cairn_map.codec.entropy.small_profile import Code, Coder, Ground, ground_of, read_modelled, write_modelled
 from cairn_map.codec.octree.octree import build_octree, parse_octree
 from cairn_map.codec.octree.octree_kernels import expand_into, leaves_of_rows
 from cairn_map.errors import BadInputError, DamagedDataError

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from cairn_map.codec.cell_code import CanonicalCell, read_canonical_cell
-from cairn_map.codec.cell_limits import VOXEL_BYTES, sampled_max_of
-from cairn_map.codec.cell_reading import CellReader, cell_reader
+from cairn_map.codec.cell_reading import VOXEL_BYTES, CellReader, cell_reader, sampled_max_of
 from cairn_map.commits.commit import (
     EVIDENCE_BYTES_MAX,
     Commit,

@@ -11,7 +11,7 @@ import numpy as np
 
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.fingerprint_kernels import weighted_sums
+from cairn_map.evidence.evidence_kernels import weighted_sums
 from cairn_map.evidence.grid import CellKey
 
 MASK = (1 << 64) - 1

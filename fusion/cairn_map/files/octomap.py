@@ -20,8 +20,7 @@ from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.view import LOG_ODDS_STEP, LOG_ODDS_ZERO
-from cairn_map.files.export_choice import chosen_in_cell
-from cairn_map.files.export_request import ExportRequest
+from cairn_map.files.export_request import ExportRequest, chosen_in_cell
 from cairn_map.kernels.morton_kernels import interleave
 
 Nodes = npt.NDArray[np.void]

@@ -17,8 +17,7 @@ from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.files.cell_files import GREY
-from cairn_map.files.export_choice import chosen_in_cell, chosen_places
-from cairn_map.files.export_request import ExportRequest
+from cairn_map.files.export_request import ExportRequest, chosen_in_cell, chosen_places
 from cairn_map.files.forward_only_file import OneWay
 
 Table = npt.NDArray[np.void]

@@ -11,6 +11,14 @@ from cairn_map.queries import body_kernels as kernels
 from cairn_map.queries.frozen_map import FrozenMap, as_points, check_within
 from cairn_map.queries.occupancy_states import State
 
+SAMPLES_MAX = 1 << 20
+"""Of a path: 20 km at 4 cm."""
+SMALL_RAD = 1e-9
+"""Turns below it are none."""
+WEIGHTS = np.array([1, 0, 2], np.uint8)
+"""Of the states: OCCUPIED before UNKNOWN before FREE."""
+STATES = np.array([State.FREE, State.UNKNOWN, State.OCCUPIED], np.uint8)
+
 SIZE_MAX_CELLS = 16
 """A body is no longer than so many cells: the cells around it are looked at one by one."""
 SQUARE = 1e-6
@@ -73,3 +81,83 @@ def _check(frozen: FrozenMap, centres_m: Floats, R: Floats, *, half_m: Floats, r
 
 def _first(true: npt.NDArray[np.bool_]) -> int | None:
     return int(true.argmax()) if true.any() else None
+
+
+def sweep_box(frozen: FrozenMap, T_map_body: npt.ArrayLike, box_m: npt.ArrayLike) -> PathStates:
+    """What a box, (2, 3) low and high corner in the body's frame, meets on its way to each of (N, 4, 4) poses."""
+    T, box = np.asarray(T_map_body, np.float64), np.asarray(box_m, np.float64)
+    at_poses = check_box(frozen, T, box)  # refuses what is no path, or no box
+    if len(T) < 2:
+        return at_poses
+    turns = _turns(T[:-1, :3, :3], T[1:, :3, :3])
+    arm_m = float(np.linalg.norm(np.abs(box).max(axis=0)))
+    moved_m = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1) + np.linalg.norm(turns, axis=1) * arm_m
+    segment, fraction = _samples(frozen, moved_m)
+    samples = np.tile(np.eye(4), (len(segment), 1, 1))
+    samples[:, :3, :3] = T[segment, :3, :3] @ _rotations(turns[segment] * fraction[:, None])
+    samples[:, :3, 3] = _between(T[:, :3, 3], segment, fraction)
+    return _worst(at_poses, check_box(frozen, samples, box), segment)
+
+
+def sweep_sphere(frozen: FrozenMap, centres_m: npt.ArrayLike, *, radius_m: float) -> PathStates:
+    """What a sphere meets on its way to each of (N, 3) centres."""
+    centres = as_points(centres_m, "centres")
+    at_poses = check_sphere(frozen, centres, radius_m=radius_m)
+    if len(centres) < 2:
+        return at_poses
+    segment, fraction = _samples(frozen, np.linalg.norm(np.diff(centres, axis=0), axis=1))
+    samples = _between(centres, segment, fraction)
+    return _worst(at_poses, check_sphere(frozen, samples, radius_m=radius_m), segment)
+
+
+def _samples(frozen: FrozenMap, moved_m: Floats) -> tuple[npt.NDArray[np.int64], Floats]:
+    """Segment (S,) and fraction (S,), 0 to 1, of samples between the poses; segment n leads to pose n + 1.
+
+    Raises:
+        BadInputError: kind `too_large`: too many.
+    """
+    steps = np.ceil(moved_m / (frozen.geometry.voxel_edge_m / 2))
+    if not steps.sum() < SAMPLES_MAX:
+        raise BadInputError("too_large", f"a path has at most {SAMPLES_MAX} steps of half a voxel; check it in parts")
+    between = np.maximum(steps.astype(np.int64) - 1, 0)
+    segment = np.repeat(np.arange(len(between)), between)
+    number = np.arange(len(segment)) - np.repeat(np.cumsum(between) - between, between)
+    return segment, (number + 1) / steps[segment]
+
+
+def _between(points: Floats, segment: npt.NDArray[np.int64], fraction: Floats) -> Floats:
+    return np.asarray(points[segment] + (points[segment + 1] - points[segment]) * fraction[:, None])
+
+
+def _turns(R_from: Floats, R_to: Floats) -> Floats:
+    """(N, 3) rotation vectors, radians, of the shortest turns that lead from (N, 3, 3) rotations to others."""
+    R = np.swapaxes(R_from, 1, 2) @ R_to
+    vectors = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1) / 2
+    sines, cosines = np.linalg.norm(vectors, axis=1), (np.trace(R, axis1=1, axis2=2) - 1) / 2
+    angles = np.arctan2(sines, cosines)
+    # Near half a turn the vector vanishes; the axis is then the longest column of R + 1.
+    symmetric = R + np.swapaxes(R, 1, 2) + (1 - np.trace(R, axis1=1, axis2=2))[:, None, None] * np.eye(3)
+    longest = np.linalg.norm(symmetric, axis=1).argmax(axis=1)
+    columns = symmetric[np.arange(len(R)), :, longest]
+    signs = np.where((columns * vectors).sum(axis=1) < 0, -1.0, 1.0)
+    axes = columns * (signs / np.maximum(np.linalg.norm(columns, axis=1), SMALL_RAD))[:, None]
+    near_half = sines < 1e-3
+    axes[~near_half] = vectors[~near_half] / sines[~near_half, None]
+    return np.asarray(np.where((near_half & (cosines > 0))[:, None], vectors, axes * angles[:, None]))
+
+
+def _rotations(turns: Floats) -> Floats:
+    """(N, 3, 3) of (N, 3) rotation vectors (Rodrigues)."""
+    angles = np.linalg.norm(turns, axis=1)
+    x, y, z = (turns / np.maximum(angles, SMALL_RAD)[:, None]).T
+    nothing = np.zeros_like(x)
+    K = np.stack([nothing, -z, y, z, nothing, -x, -y, x, nothing], axis=1).reshape(-1, 3, 3)
+    sines, versines = np.sin(angles)[:, None, None], (1 - np.cos(angles))[:, None, None]
+    return np.asarray(np.eye(3) + sines * K + versines * (K @ K))
+
+
+def _worst(at_poses: PathStates, between: PathStates, segment: npt.NDArray[np.int64]) -> PathStates:
+    """The worst of each pose and of the samples on the way to it."""
+    weights = WEIGHTS[at_poses.states]
+    np.maximum.at(weights, segment + 1, WEIGHTS[between.states])
+    return PathStates(STATES[weights])

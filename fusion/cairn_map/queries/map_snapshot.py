@@ -27,21 +27,12 @@ from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Cell, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.voxels import Reading, Voxels
-from cairn_map.queries import (
-    body_queries,
-    layer_queries,
-    nearest_queries,
-    path_queries,
-    point_queries,
-    ray_queries,
-    voxel_queries,
-)
+from cairn_map.queries import body_queries, distance_queries, layer_queries, point_queries, voxel_queries
 from cairn_map.queries.body_queries import PathStates
+from cairn_map.queries.distance_queries import Nearest, RayEnds
 from cairn_map.queries.frozen_map import Box, FrozenMap, freeze
 from cairn_map.queries.layer_queries import MapImage
-from cairn_map.queries.nearest_queries import Nearest
 from cairn_map.queries.occupancy_states import State
-from cairn_map.queries.ray_queries import RayEnds
 
 STANDARD_MODEL = SensorModel()
 
@@ -125,7 +116,7 @@ class MapSnapshot:
             max_range_m: 0 or more; infinite for as far as the map goes.
             ends_in_unknown: whether an unknown voxel ends a ray, too; else it is seen through.
         """
-        return ray_queries.cast(
+        return distance_queries.cast(
             self._frozen, origins_m, directions, max_range_m=max_range_m, ends_in_unknown=ends_in_unknown
         )
 
@@ -157,19 +148,19 @@ class MapSnapshot:
         Raises:
             BadInputError: as `check_box`; kind `too_large`: more than a million steps.
         """
-        return path_queries.sweep_box(self._frozen, T_map_body, box_m)
+        return body_queries.sweep_box(self._frozen, T_map_body, box_m)
 
     def sweep_sphere(self, centres_m: npt.ArrayLike, *, radius_m: float) -> PathStates:
         """What a sphere meets on its straight ways to each of (N, 3) centres, as `sweep_box`."""
-        return path_queries.sweep_sphere(self._frozen, centres_m, radius_m=radius_m)
+        return body_queries.sweep_sphere(self._frozen, centres_m, radius_m=radius_m)
 
     def nearest_occupied(self, points_m: npt.ArrayLike, *, radius_m: float) -> Nearest:
         """The nearest occupied voxel of each point, within a finite radius."""
-        return nearest_queries.nearest(self._frozen, points_m, State.OCCUPIED, radius_m=radius_m)
+        return distance_queries.nearest(self._frozen, points_m, State.OCCUPIED, radius_m=radius_m)
 
     def nearest_unknown(self, points_m: npt.ArrayLike, *, radius_m: float) -> Nearest:
         """The nearest unknown voxel of each point, within a finite radius; around the map all is unknown."""
-        return nearest_queries.nearest(self._frozen, points_m, State.UNKNOWN, radius_m=radius_m)
+        return distance_queries.nearest(self._frozen, points_m, State.UNKNOWN, radius_m=radius_m)
 
     def frontier(self, *, box_m: Box | None = None) -> npt.NDArray[np.int64]:
         """(M, 3) numbers of the free voxels with an unknown voxel at a face, cell by cell in Morton order.

@@ -8,8 +8,7 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Rgb
 from cairn_map.queries.map_snapshot import MapSnapshot
-from cairn_map.render.bitmap_font import write_text_into
-from cairn_map.render.legend import with_legend
+from cairn_map.render.legend import with_legend, write_text_into
 from cairn_map.render.map_render import Changes, MapRenderer, SurfaceImage
 from cairn_map.render.pose_spread import PoseSpread, spread_picture, why_withheld
 from cairn_map.render.render_picture import NOTHING, WARNING, ZERO_CELSIUS_K, Layer, Scale, painted

@@ -30,8 +30,8 @@ from cairn_map.queries.point_kernels import group_into
 from cairn_map.queries.point_queries import first_of_kind
 from cairn_map.render import render_kernels as kernels
 from cairn_map.render.camera_rays import CameraRays, checked_pose
-from cairn_map.render.node_kernels import read_nodes_into
 from cairn_map.render.node_tables import Table, mean_table, probability_table
+from cairn_map.render.render_kernels import read_nodes_into
 
 Values = npt.NDArray[np.float32]
 Changes = Mapping[CellKey, Floats]

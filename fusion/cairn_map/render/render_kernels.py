@@ -10,11 +10,15 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from cairn_map.arrays import Bytes, Floats, Int32s, Ints
+from cairn_map.arrays import Bytes, Floats, Int32s, Ints, Rgb
 from cairn_map.evidence.grid import NANOMETRES
 from cairn_map.kernels.integer_kernels import signed
 from cairn_map.queries.occupancy_kernels import KNOWN_BITS, NONE, OCCUPIED_BITS, Grid, U, place_of, slot_of
 from cairn_map.queries.ray_kernels import NOWHERE, enter_box_into, is_in_box, leave_block, ray_through, walk_block
+
+Table = npt.NDArray[np.float32]
+
+Values = npt.NDArray[np.float32]
 
 Ranges = npt.NDArray[np.float32]
 Places = npt.NDArray[np.uint32]
@@ -184,3 +188,42 @@ def in_nodes(occupied: np.uint64, node: int) -> np.uint64:
     if node == 2:
         return ~U(0) if occupied else U(0)
     return ~U(0)
+
+
+@nb.njit(cache=True, nogil=True)
+def paint_into(values: Values, palette: Rgb, low: float, high: float, unknown: Rgb, out: Rgb) -> None:
+    """(N, 3) colours of (N,) values between the two ends of a palette (256, 3); NaN is `unknown` (3,)."""
+    step = 255 / (high - low)
+    for n in range(values.shape[0]):
+        value = values[n]
+        if np.isnan(value):
+            for c in range(3):
+                out[n, c] = unknown[c]
+        else:
+            level = int(min(max((value - low) * step, 0.0), 255.0) + 0.5)
+            for c in range(3):
+                out[n, c] = palette[level, c]
+
+
+@nb.njit(cache=True, nogil=True)
+def blend_into(image: Rgb, ink: Rgb, out: Rgb) -> None:
+    """(N, 3) pixels under (N, 4) ink: its colours are multiplied by its cover already, which is the fourth."""
+    for n in range(image.shape[0]):
+        rest = 255 - int(ink[n, 3])
+        for c in range(3):
+            out[n, c] = min((image[n, c] * rest + 127) // 255 + int(ink[n, c]), 255)
+
+
+@nb.njit(cache=True, nogil=True)
+def read_nodes_into(
+    rows: Int32s, places: Places, nodes: Bytes, bricks: npt.NDArray[np.int16], table: Table, out: Table
+) -> None:
+    """Of the listed pixels of one cell: (N, P) what `node_tables` say of their nodes, all in its bricks."""
+    firsts = (0, 512, 576, 584)
+    for n in range(U(rows.shape[0])):
+        row = U(rows[n])
+        place, node = places[row], nodes[row]
+        brick = U(bricks[place >> U(9)])
+        at = U(firsts[node]) + ((place & U(511)) >> U(3 * node))
+        for p in range(out.shape[1]):
+            out[row, p] = table[brick, at, p]

@@ -16,8 +16,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
-from cairn_map.wire.messages import CursorText, LogEntry, NameText
-from cairn_map.wire.robot_status import RobotStatus
+from cairn_map.wire.messages import CursorText, LogEntry, NameText, RobotStatus
 
 CELLS_MAX = 256
 """Cells in one event; more are `many`."""

@@ -7,6 +7,7 @@ from typing import Annotated, Literal, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field, ValidationError, model_validator
 
+from cairn_map.commits.commit import ScanPose
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.commits.ids import NUMBER_LIMIT
 from cairn_map.commits.version_vector import AUTHORS_MAX, VersionVector, version_vector_from_json
@@ -14,7 +15,15 @@ from cairn_map.errors import DamagedDataError, first_error
 from cairn_map.evidence.fingerprint import Fingerprint, fingerprint_from_hex
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
-from cairn_map.wire.robot_status import RobotStatus
+
+INDEX_PAGE = 1000
+"""Entries of a page of which the asker says nothing."""
+INDEX_PAGE_MAX = 10_000
+
+Mode = Literal["high-end", "low-end", "viewer"]
+Count = Annotated[int, Field(ge=0, lt=1 << 53)]
+Seconds = Annotated[float, Field(ge=0, le=1e11, allow_inf_nan=False)]
+"""UTC since 1970; to the year 5138."""
 
 Message = TypeVar("Message", bound=BaseModel)
 CursorText = Annotated[str, Field(max_length=128)]
@@ -37,6 +46,25 @@ DAMAGED_MAX = 256
 SELECTING_PARTS = ("robot", "rig", "pushed_after_s", "pushed_before_s", "captured_after_s", "captured_before_s")
 FIELDS_MAX = 64
 """Of one object; more than any message here has."""
+
+
+class RobotStatus(BaseModel):
+    """Body of `PUT /maps/{map}/branches/{branch}/status`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    time_s: Seconds
+    """When it was so, by the robot's clock."""
+    pose: ScanPose | None = None
+    """Where its rig is in the map, and how surely."""
+    mode: Mode | None = None
+    waiting: Count = 0
+    """Commits that the server has not acknowledged."""
+    waiting_bytes: Count = 0
+    battery: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Charge, 1 = full."""
+    note: Annotated[str, Field(max_length=256)] = ""
+    """Anything else, for people."""
 
 
 class _Model(BaseModel):
@@ -298,3 +326,43 @@ def message_from_json(model: type[Message], data: bytes | str) -> Message:
         return model.model_validate_json(data, strict=True)
     except ValidationError as exc:
         raise DamagedDataError("bad_message", f"{model.__name__}: {first_error(exc)}") from None
+
+
+class CellEntry(BaseModel):
+    """One row of the cell index."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    cell: tuple[int, int, int]
+    size_bytes: int
+    digest: ShaText
+    lm: int
+    """Log entry that last changed the cell."""
+    fingerprint: FingerprintText
+    voxels: int
+    hottest_k: float | None = None
+    """Mean temperature of its hottest voxel, kelvin; None: it has none, or the server does not know it, or was not
+    asked for it: robots of old refuse what they do not know."""
+    held_lm: int | None = None
+    """Newest log entry whose evidence is still in the cell: `lm`, unless that took some out. None: nothing is in it,
+    or the server does not know it any more, or was not asked for it."""
+
+
+class CellIndex(BaseModel):
+    """Answer to `GET /maps/{map}/main/cells`: a page of the index, taken from one state of the map."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    header: ReplyHeader
+    cells: list[CellEntry]
+
+
+class Upload(BaseModel):
+    """Answer to a part, and to who asks how many are there."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    size_bytes: Annotated[int, Field(ge=0)]
+    """So many of the body's bytes are here, from its first one on: the next part begins there."""
+    sha: ShaText | None = None
+    """Of the commit that is kept for good under this id; None: none yet."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from cairn_map.commits.cursor import ENTRY_FOLD
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import CellKey, cell_from_text, cell_key, cell_of_key
-from cairn_map.wire.index_messages import INDEX_PAGE, CellEntry
+from cairn_map.wire.messages import INDEX_PAGE, CellEntry
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import CellRow
 

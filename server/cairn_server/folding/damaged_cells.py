@@ -10,7 +10,7 @@ from dataclasses import replace
 from itertools import islice
 
 from cairn_map.codec.cell_code import decode_canonical_cell
-from cairn_map.codec.cell_limits import VOXEL_BYTES
+from cairn_map.codec.cell_reading import VOXEL_BYTES
 from cairn_map.errors import BadInputError, CairnError, ConflictError, DamagedDataError, NotFoundError
 from cairn_map.evidence.cell_order import hottest_k
 from cairn_map.evidence.fingerprint import fingerprint

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 
 from cairn_map.errors import CairnError, UnreachableError
 from cairn_map.wire.live_events import CHAIN_DIGITS, Beat, EventPosition, Hello, LiveEvent, RobotHeard, RobotSign
-from cairn_map.wire.robot_status import RobotStatus
+from cairn_map.wire.messages import RobotStatus
 from cairn_server.live.live_map import LiveChanges, LiveRobots
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow

@@ -11,7 +11,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 
 from cairn_map.errors import BadInputError, NotFoundError, UnreachableError
-from cairn_map.wire.robot_status import RobotStatus
+from cairn_map.wire.messages import RobotStatus
 from cairn_server.access.rate_limits import Allowance, allowance
 from cairn_server.live.hub import Hub
 from cairn_server.store.store import Store

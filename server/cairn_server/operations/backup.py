@@ -13,7 +13,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from cairn_map.exit_codes import EXIT_CODES
+from cairn_map.errors import EXIT_CODES
 from cairn_server.operations.progress import Progress
 from cairn_server.settings import Settings
 from cairn_server.store.sqlite.backup import back_up

@@ -22,8 +22,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from cairn_map.errors import DamagedDataError
-from cairn_map.exit_codes import EXIT_CODES
+from cairn_map.errors import EXIT_CODES, DamagedDataError
 from cairn_server.folding.store_check import Finding, check_map
 from cairn_server.operations.progress import Progress
 from cairn_server.settings import Settings

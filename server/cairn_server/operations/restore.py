@@ -16,8 +16,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from cairn_map.errors import DamagedDataError
-from cairn_map.exit_codes import EXIT_CODES
+from cairn_map.errors import EXIT_CODES, DamagedDataError
 from cairn_server.operations.check import check_all
 from cairn_server.operations.progress import Progress
 from cairn_server.settings import Settings

@@ -28,8 +28,7 @@ from pydantic_settings import (
     SettingsError,
 )
 
-from cairn_map.errors import BadInputError
-from cairn_map.exit_codes import EXIT_CODES
+from cairn_map.errors import EXIT_CODES, BadInputError
 from cairn_server.http.middleware.log_format import LogForm
 from cairn_server.settings import Settings
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from cairn_map.commits.commit import COMMIT_BYTES_MAX
 from cairn_map.commits.ids import CommitId, commit_id_from_text
 from cairn_map.errors import BadInputError, CairnError, DeniedError, UnreachableError
-from cairn_map.wire.upload_messages import Upload
+from cairn_map.wire.messages import Upload
 from cairn_server.access.auth import Caller, Role
 from cairn_server.store.numbering import EvidenceGoneError
 from cairn_server.store.store import Store

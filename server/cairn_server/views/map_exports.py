@@ -18,8 +18,7 @@ from typing import IO
 from cairn_map.errors import BadInputError, UnreachableError
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey
-from cairn_map.files.export_choice import cell_may_have, node_geometry
-from cairn_map.files.export_request import ExportRequest
+from cairn_map.files.export_request import ExportRequest, cell_may_have, node_geometry
 from cairn_map.files.octomap import TREE_FORMATS, Subtree, branch_of_cell, tree_file
 from cairn_map.files.point_clouds import About, PointBounds, found_in_cell, point_file, points_of_cell, size_of_file
 from cairn_server.folding.cells_at_rest import DamagedCellError, decode_stored, sound_cell, stored_evidence

@@ -24,8 +24,7 @@ from cairn_map.render.camera_rays import cells_in_sight
 from cairn_map.render.map_picture import Ages, arrays_of, layer_picture, layer_values, npz_of
 from cairn_map.render.map_render import MapRenderer
 from cairn_map.render.partial_map import Drawing, ReadCell, draw_as_needed, read_cell
-from cairn_map.render.png import png_of
-from cairn_map.render.render_picture import Layer
+from cairn_map.render.render_picture import Layer, png_of
 from cairn_map.render.render_request import RenderRequest
 from cairn_map.warm_up import warm_up_pictures
 from cairn_server.folding.cells_at_rest import DamagedCellError, row_of_cell, sound_cell, stored_evidence

@@ -29,7 +29,7 @@ for package in ("cairn_map", "cairn_fusion", "cairn_sim"):
             if isinstance(value._cache, NullCache):
                 continue
             if any(isinstance(kernel.signature.return_type, BaseNamedTuple) for kernel in value.overloads.values()):
-                sys.exit(f"{module.__name__}.{name} makes a named tuple: ^C crashes it (kernel_interrupts.py)")
+                sys.exit(f"{module.__name__}.{name} makes a named tuple: ^C crashes it (numba_runtime.py)")
             if not value.signatures and not name.startswith("_"):
                 sys.exit(f"{module.__name__}.{name} is not called by {package}.warm_up")
 """

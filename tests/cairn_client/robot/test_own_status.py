@@ -12,8 +12,7 @@ from cairn_client.cli.maps.branch_table import branch_table, shown_age
 from cairn_client.http.api import MapApi
 from cairn_client.robot import status_report
 from cairn_map.commits.commit import ScanPose
-from cairn_map.wire.messages import BranchInfo
-from cairn_map.wire.robot_status import RobotStatus
+from cairn_map.wire.messages import BranchInfo, RobotStatus
 
 
 def branch_of(server: LiveServer, name: str = "mole") -> BranchInfo:

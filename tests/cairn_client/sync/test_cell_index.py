@@ -18,8 +18,7 @@ from cairn_client.sync.sync import fetch_cells
 from cairn_map.commits.ids import Author
 from cairn_map.errors import UnreachableError
 from cairn_map.evidence.grid import Cell, CellKey, cell_key
-from cairn_map.wire.index_messages import CellEntry, CellIndex
-from cairn_map.wire.messages import Retract
+from cairn_map.wire.messages import CellEntry, CellIndex, Retract
 
 PAGE = 2
 KEYS = sorted(cell_key((i, 0, 0)) for i in range(-3, 4))

@@ -17,7 +17,7 @@ from cairn_map.codec.cell_code import encode_cell
 from cairn_map.errors import CairnError, DamagedDataError
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.files.cell_folder import write_cell
-from cairn_map.wire.robot_status import Mode
+from cairn_map.wire.messages import Mode
 
 MAP = "lab"
 X, Y = seen(1, 2, kelvin_steps=7), seen(2, 100)

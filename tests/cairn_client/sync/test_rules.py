@@ -36,8 +36,7 @@ from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import cell_of_key
 from cairn_map.wire.frames import FrameKind
-from cairn_map.wire.index_messages import CellEntry, CellIndex
-from cairn_map.wire.messages import MissingRequest
+from cairn_map.wire.messages import CellEntry, CellIndex, MissingRequest
 
 C1, C2, C3 = cursor(1), cursor(2), cursor(3)
 X, Y, Z = seen(1, 2, kelvin_steps=7), seen(2, 100), seen(300, kelvin_steps=9)

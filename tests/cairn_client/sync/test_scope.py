@@ -17,8 +17,7 @@ from cairn_map.commits.ids import commit_id_from_text
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import Cell, cell_key, cell_of_key
 from cairn_map.wire.frames import CELL_HEAD, CellFrame
-from cairn_map.wire.messages import MissingRequest, More
-from cairn_map.wire.robot_status import Mode
+from cairn_map.wire.messages import MissingRequest, Mode, More
 
 EDGE_M = GEOMETRY.cell_edge_m
 EVERY_CELL = {Cell(i, j, 0) for i in range(-5, 5) for j in range(7)}

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from cairn_map.kernels.compile_progress import CLEAR_LINE, CompileProgress
+from cairn_map.kernels.numba_runtime import CLEAR_LINE, CompileProgress
 
 FIRST_USE = """
-from cairn_map.kernels.compile_progress import show_compiling
+from cairn_map.kernels.numba_runtime import show_compiling
 from cairn_map.evidence.evidence import empty_evidence
 from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry

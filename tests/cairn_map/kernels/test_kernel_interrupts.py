@@ -12,7 +12,7 @@ RUN_KERNELS = """
 import sys
 import numpy as np
 from numba import njit
-from cairn_map.kernels.kernel_interrupts import keep_interrupts_out_of_kernels
+from cairn_map.kernels.numba_runtime import keep_interrupts_out_of_kernels
 
 @njit
 def two_arrays(rounds):

@@ -12,7 +12,7 @@ from tests.naive import queries as naive
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Geometry
-from cairn_map.queries import ray_queries
+from cairn_map.queries import distance_queries as ray_queries
 from cairn_map.queries.map_snapshot import snapshot_of
 from cairn_map.queries.occupancy_states import State
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from cairn_map.render.bitmap_font import text_width_px, write_text_into
-from cairn_map.render.legend import BAR_PX, TITLES, with_legend
+from cairn_map.render.legend import BAR_PX, TITLES, text_width_px, with_legend, write_text_into
 from cairn_map.render.render_picture import NO_VALUE, SCALES, TEXT, Layer
 
 NOTES = ("solid: visible", "stripes: behind that", "dots: from the map alone")

@@ -21,8 +21,7 @@ from cairn_map.commits.ids import Author, CommitId, Incarnation
 from cairn_map.commits.version_vector import EMPTY
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.wire.frames import frames_of
-from cairn_map.wire.index_messages import CellIndex
-from cairn_map.wire.messages import CreateMap, MapInfo, Register, Retract
+from cairn_map.wire.messages import CellIndex, CreateMap, MapInfo, Register, Retract
 from cairn_server.service import OPERATOR
 from cairn_server.store.store_rows import MapRow
 

@@ -18,7 +18,7 @@ from cairn_map.commits.version_vector import version_vector_from_json
 from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.files.cell_files import CELL_MEDIA_TYPE
-from cairn_map.wire.index_messages import CellIndex
+from cairn_map.wire.messages import CellIndex
 from cairn_server.store.store_rows import MapRow
 
 

@@ -23,7 +23,7 @@ from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence.grid import cell_key, cell_of_key
 from cairn_map.evidence.view import ViewStyle
 from cairn_map.files.cell_files import CELL_MEDIA_TYPE, MEDIA_TYPES
-from cairn_map.wire.index_messages import CellIndex
+from cairn_map.wire.messages import CellIndex
 from cairn_server.http.routes.cell import COVERAGE_BYTES_MAX
 from cairn_server.http.routes.ranges import part_of
 from cairn_server.store.store_rows import MapRow

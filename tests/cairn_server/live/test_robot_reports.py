@@ -12,7 +12,7 @@ from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import JPEG, MOLE, PNG, WREN, pushed
 
 from cairn_map.wire.live_events import RobotHeard
-from cairn_map.wire.robot_status import RobotStatus
+from cairn_map.wire.messages import RobotStatus
 from cairn_server.live import branch_list, robot_reports
 from cairn_server.store.store_rows import MapRow
 

@@ -37,8 +37,7 @@ from cairn_client.folders.map_folder import FolderMap, map_of_folder
 from cairn_map.errors import BadInputError
 from cairn_map.render.map_picture import arrays_of, layer_picture, layer_values, npz_of
 from cairn_map.render.map_render import MapRenderer
-from cairn_map.render.png import png_of
-from cairn_map.render.render_picture import SCALES, Layer, Scale
+from cairn_map.render.render_picture import SCALES, Layer, Scale, png_of
 from cairn_map.render.render_request import RenderRequest, request_from
 
 THREADS = 2

@@ -19,7 +19,7 @@ from cairn_client.folders.state_folder import robot_of
 from cairn_client.robot.robot import Robot
 from cairn_client.sync.near_cells import Wanted, within
 from cairn_map.errors import BadInputError
-from cairn_map.wire.robot_status import Mode
+from cairn_map.wire.messages import Mode
 
 
 class PullReport(BaseModel):

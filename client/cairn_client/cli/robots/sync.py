@@ -22,7 +22,7 @@ from cairn_client.folders.folder_status import folder_status
 from cairn_client.robot.robot import Robot
 from cairn_client.robot.robot_events import CellsChanged
 from cairn_map.errors import BadInputError
-from cairn_map.wire.robot_status import Mode
+from cairn_map.wire.messages import Mode
 
 
 class SyncReport(BaseModel):

@@ -10,7 +10,7 @@ from cairn_map.commits.version_vector import vector_digest, vector_text
 from cairn_map.errors import BadInputError, NotFoundError
 from cairn_map.evidence.grid import CellKey, cell_from_text, cell_key
 from cairn_map.files.cell_files import CELL_MEDIA_TYPE, FORMS, MEDIA_TYPES, cell_file
-from cairn_map.wire.index_messages import INDEX_PAGE, INDEX_PAGE_MAX, CellIndex
+from cairn_map.wire.messages import INDEX_PAGE, INDEX_PAGE_MAX, CellIndex
 from cairn_map.wire.voxel_messages import VoxelAnswer
 from cairn_server.access.auth import Caller
 from cairn_server.folding.cell_index import IndexPage, box_from_text

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Response
 
-from cairn_map.wire.robot_status import RobotStatus
+from cairn_map.wire.messages import RobotStatus
 from cairn_server.http.routes.callers import OWNERS, READERS, Map, Operations, body_of
 
 router = APIRouter()

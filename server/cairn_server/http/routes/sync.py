@@ -13,7 +13,7 @@ from cairn_map.commits.commit_reading import commit_reader
 from cairn_map.commits.signature import TEXT_MAX
 from cairn_map.errors import ConflictError
 from cairn_map.wire.messages import MissingRequest, Pushed
-from cairn_map.wire.relay_messages import CommitList, commit_list
+from cairn_map.wire.relay_peer import CommitList, commit_list
 from cairn_server.http.routes.callers import READERS, Map, Operations, Visit, visiting_owner, visiting_robot
 from cairn_server.sync.handing_over import found_commit
 

@@ -7,7 +7,7 @@ from starlette.concurrency import run_in_threadpool
 
 from cairn_map.commits.signature import TEXT_MAX
 from cairn_map.errors import ConflictError
-from cairn_map.wire.upload_messages import Upload
+from cairn_map.wire.messages import Upload
 from cairn_server.access.auth import Caller, Role
 from cairn_server.http.routes.callers import Map, Operations, allowed, body_of
 from cairn_server.sync.uploads import Part, uploaded_by

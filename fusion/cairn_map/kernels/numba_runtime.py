@@ -13,6 +13,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+LOOKUP = "_numba_unpickle"
+
 if TYPE_CHECKING:
     from numba.core.dispatcher import Dispatcher
 
@@ -98,3 +100,15 @@ def is_compiled(kernel: "Dispatcher") -> bool:
     code, version = kernel.py_func.__code__, f"py{sys.version_info.major}{sys.version_info.minor}"
     name = f"{Path(code.co_filename).stem}.{kernel.py_func.__qualname__}-{code.co_firstlineno}.{version}.nbi"
     return (Path(kernel.stats.cache_path or "") / name).is_file()
+
+
+def keep_interrupts_out_of_kernels() -> None:
+    """From now on ^C is a KeyboardInterrupt before or after a kernel, never within; to be called before the first one.
+
+    The very first result of a kind is still made in Python; a numba without that function is left as it is.
+    """
+    from numba.core import serialize
+
+    lookup = getattr(serialize, LOOKUP, None)
+    if lookup is not None and not hasattr(lookup, "cache_info"):
+        setattr(serialize, LOOKUP, cache(lookup))
