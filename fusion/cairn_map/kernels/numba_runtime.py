@@ -1,9 +1,9 @@
-"""What is said while kernels are compiled, which the first start on a machine waits for: half a minute of silence else.
+"""Numba at run time: progress while kernels compile, and Ctrl-C while one runs.
 
     compiling kernels, only this once: carve_window, 7 of 25, 12 s
 
-On a terminal it is one line, which is gone when the kernel is done; in a log a line every few seconds. Kernels that are
-read from Numba's cache say nothing.
+The first start on a machine compiles for half a minute. On a terminal the progress is one line, which is removed when
+the kernel is done; in a log it is a line every few seconds. Kernels that are read from Numba's cache show nothing.
 """
 
 import sys
@@ -13,22 +13,23 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-LOOKUP = "_numba_unpickle"
-
 if TYPE_CHECKING:
     from numba.core.dispatcher import Dispatcher
 
 LOG_EVERY_S = 5.0
+"""Seconds of compiling between two lines of a log."""
 LOG_AFTER_S = 1.0
-"""Of compiling altogether: less is not worth a line."""
+"""Seconds of compiling before the first line of a log: less is not worth a line."""
 CLEAR_LINE = "\r\x1b[K"
+LOOKUP = "_numba_unpickle"
+"""Numba's function that finds again an object which it has unpickled before."""
 
 
 class CompileProgress:
-    """Says which kernel is being compiled, how many of those at hand are ready, and how long it has taken so far."""
+    """Progress line: the kernel being compiled, how many of those imported are ready, and the seconds taken so far."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
-        """Args: stream: where to; None: whatever `sys.stderr` is at the time."""
+        """Write to a stream; None: to `sys.stderr`, whatever that is at the time."""
         self._stream = stream
         self._taken_s = 0.0
         self._logged_s = LOG_AFTER_S - LOG_EVERY_S
@@ -45,7 +46,7 @@ class CompileProgress:
             stream.write(line + "\n")
 
     def end(self, seconds: float) -> None:
-        """Take note of how long it took."""
+        """Add the seconds that the kernel took, and remove its line from a terminal."""
         self._taken_s += seconds
         stream = self._stream or sys.stderr
         if stream.isatty():
@@ -55,14 +56,14 @@ class CompileProgress:
 
 @cache
 def show_compiling() -> None:
-    """Say from now on, on standard error, what is being compiled; a second call does nothing.
+    """Show on standard error, from now on, which kernel is being compiled; a second call does nothing.
 
     Numba is imported here and not above, so that commands without kernels start without it.
     """
     from numba.core.event import Event, Listener, register
 
     class Compiling(Listener):
-        """Hears of every kernel, in whatever thread; a kernel that another one calls is compiled within that one."""
+        """Listener to every compilation, in any thread; a kernel that another one calls is compiled within that one."""
 
         def __init__(self) -> None:
             self.progress = CompileProgress()
@@ -96,16 +97,20 @@ def known_kernels() -> "Iterator[Dispatcher]":
 
 
 def is_compiled(kernel: "Dispatcher") -> bool:
-    """Whether a kernel is on disk for this Python: as an index file `FILE.NAME-LINE.pyVERSION.nbi` in Numba's cache."""
+    """True if a kernel is on disk for this Python: as an index file `FILE.NAME-LINE.pyVERSION.nbi` in Numba's cache."""
     code, version = kernel.py_func.__code__, f"py{sys.version_info.major}{sys.version_info.minor}"
     name = f"{Path(code.co_filename).stem}.{kernel.py_func.__qualname__}-{code.co_firstlineno}.{version}.nbi"
     return (Path(kernel.stats.cache_path or "") / name).is_file()
 
 
 def keep_interrupts_out_of_kernels() -> None:
-    """From now on ^C is a KeyboardInterrupt before or after a kernel, never within; to be called before the first one.
+    """Let Ctrl-C raise KeyboardInterrupt before or after a kernel, never within; call this before the first kernel.
 
-    The very first result of a kind is still made in Python; a numba without that function is left as it is.
+    For each array of a tuple that a kernel returns, Numba calls `_numba_unpickle`, which is Python, and does not check
+    whether it raised. Ctrl-C raises at any line of Python: while a kernel ran it ended in "SystemError: CPUDispatcher
+    returned a result with an exception set". That function only looks up an object made earlier; a `functools.cache`
+    in front of it does the same without any Python, and Ctrl-C waits for the line behind the kernel. The very first
+    result of a kind is still made in Python. A Numba without that function is left unchanged.
     """
     from numba.core import serialize
 

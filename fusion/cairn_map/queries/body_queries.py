@@ -1,4 +1,12 @@
-"""Bodies on a path: where a robot would collide, and where nobody knows."""
+"""Collision queries: the states that a body, a box or a sphere, meets at poses and on its way between them.
+
+    pose n-1 ---+---+---+--- pose n        samples: no point of the body moves farther than half a voxel between two
+
+`check_*` tests the poses alone. `sweep_*` tests the way, too: the position moves straight and the rotation along the
+shortest arc, at constant speeds. Each sample is exact, so whatever is reported is met. What a body meets only between
+two samples, it overlaps by less than a quarter of a voxel's edge: a body that is larger by that to all sides misses
+nothing.
+"""
 
 from dataclasses import dataclass
 
@@ -12,39 +20,39 @@ from cairn_map.queries.frozen_map import FrozenMap, as_points, check_within
 from cairn_map.queries.occupancy_states import State
 
 SAMPLES_MAX = 1 << 20
-"""Of a path: 20 km at 4 cm."""
+"""Samples of one path: 20 km at 4 cm."""
 SMALL_RAD = 1e-9
-"""Turns below it are none."""
+"""Angle below which a rotation counts as none."""
 WEIGHTS = np.array([1, 0, 2], np.uint8)
-"""Of the states: OCCUPIED before UNKNOWN before FREE."""
+"""Weights by `State`: OCCUPIED before UNKNOWN before FREE."""
 STATES = np.array([State.FREE, State.UNKNOWN, State.OCCUPIED], np.uint8)
 
 SIZE_MAX_CELLS = 16
-"""A body is no longer than so many cells: the cells around it are looked at one by one."""
+"""Length of a body in cells, at most: the cells around it are looked at one by one."""
 SQUARE = 1e-6
-"""How far a rotation may be from one."""
+"""Largest deviation of an entry of R^T R from the unit matrix's that still counts as a rotation."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathStates:
-    """What a body meets at N poses."""
+    """States that a body meets at N poses."""
 
     states: npt.NDArray[np.uint8]
     """(N,) `State`: OCCUPIED if it meets an occupied voxel, else UNKNOWN if it meets an unknown one, else FREE."""
 
     @property
     def first_occupied(self) -> int | None:
-        """The first pose that collides, or None."""
+        """Index of the first pose that collides, or None."""
         return _first(self.states == State.OCCUPIED)
 
     @property
     def first_not_free(self) -> int | None:
-        """The first pose that collides or might, or None."""
+        """Index of the first pose that collides or may collide, or None."""
         return _first(self.states != State.FREE)
 
 
 def check_box(frozen: FrozenMap, T_map_body: npt.ArrayLike, box_m: npt.ArrayLike) -> PathStates:
-    """What a box, (2, 3) low and high corner in the body's frame, meets at (N, 4, 4) poses."""
+    """States that a box, (2, 3) low and high corner in the body's frame, meets at (N, 4, 4) poses."""
     T, box = np.asarray(T_map_body, np.float64), np.asarray(box_m, np.float64)
     if T.ndim != 3 or T.shape[1:] != (4, 4):
         raise BadInputError("bad_points", f"poses must be (N, 4, 4), got {T.shape}")
@@ -59,7 +67,7 @@ def check_box(frozen: FrozenMap, T_map_body: npt.ArrayLike, box_m: npt.ArrayLike
 
 
 def check_sphere(frozen: FrozenMap, centres_m: npt.ArrayLike, *, radius_m: float) -> PathStates:
-    """What a sphere meets at (N, 3) centres."""
+    """States that a sphere meets at (N, 3) centres."""
     if not radius_m > 0:
         raise BadInputError("bad_range", f"a radius must be more than 0, got {radius_m}")
     centres = as_points(centres_m, "centres")
@@ -84,14 +92,17 @@ def _first(true: npt.NDArray[np.bool_]) -> int | None:
 
 
 def sweep_box(frozen: FrozenMap, T_map_body: npt.ArrayLike, box_m: npt.ArrayLike) -> PathStates:
-    """What a box, (2, 3) low and high corner in the body's frame, meets on its way to each of (N, 4, 4) poses."""
+    """States that a box, (2, 3) corners in the body's frame, meets on its way to each of (N, 4, 4) poses."""
+    # The poses themselves; this also refuses arrays that are no path, or no box.
     T, box = np.asarray(T_map_body, np.float64), np.asarray(box_m, np.float64)
-    at_poses = check_box(frozen, T, box)  # refuses what is no path, or no box
+    at_poses = check_box(frozen, T, box)
     if len(T) < 2:
         return at_poses
+    # An upper bound of the way of any point: the translation, and the arc of the point farthest from the origin.
     turns = _turns(T[:-1, :3, :3], T[1:, :3, :3])
     arm_m = float(np.linalg.norm(np.abs(box).max(axis=0)))
     moved_m = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1) + np.linalg.norm(turns, axis=1) * arm_m
+    # The samples between the poses.
     segment, fraction = _samples(frozen, moved_m)
     samples = np.tile(np.eye(4), (len(segment), 1, 1))
     samples[:, :3, :3] = T[segment, :3, :3] @ _rotations(turns[segment] * fraction[:, None])
@@ -100,7 +111,7 @@ def sweep_box(frozen: FrozenMap, T_map_body: npt.ArrayLike, box_m: npt.ArrayLike
 
 
 def sweep_sphere(frozen: FrozenMap, centres_m: npt.ArrayLike, *, radius_m: float) -> PathStates:
-    """What a sphere meets on its way to each of (N, 3) centres."""
+    """States that a sphere meets on its way to each of (N, 3) centres."""
     centres = as_points(centres_m, "centres")
     at_poses = check_sphere(frozen, centres, radius_m=radius_m)
     if len(centres) < 2:
@@ -131,6 +142,7 @@ def _between(points: Floats, segment: npt.NDArray[np.int64], fraction: Floats) -
 
 def _turns(R_from: Floats, R_to: Floats) -> Floats:
     """(N, 3) rotation vectors, radians, of the shortest turns that lead from (N, 3, 3) rotations to others."""
+    # The skew part of R is sin(angle) times the axis, its trace 1 + 2 cos(angle).
     R = np.swapaxes(R_from, 1, 2) @ R_to
     vectors = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1) / 2
     sines, cosines = np.linalg.norm(vectors, axis=1), (np.trace(R, axis1=1, axis2=2) - 1) / 2
@@ -147,7 +159,7 @@ def _turns(R_from: Floats, R_to: Floats) -> Floats:
 
 
 def _rotations(turns: Floats) -> Floats:
-    """(N, 3, 3) of (N, 3) rotation vectors (Rodrigues)."""
+    """(N, 3, 3) rotations of (N, 3) rotation vectors: Rodrigues' R = 1 + sin K + (1 - cos) K^2."""
     angles = np.linalg.norm(turns, axis=1)
     x, y, z = (turns / np.maximum(angles, SMALL_RAD)[:, None]).T
     nothing = np.zeros_like(x)
@@ -157,7 +169,7 @@ def _rotations(turns: Floats) -> Floats:
 
 
 def _worst(at_poses: PathStates, between: PathStates, segment: npt.NDArray[np.int64]) -> PathStates:
-    """The worst of each pose and of the samples on the way to it."""
+    """The worst state of each pose and of the samples on the way to it."""
     weights = WEIGHTS[at_poses.states]
     np.maximum.at(weights, segment + 1, WEIGHTS[between.states])
     return PathStates(STATES[weights])

@@ -1,4 +1,4 @@
-"""Rays: how far one sees from a point before something is in the way."""
+"""Distance queries: along rays to the first occupied voxel, and from points to the nearest voxel in a state."""
 
 import math
 from dataclasses import dataclass
@@ -15,15 +15,15 @@ from cairn_map.queries.ray_kernels import cast_into
 
 ONES = ~np.uint64(0)
 CHUNK = 1 << 14
-"""Rays whose directions are made of length 1 at a time."""
+"""Rays that are cast at a time: it bounds the memory for their unit directions."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RayEnds:
-    """Where N rays end."""
+    """Ends of N rays."""
 
     distance_m: Floats
-    """(N,) to where the ray enters the voxel that ends it, 0 if it starts there; infinite if none does."""
+    """(N,) metres to where the ray enters the voxel that ends it, 0 if it starts there; infinite if none does."""
     states: npt.NDArray[np.uint8]
     """(N,) `State` of that voxel; FREE if the ray came to its maximum range."""
     voxels: npt.NDArray[np.int64]
@@ -31,7 +31,7 @@ class RayEnds:
 
     @property
     def hit(self) -> npt.NDArray[np.bool_]:
-        """(N,) whether an occupied voxel ended the ray."""
+        """(N,) True where an occupied voxel ended the ray."""
         return np.asarray(self.states == State.OCCUPIED)
 
 
@@ -43,7 +43,7 @@ def cast(
     max_range_m: float,
     ends_in_unknown: bool,
 ) -> RayEnds:
-    """The ends of (N, 3) rays of any length other than 0."""
+    """Ends of N rays, from (N, 3) origins along (N, 3) directions of any length other than 0."""
     origins, directions = as_points(origins_m, "origins"), as_points(directions, "directions")
     if origins.shape != directions.shape:
         raise BadInputError("bad_points", f"as many directions as origins, got {len(directions)} and {len(origins)}")
@@ -70,7 +70,7 @@ def cast(
 
 
 def _units(directions: Floats) -> Floats:
-    """The same of length 1.
+    """The same directions with length 1.
 
     Raises:
         BadInputError: one has no length, or is not finite.
@@ -88,13 +88,13 @@ class Nearest:
     """The nearest voxels of N points."""
 
     distance_m: Floats
-    """(N,) to the nearest point of the voxel, 0 inside it; infinite if there is none within the radius."""
+    """(N,) metres to the nearest point of the voxel, 0 inside it; infinite if there is none within the radius."""
     voxels: npt.NDArray[np.int64]
-    """(N, 3) its number, one of them if several are as near; the point's own voxel if there is none."""
+    """(N, 3) number of the voxel, of one of them if several are as near; of the point's own if there is none."""
 
     @property
     def found(self) -> npt.NDArray[np.bool_]:
-        """(N,) whether there is one."""
+        """(N,) True where there is a voxel within the radius."""
         return np.isfinite(self.distance_m)
 
 

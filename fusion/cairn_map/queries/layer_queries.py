@@ -14,8 +14,9 @@ from cairn_map.queries import point_queries
 from cairn_map.queries.frozen_map import Box, FrozenMap
 
 PIXELS_MAX = 1 << 26
-"""Of an image; cells may lie anywhere, and the box of all of them may be as large as a country."""
+"""Pixels of an image, at most: cells may lie anywhere, and the box of all of them may be as large as a country."""
 NO_TOP = np.iinfo(np.int64).min
+"""Height of a column without an occupied voxel."""
 Values = npt.NDArray[np.number]
 
 

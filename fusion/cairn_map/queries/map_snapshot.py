@@ -1,4 +1,4 @@
-"""A map to ask: what is here, what is in the way, where is nobody yet. Arrays in, arrays out.
+"""Snapshot of a map, and all queries of it: states and readings at points, rays, collisions, frontiers, layers.
 
     snapshot = robot.snapshot()
     snapshot.probability_at([[1.0, 2.0, 0.4]])                         # NaN where unknown
@@ -38,7 +38,7 @@ STANDARD_MODEL = SensorModel()
 
 
 class MapSnapshot:
-    """A map at one instant, under one sensor model."""
+    """A map at one instant, under one inverse sensor model; arrays in, arrays out."""
 
     __slots__ = ("_frozen",)
 
@@ -46,12 +46,12 @@ class MapSnapshot:
         self._frozen = frozen
 
     def refreshed(self, whole: EvidenceMap) -> Self:
-        """The map as it is now; only the cells that changed since this snapshot are looked at anew."""
+        """Snapshot of the map as it is now; only the cells that changed since this snapshot are read again."""
         return type(self)(freeze(whole, self._frozen.model, earlier=self._frozen))
 
     @property
     def frozen(self) -> FrozenMap:
-        """What queries in other modules read, such as `map_render`."""
+        """The frozen cells and states, for queries in other modules such as `map_render`."""
         return self._frozen
 
     @property
@@ -61,7 +61,7 @@ class MapSnapshot:
 
     @property
     def model(self) -> SensorModel:
-        """What hits and misses mean here."""
+        """Inverse sensor model under which hits and misses are read."""
         return self._frozen.model
 
     def state_at(self, points_m: npt.ArrayLike) -> npt.NDArray[np.uint8]:
@@ -81,7 +81,7 @@ class MapSnapshot:
         return point_queries.probability_at(self._frozen, points_m)
 
     def reading_at(self, points_m: npt.ArrayLike, channel: str) -> Reading:
-        """What a channel says: mean (N,) in its unit, or (N, 3) for colours, and weight (N,), in samples.
+        """Reading of a channel: mean (N,) in its unit, or (N, 3) for colours, and weight (N,), in samples.
 
         The mean is NaN where the weight is 0. Temperatures have a `spread`, too.
 
@@ -105,25 +105,25 @@ class MapSnapshot:
     def cast_rays(
         self, origins_m: npt.ArrayLike, directions: npt.ArrayLike, *, max_range_m: float, ends_in_unknown: bool = False
     ) -> RayEnds:
-        """Follow rays until an occupied voxel.
+        """Cast rays until they meet an occupied voxel.
 
         A ray meets a voxel if a part of it that is more than a point lies in it, or if it starts there; one along a
-        border is in the upper voxel. What lies at the maximum range itself is still met.
+        border is in the upper voxel. A voxel at the maximum range itself is still met.
 
         Args:
             origins_m: (N, 3), anywhere.
             directions: (N, 3), map frame, of any finite length but 0.
             max_range_m: 0 or more; infinite for as far as the map goes.
-            ends_in_unknown: whether an unknown voxel ends a ray, too; else it is seen through.
+            ends_in_unknown: True if an unknown voxel ends a ray, too; else it is seen through.
         """
         return distance_queries.cast(
             self._frozen, origins_m, directions, max_range_m=max_range_m, ends_in_unknown=ends_in_unknown
         )
 
     def check_box(self, T_map_body: npt.ArrayLike, box_m: npt.ArrayLike) -> PathStates:
-        """What a box meets at each pose of a path; between the poses `sweep_box` looks.
+        """States that a box meets at each pose of a path; `sweep_box` tests the way between the poses, too.
 
-        It meets the voxels that it overlaps; touching, to a millionth of a voxel, is not meeting.
+        A box meets the voxels that it overlaps; touching, to a millionth of a voxel, is not meeting.
 
         Args:
             T_map_body: (N, 4, 4) rigid transforms.
@@ -132,14 +132,15 @@ class MapSnapshot:
         return body_queries.check_box(self._frozen, T_map_body, box_m)
 
     def check_sphere(self, centres_m: npt.ArrayLike, *, radius_m: float) -> PathStates:
-        """What a sphere meets at each of (N, 3) centres, as `check_box`."""
+        """States that a sphere meets at each of (N, 3) centres, as `check_box`."""
         return body_queries.check_sphere(self._frozen, centres_m, radius_m=radius_m)
 
     def sweep_box(self, T_map_body: npt.ArrayLike, box_m: npt.ArrayLike) -> PathStates:
-        """What a box meets on its way to each pose of a path, the pose included: straight, turning the shortest way.
+        """States that a box meets on its way to each pose of a path, the pose included: straight, the shortest turn.
 
-        Looked at wherever a point of the box has moved by half a voxel. What it reports is met; what it misses is
-        overlapped by less than a quarter of a voxel's edge: with a box larger by that to all sides nothing is missed.
+        The way is sampled wherever a point of the box has moved by half a voxel. Whatever it reports is met; a voxel
+        that it misses is overlapped by less than a quarter of its edge: with a box larger by that to all sides nothing
+        is missed.
 
         Args:
             T_map_body: (N, 4, 4) rigid transforms.
@@ -151,7 +152,7 @@ class MapSnapshot:
         return body_queries.sweep_box(self._frozen, T_map_body, box_m)
 
     def sweep_sphere(self, centres_m: npt.ArrayLike, *, radius_m: float) -> PathStates:
-        """What a sphere meets on its straight ways to each of (N, 3) centres, as `sweep_box`."""
+        """States that a sphere meets on its straight ways to each of (N, 3) centres, as `sweep_box`."""
         return body_queries.sweep_sphere(self._frozen, centres_m, radius_m=radius_m)
 
     def nearest_occupied(self, points_m: npt.ArrayLike, *, radius_m: float) -> Nearest:
@@ -201,9 +202,9 @@ class MapSnapshot:
         """The n known voxels with the highest mean temperature, hottest first, fewer if there are no more.
 
         Args:
-            n: how many.
+            n: number of voxels.
             min_probability: only voxels that are occupied with at least this probability.
-            box_m: where.
+            box_m: only voxels in this box.
         """
         return voxel_queries.hottest(self._frozen, n, min_probability=min_probability, box_m=box_m)
 
@@ -220,8 +221,8 @@ class MapSnapshot:
 
 
 def snapshot_of(whole: EvidenceMap, model: SensorModel = STANDARD_MODEL) -> MapSnapshot:
-    """The map as it is now, read under a sensor model.
+    """Snapshot of the map as it is now, read under a sensor model.
 
-    Of a map that another thread changes, only while it cannot: a robot's `snapshot` sees to that.
+    If another thread changes the map, the caller holds it off meanwhile; a robot's `snapshot` does so.
     """
     return MapSnapshot(freeze(whole, model))

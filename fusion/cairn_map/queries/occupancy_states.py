@@ -1,4 +1,4 @@
-"""A map's states, unknown, free or occupied under one sensor model, as bits that kernels find without Python.
+"""Occupancy states of a map: unknown, free or occupied under one sensor model, as bits for kernels.
 
 One brick of 512 voxels is 128 bytes here and 2048 in the map: the whole of a building fits a processor's cache.
 """
@@ -18,10 +18,11 @@ from cairn_map.queries import occupancy_kernels as kernels
 from cairn_map.queries.occupancy_kernels import Grid
 
 HASH_BITS_MIN = 4
+"""Bits of the smallest hash table."""
 
 
 class State(IntEnum):
-    """What a map says of a voxel."""
+    """Occupancy of a voxel."""
 
     UNKNOWN = 0
     FREE = 1
@@ -30,11 +31,11 @@ class State(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CellStates:
-    """Bits of one cell's bricks, and the counts that they are of."""
+    """States of one cell's bricks, and the counts from which they were made."""
 
     counts: BrickCounts
     words: Words
-    """(B, 8, 2), as `state_kernels.Grid` has them."""
+    """(B, 8, 2) bits, laid out as in `occupancy_kernels.Grid`."""
 
 
 def states_of_counts(counts: BrickCounts, model: SensorModel) -> CellStates:
@@ -84,7 +85,7 @@ def state_grid(cells: Sequence[Cell], states: Sequence[CellStates], geometry: Ge
 
 @lru_cache(maxsize=4)
 def odds_of_counts(model: SensorModel) -> tuple[Floats, Floats]:
-    """What so many hits, and misses, say: (65536,) log-odds each, by the bits of a count."""
+    """Log-odds of each number of hits, and of misses: (65536,) each, by the 16 bits of a count."""
     counts = np.arange(1 << 16, dtype=np.uint16).view(np.int16)
     hits, misses = (np.multiply(counts, log_odds(p), dtype=np.float64) for p in (model.p_hit, model.p_miss))
     return hits, misses

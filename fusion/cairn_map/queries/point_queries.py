@@ -1,6 +1,6 @@
-"""What a map holds at points: states, counts, and the readings of channels.
+"""Point queries: states, counts, probabilities and the readings of channels at given points.
 
-Any number of points: they are worked on in chunks, so that what is needed beside the result is bounded.
+Points are worked on in chunks, so that the memory needed besides the result is bounded.
 """
 
 from collections.abc import Iterator
@@ -20,6 +20,7 @@ from cairn_map.queries.frozen_map import FrozenMap, as_points, check_within
 from cairn_map.queries.occupancy_states import odds_of_counts
 
 CHUNK = 1 << 17
+"""Points of a chunk."""
 Located = tuple[slice, BrickCell, npt.NDArray[np.int32], npt.NDArray[np.uint32]]
 
 
@@ -32,7 +33,7 @@ def states_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> npt.NDArray[np.uint
 
 
 def counts_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> npt.NDArray[np.int32]:
-    """(N, 2) hits and misses."""
+    """(N, 2) hits and misses of the voxels that hold (N, 3) points; zeros where unknown."""
     points = as_points(points_m, "points")
     counts = np.zeros((len(points), 2), np.int32)
     for part, cell, rows, places in _located(frozen, points):
@@ -41,7 +42,7 @@ def counts_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> npt.NDArray[np.int3
 
 
 def log_odds_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> Floats:
-    """(N,) clamped log-odds; NaN where unknown."""
+    """(N,) clamped log-odds of the voxels that hold (N, 3) points; NaN where unknown."""
     points, model = as_points(points_m, "points"), frozen.model
     odds = np.full(len(points), np.nan)
     clamps = log_odds(model.p_min), log_odds(model.p_max)
@@ -57,7 +58,8 @@ def log_odds_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> Floats:
 
 
 def probability_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> Floats:
-    """(N,) probability; NaN where unknown."""
+    """(N,) probability of occupancy of the voxels that hold (N, 3) points; NaN where unknown."""
+    # P = 1 / (1 + exp(-L)), in place.
     probability = log_odds_at(frozen, points_m)
     np.negative(probability, out=probability)
     np.exp(probability, out=probability)
@@ -67,7 +69,7 @@ def probability_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> Floats:
 
 
 def reading_at(frozen: FrozenMap, points_m: npt.ArrayLike, channel: Channel) -> Reading:
-    """What one channel of the map says."""
+    """Reading of one channel at (N, 3) points."""
     points = as_points(points_m, "points")
     planes = frozen.geometry.planes_of(channel.name)
     sums = np.zeros((len(points), planes.stop - planes.start), np.int64)
@@ -77,7 +79,7 @@ def reading_at(frozen: FrozenMap, points_m: npt.ArrayLike, channel: Channel) -> 
 
 
 def channel_named(frozen: FrozenMap, name: str) -> Channel:
-    """A channel of the map.
+    """The map's channel of a name.
 
     Raises:
         BadInputError: kind `unknown_channel`: the map has none of that name.

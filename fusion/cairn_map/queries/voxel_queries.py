@@ -1,4 +1,4 @@
-"""Which voxels of a map are of interest: where the unknown begins, what is hot, what lies in a box."""
+"""Sets of voxels of a map: the frontier to the unknown, the hottest voxels, and the voxels in a box."""
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,7 @@ from cairn_map.queries.point_queries import first_of_kind
 
 
 def frontier(frozen: FrozenMap, box_m: Box | None) -> Ints:
-    """(M, 3) numbers of the free voxels with an unknown one beside a face."""
+    """(M, 3) numbers of the free voxels of which a face borders on an unknown one."""
     low, high = frozen.voxels_of_box(box_m)
     corners = frozen.brick_corners()
     bits = np.empty((len(corners), 8), np.uint64)
@@ -26,7 +26,7 @@ def frontier(frozen: FrozenMap, box_m: Box | None) -> Ints:
 
 
 def frontier_cells(frozen: FrozenMap, box_m: Box | None) -> dict[Cell, int]:
-    """The cells with such voxels, and how many each has."""
+    """Cells with frontier voxels, and how many each has."""
     cells, counts = np.unique(frontier(frozen, box_m) >> frozen.geometry.depth, axis=0, return_counts=True)
     return {Cell(*cell): count for cell, count in zip(cells.tolist(), counts.tolist(), strict=True)}
 
@@ -58,7 +58,7 @@ def hottest(frozen: FrozenMap, n: int, *, min_probability: float, box_m: Box | N
         evidence = cell.packed()
         sums = evidence.samples[:, planes]
         numbers = voxels_in_cell(evidence.voxels[evidence.sampled], key, frozen.geometry)
-        # What is not known has no probability, and NaN is not above any.
+        # An unknown voxel's probability is NaN, and NaN is not above any number.
         likely = frozen.model.probability(evidence.counts[evidence.sampled]) >= min_probability
         keep = (sums[:, -1] > 0) & likely & _are_within(numbers, low, high)
         mean = np.full(len(sums), -np.inf)
@@ -80,7 +80,7 @@ def _are_within(numbers: Ints, low: Ints, high: Ints) -> npt.NDArray[np.bool_]:
 
 
 def _rows(evidence: Evidence, keep: npt.NDArray[np.bool_]) -> Evidence:
-    """Those voxels of packed evidence, packed."""
+    """The voxels of packed evidence where `keep` is True, packed."""
     sampled = keep[evidence.sampled]
     new_row = np.cumsum(keep, dtype=np.int64) - 1
     return Evidence(

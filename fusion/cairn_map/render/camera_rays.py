@@ -1,8 +1,8 @@
-"""Where a camera looks: one ray for each pixel, and how fine the pixels are. Any lens: who has the rays has a camera.
+"""Rays of a camera: one for each pixel, and the angle between neighbouring pixels. Any lens is a table of rays.
 
     CameraRays(rig["colour"].camera.rays())                     a calibrated camera, distortion and all
     pinhole(640, 480, focal_px=500)                        an ideal one, to look from anywhere
-    look_at((1, 2, 1.2), (4, 2, 1.0))                      T_map_camera of an eye and what it looks at
+    look_at((1, 2, 1.2), (4, 2, 1.0))                      T_map_camera of an eye and its target
 
 Camera frame: x right, y down, z forward; the centre of the top-left pixel is (0, 0).
 """
@@ -22,12 +22,14 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 PIXELS_MAX = 1 << 24
 UNIT_TOLERANCE = 1e-6
+"""Largest deviation of a ray's length from 1."""
 RIGID_TOLERANCE = 1e-6
+"""Largest deviation of an entry of R^T R from the unit matrix's."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraRays:
-    """The rays of a camera's pixels."""
+    """Rays of a camera's pixels, and their spacing."""
 
     rays: Floats
     """(H, W, 3) unit vectors, camera frame; NaN for pixels that look nowhere."""
@@ -49,7 +51,7 @@ class CameraRays:
         object.__setattr__(self, "pixel_rad", max((float(gap.max()) for gap in known if gap.size), default=1.0))
 
     def every(self, step: int) -> "CameraRays":
-        """The camera with only the middle row and column of each `step`: those of `middles`."""
+        """The camera with only the middle pixel of each `step` x `step`, as `middles` takes them."""
         return self if step == 1 else _every(self, step)
 
     @property
@@ -69,7 +71,7 @@ def _every(sight: CameraRays, step: int) -> CameraRays:
 
 
 def middles(image: npt.NDArray[Scalar], step: int) -> npt.NDArray[Scalar]:
-    """(h, w, ...) of (H, W, ...): the pixel in the middle of each `step` x `step`; the last ones may be cut."""
+    """(h, w, ...) image of the pixels in the middle of each `step` x `step` of (H, W, ...); the last may be cut."""
     rows, columns = (np.minimum(np.arange(step // 2, size + step // 2, step), size - 1) for size in image.shape[:2])
     return image[np.ix_(rows, columns)]
 
@@ -78,7 +80,7 @@ def pinhole(width: int, height: int, *, focal_px: float, centre_px: tuple[float,
     """An ideal camera, with the principal point in the middle or at `centre_px` (x, y).
 
     Raises:
-        BadInputError: kind `bad_camera`: a size or focal length that cannot be.
+        BadInputError: kind `bad_camera`: an impossible size or focal length.
     """
     if not (0 < focal_px < np.inf and width * height <= PIXELS_MAX and min(width, height) >= 2):
         raise BadInputError("bad_camera", f"no camera has {width} x {height} pixels and a focal length of {focal_px}")
@@ -115,7 +117,7 @@ def look_at(eye_m: Sequence[float], target_m: Sequence[float]) -> Floats:
 
 
 def checked_pose(T_map_camera: npt.ArrayLike, *, reach_m: float) -> Floats:
-    """(4, 4) float64 of a rigid transform within the numbered space.
+    """(4, 4) float64 of a pose, checked to be a rigid transform within the numbered space.
 
     Raises:
         BadInputError: kind `bad_pose`.
@@ -139,11 +141,12 @@ def checked_pose(T_map_camera: npt.ArrayLike, *, reach_m: float) -> Floats:
 def cells_in_sight(
     cells: npt.NDArray[np.int64], sight: CameraRays, T_map_camera: Floats, *, edge_m: float, range_max_m: float
 ) -> npt.NDArray[np.bool_]:
-    """(C,) which of (C, 3) cells, of an edge, may be seen: those outside of what all rays span certainly are not."""
+    """(C,) False for those of (C, 3) cells that are certainly not seen: outside of the cone of all rays, or too far."""
     half_m = edge_m * np.sqrt(3) / 2  # of the sphere around a cell
     centres = ((cells + 0.5) * edge_m - T_map_camera[:3, 3]) @ T_map_camera[:3, :3]
     away_m = np.linalg.norm(centres, axis=1)
     middle, widest = _span(sight)
+    # Cells within range; then those whose sphere reaches into the cone around the middle ray.
     near = away_m - half_m <= range_max_m
     if np.isnan(widest) or widest == np.pi:  # nowhere, or all around
         return np.asarray(near & (widest == np.pi))
@@ -155,7 +158,7 @@ def cells_in_sight(
 
 @lru_cache(maxsize=2)
 def _span(sight: CameraRays) -> tuple[Floats, float]:
-    """The middle of all rays, and the widest angle of one from it; pi: all around, NaN: no ray looks anywhere."""
+    """Mean direction of all rays, and the widest angle of one from it; pi: all around, NaN: no ray looks anywhere."""
     rays = sight.rays.reshape(-1, 3)
     rays = rays[~np.isnan(rays[:, 0])]
     if not len(rays):

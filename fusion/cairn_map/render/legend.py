@@ -1,6 +1,8 @@
-"""What the colours of a picture mean, in a strip below it: as many rows as its width takes, so that no word is cut.
+"""Legend of a picture, in a strip below it, and text on images in letters of 5 x 7 pixels, without an imaging library.
 
-10 [palette] 50   temperature, C, apparent   [grey] no temperature   solid: visible   ...
+    10 [palette] 50   temperature, C, apparent   [grey] no temperature   solid: visible   ...
+
+The strip has as many rows as the picture's width needs, so that no word is cut.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,16 +29,17 @@ _COLUMNS = {
     "r": "7c08040408", "s": "4854545424", "t": "04043f4424", "u": "3c4040207c", "v": "1c2040201c", "w": "3c4030403c",
     "x": "4428102844", "y": "4c9090907c", "z": "4464544c44",
 }  # fmt: skip
-"""Five columns of eight bits, in hex, the lowest bit on top."""
+"""By letter: five columns of eight bits, in hex, the lowest bit on top."""
 
 MARGIN_PX, GAP_PX = 8, 16
-"""At both ends of a row, and between what is in it."""
+"""Space at both ends of a row, and between its parts."""
 ROW_PX = 18
 EDGE_PX = 7
-"""Above the first row, and below the last."""
+"""Space above the first row, and below the last."""
 BAR_PX, BAR_MIN_PX = (160, 12), 40
-"""Of the palette: width at most, and height; and width at least."""
+"""Size of the palette: its largest width and its height; and its smallest width."""
 SAMPLE_PX = 24
+"""Width of the patch of a colour."""
 TITLES = {
     Layer.TEMPERATURE: "temperature, C, apparent",
     Layer.PROBABILITY: "probability",
@@ -47,9 +50,9 @@ TITLES = {
 
 
 def with_legend(image: Rgb, scale: Scale, notes: Sequence[str] = ()) -> Rgb:
-    """The image with its legend below: the palette with its two ends, how what has no value looks, and notes.
+    """The image with its legend below: the palette with its two ends, the grey of missing values, and notes.
 
-    On pictures narrower than their longest word, some 160 pixels, that word is cut after all.
+    On pictures narrower than their longest word, some 160 pixels, that word is cut.
     """
     width = image.shape[1]
     rows = list(_rows(list(_parts(scale, notes, width)), width))
@@ -64,7 +67,7 @@ def with_legend(image: Rgb, scale: Scale, notes: Sequence[str] = ()) -> Rgb:
 
 
 def _rows(parts: Sequence[Rgb], width: int) -> Iterator[list[Rgb]]:
-    """Parts of a legend, as many side by side as there is room for."""
+    """Rows of a legend: parts side by side, as many as fit."""
     row: list[Rgb] = []
     for part in parts:
         if row and 2 * MARGIN_PX + sum(each.shape[1] + GAP_PX for each in row) + part.shape[1] > width:
@@ -76,7 +79,7 @@ def _rows(parts: Sequence[Rgb], width: int) -> Iterator[list[Rgb]]:
 
 
 def _parts(scale: Scale, notes: Sequence[str], width: int) -> Iterator[Rgb]:
-    """(ROW_PX, w, 3) each: what is not to be torn apart."""
+    """Parts of a legend, (ROW_PX, w, 3) each, none of which is broken over two rows."""
     if scale.layer is not Layer.COLOUR:
         ends = _word(f"{scale.low:g}"), _word(f"{scale.high:g}")
         room = width - 2 * MARGIN_PX - sum(end.shape[1] + 6 for end in ends)

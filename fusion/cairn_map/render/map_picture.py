@@ -18,7 +18,7 @@ Values = npt.NDArray[np.floating]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ages:
-    """When things changed, and when it is now; both in the same unit, from the same zero."""
+    """Times of the last changes, and the time now, in the same unit and from the same zero."""
 
     changes: Changes
     now: float
@@ -27,9 +27,9 @@ class Ages:
 def layer_values(
     renderer: MapRenderer, snapshot: MapSnapshot, seen: SurfaceImage, layer: Layer, ages: Ages | None = None
 ) -> Values:
-    """(H, W) in the layer's unit: degrees Celsius, 1, metres, seconds (or what `ages` has); colours (H, W, 3).
+    """(H, W) values in the layer's unit: degrees Celsius, 1, metres, seconds (or that of `ages`); colours (H, W, 3).
 
-    NaN where nothing is seen, and where what is seen has no such value.
+    NaN where nothing is seen, and where the node seen has no such value.
 
     Raises:
         BadInputError: kind `unknown_channel`: the map has no temperatures, or no colours.
@@ -50,9 +50,9 @@ def layer_values(
 
 
 def layer_picture(values: Values, seen: SurfaceImage, scale: Scale, spread: PoseSpread | None = None) -> Rgb:
-    """(H + legend, W, 3) sRGB: values painted, grey where something is seen that has none, dark where nothing is.
+    """(H + legend, W, 3) sRGB: values painted, grey where a node without a value is seen, dark where nothing is.
 
-    With a pose's spread all is blurred as far as it may be off, or withheld where that says nothing any more.
+    With a pose's spread the picture is blurred as far as it may be off, or withheld where that is too far.
     """
     image = painted(values, scale)
     image[~seen.hit] = NOTHING
@@ -70,7 +70,7 @@ def layer_picture(values: Values, seen: SurfaceImage, scale: Scale, spread: Pose
 def arrays_of(
     values: Values, seen: SurfaceImage, layer: Layer, spread: PoseSpread | None = None
 ) -> dict[str, npt.NDArray[np.generic]]:
-    """By name: `range_m`, `depth_m`, and the layer's values (`temperature_k`, `age_s`, `probability`, `colour`).
+    """Arrays by name: `range_m`, `depth_m`, and the layer's values (`temperature_k`, `age_s`, `probability`, `colour`).
 
     With a pose's spread also `spread_px2`, (H, W, 3): the covariance xx, xy, yy of where each pixel's content appears.
     All float32, NaN where nothing is seen or nothing is known.

@@ -1,12 +1,12 @@
-"""A map as a camera sees it: which node each pixel looks at, how far it is, and what it reads.
+"""Rendering of a map for a camera: the node that each pixel sees, its range, and its readings.
 
     renderer = MapRenderer(threads=2)
     seen = renderer.nearest(snapshot, sight, T_map_camera, range_max_m=20)
     seen.range_m                                     (H, W) metres along each ray, NaN where nothing is
     renderer.temperature(snapshot, seen)             (H, W) kelvin, NaN where no temperature is known
 
-Each pixel is that of its ray, so any lens will do, and the result is the same with any number of threads. What a cell's
-nodes read is worked out once, when the first pixel asks, and kept until the cell changes.
+Each pixel is that of its ray, so any lens will do, and the result is the same with any number of threads. The readings
+of a cell's nodes are computed once, when the first pixel needs them, and kept until the cell changes.
 """
 
 import math
@@ -35,20 +35,20 @@ from cairn_map.render.render_kernels import read_nodes_into
 
 Values = npt.NDArray[np.float32]
 Changes = Mapping[CellKey, Floats]
-"""When each 4^3 block of a cell last changed, (8^(depth - 2),) in Morton order; NaN where that is unknown."""
+"""By cell: time of the last change of each 4^3 block, (8^(depth - 2),) in Morton order; NaN where that is unknown."""
 ROWS_MIN = 8
-"""Of a thread's share of an image."""
+"""Rows of a thread's share of an image, at least."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceImage:
-    """What each pixel of a camera sees of a map: an occupied node, or nothing."""
+    """Image of the surfaces that a camera sees: for each pixel an occupied node of the map, or nothing."""
 
     sight: CameraRays
     range_m: Values
     """(H, W) metres along the pixel's ray to where it enters the node; NaN where it sees nothing."""
     slots: npt.NDArray[np.int32]
-    """(H, W) which of the snapshot's cells, -1 for none."""
+    """(H, W) index of the node's cell in the snapshot, -1 for none."""
     places: npt.NDArray[np.uint32]
     """(H, W) Morton code inside the cell of the voxel that the ray enters first."""
     nodes: npt.NDArray[np.uint8]
@@ -56,7 +56,7 @@ class SurfaceImage:
 
     @property
     def hit(self) -> npt.NDArray[np.bool_]:
-        """(H, W) whether there is something."""
+        """(H, W) True where the pixel sees a node."""
         return np.asarray(self.slots >= 0)
 
     @property
@@ -68,23 +68,24 @@ class SurfaceImage:
 
 @dataclass(slots=True, eq=False)
 class CellTables:
-    """What the nodes of one cell read, by what is asked; as long as its sums are these."""
+    """Tables of the readings of one cell's nodes; valid while the cell's sums are these objects."""
 
     counts: BrickCounts
     samples: SampleRows
     tables: dict[Hashable, Table] = field(default_factory=dict)
+    """By what they show: a sensor model, or a channel."""
 
 
 class MapRenderer:
-    """Draws a map from any pose; keeps what it worked out between frames. For one thread at a time."""
+    """Renderer of a map from any pose; it keeps its tables between frames. For one thread at a time."""
 
     def __init__(self, *, threads: int = 1, on_share: Callable[[], None] = lambda: None) -> None:
-        """Use so many threads; `on_share` is called before each share of the work, and may raise to end it."""
+        """Use `threads` threads; `on_share` is called before each share of the work, and may raise to end it."""
         self._threads = max(1, threads)
         self._on_share = on_share
         self._skips: tuple[object, npt.NDArray[np.uint8]] | None = None
         self.kept: dict[CellKey, CellTables] = {}
-        """What was worked out, by cell; whoever has some already may put it here."""
+        """Tables by cell; a caller that has some already may put them here."""
 
     def nearest(
         self,
@@ -102,8 +103,8 @@ class MapRenderer:
             sight: the camera.
             T_map_camera: (4, 4) rigid.
             range_max_m: no ray goes farther.
-            between_m: two of (H, W) metres, where each ray begins and ends; NaN for those that see nothing. None: all
-                begin at the camera.
+            between_m: two of (H, W) metres, the ranges at which each ray begins and ends; NaN for rays that see
+                nothing. None: all begin at the camera.
 
         Raises:
             BadInputError: kinds `bad_pose`, `bad_range`, `bad_camera`: `between_m` of another size.
@@ -119,16 +120,18 @@ class MapRenderer:
         range_max_m: float,
         between_m: tuple[Values, Values],
     ) -> SurfaceImage:
-        """What lies behind surfaces: each ray goes on through what is there until it comes out into a voxel that is
-        known to be free, and what it meets from there on is seen. So a wall's other side is not taken for a thing
-        behind the wall, and where nobody ever looked behind a surface nothing is shown.
+        """The first occupied node behind the surfaces where the rays begin.
+
+        Each ray goes on through the surface until it comes out into a voxel that is known to be free, and sees what it
+        meets from there on. So a wall's other side is not taken for a thing behind the wall, and where the space
+        behind a surface was never seen, nothing is shown.
 
         Arguments and errors as of `nearest`.
         """
         return self._seen(snapshot.frozen, sight, T_map_camera, range_max_m, between_m, is_beyond=True)
 
     def probability(self, snapshot: MapSnapshot, seen: SurfaceImage) -> Values:
-        """(H, W) that the node is occupied, its likeliest voxel's; NaN where nothing is seen."""
+        """(H, W) probability of occupancy of the node's likeliest voxel; NaN where nothing is seen."""
         model = snapshot.model
         return self._read(snapshot, seen, model, 1, lambda key, cell: probability_table(cell, model))[..., 0]
 
@@ -141,12 +144,13 @@ class MapRenderer:
         return self._mean(snapshot, seen, ChannelKind.COLOUR, 3)
 
     def changed(self, snapshot: MapSnapshot, seen: SurfaceImage, changes: Changes) -> Floats:
-        """(H, W) when the node last changed, in the unit of `changes`; NaN where that is unknown."""
+        """(H, W) time of the node's last change, in the unit of `changes`; NaN where that is unknown."""
         H, W = seen.slots.shape
         found, flat = np.full(H * W, np.nan), seen.slots.reshape(-1)
         places, nodes = seen.places.reshape(-1), seen.nodes.reshape(-1)
         for slot, key in enumerate(snapshot.frozen.keys):
             if key in changes and len(rows := np.flatnonzero(flat == slot)):
+                # A place is a Morton code: without its lowest 6 bits the block, without 9 the brick.
                 blocks, brick = places[rows] >> np.uint32(6), changes[key].reshape(-1, 8)
                 is_brick = nodes[rows] == kernels.NODE_DEPTH  # the only node that is larger than a block
                 newest = np.fmax.reduce(brick[blocks >> np.uint32(3)], axis=1)
@@ -173,6 +177,7 @@ class MapRenderer:
         *,
         is_beyond: bool,
     ) -> SurfaceImage:
+        # Check, and convert to what the kernel takes: lengths in voxel edges, float32.
         T = checked_pose(T_map_camera, reach_m=frozen.reach_m)
         H, W, edge_m = sight.height, sight.width, frozen.geometry.voxel_edge_m
         if not 0 < range_max_m < np.inf:
@@ -183,6 +188,7 @@ class MapRenderer:
             raise BadInputError("bad_camera", f"between_m must be two of ({H}, {W}), as the camera's image is")
         starts = np.asarray(np.maximum(starts, 0) / edge_m, np.float32)
         ends = np.asarray(np.minimum(ends, reach_m) / edge_m, np.float32)
+        # Walk all rays; each thread writes rows of its own.
         skips = self._skips_of(frozen)
         seen = SurfaceImage(
             sight,
@@ -220,11 +226,13 @@ class MapRenderer:
         planes: int,
         make: Callable[[CellKey, BrickCell], Table],
     ) -> Values:
+        # Tables of the cells in sight; slot -1, nothing, is the first bin.
         frozen = snapshot.frozen
         slots = np.flatnonzero(np.bincount(seen.slots.reshape(-1) + 1, minlength=1 + len(frozen.cells))[1:])
         tables = {slot: self._table(frozen.keys[slot], frozen.cells[slot], name, make) for slot in slots.tolist()}
         out = np.full((seen.sight.height, seen.sight.width, planes), np.nan, np.float32)
 
+        # Then cell by cell, so that a cell's table stays in the processor's cache.
         def read(rows: slice) -> None:
             flat = seen.slots[rows].reshape(-1)
             starts, order = np.empty(len(frozen.cells) + 1, np.int64), np.empty(len(flat), np.int32)
@@ -245,7 +253,8 @@ class MapRenderer:
     def _table(
         self, key: CellKey, cell: BrickCell, name: Hashable, make: Callable[[CellKey, BrickCell], Table]
     ) -> Table:
-        """A cell's table, made anew when its sums are other objects than they were: who adds to a map copies first."""
+        """A cell's table, kept until the cell's sums are other objects."""
+        # Merging into a frozen cell copies its sums first, so the same object means the same sums.
         kept = self.kept.get(key)
         if kept is None or kept.counts is not cell.counts or kept.samples is not cell.samples:
             kept = self.kept[key] = CellTables(cell.counts, cell.samples)
@@ -254,6 +263,7 @@ class MapRenderer:
         return kept.tables[name]
 
     def _skips_of(self, frozen: FrozenMap) -> npt.NDArray[np.uint8]:
+        # A new snapshot of a changed map has new words; tables of cells that are gone go with the old ones.
         if self._skips is None or self._skips[0] is not frozen.grid.words:
             skips = np.empty(frozen.grid.bricks.shape, np.uint8)
             kernels.skips_into(frozen.grid, skips)
@@ -263,7 +273,8 @@ class MapRenderer:
         return self._skips[1]
 
     def _by_rows(self, height: int, work: Callable[[slice], None]) -> None:
-        """Do the work on shares of an image's rows, in as many threads as there are."""
+        """Do the work on shares of an image's rows, in all threads."""
+        # Four shares a thread: rows differ in cost, and the last share must not be waited for long.
         step = max(ROWS_MIN, -(-height // (4 * self._threads)))
         shares = [slice(start, min(start + step, height)) for start in range(0, height, step)]
 

@@ -1,11 +1,11 @@
-"""What every node of a cell's bricks reads, ready to be looked up: a voxel, and the means of 2, 4 and 8 along an edge.
+"""Tables of the readings of all nodes of a cell's bricks: its voxels, and nodes of 2, 4 and 8 voxels along an edge.
 
     table [row of the brick, 0 .. 511]    its voxels in Morton order       n = 0
                           [512 .. 575]    its nodes of 2 voxels            n = 1
                           [576 .. 583]    of 4                             n = 2
                           [584]           the brick itself                 n = 3
 
-The mean of a node is that of all samples below, its probability the highest below, as in `view`.
+The mean of a node is that of all samples below it, its probability the highest below it, as in `view`.
 """
 
 from collections.abc import Callable
@@ -20,15 +20,15 @@ from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel, known
 
 Table = npt.NDArray[np.float32]
-"""(B, 585, planes) float32; NaN where nothing is known."""
+"""(B, 585, planes) float32; NaN where the node has no value."""
 
 NODES = 585
 FIRST_OF_NODE = np.array([0, 512, 576, 584], np.int64)
-"""Where in a brick's row the nodes of 2^n voxels begin."""
+"""By n: index in a brick's row of the first node of 2^n voxels along an edge."""
 
 
 def probability_table(cell: BrickCell, model: SensorModel) -> Table:
-    """Clamped probability, one plane."""
+    """Table of the clamped probability, one plane."""
     pool = cell.counts.pool.reshape(-1, 2)
     odds = np.where(known(pool), model.log_odds(pool), -np.inf)
     highest = _pyramid(odds[:, None], lambda parts: parts.max(axis=2))
@@ -37,7 +37,7 @@ def probability_table(cell: BrickCell, model: SensorModel) -> Table:
 
 
 def mean_table(cell: BrickCell, channel: Channel, geometry: Geometry) -> Table:
-    """Mean of a channel's samples in its unit, one plane; of colours three."""
+    """Table of the mean of a channel's samples in its unit, one plane; three for colours."""
     places, samples = cell.samples.packed()
     sums = samples[:, geometry.planes_of(channel.name)]
     dense = np.zeros((len(cell.counts.pool) * 512, channel.value_count + 1))
@@ -49,7 +49,7 @@ def mean_table(cell: BrickCell, channel: Channel, geometry: Geometry) -> Table:
 
 
 def _pyramid(voxels: Floats, join: Callable[[Floats], Floats]) -> Floats:
-    """(B, 585, P) of (B * 512, P): eight neighbours in Morton order are joined to one, three times."""
+    """(B, 585, P) nodes of (B * 512, P) voxels: eight neighbours in Morton order are joined to one, three times."""
     B = len(voxels) // 512
     nodes = [voxels.reshape(B, 512, -1)]
     for count in (64, 8, 1):

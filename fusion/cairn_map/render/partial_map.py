@@ -1,7 +1,7 @@
-"""Drawing a map of which only some cells are read yet: those that a ray comes to are read, and no others.
+"""Rendering of a map that reads cells on demand: only those that a ray reaches are read.
 
-An unread cell is as solid as rock to a ray. What hits one says that it is to be read; then the picture is made anew,
-until no ray hits any. Whatever lies behind walls, or beside the view, stays unread.
+An unread cell counts as solid rock. A ray that hits one requests it; then the image is rendered again, until no ray
+hits an unread cell. All that lies behind walls, or outside of the view, stays unread.
 """
 
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
@@ -24,13 +24,15 @@ from cairn_map.render.node_tables import Table, mean_table, probability_table
 from cairn_map.render.render_picture import Layer
 
 ALL_OCCUPIED = np.full((1, 8, 2), ~np.uint64(0), np.uint64)
+"""Words of the one brick of which unread cells are made."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadCell:
-    """A cell, ready to be drawn in one layer; nobody changes it.
+    """A cell, ready to be drawn in one layer; immutable.
 
-    Of its sums nothing is kept but what that layer shows: a third of the memory, so that a cache holds thrice as many.
+    Its sums are dropped, but for those that the layer shows: a third of the memory, so that a cache holds three times
+    as many cells.
     """
 
     cell: BrickCell
@@ -47,14 +49,14 @@ class ReadCell:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawing:
-    """What a camera sees of a map, and the map of the cells that it took to know."""
+    """The surfaces that a camera sees, and the map of the cells that were read for it."""
 
     snapshot: MapSnapshot
     seen: SurfaceImage
 
 
 def read_cell(cell: BrickCell, geometry: Geometry, model: SensorModel, layer: Layer) -> ReadCell:
-    """A cell's states under a model, and what its nodes read in a layer.
+    """A cell's states under a model, and the readings of its nodes in a layer.
 
     Raises:
         BadInputError: kind `unknown_channel`: the map has no such layer.
@@ -83,19 +85,20 @@ def draw_as_needed(
     T_map_camera: Floats,
     range_max_m: float,
 ) -> Drawing:
-    """What a camera sees; cells of `unread` are read when a ray comes to them.
+    """Drawing of a map from a camera; cells of `unread` are read when a ray reaches them.
 
     Args:
         renderer: for this drawing alone.
         geometry: of the map.
         model: of the map.
         here: cells that are read already.
-        unread: the others that may be seen.
-        read: brings some of them.
+        unread: keys of the other cells that may be seen.
+        read: reads the cells of some of these keys.
         sight: the camera.
         T_map_camera: (4, 4) rigid.
         range_max_m: no ray goes farther.
     """
+    # Each turn reads at least one cell, or ends.
     have, left = dict(here), sorted(set(unread) - set(here))
     while True:
         for key, known in have.items():
@@ -113,12 +116,13 @@ def draw_as_needed(
 def _partial(
     geometry: Geometry, model: SensorModel, have: Mapping[CellKey, ReadCell], left: Sequence[CellKey]
 ) -> MapSnapshot:
-    """The cells at hand in the first slots, then those that are not, solid."""
+    """The cells that are read in the first slots, then those that are not, solid."""
     nothing = read_cell(BrickCell(geometry), geometry, model, Layer.DEPTH)
     cells = [*have.values(), *(nothing for _ in left)]
     keys = (*have, *left)
     states = tuple(each.states for each in cells)
     grid = state_grid([cell_of_key(key) for key in keys], states, geometry)
+    # All bricks of unread cells share one brick, in which every voxel is occupied.
     grid.bricks[len(have) :] = len(grid.words)
     grid = grid._replace(words=np.concatenate([grid.words, ALL_OCCUPIED]))
     return MapSnapshot(FrozenMap(geometry, model, keys, tuple(each.cell for each in cells), states, grid))

@@ -1,11 +1,11 @@
-"""How certain a camera's pose is, and what that does to a picture of the map: each pixel's ink is spread by it.
+"""Uncertainty of a camera's pose in pictures of the map: each pixel's ink is spread by its covariance in the image.
 
     C  (6, 6)  --J of each pixel, by its ray and range-->  J C J^T  (2, 2)  px^2  --> ink spread by it, or withheld
 
     T_map_camera,true = T_map_camera exp(motion)      motion = [rotation (rad), translation (m)], camera frame
 
-as `robot.align` gives `covariance` for the robot's frame, and `calib/CONVENTIONS.md` orders poses. A turn moves all
-pixels alike, a step near things more than far ones, and a step along the axis those at the edges alone.
+in the order of `calib/CONVENTIONS.md`, in which `robot.align` gives `covariance` for the robot's frame. A turn moves
+all pixels alike, a step moves near things more than far ones, and a step along the axis moves only those at the edges.
 """
 
 from dataclasses import dataclass
@@ -24,25 +24,28 @@ Ink = npt.NDArray[np.uint8]
 Values = npt.NDArray[np.float32]
 
 LOWER_NUMBERS = 21
+"""Numbers of the lower triangle of a (6, 6) matrix."""
 SIGMA_MAX_M = 1000.0
 SIGMA_MAX_RAD = float(np.pi)
 NOISE = 1e-9
-"""Of the largest: an eigenvalue may be so much below 0 from rounding."""
+"""Asymmetry that rounding may cause, as a fraction of the largest entry."""
 SHARP_PX = 0.35
-"""A spread below this is not drawn: it is less than that of a pixel itself."""
+"""Standard deviation below which a pixel is drawn sharp: it is less than that of a pixel itself (1 / sqrt(12))."""
 BLUR_MAX_PX = 16.0
-"""Nothing is drawn when half of it may be off by more (standard deviation)."""
+"""Median standard deviation above which nothing is drawn: half of the picture may be off by more."""
 COUNTS = (64, 256)
-"""Places that a pixel's ink goes to where it is spread little, and where far."""
+"""Places to which a pixel's ink is spread, where it is spread little and where far."""
 GOLDEN_RAD = np.pi * (3 - np.sqrt(5))
+"""Golden angle: Vogel's spiral of steps by it fills a disc evenly."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseSpread:
-    """How certain a camera's pose is."""
+    """Covariance of a camera's pose."""
 
     covariance: Floats
-    """(6, 6) of the motion that is left, [rotation (rad), translation (m)], camera frame."""
+    """(6, 6) covariance of the motion from the assumed to the true pose, [rotation (rad), translation (m)], camera
+    frame."""
 
     def __post_init__(self) -> None:
         C = np.array(self.covariance, dtype=np.float64)
@@ -66,7 +69,7 @@ class PoseSpread:
 
     @classmethod
     def of_sigmas(cls, sigma_m: float = 0.0, sigma_rad: float = 0.0) -> Self:
-        """The same standard deviations along and about every axis.
+        """Spread with the same standard deviations along and about every axis.
 
         Raises:
             BadInputError: kind `bad_pose`: negative, or not finite.
@@ -77,10 +80,10 @@ class PoseSpread:
 
     @classmethod
     def of_lower(cls, numbers: tuple[float, ...]) -> Self:
-        """From the lower triangle, row by row: 21 numbers, rad^2, rad m and m^2.
+        """Spread of the lower triangle of a covariance, row by row: 21 numbers, rad^2, rad m and m^2.
 
         Raises:
-            BadInputError: kind `bad_pose`: not so many, or no covariance.
+            BadInputError: kind `bad_pose`: another number of them, or no covariance.
         """
         if len(numbers) != LOWER_NUMBERS:
             raise BadInputError(
@@ -93,7 +96,8 @@ class PoseSpread:
         return cls(C + np.tril(C, -1).T)
 
     def seen_from(self, T_here_camera: Floats) -> "PoseSpread":
-        """That of a camera fixed to the frame whose spread this is, at `T_here_camera`."""
+        """Spread of a camera that is fixed, at `T_here_camera`, to the frame of this spread."""
+        # The adjoint: w' = R w, v' = R (v - t x w), with R = R_camera_here, and t the camera's place.
         R, t = T_here_camera[:3, :3].T, T_here_camera[:3, 3]
         cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
         J = np.block([[R, np.zeros((3, 3))], [-R @ cross, R]])
@@ -102,19 +106,24 @@ class PoseSpread:
 
     @property
     def is_exact(self) -> bool:
-        """Whether nothing is off."""
+        """True if the pose is certain: the covariance is zero."""
         return not self.covariance.any()
 
     def at(self, sight: CameraRays, range_m: Values) -> Values:
-        """(H, W, 3) float32: covariance xx, xy, yy, px^2, of where what lies at a range appears; NaN where it does."""
+        """(H, W, 3) float32 covariances xx, xy, yy, px^2, of the image of each pixel's surface; NaN where it has none.
+
+        Args:
+            sight: the camera.
+            range_m: (H, W) metres along its rays; NaN where there is no surface.
+        """
         out = np.empty((sight.height, sight.width, 3), np.float32)
         covariances_into(out, motions(sight, range_m), self.covariance)
         return out
 
 
 def motions(sight: CameraRays, range_m: Values) -> Floats:
-    """(H, W, 2, 6): by how many pixels what lies at a range moves in the image, per rad and per metre of the camera's
-    own motion; NaN where there is no range or ray.
+    """(H, W, 2, 6) Jacobians J: pixels by which each pixel's surface moves in the image, per rad and per metre of the
+    camera's own motion; NaN where there is no range or ray.
     """
     out = np.empty((sight.height, sight.width, 2, 6))
     # Writable, as Numba has one kernel for such arrays and another for others.
@@ -124,13 +133,14 @@ def motions(sight: CameraRays, range_m: Values) -> Floats:
 
 
 def sigma_px(covariance_px2: Values) -> Values:
-    """(...) pixels: the standard deviation in the direction in which it is largest, of (..., 3) covariances."""
+    """(...) largest standard deviation in any direction, pixels, of (..., 3) covariances."""
+    # The root of the larger eigenvalue of a symmetric 2 x 2 matrix.
     xx, xy, yy = np.moveaxis(covariance_px2, -1, 0)
     return np.asarray(np.sqrt((xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)), np.float32)
 
 
 def why_withheld(covariance_px2: Values, *, blur_max_px: float = BLUR_MAX_PX) -> str | None:
-    """Why half of what would be drawn, (N, 3), may be too far off; None if it may not."""
+    """Reason to withhold a picture with (N, 3) covariances: half of it may be too far off; None if it may not."""
     middle = float(np.median(sigma_px(covariance_px2))) if covariance_px2.size else 0.0
     if middle <= blur_max_px:
         return None
@@ -138,9 +148,9 @@ def why_withheld(covariance_px2: Values, *, blur_max_px: float = BLUR_MAX_PX) ->
 
 
 def spread_ink(ink: Ink, covariance_px2: Values) -> Ink:
-    """(H, W, 4) ink, that of each pixel spread by its (H, W, 3) covariance; sharp where that is NaN or small.
+    """(H, W, 4) ink, each pixel's spread by its (H, W, 3) covariance; sharp where that is NaN or small.
 
-    The sum of the ink stays as it is, but for what leaves the image, and where spread ink adds up to more than full.
+    The sum of the ink is preserved, except for ink that leaves the image or adds up to more than full cover.
     """
     total = _scattered(ink, covariance_px2)
     over = np.maximum(total[..., 3:] / 255, 1)
@@ -148,13 +158,14 @@ def spread_ink(ink: Ink, covariance_px2: Values) -> Ink:
 
 
 def spread_picture(rgb: Ink, covariance_px2: Values) -> Ink:
-    """(H, W, 3) sRGB, each pixel spread by its covariance: what is likely there, as the mean of what may be."""
+    """(H, W, 3) sRGB, each pixel spread by its covariance: the expected colour at each place."""
     total = _scattered(np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)]), covariance_px2)
     mean = total[..., :3] / np.maximum(total[..., 3:] / 255, 1e-6)
     return np.where(total[..., 3:] > 0, np.rint(mean), rgb).astype(np.uint8)
 
 
 def _scattered(ink: Ink, covariance_px2: Values) -> Values:
+    # A covariance of 0 is drawn sharp; NaN is not >= SHARP_PX.
     is_drawn = sigma_px(covariance_px2) >= SHARP_PX
     drawn = np.where(is_drawn[..., None], covariance_px2, np.float32(0))
     total = np.zeros(ink.shape, np.float32)
@@ -167,9 +178,11 @@ def _points() -> Values:
     """(S, N, 2) standard normal points on Vogel's spiral, their mean zero and covariance one."""
     points = np.zeros((len(COUNTS), max(COUNTS), 2), np.float32)
     for size, count in enumerate(COUNTS):
+        # Radii of the quantiles of the normal distribution's radius (Rayleigh), angles by the golden angle.
         n = np.arange(count)
         radius, angle = np.sqrt(-2 * np.log(1 - (n + 0.5) / count)), n * GOLDEN_RAD
         plain = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+        # Exactly mean 0 and covariance 1: whitened by the Cholesky factor of their own covariance.
         plain -= plain.mean(axis=0)
         points[size, :count] = plain @ np.linalg.inv(np.linalg.cholesky(plain.T @ plain / count)).T
     points.setflags(write=False)

@@ -1,9 +1,10 @@
-"""Rays of a camera through a map: for each pixel the first occupied node that is no smaller than the pixel.
+"""Kernels of rendering: rays of a camera to the nodes that its pixels see, readings of these nodes, and their colours.
 
-A ray walks as in `ray_kernels`, but only stops at occupied voxels: `skips` gives for every brick how large a cube
-around it holds nothing occupied, so that a room is crossed in a few steps. Far away, where a voxel is smaller than a
-pixel, nodes of 2, 4 or 8 voxels along an edge stand for it, the finest that no pixel's ray can miss: an obstacle never
-slips through. Lengths are in voxel edges.
+A pixel sees the first occupied node along its ray that is no smaller than the pixel. Rays walk as in `ray_kernels`, but
+stop only at occupied voxels: `skips` gives for every brick the largest cube around it that holds nothing occupied, so
+that a room is crossed in a few steps. Far away, where a voxel is smaller than a pixel, nodes of 2, 4 or 8 voxels along
+an edge stand for it, the finest that no pixel's ray can miss: an obstacle never slips through. Lengths are in voxel
+edges. These kernels check nothing.
 """
 
 import numba as nb
@@ -172,7 +173,7 @@ def look(
 
 @nb.njit(nogil=True, forceinline=True)
 def node_at(pixel: float) -> int:
-    """N of the smallest nodes, 2^n voxels along an edge, that are no smaller than a pixel there; 3 at most."""
+    """Exponent n of the smallest nodes, 2^n voxels along an edge, that are no smaller than a pixel there; 3 at most."""
     return int(pixel > 1) + int(pixel > 2) + int(pixel > 4)
 
 
@@ -192,7 +193,7 @@ def in_nodes(occupied: np.uint64, node: int) -> np.uint64:
 
 @nb.njit(cache=True, nogil=True)
 def paint_into(values: Values, palette: Rgb, low: float, high: float, unknown: Rgb, out: Rgb) -> None:
-    """(N, 3) colours of (N,) values between the two ends of a palette (256, 3); NaN is `unknown` (3,)."""
+    """Write (N, 3) colours of (N,) values between the two ends of a palette (256, 3); `unknown` (3,) for NaN."""
     step = 255 / (high - low)
     for n in range(values.shape[0]):
         value = values[n]
@@ -200,6 +201,7 @@ def paint_into(values: Values, palette: Rgb, low: float, high: float, unknown: R
             for c in range(3):
                 out[n, c] = unknown[c]
         else:
+            # Clamped to the palette, and rounded.
             level = int(min(max((value - low) * step, 0.0), 255.0) + 0.5)
             for c in range(3):
                 out[n, c] = palette[level, c]
@@ -207,8 +209,9 @@ def paint_into(values: Values, palette: Rgb, low: float, high: float, unknown: R
 
 @nb.njit(cache=True, nogil=True)
 def blend_into(image: Rgb, ink: Rgb, out: Rgb) -> None:
-    """(N, 3) pixels under (N, 4) ink: its colours are multiplied by its cover already, which is the fourth."""
+    """Write (N, 3) pixels under (N, 4) ink: colours that are multiplied by their cover already, and the cover."""
     for n in range(image.shape[0]):
+        # out = image (1 - cover) + ink, with 255 for 1; 127 rounds to the nearest.
         rest = 255 - int(ink[n, 3])
         for c in range(3):
             out[n, c] = min((image[n, c] * rest + 127) // 255 + int(ink[n, c]), 255)
@@ -218,12 +221,13 @@ def blend_into(image: Rgb, ink: Rgb, out: Rgb) -> None:
 def read_nodes_into(
     rows: Int32s, places: Places, nodes: Bytes, bricks: npt.NDArray[np.int16], table: Table, out: Table
 ) -> None:
-    """Of the listed pixels of one cell: (N, P) what `node_tables` say of their nodes, all in its bricks."""
-    firsts = (0, 512, 576, 584)
+    """Write (N, P) entries of a cell's table (`node_tables`) for the listed pixels, whose nodes lie in its bricks."""
+    firsts = (0, 512, 576, 584)  # node_tables.FIRST_OF_NODE
     for n in range(U(rows.shape[0])):
         row = U(rows[n])
         place, node = places[row], nodes[row]
         brick = U(bricks[place >> U(9)])
+        # The voxel's Morton number in the brick; without its lowest 3 n bits that of its node.
         at = U(firsts[node]) + ((place & U(511)) >> U(3 * node))
         for p in range(out.shape[1]):
             out[row, p] = table[brick, at, p]

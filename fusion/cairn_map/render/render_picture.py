@@ -1,6 +1,7 @@
-"""Values as colours with a fixed scale; `legend` says what they mean.
+"""Pictures of values: colours with a fixed scale, and PNG files of 8-bit images without an imaging library.
 
-What has no value is grey, never the cold end of a palette; where nothing is seen it is dark.
+A node without a value is grey, never the cold end of a palette; a pixel that sees nothing is dark. `legend` explains
+the colours.
 """
 
 import struct
@@ -18,28 +19,28 @@ from cairn_map.render.render_kernels import paint_into
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 LEVEL = 3
-"""Of zlib: more takes several times as long for a tenth fewer bytes."""
+"""Level of zlib: a higher one takes several times as long for a tenth fewer bytes."""
 RGB, UP = 2, 2
-"""The colour type, and the filter: what a row differs by from the one above."""
+"""PNG's colour type, and its filter: each row's difference to the row above."""
 
 Values = npt.NDArray[np.floating]
 
 ZERO_CELSIUS_K = 273.15
 NOTHING = (24, 26, 30)
-"""Where nothing is seen."""
+"""Colour of pixels that see nothing."""
 NO_VALUE = (112, 112, 112)
-"""Of what is seen, but has no value of the layer."""
+"""Colour of nodes without a value of the layer."""
 TEXT = (230, 230, 230)
 WARNING = (255, 210, 60)
 INFERNO = "000004160b39420a686a176e932667bc3754dd513af37819fca50af6d746fcffa4"
 VIRIDIS = "440154482475414487355f8d2a788e21918c22a88444bf707ad151bddf26fde725"
 """Eleven colours each, evenly spaced, of the palettes of these names (van der Walt and Smith)."""
 DARKEST = 0.12
-"""Where painting begins on the inferno: its first colours are those of nothing."""
+"""Fraction of the inferno palette at which painting begins: its first colours look like NOTHING."""
 
 
 class Layer(StrEnum):
-    """What of a map is drawn."""
+    """Quantity of a map that is drawn."""
 
     TEMPERATURE = "temperature"
     COLOUR = "colour"
@@ -50,7 +51,7 @@ class Layer(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """How values become colours: between two ends, the same in every picture."""
+    """Colour scale: the values at the two ends of a layer's palette, the same in every picture."""
 
     layer: Layer
     low: float
@@ -70,12 +71,12 @@ SCALES = {
     Layer.AGE: Scale(Layer.AGE, 0.0, 3600.0),
     Layer.COLOUR: Scale(Layer.COLOUR, 0.0, 255.0),
 }
-"""Of each layer where nobody says another: degrees Celsius, 1, metres, seconds."""
+"""Default scale of each layer: degrees Celsius, 1, metres, seconds."""
 
 
 @lru_cache(maxsize=8)
 def palette(layer: Layer) -> Rgb:
-    """(256, 3) from the low to the high end; of age, the newest is the brightest."""
+    """(256, 3) colours from the low to the high end; of ages, the newest is the brightest."""
     anchors = INFERNO if layer is Layer.TEMPERATURE else VIRIDIS
     known = np.frombuffer(bytes.fromhex(anchors), np.uint8).reshape(-1, 3)
     first = DARKEST if layer is Layer.TEMPERATURE else 0.0

@@ -1,4 +1,4 @@
-"""What a map is to be drawn as: the query of `GET .../main/render`, and what `cairn map render` asks for."""
+"""Request for a rendered picture: the query of `GET .../main/render`, and the options of `cairn map render`."""
 
 from functools import lru_cache
 from typing import Annotated, Literal, Self
@@ -25,16 +25,16 @@ LOWER_CHARACTERS_MAX = 1000
 
 
 class RenderRequest(BaseModel):
-    """A camera and its place, and what to draw."""
+    """A camera, its pose, and the layer to draw."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     x: Place
-    """Of the camera, metres, map frame; and y, z."""
+    """x, y, z: place of the camera, metres, map frame."""
     y: Place
     z: Place
     qx: Part = 0.0
-    """How it is turned: the unit quaternion of T_map_camera, x right, y down, z forward; and qy, qz, qw."""
+    """qx, qy, qz, qw: rotation of the camera, the unit quaternion of T_map_camera; x right, y down, z forward."""
     qy: Part = 0.0
     qz: Part = 0.0
     qw: Part = 1.0
@@ -42,19 +42,21 @@ class RenderRequest(BaseModel):
     height: Side = 480
     focal_px: Annotated[float, Field(ge=1, le=1e6)] = 500.0
     cx: Annotated[float, Field(ge=-1e6, le=1e6)] | None = None
-    """Principal point, pixels; None: the middle; and cy."""
+    """cx, cy: principal point, pixels; None: the middle."""
     cy: Annotated[float, Field(ge=-1e6, le=1e6)] | None = None
     layer: Layer = Layer.TEMPERATURE
     low: Level | None = None
-    """Ends of the scale, in the layer's unit; None: the usual ones."""
+    """low, high: ends of the scale, in the layer's unit; None: those of `SCALES`."""
     high: Level | None = None
     range_m: Annotated[float, Field(gt=0, le=RANGE_MAX_M)] = 20.0
-    """No ray goes farther."""
+    """Maximum range of a ray, metres."""
     sigma_m: Annotated[float, Field(ge=0, le=SIGMA_MAX_M)] = 0.0
-    """How certain the pose is, along and about any one axis; the picture is blurred by it, or withheld."""
+    """sigma_m, sigma_rad: standard deviations of the pose along and about any one axis; the picture is blurred by
+    them, or withheld."""
     sigma_rad: Annotated[float, Field(ge=0, le=SIGMA_MAX_RAD)] = 0.0
     covariance_lower: Annotated[str, Field(max_length=LOWER_CHARACTERS_MAX)] | None = None
-    """In place of both, in full: 21 numbers with commas between, `pose_spread.PoseSpread.of_lower`."""
+    """Covariance of the pose, in place of the two sigmas: 21 numbers with commas between, as
+    `pose_spread.PoseSpread.of_lower` takes them."""
     format: Literal["png", "npz"] = "png"
 
     @model_validator(mode="after")
@@ -82,12 +84,12 @@ class RenderRequest(BaseModel):
 
     @property
     def scale(self) -> Scale:
-        """How values become colours."""
+        """Colour scale of the layer."""
         return Scale(self.layer, *self._ends)
 
     @property
     def spread(self) -> PoseSpread | None:
-        """How certain `T_map_camera` is; None for exact."""
+        """Uncertainty of `T_map_camera`; None if it is exact."""
         if self.covariance_lower is None:
             found = PoseSpread.of_sigmas(self.sigma_m, self.sigma_rad)
         else:
@@ -121,10 +123,10 @@ class RenderRequest(BaseModel):
 def request_from(
     eye_m: tuple[float, float, float], target_m: tuple[float, float, float], **about: object
 ) -> RenderRequest:
-    """A request from a place, with another one in the middle of the picture.
+    """Request for a picture from an eye, with a target in its middle; `about` are further fields.
 
     Raises:
-        BadInputError: kind `bad_view`: something is out of its range; the message names it.
+        BadInputError: kind `bad_view`: a field is out of its range; the message names it.
     """
     x, y, z = eye_m
     qx, qy, qz, qw = _quaternion(look_at(eye_m, target_m)[:3, :3])
@@ -136,7 +138,7 @@ def request_from(
 
 @lru_cache(maxsize=2)
 def _camera(width: int, height: int, focal_px: float, centre_px: tuple[float, float]) -> CameraRays:
-    """An ideal camera; 30 MB at most each. Who looks around asks for the same one again."""
+    """An ideal camera, cached: a viewer that looks around requests the same one again. Each takes 30 MB at most."""
     return pinhole(width, height, focal_px=focal_px, centre_px=centre_px)
 
 

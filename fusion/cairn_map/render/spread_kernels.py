@@ -1,4 +1,4 @@
-"""How far pixels of a map may be off because the camera's pose is, and their ink spread by it: loops without checks."""
+"""Uncertainty of pixels caused by that of the camera's pose, and the spreading of their ink. No checks."""
 
 import math
 
@@ -9,17 +9,17 @@ import numpy.typing as npt
 from cairn_map.arrays import Bytes, Floats, Singles
 
 NEAREST_M = 0.01
-"""What is nearer counts as this."""
+"""Least range, metres; nearer surfaces count as this near."""
 PARALLEL = 1e-18
-"""Square of the area of what a pixel sees, in rad^2 squared, from which on its neighbours say how the lens goes on."""
+"""Square of the solid angle of a pixel, rad^4, below which its rays are parallel and give no direction."""
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def motions_into(out: Floats, rays: Floats, range_m: Singles) -> None:
-    """How each pixel's image moves with the camera: (H, W, 2, 6), pixels by [rotation (rad), translation (m)].
+    """Write (H, W, 2, 6) Jacobians of each pixel's image: pixels by [rotation w (rad), translation v (m)].
 
     The camera truly is at T exp(motion), so that a point p of its frame is truly at p - w x p - v; along its ray u, at
-    the range r, that turns the ray by du = u x w - (v - u (u . v)) / r. Neighbouring rays say what pixel step that is.
+    the range r, that turns the ray by du = u x w - (v - u (u . v)) / r. Neighbouring rays give the step in pixels.
 
     Args:
         out: filled; NaN where there is no ray or range.
@@ -31,6 +31,7 @@ def motions_into(out: Floats, rays: Floats, range_m: Singles) -> None:
     for y in range(height):
         for x in range(width):
             left, right, up, down = max(x - 1, 0), min(x + 1, width - 1), max(y - 1, 0), min(y + 1, height - 1)
+            # a, b: change of the ray per pixel along x and y; det [[aa, ab], [ab, bb]] is the pixel's area squared.
             aa, ab, bb = 0.0, 0.0, 0.0
             for c in range(3):
                 a[c] = (rays[y, right, c] - rays[y, left, c]) / (right - left)
@@ -50,6 +51,7 @@ def motions_into(out: Floats, rays: Floats, range_m: Singles) -> None:
                 out[y, x, k, 0] = p1 * u2 - p2 * u1  # p . (u x w) = w . (p x u)
                 out[y, x, k, 1] = p2 * u0 - p0 * u2
                 out[y, x, k, 2] = p0 * u1 - p1 * u0
+                # p . -(v - u (u . v)) / r = v . -(p - u (u . p)) / r
                 along = p0 * u0 + p1 * u1 + p2 * u2
                 out[y, x, k, 3] = -nearness * (p0 - along * u0)
                 out[y, x, k, 4] = -nearness * (p1 - along * u1)
@@ -58,7 +60,7 @@ def motions_into(out: Floats, rays: Floats, range_m: Singles) -> None:
 
 @nb.njit(cache=True, nogil=True)
 def covariances_into(out: Singles, motions: Floats, covariance: Floats) -> None:
-    """(H, W, 3) xx, xy, yy, px^2, of (H, W, 2, 6) motions with a (6, 6) covariance: J C J^T."""
+    """Write (H, W, 3) covariances J C J^T, xx, xy, yy, px^2, of (H, W, 2, 6) motions J and a (6, 6) covariance C."""
     height, width = out.shape[:2]
     for y in range(height):
         for x in range(width):
@@ -98,10 +100,11 @@ def scatter_into(
                 for c in range(4):
                     total[y, x, c] += ink[y, x, c]
                 continue
-            # Cholesky's factor of it.
+            # The Cholesky factor L of the covariance: L z has it, for standard normal z.
             l11 = math.sqrt(max(xx, np.float32(1e-12)))
             l21 = xy / l11
             l22 = math.sqrt(max(yy - l21 * l21, 0.0))
+            # As many places as keep neighbouring ones a few pixels apart.
             size = 0
             while size + 1 < sizes and counts[size] < 3.0 * (l11 + 1.0) * (l22 + abs(l21) + 1.0):
                 size += 1

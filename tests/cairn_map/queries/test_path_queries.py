@@ -11,7 +11,7 @@ from tests.fixtures.map.worlds import ROOM, poses, random_map, random_points, ra
 
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import Geometry
-from cairn_map.queries import path_queries
+from cairn_map.queries import body_queries
 from cairn_map.queries.map_snapshot import snapshot_of
 from cairn_map.queries.occupancy_states import State
 
@@ -107,12 +107,12 @@ def test_turns_go_the_shortest_way() -> None:
     R, to = random_rotations(rng, 40), random_rotations(rng, 40)
     to[:5] = R[:5]
     to[5] = R[5] @ np.diag([-1.0, -1.0, 1.0])
-    turns = path_queries._turns(R, to)
-    assert np.allclose(R @ path_queries._rotations(turns), to, atol=1e-9)
+    turns = body_queries._turns(R, to)
+    assert np.allclose(R @ body_queries._rotations(turns), to, atol=1e-9)
     assert np.linalg.norm(turns, axis=1).max() <= math.pi + 1e-9
     assert np.abs(turns[:5]).max() < 1e-9
     assert np.linalg.norm(turns[5]) == pytest.approx(math.pi)
-    nearly = path_queries._turns(np.eye(3)[None], path_queries._rotations(np.array([[0, math.pi - 1e-5, 0]])))
+    nearly = body_queries._turns(np.eye(3)[None], body_queries._rotations(np.array([[0, math.pi - 1e-5, 0]])))
     assert nearly[0].tolist() == pytest.approx([0, math.pi - 1e-5, 0], abs=1e-9)
 
 

@@ -12,7 +12,7 @@ from tests.naive import queries as naive
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Geometry
-from cairn_map.queries import distance_queries as ray_queries
+from cairn_map.queries import distance_queries
 from cairn_map.queries.map_snapshot import snapshot_of
 from cairn_map.queries.occupancy_states import State
 
@@ -24,7 +24,7 @@ WALL = {(10, y, z): (3, 0) for y in range(-12, 12) for z in range(-12, 12)}
 @pytest.fixture(autouse=True)
 def _small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     """So that the tests have several."""
-    monkeypatch.setattr(ray_queries, "CHUNK", 32)
+    monkeypatch.setattr(distance_queries, "CHUNK", 32)
 
 
 @pytest.mark.parametrize("geometry", [PLAIN, Geometry(voxel_edge_um=50_000, depth=4, channels=())])
