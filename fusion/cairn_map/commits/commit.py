@@ -1,9 +1,9 @@
-"""A commit: one measurement's evidence under an id, with all that is needed to find and undo it later.
+"""Commits: one measurement's evidence under an id, with all facts that are needed to find and undo it later.
 
     "CRCM" | version u8 | meta length u32 | meta (JSON) | cell count u32 | per cell: length u32, cell bytes
 
-Its SHA-256 is taken over the meta bytes and the cells' canonical digests, so that cells may be compressed anew.
-A retract is a commit without cells that names others; an amend is one with both.
+Its SHA-256 is taken over the meta bytes and the cells' canonical digests, so that cells may be recompressed without
+changing it. A retract is a commit without cells that names others; an amend is one with both. FORMAT.md is the norm.
 """
 
 import hashlib
@@ -43,7 +43,7 @@ Hex32 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 class ScanPose(BaseModel):
-    """Where the rig was for one scan: translation (m), unit quaternion x y z w, one sigma for each (m, rad)."""
+    """Pose of the rig at one scan: translation (m), unit quaternion x y z w, and one sigma for each (m, rad)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -55,24 +55,24 @@ class ScanPose(BaseModel):
 
 
 class CommitMeta(BaseModel):
-    """Everything a commit says about itself besides its evidence."""
+    """Facts of a commit besides its evidence."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     id: Annotated[str, Field(max_length=96)]
     geometry: Hex32
-    """Digest of the map's geometry: evidence for another grid is refused."""
+    """Digest of the map's geometry; evidence for another grid is refused."""
     parent: Hex32 | None = None
     """SHA-256 of the author's previous commit."""
     seen: Annotated[str, Field(max_length=128)] | None = None
-    """Cursor of the server's state that the author had when it made this."""
+    """Cursor of the server's state that the author had when it made the commit."""
     captured_s: tuple[Finite, Finite] | None = None
-    """First and last scan, UTC seconds since 1970."""
+    """Times of the first and the last scan, UTC seconds since 1970."""
     scans: Annotated[tuple[ScanPose, ...], Field(max_length=4096), FailFast()] = ()
     sensors: Annotated[tuple[Annotated[str, Field(max_length=64)], ...], Field(max_length=64), FailFast()] = ()
     rig: Hex32 | None = None
     integrator: Annotated[str, Field(max_length=256)] = ""
-    """Name, version and parameters of what turned images into evidence."""
+    """Name, version and parameters of the program that turned images into evidence."""
     retracts: Annotated[
         tuple[Annotated[str, Field(max_length=96)], ...], Field(max_length=RETRACTS_MAX), FailFast()
     ] = ()
@@ -103,7 +103,7 @@ class CommitMeta(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Commit:
-    """A whole commit: what it says, its cells' bytes and its SHA-256 (32 bytes)."""
+    """A whole commit: its meta, its cells' bytes, its SHA-256 (32 bytes), and all its bytes."""
 
     meta: CommitMeta = field(repr=False)
     cells: Mapping[CellKey, bytes] = field(repr=False)
@@ -120,30 +120,33 @@ class Commit:
 
     @property
     def text(self) -> bytes:
-        """The meta as it stands in the bytes, which the SHA-256 is over."""
+        """Bytes of the meta, over which the SHA-256 is taken."""
         return self.data[HEAD.size : HEAD.size + int(HEAD.unpack_from(self.data)[2])]
 
 
 def make_commit(
     meta: CommitMeta, diff: Mapping[CellKey, Evidence], geometry: Geometry, *, profile: Profile = Profile.FAST
 ) -> Commit:
-    """The commit of a measurement's evidence; cells without evidence are left out. Its SHA is that of every profile.
+    """Commit of a measurement's evidence; cells without evidence are left out. Its SHA is the same in every profile.
 
     Raises:
         BadInputError: negative evidence, sums without weight, too many cells, or larger than a reader would accept.
     """
     if meta.geometry != geometry.digest().hex():
         raise BadInputError("other_geometry", "the commit's meta names another geometry than its evidence has")
+    # Only evidence that adds, and that has weights.
     held = {key: evidence for key, evidence in diff.items() if len(evidence)}
     for evidence in held.values():
         if evidence.is_signed:
             raise negative_evidence()
         check_samples(evidence.samples, geometry)
+    # The bytes, and the identity over meta and digests.
     encoded = encode_cells(held, geometry, profile=profile)
     cells = {key: cell.data for key, cell in encoded.items()}
     digests = [cell.digest for cell in encoded.values()]
     text = meta.model_dump_json(exclude_defaults=True).encode()
     data = commit_bytes(text, cells)
+    # All limits of a reader, so that no server refuses the commit later.
     _check_size(len(data), len(cells), len(text))
     check_evidence_size(sum(evidence.size_bytes for evidence in diff.values()), EVIDENCE_BYTES_MAX)
     check_bricks(sum(evidence.brick_count for evidence in diff.values()))
@@ -151,7 +154,7 @@ def make_commit(
 
 
 def sha_without_evidence(data: bytes) -> bytes | None:
-    """SHA-256 of a commit in bytes that holds no evidence; None of one that does.
+    """SHA-256 of a commit's bytes if it holds no evidence; None if it holds some.
 
     Raises:
         DamagedDataError: cut off or contradictory.
@@ -185,7 +188,7 @@ def split_commit(data: bytes) -> tuple[CommitMeta, dict[CellKey, bytes]]:
 
 
 def negative_evidence() -> BadInputError:
-    """What whoever reads a commit that takes away says."""
+    """The error of a commit with negative evidence."""
     return BadInputError("negative_evidence", "a commit only adds evidence; to undo, name a commit in a retract")
 
 
@@ -200,7 +203,7 @@ def check_samples(samples: npt.NDArray[np.int64], geometry: Geometry) -> None:
 
 
 def check_evidence_size(size_bytes: int, limit_bytes: int) -> None:
-    """Refuse what would take more memory than a reader has for a commit.
+    """Refuse evidence that would take more memory than a reader has for a commit.
 
     Raises:
         BadInputError: kind `too_large`.
@@ -212,7 +215,7 @@ def check_evidence_size(size_bytes: int, limit_bytes: int) -> None:
 
 
 def commit_bytes(text: bytes, cells: Mapping[CellKey, bytes]) -> bytes:
-    """A commit's bytes, from its meta as it stands in them and its cells' bytes, rising in number."""
+    """Bytes of a commit, from the bytes of its meta and of its cells, rising in number."""
     parts = [HEAD.pack(MAGIC, VERSION, len(text)), text, struct.pack("<I", len(cells))]
     for data in cells.values():
         parts += [struct.pack("<I", len(data)), data]
@@ -220,7 +223,7 @@ def commit_bytes(text: bytes, cells: Mapping[CellKey, bytes]) -> bytes:
 
 
 def check_bricks(bricks: int) -> None:
-    """Refuse a commit that touches too many.
+    """Refuse a commit that touches too many bricks.
 
     Raises:
         BadInputError: kind `too_large`.
@@ -230,18 +233,20 @@ def check_bricks(bricks: int) -> None:
 
 
 def split_bytes(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
-    """A commit's meta, the meta as it stands in the bytes, and its cells' bytes.
+    """Meta of a commit, the bytes of the meta, and the bytes of its cells.
 
     Raises:
         DamagedDataError: cut off or contradictory.
         BadInputError: an unknown version, or larger than allowed.
     """
+    # Head: sizes are checked before anything is read by them.
     if len(data) < HEAD.size or data[:4] != MAGIC:
         raise DamagedDataError("bad_commit", "not a cairn commit: it must begin with CRCM and a whole head")
     _, version, meta_bytes = HEAD.unpack_from(data)
     if version != VERSION:
         raise BadInputError("unknown_version", f"this reader knows commits of version {VERSION}, got {version}")
     _check_size(len(data), 0, meta_bytes)
+    # Meta.
     text = data[HEAD.size : HEAD.size + meta_bytes]
     at = HEAD.size + meta_bytes + 4
     if at > len(data):
@@ -252,6 +257,7 @@ def split_bytes(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
         _UNIQUE.decode(text.decode())
     except ValidationError as exc:
         raise DamagedDataError("bad_commit", f"commit meta: {first_error(exc)}") from None
+    # Cells: a length that is cut off counts as too large, so that `at` passes the end.
     (count,) = struct.unpack_from("<I", data, at - 4)
     _check_size(len(data), count, meta_bytes)
     bodies: list[bytes] = []
@@ -270,7 +276,7 @@ def _object(pairs: list[tuple[str, object]]) -> None:
 
 
 _UNIQUE = json.JSONDecoder(object_pairs_hook=_object, parse_int=float)
-"""Refuses keys that are there twice. `json.loads` would make it anew each time."""
+"""Decoder that refuses duplicate keys; made once, because `json.loads` would make one at each call."""
 
 
 def _check_size(size_bytes: int, cells: int, meta_bytes: int) -> None:
@@ -283,7 +289,7 @@ def _check_size(size_bytes: int, cells: int, meta_bytes: int) -> None:
 
 
 def commit_sha(text: bytes, digests: list[bytes]) -> bytes:
-    """Identity of a commit: SHA-256 over its meta as it stands and its cells' digests."""
+    """Identity of a commit: SHA-256 over the bytes of its meta and its cells' digests."""
     sha = hashlib.sha256(b"cairn-commit-1" + struct.pack("<II", len(text), len(digests)) + text)
     for digest in digests:
         sha.update(digest)

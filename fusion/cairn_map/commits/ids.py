@@ -1,7 +1,7 @@
-"""Who made a commit, and which of theirs it is: `(robot, incarnation, n)`, written `robot.incarnation.n`.
+"""Ids of commits: author and number, `(robot, incarnation, n)`, written `robot.incarnation.n`.
 
-`incarnation` is drawn anew whenever a robot's commit store is made anew, so that numbers are never used twice
-although a disk was lost; `n` counts from 0 without gaps.
+A new `incarnation` is drawn whenever a robot's commit store is created again, so that no number is used twice although
+a disk was lost; `n` counts from 0 without gaps.
 """
 
 import re
@@ -18,11 +18,11 @@ NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
 INCARNATION = re.compile(r"[0-9a-f]{16}")
 NUMBER = re.compile(r"0|[1-9][0-9]{0,14}")
 NUMBER_LIMIT = 10**15
-"""Numbers of commits are below it: exact in a JSON reader that has only float64."""
+"""Exclusive upper bound of commit numbers: exact in a JSON reader that has only float64."""
 INITIAL = RobotName("initial")
 """Author of the evidence that a map starts from."""
 OPERATOR = RobotName("operator")
-"""The author of the retracts that a server makes for its operators."""
+"""Author of the retracts that a server makes for its operators."""
 
 
 class Author(NamedTuple):
@@ -64,10 +64,10 @@ def robot_name(text: str) -> RobotName:
 
 
 def author_from_text(text: str) -> Author:
-    """The author written `robot.incarnation`.
+    """Author of a text `robot.incarnation`.
 
     Raises:
-        BadInputError: it is not.
+        BadInputError: the text is not of that form.
     """
     robot, _, incarnation = text[:80].partition(".")
     if not NAME.fullmatch(robot) or not INCARNATION.fullmatch(incarnation):
@@ -76,10 +76,10 @@ def author_from_text(text: str) -> Author:
 
 
 def commit_id_from_text(text: str) -> CommitId:
-    """The commit id written `robot.incarnation.n`.
+    """Commit id of a text `robot.incarnation.n`.
 
     Raises:
-        BadInputError: it is not.
+        BadInputError: the text is not of that form.
     """
     author, _, n = text[:96].rpartition(".")
     if not NUMBER.fullmatch(n):

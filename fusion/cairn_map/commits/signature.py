@@ -1,9 +1,9 @@
-"""Who speaks in a commit, proven: Ed25519 signatures over the map's name and the commit's SHA-256.
+"""Signatures of commits, which prove their authors: Ed25519 over the map's name and the commit's SHA-256.
 
     key -> incarnation = first 16 hex digits of SHA-256("cairn-key-1" | key)
 
-A robot draws a key and takes the incarnation that follows from it, so that anybody can tell whose signature a commit
-of `robot.incarnation` needs without having met that robot. The signature stands beside the bytes, never in them.
+A robot draws a key and takes the incarnation that follows from it, so that any server knows whose signature a commit of
+`robot.incarnation` needs without having met that robot. The signature travels next to the bytes, never in them.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ from cairn_map.errors import BadInputError
 
 KEY_BYTES, MARK_BYTES = 32, 64
 SIGNATURES_MAX = 16
-"""Of one commit: its author's, and those of the robot's older incarnations from which it takes something out."""
+"""Signatures of one commit: its author's, and those of the robot's older incarnations whose commits it retracts."""
 TEXT_MAX = SIGNATURES_MAX * (2 * (KEY_BYTES + MARK_BYTES) + 2)
 
 
@@ -31,7 +31,7 @@ class Signature(NamedTuple):
     key: bytes
     """(32 bytes) public key."""
     mark: bytes
-    """(64 bytes) what only its holder can make."""
+    """(64 bytes) the Ed25519 signature itself."""
 
     def __str__(self) -> str:
         return f"{self.key.hex()}.{self.mark.hex()}"
@@ -39,24 +39,24 @@ class Signature(NamedTuple):
 
 @dataclass(frozen=True)
 class SigningKey:
-    """A secret key, by which commits are signed."""
+    """Secret key that signs commits."""
 
     seed: bytes = field(repr=False)
-    """(32 bytes)"""
+    """(32 bytes) the Ed25519 seed."""
 
     @classmethod
     def drawn(cls) -> Self:
-        """A random one."""
+        """A random key."""
         return cls(bytes.fromhex(secrets.token_hex(KEY_BYTES)))
 
     @cached_property
     def public_key(self) -> bytes:
-        """(32 bytes) what others check its signatures by."""
+        """(32 bytes) public key, by which its signatures are checked."""
         return self._secret.public_key().public_bytes_raw()
 
     @property
     def incarnation(self) -> Incarnation:
-        """The incarnation that is this key's."""
+        """Incarnation of the robot that signs with this key."""
         return incarnation_of(self.public_key)
 
     def sign(self, map_name: str, sha: bytes) -> Signature:
@@ -74,12 +74,12 @@ def incarnation_of(key: bytes) -> Incarnation:
 
 
 def signed_bytes(map_name: str, sha: bytes) -> bytes:
-    """What a signature is over; the SHA-256 is over the id, the geometry and all evidence."""
+    """Message that is signed; the SHA-256 covers the id, the geometry and all evidence."""
     return b"cairn-signed-commit-1\0" + map_name.encode() + b"\0" + sha
 
 
 def check_signatures(signatures: Collection[Signature], map_name: str, sha: bytes) -> None:
-    """Refuse a commit of which one signature is not good.
+    """Refuse a commit with an invalid signature.
 
     Raises:
         BadInputError: kind `bad_signature`.
@@ -96,17 +96,17 @@ def check_signatures(signatures: Collection[Signature], map_name: str, sha: byte
 
 
 def speaks_for(signatures: Collection[Signature], author: Author) -> bool:
-    """Whether one of the signatures is by an author's own key; they are sound."""
+    """True if one of the signatures, which are valid, is by the author's own key."""
     return any(incarnation_of(signature.key) == author.incarnation for signature in signatures)
 
 
 def signatures_to_text(signatures: Collection[Signature]) -> str:
-    """As the header `Cairn-Signature` has them."""
+    """Text of the header `Cairn-Signature`."""
     return ",".join(map(str, signatures))
 
 
 def signatures_from_text(text: str) -> tuple[Signature, ...]:
-    """The mirror of `signatures_to_text`; not checked yet.
+    """Signatures of a header's text, not checked yet; the mirror of `signatures_to_text`.
 
     Raises:
         BadInputError: kind `bad_signature`: it is malformed, or there are too many.

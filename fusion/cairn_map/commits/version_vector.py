@@ -1,4 +1,4 @@
-"""Which commits somebody has: for each author a few intervals of numbers. O(authors) for ever.
+"""Version vectors: sets of commit ids, as a few intervals of numbers for each author. Their size is O(authors).
 
     {"mole.1f2e3d4c5b6a7988": [[0, 41], [43, 50]]}      commits 0 to 41 and 43 to 50, both ends included
 
@@ -17,7 +17,7 @@ from cairn_map.errors import BadInputError
 Intervals = tuple[tuple[int, int], ...]
 AUTHORS_MAX = 65536
 INTERVALS_MAX = 65536
-"""Of all authors together."""
+"""Intervals of all authors together, at most."""
 COMMITS_MAX = 1 << 32
 """Commits that one vector names: ten in a second for thirteen years."""
 
@@ -44,7 +44,7 @@ class VersionVector:
         return sum(last - first + 1 for spans in self.intervals.values() for first, last in spans)
 
     def with_commits(self, commits: Iterable[CommitId]) -> "VersionVector":
-        """The set with some more in it."""
+        """The set with further commits."""
         added: dict[Author, list[tuple[int, int]]] = {}
         for commit in commits:
             added.setdefault(commit.author, []).append((commit.n, commit.n))
@@ -54,7 +54,7 @@ class VersionVector:
         return VersionVector(merged)
 
     def minus(self, other: "VersionVector") -> "VersionVector":
-        """What this set has and the other has not."""
+        """Commits of this set that the other does not hold."""
         left: dict[Author, Intervals] = {}
         for author, spans in self.intervals.items():
             rest = _without(spans, other.intervals.get(author, ()))
@@ -76,7 +76,7 @@ EMPTY = VersionVector()
 
 
 def vector_text(vector: VersionVector) -> str:
-    """A vector as the one JSON text that its digest is over: authors sorted, no spaces."""
+    """Canonical JSON text of a vector, over which its digest is taken: authors sorted, no spaces."""
     return json.dumps(vector.to_json(), separators=(",", ":"))
 
 
@@ -86,7 +86,7 @@ def vector_digest(vector: VersionVector) -> str:
 
 
 def version_vector_from_json(value: Mapping[str, Iterable[Iterable[int]]]) -> VersionVector:
-    """The version vector in JSON.
+    """Version vector of its JSON form; the mirror of `VersionVector.to_json`.
 
     Raises:
         BadInputError: an id is malformed, intervals do not rise, or there are too many.
@@ -113,6 +113,7 @@ def version_vector_from_json(value: Mapping[str, Iterable[Iterable[int]]]) -> Ve
 
 
 def _normal(spans: list[tuple[int, int]]) -> Intervals:
+    # Sorted, overlapping and touching spans joined.
     merged: list[tuple[int, int]] = []
     for first, last in sorted(spans):
         if merged and first <= merged[-1][1] + 1:
@@ -123,6 +124,7 @@ def _normal(spans: list[tuple[int, int]]) -> Intervals:
 
 
 def _without(spans: Intervals, holes: Intervals) -> Intervals:
+    # Both lists rise. Invariant: holes before h end before the present span.
     rest: list[tuple[int, int]] = []
     h = 0
     for first, last in spans:

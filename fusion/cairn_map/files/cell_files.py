@@ -21,7 +21,7 @@ MEDIA_TYPES = {
 }
 FORMS = "octree (no suffix), .npz, .ply or .view"
 GREY = 128
-"""Of voxels that no colour camera saw."""
+"""Red, green and blue of voxels that no colour camera saw."""
 
 
 def cell_file(

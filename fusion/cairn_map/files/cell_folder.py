@@ -53,7 +53,7 @@ def write_cell(folder: Path, cell: Cell, data: bytes) -> Path:
 
 
 def read_head(folder: Path) -> FolderHead:
-    """What `map.json` says.
+    """Contents of a folder's `map.json`.
 
     Raises:
         BadInputError: it is missing or not a map's.

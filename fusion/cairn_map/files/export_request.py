@@ -1,4 +1,8 @@
-"""What of a map is to be taken away as a file: the query of `GET .../main/export`, and `cairn map export`'s options."""
+"""Export of part of a map: the request, and the nodes of a cell that it selects.
+
+A request is the query of `GET .../main/export`, and the options of `cairn map export`: a box, a least probability, a
+band of temperatures, an octree depth, and a file format.
+"""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -15,6 +19,7 @@ from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.view import Chance, Colours, View, ViewStyle, view_of
 
 TEMPERATURE_STEP_K = 0.01
+"""Resolution of exported temperatures."""
 
 Kelvin = Annotated[float, Field(ge=0, le=1e5)]
 Height = Annotated[float, Field(ge=-1e7, le=1e7)]
@@ -31,29 +36,29 @@ EXPORT_TYPES = {
 
 
 class ExportRequest(BaseModel):
-    """Which nodes, and in what kind of file."""
+    """Selection of nodes, and the format of the file that holds them."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     format: Literal["ply", "pcd", "laz", "npz", "ot", "bt"] = "ply"
-    """Points; or an octree of OctoMap's, `ot` with probability and colour, `bt` with neither."""
+    """Point cloud; or one of OctoMap's octrees, `ot` with probability and colour, `bt` with neither."""
     box: Annotated[str, Field(max_length=BOX_CHARS_MAX)] | None = None
     """x0,y0,z0,x1,y1,z1: metres, map frame, ends included; None: everywhere."""
     floor_m: Height | None = None
-    """Nothing below."""
+    """Least height of a node's centre, metres; None: any."""
     ceiling_m: Height | None = None
-    """Nothing above."""
+    """Greatest height of a node's centre, metres; None: any."""
     p: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Least probability, compared in steps of 1/255 as on the console; unoccupied nodes never come."""
+    """Least probability, compared in steps of 1/255 as on the console; unoccupied nodes are never exported."""
     hotter_k: Kelvin | None = None
-    """Only nodes with a voxel as hot as this, kelvin; what has no temperature does not come."""
+    """Least temperature of a node's hottest voxel, kelvin; it excludes nodes without a temperature."""
     colder_k: Kelvin | None = None
-    """Only nodes that are as cold as this in the mean, kelvin; what has no temperature does not come."""
+    """Greatest mean temperature of a node, kelvin; it excludes nodes without a temperature."""
     depth: Annotated[int, Field(ge=1, le=64)] | None = None
     """Octree depth of the nodes; None: voxels."""
 
     def bounds_m(self) -> tuple[Floats, Floats]:
-        """(3,) lowest and highest place of a node's centre, metres, map frame; infinite where nothing is asked.
+        """(3,) lowest and highest place of a node's centre, metres, map frame; infinite where there is no bound.
 
         Raises:
             BadInputError: kind `bad_box`: not six finite numbers, or the lower corner is not the first.
@@ -67,7 +72,7 @@ class ExportRequest(BaseModel):
 
     @property
     def is_of_some_temperatures(self) -> bool:
-        """Whether a node must have a temperature to come."""
+        """True if only nodes with a temperature are selected."""
         return self.hotter_k is not None or self.colder_k is not None
 
     def band_k(self) -> tuple[float, float]:
@@ -86,28 +91,28 @@ class ExportRequest(BaseModel):
 
 
 class TicketedExport(ExportRequest):
-    """The query of an export that is asked for by token, or by ticket."""
+    """Query of an export, authorised by a token or by a ticket."""
 
     ticket: Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")] | None = None
 
     @property
     def request(self) -> ExportRequest:
-        """What is asked for, by whomever."""
+        """The request, without its ticket."""
         return ExportRequest.model_validate(self.model_dump(exclude={"ticket"}))
 
 
 class ExportTicket(BaseModel):
-    """Answer to who asked for a ticket: it stands for a token once, for one file."""
+    """Ticket for an export: it replaces a token once, for one file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     ticket: str
     ends_s: float
-    """UTC since 1970."""
+    """End of its validity, UTC seconds since 1970."""
     points: int
-    """Of the file."""
+    """Points of the file."""
     size_bytes: int | None
-    """Of the file; None: known when it is made."""
+    """Size of the file; None: known only once it is made."""
 
 
 def _corners(text: str) -> tuple[Floats, Floats]:
@@ -125,19 +130,19 @@ def _corners(text: str) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chosen:
-    """N nodes of one cell as a view has them, and which of them are asked for."""
+    """N nodes of one cell as a view holds them, and the selection."""
 
     view: View
     centres_m: Floats
     """(N, 3) metres, map frame."""
     rows: npt.NDArray[np.bool_]
-    """(N,)"""
+    """(N,) True for selected nodes."""
 
 
 def chosen_in_cell(
     key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel, asked: ExportRequest
 ) -> Chosen:
-    """The nodes that are asked for, with all that they hold.
+    """Selected nodes of a cell, with colours and temperatures.
 
     Raises:
         BadInputError: kind `bad_box`, `bad_style`.
@@ -148,21 +153,21 @@ def chosen_in_cell(
 def chosen_places(
     key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel, asked: ExportRequest
 ) -> Floats:
-    """(N, 3) centres of the nodes that are asked for, metres, map frame: their colours are not looked at."""
+    """(N, 3) centres of the selected nodes of a cell, metres, map frame; faster, because no colour is computed."""
     step_k = TEMPERATURE_STEP_K if asked.is_of_some_temperatures else None
     found = _chosen(key, evidence, geometry, model, asked, Colours.NONE, step_k)
     return found.centres_m[found.rows]
 
 
 def cell_may_have(key: CellKey, geometry: Geometry, asked: ExportRequest) -> bool:
-    """Whether a cell reaches into what is asked for."""
+    """True if a cell reaches into the box of a request."""
     low, high = asked.bounds_m()
     corner = np.array(cell_of_key(key)) * geometry.cell_edge_m
     return bool((corner <= high).all() and (corner + geometry.cell_edge_m >= low).all())
 
 
 def node_geometry(geometry: Geometry, asked: ExportRequest) -> Geometry:
-    """The map's geometry with the nodes that are asked for as its voxels."""
+    """The map's geometry with the nodes of the requested depth as its voxels."""
     depth = asked.depth_in(geometry)
     edge_um = geometry.voxel_edge_um << (geometry.depth - depth)
     return geometry.model_copy(update={"depth": depth, "voxel_edge_um": edge_um})
@@ -189,7 +194,7 @@ def _chosen(
 
 
 def _within_band(view: View, asked: ExportRequest) -> npt.NDArray[np.bool_]:
-    """(N,) as on the console: whose hottest voxel is hot enough, and whose mean is cold enough."""
+    """(N,) True where the hottest voxel is hot enough and the mean is cold enough, as on the console."""
     least, most = asked.band_k()
     rows = np.zeros(len(view), np.bool_)
     kelvin = view.temperature_k

@@ -1,16 +1,16 @@
-"""A file of which only what was written last is kept: it is sent on as it is made."""
+"""File in memory that is sent on while it is written, so that only its last part is kept."""
 
 import io
 
 
-class OneWay(io.RawIOBase):
-    """What was written since it was last taken; has no way back, so that a zip is written in one go."""
+class ForwardOnlyFile(io.RawIOBase):
+    """Write-only file that cannot seek; `taken` empties it. A zip archive in it is written in one pass."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
 
     def writable(self) -> bool:
-        """It is."""
+        """True: the file is written only."""
         return True
 
     def write(self, data: object) -> int:
@@ -20,7 +20,7 @@ class OneWay(io.RawIOBase):
         return len(part)
 
     def taken(self) -> bytes:
-        """What is there, and forget it."""
+        """Bytes written since the last call; they are removed from the file."""
         data = b"".join(self._parts)
         self._parts.clear()
         return data

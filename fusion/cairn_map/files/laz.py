@@ -1,14 +1,14 @@
-"""Points as LAZ: LAS 1.4 (ASPRS), compressed by LASzip, made part by part with the memory of one chunk.
+"""LAZ files of points: LAS 1.4 (ASPRS), compressed by LASzip, made part by part with the memory of one chunk.
 
-Coordinates are whole numbers of half a node's edge, so they are exact. Format 7: colours have 16 bits (8-bit sRGB times
-256). What LAS has no field for are its extra bytes, each a float with its unit in the description:
+Coordinates are whole numbers of half a node's edge, so they are exact. Point format 7: colours have 16 bits (8-bit sRGB
+times 256). Values for which LAS has no field are its extra bytes, each a float with its unit in the description:
 
     probability        0 to 1
     temperature        kelvin, mean below the node; NaN where no thermal camera looked
     hottest            kelvin, the hottest voxel below the node
 
-LASzip corrects the place of its chunk table in the file's head at the end. What is sent cannot be corrected, and LASzip
-has a way for that: the place there is -1, and the file's last eight bytes say it.
+LASzip writes the offset of its chunk table into the file's head at the end. A head that is sent already cannot be
+changed, and LASzip provides for that: the offset there is -1, and the file's last eight bytes hold it.
 """
 
 import struct
@@ -23,7 +23,7 @@ import numpy.typing as npt
 from laspy.vlrs.known import LasZipVlr, WktCoordinateSystemVlr
 
 from cairn_map.arrays import Floats
-from cairn_map.files.forward_only_file import OneWay
+from cairn_map.files.forward_only_file import ForwardOnlyFile
 
 Table = npt.NDArray[np.void]
 
@@ -34,15 +34,16 @@ EXTRA = {
     "temperature": "kelvin, mean; NaN: not seen",
     "hottest": "kelvin, maximum; NaN: not seen",
 }
-"""Extra bytes and what they are, in at most 31 letters."""
+"""Descriptions of the extra bytes, at most 31 letters each."""
 RETURN = 0x11
-"""The first of one return."""
+"""Bit field of a point: return number 1 of 1 return."""
 COLOUR_STEP = 256
+"""Factor from 8-bit to 16-bit colours."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LazHead:
-    """What a file begins with, so it must be known before the first point."""
+    """Facts of the file's head, which must be known before the first point is written."""
 
     count: int
     low_m: Floats
@@ -54,7 +55,7 @@ class LazHead:
 
 
 def laz_parts(head: LazHead, tables: Iterable[Table]) -> Iterator[bytes]:
-    """The file, part by part; `tables` are (N,) of `map_points.POINT`, `count` points together."""
+    """Parts of a LAZ file; `tables` are (N,) of `point_clouds.POINT`, `count` points together."""
     sink, header = _Uncorrected(), _header(head)
     vlr = lazrs.LazVlr.new_for_compression(POINT_FORMAT, header.point_format.num_extra_bytes)
     header.vlrs.append(LasZipVlr(vlr.record_data()))
@@ -96,30 +97,30 @@ def _rows(table: Table, dtype: np.dtype[np.void], node_edge_m: float) -> Table:
     return rows
 
 
-class _Uncorrected(OneWay):
-    """A file with places. What is written to where it is sent already comes too late, and is remembered."""
+class _Uncorrected(ForwardOnlyFile):
+    """File with offsets. A write to a part that is sent already, the offset of the chunk table, is only remembered."""
 
     def __init__(self) -> None:
         super().__init__()
         self._at = self._end = 0
         self.corrected = -1
-        """Where the chunk table is."""
+        """Offset of the chunk table in the file; -1 until LASzip writes it."""
 
     def seekable(self) -> bool:
-        """As far as LASzip sees."""
+        """True: LASzip may go to an offset, although the bytes there are gone."""
         return True
 
     def tell(self) -> int:
-        """Place of the next byte."""
+        """Offset of the next byte."""
         return self._at
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        """Go to a place."""
+        """Go to an offset."""
         self._at = offset + (0, self._at, self._end)[whence]
         return self._at
 
     def write(self, data: object) -> int:
-        """Add bytes at the end, or hear what should have been."""
+        """Add bytes at the end; anywhere else, remember the offset that LASzip writes there."""
         if self._at < self._end:
             (self.corrected,) = struct.unpack("<q", bytes(data))  # type: ignore[call-overload]
             self._at += 8

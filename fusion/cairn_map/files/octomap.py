@@ -1,12 +1,12 @@
-"""Parts of a map as octrees of OctoMap's (Hornung et al. 2013), made cell by cell: `.ot` and `.bt`, for its tools.
+"""OctoMap files (Hornung et al. 2013) of parts of a map, made cell by cell: `.ot` and `.bt`, for OctoMap's tools.
 
     .ot   ColorOcTree: log-odds of every node, and its colour; white where no colour camera looked
     .bt   OcTree: occupied or not, two bits a node
 
-An octree of OctoMap's has 16 levels around the origin, and cairn's cells are its nodes at level 16 - depth: so a cell
-is one branch, and files are written depth first, as OctoMap reads them. Inner nodes have the highest log-odds and the
-mean colour of their children, as OctoMap's `updateInnerOccupancy` makes them. A file begins with the number of its
-nodes, and the nodes above the cells come before them: so all branches are made before the first byte is sent.
+OctoMap's octree has 16 levels around the origin, and cairn's cells are its nodes at level 16 - depth: so a cell is one
+subtree, and files are written depth first, as OctoMap reads them. Inner nodes have the highest log-odds and the mean
+colour of their children, as OctoMap's `updateInnerOccupancy` makes them. A file begins with the number of its nodes,
+and the nodes above the cells come before them: so all subtrees are made before the first byte is sent.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -28,9 +28,9 @@ Nodes = npt.NDArray[np.void]
 TREE_FORMATS = ("ot", "bt")
 LEVELS = 16
 UNCOLOURED = 255
-"""OctoMap takes white for no colour; what is white comes one step darker."""
+"""White, which OctoMap takes for no colour; a node that is white is written one step darker."""
 LEAF, BRANCH = 2, 3
-"""Two bits that tell what a child is in a .bt: an occupied leaf, or a node with children."""
+"""Kinds of a child in a .bt, two bits: an occupied leaf, or a node with children."""
 NODE = np.dtype(
     [("code", "<u8"), ("level", "u1"), ("odds", "<f4"), ("rgb", "u1", 3), ("children", "u1"), ("kinds", "<u2")]
 )
@@ -40,7 +40,7 @@ IDS = {"ot": ("OcTree file", "ColorOcTree"), "bt": ("OcTree binary file", "OcTre
 
 @dataclass(frozen=True, slots=True)
 class Subtree:
-    """One cell in a tree: its place, its root, and how many nodes and leaves it has."""
+    """One cell as a subtree: its key, log-odds and colour of its root, and its numbers of nodes and leaves."""
 
     key: CellKey
     odds: float
@@ -52,15 +52,17 @@ class Subtree:
 def branch_of_cell(
     key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel, asked: ExportRequest
 ) -> tuple[Subtree, bytes] | None:
-    """A cell's occupied nodes that are asked for, and the bytes that they are in a file; None: there are none.
+    """Subtree of a cell's selected occupied nodes, and its bytes in a file; None if no node is selected.
 
     Raises:
         BadInputError: kind `bad_box`: the cell is beyond an octree of 16 levels; `bad_style`.
     """
+    # The nodes, and a check that OctoMap can number the cell.
     chosen = chosen_in_cell(key, evidence, geometry, model, asked)
     if not chosen.rows.any():
         return None
     _code_of_cells([key], geometry)
+    # Leaves: colours in which white is free for "none", log-odds in natural units.
     view = chosen.view
     rgb = np.full((len(view), 3), UNCOLOURED, np.uint8)
     rgb[view.coloured] = view.colour
@@ -69,6 +71,7 @@ def branch_of_cell(
     leaves["code"], leaves["rgb"] = view.nodes[chosen.rows], rgb[chosen.rows]
     leaves["odds"] = (view.chances[chosen.rows] - LOG_ODDS_ZERO) * LOG_ODDS_STEP
     leaves["level"] = view.depth
+    # All nodes above them up to the cell.
     nodes = _depth_first(leaves, LEAF)
     r, g, b = nodes[0]["rgb"].tolist()
     return Subtree(key, float(nodes[0]["odds"]), (r, g, b), len(nodes), len(leaves)), _bytes_of(nodes, asked.format)
@@ -77,7 +80,8 @@ def branch_of_cell(
 def tree_file(
     form: str, branches: Sequence[Subtree], bodies: Iterable[bytes], geometry: Geometry, about: str
 ) -> Iterator[bytes]:
-    """A tree, part by part; `branches` and their bytes rise in cell number."""
+    """Parts of a file of a tree; `branches`, the cells' subtrees, and their bytes rise in cell number."""
+    # The nodes above the cells, in the order of the file, with each cell's root as a placeholder.
     nodes = _above(branches, geometry)
     is_cell = nodes["level"] == LEVELS - geometry.depth
     size = sum(branch.nodes for branch in branches) + int((~is_cell).sum())
@@ -92,6 +96,7 @@ def tree_file(
         "data",
         "",
     ]
+    # Head; then nodes up to the next cell and that cell's bytes, in turns.
     begun = "\n".join(head).encode()
     start, cells = 0, np.nonzero(is_cell)[0]
     for at, body in zip(cells.tolist(), bodies, strict=True):
@@ -114,7 +119,8 @@ def _above(branches: Sequence[Subtree], geometry: Geometry) -> Nodes:
 
 
 def _code_of_cells(keys: Sequence[CellKey], geometry: Geometry) -> npt.NDArray[np.uint64]:
-    """Morton numbers among the nodes of the cells' level; in the order of the cells' numbers."""
+    """Morton numbers of cells among the nodes of their level, in the order of the cells' numbers."""
+    # OctoMap's numbers are not negative: the origin is in the middle of the tree.
     half = 1 << (LEVELS - 1 - geometry.depth)
     cells = np.array([cell_of_key(key) for key in keys], np.int64) + half
     if (cells < 0).any() or (cells >= 2 * half).any():
@@ -126,18 +132,21 @@ def _code_of_cells(keys: Sequence[CellKey], geometry: Geometry) -> npt.NDArray[n
 
 
 def _depth_first(leaves: Nodes, kind: int) -> Nodes:
-    """Leaves, rising in number, and all above them, in the order of a file; `kind`: what the leaves are."""
+    """Leaves, rising in number, and all nodes above them, in the order of a file; `kind` is that of the leaves."""
+    # Layer by layer up to the root.
     layers, layer = [leaves], leaves
     deepest = int(leaves["level"][0])
     while layer["level"][0]:
         layer, kind = _parents(layer, kind), BRANCH
         layers.append(layer)
+    # Depth first: by the first deepest node below, and of nodes that share it the highest first.
     nodes = np.concatenate(layers)
     first = nodes["code"] << (3 * (deepest - nodes["level"].astype(np.uint64)))
     return nodes[np.lexsort((nodes["level"], first))]
 
 
 def _parents(layer: Nodes, kind: int) -> Nodes:
+    # Runs of children with the same parent; `child` is 0 to 7.
     above, child = layer["code"] >> np.uint64(3), (layer["code"] & np.uint64(7)).astype(np.uint16)
     starts = np.nonzero(np.diff(above, prepend=~above[:1]))[0]
     parents = np.zeros(len(starts), NODE)
@@ -145,6 +154,7 @@ def _parents(layer: Nodes, kind: int) -> Nodes:
     parents["odds"] = np.maximum.reduceat(layer["odds"], starts)
     parents["children"] = np.bitwise_or.reduceat(np.uint16(1) << child, starts)
     parents["kinds"] = np.bitwise_or.reduceat(np.uint16(kind) << (2 * child), starts)
+    # The mean colour of the children that have one, rounded down as OctoMap does.
     coloured = (layer["rgb"] != UNCOLOURED).any(axis=1)
     count = np.add.reduceat(coloured.astype(np.int64), starts)
     sums = np.add.reduceat(layer["rgb"].astype(np.int64) * coloured[:, None], starts, axis=0)

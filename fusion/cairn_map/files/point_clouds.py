@@ -1,7 +1,7 @@
-"""Parts of a map as point clouds, cell by cell: PLY, PCD, LAZ or NPZ, none of which needs more memory than one cell.
+"""Point clouds of parts of a map, cell by cell: PLY, PCD, LAZ or NPZ, with the memory of one cell.
 
-A file begins with the number of its points, so whoever writes one counts them first. Values are those of a view
-(`view.py`): the highest probability, the mean colour and temperature of all below a node, and the hottest voxel.
+A file begins with the number of its points, so its writer counts them first. Values are those of a view (`view.py`):
+the highest probability, the mean colour and the mean temperature of all voxels below a node, and the hottest voxel.
 """
 
 import zipfile
@@ -18,7 +18,7 @@ from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.files.cell_files import GREY
 from cairn_map.files.export_request import ExportRequest, chosen_in_cell, chosen_places
-from cairn_map.files.forward_only_file import OneWay
+from cairn_map.files.forward_only_file import ForwardOnlyFile
 
 Table = npt.NDArray[np.void]
 
@@ -37,13 +37,13 @@ POINT = np.dtype(
 )
 """Centre of a node, metres, map frame; 8-bit sRGB, grey where no colour camera looked; kelvin, NaN where unknown."""
 PCD_POINT = np.dtype([(name, "<f4") for name in ("x", "y", "z", "rgb", "probability", "temperature", "hottest")])
-"""The Point Cloud Library has colours as 0x00RRGGBB in the bits of a float."""
+"""Row of a PCD file: the Point Cloud Library stores colours as 0x00RRGGBB in the bits of a float."""
 NPZ_MEMBER = "points.npy"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointBounds:
-    """What a file of points begins with: how many there are, and where."""
+    """Number of points, and their bounding box: the facts that a file of points begins with."""
 
     count: int = 0
     low_m: Floats = field(default_factory=lambda: np.full(3, np.inf))
@@ -51,14 +51,14 @@ class PointBounds:
     high_m: Floats = field(default_factory=lambda: np.full(3, -np.inf))
 
     def joined(self, other: Self) -> Self:
-        """Both together."""
+        """Bounds of both sets of points together."""
         low_m, high_m = np.minimum(self.low_m, other.low_m), np.maximum(self.high_m, other.high_m)
         return type(self)(self.count + other.count, low_m, high_m)
 
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What a file says of itself."""
+    """Source of a file's points, as its comment states it."""
 
     map_name: str
     node_edge_m: float
@@ -70,7 +70,7 @@ class About:
 def found_in_cell(
     key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel, asked: ExportRequest
 ) -> PointBounds:
-    """How many points `points_of_cell` gives, and where, without their colours."""
+    """Number and bounds of the points of `points_of_cell`; faster, because no colour is computed."""
     places = chosen_places(key, evidence, geometry, model, asked)
     return PointBounds(len(places), places.min(axis=0), places.max(axis=0)) if len(places) else PointBounds()
 
@@ -78,7 +78,7 @@ def found_in_cell(
 def points_of_cell(
     key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel, asked: ExportRequest
 ) -> Table:
-    """(N,) of `POINT`: the occupied nodes of one cell that are asked for, rising in Morton number.
+    """(N,) of `POINT`: the selected occupied nodes of one cell, rising in Morton number.
 
     Raises:
         BadInputError: kind `bad_box`, `bad_style`.
@@ -98,7 +98,7 @@ def points_of_cell(
 
 
 def point_file(form: str, found: PointBounds, tables: Iterable[Table], about: About) -> Iterator[bytes]:
-    """A file of points, part by part: PLY, PCD (both binary), LAZ, or NPZ with one array `points`."""
+    """Parts of a file of points: PLY, PCD (both binary), LAZ, or NPZ with one array `points`."""
     if form == "npz":
         return _npz_parts(found.count, tables)
     if form == "laz":
@@ -110,7 +110,7 @@ def point_file(form: str, found: PointBounds, tables: Iterable[Table], about: Ab
 
 
 def size_of_file(form: str, found: PointBounds, about: About) -> int | None:
-    """Of a PLY or PCD, bytes; None: not known before an NPZ or LAZ is made."""
+    """Size of a PLY or PCD file, bytes; None for NPZ and LAZ, whose size is unknown before they are made."""
     if form not in ("ply", "pcd"):
         return None
     head, point = (_ply_head, POINT) if form == "ply" else (_pcd_head, PCD_POINT)
@@ -163,7 +163,7 @@ def _pcd_rows(table: Table) -> bytes:
 
 
 def _npz_parts(count: int, tables: Iterable[Table]) -> Iterator[bytes]:
-    sink = OneWay()
+    sink = ForwardOnlyFile()
     description = {"descr": np.lib.format.dtype_to_descr(POINT), "fortran_order": False, "shape": (count,)}
     with (
         zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED) as archive,

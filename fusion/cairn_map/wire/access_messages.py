@@ -1,4 +1,4 @@
-"""The JSON about who may do what: tokens, and the audit log with its chain of hashes."""
+"""JSON messages of access control: tokens, and the audit log with its chain of hashes."""
 
 import hashlib
 import json
@@ -21,11 +21,11 @@ class CreateToken(_Model):
 
     role: RoleText
     map: NameText | None = None
-    """The one map that it counts on; None: all maps, those to come included."""
+    """The one map for which it is valid; None: all maps, future ones included."""
     robot: NameText | None = None
-    """Whose token it is; of role robot, or of a relay that is a robot, too."""
+    """Robot that holds the token; only for role robot, or for a relay that is a robot, too."""
     lifetime_s: Annotated[float, Field(gt=0, le=LIFETIME_MAX_S)] | None = None
-    """None: until it is revoked."""
+    """Seconds for which it is valid; None: until it is revoked."""
 
     @model_validator(mode="after")
     def _check_robot(self) -> Self:
@@ -39,7 +39,7 @@ class CreateToken(_Model):
 
 
 class TokenInfo(_Model):
-    """One token, without its secret, which nobody keeps."""
+    """Facts of one token, without its secret, which is not stored."""
 
     name: str
     role: RoleText
@@ -48,7 +48,7 @@ class TokenInfo(_Model):
     created_s: float
     expires_s: float | None
     last_used_s: float | None
-    """Written every few seconds at most."""
+    """Time of its last use, UTC seconds since 1970; updated every few seconds at most."""
 
 
 class NewSecret(_Model):
@@ -71,7 +71,7 @@ class AuditEntry(_Model):
     """SHA-256 over the line before and this one, in hex; empty for lines older than the chain."""
 
     def is_next_after(self, before: "AuditEntry") -> bool:
-        """Whether this line follows that one, and nobody changed it since."""
+        """True if this line follows the line `before` in the chain, and is unchanged."""
         chain = audit_chain(
             bytes.fromhex(before.chain), self.number, self.time_s, who=self.who, what=self.what, detail=self.detail
         )

@@ -1,4 +1,4 @@
-"""The answer to "what do I miss": a header, frames per cell that stand alone, and an end.
+"""Frames of a reply to `missing`: a header, one frame per cell, each readable alone, and an end.
 
     "CRNS" | version u8 | frame, frame, ...          frame = length u32 | type u8 | body | crc32 u32
 
@@ -10,7 +10,7 @@
     done      to, fingerprint sum of the cells without a frame                   JSON
     more      to                                                                 JSON; ask again for the rest
 
-SYNC.md's rules 3 to 5 and 8 to 9 speak of these; PROTOCOL.md is the norm.
+Rules 3 to 5 and 8 to 9 of SYNC.md are about them; PROTOCOL.md is the norm.
 """
 
 import struct
@@ -33,18 +33,19 @@ MAGIC = b"CRNS"
 VERSION = 1
 PREFIX = struct.Struct("<IB")
 CELL_HEAD = struct.Struct(f"<QB16sq{CHAIN_BYTES}s16sq{CHAIN_BYTES}s16s")
+"""Cell, flags, `from` (log, seq, chain), `to` (log, seq, chain), fingerprint."""
 FRAME_BYTES_MAX = CELL_BYTES_MAX + (1 << 20)
 JSON_BYTES_MAX = 1 << 22
-"""Of a frame in JSON, whose objects need a hundred times its bytes: version vectors of some 60 000 robots."""
+"""Bytes of a frame in JSON, whose objects need a hundred times as many: version vectors of some 60 000 robots."""
 BLOCK_LIMIT = 8 ** (DEPTH_MAX - 2)
-"""Block numbers are below it, in the deepest cell."""
+"""Number of blocks in the deepest cell: block numbers are below it."""
 FLAG_OWN_EXCLUDED = 1
 FLAG_CONTINUES = 2
 NO_CURSOR = -1
 
 
 class FrameKind(IntEnum):
-    """The type byte."""
+    """Type byte of a frame."""
 
     HEADER = 1
     DELTA = 2
@@ -60,19 +61,20 @@ CELL_KINDS = (FrameKind.DELTA, FrameKind.STATE, FrameKind.FULL, FrameKind.RESET)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CellFrame:
-    """What one cell needs to come from `from_cursor` (None: from nothing) to `to_cursor`."""
+    """Change of one cell from its state at `from_cursor` (None: empty) to that at `to_cursor`."""
 
     kind: FrameKind
     cell: CellKey
     from_cursor: Cursor | None
     to_cursor: Cursor
     fingerprint: Fingerprint
-    """Of the server's cell at `to_cursor`."""
+    """Fingerprint of the server's cell at `to_cursor`."""
     own_excluded: bool = False
+    """True if a delta leaves out the asker's own commits."""
     blocks: npt.NDArray[np.uint32] | None = None
-    """Of a `state` frame: (B,) rising Morton numbers of the 4^3 blocks that it replaces."""
+    """(B,) rising Morton numbers of the 4^3 blocks that a `state` frame replaces; None in others."""
     continues: bool = False
-    """The payload is only the rest of it: the asker said that it has the beginning."""
+    """True if the payload is only the rest of it: the asker has named the beginning as held."""
     payload: bytes = b""
     """A cell's bytes; empty for `reset`."""
 
@@ -94,14 +96,14 @@ def encode_frame(frame: Frame) -> bytes:
 
 
 class FrameReader:
-    """Frames out of bytes that come in pieces; keeps at most one unfinished frame."""
+    """Incremental parser of a reply: bytes in pieces in, frames out; it keeps at most one unfinished frame."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
         self._started = False
 
     def feed(self, data: bytes) -> Iterator[Frame]:
-        """The frames that are complete now.
+        """Frames that are complete with these bytes.
 
         Raises:
             DamagedDataError: the checksum differs, or a body contradicts itself.
@@ -122,12 +124,12 @@ class FrameReader:
 
     @property
     def is_empty(self) -> bool:
-        """Whether a reply began and nothing is left over: false at the end means the reply was cut."""
+        """True if a reply began and no bytes are left over; False at the end means that the reply was cut."""
         return self._started and not self._buffer
 
     @property
     def begun(self) -> tuple[CellKey, bool, bytes] | None:
-        """Of the frame that is not whole: cell, whether it continues, what came of its payload; nothing is checked."""
+        """Unfinished cell frame: its cell, its `continues` and the beginning of its payload, unchecked; or None."""
         if not self._started or len(self._buffer) <= PREFIX.size + CELL_HEAD.size + 4:
             return None
         size, kind = PREFIX.unpack_from(self._buffer)
@@ -142,6 +144,7 @@ class FrameReader:
     def _next(self) -> Frame | None:
         if len(self._buffer) < PREFIX.size:
             return None
+        # The size is checked before the frame is waited for: a buffer never grows beyond it.
         size, kind = PREFIX.unpack_from(self._buffer)
         limit = FRAME_BYTES_MAX if kind in CELL_KINDS else JSON_BYTES_MAX
         if size > limit:
@@ -151,6 +154,7 @@ class FrameReader:
         end = PREFIX.size + size
         if len(self._buffer) < end + 4:
             return None
+        # The checksum is over length, type and body.
         body = bytes(self._buffer[PREFIX.size : end])
         (checksum,) = struct.unpack_from("<I", self._buffer, end)
         if zlib.crc32(self._buffer[:end]) != checksum:
@@ -160,7 +164,7 @@ class FrameReader:
 
 
 def frames_of(data: bytes) -> list[Frame]:
-    """All frames of a whole reply.
+    """Frames of a whole reply.
 
     Raises:
         DamagedDataError: cut off or damaged.
@@ -212,9 +216,11 @@ def _parsed(kind: int, body: bytes) -> Frame:
 def _parsed_cell(kind: FrameKind, body: bytes) -> CellFrame:
     if len(body) < CELL_HEAD.size:
         raise DamagedDataError("bad_frame", "a cell frame is cut off")
+    # The fixed head.
     key, flags, from_log, from_seq, from_chain, to_log, to_seq, to_chain, sums = CELL_HEAD.unpack_from(body)
     at = CELL_HEAD.size
     blocks: npt.NDArray[np.uint32] | None = None
+    # The blocks of a state frame: count u32, then as many u32. A count that is cut off counts as too large.
     if kind is FrameKind.STATE:
         (count,) = struct.unpack_from("<I", body, at) if at + 4 <= len(body) else (len(body),)
         at += 4
@@ -224,6 +230,7 @@ def _parsed_cell(kind: FrameKind, body: bytes) -> CellFrame:
         if (blocks[1:] <= blocks[:-1]).any() or (blocks >= BLOCK_LIMIT).any():
             raise DamagedDataError("bad_frame", "a state frame's blocks must rise and lie in the cell")
         at += 4 * count
+    # Impossible values; all that is left is the payload.
     if key >= 1 << 63 or flags & ~(FLAG_OWN_EXCLUDED | FLAG_CONTINUES) or (kind is FrameKind.RESET and at != len(body)):
         raise DamagedDataError("bad_frame", "a cell frame has an impossible cell number, flag or payload")
     try:

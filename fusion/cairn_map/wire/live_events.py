@@ -1,14 +1,14 @@
-"""What a server tells those who listen, over SSE and WebSocket alike: JSON objects, told apart by `type`.
+"""Live events of a server for its listeners, over SSE and WebSocket alike: JSON objects with a `type`.
 
     hello   the present state; the first event of every connection
-    cells   these changed             } what one or more folds changed, in this order;
-    log     these entries came        } `cells` and `log` may be missing or come twice
+    cells   changed cells             } the changes of one or more folds, in this order;
+    log     new log entries           } `cells` and `log` may be missing or come twice
     head    the newest cursor         } after a cut, `head` ends them
-    robot   one was heard of
+    robot   news of one robot
     beat    the link is alive
 
-An event's id says what the listener has seen once it has it: `SEQ.CHAIN.TICK`, seq and the first 8 hex digits of its
-chain as in a cursor, and a number that rises with what is heard of robots. Ids never fall.
+An event's id is the position of a listener that has received it: `SEQ.CHAIN.TICK`, seq and the first 8 hex digits of
+its chain as in a cursor, and a number that rises with each piece of news of a robot. Ids never fall.
 """
 
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 from cairn_map.wire.messages import CursorText, LogEntry, NameText, RobotStatus
 
 CELLS_MAX = 256
-"""Cells in one event; more are `many`."""
+"""Cells in one event, at most; more are `many`."""
 ENTRIES_MAX = 100
-"""Log entries in one event, the newest."""
+"""Log entries in one event, at most: the newest."""
 CHAIN_DIGITS = 8
 EventId = Annotated[str, Field(max_length=64)]
 
@@ -31,37 +31,37 @@ class _Model(BaseModel):
 
 
 class RobotSign(_Model):
-    """The last that was heard of one robot."""
+    """Latest news of one robot."""
 
     branch: NameText
     mode: str
     time_s: float
-    """When, by the server's clock."""
+    """Time of the news, by the server's clock."""
     cursor: CursorText | None = None
-    """Where it stood when it last fetched."""
+    """Cursor of its last fetch."""
     status: RobotStatus | None = None
     view_s: float | None = None
-    """When its latest picture came; None: there is none."""
+    """Time at which its latest picture arrived, by the server's clock; None: there is none."""
     gone: bool = False
-    """It was deregistered."""
+    """True if it was deregistered."""
 
 
 class Hello(_Model):
-    """The present state. Who was not resumed asks `missing` for what it lacks."""
+    """The present state. A listener that was not resumed requests `missing` for the changes that it lacks."""
 
     type: Literal["hello"] = "hello"
     id: EventId
     map: NameText
     cursor: CursorText
     resumed: bool
-    """The id that the listener gave is of this log: what was folded since follows, or nothing was."""
+    """True if the listener's id is of this log: all changes folded since then follow."""
     robots: list[RobotSign]
     beat_s: float
-    """Some event comes at least this often; after twice as long without one, connect again."""
+    """Longest time between two events, seconds; after twice as long without one, connect again."""
 
 
 class CellsChanged(_Model):
-    """Cells that were changed, each with the log entry that last did."""
+    """Cells that changed, each with the log entry that last changed it."""
 
     type: Literal["cells"] = "cells"
     id: EventId
@@ -76,7 +76,7 @@ class LogGrew(_Model):
     id: EventId
     entries: Annotated[list[LogEntry], Field(max_length=ENTRIES_MAX)]
     left_out: int
-    """Older new entries that are not listed; `GET .../log` has them."""
+    """Number of older new entries that are not listed; `GET .../log` has them."""
 
 
 class HeadMoved(_Model):
@@ -88,7 +88,7 @@ class HeadMoved(_Model):
 
 
 class RobotHeard(_Model):
-    """A robot pushed, fetched, told its status, or came or went."""
+    """News of a robot: it pushed, fetched, reported its status, registered or deregistered."""
 
     type: Literal["robot"] = "robot"
     id: EventId
@@ -96,7 +96,7 @@ class RobotHeard(_Model):
 
 
 class Beat(_Model):
-    """Nothing happened for a while."""
+    """Sign of life of the link, while there is nothing else to send."""
 
     type: Literal["beat"] = "beat"
     id: EventId
@@ -109,7 +109,7 @@ LIVE_EVENT: TypeAdapter[LiveEvent] = TypeAdapter(Annotated[LiveEvent, Field(disc
 
 @dataclass(frozen=True, slots=True)
 class EventPosition:
-    """How far a listener is: the parts of an event's id."""
+    """Position of a listener in the stream of events: the parts of an event's id."""
 
     seq: int
     chain: str
@@ -120,7 +120,7 @@ class EventPosition:
 
 
 def position_from_text(text: str) -> EventPosition | None:
-    """An event's id, parsed; None for anything else."""
+    """Position of an event's id; None if the text is no id."""
     parts = text.split(".")
     if len(text) > 64 or len(parts) != 3 or not all(part.isascii() and part.isalnum() for part in parts):
         return None

@@ -1,6 +1,7 @@
-"""The JSON that client and server exchange, as models that check what they read.
+"""JSON messages between client and server, as models that validate on reading (PROTOCOL.md is the norm).
 
-Fields that hold cursors, fingerprints or version vectors carry their text forms; the properties parse them.
+Fields that hold cursors, fingerprints or version vectors carry their text forms; the properties parse them. The
+messages of tokens and the audit log are in `access_messages`, those of live streams in `live_events`.
 """
 
 from typing import Annotated, Literal, TypeVar
@@ -45,7 +46,7 @@ DAMAGED_MAX = 256
 """Damaged cells named in one header; the others are named when these are healed."""
 SELECTING_PARTS = ("robot", "rig", "pushed_after_s", "pushed_before_s", "captured_after_s", "captured_before_s")
 FIELDS_MAX = 64
-"""Of one object; more than any message here has."""
+"""Fields of one object, at most: more than any message here has."""
 
 
 class RobotStatus(BaseModel):
@@ -54,9 +55,9 @@ class RobotStatus(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     time_s: Seconds
-    """When it was so, by the robot's clock."""
+    """Time of the status by the robot's clock, UTC seconds since 1970."""
     pose: ScanPose | None = None
-    """Where its rig is in the map, and how surely."""
+    """Pose of the rig in the map, with its standard deviations."""
     mode: Mode | None = None
     waiting: Count = 0
     """Commits that the server has not acknowledged."""
@@ -64,7 +65,7 @@ class RobotStatus(BaseModel):
     battery: Annotated[float, Field(ge=0, le=1)] | None = None
     """Charge, 1 = full."""
     note: Annotated[str, Field(max_length=256)] = ""
-    """Anything else, for people."""
+    """Free text, for people."""
 
 
 class _Model(BaseModel):
@@ -72,12 +73,12 @@ class _Model(BaseModel):
 
 
 def _tuple_of(value: object) -> object:
-    """A JSON array as it must be where what was read is looked at before it is checked."""
+    """A JSON array as a tuple, which strict validation demands of values that a validator saw before."""
     return tuple(value) if isinstance(value, list) else value
 
 
 class _LongRequest(_Model):
-    """A request of which a server reads megabytes."""
+    """A request that may be megabytes long."""
 
     @model_validator(mode="before")
     @classmethod
@@ -96,7 +97,7 @@ class CreateMap(_Model):
 
 
 class MapInfo(_Model):
-    """What a server says about one map."""
+    """Facts of one map on a server."""
 
     name: NameText
     geometry: Geometry
@@ -110,7 +111,7 @@ class MapInfo(_Model):
     box_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None
     """Lowest and highest corner of the cells that hold evidence; None while the map is empty."""
     server_key: ShaText | None = None
-    """Public key by which the server signs what it says itself, in hex: what `--trust-server` takes."""
+    """Public key of the server's own commits on this map, in hex: the argument of `--trust-server`."""
 
 
 class Register(_Model):
@@ -140,18 +141,18 @@ class BranchInfo(_Model):
     behind: int | None
     """Log entries folded since the branch's cursor; None before its first fetch."""
     behind_bytes: int | None = None
-    """Bytes of others' commits in them; None before its first fetch, or if that was too long ago."""
+    """Bytes of others' commits in these entries; None before its first fetch, or if that was too long ago."""
     incarnation: str = ""
-    """With which it registered last."""
+    """Incarnation of its latest registration."""
     last_seen_s: float
     status: RobotStatus | None = None
-    """The last that it told."""
+    """Its latest status."""
     view_s: float | None = None
-    """When its latest picture came; None: there is none."""
+    """Time at which its latest picture arrived, by the server's clock; None: there is none."""
 
 
 class Pushed(_Model):
-    """Answer to a push: the commit is durable (`new`), or was already (`known`)."""
+    """Answer to a push: the commit is durable now (`new`), or was before (`known`)."""
 
     id: IdText
     state: Literal["new", "known"]
@@ -177,17 +178,17 @@ class MissingRequest(_LongRequest):
     compare: bool = False
     """Answer every listed cell with a `reset` frame: only its fingerprint."""
     box: tuple[tuple[int, int, int], tuple[int, int, int]] | None = None
-    """Lowest and highest cell (inclusive) that the asker wants to hear of; None: all."""
+    """Lowest and highest cell (inclusive) of the request; None: all."""
     size_bytes_max: Annotated[int, Field(ge=1)] | None = None
-    """After so many bytes of cell frames the reply ends with `more`; None: the server's own limit."""
+    """Bytes of cell frames after which the reply ends with `more`; None: the server's own limit."""
     kinds: Annotated[list[Literal["delta", "state", "full"]], Field(max_length=3), FailFast()] = ["delta", "full"]
-    """Kinds of frame that the asker can use now; `full` is always understood to be."""
+    """Kinds of frame that the asker can use now; `full` is always implied."""
     near: tuple[int, int, int] | None = None
     """Frames of the cells next to this one come first, then those farther away; None: the newest everywhere."""
     begun: tuple[tuple[int, int, int], Annotated[int, Field(ge=1)], ShaText] | None = None
     """Cell, bytes of its frame's payload that came before a cut, SHA-256 of them: only the rest is sent."""
     known: Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")] | None = None
-    """First digits of the SHA-256 of the last reply: if this one would be the same, 204 says so."""
+    """First digits of the SHA-256 of the last reply: if this one would be the same, the answer is 204."""
 
 
 class ReplyHeader(_Model):
@@ -199,15 +200,16 @@ class ReplyHeader(_Model):
     stable: VectorJson
     """Ids that no restore can lose any more."""
     pending: VectorJson = {}
-    """Ids that are durable here but not folded yet: they need not be pushed, and count for nothing else."""
+    """Ids that are durable on the server but not folded yet: they need not be pushed, and count for nothing else."""
     tip: tuple[Annotated[int, Field(ge=0, lt=NUMBER_LIMIT)], ShaText] | None = None
     """Highest folded number of the asker's own incarnation, and its SHA-256."""
     retracts: list[IdText] = []
     """Retracting commits that are not yet stable."""
     damaged: Annotated[list[tuple[tuple[int, int, int], FingerprintText]], Field(max_length=DAMAGED_MAX)] = []
-    """Cells that the server cannot read any more, and what they were: whoever has one as it was may send it."""
+    """Cells that the server cannot read any more, and their fingerprints: any robot with an undamaged copy may send
+    it."""
     wanted: Annotated[list[IdText], Field(max_length=WANTED_MAX)] = []
-    """Commits whose evidence a retract needs and the server forgot: whoever has one pushes it again."""
+    """Commits whose evidence a retract needs and the server forgot: any robot that has one pushes it again."""
 
     @property
     def to_cursor(self) -> Cursor:
@@ -255,30 +257,30 @@ class More(_Model):
 
 
 class Retract(_Model):
-    """Body of `POST /maps/{map}/retracts`: commits by id, and all that are here now and fit every other part named."""
+    """Body of `POST /maps/{map}/retracts`: commits by id, and all commits on the server that match every other part."""
 
     commits: Annotated[list[IdText], Field(max_length=4096), FailFast()] = []
     robot: NameText | None = None
     rig: ShaText | None = None
-    """SHA-256 of the `rig.json` that they were made with."""
+    """SHA-256 of the `rig.json` of the commits' rig."""
     pushed_after_s: Time | None = None
     pushed_before_s: Time | None = None
-    """When the server received them, UTC seconds since 1970."""
+    """Bounds of the time at which the server received the commits, UTC seconds since 1970."""
     captured_after_s: Time | None = None
     captured_before_s: Time | None = None
-    """When a scan of them was taken."""
+    """Bounds of the time of a scan of the commits, UTC seconds since 1970."""
     note: Annotated[str, Field(max_length=1024)] = ""
     preview: bool = False
-    """Only say which commits it would name."""
+    """True if the answer only lists the commits, and nothing is retracted."""
 
     @property
     def selects(self) -> bool:
-        """Whether it names commits by what they are, not only by id."""
+        """True if the request selects commits by their properties, not only by id."""
         return any(getattr(self, part) is not None for part in SELECTING_PARTS)
 
 
 class Retracted(_Model):
-    """Answer to a retract: the retracting commit, None for a preview, and what it names."""
+    """Answer to a retract: the retracting commit, None for a preview, and the commits that it names."""
 
     id: IdText | None
     commits: list[IdText]
@@ -299,13 +301,13 @@ class LogEntry(_Model):
     seen: CursorText | None = None
     """SHA-256 of the author's commit before it, and the state of the server that the author had when it made it."""
     place_m: tuple[float, float, float] | None = None
-    """Where the rig was for its last scan, metres, map frame; None: it has no scans, or is not kept any more."""
+    """Place of the rig at the commit's last scan, metres, map frame; None: it has no scans, or is not kept any more."""
     via: str | None = None
-    """Name of the token of the relay that handed it over; None: its robot did, or the server made it."""
+    """Name of the token of the relay that handed it over; None: its own robot did, or the server made it."""
 
 
 class Problem(BaseModel):
-    """RFC 9457 problem; `kind` is our stable code."""
+    """RFC 9457 problem; `kind` is cairn's stable code."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -317,7 +319,7 @@ class Problem(BaseModel):
 
 
 def message_from_json(model: type[Message], data: bytes | str) -> Message:
-    """A checked message.
+    """A message of a model, validated.
 
     Raises:
         DamagedDataError: not JSON, or a field is missing, unknown or out of range.
@@ -342,9 +344,9 @@ class CellEntry(BaseModel):
     voxels: int
     hottest_k: float | None = None
     """Mean temperature of its hottest voxel, kelvin; None: it has none, or the server does not know it, or was not
-    asked for it: robots of old refuse what they do not know."""
+    asked for it, because older robots refuse fields that they do not know."""
     held_lm: int | None = None
-    """Newest log entry whose evidence is still in the cell: `lm`, unless that took some out. None: nothing is in it,
+    """Newest log entry whose evidence is still in the cell: `lm`, unless that took some out. None: the cell is empty,
     or the server does not know it any more, or was not asked for it."""
 
 
@@ -358,11 +360,11 @@ class CellIndex(BaseModel):
 
 
 class Upload(BaseModel):
-    """Answer to a part, and to who asks how many are there."""
+    """State of the upload of a commit in parts: the answer to each part, and to a query."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     size_bytes: Annotated[int, Field(ge=0)]
-    """So many of the body's bytes are here, from its first one on: the next part begins there."""
+    """Bytes of the body that have arrived, from its first one on: the next part begins there."""
     sha: ShaText | None = None
-    """Of the commit that is kept for good under this id; None: none yet."""
+    """SHA-256 of the commit that is kept for good under this id; None: none yet."""

@@ -1,6 +1,7 @@
-"""What a relay needs of each of the two places between which it hands commits over: servers, or a folder on its way.
+"""Peers of a relay, the two places between which it hands commits over: servers, or a folder in transit.
 
 A relay is a client's program; `cairn serve --upstream` gives it the server's own map without a detour through HTTP.
+`CommitList` is the list of a place's commits as JSON, without their bytes.
 """
 
 from collections.abc import Iterable, Mapping
@@ -20,28 +21,28 @@ SUM_BYTES = 16
 
 @dataclass(frozen=True, slots=True)
 class SignedCommit:
-    """A commit on its way: its bytes, and what proves whose it is."""
+    """A commit in transit: its bytes, and the signatures that prove its author."""
 
     id: CommitId
     data: bytes = field(repr=False)
     signatures: str | None = field(repr=False)
-    """As in `Cairn-Signature`; None: nobody signed it, and no relay may hand it over."""
+    """Text of the header `Cairn-Signature`; None: the commit is unsigned, and no relay may hand it over."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Held:
-    """Which commits there are in one place."""
+    """Commits that one place holds."""
 
     vector: VersionVector
-    """All of them, folded or not."""
+    """Ids of all commits, folded or not."""
     wanted: tuple[CommitId, ...] = ()
-    """Of those, the ones whose bytes are wanted again."""
+    """Ids in `vector` whose bytes are wanted again."""
     sums: Mapping[Author, bytes] = field(default_factory=dict)
-    """Of authors of which no commit waits to be folded: the sum of their SHA-256, as `sum_of_shas`."""
+    """By author, if none of its commits waits to be folded: `sum_of_shas` of its commits."""
 
 
 def sum_of_shas(before: bytes, shas: Iterable[bytes]) -> bytes:
-    """(16 bytes) the sum of the first 16 bytes of each of them, and of the one before: of whatever order."""
+    """(16 bytes) sum of `before` and of the first 16 bytes of each SHA-256; the order does not matter."""
     total = sum((int.from_bytes(sha[:SUM_BYTES]) for sha in shas), int.from_bytes(before))
     return (total % (1 << 8 * SUM_BYTES)).to_bytes(SUM_BYTES)
 
@@ -50,19 +51,19 @@ class MapEnd(Protocol):
     """One map in one place. Every method may be repeated."""
 
     def held(self) -> Held:
-        """What is here now.
+        """Commits that the place holds now.
 
         Raises:
-            CairnError: it cannot be asked.
+            CairnError: the place cannot be reached.
         """
         ...
 
     def commit(self, commit: CommitId) -> SignedCommit:
-        """A commit.
+        """The commit of an id.
 
         Raises:
             NotFoundError: kind `no_commit`.
-            ConflictError: kind `evidence_gone`: its bytes are not kept here any more.
+            ConflictError: kind `evidence_gone`: its bytes are not kept any more.
         """
         ...
 
@@ -76,14 +77,14 @@ class MapEnd(Protocol):
 
 
 class OwnServer(Protocol):
-    """The server that `cairn serve --upstream` joins to another one."""
+    """The server that `cairn serve --upstream` connects to another one."""
 
     def map_names(self) -> list[str]:
-        """Its maps."""
+        """Names of the server's maps."""
         ...
 
     def open(self, upstream: MapInfo) -> MapEnd:
-        """Its map of the same name, made if it is not there.
+        """The server's map of the same name as the upstream's, created if there is none.
 
         Raises:
             ConflictError: kind `map_exists`: it has another grid or sensor model.
@@ -91,7 +92,7 @@ class OwnServer(Protocol):
         ...
 
     def handed_over(self, map_name: str, begun_s: float) -> None:
-        """All that was in its map at this time (UTC seconds since 1970) was given to the upstream, if it can travel."""
+        """Note that all signed commits of a map at a time (UTC seconds since 1970) were handed to the upstream."""
         ...
 
 
@@ -103,13 +104,13 @@ class CommitList(BaseModel):
     vector: VectorJson
     """All ids that are here, folded or not."""
     wanted: Annotated[list[IdText], Field(max_length=WANTED_MAX)] = []
-    """Of those, the ones whose bytes are wanted again."""
+    """Ids in `vector` whose bytes are wanted again."""
     sums: Annotated[dict[str, SumText], Field(max_length=AUTHORS_MAX)] = {}
     """By author of whom no commit waits to be folded: the sum of the first 16 bytes of their SHA-256, in hex."""
 
 
 def commit_list(held: Held) -> CommitList:
-    """As JSON has it; the mirror of `held_from_list`."""
+    """Commits held, as a list in JSON; the mirror of `held_from_list`."""
     return CommitList(
         vector=held.vector.to_json(),
         wanted=[str(commit) for commit in held.wanted],
@@ -118,7 +119,7 @@ def commit_list(held: Held) -> CommitList:
 
 
 def held_from_list(message: CommitList) -> Held:
-    """What is held.
+    """Commits held, of a list in JSON; the mirror of `commit_list`.
 
     Raises:
         BadInputError: an id or the vector is malformed.

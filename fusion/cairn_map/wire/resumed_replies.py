@@ -1,11 +1,12 @@
-"""A reply that a cut link carried in part, and the next one: no byte of a cell comes twice.
+"""Replies that resume where a cut link ended: no byte of a cell is sent twice.
 
     reply, cut:    ... | head of cell A, the first 80 kB of its payload |
     request:       begun = (A, 80 kB, their SHA-256)
     next reply:    header | ... | head of cell A, "continues", what comes after these 80 kB | ...
 
-The server keeps nothing: it compares the digest with the beginning of what it would send now. The same for a reply
-without cells, which says again and again that nothing changed: the asker names the last one by its digest.
+The server keeps nothing: it compares the digest with the beginning of the payload that it would send now. A reply
+without cells, which reports again and again that nothing changed, is resumed as a whole: the asker names the last one
+by its digest.
 """
 
 import hashlib
@@ -19,22 +20,23 @@ from cairn_map.wire.frames import CellFrame, Frame, FrameReader
 from cairn_map.wire.messages import MissingRequest
 
 Begun = tuple[tuple[int, int, int], int, str]
-"""Cell, bytes of its frame's payload that are here, SHA-256 of them."""
+"""Cell, bytes of its frame's payload that are held, SHA-256 of them."""
 
 BEGUN_BYTES_MIN = 512
-"""Naming less costs more than it saves."""
+"""Bytes of a payload that are worth naming in a request: fewer cost more than they save."""
 KNOWN_BYTES_MAX = 1 << 20
-"""A longer reply is not kept to compare the next one with."""
+"""Bytes of a reply that is kept to compare the next one with, at most."""
 KNOWN_DIGITS = 16
+"""Hex digits of the SHA-256 that name a reply."""
 
 
 def reply_digest(reply: bytes) -> str:
-    """What a request calls the last reply by."""
+    """Digest by which a request names the last reply."""
     return hashlib.sha256(reply).hexdigest()[:KNOWN_DIGITS]
 
 
 def without_begun(frames: Iterable[Frame], begun: Begun | None) -> Iterator[Frame]:
-    """The frames, without the beginning of a payload that the asker has."""
+    """Frames of a reply, without the beginning of a payload that the asker holds."""
     cell, size, sha = begun or (None, 0, "")
     for frame in frames:
         if not isinstance(frame, CellFrame) or len(frame.payload) < size or cell_of_key(frame.cell) != cell:
@@ -46,28 +48,28 @@ def without_begun(frames: Iterable[Frame], begun: Begun | None) -> Iterator[Fram
 
 
 class Replies:
-    """What one asker remembers of its replies."""
+    """Memory of one asker's replies: the unfinished payload, and the last reply without cells."""
 
     def __init__(self) -> None:
         self.begun: tuple[CellKey, bytes] | None = None
-        """Of the frame that did not come whole, the cell and the beginning of its payload."""
+        """Cell of the frame that was cut, and the beginning of its payload."""
         self.known: bytes | None = None
-        """The last reply, if it had no cells."""
+        """The last reply, if it had no cells; else None."""
 
     def reply_to(self, request: MissingRequest) -> "Reply":
-        """The reply that the next bytes are."""
+        """Reader of the reply to a request."""
         return Reply(self, request)
 
 
 class Reply:
-    """One reply that comes in."""
+    """Reader of one reply; it completes the frame that the reply before left unfinished."""
 
     def __init__(self, memory: Replies, request: MissingRequest) -> None:
         self._memory = memory
         self._begun = memory.begun
         self._known = memory.known
         self.request = request
-        """With what is here of the replies before."""
+        """The request, which names the bytes and the reply that are held already."""
         if self._begun is not None:
             key, payload = self._begun
             sha = hashlib.sha256(payload).hexdigest()
@@ -77,11 +79,11 @@ class Reply:
             self.request = self.request.model_copy(update={"known": reply_digest(self._known)})
 
     def again(self) -> Iterator[Frame]:
-        """The frames of the last reply, as this one is the same."""
+        """Frames of the last reply; for a 204, which means that this one is the same."""
         return FrameReader().feed(self._known or b"")
 
     def frames(self, parts: Iterable[bytes]) -> Iterator[Frame]:
-        """Whole frames out of its bytes.
+        """Whole frames of the reply's bytes.
 
         Raises:
             DamagedDataError: the bytes are not frames.
@@ -107,7 +109,7 @@ class Reply:
         self._memory.known = bytes(short) if short is not None else None
 
     def _whole(self, frame: CellFrame) -> CellFrame:
-        """A frame with the beginning that came with an earlier reply."""
+        """A frame, joined with the beginning of its payload from an earlier reply."""
         if self._memory.begun is not None and self._memory.begun[0] == frame.cell:
             self._memory.begun = None
         if not frame.continues:
@@ -121,14 +123,15 @@ class Reply:
         return replace(frame, continues=False, payload=self._begun[1] + frame.payload)
 
     def _note(self, reader: FrameReader) -> None:
-        """Keep what came of the frame at which the reply ended."""
+        """Keep the beginning of the frame at which the reply was cut."""
         if reader.begun is None:
             return
         key, continues, payload = reader.begun
         if continues:
             if self._begun is None or self._begun[0] != key:
                 return
-            if len(self._begun[1]) + len(payload) > CELL_BYTES_MAX:  # no cell; who always goes on must not fill us
+            # No cell is as large: a server that always continues must not fill the memory.
+            if len(self._begun[1]) + len(payload) > CELL_BYTES_MAX:
                 self._memory.begun = None
                 return
             payload = self._begun[1] + payload

@@ -1,4 +1,4 @@
-"""What a server says about one voxel, as JSON: its sums read under the map's model, and the commits that saw it."""
+"""JSON message about one voxel: its sums read under the map's sensor model, and the commits that observed it."""
 
 from typing import Annotated
 
@@ -21,15 +21,15 @@ class ChannelReading(_Model):
     kind: ChannelKind
     unit: str
     weight: int
-    """0: nothing was measured."""
+    """Sum of the samples' weights; 0: nothing was measured."""
     mean: list[float]
-    """In the unit, one number or three; empty without weight."""
+    """Mean in the unit, one number or three; empty without weight."""
     sigma: float | None
-    """Standard deviation of the samples, of temperatures only."""
+    """Standard deviation of the samples; None for all kinds but temperatures."""
 
 
 class VoxelCommit(_Model):
-    """What one commit adds to the voxel."""
+    """Contribution of one commit to the voxel."""
 
     id: IdText
     hits: int
@@ -47,15 +47,15 @@ class VoxelAnswer(_Model):
     hits: int
     misses: int
     probability: float | None
-    """That it is occupied; None: nobody saw it."""
+    """Probability that it is occupied; None: unknown."""
     channels: list[ChannelReading]
     lm: Annotated[int, Field(ge=0)]
     """Log entry that last changed its cell."""
     cursor: CursorText
-    """State that all of this is of."""
+    """State of the map of which this is true."""
     commits: list[VoxelCommit]
-    """Those that saw it, the newest first; of what is kept and was looked at."""
+    """Commits that observed it, the newest first, among those that are kept and were searched."""
     more: bool
-    """Older commits touched its cell, which were not looked at."""
+    """True if older commits that touched its cell were not searched."""
     gone: bool
-    """Of some older commits the evidence is not kept any more: only their sum is known."""
+    """True if the evidence of some older commits is not kept any more: only their sum is known."""
