@@ -1,4 +1,4 @@
-"""The layouts that are known by their files, and the one door to all of them.
+"""Layouts of recordings, detected by their files, and one function that opens any of them.
 
     open_source(path)  ->  detect_layout  ->  recording | apc_shelf | mm5 | bag
 
@@ -51,7 +51,7 @@ def import_mm5(folder: str | Path, frames: Sequence[str] | None = None, *, scans
 
 
 class SourceLayout(StrEnum):
-    """The layouts that are recognised by the files in them."""
+    """Layouts that are detected by the files in them."""
 
     RECORDING = "recording"
     APC_SHELF = "apc_shelf"
@@ -67,7 +67,7 @@ LAYOUT_FILES: dict[SourceLayout, tuple[str, ...]] = {
 
 
 def detect_layout(folder: str | Path) -> SourceLayout:
-    """Which layout a folder has.
+    """Layout of a folder.
 
     Raises:
         BadInputError: `unknown_layout`; the message lists what was looked for.
@@ -99,7 +99,7 @@ def open_source(
     frames: Sequence[str] | None = None,
     scans_per_measurement: int | None = None,
 ) -> ScanSource:
-    """A recording of any layout: by `options` or `mapping` where they are given, else by what `detect_layout` finds.
+    """A recording of any layout: by `options` or `mapping` if given, else by `detect_layout`.
 
     Raises:
         BadInputError: unknown layout, `frames` of a recording (its lists say which), `mapping` of what is no bag, or as

@@ -1,4 +1,4 @@
-"""Every kernel of this package, run once on a tiny scan, so that Numba compiles it ahead and keeps it."""
+"""Warm-up: every kernel of this package, run once on a tiny scan, so that Numba compiles and caches it."""
 
 from dataclasses import replace
 from importlib.util import find_spec

@@ -1,9 +1,9 @@
-"""What one camera sees, on another camera's pixels: thermal on colour, colour on thermal, through range.
+"""Cross view: one camera's values on another camera's pixels, thermal on colour or colour on thermal, through range.
 
-    pixel of the one --its depth--> point --Eq. 5-6--> pixel of the other --what hides it?--> value, or why not
+    pixel of the one --its depth--> point --Eq. 5-6--> pixel of the other --occlusion--> value, or the reason for none
 
-This is for the eye, on every pixel of an image. The map's samples go the other way, from the range camera's own pixels
-(`transfer`, `samples`). Several cameras may see the same spectrum: what is hidden from the first, the second may see.
+This is for viewing, on every pixel of an image. The map's samples go the other way, from the range camera's own pixels
+(`transfer`, `samples`). Several cameras may see the same spectrum: the second may see points hidden from the first.
 """
 
 from collections.abc import Mapping
@@ -25,28 +25,29 @@ from cairn_fusion.transfer.transfer import Label
 from cairn_map.arrays import Labels, Singles
 
 HIDDEN_BEHIND = 0.03
-"""How much deeper, as a share, a point must be than what hides it, besides slant and `JOIN_SIGMAS` of its noise."""
+"""Relative depth behind a surface beyond which it hides a point, besides slant and `JOIN_SIGMAS` of noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CrossView:
-    """Values of other cameras on the pixels of one."""
+    """Values of other cameras on the pixels of one camera."""
 
     camera: str
-    """Whose pixels."""
+    """Camera with the pixels."""
     sources: tuple[str, ...]
-    """Whose values, in the order in which they were asked."""
+    """Cameras with the values, in order of priority."""
     values: Singles
     """(H, W, C); NaN where the label is not OK."""
     labels: Labels
-    """(H, W) `Label`; where no source has a value, why the first has none."""
+    """(H, W) `Label`; where no source has a value, the reason of the first one."""
     source: Labels
-    """(H, W) number of the source that the value comes from."""
+    """(H, W) number of the source of the value, in `sources`."""
     depth: DenseDepth
+    """Depth through which the values were found."""
 
     @property
     def ok(self) -> npt.NDArray[np.bool_]:
-        """(H, W) pixels with a value."""
+        """(H, W) true for pixels with a value."""
         return np.asarray(self.labels == Label.OK)
 
 
@@ -58,14 +59,14 @@ def cross_view(
     drawn: Mapping[str, Drawn],
     range_camera: str,
 ) -> CrossView:
-    """What other cameras see at the pixels of the camera that a depth is of.
+    """Values of other cameras at the pixels of one camera, through their depth.
 
     Args:
-        depth: of the camera.
+        depth: of the pixels of the camera.
         rig: with all cameras.
-        images: by camera, the one to ask first, first: (H, W) or (H, W, C); NaN for no value. None: no value anywhere.
-        drawn: the surface as each of these cameras sees it; where one is missing, nothing hides.
-        range_camera: that measured the depth.
+        images: by camera, in order of priority: (H, W) or (H, W, C); NaN for no value. Without images no pixel has one.
+        drawn: the surface as each of these cameras sees it; a camera without one sees all points.
+        range_camera: camera that measured the depth.
     """
     seen = _Seen(rig, depth.camera, range_camera, drawn)
     names, known, rays = tuple(images), _known(depth), beams(rig[depth.camera].camera)
@@ -77,7 +78,7 @@ def cross_view(
     values, labels = seen.by(names[0], images[names[0]], depth.shown_m, rays, known)
     source = np.zeros(labels.shape, np.uint8)
     for number, name in enumerate(names[1:], 1):
-        # Few pixels are left, so that it is quicker to pick them out.
+        # The next camera only fills what is missing: few pixels, so that it is quicker to pick them out.
         left = np.flatnonzero((labels.ravel() != Label.OK) & (known.ravel() == Label.OK))
         range_m, picked = depth.shown_m.ravel()[left][None], rays.reshape(3, -1)[:, left][:, None]
         others, other_labels = seen.by(name, images[name], range_m, picked, known.ravel()[left][None])
@@ -87,7 +88,7 @@ def cross_view(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """Who looks at whose pixels."""
+    """The rig, and the camera whose pixels are looked up in others."""
 
     rig: Rig
     camera: str
@@ -98,12 +99,14 @@ class _Seen:
         self, name: str, image: npt.NDArray[np.generic], range_m: Singles, rays: Singles, known: Labels
     ) -> tuple[Singles, Labels]:
         """Values (H, W, C) and labels (H, W) of one source, at points `range_m` (H, W) along (3, H, W) rays."""
+        # Eq. 1-6, and the source's image averaged over the area of a pixel.
         src, dst = self.rig[self.camera], self.rig[name]
         u, v, q = places(range_m, rays, dst.camera, inverse(dst.transform) @ src.transform)
         smooth = _smoothed(image, dst.camera.focal_px[0] / src.camera.focal_px[0])
         labels, values = known.copy(), np.full((*known.shape, smooth.shape[2]), np.nan, np.float32)
         # Without parallax nothing can hide anything.
         apart = float(np.linalg.norm(src.transform[:3, 3] - dst.transform[:3, 3])) > 1e-9
+        # One bin of nearness 0 that covers the image: nothing is behind it.
         least, step = np.zeros((1, 1), np.float32), 1 << 20
         if (drawn := self.drawn.get(name)) is not None and apart:
             least, step = _least_nearness(drawn, self.rig[self.range_camera]), drawn.step_px
@@ -119,7 +122,7 @@ class _Seen:
 
 
 def _known(depth: DenseDepth) -> Labels:
-    """(H, W) OK where there is a depth, else why there is none."""
+    """(H, W) OK where there is a depth, else the reason for none."""
     height, width = depth.origins.shape
     marks = np.asarray(
         cv2.resize(
@@ -130,16 +133,17 @@ def _known(depth: DenseDepth) -> Labels:
 
 
 def _smoothed(image: npt.NDArray[np.generic], ratio: float) -> Singles:
-    """(H, W, C) float32, blurred where several of its pixels fall on one."""
+    """(H, W, C) float32, blurred where several of its pixels fall on one of the other camera."""
     side = round(ratio)
     values = np.asarray(image) if side <= 1 else np.asarray(cv2.blur(np.asarray(image, np.float32), (side, side)))
     return np.ascontiguousarray(np.atleast_3d(values), dtype=np.float32)
 
 
 def _least_nearness(drawn: Drawn, range_camera: MountedCamera) -> Singles:
-    """(h, w) 1 / metres: a point with less is behind what hides there, and 0 where nothing does.
+    """(h, w) 1 / metres: a point with less is behind the surface drawn there; 0 where none is.
 
-    Both ranges have noise, as much as is usual at the nearer: the farther a surface, the more it hides itself.
+    Both ranges have noise, the usual one at the nearer. Without it, a surface would hide itself, the more so the
+    farther it is.
     """
     hides = drawn.hiding > 0
     range_m = 1 / np.where(hides, drawn.hiding, np.float32(1.0))
@@ -148,15 +152,14 @@ def _least_nearness(drawn: Drawn, range_camera: MountedCamera) -> Singles:
 
 
 def fused_covariance(fused: CrossView, rig: Rig, *, range_camera: str) -> Singles:
-    """(H, W, 3) float32 xx, xy, yy, px^2 of each pixel's source; NaN where the label is not OK.
+    """(H, W, 3) float32 covariance xx, xy, yy, px^2, of the place in its source of each pixel's value; NaN without one.
 
-    Range noise is the range camera's; where depth was filled in, what may differ in a window and still be taken for one
-    surface.
+    Range noise is the range camera's; for filled-in depth it is the largest difference on one surface.
 
     Args:
-        fused: of `cross_view`.
+        fused: result of `cross_view`.
         rig: its rig; with a calibration's covariance if it has one.
-        range_camera: that measured.
+        range_camera: camera that measured the depth.
 
     Raises:
         BadInputError: a camera is a lidar.

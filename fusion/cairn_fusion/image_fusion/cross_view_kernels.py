@@ -1,4 +1,4 @@
-"""Points of one camera's image in another's, with what hides them, and the value there: the loops of `across`."""
+"""Points of one camera's image in another's, their occlusion, and the value there: the loops of `cross_view`."""
 
 import math
 
@@ -9,7 +9,7 @@ import numpy.typing as npt
 from cairn_map.arrays import Floats, Labels, Singles
 
 OK, OCCLUDED, OUT_OF_VIEW, NO_RANGE, NO_READING = 0, 1, 2, 3, 6
-"""`transfer.Label`."""
+"""Values of `transfer.Label`."""
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -26,9 +26,9 @@ def places_into(
     first: int,
     last: int,
 ) -> None:
-    """Where the points of an image appear in a pinhole with Brown's distortion, and 1 / range from there.
+    """Pixels of an image's points in a pinhole with Brown's distortion, and 1 / range from there.
 
-    Eq. 1-6, for rows `first` to `last` - 1. Row by row without branches, and so in vector instructions.
+    Eq. 1-6, for rows `first` to `last` - 1.
 
     Args:
         us: (H, W) takes x, pixels, also beyond the image; NaN for a point that the camera cannot see.
@@ -40,14 +40,13 @@ def places_into(
         lens: fx, fy, cx, cy
         coefficients: k1, k2, p1, p2, k3
         radius_limit: of `cairn_calib.rig.brown`.
-        first: row.
-        last: row.
+        first: first row.
+        last: one past the last row.
     """
-    f = np.float32
+    f, T = np.float32, T_dst_src
     fx, fy, cx, cy = f(lens[0]), f(lens[1]), f(lens[2]), f(lens[3])
     k1, k2, k3 = f(coefficients[0]), f(coefficients[1]), f(coefficients[4])
     p1, p2 = f(coefficients[2]), f(coefficients[3])
-    T = T_dst_src
     r00, r01, r02, t0 = f(T[0, 0]), f(T[0, 1]), f(T[0, 2]), f(T[0, 3])
     r10, r11, r12, t1 = f(T[1, 0]), f(T[1, 1]), f(T[1, 2]), f(T[1, 3])
     r20, r21, r22, t2 = f(T[2, 0]), f(T[2, 1]), f(T[2, 2]), f(T[2, 3])
@@ -55,17 +54,22 @@ def places_into(
     for row in range(first, last):
         d, a, b, c = range_m[row], rays[0, row], rays[1, row], rays[2, row]
         u, v, q = us[row], vs[row], qs[row]
+        # Without branches, over numbers that lie side by side: vector instructions.
         for n in range(range_m.shape[1]):
+            # Eq. 1 and 4: the point is range times unit ray, (a, b, c) d. Eq. 5: into the other camera's frame.
             X = (r00 * a[n] + r01 * b[n] + r02 * c[n]) * d[n] + t0
             Y = (r10 * a[n] + r11 * b[n] + r12 * c[n]) * d[n] + t1
             Z = (r20 * a[n] + r21 * b[n] + r22 * c[n]) * d[n] + t2
+            # Eq. 6, on the plane at distance 1.
             w = one / Z
             x, y = X * w, Y * w
+            # Brown's distortion, then Eq. 6's f' and the shift to the calibrated principal point.
             s = x * x + y * y
             radial = one + s * (k1 + s * (k2 + s * k3))
-            seen = (f(0.0) < Z) & (s < limit)
             uu = (x * radial + two * p1 * x * y + p2 * (s + two * x * x)) * fx + cx
             vv = (y * radial + p1 * (s + two * y * y) + two * p2 * x * y) * fy + cy
+            # Behind the camera, or where the distortion folds over, there is no pixel.
+            seen = (f(0.0) < Z) & (s < limit)
             u[n] = uu if seen else none
             v[n] = vv
             q[n] = one / math.sqrt(X * X + Y * Y + Z * Z)
@@ -82,19 +86,20 @@ def label_into(
     width: int,
     height: int,
 ) -> None:
-    """Label points that are out of another camera's view, or behind what it sees there; others keep their label.
+    """Label points out of another camera's view, or behind the surface that it sees there; others keep their label.
 
     Args:
-        labels: (H, W); only what is OK is looked at.
+        labels: (H, W); only pixels labelled OK are examined.
         us: (H, W) of `places_into`.
         vs: (H, W)
         qs: (H, W)
-        least: (h, w) 1 / metres: a point with less lies behind what the camera sees around a place.
+        least: (h, w) 1 / metres: a point with less lies behind the surface around a place.
         step_px: pixels of the camera along one of `least`.
         width: of the camera's image.
-        height: of it.
+        height: of the camera's image.
     """
     f = np.float32
+    # The centre of the top-left pixel is (0, 0), so the image begins half a pixel before it.
     right, bottom, first = f(width - 0.5), f(height - 0.5), f(-0.5)
     share, half = f(1.0 / step_px), f(0.5)
     for row in range(labels.shape[0]):
@@ -102,6 +107,7 @@ def label_into(
             if labels[row, n] != OK:
                 continue
             u, v = us[row, n], vs[row, n]
+            # Written so that NaN, a point without a pixel, is out of view too.
             if not (u >= first and v >= first and u < right and v < bottom):
                 labels[row, n] = OUT_OF_VIEW
                 continue
@@ -127,6 +133,7 @@ def sample_into(values: Singles, labels: Labels, us: Singles, vs: Singles, image
         for n in range(labels.shape[1]):
             if labels[row, n] != OK:
                 continue
+            # The four pixels around the place; on the border's outer half pixel they are the border's.
             u, v = max(us[row, n], f(0.0)), max(vs[row, n], f(0.0))
             x, y = min(int(u), right), min(int(v), bottom)
             x1, y1 = min(x + 1, right), min(y + 1, bottom)
@@ -136,6 +143,7 @@ def sample_into(values: Singles, labels: Labels, us: Singles, vs: Singles, image
                 lower = image[y1, x, c] * (f(1.0) - a) + image[y1, x1, c] * a
                 value = upper * (f(1.0) - b) + lower * b
                 values[row, n, c] = value
+                # NaN times a weight of 0 is NaN: a pixel without a value spoils each mean that it is in.
                 if math.isnan(value):
                     labels[row, n] = NO_READING
 

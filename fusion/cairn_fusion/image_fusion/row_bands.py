@@ -1,4 +1,4 @@
-"""Work on an image's rows by all cores: kernels let go of the interpreter's lock, and bands of rows share nothing."""
+"""Bands of an image's rows, worked on by all cores: kernels release the interpreter's lock, and bands share nothing."""
 
 import os
 from collections.abc import Callable
@@ -6,11 +6,11 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 BANDS_PER_CORE = 2
-"""Some bands are harder than others."""
+"""Bands take different times, so there are more of them than cores."""
 
 
 def run_in_bands(work: Callable[[int, int], None], rows: int) -> None:
-    """Call `work(first, last)` for bands that make up all rows, at once; what it raises is raised."""
+    """Call `work(first, last)` for bands that make up all rows, in parallel; its errors are raised here."""
     cores = os.cpu_count() or 1
     count = max(1, min(BANDS_PER_CORE * cores, rows)) if cores > 1 else 1
     edges = [rows * n // count for n in range(count + 1)]

@@ -1,9 +1,17 @@
-"""The surface that a scan's range image shows, and how it looks from the rig's other cameras.
+"""Surface of a scan's range image, and its image in the rig's other cameras.
 
-    range image --labels, steps--> pixels joints to a surface --Eq. 1-6--> 1 / range, drawn coarsely in each camera
+    range image --labels, steps--> pixels joined to a surface --Eq. 1-6--> 1 / range, drawn coarsely in each camera
 
-It is drawn about twice as fine as the range camera sees: there is no more in it. Drawn are triangles between pixels
-of one surface, and the nearest wins; across a step in depth nothing is drawn, because nobody knows what is there.
+It is drawn about twice as fine as the range image: more detail is not in it. Triangles between pixels of one surface
+are drawn, and the nearest wins; across a step in depth nothing is drawn, because the space there is unknown. Labels:
+
+    OK          a range within limits
+    NO_RANGE    nothing came back, or from beyond the limits
+    SATURATED   too much light came back: retroreflecting tape, bare metal face to face
+    FLYING      a mixture of a near and a far surface (`flying_kernels`)
+
+Behind glass and in mirrors a time-of-flight camera measures the path of its light, which a range alone does not show; a
+map may (`mirror_labels`).
 """
 
 import math
@@ -38,24 +46,23 @@ from cairn_map.render.camera_rays import CameraRays
 
 Values = npt.NDArray[np.float32]
 COVER = 1.5
-"""Width of what a range pixel covers, over the distance to the next one: slanted surfaces are sampled more widely."""
-
+"""Width of a range pixel in `live_range`, over the distance to the next one: slanted surfaces are sampled wider."""
 MIN_RANGE_M = 0.1
 MAX_RANGE_M = 10.0
 FLYING_STEP_M = 0.05
-"""As `integrate.Integrator` has them."""
+"""Limits of `range_labels`, as those of `integrate.Integrator`."""
 AMPLITUDE_MAX = 65535
-
+"""Highest count of an amplitude image."""
 JOIN_SIGMAS = 3 * math.sqrt(2)
-"""Of the range: what a step between two pixels of one surface may have from noise."""
+"""Largest step between two pixels of one surface by noise alone, standard deviations of the range."""
 JOIN_STEP_M = 0.06
-"""A lower step is none: the views of cameras 10 cm apart differ by 2 colour pixels where it is at 2 m."""
+"""Smaller steps do not count: at 2 m the views of cameras 10 cm apart differ there by 2 colour pixels."""
 DRAWN_PER_PIXEL = 2.2
-"""Drawn pixels along a range pixel, about."""
+"""Drawn pixels along a range pixel, approximately."""
 EDGE_REACH = 0.6
-"""How far around a range pixel something may hide what is behind it, in range pixels: its half, and a little."""
+"""Reach of occlusion around a range pixel, range pixels: half of it, and a little."""
 BORROW_PX = 6
-"""How far from a pixel with a range one without is shown, range pixels."""
+"""Largest distance from a pixel without a range to the one whose range it borrows, range pixels."""
 
 
 def range_labels(
@@ -69,36 +76,36 @@ def range_labels(
     """(H, W) uint8 `Label` of each pixel of the scan's range camera: OK, NO_RANGE, SATURATED or FLYING.
 
     Args:
-        scan: its range and, to know saturated pixels, amplitude are looked at.
+        scan: with a range image and, to detect saturated pixels, an amplitude image.
         rig: with the range camera.
-        min_range_m: nearer returns are not believed.
-        max_range_m: nor farther ones.
-        flying_step_m: how far a flying pixel must be from both its neighbours; infinite: none flies.
+        min_range_m: nearer returns are ignored.
+        max_range_m: farther returns are ignored.
+        flying_step_m: least difference of a flying pixel from both its neighbours; infinite: no pixel flies.
     """
     range_m = rig[scan.range_camera].true_ranges(scan.range_m, scan.amplitude)
     labels = np.full(range_m.shape, Label.OK, np.uint8)
     labels[flying_pixels(range_m, flying_step_m)] = Label.FLYING
-    # A comparison with NaN is false.
+    # Written so that NaN is outside the limits; a later label replaces an earlier one.
     labels[~((range_m >= min_range_m) & (range_m <= max_range_m))] = Label.NO_RANGE
     labels[full_pixels(scan, rig[scan.range_camera])] = Label.SATURATED
-    if scan.amplitude is not None:  # no count is higher: full, whatever the rig says
+    if scan.amplitude is not None:  # no count is higher, so it is saturated whatever the rig states
         labels[scan.amplitude == AMPLITUDE_MAX] = Label.SATURATED
     return labels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RangeSurface:
-    """What one range image shows."""
+    """Surface of one range image."""
 
     range_camera: str
     range_m: Singles
-    """(H, W) metres along the beam; of a pixel without a trusted one that of the nearest pixel with one, or NaN."""
+    """(H, W) metres along the beam; a pixel without a trusted range has that of the nearest with one, or NaN."""
     labels: Labels
-    """(H, W) of `range_labels`."""
+    """(H, W) `Label` by `range_labels`."""
     across: Flags
-    """(H, W) whether a pixel and the next in its row are of one surface."""
+    """(H, W) true if a pixel and the next in its row are of one surface."""
     down: Flags
-    """(H, W) and the next in its column."""
+    """(H, W) true if a pixel and the next in its column are of one surface."""
     fronts: Flags
     """(H, W) pixels where a surface ends before a farther one."""
 
@@ -114,22 +121,22 @@ class Drawn:
     nearness: Singles
     """1 / range from the camera, 1 / metres; 0 where nothing is known."""
     marks: Labels
-    """Where nothing is known, why: `Label`."""
+    """Reason where no range is known: `Label`."""
     hiding: Singles
     """1 / range of the nearest around, 1 / metres, with the half pixels beyond edges; 0 where nothing is known."""
     slack: Singles
-    """How much that may be more than the surface at the place, 1 / metres, because it slants."""
+    """Largest excess of `hiding` over the surface at the same place by slant, 1 / metres."""
 
 
 def surface_of(scan: Scan, rig: Rig, beyond: Flags | None = None) -> RangeSurface:
-    """The surface of a scan's range image, but for what a map says that a mirror shows: (H, W) `mirror_pixels`."""
+    """Surface of a scan's range image, without reflections in mirrors that a map shows: (H, W) `mirror_pixels`."""
     labels, mounted = range_labels(scan, rig), rig[scan.range_camera]
     if beyond is not None:
         labels[beyond & (labels == Label.OK)] = Label.BEYOND
     range_m = mounted.true_ranges(scan.range_m, scan.amplitude)
     noise_m = np.maximum(JOIN_SIGMAS * mounted.range_sigma_image(range_m), JOIN_STEP_M).astype(np.float32)
     shown_m = borrowed_ranges(range_m, labels, BORROW_PX)
-    # A mirror may be large; what it shows is about where the mirror is, for cameras so near to each other.
+    # A mirror may be larger than the borrowing reach; its reflection lies in about the same pixels for near cameras.
     shown_m = np.where(np.isnan(shown_m) & (labels == Label.BEYOND), range_m, shown_m)
     across, down = (joints(range_m, labels, noise_m, *step) for step in ((1, 0), (0, 1)))
     return RangeSurface(
@@ -148,8 +155,9 @@ def drawn_surface(surface: RangeSurface, rig: Rig, camera: str) -> Drawn:
     Args:
         surface: of a scan.
         rig: its rig.
-        camera: to look from.
+        camera: camera that sees it.
     """
+    # Stage 1: the range pixels in that camera (Eq. 1-6), in drawn pixels.
     src, dst = rig[surface.range_camera], rig[camera]
     seen_by, ratio = dst.camera, dst.camera.focal_px[0] / src.camera.focal_px[0]
     step = max(1, round(ratio / DRAWN_PER_PIXEL))
@@ -157,6 +165,7 @@ def drawn_surface(surface: RangeSurface, rig: Rig, camera: str) -> Drawn:
     # Pixel k drawn stands for the camera's k step to k step + step - 1.
     u, v = (((axis - (step - 1) / 2) / step).astype(np.float64) for axis in at[:2])
     q = at[2].astype(np.float64)
+    # Stage 2: triangles; trusted pixels that have none, as squares; and reasons where nothing is drawn.
     shape = -(-seen_by.height // step), -(-seen_by.width // step)
     nearness, marks, drawn = (
         np.zeros(shape, np.float32),
@@ -167,6 +176,7 @@ def drawn_surface(surface: RangeSurface, rig: Rig, camera: str) -> Drawn:
     trusted, per_pixel = surface.labels == Label.OK, ratio / step
     draw_squares_into(nearness, trusted & ~drawn, u, v, q, 0.5 * per_pixel)
     draw_labels_into(marks, nearness, surface.labels, u, v, 0.5 * per_pixel)
+    # Stage 3: the surface as an occluder, widened at the edges that the range image resolves to a pixel only.
     edges = nearness.copy()
     draw_squares_into(edges, surface.fronts, u, v, q, EDGE_REACH * per_pixel)
     hiding = nearest_of_nine(edges)
@@ -176,13 +186,13 @@ def drawn_surface(surface: RangeSurface, rig: Rig, camera: str) -> Drawn:
 
 
 def places(range_m: Singles, rays: Singles, dst: AnyCamera, T_dst_src: Transform) -> tuple[Singles, Singles, Singles]:
-    """Where the points of an image appear in another camera.
+    """Pixels of an image's points in another camera.
 
     Args:
         range_m: (H, W) metres along the beams; NaN for no point.
         rays: (3, H, W) float32, their unit rays, frame of the image's camera: `beams`, or some of them.
-        dst: to look from.
-        T_dst_src: its place.
+        dst: the other camera.
+        T_dst_src: from the image's camera to the other.
 
     Returns:
         (H, W) float32 each: x and y, pixels, also beyond the image, x NaN for a point that `dst` cannot see; and
@@ -208,7 +218,7 @@ def places(range_m: Singles, rays: Singles, dst: AnyCamera, T_dst_src: Transform
 
 @lru_cache(maxsize=16)
 def beams(camera: AnyCamera) -> Singles:
-    """(3, H, W) float32 unit ray of every pixel: as vector instructions like them; read-only."""
+    """(3, H, W) float32 unit ray of every pixel, axis by axis for vector instructions; read-only."""
     planes = np.ascontiguousarray(np.moveaxis(camera.rays(), -1, 0), dtype=np.float32)
     planes.setflags(write=False)
     return planes
@@ -216,12 +226,12 @@ def beams(camera: AnyCamera) -> Singles:
 
 @lru_cache(maxsize=16)
 def sight_of(camera: AnyCamera) -> CameraRays:
-    """A camera's rays as a map is drawn for them; kept, for what is worked out of them is."""
+    """A camera's rays as input of map rendering; cached, because results for them are cached too."""
     return CameraRays(camera.rays())
 
 
 def _slack(nearness: Singles, hiding: Singles) -> Singles:
-    """(h, w) what a slanted surface differs by from its nearest neighbour, on a place where it goes on."""
+    """(h, w) difference of a slanted surface from its nearest neighbour, where the surface goes on."""
     steps = np.zeros_like(nearness)
     for axis in (0, 1):
         ahead = np.abs(np.diff(nearness, axis=axis, append=np.float32(np.inf)))
@@ -232,10 +242,11 @@ def _slack(nearness: Singles, hiding: Singles) -> Singles:
 
 
 def live_range(scan: Scan, rig: Rig, *, camera: str, beyond: npt.NDArray[np.bool_] | None = None) -> Values:
-    """(H, W) float32, metres along the rays of a camera; NaN where the range camera says nothing.
+    """Live depth of any camera, from the range camera's image: (H, W) float32, metres along its rays; NaN for unknown.
 
-    Nor does it where too much light came back or two surfaces are mixed (`range_labels`), or where it shows what is in
-    a mirror: `beyond`, (H, W) of the range camera, from `mirror_pixels`.
+    Each range pixel covers as many of the camera's as lie between it and its neighbours; where several do, the nearest
+    counts. Saturated and flying pixels (`range_labels`) are left out, and reflections in mirrors: `beyond`, (H, W) of
+    the range camera, from `mirror_pixels`. It is for viewing and for occlusion; it never becomes evidence.
 
     Raises:
         BadInputError: kind `unknown_camera`, or images of another size.
@@ -260,7 +271,7 @@ def live_range(scan: Scan, rig: Rig, *, camera: str, beyond: npt.NDArray[np.bool
 
 
 def _pixel_rad(rays: npt.NDArray[np.float64]) -> float:
-    """Angle between neighbouring pixels in the middle of an image."""
+    """Angle between neighbouring pixels in the middle of an image, radians."""
     row = rays[rays.shape[0] // 2]
     middle = len(row) // 2
     return float(np.linalg.norm(row[middle] - row[middle - 1]))

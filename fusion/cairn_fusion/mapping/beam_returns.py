@@ -1,10 +1,14 @@
-"""What came back to a scan's range camera: points of the map, and what the camera knows beyond them.
+"""Returns of a scan's range camera: points of the map, and the certainly clear length of its beams.
 
-    range_m    a hit each              no flying pixels, no full ones, not the robot's own body, within limits
-    shield_m   what each pixel saw     flying pixels and the body too: a neighbour may have seen a part of it
-    silent     beams that met nothing  where the rig says that silence means emptiness
+    range_m    a hit each              without flying and saturated pixels and the robot's own body, within limits
+    shield_m   nearest range           with flying pixels and the body: a neighbour may have seen a part of it
+    silent     beams without a return  where the rig states that no return means empty space
 
-A pixel that is in none of the three says nothing. What the rig says that its camera adds to ranges is taken off first.
+A pixel in none of the three has no information. The rig's range bias is subtracted first. Beams are clear up to
+
+    carved images    nearest neighbour - max(1 voxel, k sigma)      `clear_kernels`: edges and slants widen it
+    single beams     range - max(1 voxel, k sigma)                  lidars: their neighbours are far apart
+    silent beams     `no_return_clears_m`, where the rig states it
 """
 
 import math
@@ -23,29 +27,30 @@ from cairn_fusion.recording.scan import Scan, check_scan
 from cairn_map.arrays import Flags, Floats, Singles
 
 MARGIN_VOXELS = 1.0
-"""How far before a surface a voxel's centre must be to be free: a little more than half a voxel's diagonal, 0.87."""
+"""Distance of a free voxel's centre from a surface, voxels: a little more than half a voxel's diagonal, 0.87."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Returns:
-    """What came back to the range camera of a scan: N points."""
+    """N points that came back to the range camera of a scan, and its other information about space."""
 
     T_map_tof: Transform
     range_m: Singles
-    """(H, W) within limits; NaN elsewhere."""
+    """(H, W) metres along the beam, within limits; NaN elsewhere."""
     shield_m: Singles
-    """(H, W) as `range_m`, with flying pixels and the robot's body; beside them nothing beyond is free."""
+    """(H, W) as `range_m`, with flying pixels and the robot's body: nothing behind their neighbours is free."""
     silent: Flags
-    """(H, W) nothing came back, and the camera is known to see whatever is within `silent_m`."""
+    """(H, W) true where nothing came back although the camera sees any surface within `silent_m`."""
     silent_m: float
+    """Clear length of silent beams, metres."""
     pixels: npt.NDArray[np.int32]
-    """(N,) numbers of the pixels."""
+    """(N,) numbers of the pixels with a range, row by row."""
     points_map: Floats
-    """(N, 3)"""
+    """(N, 3) metres, map frame."""
 
     @property
     def reach_m(self) -> float:
-        """How far away anything is that this says; 0 when it says nothing."""
+        """Length of the longest beam with information, metres; 0 without any."""
         farthest_m = float(np.nanmax(self.range_m)) if len(self.pixels) else 0.0
         return max(farthest_m, self.silent_m if self.silent.any() else 0.0)
 
@@ -53,7 +58,7 @@ class Returns:
 def returns_of(
     scan: Scan, rig: Rig, *, min_range_m: float, max_range_m: float, flying_step_m: float = math.inf
 ) -> Returns:
-    """The points of a scan (Eq. 1-5), and what else its range image says.
+    """Returns of a scan (Eq. 1-5).
 
     Raises:
         BadInputError: an image does not fit its camera.
@@ -62,18 +67,20 @@ def returns_of(
     mounted = rig[scan.range_camera]
     true_m = mounted.true_ranges(scan.range_m, scan.amplitude)
     T_map_tof = scan.T_map_rig @ mounted.transform
+    # Hits: within limits, not saturated; `shield_m` is taken before flying pixels and the body are left out.
     full = full_pixels(scan, mounted)
     within = (true_m >= min_range_m) & (true_m <= max_range_m) & ~full
     shield_m = np.where(within, true_m, np.float32(np.nan))
     if flying_step_m < math.inf:
         within &= ~flying_pixels(true_m, flying_step_m)
+    # Silence means empty space only where the rig states it, and not where too much light returned.
     silent_m = min(mounted.known_sensing.no_return_clears_m or 0.0, max_range_m)
     silent = np.isnan(true_m) & ~full & (silent_m > 0)
     if rig.body is not None:
         T_body_tof = mounted.transform if scan.T_map_body is None else inverse(scan.T_map_body) @ T_map_tof
         within &= ~_on_body(rig.body, true_m, mounted, T_body_tof)
         if silent.any():
-            # What hides behind the body, or is it, may well return nothing.
+            # A beam that the body stops may return nothing.
             beams = mounted.camera.rays() @ T_body_tof[:3, :3].T
             silent &= ~rig.body.stops(T_body_tof[:3, 3], beams, silent_m)
     range_m = np.where(within, true_m, np.float32(np.nan))
@@ -82,7 +89,7 @@ def returns_of(
 
 
 def full_pixels(scan: Scan, mounted: MountedCamera) -> Flags:
-    """(H, W) where too much light returned for a range."""
+    """(H, W) true where too much light returned for a range."""
     limit = mounted.known_sensing.saturated_amplitude
     if limit is None or scan.amplitude is None:
         return np.zeros(scan.range_m.shape, bool)
@@ -90,19 +97,19 @@ def full_pixels(scan: Scan, mounted: MountedCamera) -> Flags:
 
 
 def _on_body(body: Body, range_m: Singles, mounted: MountedCamera, T_body_tof: Transform) -> Flags:
-    """(H, W) where the point lies on the robot itself."""
+    """(H, W) true where the point lies on the robot itself."""
     with np.errstate(invalid="ignore"):  # an endless range along an axis: 0 times infinity
         points_tof = mounted.camera.rays() * range_m[..., None].astype(np.float64)
     return body.holds(transform_points(T_body_tof, points_tof))
 
 
 def margins_m(sigma_m: Floats, *, voxel_edge_m: float, noise_sigmas: float) -> Floats:
-    """(...) what to keep before a surface whose range has a standard deviation, metres; NaN for NaN."""
+    """(...) margins before surfaces, metres, by the standard deviation of their range; NaN for NaN."""
     return np.asarray(np.maximum(MARGIN_VOXELS * voxel_edge_m, noise_sigmas * sigma_m))
 
 
 def clear_image(returns: Returns, mounted: MountedCamera, *, voxel_edge_m: float, noise_sigmas: float) -> Singles:
-    """(H, W) how far each pixel of an image without gaps between its pixels is clear, metres; 0 for not known."""
+    """(H, W) clear range of each pixel of an image without gaps between its pixels, metres; 0 for unknown."""
     nearest_m, share = nearest_around(
         np.where(returns.silent, np.float32(np.inf), returns.range_m),
         returns.shield_m,

@@ -1,12 +1,12 @@
-"""A measurement's evidence while it grows: bricks of 8^3 voxels around the head, counted scan by scan.
+"""Tallies of a measurement's evidence: dense bricks of 8^3 voxels around the head, counted scan by scan.
 
     slot_of  [brick of the box] -> slot       misses   [slot, 512]     every brick that was seen
     table_of [brick of the box] -> table      row_of   [table, 512] -> row of hits and samples, only bricks with hits
 
 Hits and misses share nothing, so that one thread can add a scan's hits while another adds another scan's misses.
-The box is as large as the sensor reaches from where the first scan was taken, and a little more: the head moves. A scan
-that does not fit goes into a new tally. Counts are 16 bits: a measurement has at most 4096 scans, and a scan counts a
-voxel once.
+The box is as large as the sensor reaches from the place of the first scan, and a little more: the head moves. A scan
+that does not fit goes into a new tally (`TallyPool`). Counts are 16 bits: a measurement has at most 4096 scans, and a
+scan counts a voxel once. All sums are integers, so the evidence does not depend on which thread counts which scan.
 """
 
 import math
@@ -35,17 +35,17 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 MOVE_M = 1.0
-"""How far the head may move within a tally."""
+"""Movement of the head within one tally, metres."""
 BOX_BRICKS = 1 << 24
 """64 MB of index: 20 m across at 1 cm."""
 BOX_BRICKS_MAX = 1 << 27
 """512 MB of index: 40 m at 1 cm."""
 RESERVED = 1 << 26
-"""Bytes of a first array; what is not written costs no memory. Above the 32 MB that glibc may keep, and then clears."""
+"""Bytes of a first array: above the 32 MB that glibc may reuse and then clears; untouched pages cost no memory."""
 
 
 class ScanHits:
-    """The voxels that one scan hit: numbered, and found by brick. Of one thread; used again for scan after scan."""
+    """Voxels that one scan hit, numbered and found by brick; for one thread, and used again for scan after scan."""
 
     def __init__(self) -> None:
         self._table_of: Int32s = np.empty(0, np.int32)
@@ -53,12 +53,12 @@ class ScanHits:
         self._struck: Int32s = np.empty((0, 512), np.int32)
         self._used = 0
         self.scratch = Scratch()
-        """For the views of the same thread."""
+        """Memory for the views of the same thread."""
         self.voxels: Ints = np.empty(0, np.int64)
-        """(U,) brick number of the box times 512 plus place, by number."""
+        """(U,) voxels by number: number of the brick in the box times 512, plus place in the brick."""
 
     def number(self, points_m: Floats, tally: "BrickTally") -> tuple[Int32s, int]:
-        """Number the different voxels of a tally's box that (N, 3) points hit: (N,) each point's, and how many.
+        """Number the different voxels of a tally's box that (N, 3) points hit: (N,) numbers by point, and their count.
 
         Raises:
             BadInputError: a point lies outside the box.
@@ -66,6 +66,7 @@ class ScanHits:
         voxels = kernels.hit_voxels(points_m, tally.geometry.voxel_edge_um * 1000, tally.corner, tally.dims)
         if (voxels < 0).any():
             raise BadInputError("scan_too_large", "a point lies outside the tally's box")
+        # First the bricks with hits, then a table of numbers for each; both arrays are zeros between scans.
         bricks = int(np.prod(tally.dims))
         self._table_of = _grown(self._table_of, bricks, 0)
         self._bricks = _grown(self._bricks, min(len(voxels), bricks), 0)
@@ -98,6 +99,7 @@ class BrickTally:
         """(3,) the box's first voxel."""
         self.dims: Ints = high - low + 1
         """(3,) bricks of the box."""
+        # Two locks, since hits and misses share nothing. Indexes hold places plus one: 0 is none.
         bricks = int(np.prod(self.dims))
         self._misses_lock, self._hits_lock = Lock(), Lock()
         self._slot_of, self._table_of = np.zeros(bricks, np.int32), np.zeros(bricks, np.int32)
@@ -109,13 +111,14 @@ class BrickTally:
         self._slots = self._tables = self._rows = 0
 
     def holds(self, origin_m: Floats, farthest_m: float) -> bool:
-        """Whether a scan from there, which reaches so far, fits."""
+        """True if a scan from this place that reaches so far fits."""
         return float(np.abs(origin_m - self._centre_m).max()) + farthest_m <= self._reach_m
 
     def add_hits(self, hits: ScanHits, sums: Ints) -> None:
         """Count a hit, and add a row of (U, P) sums, for each voxel that a scan hit."""
         voxels = hits.voxels
         with self._hits_lock:
+            # Room for the worst case, then tables for new bricks and rows for new voxels.
             self._hit_bricks = _grown(self._hit_bricks, self._tables + len(voxels), self._tables)
             tables = kernels.claim_into(voxels, 9, self._table_of, self._hit_bricks, self._tables)
             self._row_of = _grown(self._row_of, tables, self._tables)
@@ -126,7 +129,8 @@ class BrickTally:
             kernels.add_hits_into(self._sums, rows, sums)
 
     def add_misses(self, hits: ScanHits, carving: Carving) -> None:
-        """Count a miss in what a view looks through, but not where the same scan hit."""
+        """Count a miss in each voxel that a view looks through, except where the same scan hit."""
+        # The scan's own hits need no lock: they belong to this thread.
         tables, struck = hits.tables_of(carving.bricks)
         bricks = carving.bricks
         with self._misses_lock:
@@ -151,14 +155,15 @@ class BrickTally:
         """Packed evidence of all cells that hold any, rising in number.
 
         Args:
-            each: as `map`, which calls the function for one cell after the other; a pool's may do some at once.
+            each: as `map`, which calls the function for one cell after the other; a pool's may do some in parallel.
         """
+        # Stage 1: all bricks with a count, each once, with their coordinates in the map.
         hit = self._hit_bricks[: self._tables]
         bricks = np.concatenate([self._seen_bricks[: self._slots], hit[self._slot_of[hit] == 0]]).astype(np.int64)
         w, h = int(self.dims[0]), int(self.dims[1])
         xyz = np.stack([bricks % w, bricks // w % h, bricks // (w * h)], axis=1) + (self.corner >> BRICK_DEPTH)
         up = self.geometry.depth - BRICK_DEPTH
-        # From the first cell of the box: all bits of a brick's number and its cell's in one.
+        # Stage 2: in order of cell and brick. Counted from the box's first cell, both numbers fit one Morton code.
         numbers = interleave(xyz - (self.corner >> self.geometry.depth << up))
         order = np.argsort(numbers)
         xyz, bricks, numbers = xyz[order], bricks[order], numbers[order]
@@ -167,36 +172,46 @@ class BrickTally:
         inner = (numbers & np.uint64((1 << 3 * up) - 1)).astype(np.int32)
         if not len(keys):
             return {}
+        # Stage 3: sizes of all cells' arrays.
         slots, tables = self._slot_of[bricks] - np.int32(1), self._table_of[bricks] - np.int32(1)
         parts = [slice(*ends) for ends in pairwise([*first.tolist(), len(bricks)])]
         counted = [kernels.count_known(slots[part], tables[part], self._misses, self._row_of) for part in parts]
         ends = np.cumsum([(0, 0), *counted], axis=0)
         V, S = ends[-1].tolist()
-        # One array for all cells, as large as may be: memory by the page costs more than all that is written to it.
+        # One array for all cells: fresh pages cost more than everything that is written to them.
         voxels, counts = np.empty(V, np.uint32), np.empty((V, 2), np.int32)
         sampled, samples = np.empty(S, np.uint32), np.empty((S, self.geometry.plane_count), np.int64)
 
         def evidence(n: int) -> Evidence:
             part, of_voxels, of_samples = parts[n], slice(*ends[n : n + 2, 0]), slice(*ends[n : n + 2, 1])
             rows = kernels.pack_known_into(
-                *(slots[part], tables[part], inner[part], self._misses, self._row_of, self._sums),
-                *(voxels[of_voxels], counts[of_voxels], sampled[of_samples], samples[of_samples]),
+                slots[part],
+                tables[part],
+                inner[part],
+                self._misses,
+                self._row_of,
+                self._sums,
+                voxels[of_voxels],
+                counts[of_voxels],
+                sampled[of_samples],
+                samples[of_samples],
             )
             own = slice(of_samples.start, of_samples.start + rows)
             return Evidence(voxels[of_voxels], counts[of_voxels], sampled[own], samples[own])
 
-        # The largest first, so that no thread is left with one when the others are done.
+        # Stage 4: the largest first, so that no thread is left with one when the others are done.
         largest_first = sorted((n for n in range(len(keys)) if counted[n][0]), key=lambda n: -counted[n][0])
         packed = zip(largest_first, each(evidence, largest_first), strict=True)
         return {keys[n]: part for n, part in sorted(packed, key=lambda cell: keys[cell[0]])}
 
 
 def tally_around(origin_m: Floats, farthest_m: float, geometry: Geometry, *, max_range_m: float) -> BrickTally:
-    """A tally for a scan from there that reaches so far, and for those that follow if memory allows.
+    """A tally for a scan from this place that reaches so far, and for those that follow if memory allows.
 
     Raises:
         BadInputError: the scan alone spans more bricks than fit in memory; limit the range or coarsen the map.
     """
+    # As far as the sensor reaches, if memory allows, else just this scan and a brick of room.
     brick_m = 8 * geometry.voxel_edge_m
     for reach_m, bricks_max in ((max_range_m + MOVE_M, BOX_BRICKS), (1.01 * farthest_m + brick_m, BOX_BRICKS_MAX)):
         if (2 * reach_m / brick_m + 2) ** 3 <= bricks_max:
@@ -215,6 +230,7 @@ def _grown(array: npt.NDArray[Scalar], needed: int, used: int) -> npt.NDArray[Sc
     """
     if needed <= len(array):
         return array
+    # Zeros come from the system, page by page when first written.
     entry = max(1, array.dtype.itemsize * math.prod(array.shape[1:]))
     grown = np.zeros((max(needed, 2 * len(array), RESERVED // entry), *array.shape[1:]), array.dtype)
     grown[:used] = array[:used]
@@ -222,17 +238,17 @@ def _grown(array: npt.NDArray[Scalar], needed: int, used: int) -> npt.NDArray[Sc
 
 
 class TallyPool:
-    """Evidence of many scans; thread-safe but for `packed`. Memory: see `tally`."""
+    """Evidence of many scans: open tallies, and the sum of those that were closed; thread-safe except for `packed`."""
 
     def __init__(self, geometry: Geometry, *, max_range_m: float, around_m: Floats | None = None) -> None:
-        """Args: around_m: (3,) where the first tally is to be centred; None: where the first scan was taken."""
+        """Args: around_m: (3,) centre of the first tally, metres; None: the place of the first scan."""
         self._geometry = geometry
         self._max_range_m = max_range_m
         self._around_m = around_m
         self._lock = Lock()
         self._closed = EvidenceMap(geometry)
         self._users: dict[BrickTally, int] = {}
-        """How many threads are adding to each open tally."""
+        """Number of threads that are adding to each open tally."""
         self._idle: list[ScanHits] = []
 
     def merge(self, diff: Diff) -> None:
@@ -242,11 +258,12 @@ class TallyPool:
 
     @contextmanager
     def around(self, origin_m: Floats, farthest_m: float) -> Iterator[tuple[BrickTally, ScanHits]]:
-        """A tally that holds a scan from there that reaches so far, and a scratch that no other thread uses meanwhile.
+        """A tally that holds a scan from this place that reaches so far, and hits that no other thread uses meanwhile.
 
         Raises:
             BadInputError: as `tally_around`.
         """
+        # Under the lock only the choice; counting takes the tally's own locks.
         with self._lock:
             tally = next((tally for tally in self._users if tally.holds(origin_m, farthest_m)), None)
             if tally is None:
@@ -257,6 +274,7 @@ class TallyPool:
         try:
             yield tally, hits
         finally:
+            # Also after an error: the next scan needs zeros.
             hits.forget()
             with self._lock:
                 self._users[tally] -= 1
@@ -271,6 +289,7 @@ class TallyPool:
         return self._closed.packed()
 
     def _new_tally(self, origin_m: Floats, farthest_m: float) -> BrickTally:
+        # The first tally at the place that was given, if this scan fits there.
         if self._around_m is not None:
             tally = tally_around(self._around_m, farthest_m, self._geometry, max_range_m=self._max_range_m)
             self._around_m = None
@@ -279,6 +298,7 @@ class TallyPool:
         return tally_around(origin_m, farthest_m, self._geometry, max_range_m=self._max_range_m)
 
     def _close_idle(self, each: Each = map) -> None:
+        # A tally in use stays open; memory is that of the open ones.
         for tally in [tally for tally, users in self._users.items() if not users]:
             self._closed.merge(tally.packed(each))
             del self._users[tally]

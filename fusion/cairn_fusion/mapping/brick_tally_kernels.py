@@ -1,4 +1,7 @@
-"""A measurement's evidence in dense bricks: finding the voxels that a scan hit, and packing them all in the end."""
+"""Kernels of `brick_tally`: voxels that a scan hit, their numbers, and the packing of a measurement's dense bricks.
+
+A voxel's number is its brick's number times 512 plus its place in the brick, in Morton order.
+"""
 
 import numba as nb
 import numpy as np
@@ -21,7 +24,9 @@ def returned_points(range_m: npt.NDArray[np.float32], rays: Floats, T_map_camera
         r = np.float64(flat[i])
         if np.isnan(r) or np.isnan(beams[i, 0]):
             continue
+        # Eq. 1 and 4: the range is measured along the beam, so the point is range times unit ray.
         x, y, z = r * beams[i, 0], r * beams[i, 1], r * beams[i, 2]
+        # Eq. 5, with the map in place of the other camera.
         for a in range(3):
             T = T_map_camera[a]
             points[count, a] = T[0] * x + T[1] * y + T[2] * z + T[3]
@@ -45,6 +50,7 @@ def hit_voxels(points_m: Floats, voxel_edge_nm: int, corner: Ints, dims: Ints) -
         for n in range(count):
             own[n] = points_m[n, axis]
         for n in range(count):
+            # The quotient may be off by one next to a border; the remainder, exact in whole nanometres, tells.
             x = np.rint(own[n] * NANOMETRES)
             i = np.floor(x * share)
             over = x - i * edge
@@ -54,9 +60,11 @@ def hit_voxels(points_m: Floats, voxel_edge_nm: int, corner: Ints, dims: Ints) -
     w, h = dims[0], dims[1]
     for n in range(count):
         i, j, k = places[0, n], places[1, n], places[2, n]
+        # Morton order: bit b of x, y, z becomes bit 3 b, 3 b + 1, 3 b + 2.
         place = (i & 1) | (i & 2) << 2 | (i & 4) << 4
         place |= (j & 1) << 1 | (j & 2) << 3 | (j & 4) << 5
         place |= (k & 1) << 2 | (k & 2) << 4 | (k & 4) << 6
+        # One negative coordinate makes the disjunction negative: outside the box.
         brick = (np.int64(k >> 3) * h + np.int64(j >> 3)) * w + np.int64(i >> 3)
         out[n] = brick << 9 | np.int64(place) if (i | j | k) >= 0 else -1
     return out
@@ -91,6 +99,7 @@ def number_hits_into(voxels: Ints, table_of: Int32s, struck: Int32s, touched: In
     count = 0
     for n in range(len(voxels)):
         table, place = table_of[voxels[n] >> 9] - 1, voxels[n] & 511
+        # Numbers are kept plus one, so that 0 means none and fresh memory needs no filling.
         number = struck[table, place]
         if number == 0:
             touched[count] = voxels[n]
@@ -103,6 +112,7 @@ def number_hits_into(voxels: Ints, table_of: Int32s, struck: Int32s, touched: In
 @nb.njit(cache=True, nogil=True)
 def forget_hits_into(bricks: Int32s, table_of: Int32s, struck: Int32s, touched: Ints) -> None:
     """Undo `number_hits_into` and `claim_into`."""
+    # Only the entries that were written: clearing the tables whole would cost more than the scan.
     for n in range(len(touched)):
         struck[table_of[touched[n] >> 9] - 1, touched[n] & 511] = 0
     for n in range(len(bricks)):
@@ -138,10 +148,12 @@ def add_hits_into(sums: Ints, rows: Int32s, added: Ints) -> None:
 @nb.njit(cache=True, nogil=True)
 def count_known(slots: Int32s, tables: Int32s, misses: Counts, row_of: Int32s) -> tuple[int, int]:
     """Voxels with a count, and those of them with a hit, in bricks with these slots and tables, -1 for none."""
+    # Three loops, so that each is free of branches: bricks with misses only, with hits only, with both.
     known, hit = np.int64(0), np.int64(0)
     for b in range(len(slots)):
         slot, table = slots[b], tables[b]
         if table < 0:
+            # A sum of comparisons becomes vector instructions.
             for i in range(512):
                 known += np.int64(misses[slot, i] > 0)
         elif slot < 0:
@@ -170,14 +182,15 @@ def pack_known_into(
 ) -> int:
     """Write the known voxels of a cell's bricks, given in rising order of number; returns rows of samples written.
 
-    As `count_known` for the first arguments; the last four are what `Evidence` holds.
+    The first arguments are those of `count_known`; the last four are the arrays of an `Evidence`.
     """
     kept, seen = np.empty(512, np.uint32), np.empty(512, np.uint16)
-    # Unsigned: Numba counts signed numbers from the end if they are negative, and asks each time.
+    # Unsigned: Numba counts signed numbers from the end if they are negative, and tests for it each time.
     at, row = np.uint64(0), np.uint64(0)
     for b in range(len(slots)):
         slot, table = slots[b], tables[b]
         first = np.uint32(numbers[b]) << np.uint32(9)
+        # Stage 1: the brick's misses, of which most bricks without hits have all or none.
         if slot >= 0:
             for i in range(512):
                 seen[i] = misses[slot, i]
@@ -195,32 +208,61 @@ def pack_known_into(
             continue
         if missed == 0 and table < 0:
             continue
-        known = np.uint64(0)
-        if table < 0:
-            for i in range(512):
-                kept[known] = i
-                known += np.uint64(seen[i] > 0)
-        else:
-            for i in range(512):
-                kept[known] = i
-                known += np.uint64((seen[i] > 0) | (row_of[table, i] > 0))
+        # Stage 2: the known voxels, with their misses.
+        known = _known_into(kept, seen, table, row_of)
         for n in range(known):
             i = kept[n]
             places[at + n] = first | i
             counts[at + n, 0] = 0
             counts[at + n, 1] = seen[i]
+        # Stage 3: hits and samples of those that were hit.
         if table >= 0:
-            for n in range(known):
-                struck = row_of[table, kept[n]] - 1
-                if struck < 0:
-                    continue
-                counts[at + n, 0] = sums[struck, 0]
-                some = False
-                for p in range(samples.shape[1]):
-                    samples[row, p] = sums[struck, 1 + p]
-                    some |= sums[struck, 1 + p] != 0
-                if some:
-                    sampled[row] = at + n
-                    row += np.uint64(1)
+            row = _pack_hits_into(counts, sampled, samples, kept, known, table, row_of, sums, at, row)
         at += known
     return int(row)
+
+
+@nb.njit(forceinline=True)
+def _known_into(kept: npt.NDArray[np.uint32], seen: Counts, table: int, row_of: Int32s) -> np.uint64:
+    """Places in a brick of the voxels with a miss or a hit, into `kept`; returns their number."""
+    known = np.uint64(0)
+    # Each place is written, and counts only if it is known: no branch that could be guessed wrong.
+    if table < 0:
+        for i in range(512):
+            kept[known] = i
+            known += np.uint64(seen[i] > 0)
+    else:
+        for i in range(512):
+            kept[known] = i
+            known += np.uint64((seen[i] > 0) | (row_of[table, i] > 0))
+    return known
+
+
+@nb.njit(forceinline=True)
+def _pack_hits_into(
+    counts: Int32s,
+    sampled: npt.NDArray[np.uint32],
+    samples: Ints,
+    kept: npt.NDArray[np.uint32],
+    known: np.uint64,
+    table: int,
+    row_of: Int32s,
+    sums: Ints,
+    at: np.uint64,
+    row: np.uint64,
+) -> np.uint64:
+    """Hits, and rows of samples from `row` on, of a brick's known voxels, which begin at `at`; returns the next row."""
+    for n in range(known):
+        struck = row_of[table, kept[n]] - 1
+        if struck < 0:
+            continue
+        counts[at + n, 0] = sums[struck, 0]
+        some = False
+        for p in range(samples.shape[1]):
+            samples[row, p] = sums[struck, 1 + p]
+            some |= sums[struck, 1 + p] != 0
+        # A row without any sample is written over by the next one.
+        if some:
+            sampled[row] = at + n
+            row += np.uint64(1)
+    return row

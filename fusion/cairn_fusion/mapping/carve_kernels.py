@@ -1,4 +1,4 @@
-"""Which voxels of which bricks a range image looks through; projectively, octant by octant.
+"""Voxels of bricks that a range image looks through; projectively, octant by octant.
 
     bricks --`cull_kernels`--> octants that are not seen | free: all of it | mixed
     mixed  --64 voxel centres into the image--> a miss where the centre is nearer than what the pixel saw
@@ -34,16 +34,17 @@ def carve_into(
 
     Args:
         misses: (B, 8, 64) of the pool, octants and their voxels in Morton order.
-        slots: (K,) where in the pool the bricks are; all different.
-        masks: (K,) which octants are free, and which are to be looked at voxel by voxel.
+        slots: (K,) places of the bricks in the pool; all different.
+        masks: (K,) octants that are free, and octants to be tested voxel by voxel.
         corners_view: (3, K) the centre of each brick's first voxel, camera frame.
         offsets_view: (3, 8, 64) from there to each voxel's centre.
-        squares: (H, W) padded image of how far each pixel is clear, squared; 0 where it is not.
+        squares: (H, W) padded image of each pixel's clear range, squared; 0 where it is not clear.
         lens: fx, fy, cx, cy of that image, with half a pixel added to the centre.
         min_square: nothing nearer than this, squared, is free.
         tables: (K,) the brick's row in `struck`; -1 for none.
         struck: (T, 8, 64) 0 where this scan has no hit.
     """
+    # By tested octant and voxel: number of the pixel, squared distance of the voxel, squared clear range of the pixel.
     where, squared, limit = np.empty((8, 64), np.uint32), np.empty((8, 64), np.float32), np.empty((8, 64), np.float32)
     where_flat, limit_flat = where.ravel(), limit.ravel()
     height, width = squares.shape
@@ -54,32 +55,58 @@ def carve_into(
         slot, mask, table = slots[k], masks[k], tables[k]
         bx, by, bz = corners_view[0, k], corners_view[1, k], corners_view[2, k]
         # Stage by stage, and without views of rows: those count references, atomically.
+        # Stage 1: the pixel that each voxel of a mixed octant falls on.
         tested = 0
         for n in range(8):
             if mask >> n & 256:
                 _addresses_into(where, squared, tested, offsets_view, n, bx, by, bz, fx, fy, cx, cy, width, height)
                 tested += 1
+        # Stage 2: how far that pixel is clear.
         for i in range(64 * tested):
             limit_flat[i] = flat[where_flat[i]]
+        # Stage 3: count.
         tested = 0
         for n in range(8):
             if mask >> n & 1:
-                if table < 0:
-                    for i in range(64):
-                        misses[slot, n, i] += np.uint16(1)
-                else:
-                    for i in range(64):
-                        misses[slot, n, i] += np.uint16(struck[table, n, i] == 0)
+                _count_free_into(misses, slot, n, table, struck)
             elif mask >> n & 256:
-                if table < 0:
-                    for i in range(64):
-                        free = (squared[tested, i] < limit[tested, i]) & (squared[tested, i] > nearest)
-                        misses[slot, n, i] += np.uint16(free)
-                else:
-                    for i in range(64):
-                        free = (squared[tested, i] < limit[tested, i]) & (squared[tested, i] > nearest)
-                        misses[slot, n, i] += np.uint16(free & (struck[table, n, i] == 0))
+                _count_nearer_into(misses, slot, n, table, struck, squared, limit, tested, nearest)
                 tested += 1
+
+
+@nb.njit(forceinline=True)
+def _count_free_into(misses: Counts, slot: int, octant: int, table: int, struck: Int32s) -> None:
+    """Count a miss in each voxel of a free octant that this scan did not hit."""
+    # A hit wins over a miss of the same scan; a brick without hits needs no test.
+    if table < 0:
+        for i in range(64):
+            misses[slot, octant, i] += np.uint16(1)
+    else:
+        for i in range(64):
+            misses[slot, octant, i] += np.uint16(struck[table, octant, i] == 0)
+
+
+@nb.njit(forceinline=True)
+def _count_nearer_into(
+    misses: Counts,
+    slot: int,
+    octant: int,
+    table: int,
+    struck: Int32s,
+    squared: Singles,
+    limit: Singles,
+    row: int,
+    nearest: np.float32,
+) -> None:
+    """Count a miss in each voxel of a mixed octant that lies before its pixel's clear range, and was not hit."""
+    if table < 0:
+        for i in range(64):
+            free = (squared[row, i] < limit[row, i]) & (squared[row, i] > nearest)
+            misses[slot, octant, i] += np.uint16(free)
+    else:
+        for i in range(64):
+            free = (squared[row, i] < limit[row, i]) & (squared[row, i] > nearest)
+            misses[slot, octant, i] += np.uint16(free & (struck[table, octant, i] == 0))
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
@@ -99,14 +126,15 @@ def _addresses_into(
     width: int,
     height: int,
 ) -> None:
-    """For each voxel of an octant the pixel that its centre falls on, 0 for none, and its squared distance."""
+    """Number of the pixel that each voxel centre of an octant falls on, 0 for none, and its squared distance."""
     zero, one = np.float32(0.0), np.float32(1.0)
     right, bottom = np.float32(width - 1), np.float32(height - 1)
     for i in range(64):
+        # Eq. 5 was done for the brick's first voxel, so the rest is a sum; then Eq. 6.
         x, y, z = bx + offsets[0, octant, i], by + offsets[1, octant, i], bz + offsets[2, octant, i]
         squared[row, i] = x * x + y * y + z * z
         inverse = one / z
         u = min(max(fx * (x * inverse) + cx, zero), right)
         v = min(max(fy * (y * inverse) + cy, zero), bottom)
-        # Pixel 0 is on the padded image's border, where nothing is clear; so is what lies behind the camera.
+        # Pixel 0 is on the padded image's border, where nothing is clear: it stands for points behind the camera.
         where[row, i] = np.int32(v) * np.int32(width) + np.int32(u) if z > zero else np.int32(0)

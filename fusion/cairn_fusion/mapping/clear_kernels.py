@@ -1,14 +1,14 @@
-"""How far each pixel of a range image is certainly clear.
+"""Certainly clear range of each pixel of a range image.
 
-A pixel sees no farther than the nearest that it or one of its neighbours saw, less a margin. So a slanted surface is
-not looked through, nor a thing that ends between two pixels. An edge shields one pixel more, because the pixel between
-two surfaces may have mixed them:
+A pixel sees no farther than the nearest range of its own and its neighbours, less a margin. So free space never leads
+through a slanted surface, nor through a thing that ends between two pixels. An edge shields one pixel more, because the
+pixel between two surfaces may have mixed them:
 
     o---o                          near
           x    shielded            mixed: its range is anything between
              o---o    free         far
 
-Neighbours that saw nothing do not count.
+Neighbours without a range do not count.
 """
 
 import math
@@ -22,7 +22,7 @@ from cairn_map.arrays import Singles
 RINGS = 2
 EDGE_STEP_M = 0.1
 SLANT_SHARE = 1.5
-"""What a pixel two away must be nearer by to be another surface: 10 cm, and 1.5 times what the slant explains."""
+"""A pixel two away is another surface if it is nearer by 10 cm and 1.5 times the difference that the slant explains."""
 EDGE_SHARE = 1.0
 """An edge shields two pixels only where their spacing is at most so many voxels: farther away one is enough."""
 GRAZING_SHARE = 0.4
@@ -34,26 +34,27 @@ GRAZING_MAX = 3.0
 def nearest_around(
     seen_m: Singles, shield_m: Singles, silent_m: float, focal_px: float, voxel_edge_m: float
 ) -> tuple[Singles, Singles]:
-    """(H, W) the nearest that counts for each pixel, metres, and how many times its margin to keep from that.
+    """(H, W) the nearest range that counts for each pixel, metres, and by how many margins to stay before it.
 
-    Both are 0 where the pixel says nothing, the second also where it is silent and nothing beside it is nearer.
-    Row by row without branches, and so in vector instructions.
+    Both are 0 where the pixel has no information, the second also where it is silent and no neighbour is nearer. Row by
+    row without branches, and so in vector instructions.
 
     Args:
-        seen_m: (H, W) ranges of pixels that may clear; infinite where nothing came back and that means empty; else NaN.
-        shield_m: (H, W) the nearest that a pixel saw, at most `seen_m`; NaN for nothing.
-        silent_m: how far an infinite one is clear.
+        seen_m: (H, W) ranges of pixels that may clear; infinite where no return means empty space; else NaN.
+        shield_m: (H, W) nearest range in a pixel, at most `seen_m`; NaN for none.
+        silent_m: clear range of an infinite one.
         focal_px: pixels per radian.
         voxel_edge_m: of the map.
     """
     height, width = seen_m.shape
     wide = width + 2 * RINGS
-    # With a border of nothing, so that no neighbour is missing.
+    # Stage 1: known ranges, infinite where unknown, with a border so that no neighbour is missing.
     known = np.full((height + 2 * RINGS, wide), np.float32(np.inf))
     for y in range(height):
         row, given = known[y + RINGS, RINGS : RINGS + width], shield_m[y]
         for x in range(width):
             row[x] = given[x] if given[x] > np.float32(0.0) else np.float32(np.inf)
+    # Stage 2: the least of each row within one and within two pixels; stage 3 combines rows.
     near, far = np.empty((height + 2 * RINGS, wide), np.float32), np.empty((height + 2 * RINGS, wide), np.float32)
     near[:], far[:] = np.inf, np.inf
     for y in range(RINGS, height + RINGS):
@@ -67,7 +68,7 @@ def nearest_around(
 
 @nb.njit(cache=True, nogil=True)
 def _least_of_row_into(near: Singles, far: Singles, known: Singles, width: int) -> None:
-    """The least of each pixel of a row and one beside it, and two beside it; `known` has `RINGS` more at both ends."""
+    """The least within one and within two pixels of each pixel of a row; `known` has `RINGS` more at both ends."""
     a, b, c, d, e = (
         known[:width],
         known[1 : 1 + width],
@@ -104,10 +105,12 @@ def _nearest_of_row_into(
     far0, far1, far2 = far[y, RINGS:][:width], far[y + 1, RINGS:][:width], far[y + 2, RINGS:][:width]
     far3, far4 = far[y + 3, RINGS:][:width], far[y + 4, RINGS:][:width]
     for x in range(width):
+        # Slant of the surface: steps to the next pixel, along rows and columns.
         middle = np.float64(own[x])
         across = step_beside(np.float64(left[x]), middle, np.float64(right[x]))
         along = step_beside(np.float64(up[x]), middle, np.float64(down[x]))
         seen = np.float64(silent_m) if seen_m[x] == np.float32(np.inf) else np.float64(seen_m[x])
+        # The least of the 3 x 3 and of the 5 x 5 pixels around.
         ring1 = near0[x] if near0[x] < near1[x] else near1[x]
         ring1 = ring1 if ring1 < near2[x] else near2[x]
         ring2 = far0[x] if far0[x] < far1[x] else far1[x]
@@ -115,13 +118,15 @@ def _nearest_of_row_into(
         ring2 = ring2 if ring2 < far3[x] else far3[x]
         ring2 = ring2 if ring2 < far4[x] else far4[x]
         least, shielded = np.float64(ring1), np.float64(ring2)
-        # Of the outer ring only another surface counts. If its nearest does not, none of it does.
+        # Of the outer ring only another surface counts: if its nearest pixel is none, no pixel of it is.
         step = EDGE_STEP_M + RINGS * SLANT_SHARE * (across + along)
         is_edge = (shielded < seen - step) & (shielded <= edge_at_most) & (shielded < least)
         least = shielded if is_edge else least
+        # Steps a pixel over the width of a pixel, seen / focal_px: the tangent of the slant.
         slope = math.sqrt(across * across + along * along) * focal_px / seen
         grazing = min(max(GRAZING_SHARE * math.sqrt(1.0 + slope * slope), 1.0), GRAZING_MAX)
         says = seen > 0.0
+        # A silent pixel with nothing nearer around it is clear as far as the camera sees.
         is_free = not least < seen and not own[x] < np.float32(np.inf)
         least = seen if is_free else least
         nearest[x] = np.float32(least if says else 0.0)

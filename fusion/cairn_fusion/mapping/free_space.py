@@ -1,7 +1,7 @@
 """Free space from a range image, projectively: a pinhole window on the camera, and the bricks that it looks through.
 
-Whatever the camera's lens, its image is first looked up through a pinhole window of the same fineness (`window_of`), so
-that a voxel's centre finds its pixel by one division. Hits are not decided here: they lie where the beams ended.
+For any lens, the image is first resampled to a pinhole window of the same resolution (`window_of`), so that a voxel's
+centre finds its pixel by one division. Hits are not decided here: they are the ends of the beams.
 """
 
 from dataclasses import dataclass
@@ -26,17 +26,18 @@ DEPTH_SHARE_MIN = 0.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """A pinhole image that shows what a camera sees."""
+    """Pinhole image with a camera's field of view."""
 
     width: int
     height: int
     lens: Floats
     """(4,) fx, fy, cx, cy of the padded window, with half a pixel added, so that rounding down finds the pixel."""
     pixel_of: Int32s
-    """(height width,) number of the camera's pixel that each of the window's shows; one past the last for none."""
+    """(height width,) number of the camera's pixel for each pixel of the window; one past the last for none."""
 
     def shown(self, clear_m: Singles) -> Singles:
-        """(height + 2, width + 2) how far each pixel of the window is clear, from (H, W) of the camera; 0 around it."""
+        """(height + 2, width + 2) clear range of each pixel of the window, from (H, W) of the camera; 0 around it."""
+        # The last entry is that of pixels outside the camera's image: never clear.
         padded = np.zeros((self.height + 2, self.width + 2), np.float32)
         found = np.append(clear_m.ravel(), np.float32(0.0))[self.pixel_of]
         padded[1:-1, 1:-1] = found.reshape(self.height, self.width)
@@ -45,43 +46,49 @@ class Window:
 
 @lru_cache(maxsize=32)
 def window_of(camera: AnyCamera) -> Window | None:
-    """The window on a camera; None for one that looks around too far for a plane."""
+    """The window on a camera; None for a field of view too wide for a plane."""
     rays = camera.rays()
     known = np.isfinite(rays[..., 2])
     if not known.any() or rays[known][:, 2].min() < DEPTH_SHARE_MIN:
         return None
+    # The field of view on the plane at distance 1, then a raster over it as fine as the camera's.
     plane = rays[..., :2] / rays[..., 2:]
     low, high = plane[known].min(axis=0), plane[known].max(axis=0)
     fx, fy = (float(f) for f in camera.focal_px)
     width, height = (int(np.ceil(span)) + 1 for span in (high - low) * (fx, fy))
     x, y = np.meshgrid(np.arange(width) / fx + low[0], np.arange(height) / fy + low[1])
+    # Which pixel of the camera each pixel of the window shows: the nearest.
     pixels = camera.project(np.stack([x, y, np.ones_like(x)], axis=-1))
     shown = camera.contains(pixels)
     nearest = np.rint(np.where(shown[..., None], pixels, 0)).astype(np.int64)
     number = np.where(shown, nearest[..., 1] * camera.width + nearest[..., 0], camera.width * camera.height)
+    # 1.5: one pixel of padding, and the half that turns rounding down into rounding.
     lens = np.array([fx, fy, 1.5 - low[0] * fx, 1.5 - low[1] * fy])
     return Window(width, height, lens, number.ravel().astype(np.int32))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Carving:
-    """What a view looks through: numbers of bricks of a box, which octants of each, and what kernels need."""
+    """Bricks of a box that a view looks through, and the inputs of the kernel that counts their misses."""
 
     bricks: Ints
+    """(K,) numbers of the bricks in the box."""
     masks: Int32s
-    """(K,) of `cull_kernels`."""
+    """(K,) octants of each brick that are free or to be tested (`cull_kernels`)."""
     squares: Singles
-    """Padded image of how far each pixel is clear, squared."""
+    """Padded image of each pixel's clear range, squared."""
     lens: Singles
+    """(4,) of `Window`."""
     corners_view: Singles
     """(3, K or more) the centre of each brick's first voxel, camera frame, metres.
 
-    From whole voxel numbers, and number by number: which box a brick is found in, and with how many others, must not
-    change a bit of where it lies, or the evidence would not depend on the scan alone.
+    Computed from whole voxel numbers, brick by brick: the box, and the number of bricks in it, must not change a bit of
+    a brick's place, or the evidence would not depend on the scan alone.
     """
     offsets_view: Singles
     """(3, 512) from there to each voxel's centre, in Morton order."""
     min_square: float
+    """Square of the least range that is free."""
 
 
 class Scratch:
@@ -92,8 +99,9 @@ class Scratch:
         self._found: Int32s = np.empty((1 << 14, 2), np.int32)
 
     def extremes(self, clear_m: Singles) -> Singles:
-        """Of `window_extremes_into`, for an image of this size."""
+        """(L, H, 2 W) window extremes of an image (`window_extremes_into`)."""
         height, width = clear_m.shape
+        # No window is larger than the image.
         levels = min(LEVELS_MAX, min(width, height).bit_length())
         if self._extremes.shape != (levels, height, 2 * width):
             self._extremes = np.empty((levels, height, 2 * width), np.float32)
@@ -101,7 +109,7 @@ class Scratch:
         return self._extremes
 
     def found(self, count: int) -> Int32s:
-        """At least (count, 2)."""
+        """Array of at least (count, 2)."""
         if count > len(self._found):
             self._found = np.empty((2 * count, 2), np.int32)
         return self._found
@@ -123,7 +131,7 @@ def carving_of(
     Args:
         clear_m: of `Window.shown`.
         window: on the camera.
-        T_map_camera: where it was.
+        T_map_camera: pose of the camera.
         corner: (3,) the box's first voxel.
         dims: (3,) bricks of the box.
         voxel_edge_m: of the map.
@@ -133,13 +141,16 @@ def carving_of(
     R: Floats = np.ascontiguousarray(T_map_camera[:3, :3])
     t: Floats = np.ascontiguousarray(T_map_camera[:3, 3])
     corner_m: Floats = corner.astype(np.float64) * voxel_edge_m
+    # Stage 1: the bricks around the eye that the longest beam reaches, a tenth of a brick more for rounding.
     reach_m = float(clear_m.max())
     around = (t - corner_m + np.array([[-reach_m], [reach_m]])) / (BRICK_VOXELS * voxel_edge_m)
     low, high = np.clip(np.floor(around + np.array([[-0.1], [0.1]])).astype(np.int64), [[0], [-1]], dims - 1)
+    # Stage 2: cubes of bricks; again with more room if there are more bricks than rows.
     view = (corner_m - t, voxel_edge_m, R, window.lens, min_range_m, reach_m, scratch.extremes(clear_m))
     count = cull_bricks_into(scratch.found(0), low, high, dims, *view)
     if count > len(scratch.found(0)):
         cull_bricks_into(scratch.found(count), low, high, dims, *view)
+    # Stage 3: octants of the bricks that are partly free.
     found, corners_view = scratch.found(count)[:count], np.empty((3, count), np.float32)
     count = split_bricks_into(found, corners_view, dims, corner, t, *view)
     return Carving(
@@ -155,6 +166,7 @@ def carving_of(
 
 def _offsets_in_view(R: Floats, voxel_edge_m: float) -> Singles:
     """(3, 512) from the first voxel's centre of a brick to each voxel's, camera frame."""
+    # The rotation into the camera's frame: R's columns are the camera's axes.
     x, y, z = MORTON_XYZ * voxel_edge_m
     return np.stack([x * R[0, a] + y * R[1, a] + z * R[2, a] for a in range(3)]).astype(np.float32)
 

@@ -1,13 +1,13 @@
-"""A scan as evidence: the paper's chapter IV from images to voxels.
+"""Integration of scans into evidence: the paper's chapter IV, from images to voxels.
 
-    returns  points of the map                       Eq. 1-5
-    samples  what cameras saw of them                Eq. 5-6: `samples`
-    clear    how far each beam is certainly free                           `clear`
-    hits     where beams ended, misses where the image looks through      `tally`, `carve`; for lidars `beams`
+    returns  points of the map, and the clear length of each beam    Eq. 1-5    `beam_returns`
+    samples  colour and temperature of these points                  Eq. 5-6    `samples`
+    counts   hits where beams ended, misses where the image looks through       `free_space`, `brick_tally`
+             for lidars, ray by ray                                             `ray_casting`
     pack     evidence by cell
 
-Inverse sensor model: one count per voxel and scan, and a hit wins over a miss. The result depends on the scan alone,
-never on the map, nor on how many scans are added in what order on how many threads.
+Inverse sensor model: one count per voxel and scan, and a hit wins over a miss. The result depends on the scans alone,
+never on the map, nor on the order or the threads in which scans are added.
 """
 
 import math
@@ -37,36 +37,37 @@ from cairn_map.evidence.grid import CellKey, Geometry, split_voxels, voxels_of_p
 
 
 class Method(StrEnum):
-    """How free space is found."""
+    """Method of finding free space."""
 
     CARVE = "carve"
-    """Projectively, where the camera's image fits in a plane; else as `CAST`."""
+    """Projective, where the camera's image fits in a plane; else as `CAST`."""
     CAST = "cast"
     """Ray by ray: for lidars, and as the slow twin."""
 
 
 @dataclass(frozen=True, slots=True)
 class Integrator:
-    """How scans become evidence; its text goes into every commit."""
+    """Parameters of the integration of scans; their text goes into every commit."""
 
     min_range_m: float = 0.1
+    """Least range of a return, metres; nearer ones are ignored."""
     max_range_m: float = 10.0
-    """Beyond it a time-of-flight camera wraps round; a return there is ignored, not taken for free space."""
+    """Greatest range of a return, metres: beyond it a time-of-flight camera wraps round. A farther one is ignored, and
+    no proof of free space."""
     method: Method = Method.CARVE
     flying_step_m: float = 0.05
-    """What a pixel must differ from both its neighbours by to be taken for a mixture of them (`flying_kernels`), and
-    so for no return; of images that are carved. Infinite: none is."""
+    """Difference from both neighbours, metres, beyond which a pixel of a carved image is a mixture of them
+    (`flying_kernels`) and no return. Infinite: no pixel is."""
     noise_sigmas: float = 2.0
-    """How many standard deviations of the range, by the rig's `sensing`, free space keeps from a surface; never less
-    than one voxel."""
+    """Margin of free space before a surface, in standard deviations of the range (the rig's `sensing`); at least one
+    voxel."""
     sample_spread_voxels: float = 1.0
-    """How uncertain, in voxels, the place of a colour or temperature may be (`certainty`); beyond it there is none."""
+    """Largest uncertainty of a sample's place, voxels (`pixel_covariance`); beyond it the sample is left out."""
     temperature_step_k: float = 4.0
-    """How much the thermal image may differ within what a range pixel covers; beyond it there is no temperature, for it
-    could be that of the background, or a hot thing's on the background. Infinite: whatever the pixel says."""
-
+    """Largest difference of the thermal image within the area of a range pixel, kelvin; beyond it there is no
+    temperature, for it could be the background's, or a hot thing's on the background. Infinite: no limit."""
     hidden_behind_m: float = DEPTH_TOLERANCE_M
-    """How much deeper than what hides it from a camera a point must be (`transfer`). Infinite: nothing hides."""
+    """Depth behind the nearest point of a bin beyond which a point is hidden, metres (`transfer`). Infinite: never."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_range_m < self.max_range_m < float("inf"):
@@ -92,10 +93,10 @@ class Integrator:
 
 
 class Integration:
-    """Scans being integrated, by any number of threads, which take turns only to count. Memory: see `tally`."""
+    """Evidence of scans that any number of threads add; they take turns only to count. Memory: see `brick_tally`."""
 
     def __init__(self, rig: Rig, geometry: Geometry, integrator: Integrator, *, around_m: Floats | None = None) -> None:
-        """Args: around_m: (3,) where the first tally is to be centred; None: where the first scan was taken."""
+        """Args: around_m: (3,) centre of the first tally, metres; None: the place of the first scan."""
         self._rig = rig
         self._geometry = geometry
         self._integrator = integrator
@@ -110,6 +111,7 @@ class Integration:
         """
         limits, rig, camera = self._integrator, self._rig, self._rig[scan.range_camera].camera
         window = window_of(camera) if limits.method is Method.CARVE else None  # pyright: ignore[reportArgumentType]
+        # Stage 1: points (Eq. 1-5). A lidar's neighbours are too far apart to tell a flying pixel.
         returns = returns_of(
             scan,
             rig,
@@ -117,7 +119,9 @@ class Integration:
             max_range_m=limits.max_range_m,
             flying_step_m=limits.flying_step_m if window is not None else math.inf,
         )
+        # Stage 2: named readings, checked before anything is counted.
         scalars = _scalar_evidence(scan, self._geometry)
+        # Stage 3: hits, samples and misses.
         if window is None:
             self._cast(scan, returns)
         elif returns.reach_m > 0:
@@ -132,15 +136,15 @@ class Integration:
         range_camera: str | None = None,
         T_map_body: Transform | None = None,
     ) -> None:
-        """Add a sweep of a sensor whose points have no order, ray by ray.
+        """Add a sweep of points without order, ray by ray.
 
         Args:
             points: (N, 3) metres, sensor frame, all seen from its origin; NaN where nothing came back.
-            T_map_sensor: where it was.
-            range_camera: the rig's camera that measured them, as its driver made points of its ranges, in its own
-                frame; they have its noise, and what the rig says that it adds to ranges (`range_bias`) is taken off,
-                at the usual amplitude. None: another sensor, with a lidar's usual noise; points are taken as they are.
-            T_map_body: where the frame of the rig's body was; None: nothing is taken for the robot's body.
+            T_map_sensor: pose of the sensor.
+            range_camera: the rig's camera whose driver made the points of its ranges, in its own frame; they have its
+                noise, and the rig's `range_bias` at the usual amplitude is subtracted. None: another sensor, with a
+                lidar's usual noise; points are taken as they are.
+            T_map_body: pose of the frame of the rig's body; None: no point is taken for the robot's body.
 
         Raises:
             BadInputError: not (N, 3), or it reaches beyond the numbered space, or points that the range camera cannot
@@ -150,12 +154,14 @@ class Integration:
             raise BadInputError("bad_points", f"points must be (N, 3), got {points.shape}")
         T = check_transform(T_map_sensor, name="T_map_sensor")
         of = None if range_camera is None else self._rig[range_camera]
+        # Points without a bias, within limits, and not on the robot itself; NaN is outside all limits.
         own = (points if of is None else of.true_points(points)).astype(np.float64)
         range_m = np.linalg.norm(own, axis=1)
         kept = (range_m >= self._integrator.min_range_m) & (range_m <= self._integrator.max_range_m)
         if self._rig.body is not None and T_map_body is not None:
             T_body_sensor = inverse(check_transform(T_map_body, name="T_map_body")) @ T
             kept &= ~self._rig.body.holds(transform_points(T_body_sensor, own))
+        # Clear up to a margin before each point, by its noise.
         sigma_m = LIDAR.sigma_at(range_m[kept], usual=LIDAR) if of is None else of.range_sigma_m(range_m[kept])
         points_map = transform_points(T, own[kept])
         clear_m = self._clear_ends(T[:3, 3], points_map, sigma_m)
@@ -166,10 +172,11 @@ class Integration:
         return self._tallies.packed(each)
 
     def _carve(self, scan: Scan, returns: Returns, window: Window) -> None:
-        """Hits where beams ended, misses where the image looks through."""
+        """Count hits where beams ended, misses where the image looks through."""
         edge_m = self._geometry.voxel_edge_m
         mounted, sigmas = self._rig[scan.range_camera], self._integrator.noise_sigmas
         clear_m = clear_image(returns, mounted, voxel_edge_m=edge_m, noise_sigmas=sigmas)
+        # Hits are numbered once; samples and misses use the numbers.
         with self._tallies.around(returns.T_map_tof[:3, 3], returns.reach_m) as (tally, hits):
             voxel_of, count = hits.number(returns.points_map, tally)
             sums = self._sample_sums(scan, returns, voxel_of, count)
@@ -187,7 +194,7 @@ class Integration:
             tally.add_misses(hits, carving)
 
     def _cast(self, scan: Scan, returns: Returns) -> None:
-        """Hits where beams ended, misses along each beam."""
+        """Count hits where beams ended, misses along each beam."""
         mounted, origin_m = self._rig[scan.range_camera], returns.T_map_tof[:3, 3]
         sigma_m = mounted.range_sigma_image(returns.range_m).ravel()[returns.pixels]
         clear_m = np.concatenate(
@@ -202,7 +209,12 @@ class Integration:
     def _sample_sums(self, scan: Scan, returns: Returns, voxel_of: npt.NDArray[np.integer], count: int) -> Ints:
         limit_m = self._integrator.sample_spread_voxels * self._geometry.voxel_edge_m
         return sample_sums(
-            *(scan, self._rig, self._geometry, returns, voxel_of, count),
+            scan,
+            self._rig,
+            self._geometry,
+            returns,
+            voxel_of,
+            count,
             spread_max_m=limit_m,
             step_max_k=self._integrator.temperature_step_k,
             hidden_behind_m=self._integrator.hidden_behind_m,
@@ -239,13 +251,13 @@ def integrate_scans(
     around_m = scans[0].T_map_rig[:3, 3] if scans else None
     integration = Integration(rig, geometry, integrator, around_m=around_m)
     with ThreadPoolExecutor(count) as pool:
-        # Whoever is done takes the next scan.
+        # A free thread takes the next scan.
         list(pool.map(integration.add, scans))
         return integration.diff(pool.map)
 
 
 def _scalar_evidence(scan: Scan, geometry: Geometry) -> dict[CellKey, Evidence]:
-    """Named readings, at the voxel where the rig stands."""
+    """Evidence of named readings, in the voxel of the rig's origin."""
     if not scan.scalars:
         return {}
     samples = np.zeros((1, geometry.plane_count), np.int64)

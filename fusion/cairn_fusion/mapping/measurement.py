@@ -1,4 +1,4 @@
-"""A measurement: the scans of one stop, summed, and what a commit must say about them."""
+"""Measurement: the sum of the scans of one stop, and the facts about them that a commit states."""
 
 from dataclasses import dataclass, field
 
@@ -20,7 +20,7 @@ SCANS_MAX = 4096
 
 @dataclass(slots=True)
 class Measurement:
-    """Scans added so far; `diff` is their evidence."""
+    """Sum of the scans added so far; `diff` is their evidence."""
 
     rig: Rig
     geometry: Geometry
@@ -54,12 +54,12 @@ class Measurement:
         range_camera: str | None = None,
         T_map_body: Transform | None = None,
     ) -> None:
-        """Add a sweep of unordered points as `Integration.add_points`; the commit says where the rig was.
+        """Add a sweep of unordered points as `Integration.add_points`; the commit states the rig's pose.
 
-        A body whose place is not given is in the rig's frame.
+        A body without a pose of its own is in the rig's frame.
 
         Raises:
-            BadInputError: the points are none, or the measurement is full; nothing was added.
+            BadInputError: not (N, 3) points, or the measurement is full; nothing was added.
         """
         self._check_room()
         body = T_map_rig if T_map_body is None else T_map_body
@@ -85,7 +85,7 @@ class Measurement:
 
 
 def scan_pose(time_s: float, T_map_rig: Transform) -> ScanPose:
-    """Where the rig was for one scan, as a commit states it."""
+    """Pose of the rig for one scan, as a commit states it."""
     x, y, z = (float(v) for v in T_map_rig[:3, 3])
     q = [float(v) for v in quaternion_from_transform(T_map_rig)]
     return ScanPose(time_s=time_s, t_map_rig=(x, y, z), q_map_rig=(q[0], q[1], q[2], q[3]))

@@ -1,7 +1,10 @@
-"""The voxels that one scan saw: hits at its end points, misses between them and the sensor.
+"""Evidence of single beams, ray by ray: of lidars, whose neighbours are far apart, and of points without order.
 
-Each voxel gets one count at most, and a hit wins over a miss, so the result does not depend on the order of the
-rays, nor on how many pixels a voxel fills. One ray is cast per end voxel (the first that ends there): the others
+    hits      voxels of the end points
+    misses    voxels that a beam passes up to where it is certainly clear, except the voxel where it ends
+
+Each voxel gets one count at most, and a hit wins over a miss, so the result depends neither on the order of the rays
+nor on the number of pixels that a voxel fills. One ray is cast per end voxel (the first that ends there): the others
 would pass through nearly the same voxels again.
 """
 
@@ -41,7 +44,7 @@ class SeenVoxels:
 def seen_voxels(
     origin_m: Floats, ends_m: Floats, ends: Ints, geometry: Geometry, *, hits: Ints | None = None
 ) -> SeenVoxels:
-    """What rays from one origin saw.
+    """Voxels that rays from one origin hit or passed.
 
     Args:
         origin_m: (3,) metres, map frame.
@@ -49,11 +52,12 @@ def seen_voxels(
         ends: (N, 3) voxel numbers, all different.
         geometry: of the map.
         hits: (M, 3) voxels that were hit, all different; None: those where the rays end. A ray that ends in a voxel
-            which was not hit, because it is clear only so far, says nothing of that voxel.
+            which was not hit, because it is clear only so far, counts nothing in that voxel.
 
     Raises:
         BadInputError: the scan spans more bricks than fit in memory; limit the range or coarsen the map.
     """
+    # Stage 1: the box of bricks around all rays and hits.
     start = voxels_of_points(origin_m, geometry)
     struck = ends if hits is None else hits
     reached = np.concatenate([ends, struck, start])
@@ -66,6 +70,7 @@ def seen_voxels(
             f"one scan spans {size_m.round(1).tolist()} m, too much at {geometry.voxel_edge_m} m voxels; "
             "limit its range or use a coarser map",
         )
+    # Stage 2: a dense index of the box's bricks, and a pool of marks for those that are touched.
     corner = low << BRICK_DEPTH
     brick_of = np.full(int(np.prod(dims)), -1, np.int32)
     bricks = np.empty(len(struck) + 1024, np.int64)
@@ -73,6 +78,7 @@ def seen_voxels(
     box_ends = ends - corner
     origin = _inside(origin_m, start[0], geometry) - corner
     targets = ends_m / geometry.voxel_edge_m - corner
+    # Stage 3: hits first, since they win over misses; then rays, with a larger pool whenever one might not fit.
     used = mark_hits_into(struck - corner, dims, brick_of, bricks, marks, 0)
     ray = 0
     while ray < len(ends):
@@ -84,7 +90,7 @@ def seen_voxels(
 
 
 def _inside(origin_m: Floats, start: Ints, geometry: Geometry) -> Floats:
-    """The origin in voxels, moved by rounding at most, so that its floor is the voxel that the grid says."""
+    """The origin in voxels, moved by rounding at most, so that its floor is its voxel by the grid's own rule."""
     exact = np.asarray(origin_m, dtype=np.float64) / geometry.voxel_edge_m
     inside: Floats = np.clip(exact, start, np.nextafter(start + 1.0, start))
     return inside
@@ -97,6 +103,7 @@ def _with_room(marks: npt.NDArray[np.uint8], room: int, used: int) -> npt.NDArra
 
 
 def _by_cell(bricks: Ints, marks: npt.NDArray[np.uint8], dims: Ints, low: Ints, geometry: Geometry) -> SeenVoxels:
+    # Coordinates of the bricks; then marks in order of cell and Morton place.
     xyz = np.stack([bricks % dims[0], bricks // dims[0] % dims[1], bricks // (dims[0] * dims[1])], axis=1) + low
     up = geometry.depth - BRICK_DEPTH
     cells = interleave((xyz >> up) + CELL_LIMIT)
@@ -111,7 +118,8 @@ def _by_cell(bricks: Ints, marks: npt.NDArray[np.uint8], dims: Ints, low: Ints, 
 def clear_ends(
     origin_m: Floats, points_map: Floats, sigma_m: Floats, *, voxel_edge_m: float, noise_sigmas: float
 ) -> Floats:
-    """(M, 3) how far the beams to (N, 3) points are certainly clear; without those that are not clear at all."""
+    """(M, 3) ends of the clear part of beams to (N, 3) points, metres; without beams that are not clear at all."""
+    # Shorter by the margin; what is left may be nothing.
     beams = points_map - origin_m
     range_m = np.linalg.norm(beams, axis=1)
     left_m = range_m - margins_m(sigma_m, voxel_edge_m=voxel_edge_m, noise_sigmas=noise_sigmas)
@@ -120,7 +128,7 @@ def clear_ends(
 
 
 def silent_ends(returns: Returns, rays: Floats) -> Floats:
-    """(M, 3) how far the beams are clear to which nothing came back, where that means something."""
+    """(M, 3) ends of the clear part of silent beams, metres, where silence means empty space."""
     T = returns.T_map_tof
     beams = rays[returns.silent] @ T[:3, :3].T
     beams = beams[~np.isnan(beams[:, 0])]
@@ -134,14 +142,15 @@ def beam_evidence(
 
     Args:
         origin_m: (3,) metres, map frame.
-        points_map: (N, 3) where they ended.
-        clear_m: (M, 3) up to where they are clear.
+        points_map: (N, 3) their ends, metres.
+        clear_m: (M, 3) ends of their clear parts, metres.
         geometry: of the map.
-        sums_of: what else is known of the voxels that were hit.
+        sums_of: samples of the voxels that were hit.
 
     Raises:
         BadInputError: they reach beyond the numbered space, or span more than fits in memory.
     """
+    # One ray for each voxel in which clear parts end.
     hits, _, voxel_of = unique_voxels(voxels_of_points(points_map, geometry))
     targets, first, _ = unique_voxels(voxels_of_points(clear_m, geometry))
     seen = seen_voxels(origin_m, clear_m[first], targets, geometry, hits=hits)
@@ -152,6 +161,7 @@ def unique_voxels(voxels: Ints) -> tuple[Ints, Ints, Ints]:
     """Different voxels (U, 3), the first point in each (U,), and the number of each point's voxel (N,)."""
     if not len(voxels):
         return voxels, np.empty(0, np.int64), np.empty(0, np.int64)
+    # One number a voxel, by its place in the box of all of them.
     low = voxels.min(axis=0)
     span = voxels.max(axis=0) - low + 1
     shifted = voxels - low
@@ -164,6 +174,7 @@ def _packed_by_cell(seen: SeenVoxels, ends: Ints, samples: Ints, geometry: Geome
     end_cells, end_places = split_voxels(ends, geometry)
     order = np.lexsort((end_places, end_cells))
     end_cells, end_places, samples = end_cells[order], end_places[order], samples[order]
+    # Both are in order of cell and place, so a cell is one slice of each.
     cells, starts = np.unique(seen.cells, return_index=True)
     bounds = np.append(starts, len(seen.cells))
     packed: dict[CellKey, Evidence] = {}

@@ -1,7 +1,7 @@
-"""What the cameras of a scan say about the points that came back: one sample a voxel, channel and scan.
+"""Samples of a scan's cameras for the points that came back: one sample a voxel, channel and scan.
 
     points   in the range camera's frame            Eq. 1-4
-    samples  colour, temperature, amplitude          Eq. 5-6 with a z-buffer; only what a camera really saw
+    samples  colour, temperature, amplitude          Eq. 5-6 with a z-buffer: no camera samples a point hidden from it
 
 Each voxel that was hit gets at most one sample per channel and scan: the mean of the pixels that fell on it, with
 weight 1. So a voxel's weights never exceed its hits, however fine the images are, and samples stay small numbers.
@@ -49,17 +49,16 @@ def sample_sums(
 ) -> Ints:
     """(count, P) sums of the scan's voxels: one sample of weight 1 for each channel that a camera saw there.
 
-    Colours and temperatures whose place is uncertain by more than `spread_max_m` are left out (`certainty`); and
-    temperatures at whose place the thermal image differs by more than `step_max_k`, within what a range pixel covers:
-    of an edge of something hot nobody knows which side the range is of. `hidden_behind_m` is that of
-    `transfer_points`.
+    Colours and temperatures whose place is uncertain by more than `spread_max_m` are left out (`pixel_covariance`); so
+    are temperatures where the thermal image differs by more than `step_max_k` within the area of a range pixel: at the
+    edge of a hot thing it is unknown which side the range belongs to. `hidden_behind_m` is that of `transfer_points`.
     """
     sums = np.zeros((count, geometry.plane_count), np.int64)
     limits = SampleLimits(spread_max_m, step_max_k, hidden_behind_m)
     sight, numbers = ImageTransfers(scan, rig, returns, limits), voxel_of.astype(np.int32, copy=False)
     for channel in geometry.channels:
         taken = np.zeros(len(returns.pixels), np.bool_)
-        # The first camera speaks for what it sees; the next ones only fill what was hidden from those before.
+        # The first camera counts wherever it sees; the next ones fill only voxels hidden from those before.
         for image, pixels, labels in sight.images_of(channel.kind):
             totals, counts = np.zeros((count, channel.value_count)), np.zeros(count, np.int64)
             add_pixels_into(totals, counts, taken, np.atleast_3d(image), pixels, labels, numbers)
@@ -69,20 +68,21 @@ def sample_sums(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Points:
-    """What the range camera saw."""
+    """Points of the range camera, and their noise."""
 
     tof: Floats
-    """(N, 3) in its frame."""
+    """(N, 3) metres, frame of the range camera."""
     range_m: Floats
+    """(N,) metres along the beam."""
     steps_m: Floats
-    """(N,) how steep the surface is there: `depth_steps`."""
+    """(N,) slant of the surface: `depth_steps`."""
     sigma_m: Floats
-    """(N,) of their ranges."""
+    """(N,) standard deviation of the ranges."""
 
 
 @dataclass(frozen=True, slots=True)
 class SampleLimits:
-    """What is taken for seen; arguments of `sample_sums`."""
+    """Limits within which a sample counts; arguments of `sample_sums`."""
 
     spread_max_m: float
     step_max_k: float
@@ -90,7 +90,7 @@ class SampleLimits:
 
 
 class ImageTransfers:
-    """Where the points of a scan appear in its images, each found when it is asked for."""
+    """Transfers of a scan's points into its images, each computed when it is needed."""
 
     def __init__(self, scan: Scan, rig: Rig, returns: Returns, limits: SampleLimits) -> None:
         self._scan = scan
@@ -100,7 +100,7 @@ class ImageTransfers:
         self._points: _Points | None = None
 
     def images_of(self, kind: ChannelKind) -> Iterator[tuple[npt.NDArray[np.generic], Ints, Labels]]:
-        """For each image of a kind: it, and pixels (N, 2) and labels (N,) of the points."""
+        """Images of a kind, each with the pixels (N, 2) and labels (N,) of the points."""
         scan = self._scan
         if kind is ChannelKind.INTENSITY and scan.amplitude is not None:
             # `take`: indexing by rows takes ten times as long.
@@ -116,28 +116,32 @@ class ImageTransfers:
             yield image, transfer.pixels, transfer.labels
 
     def _transfer(self, name: str) -> Transfer:
-        """Where all points appear in a camera's image; those whose place there is too uncertain are so labelled."""
+        """Transfer of all points into a camera's image; points with too uncertain a place there are so labelled."""
         src, limits = self._scan.range_camera, self._limits
         points = self._seen_points()
+        # Stage 1: Eq. 5-6 and the z-buffer.
         transfer = transfer_points(
-            *(points.tof, self._rig),
+            points.tof,
+            self._rig,
             src=src,
             dst=name,
             steps_m=points.steps_m,
             hidden_behind_m=limits.hidden_behind_m,
         )
+        # Stage 2: the covariance of the place, only for points that a bound does not clear.
         certain = is_certain(points.range_m, points.sigma_m, self._rig, src=src, dst=name, limit_m=limits.spread_max_m)
         doubtful = np.nonzero(transfer.ok & ~certain)[0]
         if len(doubtful):
             spread = spread_m(points.tof[doubtful], points.sigma_m[doubtful], self._rig, src=src, dst=name)
             transfer.labels[doubtful[~(spread <= limits.spread_max_m)]] = Label.UNCERTAIN
+        # Stage 3: edges in the thermal image, within the area that the range pixel covers there.
         if name in self._scan.thermal and limits.step_max_k < math.inf:
             reach_px = reach_px_of(points.range_m, points.sigma_m, self._rig, src=src, dst=name)
             image = np.ascontiguousarray(self._scan.thermal[name])
             doubt_edges_into(transfer.labels, transfer.pixels, reach_px, image, limits.step_max_k)
         return transfer
 
-    def _seen_points(self) -> "_Points":
+    def _seen_points(self) -> _Points:
         if self._points is None:
             mounted, returned = self._rig[self._scan.range_camera], self._returns.pixels
             range_m = self._returns.range_m.ravel()[returned].astype(np.float64)
@@ -152,7 +156,7 @@ class ImageTransfers:
 
 
 def _write_means_into(sums: Ints, geometry: Geometry, channel: Channel, totals: Floats, counts: Ints) -> None:
-    """One sample of weight 1, the mean of its pixels, for every voxel that has none of this channel yet."""
+    """Write one sample of weight 1, the mean of its pixels, for every voxel that has none of this channel yet."""
     planes, is_squared = geometry.planes_of(channel.name), channel.kind is ChannelKind.TEMPERATURE
     ends = (planes.start, planes.stop - 1)
     if not write_means_into(sums, *ends, totals, counts, channel.zero, channel.step, is_squared):

@@ -2,9 +2,9 @@
 
     frames/frame-{id}.depth.png  ->  ids 000000 000001 ...  ->  colour, thermal and pose of the same id
 
-Depth, colour and thermal are registered: one raster, one camera model, so the rig's cameras `depth`, `colour`
-and `thermal` are the same camera at the rig's origin. What is not registered is a matter for the recording
-format, with a rig of its own.
+Depth, colour and thermal are registered: one raster, one camera model, so the rig's cameras `depth`, `colour` and
+`thermal` are the same camera at the rig's origin. Images that are not registered need the recording format, with a rig
+of its own.
 """
 
 import re
@@ -36,20 +36,20 @@ from cairn_fusion.recording.timed_lists import read_text
 from cairn_map.errors import BadInputError
 
 TEXT_BYTES_MAX = 1 << 16
-"""Of a matrix in a text file."""
+"""Largest text file with a matrix."""
 FRAME_ID = "{id}"
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class PoseConvention(StrEnum):
-    """Which way a pose file's matrix maps points."""
+    """Direction in which a pose file's matrix maps points."""
 
     CAMERA_TO_MAP = "camera_to_map"
     MAP_TO_CAMERA = "map_to_camera"
 
 
 class FrameFolderOptions(BaseModel):
-    """What a folder of frames cannot say of itself; patterns are relative, `{id}` is the frame's id, no slash in it."""
+    """Description of a folder of frames; patterns are relative, and `{id}` is the frame's id, without a slash."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -96,7 +96,7 @@ def import_frames(
     """A folder of frames as a recording; images are read when asked for.
 
     Args:
-        folder: what the patterns are relative to.
+        folder: folder that the patterns are relative to.
         options: patterns and conventions.
         frames: only these ids, each in the folder; they keep the times and the order that they have among all.
         scans_per_measurement: group scans by this count.
@@ -110,6 +110,7 @@ def import_frames(
     if frames is not None and (not frames or not set(frames) <= set(ids)):
         unknown = ", ".join(sorted(set(frames) - set(ids))[:10]) or "of an empty choice"
         raise BadInputError("unknown_frame", f"{root} has {len(ids)} frames, but none {unknown}")
+    # Times count all frames of the folder, so that a choice of them keeps its times.
     pose = _pose_reader(root, options)
     wanted = set(ids if frames is None else frames)
     files = tuple(
@@ -136,6 +137,7 @@ def _frame_ids(root: Path, pattern: str) -> list[str]:
     """The ids that a pattern finds, numbers by value."""
     path_inside(root, pattern)
     pattern = PurePosixPath(pattern).as_posix()
+    # As a glob, to find candidates, and as an expression, in which each further `{id}` must be the same.
     wanted = re.escape(pattern).replace(re.escape(FRAME_ID), r"(?P<id>[^/]+)", 1)
     wanted = wanted.replace(re.escape(FRAME_ID), r"(?P=id)")
     glob = "*".join(escape(part) for part in pattern.split(FRAME_ID))
@@ -176,6 +178,7 @@ def _pose_reader(root: Path, options: FrameFolderOptions) -> Callable[[str], Tra
 
 
 def _pose(root: Path, relative: str, convention: PoseConvention) -> Transform:
+    # A 3 x 4 matrix lacks the last row, which is the same in all of them.
     values = _numbers(path_inside(root, relative))
     if values.size == 12:
         values = np.append(values, (0, 0, 0, 1))
@@ -211,6 +214,7 @@ def _intrinsics(root: Path, options: FrameFolderOptions) -> tuple[tuple[float, f
     if options.focal_px is not None and options.centre_px is not None:
         return options.focal_px, options.centre_px
     path = path_inside(root, options.intrinsics_file or "")
+    # fx 0 cx, 0 fy cy, 0 0 1: no skew, and scaled to one.
     K = _numbers(path)
     if K.size != 9 or not np.array_equal(K[[1, 3, 6, 7, 8]], (0, 0, 0, 0, 1)) or K[0] <= 0 or K[4] <= 0:
         raise BadInputError("bad_intrinsics", f"{path} must hold fx 0 cx, 0 fy cy, 0 0 1; got {K.tolist()[:9]}")

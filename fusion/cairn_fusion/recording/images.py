@@ -1,10 +1,10 @@
-"""Image files: PNG both ways, JPEG read; what a file claims is checked before any pixel is allocated.
+"""Image files: PNG read and written, JPEG read; a file's header is checked before any pixel is allocated.
 
     header (here, pure Python)  ->  bounds, kind, expected size  ->  pixels (OpenCV)
 
-Colour is R, G, B here and everywhere in cairn; OpenCV's B, G, R does not leave this file. PNG chunks carry a
-CRC each and all are checked, so a flipped bit is an error and not a spot on the map. JPEG has none: of a JPEG
-only the start and the end are known to be there.
+Colour is R, G, B here and everywhere in cairn; OpenCV's B, G, R does not leave this file. Every PNG chunk carries a CRC
+and all are checked, so a flipped bit is an error and not a spot on the map. JPEG has none: only its start and its end
+are checked.
 """
 
 import struct
@@ -33,12 +33,12 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class ImageHeader:
-    """What an image file says of itself."""
+    """Header of an image file."""
 
     width: int
     height: int
     grey16: bool
-    """One channel of 16 bits: the only kind that can hold range, amplitude or counts."""
+    """True for one channel of 16 bits: the only kind that can hold range, amplitude or counts."""
 
 
 def image_header(path: Path) -> ImageHeader:

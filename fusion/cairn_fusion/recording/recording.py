@@ -1,4 +1,4 @@
-"""A recording: scans on disk, found in time and read one at a time. RECORDING.md is the format.
+"""Recording: scans on disk, in order of time, read one at a time. RECORDING.md is the format.
 
     recording.json  rig.json  trajectory.txt  <camera>.txt ...
           |_____________|__________|______________|
@@ -7,7 +7,7 @@
                          Recording.scan(i)         each time: the images of one scan
 
 Lists are checked whole when the recording is opened, pixels when they are read. Importers make a `Recording` of
-foreign folders, so whatever replays one replays all.
+foreign folders, so a program that replays one replays all.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -43,11 +43,11 @@ from cairn_map.errors import BadInputError, NotFoundError
 
 
 class ScanSource(Protocol):
-    """Anything that scans can be replayed from: a `Recording`, an imported folder, a simulator."""
+    """Source of scans to replay: a `Recording`, an imported folder, a simulator."""
 
     @property
     def name(self) -> str:
-        """What it is called; a map's log shows it."""
+        """Name of the source, as a map's log shows it."""
         ...
 
     @property
@@ -70,7 +70,7 @@ class ScanSource(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScanFiles:
-    """Where the images of one scan lie; paths already checked to be where they may be."""
+    """Paths of the images of one scan, checked to be inside the recording's folder, and the rest of the scan."""
 
     time_s: float
     T_map_rig: Transform
@@ -250,6 +250,7 @@ def _measurements(folder: Path, files: Sequence[ScanFiles], size: int | None) ->
     path = path_inside(folder, MEASUREMENTS_FILE)
     if size is not None or not path.exists():
         return measurements_of(len(files), 1 if size is None else size)
+    # Each line takes the next scans up to its last time, so that all scans are in one measurement, in order.
     times_s = np.array([entry.time_s for entry in files])
     stops: list[range] = []
     start = 0

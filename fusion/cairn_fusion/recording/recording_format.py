@@ -1,7 +1,11 @@
-"""What `recording.json` says, how pixels are coded, and which paths a recording may name. RECORDING.md is the rule.
+"""Format of recordings: the header `recording.json`, the coding of pixels, the paths that it may name (RECORDING.md).
 
-A recording may come from anybody: every path in it must stay inside its folder, symbolic links included, or
-opening a stranger's recording would hand out files of ours.
+A recording may come from any source: every path in it must stay inside its folder, symbolic links included, or opening
+it would expose other files of this machine.
+
+A depth camera usually reports the distance along the optical axis (z), in integer millimetres or tenths; a
+time-of-flight camera the distance along the beam. A mix-up bends every wall by up to 20 % at the image's corners, so
+callers choose a function by convention: `range_from_z_depth` or `range_from_radial`.
 """
 
 import re
@@ -38,7 +42,7 @@ RESERVED_NAMES = frozenset(["trajectory", "measurements", "scalars"])
 COUNT_MAX = 65535
 PATH_LENGTH_MAX = 1024
 NAME_BYTES_MAX = 255
-"""Of one part of a path, on every common file system; beyond it the system's own error would come."""
+"""Longest part of a path on all common file systems; a longer one would raise the system's own error."""
 
 Metres = npt.NDArray[np.float32]
 Kelvin = npt.NDArray[np.float32]
@@ -48,7 +52,7 @@ Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class Convention(StrEnum):
-    """Which distance a depth pixel holds."""
+    """Kind of distance in a depth pixel."""
 
     RANGE = "range"
     """Along the pixel's beam, as a time-of-flight camera measures."""
@@ -57,7 +61,7 @@ class Convention(StrEnum):
 
 
 class RangeEncoding(BaseModel):
-    """How distance becomes counts: counts = metres * units_per_m; count 0 = nothing came back."""
+    """Coding of distance: counts = metres * units_per_m; count 0 = nothing came back."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -67,7 +71,7 @@ class RangeEncoding(BaseModel):
 
 
 class ThermalEncoding(BaseModel):
-    """How temperature becomes counts: kelvin = counts * kelvin_per_count + kelvin_at_zero; count 0 = no reading."""
+    """Coding of temperature: kelvin = counts * kelvin_per_count + kelvin_at_zero; count 0 = no reading."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -77,7 +81,7 @@ class ThermalEncoding(BaseModel):
 
 
 class RecordingHeader(BaseModel):
-    """`recording.json`: the name, the cameras that were recorded and how, and how far apart times may be."""
+    """`recording.json`: the name, the recorded cameras and their coding, and limits on gaps in time."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -90,9 +94,9 @@ class RecordingHeader(BaseModel):
     colour: tuple[str, ...] = ()
     thermal: dict[str, ThermalEncoding] = Field(default_factory=dict)
     max_gap_s: Seconds = 0.0
-    """How far in time another camera's image may be from the range image; 0: the same time stamp."""
+    """Largest time between the range image and another camera's image, seconds; 0: the same time stamp."""
     max_pose_gap_s: Seconds = 0.0
-    """How far apart the two poses may be between which one is interpolated; 0: the same time stamp."""
+    """Largest time between two poses for interpolation, seconds; 0: a pose with the same time stamp."""
 
     def to_json(self) -> bytes:
         """The bytes of `recording.json`; the mirror of `header_from_json`."""
@@ -161,7 +165,7 @@ def check_camera_name(name: str) -> None:
 
 
 def path_inside(folder: Path, relative: str) -> Path:
-    """The real path of a file that a recording names, certain to be inside the recording's folder.
+    """Real path of a file that a recording names, certain to be inside the recording's folder.
 
     Raises:
         BadInputError: `unsafe_path`: absolute, with `..` or a backslash, or a link that leads outside.

@@ -1,8 +1,8 @@
-"""Writing a recording, so that a half-written one is never taken for a whole one.
+"""Writer of recordings; a half-written recording is never taken for a whole one.
 
     rig.json first  ->  images, then their list lines, scan by scan  ->  recording.json last, by rename
 
-A folder with `rig.json` and no `recording.json` is one whose writer died; what its lists name is there.
+A folder with `rig.json` and no `recording.json` belongs to a writer that died; all files that its lists name exist.
 """
 
 import os
@@ -47,7 +47,7 @@ LIST_COMMENTS: Mapping[str, str] = {
 
 
 class RecordingWriter:
-    """A recording being written; finished when the `with` block ends without an error.
+    """Writer of one recording, which is finished when the `with` block ends without an error.
 
     with RecordingWriter(folder, rig, name="lab-1") as recording:
         for scan in stop:
@@ -59,8 +59,8 @@ class RecordingWriter:
         rig: the cameras of all scans.
         name: of the recording; letters, digits, dot, dash, underscore.
         note: free text for people.
-        range_encoding: units and convention of range images; what does not fit 16 bits is refused, not clipped.
-        thermal_encoding: the scale of all thermal images; likewise.
+        range_encoding: units and convention of range images; a range that does not fit 16 bits is refused.
+        thermal_encoding: the scale of all thermal images; a temperature that does not fit 16 bits is refused.
 
     Raises:
         ConflictError: the folder holds something already.
@@ -135,6 +135,7 @@ class RecordingWriter:
                 )
         if self._scan_count and (scan.T_map_body is not None) != (BODY_FILE in self._lists):
             raise BadInputError("bad_scan", "either every scan of a recording says where the body was, or none does")
+        # Images first, then their lines: a list never names a file that is missing.
         time_s = float(scan.time_s)
         for list_name, relative in self._write_images(scan).items():
             self._list(list_name).write(f"{time_s!r} {relative}\n")
@@ -171,6 +172,7 @@ class RecordingWriter:
             for file in self._lists.values():
                 file.flush()
                 os.fsync(file.fileno())
+        # The header comes last, and in one step: it is what makes a folder a recording.
         header = self._header.model_copy(
             update={
                 "range": dict.fromkeys(self._cameras("range"), self._range_encoding),
@@ -191,6 +193,7 @@ class RecordingWriter:
         """Every image of the scan, all encoded before one is written; each one's list, and its path in it."""
         name = f"{self._scan_count:06d}.png"
         camera = self.rig[scan.range_camera].camera
+        # Encoding refuses values that do not fit, before any file is written.
         counts = {scan.range_camera: encode_range(scan.range_m, camera, self._range_encoding)}
         counts |= {thermal: encode_kelvin(kelvin, self._thermal_encoding) for thermal, kelvin in scan.thermal.items()}
         if scan.amplitude is not None:

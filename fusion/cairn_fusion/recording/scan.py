@@ -1,13 +1,13 @@
-"""One scan: a head pose and all its images.
+"""Scan: a head pose and all its images.
 
     range_m      (H, W) float32   metres along each beam of `range_camera`; NaN = nothing came back (not "free")
     amplitude    (H, W) uint16    what the time-of-flight camera's own light returned
     colour       {camera: (H, W, 3) uint8}     sRGB, in R, G, B order
     thermal      {camera: (H, W) float32}      apparent temperature, kelvin; NaN = no reading
     scalars      {channel: float}              named readings at the rig's origin (dose, gas, ...)
-    T_map_body   where the robot's body was, so that its own points can be left out
+    T_map_body   pose of the robot's body, so that its own points can be left out
 
-Other conventions (z-depth, millimetres, raw counts) enter through `adapters.py` only.
+Other conventions (z-depth, millimetres, raw counts) enter through `recording_format` only.
 """
 
 from collections.abc import Mapping
@@ -30,21 +30,23 @@ class Scan:
     time_s: float
     """UTC, seconds since 1970."""
     T_map_rig: Transform
+    """Pose of the rig."""
     range_camera: str
+    """Camera of `range_m` and `amplitude`."""
     range_m: npt.NDArray[np.float32]
     amplitude: npt.NDArray[np.uint16] | None = None
     colour: Mapping[str, npt.NDArray[np.uint8]] = field(default_factory=dict)
     thermal: Mapping[str, npt.NDArray[np.float32]] = field(default_factory=dict)
     scalars: Mapping[str, float] = field(default_factory=dict)
     T_map_body: Transform | None = None
-    """Where the frame of the rig's body is; None: the body's boxes are in the rig's frame."""
+    """Pose of the frame of the rig's body; None: the body's boxes are in the rig's frame."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_map_rig", check_transform(self.T_map_rig, name="T_map_rig"))
         if self.T_map_body is not None:
             object.__setattr__(self, "T_map_body", check_transform(self.T_map_body, name="T_map_body"))
         if not isinstance(self.range_m, np.ndarray):
-            # Above all no `EyeDepth`: what was filled in for the eye is no measurement.
+            # Above all no `DenseDepth`: a range filled in for viewing is no measurement.
             raise BadInputError("bad_scan", f"range_m must be an array of ranges, got {type(self.range_m).__name__}")
         if not np.isfinite(self.time_s):
             raise BadInputError("bad_scan", f"time_s must be finite seconds, got {self.time_s}")

@@ -3,8 +3,8 @@
     1700000000.00  images/left/000000.png
     1700000000.25  images/left/000001.png
 
-Times increase strictly. Whatever is wrong is told as `file:line: what was expected, what came`. What the rest
-of a line means is the caller's: a path, a pose, a reading.
+Times increase strictly. Errors read `file:line: what was expected, what came`. The caller parses the rest of a line: a
+path, a pose, a reading.
 """
 
 import math
@@ -19,14 +19,14 @@ import numpy.typing as npt
 from cairn_map.errors import BadInputError
 
 LIST_BYTES_MAX = 64 << 20
-"""Some 700 000 lines of a trajectory; ten hours at 20 Hz."""
+"""Largest list: some 700 000 lines of a trajectory, ten hours at 20 Hz."""
 
 Value = TypeVar("Value")
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One line that is no comment, and where it stands."""
+    """One line that is no comment, with its file and number."""
 
     path: Path
     number: int

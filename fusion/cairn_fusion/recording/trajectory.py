@@ -1,4 +1,4 @@
-"""A trajectory: the rig's pose over time, in the TUM RGB-D benchmark's text format.
+"""Trajectory: the rig's pose over time, in the TUM RGB-D benchmark's text format.
 
     # time tx ty tz qx qy qz qw        T_map_rig; metres; unit quaternion, scalar last
     1700000000.0 1.5 0.0 0.4 0 0 0.70710678 0.70710678
@@ -25,15 +25,15 @@ class Trajectory:
     """Poses at strictly increasing times."""
 
     path: Path | str
-    """The file, or what else the poses are from; errors name it."""
+    """The file or other source of the poses; errors name it."""
     poses: TimedList[Transform]
 
     def pose_at(self, time_s: float, *, max_gap_s: float) -> Transform:
-        """`T_map_rig` at a time: the pose of that very time stamp, else interpolate_pose between its neighbours.
+        """`T_map_rig` at a time: the pose of that very time stamp, else interpolated between its neighbours.
 
         Args:
             time_s: seconds, on the trajectory's clock.
-            max_gap_s: how far apart the two neighbours may be; 0 allows exact matches only.
+            max_gap_s: largest time between the two neighbours; 0 allows exact matches only.
 
         Raises:
             BadInputError: `no_pose`: outside the trajectory, or the neighbours are too far apart.
@@ -65,7 +65,7 @@ def read_trajectory(path: Path) -> Trajectory:
 
 
 def trajectory_line(time_s: float, T_map_rig: Transform) -> str:
-    """One line, newline included, that reads back within 1e-15 of the rotation and exactly in position and time."""
+    """One line, newline included; it reads back within 1e-15 of the rotation, and exactly in position and time."""
     numbers = [time_s, *T_map_rig[:3, 3], *quaternion_from_transform(T_map_rig)]
     return " ".join(repr(float(number)) for number in numbers) + "\n"
 

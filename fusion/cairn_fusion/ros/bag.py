@@ -1,12 +1,12 @@
-"""A bag: what a robot that speaks ROS recorded, message by message, out of any file that ROS writes.
+"""Bag: messages that a robot with ROS recorded, one by one, from any file that ROS writes.
 
-    FILE.bag                  ROS 1                              bag_rosbags.py
-    FILE.db3                  ROS 2, SQLite                      bag_rosbags.py
-    FILE.mcap                 messages of ROS 1 or ROS 2         bag_mcap.py
+    FILE.bag                  ROS 1                              `rosbags_bag`
+    FILE.db3                  ROS 2, SQLite                      `rosbags_bag`
+    FILE.mcap                 messages of ROS 1 or ROS 2         `mcap_bag`
     DIR with one or more .db3 or .mcap, as rosbag2 makes it      each file in turn
 
-A bag may come from anybody: a file is asked for no more bytes than it has, and unpacked into no more than
-`CHUNK_BYTES_MAX`. What the bag says of its messages' layout is not used (`ros_messages.py`).
+A bag may come from any source: no more bytes are read than the file has, and no chunk is unpacked into more than
+`CHUNK_BYTES_MAX`. The bag's own definitions of its messages are not used (`messages`).
 """
 
 import struct
@@ -22,31 +22,31 @@ from typing import NamedTuple, Protocol
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError
 
 CHUNK_BYTES_MAX = 256 << 20
-"""Of one unpacked chunk, so of one message too; bags are recorded in chunks of about 1 MB."""
+"""Largest unpacked chunk, and so the largest message; bags are recorded in chunks of about 1 MB."""
 FOREIGN_ERRORS: tuple[type[Exception], ...] = (
     *(struct.error, zlib.error, EOFError, OSError, AssertionError, MemoryError, RuntimeError),
     *(LookupError, TypeError, ValueError, OverflowError, AttributeError, RecursionError),
 )
-"""What the libraries that read bags raise on damaged ones, beside their own errors."""
+"""Errors that the libraries for bags raise on damaged files, in addition to their own."""
 
 
 class Wire(StrEnum):
-    """How a message's fields are put into bytes."""
+    """Serialisation of a message's fields."""
 
     ROS1 = "ros1"
     CDR = "cdr"
-    """Of ROS 2."""
+    """Serialisation of ROS 2."""
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """What a bag says of one topic."""
+    """One topic of a bag."""
 
     name: str
     type: str
     """`sensor_msgs/Image`, in this form for ROS 1 and ROS 2."""
     wire: Wire | None
-    """None: an encoding that is none of ROS."""
+    """Serialisation; None: neither of those of ROS."""
     count: int
 
 
@@ -55,7 +55,7 @@ class BagMessage(NamedTuple):
 
     topic: str
     log_ns: int
-    """When it was recorded; the time that it speaks of is in its header."""
+    """Time of recording; the time of the measurement is in the message's header."""
     data: bytes | memoryview
 
 
@@ -74,11 +74,11 @@ class Bag(Protocol):
 
     @property
     def start_ns(self) -> int:
-        """When the first message was recorded."""
+        """Time at which the first message was recorded."""
         ...
 
     def messages(self, topics: Collection[str], *, start_ns: int = 0) -> Iterator[BagMessage]:
-        """Messages of some topics that were recorded at a time or later, in this order.
+        """Messages of some topics, recorded at a time or later, in order of recording.
 
         Raises:
             DamagedDataError: the file is damaged.
@@ -91,7 +91,7 @@ class Bag(Protocol):
 
 
 class BoundedFile(BufferedReader):
-    """A file that is never asked for more than it has, so that a false length costs no memory."""
+    """File that refuses to read beyond its end, so that a false length costs no memory."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(FileIO(path))
@@ -106,7 +106,7 @@ class BoundedFile(BufferedReader):
 
 @contextmanager
 def translate_damage(path: Path, *foreign: type[Exception], advice: str) -> Iterator[None]:
-    """Turn whatever a library raises on a damaged bag into `DamagedDataError` with the next step."""
+    """Translate errors that a library raises on a damaged bag into `DamagedDataError` with the next step."""
     try:
         yield
     except CairnError:

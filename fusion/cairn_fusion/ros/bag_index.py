@@ -1,6 +1,6 @@
-"""What is in a bag, found in one pass: how many messages of which size when, and where frames were.
+"""Index of a bag, made in one pass: times and sizes of all messages, and the poses of frames.
 
-Of images only the header is read; the pixels come when a scan is asked for (`bag_recording.py`).
+Of images only the header is read; pixels are read with their scan (`bag_recording`).
 """
 
 from array import array
@@ -36,11 +36,11 @@ from cairn_fusion.ros.tf_tree import FrameTree
 from cairn_map.errors import BadInputError, DamagedDataError
 
 MESSAGES_MAX = 20_000_000
-"""Times of that many messages are 320 MB."""
+"""Largest number of messages; their times take 320 MB."""
 BASE = "base"
-"""What a pose that names no child is of."""
+"""Child of a pose that names none."""
 STATIC_NAME = "static"
-"""In the name of a topic whose transforms count for ever."""
+"""Part of the names of topics whose transforms hold at all times."""
 
 
 @dataclass(slots=True)
@@ -50,19 +50,19 @@ class TopicIndex:
     topic: Topic
     log_ns: "array[int]" = field(default_factory=lambda: array("q"))
     times_s: "array[float]" = field(default_factory=lambda: array("d"))
-    """Of the headers; where there is none, of the recording."""
+    """Times of the headers, or of the recording for messages without one."""
     size_bytes: int = 0
     frame: str = ""
-    """That the first message names."""
+    """Frame that the first message names."""
     encoding: str = ""
-    """Of the first image, or the format of the first compressed one."""
+    """Encoding of the first image, or the format of the first compressed one."""
     image_size: tuple[int, int] | None = None
     """Width and height of the first image or camera info."""
     info: RosCameraInfo | None = None
     elevations_deg: tuple[float, ...] | None = None
-    """Of the beams in the first point cloud, the highest first."""
+    """Elevations of the beams in the first point cloud, degrees, the highest first."""
     columns: int = 0
-    """Points of a beam in it, at most."""
+    """Largest number of points of a beam in the first point cloud."""
 
     def __len__(self) -> int:
         return len(self.log_ns)
@@ -81,19 +81,19 @@ class TopicIndex:
 
 @dataclass(frozen=True, slots=True)
 class BagIndex:
-    """All topics that were looked at, and all transforms."""
+    """Indexes of topics, and all transforms."""
 
     topics: dict[str, TopicIndex]
     tree: FrameTree
-    """Of tf alone: who publishes odometry as well says the same twice."""
+    """Tree of tf alone: a robot that publishes odometry too states the same pose twice."""
     tracks: dict[str, FrameTree]
-    """Of each topic of odometry or poses: its one edge; a child without a name is `BASE`."""
+    """Tree of each topic of odometry or poses, with its one edge; a child without a name is `BASE`."""
 
 
 def index_bag(
     bag: Bag, topics: Collection[str] | None = None, *, on_message: Callable[[], object] | None = None
 ) -> BagIndex:
-    """Look through a bag once.
+    """Index a bag in one pass.
 
     Args:
         bag: the bag.
@@ -117,7 +117,7 @@ def index_bag(
 
 @contextmanager
 def translate_message_damage(bag: Bag, message: BagMessage) -> Iterator[None]:
-    """Turn what is wrong in a message's bytes into an error with topic and time."""
+    """Translate errors in a message's bytes into one with topic and time."""
     try:
         yield
     except ValueError as exc:
@@ -129,10 +129,10 @@ def translate_message_damage(bag: Bag, message: BagMessage) -> Iterator[None]:
 
 
 def wire_of(topic: Topic) -> Wire:
-    """How a topic's messages are coded.
+    """Serialisation of a topic's messages.
 
     Raises:
-        BadInputError: in none of ROS's ways.
+        BadInputError: none of ROS.
     """
     if topic.wire is None:
         raise BadInputError(
@@ -164,7 +164,7 @@ def _add(index: BagIndex, message: BagMessage, bag: Bag) -> None:
 
 
 def _look_closer(entry: TopicIndex, message: BagMessage, wire: Wire) -> None:
-    """What the first message of a topic shows of all."""
+    """Properties of all messages of a topic, from the first one."""
     if entry.topic.type == IMAGE:
         image = read_image(message.data, wire)
         entry.encoding, entry.image_size = image.encoding, (image.width, image.height)
@@ -181,7 +181,7 @@ def _look_closer(entry: TopicIndex, message: BagMessage, wire: Wire) -> None:
 
 
 def _add_poses(index: BagIndex, message: BagMessage, topic: Topic, wire: Wire) -> None:
-    """Keep the transforms, or the pose, in a message."""
+    """Add the transforms, or the pose, in a message."""
     if topic.type in TRANSFORMS:
         for edge in read_transforms(message.data, wire):
             index.tree.add(edge, is_static=STATIC_NAME in topic.name)

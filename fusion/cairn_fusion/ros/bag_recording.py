@@ -1,4 +1,4 @@
-"""Scans out of a bag: found in one pass, read one at a time.
+"""Recording in a bag: scans found in one pass, read one at a time; with or without a mapping of its topics.
 
 index_bag  ->  scans_of       times of all images, all poses           once
 BagRecording.scan(i)          decode the images of one range image     each time
@@ -38,12 +38,12 @@ from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError
 
 PixelsT = TypeVar("PixelsT", bound=Pixels)
 SKIP_MAX = 256
-"""So many messages are rather read past than the bag searched anew."""
+"""Messages that are skipped one by one; for more of them the bag is searched again."""
 
 
 @dataclass(slots=True)
 class TopicReader:
-    """The messages of one topic by number; quick when asked for in order."""
+    """Messages of one topic by number; fast for numbers in rising order."""
 
     bag: Bag
     index: TopicIndex
@@ -55,6 +55,7 @@ class TopicReader:
         """Message n."""
         if self._last is not None and self._last[0] == n:
             return self._last[1]
+        # Rewind, or jump: to the first message with the same time, from which numbers count on.
         if not 0 <= self._next <= n <= self._next + SKIP_MAX:
             log_ns = np.array(self.index.log_ns, dtype=np.int64)
             self._next = int(np.searchsorted(log_ns, log_ns[n]))
@@ -68,7 +69,7 @@ class TopicReader:
 
 
 class BagRecording:
-    """The scans of a bag; see `recording.ScanSource`. The file is closed when nobody holds it any more."""
+    """Scans of a bag; see `recording.ScanSource`. The file is closed when the object is garbage collected."""
 
     def __init__(
         self, bag: Bag, index: BagIndex, mapping: BagMapping, *, scans_per_measurement: int | None = None
@@ -79,6 +80,7 @@ class BagRecording:
             BadInputError: a topic or frame is missing or of another type, a camera has no calibration, or there is no
                 pose for a scan between others.
         """
+        # Topics that are missing or of another type are refused before anything is computed.
         self._mapping = mapping
         self._bag = bag
         self._topics = {topic: _images_of(index, topic, name, types) for topic, name, types in _image_topics(mapping)}
@@ -110,6 +112,7 @@ class BagRecording:
         """
         if not 0 <= index < len(self):
             raise NotFoundError("no_such_scan", f"{self.name} has scans 0 to {len(self) - 1}, asked for {index}")
+        # The range image makes the scan; of other cameras the images that `scans_of` found for its time.
         found = self._scans[index]
         cameras = self._mapping.cameras
         own = cameras[found.camera]
@@ -138,7 +141,7 @@ class BagRecording:
         return _range_of(self._pixels(camera.topic, found, depth_of), self.rig[found.camera].camera, camera)
 
     def _sweep(self, camera: MappedCamera, found: BagScan) -> npt.NDArray[np.float32]:
-        """The same of a lidar's cloud."""
+        """(H, W) metres along the beam, of a lidar's cloud."""
         lidar = self.rig[found.camera].camera
         message = self._readers[camera.topic].message(found.images[camera.topic])
         with translate_message_damage(self._bag, message):
@@ -167,7 +170,7 @@ def open_bag_recording(
     *,
     scans_per_measurement: int | None = None,
 ) -> BagRecording:
-    """The scans of a bag, looked through once, its images not yet decoded.
+    """Scans of a bag, indexed in one pass, its images not yet decoded.
 
     Raises:
         BadInputError: no bag, or as `BagRecording`.
@@ -175,6 +178,7 @@ def open_bag_recording(
     """
     bag = open_bag(path)
     try:
+        # One pass over the topics of the mapping, and over all transforms.
         wanted = {*mapping.topics(), mapping.poses.topic}
         if missing := sorted(wanted - bag.topics.keys()):
             raise BadInputError(
@@ -191,7 +195,7 @@ def open_bag_recording(
 
 
 def _image_topics(mapping: BagMapping) -> Iterator[tuple[str, str, tuple[str, ...]]]:
-    """Each topic of pixels, whose it is, and which types it may have."""
+    """Topics of pixels, each with its camera and the types that it may have."""
     for name, camera in mapping.cameras.items():
         yield camera.topic, name, (POINTS,) if camera.lidar else (IMAGE, COMPRESSED)
         if camera.amplitude is not None:
@@ -219,6 +223,7 @@ def _rig_of(index: BagIndex, mapping: BagMapping, topics: Mapping[str, TopicInde
         else:
             frame = camera.frame or topics[camera.topic].frame
             T_base_camera = index.tree.fixed_pose(mapping.frames.base, frame)
+        # A lidar's frame has ROS's axes, not a camera's.
         if camera.lidar is not None:
             T_base_camera = T_base_camera @ T_LIDAR_CAMERA
         cameras[name] = mount_camera(camera.spectrum, _camera_of(index, name, camera), T_base_camera)
@@ -256,7 +261,7 @@ class Survey:
 
 
 def survey(path: Path, *, on_message: Callable[[], object] | None = None) -> Survey:
-    """Look through a whole bag.
+    """Index a whole bag, and propose a mapping for it.
 
     Raises:
         BadInputError: no bag, or the libraries that read bags are not installed.
@@ -271,7 +276,7 @@ def survey(path: Path, *, on_message: Callable[[], object] | None = None) -> Sur
 
 
 def open_any_bag(path: Path, mapping: BagMapping | None, *, scans_per_measurement: int | None = None) -> BagRecording:
-    """The scans of a bag by a mapping, or by the proposed one where nothing is left to decide.
+    """Scans of a bag by a mapping, or by the proposed one if it leaves no question open.
 
     Raises:
         BadInputError: `undecided`: the message lists the questions; else as `open_bag_recording`.

@@ -1,4 +1,4 @@
-"""Which images of a bag make a scan, and where the robot was for it.
+"""Scans of a bag: the images that belong together, and the pose of the robot.
 
 The range images are the scans, in order of their headers' times; of every other camera the nearest image within
 `time_tolerance_s` goes with it. Its pose leads from `frames.base` to `frames.map` at its time.
@@ -24,22 +24,22 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class BagScan:
-    """Where the images of one scan are: numbers of messages in their topics."""
+    """One scan: numbers of its images' messages in their topics."""
 
     time_s: float
     T_map_rig: Transform
     camera: str
     images: Mapping[str, int]
-    """By topic."""
+    """Number of the message, by topic."""
 
 
 def scans_of(bag: Bag, index: BagIndex, mapping: BagMapping, topics: Mapping[str, TopicIndex]) -> tuple[BagScan, ...]:
     """A scan for each range image between the first and the last pose, in order of time.
 
     Args:
-        bag: only named.
+        bag: named in messages.
         index: of its topics and transforms.
-        mapping: which topic is what.
+        mapping: meaning of the topics.
         topics: of all images, as they are in the index.
 
     Raises:
@@ -56,10 +56,13 @@ def scans_of(bag: Bag, index: BagIndex, mapping: BagMapping, topics: Mapping[str
         if not has_pose.all():
             log.warning(
                 "%s: %d of %d images of %s are before the first or after the last pose, and are left out",
-                *(bag.path.name, int((~has_pose).sum()), len(times_s), camera.topic),
+                bag.path.name,
+                int((~has_pose).sum()),
+                len(times_s),
+                camera.topic,
             )
         for time_s in times_s[has_pose].tolist():
-            images = _beside(mapping, camera, lists, time_s)
+            images = _images_near(mapping, camera, lists, time_s)
             scans.append(BagScan(time_s=time_s, T_map_rig=pose_at(time_s), camera=name, images=images))
     if not scans:
         raise BadInputError(
@@ -70,7 +73,7 @@ def scans_of(bag: Bag, index: BagIndex, mapping: BagMapping, topics: Mapping[str
     return tuple(sorted(scans, key=lambda scan: scan.time_s))
 
 
-def _beside(
+def _images_near(
     mapping: BagMapping, camera: MappedCamera, lists: Mapping[str, TimedList[int]], time_s: float
 ) -> dict[str, int]:
     """The images of one scan: the range image itself, and the nearest of every other topic."""

@@ -5,8 +5,8 @@
     thermal      16UC1 mono16
     colour       rgb8 bgr8 rgba8 bgra8 8UC3 mono8, JPEG, PNG
 
-Names of encodings are those of sensor_msgs/image_encodings.hpp. Of the compressed ones the file's own header counts,
-and is checked before a pixel is allocated (`images.py`).
+Names of encodings are those of sensor_msgs/image_encodings.hpp. For compressed images the file's own header counts, and
+is checked before a pixel is allocated (`recording.images`).
 """
 
 import struct
@@ -34,18 +34,18 @@ RAW = {
     "rgba8": ("u1", 4),
     "bgra8": ("u1", 4),
 }
-"""Type and channels of a pixel."""
+"""Type and channels of a pixel, by encoding."""
 DEPTHS = ("16UC1", "mono16", "32FC1")
 AMPLITUDES = ("16UC1", "mono16", "8UC1", "mono8")
 THERMALS = ("16UC1", "mono16")
 COLOURS = ("rgb8", "bgr8", "8UC3", "rgba8", "bgra8", "mono8")
 BLUE_FIRST = frozenset(["bgr8", "bgra8", "8UC3"])
 DEPTH_HEAD = struct.Struct("<iff")
-"""Of a compressedDepth message: format, and the two numbers of its inverse depth."""
+"""Head of a compressedDepth message: format, and the two numbers of its inverse depth."""
 
 
 def encoding_of(image: AnyImage) -> str:
-    """What the pixels are called, for people."""
+    """Encoding of the pixels, as text for messages."""
     return image.encoding if isinstance(image, RosImage) else image.format or "compressed"
 
 
@@ -54,10 +54,10 @@ def depth_of(image: AnyImage, name: str) -> Pixels:
 
     Args:
         image: the message.
-        name: what errors call it.
+        name: name of the image in errors.
 
     Raises:
-        BadInputError: an encoding that holds no depth.
+        BadInputError: the encoding holds no depth.
         DamagedDataError: fewer bytes than pixels, or a file that cannot be decoded.
     """
     if isinstance(image, RosImage):
@@ -104,7 +104,7 @@ def colour_of(image: AnyImage, name: str) -> npt.NDArray[np.uint8]:
 
 
 def _raw(image: RosImage, allowed: tuple[str, ...], name: str) -> Pixels:
-    """(H, W) or (H, W, C) view of a raw image's bytes, without what rows may have behind their last pixel."""
+    """(H, W) or (H, W, C) pixels of a raw image's bytes, without the padding at the end of rows."""
     if image.encoding not in allowed:
         raise BadInputError(
             "unknown_encoding",

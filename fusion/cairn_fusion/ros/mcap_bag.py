@@ -1,6 +1,6 @@
 """Bags in MCAP files (mcap.dev), with messages of ROS 1 or ROS 2.
 
-Found by the index at the file's end, chunk by chunk; a chunk is unpack into no more than it states. A file whose
+Found by the index at the file's end, chunk by chunk; a chunk is unpacked into no more than it states. A file whose
 writer died has no index: `mcap recover` makes one.
 """
 
@@ -30,12 +30,12 @@ RECORD_HEAD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 MESSAGE = 0x05
 WAITING_BYTES_MAX = 1 << 30
-"""Of messages in chunks that overlap in time."""
+"""Largest size of messages that wait for chunks that overlap in time."""
 Record = TypeVar("Record")
 
 
 class McapBag:
-    """An MCAP file; see `bag_file.Bag`."""
+    """MCAP file; see `bag.Bag`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -53,7 +53,7 @@ class McapBag:
                 raise
 
     def messages(self, topics: Collection[str], *, start_ns: int = 0) -> Iterator[BagMessage]:
-        """As `Bag.messages`. Chunks that overlap in time are sorted out while they are read."""
+        """Messages as `Bag.messages`; those of chunks that overlap in time are merged while they are read."""
         ids = {channel for channel, topic in self._topic_of.items() if topic in topics}
         waiting: list[tuple[int, int, BagMessage]] = []
         waiting_bytes = n = 0
@@ -153,7 +153,7 @@ class McapBag:
 
 
 def unpack(data: bytes, packing: str, size_bytes: int) -> bytes:
-    """A chunk's own bytes, exactly as many as it states, and never more than that in memory.
+    """Unpack a chunk into exactly as many bytes as it states, never more than that in memory.
 
     Raises:
         ValueError: another packing, or another size.
@@ -163,7 +163,7 @@ def unpack(data: bytes, packing: str, size_bytes: int) -> bytes:
             with zstandard.ZstdDecompressor().stream_reader(BytesIO(data)) as stream:
                 whole = stream.read(size_bytes + 1)
         except zstandard.ZstdError as exc:
-            raise ValueError(f"a chunk cannot be unpack: {exc}") from exc
+            raise ValueError(f"a chunk cannot be unpacked: {exc}") from exc
     elif packing == "lz4":
         whole = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size_bytes + 1)
     elif packing == "":

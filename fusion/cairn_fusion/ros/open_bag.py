@@ -1,4 +1,4 @@
-"""Bag files and rosbag2 folders, opened by their names: the one place that knows which library reads which."""
+"""Bag files and rosbag2 folders, opened by their names; each kind of file with its library."""
 
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack
@@ -10,12 +10,9 @@ from cairn_fusion.ros.bag import Bag, BagMessage, Topic
 from cairn_map.errors import BadInputError, DamagedDataError
 
 SUFFIXES = (".bag", ".db3", ".mcap")
-
-
 PACKED_SUFFIXES = (".zst", ".zstd")
-
-
 FILES_MAX = 4096
+"""Largest number of files in a rosbag2 folder."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +36,7 @@ class JoinedBag:
 
     @property
     def start_ns(self) -> int:
-        """When the first message was recorded."""
+        """Time at which the first message was recorded."""
         return self.files[0].start_ns
 
     def messages(self, topics: Collection[str], *, start_ns: int = 0) -> Iterator[BagMessage]:
@@ -56,12 +53,12 @@ class JoinedBag:
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a bag by its name, or a folder by the names in it."""
+    """True if a path is a bag by its name, or a folder with bags by the names in it."""
     return path.suffix in SUFFIXES if path.is_file() else path.is_dir() and bool(_files_of(path, SUFFIXES))
 
 
 def open_bag(path: Path) -> Bag:
-    """The bag in a file, or in a rosbag2 folder.
+    """Bag in a file, or in a rosbag2 folder.
 
     Raises:
         BadInputError: no bag, packed as a whole, or the libraries that read bags are not installed.
@@ -84,7 +81,7 @@ def open_bag(path: Path) -> Bag:
 
 
 def _open_file(path: Path, stack: ExitStack) -> Bag:
-    """One file, which the stack closes."""
+    """Bag in one file, which the stack closes."""
     bag = _bag_of(path)
     stack.callback(bag.close)
     return bag

@@ -18,23 +18,23 @@ from cairn_fusion.ros.messages import RosHeader, WireReader, header_of
 FIELD_BYTES_MIN = 13
 FIELDS_MAX = 64
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-"""Of sensor_msgs/PointField."""
+"""NumPy types by the numbers of sensor_msgs/PointField."""
 STEP_MIN_DEG = 0.01
-"""Beams nearer to each other are one."""
+"""Least angle between two beams; a smaller one makes them one beam."""
 R_LIDAR_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""From a camera's axes (x right, y down, z forward) to those of a lidar in ROS (x forward, y left, z up; REP 103)."""
+"""Rotation from a camera's axes (x right, y down, z forward) to a lidar's in ROS (x forward, y left, z up; REP 103)."""
 T_LIDAR_CAMERA = np.block([[R_LIDAR_CAMERA, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
 
 
 @dataclass(frozen=True, slots=True)
 class RosPoints:
-    """A cloud, its points still in their bytes."""
+    """Cloud with its points still as bytes."""
 
     header: RosHeader
     width: int
     height: int
     fields: dict[str, tuple[int, str]]
-    """Offset in the point, and NumPy's letter for the type."""
+    """Offset in the point and NumPy type, by name of the field."""
     point_step: int
     row_step: int
     data: memoryview
@@ -60,7 +60,7 @@ class RosPoints:
 
 
 def read_points(data: bytes | memoryview, wire: Wire) -> RosPoints:
-    """A `sensor_msgs/PointCloud2`. ValueError: the bytes are not that."""
+    """A `sensor_msgs/PointCloud2`; ValueError for other bytes."""
     reader = WireReader(data, wire)
     header = header_of(reader, wire)
     height, width = reader.integer("I"), reader.integer("I")
@@ -70,6 +70,7 @@ def read_points(data: bytes | memoryview, wire: Wire) -> RosPoints:
     found = [(reader.text(), reader.integer("I"), reader.integer("B"), reader.integer("I")) for _ in range(count)]
     order = ">" if reader.integer("B") else "<"
     point_step, row_step, octets = reader.integer("I"), reader.integer("I"), reader.octets()
+    # The layout that the message states must fit its bytes, before any array is made.
     fields = {name: (offset, order + TYPES[kind]) for name, offset, kind, _ in found if kind in TYPES}
     if not (width and height):
         width = height = 0  # no rows of nothing: 2^32 of them would take no bytes
@@ -85,7 +86,7 @@ def read_points(data: bytes | memoryview, wire: Wire) -> RosPoints:
 
 
 def elevations_of(points: RosPoints) -> tuple[float, ...] | None:
-    """Degrees of each beam in a cloud, the highest first: by the field `ring`, else by rows; None: neither tells."""
+    """Elevations of a cloud's beams, degrees, highest first: by the field `ring`, else by rows; None without both."""
     if not {"x", "y", "z"} <= points.fields.keys():
         return None
     xyz = points.xyz()
@@ -95,6 +96,7 @@ def elevations_of(points: RosPoints) -> tuple[float, ...] | None:
         beams = np.repeat(np.arange(points.height), points.width)
     else:
         return None
+    # The median over a beam is robust against noise and against points without a direction.
     across = np.hypot(xyz[:, 0], xyz[:, 1])
     seen = np.isfinite(xyz).all(axis=1) & (across > 0)
     beams, elevations_deg = beams[seen], np.degrees(np.arctan2(xyz[seen, 2], across[seen]))

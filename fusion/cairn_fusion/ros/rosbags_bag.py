@@ -28,16 +28,16 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 @dataclass(frozen=True, slots=True)
 class BoundedPath:
-    """As much of a path as the reader of ROS 1 bags uses; the file is a `BoundedFile`."""
+    """Path with the methods that the reader of ROS 1 bags uses; its file is a `BoundedFile`."""
 
     path: Path
 
     def exists(self) -> bool:
-        """Whether the file is there."""
+        """True if the file exists."""
         return self.path.exists()
 
     def open(self, *_: Any) -> BinaryIO:
-        """The file, to read."""
+        """The file, opened for reading."""
         return BoundedFile(self.path)
 
 
@@ -52,7 +52,7 @@ class BoundedReader1(Reader1):
 
 
 class RosbagsBag:
-    """A .bag or .db3 file; see `bag_file.Bag`."""
+    """A .bag or .db3 file; see `bag.Bag`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -71,7 +71,7 @@ class RosbagsBag:
                 raise
 
     def messages(self, topics: Collection[str], *, start_ns: int = 0) -> Iterator[BagMessage]:
-        """As `Bag.messages`."""
+        """Messages as `Bag.messages`."""
         connections = [connection for connection in self._reader.connections if connection.topic in topics]
         if not connections:
             return

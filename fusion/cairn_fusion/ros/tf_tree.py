@@ -1,4 +1,4 @@
-"""The tree of frames in a bag: which frame hangs on which, where, and when (tf, tf_static, odometry).
+"""Tree of frames in a bag: the pose of each frame on its parent over time (tf, tf_static, odometry).
 
     map -> odom -> base_link -> camera_link -> camera_optical_frame
      moving   moving       fixed          fixed
@@ -22,13 +22,13 @@ from cairn_map.errors import BadInputError
 
 EDGES_MAX = 10_000
 POSES_MAX = 4_000_000
-"""In one bag, 64 bytes each; 30 moving frames at 50 Hz for three quarters of an hour."""
+"""Largest number of poses in one bag, 64 bytes each: 30 moving frames at 50 Hz for three quarters of an hour."""
 DEPTH_MAX = 256
 
 
 @dataclass(slots=True)
 class Edge:
-    """Where one frame is on its parent, over time."""
+    """Pose of one frame on its parent, over time."""
 
     parent: str
     is_static: bool
@@ -47,17 +47,17 @@ class Edge:
 
     @property
     def is_fixed(self) -> bool:
-        """Whether it never moves."""
+        """True if it never moves."""
         rows = np.array(self.poses, dtype=np.float64).reshape(-1, 8)
         return self.is_static or bool((rows[:, 1:] == rows[0, 1:]).all())
 
 
 @dataclass(slots=True)
 class FrameTree:
-    """All edges of a bag, by the child's name."""
+    """Edges of a bag, by the child's name."""
 
     source: str
-    """What errors call the bag."""
+    """Name of the bag in errors."""
     edges: dict[str, Edge] = field(default_factory=dict)
     _count: int = 0
 
@@ -65,7 +65,7 @@ class FrameTree:
         """Add a pose of one edge.
 
         Raises:
-            BadInputError: the frame hangs on another one already, or there is too much.
+            BadInputError: the frame has another parent already, or there are too many poses or frames.
         """
         if not 0.5 < float(np.linalg.norm(found.pose[3:])) < 1.5 or not np.isfinite(found.pose).all():
             raise BadInputError(
@@ -124,7 +124,7 @@ class FrameTree:
         return max((first for first, _ in known), default=-np.inf), min((last for _, last in known), default=np.inf)
 
     def roots(self) -> list[str]:
-        """Frames that hang on no other, in order of their names."""
+        """Frames without a parent, in order of their names."""
         return sorted({edge.parent for edge in self.edges.values()} - self.edges.keys())
 
     def frames(self) -> set[str]:
@@ -132,10 +132,10 @@ class FrameTree:
         return self.edges.keys() | {edge.parent for edge in self.edges.values()}
 
     def way_up(self, frame: str) -> list[str]:
-        """A frame and those it hangs on, up to the root.
+        """A frame and its ancestors, up to the root.
 
         Raises:
-            BadInputError: the frames hang in a circle.
+            BadInputError: the frames form a circle.
         """
         way = [frame]
         while way[-1] in self.edges:
@@ -145,7 +145,7 @@ class FrameTree:
         return way
 
     def _ways(self, target: str, source: str) -> tuple[list[str], list[str]]:
-        """The edges, by their children, from both frames up to where they meet."""
+        """Edges, by their children, from both frames up to their first common ancestor."""
         above_target, above_source = self.way_up(target), self.way_up(source)
         meeting = next((frame for frame in above_source if frame in above_target), None)
         if meeting is None:

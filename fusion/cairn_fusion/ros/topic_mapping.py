@@ -1,4 +1,4 @@
-"""Which topics of a bag are what: the YAML file that `cairn robot inspect` proposes and `replay` follows.
+"""Mapping of a bag's topics to cameras and poses: the YAML that `cairn robot inspect` proposes and `replay` follows.
 
 name: lab-1
 frames: {map: odom, base: base_link}
@@ -43,13 +43,13 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Model(BaseModel):
-    """Values that do not change, and no fields that there are not."""
+    """Immutable values; unknown fields are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class Frames(Model):
-    """Two names out of the tree of frames."""
+    """Two frames of the tree of frames."""
 
     map: Frame
     """The frame that stays: the map's voxels are in it."""
@@ -58,12 +58,12 @@ class Frames(Model):
 
 
 class Poses(Model):
-    """Where poses come from."""
+    """Source of poses."""
 
     topic: Topic = "/tf"
     """tf, nav_msgs/Odometry, or geometry_msgs/PoseStamped."""
     max_gap_s: Seconds = 0.2
-    """How far apart the two poses may be between which one is interpolated."""
+    """Largest time between two poses for interpolation, seconds."""
 
 
 class Intrinsics(Model):
@@ -81,9 +81,9 @@ class MappedLidar(Model):
     """The raster that a spinning lidar's points are sorted into; its frame is ROS's: x forward, y left, z up."""
 
     columns: Side
-    """In one turn."""
+    """Columns of one turn."""
     elevations_deg: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=1024)]
-    """Of each beam, the highest first."""
+    """Elevation of each beam, degrees, the highest first."""
 
     @model_validator(mode="after")
     def _is_lidar(self) -> Self:
@@ -91,44 +91,44 @@ class MappedLidar(Model):
         return self
 
     def lidar(self) -> SpinningLidar:
-        """As a camera."""
+        """The lidar as a camera model."""
         beams = self.elevations_deg
         return SpinningLidar(width=self.columns, height=len(beams), elevations_deg=beams)
 
 
 class MappedCamera(Model):
-    """One camera: its topics, its place, and how its pixels are coded."""
+    """One camera: its topics, its pose, and the coding of its pixels."""
 
     spectrum: Spectrum
     topic: Topic
     amplitude: Topic | None = None
-    """Of a range camera: images of its own light, same raster."""
+    """Topic of a range camera's images of its own light, same raster."""
     info: Topic | None = None
-    """CameraInfo; its first message counts."""
+    """Topic of CameraInfo, of which the first message counts."""
     intrinsics: Intrinsics | None = None
-    """Instead of `info`."""
+    """Intrinsics instead of `info`."""
     lidar: MappedLidar | None = None
-    """Instead of both: the topic holds the point clouds of a spinning lidar."""
+    """Raster instead of both: the topic holds the point clouds of a spinning lidar."""
     is_rectified: bool = Field(default=False, alias="rectified")
-    """The images are rectified: of `info` then P counts, and no distortion."""
+    """True for rectified images: of `info` then P counts, and no distortion."""
     frame: Frame | None = None
-    """The optical frame; else the one that the images name."""
+    """Optical frame; None: the frame that the images name."""
     T_base_camera: tuple[Row, Row, Row, Row] | None = None
-    """Instead of `frame` and tf: maps points of the camera (x right, y down, z forward) to the base; metres."""
+    """Transform instead of `frame` and tf: from the camera (x right, y down, z forward) to the base; metres."""
     units_per_m: Positive = 1000.0
-    """Of range images with 16 bits; those with 32FC1 are metres."""
+    """Counts per metre of range images with 16 bits; those with 32FC1 are metres."""
     convention: Convention = Convention.Z
     kelvin_per_count: Positive = 0.01
     kelvin_at_zero: Finite = 0.0
 
     @property
     def range_encoding(self) -> RangeEncoding:
-        """How 16-bit range is coded."""
+        """Coding of 16-bit range."""
         return RangeEncoding(units_per_m=self.units_per_m, convention=self.convention)
 
     @property
     def thermal_encoding(self) -> ThermalEncoding:
-        """How temperature is coded."""
+        """Coding of temperature."""
         return ThermalEncoding(kelvin_per_count=self.kelvin_per_count, kelvin_at_zero=self.kelvin_at_zero)
 
     @model_validator(mode="after")
@@ -143,13 +143,13 @@ class MappedCamera(Model):
 
 
 class BagMapping(Model):
-    """The whole file."""
+    """Mapping of a bag: the whole file."""
 
     name: Name = "bag"
     frames: Frames
     poses: Poses = Poses()
     time_tolerance_s: Seconds = 0.02
-    """How far another image may be from the range image."""
+    """Largest time between the range image and another image, seconds."""
     scans_per_measurement: Annotated[int, Field(ge=1, le=4096)] = 1
     cameras: Annotated[dict[str, MappedCamera], Field(min_length=1, max_length=32)]
 
@@ -165,7 +165,7 @@ class BagMapping(Model):
         return self
 
     def topics(self) -> dict[str, str]:
-        """All topics of images and camera infos, and what each is for."""
+        """Topics of images and camera infos, each with its purpose."""
         wanted: dict[str, str] = {}
         for name, camera in self.cameras.items():
             wanted |= {
@@ -212,6 +212,7 @@ def camera_of_info(info: RosCameraInfo, *, is_rectified: bool, name: str) -> Cam
             "bad_intrinsics",
             f"{name} is not calibrated: its focal lengths are {fx:g} and {fy:g} px; give intrinsics instead of info",
         )
+    # Missing coefficients are 0; more than five, or another model's, are refused unless they are 0 too.
     k1, k2, p1, p2, k3, *more = (*(() if is_rectified else info.distortion), 0.0, 0.0, 0.0, 0.0, 0.0)
     k = (k1, k2, p1, p2, k3)
     if any(more) or (info.model not in (*PLUMB_BOB, "rational_polynomial") and any(k)):

@@ -1,10 +1,10 @@
-"""A guess at which topics of a bag are what, as the YAML text that `bag_mapping.py` reads, and what it cannot know.
+"""Proposed mapping of a bag's topics, as the YAML text that `topic_mapping` reads, with questions that it leaves open.
 
     depth      16 bits or float, "depth" in its name          thermal    16 bits, a thermal camera's name
     amplitude  grey, "infra", "ir" or "amplitude" in its name  colour     every other picture
     poses      tf, if a moving edge lies above the range camera; else the one odometry or pose topic
 
-What is certain only to whoever made the bag becomes a question, and `replay` without a file refuses it.
+A fact that only the maker of the bag knows becomes a question, and `replay` without a file refuses the bag.
 """
 
 import json
@@ -25,25 +25,27 @@ AMPLITUDE_WORDS = re.compile(r"infra|amplitude|intensity|(^|[_/])(ir|nir)\d*([_/
 THERMAL_WORDS = re.compile(r"therm|lwir|flir|boson|lepton|tau2|optris|seek")
 IGNORED_WORDS = re.compile(r"confidence|theora|ffmpeg|aligned_.*_mask|segmentation|label")
 CAMERA_WORDS = re.compile(r"depth|camera|stereo|rgb|color")
-"""In names of clouds that a depth camera's driver makes of its images."""
+"""Words in the names of clouds that a depth camera's driver makes from its images."""
 TOLERANCE_S = (0.005, 0.05)
+"""Least and greatest proposal of `time_tolerance_s`: half the time between range images, within these."""
 GAP_S = (0.1, 5.0)
+"""Least and greatest proposal of `max_gap_s`."""
 GAPS = 3
-"""Poses that may be missing in a row."""
+"""Usual gaps between poses that the proposed `max_gap_s` spans."""
 
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """A text to start from."""
+    """Proposed mapping, as text to edit."""
 
     text: str
     questions: tuple[str, ...]
-    """What must be decided by hand; none: the text can be used as it is."""
+    """Decisions left to the user; with none the text can be used unchanged."""
 
 
 @dataclass(slots=True)
 class Guess:
-    """One camera."""
+    """Guess of one camera."""
 
     name: str
     spectrum: Spectrum
@@ -53,26 +55,29 @@ class Guess:
 
     @property
     def is_rectified(self) -> bool:
-        """Whether its name says so, and its camera info makes a difference."""
+        """True if the topic's name says that its images are rectified."""
         return "rect" in self.entry.topic.name.rsplit("/", 1)[-1]
 
 
 def propose(index: BagIndex, path: Path) -> Proposal:
-    """The mapping that fits an index of all topics best.
+    """Mapping that fits an index of all topics best.
 
     Args:
         index: of the whole bag.
         path: of the bag; names the recording.
     """
+    # Stage 1: cameras by their names and encodings. Each stage adds the questions that it cannot answer.
     questions: list[str] = []
     cameras = _cameras(index, questions)
     ranges = [camera for camera in cameras if camera.spectrum is Spectrum.RANGE]
     if not ranges:
         questions.append("no topic looks like depth images; name one under cameras, with `spectrum: range`")
+    # Stage 2: poses of the first range camera's frame, and times by its rate.
     frame = ranges[0].entry.frame if ranges else ""
     pose_lines = _pose_lines(index, frame, questions)
     rate_hz = ranges[0].entry.rate_hz if ranges else 0.0
     tolerance_s = float(np.clip(0.5 / rate_hz if rate_hz else 0.02, *TOLERANCE_S))
+    # Stage 3: the text, with the questions as comments.
     lines = [
         f"# Which topics of {path.name} are what: cairn robot replay {path.name} --topics THIS_FILE --map URL",
         *(f"# DECIDE: {question}" for question in questions),
@@ -88,9 +93,10 @@ def propose(index: BagIndex, path: Path) -> Proposal:
 
 
 def _cameras(index: BagIndex, questions: list[str]) -> list[Guess]:
-    """One guess a camera; of the raw and compressed topics of one camera the raw one."""
+    """One guess for each camera; of its raw and compressed topics the raw one."""
     images = [entry for entry in index.topics.values() if entry.topic.type in (IMAGE, COMPRESSED) and len(entry)]
     images = [entry for entry in images if entry.topic.wire is not None and not IGNORED_WORDS.search(_word(entry))]
+    # A compressed topic lies one level below the raw topic of the same camera.
     plain = {entry.topic.name for entry in images if entry.topic.type == IMAGE}
     images = [e for e in images if e.topic.type == IMAGE or e.topic.name.rsplit("/", 1)[0] not in plain]
     roles = {entry.topic.name: _role(entry) for entry in images}
@@ -103,6 +109,7 @@ def _cameras(index: BagIndex, questions: list[str]) -> list[Guess]:
             guesses.append(Guess(name, spectrum, entry, info))
             if info is None:
                 questions.append(f"camera {name}: no CameraInfo beside {entry.topic.name}; write its intrinsics")
+    # Depth cameras first, so that the first range camera is one of them if there is any.
     ranges = [guess for guess in guesses if guess.spectrum is Spectrum.RANGE]
     guesses += _lidars(index, questions)
     if len(ranges) > 1:
@@ -119,7 +126,7 @@ def _cameras(index: BagIndex, questions: list[str]) -> list[Guess]:
 
 
 def _lidars(index: BagIndex, questions: list[str]) -> list[Guess]:
-    """Every topic of point clouds that a lidar can have made."""
+    """Guesses for topics of point clouds that a lidar may have made."""
     clouds = [e for e in index.topics.values() if e.topic.type == POINTS and len(e) and e.topic.wire is not None]
     found = [e for e in clouds if not CAMERA_WORDS.search(_word(e))]
     for n, entry in enumerate(found):
@@ -129,7 +136,7 @@ def _lidars(index: BagIndex, questions: list[str]) -> list[Guess]:
 
 
 def _role(entry: TopicIndex) -> str:
-    """What a picture shows, by its encoding and name."""
+    """Role of a topic's pictures, by their encoding and name."""
     word, encoding = _word(entry), entry.encoding
     is_deep = encoding.startswith(("16UC1", "mono16", "32FC1")) or "compressedDepth" in encoding
     if is_deep and ("depth" in word or encoding.startswith("32FC1") or "compressedDepth" in encoding):
@@ -160,25 +167,26 @@ def _place(entry: TopicIndex) -> str:
 
 def _info_of(entry: TopicIndex, index: BagIndex) -> str | None:
     infos = [e for e in index.topics.values() if e.topic.type == CAMERA_INFO and e.info is not None]
-    beside = [e for e in infos if e.topic.name == f"{_place(entry)}/camera_info"]
+    siblings = [e for e in infos if e.topic.name == f"{_place(entry)}/camera_info"]
     alike = [e for e in infos if e.frame == entry.frame and entry.image_size in (None, e.image_size)]
-    found = beside or alike
+    found = siblings or alike
     return found[0].topic.name if len(found) == 1 else None
 
 
 def _amplitude_of(guess: Guess, candidates: Iterable[TopicIndex]) -> str | None:
-    """The one picture that the range camera's own light can have made: same frame, same raster."""
+    """Topic of the range camera's own light: the only one with the same frame and raster, or None."""
     mine = (guess.entry.frame, guess.entry.image_size)
     found = [entry for entry in candidates if (entry.frame, entry.image_size) == mine]
     return found[0].topic.name if len(found) == 1 else None
 
 
 def _pose_lines(index: BagIndex, camera_frame: str, questions: list[str]) -> list[str]:
-    """Frames and poses."""
+    """Lines of frames and poses."""
     tf_topics = [e.topic.name for e in index.topics.values() if e.topic.type in TRANSFORMS and len(e)]
     way = index.tree.way_up(camera_frame) if camera_frame else []
     moving = [child for child in way[:-1] if not index.tree.edges[child].is_fixed]
     tracks = {topic: next(iter(track.edges.items())) for topic, track in index.tracks.items()}
+    # A moving edge above the camera; else the only topic of odometry or poses; else a question.
     if moving:
         topic, base, root = next(t for t in [*tf_topics] if "static" not in t), moving[0], way[-1]
         gap_s = max(_gap_s(index.tree, child) for child in moving)
@@ -206,7 +214,7 @@ def _pose_lines(index: BagIndex, camera_frame: str, questions: list[str]) -> lis
 
 
 def _gap_s(tree: FrameTree, child: str) -> float:
-    """A few times what usually lies between two poses."""
+    """A few times the usual gap between two poses, seconds."""
     gaps_s = np.diff(tree.edges[child].trajectory(child).poses.times_s)
     return float(np.clip(GAPS * np.median(gaps_s) if len(gaps_s) else 0.0, *GAP_S))
 

@@ -1,11 +1,11 @@
-"""What a calibration's uncertainty makes of a transferred pixel: G Cov G^T with the rig's own covariance.
+"""Covariance of a transferred pixel by the rig's calibration: G Cov G^T with the calibration's own covariance.
 
 A point P = d u(x, I_s) along the ray of its pixel goes through the rig's frame to the other camera and its pixel (Eq.
 1-6):
 
     p = pi( R_d^T ( exp(r_s) R_s d u + t_s + dt_s - t_d - dt_d ), I_d )
 
-G is its derivative by all that was calibrated: intrinsics I of both cameras, and of each pose the small turn r and
+G is its derivative by all calibrated parameters: intrinsics I of both cameras, and of each pose the small turn r and
 shift dt about the rig's axes, as `cairn_calib.rig.calibration` defines them. A rig without covariance may still state
 one number a camera, `calibration_sigma_px`.
 """
@@ -22,13 +22,13 @@ from cairn_map.errors import BadInputError
 
 
 def calibration_covariance(points_src: Floats, rig: Rig, *, src: str, dst: str) -> Floats:
-    """(N, 2, 2) covariance, px^2, that calibration leaves to where one camera's points appear in another's image.
+    """(N, 2, 2) covariance, px^2, of the pixels of one camera's points in another's image, by calibration alone.
 
     Args:
         points_src: (N, 3) metres, frame of `src`, each on the ray of its pixel there.
         rig: with both cameras, which have lenses; `src` may be a lidar.
-        src: the camera whose pixels are carried.
-        dst: the camera to look from.
+        src: source camera.
+        dst: camera with the pixels.
     """
     calibration = rig.calibration
     if calibration is None or calibration.covariance is None:
@@ -44,21 +44,24 @@ def calibration_covariance(points_src: Floats, rig: Rig, *, src: str, dst: str) 
 
 
 def place_gradients(points_src: Floats, rig: Rig, *, src: str, dst: str) -> dict[tuple[str, str], Floats]:
-    """(N, 2) by camera and parameter: how the pixel in `dst` moves with it, pixels a unit; none where src is dst."""
+    """(N, 2) derivatives of the pixel in `dst` by camera and parameter, pixels a unit; none where src is dst."""
     if src == dst:
         return {}
     S, D = rig[src].transform, rig[dst].transform
     camera = lens_of(rig, dst)
+    # Points about the rig's axes: turned by the source's rotation, and seen from the other camera's centre.
     from_rig = inverse(D)[:3, :3]
     turned = points_src @ S[:3, :3].T
     away = turned + S[:3, 3] - D[:3, 3]
     seen = camera.projection(transform_points(inverse(D) @ S, points_src))
     by_rig = seen.by_point @ from_rig
+    # A small turn r moves a point p by r x p, a shift by itself; those of `dst` move it the other way.
     gradients = {
         **_named(src, tuple(POSE_UNITS), np.concatenate([-by_rig @ cross_matrix(turned), by_rig], axis=-1)),
         **_named(dst, tuple(POSE_UNITS), np.concatenate([by_rig @ cross_matrix(away), -by_rig], axis=-1)),
         **_named(dst, camera.intrinsic_names, seen.by_intrinsics),
     }
+    # The source's intrinsics turn the ray of the pixel, along which the range stays.
     lens = rig[src].camera
     if isinstance(lens, Lens):
         rays = lens.unprojection(lens.project(points_src))
@@ -80,7 +83,7 @@ def lens_of(rig: Rig, name: str) -> Lens:
 
 
 def pixel_gradients(points_src: Floats, rig: Rig, *, src: str, dst: str) -> Floats:
-    """(N, 2, 2) how the pixel in `dst` moves with that in `src`, pixels a pixel; NaN where `src` has no lens."""
+    """(N, 2, 2) derivative of the pixel in `dst` by that in `src`, pixels a pixel; NaN where `src` has no lens."""
     lens, camera = rig[src].camera, lens_of(rig, dst)
     if not isinstance(lens, Lens):
         return np.full((len(points_src), 2, 2), np.nan)

@@ -1,6 +1,6 @@
-"""The covariance of every transferred pixel of an image: worked out on a coarse grid, interpolated between.
+"""Covariance of every transferred pixel of an image, computed on a coarse grid and interpolated.
 
-    12 x 9 pixels x 12 ranges    C + sigma_d^2 m m^T + sigma_u^2 D D^T     of `certainty`, each part by itself
+    12 x 9 pixels x 12 ranges    C + sigma_d^2 m m^T + sigma_u^2 D D^T     (`pixel_covariance`), each part by itself
     any pixel, range, noise      linear in the pixel and in 1 / range
 
 All parts change slowly over the image, and at most with the square of 1 / range: between nodes half as far again from
@@ -23,22 +23,23 @@ from cairn_fusion.transfer.covariance_grid_kernels import covariances_into
 from cairn_map.arrays import Floats, Singles
 
 COLUMNS, ROWS = 12, 9
+"""Nodes along the image's rows and columns."""
 NODES = np.geomspace(1 / 20.0, 1 / 0.2, 12)
-"""1 / range: 0.2 to 20 m; what is nearer or farther counts as these."""
+"""1 / range of the nodes: 0.2 to 20 m; nearer and farther points count as these."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CovarianceGrid:
-    """How uncertain the place in one camera's image is of what another camera's pixels show."""
+    """Covariance of the pixels in one camera's image that show the points of another camera's pixels."""
 
     grid: Floats
-    """(12, 9, 12, 8): `place_covariance_kernels`."""
+    """(12, 9, 12, 8) by 1 / range, row, column, and number of `covariance_grid_kernels`."""
     step_px: tuple[float, float]
-    """From column to column and from row to row."""
+    """Pixels from column to column and from row to row."""
 
     @classmethod
     def of(cls, rig: Rig, *, src: str, dst: str) -> Self:
-        """That of a pair of cameras; kept, because it takes some milliseconds.
+        """Grid of a pair of cameras; cached, because it takes some milliseconds.
 
         Raises:
             BadInputError: one of them is a lidar.
@@ -55,13 +56,13 @@ class CovarianceGrid:
         *,
         pixel_sigma_px: float = 0.0,
     ) -> Singles:
-        """(N, 3) float32 xx, xy, yy, px^2 of `dst`; NaN where the range is, or the other camera cannot see.
+        """(N, 3) float32 xx, xy, yy, px^2 of `dst`; NaN where the range is NaN, or the other camera cannot see.
 
         Args:
             pixels: (N, 2) x, y in `src`.
-            range_m: (N,) along their rays.
-            sigma_m: (N,) standard deviation of that.
-            pixel_sigma_px: of the pixels themselves.
+            range_m: (N,) metres along their rays.
+            sigma_m: (N,) standard deviation of the range.
+            pixel_sigma_px: standard deviation of the pixels themselves.
         """
         out = np.empty((len(pixels), 3), np.float32)
         xs, ys = (np.ascontiguousarray(pixels[:, n], dtype=np.float32) for n in (0, 1))
@@ -71,7 +72,7 @@ class CovarianceGrid:
 
 
 def calibration_bound_px(rig: Rig, *, src: str, dst: str) -> float:
-    """The largest standard deviation, px, that calibration leaves anywhere on the grid, whatever the direction."""
+    """Largest standard deviation by calibration anywhere on the grid and in any direction, px."""
     if rig.calibration is None or rig.calibration.covariance is None:
         return rig[dst].calibration_sigma_px or 0.0
     if not isinstance(rig[src].camera, Lens):
@@ -88,6 +89,7 @@ def _grid_of(
     x, y = np.linspace(0, seen_in.camera.width - 1, COLUMNS), np.linspace(0, seen_in.camera.height - 1, ROWS)
     rays = seen_in.camera.unproject(np.stack(np.meshgrid(x, y), axis=-1)).reshape(-1, 3)
     points = (rays[None] / NODES[:, None, None]).reshape(-1, 3)
+    # The three parts of a node: C by calibration, m = J t / d by range, D D^T by the pixel itself.
     grid = np.empty((len(points), 8))
     grid[:, :3] = _three(calibration_covariance(points, rig, src=src, dst=dst))
     T_dst_src = inverse(seen_by.transform) @ seen_in.transform

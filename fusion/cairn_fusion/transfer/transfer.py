@@ -1,11 +1,11 @@
-"""What other cameras saw of the points that the range camera measured (chapter IV of Kocmanova et al.).
+"""Transfer of the range camera's points into other cameras' images (chapter IV of Kocmanova et al.).
 
     range image --Eq. 1-4--> points in the range camera's frame --Eq. 5--> another camera's --Eq. 6--> its pixels
 
-A camera that stands elsewhere may see something else in front of a point. A z-buffer finds that out; its bins are
-as wide as the distance between neighbouring range pixels in the other image, else the sparse points of the coarse
-camera would let the background shine through between them. In so wide a bin a slanted surface, such as the floor far
-ahead, lies at many depths; how steep it is there is known from the neighbours in the range image.
+From the place of another camera, something else may hide a point. A z-buffer detects that; its bins are as wide as the
+distance between neighbouring range pixels in the other image, or the background would be seen between the sparse points
+of the coarse camera. In so wide a bin a slanted surface, such as the floor far ahead, lies at many depths; its slant is
+known from the neighbours in the range image.
 """
 
 from dataclasses import dataclass
@@ -28,14 +28,14 @@ BIN_MARGIN = 1.5
 """Bin width over the spacing of projected range pixels: they spread a little with obliqueness."""
 DEPTH_TOLERANCE = 0.05
 DEPTH_TOLERANCE_M = 0.03
-"""A point is hidden if it lies deeper than the nearest of its bin by more than 5 %, 3 cm and what its surface's slant
-makes of the bin's width."""
+"""A point is hidden if it lies deeper than the nearest of its bin by more than 5 %, 3 cm and the depth that its slanted
+surface spans in the bin."""
 KERNEL_COEFFICIENTS = 5
-"""Of the pinholes that the kernel knows; rational ones and other lenses take the longer way."""
+"""Distortion coefficients of the pinholes that the kernel projects; other lenses are projected by their own class."""
 
 
 class Label(IntEnum):
-    """What became of a point in another camera's image."""
+    """Result of the transfer of a point, or reason why a pixel has no value."""
 
     OK = 0
     OCCLUDED = 1
@@ -48,21 +48,21 @@ class Label(IntEnum):
     NO_READING = 6
     """The camera sees it, and has no value there."""
     UNCERTAIN = 7
-    """What the camera has there may be of another place (`certainty`, `samples`)."""
+    """The camera's value there may belong to another place (`pixel_covariance`, `samples`)."""
     BEYOND = 8
-    """The beam went on behind a surface of the map: a mirror, or that is gone (`beyond_labels`)."""
+    """The beam went on behind a surface of the map: a mirror, or a thing that is gone (`mirror_labels`)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Transfer:
-    """Where points appear in a camera: (N, 2) int64 pixels (x, y), valid where the label is OK; (N,) labels."""
+    """Pixels of points in a camera's image: (N, 2) int64 (x, y), valid where the label is OK; and (N,) labels."""
 
     pixels: Pixels
     labels: npt.NDArray[np.uint8]
 
     @property
     def ok(self) -> npt.NDArray[np.bool_]:
-        """(N,) points that the camera sees."""
+        """(N,) true for points that the camera sees."""
         return np.asarray(self.labels == Label.OK)
 
     def sample(self, image: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
@@ -89,13 +89,14 @@ def points_from_range(range_m: npt.NDArray[np.floating], camera: AnyCamera) -> F
         BadInputError: `range_m` is not the size of the camera's image.
     """
     camera.check_image(range_m, name="range image")
+    # Eq. 4 and Eq. 1: a unit ray times the range along it.
     return camera.rays() * range_m.astype(np.float64)[..., None]
 
 
 def depth_steps(points: Floats) -> Floats:
-    """How steep the surface is at each range pixel: depth to the next pixel, of rows and columns together.
+    """Slant of the surface at each range pixel: difference of depth to the next pixel, along rows plus along columns.
 
-    Of the two neighbours on a line the closer in depth counts, so that the step beside an edge is not taken for slant.
+    Of the two neighbours on a line the closer in depth counts, so that the step at an edge is not taken for slant.
 
     Args:
         points: (H, W, 3), metres, from `points_from_range`.
@@ -115,31 +116,37 @@ def transfer_points(
     steps_m: Floats | None = None,
     hidden_behind_m: float = DEPTH_TOLERANCE_M,
 ) -> Transfer:
-    """Where points of one camera's frame appear in another's image.
+    """Pixels of one camera's points in another's image, and their labels.
 
     Args:
         points_src: (N, 3), metres, frame of camera `src`; NaN for no range.
         rig: with both cameras.
         src: the range camera.
-        dst: the camera to look from.
+        dst: the camera whose image is searched.
         steps_m: (N,) `depth_steps` of the points; None: surfaces that face the camera.
-        hidden_behind_m: how much deeper than what hides it a point must be, besides 5 % and slant; infinite: none is.
+        hidden_behind_m: depth behind the nearest point of its bin beyond which a point is hidden, besides 5 % and
+            slant; infinite: none is.
     """
+    # Eq. 5's transform: source camera to rig to destination camera.
     T_dst_src, seen_by = inverse(rig[dst].transform) @ rig[src].transform, rig[dst].camera
     N = len(points_src)
     pixels, depth_m, labels = np.empty((N, 2), np.int64), np.empty(N), np.empty(N, np.uint8)
+    # Stage 1: into the other camera's frame (Eq. 5) and image (Eq. 6).
     if isinstance(seen_by, Camera) and len(seen_by.distortion) == KERNEL_COEFFICIENTS:
         lens = np.array([*seen_by.focal_px, *seen_by.centre_px])
         coefficients, limit = np.array(seen_by.distortion), radius_limit(seen_by.distortion)
         points, size = np.ascontiguousarray(points_src, dtype=np.float64), (seen_by.width, seen_by.height)
         project_into(pixels, depth_m, labels, points, T_dst_src, lens, coefficients, limit, *size)
     else:
+        # Other lenses: the same by their own projection.
         points = transform_points(T_dst_src, points_src)
         exact = seen_by.project(points)
         seen = seen_by.contains(exact)
         labels[:] = np.where(np.isnan(points[:, 2]), Label.NO_RANGE, np.where(seen, Label.OK, Label.OUT_OF_VIEW))
         pixels[:], depth_m[:] = np.rint(np.where(seen[:, None], exact, 0)), np.linalg.norm(points, axis=1)
+    # Stage 2: occlusion, by a z-buffer with bins as wide as the points are apart.
     if not _same_centre(T_dst_src):
+        # `steps_m` is the slant along one range pixel, of which a bin spans bin_px / ratio.
         ratio = seen_by.focal_px[0] / rig[src].camera.focal_px[0]
         bin_px = int(np.ceil(BIN_MARGIN * max(ratio, 1)))
         slant_m = np.zeros(N) if steps_m is None else steps_m * (bin_px / ratio)
@@ -149,5 +156,5 @@ def transfer_points(
 
 
 def _same_centre(T_dst_src: Transform) -> bool:
-    """Without parallax nothing can hide anything: both cameras look along the same rays."""
+    """True if both cameras look along the same rays: without parallax nothing can hide anything."""
     return bool(np.linalg.norm(T_dst_src[:3, 3]) < 1e-9)

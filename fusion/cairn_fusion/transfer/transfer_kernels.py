@@ -1,4 +1,4 @@
-"""Points into another camera's image, and which of them something else hides: the loops of `transfer`."""
+"""Points in another camera's image, and their occlusion: the loops of `transfer`."""
 
 import math
 
@@ -12,7 +12,7 @@ Pixels = npt.NDArray[np.int64]
 
 OK, OCCLUDED, OUT_OF_VIEW, NO_RANGE = 0, 1, 2, 3
 UNCERTAIN = 7
-"""`transfer.Label`."""
+"""Values of `transfer.Label`."""
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -30,7 +30,7 @@ def project_into(
 ) -> None:
     """Nearest pixels, depths and labels (not OCCLUDED yet) of (N, 3) points in a pinhole with Brown's distortion.
 
-    Eq. 5-6; what `cairn_calib.rig.camera.Camera.project` and `contains` say. `lens` is fx, fy, cx, cy.
+    Eq. 5-6, as `cairn_calib.rig.camera.Camera.project` and `contains`. `lens` is fx, fy, cx, cy.
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     k1, k2, p1, p2, k3 = coefficients[0], coefficients[1], coefficients[2], coefficients[3], coefficients[4]
@@ -44,17 +44,22 @@ def project_into(
     for n in range(count):
         own[0, n], own[1, n], own[2, n] = points[n, 0], points[n, 1], points[n, 2]
     for n in range(count):
+        # Eq. 5: into the other camera's frame.
         a, b, c = own[0, n], own[1, n], own[2, n]
         z = r20 * a + r21 * b + r22 * c + t2
+        # Eq. 6 on the plane at distance 1; f' and the principal point follow the distortion.
         x, y = (r00 * a + r01 * b + r02 * c + t0) / z, (r10 * a + r11 * b + r12 * c + t1) / z
         s = x * x + y * y
         radial = 1 + s * (k1 + s * (k2 + s * k3))
+        # Derivatives of the distorted place by x and y: a symmetric matrix, [xx xy; xy yy].
         slope = 2 * (k1 + s * (2 * k2 + s * 3 * k3))
         xx = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
         xy = x * y * slope + 2 * p1 * x + 2 * p2 * y
         yy = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
         u = (x * radial + 2 * p1 * x * y + p2 * (s + 2 * x * x)) * fx + cx
         v = (y * radial + p1 * (s + 2 * y * y) + 2 * p2 * x * y) * fy + cy
+        # Its determinant is positive where the lens maps one to one. Beyond, the polynomial folds the image over, and
+        # a point from far outside the view would appear in it.
         seen = (z > 0.0) & (math.sqrt(s) < radius_limit) & (xx * yy - xy * xy > 0.0)
         seen &= (u >= -0.5) & (v >= -0.5) & (u < right) & (v < bottom)
         depth_m[n] = z
@@ -83,9 +88,10 @@ def hide_into(
     tolerance: float,
     tolerance_m: float,
 ) -> None:
-    """Label what something nearer hides: deeper than the nearest point of its bin by more than is tolerated."""
+    """Label points OCCLUDED that lie deeper than the nearest of their bin by more than the tolerances."""
+    # The z-buffer: the nearest depth of each bin.
     nearest_m, bins = np.full(rows * columns, np.inf), np.empty(labels.shape[0], np.int32)
-    # By multiplication: what is half a pixel off a bin's edge is never rounded into the next.
+    # By multiplication: half a pixel off a bin's edge is never rounded into the next bin.
     share = 1.0 / bin_px
     for n in range(labels.shape[0]):
         column, row = np.int32((pixels[n, 0] + 0.5) * share), np.int32((pixels[n, 1] + 0.5) * share)
@@ -93,6 +99,7 @@ def hide_into(
     for n in range(labels.shape[0]):
         if labels[n] == OK and depth_m[n] < nearest_m[bins[n]]:
             nearest_m[bins[n]] = depth_m[n]
+    # Hidden: deeper by a share of the depth, a fixed step, and the depth that a slanted surface spans in a bin.
     for n in range(labels.shape[0]):
         if labels[n] == OK and depth_m[n] > nearest_m[bins[n]] * (1 + tolerance) + tolerance_m + slant_m[n]:
             labels[n] = OCCLUDED
@@ -102,6 +109,7 @@ def hide_into(
 def steps_of(depth_m: Floats) -> Floats:
     """(H, W) of `transfer.depth_steps`."""
     height, width = depth_m.shape
+    # With a border of unknown depth, so that no neighbour is missing.
     padded = np.full((height + 2, width + 2), np.inf)
     for y in range(height):
         row, given = padded[y + 1, 1 : 1 + width], depth_m[y]
@@ -119,9 +127,9 @@ def steps_of(depth_m: Floats) -> Floats:
 
 @nb.njit(forceinline=True)
 def step_beside(before: float, here: float, after: float) -> float:
-    """How much farther the surface is from one pixel of a line to the next; beside an edge, on this side of it.
+    """Difference of range from one pixel of a line to the next, on this side of an edge if there is one.
 
-    Infinite is not known: then there is none.
+    Infinite ranges are unknown; without a known neighbour the difference is 0.
     """
     one, other = abs(before - here), abs(after - here)
     least = np.inf

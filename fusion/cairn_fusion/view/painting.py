@@ -19,25 +19,25 @@ TEXT = (240, 240, 240)
 SHADOW = (0, 0, 0)
 BAR_PX = 14
 BAR_SHARE = 0.4
-"""Of the picture's height."""
+"""Length of the palette's bar, over the picture's height."""
 MARGIN_PX = 12
 CROSS_PX = 9
 LABEL_GAP_PX = 6
-"""Between the legend and the label of the hottest place."""
+"""Gap between the legend and the label of the hottest place."""
 READABLE_PX = 240
-"""Lower pictures are shown larger: legend and marker would cover half of them."""
+"""Height up to which pictures are enlarged: legend and marker would cover half of them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Emphasis:
-    """Which temperatures are paint_over, and how strongly."""
+    """Temperatures that are painted, and the strength of the paint."""
 
     alpha: float = 0.5
-    """0: nothing of the palette is seen, 1: nothing else."""
+    """Weight of the palette's colour: 0 the picture alone, 1 the palette alone."""
     from_k: float = -math.inf
-    """Colder is left as it is: with `to_k` endless, hot things only."""
+    """Lowest temperature that is painted, kelvin: with `to_k` infinite, hot things only."""
     to_k: float = math.inf
-    """Hotter is left as it is: an isotherm band."""
+    """Highest temperature that is painted, kelvin: with `from_k`, an isotherm band."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.alpha <= 1:
@@ -51,7 +51,7 @@ class Emphasis:
 
 @dataclass(frozen=True, slots=True)
 class Hottest:
-    """The hottest place in a picture: pixel x, y, and its temperature."""
+    """Hottest place in a picture: pixel x, y, and its temperature."""
 
     x: int
     y: int
@@ -59,14 +59,14 @@ class Hottest:
 
 
 def paint_over(base: Rgb, kelvin: Singles, labels: Labels, scale: TemperatureScale, emphasis: Emphasis) -> Rgb:
-    """A picture with temperatures blended over it; hatched where the label is not OK or there is no temperature.
+    """Picture with temperatures blended over it; hatched where the label is not OK or no temperature is known.
 
     Args:
-        base: (H, W, 3) what is beneath.
+        base: (H, W, 3) the picture beneath.
         kelvin: (H, W)
         labels: (H, W) `Label`.
         scale: of the palette.
-        emphasis: what is paint_over.
+        emphasis: temperatures that are painted.
     """
     out = np.empty_like(base)
     limits = (scale.low_k, scale.high_k, emphasis.from_k, emphasis.to_k, emphasis.alpha)
@@ -85,7 +85,7 @@ def paint_alone(kelvin: Singles, labels: Labels, scale: TemperatureScale) -> Rgb
 
 
 def enlargement(picture: Rgb) -> int:
-    """By which whole number a picture is shown larger, so that there is room for words on it."""
+    """Whole factor by which a picture is enlarged, so that there is room for text on it."""
     return -(-READABLE_PX // len(picture))
 
 
@@ -96,18 +96,19 @@ def enlarge(picture: Rgb) -> Rgb:
 
 
 def hottest(kelvin: Singles, labels: Labels) -> Hottest | None:
-    """The hottest square of 3 x 3 pixels, by its mean: one noisy pixel is none; None where no square is known."""
+    """Hottest square of 3 x 3 pixels, by its mean: one noisy pixel does not count; None if no square is known."""
     x, y, kelvin_there = hottest_square(kelvin, labels)
     return Hottest(x, y, kelvin_there) if x >= 0 else None
 
 
 def mark_hottest_into(picture: Rgb, place: Hottest, *, legend_end: tuple[int, int] = (0, 0)) -> None:
-    """Draw a cross at the hottest place, and its temperature beside it, right of the legend that ends at x, y."""
+    """Draw a cross at the hottest place, and its temperature next to it, right of the legend that ends at x, y."""
     at, size = (place.x, place.y), _text_size(picture)
     for ink, width in ((SHADOW, 3), (TEXT, 1)):
         cv2.drawMarker(picture, at, ink, cv2.MARKER_CROSS, 2 * CROSS_PX, width)
     text = f"{place.kelvin - ZERO_CELSIUS_K:.1f} deg C"
     (width_px, height_px), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
+    # Right of and below the cross, or on the other side at the picture's edge; never on the legend.
     right, below = place.x + CROSS_PX + 2, place.y + CROSS_PX + height_px
     x = right if right + width_px < picture.shape[1] else place.x - CROSS_PX - width_px
     y = below if below < picture.shape[0] else place.y - CROSS_PX
@@ -118,13 +119,14 @@ def mark_hottest_into(picture: Rgb, place: Hottest, *, legend_end: tuple[int, in
 
 
 def draw_legend_into(picture: Rgb, scale: TemperatureScale) -> tuple[int, int]:
-    """Draw the palette's bar at the left edge, with its ends and how they came about; x, y where it ends."""
+    """Draw the palette's bar at the left edge, with its ends and their origin; returns x, y of its end."""
     height, size = picture.shape[0], _text_size(picture)
     top, length = 2 * MARGIN_PX + round(36 * size), max(8, round(BAR_SHARE * height))
     bar = PALETTE[np.linspace(255, 0, length).astype(np.uint8)]
     bottom = min(top + length, height)
     picture[top:bottom, MARGIN_PX : MARGIN_PX + BAR_PX] = bar[: bottom - top, None]
     cv2.rectangle(picture, (MARGIN_PX, top), (MARGIN_PX + BAR_PX, bottom - 1), SHADOW, 1)
+    # Three values next to the bar, and above it the scale's origin.
     celsius = [limit - ZERO_CELSIUS_K for limit in (scale.high_k, (scale.low_k + scale.high_k) / 2, scale.low_k)]
     step = round(8 * size)
     rows = (top + step, (top + bottom) // 2 + step // 2, bottom - 2)
@@ -135,7 +137,7 @@ def draw_legend_into(picture: Rgb, scale: TemperatureScale) -> tuple[int, int]:
 
 
 def write_into(picture: Rgb, text: str, at: tuple[int, int]) -> int:
-    """Write light text on a darkened ground, readable on anything; x where it ends."""
+    """Write light text on a darkened ground, readable on anything; returns x of its end."""
     size, (x, y) = _text_size(picture), at
     (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
     ground = picture[max(y - height - 2, 0) : y + below, max(x - 2, 0) : x + width + 2]

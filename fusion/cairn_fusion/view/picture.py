@@ -1,7 +1,7 @@
-"""A map as a picture: the same occupied voxels three times, by colour, temperature and probability.
+"""Picture of a map: the same occupied voxels three times, by colour, temperature and probability.
 
 Voxels are drawn as small cubes in a parallel view from above one corner, far ones first. Only faces that touch no
-other occupied voxel are drawn. Of a closed room one sees nothing but the roof, unless the ceiling is cut off.
+other occupied voxel are drawn. A closed room shows nothing but its roof, unless the ceiling is cut off.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ MARGIN_PX = 16
 BACKGROUND = (24, 26, 30)
 TEXT = (230, 230, 230)
 UNKNOWN = (96, 96, 96)
-"""Of voxels that no camera of that spectrum saw: grey, never the cold end of a palette."""
+"""Colour of voxels that no camera of that spectrum saw: grey, never the cold end of a palette."""
 VIEW_YAW_RAD = np.radians(35.0)
 VIEW_PITCH_RAD = np.radians(48.0)
 FACE_SHADE = ((0, 0.72), (1, 0.86), (2, 1.0))
@@ -71,7 +71,7 @@ def write_map_picture(path: Path, voxels: Voxels, *, voxel_edge_m: float, ceilin
 
 
 def _in_frame(voxels: Voxels, ceiling_m: float | None) -> npt.NDArray[np.bool_]:
-    """(N,) voxels to draw: below the ceiling, and no stray ones far away, for which all others would shrink."""
+    """(N,) true for voxels to draw: below the ceiling, and no stray ones, for which all others would be drawn small."""
     keep = voxels.centres_m[:, 2] <= (ceiling_m if ceiling_m is not None else np.inf)
     if keep.any():
         low, high = np.percentile(voxels.centres_m[keep], FRAME_PERCENTILES, axis=0)
@@ -90,7 +90,7 @@ def _panels(voxels: Voxels) -> list[Panel]:
 
 
 def _scalar_panel(title: str, values: Floats, palette: int, form: str) -> Panel:
-    """Values painted between their outer percentiles; grey where there is none."""
+    """Panel of values painted between their outer percentiles; grey where there is none."""
     known = np.isfinite(values)
     rgb = np.full((len(values), 3), UNKNOWN, np.uint8)
     if not known.any():
@@ -124,26 +124,29 @@ def _draw(panel: Panel, numbers: npt.NDArray[np.int64], keep: npt.NDArray[np.boo
 
 def _draw_cubes(image: Rgb, numbers: npt.NDArray[np.int64], rgb: Rgb) -> None:
     """Paint visible faces into the image, far voxels first."""
+    # Stage 1: a parallel projection, with the middle of the map in the middle of the panel.
     right, down, away = _axes()
     scale = _scale_px(numbers)
     corners = numbers.min(axis=0), numbers.max(axis=0) + 1
     middle = (corners[0] + corners[1]) / 2
     screen = np.array([image.shape[1], image.shape[0]]) / 2
     plane = np.stack([right, down], axis=1)
+    # Stage 2: of each cube the three faces towards the viewer.
     occupied = {tuple(number) for number in numbers.tolist()}
     toward = [1 if away[axis] < 0 else -1 for axis in range(3)]
     faces = [_face(axis, toward[axis]) @ plane * scale for axis in range(3)]
     origins = (numbers - middle) @ plane * scale + screen
     shaded = [np.rint(rgb * shade).astype(int).tolist() for _, shade in FACE_SHADE]
+    # Stage 3: far voxels first, so that near ones are painted over them.
     for row in np.argsort(-(numbers @ away), kind="stable").tolist():
         at = numbers[row].tolist()
         for axis in range(3):
-            if _beside(at, axis, toward[axis]) not in occupied:
+            if _neighbour(at, axis, toward[axis]) not in occupied:
                 outline = np.rint((origins[row] + faces[axis]) * 16).astype(np.int32)
                 cv2.fillConvexPoly(image, outline, shaded[axis][row], lineType=cv2.LINE_8, shift=4)
 
 
-def _beside(at: list[int], axis: int, step: int) -> tuple[int, ...]:
+def _neighbour(at: list[int], axis: int, step: int) -> tuple[int, ...]:
     return tuple(value + step if a == axis else value for a, value in enumerate(at))
 
 
@@ -167,7 +170,7 @@ def _axes() -> tuple[Floats, Floats, Floats]:
 
 
 def _scale_px(numbers: npt.NDArray[np.int64]) -> float:
-    """Pixels along a voxel's edge so that all of them fit into a panel."""
+    """Pixels along a voxel's edge, so that all voxels fit into a panel."""
     right, down, _ = _axes()
     low, high = numbers.min(axis=0), numbers.max(axis=0) + 1
     box = np.array([[(low, high)[c >> a & 1][a] for a in range(3)] for c in range(8)], dtype=np.float64)

@@ -1,10 +1,10 @@
-"""Telepresence: what an operator sees of a robot's cameras, scan by scan.
+"""Telepresence: an operator's view through a robot's cameras, scan by scan.
 
-scan --surface--> drawn in each camera --the picture as guide--> depth of every pixel --cross_view--> fused --> picture
+scan --surface--> drawn in each camera --the picture as guide--> depth of every pixel --cross view--> fused --> picture
 
 thermal-on-colour    colour, with temperatures blended over it
 colour-on-thermal    the thermal camera's view, with colour in it
-side-by-side         colour, and beside it the temperatures of the same pixels
+side-by-side         colour, and next to it the temperatures of the same pixels
 stereo               thermal-on-colour for both eyes, from the left and the right colour camera
 """
 
@@ -44,11 +44,11 @@ from cairn_map.render.map_render import MapRenderer
 Image = npt.NDArray[np.generic]
 
 SAME_SHARE = 0.05
-"""Of a range: what differs by less is one place."""
+"""Largest relative difference of range at one place."""
 
 
 class ViewMode(StrEnum):
-    """What a picture shows."""
+    """Content of a picture."""
 
     THERMAL_ON_COLOUR = "thermal-on-colour"
     COLOUR_ON_THERMAL = "colour-on-thermal"
@@ -58,22 +58,23 @@ class ViewMode(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewOptions:
-    """What an operator chooses."""
+    """An operator's choices."""
 
     mode: ViewMode = ViewMode.THERMAL_ON_COLOUR
     camera: str | None = None
-    """To look through; None: the first that fits the mode."""
+    """Camera with the pixels; None: the first that fits the mode."""
     emphasis: Emphasis = field(default_factory=Emphasis)
     scale: TemperatureScale | None = None
-    """None: that of the first picture, from then on."""
+    """Scale of temperatures; None: the first picture's, for all."""
     marks_hottest: bool = True
+    """True if the hottest place is marked."""
 
 
 class Telepresence:
     """Pictures of one rig; the temperature scale is kept from one to the next."""
 
     def __init__(self, rig: Rig, options: ViewOptions, snapshot: MapSnapshot | None = None) -> None:
-        """With a map, what that says is in a mirror is not paint_over.
+        """With a map, reflections in mirrors that it proves are not painted.
 
         Raises:
             BadInputError: the rig lacks a camera that the mode needs.
@@ -84,22 +85,25 @@ class Telepresence:
 
     @property
     def scale(self) -> TemperatureScale | None:
-        """That all pictures have; None before the first that shows a temperature."""
+        """Scale of all pictures; None before the first that shows a temperature."""
         return self._scale
 
     def view(self, scan: Scan) -> Rgb:
-        """(H, W, 3) sRGB: the picture of a scan; two side by side are twice as wide, and one lower than 240 pixels is a
-        whole number of times as large as the camera's.
+        """(H, W, 3) sRGB: the picture of a scan.
+
+        Two side by side are twice as wide; one lower than 240 pixels is enlarged by a whole number.
 
         Raises:
             BadInputError: an image does not fit its camera, or that of the camera to look through is missing.
         """
+        # Stage 1: each eye's pixels, with the values of the other spectrum.
         beyond = None
         if self._snapshot is not None:
             beyond = mirror_pixels(scan, self._rig, self._snapshot, renderer=self._renderer)
         fused = [fuse(scan, self._rig, camera, beyond) for camera in self._eyes]
         if self._options.mode is ViewMode.COLOUR_ON_THERMAL:
             return self._colour_on_thermal(scan, fused[0])
+        # Stage 2: paint, on one scale for all pictures of the view.
         pictures, places = [], self._hottest(fused)
         for each, place in zip(fused, places, strict=True):
             base, kelvin = scan.colour[each.camera], each.values[..., 0]
@@ -114,7 +118,7 @@ class Telepresence:
         return pictures[0] if len(pictures) == 1 else np.hstack(pictures)
 
     def _hottest(self, fused: Sequence[CrossView]) -> list[Hottest | None]:
-        """What is marked for each eye: the same place for both, or they could not be seen as one."""
+        """Place to mark for each eye: the same for both, or the eyes could not merge the pictures."""
         first = hottest(fused[0].values[..., 0], fused[0].labels)
         return [first, *(first and find_in(first, fused[0], each, self._rig) for each in fused[1:])]
 
@@ -123,7 +127,7 @@ class Telepresence:
         scale, known = self._locked(kelvin[::4, ::4]), np.where(np.isfinite(kelvin), Label.OK, Label.NO_READING)
         labels, alone = known.astype(np.uint8), Emphasis(alpha=1.0)
         warm = paint_over(np.full((*kelvin.shape, 3), 40, np.uint8), kelvin, labels, scale, alone)
-        # Where no colour is known the palette is left alone: the temperature is.
+        # Where no colour is known the palette stands alone, for the temperature is known.
         base = np.where(fused.ok[..., None], np.nan_to_num(fused.values).clip(0, 255).astype(np.uint8), warm)
         picture = paint_over(base, kelvin, labels, scale, self._options.emphasis)
         return self._finished(picture, hottest(kelvin, labels))
@@ -134,7 +138,7 @@ class Telepresence:
         return self._scale or TemperatureScale(273.15, 323.15, "no temperature yet")
 
     def _finished(self, picture: Rgb, place: Hottest | None) -> Rgb:
-        """With legend and marker; a small one enlarge."""
+        """The picture with legend and marker; enlarged if it is small."""
         times, larger = enlargement(picture), enlarge(picture)
         end = draw_legend_into(larger, self._scale or self._locked(np.empty(0, np.float32)))
         if place is not None and self._options.marks_hottest:
@@ -145,21 +149,22 @@ class Telepresence:
 
 
 def fuse(scan: Scan, rig: Rig, camera: str, beyond: npt.NDArray[np.bool_] | None = None) -> CrossView:
-    """What the cameras of the other spectrum see at each pixel of a colour or thermal camera, with its depth.
+    """Values of the other spectrum's cameras at each pixel of a colour or thermal camera, through its depth.
 
-    Several cameras of that spectrum are asked, the nearest first.
+    Of several cameras of that spectrum the nearest has priority.
 
     Args:
-        scan: with the camera's image; of images of the other spectrum what there is.
+        scan: with the camera's image, and any images of the other spectrum.
         rig: of the scan.
-        camera: whose pixels.
-        beyond: (H, W) range pixels that show what is in a mirror, `mirror_pixels`: nothing is paint_over there.
+        camera: camera with the pixels.
+        beyond: (H, W) true for range pixels that show a reflection (`mirror_pixels`): nothing is painted there.
 
     Raises:
         BadInputError: an image does not fit its camera, the camera's own is missing, or it has none.
     """
     check_scan(scan, rig)
     images = source_order(scan, rig, camera)
+    # Range image to surface, surface to each camera, and dense depth for the one camera.
     surface = surface_of(scan, rig, beyond)
     drawn = {name: drawn_surface(surface, rig, name) for name in (camera, *images)}
     depth = view_depth(scan, rig, camera, drawn[camera])
@@ -168,7 +173,7 @@ def fuse(scan: Scan, rig: Rig, camera: str, beyond: npt.NDArray[np.bool_] | None
 
 
 def mask_mirrors(fused: CrossView) -> CrossView:
-    """The same, with nothing where a depth was filled in over what a mirror shows."""
+    """The same, without values where depth was filled in over a reflection."""
     step, (height, width) = fused.depth.drawn.step_px, fused.labels.shape
     marked = (fused.depth.drawn.marks == Label.BEYOND).repeat(step, axis=0).repeat(step, axis=1)[:height, :width]
     marked &= fused.depth.origins != Origin.MEASURED
@@ -177,7 +182,7 @@ def mask_mirrors(fused: CrossView) -> CrossView:
 
 
 def source_order(scan: Scan, rig: Rig, camera: str) -> dict[str, Image]:
-    """The images of the other spectrum than a camera's, that of the camera nearest to it first."""
+    """Images of the other spectrum than a camera's, that of the camera nearest to it first."""
     images: dict[str, Image] = dict(scan.thermal if camera in scan.colour else scan.colour)
     place_m = rig[camera].transform[:3, 3]
     order = sorted(images, key=lambda name: float(np.linalg.norm(rig[name].transform[:3, 3] - place_m)))
@@ -185,8 +190,9 @@ def source_order(scan: Scan, rig: Rig, camera: str) -> dict[str, Image]:
 
 
 def find_in(place: Hottest, one: CrossView, other: CrossView, rig: Rig) -> Hottest | None:
-    """A place of one camera's picture in another's, at the same temperature; None where that does not see it."""
+    """Place of one camera's picture in another's, at the same temperature; None if that camera does not see it."""
     src, dst, range_m = rig[one.camera], rig[other.camera], one.depth.shown_m[place.y, place.x]
+    # Eq. 1-6; the other camera sees the place if its own depth there agrees.
     point = src.camera.rays()[place.y, place.x] * float(range_m)
     there = transform_points(inverse(dst.transform) @ src.transform, point[None])
     pixel = dst.camera.project(there)
@@ -199,7 +205,7 @@ def find_in(place: Hottest, one: CrossView, other: CrossView, rig: Rig) -> Hotte
 
 
 def view_depth(scan: Scan, rig: Rig, camera: str, drawn: Drawn) -> DenseDepth:
-    """The depth of a colour or thermal camera's pixels, its own image as guide.
+    """Dense depth of a colour or thermal camera's pixels, with its own image as guide.
 
     Raises:
         BadInputError: the scan has no image of it.

@@ -1,4 +1,4 @@
-"""Which colour means which temperature: the same for as long as an operator looks, or nothing could be compared."""
+"""Temperature scale: the colours of temperatures, the same in all pictures of a view so that they can be compared."""
 
 from dataclasses import dataclass
 
@@ -11,8 +11,9 @@ from cairn_map.errors import BadInputError
 
 ZERO_CELSIUS_K = 273.15
 PERCENTILES = (1.0, 99.5)
+"""Temperatures at the ends of a locked scale."""
 LEAST_SPAN_K = 10.0
-"""A scale that is locked on a picture spans this at least: what differs less is noise, or nothing to look at."""
+"""Least span of a scale that is locked on a picture: smaller differences are noise, or of no interest."""
 ROUND_K = 1.0
 
 
@@ -33,7 +34,7 @@ class TemperatureScale:
     low_k: float
     high_k: float
     note: str = "fixed"
-    """How it came about, for the legend."""
+    """Origin of the scale, for the legend."""
 
     def __post_init__(self) -> None:
         if not (0 <= self.low_k < self.high_k < float("inf")):
@@ -43,13 +44,13 @@ class TemperatureScale:
             )
 
     def colours(self, kelvin: npt.NDArray[np.floating]) -> Bytes:
-        """(..., 3) R, G, B of (...) temperatures; of NaN that of the lower end, so leave those out."""
+        """(..., 3) R, G, B of (...) temperatures; NaN has the colour of the lower end, so leave it out."""
         level = np.clip((kelvin - self.low_k) * (255 / (self.high_k - self.low_k)) + 0.5, 0, 255)
         return np.asarray(PALETTE[np.nan_to_num(level).astype(np.uint8)])
 
 
 def locked_scale(kelvin: npt.NDArray[np.floating]) -> TemperatureScale:
-    """The scale for what a picture shows, to be kept for the next ones: all but the outermost, in whole degrees.
+    """Scale for a picture and the next ones: all temperatures except the outermost, in whole degrees.
 
     Args:
         kelvin: any shape; NaN for no temperature.

@@ -1,4 +1,4 @@
-"""The surface of a range image: what is joints, how it is drawn in other cameras, and its kernels' slow twins."""
+"""The surface of a range image: its joined pixels, the drawing in other cameras, and its kernels' slow twins."""
 
 import numpy as np
 import numpy.typing as npt

@@ -55,7 +55,7 @@ NO_IMAGE = ("missing_image", "unknown_camera")
 View = tuple[int, npt.NDArray[np.uint8]]
 """A scan's number and its picture."""
 MAP = "map"
-"""ViewMode: the map over the live image."""
+"""Mode that draws the map over the live image."""
 
 
 def main(argv: list[str]) -> int:
