@@ -59,7 +59,7 @@ def test_an_editable_install_without_the_page_says_how_to_build_it(sources: Path
         "import sys; sys.path.insert(0, 'server/console'); import hatch_build; "
         "hatch_build.ConsoleHook('.', {}, None, None, '', 'wheel').initialize('%s', {})"
     )
-    page = "from cairn_server.http.routes.console_files import ConsoleFiles; print(ConsoleFiles().page.plain.decode())"
+    page = "from cairn_server.http.routes.console import ConsoleFiles; print(ConsoleFiles().page.plain.decode())"
     folders = os.pathsep.join(str(sources / name) for name in ("fusion", "server"))
     try:
         _python(sources, "-c", hook % "editable", **WITHOUT_NODE)

@@ -29,7 +29,7 @@ from cairn_map.codec.view_code import decode_view
 from cairn_map.commits.commit import make_commit
 from cairn_map.evidence.grid import Geometry, geometry_for
 from cairn_map.wire.messages import CreateMap, Register
-from cairn_server.http.routes.console_files import STATIC
+from cairn_server.http.routes.console import STATIC
 from cairn_sim.robots.record import Plan, scans_of, shots_of
 from cairn_sim.robots.robots import ROBOTS
 from cairn_sim.robots.trajectories import path_names

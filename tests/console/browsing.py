@@ -14,7 +14,7 @@ import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 from tests.console.room import ADMIN_TOKEN, Room
 
-from cairn_server.http.routes.console_files import STATIC
+from cairn_server.http.routes.console import STATIC
 
 CHROMIUM = shutil.which("chromium")
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]

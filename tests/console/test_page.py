@@ -16,7 +16,7 @@ from tests.console.browsing import LOADED_MACHINE, VIEW, Console, tab
 from tests.console.casting import occupied, picks_met_first
 from tests.console.room import GEOMETRY, MAP, Room
 
-from cairn_server.http.routes.console_files import STATIC
+from cairn_server.http.routes.console import STATIC
 
 pytestmark = pytest.mark.browser
 

@@ -1,111 +1,48 @@
-"""The routes for machines (OpenAPI 3.1): what the framework finds out by itself, set right where it cannot know.
+"""The routes' document: for machines as OpenAPI 3.1, for people as one page of plain HTML made from it.
 
-It knows JSON. Bodies of bytes, answers of several kinds and problems are said here, by route; a test asks every route
-and compares.
+The framework and the routes' decorators say most of it; what all routes of one form may answer is added here. The
+framework's own page loads its scripts from another host, which a robot in the field does not reach.
 """
 
+import json
 from collections.abc import Iterator
-from typing import Any
+from html import escape
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
-from cairn_map.files.cell_files import CELL_MEDIA_TYPE, MEDIA_TYPES
-from cairn_map.files.export_request import EXPORT_TYPES
 from cairn_map.wire.messages import Problem
-from cairn_server.http.openapi_examples import EXAMPLES
-from cairn_server.http.routes.problems import MEDIA_TYPE as PROBLEM_MEDIA_TYPE
-from cairn_server.http.routes.sync import REPLY_MEDIA_TYPE
-from cairn_server.views.view_bundle import MEDIA_TYPE as VIEWS_MEDIA_TYPE
+from cairn_server.http.routes.documentation import Json, problems
 
-Json = dict[str, Any]
 Route = tuple[str, str]
-
-MAP = "/maps/{name}"
-UPLOAD = f"{MAP}/commits/{{commit}}/upload"
-CELL = f"{MAP}/main/cells/{{cell}}"
-VIEWS = f"{MAP}/main/views"
-RENDER = f"{MAP}/main/render"
-EXPORT = f"{MAP}/main/export"
-TICKETS = f"{EXPORT}/tickets"
-VIEW = f"{MAP}/branches/{{branch}}/view"
-COMMIT_MEDIA_TYPE = "application/vnd.cairn.commit"
-CELL_TYPES = (CELL_MEDIA_TYPE, *MEDIA_TYPES.values())
-CONSOLE_TYPES = ("text/javascript", "text/css", "image/svg+xml")
-PICTURES = ("image/jpeg", "image/png")
-BODIES: dict[Route, tuple[str, ...]] = {
-    ("put", f"{MAP}/commits/{{commit}}"): (COMMIT_MEDIA_TYPE,),
-    ("patch", UPLOAD): ("application/octet-stream",),
-    ("put", VIEW): PICTURES,
-    ("put", CELL): (CELL_MEDIA_TYPE,),
-}
-ANSWERS: dict[Route, dict[int, tuple[str, ...]]] = {
-    ("post", f"{MAP}/branches/{{branch}}/missing"): {200: (REPLY_MEDIA_TYPE,), 204: ()},
-    ("get", f"{MAP}/commits/{{commit}}"): {200: (COMMIT_MEDIA_TYPE,)},
-    ("get", "/"): {200: ("text/html",), 304: ()},
-    ("get", "/assets/{file}"): {200: CONSOLE_TYPES, 304: ()},
-    ("get", "/metrics"): {200: ("text/plain",)},
-    ("get", CELL): {200: CELL_TYPES, 206: CELL_TYPES, 304: ()},
-    ("head", CELL): {200: CELL_TYPES, 304: ()},
-    ("get", f"{MAP}/main/vector"): {200: ("application/json",)},
-    ("get", VIEWS): {200: (VIEWS_MEDIA_TYPE,)},
-    ("get", VIEW): {200: PICTURES, 304: ()},
-    ("get", RENDER): {200: ("image/png", "application/x-npz"), 304: ()},
-    ("get", EXPORT): {200: tuple(EXPORT_TYPES.values())},
-    ("get", f"{MAP}/events"): {200: ("text/event-stream",)},
-    ("get", f"{MAP}/live"): {101: ()},
-}
-"""Media types by status, of answers that the framework takes for JSON; () for none."""
-ALSO: dict[Route, int] = {("put", MAP): 200, ("put", f"{MAP}/commits/{{commit}}"): 201, ("patch", UPLOAD): 201}
-"""A second status of success with the same body: what was there already, or is new."""
-PROBLEMS: dict[Route, tuple[int, ...]] = {
-    ("put", MAP): (409,),
-    ("put", f"{MAP}/commits/{{commit}}"): (409, 429, 507),
-    ("patch", UPLOAD): (409, 429, 507),
-    ("get", f"{MAP}/commits/{{commit}}"): (409,),
-    ("post", f"{MAP}/retracts"): (409,),
-    ("put", "/tokens/{token}"): (409,),
-    ("put", CELL): (409,),
-    ("post", f"{MAP}/branches/{{branch}}/missing"): (410,),
-    ("get", f"{MAP}/main/vector"): (410,),
-    ("get", CELL): (416,),
-    ("get", RENDER): (413,),
-    ("get", EXPORT): (413,),
-    ("post", TICKETS): (429,),
-    ("get", f"{MAP}/events"): (429,),
-    ("get", f"{MAP}/live"): (426,),
-}
-"""Statuses of problems beside those that every route of its kind may answer."""
-CELL_HEADERS = ("ETag", "Cairn-Cursor", "Cairn-Coverage", "Cairn-Coverage-Digest", "Cairn-Fingerprint")
-HEADERS: dict[Route, tuple[str, ...]] = {
-    ("get", CELL): CELL_HEADERS,
-    ("head", CELL): CELL_HEADERS,
-    ("get", VIEW): ("ETag", "Last-Modified"),
-    ("get", VIEWS): ("Cairn-View-Depth",),
-    ("get", RENDER): ("ETag", "Cairn-Cursor"),
-    ("get", EXPORT): ("Cairn-Cursor", "Cairn-Points"),
-    ("get", f"{MAP}/commits/{{commit}}"): ("ETag", "Cairn-Seal"),
-}
-BYTES: Json = {"schema": {"type": "string", "format": "binary"}}
-TEXT: Json = {"schema": {"type": "string"}}
-JSON: Json = {"schema": {}}
+STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem}
+body{color:#222;background:#fff}
+h2{font:600 1rem ui-monospace,monospace;margin:2.5rem 0 .5rem;padding-top:.5rem;border-top:1px solid #ccc}
+table{border-collapse:collapse;width:100%}td,th{text-align:left;vertical-align:top;padding:.15rem .75rem .15rem 0}
+code,pre{font:.9em ui-monospace,monospace}pre{background:#f4f4f4;padding:.75rem;overflow:auto}nav a{display:block}
+@media(prefers-color-scheme:dark){body{color:#ddd;background:#1b1b1b}pre{background:#2a2a2a}a{color:#8bf}}"""
 
 
-def openapi_of(app: FastAPI) -> Json:
-    """The document; made once."""
-    if app.openapi_schema is None:
-        document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
-        for route, operation in operations(document):
-            _correct(route, operation)
-        parts = document.setdefault("components", {})
-        schemas = parts.setdefault("schemas", {})
-        schemas["Problem"] = Problem.model_json_schema()
-        for name in ("HTTPValidationError", "ValidationError"):
-            schemas.pop(name, None)
-        for scheme in parts.get("securitySchemes", {}).values():
-            scheme["description"] = "A token, as PROTOCOL.md section 2 says; a server without tokens takes none."
-        app.openapi_schema = document
-    return app.openapi_schema
+class DocumentedApp(FastAPI):
+    """FastAPI application whose document names problems (RFC 9457) for errors."""
+
+    def openapi(self) -> Json:
+        """The document; made once."""
+        if self.openapi_schema is None:
+            document = get_openapi(
+                title=self.title, version=self.version, description=self.description, routes=self.routes
+            )
+            for (_, path), operation in operations(document):
+                _add_problems(path, operation)
+            parts = document.setdefault("components", {})
+            schemas = parts.setdefault("schemas", {})
+            schemas["Problem"] = Problem.model_json_schema()
+            for name in ("HTTPValidationError", "ValidationError"):
+                schemas.pop(name, None)
+            for scheme in parts.get("securitySchemes", {}).values():
+                scheme["description"] = "A token, as PROTOCOL.md section 2 says; a server without tokens takes none."
+            self.openapi_schema = document
+        return self.openapi_schema
 
 
 def operations(document: Json) -> Iterator[tuple[Route, Json]]:
@@ -115,45 +52,80 @@ def operations(document: Json) -> Iterator[tuple[Route, Json]]:
             yield (method, path), operation
 
 
-def _correct(route: Route, operation: Json) -> None:
-    answers: Json = operation["responses"]
-    if route in BODIES:
-        content = {media_type: dict(BYTES) for media_type in BODIES[route]}
-        operation["requestBody"] = {"required": True, "content": content}
-    if route in ANSWERS:
-        answers.clear()
-        for status, media_types in ANSWERS[route].items():
-            answers[str(status)] = _answer(route, status, media_types)
-    if route in ALSO:
-        (known,) = (answer for status, answer in answers.items() if status in ("200", "201"))
-        answers[str(ALSO[route])] = known
-    for refused in _problems(route, operation):
-        content = {PROBLEM_MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
-        answers[str(refused)] = {"description": "Problem (RFC 9457)", "content": content}
-    if route in EXAMPLES:
-        operation["requestBody"]["content"]["application/json"]["example"] = EXAMPLES[route]
-
-
-def _answer(route: Route, status: int, media_types: tuple[str, ...]) -> Json:
-    kinds = {"application/json": JSON, "text/event-stream": TEXT, "text/plain": TEXT}
-    words = {101: "Switching to the WebSocket", 206: "Part", 304: "Still the same"}
-    answer: Json = {"description": words.get(status, "Done")}
-    if media_types:
-        answer["content"] = {media_type: dict(kinds.get(media_type, BYTES)) for media_type in media_types}
-    if route in HEADERS:
-        answer["headers"] = {name: dict(TEXT) for name in HEADERS[route]}
-    return answer
-
-
-def _problems(route: Route, operation: Json) -> list[int | str]:
-    """Statuses of the problems that a route may answer."""
-    found: set[int] = {500, 503, *PROBLEMS.get(route, ())}
+def _add_problems(path: str, operation: Json) -> None:
+    """Add the problems that every route of this form may answer."""
+    statuses = {500, 503}
     if operation.get("security"):
-        found |= {401, 403}
-    if "{" in route[1]:
-        found |= {400, 404}
+        statuses |= {401, 403}
+    if "{" in path:
+        statuses |= {400, 404}
     if operation.get("parameters") or operation.get("requestBody"):
-        found |= {400, 422}
+        statuses |= {400, 422}
     if operation.get("requestBody"):
-        found |= {413}
-    return [*sorted(found), "default"]
+        statuses |= {413}
+    found = {str(status): entry for status, entry in problems(*statuses).items()}
+    answers = dict(sorted((operation["responses"] | found).items()))
+    operation["responses"] = answers | {"default": problems("default")["default"]}
+
+
+def docs_page(document: Json) -> str:
+    """HTML page of a document, without anything from another host."""
+    routes = [(method.upper(), path, operation) for (method, path), operation in operations(document)]
+    contents = "".join(f'<a href="#{_anchor(m, p)}"><code>{m} {escape(p)}</code></a>' for m, p, _ in routes)
+    parts = "".join(_route(method, path, operation) for method, path, operation in routes)
+    title = escape(document["info"]["title"])
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}: routes</title>'
+        f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style><h1>{title}: routes</h1>'
+        "<p>For machines: <a href='openapi.json'>openapi.json</a>. What the routes promise is in PROTOCOL.md, what the "
+        f"bytes are in FORMAT.md.</p><nav>{contents}</nav>{parts}</html>"
+    )
+
+
+def _route(method: str, path: str, operation: Json) -> str:
+    words = escape(operation.get("description") or operation.get("summary", ""))
+    closed = "<p>Takes a token, where the server has tokens.</p>" if operation.get("security") else ""
+    return (
+        f'<section id="{_anchor(method, path)}"><h2>{method} {escape(path)}</h2><p>{words}</p>{closed}'
+        f"{_parameters(operation)}{_body(operation)}{_answers(operation)}</section>"
+    )
+
+
+def _parameters(operation: Json) -> str:
+    rows = [
+        f"<tr><td><code>{escape(parameter['name'])}</code><td>{escape(parameter['in'])}"
+        f"<td>{escape(parameter.get('description', ''))}"
+        for parameter in operation.get("parameters", [])
+    ]
+    return f"<table><tr><th>parameter<th>in<th>{''.join(rows)}</table>" if rows else ""
+
+
+def _body(operation: Json) -> str:
+    content = operation.get("requestBody", {}).get("content", {})
+    text = "".join(
+        f"<p>Body: <code>{escape(media_type)}</code> {_schema(kind)}</p>" for media_type, kind in content.items()
+    )
+    example = next((kind["example"] for kind in content.values() if "example" in kind), None)
+    return text + (f"<pre>{escape(json.dumps(example, indent=2))}</pre>" if example is not None else "")
+
+
+def _answers(operation: Json) -> str:
+    rows = []
+    for status, answer in operation["responses"].items():
+        kinds = "<br>".join(
+            f"<code>{escape(media_type)}</code> {_schema(kind)}"
+            for media_type, kind in answer.get("content", {}).items()
+        )
+        rows.append(f"<tr><td>{escape(status)}<td>{escape(answer['description'])}<td>{kinds}")
+    return f"<table><tr><th>status<th>answer<th>{''.join(rows)}</table>"
+
+
+def _schema(kind: Json) -> str:
+    """The name of a message, if it is one."""
+    schema = kind.get("schema", {})
+    name = schema.get("$ref") or schema.get("items", {}).get("$ref", "")
+    return escape(name.rpartition("/")[2])
+
+
+def _anchor(method: str, path: str) -> str:
+    return "".join(letter if letter.isalnum() else "-" for letter in f"{method}{path}").lower()

@@ -24,8 +24,7 @@ from cairn_map.evidence.grid import cell_key, cell_of_key
 from cairn_map.evidence.view import ViewStyle
 from cairn_map.files.cell_files import CELL_MEDIA_TYPE, MEDIA_TYPES
 from cairn_map.wire.messages import CellIndex
-from cairn_server.http.routes.cell import COVERAGE_BYTES_MAX
-from cairn_server.http.routes.ranges import part_of
+from cairn_server.http.routes.cell import COVERAGE_BYTES_MAX, part_of
 from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.replies import ENTRIES_MAX
 

@@ -7,7 +7,7 @@ import pytest
 from tests.fixtures.server.live import Live
 
 from cairn_map.errors import NotFoundError
-from cairn_server.http.routes.console_files import ConsoleFiles
+from cairn_server.http.routes.console import ConsoleFiles
 
 
 @pytest.fixture

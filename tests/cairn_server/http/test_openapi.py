@@ -12,12 +12,20 @@ from tests.fixtures.server.live import Live
 from tests.fixtures.server.protocol_document import routes_of
 from tests.fixtures.server.pushes import JPEG, PNG, pushed
 
-from cairn_server.http.openapi import ANSWERS, BODIES, operations
-from cairn_server.http.openapi_examples import EXAMPLES
+from cairn_server.http.openapi import operations
 from cairn_server.store.store_rows import MapRow
 
 UNDOCUMENTED = {("GET", "/openapi.json")}
 PROBLEM = "application/problem+json"
+EXAMPLES = (
+    ("put", "/maps/{name}"),
+    ("post", "/maps/{name}/branches"),
+    ("post", "/maps/{name}/branches/{branch}/missing"),
+    ("post", "/maps/{name}/retracts"),
+    ("post", "/maps/{name}/main/export/tickets"),
+    ("put", "/maps/{name}/branches/{branch}/status"),
+)
+"""Routes whose entries have an example of a body."""
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +57,7 @@ def check(document: dict[str, Any], method: str, path: str, answer: httpx.Respon
 def test_every_route_is_in_the_document_and_no_other(live: Live, document: dict[str, Any]) -> None:
     told = {(method.upper(), path) for (method, path), _ in operations(document)}
     assert told == routes_of(live) - UNDOCUMENTED
-    assert {(method.upper(), path) for method, path in (ANSWERS | BODIES | EXAMPLES)} <= told
+    assert {(method.upper(), path) for method, path in EXAMPLES} <= told
 
 
 def test_every_error_is_a_problem(document: dict[str, Any]) -> None:
@@ -120,7 +128,6 @@ def test_every_example_is_taken(live: Live, row: MapRow, document: dict[str, Any
     method, path = route
     content = document["paths"][path][method]["requestBody"]["content"]
     example = content["application/json"]["example"]
-    assert example == EXAMPLES[route]
     name = row.name if path != "/maps/{name}" else "example"
     answer = live.http.request(method.upper(), path.format(name=name, branch="mole"), json=example)
     assert answer.is_success, answer.text

@@ -1,4 +1,4 @@
-"""Who calls and what of: the dependencies that routes share. Checks of rights are made here, by `auth`.
+"""Callers and what they ask for: the dependencies that routes share. Rights are checked here, by `auth`.
 
 Those that every push and fetch needs are `async`, which here only means that no other thread is needed to run them: a
 change of threads takes longer than they do, more so while other threads are at work, and each push would make five. A
@@ -11,9 +11,11 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from starlette.requests import HTTPConnection
 
 from cairn_map.errors import NotFoundError
 from cairn_server.access.auth import READING, Caller, Role, bad_token, caller_of, require, require_all_maps
+from cairn_server.http.middleware.token_first import noted_caller
 from cairn_server.service import Service
 from cairn_server.store.store_rows import MapRow
 
@@ -30,37 +32,68 @@ Operations = Annotated[Service, Depends(service_of)]
 Credentials = Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]
 
 
-def map_now(name: str, service: Service, credentials: HTTPAuthorizationCredentials | None) -> MapRow:
-    """The map of a name; strangers are not told which names there are."""
-    try:
-        return service.store.map(name)
-    except NotFoundError:
-        if caller_now(service, None, credentials).map_number is not None:
-            raise bad_token() from None
-        raise
+@dataclass(frozen=True, slots=True)
+class Asker:
+    """Client of one request or stream, and the service that it asks."""
+
+    service: Service
+    credentials: HTTPAuthorizationCredentials | None
+    noted: Caller | None = None
+    """Caller, if the request was authenticated at its head."""
+
+    def map(self, name: str) -> MapRow:
+        """The map of a name; clients without access to all maps cannot find out which names exist."""
+        try:
+            return self.service.store.map(name)
+        except NotFoundError:
+            if self.caller(None).map_number is not None:
+                raise bad_token() from None
+            raise
+
+    def caller(self, row: MapRow | None) -> Caller:
+        """The caller, on a map or (None) where none is named; a token of one map counts on that map only."""
+        if self.noted is None:
+            token = self.credentials.credentials if self.credentials else None
+            return caller_of(token, row, self.service.store, self.service.settings)
+        if row is not None and not self.noted.counts_on(row.number):
+            raise bad_token()
+        return self.noted
+
+    def reader(self, name: str) -> MapRow:
+        """The map of a name, if the caller may read it."""
+        row = self.map(name)
+        require(self.caller(row), *READING)
+        return row
 
 
-def caller_now(service: Service, row: MapRow | None, credentials: HTTPAuthorizationCredentials | None) -> Caller:
-    """Who calls, on a map or (None) where none is named; a token of one map counts on that map only."""
-    return caller_of(credentials.credentials if credentials else None, row, service.store, service.settings)
+async def asker_of(request: Request, credentials: Credentials) -> Asker:
+    """The client of a request."""
+    return _asker(request, credentials)
 
 
-async def map_of(name: str, service: Operations, credentials: Credentials) -> MapRow:
+def _asker(request: HTTPConnection, credentials: HTTPAuthorizationCredentials | None) -> Asker:
+    return Asker(request.app.state.service, credentials, noted_caller(request.scope))
+
+
+Asking = Annotated[Asker, Depends(asker_of)]
+
+
+async def map_of(name: str, asker: Asking) -> MapRow:
     """The map named in the path."""
-    return map_now(name, service, credentials)
+    return asker.map(name)
 
 
 Map = Annotated[MapRow, Depends(map_of)]
 
 
-def anybody(service: Operations, credentials: Credentials) -> Caller:
-    """Who calls, where no map is named yet."""
-    return caller_now(service, None, credentials)
+def caller_anywhere(asker: Asking) -> Caller:
+    """The caller, where no map is named."""
+    return asker.caller(None)
 
 
-async def caller_on_map(service: Operations, row: Map, credentials: Credentials) -> Caller:
-    """Who calls, on the map in the path."""
-    return caller_now(service, row, credentials)
+async def caller_on_map(row: Map, asker: Asking) -> Caller:
+    """The caller, on the map in the path."""
+    return asker.caller(row)
 
 
 OnMap = Annotated[Caller, Depends(caller_on_map)]
@@ -76,14 +109,14 @@ def allowed(*roles: Role) -> Callable[[Caller], Awaitable[Caller]]:
     return check
 
 
-def admin(caller: Annotated[Caller, Depends(anybody)]) -> Caller:
+def admin(caller: Annotated[Caller, Depends(caller_anywhere)]) -> Caller:
     """The caller, if it is an admin of all maps."""
     require(caller)
     require_all_maps(caller)
     return caller
 
 
-def reader_somewhere(caller: Annotated[Caller, Depends(anybody)]) -> Caller:
+def reader_somewhere(caller: Annotated[Caller, Depends(caller_anywhere)]) -> Caller:
     """The caller, if it may read some map or all."""
     require(caller, *READING)
     return caller
@@ -96,13 +129,13 @@ async def own_branch(branch: str, caller: OnMap) -> Caller:
 
 
 def require_owner(caller: Caller, branch: str) -> None:
-    """Refuse who is neither an admin nor the robot of a branch."""
+    """Refuse a caller that is neither an admin nor the robot of a branch."""
     require(caller, *([Role.ROBOT, Role.RELAY] if caller.robot == branch else []))
 
 
 @dataclass(frozen=True, slots=True)
 class Visit:
-    """Who does something with a map, all at once: for routes that robots ask all day.
+    """Service, map and caller of a request, found in one dependency: for routes that robots call all day.
 
     FastAPI takes some 40 us for each dependency of a dependency, which for a push was as long as its check.
     """
@@ -127,9 +160,9 @@ async def visiting_owner(name: str, branch: str, request: Request, credentials: 
 
 
 def _visit(name: str, request: Request, credentials: HTTPAuthorizationCredentials | None) -> Visit:
-    service: Service = request.app.state.service
-    row = map_now(name, service, credentials)
-    return Visit(service, row, caller_now(service, row, credentials))
+    asker = _asker(request, credentials)
+    row = asker.map(name)
+    return Visit(asker.service, row, asker.caller(row))
 
 
 async def body_of(request: Request) -> bytes:

@@ -1,5 +1,6 @@
-"""Routes of main's cells. Nothing is decided here."""
+"""Routes of the cells of a map: the index, cells as files and views, single voxels, and healing."""
 
+import re
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
@@ -16,14 +17,18 @@ from cairn_server.access.auth import Caller
 from cairn_server.folding.cell_index import IndexPage, box_from_text
 from cairn_server.folding.cells_at_rest import stored_evidence
 from cairn_server.http.routes.callers import READERS, Map, Operations, body_of, reader
+from cairn_server.http.routes.documentation import answers, body, problems
 from cairn_server.http.routes.problems import answer_to
-from cairn_server.http.routes.ranges import part_of
 from cairn_server.store.store_rows import CellRow, Head, MapRow
 from cairn_server.views.cell_view import asked_cell_view, cell_etag, is_same
 from cairn_server.views.view_bundle import MEDIA_TYPE as VIEWS_MEDIA_TYPE
 from cairn_server.views.view_bundle import ready_views
 from cairn_server.views.voxel_report import asked_voxel
 
+ONE_RANGE = re.compile(r"bytes=[ \t]*(\d{0,18})-(\d{0,18})[ \t]*", re.ASCII | re.IGNORECASE)
+"""One range of bytes; a request for several, or for none, is answered with the whole, as RFC 9110 allows."""
+CELL_TYPES = (CELL_MEDIA_TYPE, *MEDIA_TYPES.values())
+CELL_HEADERS = ("ETag", "Cairn-Cursor", "Cairn-Coverage", "Cairn-Coverage-Digest", "Cairn-Fingerprint")
 COVERAGE_BYTES_MAX = 4096
 """Of the header `Cairn-Coverage`: a longer one would be refused by proxies and by small HTTP libraries."""
 
@@ -52,7 +57,12 @@ def cell_index(
     return service.cell_index(row, author_from_text(author) if author else None, page)
 
 
-@router.get("/maps/{name}/main/views", dependencies=READERS, response_class=Response)
+@router.get(
+    "/maps/{name}/main/views",
+    dependencies=READERS,
+    response_class=Response,
+    responses=answers({200: (VIEWS_MEDIA_TYPE,)}, headers=("Cairn-View-Depth",)),
+)
 def views(service: Operations, row: Map) -> Response:
     """What all cells look like, at a coarse depth, as far as the server has it ready: for a page's first picture."""
     depth, found = ready_views(service.store, service.cell_views, row)
@@ -60,7 +70,12 @@ def views(service: Operations, row: Map) -> Response:
     return Response(found, media_type=VIEWS_MEDIA_TYPE, headers=headers)
 
 
-@router.get("/maps/{name}/main/vector", dependencies=READERS)
+@router.get(
+    "/maps/{name}/main/vector",
+    dependencies=READERS,
+    response_class=Response,
+    responses=answers({200: ("application/json",)}) | problems(410),
+)
 def vector(service: Operations, row: Map, at: Annotated[str, Query(max_length=128)]) -> Response:
     """The version vector at a cursor: what `Cairn-Coverage` says where it is short enough."""
     found = service.vector_at(row, cursor_from_text(at))
@@ -73,8 +88,18 @@ def voxel(voxel: str, service: Operations, row: Map) -> VoxelAnswer:
     return asked_voxel(service.store, service.cells, row, voxel)
 
 
-@router.head("/maps/{name}/main/cells/{cell}", dependencies=READERS)
-@router.get("/maps/{name}/main/cells/{cell}", dependencies=READERS)
+@router.head(
+    "/maps/{name}/main/cells/{cell}",
+    dependencies=READERS,
+    response_class=Response,
+    responses=answers({200: CELL_TYPES, 304: ()}, headers=CELL_HEADERS),
+)
+@router.get(
+    "/maps/{name}/main/cells/{cell}",
+    dependencies=READERS,
+    response_class=Response,
+    responses=answers({200: CELL_TYPES, 206: CELL_TYPES, 304: ()}, headers=CELL_HEADERS) | problems(416),
+)
 def get_cell(
     cell: str,
     request: Request,
@@ -149,7 +174,12 @@ def _coverage(head: Head) -> dict[str, str]:
     return {"Cairn-Coverage-Digest": vector_digest(head.vector)}
 
 
-@router.put("/maps/{name}/main/cells/{cell}", status_code=204)
+@router.put(
+    "/maps/{name}/main/cells/{cell}",
+    status_code=204,
+    responses=problems(409),
+    openapi_extra=body(CELL_MEDIA_TYPE),
+)
 def heal_cell(
     cell: str,
     service: Operations,
@@ -159,3 +189,27 @@ def heal_cell(
 ) -> None:
     """Put right a cell that the server's disk damaged: only the very bytes that it had are taken."""
     service.heal_cell(row, cell_key(cell_from_text(cell)), data, by=caller)
+
+
+def part_of(size_bytes: int, asked: str | None, *, etag: str, if_range: str | None) -> tuple[int, int] | None:
+    """First byte and the one after the last that a request asks for; None: the whole.
+
+    `Range` and `If-Range` of RFC 9110, sections 13.1.5 and 14.
+
+    Raises:
+        BadInputError: kind `bad_range`: it begins behind the end (416).
+    """
+    found = ONE_RANGE.fullmatch(asked) if asked else None
+    # Only the very ETag, and a strong one, promises that the parts belong together; a date never does.
+    if found is None or found.groups() == ("", "") or (if_range is not None and if_range.strip() != etag):
+        return None
+    first, last = found.groups()
+    if not first:  # the last so many
+        start, stop = max(0, size_bytes - int(last)), size_bytes
+    else:
+        start, stop = int(first), min(size_bytes, int(last) + 1 if last else size_bytes)
+        if last and int(last) < int(first):
+            return None  # no range at all
+    if start >= size_bytes:
+        raise BadInputError("bad_range", f"there are {size_bytes} bytes; the range asked for begins behind them")
+    return start, stop

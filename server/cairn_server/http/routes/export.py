@@ -1,30 +1,52 @@
-"""The routes by which a part of a map is taken away. Nothing is decided here."""
+"""Routes by which a map leaves the server: as a picture, or as a file of points or an octree."""
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Query, Request
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from cairn_map.files.export_request import EXPORT_TYPES, ExportRequest, ExportTicket, TicketedExport
-from cairn_server.access.auth import READING, require
-from cairn_server.http.routes.callers import READERS, Credentials, Map, Operations, caller_now, map_now
+from cairn_map.render.render_request import RenderRequest
+from cairn_server.http.routes.callers import READERS, Asking, Credentials, Map, Operations
+from cairn_server.http.routes.documentation import answers, example, problems
 from cairn_server.store.store_rows import MapRow
+
+PICTURES = {"png": "image/png", "npz": "application/x-npz"}
 
 router = APIRouter()
 
 
-async def map_without_ticket(
-    name: str, request: Request, service: Operations, credentials: Credentials
-) -> MapRow | None:
-    """The map, for who may read it by a token; None: a ticket is shown, and tells what it is for."""
-    if "ticket" in request.query_params:
-        return None
-    row = map_now(name, service, credentials)
-    require(caller_now(service, row, credentials), *READING)
-    return row
+@router.get(
+    "/maps/{name}/main/render",
+    dependencies=READERS,
+    response_class=Response,
+    responses=answers({200: tuple(PICTURES.values()), 304: ()}, headers=("ETag", "Cairn-Cursor")) | problems(413),
+)
+def render(
+    service: Operations,
+    row: Map,
+    asked: Annotated[RenderRequest, Query()],
+    if_none_match: Annotated[str | None, Header()] = None,
+) -> Response:
+    """The map as a camera at a pose would see it: PNG with a legend, or the values as NPZ; strong ETag."""
+    view = service.views.asked(row, asked, known=if_none_match)
+    headers = {"ETag": view.etag, "Cache-Control": "no-cache", "Cairn-Cursor": str(view.head.cursor)}
+    if view.body is None:
+        return Response(status_code=304, headers=headers)
+    headers["X-Content-Type-Options"] = "nosniff"
+    return Response(view.body, media_type=PICTURES[asked.format], headers=headers)
 
 
-@router.get("/maps/{name}/main/export")
+async def map_without_ticket(name: str, request: Request, asker: Asking) -> MapRow | None:
+    """The map, for a caller that may read it by a token; None: the request has a ticket, which says what it is for."""
+    return None if "ticket" in request.query_params else asker.reader(name)
+
+
+@router.get(
+    "/maps/{name}/main/export",
+    response_class=Response,
+    responses=answers({200: tuple(EXPORT_TYPES.values())}, headers=("Cairn-Cursor", "Cairn-Points")) | problems(413),
+)
 def export(
     service: Operations,
     name: str,
@@ -48,7 +70,13 @@ def export(
     return StreamingResponse(made.parts, media_type=EXPORT_TYPES[asked.format], headers=headers)
 
 
-@router.post("/maps/{name}/main/export/tickets", dependencies=READERS, status_code=201)
+@router.post(
+    "/maps/{name}/main/export/tickets",
+    dependencies=READERS,
+    status_code=201,
+    responses=problems(429),
+    openapi_extra=example({"format": "laz", "box": "-4,-4,0,4,4,2.5", "p": 0.7}),
+)
 def ask_for_ticket(service: Operations, row: Map, asked: ExportRequest, credentials: Credentials) -> ExportTicket:
     """A ticket that stands for the token shown, once and for this export: what a link to save it by has instead."""
     return service.tickets.give(row, asked, credentials.credentials if credentials else None)

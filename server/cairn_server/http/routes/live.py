@@ -24,7 +24,8 @@ from starlette.types import Receive, Scope, Send
 from cairn_map.errors import BadInputError, CairnError, DeniedError
 from cairn_map.wire.live_events import Beat, EventPosition, LiveEvent, position_from_text
 from cairn_server.access.auth import READING, require
-from cairn_server.http.routes.callers import READERS, Credentials, Map, Operations, caller_now, map_now
+from cairn_server.http.routes.callers import READERS, Asker, Asking, Map
+from cairn_server.http.routes.documentation import answers, problems
 from cairn_server.http.routes.problems import answer_to
 from cairn_server.live.hub import Listener
 from cairn_server.service import Service
@@ -47,20 +48,19 @@ router = APIRouter()
 class _Stream:
     """A listener and what wakes it, in the event loop."""
 
-    def __init__(self, service: Service, row: MapRow, credentials: HTTPAuthorizationCredentials | None) -> None:
-        self._service = service
+    def __init__(self, asker: Asker, row: MapRow) -> None:
+        self._asker = asker
         self._row = row
-        self._credentials = credentials
         self._loop = asyncio.get_running_loop()
         self._woken = asyncio.Event()
         self._listener: Listener | None = None
 
     async def join(self, after: EventPosition | None) -> None:
         """Begin to listen."""
-        shown = self._credentials.credentials if self._credentials else ""
+        shown = self._asker.credentials.credentials if self._asker.credentials else ""
         token = hashlib.sha256(shown.encode(errors="replace")).digest()
         self._listener = await run_in_threadpool(
-            lambda: self._service.live.join(self._row, token, self._wake, after=after)
+            lambda: self._asker.service.live.join(self._row, token, self._wake, after=after)
         )
 
     async def pump(self, send: Callable[[LiveEvent], Awaitable[None]]) -> int:
@@ -99,7 +99,7 @@ class _Stream:
     def _may_listen(self) -> bool:
         """Whether the token is still good."""
         try:
-            require(caller_now(self._service, self._row, self._credentials), *READING)
+            require(self._asker.caller(self._row), *READING)
         except DeniedError:
             return False
         except CairnError as exc:  # not to know is not to be refused
@@ -140,21 +140,25 @@ class EventStream(StreamingResponse):
         await send({"type": "http.response.body", "body": b"", "more_body": False})
 
 
-@router.get("/maps/{name}/events", dependencies=READERS, response_class=Response)
+@router.get(
+    "/maps/{name}/events",
+    dependencies=READERS,
+    response_class=Response,
+    responses=answers({200: ("text/event-stream",)}) | problems(429),
+)
 async def events(
-    service: Operations,
+    asker: Asking,
     row: Map,
-    credentials: Credentials,
     after: After = None,
     last_event_id: Annotated[str | None, Header()] = None,
 ) -> Response:
     """Live changes as Server-Sent Events; `Last-Event-ID`, or `after`, goes on from there."""
-    stream = _Stream(service, row, credentials)
+    stream = _Stream(asker, row)
     await stream.join(position_from_text(last_event_id or after or ""))
     return EventStream(stream)
 
 
-@router.get("/maps/{name}/live", dependencies=READERS)
+@router.get("/maps/{name}/live", dependencies=READERS, status_code=101, responses=answers({101: ()}) | problems(426))
 def live_without_upgrade() -> None:
     """Live changes by WebSocket (RFC 6455): ask for `Upgrade: websocket`."""
     raise BadInputError("upgrade_required", "this is a WebSocket; for plain HTTP there is .../events")
@@ -166,9 +170,9 @@ async def live(socket: WebSocket, name: str, after: After = None) -> None:
     service: Service = socket.app.state.service
     try:
         _check_origin(socket)
-        credentials = _credentials(socket)
-        row = await run_in_threadpool(_admitted, service, name, credentials)
-        stream = _Stream(service, row, credentials)
+        asker = Asker(service, _credentials(socket))
+        row = await run_in_threadpool(asker.reader, name)
+        stream = _Stream(asker, row)
         await stream.join(position_from_text(after or ""))
     except CairnError as exc:
         await socket.send_denial_response(answer_to(exc))
@@ -199,12 +203,6 @@ async def _until_left(socket: WebSocket) -> None:
     """Read until the other side is gone; it has nothing to say."""
     while (await socket.receive())["type"] != "websocket.disconnect":
         pass
-
-
-def _admitted(service: Service, name: str, credentials: HTTPAuthorizationCredentials | None) -> MapRow:
-    row = map_now(name, service, credentials)
-    require(caller_now(service, row, credentials), *READING)
-    return row
 
 
 def _credentials(socket: WebSocket) -> HTTPAuthorizationCredentials | None:

@@ -1,12 +1,13 @@
-"""Routes of maps, their branches and their log. Nothing is decided here."""
+"""Routes of maps and their log."""
 
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Response
 
-from cairn_map.wire.messages import BranchInfo, CreateMap, LogEntry, MapInfo, Register, Registered, Retract, Retracted
+from cairn_map.wire.messages import CreateMap, LogEntry, MapInfo, Retract, Retracted
 from cairn_server.access.auth import READING, Caller, Role
-from cairn_server.http.routes.callers import READERS, Map, Operations, admin, allowed, own_branch, reader_somewhere
+from cairn_server.http.routes.callers import READERS, Map, Operations, admin, allowed, reader_somewhere
+from cairn_server.http.routes.documentation import also, example, problems
 
 LOG_PAGE_MAX = 1000
 
@@ -19,7 +20,14 @@ def list_maps(service: Operations, caller: Annotated[Caller, Depends(reader_some
     return [service.map_info(row) for row in service.store.maps() if caller.counts_on(row.number)]
 
 
-@router.put("/maps/{name}", status_code=201)
+@router.put(
+    "/maps/{name}",
+    status_code=201,
+    responses=also(200, MapInfo) | problems(409),
+    openapi_extra=example(
+        {"geometry": {"voxel_edge_um": 40_000, "depth": 7}, "sensor_model": {"p_hit": 0.7, "p_miss": 0.4}}
+    ),
+)
 def create_map(
     name: str,
     body: CreateMap,
@@ -41,30 +49,12 @@ def get_map(service: Operations, row: Map) -> MapInfo:
     return service.map_info(row)
 
 
-@router.post("/maps/{name}/branches", status_code=201)
-def register(
-    body: Register, service: Operations, row: Map, caller: Annotated[Caller, Depends(allowed(Role.ENROLLER))]
-) -> Registered:
-    """Register a robot; registering again replaces its token."""
-    registered = service.register(row, body)
-    service.store.audit_log.add(caller.name, "register", f"map {row.name}: {body.robot}")
-    return registered
-
-
-@router.get("/maps/{name}/branches", dependencies=READERS)
-def list_branches(service: Operations, row: Map) -> list[BranchInfo]:
-    """All robots, and how far behind each is."""
-    return service.branches(row)
-
-
-@router.delete("/maps/{name}/branches/{branch}", status_code=204)
-def deregister(branch: str, service: Operations, row: Map, caller: Annotated[Caller, Depends(own_branch)]) -> None:
-    """Deregister a robot; its evidence stays."""
-    service.deregister(row, branch)
-    service.store.audit_log.add(caller.name, "deregister", f"map {row.name}: {branch}")
-
-
-@router.post("/maps/{name}/retracts", status_code=201)
+@router.post(
+    "/maps/{name}/retracts",
+    status_code=201,
+    responses=problems(409),
+    openapi_extra=example({"commits": ["mole.1f2e3d4c5b6a7988.12"], "note": "wrong calibration"}),
+)
 def retract(
     body: Retract, service: Operations, row: Map, caller: Annotated[Caller, Depends(allowed(Role.OPERATOR))]
 ) -> Retracted:

@@ -1,18 +1,33 @@
-"""Routes for whoever runs the server: probes and figures. Nothing is decided here."""
+"""Routes for operators of the server: probes and metrics, tokens and the audit log."""
 
-from fastapi import APIRouter, Depends
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Query
 from fastapi.responses import PlainTextResponse
 
-from cairn_server.http.routes.callers import Credentials, Operations, admin, anybody
+from cairn_map.wire.access_messages import AuditEntry, CreateToken, NewSecret, TokenInfo
+from cairn_server.access.auth import Caller
+from cairn_server.access.tokens import create_token, list_tokens, revoke_token, rotate_token
+from cairn_server.http.routes.callers import ADMIN, Asking, Operations, admin
+from cairn_server.http.routes.documentation import problems
 from cairn_server.metrics import MEDIA_TYPE
 
+AUDIT_PAGE_MAX = 1000
+
 router = APIRouter()
+Admin = Annotated[Caller, Depends(admin)]
 
 
-def metrics_reader(service: Operations, credentials: Credentials) -> None:
-    """Pass who may read the figures: an admin, or with `--metrics-open` anybody."""
-    if not service.settings.metrics_open:
-        admin(anybody(service, credentials))
+@router.get("/healthz")
+def healthz() -> dict[str, str]:
+    """The process answers."""
+    return {"status": "ok"}
+
+
+def metrics_reader(asker: Asking) -> None:
+    """Pass a caller that may read the metrics: an admin, or with `--metrics-open` any client."""
+    if not asker.service.settings.metrics_open:
+        admin(asker.caller(None))
 
 
 @router.get("/readyz")
@@ -26,3 +41,37 @@ def readyz(service: Operations) -> dict[str, str]:
 def metrics(service: Operations) -> PlainTextResponse:
     """Figures for Prometheus."""
     return PlainTextResponse(service.metrics_text(), media_type=MEDIA_TYPE)
+
+
+@router.get("/tokens", dependencies=ADMIN)
+def get_tokens(service: Operations) -> list[TokenInfo]:
+    """All tokens, without their secrets."""
+    return list_tokens(service.store)
+
+
+@router.put("/tokens/{token}", status_code=201, responses=problems(409))
+def put_token(token: str, body: CreateToken, service: Operations, caller: Admin) -> NewSecret:
+    """Create a token; its secret is shown this once."""
+    return create_token(service.store, token, body, by=caller)
+
+
+@router.post("/tokens/{token}/rotate")
+def rotate(token: str, service: Operations, caller: Admin) -> NewSecret:
+    """Another secret for a token; the old one is worth nothing at once."""
+    return rotate_token(service.store, token, by=caller)
+
+
+@router.delete("/tokens/{token}", status_code=204)
+def delete_token(token: str, service: Operations, caller: Admin) -> None:
+    """Revoke a token."""
+    revoke_token(service.store, token, by=caller)
+
+
+@router.get("/audit", dependencies=ADMIN)
+def get_audit(
+    service: Operations,
+    after: Annotated[int, Query(ge=0, lt=1 << 63)] = 0,
+    limit: Annotated[int, Query(ge=1, le=AUDIT_PAGE_MAX)] = 100,
+) -> list[AuditEntry]:
+    """Lines of the audit log, oldest first."""
+    return service.store.audit_log.page(after=after, limit=limit)

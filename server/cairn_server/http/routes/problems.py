@@ -1,8 +1,10 @@
 """Errors as RFC 9457 problems: `application/problem+json` with our stable `kind`."""
 
 import logging
+from collections.abc import Callable
+from typing import Any
 
-from fastapi import FastAPI, Request
+from fastapi import Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
@@ -69,33 +71,29 @@ def answer_to(exc: CairnError) -> JSONResponse:
     return _problem(status_of(exc), exc.kind, exc.message, headers)
 
 
-def add_problem_handlers(app: FastAPI) -> None:
-    """Make every error of the app a problem."""
+def _of_cairn(request: Request, exc: CairnError) -> JSONResponse:
+    return answer_to(exc)
 
-    @app.exception_handler(CairnError)
-    def of_cairn(request: Request, exc: CairnError) -> JSONResponse:
-        return answer_to(exc)
 
-    @app.exception_handler(RequestValidationError)
-    def of_validation(request: Request, exc: RequestValidationError) -> JSONResponse:
-        first = exc.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        return _problem(422, "bad_message", f"{where}: {first['msg']}", {})
+def _of_validation(request: Request, exc: RequestValidationError) -> JSONResponse:
+    first = exc.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    return _problem(422, "bad_message", f"{where}: {first['msg']}", {})
 
-    @app.exception_handler(HTTPException)
-    def of_http(request: Request, exc: HTTPException) -> JSONResponse:
-        kind = KIND_OF_STATUS.get(exc.status_code, "http")
-        return _problem(exc.status_code, kind, str(exc.detail), dict(exc.headers or {}))
 
-    @app.exception_handler(ClientDisconnect)
-    def of_cut_link(request: Request, exc: ClientDisconnect) -> JSONResponse:
-        log.info("%s %s: the link was cut before the body was whole", request.method, request.url.path[:200])
-        return _problem(400, "cut_off", "the body did not come whole", {})
+def _of_http(request: Request, exc: HTTPException) -> JSONResponse:
+    kind = KIND_OF_STATUS.get(exc.status_code, "http")
+    return _problem(exc.status_code, kind, str(exc.detail), dict(exc.headers or {}))
 
-    @app.exception_handler(Exception)
-    def of_bug(request: Request, exc: Exception) -> JSONResponse:
-        log.error("%s %s failed", request.method, request.url.path, exc_info=exc)
-        return _problem(500, "internal", "the server failed in a way that it did not expect; its log says more", {})
+
+def _of_cut_link(request: Request, exc: ClientDisconnect) -> JSONResponse:
+    log.info("%s %s: the link was cut before the body was whole", request.method, request.url.path[:200])
+    return _problem(400, "cut_off", "the body did not come whole", {})
+
+
+def _of_bug(request: Request, exc: Exception) -> JSONResponse:
+    log.error("%s %s failed", request.method, request.url.path, exc_info=exc)
+    return _problem(500, "internal", "the server failed in a way that it did not expect; its log says more", {})
 
 
 def _problem(status: int, kind: str, detail: str, headers: dict[str, str]) -> JSONResponse:
@@ -103,3 +101,13 @@ def _problem(status: int, kind: str, detail: str, headers: dict[str, str]) -> JS
     detail = detail[:DETAIL_CHARACTERS_MAX].encode(errors="replace").decode()
     problem = Problem(title=kind.replace("_", " "), status=status, detail=detail, kind=kind)
     return JSONResponse(problem.model_dump(), status, headers, media_type=MEDIA_TYPE)
+
+
+PROBLEM_HANDLERS: dict[int | type[Exception], Callable[..., Any]] = {
+    CairnError: _of_cairn,
+    RequestValidationError: _of_validation,
+    HTTPException: _of_http,
+    ClientDisconnect: _of_cut_link,
+    Exception: _of_bug,
+}
+"""Handlers that make every error of the app a problem."""

@@ -1,33 +1,51 @@
-"""Routes of push and fetch-missing. Nothing is decided here but where a push is worked on.
+"""Routes of synchronisation: push, whole or in parts, and fetch-missing.
 
-A small one on the event loop: its check takes less time than to change to a thread and back, and then another thread
-waits for the disk on its behalf. Whatever may take longer has a thread of its own.
+A small push is checked on the event loop: that takes less time than to change to a thread and back, and another thread
+then waits for the disk. All that may take longer runs in a thread of its own.
 """
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header, Request, Response
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 
 from cairn_map.commits.commit_reading import commit_reader
 from cairn_map.commits.signature import TEXT_MAX
 from cairn_map.errors import ConflictError
-from cairn_map.wire.messages import MissingRequest, Pushed
+from cairn_map.wire.messages import MissingRequest, Pushed, Upload
 from cairn_map.wire.relay_peer import CommitList, commit_list
-from cairn_server.http.routes.callers import READERS, Map, Operations, Visit, visiting_owner, visiting_robot
+from cairn_server.access.auth import Caller, Role
+from cairn_server.http.routes.callers import (
+    READERS,
+    Map,
+    Operations,
+    Visit,
+    allowed,
+    body_of,
+    visiting_owner,
+    visiting_robot,
+)
+from cairn_server.http.routes.documentation import also, answers, body, example, problems
 from cairn_server.sync.handing_over import found_commit
+from cairn_server.sync.uploads import Part, uploaded_by
 
 COMMIT_MEDIA_TYPE = "application/vnd.cairn.commit"
 REPLY_MEDIA_TYPE = "application/vnd.cairn.reply"
 
+AT_ONCE_BYTES = 1 << 16
+"""A body that is not larger is looked into at once."""
+UPLOAD = "/maps/{name}/commits/{commit}/upload"
+Digest = Annotated[str, Query(pattern="^[0-9a-f]{64}$", description="SHA-256 of the whole body")]
+Count = Annotated[int, Query(ge=0, lt=1 << 53)]
+
 router = APIRouter()
 
 
-AT_ONCE_BYTES = 1 << 16
-"""A body that is not larger is looked into at once."""
-
-
-@router.put("/maps/{name}/commits/{commit}")
+@router.put(
+    "/maps/{name}/commits/{commit}",
+    responses=also(201, Pushed) | problems(409, 429, 507),
+    openapi_extra=body(COMMIT_MEDIA_TYPE),
+)
 async def push(
     commit: str,
     visit: Annotated[Visit, Depends(visiting_robot)],
@@ -53,7 +71,12 @@ async def push(
     return Pushed(id=commit, state="new" if is_new else "known")
 
 
-@router.get("/maps/{name}/commits/{commit}", dependencies=READERS)
+@router.get(
+    "/maps/{name}/commits/{commit}",
+    dependencies=READERS,
+    response_class=Response,
+    responses=answers({200: (COMMIT_MEDIA_TYPE,)}, headers=("ETag", "Cairn-Seal")) | problems(409),
+)
 def get_commit(commit: str, service: Operations, row: Map) -> Response:
     """A commit's bytes as they were pushed, while its evidence is kept."""
     found = found_commit(service.store, row, commit)
@@ -69,8 +92,62 @@ def list_commits(service: Operations, row: Map) -> CommitList:
     return commit_list(service.held.of(row))
 
 
-@router.post("/maps/{name}/branches/{branch}/missing")
+@router.post(
+    "/maps/{name}/branches/{branch}/missing",
+    response_class=Response,
+    responses=answers({200: (REPLY_MEDIA_TYPE,), 204: ()}) | problems(410),
+    openapi_extra=example({"author": "mole.1f2e3d4c5b6a7988", "kinds": ["delta", "full"]}),
+)
 def missing(branch: str, body: MissingRequest, visit: Annotated[Visit, Depends(visiting_owner)]) -> Response:
     """The frames that bring the asker to the head; 204 if they are those of the last reply."""
     reply = visit.service.missing(visit.row, branch, body)
     return Response(reply, media_type=REPLY_MEDIA_TYPE) if reply else Response(status_code=204)
+
+
+async def author(commit: str, caller: Annotated[Caller, Depends(allowed(Role.ROBOT, Role.RELAY))]) -> Caller:
+    """The caller, if it may push this commit."""
+    uploaded_by(caller, commit)
+    return caller
+
+
+Author = Annotated[Caller, Depends(author)]
+
+
+@router.get(UPLOAD)
+def upload(
+    commit: str,
+    service: Operations,
+    row: Map,
+    caller: Author,
+    digest: Digest,
+) -> Upload:
+    """How many bytes of a commit came already, and whether it is kept."""
+    return service.uploads.state(row, caller, commit, digest)
+
+
+@router.patch(
+    UPLOAD,
+    responses=also(201, Upload) | problems(409, 429, 507),
+    openapi_extra=body("application/octet-stream"),
+)
+async def add_part(
+    commit: str,
+    service: Operations,
+    row: Map,
+    caller: Author,
+    response: Response,
+    data: Annotated[bytes, Depends(body_of)],
+    digest: Digest,
+    total: Count,
+    offset: Count,
+    cairn_signature: Annotated[str | None, Header(max_length=TEXT_MAX)] = None,
+) -> Upload:
+    """Add a part of a commit's bytes; with the last one it is pushed."""
+    part = Part(digest, total, offset, data, cairn_signature)
+    try:
+        found, is_new = await run_in_threadpool(service.uploads.add, row, caller, commit, part)
+    except ConflictError as exc:
+        await run_in_threadpool(service.pushes.note_conflict, row, caller, exc)
+        raise
+    response.status_code = 201 if is_new else 200
+    return found

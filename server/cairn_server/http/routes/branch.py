@@ -1,0 +1,106 @@
+"""Routes of branches, one for each robot of a map: registration, and a robot's status and latest picture."""
+
+from email.utils import formatdate
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Header, Response
+
+from cairn_map.wire.messages import BranchInfo, Register, Registered, RobotStatus
+from cairn_server.access.auth import Caller, Role
+from cairn_server.http.routes.callers import OWNERS, READERS, Map, Operations, allowed, body_of, own_branch
+from cairn_server.http.routes.documentation import answers, body, example
+
+PICTURES = ("image/jpeg", "image/png")
+
+router = APIRouter()
+
+
+@router.post(
+    "/maps/{name}/branches",
+    status_code=201,
+    openapi_extra=example(
+        {
+            "robot": "mole",
+            "mode": "high-end",
+            "incarnation": "1f2e3d4c5b6a7988",
+            "sensors": ["tof", "colour", "thermal"],
+        }
+    ),
+)
+def register(
+    body: Register, service: Operations, row: Map, caller: Annotated[Caller, Depends(allowed(Role.ENROLLER))]
+) -> Registered:
+    """Register a robot; registering again replaces its token."""
+    registered = service.register(row, body)
+    service.store.audit_log.add(caller.name, "register", f"map {row.name}: {body.robot}")
+    return registered
+
+
+@router.get("/maps/{name}/branches", dependencies=READERS)
+def list_branches(service: Operations, row: Map) -> list[BranchInfo]:
+    """All robots, and how far behind each is."""
+    return service.branches(row)
+
+
+@router.delete("/maps/{name}/branches/{branch}", status_code=204)
+def deregister(branch: str, service: Operations, row: Map, caller: Annotated[Caller, Depends(own_branch)]) -> None:
+    """Deregister a robot; its evidence stays."""
+    service.deregister(row, branch)
+    service.store.audit_log.add(caller.name, "deregister", f"map {row.name}: {branch}")
+
+
+@router.put(
+    "/maps/{name}/branches/{branch}/status",
+    status_code=204,
+    dependencies=OWNERS,
+    openapi_extra=example(
+        {
+            "time_s": 1795253400.0,
+            "pose": {
+                "time_s": 1795253400.0,
+                "t_map_rig": [1.5, -2.0, 0.4],
+                "q_map_rig": [0.0, 0.0, 0.0, 1.0],
+                "sigma_m": 0.05,
+                "sigma_rad": 0.01,
+            },
+            "mode": "high-end",
+            "waiting": 3,
+            "waiting_bytes": 1500000,
+            "battery": 0.8,
+            "note": "at the stairs",
+        }
+    ),
+)
+def put_status(branch: str, body: RobotStatus, service: Operations, row: Map) -> None:
+    """Tell where a robot is and how it is doing; only the last one is kept."""
+    service.reports.put_status(row, branch, body)
+
+
+@router.put("/maps/{name}/branches/{branch}/view", status_code=204, dependencies=OWNERS, openapi_extra=body(*PICTURES))
+def put_view(branch: str, service: Operations, row: Map, data: Annotated[bytes, Depends(body_of)]) -> None:
+    """Show what a robot sees: a JPEG or PNG, kept in memory until the next one."""
+    service.reports.put_view(row, branch, data)
+
+
+@router.get(
+    "/maps/{name}/branches/{branch}/view",
+    dependencies=READERS,
+    response_class=Response,
+    responses=answers({200: PICTURES, 304: ()}, headers=("ETag", "Last-Modified")),
+)
+def get_view(
+    branch: str, service: Operations, row: Map, if_none_match: Annotated[str | None, Header()] = None
+) -> Response:
+    """A robot's latest picture; strong ETag, `Last-Modified` is when it came."""
+    view = service.reports.view(row, branch)
+    headers = {
+        "ETag": f'"{view.digest}"',
+        "Last-Modified": formatdate(view.time_s, usegmt=True),
+        "Cache-Control": "no-cache",
+        # Whatever else the bytes may be read as, a browser is to take them for a picture.
+        "X-Content-Type-Options": "nosniff",
+        "Content-Security-Policy": "default-src 'none'; sandbox",
+    }
+    if if_none_match and (if_none_match.strip() == "*" or headers["ETag"] in if_none_match):
+        return Response(status_code=304, headers=headers)
+    return Response(view.data, media_type=view.media_type, headers=headers)
