@@ -6,7 +6,7 @@
     $ cairn sim evaluate-fusion pictures/              # fused images against the truth, and the paper's Fig. 24
     $ cairn robot replay lab-1 --map http://127.0.0.1:8750/maps/lab
 
-A recording is like a real robot's; the truth behind every image lies beside it, in its folder truth/. The path
+A recording is like a real robot's; the truth behind every image lies in its folder truth/. The path
 `experiment` of the building is the paper's: 54 stops of 36 scans. The same seed gives the same bytes.
 """
 
@@ -33,7 +33,7 @@ from cairn_sim.scene.scene_file import SHIPPED, load_scene, shipped_text
 from cairn_sim.scene.scene_format import ZERO_C_K
 
 MEGABYTES_PER_SCAN = {"orpheus": 4.8, "tof": 0.24, "lidar": 0.2, "handheld": 3.1}
-"""Of a recording at full size with the truth of the range camera, measured in the building."""
+"""Bytes of a recording at full size with the truth of the range camera, measured in the building."""
 TRUTH_FACTORS = {"none": 0.95, "range": 1.0, "all": 2.1}
 
 

@@ -27,7 +27,7 @@ COLD, NONE, WARM = (33, 86, 168), (247, 247, 247), (178, 24, 43)
 SURE, UNSURE = (38, 30, 80), (246, 222, 90)
 UNSEEN = "#c9cdd3"
 ARROW_SHARE = 0.04
-"""Of the image's width: how long a residual of twice the noise is drawn."""
+"""Length of a residual of twice the noise as drawn, as a share of the image's width."""
 
 
 def quiver(size_px: tuple[int, int], corners: Floats, misses: Floats, kept: Flags, sigma_px: float) -> str:

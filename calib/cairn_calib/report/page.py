@@ -54,7 +54,7 @@ def _template(package: str, name: str) -> Callable[..., str]:
     except ModuleNotFoundError as exc:
         raise missing_extra(exc) from exc
     loader = ChoiceLoader([PackageLoader(package), PackageLoader(HERE)])
-    # StrictUndefined: a fact that a template names and nobody gave is an error, never an empty place on the page.
+    # StrictUndefined: a fact that a template names and no caller gave is an error, never an empty place on the page.
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )

@@ -1,6 +1,6 @@
 """The images of a calibration for its report: small, with the corners that were found, or why there are none.
 
-`cairn calib corners` draws every image beside its document; here they are made small enough for one page.
+`cairn calib corners` draws every image next to its document; here they are made small enough for one page.
 """
 
 import base64
@@ -14,7 +14,7 @@ from cairn_calib.board.corner_pictures import thumbnail
 from cairn_calib.diagnosis.view_residuals import ViewResiduals
 
 IMAGES_MAX = 60
-"""Of one camera: a page of some megabytes at the most."""
+"""Images of one camera at most: a page of some megabytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class ReportImage:
 
     document: CornerFile
     picture: bytes | None
-    """JPEG; None where there is no picture beside the document."""
+    """JPEG; None where there is no picture next to the document."""
 
 
 def report_images(folders: Mapping[str, Path]) -> dict[str, list[ReportImage]]:

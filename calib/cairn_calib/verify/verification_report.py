@@ -10,7 +10,7 @@ from cairn_calib.verify.verification_table import SOURCES, CameraRow
 
 AXES = ("x", "y")
 FIRST_FIGURE = 9
-"""Of the paper's plots: a camera's x, its y, the next camera's."""
+"""Number of the paper's first plot: a camera's x, then its y, then the next camera's."""
 
 
 HEAD = (

@@ -1,4 +1,4 @@
-"""What the demo claims, checked: all maps are the same, and a retract leaves no trace."""
+"""Proof of the demo's claims: all maps are the same, and a retract leaves no trace."""
 
 import time
 from collections.abc import Callable, Sequence

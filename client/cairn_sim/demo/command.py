@@ -53,7 +53,7 @@ MAP = "building"
 IMAGE_SCALE = 0.25
 """Colour and thermal images a quarter as wide: enough for voxels of 4 cm, and quickly rendered."""
 CEILING_M = 0.9
-"""Where the picture cuts the map: over the heads, under the ceiling's 1.7 m."""
+"""Height at which the picture cuts the map: over the heads, under the ceiling's 1.7 m."""
 QUICK_SCANS = (4, 1)
 """Yaws and pitches of `--quick`: the same story with a poorer map."""
 SERVER_START_S = 60.0

@@ -21,7 +21,7 @@ from cairn_sim.scene.scene import Scene
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoDrive:
-    """What one robot of the demo does."""
+    """Drive of one robot of the demo: its path, its cameras, its mode and its lapses."""
 
     name: str
     head: str
@@ -39,7 +39,7 @@ class DemoDrive:
 
 @dataclass(slots=True)
 class DemoProgress:
-    """How far a robot is, for the table."""
+    """Progress of a robot, for the table."""
 
     state: str = "waits"
     stops_done: int = 0
@@ -70,7 +70,7 @@ class DemoRobot:
 
     @property
     def is_done(self) -> bool:
-        """Whether the robot is at the end of its path, or failed."""
+        """True once the robot is at the end of its path, or failed."""
         return not self._thread.is_alive()
 
     def close(self) -> None:

@@ -43,7 +43,7 @@ SCANS_OF_STOP = 36
 FIGURE = (20, 22)
 """Stop and scan of the pictures: a person, hot things before a wall, glass, and a floor too dark for a range."""
 STOPS = (3, 20, 40)
-"""Of the experiment: a laboratory with hot pipes, one with people and hot things, the corridor."""
+"""Stops of the experiment: a laboratory with hot pipes, one with people and hot things, the corridor."""
 
 
 def add_evaluate_arguments(options: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""How true fusion is, in the simulator: images against `fusion_truth`, and the temperatures of a map.
+"""Evaluation of fusion in the simulator: images against `fusion_truth`, and the temperatures of a map.
 
 Images are scored in several ways from the same depth, so that each row says what one step is worth:
 
@@ -35,13 +35,13 @@ from cairn_sim.robots.record import Plan, scans_of, shots_of
 from cairn_sim.scene.scene import Scene
 
 HOT_CUP = 13
-"""Of `label_mapping.json`."""
+"""Number of the class in `label_mapping.json`."""
 HOT_SHARE = 0.5
 """A pixel is hot from half the way up from the frame's median to the label's hottest; ambient is 13 deg C, cups 75."""
 HOT_AT_LEAST_K = 5.0
 """Above the median: a label whose thing has cooled down says nothing."""
 AROUND_PX = 40
-"""How far from the label hot pixels belong to it; other hot things have labels of their own."""
+"""Distance from the label within which hot pixels belong to it; other hot things have labels of their own."""
 
 WAYS = ("both cameras", "one camera", "nothing hides", "not calibrated")
 MAPPINGS: Mapping[str, Integrator] = {
@@ -91,7 +91,7 @@ def scored_view(scene: Scene, rig: Rig, scan: Scan, camera: str) -> ScoredView:
 def mapped_scores(
     scene: Scene, rig: Rig, stops: Sequence[Sequence[Scan]], *, voxel_edge_m: float
 ) -> dict[str, dict[str, TemperatureScores]]:
-    """How true a map's temperatures are: by way of mapping, of bodies, pipes, behind glass, in mirrors, and else."""
+    """Scores of a map's temperatures by way of mapping: bodies, pipes, behind glass, in mirrors, everything else."""
     geometry = geometry_for(voxel_edge_m=voxel_edge_m)
     eyes_m = [scans[0].T_map_rig[:3, 3] for scans in stops]
     found = {}
@@ -114,7 +114,7 @@ class LabelledFrame:
     fused: CrossView
     label: Flags
     given_iou: float
-    """Of the set's own registration."""
+    """Intersection over union of the data set's own registration."""
     fused_iou: float
 
 

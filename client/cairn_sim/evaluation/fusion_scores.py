@@ -1,11 +1,11 @@
-"""How true fused images are: errors of temperature and colour pixel by pixel, and of what is called hidden.
+"""Scores of fused images: errors of temperature and colour pixel by pixel, and of occlusion labels.
 
     painted     pixels with a value, of all
     error       |fused - true| of painted pixels: median, 95 %, share above `LARGE`; also away from edges
     hidden      painted although no source sees the place, of painted
     precision   pixels called occluded that are hidden, of those called so
     recall      hidden pixels called occluded, of the hidden ones in view that have a depth
-    ... +-1     the same, where one a range pixel away counts: nobody measured better where an edge is
+    ... +-1     the same, where one a range pixel away counts: the edge is measured no better
 
 Pixels that look through glass or into a mirror are counted by themselves: there the range camera measured something
 else.
@@ -30,7 +30,7 @@ EMPTY = np.empty(0, np.float32)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FusionScores:
-    """Of one fused image or, added, of several."""
+    """Counts and errors of one fused image or, added, of several."""
 
     unit: str
     pixels: int = 0
@@ -46,15 +46,15 @@ class FusionScores:
     hidden: int = 0
     """From the first source, in its view, and with a depth."""
     hidden_near: int = 0
-    """Of these, within a range pixel of one that was called so."""
+    """Hidden pixels within a range pixel of one that was called occluded."""
     errors: Singles = field(default_factory=lambda: EMPTY)
-    """Of painted pixels."""
+    """Errors of painted pixels."""
     errors_away: Singles = field(default_factory=lambda: EMPTY)
-    """Of those away from edges."""
+    """Errors of painted pixels away from edges."""
     errors_filled: Singles = field(default_factory=lambda: EMPTY)
-    """Of those whose depth was filled in."""
+    """Errors of painted pixels whose depth was filled in."""
     errors_beyond: Singles = field(default_factory=lambda: EMPTY)
-    """Of those that show what is behind glass or in a mirror; in none of the others."""
+    """Errors of pixels that show things behind glass or in a mirror; counted in none of the others."""
 
     def __add__(self, other: "FusionScores") -> "FusionScores":
         added: dict[str, object] = {"unit": self.unit}
@@ -65,12 +65,12 @@ class FusionScores:
 
     @property
     def precision(self) -> float:
-        """Of pixels called occluded, those that are; 0 to 1, NaN for 0 of 0."""
+        """Share of the pixels called occluded that are hidden; 0 to 1, NaN for 0 of 0."""
         return self.called_hidden / self.called if self.called else math.nan
 
     @property
     def recall(self) -> float:
-        """Of hidden pixels, those called occluded."""
+        """Share of the hidden pixels that are called occluded; 0 to 1, NaN for 0 of 0."""
         return self.called_hidden / self.hidden if self.hidden else math.nan
 
     @property

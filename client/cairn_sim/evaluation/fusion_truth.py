@@ -22,7 +22,7 @@ from cairn_sim.render.sensors import ColourSensor, ThermalSensor
 from cairn_sim.scene.scene import Scene
 
 HIDDEN_M = 0.1
-"""What hides stands so much before what it hides: the bend of a surface seen at a glance hides nothing else."""
+"""Distance between an occluder and the surface behind it at least: a surface's own curvature hides nothing."""
 EDGE_SHARE = 0.05
 EDGE_M = HIDDEN_M / 2
 """Neighbours whose ranges differ by more than the share, or by as much as may hide something, are on both sides of an

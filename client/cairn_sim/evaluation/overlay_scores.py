@@ -1,4 +1,4 @@
-"""Whether the map over a live image is where its cubes are: against their projection, worked out without the map.
+"""Scores of the map over a live image, against the projection of its cubes, computed without the map.
 
     cubes       occupied voxels at random places, all that the map has
     expected    pixels whose centre lies in the outline of a cube's image: its edges projected through the lens
@@ -31,14 +31,14 @@ GEOMETRY = Geometry(voxel_edge_um=50_000, depth=5, channels=(TEMPERATURE,))
 CUBES, REACH_VOXELS = 40, 6
 """So many, at most so far from the origin along each axis."""
 AWAY_M, ASIDE_M = 0.9, 0.1
-"""How far the eye is from the origin, and what it looks at, along each axis."""
+"""Distance of the eye from the origin, and of the point that it looks at, along each axis, metres."""
 EDGE_STEPS = 9
 """Points along a cube's edge, which a lens bends."""
 
 
 @dataclass(frozen=True, slots=True)
 class OverlayScore:
-    """Of one pose: intersection over union, 0 to 1, by how the map is drawn."""
+    """Intersection over union of one pose, 0 to 1, by how the map is drawn."""
 
     visible: float
     map_only: float
@@ -83,7 +83,7 @@ def map_of_cubes(cubes: Ints) -> MapSnapshot:
 
 
 def cubes_seen(cubes: Ints, camera: AnyCamera, T_map_camera: Transform) -> tuple[Flags, npt.NDArray[np.float32]]:
-    """What a camera sees of cubes that are all before it.
+    """Cubes in a camera's image; all of them are in front of it.
 
     Args:
         cubes: (N, 3) voxel numbers.
@@ -123,5 +123,5 @@ def _entered_m(rays: Floats, corners_m: Floats) -> Floats:
 
 
 def intersection_over_union(one: Flags, other: Flags) -> float:
-    """Of two masks of one size, 0 to 1; 0 for two empty ones."""
+    """Intersection over union of two masks of one size, 0 to 1; 0 for two empty ones."""
     return float((one & other).sum() / max(int((one | other).sum()), 1))

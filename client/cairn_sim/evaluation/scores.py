@@ -1,4 +1,4 @@
-"""How true a map is: its voxels against `truth_grid`, as counts that add up over cells and as ratios.
+"""Scores of a map against `truth_grid`: counts of voxels that add up over cells, and their ratios.
 
     recall             surface voxels that the map calls occupied; the rest was carved away, or is unknown
     recall of free     free voxels that the map calls free
@@ -25,9 +25,9 @@ from cairn_sim.evaluation.truth_grid import HALF_SOLID, Truth, TruthClass, Voxel
 States = npt.NDArray[np.int8]
 
 FREE, UNKNOWN, OCCUPIED = -1, 0, 1
-"""Of a map's voxel: the sign of its log-odds."""
+"""State of a map's voxel: the sign of its log-odds."""
 VOXELS_AT_ONCE = 1 << 20
-"""Of a cell's evidence; bounds the memory to some 50 MB."""
+"""Voxels of a cell's evidence scored at once; bounds the memory to some 50 MB."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,23 +35,23 @@ class Scores:
     """Voxels of one box or, added, of several."""
 
     surface: int = 0
-    """Of the truth."""
+    """Surface voxels of the truth."""
     surface_occupied: int = 0
-    """Of those, how many the map calls occupied."""
+    """Surface voxels that the map calls occupied."""
     surface_free: int = 0
     """And free: carved away."""
     free: int = 0
-    """Of the truth."""
+    """Free voxels of the truth."""
     free_free: int = 0
     free_occupied: int = 0
     map_free: int = 0
     map_free_touching: int = 0
-    """Of the map's free voxels, those with any of the 64 samples in a solid."""
+    """Free voxels of the map with any of the 64 samples in a solid."""
     map_free_half_solid: int = 0
     """With at least half of them."""
     map_occupied: int = 0
     map_occupied_empty: int = 0
-    """Of the map's occupied voxels, those without a sample in a solid."""
+    """Occupied voxels of the map without a sample in a solid."""
     map_occupied_near: int = 0
     """Those that are, or have as one of 26 neighbours, a voxel that touches a solid or is surface."""
 
@@ -70,42 +70,42 @@ class Scores:
 
     @property
     def recall(self) -> float:
-        """Of the surface, what the map calls occupied; this and all ratios 0 to 1, NaN for 0 of 0."""
+        """Share of the surface that the map calls occupied; this and all ratios 0 to 1, NaN for 0 of 0."""
         return _ratio(self.surface_occupied, self.surface)
 
     @property
     def carved(self) -> float:
-        """Of the surface, what the map calls free."""
+        """Share of the surface that the map calls free."""
         return _ratio(self.surface_free, self.surface)
 
     @property
     def unknown(self) -> float:
-        """Of the surface, what the map does not know."""
+        """Share of the surface that is unknown in the map."""
         return _ratio(self.surface_unknown, self.surface)
 
     @property
     def recall_free(self) -> float:
-        """Of the free voxels, what the map calls free."""
+        """Share of the free voxels that the map calls free."""
         return _ratio(self.free_free, self.free)
 
     @property
     def false_free(self) -> float:
-        """Of the map's free voxels, those that touch a solid."""
+        """Share of the map's free voxels that touch a solid."""
         return _ratio(self.map_free_touching, self.map_free)
 
     @property
     def false_free_half(self) -> float:
-        """Of the map's free voxels, those at least half solid."""
+        """Share of the map's free voxels that are at least half solid."""
         return _ratio(self.map_free_half_solid, self.map_free)
 
     @property
     def occupied_empty(self) -> float:
-        """Of the map's occupied voxels, those without solid."""
+        """Share of the map's occupied voxels without solid."""
         return _ratio(self.map_occupied_empty, self.map_occupied)
 
     @property
     def precision(self) -> float:
-        """Of the map's occupied voxels, those at most one voxel from a solid or a surface."""
+        """Share of the map's occupied voxels at most one voxel from a solid or a surface."""
         return _ratio(self.map_occupied_near, self.map_occupied)
 
     def __str__(self) -> str:
@@ -118,7 +118,7 @@ class Scores:
 
 
 def scores_of(truth: Truth, diff: Diff, geometry: Geometry, *, model: SensorModel | None = None) -> Scores:
-    """What a map says of one box, against the truth.
+    """Scores of a map's evidence in one box against the truth.
 
     Args:
         truth: of a box on the map's grid.
@@ -133,7 +133,7 @@ def scores_of(truth: Truth, diff: Diff, geometry: Geometry, *, model: SensorMode
 
 
 def scores_from(truth: Truth, states: States) -> Scores:
-    """What states (X, Y, Z) of a box's voxels, FREE, UNKNOWN or OCCUPIED, are worth against the truth."""
+    """Scores of (X, Y, Z) states of a box's voxels, FREE, UNKNOWN or OCCUPIED, against the truth."""
     occupied, free = states == OCCUPIED, states == FREE
     surface, open_space = truth.classes == TruthClass.SURFACE, truth.classes == TruthClass.FREE
     return Scores(

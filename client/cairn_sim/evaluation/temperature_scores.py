@@ -1,4 +1,4 @@
-"""How true a map's temperatures are: voxels of bodies and pipes against what their surfaces really send.
+"""Scores of a map's temperatures: voxels of bodies and pipes against the radiation of their surfaces.
 
     truth     what a thermal camera reads of the surfaces in a voxel: from the coldest to the warmest of them
     error     how far the voxel's mean is from that
@@ -40,7 +40,7 @@ SAMPLES = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TemperatureScores:
-    """Of the mapped voxels on some solids."""
+    """Temperature errors of the mapped voxels on some solids."""
 
     errors_k: Floats
     """(N,) of those with a temperature."""
@@ -54,7 +54,7 @@ class TemperatureScores:
 
     @property
     def p95_k(self) -> float:
-        """Of 20 voxels 19 are better; NaN for none."""
+        """95th percentile of the errors, kelvin; NaN without voxels."""
         return float(np.quantile(self.errors_k, 0.95)) if len(self.errors_k) else math.nan
 
     @property
@@ -65,12 +65,12 @@ class TemperatureScores:
 
 
 def is_body(name: str) -> bool:
-    """Whether a solid of that name is a person's."""
+    """True for the name of a person's solid."""
     return name.split("/")[0].startswith(BODIES) or "person" in name.split("/")[0]
 
 
 def is_pipe(name: str) -> bool:
-    """Whether a solid of that name is a pipe."""
+    """True for the name of a pipe."""
     return any(word in name for word in PIPES)
 
 

@@ -32,12 +32,12 @@ Marks = npt.NDArray[np.uint8]
 Triple = tuple[int, int, int]
 
 VOXELS_MAX = 1 << 28
-"""Of a box: 2 GB of masks. A cell of 5.12 m has 2^24 at 2 cm."""
+"""Voxels of a box at most: 2 GB of masks. A cell of 5.12 m has 2^24 at 2 cm."""
 SAMPLES_PER_VOXEL = 64
 HALF_SOLID = SAMPLES_PER_VOXEL // 2
 """A voxel with as many samples in solids is solid."""
 MAX_RANGE_M = 10.0
-"""Of the camera; as `Integrator.max_range_m`."""
+"""Reach of the camera, metres; as `Integrator.max_range_m`."""
 FINENESS = 4
 """Rays along a pixel's edge: 1.7 cm apart at 10 m for the ToF camera."""
 
@@ -47,7 +47,7 @@ BUNDLE_PX = 4
 
 
 class TruthClass(IntEnum):
-    """What a voxel is to one who has been on the trajectory: the first of SURFACE, SOLID, FREE, UNSEEN that is true.
+    """True class of a voxel, given the trajectory: the first of SURFACE, SOLID, FREE, UNSEEN that holds.
 
     So a voxel that rays pass is free only if less than half of it is solid: else a map would be asked to call free what
     is then counted as falsely free.
@@ -103,7 +103,7 @@ class VoxelBox:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What is true of each voxel of a box; (X, Y, Z) arrays."""
+    """Truth of each voxel of a box; (X, Y, Z) arrays."""
 
     box: VoxelBox
     classes: Marks
@@ -111,11 +111,11 @@ class Truth:
     solid_samples: Marks
     """0 to 64 of the samples in solids."""
     near_solid: Flags
-    """Whether it, or one of its 26 neighbours, touches a solid or holds an end point."""
+    """True where the voxel, or one of its 26 neighbours, touches a solid or holds an end point."""
 
     @property
     def solid_fraction(self) -> npt.NDArray[np.float32]:
-        """What part of each voxel is solid, 0 to 1."""
+        """Solid share of each voxel, 0 to 1."""
         return self.solid_samples.astype(np.float32) / np.float32(SAMPLES_PER_VOXEL)
 
 
@@ -177,7 +177,7 @@ def seen_marks(
     max_range_m: float = MAX_RANGE_M,
     fineness: int = FINENESS,
 ) -> list[Marks]:
-    """What a camera could have seen of each box: (X, Y, Z) 0, PASSED or HIT.
+    """Marks of the voxels that a camera could have seen in each box: (X, Y, Z) 0, PASSED or HIT.
 
     Rays are cast once for all boxes. Where several cameras went, take the largest of their marks.
 
@@ -253,7 +253,7 @@ def _finer_rays(camera: AnyCamera, fineness: int) -> Floats:
 
 
 def _near(flags: Flags) -> Flags:
-    """Whether one of the 27 voxels around each is set; of all but the outermost."""
+    """Flags dilated by one voxel in all 26 directions; of all voxels but the outermost."""
     flags = flags[:-2] | flags[1:-1] | flags[2:]
     flags = flags[:, :-2] | flags[:, 1:-1] | flags[:, 2:]
     near: Flags = flags[:, :, :-2] | flags[:, :, 1:-1] | flags[:, :, 2:]

@@ -62,6 +62,8 @@ def add_solid_into(
     voxel_reach = math.sqrt(3.0) * edge_m * (SAMPLES - 1) / (2 * SAMPLES) + TOUCH_M
     block_reach = math.sqrt(3.0) * edge_m * (BLOCK - 1) / 2 + voxel_reach
     middle = (BLOCK - 1) / 2
+    # Stage 1, blocks of 8^3 voxels: `_excess` bounds the distance, so a block far from the surface is wholly in or
+    # out.
     for bx in range(start[0], stop[0], BLOCK):
         for by in range(start[1], stop[1], BLOCK):
             for bz in range(start[2], stop[2], BLOCK):
@@ -77,6 +79,7 @@ def add_solid_into(
                 )
                 if excess > block_reach:
                     continue
+                # Stage 2, voxels of a block that the surface may cross.
                 for i in range(bx, min(bx + BLOCK, stop[0])):
                     for j in range(by, min(by + BLOCK, stop[1])):
                         px, py, pz = cx + i * xx + j * yx, cy + i * xy + j * yy, cz + i * xz + j * yz
@@ -84,12 +87,14 @@ def add_solid_into(
                             if excess < -block_reach:
                                 masks[i, j, k] = ALL
                                 continue
+                            # Another solid fills this voxel already.
                             if masks[i, j, k] == ALL:
                                 continue
                             x, y, z = px + k * zx, py + k * zy, pz + k * zz
                             here = _excess(kind, x, y, z, hx, hy, hz)
                             if here < -voxel_reach:
                                 masks[i, j, k] = ALL
+                            # Stage 3, the 4^3 samples of a voxel that the surface may cross.
                             elif here <= voxel_reach:
                                 masks[i, j, k] |= _mask(kind, x, y, z, xx, xy, xz, yx, yy, yz, zx, zy, zz, hx, hy, hz)
 
@@ -128,6 +133,7 @@ def _mask(
     """The samples in a solid of the voxel with its centre at x, y, z; xx to zz are the steps to the next voxels."""
     mask, bit = np.uint64(0), np.uint64(1)
     for i in range(SAMPLES):
+        # Centres of 4^3 cubes, as shares of the edge from the voxel's centre.
         a = (2 * i + 1 - SAMPLES) / (2 * SAMPLES)
         for j in range(SAMPLES):
             b = (2 * j + 1 - SAMPLES) / (2 * SAMPLES)
@@ -163,11 +169,13 @@ def mark_seen_into(
         far = range_m[n]
         if not far <= max_range_m:
             continue
+        # The end point's voxel; a hit is never overwritten by a later pass.
         hx = _voxel(origin[0] + far * directions[n, 0], edge_nm) - low[0]
         hy = _voxel(origin[1] + far * directions[n, 1], edge_nm) - low[1]
         hz = _voxel(origin[2] + far * directions[n, 2], edge_nm) - low[2]
         if 0 <= hx < nx and 0 <= hy < ny and 0 <= hz < nz:
             marks[hx, hy, hz] = HIT
+        # The part of the ray inside the box, in units of voxels.
         dx, dy, dz = directions[n, 0] * per_m, directions[n, 1] * per_m, directions[n, 2] * per_m
         ix, iy, iz = inverse_of(dx), inverse_of(dy), inverse_of(dz)
         ax, bx = _inside(ox, ix, nx)
@@ -176,16 +184,19 @@ def mark_seen_into(
         t, far = max(max(ax, ay), max(az, 0.0)), min(min(bx, by), min(bz, far))
         if not far - t > GRAZE_M:
             continue
+        # Walk from border to border (Amanatides and Woo 1987): the next is the nearest of three.
         x, y, z = _start(ox + t * dx, nx), _start(oy + t * dy, ny), _start(oz + t * dz, nz)
         tx, sx, ux = _borders(ox, ix, x)
         ty, sy, uy = _borders(oy, iy, y)
         tz, sz, uz = _borders(oz, iz, z)
         while True:
             out = min(min(tx, ty), tz)
+            # A voxel counts as passed if the ray stays in it, and if no hit lies there.
             if out - t > GRAZE_M and marks[x, y, z] == 0:
                 marks[x, y, z] = PASSED
             if out >= far - GRAZE_M:
                 break
+            # Step across the border that is reached first.
             t = out
             if tx == out:
                 x += ux
@@ -209,7 +220,7 @@ def _voxel(at_m: float, edge_nm: int) -> int:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _inside(o: float, inverse: float, count: int) -> tuple[float, float]:
-    """Where along the ray one axis enters 0 to `count`, and leaves it."""
+    """Distances along the ray at which one axis enters 0 to `count`, and leaves it."""
     a, b = -o * inverse, (count - o) * inverse
     return min(a, b), max(a, b)
 

@@ -78,7 +78,7 @@ def _figures(whole: EvidenceMap, key: CellKey, model: SensorModel) -> tuple[Evid
 
 
 def _timed(work: Callable[[], T]) -> tuple[T, float]:
-    """What the work gives, and the CPU seconds of this thread that it took."""
+    """Result of the work, and the CPU seconds of this thread that it took."""
     start_s = time.thread_time()
     result = work()
     return result, time.thread_time() - start_s

@@ -21,7 +21,7 @@ class Coding:
     name: str
     """Short: it heads a column and keys `report.json`."""
     holds: str
-    """What can be read from the bytes."""
+    """Content that can be read back from the bytes."""
     encode: Encode
     """Packed evidence to bytes."""
     decode: Callable[[bytes], object]
@@ -63,7 +63,7 @@ EXACT_FAST = Coding(
     encode=_fast,
     decode=_decoded_exact,
 )
-"""What a map's folder holds."""
+"""Codings of a map's folder."""
 EXACT_SMALL = Coding(
     name="cairn, exact, small",
     holds="the same, with the same digest, in fewer bytes and more time.",

@@ -1,4 +1,4 @@
-"""The paper's experiment: one map at several resolutions, with the paper's tables and figures beside ours.
+"""The paper's experiment: one map at several resolutions, with the paper's tables and figures next to ours.
 
     $ cairn experiment --resolutions 4 --output experiment
     2 robots, 54 measurements, 1944 scans; maps at 4 cm
@@ -15,7 +15,7 @@ resolutions, and never kept.
     map-4cm/ ...   the maps; `cairn map create URL --from experiment/map-4cm` serves one
 
 `--recording` maps what was recorded instead: each folder is one robot's. Recordings of `cairn sim record` have the
-truth beside them. `--stops 2` is a short run. A run at 2 cm needs 5 GB of memory; interrupted, it keeps the
+truth in their folder. `--stops 2` is a short run. A run at 2 cm needs 5 GB of memory; interrupted, it keeps the
 resolutions that were finished.
 """
 

@@ -1,4 +1,4 @@
-"""What the experiment measures, number by number; `report.json` is this, and the pages are drawn from it.
+"""Figures of the experiment, number by number: the content of `report.json` and the source of the pages.
 
 RunFigures > ResolutionFigures > MeasurementFigures      one commit
                                > CellFigures > CodedCell  one cell, written in one of the `codings`
@@ -14,7 +14,7 @@ import numpy as np
 from cairn_sim.evaluation.scores import Scores
 
 PAPER_VOXEL_BYTES = 8
-"""Of the paper's uncompressed cube: 16 MB for 128^3 voxels (Table 3)."""
+"""Bytes of a voxel in the paper's uncompressed cube: 16 MB for 128^3 voxels (Table 3)."""
 Json = dict[str, object]
 
 
@@ -29,7 +29,7 @@ class MeasurementFigures:
     """Pixels with a range inside the integrator's limits."""
     integrate_s: float
     integrate_cpu_s: float
-    """Of all threads together."""
+    """CPU seconds of all threads together."""
     commit_s: float
     """Encoding the evidence into a commit."""
     merge_s: float
@@ -72,7 +72,7 @@ class TruthFigures:
     cells: int
     """Compared; evenly chosen where that is not all."""
     poses: int
-    """Of the range camera, from which the truth was looked at."""
+    """Poses of the range camera from which the truth was computed."""
     scores: Scores
 
 
@@ -85,7 +85,7 @@ class CodingTotals:
     ratio: float
     """Uncompressed map over compressed map."""
     bits_per_occupied: float | None
-    """Of the compressed map, for each occupied voxel; None without any. Empty cells make a ratio large, not this."""
+    """Bits of the compressed map for each occupied voxel; None without any. Empty cells raise a ratio, not this."""
     encode_median_s: float
     decode_median_s: float
 
@@ -98,7 +98,7 @@ class ResolutionFigures:
     side: int
     """Voxels along a cell's edge."""
     map_memory_bytes: int
-    """Of the map's bricks in memory."""
+    """Bytes of the map's bricks in memory."""
     measurements: Sequence[MeasurementFigures]
     cells: Sequence[CellFigures]
     truth: TruthFigures | None
@@ -147,7 +147,7 @@ class ResolutionFigures:
         )
 
     def rates(self) -> dict[str, float]:
-        """How fast images became evidence, over all measurements."""
+        """Speed of turning images into evidence, over all measurements."""
         seconds = sum(one.integrate_s for one in self.measurements)
         cpu_s = sum(one.integrate_cpu_s for one in self.measurements)
         scans, rays = (sum(getattr(one, name) for one in self.measurements) for name in ("scans", "rays"))
@@ -191,7 +191,7 @@ class RunFigures:
     resolutions: list[ResolutionFigures] = field(default_factory=list)
 
     def to_json(self) -> Json:
-        """What `report.json` says."""
+        """The document `report.json`."""
         return {
             "format": "cairn-experiment",
             "version": 1,

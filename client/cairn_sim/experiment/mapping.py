@@ -1,7 +1,7 @@
 """Maps of one drive at several resolutions: each measurement is taken once, and becomes a commit on every map.
 
 A robot's commits are numbered and chained as a real robot's are; the map is their sum, so its bytes do not
-depend on the order of the robots, and a test adds them up anew.
+depend on the order of the robots, and a test adds them up again.
 """
 
 import hashlib

@@ -27,7 +27,7 @@ from cairn_sim.scene.scene import AMBIENT_K
 
 PAPER_WHITE = (255, 255, 255)
 NO_TEMPERATURE = (214, 214, 214)
-"""Of voxels that no thermal camera saw."""
+"""Colour of voxels that no thermal camera saw."""
 HEAT = np.array(
     [[20, 11, 52], [101, 21, 110], [159, 42, 99], [212, 72, 66], [245, 125, 21], [250, 193, 39], [252, 255, 164]]
 )
@@ -113,7 +113,7 @@ class PlanView:
         )
 
     def temperature_range_k(self) -> tuple[float, float]:
-        """What the two ends of the temperature's colours mean."""
+        """Temperatures at the two ends of the colour scale, kelvin."""
         kelvin = [tile.kelvin[tile.kelvin > 0] for tile in self._drawn().values()]
         values = np.concatenate([*kelvin, np.empty(0, np.float32)])
         low_k, high_k = np.percentile(values, PERCENTILES) if len(values) else (AMBIENT_K, AMBIENT_K)

@@ -28,13 +28,13 @@ NODE = np.dtype([("mask", "u1"), ("first", "<u4")])
 HEAD = struct.Struct("<4sBII")
 MAGIC = b"POCT"
 ZIP_LEVEL = 6
-"""What zip takes when it is not told."""
+"""Default level of zip."""
 LOG_ODDS_STEP = 0.001
 TEMPERATURE_STEP_K = 0.01
 TEMPERATURE_ZERO_K = 273.15
 """So that an i16 reaches from -327 to 327 degrees Celsius."""
 NO_TEMPERATURE = -(1 << 15)
-"""Where no thermal camera looked; without colour R, G and B are 0."""
+"""Temperature of voxels that no thermal camera saw; without colour R, G and B are 0."""
 RAW_BYTES_MAX = 1 << 29
 
 
@@ -48,7 +48,7 @@ class OccupiedVoxels:
 
 
 def occupied_voxels(key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel) -> OccupiedVoxels:
-    """What the paper's octree keeps of a cell's evidence."""
+    """Occupied voxels of a cell's evidence, as the paper's octree keeps them."""
     places = evidence.voxels[model.occupied(evidence.counts)]
     voxels = voxels_of_evidence(key, evidence, geometry, model, occupied_only=True)
     fields = np.zeros(len(places), FIELDS)

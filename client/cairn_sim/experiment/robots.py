@@ -1,7 +1,7 @@
 """The robots of the experiment: simulated now, or read from recordings; both give the scans of one stop at a time.
 
 simulated_robots   the paper's two paths at right angles, one robot each: `labs`, `corridors`
-recorded_robot     a recording folder, and the truth beside it where `cairn sim record` wrote one
+recorded_robot     a recording folder, and the truth in it where `cairn sim record` wrote one
 """
 
 from collections.abc import Callable, Sequence
@@ -23,7 +23,7 @@ from cairn_sim.scene.scene import Scene
 from cairn_sim.scene.scene_file import FILE_BYTES_MAX, load_scene
 
 PATHS = ("labs", "corridors")
-"""Of the building, VI.C: 26 and 28 stops; together the path `experiment`."""
+"""Paths in the building, VI.C: 26 and 28 stops; together the path `experiment`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,7 +44,7 @@ class ExperimentRobot:
     stops: Sequence[Transform]
     """`T_map_rig` of the first scan of each stop, as the robot believes it is."""
     scan_count: int
-    """Of all stops."""
+    """Scans of all stops."""
     scans_at: Callable[[int], Sequence[Scan]]
     """The scans of a stop, rendered or read when asked for."""
     truth: KnownTruth | None

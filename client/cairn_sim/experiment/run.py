@@ -38,12 +38,12 @@ LIBRARIES = ("cairn-robotics", "numpy", "numba", "zstandard")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExperimentSettings:
-    """What is to be done, besides the robots."""
+    """Settings of an experiment, without its robots."""
 
     voxel_edges_m: Sequence[float]
     threads: int
     ceiling_m: float
-    """Of the picture."""
+    """Height at which the picture cuts the map, metres."""
     about: Json
     """Parameters for the report."""
 
@@ -113,7 +113,7 @@ def _measured(
 
 
 def _truth_grid(growing: GrowingMap, robots: Sequence[ExperimentRobot]) -> TruthGrid | None:
-    """What could be seen of the map's cells; None if the truth of a robot is not known, or not of the same scene."""
+    """Truth of the map's cells; None if a robot's truth is unknown, or of another scene."""
     scenes = {robot.truth.scene.name if robot.truth else None for robot in robots}
     if None in scenes or len(scenes) > 1:
         return None
@@ -124,7 +124,7 @@ def _truth_grid(growing: GrowingMap, robots: Sequence[ExperimentRobot]) -> Truth
 
 
 def map_folder_name(geometry: Geometry) -> str:
-    """Where a map's cells lie in the experiment's folder: `map-4cm`."""
+    """Name of the folder of a map's cells in the experiment's folder: `map-4cm`."""
     return f"map-{geometry.voxel_edge_m * 100:g}cm"
 
 

@@ -9,7 +9,7 @@ from cairn_sim.experiment.tables import MIB, MISSING, shown
 
 @dataclass(frozen=True, slots=True)
 class PaperColumn:
-    """What Table 3 of the paper prints for one resolution; MB, and the ratio's larger side."""
+    """Column of the paper's Table 3 as printed for one resolution; MB, and the ratio's larger side."""
 
     cube: str
     compressed_cube: str

@@ -47,7 +47,7 @@ class FigureTable:
     """Figures by resolution."""
 
     titles: Sequence[str]
-    """Of the resolutions: `4 cm`."""
+    """Titles of the resolutions: `4 cm`."""
     rows: Sequence[FigureRow]
 
 
@@ -60,7 +60,7 @@ def figure_table(resolutions: Sequence[ResolutionFigures], rows: Sequence[tuple[
 
 
 def fill_rows() -> list[tuple[str, Read, str]]:
-    """What stands beside Fig. 22."""
+    """Rows of the table at Fig. 22: how full the cells are."""
     return [
         (
             "occupied, median",
@@ -76,7 +76,7 @@ def fill_rows() -> list[tuple[str, Read, str]]:
 
 
 def time_rows(coding_names: Sequence[str]) -> list[tuple[str, Read, str]]:
-    """What stands beside Fig. 23."""
+    """Rows of the table at Fig. 23: times to encode and decode a cell."""
     rows: list[tuple[str, Read, str]] = [
         (
             "grid to rows, ms",
@@ -114,7 +114,7 @@ def _coding_time_rows(name: str) -> list[tuple[str, Read, str]]:
 
 
 def rate_rows() -> list[tuple[str, Read, str]]:
-    """How fast images become evidence."""
+    """Rows of the table of speeds: images to evidence, commits, merges."""
 
     def rate(name: str, factor: float = 1.0) -> Read:
         return lambda one: shown(one.rates()[name] * factor)
@@ -132,7 +132,7 @@ def rate_rows() -> list[tuple[str, Read, str]]:
 
 
 def commit_rows() -> list[tuple[str, Read, str]]:
-    """How large commits are."""
+    """Rows of the table of commit sizes."""
 
     def quartile(number: int) -> Read:
         return lambda one: shown(quartiles([float(m.commit_bytes) for m in one.measurements])[number] / KIB)
@@ -155,7 +155,7 @@ def commit_rows() -> list[tuple[str, Read, str]]:
 
 
 def truth_rows() -> list[tuple[str, Read, str]]:
-    """How true the map is."""
+    """Rows of the table of scores against the truth."""
 
     def score(name: str) -> Read:
         return lambda one: percent(getattr(one.truth.scores, name)) if one.truth else MISSING

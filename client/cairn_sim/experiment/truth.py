@@ -17,16 +17,16 @@ from cairn_sim.experiment.figures import TruthFigures
 from cairn_sim.experiment.robots import ExperimentRobot
 
 POSE_STEP = 5
-"""Of 36 scans at a stop, 12 pans by 3 tilts, every fifth looks everywhere; a scan costs 50 ms here."""
+"""Step between the scans used for the truth: every fifth of a stop's 36 looks everywhere; a scan costs 50 ms."""
 FINENESS = 2
 """Rays along a pixel's edge."""
 VOXELS_MAX = 1 << 28
-"""Of all boxes compared at once; a byte each."""
+"""Voxels of all boxes compared at once; a byte each."""
 POSES_AT_ONCE = 16
 
 
 class TruthGrid:
-    """What the cameras could have seen of some cells, and then the scores of those cells, one by one."""
+    """Truth of the cells that cameras could have seen, and the scores of those cells, one by one."""
 
     def __init__(self, robots: Sequence[ExperimentRobot], geometry: Geometry, keys: Sequence[CellKey]) -> None:
         """Args: robots: each with a truth, all in one scene. keys: cells of the map, rising."""
@@ -68,6 +68,6 @@ class TruthGrid:
             self._scores += scores_of(truth, {key: evidence}, self._geometry, model=model)
 
     def figures(self) -> TruthFigures:
-        """What came out."""
+        """Figures of all cells scored so far."""
         poses = sum(len(poses) for _, _, poses in self._views)
         return TruthFigures(cells=len(self._rims), poses=poses, scores=self._scores)

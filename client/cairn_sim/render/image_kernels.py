@@ -2,7 +2,7 @@
 
 An image is cast once through its pixels' centres. Where neighbours show different things, a pixel's area is cast again
 on a grid of finer rays, and what these receive is added up: light in the visible and far infrared, waves in the near
-infrared. The mixed ranges at edges, `flying pixels`, follow from the waves and are nobody's formula.
+infrared. The mixed ranges at edges, `flying pixels`, follow from the waves; no formula makes them.
 
 `render` is the caller that checks; tests/naive/images.py holds the slow twins.
 """
@@ -21,21 +21,22 @@ Longs = npt.NDArray[np.int64]
 LIGHT_STEP = 0.02
 """Change of the cosine of incidence from pixel to pixel that counts as an edge: of a box, not of a round wall."""
 GLOSS_EXPONENT = 60.0
-"""Of the cosine of incidence: a glossy face fades to half at 9 degrees from head-on (Phong 1975)."""
+"""Exponent of the cosine of incidence: a glossy face fades to half at 9 degrees from head-on (Phong 1975)."""
 BLOOM_PX = 2
 """As far along each axis as a full pixel spills; what a pixel gets falls by e for each pixel of distance."""
 PASS_LEFT = 0.85
-"""Of visible and near infrared light behind a pane or a mirror."""
+"""Share of visible and near infrared light that passes a pane or returns from a mirror."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def edge_pixels(hits: Hits, width: int, height: int, order: Int32s) -> Longs:
-    """(E,) numbers, in the given order of all pixels, of those beside, above or below one that shows something else."""
+    """(E,) numbers, in the given order of all pixels, of the pixels with a neighbour that shows another solid."""
     _, _, _, seen, second, _, _, incidence, way, passes, _ = hits
     mark = np.zeros(width * height, np.uint8)
     for y in range(height):
         for x in range(width):
             here = y * width + x
+            # Each pair of neighbours once: to the right and below; at the rim a pixel is its own neighbour.
             for there in (here + 1 if x + 1 < width else here, here + width if y + 1 < height else here):
                 if (
                     seen[here] != seen[there]
@@ -46,6 +47,7 @@ def edge_pixels(hits: Hits, width: int, height: int, order: Int32s) -> Longs:
                 ):
                     mark[here] = 1
                     mark[there] = 1
+    # In the caller's order, so that bundles of rays stay together.
     edges = np.empty(len(order), np.int64)
     count = 0
     for pixel in order:
@@ -74,6 +76,7 @@ def finer_rays(rays: Floats, pixels: Longs, n: int) -> Floats:
             for i in range(n):
                 # Staggered: no two in a row or column of the grid, so that an edge along it moves smoothly over them.
                 a, b = (i + (j + 0.5) / n) / n - 0.5, (j + 1 - (i + 0.5) / n) / n - 0.5
+                # The ray at offsets (a, b) of a pixel from its centre, normalised.
                 length = 0.0
                 at = (e * n + j) * n + i
                 for c in range(3):
@@ -98,11 +101,13 @@ def colours(
     out = np.empty((len(seen), 3), np.float32)
     for i in range(len(seen)):
         k = seen[i]
+        # Each pane or mirror on the way takes its share.
         left = PASS_LEFT ** passes[i] if passes[i] else 1.0
         if k < 0:
             for c in range(3):
                 out[i, c] = left * sky_srgb[c]
             continue
+        # Lambert's cosine to the light from afar.
         lambert = normal[i, 0] * light[0] + normal[i, 1] * light[1] + normal[i, 2] * light[2]
         factor = left * (ambient + (1.0 - ambient) * lambert) * (1.0 + grain[k] * pattern[i])
         for c in range(3):
@@ -122,7 +127,7 @@ def surface_values(hits: Hits, values: Singles, nothing: float) -> Singles:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def returns(hits: Hits, diffuse: Singles, gloss: Singles, retroreflection: Singles) -> Singles:
-    """(N,) light that returns to a lamp beside the lens, 1 from white 1 m ahead; through glass there and back."""
+    """(N,) light that returns to a lamp next to the lens, 1 from white 1 m ahead; through glass there and back."""
     _, _, path_m, seen, second, _, _, incidence, _, passes, _ = hits
     out = np.zeros(len(seen), np.float32)
     for i in range(len(seen)):
@@ -130,10 +135,12 @@ def returns(hits: Hits, diffuse: Singles, gloss: Singles, retroreflection: Singl
         if k < 0:
             continue
         m = second[i]
+        # Diffuse return by Lambert's law, retroreflectors multiply it; gloss after Phong on top.
         cosine = max(incidence[i], 0.0)
         reflected = diffuse[k, m] * cosine * retroreflection[k, m]
         if gloss[k, m] > 0.0:
             reflected += gloss[k, m] * cosine**GLOSS_EXPONENT
+        # There and back; and the lamp's light thins with the square of the way.
         left = PASS_LEFT ** (2 * passes[i]) if passes[i] else 1.0
         out[i] = left * reflected / (path_m[i] * path_m[i])
     return out
@@ -149,6 +156,7 @@ def mixed_waves(path_m: Floats, strength: Singles, n: int, wrap_m: float) -> tup
     range_m, total = np.full(pixels, np.inf), np.zeros(pixels, np.float32)
     for p in range(pixels):
         real, imaginary = 0.0, 0.0
+        # The sum of n phasors: a range camera measures the phase of all light that a pixel receives.
         for i in range(p * n, p * n + n):
             if strength[i] > 0.0:
                 phase = 2.0 * math.pi * path_m[i] / wrap_m
@@ -156,6 +164,7 @@ def mixed_waves(path_m: Floats, strength: Singles, n: int, wrap_m: float) -> tup
                 imaginary += strength[i] * math.sin(phase)
         length = math.hypot(real, imaginary)
         if length > 0.0:
+            # Its phase as a range within one wrap, its length as the amplitude.
             turn = math.atan2(imaginary, real) / (2.0 * math.pi)
             range_m[p] = wrap_m * (turn - math.floor(turn))
             total[p] = length / n
@@ -170,6 +179,7 @@ def bloomed(range_m: Floats, strength: Singles, spill: Singles, width: int, wrap
     """
     height = len(range_m) // width
     real, imaginary = np.zeros(len(range_m)), np.zeros(len(range_m))
+    # Weights by distance, which sum to one: no light is lost.
     weights = np.empty((2 * BLOOM_PX + 1, 2 * BLOOM_PX + 1))
     for j in range(-BLOOM_PX, BLOOM_PX + 1):
         for i in range(-BLOOM_PX, BLOOM_PX + 1):
@@ -178,6 +188,7 @@ def bloomed(range_m: Floats, strength: Singles, spill: Singles, width: int, wrap
     for p in range(len(spill)):
         if not spill[p] > 0.0:
             continue
+        # Phasors that each full pixel gives to its neighbours.
         y, x = p // width, p % width
         phase = 2.0 * math.pi * range_m[p] / wrap_m
         cosine, sine = math.cos(phase), math.sin(phase)
@@ -186,6 +197,7 @@ def bloomed(range_m: Floats, strength: Singles, spill: Singles, width: int, wrap
                 given = spill[p] * weights[v - y + BLOOM_PX, u - x + BLOOM_PX]
                 real[v * width + u] += given * cosine
                 imaginary[v * width + u] += given * sine
+    # Neighbours: their own phasor and the spilled ones, as a range again.
     new_range_m, new_strength = range_m.copy(), strength.copy()
     for p in range(len(range_m)):
         if spill[p] > 0.0 or (real[p] == 0.0 and imaginary[p] == 0.0):

@@ -1,4 +1,4 @@
-"""What rays meet in a scene. A solid is seen from outside only; the nearest that a ray enters is its hit.
+"""Ray casting in a scene. A solid is seen from outside only; the nearest that a ray enters is its hit.
 
 Light that meets glass goes on, and light that meets a mirror turns; so each ray has a first hit, which is the geometry,
 and a last one, which is what is seen. `rays` is the caller that checks; tests/naive/raycast.py is the slow
@@ -16,6 +16,7 @@ from cairn_sim.scene.solid_kernels import FAR, SIDE, Shapes, enter, grain_at, su
 from cairn_sim.scene.surfaces import Optics
 from cairn_sim.scene.tree_kernels import STACK, candidates_into, first_entry, spread_into
 
+Bytes = npt.NDArray[np.int8]
 Marks = npt.NDArray[np.uint8]
 
 GLASS, MIRROR = int(Optics.GLASS), int(Optics.MIRROR)
@@ -25,7 +26,7 @@ PASSES_MAX = 8
 
 
 class Hits(NamedTuple):
-    """What N rays met."""
+    """Hits of N rays."""
 
     range_m: Floats
     """(N,) metres to the first surface, infinite for none."""
@@ -54,7 +55,7 @@ class Hits(NamedTuple):
 def cast_rays(
     origin: Floats, R_map_camera: Floats, rays: Floats, order: Int32s, starts: Int32s, shapes: Shapes, opaque: bool
 ) -> Hits:
-    """What each ray from one origin meets first, and what it shows.
+    """First and last hit of each ray from one origin.
 
     Rays come in bundles of about the same direction. A bundle asks the tree once, for the solids that any of its rays
     might meet, nearest first; a ray then asks these until the rest is farther than what it found. That takes a third
@@ -98,7 +99,10 @@ def _cast_into(
     shapes: Shapes,
     opaque: bool,
 ) -> None:
-    """As `cast_rays`; a kernel that made the `Hits` itself would crash at ^C: numba calls a class without a look."""
+    """Fill the hits of `cast_rays`.
+
+    A kernel that made the `Hits` itself would crash at ^C: numba calls a class without a look.
+    """
     # As plain arrays: each use of a tuple's member in the loop would count references, two thirds of the time.
     range_m, solid, path_m, seen, second, grain, normal, incidence, way, passes, straight_m = hits
     kind, frame, half_m, optics, texture, bounds, endless, nodes, links, leaves = shapes
@@ -106,6 +110,7 @@ def _cast_into(
     candidates, candidate_nears = np.empty(len(kind), np.int32), np.empty(len(kind))
     spread, directions = np.empty((3, 2)), np.empty((np.diff(starts).max() if len(starts) > 1 else 0, 3))
     for bundle in range(len(starts) - 1):
+        # The solids that any ray of the bundle may meet, nearest first.
         spread_into(spread, directions, R_map_camera, rays, order, starts[bundle], starts[bundle + 1])
         count = candidates_into(
             candidates, candidate_nears, origin, spread, bounds, endless, nodes, links, leaves, stack
@@ -115,18 +120,13 @@ def _cast_into(
             ox, oy, oz = origin[0], origin[1], origin[2]
             d = place - starts[bundle]
             dx, dy, dz = directions[d, 0], directions[d, 1], directions[d, 2]
-            t, k, face = FAR, -1, SIDE
-            if dx == dx:
-                for c in range(count):
-                    if candidate_nears[c] > t:
-                        break
-                    new, new_face = enter(ox, oy, oz, dx, dy, dz, candidates[c], kind, frame, half_m)
-                    if new > 0.0 and (new < t or (new == t and candidates[c] < k)):
-                        t, k, face = new, candidates[c], new_face
-            solid[i] = k
-            range_m[i] = t if k >= 0 else np.inf
-            gone_m, behind, path, crossed = 0.0, 0.0, np.uint8(0), np.uint8(0)
-            straight_m[i] = np.inf
+            t, k, face = _nearest_candidate(
+                ox, oy, oz, dx, dy, dz, candidates, candidate_nears, count, kind, frame, half_m
+            )
+            solid[i], range_m[i] = k, t if k >= 0 else np.inf
+            # Last hit: through panes and round mirrors. `gone_m` is the way up to the last mirror, `behind` the
+            # pane that the ray just crossed.
+            gone_m, behind, path, crossed, straight_m[i] = 0.0, 0.0, np.uint8(0), np.uint8(0), np.inf
             nx, ny, nz, u, v, along = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             while k >= 0:
                 x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
@@ -138,6 +138,7 @@ def _cast_into(
                     break
                 behind = t
                 if optics[k] == MIRROR:
+                    # d' = d - 2 (d . n) n
                     gone_m, behind = gone_m + t, 0.0
                     ox, oy, oz = x, y, z
                     dx, dy, dz = dx - 2 * along * nx, dy - 2 * along * ny, dz - 2 * along * nz
@@ -151,16 +152,50 @@ def _cast_into(
                     t, k, face = first_entry(
                         ox, oy, oz, dx, dy, dz, behind, kind, frame, half_m, endless, nodes, links, leaves, stack, nears
                     )
-            seen[i], way[i], passes[i] = k, path, crossed
-            path_m[i] = gone_m + t if k >= 0 else np.inf
+            # The surface that is seen: its range along the light's way, material, grain and normal.
+            seen[i], way[i], passes[i], path_m[i] = k, path, crossed, gone_m + t if k >= 0 else np.inf
             second[i] = turn_at(u, v, k, texture) if k >= 0 else 0
-            grain[i] = 0.0
-            if k >= 0 and texture[k, 4] > 0.0:
-                grain[i] = grain_at(u * texture[k, 5], v * texture[k, 5], face + 7 * k)
+            grain[i] = _texture_grain(u, v, k, face, texture)
             if k < 0:
                 nx, ny, nz, along = 0.0, 0.0, 0.0, 0.0
             normal[i, 0], normal[i, 1], normal[i, 2] = nx, ny, nz
             incidence[i] = -along
+
+
+@njit(nogil=True, error_model="numpy")
+def _texture_grain(u: float, v: float, k: int, face: int, texture: Floats) -> float:
+    """Irregular pattern of solid k at (u, v) metres on a face, -1 to 1; 0 without texture or solid."""
+    if k < 0 or not texture[k, 4] > 0.0:
+        return 0.0
+    return grain_at(u * texture[k, 5], v * texture[k, 5], face + 7 * k)
+
+
+@njit(nogil=True, error_model="numpy")
+def _nearest_candidate(
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    candidates: Int32s,
+    nears: Floats,
+    count: int,
+    kind: Bytes,
+    frame: Floats,
+    half_m: Floats,
+) -> tuple[float, int, int]:
+    """Range, solid and face of a ray's first hit among a bundle's candidates; FAR and -1 for none, or a NaN ray."""
+    t, k, face = FAR, -1, SIDE
+    if dx == dx:
+        for c in range(count):
+            # Candidates come by range: those that begin behind the hit cannot be nearer.
+            if nears[c] > t:
+                break
+            new, new_face = enter(ox, oy, oz, dx, dy, dz, candidates[c], kind, frame, half_m)
+            if new > 0.0 and (new < t or (new == t and candidates[c] < k)):
+                t, k, face = new, candidates[c], new_face
+    return t, k, face
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -21,7 +21,7 @@ VISIBLE_SLACK_M = 1e-6
 
 
 def cast(scene: Scene, camera: AnyCamera, T_map_camera: Transform, *, opaque: bool = False) -> Hits:
-    """What the rays through the centres of a camera's pixels meet, N = H W, row by row.
+    """Hits of the rays through the centres of a camera's pixels, N = H W, row by row.
 
     Args:
         scene: to look at.
@@ -58,7 +58,7 @@ def tiles(width: int, height: int) -> tuple[Int32s, Int32s]:
 
 
 def cast_directions(scene: Scene, directions: Floats, T_map_camera: Transform, *, bundle: int, opaque: bool) -> Hits:
-    """What (N, 3) unit rays of the camera's frame meet; each `bundle` of them should have about the same direction."""
+    """Hits of (N, 3) unit rays of the camera's frame; each `bundle` of them should have about the same direction."""
     order = np.arange(len(directions), dtype=np.int32)
     starts = np.append(order[::bundle], np.int32(len(directions)))
     T = T_map_camera

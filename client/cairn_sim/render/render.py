@@ -1,4 +1,4 @@
-"""What a head sees of a scene: every camera's rays cast exactly, then each sensor's own imperfections.
+"""Images of a scene: every camera's rays cast exactly, then each sensor's own imperfections.
 
     colour      texture x even light and one from afar, no shadows: a place has one colour from wherever it is seen
     thermal     apparent temperature: what a surface emits and what it mirrors of the surroundings
@@ -10,7 +10,7 @@ image's type. With noise it is the camera of `sensors`, and the seed fixes every
 """
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -39,7 +39,7 @@ from cairn_sim.render.sensors import COUNT_MAX, ColourSensor, Noise, RangeSensor
 from cairn_sim.scene.scene import Scene
 
 Shade = Callable[[Hits], Singles]
-"""What N hits send: (N,) or (N, 3)."""
+"""Light that N hits send: (N,) or (N, 3)."""
 
 LIGHT = np.array([0.45, 0.30, 0.84]) / np.linalg.norm([0.45, 0.30, 0.84])
 """Towards the light: above, and off both axes, so that no two walls look alike."""
@@ -128,20 +128,9 @@ def render_scan(
         own = None
         if noise is not None:
             own = ImageNoise(rng=noise.of_image(name, number), pattern=noise.fixed_pattern(name, view.shape))
-        match sensor:
-            case ColourSensor():
-                return (colour_image(view, sensor, own),)
-            case ThermalSensor():
-                return (thermal_image(view, sensor, own),)
-            case RangeSensor():
-                return range_images(view, sensor, own)
+        return _images_of(view, sensor, own)
 
-    workers = min(threads or os.cpu_count() or 1, len(names))
-    if workers == 1:
-        images = dict(zip(names, map(render, names), strict=True))
-    else:
-        with ThreadPoolExecutor(workers) as pool:
-            images = dict(zip(names, pool.map(render, names), strict=True))
+    images = dict(zip(names, _map_threads(render, names, threads), strict=True))
     range_m, amplitude = images[range_camera]
     return Scan(
         time_s=time_s,
@@ -154,8 +143,30 @@ def render_scan(
     )
 
 
+def _images_of(view: CameraView, sensor: Sensor, noise: ImageNoise | None) -> tuple[npt.NDArray[np.generic], ...]:
+    """The image of one camera, or range and amplitude of a range camera."""
+    match sensor:
+        case ColourSensor():
+            return (colour_image(view, sensor, noise),)
+        case ThermalSensor():
+            return (thermal_image(view, sensor, noise),)
+        case RangeSensor():
+            return range_images(view, sensor, noise)
+
+
+def _map_threads(
+    render: Callable[[str], tuple[npt.NDArray[np.generic], ...]], names: Sequence[str], threads: int | None
+) -> list[tuple[npt.NDArray[np.generic], ...]]:
+    """Render by name, several cameras at once: kernels let go of the interpreter's lock."""
+    workers = min(threads or os.cpu_count() or 1, len(names))
+    if workers == 1:
+        return [render(name) for name in names]
+    with ThreadPoolExecutor(workers) as pool:
+        return list(pool.map(render, names))
+
+
 def colour_image(view: CameraView, sensor: ColourSensor, noise: ImageNoise | None) -> npt.NDArray[np.uint8]:
-    """(H, W, 3) sRGB. The light multiplies sRGB values: nobody measures radiance here."""
+    """(H, W, 3) sRGB. The light multiplies sRGB values: radiance is not measured in the visible."""
     srgb, grains = view.scene.surfaces.colours_srgb, view.scene.shapes.texture[:, 4].copy()
     sky = np.array(view.scene.sky_srgb, dtype=np.float32)
 
@@ -230,7 +241,7 @@ def _returned(view: CameraView, sensor: RangeSensor, hits: Hits) -> Singles:
 
 
 def _radiance(scene: Scene, sensor: ThermalSensor) -> Shade:
-    """What surfaces send in the far infrared, in counts: their own, and the surroundings' share that they mirror."""
+    """Far infrared light of surfaces, in counts: their own, and the surroundings' share that they mirror."""
     s = scene.surfaces
     own = sensor.counts_of(s.temperature_k.astype(np.float64))
     mirrored = sensor.counts_of(np.array(scene.ambient_k))

@@ -1,4 +1,4 @@
-"""What a real camera adds to what it receives: one model for each spectrum, with the sources of its numbers.
+"""Sensor models: blur, noise and quantisation of a real camera, one model for each spectrum, with sources.
 
     colour    sub-pixel area, vignetting, blur, shot and read noise, 8 bits
     thermal   sub-pixel area, blur, radiance to counts (Planck), fixed pattern, temporal noise, 16 bits
@@ -28,18 +28,18 @@ class ColourSensor:
     """A colour camera with a lens; TheImagingSource DFK23G445 unless said otherwise."""
 
     read_sigma: float = 3.0
-    """Of 255, in the dark."""
+    """Noise in the dark, of 255."""
     shot_per_value: float = 0.02
     """Variance that each of the 255 adds: sigma is 3.0 in black and 3.75 in white."""
     blur_px: float = 0.6
     """Sigma of the lens; with the pixel's area the contrast of the finest stripes, one pixel each, falls to 0.11."""
     vignetting: float = 1.0
-    """Exponent of the cos^4 law: 1 for a lens that nobody corrected, 0 for none."""
+    """Exponent of the cos^4 law: 1 for an uncorrected lens, 0 for no vignetting."""
     fineness: int = 2
     """Rays along a pixel's side where it sees more than one thing."""
 
     def sigma(self, value: Singles) -> Singles:
-        """Of noise, of 255, at values 0 to 255."""
+        """Standard deviation of the noise, of 255, at values 0 to 255."""
         sigma: Singles = np.sqrt(
             np.float32(self.read_sigma**2) + np.float32(self.shot_per_value) * np.clip(value, 0, 255)
         )
@@ -53,7 +53,7 @@ class ThermalSensor:
     netd_k: float = 0.05
     """Temporal noise at 300 K; PAPER.md section 2."""
     fixed_pattern_k: float = 0.05
-    """What is left of the pixels' own offsets after calibration, the same in all images; at 300 K."""
+    """Residual of the pixels' own offsets after calibration, kelvin at 300 K; the same in all images."""
     blur_px: float = 0.7
     fineness: int = 3
     planck_r: float = 300_000.0
@@ -87,9 +87,9 @@ class RangeSensor:
     """A time-of-flight camera; MESA SR4000 unless said otherwise."""
 
     wrap_m: float = 10.0
-    """Where the phase begins anew: 15 MHz."""
+    """Range at which the phase wraps, metres: 15 MHz."""
     amplitude_at_1m: float = 20_000.0
-    """Of a white surface seen head-on: its range is lost to saturation nearer than 0.55 m."""
+    """Amplitude of a white surface seen head-on at 1 m: its range is lost to saturation nearer than 0.55 m."""
     amplitude_min: float = 130.0
     """No range below it. Plaster (0.65) head-on reaches 10 m; what returns more from farther away wraps."""
     amplitude_max: float = float(COUNT_MAX)
@@ -134,7 +134,7 @@ Sensor = ColourSensor | ThermalSensor | RangeSensor
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Where all randomness comes from: an image's noise depends on the seed, the camera's name and its number alone.
+    """Seeded noise: an image's noise depends on the seed, the camera's name and the image's number alone.
 
     So images can be rendered in any order, on any number of threads, and are the same to the byte.
     """

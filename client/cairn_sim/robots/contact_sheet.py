@@ -19,7 +19,7 @@ CAPTION_PX = 30
 BACKGROUND = (24, 26, 30)
 TEXT = (225, 228, 232)
 NOTHING = (60, 60, 66)
-"""Where an image has no value: never drawn as cold, near or dark."""
+"""Colour of pixels without a value: never that of cold, near or dark ones."""
 PLAN_LONG_PX = 1280
 PLAN_MARGIN_M = 0.5
 CUT_ABOVE_M = 0.6

@@ -38,7 +38,7 @@ class HeadLens(NamedTuple):
     distortion: Distortion
     """k1, k2, p1, p2, k3"""
     off_centre: tuple[float, float]
-    """Of the principal point from the image's middle, as a share of the width."""
+    """Offset of the principal point from the image's middle, as a share of the width."""
 
     def camera(self, *, scale: float = 1.0, ideal: bool = False, mirrored: bool = False) -> Camera:
         """A camera with this lens; `ideal`: a pinhole; `mirrored`: tangential terms and offset of opposite sign."""
@@ -99,7 +99,7 @@ def tof_head(*, ideal: bool = False) -> Rig:
 
 
 def handheld_head(*, scale: float = 1.0) -> Rig:
-    """A colour camera 2.5 cm beside a depth camera of the same size, as hand-held depth cameras have them."""
+    """Colour camera 2.5 cm from a depth camera of the same size, as hand-held depth cameras have them."""
     depth = mount_camera(Spectrum.RANGE, HANDHELD.camera(mirrored=True), look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0)))
     colour = HANDHELD.camera(scale=scale)
     return Rig(

@@ -48,7 +48,7 @@ class Manipulator:
     """From the tilt axis to the time-of-flight camera, forward and up."""
 
     def T_robot_rig(self, joints: Joints) -> Transform:
-        """Where the head is on the robot."""
+        """Pose of the head on the robot."""
         forward_m, up_m = self.head_m
         return (
             placed((0, 0, self.shoulder_m), (0, joints.arm_rad, 0))
@@ -83,7 +83,7 @@ def measurement_joints(n_pan: int = 12, n_tilt: int = 3) -> list[Joints]:
 def with_backlash(
     joints: Sequence[Joints], *, gap_rad: float, sigma_rad: float, rng: np.random.Generator
 ) -> list[Joints]:
-    """Where gears with play truly put joints that were told to go somewhere, one after the other, after parking.
+    """True joint angles after a series of commands from the parking position, by gears with play.
 
     A gear stops half a gap short of where it was sent, on the side that it came from; load shakes it by `sigma_rad`.
     """

@@ -1,4 +1,4 @@
-"""A simulated robot's recording, with the truth beside it.
+"""Recording of a simulated robot, with the truth in a folder of its own.
 
     lab-1/             a recording as any other (RECORDING.md): images, and the poses that the robot believed
       raw/           thermal images as the camera counted, 16-bit PNG (when asked for)
@@ -50,18 +50,18 @@ Truths = Literal["none", "range", "all"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """What to record."""
+    """Plan of a recording: scene, robot, path, and the imperfections to simulate."""
 
     scene: Scene
     robot: SimRobot
     path: str
     seed: int = 1
     perfect: bool = False
-    """Whether sensors are without noise."""
+    """True for sensors without noise."""
     scale: float = 1.0
-    """Of colour and thermal images."""
+    """Size of colour and thermal images, as a share of the sensor's."""
     raw: bool = False
-    """Whether thermal images are written as raw counts, too."""
+    """True if thermal images are written as raw counts, too."""
     truth: Truths = "range"
     """For which images the truth is written."""
     errors: PoseErrors = field(default_factory=PoseErrors)
@@ -96,15 +96,15 @@ class Shot:
     """One scan to take."""
 
     number: int
-    """Of all scans of the path."""
+    """Number of the scan along the path."""
     stop: int
     scan: int
-    """Of the stop."""
+    """Number of the scan at its stop."""
     time_s: float
     T_map_rig: Transform
-    """Where the head truly is."""
+    """True pose of the head."""
     T_believed: Transform
-    """Where the robot says it is."""
+    """Pose of the head as the robot believes it."""
     ends_stop: bool
 
 
@@ -191,7 +191,7 @@ def record(plan: Plan, folder: Path, *, scene_text: str) -> Iterator[Shot]:
     Args:
         plan: what to record.
         folder: new or empty.
-        scene_text: the scene's file, kept beside the truth.
+        scene_text: the scene's file, kept with the truth.
 
     The recording is finished when the iterator came to its end; one that is left early stays unfinished.
 

@@ -42,7 +42,7 @@ class SimRobot:
     rig_of: Callable[[float], Rig]
     """The head, with colour and thermal images shrunk by a scale."""
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
-    """Of cameras that are not their spectrum's usual one."""
+    """Sensors of cameras that differ from their spectrum's usual one, by camera."""
     manipulator: Manipulator | None = None
     """None: the head is fixed, `fixed_m` above the ground and looking ahead."""
     fixed_m: float = 1.1
@@ -55,7 +55,7 @@ class SimRobot:
         return self.scans[0] * self.scans[1]
 
     def head_poses(self, T_map_robot: Transform) -> list[Transform]:
-        """`T_map_rig` of each scan at one stop, as the joints were told."""
+        """`T_map_rig` of each scan at one stop, at the commanded joint angles."""
         if self.manipulator is None:
             return [T_map_robot @ placed((0, 0, self.fixed_m)) @ T_FORWARD_CAMERA]
         return [T_map_robot @ self.manipulator.T_robot_rig(joints) for joints in measurement_joints(*self.scans)]

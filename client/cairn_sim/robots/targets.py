@@ -1,4 +1,4 @@
-"""What a rig is calibrated and verified with: a heated checkerboard and heated discs, in a plain laboratory.
+"""Calibration and verification targets: a heated checkerboard and heated discs, in a plain laboratory.
 
     board, seen from its front                        target, from its side
       +---------------------------+  frame                  z -->
@@ -36,13 +36,13 @@ STEP_M = 5e-4
 TAPE_M = 0.025
 """Width of the tape on a target's rim."""
 PAPER_SHARE = 0.75
-"""Of what the tape leaves of a target's radius."""
+"""Radius of the paper, as a share of the target's radius inside the tape."""
 DIAMETER_MIN_M = 0.08
 """So that tape, bare aluminium and paper are all there."""
 
 
 class Look(Enum):
-    """How bare aluminium compares with matt black in visible or near infrared light: it shows what it mirrors."""
+    """Brightness of bare aluminium against matt black in visible or near infrared light: it shows what it mirrors."""
 
     BRIGHT = "bright"
     DARK = "dark"
@@ -91,7 +91,7 @@ class SimulatedBoard:
 
     @property
     def centre(self) -> tuple[float, float]:
-        """Of the checker, x and y in the board's frame."""
+        """Centre of the checker, x and y in the board's frame, metres."""
         return (self.columns - 2) / 2 * self.square_m, (self.rows - 2) / 2 * self.square_m
 
     @property

@@ -1,4 +1,4 @@
-"""Where robots stand and drive, truly, and where they believe they are.
+"""Trajectories: true poses of robots that stop or drive along a path, and the poses that they believe.
 
 A path is a line of waypoints on the ground of a scene. A robot stops along it (`stops`), as the paper's did, or drives
 through (`drive`). The ground is found by a ray straight down, so the same path works on a floor and on a slope.
@@ -26,11 +26,11 @@ Xy = tuple[float, float]
 EXPERIMENT = "experiment"
 """The path of the building that is the paper's: `labs`, then `corridors`."""
 POSES_MAX = 100_000
-"""Of one drive."""
+"""Poses of one drive at most."""
 ERROR_MAX = 100.0
-"""Of a pose, metres or radians: more is a slip of the pen."""
+"""Error of a pose at most, metres or radians: more is a typing error."""
 CORNER_M = 0.6
-"""How far before a waypoint a drive begins to turn."""
+"""Distance before a waypoint at which a drive begins to turn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Route:
     spread_m: float = 0.0
     """Largest deviation from that."""
     busy: tuple[float, float] = (0.0, 0.0)
-    """Where along the path, as shares of its length, the stops stand closer."""
+    """Part of the path, as shares of its length, in which stops stand closer."""
 
 
 PATHS: Mapping[str, Mapping[str, Route]] = MappingProxyType(
@@ -130,12 +130,12 @@ def on_ground(scene: Scene, path: Route, at_m: float) -> Transform:
 
 @dataclass(frozen=True, slots=True)
 class PoseErrors:
-    """How a robot's idea of its pose departs from the truth; all zero: not at all."""
+    """Errors of a robot's believed poses; all zero: it knows the truth."""
 
     sigma_m: float = 0.0
-    """Of each pose by itself, along each axis."""
+    """Standard deviation of each pose on its own, along each axis, metres."""
     sigma_rad: float = 0.0
-    """Of each pose by itself, about each axis."""
+    """Standard deviation of each pose on its own, about each axis, radians."""
     drift: float = 0.0
     """Sigma of the position's random walk after one metre of way, in metres; grows with the root of the way."""
     drift_rad: float = 0.0

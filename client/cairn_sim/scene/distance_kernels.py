@@ -24,6 +24,7 @@ def nearest_solids(points: Floats, shapes: Shapes) -> tuple[Floats, Int32s]:
             continue
         nearest = np.inf
         for k in range(len(kind)):
+            # The box around a solid bounds its distance from below, at a tenth of the price.
             if _outside_box(x, y, z, bounds, k) > nearest:
                 continue
             distance = _distance(x, y, z, k, kind, frame, half_m)
@@ -46,13 +47,16 @@ def _outside_box(x: float, y: float, z: float, bounds: Floats, k: int) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _distance(x: float, y: float, z: float, k: int, kind: npt.NDArray[np.int8], f: Floats, half_m: Floats) -> float:
+    # The point in the solid's own axes.
     dx, dy, dz = x - f[k, 9], y - f[k, 10], z - f[k, 11]
     lx = f[k, 0] * dx + f[k, 1] * dy + f[k, 2] * dz
     ly = f[k, 3] * dx + f[k, 4] * dy + f[k, 5] * dz
     lz = f[k, 6] * dx + f[k, 7] * dy + f[k, 8] * dz
+    # A plane's distance is the height above it.
     distance: float = lz
     if kind[k] == BOX:
         a, b, c = abs(lx) - half_m[k, 0], abs(ly) - half_m[k, 1], abs(lz) - half_m[k, 2]
+        # Outside: to the nearest face, edge or corner; inside: minus the depth below the nearest face.
         distance = math.sqrt(max(a, 0.0) ** 2 + max(b, 0.0) ** 2 + max(c, 0.0) ** 2) + min(max(max(a, b), c), 0.0)
     elif kind[k] == CYLINDER:
         a, c = math.hypot(lx, ly) - half_m[k, 0], abs(lz) - half_m[k, 2]

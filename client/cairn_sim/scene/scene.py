@@ -20,9 +20,9 @@ from cairn_sim.scene.surfaces import TEMPERATURE_K, Material, Rgb
 LEAF_MAX = 2
 """Solids of a leaf. 1, 2 and 4 differ by less than 5 % in the building; 2 has half the nodes of 1."""
 NOWHERE_M = 1e300
-"""Where the node of an empty tree is: farther than the kernels' FAR, so that no ray gets there."""
+"""Corner of an empty tree's node: farther than the kernels' FAR, so that no ray reaches it."""
 DEPTH_MAX = 48
-"""Of branches; below it a node is a leaf, whatever it holds, so that the kernel's stack is bounded."""
+"""Branches from the root at most; a node at this depth is a leaf of any size, so that the kernel's stack is bounded."""
 
 AMBIENT_K = 293.15
 SOLIDS_MAX = 20_000
@@ -35,7 +35,7 @@ KINDS: tuple[type, ...] = (Box, Cylinder, Sphere, Plane)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surfaces:
-    """What P solids look like, by number; the second axis of materials is the first and the second of a texture."""
+    """Appearance of P solids, by number; the second axis of materials is a texture's first and second."""
 
     colours_srgb: Singles
     """(P, 2, 3) 0 to 255."""
@@ -60,7 +60,7 @@ class Scene:
     shapes: Shapes
     surfaces: Surfaces
     ambient_k: float
-    """Of the surroundings that bare metal mirrors in the far infrared."""
+    """Temperature of the surroundings that bare metal mirrors in the far infrared, kelvin."""
     sky_k: float
     """Apparent temperature where nothing is met."""
     sky_srgb: Rgb

@@ -263,7 +263,7 @@ def _rgb(colour: str) -> Rgb:
 
 
 def _complaint(exc: ValidationError) -> str:
-    """Where the first field is that is wrong, what it should be, and what came."""
+    """Message on the first wrong field: its place, the values expected there, and the value that came."""
     if exc.error_count() > COMPLAINTS_MAX:
         return f"more than {COMPLAINTS_MAX} fields are wrong"
     first = exc.errors(include_url=False, include_context=False)[0]

@@ -1,4 +1,4 @@
-"""What a scene file may say, field by field; `scene_file` is the rule in words, and makes solids of it."""
+"""Schema of a scene file, field by field; `scene_file` states the rules in words, and makes solids of the entries."""
 
 import math
 from typing import Annotated, Literal, Self
@@ -110,7 +110,7 @@ class PlaceEntry(BaseModel):
 
 
 class AreaEntry(BaseModel):
-    """What stands together."""
+    """Named group of solids, with the part of the scene that they stand in."""
 
     model_config = STRICT
 

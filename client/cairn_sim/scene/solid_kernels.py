@@ -1,4 +1,4 @@
-"""Where a ray enters a solid, and what its surface is like there; exact, in the solid's own axes.
+"""Entry of a ray into a solid, and the surface at that point; exact, in the solid's own axes.
 
     box         the overlap of three pairs of planes
     cylinder    the overlap of a circle in x, y and a pair of planes in z
@@ -66,15 +66,18 @@ def enter(
     frame: Floats,
     half_m: Floats,
 ) -> tuple[float, int]:
-    """Where the ray enters a solid, and through which face; -1 when it does not."""
+    """Distance along the ray to a solid, and the number of the face that it enters; -1 when it misses."""
+    # The ray in the solid's own axes, where every shape is centred and upright.
     px, py, pz = _own(ox - frame[k, 9], oy - frame[k, 10], oz - frame[k, 11], frame, k)
     ex, ey, ez = _own(dx, dy, dz, frame, k)
+    # Own normal, and lengths along the face.
     if kind[k] == BOX:
         return _enter_box(px, py, pz, ex, ey, ez, half_m[k, 0], half_m[k, 1], half_m[k, 2])
     if kind[k] == CYLINDER:
         return _enter_cylinder(px, py, pz, ex, ey, ez, half_m[k, 0], half_m[k, 2])
     if kind[k] == SPHERE:
         return _enter_sphere(px, py, pz, ex, ey, ez, half_m[k, 0])
+    # A plane: the ray goes below z = 0.
     return (-pz / ez, END) if ez < -PARALLEL else (-1.0, END)
 
 
@@ -82,6 +85,7 @@ def enter(
 def _enter_box(
     px: float, py: float, pz: float, ex: float, ey: float, ez: float, hx: float, hy: float, hz: float
 ) -> tuple[float, int]:
+    # Slab by slab: the entry is the last of three, the exit the first; the face is the axis that is entered last.
     inverse = inverse_of(ex)
     middle, reach = -px * inverse, hx * abs(inverse)
     near, far, axis = middle - reach, middle + reach, 0
@@ -102,6 +106,7 @@ def _enter_box(
 def _enter_cylinder(
     px: float, py: float, pz: float, ex: float, ey: float, ez: float, radius: float, half: float
 ) -> tuple[float, int]:
+    # The circle: |p + t e|^2 = r^2 in x and y, a quadratic in t.
     a = ex * ex + ey * ey
     b = px * ex + py * ey
     # The ray's miss of the axis, squared, by the cross product: b^2 - a c would cancel far from the axis.
@@ -111,12 +116,14 @@ def _enter_cylinder(
         if not root > 0.0:
             return -1.0, SIDE
         near, far = (-b - math.sqrt(root)) / a, (-b + math.sqrt(root)) / a
+    # Parallel to the axis: inside the circle for ever, or never.
     elif px * px + py * py < radius * radius:
         near, far = -np.inf, np.inf
     else:
         return -1.0, SIDE
     inverse = inverse_of(ez)
     middle, reach = -pz * inverse, half * abs(inverse)
+    # The caps: an entry through one of them is later than that through the side.
     face = SIDE
     if middle - reach > near:
         near, face = middle - reach, END
@@ -126,6 +133,7 @@ def _enter_cylinder(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _enter_sphere(px: float, py: float, pz: float, ex: float, ey: float, ez: float, radius: float) -> tuple[float, int]:
+    # The nearest point of the ray to the centre, q = p - b e; e is a unit vector.
     b = px * ex + py * ey + pz * ez
     qx, qy, qz = px - b * ex, py - b * ey, pz - b * ez
     root = radius * radius - (qx * qx + qy * qy + qz * qz)
@@ -173,6 +181,7 @@ def surface_at(
         radius = half_m[k, 0]
         nx, ny = lx / radius, ly / radius
         nz = lz / radius if kind[k] == SPHERE else 0.0
+        # Arc length and height.
         u, v = radius * math.atan2(ly, lx), lz
     return (
         f[k, 0] * nx + f[k, 3] * ny + f[k, 6] * nz,
@@ -196,6 +205,7 @@ def second_at(points: Floats, solids: Int32s, shapes: Shapes) -> Marks:
         lx, ly, lz = _own(points[i, 0] - f[k, 9], points[i, 1] - f[k, 10], points[i, 2] - f[k, 11], f, k)
         face = END
         if kind[k] == BOX:
+            # The face whose plane the point lies farthest outside of, or nearest to.
             outside = max(max(abs(lx) - half[0], abs(ly) - half[1]), abs(lz) - half[2])
             face = 0 if abs(lx) - half[0] == outside else (1 if abs(ly) - half[1] == outside else 2)
         elif kind[k] == CYLINDER:
@@ -209,7 +219,8 @@ def second_at(points: Floats, solids: Int32s, shapes: Shapes) -> Marks:
 
 @njit(nogil=True, error_model="numpy")
 def turn_at(u: float, v: float, k: int, texture: Floats) -> int:
-    """Which of a surface's two materials shows."""
+    """Number of the material, 0 or 1, that a texture shows at (u, v) metres on face k."""
+    # A checker: steps along u and v, counted together; odd ones show the second material.
     turns = math.floor((u - texture[k, 2]) * texture[k, 0]) + math.floor((v - texture[k, 3]) * texture[k, 1])
     return int(turns) & 1
 
@@ -224,6 +235,7 @@ def grain_at(u: float, v: float, salt: int) -> float:
 def _lattice(u: float, v: float, salt: int) -> float:
     i, j = math.floor(u), math.floor(v)
     a, b = u - i, v - j
+    # Smoothstep, so that the pattern has no creases at lattice lines.
     a, b = a * a * (3.0 - 2.0 * a), b * b * (3.0 - 2.0 * b)
     low = _hashed(i, j, salt) * (1.0 - a) + _hashed(i + 1, j, salt) * a
     high = _hashed(i, j + 1, salt) * (1.0 - a) + _hashed(i + 1, j + 1, salt) * a
@@ -233,6 +245,7 @@ def _lattice(u: float, v: float, salt: int) -> float:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _hashed(i: float, j: float, salt: int) -> float:
     """-1 to 1, by the finalizer of splitmix64 (Steele, Lea and Flood 2014)."""
+    # One 64-bit number of place and salt, its bits mixed; 53 of them become a float.
     z = np.uint64(np.int64(i)) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(np.int64(j)) * np.uint64(0xC2B2AE3D27D4EB4F)
     z += np.uint64(salt) * np.uint64(0x165667B19E3779F9)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

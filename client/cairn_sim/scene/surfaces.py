@@ -1,7 +1,7 @@
-"""What the three spectra see of a surface: a material, or two that take turns.
+"""Surfaces in three spectra: one material, or two that alternate in a texture.
 
     visible         sRGB, times the light that falls on the face
-    near infrared   what comes back to a lamp beside the lens: diffuse, glossy and retroreflecting parts
+    near infrared   light that returns to a lamp next to the lens: diffuse, glossy and retroreflecting parts
     far infrared    temperature and emissivity; what is not emitted is the surroundings' light, mirrored
 
 A texture depends on the place alone, so all robots see the same there. Lengths along a surface, `uv`, are metres from
@@ -17,11 +17,11 @@ from cairn_map.errors import BadInputError
 
 Rgb = tuple[int, int, int]
 TEMPERATURE_K = (50, 5000)
-"""What a material, the surroundings and the sky may have: colder sends nothing that a float holds."""
+"""Temperatures of materials, surroundings and sky, kelvin: below 50 K the radiance underflows a float."""
 
 
 class Optics(IntEnum):
-    """What a surface does with visible and near infrared light. In the far infrared every surface is opaque."""
+    """Optical kind of a surface in visible and near infrared light. In the far infrared every surface is opaque."""
 
     OPAQUE = 0
     GLASS = 1
@@ -39,11 +39,11 @@ class Material:
     emissivity: float = 0.95
     """In the far infrared, 8 to 14 um, 0 to 1; bare metal has 0.05 to 0.3, nearly everything else above 0.85."""
     reflectivity_nir: float = 0.5
-    """Of 850 nm light, diffuse, 0 to 1."""
+    """Diffuse reflectivity for 850 nm light, 0 to 1."""
     gloss_nir: float = 0.0
-    """Of 850 nm light, what a face turned to the lamp returns on top; fades within some 10 degrees."""
+    """Extra return of 850 nm light from a face turned to the lamp; fades within some 10 degrees."""
     retroreflection: float = 1.0
-    """How often more light returns to the lamp than from a diffuse surface; tape has several hundred."""
+    """Light that returns to the lamp, as a multiple of a diffuse surface's; tape has several hundred."""
     optics: Optics = Optics.OPAQUE
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Which solids a ray, or a bundle of rays, may meet: walks through the tree of `tree.tree_of`."""
+"""Tree walks: the solids that a ray, or a bundle of rays, may meet, in the tree of `scene.tree_of`."""
 
 import numpy as np
 import numpy.typing as npt
@@ -38,16 +38,19 @@ def first_entry(
     """
     # Not infinite, or a box that is missed, with `_near` infinite, would look as near as the best.
     best, which, best_face = FAR, -1, SIDE
+    # Planes first: no tree holds them.
     for at in range(len(endless)):
         k = int(endless[at])
         t, face = enter(ox, oy, oz, dx, dy, dz, k, kind, frame, half_m)
         if behind < t < best:
             best, which, best_face = t, k, face
+    # Then the tree, nearest node first, with the farther ones on a stack.
     ix, iy, iz = inverse_of(dx), inverse_of(dy), inverse_of(dz)
     node, top = 0, 0
     if len(leaves) == 0 or not _near(ox, oy, oz, ix, iy, iz, nodes, 0, best) <= best:
         return best, which, best_face
     while True:
+        # A leaf holds `count` solids from leaves[links[node, 0]] on; a branch has count 0.
         count = links[node, 1]
         if count > 0:
             for at in range(links[node, 0], links[node, 0] + count):
@@ -56,6 +59,7 @@ def first_entry(
                 if behind < t and (t < best or (t == best and k < which)):
                     best, which, best_face = t, k, face
         else:
+            # The first child follows its parent, the second is linked: the two in order of range.
             one, other = node + 1, int(links[node, 0])
             near_one = _near(ox, oy, oz, ix, iy, iz, nodes, one, best)
             near_other = _near(ox, oy, oz, ix, iy, iz, nodes, other, best)
@@ -67,6 +71,7 @@ def first_entry(
             if near_one <= best:
                 node = one
                 continue
+        # Nodes that begin behind the best hit are dropped unopened.
         while top > 0 and nears[top - 1] > best:
             top -= 1
         if top == 0:
@@ -79,7 +84,8 @@ def first_entry(
 def _near(
     ox: float, oy: float, oz: float, ix: float, iy: float, iz: float, nodes: Floats, n: int, best: float
 ) -> float:
-    """Where the ray enters a node's box, at least 0; infinite when it does not, or not before `best`."""
+    """Distance at which the ray enters a node's box, at least 0; infinite when it misses, or enters behind `best`."""
+    # Slabs (Kay and Kajiya 1986): the ray is in the box between the last entry and the first exit of three axes.
     x0, x1 = (nodes[n, 0] - ox) * ix, (nodes[n, 3] - ox) * ix
     y0, y1 = (nodes[n, 1] - oy) * iy, (nodes[n, 4] - oy) * iy
     z0, z1 = (nodes[n, 2] - oz) * iz, (nodes[n, 5] - oz) * iz
@@ -95,6 +101,7 @@ def spread_into(
     """A bundle's rays in the map frame, and (3, 2) their lowest and highest component along each axis but for NaN."""
     for a in range(3):
         low, high = np.inf, -np.inf
+        # A NaN compares false, so a ray without direction leaves the bounds alone.
         for place in range(start, end):
             i = order[place]
             d = R[a, 0] * rays[i, 0] + R[a, 1] * rays[i, 1] + R[a, 2] * rays[i, 2]
@@ -127,8 +134,10 @@ def candidates_into(
     while top > 0:
         top -= 1
         node = int(stack[top])
+        # No ray of the bundle enters this node.
         if not _bundle_near(origin, spread, nodes, node) < FAR:
             continue
+        # A branch: both children wait.
         if links[node, 1] == 0:
             stack[top], stack[top + 1] = links[node, 0], node + 1
             top += 2
@@ -137,6 +146,7 @@ def candidates_into(
             near = _bundle_near(origin, spread, bounds, leaves[at])
             if near < FAR:
                 place = count
+                # Insertion sort: a bundle meets a handful of solids.
                 while place > 0 and nears[place - 1] > near:
                     candidates[place], nears[place] = candidates[place - 1], nears[place - 1]
                     place -= 1
@@ -152,11 +162,14 @@ def _bundle_near(origin: Floats, spread: Floats, boxes: Floats, n: int) -> float
     for a in range(3):
         low, high = boxes[n, a] - origin[a], boxes[n, 3 + a] - origin[a]
         slow, fast = spread[a, 0], spread[a, 1]
+        # Mirror the axis, so that the bundle moves upwards or stands.
         if fast < 0.0:
             slow, fast, low, high = -fast, -slow, -high, -low
+        # All rays move upwards: the earliest entry is that of the fastest, or of the slowest inside.
         if slow > 0.0:
             near = max(near, low / fast if low > 0.0 else low / slow)
             far = min(far, high / slow if high > 0.0 else high / fast)
+        # Some stand or turn back: only an entry ahead can be bounded.
         elif low > 0.0:
             near = max(near, low / fast)
         elif high < 0.0:

@@ -12,7 +12,7 @@
 
 Ten configurations c1 to c10, of 2 to 9 images: how many, head-on or tilted, middle or corners, one distance or several.
 Each is photographed by the simulated head, its corners are found, the rig is solved from them alone, and verified with
-circle targets along a drive of 87 images (as `cairn calib verify`). Out comes Table 2 of Kocmanova et al., ours beside
+circle targets along a drive of 87 images (as `cairn calib verify`). Out comes Table 2 of Kocmanova et al., ours next to
 theirs. Configurations that leave a number undetermined are refused, in words.
 
 DIR gets study.html, study.json, and rig-c1.json ... to look at with `cairn calib`. Takes some minutes; the same

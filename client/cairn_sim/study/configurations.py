@@ -26,7 +26,7 @@ EDGE_M = 0.42
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where the board is held, as seen by the range camera."""
+    """Pose of the board for one image, as seen by the range camera."""
 
     x: float
     y: float

@@ -24,7 +24,7 @@ CAMERAS = ("colour_left", "colour_right", "thermal_left", "thermal_right")
 BARS: Mapping[Method, tuple[float, float]] = {"paper": (2.8, 1.1), "grey": (1.5, 0.6)}
 """Pixels of colour and thermal cameras that the best configuration's sigma must not exceed."""
 EXPECTED_WITHIN = 0.10
-"""Of the expected total, for the root mean square of the best."""
+"""Relative difference allowed between the best configuration's root mean square and its expected total."""
 NOT_THE_SAME = (
     "The paper's Table 1, which said what its configurations were, is lost: equal numbers name different sets of "
     "images. Its configurations 1 to 3 were far from real."
@@ -33,14 +33,14 @@ NOT_THE_SAME = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Study:
-    """What was done, and what came of it."""
+    """Study that was run: its parameters and the outcome of each configuration."""
 
     outcomes: Sequence[StudyOutcome]
     images: int
-    """Of targets."""
+    """Images of the circle targets."""
     seed: int
     scale: float
-    """Of colour and thermal images."""
+    """Size of colour and thermal images, as a share of the sensor's."""
 
     @property
     def best(self) -> StudyOutcome | None:
@@ -67,7 +67,7 @@ def study_text(study: Study) -> str:
 
 
 def judged(rows: Sequence[CameraRow], method: Method, *, scale: float = 1.0) -> list[str]:
-    """What the best configuration must do, and does or not, a line for each camera; `scale` of the images' size."""
+    """Bars of the best configuration and whether it meets them, a line for each camera; `scale` of the images' size."""
     lines = []
     for row in rows:
         bar = scale * BARS[method][0 if row.camera.startswith("colour") else 1]

@@ -43,9 +43,9 @@ from cairn_sim.study.configurations import CONFIGURATIONS, Configuration, Place,
 T_MAP_HEAD: Transform = placed((0.0, 0.0, 1.4)) @ T_FORWARD_CAMERA
 """In the middle of the laboratory's height."""
 RANGES_M = (1.1, 5.7)
-"""Of the paper's 211 objects."""
+"""Nearest and farthest of the paper's 211 objects, metres."""
 RADIUS_MAX_PX = 67.0
-"""Of the range camera's image, from its principal point; the paper's."""
+"""Radius in the range camera's image, from its principal point; the paper's."""
 TILT_MAX_RAD = 0.5
 DIAMETERS_M = (0.20, 0.30, 0.30)
 """Three targets, of 20 and 30 cm."""
