@@ -8,25 +8,13 @@ map, calib, fusion, client <- cairn        the public door: names of theirs, and
 import ast
 import re
 import tomllib
-from collections.abc import Iterator
 from fnmatch import fnmatch
 from functools import cache
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
-
-ROOT = Path(__file__).resolve().parent.parent
-
-FOLDERS = {
-    "cairn": "client",
-    "cairn_map": "fusion",
-    "cairn_calib": "calib",
-    "cairn_fusion": "fusion",
-    "cairn_client": "client",
-    "cairn_sim": "client",
-    "cairn_server": "server",
-}
+from tests.fixtures.sources import FOLDERS, ROOT, imports, modules
 
 MAY_IMPORT = {
     "cairn/*": {"cairn_client", "cairn_fusion", "cairn_map", "cairn_calib"},
@@ -133,28 +121,6 @@ LINES_MAX = 600
 SHIPPED = ["*.md", "*.toml", "Makefile", ".dockerignore", ".ci/*", "docker/*"]
 """Besides the packages, tests and docs: files with text that a user gets to see."""
 TEXT = {".py", ".md", ".toml", ".yaml", ".json", ""}
-
-
-def modules() -> Iterator[tuple[str, Path]]:
-    """All modules of the packages as `cairn_map/evidence/grid.py` and their files."""
-    for package, folder in FOLDERS.items():
-        for path in sorted((ROOT / folder / package).rglob("*.py")):
-            yield path.relative_to(ROOT / folder).as_posix(), path
-
-
-@cache
-def imports(path: Path) -> set[str]:
-    """Dotted names of the modules that a module imports from, anywhere in it."""
-    names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            names.update(alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0 and node.module, f"{path}: import from the defining module by its full name"
-            names.add(node.module)
-            # A module imported from its room: `from cairn_map.wire import frames`.
-            names.update(f"{node.module}.{alias.name}" for alias in node.names if node.module.startswith("cairn_"))
-    return names
 
 
 def is_within(name: str, parents: set[str]) -> bool:
