@@ -133,7 +133,7 @@ def test_retracting_a_robot_leaves_the_map_of_the_others(server: str, room_recor
             folder=tmp_path,
         )
     assert "takes out 1 commits" in typed("map", "retract", both, "--robot", "bad", folder=tmp_path)
-    typed("robot", "pull", "--map", both, "--state", "copy", folder=tmp_path)  # waits for nothing, but must not fail
+    typed("robot", "sync", "copy", "--map", both, folder=tmp_path)  # waits for nothing, but must not fail
     expected = digests(alone, tmp_path, "expected")
     for attempt in range(100):
         if digests(both, tmp_path, f"try{attempt}") == expected:
@@ -146,9 +146,9 @@ def test_a_low_end_copy_holds_only_the_cells_near_a_place(server: str, room_reco
     cairn("robot", "replay", room_recording, "--map", url, "--voxel", VOXEL_M, folder=tmp_path)
     wait_for_fold(url)
     near = ("--mode", "low-end", "--near", "1,1,1", "--radius", "0.1")
-    assert "1 cells," in cairn("robot", "pull", "--map", url, "--state", "low", *near, folder=tmp_path)
-    whole = cairn("robot", "pull", "--map", url, "--state", "whole", "--mode", "low-end", folder=tmp_path)
-    viewer = cairn("robot", "pull", "--map", url, "--state", "viewer", folder=tmp_path)
+    assert "1 cells," in cairn("robot", "sync", "low", "--map", url, *near, folder=tmp_path)
+    whole = cairn("robot", "sync", "whole", "--map", url, "--mode", "low-end", folder=tmp_path)
+    viewer = cairn("robot", "sync", "viewer", "--map", url, folder=tmp_path)
     assert whole.split(" in ")[0] == viewer.split(" in ")[0] != "1 cells"
 
 
@@ -161,7 +161,7 @@ def test_a_robot_without_a_link_keeps_its_commits_until_there_is_one(
     out = cairn(*("robot", "replay", room_recording, "--map", nowhere, "--voxel", VOXEL_M, *state), folder=tmp_path)
     assert "2 commits wait" in out
     cairn("map", "create", url, "--voxel", VOXEL_M, folder=tmp_path)
-    assert "2 commits pushed" in cairn("robot", "pull", "--map", url, "--state", "state", folder=tmp_path)
+    assert "pushed 2 commits" in cairn("robot", "sync", "state", "--map", url, folder=tmp_path)
     assert digests(url, tmp_path, "cells") != {}
 
 
@@ -214,7 +214,7 @@ def test_after_a_replay_the_server_knows_that_the_robot_is_level(
     url = f"{server}/maps/level"
     cairn("robot", "replay", room_recording, "--map", url, "--voxel", VOXEL_M, folder=tmp_path)
     wait_for_fold(url)
-    cairn("robot", "pull", "--map", url, "--state", "cairn-room", folder=tmp_path)
+    cairn("robot", "sync", "cairn-room", "--map", url, folder=tmp_path)
     assert "0 log entries since it last asked" in typed("map", "info", url, folder=tmp_path)
 
 
@@ -228,7 +228,7 @@ def test_files_that_cannot_be_written_and_cells_with_negative_numbers(
     assert "[bad_output]" in cairn("map", "get", url, "0,0,0", "-o", "no/such/x.ply", folder=tmp_path, code=1)
     assert "-9,0,0" in cairn("map", "get", url, "-9,0,0", "-o", "x.ply", folder=tmp_path, code=3)
     low_end = ("--mode", "low-end", "--near", "-1,0.5,1")
-    assert "cells," in cairn("robot", "pull", "--map", url, "--state", "low", *low_end, folder=tmp_path)
+    assert "cells," in cairn("robot", "sync", "low", "--map", url, *low_end, folder=tmp_path)
     bent = ("--depth", "{id}.png", "--pose", "pose.txt", "--intrinsics", "9,9,9,9", "--distortion", "-0.1,0,0,0,0")
     assert "[no_frames]" in cairn("robot", "replay", "cells", "--map", url, *bent, folder=tmp_path, code=1)
 

@@ -19,7 +19,7 @@ from tests.fixtures.sources import FOLDERS, ROOT, imports, modules
 MAY_IMPORT = {
     "cairn/*": {"cairn_client", "cairn_fusion", "cairn_map", "cairn_calib"},
     "cairn_map/*": set(),
-    "cairn_calib/*": {"cairn_map.errors", "cairn_map.arrays"},
+    "cairn_calib/*": {"cairn_map.errors", "cairn_map.arrays", "cairn_map.progress"},
     "cairn_fusion/*": {"cairn_map", "cairn_calib"},
     "cairn_client/*": {"cairn_fusion", "cairn_map", "cairn_calib"},
     "cairn_sim/*": {"cairn_client", "cairn_fusion", "cairn_map", "cairn_calib"},
@@ -94,7 +94,7 @@ MAY_NAME = {
 
 ROOMS = {
     "cairn_map": """
-        errors arrays
+        errors arrays progress
         kernels evidence codec.octree codec.entropy codec commits wire files queries render
         warm_up
     """,

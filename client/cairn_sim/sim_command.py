@@ -17,9 +17,10 @@ from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 
-from cairn_client.cli.arguments import parser, say, with_progress
+from cairn_client.cli.arguments import parser, say
 from cairn_fusion.recording.images import write_colour
 from cairn_map.errors import BadInputError
+from cairn_map.progress import with_progress
 from cairn_sim.evaluation.evaluate_command import add_evaluate_arguments, evaluate
 from cairn_sim.render.render import render_scan
 from cairn_sim.robots.contact_sheet import contact_sheet, view_from_above

@@ -22,7 +22,7 @@ from tests.bench.pushing import Diff, meta_of
 from tests.console.browsing import CHROMIUM, VIEW, Console, browser
 from tests.fixtures.server.live import Process
 
-from cairn_client.cli.maps.prior_data import push_prior_data
+from cairn_client.cli.maps.create import push_prior_data
 from cairn_client.http.api import MapApi
 from cairn_fusion.mapping.integrate import Integrator, integrate_scans
 from cairn_map.codec.view_code import decode_view

@@ -18,8 +18,8 @@ from tests.bench.building import building_map, wait_until_folded
 from tests.fixtures.server.live import Process
 
 from cairn_calib.rig.rig import Rig
+from cairn_client.cli.maps.create import push_prior_data
 from cairn_client.cli.maps.overlay_drawing import MapOverlay
-from cairn_client.cli.maps.prior_data import push_prior_data
 from cairn_client.folders.map_folder import FolderMap, map_of_folder
 from cairn_client.http.api import MapApi
 from cairn_fusion.image_fusion.mirror_labels import mirror_pixels

@@ -52,9 +52,9 @@ from cairn_calib.board.corner_pictures import overlay, write_picture
 from cairn_calib.board.corners import Attempt, Detection
 from cairn_calib.board.polarity import PolarityCandidates, chessboard_candidates, count_votes, disc_candidates
 from cairn_calib.board.still_frames import StillImage, read_still, refuse_movement
-from cairn_calib.cli.progress import with_progress
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError, NotFoundError, first_error
+from cairn_map.progress import with_passing_progress
 
 NAMED_MAX = 8
 """Images without a board that the last line names."""
@@ -136,7 +136,7 @@ def _run(args: argparse.Namespace) -> int:
     seen_before: dict[bytes, str] = {}
     results = [
         _find_and_draw(path, board, args, pointed.get(path.name), seen_before)
-        for path in with_progress(args.images, "images")
+        for path in with_passing_progress(args.images, "images", total=len(args.images))
     ]
     polarity = _polarity([each.candidates for each in results], args)
     for each in results:

@@ -37,7 +37,6 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from cairn_calib.cli.progress import while_working
 from cairn_calib.cli.solve_options import add_solve_options, solve_as_asked
 from cairn_calib.diagnosis.examination import examine
 from cairn_calib.report.range_report import told_ranges
@@ -45,6 +44,7 @@ from cairn_calib.report.report_files import refuse_overwriting, write_file, writ
 from cairn_calib.report.report_images import report_images
 from cairn_calib.rig.calibration import Statistics
 from cairn_calib.solve.solved_rig import solved_rig, statistics_of
+from cairn_map.progress import while_working
 
 if TYPE_CHECKING:
     from argparse import _SubParsersAction

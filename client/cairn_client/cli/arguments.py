@@ -1,34 +1,78 @@
-"""What all subcommands share: help from the module's docstring, tokens, a progress bar, maps by URL."""
+"""Parts that all commands share: parsers, subcommands, tokens, maps by URL, output for people.
+
+All commands follow one protocol. The module behind an entry point of `cairn.commands` has `main(argv) -> int`, which
+parses the arguments and returns the exit code. The module of a subcommand has `add_parser(commands)`, which adds a
+parser whose default `run` is a function of the parsed arguments that returns the exit code.
+"""
 
 import argparse
 import os
 import re
 import sys
-from collections.abc import Iterable, Iterator
-from typing import Any, TypeVar
-
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
 
 from cairn_client.http.api import MapApi
 from cairn_client.http.map_url import split_map_url
 from cairn_map.errors import EXIT_CODES
 
-Item = TypeVar("Item")
 TOKEN_VARIABLE = "CAIRN_TOKEN"  # noqa: S105 - the variable's name
+NEGATIVE_LIST = re.compile(r"-\d[-\d.]*[,:][-\d.,:]*")
+"""A list or span that begins with a negative number: `-1,0,0`, `-5:40`."""
+
+Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+Run: TypeAlias = Callable[[argparse.Namespace], int]
+AddParser: TypeAlias = Callable[[Subparsers], None]
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser whose help, and that of its subcommands, is shown as written, and ends with the exit codes."""
+    """A parser whose help, and that of its subcommands, is shown as written, and ends with the exit codes.
+
+    It takes `-1,0,0` and `-5:40` for values, where argparse by itself does so with `-1` alone.
+    """
 
     def __init__(self, *args: Any, **options: Any) -> None:
         shown: dict[str, Any] = {"epilog": EXIT_CODES, "formatter_class": argparse.RawDescriptionHelpFormatter}
         super().__init__(*args, **(shown | options))
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As argparse, which takes no word for an option that begins with a space; numbers may begin with one."""
+        words = sys.argv[1:] if args is None else args
+        return super().parse_known_args(
+            [f" {word}" if NEGATIVE_LIST.fullmatch(word) else word for word in words], namespace
+        )
+
 
 def parser(program: str, text: str | None) -> argparse.ArgumentParser:
     """A parser whose help is a docstring."""
     return CommandParser(program, description=text)
+
+
+def run_subcommand(program: str, text: str | None, parts: Sequence[AddParser], argv: list[str]) -> int:
+    """Run the subcommand that is named first; its exit code.
+
+    Args:
+        program: the command, `cairn map`.
+        text: the command's help.
+        parts: `add_parser` of each subcommand, in the order of the help.
+        argv: the arguments behind the command.
+    """
+    top = parser(program, text)
+    commands = top.add_subparsers(required=True, metavar="COMMAND")
+    for add_parser in parts:
+        add_parser(commands)
+    args = top.parse_args(argv)
+    run: Run = args.run
+    return run(args)
+
+
+def add_map_parser(commands: Subparsers, name: str, run: Run, *, text: str) -> argparse.ArgumentParser:
+    """Add the parser of a subcommand on one map of a server: its URL and the token."""
+    added = commands.add_parser(name, help=text, description=text)
+    added.add_argument("map", help="http://HOST:PORT/maps/NAME")
+    add_token(added)
+    added.set_defaults(run=run)
+    return added
 
 
 def add_token(parser: argparse.ArgumentParser) -> None:
@@ -38,32 +82,14 @@ def add_token(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def allow_negative_lists(parser: argparse.ArgumentParser) -> None:
-    """Take `-1,0,0` or `-5:40` for a value and not for an option, as argparse by itself does with `-1` alone."""
-    parser._negative_number_matcher = re.compile(r"^-\d[-\d.,:]*$")
-
-
 def api_of(map_url: str, token: str | None) -> tuple[MapApi, str]:
     """The server of a map's URL, and the map's name."""
     server, name = split_map_url(map_url)
     return MapApi(server, token=token), name
 
 
-def with_progress(items: Iterable[Item], what: str, *, total: int) -> Iterator[Item]:
-    """The items, with a bar on standard error: count, rate, time left."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        yield from bar.track(items, total=total, description=what)
-
-
 def say(text: str = "") -> None:
-    """A line of the command's result."""
+    """Write a line of the command's result."""
     sys.stdout.write(text + "\n")
 
 
@@ -81,3 +107,11 @@ def shown_bytes(count: float) -> str:
             return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
         count /= 1000
     return f"{count:.2f} GB"
+
+
+def shown_age(seconds: float) -> str:
+    """An age for people."""
+    for limit, unit, size in ((120, "s", 1), (7200, "min", 60), (172_800, "h", 3600)):
+        if seconds < limit:
+            return f"{max(0.0, seconds) / size:.0f} {unit}"
+    return f"{seconds / 86_400:.0f} d"

@@ -2,11 +2,14 @@
 
 import argparse
 
-from cairn_client.cli.arguments import add_token, allow_negative_lists
+import numpy as np
+
+from cairn_client.cli.arguments import add_token
 from cairn_client.robot.limits import Limits
 from cairn_client.sync.link_profile import LINKS
 from cairn_client.sync.scope import Scope
 from cairn_map.errors import BadInputError
+from cairn_map.render.pose_spread import PoseSpread
 
 
 def add_map(command: argparse.ArgumentParser) -> None:
@@ -18,7 +21,6 @@ def add_map(command: argparse.ArgumentParser) -> None:
 
 def add_amount(command: argparse.ArgumentParser) -> None:
     """How much of the map, and the token."""
-    allow_negative_lists(command)
     command.add_argument("--box", type=box, metavar="X0,Y0,Z0,X1,Y1,Z1", help="fetch only cells in it, metres")
     command.add_argument(
         "--reply-bytes", type=int, metavar="BYTES", help="of cells in one reply; the rest comes in the next ones"
@@ -73,3 +75,36 @@ def box(text: str) -> tuple[float, ...]:
     if len(parts) != 6:
         raise argparse.ArgumentTypeError(f"expected X0,Y0,Z0,X1,Y1,Z1 in metres, got {text!r}")
     return (*place(",".join(parts[:3])), *place(",".join(parts[3:])))
+
+
+def add_spread_arguments(options: argparse.ArgumentParser) -> None:
+    """Add `--sigma` and `--covariance`, of which one at most is given."""
+    certain = options.add_mutually_exclusive_group()
+    certain.add_argument("--sigma", type=_sigma, default=(0.0, 0.0), metavar="M,DEG", help="of the pose (0,0)")
+    certain.add_argument("--covariance", type=_numbers, metavar="N,N,...", help="of the pose, 21 numbers: see above")
+
+
+def spread_of(args: argparse.Namespace) -> PoseSpread:
+    """How certain a pose is, as `--covariance` or `--sigma` says.
+
+    Raises:
+        BadInputError: kind `bad_pose`: it is no covariance.
+    """
+    if args.covariance is not None:
+        return PoseSpread.of_lower(args.covariance)
+    return PoseSpread.of_sigmas(args.sigma[0], float(np.radians(args.sigma[1])))
+
+
+def _sigma(text: str) -> tuple[float, float]:
+    try:
+        metres, degrees = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected METRES,DEGREES, such as 0.02,1; got {text!r}") from None
+    return metres, degrees
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected numbers with commas between, got {text!r}") from None

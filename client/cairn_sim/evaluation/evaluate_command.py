@@ -24,11 +24,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from cairn_calib.rig.rig import Spectrum
-from cairn_client.cli.arguments import say, with_progress
+from cairn_client.cli.arguments import say
 from cairn_fusion.recording.images import write_colour
 from cairn_fusion.view.telepresence import Telepresence, ViewMode, ViewOptions
 from cairn_fusion.view.temperature_scale import locked_scale
 from cairn_map.errors import BadInputError
+from cairn_map.progress import with_progress
 from cairn_sim.evaluation.fusion_evaluation import WAYS, labelled_frames, mapped_scores, plan_scans, scored_view
 from cairn_sim.evaluation.fusion_pictures import error_picture, figure_24
 from cairn_sim.evaluation.fusion_scores import COLUMNS, FusionScores

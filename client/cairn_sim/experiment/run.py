@@ -19,10 +19,10 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
-from cairn_client.cli.arguments import with_progress
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import Geometry, geometry_for
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_map.progress import with_progress
 from cairn_sim.experiment.cells import measure_cells
 from cairn_sim.experiment.figures import CellFigures, Json, ResolutionFigures, RunFigures, TruthFigures
 from cairn_sim.experiment.mapping import GrowingMap, map_all

@@ -22,8 +22,9 @@ seed gives the same numbers.
 import argparse
 from pathlib import Path
 
-from cairn_client.cli.arguments import parser, say, with_progress
+from cairn_client.cli.arguments import parser, say
 from cairn_map.errors import BadInputError
+from cairn_map.progress import with_progress
 from cairn_sim.robots.heads import full_head
 from cairn_sim.study.configurations import CONFIGURATIONS
 from cairn_sim.study.report import Study, study_json, study_page, study_text

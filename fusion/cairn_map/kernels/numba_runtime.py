@@ -13,6 +13,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+from cairn_map.progress import StatusLine
+
 if TYPE_CHECKING:
     from numba.core.dispatcher import Dispatcher
 
@@ -20,7 +22,6 @@ LOG_EVERY_S = 5.0
 """Seconds of compiling between two lines of a log."""
 LOG_AFTER_S = 1.0
 """Seconds of compiling before the first line of a log: less is not worth a line."""
-CLEAR_LINE = "\r\x1b[K"
 LOOKUP = "_numba_unpickle"
 """Numba's function that finds again an object which it has unpickled before."""
 
@@ -30,28 +31,23 @@ class CompileProgress:
 
     def __init__(self, stream: TextIO | None = None) -> None:
         """Write to a stream; None: to `sys.stderr`, whatever that is at the time."""
-        self._stream = stream
+        self._line = StatusLine(stream)
         self._taken_s = 0.0
         self._logged_s = LOG_AFTER_S - LOG_EVERY_S
 
     def begin(self, kernel: str, *, ready: int, total: int) -> None:
         """Say that a kernel is being compiled, while `ready` of `total` are."""
-        line = f"compiling kernels, only this once: {kernel}, {min(ready + 1, total)} of {total}, {self._taken_s:.0f} s"
-        stream = self._stream or sys.stderr
-        if stream.isatty():
-            stream.write(CLEAR_LINE + line)
-            stream.flush()
-        elif self._taken_s >= self._logged_s + LOG_EVERY_S:
+        if not self._line.is_terminal:
+            if self._taken_s < self._logged_s + LOG_EVERY_S:
+                return
             self._logged_s = self._taken_s
-            stream.write(line + "\n")
+        count = f"{min(ready + 1, total)} of {total}"
+        self._line.show(f"compiling kernels, only this once: {kernel}, {count}, {self._taken_s:.0f} s")
 
     def end(self, seconds: float) -> None:
         """Add the seconds that the kernel took, and remove its line from a terminal."""
         self._taken_s += seconds
-        stream = self._stream or sys.stderr
-        if stream.isatty():
-            stream.write(CLEAR_LINE)
-            stream.flush()
+        self._line.clear()
 
 
 @cache

@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 from cairn_map.errors import EXIT_CODES
-from cairn_server.operations.progress import Progress
+from cairn_map.progress import PercentLine
 from cairn_server.settings import Settings
 from cairn_server.store.sqlite.backup import back_up
 
@@ -27,7 +27,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help="folder of the store")
     parser.add_argument("file", type=Path, metavar="FILE", help="the backup; an older one of that name is replaced")
     args = parser.parse_args(argv)
-    progress = Progress("backup")
+    progress = PercentLine("backup")
     size_bytes = back_up(args.data, args.file, progress.at)
     progress.finish()
     sys.stdout.write(f"{args.file}: {size_bytes / 1e6:.1f} MB, the state of {args.data}\n")

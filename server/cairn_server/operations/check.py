@@ -12,8 +12,8 @@ the server. The exit code is 0 if all is sound and 6 if not.
 
 With --repair, which needs the server stopped, damaged cells are made anew where the log still has all of their commits.
 Others stay set aside: the server answers 500 damaged_store for such a cell alone and goes on with all others; commits
-that touch it wait. What heals it: the next robot that syncs and still has the cell as it was, by itself; an export that
-has it (`cairn map heal`); or a backup from before the damage, after which robots push again what is newer.
+that touch it wait. The next robot that syncs and still has the cell as it was heals it by itself; or a backup from
+before the damage is restored, after which robots push again what is newer.
 """
 
 import argparse
@@ -23,8 +23,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cairn_map.errors import EXIT_CODES, DamagedDataError
+from cairn_map.progress import PercentLine
 from cairn_server.folding.store_check import Finding, check_map
-from cairn_server.operations.progress import Progress
 from cairn_server.settings import Settings
 from cairn_server.store.sqlite.archive import SqliteArchive
 from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
@@ -80,7 +80,7 @@ class Outcome:
 def check_all(store: Store, complaints: Iterable[str] = ()) -> Outcome:
     """Everything in a store; `complaints` about its file come first."""
     findings: list[tuple[MapRow | None, Finding]] = [(None, Finding("file", text)) for text in complaints]
-    progress = Progress("check")
+    progress = PercentLine("check")
     rows = store.maps()
     commits = cells = not_kept = 0
     for row in rows:

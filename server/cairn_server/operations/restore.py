@@ -17,8 +17,8 @@ import sys
 from pathlib import Path
 
 from cairn_map.errors import EXIT_CODES, DamagedDataError
+from cairn_map.progress import PercentLine
 from cairn_server.operations.check import check_all
-from cairn_server.operations.progress import Progress
 from cairn_server.settings import Settings
 from cairn_server.store.sqlite.archive import SqliteArchive
 from cairn_server.store.sqlite.backup import restore
@@ -36,7 +36,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("file", type=Path, metavar="FILE", help="a file that `cairn serve backup` made")
     parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help="a new or empty folder")
     args = parser.parse_args(argv)
-    progress = Progress("restore")
+    progress = PercentLine("restore")
     summary: list[str] = []
     restore(args.file, args.data, progress.at, lambda path: summary.append(_verified(path)))
     progress.finish()

@@ -148,6 +148,11 @@ def test_a_round_for_a_folder_pushes_and_fetches(
     assert len(stored_commits(tmp_path / "server")) == 1
 
 
+def test_the_removed_command_names_the_one_that_replaces_it(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cairn.main(["robot", "pull", "--map", NOWHERE, "--state", "mole"]) == 1
+    assert "`cairn robot sync DIR --map URL` does the same" in capsys.readouterr().err
+
+
 def test_a_folder_in_use_is_not_synced_by_another(server: LiveServer, tmp_path: Path) -> None:
     with robot_in(tmp_path, server.map_url):
         assert code_of("sync", tmp_path / "mole") == 4

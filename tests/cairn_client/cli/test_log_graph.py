@@ -4,8 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cairn_client.cli.maps.graph_drawing import LANES_MAX, draw
-from cairn_client.cli.maps.log_graph import graph_of, log_graph
+from cairn_client.cli.maps.map_log import LANES_MAX, draw, graph_of, log_graph
 from cairn_map.wire.messages import LogEntry
 
 Graph = list[list[int]]

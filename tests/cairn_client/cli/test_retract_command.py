@@ -6,7 +6,7 @@ import pytest
 from tests.fixtures.server.live import Live, live
 from tests.fixtures.server.pushes import MOLE, WREN, pushed, read, sum_of
 
-from cairn_client.cli.maps.retract import seconds_of
+from cairn_client.cli.maps.command import seconds_of
 from cairn_client.main import main
 from cairn_map.errors import BadInputError
 

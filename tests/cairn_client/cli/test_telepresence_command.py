@@ -13,8 +13,7 @@ import pytest
 from tests.fixtures.server.live import Live
 
 from cairn_client.cli.robots import telepresence as telepresence_command
-from cairn_client.cli.robots.telepresence import main
-from cairn_client.cli.robots.view_publishing import publish_views
+from cairn_client.cli.robots.telepresence import main, publish_views
 from cairn_client.http.api import MapApi
 from cairn_fusion.importers import open_source
 from cairn_fusion.recording.images import read_colour

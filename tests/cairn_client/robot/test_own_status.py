@@ -8,7 +8,8 @@ from tests.fixtures.client.made import MAP
 from tests.fixtures.client.robot_program import scan_of
 from tests.fixtures.client.robots import map_commit, robot_in
 
-from cairn_client.cli.maps.branch_table import branch_table, shown_age
+from cairn_client.cli.arguments import shown_age
+from cairn_client.cli.maps.branch_table import branch_table
 from cairn_client.http.api import MapApi
 from cairn_client.robot import status_report
 from cairn_map.commits.commit import ScanPose

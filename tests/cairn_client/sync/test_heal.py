@@ -10,13 +10,11 @@ from tests.fixtures.client.made import A, B, cells_of, flip_a_bit, seen
 from tests.fixtures.client.robots import evidence_of, map_commit, robot_in
 from tests.fixtures.client.team import Team
 
-from cairn_client.cli.maps import command as map_command
 from cairn_client.cli.robots import replay as replay_command
 from cairn_client.http.api import MapApi
 from cairn_map.codec.cell_code import encode_cell
 from cairn_map.errors import CairnError, DamagedDataError
 from cairn_map.evidence.grid import CellKey, cell_of_key
-from cairn_map.files.cell_folder import write_cell
 from cairn_map.wire.messages import Mode
 
 MAP = "lab"
@@ -181,22 +179,3 @@ def test_a_replay_goes_on_though_a_cell_of_the_server_is_damaged(
         assert replay_command._try_sync(owl)
         assert owl.waiting == 0
     assert "all others came" in caplog.text
-
-
-def test_an_export_heals_a_server(
-    team: Team, server: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    team["mole"].commit({A: X, B: X})
-    team.push("mole")
-    folder = tmp_path / "export"
-    assert map_command.main(["export", server.map_url, "--cells", str(folder)]) == 0
-    before = cell_on(server, FIRST)
-    damage(server, FIRST)
-    assert is_damaged(server, FIRST)
-    assert map_command.main(["heal", server.map_url, str(folder)]) == 0
-    assert f"cell {cell_of_key(FIRST)} is sound again" in capsys.readouterr().out
-    assert cell_on(server, FIRST) == before
-    damage(server, FIRST, ("cell",))
-    write_cell(folder, cell_of_key(FIRST), encode_cell(FIRST, Y, team["mole"].geometry).data)
-    with pytest.raises(DamagedDataError, match="still damaged"):
-        map_command.main(["heal", server.map_url, str(folder)])

@@ -100,13 +100,13 @@ def test_the_command_pulls_a_box(
 ) -> None:
     box = ",".join(str(value) for corner in BOX_M for value in corner)
     small = ["--reply-bytes", "500"] if mode == "viewer" else []
-    command = ["pull", "--map", large.map_url, "--state", str(tmp_path / "copy"), "--mode", mode, "--box", box, *small]
+    command = ["sync", str(tmp_path / "copy"), "--map", large.map_url, "--mode", mode, "--box", box, *small]
     assert robot_command.main(command) == 0
     assert f"{len(IN_BOX)} cells" in capsys.readouterr().out
 
 
 def test_a_limit_of_bytes_says_nothing_to_a_low_end_robot(tmp_path: Path) -> None:
-    command = ["pull", "--map", "http://127.0.0.1:9/maps/lab", "--state", str(tmp_path), "--mode", "low-end"]
+    command = ["sync", str(tmp_path), "--map", "http://127.0.0.1:9/maps/lab", "--mode", "low-end"]
     with pytest.raises(BadInputError, match="low-end fetches cells"):
         robot_command.main([*command, "--reply-bytes", "500"])
 

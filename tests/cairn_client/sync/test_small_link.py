@@ -237,7 +237,7 @@ def test_a_copy_comes_whole_over_a_small_link(
     with MapApi(city.url) as api:
         cells = api.map_info(MAP).cells
     state = str(tmp_path / "copy")
-    assert robot_command.main(["pull", "--map", city.map_url, "--state", state, "--link", "small", "--json"]) == 0
+    assert robot_command.main(["sync", state, "--map", city.map_url, "--link", "small", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert (report["cells"], report["pushed"], report["refused"], report["waiting"]) == (cells, 0, {}, 0)
     assert report["voxels"] > 0 and report["down_bytes"] > 0

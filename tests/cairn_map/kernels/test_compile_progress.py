@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from cairn_map.kernels.numba_runtime import CLEAR_LINE, CompileProgress
+from cairn_map.kernels.numba_runtime import CompileProgress
+from cairn_map.progress import CLEAR_LINE
 
 FIRST_USE = """
 from cairn_map.kernels.numba_runtime import show_compiling

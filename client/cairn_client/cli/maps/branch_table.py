@@ -1,13 +1,35 @@
-"""The robots of a map as a table: who is how far behind, when it was last heard of, and where it is."""
+"""`cairn map branches`: the robots of a map as a table: how far behind, when last heard of, and where."""
 
+import argparse
+import json
 import math
 import time
 from collections.abc import Iterator
 
-from cairn_client.cli.arguments import shown_bytes
+from cairn_client.cli.arguments import Subparsers, add_map_parser, api_of, say, shown_age, shown_bytes
 from cairn_map.wire.messages import BranchInfo
 
 HEAD = ("robot", "mode", "seen", "behind", "bytes", "waiting", "battery", "pose (m, deg)", "note")
+
+
+def add_parser(commands: Subparsers) -> None:
+    """Add the subcommand."""
+    listing = add_map_parser(commands, "branches", _branches, text="the robots of a map: lag, last sign of life, pose")
+    listing.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _branches(args: argparse.Namespace) -> int:
+    api, name = api_of(args.map, args.token)
+    with api:
+        branches = api.branches(name)
+    if args.json:
+        say(json.dumps([branch.model_dump(mode="json") for branch in branches]))
+        return 0
+    for line in branch_table(branches):
+        say(line)
+    if not branches:
+        say("(none yet; a robot registers by itself when it first syncs)")
+    return 0
 
 
 def branch_table(branches: list[BranchInfo], *, now_s: float | None = None) -> Iterator[str]:
@@ -17,14 +39,6 @@ def branch_table(branches: list[BranchInfo], *, now_s: float | None = None) -> I
     widths = [max(len(row[c]) for row in rows) for c in range(len(HEAD))]
     for row in rows:
         yield "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
-
-
-def shown_age(seconds: float) -> str:
-    """How long ago, for people."""
-    for limit, unit, size in ((120, "s", 1), (7200, "min", 60), (172_800, "h", 3600)):
-        if seconds < limit:
-            return f"{max(0.0, seconds) / size:.0f} {unit}"
-    return f"{seconds / 86_400:.0f} d"
 
 
 def _row(branch: BranchInfo, now_s: float) -> tuple[str, ...]:
@@ -46,7 +60,7 @@ def _row(branch: BranchInfo, now_s: float) -> tuple[str, ...]:
 
 
 def _shown_pose(branch: BranchInfo) -> str:
-    """Place and heading, and how surely."""
+    """Place, its standard deviation, and heading."""
     if branch.status is None or branch.status.pose is None:
         return "-"
     pose = branch.status.pose

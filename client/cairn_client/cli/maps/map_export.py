@@ -1,24 +1,76 @@
-"""Maps as files: the `get` and `export` subcommands of `cairn map`."""
+"""Maps as files: `cairn map get` and `cairn map export`.
+
+A whole map is made into files here, from its cells; a part of a map is made by the server:
+
+    $ cairn map export http://127.0.0.1:8750/maps/lab --pcd lab.pcd --box=0,0,0,8,6,3 --ceiling 2.2 --p 0.8
+    lab.pcd: 1.4 MB
+"""
 
 import argparse
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import urlencode
 
-from cairn_client.cli.arguments import api_of, say, shown_bytes, with_progress
-from cairn_client.cli.maps.part_export import FORMATS, export_part, is_part
+from pydantic import ValidationError
+
+from cairn_client.cli.arguments import Subparsers, add_map_parser, api_of, say, shown_bytes
 from cairn_client.http.api import MapApi
 from cairn_client.http.http_link import cells_with_evidence, download_cell
 from cairn_map.codec.cell_code import DecodedCell
-from cairn_map.errors import BadInputError, NotFoundError
+from cairn_map.errors import BadInputError, NotFoundError, first_error
 from cairn_map.evidence.grid import cell_from_text, cell_key, cell_of_key
 from cairn_map.evidence.voxels import Voxels, joined_voxels, voxels_of_evidence
 from cairn_map.files.cell_files import cell_file, npz_file, ply_file
 from cairn_map.files.cell_folder import FolderHead, write_cell, write_head
+from cairn_map.files.export_request import ExportRequest
+from cairn_map.progress import with_progress
 from cairn_map.wire.messages import MapInfo
 
+FORMATS = ("ply", "pcd", "laz", "npz", "ot", "bt")
+ZERO_CELSIUS_K = 273.15
 
-def get_cell(args: argparse.Namespace) -> None:
+
+def add_get_parser(commands: Subparsers) -> None:
+    """Add `cairn map get`."""
+    get = add_map_parser(commands, "get", _get, text="download one cell")
+    get.add_argument("cell", type=str.strip, help="its number, i,j,k")
+    get.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=".cell, .npz, .ply or .view")
+
+
+def add_export_parser(commands: Subparsers) -> None:
+    """Add `cairn map export`."""
+    export = add_map_parser(commands, "export", _export, text="download a whole map, or a part of it as points")
+    export.add_argument("--cells", type=Path, metavar="DIR", help="one file a cell, named by its number")
+    export.add_argument("--ply", type=Path, metavar="FILE", help="occupied voxels as a point cloud")
+    export.add_argument("--npz", type=Path, metavar="FILE", help="all known voxels as NumPy arrays")
+    export.add_argument("--picture", type=Path, metavar="FILE", help="PNG: colour, temperature, probability")
+    export.add_argument(
+        "--ceiling", type=float, metavar="METRES", help="leave out what is higher; with --picture, of the picture alone"
+    )
+    _add_part_arguments(export)
+
+
+def _add_part_arguments(export: argparse.ArgumentParser) -> None:
+    """Options that name a part of a map, and the kinds of file that only the server makes."""
+    export.add_argument("--pcd", type=Path, metavar="FILE", help="occupied voxels for PCL and Open3D")
+    export.add_argument("--laz", type=Path, metavar="FILE", help="occupied voxels for CloudCompare, PDAL, Potree, GIS")
+    export.add_argument("--ot", type=Path, metavar="FILE", help="OctoMap's octree with probability and colour")
+    export.add_argument("--bt", type=Path, metavar="FILE", help="OctoMap's octree of occupied or not, small")
+    part = export.add_argument_group(
+        "a part", "of what is occupied, as the console shows it: made by the server, as x, y, z, colour, p, temperature"
+    )
+    part.add_argument(
+        "--box", type=str.strip, metavar="X,Y,Z,X,Y,Z", help="lowest and highest corner, metres: --box=0,0,0,8,6,3"
+    )
+    part.add_argument("--floor", type=float, metavar="METRES", help="leave out what is lower")
+    part.add_argument("--p", type=float, metavar="P", help="least probability, 0 to 1")
+    part.add_argument("--hotter", type=float, metavar="CELSIUS", help="only what has a voxel as hot as this")
+    part.add_argument("--colder", type=float, metavar="CELSIUS", help="only what is as cold as this in the mean")
+    part.add_argument("--depth", type=int, metavar="N", help="octree depth: fewer, larger nodes (that of voxels)")
+
+
+def _get(args: argparse.Namespace) -> int:
     """Download one cell as an octree, NPZ, PLY or view, by the output's suffix."""
     api, name = api_of(args.map, args.token)
     output: Path = args.output
@@ -37,16 +89,17 @@ def get_cell(args: argparse.Namespace) -> None:
         data, _ = cell_file(suffix[1:], key, decoded.evidence, info.geometry, model)
     output.write_bytes(data)
     say(f"cell {cell}: {len(decoded.evidence)} known voxels, {shown_bytes(len(data))} in {output}")
+    return 0
 
 
-def export_map(args: argparse.Namespace) -> None:
+def _export(args: argparse.Namespace) -> int:
     """Download all cells, and write what was asked for."""
-    if is_part(args):
+    if _is_part(args):
         _check_outputs(*(getattr(args, form) for form in FORMATS))
         api, name = api_of(args.map, args.token)
         with api:
-            export_part(api, name, args)
-        return
+            _export_part(api, name, args)
+        return 0
     if not (args.cells or args.ply or args.npz or args.picture):
         raise BadInputError("nothing_asked", "say what to write: --cells DIR, --ply FILE, --npz FILE or --picture FILE")
     _check_outputs(args.ply, args.npz, args.picture)
@@ -60,7 +113,7 @@ def export_map(args: argparse.Namespace) -> None:
             write_cell(args.cells, cell_of_key(cell.key), body)
         say(f"{len(cells)} cells in {args.cells}/")
     if not (args.ply or args.npz or args.picture):
-        return
+        return 0
     if not cells:
         raise NotFoundError("empty_map", f"map {name} holds nothing yet")
     if args.npz:
@@ -75,6 +128,7 @@ def export_map(args: argparse.Namespace) -> None:
             edge_m = info.geometry.voxel_edge_m
             write_map_picture(args.picture, occupied, voxel_edge_m=edge_m, ceiling_m=args.ceiling)
             say(f"{args.picture}: {len(occupied)} occupied voxels")
+    return 0
 
 
 def fetch_map(api: MapApi, name: str) -> Iterator[tuple[bytes, DecodedCell]]:
@@ -106,3 +160,64 @@ def _voxels(cell: DecodedCell, info: MapInfo, *, occupied_only: bool) -> Voxels:
 def _write(path: Path, data: bytes) -> None:
     path.write_bytes(data)
     say(f"{path}: {shown_bytes(len(data))}")
+
+
+def _is_part(args: argparse.Namespace) -> bool:
+    """True if the server is asked for points, not for whole cells."""
+    only_parts = (args.pcd, args.laz, args.ot, args.bt)
+    asked = (args.box, args.floor, args.p, args.hotter, args.colder, args.depth)
+    if any(value is not None for value in (*only_parts, *asked)):
+        return True
+    # With a picture the ceiling is the picture's, and files are of the whole map.
+    return args.ceiling is not None and args.picture is None and (args.ply is not None or args.npz is not None)
+
+
+def _export_part(api: MapApi, name: str, args: argparse.Namespace) -> None:
+    """Write the part as each of the files that are asked for.
+
+    Raises:
+        BadInputError: kind `bad_option`: a number is out of its range, or the option is not for parts.
+    """
+    if args.cells or args.picture:
+        raise BadInputError("bad_option", "--cells and --picture are of the whole map: run the command once for each")
+    if not any(getattr(args, form) for form in FORMATS):
+        raise BadInputError("nothing_asked", f"say what to write: {', '.join(f'--{form} FILE' for form in FORMATS)}")
+    about = {
+        **{"box": args.box, "floor_m": args.floor, "ceiling_m": args.ceiling, "p": args.p or 0.0, "depth": args.depth},
+        **{"hotter_k": _kelvin(args.hotter), "colder_k": _kelvin(args.colder)},
+    }
+    for form in FORMATS:
+        path: Path | None = getattr(args, form)
+        if path is not None:
+            try:
+                asked = ExportRequest.model_validate({"format": form, **about})
+            except ValidationError as exc:
+                raise BadInputError("bad_option", f"no such part: {first_error(exc)}") from exc
+            asked.bounds_m()
+            say(f"{path}: {shown_bytes(export_points(api, name, asked, path))}")
+
+
+def _kelvin(celsius: float | None) -> float | None:
+    return None if celsius is None else celsius + ZERO_CELSIUS_K
+
+
+def export_points(api: MapApi, name: str, asked: ExportRequest, path: Path) -> int:
+    """Occupied nodes of a map as a file, written as it comes; its size in bytes.
+
+    What was there under this name stays until the new file is whole.
+
+    Raises:
+        UnreachableError: the link broke.
+        BadInputError: the server refuses what is asked for.
+    """
+    query = urlencode(asked.model_dump(mode="json", exclude_none=True))
+    part = path.with_name(f"{path.name}.part")
+    try:
+        with part.open("wb") as file:
+            for data in api.stream(f"/maps/{name}/main/export?{query}"):
+                file.write(data)
+        size_bytes = part.stat().st_size
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    return size_bytes

@@ -5,8 +5,8 @@
     $ cairn pull lab
     lab: up to date
 
-It pushes nothing. A robot's own folder, with commits that wait, is brought up to date by `cairn robot sync DIR`; and
-`cairn robot pull --map URL --state DIR` makes such a folder, of a part of the map if need be.
+It pushes nothing. A robot's own folder, with commits that wait, is brought up to date by `cairn robot sync DIR`, which
+with --map also makes such a folder, of a part of the map if need be.
 """
 
 import json

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cairn_client.cli.arguments import allow_negative_lists, say
+from cairn_client.cli.arguments import Subparsers, say
 from cairn_client.cli.robot_arguments import box, place
 from cairn_client.folders.map_folder import open_map
 from cairn_map.evidence.channels import ChannelKind
@@ -37,22 +37,22 @@ from cairn_map.queries.occupancy_states import State
 
 ZERO_CELSIUS_K = 273.15
 WIDTH = 100
-"""Of a slice on a terminal, in characters."""
+"""Widest slice on a terminal, in characters."""
 SIGNS = {State.UNKNOWN: " ", State.FREE: ".", State.OCCUPIED: "#"}
 Answer = Callable[[MapSnapshot, argparse.Namespace], tuple[Any, list[str]]]
-"""What a question says as JSON, and as lines for people."""
+"""Answer to a question, as JSON and as lines for people."""
 
 
-def add_query_arguments(query: argparse.ArgumentParser) -> None:
-    """The questions, each a subcommand."""
-    query.description, query.formatter_class = __doc__, argparse.RawDescriptionHelpFormatter
-    query.add_argument("folder", type=Path, help="of cells, or a robot's state")
+def add_parser(commands: Subparsers) -> None:
+    """Add the subcommand, each of whose questions is a subcommand in turn."""
+    text = "ask a map that lies in a folder, without a server"
+    query = commands.add_parser("query", help=text, description=__doc__)
+    query.add_argument("folder", type=Path, help="cells, or a robot's state")
     query.set_defaults(run=_run)
     questions = query.add_subparsers(required=True, metavar="QUESTION")
 
     def question(name: str, text: str, answer: Answer) -> argparse.ArgumentParser:
         added = questions.add_parser(name, help=text, description=text)
-        allow_negative_lists(added)
         added.add_argument("--json", action="store_true", help="print JSON")
         added.set_defaults(answer=answer)
         return added
@@ -77,11 +77,12 @@ def add_query_arguments(query: argparse.ArgumentParser) -> None:
         limited.add_argument("--box", type=box, metavar="X0,Y0,Z0,X1,Y1,Z1", help="only in this box, metres")
 
 
-def _run(args: argparse.Namespace) -> None:
+def _run(args: argparse.Namespace) -> int:
     answer: Answer = args.answer
     found, lines = answer(open_map(args.folder), args)
     for line in [json.dumps(found)] if args.json else lines:
         say(line)
+    return 0
 
 
 def _points(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
@@ -153,7 +154,7 @@ def _or_none(value: float) -> float | None:
 
 
 def _value(reading: Reading, n: int) -> dict[str, Any] | None:
-    """What a channel says of a voxel, with its unit; None if nothing."""
+    """Reading of one voxel in a channel, with its unit; None if there is none."""
     if not reading.weight[n]:
         return None
     value = {"mean": reading.mean[n].tolist(), "unit": reading.channel.unit, "weight": int(reading.weight[n])}

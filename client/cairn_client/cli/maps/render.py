@@ -30,9 +30,8 @@ from urllib.parse import urlencode
 
 import numpy as np
 
-from cairn_client.cli.arguments import add_token, allow_negative_lists, api_of, say
-from cairn_client.cli.robot_arguments import place
-from cairn_client.cli.spread_arguments import add_spread_arguments, spread_of
+from cairn_client.cli.arguments import Subparsers, add_token, api_of, say
+from cairn_client.cli.robot_arguments import add_spread_arguments, place, spread_of
 from cairn_client.folders.map_folder import FolderMap, map_of_folder
 from cairn_map.errors import BadInputError
 from cairn_map.render.map_picture import arrays_of, layer_picture, layer_values, npz_of
@@ -43,10 +42,10 @@ from cairn_map.render.render_request import RenderRequest, request_from
 THREADS = 2
 
 
-def add_render_arguments(render: argparse.ArgumentParser) -> None:
-    """What to look at, from where, and what to write."""
-    render.description, render.formatter_class = __doc__, argparse.RawDescriptionHelpFormatter
-    allow_negative_lists(render)
+def add_parser(commands: Subparsers) -> None:
+    """Add the subcommand."""
+    text = "draw a map from a pose, or over a camera's image"
+    render = commands.add_parser("render", help=text, description=__doc__)
     render.add_argument("map", metavar="URL|DIR", help="http://HOST:PORT/maps/NAME, or a folder")
     render.add_argument("-o", "--output", type=Path, metavar="FILE", help="PNG")
     render.add_argument(
@@ -71,7 +70,7 @@ def add_render_arguments(render: argparse.ArgumentParser) -> None:
     render.set_defaults(run=_run)
 
 
-def _run(args: argparse.Namespace) -> None:
+def _run(args: argparse.Namespace) -> int:
     if args.output is None and args.npz is None:
         raise BadInputError("nothing_asked", "say what to write: -o FILE.png, or --npz FILE")
     is_url = args.map.startswith(("http://", "https://"))
@@ -83,12 +82,13 @@ def _run(args: argparse.Namespace) -> None:
             _ask_server(args, request)
         else:
             _look(args, request, _folder_map(args))
-        return
+        return 0
     if is_url:
         raise BadInputError(
             "bad_option", "an overlay needs the map here: `cairn clone URL DIR`, and then DIR for the URL"
         )
     _draw_over(args, _folder_map(args))
+    return 0
 
 
 def _folder_map(args: argparse.Namespace) -> FolderMap:

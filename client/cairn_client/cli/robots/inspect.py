@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from cairn_client.cli.arguments import say, shown_bytes
+from cairn_client.cli.arguments import Subparsers, say, shown_bytes
 from cairn_map.errors import ConflictError
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def _topic_json(topic: "TopicIndex") -> dict[str, object]:
     }
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_parser(commands: Subparsers) -> None:
     """Add the subcommand."""
     inspect = commands.add_parser(
         "inspect",

@@ -7,13 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cairn_client.cli.arguments import (
-    api_of,
-    say,
-    shown_bytes,
-    shown_length,
-    with_progress,
-)
+from cairn_client.cli.arguments import Subparsers, api_of, say, shown_bytes, shown_length
 from cairn_client.cli.frame_arguments import add_frame_arguments, frame_options
 from cairn_client.cli.robot_arguments import add_map, scope_of
 from cairn_client.http.api import MapApi
@@ -27,6 +21,7 @@ from cairn_map.commits.commit import Commit
 from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError, UnreachableError
 from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel
 from cairn_map.evidence.grid import Geometry, geometry_for
+from cairn_map.progress import with_progress
 from cairn_map.wire.messages import CreateMap
 
 log = logging.getLogger(__name__)
@@ -88,7 +83,7 @@ def _replay(args: argparse.Namespace) -> int:
         f"{shown_bytes(traffic.up_bytes)} up, {shown_bytes(traffic.down_bytes)} down, {waiting} commits wait"
     )
     if not is_linked:
-        say(f"no link to {args.map}: `cairn robot pull --map URL --state {state}` pushes them when there is one")
+        say(f"no link to {args.map}: `cairn robot sync {state} --map URL` pushes them when there is one")
     return 0
 
 
@@ -170,7 +165,7 @@ def default_name(text: str) -> str:
     return name[:32] or "robot"
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_parser(commands: Subparsers) -> None:
     """Add the subcommand."""
     replay = commands.add_parser("replay", help="map a recording", description="map a recording")
     add_map(replay)

@@ -21,7 +21,7 @@ import threading
 from dataclasses import dataclass
 from pathlib import Path
 
-from cairn_client.cli.arguments import say, shown_bytes
+from cairn_client.cli.arguments import Subparsers, say, shown_bytes
 from cairn_client.cli.event_lines import lines_on_stderr, until_signal
 from cairn_client.cli.robot_arguments import add_limits, add_map, limits_of, scope_of
 from cairn_client.cli.robots.replay import default_name, ensure_map
@@ -50,7 +50,7 @@ class _Tally:
     commits: int = 0
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_parser(commands: Subparsers) -> None:
     """Add the subcommand."""
     run = commands.add_parser("run", help="map what comes into a folder, until a signal", description=__doc__)
     run.add_argument("spool", type=Path, metavar="SPOOL", help="the folder that recordings come into")

@@ -23,6 +23,7 @@ picture of it, with all options: `cairn map render --over`.
 """
 
 import argparse
+import logging
 import math
 import time
 from collections.abc import Iterable, Iterator
@@ -31,12 +32,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from cairn_client.cli.arguments import add_token, allow_negative_lists, api_of, parser, say, with_progress
+from cairn_client.cli.arguments import add_token, api_of, parser, say
 from cairn_client.cli.frame_arguments import add_frame_arguments, frame_options
 from cairn_client.cli.maps.overlay_drawing import MapOverlay
-from cairn_client.cli.robots.view_publishing import publish_views
-from cairn_client.cli.spread_arguments import add_spread_arguments, spread_of
+from cairn_client.cli.robot_arguments import add_spread_arguments, spread_of
 from cairn_client.folders.map_folder import map_of_folder
+from cairn_client.http.api import MapApi
 from cairn_fusion.importers import open_source
 from cairn_fusion.recording.images import write_colour
 from cairn_fusion.recording.recording import ScanSource
@@ -45,8 +46,12 @@ from cairn_fusion.view.overlay import OverlayStyle
 from cairn_fusion.view.painting import Emphasis
 from cairn_fusion.view.telepresence import Telepresence, ViewMode, ViewOptions
 from cairn_fusion.view.temperature_scale import ZERO_CELSIUS_K, TemperatureScale
-from cairn_map.errors import BadInputError
+from cairn_map.arrays import Rgb
+from cairn_map.errors import BadInputError, UnreachableError
+from cairn_map.progress import with_progress
 from cairn_map.render.render_picture import Layer, Scale
+
+log = logging.getLogger(__name__)
 
 RATE_HZ = 5.0
 ALPHA = 0.5
@@ -277,5 +282,28 @@ def _parser() -> argparse.ArgumentParser:
     options.add_argument("--no-marker", action="store_true", help="do not mark the hottest place")
     options.add_argument("--rate", type=_rate, default=RATE_HZ, metavar="HZ", help=f"pictures a second ({RATE_HZ:g})")
     add_frame_arguments(options)
-    allow_negative_lists(options)
     return options
+
+
+def publish_views(pictures: Iterable[Rgb], api: MapApi, map_name: str, branch: str) -> tuple[int, int]:
+    """Send pictures, (H, W, 3) uint8, R, G, B, as they come; how many went through, and how many did not.
+
+    Raises:
+        CairnError: the server refuses them: the robot is not registered, or this is not its token.
+    """
+    latest = Latest()
+    sent = lost = 0
+    again_s = -math.inf
+    for picture in pictures:
+        if time.monotonic() < again_s:
+            lost += 1
+            continue
+        latest.show(picture)
+        try:
+            api.put_view(map_name, branch, latest.jpeg)
+            sent += 1
+        except UnreachableError as exc:
+            lost += 1
+            again_s = time.monotonic() + (exc.retry_after_s or 0.0)
+            log.warning("picture %d of %s was not sent: %s", sent + lost, branch, exc.message)
+    return sent, lost

@@ -35,10 +35,11 @@ from cairn_calib.verify.target_pictures import TILES_MAX, target_tile, tile_shee
 from cairn_calib.verify.verification import CENTROID_SIGMA_PX, Sightings, add_sights, find_targets, range_camera_of
 from cairn_calib.verify.verification_report import verification_json, verification_page
 from cairn_calib.verify.verification_table import table_of, table_text
-from cairn_client.cli.arguments import parser, say, with_progress
+from cairn_client.cli.arguments import parser, say
 from cairn_fusion.recording.recording import open_recording
 from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import BadInputError, NotFoundError
+from cairn_map.progress import with_progress
 
 Image = npt.NDArray[np.generic]
 

@@ -1,0 +1,140 @@
+"""`cairn map create`: a new map, empty or from prior data: a folder of cells, or another map.
+
+Prior data are the map's first commits, of author `initial`. They are commits like any other: every robot gets them by
+ordinary sync, and a retract takes them out again.
+"""
+
+import argparse
+import hashlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from cairn_client.cli.arguments import Subparsers, add_map_parser, api_of, say, shown_length
+from cairn_client.cli.maps.map_export import fetch_map
+from cairn_client.http.api import MapApi
+from cairn_map.codec.cell_code import DecodedCell
+from cairn_map.commits.commit import Commit, CommitMeta, make_commit
+from cairn_map.commits.ids import INITIAL, Author, CommitId, Incarnation
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
+from cairn_map.evidence.grid import Geometry, geometry_for
+from cairn_map.files.cell_folder import FolderHead, read_cells, read_head
+from cairn_map.wire.messages import CreateMap, MapInfo
+
+CELLS_A_COMMIT = 16
+"""Cells of prior data in one commit, which stays far below a commit's largest size."""
+CHANNELS = {"colour": COLOUR, "intensity": INTENSITY, "temperature": TEMPERATURE}
+
+
+def add_parser(commands: Subparsers) -> None:
+    """Add the subcommand."""
+    create = add_map_parser(commands, "create", _create, text="create a map, empty or from prior data")
+    create.add_argument("--voxel", type=float, default=0.04, metavar="METRES", help="voxel edge (0.04)")
+    create.add_argument("--channels", default="colour,intensity,temperature", help="scalars as NAME:UNIT:STEP")
+    create.add_argument("--from", dest="source", metavar="DIR|URL", help="folder of cells, or another map's URL")
+
+
+def _create(args: argparse.Namespace) -> int:
+    api, name = api_of(args.map, args.token)
+    geometry = _geometry(args)
+    if args.source is not None:
+        with api:
+            info, count, added = push_prior_data(api, name, args.source, token=args.token)
+        say_map(info)
+        say(f"started from {args.source}: {count} cells, as the commit of author `initial`")
+        if added < count:
+            say(f"{count - added} of them were pushed before, and are not added again (nor if they were retracted)")
+        return 0
+    with api:
+        made = api.create_map(name, CreateMap(geometry=geometry))
+    say_map(made)
+    return 0
+
+
+def say_map(info: MapInfo) -> None:
+    """Write a line about a map: its voxels, cells and channels."""
+    geometry = info.geometry
+    names = ", ".join(channel.name for channel in geometry.channels) or "none but occupancy"
+    say(
+        f"map {info.name}: voxels of {shown_length(geometry.voxel_edge_m)}, "
+        f"cells of {geometry.cell_edge_m:g} m, channels {names}"
+    )
+
+
+def push_prior_data(api: MapApi, name: str, source: str, *, token: str | None) -> tuple[MapInfo, int, int]:
+    """Create a map with the grid and the evidence of a folder or another map; returns it, the
+    count of cells, and how many of them were added.
+
+    It may be repeated after a cut link: evidence that is there already is not added again.
+
+    Raises:
+        BadInputError: the source is neither a folder of cells nor a map's URL.
+        ConflictError: the map exists with another grid.
+    """
+    head, cells = _open(source, token)
+    api.create_map(name, CreateMap(geometry=head.geometry, sensor_model=head.sensor_model))
+    count = added = 0
+    author: Author | None = None
+    for n, group in enumerate(_groups(cells)):
+        author = author or Author(INITIAL, _incarnation(group))
+        pushed = api.push(name, _commit(CommitId(author, n), group, head.geometry))
+        count += len(group)
+        added += len(group) if pushed.state == "new" else 0
+    return api.map_info(name), count, added
+
+
+def _open(source: str, token: str | None) -> tuple[FolderHead, Iterable[DecodedCell]]:
+    if "://" not in source:
+        head = read_head(Path(source))
+        return head, read_cells(Path(source), head.geometry)
+    api, name = api_of(source, token)
+    info = api.map_info(name)
+    return FolderHead(geometry=info.geometry, sensor_model=info.sensor_model), _fetched(api, name)
+
+
+def _fetched(api: MapApi, name: str) -> Iterator[DecodedCell]:
+    with api:
+        for _, cell in fetch_map(api, name):
+            yield cell
+
+
+def _groups(cells: Iterable[DecodedCell]) -> Iterator[list[DecodedCell]]:
+    group: list[DecodedCell] = []
+    for cell in cells:
+        if len(cell.evidence):
+            group.append(cell)
+        if len(group) == CELLS_A_COMMIT:
+            yield group
+            group = []
+    if group:
+        yield group
+
+
+def _incarnation(cells: list[DecodedCell]) -> Incarnation:
+    """An incarnation that follows from the first commit's evidence, so that doing it again adds nothing."""
+    return Incarnation(hashlib.sha256(b"".join(cell.digest for cell in cells)).hexdigest()[:16])
+
+
+def _commit(commit: CommitId, cells: list[DecodedCell], geometry: Geometry) -> Commit:
+    meta = CommitMeta(id=str(commit), geometry=geometry.digest().hex(), note="prior data")
+    return make_commit(meta, {cell.key: cell.evidence for cell in cells}, geometry)
+
+
+def _geometry(args: argparse.Namespace) -> Geometry:
+    channels = tuple(_channel(text) for text in args.channels.split(",")) if args.channels else ()
+    return geometry_for(voxel_edge_m=args.voxel, channels=channels)
+
+
+def _channel(text: str) -> Channel:
+    """`colour`, `intensity`, `temperature`, or a scalar `name:unit:step`."""
+    if text in CHANNELS:
+        return CHANNELS[text]
+    name, *rest = text.split(":")
+    try:
+        unit, step = rest
+        return Channel(kind=ChannelKind.SCALAR, name=name, unit=unit, step=float(step))
+    except ValueError as exc:
+        raise BadInputError(
+            "bad_channel",
+            f"a channel is {', '.join(CHANNELS)}, or a scalar NAME:UNIT:STEP such as dose:uSv/h:0.01; got {text!r}",
+        ) from exc
