@@ -1,15 +1,15 @@
-"""Compile the kernels ahead, so that the first start is not slow.
+"""Compile the kernels in advance, so that the first start is not slow.
 
     $ cairn compile
     compiling kernels, only this once: pull_samples, 9 of 43, 12 s
     fusion: ready after 3.6 s
     map: ready after 1.8 s
     sim: ready after 6.9 s
-    $ cairn compile map     # that package's alone: on several cores, one command for each
+    $ cairn compile map     # those of one package: on several cores, run one command for each
 
-The first line is on standard error, and goes when the kernel is ready. Numba compiles a kernel when it is first
-called, and keeps the result in __pycache__ beside the source, or in the folder that NUMBA_CACHE_DIR names. A second
-call only reads what the first one kept.
+The first line is on standard error, and is taken away when the kernel is ready. Numba compiles a kernel when it is
+first called, and keeps the result in __pycache__ next to the source, or in the folder that NUMBA_CACHE_DIR names. A
+second run reads what the first one kept.
 """
 
 import sys

@@ -15,8 +15,8 @@
     ok    speed         48.1 MB/s down: a cell of 212.0 kB in 4 ms
 
 Without an argument, the installation alone; with a server's or a map's URL, the way there as well; with a state folder
-(of a robot, or of `cairn clone`), what is in it, and of a copy the way to its server. Lines that are not `ok` have the
-next step below them. It ends with 0 if nothing failed (warnings may be there), else with 1.
+(of a robot, or of `cairn clone`), what is in it, and of a copy the way to its server. A line that is
+not `ok` has the next step below it. The exit code is 0 if nothing failed (there may be warnings), else 1.
 """
 
 import json
@@ -24,7 +24,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from cairn_client.cli.arguments import add_token, parser, say
-from cairn_client.cli.doctor_checks import Check, Verdict, disk_check, installation_checks
+from cairn_client.cli.doctor_checks import Check, CheckResult, disk_check, installation_checks
 from cairn_client.cli.doctor_link import folder_checks, server_checks
 from cairn_client.folders.state_folder import opened_replica
 from cairn_client.http.map_url import split_map_url
@@ -35,7 +35,7 @@ SOUND, ILL = 0, 1
 
 
 def main(argv: list[str]) -> int:
-    """Check."""
+    """Run the checks."""
     command = parser("cairn doctor", __doc__)
     command.add_argument("target", nargs="?", metavar="URL|DIR", help="a server, a map, or a state folder")
     command.add_argument("--json", action="store_true", help="print JSON")
@@ -48,7 +48,7 @@ def main(argv: list[str]) -> int:
             _show(check)
     if args.json:
         say(json.dumps([check.as_json() for check in checks]))
-    return ILL if any(check.verdict is Verdict.FAIL for check in checks) else SOUND
+    return ILL if any(check.verdict is CheckResult.FAIL for check in checks) else SOUND
 
 
 def _checks(target: str | None, token: str | None) -> Iterator[Check]:

@@ -1,4 +1,4 @@
-"""What can be wrong with an installation, one check a function: what was found, and what to do about it."""
+"""Checks of an installation, a function each: Python, cairn, extras, kernels, and room on the disk."""
 
 import platform
 import shutil
@@ -23,16 +23,16 @@ EXTRAS: Mapping[str, tuple[str, str]] = {
     "fastapi": ("server", "`cairn serve` does not start"),
     "uvicorn": ("server", "`cairn serve` does not start"),
 }
-"""Modules, the extra that brings each, and what is missed without."""
+"""Optional modules: the extra that brings each, and the functions that fail without it."""
 DISK_WARN_BYTES, DISK_FAIL_BYTES = 2 << 30, 64 << 20
 
 
-class Verdict(StrEnum):
-    """How a check ended."""
+class CheckResult(StrEnum):
+    """Result of a check."""
 
     OK = "ok"
     WARN = "warn"
-    """It works, but not well, or not all of it."""
+    """It works, but badly or in part."""
     FAIL = "fail"
 
 
@@ -41,7 +41,7 @@ class Check:
     """One line of the doctor's report."""
 
     what: str
-    verdict: Verdict
+    verdict: CheckResult
     found: str
     advice: str = ""
     """The next step, where one is needed."""
@@ -52,7 +52,7 @@ class Check:
 
 
 def installation_checks() -> Iterator[Check]:
-    """Python, cairn, what optional commands need, and kernels."""
+    """Checks of Python, cairn, the libraries of optional commands, and kernels."""
     yield _python()
     yield _cairn()
     yield from _extras()
@@ -67,39 +67,41 @@ def disk_check(folder: Path) -> Check:
     free = shutil.disk_usage(place).free
     found = f"{shown_bytes(free)} free at {place}"
     if free < DISK_FAIL_BYTES:
-        return Check("disk", Verdict.FAIL, found, "make room: a robot that cannot write cannot keep its commits")
+        return Check("disk", CheckResult.FAIL, found, "make room: a robot that cannot write cannot keep its commits")
     if free < DISK_WARN_BYTES:
-        return Check("disk", Verdict.WARN, found, "make room soon; a day's commits may take gigabytes")
-    return Check("disk", Verdict.OK, found)
+        return Check("disk", CheckResult.WARN, found, "make room soon; a day's commits may take gigabytes")
+    return Check("disk", CheckResult.OK, found)
 
 
 def _python() -> Check:
     found = f"{platform.python_version()} on {platform.machine()}"
     if sys.version_info < PYTHON_MIN:
-        return Check("python", Verdict.FAIL, found, f"cairn needs Python {'.'.join(map(str, PYTHON_MIN))} or later")
-    return Check("python", Verdict.OK, found)
+        return Check("python", CheckResult.FAIL, found, f"cairn needs Python {'.'.join(map(str, PYTHON_MIN))} or later")
+    return Check("python", CheckResult.OK, found)
 
 
 def _cairn() -> Check:
     try:
-        return Check("cairn", Verdict.OK, version(PACKAGE))
+        return Check("cairn", CheckResult.OK, version(PACKAGE))
     except PackageNotFoundError:
-        return Check("cairn", Verdict.WARN, "runs from its sources", f"pip install {PACKAGE}, to have `cairn` itself")
+        return Check(
+            "cairn", CheckResult.WARN, "runs from its sources", f"pip install {PACKAGE}, to have `cairn` itself"
+        )
 
 
 def _extras() -> Iterator[Check]:
     for extra in sorted({extra for extra, _ in EXTRAS.values()}):
         missing = {name: what for name, (of, what) in EXTRAS.items() if of == extra and find_spec(name) is None}
         if not missing:
-            yield Check(f"extra {extra}", Verdict.OK, "all there")
+            yield Check(f"extra {extra}", CheckResult.OK, "all there")
             continue
         lacks = "; ".join(sorted(set(missing.values())))
         found = f"{', '.join(missing)} missing: {lacks}"
-        yield Check(f"extra {extra}", Verdict.WARN, found, f'pip install "{PACKAGE}[{extra}]" if you need it')
+        yield Check(f"extra {extra}", CheckResult.WARN, found, f'pip install "{PACKAGE}[{extra}]" if you need it')
 
 
 def _kernels() -> Check:
-    """How many of a robot's kernels are compiled and kept: those with an index file where Numba looks for one."""
+    """Count of a robot's kernels that are compiled and kept: those with an index file where Numba looks for one."""
     for point in entry_points(group=WARM_UPS):
         if not point.extras:
             point.load()
@@ -108,5 +110,5 @@ def _kernels() -> Check:
     found = f"{ready} of {len(kernels)} compiled"
     if ready < len(kernels):
         advice = "`cairn compile` compiles them now, half a minute; else the first scans wait for it"
-        return Check("kernels", Verdict.WARN, found, advice)
-    return Check("kernels", Verdict.OK, found)
+        return Check("kernels", CheckResult.WARN, found, advice)
+    return Check("kernels", CheckResult.OK, found)

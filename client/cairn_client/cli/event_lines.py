@@ -26,7 +26,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def event_line(event: Event) -> str:
-    """What happened, in a line."""
+    """An event as one line."""
     match event:
         case Committed(commit=commit, cells=cells, size_bytes=size_bytes):
             return f"committed {commit}: {len(cells)} cells, {shown_bytes(size_bytes)}"

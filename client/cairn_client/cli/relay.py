@@ -7,10 +7,10 @@
 
 Each place gets what it lacks and the other has, and a repetition changes nothing. A place is a map's URL or a folder;
 two URLs join two servers, with --every SECONDS until stopped. Servers take commits from a token of role relay (`cairn
-token create URL NAME --role relay --map MAP`), and only as they were signed: whoever carries them can change none
-and add none in the name of a robot whose key it has not; of robots that it invents, `cairn map log --json` says by
-whom they came (`via`). `cairn serve --upstream` does the same for all maps of a server. Ends with 1 if something could
-not be handed over; the log says what, and why.
+token create URL NAME --role relay --map MAP`), and only as they were signed: a relay can change none, and add none in
+the name of a robot whose key it does not have; a robot that a relay invents is recognised in `cairn map log --json` by
+the relay that brought it (`via`). `cairn serve --upstream` does the same for all maps of a server. The exit code is 1
+if something could not be handed over; the log gives the reason.
 """
 
 import argparse
@@ -36,9 +36,9 @@ log = logging.getLogger(__name__)
 
 TOKENS = ("CAIRN_TOKEN", "CAIRN_TOKEN_THERE")
 CUTS_MAX = 6
-"""Rounds that break, one after the other, without a commit, or a part of one, that moved."""
+"""Most rounds in a row that break without moving a commit or a part of one."""
 WAIT_MAX_S = 60.0
-"""Who should come back later than this is told so."""
+"""Longest wait that a server may ask for; a longer one ends the command with the server's error."""
 FOLDER_MB = 10_000.0
 MEGABYTE = 1e6
 
@@ -71,7 +71,7 @@ def main(argv: list[str]) -> int:
 
 
 def _once(here: MapEnd, there: MapEnd, resting: Resting, *, map_name: str, where: str) -> RelayReport:
-    """Rounds until there is nothing more to hand over; what all of them did."""
+    """Rounds until there is nothing more to hand over; the sum of their reports."""
     total, backoff, cuts = RelayReport(has_more=True), Backoff(), 0
     while total.has_more:
         report = hold_between(relay_round(resting), here, there)

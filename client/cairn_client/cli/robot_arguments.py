@@ -1,4 +1,4 @@
-"""Arguments that the robot's commands share."""
+"""Arguments that the robot's commands share: map, part of it, limits, places, uncertainty of a pose."""
 
 import argparse
 
@@ -13,14 +13,14 @@ from cairn_map.render.pose_spread import PoseSpread
 
 
 def add_map(command: argparse.ArgumentParser) -> None:
-    """Which map, as whom, and how much of it."""
+    """Add the map, the robot's name, and the options of `add_amount`."""
     command.add_argument("--map", required=True, metavar="URL", help="http://HOST:PORT/maps/NAME")
     command.add_argument("--name", help="the robot's name on the map")
     add_amount(command)
 
 
 def add_amount(command: argparse.ArgumentParser) -> None:
-    """How much of the map, and the token."""
+    """Add options that bound the part of the map that is fetched, and the token."""
     command.add_argument("--box", type=box, metavar="X0,Y0,Z0,X1,Y1,Z1", help="fetch only cells in it, metres")
     command.add_argument(
         "--reply-bytes", type=int, metavar="BYTES", help="of cells in one reply; the rest comes in the next ones"
@@ -35,14 +35,14 @@ def add_amount(command: argparse.ArgumentParser) -> None:
 
 
 def scope_of(args: argparse.Namespace) -> Scope:
-    """What of the map to fetch."""
+    """Part of the map to fetch, as the options say."""
     if args.reply_bytes is not None and args.mode == "low-end":
         raise BadInputError("bad_option", "--reply-bytes bounds the answers with differences; low-end fetches cells")
     return Scope(box_m=(args.box[:3], args.box[3:]) if args.box else None, reply_bytes_max=args.reply_bytes)
 
 
 def add_limits(command: argparse.ArgumentParser) -> None:
-    """How much the robot may keep, megabytes (10^6)."""
+    """Add options that bound what the robot keeps, in megabytes (10^6 bytes)."""
     for name, what in (
         ("disk", "of the robot's file: then the server's farthest cells go"),
         ("memory", "of the map in memory: likewise"),
@@ -85,7 +85,7 @@ def add_spread_arguments(options: argparse.ArgumentParser) -> None:
 
 
 def spread_of(args: argparse.Namespace) -> PoseSpread:
-    """How certain a pose is, as `--covariance` or `--sigma` says.
+    """Uncertainty of a pose, as `--covariance` or `--sigma` says.
 
     Raises:
         BadInputError: kind `bad_pose`: it is no covariance.

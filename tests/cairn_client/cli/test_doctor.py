@@ -7,7 +7,7 @@ from tests.fixtures.client.made import A, opened, seen
 from tests.fixtures.server.live import Live
 
 from cairn_client.cli.doctor import main
-from cairn_client.cli.doctor_checks import Verdict
+from cairn_client.cli.doctor_checks import CheckResult
 from cairn_client.cli.doctor_link import clock_check
 from cairn_client.folders.map_copy import clone
 from cairn_client.robot.robot import Robot
@@ -85,7 +85,13 @@ def test_a_token_that_is_not_good_fails(tmp_path: Path, capsys: pytest.CaptureFi
 
 @pytest.mark.parametrize(
     ("offset_s", "verdict"),
-    [(0.4, Verdict.OK), (-4.0, Verdict.OK), (30.0, Verdict.WARN), (-7200.0, Verdict.FAIL), (None, Verdict.WARN)],
+    [
+        (0.4, CheckResult.OK),
+        (-4.0, CheckResult.OK),
+        (30.0, CheckResult.WARN),
+        (-7200.0, CheckResult.FAIL),
+        (None, CheckResult.WARN),
+    ],
 )
-def test_clocks_may_differ_by_seconds_but_not_by_hours(offset_s: float | None, verdict: Verdict) -> None:
+def test_clocks_may_differ_by_seconds_but_not_by_hours(offset_s: float | None, verdict: CheckResult) -> None:
     assert clock_check(offset_s, 0.01).verdict is verdict

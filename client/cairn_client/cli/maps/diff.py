@@ -1,4 +1,4 @@
-"""What differs between two maps: a copy and its server, two servers, two folders.
+"""Compare two maps: a copy and its server, two servers, two folders.
 
     $ cairn diff lab                                     # a copy against the server that it is from
     equal: 34 cells, 412873 voxels
@@ -11,7 +11,7 @@
 
 A and B are a map's URL, a folder of `cairn clone`, a robot's state folder (commits that wait are part of its map), or a
 folder of `cairn map export --cells`. Cells are compared by their fingerprints: none is downloaded.
-As diff, it ends with 0 if they are equal and with 1 if they are not, or if it cannot be told.
+As with diff, the exit code is 0 if they are equal, and 1 if they are not or if they cannot be compared.
 """
 
 import argparse
@@ -29,7 +29,7 @@ SHOWN = 12
 
 
 def main(argv: list[str]) -> int:
-    """Compare."""
+    """Compare the two maps."""
     command = parser("cairn diff", __doc__)
     command.add_argument("a", metavar="A", help="URL or folder")
     command.add_argument("b", metavar="B", nargs="?", help="URL or folder (the server that A is a copy of)")
@@ -67,7 +67,7 @@ def _show(a: Side, b: Side, found: Difference) -> None:
 
 
 def _commits_line(found: Difference) -> str:
-    """Equal cells by other commits, such as one and the retract of it."""
+    """Note on commits that only one side has, though all cells are equal: one and its retract, for example."""
     if not found.commits_only_a and not found.commits_only_b:
         return ""
     return f"; of {found.commits_only_a} commits only A, of {found.commits_only_b} only B knows"

@@ -1,4 +1,4 @@
-"""Two maps side by side, wherever each is: which cells and commits only one of them has, and which cells differ.
+"""Two maps side by side: the cells and commits that only one of them has, and the cells that differ.
 
 http://HOST:PORT/maps/NAME     a server's map, by its cell index; no cell is downloaded
 DIR with robot.sqlite          a copy's or robot's folder: the map that it sees, commits that wait included
@@ -26,20 +26,20 @@ class SideCell:
 
     fingerprint: Fingerprint
     voxels: int
-    """Known ones."""
+    """Known voxels."""
     size_bytes: int
 
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """One map."""
+    """One of two maps that are compared."""
 
     name: str
     geometry: Geometry
     cells: Mapping[CellKey, SideCell]
-    """Those that hold evidence."""
+    """Cells that hold evidence."""
     commits: VersionVector | None
-    """In it; None: not known."""
+    """Commits in the map; None: unknown."""
 
     @property
     def voxels(self) -> int:
@@ -54,19 +54,19 @@ class Side:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """What two sides do not have in common."""
+    """Cells and commits that two sides do not have in common."""
 
     only_a: list[CellKey]
     only_b: list[CellKey]
     other: list[CellKey]
-    """In both, with other evidence."""
+    """Cells in both, with different evidence."""
     commits_only_a: int | None
-    """None: one of the sides does not know its commits."""
+    """Count; None if one of the sides does not know its commits."""
     commits_only_b: int | None
 
     @property
     def is_equal(self) -> bool:
-        """Whether both are the same map: all cells equal, whichever commits made them."""
+        """True if both are the same map: all cells equal, whichever commits made them."""
         return not (self.only_a or self.only_b or self.other)
 
 
@@ -92,7 +92,7 @@ def side_of(place: str, *, token: str | None) -> Side:
 
 
 def difference(a: Side, b: Side) -> Difference:
-    """What two sides do not have in common.
+    """Difference of two sides, by the fingerprints of their cells.
 
     Raises:
         BadInputError: kind `other_geometry`: their grids differ, so nothing can be compared.

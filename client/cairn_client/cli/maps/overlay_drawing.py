@@ -1,4 +1,4 @@
-"""A map over what a rig's colour camera saw: for `cairn map render --over` and `cairn telepresence --map`."""
+"""A map over an image of a rig's colour camera: for `cairn map render --over` and `cairn telepresence --map`."""
 
 from dataclasses import dataclass, field, replace
 
@@ -26,13 +26,13 @@ class MapOverlay:
     map: FolderMap
     style: OverlayStyle
     camera: str | None = None
-    """None: the first colour camera that has an image."""
+    """Name of the colour camera; None: the first that has an image."""
     spread: PoseSpread = EXACT
-    """Of `T_map_rig`: [rotation (rad), translation (m)], rig frame."""
+    """Uncertainty of `T_map_rig`: [rotation (rad), translation (m)], rig frame."""
     renderer: MapRenderer = field(default_factory=lambda: MapRenderer(threads=THREADS))
 
     def draw(self, scan: Scan) -> Overlay:
-        """The map over one image of a scan; what it is old counts from then, if that is later than the map.
+        """The map over one image of a scan; ages count from the scan, if it is later than the map.
 
         Raises:
             BadInputError: kind `unknown_camera`: the camera took no image then.
@@ -56,7 +56,7 @@ class MapOverlay:
         return with_overlay_legend(self.draw(scan).picture, self.style.colours)
 
     def camera_of(self, scan: Scan) -> str:
-        """Whose image it is drawn over.
+        """Camera whose image the map is drawn over.
 
         Raises:
             BadInputError: kind `unknown_camera`: there is none.
@@ -70,7 +70,7 @@ class MapOverlay:
 
 
 def about(drawn: Overlay) -> str:
-    """What was drawn, in a few words."""
+    """Summary of a drawing in a few words, for people."""
     if drawn.withheld is not None:
         return f"withheld, {drawn.withheld}"
     visible, alone = ((drawn.front_modes == mode).mean() for mode in (OverlayMode.VISIBLE, OverlayMode.MAP_ONLY))

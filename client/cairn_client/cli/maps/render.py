@@ -1,4 +1,4 @@
-"""Look at a map from any pose, or over what a robot's camera saw.
+"""Draw a map as seen from any pose, or over an image of a robot's camera.
 
     $ cairn map render lab/ --from 1,2,1.4 --to 4,2.5,1 -o view.png
     view.png: temperature, 640 x 480 pixels, 91% of them on the map, 0.3 to 11.2 m away
@@ -8,18 +8,17 @@
 
 A map is the URL of one on a server, the folder that `cairn map export --cells` wrote, or the state folder of a robot
 that is not running. Layers: temperature, colour, probability, depth, and age, in seconds before the newest measurement:
-a server knows it of everything, a robot's state of what that robot measured and has not handed over for good. The scale
-is fixed (--low, --high), so that pictures can be compared; what has no value is grey, and where nothing is mapped it is
-dark.
+a server knows it of everything, a robot's state of commits of its own that it still keeps. The scale is fixed (--low,
+--high), so that pictures can be compared; surfaces without a value are grey, and unmapped space is dark.
 
-Over a recorded image the map is compared with the depth that the robot measured there and then: what agrees is painted
-solid; what lies behind the surface that the camera sees, beyond the next free space, in stripes, fainter the farther
-away and, where its age is known, the older; what no live depth says anything of in dots. So a robot without a thermal
+Over a recorded image the map is compared with the depth that the robot measured there and then. Parts that agree are
+painted solid; parts behind the surface that the camera sees, beyond the next free space, in stripes, fainter the
+farther away and, where their age is known, the older; parts without live depth in dots. So a robot without a thermal
 camera shows temperatures that others measured, also behind things. `cairn telepresence --map` does it live.
 
---sigma says how certain the pose is, along and about any one axis: the paint spreads by it, and is withheld when it
-could be anywhere. --covariance says it in full: the lower triangle, row by row, of rx, ry, rz (rad), tx, ty, tz (m), of
-the motion by which the true pose differs, in the frame of what is posed (--over: the rig, else the camera), as
+--sigma gives the standard deviation of the pose, along and about any one axis: the paint spreads by it, and is withheld
+when it could be anywhere. --covariance gives it in full: the lower triangle, row by row, of rx, ry, rz (rad), tx, ty,
+tz (m), of the motion by which the true pose differs, in the frame that is posed (--over: the rig, else the camera), as
 `robot.align` gives it. --npz writes the values as NumPy arrays, kelvin and metres.
 """
 

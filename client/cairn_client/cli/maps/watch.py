@@ -1,4 +1,4 @@
-"""See live what happens to a map: commits folded, robots heard of, the head moving.
+"""Follow a map live: commits that are folded, robots that report, the head that moves.
 
     $ cairn watch http://127.0.0.1:8750/maps/lab
     15:04:05  lab is at 15, robots: mole wren
@@ -8,8 +8,8 @@
     15:04:10  head  16
     $ cairn watch http://127.0.0.1:8750/maps/lab --json | jq -c 'select(.type == "head")'
 
-It goes on until Ctrl-C, and connects again when the link breaks, from where it was (what was missed meanwhile is told
-then). --json prints each event as a line, as PROTOCOL.md 4.6 has it; `lost` is our own, for a broken link. --events N
+It goes on until Ctrl-C, and connects again when the link breaks, from where it was; events missed meanwhile are printed
+then. --json prints each event as a line, as PROTOCOL.md 4.6 has it; `lost` is our own, for a broken link. --events N
 ends after N of them.
 """
 
@@ -27,7 +27,7 @@ from cairn_map.wire.live_events import CellsChanged, HeadMoved, Hello, LiveEvent
 
 
 def main(argv: list[str]) -> int:
-    """Listen."""
+    """Print events until interrupted."""
     command = parser("cairn watch", __doc__)
     command.add_argument("map", help="http://HOST:PORT/maps/NAME")
     command.add_argument("--json", action="store_true", help="print each event as a line of JSON")
@@ -53,7 +53,7 @@ def main(argv: list[str]) -> int:
 
 
 def lines_of(event: LiveEvent | Lost) -> Iterator[str]:
-    """An event for people; a beat says nothing."""
+    """An event as lines for people; none for a heartbeat."""
     match event:
         case Hello():
             robots = " ".join(sign.branch for sign in event.robots if not sign.gone) or "none"
@@ -95,6 +95,6 @@ def _as_json(event: LiveEvent | Lost) -> dict[str, object]:
 
 
 def _write(stream: TextIO, line: str) -> None:
-    """At once, for whoever reads a pipe."""
+    """Write a line and flush it, so that a program that reads a pipe gets it at once."""
     stream.write(line + "\n")
     stream.flush()

@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 REPLAYED_FILE = "replayed.txt"
 SYNC_EVERY_S = 2.0
-"""While replaying; at the end everything is pushed and fetched once more."""
+"""Pause between syncs while replaying; at the end everything is pushed and fetched once more."""
 
 
 def _replay(args: argparse.Namespace) -> int:
@@ -88,7 +88,7 @@ def _replay(args: argparse.Namespace) -> int:
 
 
 def _say_range(source: ScanSource) -> None:
-    """Ranges of the first scan: who sees 5 m for a shelf at arm's length has given the wrong depth units."""
+    """Write the ranges of the first scan: 5 m for a shelf at arm's length are wrong depth units."""
     range_m = source.scan(0).range_m
     seen = range_m[np.isfinite(range_m)]
     median = f"median range {np.median(seen):.2f} m" if len(seen) else "no range at all"
@@ -102,7 +102,7 @@ def _replayed(state: Path) -> set[str]:
 
 
 def _commit(robot: Robot, profile: Profile | None) -> Commit | None:
-    """If the folder's limits are reached, after a sync: it may make room."""
+    """Commit; where the folder's limits are reached, after a sync, which may make room."""
     try:
         return robot.commit(profile=profile)
     except UnreachableError as exc:
@@ -122,7 +122,7 @@ def _try_sync(robot: Robot) -> bool:
 
 
 def ensure_map(args: argparse.Namespace, source: ScanSource) -> Geometry | None:
-    """The map's geometry; makes the map if there is none. None: no link, and perhaps the state folder knows it."""
+    """The map's geometry, of a new map if there is none; None without a link: the state folder may know it."""
     api, name = api_of(args.map, args.token)
     with api:
         return _ensured(api, name, args, source)
@@ -153,7 +153,7 @@ def _ensured(api: MapApi, name: str, args: argparse.Namespace, source: ScanSourc
 
 
 def _channels(source: ScanSource) -> tuple[Channel, ...]:
-    """What the recording's first scan can fill."""
+    """Channels that the recording's first scan can fill."""
     scan = source.scan(0)
     has = ((COLOUR, bool(scan.colour)), (INTENSITY, scan.amplitude is not None), (TEMPERATURE, bool(scan.thermal)))
     return tuple(channel for channel, found in has if found)

@@ -1,18 +1,18 @@
-"""`cairn robot run`: map what a driver puts into a folder, and sync, until a signal ends it.
+"""`cairn robot run`: map the recordings that a driver puts into a folder, and sync, until a signal ends it.
 
     $ cairn robot run spool/ --map http://base:8750/maps/lab --voxel 0.04 --name mole
     committed mole.5f0c2a9be1d3f607.0: 4 cells, 40.6 kB
     pushed mole.5f0c2a9be1d3f607.0
     ^Cmapped 12 scans as 3 commits, 120.5 kB up, 8.1 kB down; 0 commits wait
 
-SPOOL holds recordings (RECORDING.md), a folder each, in the order of their names; one counts from when it has its
+SPOOL holds recordings (RECORDING.md), a folder each, in the order of their names; one is taken when it has its
 recording.json, which is written last. So a driver writes each stop as a recording of its own. Each measurement is
-mapped once, whatever happens: what is done stands in the robot's folder. --delete removes recordings that are mapped
-whole. What no commit can be made of is left out; the log says why.
+mapped exactly once, whatever happens: the robot's folder records those that are done. --delete removes recordings that
+are mapped whole. A measurement that makes no commit is left out; the log gives the reason.
 
-What happens is told on standard error. Without a link it maps on. ^C or SIGTERM: what waits is pushed for some seconds,
-and the robot leaves the map, if nothing is left and unless --stay; a measurement under way is mapped at the next start.
-A second ^C ends it at once, and nothing is lost.
+Events are reported on standard error. Without a link it maps on. On ^C or SIGTERM waiting commits are pushed for some
+seconds, and the robot leaves the map, if none is left and unless --stay is given; a measurement under way is mapped at
+the next start. A second ^C ends it at once, and nothing is lost.
 """
 
 import argparse
@@ -35,16 +35,16 @@ from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
 log = logging.getLogger(__name__)
 
 LOOK_EVERY_S = 1.0
-"""For recordings that have come."""
+"""Pause between two looks for new recordings."""
 COMMIT_AGAIN_S = 5.0
-"""After the disk or the outbox was full."""
+"""Pause before a commit is tried again after the disk or the outbox was full."""
 FLUSH_S = 8.0
-"""How long what waits is pushed at the end: containers are killed ten seconds after they were asked to stop."""
+"""Longest push of waiting commits at the end: containers are killed ten seconds after they are asked to stop."""
 
 
 @dataclass(slots=True)
 class _Tally:
-    """What was mapped."""
+    """Counts of what was mapped."""
 
     scans: int = 0
     commits: int = 0

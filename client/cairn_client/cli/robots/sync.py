@@ -91,7 +91,7 @@ def _sync(args: argparse.Namespace) -> int:
 def _robot(args: argparse.Namespace) -> Robot:
     """The folder's robot as it was set up, or a new one where nothing is there and --map is given."""
     known = folder_status(args.folder) if args.map is None or robot_of(args.folder) else None
-    url = args.map or (known and known.url)
+    url = args.map or (known.url if known else None)
     if url is None:
         raise BadInputError("no_url", f"{args.folder} does not say where its server is; give --map URL")
     args.mode = args.mode or ((known.mode or "high-end") if known else NEW_COPY)

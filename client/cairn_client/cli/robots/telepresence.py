@@ -5,21 +5,22 @@
     $ cairn telepresence lab-1 --hotter 40 --scale 15:60 --output pictures/    # all scans; only what is hot
     $ cairn telepresence lab-1 --band 34:38 --mode stereo --serve 8760  # for a browser: http://127.0.0.1:8760/
     $ cairn telepresence lab-1 --mode colour-on-thermal --output view.png
-    $ cairn telepresence lab-1 --publish http://127.0.0.1:8750/maps/lab --robot scout    # on the page, beside the map
+    $ cairn telepresence lab-1 --publish http://127.0.0.1:8750/maps/lab --robot scout    # on the page, next to the map
     $ cairn telepresence lab-1 --map lab/ --mode map --serve 8760       # what the map knows, over what the robot sees
 
-Range carries each temperature to the colour pixel of the same place; what the thermal camera does not see from where
-it stands is taken from the second one. Where no temperature is known the picture is hatched: it is never shown as
-cold. With --map, a folder as of `cairn map render`, what a mirror shows is hatched, too, where the map tells: behind a
-surface that others saw from elsewhere. Glass does not show: there the pane's own temperature is on what is behind it.
-The scale is that of the first picture, or what --scale says, and stays. Temperatures are apparent, in deg C.
+Range carries each temperature to the colour pixel of the same place; pixels that the thermal camera does not see from
+where it stands are taken from the second one. Where no temperature is known the picture is hatched: it is never shown
+as cold. With --map, a folder as for `cairn map render`, reflections in mirrors are hatched, too, where the map proves
+them: behind a surface that others saw from elsewhere. Glass is not detected: the pane's own temperature is painted on
+the things behind it. The scale is that of the first picture, or of --scale, and stays. Temperatures are apparent, deg
+C.
 
 --mode map draws the map itself over the colour image, temperatures or another --layer, so that a robot without a
-thermal camera shows those that others measured: solid where the map agrees with the live depth, in stripes what lies
-behind it, fainter the farther and, where that is known, the older; in dots what the map alone knows. Its scale is that
-of the layer, or --scale. --sigma says how certain the rig's poses are, along and about any one axis, or --covariance in
-full, as `cairn map render --help` explains: the map spreads by it, and is withheld where it could be anywhere. One
-picture of it, with all options: `cairn map render --over`.
+thermal camera shows those that others measured: solid where the map agrees with the live depth; in stripes what lies
+behind it, fainter the farther and, where the age is known, the older; in dots what only the map knows. Its scale is
+that of the layer, or of --scale. --sigma gives the uncertainty of the rig's poses, along and about any one axis, or
+--covariance in full, as `cairn map render --help` explains: the map spreads by it, and is withheld where it could be
+anywhere. One picture of it, with all options: `cairn map render --over`.
 """
 
 import argparse
@@ -56,7 +57,7 @@ log = logging.getLogger(__name__)
 RATE_HZ = 5.0
 ALPHA = 0.5
 NO_IMAGE = ("missing_image", "unknown_camera")
-"""What a scan without an image of the camera is refused as."""
+"""Kinds of the error for a scan without an image of the camera."""
 View = tuple[int, npt.NDArray[np.uint8]]
 """A scan's number and its picture."""
 MAP = "map"
@@ -81,7 +82,7 @@ def main(argv: list[str]) -> int:
 
 
 def _pictures(source: ScanSource, args: argparse.Namespace) -> Telepresence | MapOverlay:
-    """What makes a picture of a scan."""
+    """The maker of pictures from scans that the options ask for."""
     if args.map is not None and args.map.startswith(("http://", "https://")):
         raise BadInputError(
             "bad_option", f"the map is needed here: `cairn clone {args.map} FOLDER`, and then FOLDER for the URL"
@@ -102,7 +103,7 @@ def _pictures(source: ScanSource, args: argparse.Namespace) -> Telepresence | Ma
 
 
 def _check_options(args: argparse.Namespace) -> None:
-    """Refuse what the mode would not show.
+    """Refuse options that the mode would not show.
 
     Raises:
         BadInputError: kind `bad_option`.
@@ -123,7 +124,7 @@ def _check_options(args: argparse.Namespace) -> None:
 
 
 def _views(source: ScanSource, telepresence: Telepresence | MapOverlay, numbers: Iterable[int]) -> Iterator[View]:
-    """Numbers and pictures of scans, one after the other; what has no image of the camera is told and left out.
+    """Numbers and pictures of scans in order; scans without an image of the camera are reported and left out.
 
     Raises:
         BadInputError: kind `missing_image` or `unknown_camera`: none has one.
