@@ -19,6 +19,7 @@ from tests.console.casting import occupied, picks_met_first
 from tests.console.room import LOOPBACK, Room
 from tests.fixtures.client.live_server import wait_until
 from tests.fixtures.server.live import free_port
+from tests.test_documents import DOCS, commands_of, programs_of
 
 from cairn_client.cli.arguments import api_of
 from cairn_client.http.http_link import index_of
@@ -247,6 +248,34 @@ def test_the_example_robot_shares_what_it_sees(server: str, room_recording: Path
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=COMMAND_S, check=True)
     assert re.search(r"commit walle\.[0-9a-f]{16}\.1: \d+ cells, \d+ bytes", done.stdout)
     assert " 0 commits wait" in done.stdout
+
+
+def test_commands_of_the_operators_page_work_in_their_order(server: str, room_recording: Path, tmp_path: Path) -> None:
+    maps = f"{server}/maps/operator-"
+    replay = ("robot", "replay", room_recording, "--voxel", VOXEL_M, "--name", "mole")
+    cairn(*replay, "--map", f"{maps}lab", folder=tmp_path)
+    wait_for_fold(f"{maps}lab")
+    for arguments in commands_of(DOCS / "operator.md"):
+        if arguments[0] not in ("serve", "watch", "telepresence"):  # without an end, or of a recording
+            here = [
+                word.replace("http://127.0.0.1:8750/maps/", maps).replace("http://127.0.0.1:8750", server)
+                for word in arguments
+            ]
+            cairn(*here, folder=tmp_path)
+
+
+def test_programs_of_the_page_about_python_run(
+    server: str, room_recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    url = f"{server}/maps/python-api"
+    cairn("map", "create", url, "--voxel", VOXEL_M, folder=tmp_path)
+    (tmp_path / "lab-1").symlink_to(room_recording)
+    names: dict[str, object] = {}
+    for program in programs_of(DOCS / "python-api.md"):
+        with chdir(tmp_path):
+            exec(compile(program.replace("http://127.0.0.1:8750/maps/lab", url), "python-api.md", "exec"), names)
+        wait_for_fold(url)
+    assert len(capsys.readouterr().out.splitlines()) >= 3
 
 
 @pytest.mark.parametrize("command", ["map", "robot", "serve", "demo", "experiment"])

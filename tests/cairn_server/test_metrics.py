@@ -40,7 +40,7 @@ def test_the_names_in_the_document_are_those_of_the_page(live: Live) -> None:
 
 
 def test_the_alarms_in_the_handbook_are_about_figures_that_there_are(live: Live) -> None:
-    names = set(re.findall(r"cairn_[a-z_]+", (ROOT / "docs" / "operations.md").read_text()))
+    names = set(re.findall(r"cairn_[a-z_]+", (ROOT / "docs" / "administrator.md").read_text()))
     assert names - {"cairn_server"} <= set(families_of(text_of(live)))
 
 

@@ -114,7 +114,7 @@ def _ready(api: MapApi) -> Check:
         api.probe("/readyz")
     except CairnError as exc:
         return Check(
-            "ready", CheckResult.FAIL, f"{exc.message} [{exc.kind}]", "see the server's log; docs/operations.md"
+            "ready", CheckResult.FAIL, f"{exc.message} [{exc.kind}]", "see the server's log; docs/administrator.md"
         )
     return Check("ready", CheckResult.OK, "takes pushes and folds them")
 

@@ -6,7 +6,7 @@
 The file holds one state of all maps. It takes its name only when all of it is on the disk, so that an older backup of
 that name is there until the new one is whole. Run it as the user that the server runs as. What is pushed after it
 is not in it: `cairn serve --stable-after` must be longer than the age of the oldest backup that you may restore
-(docs/operations.md).
+(docs/administrator.md).
 """
 
 import argparse

@@ -25,7 +25,7 @@ A field server joins a base with --upstream http://BASE:PORT and a token of role
 operator of one server to count on the other, each needs the other's key: --trust-server KEY (`cairn map ls --json`
 shows it).
 
-Three more commands look after the folder (docs/operations.md); each explains itself with --help:
+Three more commands look after the folder (docs/administrator.md); each explains itself with --help:
 
     cairn serve backup --data DIR FILE      copy the store into one file, while the server runs
     cairn serve restore FILE --data DIR     make a folder out of such a file
