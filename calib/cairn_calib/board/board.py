@@ -52,12 +52,12 @@ class Board(BaseModel):
 
     @property
     def count(self) -> int:
-        """How many points it has."""
+        """Number of points."""
         return self.columns * self.rows
 
     @property
     def turns_unseen(self) -> bool:
-        """Whether the board looks the same after a half or a quarter turn, so that no image tells its first point."""
+        """True if the board looks the same after a half or a quarter turn, so that no image shows its first point."""
         if self.pattern == "asymmetric-circles":
             return self.rows % 2 == 0
         return self.pattern == "circles" or (self.columns + self.rows) % 2 == 0

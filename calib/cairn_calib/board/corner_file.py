@@ -35,7 +35,7 @@ class CornerEntry(BaseModel):
 
 
 class AttemptEntry(BaseModel):
-    """How one method at one scale ended."""
+    """Outcome of one method at one scale."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -56,7 +56,7 @@ class CornerFile(BaseModel):
     image_sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None
     """None, as the size, of an image that could not be read."""
     frames: Annotated[int, Field(ge=1, le=1 << 20)] = 1
-    """Of a still pose, of which the image is the mean."""
+    """Number of frames of a still pose, whose mean the image is."""
     width: Side | None
     height: Side | None
     board: Board

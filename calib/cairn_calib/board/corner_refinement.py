@@ -21,24 +21,28 @@ from cairn_map.arrays import Flags, Floats
 Image = npt.NDArray[np.float32]
 
 STEPS = 12
+"""Gauss-Newton steps, at most."""
 RADIUS_PX = (2, 8)
-"""Of the window: at least 5 x 5 pixels, and not more than 17 x 17."""
-REACH = 0.5
-"""Half width of the window in cells; beyond, the next corner would be seen."""
+"""Bounds of the window's half width: at least 5 x 5 pixels, and not more than 17 x 17."""
+REACH_CELLS = 0.5
+"""Half width of the window, cells; beyond, the next corner would be seen."""
 REACH_PX = 2.2
-"""At least this much half width in pixels, where cells are small, but not over REACH_MAX."""
-REACH_MAX = 0.7
+"""Half width of the window, pixels, at least, where cells are small; at most REACH_CELLS_MAX."""
+REACH_CELLS_MAX = 0.7
 BLUR_PX = (0.25, 6.0)
-TURN_RAD = 0.15
+"""Bounds of the blur s, pixels."""
+TURN_SIGMA_RAD = 0.15
 """Prior of an edge's direction about that of the grid, standard deviation: only tiny windows feel it."""
-BLUR_LOG = 0.7
+BLUR_LOG_SIGMA = 0.7
 """Prior of the blur about 0.8 px, standard deviation of its logarithm."""
 PIXELS_MIN = 12
+"""Pixels of a window without which its corner is not fitted."""
 UNKNOWNS = 7
-POOLED = 40.0
-"""Degrees of freedom that the noise of all the image's corners weighs in that of one."""
+"""x, y, direction 1, direction 2, blur, mean, contrast: the columns of `unknown` below."""
+POOL_DOF = 40.0
+"""Degrees of freedom with which the usual noise of the image's corners counts in that of one."""
 SHADING_MIN = 12
-"""Corners that tell how the mean brightness changes over a board."""
+"""Corners without which the change of brightness over a board is not estimated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,13 +72,14 @@ def fit_corners(image: Image, guesses: Floats, steps: Floats) -> FittedCorners:
     Returns:
         The corners, in the order of the guesses.
     """
+    # Fit; take the shading from the fitted means; fit again without it.
     first = _fit(image, guesses, steps, np.zeros_like(guesses))
     shading = _shading(first.pixels, first.mean)
     final = _fit(image, np.where(np.isfinite(first.pixels), first.pixels, guesses), steps, shading)
     moved = np.linalg.solve(_columns(steps), np.nan_to_num(final.pixels - guesses)[..., None])[..., 0]
     return FittedCorners(
         pixels=final.pixels,
-        covariance_px2=final.inverse * _pooled(final.variance, final.dof)[:, None, None],
+        covariance_px2=final.inverse * _pool(final.variance, final.dof)[:, None, None],
         contrast=final.contrast,
         misfit=np.sqrt(final.variance) / np.maximum(np.abs(final.contrast), 1e-9),
         moved=np.where(np.isfinite(final.pixels[:, 0]), np.linalg.norm(moved, axis=1), np.nan),
@@ -92,12 +97,15 @@ class _Fit:
 
 
 def _fit(image: Image, guesses: Floats, steps: Floats, shading: Floats) -> _Fit:
+    """Gauss-Newton fit of all corners at once, each in its own window; `shading` is (N, 2) counts a pixel."""
+    # Windows of pixels about the guesses, without shading.
     column, line, weight, usable = _windows(image, guesses, steps)
     values = image[np.clip(line, 0, image.shape[0] - 1), np.clip(column, 0, image.shape[1] - 1)].astype(np.float64)
     x, y = column.astype(np.float64), line.astype(np.float64)
     start = np.where(usable[:, None], guesses, 0.0)
     ramp = shading[:, :1] * (x - start[:, :1]) + shading[:, 1:] * (y - start[:, 1:])
     values = values - ramp
+    # Start: edges along the grid, a usual blur, the window's mean.
     count = np.maximum(weight.sum(axis=1), 1)
     angles = np.arctan2(steps[..., 1], steps[..., 0])
     mean = (weight * values).sum(axis=1) / count
@@ -110,23 +118,25 @@ def _fit(image: Image, guesses: Floats, steps: Floats, shading: Floats) -> _Fit:
         (weight * shape**2).sum(axis=1), 1e-9
     )
     prior = np.zeros((len(start), UNKNOWNS))
-    limit = REACH * np.minimum(*(np.linalg.norm(steps[:, k], axis=1) for k in (0, 1)))
+    limit = REACH_CELLS * np.minimum(*(np.linalg.norm(steps[:, k], axis=1) for k in (0, 1)))
     for _ in range(STEPS):
         residual, normal, gradient = _normal(unknown, x, y, values, weight)
         # Counts to the prior's units: a prior worth one pixel whose noise is a tenth of the spread.
         strength = (0.1 * scale) ** 2
-        prior[:, 2:4] = (strength / TURN_RAD**2)[:, None]
-        prior[:, 4] = strength / (BLUR_LOG * unknown[:, 4]) ** 2
-        gradient[:, 2:4] += prior[:, 2:4] * _wrapped(angles - unknown[:, 2:4])
+        prior[:, 2:4] = (strength / TURN_SIGMA_RAD**2)[:, None]
+        prior[:, 4] = strength / (BLUR_LOG_SIGMA * unknown[:, 4]) ** 2
+        gradient[:, 2:4] += prior[:, 2:4] * _wrap(angles - unknown[:, 2:4])
         gradient[:, 4] += prior[:, 4] * unknown[:, 4] * np.log(0.8 / unknown[:, 4])
         normal += _ridge(normal, prior, scale)
         step = np.linalg.solve(normal, gradient[..., None])[..., 0]
+        # Steps are bounded: half the limit for the place, 0.3 rad for the directions.
         step[:, :2] *= np.minimum(1, limit / np.maximum(2 * np.linalg.norm(step[:, :2], axis=1), 1e-12))[:, None]
         step[:, 2:4] = np.clip(step[:, 2:4], -0.3, 0.3)
         unknown += step
         unknown[:, 4] = np.clip(unknown[:, 4], *BLUR_PX)
         if np.abs(step[usable, :2]).max(initial=0.0) < 1e-4:
             break
+    # Residuals and normal matrix at the minimum; a corner that left its surroundings is lost.
     residual, normal, _ = _normal(unknown, x, y, values, weight)
     normal += _ridge(normal, prior, scale)
     dof = np.maximum(count - UNKNOWNS, 1)
@@ -155,7 +165,7 @@ def _windows(
     lengths = np.linalg.norm(steps, axis=2)
     # One that is not in the image, however far, lacks half of its window.
     sound = ((guesses > -1) & (guesses < image.shape[::-1])).all(axis=1) & (lengths > 1).all(axis=1)
-    reach = np.clip(REACH_PX / np.maximum(lengths, 1e-9), REACH, REACH_MAX)
+    reach = np.clip(REACH_PX / np.maximum(lengths, 1e-9), REACH_CELLS, REACH_CELLS_MAX)
     wanted = float(np.max(np.where(sound, (reach * lengths).sum(axis=1), 0.0), initial=0.0))
     radius = int(np.clip(np.ceil(wanted), *RADIUS_PX))
     at = np.round(np.where(sound[:, None], guesses, 0)).astype(np.intp)
@@ -184,10 +194,12 @@ def _model(unknown: Floats, x: Floats, y: Floats) -> tuple[Floats, ...]:
     dx, dy = x - unknown[:, :1], y - unknown[:, 1:2]
     sin1, cos1, sin2, cos2 = (f(unknown[:, k : k + 1]) for k in (2, 3) for f in (np.sin, np.cos))
     blur = unknown[:, 4:5]
+    # Distances from both edges, and places along them.
     u, v = cos1 * dy - sin1 * dx, sin2 * dx - cos2 * dy
     along_u, along_v = cos1 * dx + sin1 * dy, cos2 * dx + sin2 * dy
     edge_u, slope_u = _edge(u, blur)
     edge_v, slope_v = _edge(v, blur)
+    # Chain rule: d(edge_u edge_v) by u and by v, then by place, directions and blur.
     in_u, in_v = slope_u * edge_v, edge_u * slope_v
     by_x = in_u * sin1 - in_v * sin2
     by_y = in_v * cos2 - in_u * cos1
@@ -215,15 +227,16 @@ def _edge(distance: Floats, blur: Floats) -> tuple[Floats, Floats]:
     return np.sign(z) * (1 - tail), np.sqrt(2 / np.pi) / blur * bell
 
 
-def _wrapped(angle: Floats) -> Floats:
+def _wrap(angle: Floats) -> Floats:
     return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _shading(pixels: Floats, mean: Floats) -> Floats:
-    """(N, 2) counts a pixel: how the mean brightness changes at each corner, by a quadric over all of them.
+    """(N, 2) gradient of the mean brightness at each corner, counts a pixel, by a quadric over all of them.
 
-    An uneven light over a board would push corners sideways; over one corner's window it cannot be told from a move.
+    An uneven light over a board would push corners sideways; over one corner's window it looks like a move.
     """
+    # A quadric through the fitted means, twice: the second time without outliers.
     sound = np.isfinite(mean)
     if sound.sum() < SHADING_MIN:
         return np.zeros_like(pixels)
@@ -240,8 +253,8 @@ def _shading(pixels: Floats, mean: Floats) -> Floats:
     return np.asarray(np.nan_to_num(np.stack([by_x, by_y], axis=-1)))
 
 
-def _pooled(variance: Floats, dof: Floats) -> Floats:
-    """(N,) noise of each corner, counts squared: what its residuals say, and what is usual in the image."""
+def _pool(variance: Floats, dof: Floats) -> Floats:
+    """(N,) noise of each corner, counts squared: its residuals', pooled with the image's usual noise."""
     sound = np.isfinite(variance)
     usual = float(np.median(variance[sound])) if sound.any() else np.nan
-    return np.asarray((dof * variance + POOLED * usual) / (dof + POOLED))
+    return np.asarray((dof * variance + POOL_DOF * usual) / (dof + POOL_DOF))

@@ -1,4 +1,4 @@
-"""Places where a picture looks like the corner of a chessboard: saddles of brightness with four quiet quarters.
+"""Saddle points: places where an image looks like the corner of a chessboard, with four even quarters.
 
     -det(Hessian) of the smoothed image -> its maxima -> a ring of samples about each -> saddles with two directions
 
@@ -17,18 +17,21 @@ from cairn_map.arrays import Floats
 Image = npt.NDArray[np.float32]
 
 SMOOTH_PX = 1.5
+"""Standard deviation of the Gaussian before the Hessian, pixels."""
 RING_PX = 3.5
-"""Less than half a cell of 8 pixels; smaller cells are looked for in an enlarged image."""
+"""Radius of the ring of samples, pixels: less than half a cell of 8; smaller cells need an enlarged image."""
 RING = 16
+"""Samples on the ring."""
 APART_PX = 2
-"""Of two maxima this near only the higher one counts."""
-MAXIMA = 2500
-KEPT = 400
-WEAK = 0.06
-"""Of the strongest: what is weaker is noise, or hidden in it."""
-SECOND_MIN = 0.45
+"""Distance, pixels, within which only the highest of several maxima counts."""
+MAXIMA_MAX, SADDLES_MAX = 2500, 400
+"""Maxima that are checked, and saddles that are kept, the strongest first."""
+STRENGTH_SHARE_MIN = 0.06
+"""Strength of a saddle over the strongest one's, at least: weaker ones are noise, or hidden in it."""
+SECOND_SHARE_MIN = 0.45
 """Share of the second Fourier term in the ring's variance: 0.81 at right angles, 0.5 at 40 degrees."""
-ODD_MAX = 0.25
+ODD_SHARE_MAX = 0.25
+"""Share of the odd Fourier terms in the ring's variance, at most: 0 for a pattern that half a turn maps to itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +51,11 @@ class SaddlePoints:
 def saddle_points(image: Image) -> SaddlePoints:
     """The saddles of an (H, W) float32 image whose contrast is about 1."""
     smooth = np.asarray(cv2.GaussianBlur(image, (0, 0), SMOOTH_PX), np.float32)
+    # Second derivatives: Sobel's 3 x 3 kernels weigh by 4.
     xx, yy, xy = (
         np.asarray(cv2.Sobel(smooth, cv2.CV_32F, i, j, ksize=3), np.float32) / 4 for i, j in ((2, 0), (0, 2), (1, 1))
     )
+    # Local maxima of -det(Hessian), away from the border, the strongest first.
     response = np.maximum(xy * xy - xx * yy, 0)
     peak = np.asarray(cv2.dilate(response, np.ones((2 * APART_PX + 1, 2 * APART_PX + 1), np.uint8)))
     margin = int(np.ceil(RING_PX))
@@ -58,12 +63,13 @@ def saddle_points(image: Image) -> SaddlePoints:
     highest[:margin] = highest[-margin:] = False
     highest[:, :margin] = highest[:, -margin:] = False
     y, x = np.nonzero(highest)
-    order = np.argsort(-response[y, x], kind="stable")[:MAXIMA]
+    order = np.argsort(-response[y, x], kind="stable")[:MAXIMA_MAX]
     y, x = y[order], x[order]
+    # Those whose ring looks like a corner's, and that are not much weaker than the strongest.
     sound = _ring_is_corner(smooth, x, y)
-    y, x = y[sound][:KEPT], x[sound][:KEPT]
+    y, x = y[sound][:SADDLES_MAX], x[sound][:SADDLES_MAX]
     strength = np.sqrt(response[y, x].astype(np.float64))
-    strong = strength > WEAK * strength.max(initial=0.0)
+    strong = strength > STRENGTH_SHARE_MIN * strength.max(initial=0.0)
     y, x, strength = y[strong], x[strong], strength[strong]
     hessian = np.stack([np.stack([xx[y, x], xy[y, x]], -1), np.stack([xy[y, x], yy[y, x]], -1)], -1).astype(np.float64)
     # The directions of edges want more smoothing than the places of corners do.
@@ -77,6 +83,7 @@ def saddle_points(image: Image) -> SaddlePoints:
 
 
 def _ring_is_corner(smooth: Image, x: npt.NDArray[np.intp], y: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
+    """(N,) True for each place whose ring is bright, dark, bright, dark: see the head of this module."""
     angle = np.arange(RING) * 2 * np.pi / RING
     at_x = (x[:, None] + RING_PX * np.cos(angle)).astype(np.float32)
     at_y = (y[:, None] + RING_PX * np.sin(angle)).astype(np.float32)
@@ -84,13 +91,14 @@ def _ring_is_corner(smooth: Image, x: npt.NDArray[np.intp], y: npt.NDArray[np.in
         return np.zeros(0, bool)
     ring = np.asarray(cv2.remap(smooth, at_x, at_y, cv2.INTER_LINEAR))
     power = np.abs(np.fft.rfft(ring, axis=1)) ** 2
+    # A real signal's highest term stands for one frequency, all others for two.
     power[:, RING // 2] /= 2
     total = np.maximum(power[:, 1:].sum(axis=1), 1e-20)
-    return np.asarray((power[:, 2] / total > SECOND_MIN) & (power[:, 1::2].sum(axis=1) / total < ODD_MAX))
+    return np.asarray((power[:, 2] / total > SECOND_SHARE_MIN) & (power[:, 1::2].sum(axis=1) / total < ODD_SHARE_MAX))
 
 
 def _between_pixels(smooth: Image, x: npt.NDArray[np.intp], y: npt.NDArray[np.intp], hessian: Floats) -> Floats:
-    """Where the gradient vanishes, by one Newton step of at most a pixel."""
+    """(N, 2) places at which the gradient vanishes, by one Newton step of at most a pixel."""
     by_x = (smooth[y, x + 1].astype(np.float64) - smooth[y, x - 1]) / 2
     by_y = (smooth[y + 1, x].astype(np.float64) - smooth[y - 1, x]) / 2
     gradient = np.stack([by_x, by_y], axis=-1)

@@ -1,7 +1,7 @@
-"""The image of one still pose of a board: one file, or the mean of a folder's frames, whose noise is less.
+"""Image of one still pose of a board: one file, or the mean of a folder's frames, which has less noise.
 
 The noise of a mean of n frames is that of one by the root of n. If the board moved meanwhile, its edges are smeared and
-the corners lie wherever; so the first half of the frames is compared with the second at the corners that were found.
+its corners are wrong; so the first half of the frames is compared with the second at the corners that were found.
 """
 
 import hashlib
@@ -17,22 +17,22 @@ from cairn_map.errors import BadInputError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 MOVED_MAX_PX = 0.25
-"""Between the means of both halves. A corner of a mean of two such images is wrong by half as much, to either side."""
+"""Largest move of the board between the means of both halves, pixels; its corners are then wrong by half as much."""
 WINDOW = (5, 31)
 """Half widths that the comparison's window may have, pixels."""
 
 
 @dataclass(frozen=True, slots=True)
 class StillImage:
-    """What was recorded of one pose."""
+    """Image of one pose, with the number and digest of its frames."""
 
     counts: Grey
     """(H, W) float32: the mean of all frames."""
     sha256: str
-    """Of the file's bytes; of several, of theirs one after another, by name."""
+    """Digest of the file's bytes; of several frames, of their bytes one after another, by name."""
     frames: int
     halves: tuple[Grey, Grey] | None
-    """The means of the first and of the second half of the frames; None of a single one."""
+    """Means of the first and of the second half of the frames; None with a single frame."""
 
 
 def read_still(path: Path) -> StillImage:
@@ -65,7 +65,7 @@ def read_still(path: Path) -> StillImage:
 
 
 def refuse_movement(image: StillImage, detection: Detection) -> Detection:
-    """What was found, or nothing and why if the board moved between the frames."""
+    """The detection; one without corners, with the reason, if the board moved between the frames."""
     if image.halves is None or detection.corners is None:
         return detection
     moved = _moved_px(*image.halves, detection.corners)
@@ -80,7 +80,7 @@ def refuse_movement(image: StillImage, detection: Detection) -> Detection:
 
 
 def _moved_px(first: Grey, second: Grey, corners: Corners) -> float:
-    """By how much a board's points lie elsewhere in the second image, median, pixels; Lucas and Kanade's method."""
+    """Median distance of a board's points between two images, pixels; Lucas and Kanade's method."""
     low, high = np.percentile(first, (0.5, 99.8))
     scale = 255 / max(float(high - low), 1e-9)
     before, after = (np.clip((each - low) * scale, 0, 255).astype(np.uint8) for each in (first, second))

@@ -27,29 +27,29 @@ COEFFICIENT_MAX = 1e12
 Coefficient = Annotated[float, Field(ge=-COEFFICIENT_MAX, le=COEFFICIENT_MAX, allow_inf_nan=False)]
 
 
-def _filled(given: tuple[float, ...]) -> tuple[float, ...]:
-    """Five coefficients, or eight with a denominator: what is not given is 0."""
+def _fill(given: tuple[float, ...]) -> tuple[float, ...]:
+    """Five coefficients, or eight with a denominator: missing ones are 0."""
     return given + (0.0,) * ((5 if len(given) <= 5 else 8) - len(given))
 
 
-Coefficients = Annotated[tuple[Coefficient, ...], Field(min_length=2, max_length=8), AfterValidator(_filled)]
+Coefficients = Annotated[tuple[Coefficient, ...], Field(min_length=2, max_length=8), AfterValidator(_fill)]
 """k1, k2[, p1, p2[, k3[, k4, k5, k6]]] as given; five or eight once read. The functions take five or eight."""
 
 RADIUS_MAX = 1e3
-"""Of the plane, where nothing folds: 89.9 degrees off the axis."""
+"""Largest radius in the plane of a lens that does not fold: 89.9 degrees off the axis."""
 BEFORE_POLE = 1 - 1e-6
-"""Of the radius at which the denominator is zero."""
+"""Share of the radius at which the denominator is zero up to which the lens is used."""
 TABLE_SIZE = 4096
 """Radii of the table that Newton starts from, 0.5 % apart: two steps later it is exact."""
 CHUNK = 1 << 14
 """Points at a time, so that a step stays in the processor's cache: 0.2 s against 0.5 s for 1280 x 960."""
 STEPS = 30
 STEP_AGAIN = 1e-11
-"""Error of the plane beyond which another step is worth it; the step itself squares it."""
+"""Error of the plane above which another step is taken; each step squares the error."""
 TOLERANCE = 5e-13
-"""Error of the plane, relative beyond 1: 7e-10 px at a focal length of 1300 px. What is worse has no origin."""
+"""Error of the plane, relative beyond 1: 7e-10 px at a focal length of 1300 px. Beyond it, no origin."""
 PULL_BACK = 0.98
-"""Of the radius of a guess that went over the fold."""
+"""Factor on the radius of a guess that went over the fold."""
 
 
 def distort(plane: Floats, coefficients: Coefficients) -> Floats:

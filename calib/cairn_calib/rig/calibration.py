@@ -1,4 +1,4 @@
-"""How a rig's numbers came about and how certain they are: the `calibration` of `rig.json`.
+"""Origin and covariance of a rig's numbers: the `calibration` of `rig.json`.
 
     "calibration": {"software": "cairn 0.1.0", "made_s": 1763740800.0, "gauge": "tof",
      "units": {"length": "m", "angle": "rad", "image": "px", "distortion": "1"},
@@ -35,11 +35,11 @@ PARAMETERS_MAX = 240
 POSE_UNITS: dict[str, Unit] = {"rx": "rad", "ry": "rad", "rz": "rad", "tx": "m", "ty": "m", "tz": "m"}
 PIXEL_NAMES = frozenset({"fx", "fy", "cx", "cy"})
 INDEFINITE_SHARE = 1e-9
-"""Of the largest eigenvalue of the correlations: a smaller negative one is rounding."""
+"""Share of the correlations' largest eigenvalue below which a negative one is rounding."""
 
 
 class Units(BaseModel):
-    """What the numbers of the whole file are in; there is no choice."""
+    """Units of all numbers of the file; there is no choice."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -107,14 +107,14 @@ class Covariance(BaseModel):
 
 
 class CameraStatistics(BaseModel):
-    """How well one camera's points were met; pixels of one axis, as mrcal says it (OpenCV's is sqrt(2) as large)."""
+    """Residuals of one camera's points; pixels of one axis, as mrcal states them (OpenCV's are sqrt(2) as large)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     images: Count
     points: Count
     outliers: Count
-    """Of the points; they count in no other number."""
+    """Points that were left out; they count in no other number."""
     rms_px: Positive
     """sqrt(sum of squares of x and y residuals / (2 points))."""
     sigma_px: Positive
@@ -122,7 +122,7 @@ class CameraStatistics(BaseModel):
 
 
 class Statistics(BaseModel):
-    """How well everything was met, by the estimated noise."""
+    """Residuals of the whole rig, by the estimated noise."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -157,7 +157,7 @@ class Calibration(BaseModel, frozen=True):
     inputs: Annotated[tuple[InputFile, ...], Field(max_length=1000)] = ()
 
     def check_cameras(self, cameras: Mapping[str, Raster]) -> None:
-        """Whether it speaks of these cameras.
+        """Check that the calibration is of these cameras.
 
         Raises:
             ValueError: a camera that is not there, a parameter that its camera has not, or a pose of the gauge.

@@ -1,4 +1,4 @@
-"""What every camera behind a lens has: a focal length, a principal point, coefficients, and derivatives by all of them.
+"""Interface of cameras with a lens: focal length, principal point, coefficients, and derivatives by all of them.
 
     point --(the model)--> place in the plane of unit focal length --focal_px, centre_px--> pixel
 
@@ -24,10 +24,10 @@ Place = Annotated[float, Field(allow_inf_nan=False)]
 
 @dataclass(frozen=True, slots=True)
 class Projection:
-    """Where points appear, and how that moves; P is the number of intrinsics."""
+    """Pixels of points, and their derivatives; P is the number of intrinsics."""
 
     pixels: Floats
-    """(..., 2) as `project` says; NaN where it says NaN."""
+    """(..., 2) pixels of `project`; NaN where it gives NaN."""
     by_point: Floats
     """(..., 2, 3) pixels a metre, camera frame."""
     by_intrinsics: Floats
@@ -103,7 +103,7 @@ class Lens(Raster, frozen=True):
         return pixels
 
     def pixel_gradients(self, points: npt.NDArray[np.floating]) -> Floats:
-        """How pixels move with points: the derivatives of `project`.
+        """Derivatives of `project` by the points.
 
         Args:
             points: (..., 3), metres, camera frame.

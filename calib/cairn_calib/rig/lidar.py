@@ -7,8 +7,8 @@
 
 Columns go round once, clockwise seen from above, and are equally wide; the row of an elevation is interpolated
 between the beams, which need not be equally far apart. Camera frame: x right, y down, z forward. All beams are
-taken to leave from one point at one time: offsets of single lasers and the rig's motion during a turn are the
-business of whoever sorts the returns into the image.
+taken to leave from one point at one time: offsets of single lasers and the rig's motion during a turn must be
+corrected before the returns are sorted into the image.
 """
 
 from typing import Annotated, Literal, Self
@@ -34,7 +34,7 @@ class SpinningLidar(Raster, frozen=True):
         tuple[Annotated[float, Field(ge=-89, le=89, allow_inf_nan=False)], ...],
         Field(min_length=1, max_length=MAX_SIDE_PX),
     ]
-    """Of each row's beam above the x-z plane, from the top row down."""
+    """Elevation of each row's beam above the x-z plane, from the top row down."""
 
     @model_validator(mode="after")
     def _one_elevation_per_row(self) -> Self:
@@ -101,4 +101,4 @@ class SpinningLidar(Raster, frozen=True):
 
 
 AnyCamera = Camera | FisheyeCamera | SpinningLidar
-"""What a rig carries. All are rasters; those with a lens have derivatives too."""
+"""Any camera of a rig. All are rasters; those with a lens have derivatives, too."""

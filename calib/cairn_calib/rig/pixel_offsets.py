@@ -1,10 +1,10 @@
-"""What each pixel of a range camera adds to its ranges beside what all do: a map, with its certainty, in `rig.json`.
+"""Map of the offsets that single pixels of a range camera add to its ranges, with its certainty, in `rig.json`.
 
     "pixel_offsets": {"width": 176, "height": 144, "unit": "0.0001 m", "encoding": "base64, zlib, little endian, rows",
      "offset": "eJz...", "sigma": "eJz...", "count": "eJz...", "pattern_sigma_m": 0.006, "noise_sigma_m": 0.008}
 
-Inside the document, not beside it: ranges are then true wherever the rig is, and its digest is of them, too. How it is
-found: `pixel_pattern.py`.
+The map is part of the document, not a file of its own: every copy of the rig then has true ranges, and the rig's digest
+covers the map. `pixel_pattern.py` estimates it.
 """
 
 import base64
@@ -23,7 +23,7 @@ from cairn_map.arrays import Floats
 Counts = npt.NDArray[np.uint8]
 
 UNIT_M = 1e-4
-"""Of offsets and sigmas: a hundredth of the noise; 16 bits reach 3.2 m."""
+"""Unit of stored offsets and sigmas, metres: a hundredth of the noise; 16 bits reach 3.2 m."""
 TEXT_MAX = 3 << 20
 COUNT_MAX = 255
 Text = Annotated[str, Field(max_length=TEXT_MAX)]
@@ -31,7 +31,7 @@ Metres = Annotated[float, Field(ge=0, le=3, allow_inf_nan=False)]
 
 
 class PixelOffsets(BaseModel):
-    """Metres that each pixel adds, their standard deviations, and how many ranges of boards they come from."""
+    """Metres that each pixel adds, their standard deviations, and the number of board ranges behind each."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -46,9 +46,9 @@ class PixelOffsets(BaseModel):
     count: Text
     """(H, W) uint8, 255 for more."""
     pattern_sigma_m: Metres
-    """Of the pixels about their mean."""
+    """Standard deviation of the pixels' offsets about their mean."""
     noise_sigma_m: Metres
-    """Of a single range about its pixel's offset."""
+    """Standard deviation of a single range about its pixel's offset."""
 
     @model_validator(mode="after")
     def _is_of_its_size(self) -> Self:
@@ -71,7 +71,7 @@ class PixelOffsets(BaseModel):
     @property
     def counts(self) -> Counts:
         """(H, W) ranges of boards, at most 255."""
-        return _unpacked(self.count, "u1", self.height, self.width).astype(np.uint8)
+        return _unpack(self.count, "u1", self.height, self.width).astype(np.uint8)
 
     @property
     def unseen_sigma_m(self) -> float:
@@ -81,7 +81,7 @@ class PixelOffsets(BaseModel):
 
     @property
     def mean_variance_m2(self) -> float:
-        """Of a pixel's offset, over all pixels."""
+        """Mean over all pixels of the variance of a pixel's offset, m^2."""
         return _mean_square(self.sigma, self.height, self.width)
 
 
@@ -92,20 +92,20 @@ def pixel_offsets(
     return PixelOffsets(
         width=offset_m.shape[1],
         height=offset_m.shape[0],
-        offset=_packed(np.clip(np.rint(offset_m / UNIT_M), -32767, 32767), "<i2"),
+        offset=_pack(np.clip(np.rint(offset_m / UNIT_M), -32767, 32767), "<i2"),
         # Upwards: no uncertainty is rounded away.
-        sigma=_packed(np.clip(np.ceil(sigma_m / UNIT_M - 1e-9), 0, 65535), "<u2"),
-        count=_packed(np.minimum(counts, COUNT_MAX), "u1"),
+        sigma=_pack(np.clip(np.ceil(sigma_m / UNIT_M - 1e-9), 0, 65535), "<u2"),
+        count=_pack(np.minimum(counts, COUNT_MAX), "u1"),
         pattern_sigma_m=pattern_sigma_m,
         noise_sigma_m=noise_sigma_m,
     )
 
 
-def _packed(values: npt.NDArray[np.generic], dtype: str) -> str:
+def _pack(values: npt.NDArray[np.generic], dtype: str) -> str:
     return base64.b64encode(zlib.compress(values.astype(dtype).tobytes(), 9)).decode()
 
 
-def _unpacked(text: str, dtype: str, height: int, width: int) -> npt.NDArray[np.generic]:
+def _unpack(text: str, dtype: str, height: int, width: int) -> npt.NDArray[np.generic]:
     size = height * width * np.dtype(dtype).itemsize
     try:
         unpacker = zlib.decompressobj()
@@ -119,7 +119,7 @@ def _unpacked(text: str, dtype: str, height: int, width: int) -> npt.NDArray[np.
 
 @lru_cache(maxsize=16)
 def _metres(text: str, dtype: str, height: int, width: int) -> Floats:
-    metres = UNIT_M * _unpacked(text, dtype, height, width).astype(np.float64)
+    metres = UNIT_M * _unpack(text, dtype, height, width).astype(np.float64)
     metres.setflags(write=False)
     return metres
 

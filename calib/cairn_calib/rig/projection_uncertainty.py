@@ -1,10 +1,10 @@
-"""How certain it is where a point appears: the calibration's covariance, carried into pixels.
+"""Uncertainty of projected points: the calibration's covariance, propagated to pixels.
 
     project_certain(rig, "left", points_rig)                    points of the rig's frame in a camera
     transfer_certain(rig, "tof", "left", pixels, range_m, ...)  pixels with range, carried to another camera: Eq. 1-6 of
                                                                 Kocmanova et al., with the share of each source of error
 
-Both read nothing but a `rig.json` with `calibration.covariance`. What that does not list counts as certain.
+Both need only a `rig.json` with `calibration.covariance`. Parameters that it does not list count as certain.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ Moves = dict[tuple[str, str], Floats]
 
 @dataclass(frozen=True, slots=True)
 class CertainPixels:
-    """Where points appear, and how certain that is."""
+    """Pixels of points, with their covariance."""
 
     pixels: Floats
     """(..., 2); NaN where the camera does not see a point."""
@@ -35,20 +35,20 @@ class CertainPixels:
 
 @dataclass(frozen=True, slots=True)
 class CertainTransfer:
-    """Where pixels of one camera appear in another, and what makes that uncertain, by its sources."""
+    """Pixels of one camera as they appear in another, with the covariance by its sources."""
 
     pixels: Floats
     """(..., 2); NaN where the camera does not see a point."""
     calibration_px2: Floats
-    """(..., 2, 2) of lenses and places."""
+    """(..., 2, 2) covariance by lenses and places."""
     centroid_px2: Floats
-    """(..., 2, 2) of the pixel in the first camera."""
+    """(..., 2, 2) covariance by the pixel in the first camera."""
     range_px2: Floats
-    """(..., 2, 2) of the range."""
+    """(..., 2, 2) covariance by the range."""
 
     @property
     def covariance_px2(self) -> Floats:
-        """(..., 2, 2) all together."""
+        """(..., 2, 2) covariance by all sources."""
         return self.calibration_px2 + self.centroid_px2 + self.range_px2
 
 
@@ -58,8 +58,8 @@ def project_certain(rig: Rig, camera: str, points_rig: npt.NDArray[np.floating])
     Raises:
         BadInputError: no such camera, no lens, or the rig has no covariance.
     """
-    pixels, _, moves = _seen(rig, camera, np.asarray(points_rig, np.float64))
-    return CertainPixels(pixels, _carried(rig, moves))
+    pixels, _, moves = _project_with_moves(rig, camera, np.asarray(points_rig, np.float64))
+    return CertainPixels(pixels, _propagate(rig, moves))
 
 
 def transfer_certain(
@@ -72,7 +72,7 @@ def transfer_certain(
     pixel_sigma_px: float = 0.0,
     range_sigma_m: float = 0.0,
 ) -> CertainTransfer:
-    """Pixels of `target` at which appears what `source` sees at pixels and ranges.
+    """Pixels of `target` at which the points appear that `source` sees at pixels and ranges.
 
     Args:
         rig: with `calibration.covariance`.
@@ -86,10 +86,10 @@ def transfer_certain(
     Raises:
         BadInputError: no such camera, no lens, or the rig has no covariance.
     """
-    found, by_pixel, by_range, moves = _transferred(rig, source, target, pixels, range_m)
+    found, by_pixel, by_range, moves = _transfer(rig, source, target, pixels, range_m)
     return CertainTransfer(
         found,
-        _carried(rig, moves),
+        _propagate(rig, moves),
         pixel_sigma_px**2 * by_pixel @ np.swapaxes(by_pixel, -1, -2),
         range_sigma_m**2 * by_range @ np.swapaxes(by_range, -1, -2),
     )
@@ -99,16 +99,16 @@ def transfer_moves(
     rig: Rig, source: str, target: str, pixels: npt.NDArray[np.floating], range_m: npt.NDArray[np.floating]
 ) -> tuple[Floats, Moves]:
     """Pixels of `target` as above, and how they move with every parameter of both cameras."""
-    found, _, _, moves = _transferred(rig, source, target, pixels, range_m)
+    found, _, _, moves = _transfer(rig, source, target, pixels, range_m)
     return found, moves
 
 
 def projection_moves(rig: Rig, camera: str, points_rig: Floats) -> tuple[Floats, Floats, Moves]:
     """Pixels of (..., 3) points, rig frame; (..., 2, 3) by the point; and how they move by parameter."""
-    return _seen(rig, camera, points_rig)
+    return _project_with_moves(rig, camera, points_rig)
 
 
-def _transferred(
+def _transfer(
     rig: Rig, source: str, target: str, pixels: npt.NDArray[np.floating], range_m: npt.NDArray[np.floating]
 ) -> tuple[Floats, Floats, Floats, Moves]:
     """Pixels, (..., 2, 2) by the pixel, (..., 2, 1) by the range, and by each parameter."""
@@ -116,7 +116,7 @@ def _transferred(
     seen = lens.unprojection(pixels)
     R, far = T_rig_source[:3, :3], np.asarray(range_m, np.float64)[..., None]
     q = far * (seen.rays @ R.T)
-    found, by_point, moves = _seen(rig, target, q + T_rig_source[:3, 3])
+    found, by_point, moves = _project_with_moves(rig, target, q + T_rig_source[:3, 3])
     by_ray = far[..., None] * (by_point @ R)
     # The source's camera turns and shifts its points: dp = dr x q + dt.
     own = _by_name(source, lens, by_ray @ seen.by_intrinsics, -by_point @ cross_matrix(q), by_point)
@@ -126,7 +126,7 @@ def _transferred(
     return found, by_ray @ seen.by_pixel, by_point @ (seen.rays @ R.T)[..., None], moves
 
 
-def _seen(rig: Rig, camera: str, points: Floats) -> tuple[Floats, Floats, Moves]:
+def _project_with_moves(rig: Rig, camera: str, points: Floats) -> tuple[Floats, Floats, Moves]:
     """Pixels, (..., 2, 3) by the point in the rig's frame, and by each parameter of the camera."""
     lens, T_rig_camera = mounted_lens(rig, camera), rig[camera].transform
     R = T_rig_camera[:3, :3]
@@ -144,7 +144,7 @@ def _by_name(camera: str, lens: Lens, by_intrinsics: Floats, by_rotation: Floats
     return {(camera, name): column for name, column in zip(names, columns, strict=True)}
 
 
-def _carried(rig: Rig, moves: Moves) -> Floats:
+def _propagate(rig: Rig, moves: Moves) -> Floats:
     calibration = rig.calibration
     if calibration is None or calibration.covariance is None:
         raise BadInputError(

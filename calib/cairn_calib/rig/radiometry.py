@@ -1,12 +1,12 @@
-"""What a thermal camera's counts mean: its response to a black body, both ways, and how certain it is.
+"""Radiometry of a thermal camera: its response to a black body, both ways, and its covariance.
 
     kelvin  --counts_of-->  counts          "radiometry" of a thermal camera in rig.json (CONVENTIONS.md)
-    kelvin  <--kelvin_of--  counts          how it is found: response_fit.py, flir_file.py, flat_field.py
+    kelvin  <--kelvin_of--  counts          its sources: response_fit.py, flir_file.py, flat_field.py
 
 Two laws. `planck`: U = R / (exp(B / T) - F) + O, FLIR's form of Planck's law over the camera's band, for counts that
 are proportional to the light received. `polynomial`: T = c0 + c1 U + c2 U^2, for cameras that compute a temperature
-themselves. Both are refused where they do not rise all over their range; beyond it there is no temperature, for there
-nobody looked.
+themselves. Both are refused where they do not rise all over their range; beyond it there is no temperature, since no
+reference was measured there.
 """
 
 from typing import Annotated, Literal, Self
@@ -39,7 +39,7 @@ class PlanckResponse(BaseModel):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the numbers that a covariance is of."""
+        """Names of the response's numbers, in the order of their covariance."""
         return ("r", "b_k", "o")
 
     def counts_of(self, kelvin: npt.ArrayLike) -> Floats:
@@ -85,7 +85,7 @@ class PolynomialResponse(BaseModel):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the numbers that a covariance is of."""
+        """Names of the response's numbers, in the order of their covariance."""
         return ("c0", "c1", "c2")
 
     def kelvin_of(self, counts: npt.ArrayLike) -> Floats:
@@ -115,7 +115,7 @@ Response = Annotated[PlanckResponse | PolynomialResponse, Field(discriminator="l
 
 
 class MapsFile(BaseModel):
-    """The file beside rig.json that says how each pixel differs from the mean one (`flat_field.py`)."""
+    """File next to rig.json with the differences of the pixels from their mean (`flat_field.py`)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -124,23 +124,23 @@ class MapsFile(BaseModel):
 
 
 class Housing(BaseModel):
-    """What the warmth of the camera itself adds to its counts: `counts_per_k` (T_housing - at_k)."""
+    """Counts that the camera's own temperature adds: `counts_per_k` (T_housing - at_k)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     at_k: Kelvin
-    """The response holds for this: the references' mean."""
+    """Temperature of the housing for which the response holds: the mean of the references."""
     counts_per_k: Finite
     covariance_row: tuple[Finite, Finite, Finite, AtLeast0]
-    """Of `counts_per_k` with the response's three numbers, and its own variance."""
+    """Covariance of `counts_per_k` with the response's three numbers, and its own variance."""
     range_k: tuple[Kelvin, Kelvin]
-    """Housings between these were looked at; of a colder or warmer one there is no temperature."""
+    """Lowest and highest housing temperature of the references; outside, no temperature is given."""
     spread_k: AtLeast0
-    """Standard deviation of the references' housings: how far off one is of which nobody says how warm it was."""
+    """Standard deviation of the references' housings: the uncertainty of a housing whose temperature is unknown."""
 
 
 class Radiometry(BaseModel):
-    """The response of one camera, its range, how certain it is; `radiometry` in rig.json, or a file of its own."""
+    """Response of one camera, its range and covariance; `radiometry` in rig.json, or a file of its own."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -148,19 +148,19 @@ class Radiometry(BaseModel):
     version: Literal[1] = 1
     response: Response
     range_k: tuple[Kelvin, Kelvin]
-    """Black bodies between these were looked at; what is colder or hotter has no temperature."""
+    """Lowest and highest black body that was measured; colder or hotter things have no temperature."""
     covariance_lower: tuple[tuple[Finite, ...], ...] | None = None
-    """Of the response's numbers, lower triangle row by row; absent where nobody said (a maker's own numbers)."""
+    """Lower triangle of the covariance of the response's numbers, row by row; absent for a maker's own numbers."""
     accuracy_k: AtLeast0 = 0.0
-    """What a maker states, standard deviation, the same at all pixels; on top of the covariance."""
+    """Standard deviation that the maker states, the same error at all pixels; added to the covariance."""
     noise_counts: AtLeast0 = 0.0
-    """Of a pixel from image to image, standard deviation."""
+    """Standard deviation of a pixel's counts from image to image."""
     pattern_counts: AtLeast0 = 0.0
-    """What is left of the pixels' own offsets after the maps, standard deviation."""
+    """Standard deviation of the pixels' own offsets that the maps leave."""
     housing: Housing | None = None
-    """Absent: nobody said how warm the camera was, or it was always as warm."""
+    """Effect of the housing's temperature; absent where it is unknown, or was always the same."""
     source: Annotated[str, Field(min_length=1, max_length=400)]
-    """Where the numbers come from, for people."""
+    """Origin of the numbers, for people."""
     maps: MapsFile | None = None
 
     @model_validator(mode="after")

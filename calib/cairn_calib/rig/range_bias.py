@@ -1,4 +1,4 @@
-"""What a time-of-flight camera adds to every range: its model, as a sum of a few shapes and a number for each pixel.
+"""Range bias of a time-of-flight camera: a sum of a few shapes, and a number for each pixel.
 
     measured = true + offset_m + scale * true + radial_m * q + radial4_m * q^2                   q: off the middle
              + sum of wiggleK_cos_m * cos(K phi) + wiggleK_sin_m * sin(K phi)                    phi = 4 pi f true / c
@@ -6,14 +6,14 @@
     q = (distance from the image's middle / corner)^2
 
 The offset is the same everywhere, the scale a modulation frequency's error, the radial part that of pixels further out
-(their light goes another way through lens and illumination). What is free is known before to be small (`range_terms`);
+(their light goes another way through lens and illumination). Priors hold all free numbers small (`range_terms`);
 where the boards do not reach the image's corners, the fourth power stays there and a warning says so. The other shapes
 are there only where the boards' images show them (`range_choice.py`), pixels where they differ (`pixel_pattern.py`).
 
 Scale and waves are of the true range, not of the measured one: residuals of a model with (1 - scale) * measured in it
 shrink with the noise that they hold, and least squares then finds a scale where there is none (measured: 3.6 sigma).
 
-What a solve found stands in `rig.json` at its camera, and is taken off where ranges enter the fusion:
+`rig.json` states the solved bias with its camera; it is subtracted where ranges enter the fusion:
 
     "range_bias": {"version": 1, "offset_m": 0.024, "scale": 0.003, "radial_m": 0.012, "radial4_m": 0.0,
      "covariance_lower": [[4e-6], [-2e-6, 1e-6], [0.0, 0.0, 1e-6], [0.0, 0.0, 0.0, 4e-6]]}
@@ -33,12 +33,12 @@ from cairn_map.arrays import Floats
 Real = TypeVar("Real", bound=np.floating)
 
 MEAN_OFF_MIDDLE = 1 / 3
-"""Of `off_middle` over an image, whatever its sides."""
+"""Mean of `off_middle` over an image of any size."""
 INDEFINITE_SHARE = 1e-9
-"""Of the largest eigenvalue of the correlations: a smaller negative one is rounding."""
+"""Share of the correlations' largest eigenvalue below which a negative one is rounding."""
 WAVES_MAX = 4
 STEEPEST = 0.5
-"""Metres a metre of all waves together: less than that, and every measured range has one true range."""
+"""Bound on the slope of all waves together, metres per metre: below it every measured range has one true range."""
 NEWTON_STEPS = 4
 """Each squares the error, which begins with the waves' few centimetres."""
 Metres = Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)]
@@ -47,7 +47,7 @@ Amplitude = Annotated[float, Field(gt=0, le=65535, allow_inf_nan=False)]
 
 
 class Wave(BaseModel):
-    """A part of the circular error: how often it comes in a turn of the light's phase, and its cosine and sine."""
+    """One wave of the circular error: its number in a turn of the light's phase, and its cosine and sine."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -66,13 +66,13 @@ class Wiggle(BaseModel):
 
 
 class ByAmplitude(BaseModel):
-    """What faint pixels add: faint_m (at / amplitude - 1), the amplitude held within what was seen."""
+    """Offset of faint pixels: faint_m (at / amplitude - 1), with the amplitude clamped to `low` and `high`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     faint_m: Metres
     at: Amplitude
-    """The usual amplitude, counts: there, and where the amplitude is not known, it adds nothing."""
+    """Usual amplitude, counts, at which the offset is 0, as it is where the amplitude is unknown."""
     low: Amplitude
     high: Amplitude
     """Amplitudes that the boards had, counts."""
@@ -85,7 +85,7 @@ class ByAmplitude(BaseModel):
 
 
 class RangeBias(BaseModel, frozen=True):
-    """What one range camera adds to its ranges, and how certain that is."""
+    """Metres that one range camera adds to its ranges, with their covariance."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -97,11 +97,11 @@ class RangeBias(BaseModel, frozen=True):
     wiggle: Wiggle | None = None
     by_amplitude: ByAmplitude | None = None
     parameters: Annotated[tuple[str, ...], Field(max_length=16)] | None = None
-    """Names of the covariance's rows, `names`; None: not said."""
+    """Names of the covariance's rows, which must be `names`; None: not stated."""
     covariance_lower: Annotated[tuple[tuple[Finite, ...], ...], Field(max_length=16)] | None = None
-    """Lower triangle of the covariance, in the order of `names`, row by row; None: not known."""
+    """Lower triangle of the covariance, in the order of `names`, row by row; None: unknown."""
     pixel_offsets: PixelOffsets | None = None
-    """What each pixel adds beside that."""
+    """Offsets that single pixels add to it."""
 
     @model_validator(mode="after")
     def _is_one(self) -> Self:

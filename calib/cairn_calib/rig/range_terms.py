@@ -1,16 +1,16 @@
-"""The shapes of what a time-of-flight camera adds to its ranges, one number each: `range_bias.py` says what they mean.
+"""Shapes of a time-of-flight camera's range bias, one number each; `range_bias.py` has the formula.
 
     offset_m, scale, radial_m, radial4_m                      always
     wiggleK_cos_m, wiggleK_sin_m                              where the ranges cover enough of the K-th wave's period
     faint_m                                                   where amplitudes are known and differ enough
-    nodeR_C_m                                                 where what is left varies smoothly over the image
+    nodeR_C_m                                                 where residuals vary smoothly over the image
 
 A phase is measured by a few samples of a wave that is no perfect sine: the range errs periodically with the phase
 phi = 4 pi f d / c, f the modulation frequency ("circular error", "wiggling"). Once and twice a wave are crosstalk and
 uneven gains; four times is what the odd harmonics of the light leave to four samples (Lange 2000, section 2.2).
 
 Nodes are a coarse grid over the image, linear between them. They are solved for with the boards' places, which would
-else swallow what they say; in `rig.json` they are part of the map of the pixels (`pixel_offsets.py`).
+otherwise absorb their part; in `rig.json` they are part of the map of the pixels (`pixel_offsets.py`).
 """
 
 from dataclasses import dataclass
@@ -24,51 +24,51 @@ from cairn_map.arrays import Floats
 LIGHT_M_S = 299_792_458.0
 BIAS_NAMES = ("offset_m", "scale", "radial_m", "radial4_m")
 BIAS_SIGMAS = (0.1, 0.01, 0.05, 0.02)
-"""Before anything is measured: metres, metres a metre, metres at the corner, likewise."""
+"""Priors of `BIAS_NAMES`, standard deviations from 0: metres, metres per metre, twice metres at the image's corner."""
 WIGGLE_SIGMA_M, FAINT_SIGMA_M, NODE_SIGMA_M = 0.02, 0.02, 0.01
-"""Before anything is measured: of a wave's cosine and sine, at half the usual amplitude, of a node."""
+"""Priors, standard deviations from 0, metres: of a wave's cosine and sine, at half the usual amplitude, of a node."""
 
 
 @dataclass(frozen=True, slots=True)
 class RangeTerms:
-    """Which shapes there are: B of them, in the order of `names`."""
+    """Shapes of one bias: B of them, in the order of `names`."""
 
     modulation_hz: float | None = None
     harmonics: tuple[int, ...] = ()
-    """How often each wave comes while the light's phase turns once."""
+    """Number of periods of each wave in one turn of the light's phase."""
     amplitude_at: float | None = None
-    """The usual amplitude, counts; None: no shape for it."""
+    """Usual amplitude, counts; None: no shape depends on the amplitude."""
     nodes: tuple[int, int] | None = None
     """Columns and rows of a grid over the image; None: there is none."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(B,) of the numbers; `_m` are metres, scale is metres a metre."""
+        """(B,) names of the numbers; those in `_m` are metres, scale is metres per metre."""
         columns, rows = self.nodes or (0, 0)
         nodes = [f"node{row}_{column}_m" for row in range(rows) for column in range(columns)]
         return (*self.document_names, *nodes)
 
     @property
     def document_names(self) -> tuple[str, ...]:
-        """Of those that `rig.json` states by name: all but the nodes, which are last."""
+        """Names of the numbers that `rig.json` states: all except the nodes, which are last."""
         waves = [f"wiggle{k}_{part}_m" for k in self.harmonics for part in ("cos", "sin")]
         return (*BIAS_NAMES, *waves, *(("faint_m",) if self.amplitude_at is not None else ()))
 
     @property
     def sigmas(self) -> tuple[float, ...]:
-        """(B,) of the numbers about 0, before anything is measured."""
+        """(B,) prior standard deviations of the numbers from 0."""
         faint = (FAINT_SIGMA_M,) if self.amplitude_at is not None else ()
         columns, rows = self.nodes or (0, 0)
         nodes = (NODE_SIGMA_M,) * (columns * rows)
         return (*BIAS_SIGMAS, *(WIGGLE_SIGMA_M,) * (2 * len(self.harmonics)), *faint, *nodes)
 
     def shapes(self, range_m: Floats, off_middle: Floats, faintness: Floats) -> Floats:
-        """(..., D) what one unit of each of `document_names` adds to (...) true ranges, metres.
+        """(..., D) metres that one unit of each of `document_names` adds to (...) true ranges.
 
         Args:
             range_m: (...) true ranges.
             off_middle: (...) squared distance from the image's middle, 1 at its corners.
-            faintness: (...) `faintness`, 0 where it is not known; not looked at without that shape.
+            faintness: (...) `faintness`, 0 where it is unknown; unused without that shape.
         """
         columns = [np.ones_like(range_m), range_m, off_middle, off_middle**2]
         for k in self.harmonics:
@@ -79,7 +79,7 @@ class RangeTerms:
         return np.stack(np.broadcast_arrays(*columns), axis=-1)
 
     def slopes(self, range_m: Floats) -> Floats:
-        """(..., D) how much that changes a metre of true range."""
+        """(..., D) derivatives of `shapes` by the true range."""
         nothing = np.zeros_like(range_m)
         columns = [nothing, np.ones_like(range_m), nothing, nothing]
         for k in self.harmonics:
@@ -90,22 +90,22 @@ class RangeTerms:
         return np.stack(columns, axis=-1)
 
     def phase_a_metre(self, harmonic: int) -> float:
-        """Radians by which a wave turns in a metre of range."""
+        """Phase of a wave per metre of range, radians."""
         return 4 * np.pi * harmonic * (self.modulation_hz or 0.0) / LIGHT_M_S
 
     def faintness(self, amplitude: Floats) -> Floats:
-        """(...) usual over actual amplitude, minus 1: 1 at half of the usual; 0 where it is not known (NaN)."""
+        """(...) usual over actual amplitude, minus 1: 1 at half of the usual; 0 where it is unknown (NaN)."""
         with np.errstate(divide="ignore", invalid="ignore"):
             faint = (self.amplitude_at or 0.0) / amplitude - 1
         return np.where(np.isfinite(faint), faint, 0.0)
 
 
 ALWAYS = RangeTerms()
-"""Those that need no more than ranges."""
+"""Shapes that need no more than ranges."""
 
 
 def wave_period_m(modulation_hz: float, harmonic: int) -> float:
-    """Range after which a wave comes again."""
+    """Period of a wave in range, metres."""
     return LIGHT_M_S / (2 * modulation_hz * harmonic)
 
 
@@ -122,7 +122,7 @@ def _off_middle(width: int, height: int, pixels: Floats) -> Floats:
 
 @lru_cache(maxsize=16)
 def off_middle_image(width: int, height: int) -> Floats:
-    """(H, W) the same of every pixel, read-only."""
+    """(H, W) `off_middle` of every pixel, read-only."""
     y, x = np.mgrid[:height, :width]
     off = _off_middle(width, height, np.stack([x, y], axis=-1).astype(np.float64))
     off.setflags(write=False)

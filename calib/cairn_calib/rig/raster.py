@@ -1,7 +1,7 @@
-"""What every camera has, whatever its lens: a raster of pixels, each with one ray.
+"""Interface of all cameras: a raster of pixels, each with one ray.
 
-The centre of the top-left pixel is (0, 0), pixels are (x, y), arrays [y, x]. The lenses are next door:
-`camera.py` (pinhole) and `lidar.py` (cylinder).
+The centre of the top-left pixel is (0, 0), pixels are (x, y), arrays [y, x]. The models are `camera.py`
+(pinhole), `fisheye.py` and `lidar.py` (cylinder).
 """
 
 from abc import ABC, abstractmethod

@@ -1,13 +1,17 @@
-"""A rig: the cameras of one sensor head and where each sits on it; `rig.json` on disk.
+"""Rig: the cameras of one sensor head and the pose of each on it; `rig.json` on disk.
 
     {"format": "cairn-rig", "version": 1, "name": "orpheus-head",
      "cameras": {"tof": {"spectrum": "range", "camera": {...}, "T_rig_camera": [[...], ...]}, ...}}
 
 `T_rig_camera` maps points from the camera's frame to the rig's, in metres. Which camera sees which
 spectrum is part of the rig, so an image's meaning never depends on its file name. A camera without `model` is a
-pinhole; a fisheye says `"model": "kb4"`, a spinning lidar `"model": "spinning"`. What is optional and not said is not
-in the document either: `sensing` and `range_bias` of a range camera, `calibration_sigma_px` of a camera, the robot's
-`body`, and how the numbers came about and how certain they are (`calibration`).
+pinhole; a fisheye has `"model": "kb4"`, a spinning lidar `"model": "spinning"`. Optional parts are absent when unknown:
+`sensing` and `range_bias` of a range camera, `calibration_sigma_px` of a camera, the robot's `body`, and the origin and
+covariance of the numbers (`calibration`). Of a range camera's `sensing`,
+
+    "sensing": {"sigma_m": [[0, 0.005], [3, 0.01], [10, 0.03]], "saturated_amplitude": 65535, "no_return_clears_m": 30}
+
+each field that is absent is that of a usual sensor (`TIME_OF_FLIGHT`, `LIDAR`).
 """
 
 import hashlib
@@ -44,17 +48,17 @@ Row = tuple[float, float, float, float]
 
 
 class RangeSensing(BaseModel):
-    """What a range camera's manufacturer, or a measurement, says of it."""
+    """Noise and limits of a range camera, as its manufacturer states or a measurement shows them."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     sigma_m: Annotated[tuple[Node, ...], Field(min_length=1, max_length=64)] | None = None
     """Range and standard deviation there, metres, by rising range: linear between two, constant beyond the ends."""
     saturated_amplitude: Annotated[int, Field(ge=1, le=65535)] | None = None
-    """From this amplitude on too much light returned, and the range is worth nothing."""
+    """Amplitude from which on too much light returned, and the range is void."""
     no_return_clears_m: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)] | None = None
-    """A beam to which nothing comes back has met nothing so far. Only of a sensor whose every surface within this
-    range returns something: to a time-of-flight camera black, tilted or mirroring things return nothing."""
+    """Range that a beam without return has found clear. Only for a sensor to which every surface within this range
+    returns something: to a time-of-flight camera black, tilted or mirroring things return nothing."""
 
     @model_validator(mode="after")
     def _nodes_rise(self) -> Self:
@@ -70,13 +74,14 @@ class RangeSensing(BaseModel):
 
 
 TIME_OF_FLIGHT = RangeSensing(sigma_m=((0.0, 0.005), (3.0, 0.01), (6.0, 0.03)))
-"""5 mm at best, 1 cm at 3 m from a grey surface, growing with the square of the range: MESA SR4000 and its kind."""
+"""Usual time-of-flight camera: 5 mm at best, 1 cm at 3 m from a grey surface, growing with the square of the range
+(MESA SR4000 and its kind)."""
 LIDAR = RangeSensing(sigma_m=((0.0, 0.02),))
-"""2 cm at every range, as data sheets of spinning lidars say."""
+"""Usual spinning lidar: 2 cm at every range, as data sheets state."""
 
 
 class Spectrum(StrEnum):
-    """What a camera's pixels mean."""
+    """Quantity that a camera's pixels measure."""
 
     RANGE = "range"
     """Time of flight: metres along the beam, and optionally the amplitude (near infrared) that came back."""
@@ -87,7 +92,7 @@ class Spectrum(StrEnum):
 
 
 def _model_of(camera: object) -> str | None:
-    """Which model a camera in a document has; None: one that there is not."""
+    """Model of a camera in a document; None for an unknown one."""
     if not isinstance(camera, dict):
         return str(getattr(camera, "model", "pinhole"))
     if "model" not in camera:
@@ -114,13 +119,13 @@ class MountedCamera(BaseModel, frozen=True):
     ]
     T_rig_camera: tuple[Row, Row, Row, Row]
     sensing: RangeSensing | None = None
-    """Of a range camera."""
+    """Noise and limits of a range camera."""
     calibration_sigma_px: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
-    """How far off, in its own pixels, points of the range camera are expected in it: one axis, standard deviation."""
+    """Expected error of the range camera's points in this camera, its own pixels: one axis, standard deviation."""
     radiometry: Radiometry | None = None
-    """Of a thermal camera: what its counts mean."""
+    """Response of a thermal camera to temperature."""
     range_bias: RangeBias | None = None
-    """Of a range camera with a lens: what it adds to its ranges."""
+    """Bias of a range camera with a lens."""
 
     @model_validator(mode="after")
     def _rigid(self) -> Self:
@@ -165,30 +170,30 @@ class MountedCamera(BaseModel, frozen=True):
     @property
     def transform(self) -> Transform:
         """`T_rig_camera` as (4, 4) float64, read-only."""
-        return _transform_of(self.T_rig_camera)
+        return _rigid_transform(self.T_rig_camera)
 
     @property
     def known_sensing(self) -> RangeSensing:
-        """What is said of a range camera; nothing, where nothing is said."""
+        """Stated `sensing`; one without any statement where the rig has none."""
         return self.sensing or RangeSensing()
 
     def range_sigma_m(self, range_m: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
         """(...) standard deviation of the range camera at ranges, metres: as stated, else as is usual.
 
-        What is not known of its `range_bias` is in it, as if it were noise.
+        The uncertainty of its `range_bias` is included, as if it were noise.
         """
         sigma_m = self.range_noise_m(range_m)
         return sigma_m if self.range_bias is None else np.hypot(sigma_m, self.range_bias.sigma_at(range_m))
 
     def range_sigma_image(self, range_m: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-        """(H, W) the same for an image of ranges, with what is known of each pixel's own part of `range_bias`."""
+        """(H, W) standard deviation at (H, W) ranges, metres, with each pixel's own uncertainty of `range_bias`."""
         if self.range_bias is None:
             return self.range_sigma_m(range_m)
         usual = self.known_sensing.sigma_at(range_m, usual=TIME_OF_FLIGHT)
         return np.hypot(usual, self.range_bias.sigma_image(self.camera, range_m))
 
     def range_noise_m(self, range_m: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-        """(...) the same without the bias: what is independent from pixel to pixel."""
+        """(...) standard deviation at ranges, metres, without the bias: independent from pixel to pixel."""
         usual = LIDAR if isinstance(self.camera, SpinningLidar) else TIME_OF_FLIGHT
         return self.known_sensing.sigma_at(range_m, usual=usual)
 
@@ -231,7 +236,7 @@ class MountedCamera(BaseModel, frozen=True):
 
 
 @lru_cache(maxsize=256)
-def _transform_of(rows: tuple[Row, Row, Row, Row]) -> Transform:
+def _rigid_transform(rows: tuple[Row, Row, Row, Row]) -> Transform:
     # Kept: to make a rotation orthonormal takes 0.2 ms, as long as all the rest that is asked of a rig for a scan.
     T = check_transform(rows, name="T_rig_camera")
     T.setflags(write=False)
@@ -248,9 +253,9 @@ class Rig(BaseModel):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
     cameras: Annotated[dict[str, MountedCamera], Field(min_length=1, max_length=32)]
     body: Body | None = None
-    """Of the robot that carries it."""
+    """Shape of the robot that carries the rig."""
     calibration: Calibration | None = None
-    """How the numbers came about, and how certain they are."""
+    """Origin of the numbers, and their covariance."""
 
     @field_validator("version", mode="before")
     @classmethod

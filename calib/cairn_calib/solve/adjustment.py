@@ -21,45 +21,47 @@ from cairn_calib.solve.solve_plan import NoisePlan, Prior
 from cairn_map.arrays import Flags, Floats
 
 STEPS_MAX = 100
+"""Steps of one descent, at most."""
 DAMPING, DAMPING_MIN, DAMPING_MAX = 1e-4, 1e-12, 1e10
+"""Marquardt's damping at the start, and its bounds: shares of the normal equations' diagonal."""
 WARM = 1e-8
 """Damping near a minimum, where it would only slow down what is weakly determined."""
 ROUNDING = 1e-12
-"""Relative rise of the cost that is none."""
+"""Relative rise of the cost that counts as rounding, not as a rise."""
 SETTLED = 1e-10
 """Expected fall of the cost, in squared sigmas, below which a step is not worth it: 1e-5 sigma."""
 COARSE = 1e-2
-"""The same where outliers and noise are still to be found: a tenth of a sigma."""
+"""Expected fall of the cost that ends a descent while outliers and noise are still open: a tenth of a sigma."""
 SCALE_SETTLED = 1e-3
-"""Relative change of a sensor's noise."""
+"""Relative change of a sensor's noise below which its estimate has settled."""
 MEDIAN_SQUARE = {1: 0.4549, 2: 1.3863}
-"""Of chi2 with 1 and 2 degrees of freedom."""
+"""Median of chi2 with 1 and 2 degrees of freedom."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """One source of residuals, and how its noise stands."""
+    """One source of residuals, with its estimated noise and its outliers."""
 
     data: CornerData | RangeData
     scale: float
-    """Of the stated noise."""
+    """Estimated noise over the stated one."""
     kept: Flags
-    """(V, N) what counts: there, and no outlier."""
+    """(V, N) True for each point that counts: measured, and no outlier."""
 
     @property
     def there(self) -> Flags:
-        """(V, N) what was measured."""
+        """(V, N) True for each point that was measured."""
         return self.data.seen if isinstance(self.data, CornerData) else self.data.measured
 
     @property
     def axes(self) -> int:
-        """Residuals of one point."""
+        """Number of residuals of one point."""
         return 2 if isinstance(self.data, CornerData) else 1
 
 
 @dataclass(frozen=True, slots=True)
 class AdjustmentProblem:
-    """All that is to be met."""
+    """Residuals, priors and free parameters of one least-squares problem."""
 
     board: Board
     layout: ParameterLayout
@@ -67,7 +69,7 @@ class AdjustmentProblem:
     priors: tuple[Prior, ...]
 
     def blocks(self, state: RigState, *, huber_sigmas: float = np.inf) -> list[Block]:
-        """One for each sensor."""
+        """Blocks of the normal equations at a state, one for each sensor."""
         board = (self.board.points(), warp_shape(self.board))
         blocks = []
         for sensor in self.sensors:
@@ -79,11 +81,12 @@ class AdjustmentProblem:
         return blocks
 
     def normal(self, state: RigState, blocks: list[Block]) -> NormalEquations:
-        """The sum of all, and of the priors."""
+        """Normal equations at a state: the sum of all blocks and of the priors."""
         normal = sum_blocks(blocks, self.layout.size, len(state.T_rig_board))
         A, a, cost = normal.A.copy(), normal.a.copy(), normal.cost
         values = shared_values(state, self.layout)
         for prior in self.priors:
+            # A prior is one more residual, (row . values - value) / sigma.
             row = self.prior_row(prior)
             miss = float(row @ values - prior.value) / prior.sigma
             A += np.outer(row, row) / prior.sigma**2
@@ -92,7 +95,7 @@ class AdjustmentProblem:
         return replace(normal, A=A, a=a, cost=cost)
 
     def prior_row(self, prior: Prior) -> Floats:
-        """(P,) its coefficients."""
+        """(P,) coefficients of a prior; parameters that are held fall out."""
         row = np.zeros(self.layout.size)
         for owner, name, coefficient in prior.terms:
             at = self.layout.index(owner, name)
@@ -103,7 +106,7 @@ class AdjustmentProblem:
 
 @dataclass(frozen=True, slots=True)
 class Adjustment:
-    """Where it ended."""
+    """End of an adjustment: the estimate, and the equations there."""
 
     problem: AdjustmentProblem
     state: RigState
@@ -120,25 +123,28 @@ def adjust(problem: AdjustmentProblem, state: RigState, noise: NoisePlan) -> Adj
     """
     if noise.rounds == 0:
         return descend(problem, state, huber_sigmas=noise.huber_sigmas)
-    result = descend(_median_scaled(problem, state), state, huber_sigmas=noise.huber_sigmas, settled=COARSE)
-    result = replace(result, problem=_median_scaled(result.problem, result.state))
+    # 1. Robust: noise from the median at the start, Huber's loss, noise from the median at the minimum.
+    result = descend(_rescale_by_median(problem, state), state, huber_sigmas=noise.huber_sigmas, settled=COARSE)
+    result = replace(result, problem=_rescale_by_median(result.problem, result.state))
+    # 2. Least squares over what is within the bound; outliers and noise by turns, until neither changes.
     for _ in range(noise.rounds):
         before = result.problem.sensors
         blocks = result.problem.blocks(result.state)
-        kept = tuple(_culled(sensor, each, noise.cull_sigmas) for sensor, each in zip(before, blocks, strict=True))
+        kept = tuple(_cull(sensor, each, noise.cull_sigmas) for sensor, each in zip(before, blocks, strict=True))
         result = descend(replace(result.problem, sensors=kept), result.state, settled=COARSE, damping=WARM)
-        scaled = _scaled(result)
+        scaled = _rescale(result)
         result = replace(result, problem=replace(result.problem, sensors=scaled))
         if all(
             np.array_equal(a.kept, b.kept) and abs(a.scale / c.scale - 1) < SCALE_SETTLED
             for a, b, c in zip(before, kept, scaled, strict=True)
         ):
             break
+    # Last, to full precision.
     return descend(result.problem, result.state, damping=WARM)
 
 
 def resume(problem: AdjustmentProblem, state: RigState, noise: NoisePlan) -> Adjustment:
-    """The minimum of a problem with more parameters than the one whose outliers, noise and state it begins with.
+    """The minimum of a problem with more parameters, from the outliers, noise and state of one with fewer.
 
     Raises:
         numpy.linalg.LinAlgError: the data do not determine all parameters.
@@ -146,7 +152,7 @@ def resume(problem: AdjustmentProblem, state: RigState, noise: NoisePlan) -> Adj
     result = descend(problem, state, settled=COARSE, damping=WARM)
     if noise.rounds == 0:
         return descend(problem, result.state, damping=WARM)
-    return descend(replace(problem, sensors=_scaled(result)), result.state, damping=WARM)
+    return descend(replace(problem, sensors=_rescale(result)), result.state, damping=WARM)
 
 
 def descend(
@@ -166,6 +172,7 @@ def descend(
     normal = problem.normal(state, blocks)
     if not np.isfinite(normal.cost):
         raise np.linalg.LinAlgError("the start puts corners where the lens sees nothing")
+    # Invariant: `blocks` and `normal` are those of `state`, whose cost only falls.
     for step in range(STEPS_MAX):
         shared, boards, expected = normal.step(damping)
         if expected < settled:
@@ -173,6 +180,7 @@ def descend(
         trial = step_state(state, problem.layout, shared, boards)
         trial_blocks = problem.blocks(trial, huber_sigmas=huber_sigmas)
         trial_normal = problem.normal(trial, trial_blocks)
+        # A step that helps is taken with less damping next; one that does not is tried again, shorter.
         if trial_normal.cost < normal.cost:
             state, blocks, normal = trial, trial_blocks, trial_normal
             damping = max(damping / 10, DAMPING_MIN)
@@ -185,20 +193,24 @@ def descend(
 
 
 def redundancies(blocks: list[Block], known: Uncertainty, sensors: tuple[Sensor, ...]) -> list[float]:
-    """Of each sensor: how many of its residuals are left free by what is estimated."""
+    """Redundancy of each sensor: the number of its residuals that the estimated parameters leave free.
+
+    Foerstner 1979: r = m - trace(J cov J^T), which is the expected sum of squares of whitened residuals.
+    """
     return [
         float(sensor.kept.sum() * sensor.axes - np.sum(known.of_block(block.at, block.frames) * block.square))
         for block, sensor in zip(blocks, sensors, strict=True)
     ]
 
 
-def _culled(sensor: Sensor, block: Block, sigmas: float) -> Sensor:
+def _cull(sensor: Sensor, block: Block, sigmas: float) -> Sensor:
+    """The sensor whose measured points count if they are within `sigmas`, whatever they did before."""
     squares = np.sum(block.residuals**2, axis=-1)
     return replace(sensor, kept=sensor.there & (squares <= sigmas**2))
 
 
-def _scaled(result: Adjustment) -> tuple[Sensor, ...]:
-    """Sensors whose noise is what their residuals show, given how many of them are free."""
+def _rescale(result: Adjustment) -> tuple[Sensor, ...]:
+    """Sensors with the noise that their residuals show: variance is their sum of squares over their redundancy."""
     sensors = result.problem.sensors
     free = redundancies(result.blocks, uncertainty(result.normal), sensors)
     scaled = []
@@ -208,7 +220,8 @@ def _scaled(result: Adjustment) -> tuple[Sensor, ...]:
     return tuple(scaled)
 
 
-def _median_scaled(problem: AdjustmentProblem, state: RigState) -> AdjustmentProblem:
+def _rescale_by_median(problem: AdjustmentProblem, state: RigState) -> AdjustmentProblem:
+    """The problem with noise by the median of squared residuals, which half of the points may spoil."""
     scaled = []
     for sensor, block in zip(problem.sensors, problem.blocks(state), strict=True):
         squares = np.sum(block.residuals**2, axis=-1)[sensor.kept]

@@ -1,4 +1,4 @@
-"""What a rig's cameras saw of one board: the input of a calibration.
+"""Views of one board by the cameras of a rig, with range images if there are any: the input of a calibration.
 
     frame "03":   tof/03.json   left/03.json   ...        one frame = one place of the board, seen by some cameras
     frame "04":   tof/04.json                  ...
@@ -27,7 +27,7 @@ from cairn_map.errors import BadInputError
 
 KIND = "bad_board_views"
 SEEN_MIN = 6
-"""Points of a board in one image: fewer, and its place is hardly more than the noise's."""
+"""Points of a board in one image; with fewer its pose is hardly more than noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class RangeView:
     frame: str
     range_m: npt.NDArray[np.floating]
     amplitude: npt.NDArray[np.integer] | None = None
-    """(H, W) counts of the light that came back; 0: not known, 65535: too much."""
+    """(H, W) counts of the light that came back; 0: unknown, 65535: too much."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class BoardViews:
     ranges: tuple[RangeView, ...] = ()
     inputs: tuple[InputFile, ...] = ()
     polarities: Mapping[str, Polarity] | None = None
-    """As the corners were found with; only to be told."""
+    """Polarity with which each camera's corners were found; for the report only."""
 
     def __post_init__(self) -> None:
         if len({(view.camera, view.frame) for view in self.views}) < len(self.views):
@@ -175,16 +175,16 @@ def _input_file(camera: str, path: Path) -> InputFile:
 def add_ranges(
     views: BoardViews, plan: SolvePlan, folder: Path, units_per_m: float, *, amplitudes: Path | None = None
 ) -> BoardViews:
-    """The views with the 16-bit range images of a folder, of the first range camera, and their amplitudes' images.
+    """Add the 16-bit range images of a folder, of the first range camera, and their amplitude images, to the views.
 
     They count as inputs, with their digests, after the corner documents.
 
     Args:
-        views: of the boards.
+        views: views of the boards.
         plan: names the range camera.
-        folder: of range images, radial; 0 where nothing came back. They belong to frames as corner images do.
-        units_per_m: of their counts.
-        amplitudes: a folder of images of the same frames; None: the amplitudes are not known.
+        folder: range images, radial; 0 where nothing came back. They belong to frames as corner images do.
+        units_per_m: counts of a range image per metre.
+        amplitudes: a folder of images of the same frames; None: the amplitudes are unknown.
 
     Raises:
         BadInputError: there is no range camera, or no image, or one that cannot be read, or two are of one frame.

@@ -1,6 +1,6 @@
-"""Each camera by itself: homographies, Zhang's guess, then its lens and its boards with distortion (paper, III).
+"""Calibration of each camera alone: homographies, Zhang's guess, then lens and boards with distortion (paper, III).
 
-What comes out is where the joint solve starts; and what a camera's own images cannot tell is refused here, in words.
+The joint solve starts from it. Images that do not determine the camera are refused here, with advice.
 """
 
 from collections.abc import Mapping
@@ -23,31 +23,35 @@ from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 
 VIEWS_MIN = 2
+"""Views of a camera: one leaves its focal length open."""
 TILT_MIN_DEG = 3.0
-"""Between the boards of a camera's views: under this they are as good as parallel."""
+"""Largest angle between two boards of a camera's views, degrees, below which they are as good as parallel."""
 FIRST = NoisePlan(huber_sigmas=1.5, cull_sigmas=4.0, rounds=1)
+"""Noise of the solve of one camera: a single round, for the joint solve estimates it again."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraAlone:
-    """A camera by its own images."""
+    """A camera by its own images: the start of the joint solve."""
 
     lens: Lens
     T_camera_board: Mapping[str, Transform]
     """By frame."""
     scale: float
-    """Of the noise of its corners, to the stated."""
+    """Noise of its corners over the stated one."""
 
 
 def camera_alone(name: str, views: BoardViews, plan: SolvePlan) -> CameraAlone:
-    """The camera by itself.
+    """The camera by its own images.
 
     Raises:
         BadInputError: its views do not determine it.
     """
+    # Zhang's guess, without distortion.
     seen = views.alone(name)
     _refuse_too_few(name, len(seen.views))
     lens, poses = _guess(seen, plan.cameras[name])
+    # The plan of a rig of this camera alone: a flat board of the stated pitch, and no priors of others.
     own = replace(
         plan,
         cameras={name: plan.cameras[name]},
@@ -60,6 +64,7 @@ def camera_alone(name: str, views: BoardViews, plan: SolvePlan) -> CameraAlone:
     state = RigState(
         (lens,), np.eye(4)[None], np.stack([poses[frame] for frame in frames]), np.zeros(2), 1.0, np.zeros(0)
     )
+    # Least squares over lens and boards.
     priors = usual_priors(own, {name: lens}, {name: len(seen.views)}, seen.board, ranges=None)
     data = corner_data(0, seen.of_camera(name), frames)
     layout = parameter_layout(own, {name: lens}, [])
@@ -109,6 +114,7 @@ def _refuse_parallel(name: str, boards: Floats) -> None:
 def _guess(seen: BoardViews, plan: CameraPlan) -> tuple[Lens, dict[str, Transform]]:
     (name,) = seen.cameras
     size = seen.sizes_px[name]
+    # Views whose corners lie on a line have no homography.
     usable = [(view, H) for view in seen.views if (H := homography_of(view.corners)) is not None]
     _refuse_too_few(name, len(usable))
     K = first_camera_matrix([view.corners for view, _ in usable], [H for _, H in usable], size)

@@ -1,7 +1,7 @@
-r"""Normal equations of a calibration, and how to solve them: a Schur complement on the boards' poses.
+r"""Normal equations of a calibration and their solution by a Schur complement on the boards' poses.
 
-    | A    B |  | shared |     | a |       A (P, P) all that is shared: cameras, warp, scale, range bias
-    |        |  |        |  =  |   |       C (F, 6, 6) one block for each board, for boards do not meet each other
+    | A    B |  | shared |     | a |       A (P, P) shared parameters: cameras, warp, scale, range bias
+    |        |  |        |  =  |   |       C (F, 6, 6) one block for each board: no residual is of two boards
     | B^T  C |  | boards |     | b |       B (F, P, 6)
 
     (A - sum_f B C^-1 B^T) shared = a - sum_f B C^-1 b        P unknowns, however many boards
@@ -21,19 +21,19 @@ Indices = npt.NDArray[np.intp]
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """What a sensor's residuals cost."""
+    """Cost of a sensor's residuals: squares, and beyond a bound lengths."""
 
     scale: float
     """Noise of the sensor over the stated one."""
     kept: npt.NDArray[np.bool_]
     """(V, N) points that count."""
     huber_sigmas: float
-    """Beyond it the cost grows linearly (Huber 1964)."""
+    """Length of a residual, sigmas, beyond which its cost grows linearly (Huber 1964)."""
 
     def __call__(self, squares: Floats) -> tuple[Floats, float]:
         """(V, N) weights of squared lengths of residuals, and the sum of their costs; infinite if one is NaN.
 
-        What does not count has no weight and no cost.
+        Points that are not kept have no weight and no cost.
         """
         squares = np.where(self.kept, squares, 0.0)
         if np.isnan(squares).any():
@@ -48,28 +48,28 @@ class Loss:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """What one camera's views say: the squares of their whitened derivatives.
+    """One sensor's share of the normal equations: squares of its whitened derivatives.
 
     V views, each of one frame; K columns of shared parameters, then 6 of the frame's board.
     """
 
     at: Indices
-    """(K,) where the shared columns stand."""
+    """(K,) positions of the shared columns among all shared parameters."""
     frames: Indices
-    """(V,) of each view, all different."""
+    """(V,) frame of each view, all different."""
     square: Floats
     """(V, K + 6, K + 6) J^T J."""
     pull: Floats
     """(V, K + 6) -J^T r."""
     residuals: Floats
-    """(V, M, D) whitened, D a corner's or a pixel's axes; of outliers, too; 0 where there is nothing."""
+    """(V, M, D) whitened residuals, D axes of a corner or a pixel; outliers included; 0 where nothing was measured."""
     cost: float
-    """Sum of what the loss makes of the residuals' squares."""
+    """Sum of the loss over all points."""
 
 
 @dataclass(frozen=True, slots=True)
 class NormalEquations:
-    """The sum of all blocks."""
+    """Normal equations of a whole problem; shapes as drawn above."""
 
     A: Floats
     B: Floats
@@ -90,7 +90,8 @@ class NormalEquations:
         C = self.C * (1 + damping * np.eye(6))
         right = np.concatenate([np.swapaxes(self.B, 1, 2), self.b[..., None]], axis=2)
         solved = np.asarray(np.linalg.solve(C, right), np.float64)
-        # F small products: a single large one makes BLAS start threads, 30 times slower where processors are busy.
+        # sum_f B C^-1 [B^T b] as F small products: a single large one makes BLAS start threads,
+        # 30 times slower where processors are busy.
         inner: Floats = (self.B @ solved).sum(axis=0)
         return A - inner[:, :-1], self.a - inner[:, -1], solved[..., :-1], solved[..., -1]
 
@@ -100,6 +101,7 @@ class NormalEquations:
         Raises:
             numpy.linalg.LinAlgError: it is singular.
         """
+        # First what is shared, then each board from it.
         S, s, by_shared, alone = self.reduced(damping)
         shared = solve_scaled(S, s)
         boards = alone - by_shared @ shared
@@ -110,11 +112,12 @@ class NormalEquations:
 
 
 def sum_blocks(blocks: list[Block], size: int, frame_count: int) -> NormalEquations:
-    """The sum of blocks, for P = `size` shared parameters and F = `frame_count` boards."""
+    """Sum of blocks, for P = `size` shared parameters and F = `frame_count` boards."""
     A, a = np.zeros((size, size)), np.zeros(size)
     B, C, b = np.zeros((frame_count, size, 6)), np.zeros((frame_count, 6, 6)), np.zeros((frame_count, 6))
     for block in blocks:
         k = len(block.at)
+        # Indices of one block are all different, so += on fancy indices adds each once.
         A[np.ix_(block.at, block.at)] += block.square[:, :k, :k].sum(axis=0)
         a[block.at] += block.pull[:, :k].sum(axis=0)
         B[np.ix_(block.frames, block.at)] += block.square[:, :k, k:]
@@ -146,9 +149,9 @@ class Uncertainty:
     shared: Floats
     """(P, P)"""
     by_shared: Floats
-    """(F, 6, P) C^-1 B^T: by a change of the shared parameters each board moves by minus that."""
+    """(F, 6, P) C^-1 B^T: minus the derivative of each board's pose by the shared parameters."""
     own: Floats
-    """(F, 6, 6) C^-1: of each board if the shared parameters were known."""
+    """(F, 6, 6) C^-1: covariance of each board's pose if the shared parameters were known."""
 
     def of_board(self, frame: int) -> Floats:
         """(6, 6) covariance of one board's pose."""
@@ -159,6 +162,7 @@ class Uncertainty:
         """(V, K + 6, K + 6) covariance of some shared parameters with each frame's board."""
         k = len(at)
         result = np.empty((len(frames), k + 6, k + 6))
+        # [shared, board] = [[S^-1, S^-1 M^T], [M S^-1, C^-1 + M S^-1 M^T]] with M = -C^-1 B^T.
         moves = -self.by_shared[frames]
         cross = moves @ self.shared
         result[:, :k, :k] = self.shared[np.ix_(at, at)]
@@ -169,7 +173,7 @@ class Uncertainty:
 
 
 def uncertainty(normal: NormalEquations) -> Uncertainty:
-    """The covariances at a minimum.
+    """Covariances at a minimum.
 
     Raises:
         numpy.linalg.LinAlgError: something is not determined.

@@ -1,4 +1,4 @@
-r"""What each pixel of a range camera adds beside what all do: what a solve leaves of the boards' planes there.
+r"""Range offset of each single pixel, by the residuals that a solve leaves on the boards' planes.
 
     residual of a range = offset of its pixel + noise          offset ~ 0 +- pattern, noise ~ 0 +- noise
 
@@ -29,32 +29,32 @@ from cairn_map.arrays import Floats
 Indices = npt.NDArray[np.intp]
 
 FOUND_SIGMAS = 4.0
-"""By which the pattern's variance must be above 0."""
+"""Standard deviations by which the pattern's variance must exceed 0."""
 STRAY_SIGMAS = 4.0
-"""From a pixel's median, of the noise with the pattern: further off, a range is left out."""
+"""Standard deviations (noise and pattern) from a pixel's median beyond which a range is left out."""
 
 BLOCK_PX = 16
-"""Side of a block whose mean residual tells what varies smoothly."""
+"""Side of a block of pixels whose mean residual shows what varies smoothly, pixels."""
 BLOCK_SHARE = 0.25
-"""Of a block's pixels, that one image must show."""
+"""Share of a block's pixels that one image must show."""
 
 
 @dataclass(frozen=True, slots=True)
 class PixelPattern:
-    """What was found of the pixels' own offsets."""
+    """Estimate of the pixels' own offsets."""
 
     pairs: int
-    """Of residuals of one pixel, from two images."""
+    """Number of pairs of residuals of one pixel, from two images."""
     variance_m2: float
-    """Of the pixels' offsets; chance may make it negative."""
+    """Variance of the pixels' offsets; chance may make it negative."""
     variance_sigma_m2: float
-    """Of that by chance alone, were there no pattern."""
+    """Standard deviation of `variance_m2` by chance alone, were there no pattern."""
     seen_share: float
-    """Of the image's pixels, those on which a board was."""
+    """Share of the image's pixels on which a board was."""
     smooth_m: float
-    """Standard deviation of what blocks of pixels add, metres; 0 where it is no more than chance makes."""
+    """Standard deviation of the blocks' offsets, metres; 0 where it is no more than chance makes."""
     offsets: PixelOffsets | None
-    """None: there is no more than chance makes."""
+    """Map of the offsets; None where the pattern is no more than chance makes."""
 
     @property
     def at_most_m(self) -> float:
@@ -63,7 +63,7 @@ class PixelPattern:
 
 
 def pixel_pattern(views: BoardViews, done: Adjustment, covariance: Floats) -> PixelPattern | None:
-    """The pixels' own offsets, by what a solve left, and those of its nodes; None without range images in it.
+    """Each pixel's offset, by the residuals of a solve, plus its nodes' part; None without range images in it.
 
     `covariance` is (P, P), of the solve's shared parameters.
     """
@@ -71,6 +71,7 @@ def pixel_pattern(views: BoardViews, done: Adjustment, covariance: Floats) -> Pi
     used = sensor.data
     if not isinstance(used, RangeData):
         return None
+    # Residuals of all pixels of all boards, not only of those that the solve was of.
     lens = state.lenses[used.camera]
     whole = lens.width * lens.height
     every = range_data(used.camera, views.ranges, views.frames, state, board, sigma_m=used.sigma_m, pixels_max=whole)
@@ -79,6 +80,7 @@ def pixel_pattern(views: BoardViews, done: Adjustment, covariance: Floats) -> Pi
     every = every.with_terms(used.terms, lens)
     true_m = plane_ranges(every, state, board)
     left_m = every.range_m - true_m - every.added_m(lens, true_m, state.bias)
+    # The pixels' own part, then the nodes'.
     sound = _sound(every, left_m, lens.width, STRAY_SIGMAS * sensor.scale * used.sigma_m)
     found = _pattern_of(sound, (lens.height, lens.width))
     at = done.problem.layout.bias_at[len(used.terms.document_names) :]
@@ -102,13 +104,14 @@ class _Sound:
 
 
 def _sound(data: RangeData, left_m: Floats, width: int, stray_m: float) -> _Sound:
-    """Residuals without those far from their pixel's median.
+    """Residuals, without those far from their pixel's median.
 
-    Of a pixel with fewer than three, they are measured from 0: two cannot tell which is wrong.
+    Those of a pixel with fewer than three are measured from 0: two cannot show which of them is wrong.
     """
     seen = data.measured & np.isfinite(left_m)
     x, y = data.pixels[seen].astype(np.intp).T
     pixels, left, views = y * width + x, left_m[seen], np.nonzero(seen)[0]
+    # Sorted by pixel, then by residual, each pixel's median stands in the middle of its run.
     order = np.lexsort((left, pixels))
     pixels, left, views = pixels[order], left[order], views[order]
     _, starts, counts = np.unique(pixels, return_index=True, return_counts=True)
@@ -124,12 +127,14 @@ def _pattern_of(sound: _Sound, shape: tuple[int, int]) -> PixelPattern:
         np.asarray(np.bincount(pixels, weights=each, minlength=size), np.float64) for each in (left_m, left_m**2)
     )
     total = float(np.mean(left_m**2)) if len(left_m) else 0.0
+    # A pixel that is always far off keeps its offset, but has no say in the pattern.
     usual = np.abs(sums) <= STRAY_SIGMAS * np.sqrt(total) * np.maximum(counts, 1)
     pairs, variance, by_chance = _shared_variance(counts[usual], sums[usual], squares[usual])
     smooth_m = _smooth(sound, usual, shape, variance)
     seen_share = float(np.mean(counts > 0))
     if not variance > FOUND_SIGMAS * by_chance:
         return PixelPattern(pairs, variance, by_chance, seen_share, smooth_m, None)
+    # Shrunken offsets and their standard deviations, as in the head; noise is what the pattern leaves of the total.
     noise = max(float(np.sum(squares[usual]) / np.sum(counts[usual])) - variance, 1e-3 * total)
     offset_m = sums / (counts + noise / variance)
     sigma_m = np.sqrt(variance * noise / (counts * variance + noise))
@@ -144,10 +149,10 @@ def _pattern_of(sound: _Sound, shape: tuple[int, int]) -> PixelPattern:
 
 
 def _with_nodes(found: PixelPattern, sound: _Sound, smooth_m: Floats, variance_m2: Floats) -> PixelOffsets:
-    """The map with (H, W) metres and variances of the nodes, besides what is the pixels' own."""
+    """Map of the pixels' own offsets plus (H, W) metres and variances of the nodes."""
     fine = found.offsets
     counts = np.bincount(sound.pixels, minlength=smooth_m.size).reshape(smooth_m.shape)
-    # Where no board was, nothing is known but what was before.
+    # Where no board was, only the prior is known.
     offset_m = np.where(counts > 0, smooth_m, 0.0) + (0.0 if fine is None else fine.offset_m)
     seen_m2 = float(np.mean(smooth_m[counts > 0] ** 2))
     unseen_m2 = max(NODE_SIGMA_M**2, seen_m2)
@@ -162,19 +167,20 @@ def _with_nodes(found: PixelPattern, sound: _Sound, smooth_m: Floats, variance_m
 
 
 def _shared_variance(counts: Indices, sums: Floats, squares: Floats) -> tuple[int, float, float]:
-    """How many pairs of residuals share a group; the variance that they share, and what chance makes of it, m^2.
+    """Number of pairs of residuals within groups, the variance that pairs share, and its sigma by chance, m^2.
 
-    Of each group the number of its residuals, their sum and the sum of their squares.
+    `counts`, `sums` and `squares` are the number of each group's residuals, their sum and their sum of squares.
     """
     pairs = int(np.sum(counts * (counts - 1))) // 2
     if pairs == 0:
         return 0, 0.0, 0.0
+    # Sum over pairs of r_i r_j = (sum^2 - sum of squares) / 2; products of pure noise scatter by its variance.
     total = float(np.sum(squares) / np.sum(counts))
     return pairs, float(np.sum(sums**2 - squares)) / (2 * pairs), total / float(np.sqrt(pairs))
 
 
 def _smooth(sound: _Sound, usual: npt.NDArray[np.bool_], shape: tuple[int, int], fine_m2: float) -> float:
-    """Standard deviation of what blocks of pixels add, by their mean residuals in several images, metres.
+    """Standard deviation of the blocks' offsets, by their mean residuals in several images, metres.
 
     `fine_m2` is the variance of single pixels.
     """
@@ -192,6 +198,6 @@ def _smooth(sound: _Sound, usual: npt.NDArray[np.bool_], shape: tuple[int, int],
         np.asarray(np.bincount(block, weights=each, minlength=blocks), np.float64) for each in (means, means**2)
     )
     _, variance, by_chance = _shared_variance(np.bincount(block, minlength=blocks), sums, squares)
-    # What single pixels add is a little of their blocks' means, too.
+    # Offsets of single pixels add a little to their blocks' means: that is no smooth part.
     variance -= max(fine_m2, 0.0) * float(np.mean(1 / seen[whole])) if len(whole) else 0.0
     return float(np.sqrt(variance)) if variance > FOUND_SIGMAS * by_chance else 0.0

@@ -1,6 +1,6 @@
-"""What is known of cameras, boards and range sensors before anything is measured, and said only where it is needed.
+"""Usual priors: knowledge of cameras, boards and range sensors before any measurement, added only where needed.
 
-A prior that the data overrule does no harm; one that rules is told in the report (`solve_warnings.py`).
+A prior that the data overrule does no harm; one that decides is named in the report (`solve_warnings.py`).
 """
 
 from collections.abc import Mapping
@@ -15,21 +15,23 @@ from cairn_calib.solve.rig_state import SCALE, WARP
 from cairn_calib.solve.solve_plan import SHARED, CameraPlan, Prior, SolvePlan
 
 FEW_VIEWS = 4
-"""Each view says two things about fx, fy, cx and cy; with fewer than four the lens's bend has no say."""
+"""Views below which more is assumed: each gives two equations for fx, fy, cx and cy, none are left for distortion."""
 CENTRE_SIGMA = 0.03
-"""Of the image's width: how far from its middle makers put the axis."""
+"""Standard deviation of the principal point from the image's middle, as lenses are mounted; share of the width."""
 ASPECT_SIGMA = 0.01
-"""Of fx / fy from 1."""
+"""Standard deviation of fx / fy from 1."""
 USUAL_SIGMAS = {"p1": 0.002, "p2": 0.002, "k3": 0.1}
-"""Of every pinhole's coefficients from 0: lenses sit within some hundredths of a millimetre, and bend little more than
-k1 and k2 say. Images that reach the corners overrule them; images that do not must not make them up."""
+"""Standard deviations of every pinhole's coefficients from 0: lenses are centred within some hundredths of a
+millimetre, and bend little more than k1 and k2 describe. Images that reach the corners overrule them; others must not
+invent them."""
 FEW_SIGMAS = {"k1": 0.5, "k2": 0.5, "k3": 0.5, "k4": 0.5, "p1": 0.01, "p2": 0.01}
-"""Of few views, where nothing else is said."""
+"""Standard deviations of the coefficients from 0 with few views, unless others apply."""
 RANGE_K2_SIGMA = 0.3
+"""Standard deviation of k2 from 0 for range cameras, whose coarse images show little of it."""
 RATIONAL = {"k4", "k5", "k6"}
-"""With a denominator k3 is no small correction."""
+"""Coefficients of the rational model: with a denominator k3 is no small correction, and has no prior."""
 WARP_SIGMA = 0.005
-"""Of the board's longer side: 4 mm on 0.8 m."""
+"""Standard deviation of the warp, share of the board's longer side: 4 mm on 0.8 m."""
 
 
 def usual_priors(

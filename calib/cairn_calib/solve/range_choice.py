@@ -1,4 +1,4 @@
-"""Which shapes of a range bias the boards' images determine: by the ranges and amplitudes that they cover.
+"""Choice of the range bias's shapes: those that the ranges and amplitudes of the boards' images determine.
 
 A wave of which only a piece was seen looks like an offset and a scale, a dependence on the amplitude that hardly
 changed like an offset: both then fit, and both are wrong a metre further on. They are left out, and a warning says why.
@@ -15,49 +15,50 @@ from cairn_calib.solve.rig_state import RigState
 from cairn_map.errors import BadInputError
 
 HARMONICS = (1, 2, 4)
-"""Waves that are looked for: `range_terms.py`."""
+"""Harmonics of the modulation that are estimated: `range_terms.py`."""
 PERIOD_SHARE = 0.75
-"""Of a wave's period that the ranges must cover."""
+"""Share of a wave's period that the ranges must cover."""
 AMPLITUDE_RATIO = 2.0
-"""Of the highest to the lowest amplitude."""
+"""Ratio of the highest to the lowest amplitude that determines a dependence on it."""
 TIMES_MAX = 1.5
-"""The board's distance, or its inverse: no camera is so far off, but its images may be of other units."""
+"""Ratio between measured and true distances, at most, either way: no camera errs so much, but units may differ."""
 ENDS = (2.0, 98.0)
-"""Percentiles that count as nearest and farthest, faintest and brightest."""
+"""Percentiles that are taken for nearest and farthest, faintest and brightest."""
 
 
 @dataclass(frozen=True, slots=True)
 class RangeSpans:
-    """What the boards' pixels covered."""
+    """Distances and amplitudes that the boards' pixels covered."""
 
     nearest_m: float
     farthest_m: float
     amplitudes: tuple[float, float, float] | None
-    """Lowest, middle and highest, counts; None: not all images have theirs."""
+    """Lowest, middle and highest, counts; None unless all images have amplitudes."""
 
     @property
     def span_m(self) -> float:
-        """Between the nearest and the farthest."""
+        """Distance from the nearest to the farthest, metres."""
         return self.farthest_m - self.nearest_m
 
     @property
     def amplitude_ratio(self) -> float:
-        """Highest over lowest; 0 where they are not known."""
+        """Highest amplitude over the lowest; 0 where they are unknown."""
         return 0.0 if self.amplitudes is None else self.amplitudes[2] / self.amplitudes[0]
 
     def period_share(self, modulation_hz: float, harmonic: int) -> float:
-        """Of a wave's period, what the ranges cover."""
+        """Share of a wave's period that the ranges cover."""
         return self.span_m / wave_period_m(modulation_hz, harmonic)
 
 
 def range_spans(data: RangeData, state: RigState, board: Board) -> RangeSpans:
-    """What the pixels covered that look at boards.
+    """Distances and amplitudes of all pixels on boards.
 
     Raises:
-        BadInputError: they are of other units than the board.
+        BadInputError: the ranges are in other units than the board.
     """
     seen = data.measured
     true_m = plane_ranges(data, state, board)[seen]
+    # Ranges in other units would be met by an absurd scale.
     times = float(np.median(data.range_m[seen] / true_m))
     if not 1 / TIMES_MAX < times < TIMES_MAX:
         raise BadInputError(
@@ -74,7 +75,7 @@ def range_spans(data: RangeData, state: RigState, board: Board) -> RangeSpans:
 
 
 def choose_terms(spans: RangeSpans, modulation_hz: float | None) -> RangeTerms:
-    """The shapes that they determine."""
+    """Shapes of the range bias that these spans determine."""
     waves = () if modulation_hz is None else HARMONICS
     harmonics = tuple(k for k in waves if spans.period_share(modulation_hz or 0.0, k) >= PERIOD_SHARE)
     known = spans.amplitudes is not None and spans.amplitude_ratio >= AMPLITUDE_RATIO

@@ -1,7 +1,7 @@
-"""A coarse grid of nodes over a range camera's image, linear between them: what its pixels add that varies smoothly.
+"""Coarse grid of nodes over a range camera's image, linear between them: the part of the bias that varies smoothly.
 
 Every pixel lies between four nodes. Sums over pixels are taken four nodes at a time, never as products of matrices that
-are nearly all 0: these take ten times as long as all else of a range image (and start threads: `normal_equations.py`).
+are nearly all 0: those take ten times as long as the rest of a range image (and start threads: `normal_equations.py`).
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""By how much ranges miss the board's plane: what the range camera's images add to the normal equations.
+"""Range residuals against the board's plane: the range camera's share of the normal equations.
 
     true range = (n . (o - c) + w) / (n . v)      n, o: the board's normal and origin, w: its warp there; v: the pixel's
     residual   = (true + bias - measured) / s     ray, c: the camera; all in the rig's frame, metres
@@ -23,14 +23,15 @@ from cairn_calib.solve.rig_state import ParameterLayout, RigState, warp_at_place
 from cairn_map.arrays import Flags, Floats
 
 PIXELS_MAX = 400
-"""Of one image, evenly spread: more would only say the same again."""
+"""Pixels of one image that count, evenly spread: more would only repeat them."""
 PIXELS_MIN = 12
+"""Pixels on the board without which an image is left out."""
 AMPLITUDE_FULL = 65535
-"""Counts: so much light that the range is worth nothing."""
+"""Amplitude, counts, at which a pixel is saturated and its range is void."""
 WARP_ROUNDS = 3
-"""Of finding where a ray meets the bent board; each is a thousand times nearer."""
+"""Rounds of intersecting a ray with the bent board; each is a thousand times nearer."""
 INSIDE = 0.0
-"""How far inside the outermost corners a pixel's middle must be, in pitches: half a cell of board is around them."""
+"""Pitches inside the outermost corners that a pixel's middle must be: half a cell of board is around them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,27 +50,27 @@ class RangeData:
     sigma_m: float
     """Expected standard deviation."""
     amplitude: Floats
-    """(V, M) counts; NaN where not known."""
+    """(V, M) counts; NaN where unknown."""
     terms: RangeTerms = ALWAYS
-    """Of the bias."""
+    """Shapes of the bias."""
     nodes: PixelNodes | None = None
-    """Of the terms; None: there are none."""
+    """Nodes around each pixel; None where `terms` has no nodes."""
 
     def shapes(self, raster: Raster, range_m: Floats) -> Floats:
-        """(V, M, D) what one unit of each of `terms` but the nodes adds to (V, M) true ranges, metres."""
+        """(V, M, D) metres that one unit of each of `terms`, except nodes, adds to (V, M) true ranges."""
         return self.terms.shapes(range_m, off_middle(raster, self.pixels), self.terms.faintness(self.amplitude))
 
     def added_m(self, raster: Raster, range_m: Floats, bias: Floats) -> Floats:
-        """(V, M) what a bias (B,) adds to (V, M) true ranges, metres."""
+        """(V, M) metres that a bias (B,) adds to (V, M) true ranges."""
         smooth = self.shapes(raster, range_m) @ bias[: len(self.terms.document_names)]
         return smooth if self.nodes is None else smooth + self.nodes.values(bias[len(self.terms.document_names) :])
 
     def slope(self, range_m: Floats, bias: Floats) -> Floats:
-        """(V, M) measured range a metre of true range."""
+        """(V, M) change of the measured range per metre of true range."""
         return 1 + self.terms.slopes(range_m) @ bias[: len(self.terms.document_names)]
 
     def with_terms(self, terms: RangeTerms, raster: Raster) -> "RangeData":
-        """The same for another bias."""
+        """The same ranges for a bias of other shapes."""
         nodes = None if terms.nodes is None else pixel_nodes(raster, self.pixels, terms.nodes)
         return replace(self, terms=terms, nodes=nodes)
 
@@ -84,11 +85,12 @@ def range_data(
     sigma_m: float,
     pixels_max: int = PIXELS_MAX,
 ) -> RangeData | None:
-    """The pixels that look at the board, where it is by a first solution; None where there are hardly any.
+    """Ranges of the pixels that look at the board, whose pose a first solution gives; None where there are hardly any.
 
     Raises:
         BadInputError: an image has another size than the camera.
     """
+    # Pixels of each image on the board, with a range and no saturation.
     lens = state.lenses[camera]
     chosen = []
     for view in views:
@@ -103,6 +105,7 @@ def range_data(
             chosen.append((frames.index(view.frame), pixels, view.range_m[y, x], amplitude[y, x]))
     if not chosen:
         return None
+    # Rows of equal length, padded with what was not measured.
     width = max(len(pixels) for _, pixels, _, _ in chosen)
     pixels_px, range_m = np.zeros((len(chosen), width, 2)), np.ones((len(chosen), width))
     measured, amplitude = np.zeros((len(chosen), width), bool), np.full((len(chosen), width), np.nan)
@@ -115,34 +118,37 @@ def range_data(
 
 def plane_ranges(data: RangeData, state: RigState, board: Board) -> Floats:
     """(V, M) ranges at which the pixels' rays meet the board, metres."""
-    return _met(data, state, board, state.lenses[data.camera].unproject(data.pixels)).range_m
+    return _intersect_board(data, state, board, state.lenses[data.camera].unproject(data.pixels)).range_m
 
 
 def range_block(data: RangeData, state: RigState, layout: ParameterLayout, board: Board, loss: Loss) -> Block:
-    """The camera's share; its noise is `sigma_m` times the loss's scale."""
+    """The camera's share of the normal equations; its noise is `sigma_m` times the loss's scale."""
     c = data.camera
     seen = state.lenses[c].unprojection(data.pixels)
-    met = _met(data, state, board, seen.rays)
+    hits = _intersect_board(data, state, board, seen.rays)
     R_rig_camera = state.T_rig_camera[c, :3, :3]
-    shapes = data.shapes(state.lenses[c], met.range_m)
-    n, v, d, slant = met.normals, met.rays, met.range_m, met.slant
+    shapes = data.shapes(state.lenses[c], hits.range_m)
+    n, v, d, slant = hits.normals, hits.rays, hits.range_m, hits.slant
+    # Derivatives of the true range d = (n . (o - c) + w) / (n . v): by the ray v, thus by the intrinsics; ...
     by_ray = -(d / slant)[..., None] * n
     columns = [
         np.squeeze((by_ray @ R_rig_camera)[..., None, :] @ seen.by_intrinsics, -2)[..., layout.intrinsic_columns[c]]
     ]
     at = [layout.intrinsic_at[c]]
+    # ... by the camera's rotation and place, the warp, and the board's rotation and place.
     if len(layout.pose_at[c]):
         columns += [np.cross(v, by_ray), -n / slant[..., None]]
         at.append(layout.pose_at[c])
     if len(layout.warp_at):
-        columns.append(met.warp_shape / slant[..., None])
+        columns.append(hits.warp_shape / slant[..., None])
         at.append(layout.warp_at)
-    columns += [np.cross(n, met.off_board) / slant[..., None], n / slant[..., None]]
-    # All so far move the true range, with which the bias changes.
-    slope = data.slope(met.range_m, state.bias)
+    columns += [np.cross(n, hits.off_board) / slant[..., None], n / slant[..., None]]
+    # The measured range moves by `slope` with the true one. Columns of the bias stand before the board's two.
+    slope = data.slope(hits.range_m, state.bias)
     columns = [slope[..., None] * column for column in columns]
     columns.insert(-2, shapes)
     at.append(layout.bias_at[: shapes.shape[-1]])
+    # Whiten, weigh by the loss, and sum.
     noise_m = loss.scale * data.sigma_m
     missed = d + data.added_m(state.lenses[c], d, state.bias) - data.range_m
     residuals = np.where(data.measured, missed / noise_m, 0.0)
@@ -161,9 +167,15 @@ def range_block(data: RangeData, state: RigState, layout: ParameterLayout, board
 def _with_nodes(
     block: Block, nodes: PixelNodes, J: Floats, root_a_metre: Floats, residuals: Floats, at: Indices
 ) -> Block:
-    """A block with the nodes' columns before the others.
+    """Block with the nodes' columns before the others.
 
-    Of the ranges (V, M, J) derivatives by the others, (V, M) roots of the weights, 1 / m, and weighted residuals.
+    Args:
+        block: the block of all other parameters.
+        nodes: the nodes around each pixel.
+        J: (V, M, J) weighted derivatives by the other parameters.
+        root_a_metre: (V, M) roots of the weights, 1 / m, which are the derivatives by a node of share 1.
+        residuals: (V, M) weighted.
+        at: positions of the nodes' columns.
     """
     count = nodes.count
     sums = nodes.products(root_a_metre[..., None] * np.concatenate([J, residuals[..., None]], axis=-1))
@@ -176,11 +188,11 @@ def _with_nodes(
 
 
 @dataclass(frozen=True, slots=True)
-class _Met:
-    """Where rays meet the board, in the rig's frame."""
+class _Intersections:
+    """Intersections of rays with the board, in the rig's frame."""
 
     normals: Floats
-    """(V, M, 3) of the bent board, there; 1 long but for the bend."""
+    """(V, M, 3) normals of the bent board there; of length 1 except for the bend."""
     rays: Floats
     """(V, M, 3)"""
     slant: Floats
@@ -188,33 +200,35 @@ class _Met:
     range_m: Floats
     """(V, M)"""
     off_board: Floats
-    """(V, M, 3) from where the ray meets it to the board's origin."""
+    """(V, M, 3) from the intersection to the board's origin."""
     warp_shape: Floats
     """(V, M, 2)"""
 
 
-def _met(data: RangeData, state: RigState, board: Board, rays_camera: Floats) -> _Met:
+def _intersect_board(data: RangeData, state: RigState, board: Board, rays_camera: Floats) -> _Intersections:
     T_rig_camera, T_rig_board = state.T_rig_camera[data.camera], state.T_rig_board[data.frames]
     R_rig_board = T_rig_board[:, :3, :3]
     n = R_rig_board[:, :, 2]
     v = rays_camera @ T_rig_camera[:3, :3].T
     slant = np.einsum("vi,vmi->vm", n, v)
     offset = T_rig_board[:, :3, 3] - T_rig_camera[:3, 3]
+    # The flat board first; then the warp at the place that the round before found, n . (o - c) + w = d (n . v).
     flat_m = np.einsum("vi,vi->v", n, offset)[:, None] / slant
     range_m, places, shape = flat_m, np.empty(0), np.empty(0)
     for _ in range(WARP_ROUNDS):
         places = (range_m[..., None] * v - offset[:, None]) @ R_rig_board
         shape = warp_at_places(board, places[..., :2])
         range_m = flat_m + (shape @ state.warp_m) / slant
+    # The bent board's normal, from the slopes of its two parabolas (`warp_at_places`).
     last = board.points()[:, :2].max(axis=0)
     slopes = -4 / last * (2 * places[..., :2] / last - 1) * state.warp_m
     local = np.concatenate([-slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1) @ np.swapaxes(R_rig_board, 1, 2)
     slant = np.einsum("vmi,vmi->vm", local, v)
-    return _Met(local, v, slant, range_m, offset[:, None] - range_m[..., None] * v, shape)
+    return _Intersections(local, v, slant, range_m, offset[:, None] - range_m[..., None] * v, shape)
 
 
 def _known_amplitude(view: RangeView, lens: Lens) -> Floats:
-    """(H, W) counts; NaN where there is no image of them, or nothing in it."""
+    """(H, W) amplitude, counts; NaN where there is no image of it, or a count of 0."""
     if view.amplitude is None:
         return np.full(view.range_m.shape, np.nan)
     lens.check_image(view.amplitude, name=f"amplitude image of frame {view.frame}")

@@ -29,9 +29,9 @@ Poses = Mapping[str, Transform]
 """T_camera_board of one camera, by frame."""
 
 AGREE_RAD = 0.2
-"""Two readings of a relative pose further apart, rotation plus translation over the board's distance, disagree."""
+"""Largest distance between readings of a relative pose that agree: rotation plus translation over the board's range."""
 TURNED_RAD = 0.05
-"""How much better, a frame, boards must agree when one camera named their corners from the other end."""
+"""Radians a frame by which boards must agree better for corners to count as named from the other end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class _Edge:
     T_one_other: Transform
     weight: float
     turned: tuple[str, ...]
-    """Frames in which one of both is turned."""
+    """Frames in which one of both cameras named the corners from the other end."""
 
 
 def rig_start(
@@ -62,12 +62,13 @@ def rig_start(
         BadInputError: some cameras never saw a board together with the others, or all of a camera's corners are named
             from the wrong end.
     """
+    # Readings of each board, as found, then mirrored.
     middle = board.points().mean(axis=0)
-    # Each as it is, then mirrored.
     readings = {
         name: {frame: np.stack([T, mirrored_pose(T, middle)]) for frame, T in frames.items()}
         for name, frames in poses.items()
     }
+    # An edge for each two cameras that saw boards together.
     edges = []
     names = list(poses)
     for n, one in enumerate(names):
@@ -77,6 +78,7 @@ def rig_start(
                 weight = sum(min(weights[one, frame], weights[other, frame]) for frame in common)
                 pairs = [np.stack([readings[name][frame] for frame in common]) for name in (one, other)]
                 edges.append(_edge((one, other), common, pairs[0], pairs[1], half_turn(board), weight))
+    # Prim's maximum spanning tree from the gauge: of all edges that leave the tree, the heaviest joins it.
     T_rig_camera: dict[str, Transform] = {gauge: np.eye(4)}
     turned: dict[str, list[_Edge]] = {name: [] for name in names}
     while len(T_rig_camera) < len(names):
@@ -160,7 +162,7 @@ def half_turn(board: Board) -> Transform:
 def _edge(
     names: tuple[str, str], frames: Sequence[str], one: Floats, other: Floats, turn: Transform, weight: float
 ) -> _Edge:
-    """The relative pose that most of F frames agree on, of (F, 2, 4, 4) readings of each camera's."""
+    """Relative pose that most of F frames agree on, of (F, 2, 4, 4) readings of each camera."""
     ways = np.stack([np.eye(4), turn])
     # (F, way, reading of one, reading of the other): as they are stand before turned and mirrored.
     T = one[:, None, :, None] @ ways[:, None, None] @ np.linalg.inv(other)[:, None, None]
@@ -170,6 +172,7 @@ def _edge(
     apart = _apart(T, distance).reshape(len(T), count, 8)
     # A board tilted about one spot fits mirrored and named from the other end as well: as it is, unless that is clear.
     doubts = np.minimum(apart.min(axis=2), AGREE_RAD).sum(axis=1) + TURNED_RAD * count * (np.arange(len(T)) % 8 >= 4)
+    # The reading with the least doubt, then the mean of each frame's reading nearest to it, if that agrees.
     best = int(np.argmin(doubts.round(6)))
     nearest = apart[best].argmin(axis=1)
     agrees = apart[best].min(axis=1) < AGREE_RAD

@@ -1,6 +1,6 @@
-"""The unknowns of a calibration: a rig and the boards before it, and the small steps by which a solver changes them.
+"""Unknowns of a calibration: a rig and the boards before it, and the small steps by which a solver changes them.
 
-    step = [shared: of each camera its free intrinsics and, but for the gauge, r and t; warp; scale; range bias]
+    step = [shared: each camera's free intrinsics and, except the gauge's, r and t; warp; scale; range bias]
            [6 a frame: r and t of the board]
 
 A pose T steps to [exp(r) R | t + dt]: rotation about the axes of the rig, in radians, translation along them, metres.
@@ -28,7 +28,7 @@ SCALE = "scale"
 
 @dataclass(frozen=True, slots=True)
 class RigState:
-    """Lenses and places of C cameras and F boards."""
+    """Lenses and poses of C cameras, poses of F boards, the board's shape and the range bias."""
 
     lenses: tuple[Lens, ...]
     T_rig_camera: Floats
@@ -40,32 +40,32 @@ class RigState:
     scale: float
     """True pitch over the stated one."""
     bias: Floats
-    """(B,) of the range camera; empty where there is none (range_bias.py)."""
+    """(B,) bias of the range camera; empty where none is estimated (range_bias.py)."""
 
 
 @dataclass(frozen=True, slots=True)
 class ParameterLayout:
-    """Where each parameter stands in the shared part of a step."""
+    """Position of each parameter in the shared part of a step."""
 
     names: tuple[tuple[str, str], ...]
     """Owner and name of each: a camera, or the board (SHARED)."""
     intrinsic_columns: tuple[Indices, ...]
-    """Of each camera, which of its lens's intrinsics are free."""
+    """Indices of each camera's free intrinsics among those of its lens."""
     intrinsic_at: tuple[Indices, ...]
-    """And where in the step they stand."""
+    """Positions of these in the step, for each camera."""
     pose_at: tuple[Indices, ...]
-    """(6,) for each camera; empty for the gauge."""
+    """(6,) positions of each camera's pose; empty for the gauge."""
     warp_at: Indices
     scale_at: Indices
     bias_at: Indices
 
     @property
     def size(self) -> int:
-        """How many shared parameters there are."""
+        """Number of shared parameters."""
         return len(self.names)
 
     def index(self, owner: str, name: str) -> int | None:
-        """Where a parameter stands; None: it is held."""
+        """Position of a parameter; None if it is held."""
         wanted = (owner, name)
         return self.names.index(wanted) if wanted in self.names else None
 
@@ -73,7 +73,7 @@ class ParameterLayout:
 def parameter_layout(
     plan: SolvePlan, lenses: Mapping[str, Lens], bias_names: Sequence[tuple[str, str]]
 ) -> ParameterLayout:
-    """The places of all free parameters; `bias_names` are owner and name of the range bias's."""
+    """Positions of all free parameters; `bias_names` are owner and name of those of the range bias."""
     names: list[tuple[str, str]] = []
 
     def placed(owner: str, added: Sequence[str]) -> Indices:
@@ -103,7 +103,7 @@ def parameter_layout(
 
 
 def shared_values(state: RigState, layout: ParameterLayout) -> Floats:
-    """(P,) the shared parameters as they are; those of poses, which are errors, 0."""
+    """(P,) values of the shared parameters; 0 for poses, whose parameters are errors."""
     values = np.zeros(layout.size)
     for lens, columns, at in zip(state.lenses, layout.intrinsic_columns, layout.intrinsic_at, strict=True):
         values[at] = lens.intrinsics[columns]
@@ -152,6 +152,6 @@ def warp_shape(board: Board) -> Floats:
 
 
 def warp_at_places(board: Board, places_m: Floats) -> Floats:
-    """(..., 2) the same at (..., 2) places of the board's plane, metres."""
+    """(..., 2) `warp_shape` at (..., 2) places of the board's plane, metres."""
     last = board.points()[:, :2].max(axis=0)
     return np.asarray(1 - (2 * places_m / last - 1) ** 2)

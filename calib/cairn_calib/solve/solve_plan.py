@@ -1,9 +1,9 @@
-"""What a solve is to find out: cameras and lenses, which numbers are free, what is known before, how noise is met.
+"""Plan of a solve: cameras and lenses, free parameters, priors, and the treatment of noise.
 
 Free by default are fx fy cx cy k1 k2 p1 p2 k3 of every pinhole (k4 to k6 only by name; fisheyes have four others), with
-what is usual of such lenses as priors (`usual_priors.py`). Why so many: what is held at 0 and is not goes into cx, cy
-and the places of the cameras. Simulated head, found corners, what the ToF camera sees carried to the others, root mean
-square error against the truth, px, colour and thermal (stated sigma):
+the usual values of such lenses as priors (`priors.py`). Why so many: a coefficient that is wrongly held at 0 goes into
+cx, cy and the places of the cameras. Simulated head, found corners, targets carried from the ToF camera to the others,
+root mean square error against the truth, px, colour and thermal (stated sigma):
 
     free                              8 images, to the corners    22 images
     k1 k2 of range, k1 k2 k3 thermal  4.5 (4.0)  0.23 (0.07)      0.43 (0.10)  0.14 (0.02)
@@ -28,7 +28,7 @@ BROWN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 SHARED = ""
 """The owner of what belongs to no camera: the board's warp and scale."""
 PITCH_SIGMA = 2e-4
-"""Of the pitch of a printed board, relative: 20 um on 100 mm."""
+"""Relative standard deviation of a printed board's pitch: 20 um on 100 mm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,14 +67,14 @@ class CameraPlan:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NoisePlan:
-    """How noise is met: a robust loss, culling with re-admission, and a scale of noise for each sensor."""
+    """Treatment of noise: a robust loss, culling with re-admission, and a scale of noise for each sensor."""
 
     huber_sigmas: float = 1.5
-    """Beyond that residuals pull with constant force, until outliers are known; infinite: never."""
+    """Length of a residual beyond which it pulls with constant force, until outliers are known; infinite: none."""
     cull_sigmas: float = 4.0
-    """Points further off are left out, and let in again if they fit later; infinite: never."""
+    """Length of a residual beyond which its point is left out, and let in again if it fits later; infinite: none."""
     rounds: int = 8
-    """Of estimating noise and culling, at most; 0: the corners' covariances are taken as stated."""
+    """Rounds of estimating noise and culling, at most; 0: the corners' covariances are taken as stated."""
 
 
 STATED = NoisePlan(huber_sigmas=np.inf, cull_sigmas=np.inf, rounds=0)
@@ -83,25 +83,25 @@ STATED = NoisePlan(huber_sigmas=np.inf, cull_sigmas=np.inf, rounds=0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolvePlan:
-    """The whole of it; cameras by name, in the rig's order."""
+    """Plan of a whole rig; cameras by name, in the rig's order."""
 
     cameras: Mapping[str, CameraPlan]
     gauge: str
     """The camera whose frame is the rig's."""
     rig_name: str = "rig"
     pitch_sigma: float = PITCH_SIGMA
-    """Of the board's pitch, relative; 0: exact."""
+    """Relative standard deviation of the board's pitch; 0: exact."""
     warp: bool = True
-    """Whether the board may be bent: a parabola along x and one along y."""
+    """True if the board may be bent: a parabola along x and one along y."""
     priors: tuple[Prior, ...] = ()
-    """Besides those that this module gives by itself."""
+    """Priors besides the usual ones."""
     usual_priors: bool = True
-    """Whether those that few views or a coarse sensor need are added."""
+    """True if the priors that few views or a coarse sensor need are added."""
     noise: NoisePlan = field(default_factory=NoisePlan)
     modulation_hz: float | None = None
-    """Of the range camera's light; None: not known, and so no circular error is looked for."""
+    """Modulation of the range camera's light; None where unknown: then no circular error is estimated."""
     range_terms: RangeTerms | None = None
-    """Of the range camera's bias; None: those that the images determine."""
+    """Shapes of the range camera's bias; None: those that the images determine."""
 
     def __post_init__(self) -> None:
         if self.gauge not in self.cameras:
@@ -109,7 +109,7 @@ class SolvePlan:
 
 
 def usual_plan(spectra: Mapping[str, Spectrum], *, rig_name: str = "rig", gauge: str | None = None) -> SolvePlan:
-    """The plan for cameras by spectrum: gauge is the first range camera, all else as usual."""
+    """Plan for cameras by spectrum: the gauge is the first range camera, else the first; everything else as usual."""
     first_range = next((name for name, spectrum in spectra.items() if spectrum is Spectrum.RANGE), None)
     cameras = {name: CameraPlan(spectrum=spectrum) for name, spectrum in spectra.items()}
     return SolvePlan(cameras=cameras, gauge=gauge or first_range or next(iter(spectra)), rig_name=rig_name)

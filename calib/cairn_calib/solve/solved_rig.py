@@ -1,4 +1,4 @@
-"""The `rig.json` of a solution: cameras, places, range bias, covariance, statistics, and what it came from."""
+"""Rig of a solution, as `rig.json` states it: cameras, poses, range bias, covariance, statistics and inputs."""
 
 import importlib.metadata
 from dataclasses import replace
@@ -14,7 +14,7 @@ from cairn_calib.solve.solution import Solution
 
 
 def solved_rig(solution: Solution, *, made_s: float) -> Rig:
-    """The rig of a solution, `made_s` seconds since 1970; the covariance is of its cameras, all else eliminated."""
+    """Rig of a solution made `made_s` seconds after 1970; its covariance is of the cameras, all else eliminated."""
     plan, state = solution.plan, solution.state
     cameras = {
         name: mount_camera(camera.spectrum, lens, T)
@@ -54,7 +54,7 @@ def _range_bias(solution: Solution) -> RangeBias | None:
 
 
 def statistics_of(solution: Solution) -> Statistics:
-    """How well everything was met."""
+    """Residuals of a solution: chi2 and its degrees of freedom, and each camera's noise and outliers."""
     cameras = {}
     board = (solution.views.board.points(), warp_shape(solution.views.board))
     names = list(solution.plan.cameras)

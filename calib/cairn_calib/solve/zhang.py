@@ -1,9 +1,11 @@
-"""A first idea of a camera and of where a flat board was, from homographies alone (Zhang 2000).
+"""First guess of a camera and of a flat board's poses, from homographies alone.
+
+Z. Zhang, "A flexible new technique for camera calibration", 2000; equation numbers below are his.
 
 Each view's homography H = K [r1 r2 t] makes two equations in the image of the absolute conic, B = K^-T K^-1, for r1
-and r2 are perpendicular and equally long. Lens distortion is not known yet and bends all of it, so several guesses are
-made: Zhang's own, one with the principal point in the middle, and where both are impossible fixed fields of view; the
-one is taken that meets the corners best.
+and r2 are perpendicular and equally long. Lens distortion is unknown here and bends all of it, so several guesses are
+made: Zhang's own, one with the principal point in the middle, and where both are impossible, fixed fields of view. The
+guess that meets the corners best is taken.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,11 +18,11 @@ from cairn_calib.rig.poses import Transform
 from cairn_map.arrays import Floats
 
 FOCAL_SHARES = tuple(np.geomspace(0.35, 8.0, 14))
-"""Focal lengths of the width that are tried: fields of view from 110 to 7 degrees."""
+"""Focal lengths that are tried, shares of the width: fields of view from 110 to 7 degrees."""
 SANE = (0.2, 20.0)
-"""Focal lengths of the width that are believed."""
+"""Bounds of a plausible focal length, shares of the width."""
 OFF_CENTRE = 0.25
-"""Of the image's size: how far from its middle a principal point is believed."""
+"""Largest plausible distance of the principal point from the image's middle, share of the image's size."""
 
 
 def first_camera_matrix(views: Sequence[Corners], homographies: Sequence[Floats], size_px: tuple[int, int]) -> Floats:
@@ -44,10 +46,12 @@ def homography_of(corners: Corners) -> Floats | None:
 
 def pose_from_homography(H: Floats, K: Floats) -> Transform:
     """`T_camera_board` of a homography from metres on the board to pixels of an undistorted camera."""
+    # [r1 r2 t] up to scale (Zhang, section 3.1), scaled so that r1 and r2 are 1 long, with the board before the camera.
     columns = np.linalg.solve(K, H)
     columns *= 2 / (np.linalg.norm(columns[:, 0]) + np.linalg.norm(columns[:, 1]))
     if columns[2, 2] < 0:
         columns = -columns
+    # The rotation nearest to [r1 r2 r1 x r2] (Zhang, appendix C).
     U, _, Vt = np.linalg.svd(np.column_stack([columns[:, :2], np.cross(columns[:, 0], columns[:, 1])]))
     T = np.eye(4)
     T[:3, :3] = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
@@ -56,9 +60,9 @@ def pose_from_homography(H: Floats, K: Floats) -> Transform:
 
 
 def mirrored_pose(T_camera_board: Transform, middle: Floats) -> Transform:
-    """The other pose in which a small, distant board looks nearly the same: its normal mirrored at the sight.
+    """The other pose in which a small, distant board looks nearly the same: its normal mirrored at the line of sight.
 
-    Schweighofer and Pinz 2006; `middle` (3,): the board's middle, metres, board frame.
+    Schweighofer and Pinz 2006. `middle` is the (3,) middle of the board, metres, board frame.
     """
     at = T_camera_board[:3, :3] @ middle + T_camera_board[:3, 3]
     sight = at / np.linalg.norm(at)
@@ -67,6 +71,7 @@ def mirrored_pose(T_camera_board: Transform, middle: Floats) -> Transform:
     sine, cosine = float(np.linalg.norm(axis)), float(normal @ sight)
     if sine < 1e-9:
         return T_camera_board.copy()
+    # Rodrigues: turn by twice the angle between normal and sight, about the board's middle.
     angle = 2 * np.arctan2(sine, cosine)
     unit = axis / sine
     K = np.array([[0, -unit[2], unit[1]], [unit[2], 0, -unit[0]], [-unit[1], unit[0], 0]])
@@ -93,7 +98,7 @@ def _guesses(homographies: Sequence[Floats], size_px: tuple[int, int]) -> Iterat
 
 
 def _zhang(homographies: Sequence[Floats], middle: Floats, width: int) -> Floats | None:
-    """All four numbers, from three views or more; None where they come out impossible."""
+    """Camera matrix with fx, fy, cx and cy, from three views or more; None where they come out impossible."""
     if len(homographies) < 3:
         return None
     # Near 1 in all coordinates, so that the equations weigh alike.
@@ -102,11 +107,14 @@ def _zhang(homographies: Sequence[Floats], middle: Floats, width: int) -> Floats
     for H in homographies:
         h = shift @ H
         h = h / np.linalg.norm(h[:, :2])
+        # Zhang's eq. 8: h1^T B h2 = 0 and h1^T B h1 = h2^T B h2.
         rows += [_conic_row(h[:, 0], h[:, 1]), _conic_row(h[:, 0], h[:, 0]) - _conic_row(h[:, 1], h[:, 1])]
+    # B spans the null space of Zhang's eq. 9; its sign makes the first entry positive.
     _, _, Vt = np.linalg.svd(np.array(rows))
     xx, yy, xz, yz, zz = Vt[-1] * np.sign(Vt[-1, 0] or 1.0)
     if xx <= 0 or yy <= 0:
         return None
+    # Zhang, appendix B, without skew: `rest` is his scale lambda.
     rest = zz - xz**2 / xx - yz**2 / yy
     if rest <= 0:
         return None
@@ -117,12 +125,12 @@ def _zhang(homographies: Sequence[Floats], middle: Floats, width: int) -> Floats
 
 
 def _conic_row(a: Floats, b: Floats) -> Floats:
-    """(5,) a^T B b in B's xx, yy, xz, yz, zz; without skew xy is 0."""
+    """(5,) coefficients of a^T B b in B's xx, yy, xz, yz, zz (Zhang's eq. 7; without skew xy is 0)."""
     return np.array([a[0] * b[0], a[1] * b[1], a[0] * b[2] + a[2] * b[0], a[1] * b[2] + a[2] * b[1], a[2] * b[2]])
 
 
 def _centred(homographies: Sequence[Floats], middle: Floats) -> Floats | None:
-    """One focal length, the principal point in the middle: from one tilted view on."""
+    """Camera matrix with one focal length and the principal point in the middle, from one tilted view on."""
     rows, right = [], []
     for H in homographies:
         h = np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, 1]]) @ H
@@ -130,6 +138,7 @@ def _centred(homographies: Sequence[Floats], middle: Floats) -> Floats | None:
         a, b = h[:, 0], h[:, 1]
         rows += [a[0] * b[0] + a[1] * b[1], a[0] ** 2 + a[1] ** 2 - b[0] ** 2 - b[1] ** 2]
         right += [-a[2] * b[2], -(a[2] ** 2 - b[2] ** 2)]
+    # The same two equations are linear in 1 / f^2: least squares over all views.
     inverse_square = float(np.dot(rows, right) / max(np.dot(rows, rows), 1e-300))
     if inverse_square <= 0:
         return None
