@@ -30,7 +30,7 @@ first row, end of last row, start of last row, and pass the file as `--outer-cor
      "images": {"left02.png": [[412, 96], [688, 130], [655, 310], [401, 288]]}}
 
 For grids of discs say `--pattern circles` or `asymmetric-circles`; `--square` is then from disc to disc, and `--disc`
-their diameter: a tilted disc's image has its centroid beside its centre, which `cairn calib solve` must know.
+their diameter: the centroid of a tilted disc's image is not its centre's, which `cairn calib solve` must know.
 If no board was found in any image, that is an error (exit code 3).
 """
 

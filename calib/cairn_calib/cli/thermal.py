@@ -14,17 +14,18 @@
 `fit` takes a table of black bodies (CSV with a head line): image, celsius, sigma_k (standard deviation of the black
 body's temperature), and, where it does not fill the view, x, y, width, height of the part of the image that it fills,
 in pixels. List several images of each temperature: they tell the noise. Two temperatures will do, and four or more tell
-Planck's B, too. Where black bodies fill the view, maps of the pixels' gain, offset and shading come out beside it, each
-with its standard deviation. Cameras that compute a temperature themselves, whose counts step by so many a kelvin, need
-`--law polynomial`.
+Planck's B, too. Where black bodies fill the view, maps of the pixels' gain, offset and shading come out next to it,
+each with its standard deviation. Cameras that compute a temperature themselves, whose counts step by so many a kelvin,
+need `--law polynomial`.
 
 A warm camera sees itself: give `housing_celsius`, what its own thermometer said, in the table, black bodies seen by a
 cold and by a warm camera, and `read --housing` later. Images during a flat-field correction (the shutter) and within
-2 s after it are left out: the column `since_ffc_s` says how long ago it was, 0 during it; repeated images are noticed.
+2 s after it are left out: the column `since_ffc_s` says how long ago it was, 0 during it; repeated
+images are found by the program.
 
 `read` turns 16-bit images into kelvin; radiometric JPEGs of FLIR bring their camera's numbers along. Temperatures of
-surfaces need their emissivity and what they mirror: `--emissivity`, `--reflected`. What nobody measured has no
-temperature: without radiometry you get counts, and beyond its range nothing.
+surfaces need their emissivity and what they mirror: `--emissivity`, `--reflected`. There is no temperature
+without a measurement: without radiometry you get counts, and beyond its range nothing.
 """
 
 import argparse
@@ -49,7 +50,7 @@ from cairn_calib.thermal.reference_table import (
     SINCE_FFC,
     BlackBody,
     read_references,
-    repeated,
+    repetition_text,
 )
 from cairn_calib.thermal.response_fit import Reference, ResponseFit, fit_response
 from cairn_map.errors import BadInputError
@@ -58,7 +59,7 @@ if TYPE_CHECKING:
     from argparse import _SubParsersAction
 
 COUNTS_PER_KELVIN = 100
-"""Of `--output`, as in recordings; 0 is no reading."""
+"""Unit of `--output`, as in recordings; 0 is no reading."""
 
 
 def add_parser(commands: "_SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -115,7 +116,7 @@ def _fit(args: argparse.Namespace) -> None:
 
 
 def _reference(body: BlackBody, flat: FlatFieldFit | None) -> Reference:
-    level = np.array([flat.flat_field.levelled(image) if flat else image for image in body.counts], np.float64)
+    level = np.array([flat.flat_field.level_counts(image) if flat else image for image in body.counts], np.float64)
     region = body.region
     if region is not None:
         x, y, width, height = region
@@ -198,7 +199,7 @@ def _read(args: argparse.Namespace) -> None:
         else:
             counts, _ = read_grey(path)
         if (twin := seen_before.setdefault(counts.tobytes(), path.name)) != path.name:
-            _say(f"{path.name}: {repeated(twin)}")
+            _say(f"{path.name}: {repetition_text(twin)}")
         found = temperatures(counts, own, viewing=_viewing(viewing, args), flat_field=flat, housing_k=housing_k)
         if isinstance(found, NotRadiometric):
             _say(f"{path.name}: counts {counts.min():g} to {counts.max():g}, not radiometric: {found.reason}")

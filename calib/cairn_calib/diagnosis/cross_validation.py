@@ -1,7 +1,7 @@
-"""Half of the frames against the other half: whether two solves differ by no more than they say they may.
+"""Cross-validation: two solves, each of half of the frames, and their difference against the predicted one.
 
 Where noise is all that is wrong, parameters differ by their joint covariance, and probe points by about their predicted
-sigma. Where the model is wrong (a lens that Brown's model cannot say, a board that moved, images taken one after the
+sigma. Where the model is wrong (a lens that Brown's model does not fit, a board that moved, images taken one after the
 other), they differ by more. Small sigmas alone never show that.
 """
 
@@ -21,18 +21,18 @@ from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 
 FRAMES_MIN = 3
-"""Of each camera in each half."""
+"""Frames of each camera in each half, at least."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraHalves:
-    """How one camera's probe points differ between the halves."""
+    """Difference of one camera's probe points between the halves."""
 
     camera: str
     difference_px: float
     """Root mean square, one axis."""
     predicted_px: float
-    """Of the same, from both covariances."""
+    """Root mean square that both covariances predict, one axis."""
 
     @property
     def ratio(self) -> float:
@@ -42,22 +42,23 @@ class CameraHalves:
 
 @dataclass(frozen=True, slots=True)
 class Halves:
-    """Two halves, compared."""
+    """Comparison of the two halves."""
 
     cameras: tuple[CameraHalves, ...]
     chi2: float
-    """Of all parameters' differences, by their covariances; about `parameters` if the model is right."""
+    """chi2 of all parameters' differences, by their covariances; about `parameters` if the model is right."""
     parameters: int
 
 
 def cross_validate(solution: Solution, probes: Sequence[Probes]) -> Halves | None:
-    """Every second frame against the others; None where a half does not determine the rig."""
+    """Comparison of every second frame with the others; None where a half does not determine the rig."""
     frames = solution.views.frames
     try:
         one, other = (_half(solution, frames[start::2]) for start in (0, 1))
     except BadInputError:
         return None
-    rows = _camera_rows(solution)
+    # Both halves are independent: their difference has the sum of their covariances.
+    rows = _camera_parameters(solution)
     step = (_step(solution, one) - _step(solution, other))[rows]
     covariance = (one.covariance + other.covariance)[np.ix_(rows, rows)]
     cameras = []
@@ -74,6 +75,7 @@ def _half(solution: Solution, frames: Sequence[str]) -> Solution:
     for camera in views.cameras:
         if len(views.of_camera(camera)) < FRAMES_MIN:
             raise BadInputError("not_observable", f"{camera} has too few frames for two halves")
+    # From the whole solution's state and noise, with its shapes of the range bias: all have the same parameters.
     every = solution.views.frames
     rows = [every.index(frame) for frame in views.frames]
     state = replace(solution.state, T_rig_board=solution.state.T_rig_board[rows])
@@ -86,8 +88,8 @@ def _half(solution: Solution, frames: Sequence[str]) -> Solution:
     return solve_from(views, replace(solution.plan, range_terms=terms), state, scales)
 
 
-def _camera_rows(solution: Solution) -> npt.NDArray[np.intp]:
-    """Where the cameras' parameters stand: warp and scale are not compared, nor the nodes, many of which nobody saw."""
+def _camera_parameters(solution: Solution) -> npt.NDArray[np.intp]:
+    """Positions of the cameras' parameters: warp and scale are not compared, nor nodes, many of which no board met."""
     names = solution.layout.names
     cameras = solution.plan.cameras
     return np.array([n for n, (o, name) in enumerate(names) if o in cameras and not name.startswith("node")], np.intp)

@@ -1,4 +1,4 @@
-"""All that is asked of a solution before it is trusted, in one place: what the report and the command tell."""
+"""Examination of a solution before it is trusted: all figures and warnings of the report and the command."""
 
 from dataclasses import dataclass
 
@@ -16,19 +16,19 @@ from cairn_calib.solve.solution import Solution
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """What was found."""
+    """Figures and warnings of one solution."""
 
     solution: Solution
     rig: Rig
     probes: tuple[Probes, ...]
     coverage: tuple[Coverage, ...]
     influences: tuple[Influence, ...]
-    """The strongest first."""
+    """Influence of each frame, the strongest first."""
     halves: Halves | None
-    """None: too few images."""
+    """Comparison of two halves of the frames; None with too few images."""
     modes: tuple[WeakMode, ...]
     next_images: tuple[NextImage, ...]
-    """The best first."""
+    """Images to shoot next, the best first."""
     warnings: tuple[SolveWarning, ...]
 
 

@@ -1,4 +1,4 @@
-"""What each frame does to a solution: how far everything would move without it, and what one more would add.
+"""Influence of each frame on a solution: the move of everything without it, and the gain of one more.
 
     (S - S_f) da = -a_f          S: the reduced normal equations of all; S_f, a_f: the frame's share of them
 
@@ -18,13 +18,13 @@ from cairn_map.arrays import Floats
 
 @dataclass(frozen=True, slots=True)
 class Influence:
-    """Of one frame."""
+    """Influence of one frame."""
 
     frame: str
     moves_px: float
-    """How far the solution's probe points would move without it: the most moved of any camera."""
+    """Largest move of any camera's probe points without the frame."""
     camera: str
-    """In which."""
+    """Camera of that point."""
     sigmas: float
     """The most moved point in its own standard deviations, of any camera."""
 
@@ -32,7 +32,7 @@ class Influence:
 def frame_shares(blocks: list[Block], size: int, frame_count: int, *, floor: float = 0.0) -> tuple[Floats, Floats]:
     """(F, P, P) and (F, P): each frame's part of the reduced normal equations, its board eliminated.
 
-    `floor` is added to the diagonal of each board's own, so that one that nobody sees takes no effect.
+    `floor` is added to the diagonal of each board's own block, so that a board that no camera sees has no effect.
     """
     A, a = np.zeros((frame_count, size, size)), np.zeros((frame_count, size))
     B, C, b = np.zeros((frame_count, size, 6)), np.zeros((frame_count, 6, 6)), np.zeros((frame_count, 6))
@@ -43,12 +43,13 @@ def frame_shares(blocks: list[Block], size: int, frame_count: int, *, floor: flo
         B[np.ix_(block.frames, block.at)] += block.square[:, :k, k:]
         C[block.frames] += block.square[:, k:, k:]
         b[block.frames] += block.pull[:, k:]
+    # Schur complement of each board's own block, as in `normal_equations.py`, but frame by frame.
     solved = np.linalg.solve(C + floor * np.eye(6), np.concatenate([np.swapaxes(B, 1, 2), b[..., None]], axis=2))
     return A - B @ solved[..., :-1], a - (B @ solved[..., -1:])[..., 0]
 
 
 def influences(solution: Solution, probes: list[Probes]) -> list[Influence]:
-    """Of every frame, the strongest first; frames without which nothing is determined are infinitely strong."""
+    """Influence of every frame, the strongest first; infinite for frames without which nothing is determined."""
     done = solution.adjusted
     S, _, _, _ = done.normal.reduced()
     shares, pulls = frame_shares(done.blocks, solution.layout.size, len(solution.views.frames))
@@ -56,6 +57,7 @@ def influences(solution: Solution, probes: list[Probes]) -> list[Influence]:
     result = []
     for frame, share, pull in zip(solution.views.frames, shares, pulls, strict=True):
         try:
+            # One Newton step of what is left without the frame, whose gradient is minus the frame's.
             step = solve_scaled(S - share, -pull)
         except np.linalg.LinAlgError:
             result.append(Influence(frame, np.inf, probes[0].camera, np.inf))

@@ -1,7 +1,7 @@
-"""Which image to shoot next: of many places of the board, the one that would sharpen the rig most.
+"""Image to shoot next: of many places of the board, the one that would sharpen the rig most.
 
 Each candidate adds its share to the normal equations (no residual is needed for that), and the probe points' variance
-with it is compared to that without. What is chosen is told in words: where in whose image, how far, how tilted.
+with it is compared to that without. The choice is put in words: where in whose image, how far, how tilted.
 """
 
 from collections.abc import Sequence
@@ -19,13 +19,15 @@ from cairn_calib.solve.solution import Solution
 from cairn_map.arrays import Floats
 
 COLUMNS, ROWS = 3, 3
+"""Parts of an image in whose middles the board is tried."""
 SHARES = (0.3, 0.55)
-"""Of the image's width that the board fills."""
+"""Shares of the image's width that the board fills."""
 TILT_DEG = 35.0
+"""Tilt of every candidate, degrees: boards seen from the front do not separate focal length and distance."""
 TILTS = {"right": (0.0, -1.0), "left": (0.0, 1.0), "lower": (1.0, 0.0), "upper": (-1.0, 0.0)}
-"""Which of its edges goes further away, and the axis, camera frame, about which it turns then."""
+"""Edge of the board that is turned away, and the axis of that turn in the camera's frame."""
 SEEN_SHARE = 0.6
-"""Of the board's points: a camera that sees fewer may not find it. The one that it is aimed at must see all."""
+"""Share of the board's points without which a camera may not find it; the one that it is aimed at must see all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,12 +36,12 @@ class NextImage:
 
     camera: str
     pixel: tuple[float, float]
-    """Where its middle appears in that camera."""
+    """Pixel of the board's middle in that camera."""
     range_m: float
     edge: str
-    """Of the board's four, the one that is further away."""
+    """Edge of the board that is turned away."""
     gain: float
-    """By which share the probe points' variance falls, with this one image of every camera that sees it."""
+    """Share by which the probe points' variance falls with this one image of every camera that sees the board."""
 
     def __str__(self) -> str:
         x, y = self.pixel
@@ -61,6 +63,7 @@ def next_images(solution: Solution, probes: Sequence[Probes], *, count: int = 3)
     for each in probes:
         G = each.rows.reshape(-1, solution.layout.size) / noise[each.camera]
         target += G.T @ G / len(G)
+    # trace(target (S + share)^-1): the probe points' variance with the candidate. Its camera must see the whole board.
     before = float(np.sum(target * solution.covariance))
     gains = np.full(len(candidates), -1.0)
     for n, ((place, _), share) in enumerate(zip(candidates, shares, strict=True)):
@@ -82,6 +85,7 @@ def _candidates(solution: Solution, camera: int) -> list[tuple[NextImage, Floats
     T_rig_camera = solution.state.T_rig_camera[camera]
     points = solution.views.board.points()
     middle, width_m = points.mean(axis=0), float(np.ptp(points[:, 0]))
+    # Angle of the image's width: it gives the distance at which the board fills a share of it.
     left, right = lens.unproject(np.array([[0.0, lens.centre_px[1]], [lens.width - 1.0, lens.centre_px[1]]]))
     across = float(np.arccos(np.clip(left @ right, -1, 1)))
     name = solution.views.cameras[camera]
@@ -100,7 +104,7 @@ def _candidates(solution: Solution, camera: int) -> list[tuple[NextImage, Floats
 
 
 def _shares(solution: Solution, poses: Floats) -> tuple[Floats, Floats]:
-    """(K, C) share of the board's points that each camera sees, and (K, P, P) what each pose adds."""
+    """(K, C) share of the board's points that each camera sees, and (K, P, P) share of each pose in the equations."""
     state = replace(solution.state, T_rig_board=poses)
     board = (solution.views.board.points(), warp_shape(solution.views.board))
     p_rig = board_points(state, *board) @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
@@ -119,7 +123,7 @@ def _shares(solution: Solution, poses: Floats) -> tuple[Floats, Floats]:
         whitening = np.broadcast_to(np.eye(2) / sensor.data.sigma_px, (*kept.shape, 2, 2))
         data = CornerData(c, frames, np.zeros((*kept.shape, 2)), whitening, kept, sensor.data.sigma_px)
         blocks.append(corner_block(data, state, solution.layout, board, Loss(sensor.scale, kept, np.inf)))
-    # Boards that hardly anybody sees: no more than the pose's prior, which adds nothing.
+    # The floor makes boards that hardly a camera sees solvable; they add nothing.
     shares, _ = frame_shares(blocks, solution.layout.size, len(poses), floor=1e-6)
     return seen, shares
 

@@ -1,6 +1,6 @@
-"""Points at which a calibration is looked at: over the gauge camera's image, at 1, 2 and 5 m, in every camera.
+"""Probe points of a calibration: over the gauge camera's image, at 1, 2 and 5 m, as they appear in every camera.
 
-What counts is not a parameter's sigma but where things appear: a pixel of the range camera carried to the colour
+Not the sigma of a parameter matters, but that of a point's pixel: a pixel of the range camera carried to the colour
 camera. Focal length and distance, principal point and rotation may be uncertain together and yet carry every pixel
 well. Of the gauge itself it is where a direction of its frame appears.
 """
@@ -21,7 +21,7 @@ COLUMNS, ROWS = 9, 7
 
 @dataclass(frozen=True, slots=True)
 class Probes:
-    """R points in one camera."""
+    """R probe points in one camera."""
 
     camera: str
     pixels: Floats
@@ -38,7 +38,7 @@ class Probes:
 
 
 def probes_of(rig: Rig, gauge: str, layout: ParameterLayout) -> list[Probes]:
-    """The points of each camera that lie in its image."""
+    """Probe points of each camera that lie in its image."""
     lens = mounted_lens(rig, gauge)
     grid = image_grid(lens.width, lens.height, COLUMNS, ROWS)
     source = np.concatenate([grid] * len(RANGES_M))

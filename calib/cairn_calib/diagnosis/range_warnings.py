@@ -1,4 +1,4 @@
-"""What the range images of a calibration cannot tell, in words: why a shape of the range bias was left out."""
+"""Warnings about range images: shapes of the range bias that they do not determine, and the reason."""
 
 from collections.abc import Iterator
 
@@ -9,18 +9,18 @@ from cairn_calib.solve.range_choice import AMPLITUDE_RATIO, HARMONICS, PERIOD_SH
 from cairn_calib.solve.solution import Solution
 
 UNSEEN_SHARE = 0.1
-"""Of the pixels of an image, without any board on them, from which on it is told."""
+"""Share of an image's pixels without any board that is worth a warning."""
 PAIRS_MIN = 1000
-"""Of residuals of one pixel: with fewer even a pattern as large as the noise is hardly more than chance."""
+"""Pairs of residuals of one pixel, with fewer of which even a pattern as large as the noise may be chance."""
 
 NOISE_M = 0.05
-"""Of the ranges of boards within some metres: time-of-flight cameras have a fifth of it."""
+"""Noise of ranges within some metres that is worth a warning: time-of-flight cameras have a fifth of it."""
 USUAL_TIMES = 4.0
-"""Of what is assumed of each number of the bias."""
+"""Value of a number of the bias that is worth a warning, in standard deviations of its prior."""
 
 
 def range_warnings(solution: Solution) -> Iterator[SolveWarning]:
-    """All that is to be said of them, and of range cameras without any."""
+    """Warnings about all range images, and about range cameras without any."""
     used, given = solution.ranges, solution.views.ranges
     count = 0 if used is None else len(used.frames)
     if count < len(given):
@@ -39,7 +39,7 @@ def range_warnings(solution: Solution) -> Iterator[SolveWarning]:
 
 
 def _of_none(solution: Solution) -> Iterator[SolveWarning]:
-    """Of range cameras whose ranges nothing is known of."""
+    """Warnings about range cameras whose bias is unknown."""
     names = list(solution.plan.cameras)
     shown = None if solution.ranges is None else names[solution.ranges.camera]
     for name in names:

@@ -1,7 +1,8 @@
-"""What the data of a calibration cannot tell, in words, each with its threshold and what was measured.
+"""Warnings about what the images of a calibration do not determine, each with its threshold and measured value.
 
-A residual says nothing of this: two published solutions of one time-of-flight camera, both with 0.04 px, have focal
-lengths of 250 and 179 px. Warnings leave the solution as it is; what is not determined at all is refused (`refuse`).
+Residuals do not show this: two published solutions of one time-of-flight camera, both with 0.04 px, have focal
+lengths of 250 and 179 px. Warnings leave the solution unchanged; a focal length that is not determined at all is
+refused (`refuse_undetermined`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,35 +23,43 @@ from cairn_calib.solve.solve_plan import SHARED
 from cairn_map.errors import BadInputError
 
 TILT_DEG = 30.0
+"""Largest angle between two boards, degrees, at least."""
 RANGE_RATIO = 1.3
+"""Farthest board's distance over the nearest one's, at least."""
 RADIUS_SHARE = 0.8
+"""Outermost corner's distance from the image's middle, share of the half diagonal, at least."""
 CELL_SHARE = 0.5
+"""Share of the parts of the image with corners, at least."""
 PRIOR_SHARE = 0.7
+"""Sigma of a parameter over that of its prior, above which the prior decided it."""
 NOISE_SCALE = 3.0
+"""Estimated noise of corners over the stated one, at most."""
 NOISE_PX = 0.1
-"""Less than that is no model's error, whatever was stated: simulated images of exact boards come to 0.05 px."""
-OUTLIER_SHARE = 0.05
-IMAGE_OUTLIER_SHARE = 0.2
-HALVES_RATIO = 3.0
-HALVES_CHI2_SIGMAS = 5.0
+"""Noise of corners, pixels, that is no error of a model: simulated images of exact boards have 0.05 px."""
+OUTLIER_SHARE, IMAGE_OUTLIER_SHARE = 0.05, 0.2
+"""Share of outliers among the corners of a camera, and of a single image, at most."""
+HALVES_RATIO, HALVES_CHI2_SIGMAS = 3.0, 5.0
+"""Difference of the halves: measured over predicted pixels, and standard deviations of chi2 a parameter, at most."""
 INFLUENCE_SIGMAS = 3.0
+"""Move of a probe point without one frame, in its standard deviations, at most."""
 MODE_PX = 1.0
+"""Standard deviation of the weakest mode at the probe points, pixels, at most."""
 FOCAL_SHARE_MAX = 0.2
-"""Of the focal length: less certain than that, and it is not determined."""
+"""Relative standard deviation of a focal length above which it is not determined."""
 
 
 @dataclass(frozen=True, slots=True)
 class SolveWarning:
-    """One thing that the data cannot tell, or that contradicts itself."""
+    """One number that the images do not determine, or on which they contradict each other."""
 
     kind: str
     camera: str
-    """Empty: the rig."""
+    """Camera that it is about; empty for the whole rig."""
     measured: float
     threshold: float
     unit: str
     text: str
-    """What it means, and what to do."""
+    """Meaning and advice."""
 
     def __str__(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
@@ -59,10 +68,10 @@ class SolveWarning:
 
 
 def refuse_undetermined(solution: Solution) -> None:
-    """Whether every camera's focal length is known at all.
+    """Check that every camera's focal length is determined.
 
     Raises:
-        BadInputError: it is not.
+        BadInputError: one is not.
     """
     values, sigmas = solution.values(), solution.sigmas()
     for name in solution.plan.cameras:
@@ -82,7 +91,7 @@ def warnings_of(
     halves: Halves | None,
     modes: Sequence[WeakMode],
 ) -> list[SolveWarning]:
-    """All that is to be said, cameras first."""
+    """All warnings but those about ranges, cameras first."""
     found = [each for camera in covered for each in _of_coverage(camera, solution)]
     found += [*_of_priors(solution), *_of_coefficients(solution), *_of_noise(solution)]
     found += [*_of_discs(solution), *(each for mode in modes for each in _of_mode(mode))]
@@ -119,7 +128,7 @@ def _of_priors(solution: Solution) -> Iterator[SolveWarning]:
             continue
         owner, name, _ = prior.terms[0]
         after = sigmas.get((owner, name))
-        # Of the pixels' nodes, many of which no board meets, the map tells.
+        # Many nodes of the pixels meet no board: their map shows that.
         if after is None or (owner, name) == (SHARED, SCALE) or name.startswith("node"):
             continue
         if after / prior.sigma > PRIOR_SHARE:
@@ -134,7 +143,7 @@ def _of_coefficients(solution: Solution) -> Iterator[SolveWarning]:
     values, sigmas = solution.values(), solution.sigmas()
     assumed = {prior.terms[0][:2] for prior in solution.adjusted.problem.priors}
     for name, camera in solution.plan.cameras.items():
-        # A tangential part of 0 is what a good lens has; of what is known before, `prior` warns.
+        # A good lens has a tangential part of 0; `_of_priors` warns about assumed coefficients.
         radial = [each for each in camera.coefficients if each.startswith("k") and (name, each) not in assumed]
         lost = {each: sigmas[name, each] / max(abs(values[name, each]), 1e-12) for each in radial}
         unknown = [each for each, share in lost.items() if share > 1]

@@ -1,4 +1,4 @@
-"""How much of each camera's image, and of what lies before it, the boards covered."""
+"""Coverage of each camera's image and distances by the boards."""
 
 from dataclasses import dataclass
 
@@ -10,19 +10,19 @@ from cairn_calib.solve.camera_alone import tilt_range_deg
 from cairn_calib.solve.solution import Solution
 
 CELLS = (8, 6)
-"""Columns and rows that an image is divided into."""
+"""Columns and rows into which an image is divided."""
 
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """Of one camera."""
+    """Coverage of one camera."""
 
     camera: str
     images: int
     counts: npt.NDArray[np.intp]
     """(6, 8) corners in each part of the image."""
     radius_share: float
-    """The outermost corner's distance from the image's middle, over the image's corner's."""
+    """Distance of the outermost corner from the image's middle, over that of the image's corner."""
     tilt_deg: float
     """Largest angle between two boards."""
     nearest_m: float
@@ -31,12 +31,12 @@ class Coverage:
 
     @property
     def cell_share(self) -> float:
-        """Of the parts of the image, those with corners."""
+        """Share of the parts of the image with corners."""
         return float(np.mean(self.counts > 0))
 
 
 def coverage(solution: Solution, camera: str) -> Coverage:
-    """What the boards covered of a camera's image."""
+    """Coverage of a camera by the boards of a solution."""
     views = solution.views.of_camera(camera)
     width, height = solution.views.sizes_px[camera]
     pixels = np.concatenate([view.corners.pixels[view.corners.seen] for view in views])

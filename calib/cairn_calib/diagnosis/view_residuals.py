@@ -1,4 +1,4 @@
-"""How well each image's corners were met by a solution, and which were left out."""
+"""Residuals of each image's corners at a solution, and the corners that were left out."""
 
 from dataclasses import dataclass
 
@@ -13,31 +13,31 @@ from cairn_map.arrays import Floats
 
 @dataclass(frozen=True, slots=True)
 class ViewResiduals:
-    """Of one image."""
+    """Residuals of one image."""
 
     camera: str
     frame: str
     image: str
     pixels: Floats
-    """(M, 2) of the corners that were found."""
+    """(M, 2) corners that were found."""
     misses_px: Floats
     """(M, 2) predicted minus found."""
     kept: npt.NDArray[np.bool_]
-    """(M,) which count."""
+    """(M,) True for each corner that counts."""
 
     @property
     def outliers(self) -> int:
-        """How many do not."""
+        """Number of corners that were left out."""
         return int(np.sum(~self.kept))
 
     @property
     def rms_px(self) -> float:
-        """Of one axis, of those that count."""
+        """Root mean square of one axis, over the corners that count."""
         return float(np.sqrt(np.mean(self.misses_px[self.kept] ** 2))) if self.kept.any() else float("nan")
 
 
 def view_residuals(solution: Solution) -> list[ViewResiduals]:
-    """Of every image, by camera and frame."""
+    """Residuals of every image, by camera and frame."""
     board = (solution.views.board.points(), warp_shape(solution.views.board))
     result = []
     for sensor in solution.adjusted.problem.sensors:

@@ -1,4 +1,4 @@
-"""The direction in which a camera is least certain, in words.
+"""Weak modes: the combination of parameters in which a camera is least certain, in words.
 
     covariance = L L^T,  mode = L v       v: the direction in which the camera's probe points move most
 
@@ -16,7 +16,7 @@ from cairn_calib.solve.solution import Solution
 from cairn_calib.solve.solve_plan import SHARED
 
 STRONG = 0.5
-"""Correlation of a parameter with a mode from which on it is named."""
+"""Correlation with a mode, at least, of the parameters that name it."""
 NAMED_MAX = 5
 ADVICE = (
     (
@@ -32,13 +32,13 @@ ADVICE = (
 
 @dataclass(frozen=True, slots=True)
 class WeakMode:
-    """Of one camera."""
+    """Weakest mode of one camera."""
 
     camera: str
     sigma_px: float
-    """How far it moves the camera's probe points: root mean square, one axis."""
+    """Move of the camera's probe points by one standard deviation of it: root mean square, one axis."""
     share: float
-    """Of all variance of the probe points."""
+    """Share in the variance of the probe points."""
     parameters: tuple[tuple[str, str, float], ...]
     """Camera, name and correlation with the mode, the strongest first."""
 
@@ -54,7 +54,7 @@ class WeakMode:
 
     @property
     def advice(self) -> str:
-        """What to shoot: by the names that go together most."""
+        """Advice on what to shoot, by the parameters that go together most."""
         names = {name for _, name, _ in self.parameters}
         return max(ADVICE, key=lambda each: len(each[0] & names) / len(each[0]))[1]
 
@@ -68,6 +68,7 @@ def weak_modes(solution: Solution, probes: Sequence[Probes]) -> list[WeakMode]:
     root = sigmas[:, None] * vectors * np.sqrt(np.maximum(values, 0))
     modes = []
     for each in probes:
+        # covariance = root root^T; the mode is the direction of largest G root, back in parameters.
         G = each.rows.reshape(-1, len(sigmas)) @ root
         strengths, directions = np.linalg.eigh(G.T @ G / len(G))
         mode = root @ directions[:, -1]

@@ -1,9 +1,9 @@
-"""How certain a camera's picture of the world is, where the world is what the boards say it is (mrcal's uncertainty).
+"""Uncertainty of a camera's pixels in a world that is held to the boards (mrcal's projection uncertainty).
 
 Turn a camera by a little and shift its principal point: its images are the same, only what "ahead" means has changed.
-So a point is held not to the camera but to the boards; each says, with its own error, where the point went, and the
-mean of all is taken: dp = mean over boards of dt + dr x (p - t) = tau + rho x p. The six numbers rho and tau are as
-certain as the solve says, and correlated with every camera.
+So a point is held not to the camera but to the boards; each moves it with its own error, and the mean of all is taken:
+dp = mean over boards of dt + dr x (p - t) = tau + rho x p. The six numbers rho and tau have a covariance from the
+solve, and are correlated with every camera.
 
 Kogan, mrcal: "projection uncertainty", the mean-frames method. It does not depend on the gauge.
 """
@@ -23,7 +23,7 @@ from cairn_map.arrays import Floats
 
 @dataclass(frozen=True, slots=True)
 class WorldCovariance:
-    """(P + 6, P + 6): the shared parameters, then rho (radians) and tau (metres) of the boards' mean."""
+    """(P + 6, P + 6) covariance: shared parameters, then rho (radians) and tau (metres) of the boards' mean."""
 
     matrix: Floats
 
@@ -32,9 +32,11 @@ def world_covariance(solution: Solution) -> WorldCovariance:
     """The joint covariance of the cameras and of the world that the boards make."""
     known, boards = solution.known, solution.state.T_rig_board
     count, size = len(boards), solution.layout.size
+    # Of each board's errors r and t: rho = r, tau = t - r x t_board = t + [t_board]x r; then their mean.
     to_world = np.zeros((count, 6, 6))
     to_world[:, :3, :3] = to_world[:, 3:, 3:] = np.eye(3)
     to_world[:, 3:, :3] = cross_matrix(boards[:, :3, 3])
+    # Boards move with the shared parameters by -C^-1 B^T, and each by its own error.
     moves = -(to_world @ known.by_shared).mean(axis=0)
     own = (to_world @ known.own @ np.swapaxes(to_world, 1, 2)).sum(axis=0) / count**2
     matrix = np.empty((size + 6, size + 6))
@@ -48,9 +50,9 @@ def world_covariance(solution: Solution) -> WorldCovariance:
 def pixel_covariance(
     solution: Solution, rig: Rig, world: WorldCovariance, camera: str, pixels: Floats, range_m: float
 ) -> Floats:
-    """(..., 2, 2) covariance, pixels squared, of where a point of the world appears, that is at (..., 2) pixels.
+    """(..., 2, 2) covariance, pixels squared, of the pixels of the world's points that appear at (..., 2) pixels.
 
-    `range_m` is its distance from the camera; infinite ones are to be given as large.
+    `range_m` is their distance from the camera; give a large one for infinity.
     """
     lens = mounted_lens(rig, camera)
     T = rig[camera].transform
@@ -60,6 +62,7 @@ def pixel_covariance(
     for n, parameter in enumerate(solution.layout.names):
         if parameter in moves:
             rows[..., n] = moves[parameter]
+    # dp = tau + rho x p, thus d(pixel) = G (tau - [p]x rho).
     rows[..., -6:-3] = -by_point @ cross_matrix(points)
     rows[..., -3:] = by_point
     return np.asarray(rows @ world.matrix @ np.swapaxes(rows, -1, -2))
@@ -76,9 +79,9 @@ def sigma_map(solution: Solution, rig: Rig, camera: str, range_m: float, *, colu
 
 
 def transfer_map(rig: Rig, source: str, target: str, range_m: float, *, columns: int = 24) -> Floats:
-    """(rows, columns) over the image of `target`: how certain it is where a pixel of `source` appears there.
+    """(rows, columns) standard deviation, over the image of `target`, of the pixels that `source` is transferred to.
 
-    Pixels of one axis; NaN where `source` does not look. The range is from `target`.
+    Pixels of one axis; NaN outside the view of `source`. The range is from `target`.
     """
     lens, other = mounted_lens(rig, target), mounted_lens(rig, source)
     rows = max(1, round(columns * lens.height / lens.width))

@@ -31,7 +31,7 @@ Row = tuple[float, float, float, float]
 
 
 class _CamchainCamera(BaseModel):
-    """What of one entry has a counterpart in a rig; the rest is listed."""
+    """Fields of one entry with a counterpart in a rig; all others are listed as left out."""
 
     model_config = ConfigDict(extra="allow")
 

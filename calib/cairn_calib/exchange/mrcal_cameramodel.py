@@ -42,7 +42,7 @@ Six = tuple[Number, Number, Number, Number, Number, Number]
 
 
 class _Cameramodel(BaseModel):
-    """What of the file has a counterpart in a rig; the rest is listed."""
+    """Fields of the file with a counterpart in a rig; all others are listed as left out."""
 
     model_config = ConfigDict(extra="allow")
 

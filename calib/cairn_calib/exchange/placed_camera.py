@@ -3,8 +3,8 @@
     rig.json  <->  (PlacedCamera, ...)  <->  Kalibr, OpenCV, ROS, mrcal           a module each
 
 Each format's module reads text into `CameraFile` and writes a sequence of placed cameras. A number that changes where a
-pixel looks and has no counterpart on the other side is an error that names it; what a file says besides, which no rig
-holds, is listed, so that whoever converts can tell the user.
+pixel looks and has no counterpart on the other side is an error that names it; other fields of a file that no rig
+holds are listed, so that a command can show them to its user.
 """
 
 import re
@@ -19,7 +19,7 @@ from cairn_calib.rig.poses import Transform
 from cairn_map.errors import BadInputError, first_error
 
 TEXT_BYTES_MAX = 1 << 24
-"""A .cameramodel with all that mrcal knows of its solve is some hundred kilobytes."""
+"""Largest file, bytes: a .cameramodel with mrcal's whole solve is some hundred kilobytes."""
 KIND = "bad_camera_file"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 Model = TypeVar("Model", bound=BaseModel)
@@ -27,7 +27,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedCamera:
-    """One camera; `T_rig_camera` is None where the file has no place for a place."""
+    """One camera; `T_rig_camera` is None where the format holds no pose."""
 
     name: str
     camera: Lens
@@ -49,7 +49,7 @@ class CameraFile:
 
 
 def validate(model: type[Model], document: object, *, name: str) -> Model:
-    """What a file says, as a model.
+    """The data of a file as a model.
 
     Raises:
         BadInputError: a field is missing or wrong; the message names it.
@@ -77,5 +77,5 @@ def only_camera(cameras: Sequence[PlacedCamera], *, format_name: str) -> PlacedC
 
 
 def not_held(camera: PlacedCamera, field: str, why: str) -> BadInputError:
-    """What to raise where a format cannot say a number."""
+    """Error to raise where a format cannot hold a number."""
     return BadInputError(KIND, f"cameras.{camera.name}.{field}: {why}")

@@ -1,8 +1,7 @@
-"""Rigs from and to the files of Kalibr, OpenCV, ROS and mrcal: which format a file is of, what each side cannot say.
+"""Exchange of rigs with the files of Kalibr, OpenCV, ROS and mrcal: formats, and fields that one side cannot hold.
 
-None of these formats says which spectrum a camera sees, how a range camera measures, or how certain anything is. The
-spectrum comes from whoever converts; what a rig says and the other file cannot is refused by name, until it is named
-to be left out.
+None of these formats states a camera's spectrum, a range camera's sensing, or any uncertainty. The caller gives the
+spectrum; a field of a rig that the other file cannot hold is refused by name, until the caller names it to be left out.
 """
 
 import re
@@ -28,7 +27,7 @@ DROPPABLE = ("T_rig_camera", "sensing", "calibration_sigma_px", "radiometry", "r
 
 @dataclass(frozen=True, slots=True)
 class ExchangeFormat:
-    """How a format's text is read and written, and whether it says where a camera is."""
+    """Reader and writer of one format; `holds_place` is True if it states a camera's pose."""
 
     read: Callable[..., CameraFile]
     write: Callable[[Sequence[PlacedCamera]], str]

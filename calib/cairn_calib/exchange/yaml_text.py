@@ -18,7 +18,7 @@ SHOWN_MAX = 200
 
 
 def document_of_yaml(text: str) -> object:
-    """What a YAML text says: plain data, and OpenCV's matrices as mappings `rows`, `cols`, `dt`, `data`.
+    """Content of a YAML text: plain data, and OpenCV's matrices as mappings `rows`, `cols`, `dt`, `data`.
 
     Raises:
         ValueError: it is no YAML; the message says where, in one line.

@@ -86,7 +86,7 @@ def _camera(seen: Examination, name: str) -> dict[str, object]:
 
 
 def _unit(name: str) -> str:
-    """Of a free parameter, as it is named: warp and what a range camera adds are metres."""
+    """Unit of a free parameter, by its name: those of warp and range bias are metres."""
     return "m" if name.endswith("_m") or name in WARP else unit_of(name)
 
 

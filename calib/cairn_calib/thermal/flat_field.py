@@ -1,11 +1,11 @@
-"""How the pixels of a thermal camera differ: gain, offset and shading, from images of an even surface.
+"""Flat field of a thermal camera: gain, offset and shading of its pixels, from images of an even surface.
 
     levelled = gain * counts + offset + shading          as if every pixel were the mean one
 
 An even surface of one temperature, filling the view, gives offsets; of two or more, gains too. The lens and the
 housing shine on the sensor as well, more on its corners than on its middle: that is the smooth part, `shading`. It is
 kept apart because a shutter behind the lens, with which such cameras level themselves every few minutes, cannot see it:
-after that the offsets are new and the shading is as before (`after_shutter`).
+after that the offsets are new and the shading is unchanged (`after_shutter`).
 
 Each map has its standard deviation, from the images' noise: a pixel's level is surest between the temperatures that it
 was shown, and less sure the further its counts are from them (`level_sigma`).
@@ -28,13 +28,13 @@ from cairn_map.errors import BadInputError, DamagedDataError
 Mask = npt.NDArray[np.bool_]
 
 SHADING_ORDER = 4
-"""Of the polynomial in x and y that is the smooth part: a bowl, a ring and a tilt, and nothing of a pixel's size."""
-BAD_GAIN = 0.3
-"""A pixel whose gain is further from 1 does not see."""
-BAD_SIGMAS = 8.0
-"""Robust standard deviations from its neighbourhood's offset, or of what is left, that a sound pixel never has."""
+"""Order of the smooth part, a polynomial in x and y: a bowl, a ring and a tilt, and nothing of a pixel's size."""
+GAIN_ERROR_MAX = 0.3
+"""Distance of a pixel's gain from 1 beyond which the pixel is bad."""
+STRAY_SIGMAS = 8.0
+"""Robust standard deviations of the offsets, or of the residuals, beyond which a pixel is bad."""
 GAIN_SIGMA = 0.02
-"""Of a pixel's gain from 1 where only one temperature was shown: as uncooled sensors scatter unlevelled."""
+"""Standard deviation of a pixel's gain from 1 where only one temperature was shown: as uncooled sensors scatter."""
 FILE_BYTES_MAX = 64 << 20
 SIGMAS = ("gain_sigma", "offset_sigma", "shading_sigma")
 UNITS = "gain, gain_sigma: 1 (levelled counts per count); bad: true or false; all else: counts of the camera"
@@ -42,7 +42,7 @@ UNITS = "gain, gain_sigma: 1 (levelled counts per count); bad: true or false; al
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlatField:
-    """The maps of one camera, in counts; of the mean pixel they change nothing."""
+    """Maps of one camera, in counts; they change nothing of the mean pixel."""
 
     gain: Singles
     """(H, W), mean 1."""
@@ -51,17 +51,17 @@ class FlatField:
     shading: Singles
     """(H, W) counts: lens and housing, smooth, mean 0."""
     bad: Mask
-    """(H, W) pixels that see nothing."""
+    """(H, W) True for each pixel that sees nothing."""
     at_counts: float = 0.0
     """Level, in counts, at which pixels are surest: the mean of those that were shown."""
     gain_sigma: Singles | None = None
-    """(H, W) standard deviation of `gain`; None: nobody said (files before these were written)."""
+    """(H, W) standard deviation of `gain`; None where unknown, as in older files."""
     offset_sigma: Singles | None = None
     """(H, W) counts: standard deviation of `offset + shading`, at `at_counts`."""
     shading_sigma: Singles | None = None
-    """(H, W) counts: standard deviation of `shading` alone, which is what is left to trust after the shutter."""
+    """(H, W) counts: standard deviation of `shading` alone, which stays after a shutter's new offsets."""
 
-    def levelled(self, counts: npt.NDArray[np.generic]) -> Floats:
+    def level_counts(self, counts: npt.NDArray[np.generic]) -> Floats:
         """(H, W) counts as the mean pixel would have given them; NaN at bad pixels.
 
         Raises:
@@ -73,7 +73,7 @@ class FlatField:
         return np.where(self.bad, np.nan, level)
 
     def level_sigma(self, level: Floats) -> Floats:
-        """(H, W) standard deviation that the maps leave in (H, W) levelled counts; 0 where nobody said."""
+        """(H, W) standard deviation that the maps leave in (H, W) levelled counts; 0 where unknown."""
         if self.gain_sigma is None or self.offset_sigma is None:
             return np.zeros(self.gain.shape)
         return np.asarray(np.hypot(self.offset_sigma, self.gain_sigma * (level - self.at_counts) / self.gain))
@@ -93,13 +93,13 @@ class FlatField:
 
 @dataclass(frozen=True, slots=True)
 class FlatFieldFit:
-    """Maps, and how even images are with them."""
+    """Maps, with the noise and the pattern that images keep with them."""
 
     flat_field: FlatField
     noise_counts: float
-    """Of a pixel from image to image."""
+    """Standard deviation of a pixel's counts from image to image."""
     pattern_counts: float
-    """What is left of the differences, in the images' mean; with one temperature the noise of that mean."""
+    """Standard deviation of the differences that the maps leave in the images' mean; with one temperature, noise."""
 
 
 def fit_flat_field(stacks: Sequence[npt.NDArray[np.generic]]) -> FlatFieldFit:
@@ -113,9 +113,11 @@ def fit_flat_field(stacks: Sequence[npt.NDArray[np.generic]]) -> FlatFieldFit:
     """
     if not stacks or any(s.ndim != 3 or len(s) < 2 or s.shape[1:] != stacks[0].shape[1:] for s in stacks):
         raise BadInputError("bad_flat_field", "a flat field needs two images or more of each temperature, of one size")
+    # The mean image of each temperature, and a pixel's noise about it.
     means = np.array([np.asarray(s, np.float64).mean(axis=0) for s in stacks])
     variance = np.mean([np.asarray(s, np.float64).var(axis=0, ddof=1) for s in stacks], axis=0)
     noise = float(np.sqrt(np.median(variance)))
+    # Gain: the slope that stretches a pixel's counts to the level, by least squares over the temperatures.
     level = np.median(means, axis=(1, 2))
     bad = np.zeros(means.shape[1:], np.bool_)
     gain = np.ones_like(means[0])
@@ -124,17 +126,19 @@ def fit_flat_field(stacks: Sequence[npt.NDArray[np.generic]]) -> FlatFieldFit:
     if len(means) > 1:
         covariance = np.tensordot(level - level.mean(), about, axes=1)
         gain = covariance / np.where(spread > 0, spread, np.inf)
-        # A pixel's gain says how much its counts must be stretched, so a dead one's is anything.
-        bad |= np.abs(gain - 1) > BAD_GAIN
+        # A dead pixel's counts do not rise, so its gain is arbitrary.
+        bad |= np.abs(gain - 1) > GAIN_ERROR_MAX
+    # Offset and shading together, then the smooth part, without strays: they would bend it.
     total = level.mean() - gain * means.mean(axis=0)
-    shading = _smooth(np.where(bad, np.nan, total))[0]
-    bad |= _strays(total - shading)
+    shading = _fit_polynomial(np.where(bad, np.nan, total))[0]
+    bad |= _mark_strays(total - shading)
     left = gain * means + total - level[:, None, None]
-    bad |= _strays(np.abs(left).max(axis=0)) if len(means) > 2 else False
-    shading, leverage = _smooth(np.where(bad, np.nan, total))
+    bad |= _mark_strays(np.abs(left).max(axis=0)) if len(means) > 2 else False
+    shading, leverage = _fit_polynomial(np.where(bad, np.nan, total))
     shading -= shading[~bad].mean()
     gain = np.where(bad, 1.0, gain)
     offset = np.where(bad, 0.0, total - shading)
+    # Residuals with two numbers a pixel; with fewer than three temperatures only the noise is known.
     freedom = max(len(means) - 2, 1)
     pattern = float(np.sqrt((left[:, ~bad] ** 2).sum() / (freedom * (~bad).sum()))) if len(means) > 2 else 0.0
     pattern = max(pattern, noise / np.sqrt(min(len(s) for s in stacks)))
@@ -153,7 +157,7 @@ def fit_flat_field(stacks: Sequence[npt.NDArray[np.generic]]) -> FlatFieldFit:
 
 
 def write_flat_field(path: Path, flat_field: FlatField) -> MapsFile:
-    """An .npz file of the maps, and how rig.json names it."""
+    """Write an .npz file of the maps; returns its entry in rig.json."""
     buffer = io.BytesIO()
     maps = {name: getattr(flat_field, name) for name in ("gain", "offset", "shading", "bad", *SIGMAS)}
     maps = {name: each for name, each in maps.items() if each is not None}
@@ -193,7 +197,7 @@ def read_flat_field(path: Path, expected: MapsFile) -> FlatField:
     return FlatField(gain, offset, shading, bad, at_counts=at_counts, **sigmas)
 
 
-def _smooth(values: Floats) -> tuple[Floats, Floats]:
+def _fit_polynomial(values: Floats) -> tuple[Floats, Floats]:
     """(H, W) the polynomial in x and y nearest to values that are not NaN; (H, W) its sigma if theirs is 1."""
     y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in values.shape), indexing="ij")
     powers = [(i, j) for i in range(SHADING_ORDER + 1) for j in range(SHADING_ORDER + 1 - i)]
@@ -204,8 +208,8 @@ def _smooth(values: Floats) -> tuple[Floats, Floats]:
     return np.asarray(terms @ found), np.sqrt(np.einsum("yxi,ij,yxj->yx", terms, inverse, terms))
 
 
-def _strays(values: Floats) -> Mask:
-    """(H, W) which values are far from the median, by its own measure."""
+def _mark_strays(values: Floats) -> Mask:
+    """(H, W) True for each value far from the median, by the median absolute deviation."""
     middle = np.median(values)
     spread = 1.4826 * float(np.median(np.abs(values - middle)))
-    return np.asarray(np.abs(values - middle) > BAD_SIGMAS * max(spread, 1e-9))
+    return np.asarray(np.abs(values - middle) > STRAY_SIGMAS * max(spread, 1e-9))

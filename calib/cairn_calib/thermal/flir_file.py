@@ -1,4 +1,4 @@
-r"""FLIR's radiometric JPEG files: raw counts, Planck's numbers of the camera, and what it was told of the scene.
+r"""FLIR's radiometric JPEG files: raw counts, Planck's numbers of the camera, and the scene as its user entered it.
 
     JPEG APP1 segments "FLIR\0", in order  ->  one stream "FFF\0"  ->  a table of records
     record 0x01: raw counts, 16 bits, as they are or as a PNG (whose bytes FLIR writes the wrong way round)
@@ -35,13 +35,13 @@ ACCURACY_K = 1.0
 
 @dataclass(frozen=True, slots=True)
 class FlirImage:
-    """What a file holds."""
+    """Counts and numbers of one FLIR file."""
 
     counts: Counts
     """(H, W)"""
     radiometry: Radiometry
     viewing: Viewing
-    """As its user told the camera."""
+    """Surface and surroundings, as the camera's user entered them."""
     model: str
 
 

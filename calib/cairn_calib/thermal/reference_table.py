@@ -1,10 +1,10 @@
-"""The table of black bodies that a thermal camera is calibrated with, and which of its images tell nothing.
+"""Table of black bodies for the calibration of a thermal camera, without images that a flat-field correction spoils.
 
     image, celsius, sigma_k [, x, y, width, height] [, housing_celsius] [, since_ffc_s]
 
 Every few minutes such a camera closes a shutter and levels its pixels (a flat-field correction). Meanwhile it repeats
-its last image, and for a moment after it the shutter's warmth is still in the picture: what the table or a repeated
-image tells of that is left out, and told.
+its last image, and for a moment after it the shutter's warmth is still in the picture. Images that the table or a
+repetition shows to be such are left out, with a line that says so.
 """
 
 import csv
@@ -23,7 +23,7 @@ COLUMNS = ["image", "celsius", "sigma_k"]
 REGION = ["x", "y", "width", "height"]
 HOUSING, SINCE_FFC = "housing_celsius", "since_ffc_s"
 FFC_SETTLE_S = 2.0
-"""After a flat-field correction: a shutter opens within half a second, and cameras average over the frames after it."""
+"""Seconds after a flat-field correction: a shutter opens within half a second, and cameras average the next frames."""
 Counts = npt.NDArray[np.float32]
 Region = tuple[int, int, int, int]
 
@@ -37,18 +37,18 @@ class BlackBody:
     region: Region | None
     """x, y, width, height of the part of the image that it fills, pixels; None: all of it."""
     housing_k: float | None
-    """How warm the camera was, kelvin; None: nobody said."""
+    """Temperature of the camera itself, kelvin; None where unknown."""
     counts: Counts
     """(K, H, W)"""
 
 
 @dataclass(frozen=True, slots=True)
 class ReferenceTable:
-    """What is used of a table, and what is not."""
+    """Black bodies of a table, and the images that were left out."""
 
     bodies: tuple[BlackBody, ...]
     left_out: tuple[str, ...]
-    """A line for each image: its name, and why."""
+    """A line for each image: its name and the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class _Line:
 
     @property
     def group(self) -> tuple[object, ...]:
-        """Lines of one black body: the same temperature, seen by a camera as warm, to a kelvin."""
+        """Key of one black body's lines: temperature, region, and the camera's own temperature to a kelvin."""
         warm = None if self.housing_celsius is None else round(self.housing_celsius)
         return self.celsius, self.sigma_k, self.region, warm
 
@@ -83,14 +83,14 @@ def read_references(table: Path) -> ReferenceTable:
             continue
         counts = read_grey(line.image)[0]
         if (twin := seen.setdefault(counts.tobytes(), line.image.name)) != line.image.name:
-            left_out.append(f"{line.image.name}: {repeated(twin)}")
+            left_out.append(f"{line.image.name}: {repetition_text(twin)}")
             continue
         groups.setdefault(line.group, []).append((line, counts))
     return ReferenceTable(tuple(_body(table, rows) for rows in groups.values()), tuple(left_out))
 
 
-def repeated(twin: str) -> str:
-    """What is said of an image that has the same counts as another one, which noise makes impossible."""
+def repetition_text(twin: str) -> str:
+    """Reason against an image with the same counts as another one, which noise makes impossible."""
     return f"the same counts as {twin}, as a camera repeats its last image during a flat-field correction"
 
 

@@ -2,8 +2,8 @@
 
     threshold (Otsu) -> opening (small parts go) -> closing -> fill -> gates -> centroid
 
-as in Kocmanova et al., V. What is bright is the amplitude of a time-of-flight camera (the tape returns too much light),
-the temperature, and of colours how much red there is beyond green and blue.
+as in Kocmanova et al., V. Targets are bright in the amplitude of a time-of-flight camera (the tape returns too much
+light), in the temperature, and in the excess of red over green and blue.
 
 Two centroids. `paper`: of the filled outline's pixels. `grey`: each pixel weighs by how far its brightness is between
 the ground's and the target's. A time-of-flight camera's full pixels flood their neighbours, outwards and into the dark
@@ -25,23 +25,24 @@ from cairn_map.errors import BadInputError
 
 Method = Literal["grey", "paper"]
 
-SPECK = 1.6e-4
-"""Share of the image: smaller parts are noise. 4 pixels of a time-of-flight camera, 52 of a thermal one."""
+SPECK_SHARE = 1.6e-4
+"""Share of the image below which a part is noise: 4 pixels of a time-of-flight camera, 52 of a thermal one."""
 AREA_MIN_PX = 12
-CLOSING = 512
-"""Pixels of width for two of the closing's: 3 up to a width of 700, 5 for 1280."""
-ELLIPSE_MIN = 0.8
-"""Of the area of the ellipse with the same moments that the outline covers, and the other way round."""
-FLATTEST = 0.4
-"""Short axis over long one: a disc tilted by 66 degrees."""
-STANDS_OUT = 5.0
-"""Robust standard deviations of the image between ground and threshold, at least."""
+"""Smallest area of a target, pixels."""
+CLOSING_WIDTH_PX = 512
+"""Pixels of image width for two of the closing's side: 3 up to a width of 700, 5 for 1280."""
+ELLIPSE_SHARE_MIN = 0.8
+"""Smallest ratio between the outline's area and that of the ellipse with the same moments, either way."""
+AXES_RATIO_MIN = 0.4
+"""Short axis over long one, at least: a disc tilted by 66 degrees."""
+CONTRAST_SIGMAS = 5.0
+"""Robust standard deviations of the image between its median and the threshold, at least."""
 SOFT_PX = 3
-"""Beyond the outline to which brightness is followed."""
+"""Pixels beyond the outline whose brightness counts for the grey centroid."""
 RIM_QUANTILE = 0.8
-"""Of the brightness within the outline: that of the rim, which is a third of the area or more."""
+"""Quantile of the brightness within the outline that is the rim's, which is a third of the area or more."""
 MIDDLE_SHARE = 0.4
-"""Of the dark middle's centroid; 0.3 and 0.5 are worse by a tenth."""
+"""Weight of the dark middle's centroid in the grey one; 0.3 and 0.5 are worse by a tenth."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,9 +52,9 @@ class Disc:
     centroid: Floats
     """(2,) x, y."""
     radius_px: float
-    """Of a disc of the outline's area."""
+    """Radius of a disc with the outline's area."""
     pixels: npt.NDArray[np.int64]
-    """(M, 2) x, y of all pixels within the outline but the outermost."""
+    """(M, 2) x, y of all pixels within the outline, except the outermost."""
 
 
 def brightness_of(image: npt.NDArray[np.generic], spectrum: Spectrum) -> Singles:
@@ -70,7 +71,7 @@ def brightness_of(image: npt.NDArray[np.generic], spectrum: Spectrum) -> Singles
 
 
 def find_discs(bright: Singles, spectrum: Spectrum, *, method: Method = "grey") -> list[Disc]:
-    """The targets in a picture of `brightness_of`, but those that the border cuts; none where nothing stands out."""
+    """Targets in an image of `brightness_of`, without those that the border cuts; none where nothing stands out."""
     mask = _outlines(bright)
     if mask is None:
         return []
@@ -99,17 +100,19 @@ def _outlines(bright: Singles) -> Bytes | None:
     low, high = float(np.percentile(bright, 1)), float(bright.max())
     if not high > low:
         return None
+    # Threshold: Otsu's, but well above the noise.
     stretched = np.clip((bright - low) / (high - low) * 255, 0, 255).astype(np.uint8)
     level, _ = cv2.threshold(stretched, 0, 1, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
     middle = float(np.median(stretched))
     spread = 1.4826 * float(np.median(np.abs(stretched.astype(np.float32) - middle)))
     # Otsu's threshold halves the noise where targets are a small share of the image.
-    level = max(level, middle + STANDS_OUT * max(spread, 1.0))
+    level = max(level, middle + CONTRAST_SIGMAS * max(spread, 1.0))
     mask = (stretched > level).astype(np.uint8)
+    # Opening, closing, filling.
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
-    is_large = stats[:, cv2.CC_STAT_AREA] >= SPECK * bright.size
+    is_large = stats[:, cv2.CC_STAT_AREA] >= SPECK_SHARE * bright.size
     mask = (mask * is_large[np.asarray(labels, np.intp)]).astype(np.uint8)
-    side = max(3, 2 * round(bright.shape[1] / CLOSING) + 1)
+    side = max(3, 2 * round(bright.shape[1] / CLOSING_WIDTH_PX) + 1)
     mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8)), np.uint8)
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     filled = np.zeros(mask.shape, np.uint8)
@@ -118,32 +121,35 @@ def _outlines(bright: Singles) -> Bytes | None:
 
 
 def _is_ellipse(part: Bytes) -> bool:
-    """Whether a mask's area is that of the ellipse with its moments, and that ellipse no line."""
+    """True if a mask's area is about that of the ellipse with its moments, and that ellipse is no line."""
     m = cv2.moments(part, binaryImage=True)
     # A pixel is a square: a twelfth of its area is its own second moment.
     xx, xy, yy = (m[name] / m["m00"] + own for name, own in (("mu20", 1 / 12), ("mu11", 0.0), ("mu02", 1 / 12)))
     short, long = (float(v) for v in np.linalg.eigvalsh([[xx, xy], [xy, yy]]))
     share = m["m00"] / (4 * np.pi * np.sqrt(long * short))
-    return short > FLATTEST**2 * long and ELLIPSE_MIN < share < 1 / ELLIPSE_MIN
+    return short > AXES_RATIO_MIN**2 * long and ELLIPSE_SHARE_MIN < share < 1 / ELLIPSE_SHARE_MIN
 
 
 def _grey_centroid(bright: Floats, part: Bytes, all_parts: Bytes, spectrum: Spectrum) -> Floats:
-    """(2,) in the window's pixels."""
-    near, beyond = (_grown(part, reach) for reach in (SOFT_PX, SOFT_PX + 1))
-    others = _grown((all_parts > 0) & (part == 0), 1)
+    """(2,) grey-weighted centroid of one part, pixels of the window."""
+    # Ground: a ring beyond the soft edge, away from other parts. Top: the rim's brightness.
+    near, beyond = (_grow(part, reach) for reach in (SOFT_PX, SOFT_PX + 1))
+    others = _grow((all_parts > 0) & (part == 0), 1)
     ground = float(np.median(bright[beyond & ~near & ~others] if (beyond & ~near & ~others).any() else bright[~near]))
     inside = part > 0
     top = float(np.quantile(bright[inside], RIM_QUANTILE))
     soft = np.clip((bright - ground) / max(top - ground, 1e-9), 0, 1)
+    # The outline's centroid: whole pixels inside, soft ones about the edge.
     core = cv2.erode(part, np.ones((3, 3), np.uint8)) > 0
     outline = _mean_place(np.where(core, 1.0, soft * (near & ~others)))
     if spectrum is not Spectrum.RANGE:
         return outline
+    # A range camera's full pixels flood both ways: average with the dark middle.
     dark = np.where(inside, np.clip(0.5 - (bright - ground) / max(top - ground, 1e-9), 0, None), 0.0)
     return outline if dark.sum() <= 0 else (1 - MIDDLE_SHARE) * outline + MIDDLE_SHARE * _mean_place(dark)
 
 
-def _grown(part: npt.NDArray[np.generic], reach: int) -> npt.NDArray[np.bool_]:
+def _grow(part: npt.NDArray[np.generic], reach: int) -> npt.NDArray[np.bool_]:
     side = 2 * reach + 1
     return np.asarray(cv2.dilate(part.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 

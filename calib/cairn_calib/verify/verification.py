@@ -1,11 +1,15 @@
-"""How well a rig carries what its range camera sees into its other cameras: chapter V of Kocmanova et al.
+"""Verification of a rig by targets carried from its range camera to the others: chapter V of Kocmanova et al.
 
     targets in the range camera's amplitude --range of the matt middle--> Eq. 1-6 --> predicted pixel in each camera
     targets in that camera's own image ---------------------------------------------> found pixel, if near enough
     difference = predicted - found
 
-Each difference comes with what was to be expected of it, by source: the calibration (the rig's own covariance), the two
-centroids, the range. The perspective of a tilted disc moves its centroid off its centre's image, in both images alike.
+Each difference comes with its expected standard deviations, by source: the calibration (the rig's own covariance), the
+two centroids, the range. The perspective of a tilted disc moves its centroid off its centre's image, in both images
+alike.
+
+A target's range is that of a robust plane over all pixels of its middle that have a range (`disc_range`): the tape on
+its rim returns too much light and has none, the matt black middle has.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,28 +27,31 @@ from cairn_calib.verify.disc_images import Disc, Method, brightness_of, find_dis
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 
-PIXELS_MIN = 3
+RANGE_PIXELS_MIN = 3
+"""Pixels of a target's middle with a range, at least: a plane has three numbers."""
 SLANT_SIGMA = 0.6
-"""Of the tangent of the target's tilt: 31 degrees."""
+"""Prior standard deviation of the tangent of the target's tilt: 31 degrees."""
 RELIEF_SIGMA_M = 0.0012
-"""Of what is not in the plane: paper, aluminium and tape lie on one another, and light mixes at their edges. On
-simulated targets, half a millimetre apart, ranges come out 1.2 mm too long whatever the number of pixels."""
-ROUNDS = 10
-TUKEY = 4.685
-"""Robust standard deviations beyond which a pixel counts for nothing."""
+"""Standard deviation of the target's relief: paper, aluminium and tape lie on one another, and light mixes at their
+edges. On simulated targets, half a millimetre apart, ranges come out 1.2 mm too long for any number of pixels."""
+PLANE_ROUNDS = 10
+"""Rounds of reweighting."""
+TUKEY_SIGMAS = 4.685
+"""Robust standard deviations beyond which a pixel has no weight (Tukey's biweight)."""
 
 Image = npt.NDArray[np.generic]
 
 GATE_SIGMAS = 3.0
+"""Standard deviations beyond the target's own outline within which it must be found."""
 SIZE_FACTOR = 1.7
-"""Between the radius that is found and the one that the range camera's predicts."""
+"""Largest ratio between the radius that is found and the one predicted by the range camera's."""
 STEP_PX, STEP_M = 0.5, 1e-3
-"""Of the differences that tell how a predicted pixel moves; between them it is straight to 1e-4 of that."""
+"""Steps of the differences that approximate derivatives of a predicted pixel, good to 1e-4 of them."""
 CENTROID_SIGMA_PX: Mapping[Method, Mapping[Spectrum, float]] = {
     "paper": {Spectrum.RANGE: 0.19, Spectrum.COLOUR: 0.14, Spectrum.THERMAL: 0.085},
     "grey": {Spectrum.RANGE: 0.088, Spectrum.COLOUR: 0.15, Spectrum.THERMAL: 0.085},
 }
-"""One axis, of its own pixels: as measured on simulated targets (tests/cairn_sim/study/test_study.py)."""
+"""Standard deviation of a centroid, one axis, own pixels; by simulated targets (tests/cairn_sim/study/test_study.py)"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,16 +63,16 @@ class TargetSighting:
     source_px: Floats
     """(2,) centroid in the range camera."""
     radius_px: float
-    """Of that from the range camera's principal point: the paper's "ToF image radius"."""
+    """Distance of `source_px` from the range camera's principal point: the paper's "ToF image radius"."""
     range_m: float
     predicted_px: Floats
-    """(2,)"""
+    """(2,) predicted centroid in the other camera."""
     found_px: Floats
-    """(2,)"""
+    """(2,) centroid found in the other camera."""
     disc_px: float
     """Radius of the target in the other camera."""
     shares_px: Mapping[str, Floats]
-    """(2,) standard deviations of x and y to be expected: `calibration` (absent where the rig does not say),
+    """(2,) expected standard deviations of x and y by source: `calibration` (absent without a covariance in the rig),
     `centroid`, `range`."""
 
     @property
@@ -76,7 +83,7 @@ class TargetSighting:
 
 @dataclass(slots=True)
 class Sightings:
-    """All that was found in a set of images, and what was left out, by reason."""
+    """Sightings in a set of images, and the number of targets left out, by reason."""
 
     rig: Rig
     source: str
@@ -86,27 +93,27 @@ class Sightings:
     left_out: dict[str, int] = field(default_factory=dict)
     images: int = 0
     targets: int = 0
-    """Seen by the range camera, with a range."""
+    """Number of targets that the range camera saw, with a range."""
 
     def of_camera(self, name: str) -> list[TargetSighting]:
-        """The sights of one camera."""
+        """Sightings of one camera."""
         return [sight for sight in self.sights if sight.camera == name]
 
     @property
     def cameras(self) -> list[str]:
-        """The cameras that are looked at, in the rig's order."""
+        """Cameras with a lens, except the range camera, in the rig's order."""
         return [
             name for name, each in self.rig.cameras.items() if name != self.source and isinstance(each.camera, Lens)
         ]
 
     def note(self, reason: str) -> None:
-        """One more target that is left out."""
+        """Count one more target that is left out."""
         self.left_out[reason] = self.left_out.get(reason, 0) + 1
 
 
 @dataclass(frozen=True, slots=True)
 class PoseTargets:
-    """The targets in one head pose's images, before any rig has a say."""
+    """Targets in the images of one head pose, which depend on no calibration."""
 
     image: str
     range_m: Image
@@ -114,7 +121,7 @@ class PoseTargets:
     discs: Mapping[str, Sequence[Disc]]
     """By camera."""
     amplitude: Image | None = None
-    """(H, W) of the range camera, counts; None: not known."""
+    """(H, W) of the range camera, counts; None where unknown."""
 
 
 def range_camera_of(rig: Rig) -> str:
@@ -130,14 +137,14 @@ def range_camera_of(rig: Rig) -> str:
 
 
 def find_targets(rig: Rig, images: Mapping[str, Image], range_m: Image, *, name: str, method: Method) -> PoseTargets:
-    """The targets in the images of one head pose.
+    """Find the targets in the images of one head pose.
 
     Args:
-        rig: of which only the spectra matter here.
+        rig: names and spectra of the cameras; its calibration is not used.
         images: by camera: amplitude, (H, W, 3) colour R, G, B, or temperature.
-        range_m: of the range camera.
-        name: of the pose, for people.
-        method: which centroid.
+        range_m: (H, W) ranges of the range camera, metres.
+        name: name of the pose, for people.
+        method: kind of centroid.
     """
     discs = {
         camera: find_discs(brightness_of(image, rig[camera].spectrum), rig[camera].spectrum, method=method)
@@ -153,13 +160,14 @@ def add_sights(
     """Carry the range camera's targets of one pose to the other cameras, and keep those that were found there.
 
     Args:
-        into: grows.
+        into: the sightings, which grow.
         found: the targets of the pose.
-        centroid_sigma_px: one axis, by spectrum; None for those of the method.
+        centroid_sigma_px: standard deviation of a centroid, one axis, by spectrum; None for those of the method.
     """
     rig, source = into.rig, into.source
     sigmas = centroid_sigma_px or CENTROID_SIGMA_PX[into.method]
     into.images += 1
+    # Targets of the range camera with their range, without the camera's bias.
     range_m = rig[source].true_ranges(np.asarray(found.range_m, np.float64), found.amplitude)
     carried = []
     for disc in found.discs.get(source, ()):
@@ -169,12 +177,13 @@ def add_sights(
             continue
         into.targets += 1
         carried.append((disc, *measured))
+    # In each other camera: predict, and take the nearest disc of about the right size, each only once.
     for camera in into.cameras:
         if camera not in found.discs:
             continue
         free = list(found.discs[camera])
         for disc, distance_m, range_sigma_m in carried:
-            predicted, shares = _expected(rig, source, camera, disc.centroid, distance_m, range_sigma_m, sigmas)
+            predicted, shares = _predict(rig, source, camera, disc.centroid, distance_m, range_sigma_m, sigmas)
             lens = rig[camera].camera
             radius_px = disc.radius_px * _focal(rig, camera) / _focal(rig, source)
             if not _is_within(lens, predicted, radius_px):
@@ -208,11 +217,11 @@ def transfer_pixels(rig: Rig, source: str, target: str, pixels: Floats, range_m:
 
 
 def source_pixel_in(rig: Rig, source: str, target: str) -> float:
-    """How many pixels of another camera one of the range camera is wide: the ratio of their focal lengths."""
+    """Width of a range camera's pixel in pixels of another camera: the ratio of their focal lengths."""
     return _focal(rig, target) / _focal(rig, source)
 
 
-def _expected(
+def _predict(
     rig: Rig,
     source: str,
     target: str,
@@ -221,7 +230,8 @@ def _expected(
     range_sigma_m: float,
     sigmas: Mapping[Spectrum, float],
 ) -> tuple[Floats, dict[str, Floats]]:
-    """(2,) the predicted pixel, and (2,) the standard deviation of the difference by each source."""
+    """(2,) predicted pixel, and (2,) standard deviation of the difference by each source."""
+    # Central differences by x, y and range.
     steps = np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float64)
     at = transfer_pixels(rig, source, target, pixel + STEP_PX * steps[:, :2], range_m + STEP_M * steps[:, 2])
     by_x, by_y = (at[1] - at[2]) / (2 * STEP_PX), (at[3] - at[4]) / (2 * STEP_PX)
@@ -238,7 +248,7 @@ def _expected(
 
 
 def _is_within(lens: Raster, pixel: Floats, radius_px: float) -> bool:
-    """Whether a disc about a pixel lies in the image."""
+    """True if a disc about a pixel lies in the image."""
     edge = np.array([lens.width - 1, lens.height - 1])
     return bool(np.isfinite(pixel).all() and (pixel >= radius_px).all() and (pixel <= edge - radius_px).all())
 
@@ -267,31 +277,39 @@ def _focal(rig: Rig, camera: str) -> float:
 def disc_range(disc: Disc, range_m: npt.NDArray[np.floating], mounted: MountedCamera) -> tuple[float, float] | None:
     """Range along the beam through a target's centroid, and its standard deviation, metres; None without a range.
 
+    On a plane with the vector n, n . X = 1, a beam along the unit vector b ends at the range d with 1 / d = n . b. That
+    is linear in n, for a lens that distorts, too. Where few pixels are left, a weak prior makes the target face the
+    camera. Noise of the pixels falls with their number; the target's relief and the uncertainty of the camera's range
+    bias, which all of them share, do not.
+
     Args:
-        disc: found in the camera's amplitude.
+        disc: a target found in the camera's amplitude.
         range_m: (H, W), metres along the beam; NaN where nothing came back.
         mounted: the range camera.
     """
     x, y = disc.pixels.T
     d = np.asarray(range_m, np.float64)[y, x]
     seen = np.isfinite(d)
-    if seen.sum() < PIXELS_MIN:
+    if seen.sum() < RANGE_PIXELS_MIN:
         return None
     d = d[seen]
+    # n in a frame along the target's beam: its first number is 1 / range there, the other two the tilt.
     beams = mounted.camera.unproject(disc.pixels[seen].astype(np.float64))
     axis = mounted.camera.unproject(disc.centroid)
     sideways = np.linalg.svd(axis[None])[2][1:]
     terms = beams @ np.vstack([axis, sideways]).T
+    # Noise of 1 / d, and the prior of the tilt.
     sigma = np.maximum(mounted.range_noise_m(d), 1e-6) / d**2
     middle = float(np.median(1 / d))
     prior = np.diag([0.0, 1.0, 1.0]) / (SLANT_SIGMA * middle) ** 2
     weight = np.ones(len(d))
     n, normal = np.array([middle, 0.0, 0.0]), prior
-    for _ in range(ROUNDS):
+    # Iteratively reweighted least squares.
+    for _ in range(PLANE_ROUNDS):
         left = (1 / d - terms @ n) / sigma
         spread = max(1.0, 1.4826 * float(np.median(np.abs(left - np.median(left)))))
-        weight = np.maximum(0, 1 - (left / (TUKEY * spread)) ** 2) ** 2 / (sigma * spread) ** 2
-        if (weight > 0).sum() < PIXELS_MIN:
+        weight = np.maximum(0, 1 - (left / (TUKEY_SIGMAS * spread)) ** 2) ** 2 / (sigma * spread) ** 2
+        if (weight > 0).sum() < RANGE_PIXELS_MIN:
             return None
         normal = (terms * weight[:, None]).T @ terms + prior
         n = np.linalg.solve(normal, (terms * weight[:, None]).T @ (1 / d))

@@ -21,7 +21,7 @@ SOURCES = ("calibration", "centroid", "range")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraRow:
-    """What is said of one camera; pixels of it."""
+    """One camera's row of the table; its own pixels."""
 
     camera: str
     count: int
@@ -34,7 +34,7 @@ class CameraRow:
     bias_x_px: float
     bias_y_px: float
     rms_px: float
-    """Of the differences themselves, bias and all, one axis."""
+    """Root mean square of the differences, bias included, one axis."""
     expected_px: dict[str, float | None]
     """By source, one axis; None where the rig does not say."""
     total_px: float | None

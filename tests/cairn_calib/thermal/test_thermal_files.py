@@ -88,7 +88,7 @@ def test_maps_level_the_pixels_of_images_that_they_were_not_made_of() -> None:
     fitted = fit_flat_field([images(true, level, 16, rng) for level in (4000.0, 5000.0, 6500.0)])
     assert (fitted.flat_field.bad == true.bad).all()
     assert fitted.noise_counts == pytest.approx(2.0, rel=0.05)
-    level = fitted.flat_field.levelled(images(true, 5600.0, 1, rng, noise=0.0)[0])
+    level = fitted.flat_field.level_counts(images(true, 5600.0, 1, rng, noise=0.0)[0])
     assert np.isnan(level[true.bad]).all()
     # 60 counts before; the maps' own noise is 2 / sqrt(16), smaller between two of their levels.
     assert np.std(level[~true.bad]) < 0.6 and np.nanmean(level) == pytest.approx(5600.0, abs=6)
@@ -105,8 +105,8 @@ def test_shading_is_the_smooth_part_and_outlives_the_shutter() -> None:
     behind = FlatField(warm.gain, warm.offset, np.zeros_like(warm.shading), warm.bad)
     again = fitted.after_shutter(images(behind, 5000.0, 1, rng, noise=0.0)[0])
     now = images(warm, 5200.0, 1, rng, noise=0.0)[0]
-    assert np.std(fitted.levelled(now)) > 10
-    assert np.std(again.levelled(now)) < 3
+    assert np.std(fitted.level_counts(now)) > 10
+    assert np.std(again.level_counts(now)) < 3
 
 
 def test_one_temperature_gives_offsets_and_no_gain() -> None:
@@ -114,7 +114,7 @@ def test_one_temperature_gives_offsets_and_no_gain() -> None:
     true = scene(rng, bad=0)
     fitted = fit_flat_field([images(true, 5000.0, 8, rng)])
     assert (fitted.flat_field.gain == 1).all()
-    assert np.std(fitted.flat_field.levelled(images(true, 5000.0, 1, rng, noise=0)[0])) < 1.0
+    assert np.std(fitted.flat_field.level_counts(images(true, 5000.0, 1, rng, noise=0)[0])) < 1.0
     with pytest.raises(BadInputError, match="two images or more"):
         fit_flat_field([images(true, 5000.0, 1, rng)])
 
@@ -129,7 +129,7 @@ def test_maps_come_back_from_their_file_and_another_file_is_refused(tmp_path: Pa
     with pytest.raises(BadInputError, match="SHA-256 differs"):
         read_flat_field(tmp_path / "a.maps.npz", named)
     with pytest.raises(BadInputError, match="the maps are of"):
-        back.levelled(np.zeros((4, 4)))
+        back.level_counts(np.zeros((4, 4)))
 
 
 def black_bodies(folder: Path, rng: np.random.Generator, *, celsius: tuple[float, ...]) -> Path:

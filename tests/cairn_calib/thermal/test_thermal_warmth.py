@@ -75,7 +75,7 @@ def test_a_housing_that_stays_or_goes_with_the_black_bodies_has_no_term(step_k: 
 
 def error_over_sigma(field: FlatField, true: FlatField, level: float, rng: np.random.Generator) -> float:
     """Root mean square over pixels: the maps' error in even images without noise, over what is stated."""
-    levelled = field.levelled(images(true, level, 1, rng, noise=0.0)[0])
+    levelled = field.level_counts(images(true, level, 1, rng, noise=0.0)[0])
     off = levelled - np.nanmean(levelled)
     return float(np.sqrt(np.nanmean((off / field.level_sigma(levelled)) ** 2)))
 
