@@ -27,6 +27,7 @@ class FlatView:
 
     def pixels(self, lattice: Floats) -> Floats:
         """(N, 2) pixels at which places of the board appear."""
+        # Straight place first, then bend it: the model undistorts, so the bent radius must be solved for.
         straight = map_points(self.homography, lattice)
         radius = np.linalg.norm(straight, axis=-1, keepdims=True)
         # Newton's method for r (1 + k r^2) = R; the slope's bound keeps it from running off where the lens folds.
@@ -53,6 +54,7 @@ def flat_view(lattice: Floats, pixels: Floats, shape: tuple[int, ...]) -> FlatVi
     """
     centre = np.array([shape[1] - 1, shape[0] - 1]) / 2
     scale = float(np.hypot(*centre))
+    # In units in which the image's corner is 1 from its middle, so that k is a pure number.
     plane = (pixels - centre) / scale
     square = (plane**2).sum(axis=1, keepdims=True)
 

@@ -170,6 +170,7 @@ def _homography_by_hull(blobs: Floats, board: Board, *, upright: bool) -> Floats
                 if homography is None:
                     continue
                 at = map_points(homography, lattice)
+                # An upright grid's rows run to the right, within 45 degrees.
                 if upright and not at[board.columns - 1, 0] - at[0, 0] > abs(at[board.columns - 1, 1] - at[0, 1]):
                     continue
                 met = _have_blob(homography, lattice, at, cloud)
@@ -182,6 +183,7 @@ def _homography_by_hull(blobs: Floats, board: Board, *, upright: bool) -> Floats
 def _simplify_hull(hull: Floats) -> Floats:
     """Hull of at most `HULL_MAX` vertices, without those that add the least area."""
     while len(hull) > HULL_MAX:
+        # Twice the area of the triangle that a vertex makes with its neighbours.
         to, back = np.roll(hull, -1, axis=0) - hull, np.roll(hull, 1, axis=0) - hull
         hull = np.delete(hull, int(np.abs(to[:, 0] * back[:, 1] - to[:, 1] * back[:, 0]).argmin()), axis=0)
     return hull
@@ -189,6 +191,7 @@ def _simplify_hull(hull: Floats) -> Floats:
 
 def _blob_clouds(blobs: Floats, count: int) -> list[Floats]:
     """Blobs that have two neighbours about as near as is usual, then all blobs: strays stand alone."""
+    # The second nearest neighbour: column 0 is the blob itself.
     away = np.linalg.norm(blobs[:, None] - blobs[None], axis=2)
     second = np.sort(away, axis=1)[:, min(2, len(blobs) - 1)]
     near = second < 1.8 * np.median(second)
@@ -230,6 +233,7 @@ def _measure(signed: Image, board: Board, homography: Floats) -> Corners | str:
         pixels[index] = centre
     # Gates: contrast, orientation, flatness.
     usual = float(np.nanmedian(contrast))
+    # Discs with a contrast far from the usual one are hidden or something else.
     sound = np.isfinite(pixels[:, 0]) & (contrast > usual / CONTRAST_RATIO) & (contrast < usual * CONTRAST_RATIO)
     if usual <= 0 or sound.sum() < SEEN_MIN * board.count:
         count = sound.sum() if usual > 0 else 0

@@ -67,6 +67,7 @@ def find_chessboard(
         BadInputError: colours do not tell the first corner of this board, and it is not said to be upright; or the
             image is not one.
     """
+    # Without colours or a known way up the first corner cannot be named.
     if board.turns_unseen and not upright:
         raise BadInputError(
             "board_turns",
@@ -108,8 +109,10 @@ def grey(image: npt.NDArray[np.generic]) -> Image:
 
 def normalise_contrast(counts: Image) -> Image:
     """(H, W) image with a contrast of about 1, without the slow change of brightness over it."""
+    # Percentiles, not extremes: hot spots and dead pixels must not set the contrast.
     low, high = np.percentile(counts, STRETCH)
     flat = np.clip((counts - low) / max(float(high - low), 1e-9), -0.5, 1.5).astype(np.float32)
+    # The shade is smooth, so 32 x 32 pixels hold it.
     small = cv2.resize(flat, (32, 32), interpolation=cv2.INTER_AREA)
     shade = cv2.GaussianBlur(small, (0, 0), SHADE_SHARE * 32)
     shade = cv2.resize(shade, flat.shape[::-1], interpolation=cv2.INTER_LINEAR)
@@ -119,6 +122,7 @@ def normalise_contrast(counts: Image) -> Image:
 def _resize(even: Image, scale: float) -> Image:
     if scale == 1:
         return even
+    # Reduced by areas, so that no pixel is skipped.
     way = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
     return np.asarray(cv2.resize(even, None, fx=scale, fy=scale, interpolation=way), np.float32)
 
@@ -196,6 +200,7 @@ def _drop_unsound(fitted: FittedCorners, signs: Floats, *, apart_px: float) -> F
 
     Where two names have come to one place, either may be wrong, so neither is kept: the others predict both again.
     """
+    # Corners that do not look like this board's, then those that coincide.
     lost = ~sound_corners(fitted, signs)
     apart = np.linalg.norm(fitted.pixels[:, None] - fitted.pixels[None], axis=2)
     apart[np.diag_indices(len(apart))] = np.inf
@@ -264,6 +269,7 @@ def fit_pointed_at(image: npt.NDArray[np.generic], board: Board, pointed: Floats
     """
     counts = grey(image)
     lattice = board.lattice()
+    # Four clicks name the outer corners, more name every corner in order.
     outer = [0, board.columns - 1, board.count - 1, board.count - board.columns]
     places = lattice[outer] if len(pointed) == 4 else lattice
     homography = fit_homography(places, pointed)

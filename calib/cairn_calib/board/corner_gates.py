@@ -95,6 +95,7 @@ def sound_corners(fitted: FittedCorners, signs: Floats) -> npt.NDArray[np.bool_]
         signs: (N,) 1 or -1, the checker's sign at each; either all agree with the contrasts or all disagree.
     """
     there = np.isfinite(fitted.pixels[:, 0])
+    # Three tests: the sign and size of the contrast, the residuals, and the distance from the proposal.
     signed = np.where(there, fitted.contrast, 0) * signs
     if not there.any():
         return there
@@ -104,6 +105,7 @@ def sound_corners(fitted: FittedCorners, signs: Floats) -> npt.NDArray[np.bool_]
     usual = float(np.median(signed[there]))
     alike = (signed > usual / CONTRAST_RATIO) & (signed < usual * CONTRAST_RATIO)
     misfit = np.nan_to_num(fitted.misfit, nan=9.0)
+    # Relative to the board's median, since all corners of a blurred or noisy image fit worse.
     crisp = misfit < min(MISFIT_MAX, MISFIT_RATIO * float(np.median(misfit[there])) + MISFIT_SPARE)
     return np.asarray(there & alike & crisp & (np.nan_to_num(fitted.moved, nan=9.0) < MOVED_MAX))
 
@@ -131,6 +133,7 @@ def _outer_lines(grid: FittedGrid) -> str | None:
     A single stray next to a smaller board would shift the names of all its rows.
     """
     board, kept, lattice = grid.board, grid.kept, grid.board.lattice()
+    # Few corners of a line are proof only if something at the line's other places looks like corners, too.
     index = np.arange(board.count).reshape(board.rows, board.columns)
     lines = {
         "first row": index[0],
@@ -167,6 +170,7 @@ def _cell_size(grid: FittedGrid) -> str | None:
 
 def _separation(grid: FittedGrid) -> str | None:
     pixels = grid.fitted.pixels[grid.kept]
+    # Two names at one place mean that a line was counted twice.
     apart = np.linalg.norm(pixels[:, None] - pixels[None], axis=2)
     apart[np.diag_indices(len(pixels))] = np.inf
     shortest = np.linalg.norm(grid.steps[grid.kept], axis=2).min()
@@ -174,6 +178,7 @@ def _separation(grid: FittedGrid) -> str | None:
 
 
 def _flatness(grid: FittedGrid) -> str | None:
+    # One radial term covers usual lenses; walls and windows at different depths do not fit.
     rms = flat_rms_px(grid.board.lattice()[grid.kept], grid.fitted.pixels[grid.kept], grid.image.shape)
     cell = float(np.linalg.norm(grid.steps[grid.kept], axis=2).mean())
     limit = flat_limit_px(cell)
@@ -184,6 +189,7 @@ def _spacing(grid: FittedGrid) -> str | None:
     """Gate of the spacing: wide and narrow cells must not take turns along the rows or the columns."""
     lattice, pixels = grid.board.lattice()[grid.kept], grid.fitted.pixels[grid.kept]
     off = pixels - map_points(grid.homography, lattice)
+    # -1, 1, -1, ... along the columns and along the rows, about 0.
     turns = np.where(lattice % 2 == 0, 1.0, -1.0)
     # Least squares: the share of +1, -1, +1, ... along either axis in the misses of the homography.
     turns -= turns.mean(axis=0)
@@ -207,6 +213,7 @@ def _alternation(grid: FittedGrid) -> str | None:
     signed = middles * signs
     right = total = 0
     for down, across in ((0, 1), (1, 0)):
+        # Neighbours with all corners there, one bright and one dark: signed brightnesses add up to more than 0.
         ends = (row + down < board.rows - 1) & (column + across < board.columns - 1)
         r, c = row[ends], column[ends]
         both = whole[r + down, c + across]
@@ -226,6 +233,7 @@ def _evenness(grid: FittedGrid) -> str | None:
     bright, dark = middles[whole & (signs > 0)], middles[whole & (signs < 0)]
     if not len(bright) or not len(dark):
         return "no four corners that enclose a bright cell, or a dark one, are there"
+    # Half the step from dark to bright, as the corners' fitted contrast is.
     half = float(np.median(bright) - np.median(dark)) / 2
     corners = float(np.median(np.abs(grid.fitted.contrast[grid.kept])))
     if not EVEN[0] * half < corners < EVEN[1] * half:
@@ -238,6 +246,7 @@ def _border(grid: FittedGrid) -> str | None:
     """Gate of the places beyond each rim: if the pattern goes on there, these corners may be any part of it."""
     board = grid.board
     columns, rows = np.arange(board.columns, dtype=float), np.arange(board.rows, dtype=float)
+    # Places one step beyond each side of the grid.
     rims = {
         "left": np.column_stack([np.full(board.rows, -1.0), rows]),
         "right": np.column_stack([np.full(board.rows, float(board.columns)), rows]),
@@ -249,6 +258,7 @@ def _border(grid: FittedGrid) -> str | None:
         like, fitted = _look_like_corners(grid, rim, by=grid.kept)
         with np.errstate(invalid="ignore"):
             alike = like & (fitted.misfit < 1.5 * misfit + 0.03)
+        # A few chance corners outside are no board.
         if alike.mean() > BEYOND_MAX:
             return f"the pattern goes on {name} of the board: {int(alike.sum())} of {len(rim)} places there are corners"
     return None
@@ -256,8 +266,10 @@ def _border(grid: FittedGrid) -> str | None:
 
 def _look_like_corners(grid: FittedGrid, places: Floats, *, by: Flags) -> tuple[Flags, FittedCorners]:
     """(M,) True for each place of the lattice with a corner where those flagged in `by` predict it; and the fits."""
+    # Fit at the predicted places, and compare sign, contrast and distance with the board's own corners.
     fitted = fit_corners(grid.image, _predict(grid, places, by), steps_between(grid.homography, places))
     usual = float(np.median(np.abs(grid.fitted.contrast[by])))
+    # The checker goes on beyond the board with the same signs.
     way = 1.0 if np.nansum(grid.fitted.contrast * checker_signs(grid.board)) > 0 else -1.0
     signs = np.where(places.sum(axis=1) % 2 == 0, way, -way)
     with np.errstate(invalid="ignore"):
@@ -289,11 +301,13 @@ def _cells(grid: FittedGrid) -> tuple[npt.NDArray[np.bool_], Floats, Floats]:
 def _cell_means(grid: FittedGrid) -> Floats:
     """((rows - 1) * (columns - 1),) mean brightness of the middle of each cell, bilinear."""
     board, image = grid.board, grid.image
+    # Hidden corners are where the homography puts them.
     places = np.where(grid.kept[:, None], grid.fitted.pixels, map_points(grid.homography, board.lattice()))
     places = places.reshape(board.rows, board.columns, 2)
     samples = []
     for v in (0.5 - CELL_MIDDLE, 0.5, 0.5 + CELL_MIDDLE):
         for u in (0.5 - CELL_MIDDLE, 0.5, 0.5 + CELL_MIDDLE):
+            # Nine places about the middle, bilinear between the cell's four corners and again between pixels.
             at = (1 - v) * ((1 - u) * places[:-1, :-1] + u * places[:-1, 1:]) + v * (
                 (1 - u) * places[1:, :-1] + u * places[1:, 1:]
             )

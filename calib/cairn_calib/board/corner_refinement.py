@@ -174,6 +174,7 @@ def _windows(
     away = np.stack([x, y], axis=-1) - np.where(sound[:, None], guesses, 0)[:, None]
     safe = np.where(sound[:, None, None], steps, np.eye(2))
     # (N, K, 2) in cells along columns and rows.
+    # In the lattice's own axes a window is a square, however the board is tilted.
     cells = np.linalg.solve(_columns(safe)[:, None], away[..., None])[..., 0]
     inside = (x >= 0) & (y >= 0) & (x < image.shape[1]) & (y < image.shape[0])
     near = (np.abs(cells) < reach[:, None]).all(axis=-1) & (np.hypot(away[..., 0], away[..., 1]) < radius + 0.5)

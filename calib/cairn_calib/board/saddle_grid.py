@@ -138,6 +138,7 @@ def _neighbours(points: SaddlePoints) -> npt.NDArray[np.intp]:
 
 def _drop_long_steps(found: npt.NDArray[np.intp], own: Floats) -> npt.NDArray[np.intp]:
     """Neighbours, except those whose distance (`own`, pixels) is much larger than either end's shortest."""
+    # Of both ends the shorter one: a step past a corner is long at either end.
     nearest = own.min(axis=(1, 2))
     limit = STEP_RATIO_MAX * np.minimum(nearest[:, None, None], nearest[np.maximum(found, 0)])
     return np.where(own <= limit, found, -1)
@@ -182,6 +183,7 @@ def _continues(lattice: Lattice, pixels: Floats, here: tuple[int, int], key: tup
     column, row = key[0] - here[0], key[1] - here[1]
     at = pixels[lattice[here]]
     step = pixels[there] - at
+    # The step before this one, and the steps next to it on both sides, as far as they are known.
     steps = []
     behind = (here[0] - column, here[1] - row)
     if behind in lattice:
@@ -266,6 +268,7 @@ def _grow(lattice: Lattice, points: SaddlePoints) -> Lattice:
 
 def _trim(lattice: Lattice) -> Lattice:
     """Lattice without outer rows that hold a few strays only; repeated, as each row that goes bares the next."""
+    # Until nothing goes; each axis looks at its first and its last line.
     while True:
         count = len(lattice)
         for axis in (0, 1):
@@ -283,6 +286,7 @@ def _board_part(lattice: Lattice, pixels: Floats, board: Board) -> Floats | None
     if len(lattice) < SEEN_SHARE_MIN * board.count:
         return None
     keys = np.array(list(lattice))
+    # The lattice as an array, NaN in its holes.
     keys -= keys.min(axis=0)
     across, down = (keys.max(axis=0) + 1).tolist()
     grid = np.full((down, across, 2), np.nan)

@@ -48,6 +48,7 @@ def read_still(path: Path) -> StillImage:
     paths = sorted(each for each in path.iterdir() if each.suffix.lower() in SUFFIXES)
     if not paths:
         raise BadInputError("missing_image", f"{path} must hold the frames of one pose ({', '.join(SUFFIXES)})")
+    # One frame in memory at a time: a sum for each half.
     digest, sums = hashlib.sha256(), [np.zeros(0), np.zeros(0)]
     for at, each in enumerate(paths):
         counts, data = read_grey(each)
@@ -58,6 +59,7 @@ def read_still(path: Path) -> StillImage:
         sums[half] = sums[half] + counts if sums[half].size else counts.astype(np.float64)
     if len(paths) == 1:
         return StillImage(sums[0].astype(np.float32), digest.hexdigest(), 1, None)
+    # With an odd number of frames the first half has one more, as 2 * at // len(paths) counts.
     first = (len(paths) + 1) // 2
     halves = (sums[0] / first).astype(np.float32), (sums[1] / (len(paths) - first)).astype(np.float32)
     mean = ((sums[0] + sums[1]) / len(paths)).astype(np.float32)
@@ -85,6 +87,7 @@ def _moved_px(first: Grey, second: Grey, corners: Corners) -> float:
     scale = 255 / max(float(high - low), 1e-9)
     before, after = (np.clip((each - low) * scale, 0, 255).astype(np.uint8) for each in (first, second))
     at = corners.pixels[corners.seen].astype(np.float32)
+    # A window of most of a cell, so that neighbours do not take part.
     apart = np.linalg.norm(at[:, None] - at[None], axis=2)
     apart[np.diag_indices(len(at))] = np.inf
     side = 2 * int(np.clip(0.7 * np.median(apart.min(axis=1)), *WINDOW)) + 1

@@ -69,6 +69,7 @@ def next_images(solution: Solution, probes: Sequence[Probes], *, count: int = 3)
     for n, ((place, _), share) in enumerate(zip(candidates, shares, strict=True)):
         if seen[n, list(solution.plan.cameras).index(place.camera)] == 1:
             gains[n] = 1 - float(np.trace(np.linalg.solve(S + share, target))) / before
+    # The best of each camera and part of its image.
     chosen: list[NextImage] = []
     for n in np.argsort(-gains):
         place = candidates[n][0]
@@ -94,6 +95,7 @@ def _candidates(solution: Solution, camera: int) -> list[tuple[NextImage, Floats
         ray = lens.unproject(pixel)
         for share in SHARES:
             range_m = width_m / (2 * np.tan(max(share * across, 0.02) / 2))
+            # The board's middle on the pixel's ray, tilted about an axis of the camera.
             for words, axis in TILTS.items():
                 T = np.eye(4)
                 T[:3, :3] = rotation_from_vector(np.radians(TILT_DEG) * np.array([*axis, 0.0]))
@@ -119,6 +121,7 @@ def _shares(solution: Solution, poses: Floats) -> tuple[Floats, Floats]:
         frames = np.flatnonzero(seen[:, c] >= SEEN_SHARE)
         if not len(frames):
             continue
+        # No residual is needed: pixels of 0 stand in, for only derivatives count.
         kept = inside[frames]
         whitening = np.broadcast_to(np.eye(2) / sensor.data.sigma_px, (*kept.shape, 2, 2))
         data = CornerData(c, frames, np.zeros((*kept.shape, 2)), whitening, kept, sensor.data.sigma_px)

@@ -60,6 +60,7 @@ def distort(plane: Floats, coefficients: Coefficients) -> Floats:
     # Taken out before: far away the polynomial overflows.
     near = np.where((radius < radius_limit(coefficients))[..., None], plane, np.nan)
     x, y = near[..., 0], near[..., 1]
+    # The lens may fold inside that radius, too: there the determinant of the Jacobian turns negative.
     unfolded = jacobian(x, y, coefficients)[3] > 0
     return np.where(unfolded[..., None], np.stack(_brown(x, y, coefficients), axis=-1), np.nan)
 
@@ -70,6 +71,7 @@ def undistort(plane: Floats, coefficients: Coefficients) -> Floats:
         return plane
     flat = plane.reshape(-1, 2)
     result = np.empty_like(flat)
+    # Point by point independent, so cut into chunks.
     for start in range(0, len(flat), CHUNK):
         part = slice(start, start + CHUNK)
         result[part, 0], result[part, 1] = _newton(flat[part, 0], flat[part, 1], coefficients)
@@ -105,10 +107,12 @@ def jacobian(x: Floats, y: Floats, coefficients: Coefficients) -> tuple[Floats, 
     k1, k2, p1, p2, k3 = coefficients[:5]
     s = x * x + y * y
     radial = _radial(s, coefficients)
+    # slope = 2 d(radial) / ds; with a denominator by the quotient rule.
     slope = 2 * (k1 + s * (2 * k2 + s * 3 * k3))
     if len(coefficients) > 5:
         k4, k5, k6 = coefficients[5:]
         slope = (slope - 2 * radial * (k4 + s * (2 * k5 + s * 3 * k6))) / _denominator(s, coefficients)
+    # Derivatives of CONVENTIONS.md's formulae, the radial part and then the tangential.
     xx = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
     xy = x * y * slope + 2 * p1 * x + 2 * p2 * y
     yy = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
@@ -118,6 +122,7 @@ def jacobian(x: Floats, y: Floats, coefficients: Coefficients) -> tuple[Floats, 
 def coefficient_gradients(x: Floats, y: Floats, coefficients: Coefficients) -> Floats:
     """(..., 2, 5 or 8) how places of the distorted plane move with each coefficient, in their order."""
     s = x * x + y * y
+    # x' and y' are linear in k1 to p2; k4 to k6 stand in the denominator.
     below = np.ones_like(s) if len(coefficients) == 5 else _denominator(s, coefficients)
     rising = np.stack([s, s * s, s * s * s], axis=-1) / below[..., None]
     k1, k2, k3 = (rising[..., n, None] * np.stack([x, y], axis=-1) for n in range(3))
@@ -144,18 +149,21 @@ def _newton(x_to: Floats, y_to: Floats, coefficients: Coefficients) -> tuple[Flo
     x, y = x_to * scale, y_to * scale
     for _ in range(STEPS):
         x_at, y_at = _brown(x, y, coefficients)
+        # Newton: subtract the inverse Jacobian times the error. A guess beyond the fold is pulled back instead.
         x_error, y_error = x_at - x_to, y_at - y_to
         xx, xy, yy, det = jacobian(x, y, coefficients)
         inside = det > 0
         det = np.where(inside, det, 1.0)
         x = np.where(inside, x - (yy * x_error - xy * y_error) / det, x * PULL_BACK)
         y = np.where(inside, y - (xx * y_error - xy * x_error) / det, y * PULL_BACK)
+        # Invariant: every guess stays within the radial limit, where the model is a lens.
         radius = np.hypot(x, y)
         over = radius >= radii[-1]
         x[over], y[over] = (v[over] * (PULL_BACK * radii[-1] / radius[over]) for v in (x, y))
         if not np.any(np.abs(x_error) + np.abs(y_error) > STEP_AGAIN):
             break
     x_at, y_at = _brown(x, y, coefficients)
+    # A place counts only if its origin maps back to it, before the fold.
     right = np.hypot(x_at - x_to, y_at - y_to) <= TOLERANCE * np.maximum(radius_to, 1)
     found = right & (jacobian(x, y, coefficients)[3] > 0)
     return np.where(found, x, np.nan), np.where(found, y, np.nan)
@@ -182,6 +190,7 @@ def _denominator(s: Floats, coefficients: Coefficients) -> Floats:
 
 def _brown(x: Floats, y: Floats, coefficients: Coefficients) -> tuple[Floats, Floats]:
     p1, p2 = coefficients[2:4]
+    # Brown 1971 in OpenCV's form: radial part, then tangential (decentring) part.
     s = x * x + y * y
     radial = _radial(s, coefficients)
     return (

@@ -1,4 +1,4 @@
-"""A fisheye camera: Kannala and Brandt's model with four coefficients, OpenCV's `fisheye`, Kalibr's `equidistant`.
+"""Fisheye camera: Kannala and Brandt's model with four coefficients, OpenCV's `fisheye`, Kalibr's `equidistant`.
 
     theta = angle between the ray and the optical axis             point (X, Y, Z), r = sqrt(X^2 + Y^2)
     theta' = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
@@ -54,6 +54,7 @@ class FisheyeCamera(Lens, frozen=True):
         """(..., 2, 3) by the point and (..., 2, 4) by the coefficients; NaN straight back and at the own place."""
         off_axis, theta, radial = self._angles(points)
         z = points[..., 2]
+        # The place is theta' e, e the direction off the axis: d theta' / d theta moves it along e, theta' / r across.
         toward = points[..., :2] / np.where(off_axis > 0, off_axis, 1)[..., None]
         slope = _slope(theta, self.distortion) / (off_axis * off_axis + z * z)
         outer = toward[..., :, None] * toward[..., None, :]
@@ -84,7 +85,7 @@ class FisheyeCamera(Lens, frozen=True):
         theta = np.where((off_axis > 0) | (z > 0), np.arctan2(off_axis, z), np.nan)
         # On the axis theta' / r is 1 / z.
         near = np.where(off_axis > 0, off_axis, 1)
-        radial = np.where(off_axis > 0, _bent(theta, self.distortion) / near, 1 / np.where(z > 0, z, np.nan))
+        radial = np.where(off_axis > 0, _bend(theta, self.distortion) / near, 1 / np.where(z > 0, z, np.nan))
         return off_axis, theta, radial
 
 
@@ -101,22 +102,24 @@ def _angle_of(reach: Floats, coefficients: Coefficients) -> Floats:
     wanted = np.where(reach < reached[-1], reach, np.nan)
     theta = np.interp(wanted, reached, angles)
     for _ in range(STEPS):
-        error = _bent(theta, coefficients) - wanted
+        # Newton for theta' = wanted, within the angle up to which theta' rises.
+        error = _bend(theta, coefficients) - wanted
         slope = _slope(theta, coefficients)
         theta = np.clip(theta - error / np.where(slope > 0, slope, np.nan), 0, limit)
         if not np.any(np.abs(error) > STEP_AGAIN):
             break
-    right = (np.abs(_bent(theta, coefficients) - wanted) <= TOLERANCE) & (theta < limit)
+    # Only angles that map back count.
+    right = (np.abs(_bend(theta, coefficients) - wanted) <= TOLERANCE) & (theta < limit)
     return np.where(right, theta, np.nan)
 
 
 @lru_cache(maxsize=64)
 def _table(coefficients: Coefficients) -> tuple[Floats, Floats]:
     angles = np.linspace(0, angle_limit(coefficients), TABLE_SIZE)
-    return angles, _bent(angles, coefficients)
+    return angles, _bend(angles, coefficients)
 
 
-def _bent(theta: Floats, coefficients: Coefficients) -> Floats:
+def _bend(theta: Floats, coefficients: Coefficients) -> Floats:
     k1, k2, k3, k4 = coefficients
     s = theta * theta
     return theta * (1 + s * (k1 + s * (k2 + s * (k3 + s * k4))))

@@ -120,6 +120,7 @@ class Lens(Raster, frozen=True):
         p = np.asarray(points, dtype=np.float64)
         plane, focal = self.plane(p), np.array(self.focal_px)
         by_point, by_coefficient = self.plane_gradients(p)
+        # pixel = focal * plane + centre, so the derivative by the focal length is the place in the plane.
         by_focal, by_centre = plane[..., None] * np.eye(2), np.broadcast_to(np.eye(2), (*plane.shape, 2))
         by_intrinsics = np.concatenate([by_focal, by_centre, focal[:, None] * by_coefficient], axis=-1)
         return Projection(plane * focal + np.array(self.centre_px), focal[:, None] * by_point, by_intrinsics)
@@ -134,6 +135,7 @@ class Lens(Raster, frozen=True):
         rays = self.unproject(pixels)
         there = self.projection(rays)
         G = there.by_point
+        # Pseudo-inverse G^T (G G^T)^-1, with the 2 x 2 inverse written out.
         square = G @ np.swapaxes(G, -1, -2)
         a, b, d = square[..., 0, 0], square[..., 0, 1], square[..., 1, 1]
         adjugate = np.stack([np.stack([d, -b], axis=-1), np.stack([-b, a], axis=-1)], axis=-2)

@@ -86,6 +86,7 @@ def transfer_certain(
     Raises:
         BadInputError: no such camera, no lens, or the rig has no covariance.
     """
+    # Three independent sources: J cov J^T of the calibration, of the pixel, of the range.
     found, by_pixel, by_range, moves = _transfer(rig, source, target, pixels, range_m)
     return CertainTransfer(
         found,
@@ -113,10 +114,13 @@ def _transfer(
 ) -> tuple[Floats, Floats, Floats, Moves]:
     """Pixels, (..., 2, 2) by the pixel, (..., 2, 1) by the range, and by each parameter."""
     lens, T_rig_source = mounted_lens(rig, source), rig[source].transform
+    # Eq. 1, 4 and 5: the pixel's ray times its range, then to the rig's frame; q: from the camera, rig axes.
     seen = lens.unprojection(pixels)
     R, far = T_rig_source[:3, :3], np.asarray(range_m, np.float64)[..., None]
     q = far * (seen.rays @ R.T)
+    # Eq. 6: into the target.
     found, by_point, moves = _project_with_moves(rig, target, q + T_rig_source[:3, 3])
+    # By the ray, and through it by the source's intrinsics and pixel.
     by_ray = far[..., None] * (by_point @ R)
     # The source's camera turns and shifts its points: dp = dr x q + dt.
     own = _by_name(source, lens, by_ray @ seen.by_intrinsics, -by_point @ cross_matrix(q), by_point)
@@ -151,6 +155,7 @@ def _propagate(rig: Rig, moves: Moves) -> Floats:
             "no_covariance", f"rig {rig.name} does not say how certain it is: solve it with cairn calib solve"
         )
     parameters = [(each.camera, each.name) for each in calibration.covariance.parameters]
+    # Parameters that the covariance does not list are certain.
     used = [n for n, parameter in enumerate(parameters) if parameter in moves]
     covariance = calibration.covariance.matrix[np.ix_(used, used)]
     J = np.stack([moves[parameters[n]] for n in used], axis=-1)

@@ -128,6 +128,7 @@ def adjust(problem: AdjustmentProblem, state: RigState, noise: NoisePlan) -> Adj
     result = replace(result, problem=_rescale_by_median(result.problem, result.state))
     # 2. Least squares over what is within the bound; outliers and noise by turns, until neither changes.
     for _ in range(noise.rounds):
+        # Outliers by all residuals, then the minimum without them, then the noise there.
         before = result.problem.sensors
         blocks = result.problem.blocks(result.state)
         kept = tuple(_cull(sensor, each, noise.cull_sigmas) for sensor, each in zip(before, blocks, strict=True))
@@ -168,6 +169,7 @@ def descend(
     Raises:
         numpy.linalg.LinAlgError: the data do not determine all parameters.
     """
+    # The cost at the start; NaN where a point has no image.
     blocks = problem.blocks(state, huber_sigmas=huber_sigmas)
     normal = problem.normal(state, blocks)
     if not np.isfinite(normal.cost):
@@ -206,6 +208,7 @@ def redundancies(blocks: list[Block], known: Uncertainty, sensors: tuple[Sensor,
 def _cull(sensor: Sensor, block: Block, sigmas: float) -> Sensor:
     """The sensor whose measured points count if they are within `sigmas`, whatever they did before."""
     squares = np.sum(block.residuals**2, axis=-1)
+    # Out and in again: a point that fits later counts again.
     return replace(sensor, kept=sensor.there & (squares <= sigmas**2))
 
 
@@ -215,6 +218,7 @@ def _rescale(result: Adjustment) -> tuple[Sensor, ...]:
     free = redundancies(result.blocks, uncertainty(result.normal), sensors)
     scaled = []
     for sensor, block, count in zip(sensors, result.blocks, free, strict=True):
+        # Residuals are whitened by the old scale, so the new one is its multiple.
         variance = float(np.sum(block.residuals[sensor.kept] ** 2)) / count if count > 1 else 1.0
         scaled.append(replace(sensor, scale=sensor.scale * np.sqrt(variance) if variance > 0 else sensor.scale))
     return tuple(scaled)
@@ -225,6 +229,7 @@ def _rescale_by_median(problem: AdjustmentProblem, state: RigState) -> Adjustmen
     scaled = []
     for sensor, block in zip(problem.sensors, problem.blocks(state), strict=True):
         squares = np.sum(block.residuals**2, axis=-1)[sensor.kept]
+        # Squares of residuals of one sigma have the median of chi2.
         factor = np.sqrt(np.median(squares) / MEDIAN_SQUARE[sensor.axes]) if squares.size else 1.0
         scaled.append(replace(sensor, scale=sensor.scale * float(factor or 1.0)))
     return replace(problem, sensors=tuple(scaled))

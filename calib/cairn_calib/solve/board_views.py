@@ -126,6 +126,7 @@ def read_board_views(folders: Mapping[str, Path]) -> BoardViews:
     polarities: dict[str, Polarity] = {}
     boards: dict[Board, Path] = {}
     for camera, folder in folders.items():
+        # A camera is a folder: one polarity, one image size.
         documents = _documents(folder)
         inputs += [_input_file(camera, path) for path, _ in documents]
         polarities[camera] = documents[0][1].polarity
@@ -133,6 +134,7 @@ def read_board_views(folders: Mapping[str, Path]) -> BoardViews:
         frames: dict[str, Path] = {}
         for path, document in documents:
             boards.setdefault(document.board, path)
+            # One image of a frame for each camera.
             frame = frame_of(path.stem)
             if frame in frames:
                 raise BadInputError(
@@ -141,6 +143,7 @@ def read_board_views(folders: Mapping[str, Path]) -> BoardViews:
                     "images so that the number counts the places of the board",
                 )
             frames[frame] = path
+            # Images without a board are inputs, but no views.
             corners = document.to_corners()
             if corners is not None and corners.seen.sum() >= SEEN_MIN:
                 views.append(BoardView(camera, frame, document.image, corners))

@@ -70,9 +70,11 @@ def camera_alone(name: str, views: BoardViews, plan: SolvePlan) -> CameraAlone:
     layout = parameter_layout(own, {name: lens}, [])
     problem = AdjustmentProblem(seen.board, layout, (Sensor(data, 1.0, data.seen),), priors)
     try:
+        # Robust, since wrong corners are not known yet.
         done = adjust(problem, state, FIRST)
     except np.linalg.LinAlgError as exc:
         raise BadInputError("not_observable", f"the images of {name} do not determine its lens: {_ADVICE}") from exc
+    # Parallel boards meet the corners at any focal length: small residuals do not show it.
     _refuse_parallel(name, done.state.T_rig_board)
     return CameraAlone(
         done.state.lenses[0],
@@ -127,5 +129,6 @@ def _guess(seen: BoardViews, plan: CameraPlan) -> tuple[Lens, dict[str, Transfor
     }
     if plan.model == "kb4":
         return FisheyeCamera.model_validate(parts), poses
+    # Eight coefficients only where one of the denominator's is free.
     rational = any(each in plan.coefficients for each in ("k4", "k5", "k6"))
     return Camera.model_validate({**parts, "distortion": (0.0,) * (8 if rational else 5)}), poses

@@ -50,6 +50,7 @@ def corner_data(camera: int, views: Sequence[BoardView], frames: Sequence[str]) 
     seen = np.stack([view.corners.seen for view in views])
     covariance = np.stack([view.corners.covariance_px2 for view in views])
     seen &= np.isfinite(covariance).all(axis=(2, 3))
+    # Hidden points have no covariance: any invertible one does, for their whitening is then set to 0.
     safe = np.where(seen[..., None, None], covariance, np.eye(2))
     # cov = L L^T, so W = L^-1 gives W^T W = cov^-1.
     whitening = np.asarray(np.linalg.inv(np.linalg.cholesky(safe)), np.float64) * seen[..., None, None]
@@ -75,6 +76,7 @@ def board_points(state: RigState, lattice: Floats, shape: Floats) -> Floats:
 def corner_misses(data: CornerData, state: RigState, lattice: Floats, shape: Floats) -> Floats:
     """(V, N, 2) predicted minus found, pixels; 0 where hidden; NaN where the model cannot see a point."""
     T_rig_board, T_rig_camera = state.T_rig_board[data.frames], state.T_rig_camera[data.camera]
+    # board -> rig -> camera, as drawn above; R^T by multiplying rows from the right.
     p_rig = (
         board_points(state, lattice, shape) @ np.swapaxes(T_rig_board[:, :3, :3], 1, 2) + T_rig_board[:, None, :3, 3]
     )
@@ -140,6 +142,7 @@ def corner_block(
     """
     misses, J, at = corner_derivatives(data, state, layout, *board)
     whitening = data.whitening / loss.scale
+    # r = W miss / s; weights of the loss by the length of r.
     residuals = _whiten(whitening, misses[..., None])[..., 0]
     weights, cost = loss(np.sum(residuals**2, axis=-1))
     root = np.sqrt(weights)[..., None]

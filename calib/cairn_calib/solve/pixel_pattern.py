@@ -184,6 +184,7 @@ def _smooth(sound: _Sound, usual: npt.NDArray[np.bool_], shape: tuple[int, int],
 
     `fine_m2` is the variance of single pixels.
     """
+    # Mean residual of each block in each image, where enough of it was seen.
     kept = usual[sound.pixels]
     y, x = np.divmod(sound.pixels[kept], shape[1])
     columns = -(-shape[1] // BLOCK_PX)

@@ -46,17 +46,20 @@ def usual_priors(
     priors: list[Prior] = []
     if plan.usual_priors:
         for name, camera in plan.cameras.items():
+            # With few views all coefficients and the principal point are held near usual values, and fx near fy.
             known = _known(camera)
             if view_counts[name] < FEW_VIEWS:
                 priors += _of_few_views(name, lenses[name])
                 known = {each: known.get(each, FEW_SIGMAS.get(each)) for each in camera.coefficients}
             priors += [single_prior(name, each, 0.0, sigma) for each, sigma in known.items() if sigma is not None]
         if plan.warp:
+            # The board: warp near 0, pitch near the stated one.
             side = float(np.ptp(board.points(), axis=0).max())
             priors += [single_prior(SHARED, axis, 0.0, WARP_SIGMA * side) for axis in WARP]
     if plan.pitch_sigma > 0:
         priors.append(single_prior(SHARED, SCALE, 1.0, plan.pitch_sigma))
     if ranges is not None:
+        # The range bias: each shape near 0.
         owner, terms = ranges
         priors += [single_prior(owner, name, 0.0, sigma) for name, sigma in zip(terms.names, terms.sigmas, strict=True)]
     return (*priors, *plan.priors)

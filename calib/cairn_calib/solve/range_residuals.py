@@ -128,6 +128,7 @@ def range_block(data: RangeData, state: RigState, layout: ParameterLayout, board
     hits = _intersect_board(data, state, board, seen.rays)
     R_rig_camera = state.T_rig_camera[c, :3, :3]
     shapes = data.shapes(state.lenses[c], hits.range_m)
+    # Names as in the head of this module.
     n, v, d, slant = hits.normals, hits.rays, hits.range_m, hits.slant
     # Derivatives of the true range d = (n . (o - c) + w) / (n . v): by the ray v, thus by the intrinsics; ...
     by_ray = -(d / slant)[..., None] * n
@@ -177,6 +178,7 @@ def _with_nodes(
         residuals: (V, M) weighted.
         at: positions of the nodes' columns.
     """
+    # Sparse sums (`range_nodes.py`): nodes with all others and the residuals, and nodes with nodes.
     count = nodes.count
     sums = nodes.products(root_a_metre[..., None] * np.concatenate([J, residuals[..., None]], axis=-1))
     cross, pull = sums[:, :-1], -sums[:, -1]
@@ -240,6 +242,7 @@ def _inside(
     readable: Flags, rays: Floats, state: RigState, camera: int, frame: int, board: Board, pixels_max: int
 ) -> npt.NDArray[np.intp]:
     """(M, 2) pixels whose rays meet the board inside its corners, of those that are readable."""
+    # Intersect every pixel's ray with the flat board, in the camera's frame.
     T_camera_board = np.linalg.inv(state.T_rig_camera[camera]) @ state.T_rig_board[frame]
     n, o = T_camera_board[:3, 2], T_camera_board[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -248,5 +251,6 @@ def _inside(
         inside = ((places > INSIDE * board.pitch_m) & (places < last - INSIDE * board.pitch_m)).all(axis=-1)
         inside &= readable & (rays @ n * (n @ o) > 0)
     y, x = np.nonzero(inside)
+    # Every n-th pixel, so that at most `pixels_max` stay, spread over the board.
     step = max(1, -(-len(x) // pixels_max))
     return np.stack([x, y], axis=-1)[::step]

@@ -86,6 +86,7 @@ def rig_start(
         if not open_edges:
             _refuse_unconnected(names, T_rig_camera)
         best = max(open_edges, key=lambda edge: edge.weight)
+        # The edge may lead either way.
         known, new, T = (best.one, best.other, best.T_one_other)
         if known not in T_rig_camera:
             known, new, T = best.other, best.one, inverse(best.T_one_other)
@@ -169,6 +170,7 @@ def _edge(
     count = len(frames)
     T = T.reshape(count * 8, 4, 4)
     distance = float(np.median(np.linalg.norm(np.concatenate([one[:, 0], other[:, 0]])[:, :3, 3], axis=1)))
+    # (F * 8, F, 8): distance of each reading from all eight of every frame.
     apart = _apart(T, distance).reshape(len(T), count, 8)
     # A board tilted about one spot fits mirrored and named from the other end as well: as it is, unless that is clear.
     doubts = np.minimum(apart.min(axis=2), AGREE_RAD).sum(axis=1) + TURNED_RAD * count * (np.arange(len(T)) % 8 >= 4)

@@ -80,6 +80,7 @@ def parameter_layout(
         names.extend((owner, name) for name in added)
         return np.arange(len(names) - len(added), len(names))
 
+    # Each camera's free intrinsics and pose, then the board, then the bias: the order of `names`.
     columns, intrinsic_at, pose_at = [], [], []
     for name, camera in plan.cameras.items():
         every = lenses[name].intrinsic_names
@@ -115,6 +116,7 @@ def shared_values(state: RigState, layout: ParameterLayout) -> Floats:
 
 def step_state(state: RigState, layout: ParameterLayout, shared: Floats, boards: Floats) -> RigState:
     """The state after a step: (P,) shared and (F, 6) of the boards."""
+    # Values step by addition, poses by rotation and translation; the gauge has no pose in the step.
     lenses, poses = [], state.T_rig_camera.copy()
     for n, lens in enumerate(state.lenses):
         intrinsics = lens.intrinsics

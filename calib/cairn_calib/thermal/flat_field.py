@@ -86,6 +86,7 @@ class FlatField:
             sigma_counts: standard deviation of the noise that is left in a pixel of it.
         """
         seen = self.gain * np.asarray(shutter, np.float64)
+        # Behind the lens the shutter shows no shading: its offsets are the pixels' own.
         middle = float(seen[~self.bad].mean())
         sigma = None if self.shading_sigma is None else np.hypot(self.shading_sigma, sigma_counts).astype(np.float32)
         return replace(self, offset=(middle - seen).astype(np.float32), offset_sigma=sigma, at_counts=middle)
@@ -132,10 +133,12 @@ def fit_flat_field(stacks: Sequence[npt.NDArray[np.generic]]) -> FlatFieldFit:
     total = level.mean() - gain * means.mean(axis=0)
     shading = _fit_polynomial(np.where(bad, np.nan, total))[0]
     bad |= _mark_strays(total - shading)
+    # What a pixel keeps after levelling; with two temperatures a line meets both, so it tells nothing.
     left = gain * means + total - level[:, None, None]
     bad |= _mark_strays(np.abs(left).max(axis=0)) if len(means) > 2 else False
     shading, leverage = _fit_polynomial(np.where(bad, np.nan, total))
     shading -= shading[~bad].mean()
+    # Bad pixels have neutral maps.
     gain = np.where(bad, 1.0, gain)
     offset = np.where(bad, 0.0, total - shading)
     # Residuals with two numbers a pixel; with fewer than three temperatures only the noise is known.
@@ -203,6 +206,7 @@ def _fit_polynomial(values: Floats) -> tuple[Floats, Floats]:
     powers = [(i, j) for i in range(SHADING_ORDER + 1) for j in range(SHADING_ORDER + 1 - i)]
     terms = np.stack([x**i * y**j for i, j in powers], axis=-1)
     sound = np.isfinite(values)
+    # Least squares over sound pixels; the sigma of the fit is sqrt(t^T (T^T T)^-1 t).
     found, *_ = np.linalg.lstsq(terms[sound], values[sound], rcond=None)
     inverse = np.linalg.inv(terms[sound].T @ terms[sound])
     return np.asarray(terms @ found), np.sqrt(np.einsum("yxi,ij,yxj->yx", terms, inverse, terms))

@@ -128,6 +128,7 @@ def _housing_refusal(radiometry: Radiometry, housing_k: float | None) -> str | N
     """Reason why the response does not hold for a camera as warm as `housing_k`, or None."""
     if radiometry.housing is None or housing_k is None:
         return None
+    # References were measured with the housing in this range only.
     low_k, high_k = radiometry.housing.range_k
     if low_k <= housing_k <= high_k:
         return None
@@ -172,6 +173,7 @@ def seen_counts(kelvin: npt.ArrayLike, radiometry: Radiometry, viewing: Viewing)
     """(...) counts of surfaces at temperatures: the model forwards, the mirror of `temperatures`."""
     eps, tau = viewing.emissivity, viewing.transmission
     mirrored, air = (_counts_at(radiometry, k) for k in (viewing.reflected_k, viewing.air_k))
+    # The equation of this module's head, without the housing.
     own = radiometry.response.counts_of(kelvin)
     return np.asarray(eps * tau * own + (1 - eps) * tau * mirrored + (1 - tau) * air)
 
@@ -188,6 +190,7 @@ def air_transmission(
         constants: alpha 1, alpha 2, beta 1, beta 2, x; FLIR writes them into its files.
     """
     alpha_1, alpha_2, beta_1, beta_2, x = constants
+    # Root of the water in the air, then two exponentials of distance and water.
     water = np.sqrt(humidity * np.exp(np.polynomial.polynomial.polyval(air_k - 273.15, WATER)))
     root = np.sqrt(distance_m)
     parts = (np.exp(-root * (a + b * water)) for a, b in ((alpha_1, beta_1), (alpha_2, beta_2)))

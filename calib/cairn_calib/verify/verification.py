@@ -172,6 +172,7 @@ def add_sights(
     carried = []
     for disc in found.discs.get(source, ()):
         measured = disc_range(disc, range_m, rig[source])
+        # A disc without range cannot be carried.
         if measured is None:
             into.note(f"{source}: no range on its middle")
             continue
@@ -183,6 +184,7 @@ def add_sights(
             continue
         free = list(found.discs[camera])
         for disc, distance_m, range_sigma_m in carried:
+            # Eq. 1 to 6, with the standard deviation by each source.
             predicted, shares = _predict(rig, source, camera, disc.centroid, distance_m, range_sigma_m, sigmas)
             lens = rig[camera].camera
             radius_px = disc.radius_px * _focal(rig, camera) / _focal(rig, source)
@@ -193,6 +195,7 @@ def add_sights(
             if near is None:
                 into.note(f"{camera}: not found where predicted")
                 continue
+            # A disc that is taken serves no second target.
             free.remove(near)
             into.sights.append(
                 TargetSighting(
@@ -211,6 +214,7 @@ def add_sights(
 
 def transfer_pixels(rig: Rig, source: str, target: str, pixels: Floats, range_m: Floats) -> Floats:
     """(..., 2) where pixels with ranges of one camera appear in another: Eq. 1 to 6, with the lenses of both."""
+    # Source pixel -> ray times range -> target's frame -> target pixel.
     T_target_source = inverse(rig[target].transform) @ rig[source].transform
     points = rig[source].camera.unproject(pixels) * np.asarray(range_m, np.float64)[..., None]
     return rig[target].camera.project(transform_points(T_target_source, points))
@@ -236,6 +240,7 @@ def _predict(
     at = transfer_pixels(rig, source, target, pixel + STEP_PX * steps[:, :2], range_m + STEP_M * steps[:, 2])
     by_x, by_y = (at[1] - at[2]) / (2 * STEP_PX), (at[3] - at[4]) / (2 * STEP_PX)
     by_range = (at[5] - at[6]) / (2 * STEP_M)
+    # Both centroids are noisy: the source's is carried along, the target's is its own.
     source_px, own_px = sigmas[rig[source].spectrum], sigmas[rig[target].spectrum]
     shares = {
         "centroid": np.sqrt(source_px**2 * (by_x**2 + by_y**2) + own_px**2),
@@ -255,7 +260,9 @@ def _is_within(lens: Raster, pixel: Floats, radius_px: float) -> bool:
 
 def _nearest(discs: Sequence[Disc], predicted: Floats, shares: Mapping[str, Floats], radius_px: float) -> Disc | None:
     """The disc of about the right size nearest to the prediction, within the target's own outline and 3 sigma."""
+    # All sources together, both axes.
     sigma = float(np.sqrt(sum(float(share @ share) for share in shares.values())))
+    # A disc of another size is another thing.
     sized = [disc for disc in discs if 1 / SIZE_FACTOR < disc.radius_px / radius_px < SIZE_FACTOR]
     if not sized:
         return None
@@ -307,6 +314,7 @@ def disc_range(disc: Disc, range_m: npt.NDArray[np.floating], mounted: MountedCa
     # Iteratively reweighted least squares.
     for _ in range(PLANE_ROUNDS):
         left = (1 / d - terms @ n) / sigma
+        # Robust scale by the median absolute deviation, at least the stated noise.
         spread = max(1.0, 1.4826 * float(np.median(np.abs(left - np.median(left)))))
         weight = np.maximum(0, 1 - (left / (TUKEY_SIGMAS * spread)) ** 2) ** 2 / (sigma * spread) ** 2
         if (weight > 0).sum() < RANGE_PIXELS_MIN:
@@ -316,6 +324,7 @@ def disc_range(disc: Disc, range_m: npt.NDArray[np.floating], mounted: MountedCa
     distance = float(1 / n[0])
     if not distance > 0:
         return None
+    # d = 1 / n0, so sigma_d = d^2 sigma_n0. Noise, bias and relief are independent.
     noise = distance**2 * float(np.sqrt(np.linalg.inv(normal)[0, 0]))
     bias = 0.0 if mounted.range_bias is None else float(mounted.range_bias.sigma_at(np.array(distance)))
     return distance, float(np.linalg.norm([noise, bias, RELIEF_SIGMA_M]))
