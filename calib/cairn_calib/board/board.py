@@ -21,7 +21,7 @@ from cairn_map.errors import BadInputError
 
 Pattern = Literal["chessboard", "circles", "asymmetric-circles"]
 Polarity = Literal["normal", "reversed"]
-"""normal: what is printed dark looks dark."""
+"""normal: the camera sees printed dark as dark; reversed: as bright."""
 Side = Annotated[int, Field(ge=3, le=64)]
 Length = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
 

@@ -3,7 +3,7 @@
     blobs like ellipses -> four of their hull as the board's outer discs -> all the others by a homography
     -> grey-weighted centroids -> gates
 
-What is measured is the centroid of the disc's image, and that is not the image of its centre: a tilted disc's nearer
+The centroid of a disc's image is measured, which is not the image of its centre: a tilted disc's nearer
 half is larger. A model must project the rim and take the centroid of that (corner_residuals.py). Blur does not move it.
 """
 
@@ -67,7 +67,7 @@ def find_circles(
 ) -> Detection:
     """The discs of a grid; arguments and errors are those of `find_chessboard`, `pointed` is that of `fit_pointed_at`.
 
-    With normal polarity discs are darker than what is around them.
+    With normal polarity discs are darker than their ground.
     """
     counts = grey(image)
     signed = counts if polarity == "normal" else -counts

@@ -56,7 +56,7 @@ def find_chessboard(
     Args:
         image: (H, W) counts of any number type, as recorded.
         board: the chessboard.
-        polarity: how the camera sees what is printed dark.
+        polarity: whether the camera sees printed dark as dark or as bright.
         upright: the board's rows run within 90 degrees (of a square board 45) of the image's rows, which names the
             first corner where colours cannot.
 
@@ -64,8 +64,8 @@ def find_chessboard(
         The corners, NaN where hidden, or None; and every attempt.
 
     Raises:
-        BadInputError: colours do not tell the first corner of this board, and it is not said to be upright; or the
-            image is not one.
+        BadInputError: colours do not determine the first corner of this board, and it is not stated to be upright; or
+            the array is no image.
     """
     # Without colours or a known way up the first corner cannot be named.
     if board.turns_unseen and not upright:

@@ -1,7 +1,7 @@
 """Files of corners: one JSON document an image, and the four-corner file that helps where detection failed.
 
-CONVENTIONS.md has both formats. A document of an image without a board has no corners, and says of each attempt at
-which stage it ended.
+CONVENTIONS.md has both formats. A document of an image without a board has no corners, and names the stage
+at which each attempt ended.
 """
 
 from pathlib import Path
@@ -102,9 +102,9 @@ def corner_file(
     polarity: Polarity,
     frames: int = 1,
 ) -> CornerFile:
-    """The document of what was found in an image, `size` (width, height), the mean of `frames` frames.
+    """Document of a detection in an image of `size` (width, height), which is the mean of `frames` frames.
 
-    Of an image that could not be read, digest and size are None.
+    Digest and size are None for an image that could not be read.
     """
     width, height = (None, None) if size is None else size
     found = detection.corners

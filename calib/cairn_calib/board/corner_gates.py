@@ -55,7 +55,7 @@ BEYOND_MAX = 0.6
 LIKE_CONTRAST = 0.6
 """Contrast of what looks like a corner, at least, over the board's usual contrast."""
 LIKE_MOVED = 0.15
-"""Cells between where the others predict a corner and where one is: 0.00 to 0.05 of boards of which parts were hidden.
+"""Cells between where the others predict a corner and where one is: 0.00 to 0.05 for boards with hidden parts.
 Where a smaller board's outer cells are cut, or its margin ends, what looks like corners is 0.32 to 0.54 off."""
 
 
@@ -332,4 +332,4 @@ GATES: tuple[tuple[str, Gate], ...] = (
     ("evenness", _evenness),
     ("border", _border),
 )
-"""Gates in the order in which they are asked, cheap ones first; each name is the stage of a refused attempt."""
+"""Gates in order, cheap ones first; each name is the stage of a refused attempt."""

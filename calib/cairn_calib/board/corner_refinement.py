@@ -1,12 +1,12 @@
-r"""Corners of a chessboard to a fraction of a pixel, each with its covariance.
+r"""Sub-pixel refinement of a chessboard's corners, each with its covariance.
 
       bright | dark        Near a corner the image is two edges that cross. Blurred, it is about
       -------+------       I(p) = mean + contrast * erf(u / sqrt2 s) * erf(v / sqrt2 s)
        dark  | bright      with u, v the distances of p from the two edges and s the blur, in pixels.
 
-The seven numbers (place, two directions, s, mean, contrast) are fitted by Gauss-Newton to the pixels of about one
-cell, on the image as recorded: nothing is resampled. The model looks the same after half a turn about the corner, and
-so does what it leaves out (skew, the cells beyond), so the place stays unbiased. The covariance of the place is that of
+The seven numbers (place, two directions, s, mean, contrast) are fitted by Gauss-Newton to the pixels of about one cell,
+on the image as recorded: nothing is resampled. The model is symmetric under half a turn about the corner, and so are
+the parts that it leaves out (skew, the cells beyond): the place stays unbiased. The covariance of the place is that of
 the least-squares fit, with the noise found in the residuals. It is right for noise that is independent from pixel to
 pixel; compression and interpolation make it too small, by a factor that a solve finds per camera.
 """

@@ -69,7 +69,7 @@ def add_parser(commands: "_SubParsersAction[argparse.ArgumentParser]") -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Convert, say what was written, and on standard error what was left out."""
+    """Convert; report the files on standard output, and left-out fields on standard error."""
     out: Path = args.out
     target = args.format or SUFFIXES.get(out.suffix)
     if target is None:

@@ -1,16 +1,16 @@
-"""The report of a calibration that is there already: from rig.json and the corners that it was solved from.
+"""Report an existing calibration: from rig.json and the corners that it was solved from.
 
     $ cairn calib report rig.json corners/tof corners/left --output report.html
     rig.json comes from these corners: the same to 0.0001 sigma
     report.html: 2 warnings; the same as report.json
 
-`cairn calib solve --report` writes the same page while it solves. Here it is made again, with what has come into
-rig.json since (the radiometry of `cairn calib thermal fit`), and nothing is changed: the corners are solved once more,
-as rig.json says that it was done, and if another rig comes out, or a document is not the one that went in, that is an
-error. What rig.json does not say goes into --solved-with: `--solved-with "--flat --range ranges"`.
+`cairn calib solve --report` writes the same page while it solves. This command makes it again, with later additions to
+rig.json (the radiometry of `cairn calib thermal fit`), and changes nothing: the corners are solved once more with the
+options that rig.json states, and it is an error if another rig comes out, or if a document is not the one that went in.
+Options that rig.json does not state go into --solved-with: `--solved-with "--flat --range ranges"`.
 
-The page is one file, to be read without a network and to be printed: what was found and how certain it is, warnings,
-the image to shoot next, residuals, coverage, certainty at 1, 2 and 5 m, radiometry, and every image with its corners.
+The page is one file, to be read without a network and to be printed: estimates and how certain they are, warnings, the
+image to shoot next, residuals, coverage, certainty at 1, 2 and 5 m, radiometry, and every image with its corners.
 """
 
 import argparse
@@ -111,27 +111,27 @@ def sigmas_apart(rig: Rig, again: Solution) -> float:
         if not isinstance(lens, Lens) or not isinstance(theirs, Lens) or lens.intrinsic_names != theirs.intrinsic_names:
             return np.inf
         for each, one, two in zip(lens.intrinsic_names, lens.intrinsics, theirs.intrinsics, strict=True):
-            apart.append(_over(one - two, sigmas.get((name, each))))
+            apart.append(_sigmas_between(one - two, sigmas.get((name, each))))
         moved = mounted.transform[:3, 3] - other[name].transform[:3, 3]
         turned = (mounted.transform[:3, :3] @ other[name].transform[:3, :3].T - np.eye(3))[[2, 0, 1], [1, 2, 0]]
         for each, off in zip(POSE_UNITS, (*turned, *moved), strict=True):
-            apart.append(_over(off, sigmas.get((name, each))))
-        apart.append(_biases_apart(mounted.range_bias, other[name].range_bias))
+            apart.append(_sigmas_between(off, sigmas.get((name, each))))
+        apart.append(_bias_sigmas_apart(mounted.range_bias, other[name].range_bias))
     return float(np.max(apart))
 
 
-def _biases_apart(one: RangeBias | None, two: RangeBias | None) -> float:
-    """The same of what a camera adds to its ranges; infinite where it is of other shapes."""
+def _bias_sigmas_apart(one: RangeBias | None, two: RangeBias | None) -> float:
+    """Largest difference between two range biases, in standard deviations of the second; infinite for other shapes."""
     if one is None or two is None:
         return 0.0 if one is two else np.inf
     if one.names != two.names or (one.pixel_offsets is None) != (two.pixel_offsets is None):
         return np.inf
     sigmas = np.sqrt(np.diag(two.covariance)).tolist()
-    return max(map(_over, (one.values - two.values).tolist(), sigmas))
+    return max(map(_sigmas_between, (one.values - two.values).tolist(), sigmas))
 
 
-def _over(difference: float, sigma: float | None) -> float:
-    """In standard deviations; what is held must be the same."""
+def _sigmas_between(difference: float, sigma: float | None) -> float:
+    """A difference in standard deviations; a parameter that is held must be the same."""
     return abs(difference) / sigma if sigma else (0.0 if abs(difference) < 1e-9 else np.inf)
 
 

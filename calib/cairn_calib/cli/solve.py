@@ -14,18 +14,18 @@ A camera's name is its folder's. Images of one place of the board have the same 
 (tof03.png, left03.png). The first range camera is the rig's frame, else the first camera (--gauge).
 
 First each camera is solved alone, then all of them with all places of the board. Corners count by their covariance
-and by each camera's own noise, which is estimated; what is off by more than 4 sigma is left out and counted. The
+and by each camera's own noise, which is estimated; corners off by more than 4 sigma are left out and counted. The
 board may be bent (--flat: it is not), its pitch wrong by 0.02 % (--pitch-sigma). Free coefficients of every lens are
 k1,k2,p1,p2,k3, with p1 and p2 assumed to be 0 +- 0.002 and k3 0 +- 0.1; --distortion says otherwise, --fisheye names
 cameras with Kannala and Brandt's model.
 
-With --range DIR the range camera's images of the same boards (16 bit, radial, --range-units-per-m) show what it adds
-to its ranges, which rig.json states and mapping takes off: an offset, a scale, more at the image's corners, and each
+With --range DIR the range camera's images of the same boards (16 bit, radial, --range-units-per-m) show the bias of
+its ranges, which rig.json states and mapping takes off: an offset, a scale, more at the image's corners, and each
 pixel's own part where pixels differ. With --amplitude DIR (16 bit, same names) also how that depends on the amplitude,
 with --modulation-mhz F its circular error: each only if amplitudes and ranges of the boards differ enough; else a
 warning says so.
 
-What the images cannot tell is warned about, with the threshold and what was measured: tilt, distances, the image's
+Warnings name what the images do not determine, with threshold and measured value: tilt, distances, the image's
 edge, numbers that come from assumptions, halves of the images that contradict each other, single frames that much hangs
 on; and which image would help most. Images that leave a camera open (one view, parallel boards, cameras that never saw
 a board together) are refused. The report has it all, with residuals, coverage, and how certain each pixel is at 1, 2
@@ -63,7 +63,7 @@ def add_parser(commands: "_SubParsersAction[argparse.ArgumentParser]") -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Solve, and write what was asked for."""
+    """Solve, and write the rig and, if asked for, the report."""
     refuse_overwriting(args.report, args.output)
     with while_working("solving"):
         solution = solve_as_asked(args)

@@ -1,4 +1,4 @@
-"""Find out what a thermal camera's counts mean, and read temperatures from its images.
+"""Calibrate the counts of a thermal camera, and read temperatures from its images.
 
     $ cairn calib thermal fit blackbody.csv tau.json
     planck law from 5 temperatures, 10.0 to 90.0 C: chi2 2.1 of 2
@@ -13,7 +13,7 @@
 
 `fit` takes a table of black bodies (CSV with a head line): image, celsius, sigma_k (standard deviation of the black
 body's temperature), and, where it does not fill the view, x, y, width, height of the part of the image that it fills,
-in pixels. List several images of each temperature: they tell the noise. Two temperatures will do, and four or more tell
+in pixels. List several images of each temperature: they show the noise. Two temperatures will do, and four or more fix
 Planck's B, too. Where black bodies fill the view, maps of the pixels' gain, offset and shading come out next to it,
 each with its standard deviation. Cameras that compute a temperature themselves, whose counts step by so many a kelvin,
 need `--law polynomial`.

@@ -2,8 +2,8 @@
 
     (S - S_f) da = -a_f          S: the reduced normal equations of all; S_f, a_f: the frame's share of them
 
-One step of Newton's from the solution: nothing is solved again. The same shares, of frames that are not yet taken, tell
-by how much they would sharpen the rig (`next_image.py`).
+One Newton step from the solution, without solving again. The same shares of frames that are not taken yet show by how
+much they would sharpen the rig (`next_image.py`).
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Warnings about what the images of a calibration do not determine, each with its threshold and measured value.
+"""Warnings about numbers that the images do not determine, each with its threshold and measured value.
 
 Residuals do not show this: two published solutions of one time-of-flight camera, both with 0.04 px, have focal
 lengths of 250 and 179 px. Warnings leave the solution unchanged; a focal length that is not determined at all is

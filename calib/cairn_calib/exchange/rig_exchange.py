@@ -43,7 +43,7 @@ FORMATS = {
 
 
 def format_of_text(path: Path, text: str) -> str:
-    """The format of a file, by its suffix and, where several share one, by what it holds.
+    """The format of a file, by its suffix and, where several share one, by its content.
 
     Raises:
         BadInputError: none of them.
@@ -82,10 +82,10 @@ def read_text(path: Path) -> str:
 
 
 def cameras_of_rig(rig: Rig, *, format_name: str, drop: Sequence[str] = ()) -> CameraFile:
-    """The cameras of a rig for a format; what it cannot say must be dropped.
+    """Cameras of a rig for a format; fields that the format cannot hold must be dropped.
 
     Raises:
-        BadInputError: the rig says something that the format cannot; the message names all of it, and what to do.
+        BadInputError: the rig has fields that the format cannot hold; the message names all of them, and what to do.
     """
     held = FORMATS[format_name].holds_place
     said: list[str] = []
@@ -129,9 +129,9 @@ def rig_of_cameras(cameras: Sequence[PlacedCamera], *, name: str, spectra: Mappi
     """A rig of cameras that were read from other files.
 
     Args:
-        cameras: of which one alone may be without a place: it is the rig's frame then.
-        name: the rig's.
-        spectra: by camera.
+        cameras: the cameras; a single one may be without a pose, and its frame is the rig's then.
+        name: name of the rig.
+        spectra: spectrum of each camera.
 
     Raises:
         BadInputError: a spectrum or a place is missing, or the name is none.

@@ -1,8 +1,8 @@
 """YAML as calibration programs write it: read with care, written so that all of them read it back to the last bit.
 
-All is read as YAML 1.2, whatever version it says it is: to 1.1 `1e-05` is a word, and `no` is not. OpenCV heads its
-files `%YAML:1.0`, which is no YAML (opencv#22118), and tags its matrices; both are read, and what is written here
-begins as YAML 1.1, which OpenCV takes as well. A number is written with the fewest digits that come back as the same
+Every text is read as YAML 1.2, whatever version its head states: in 1.1 `1e-05` is a word, and `no` is not. OpenCV
+heads its files `%YAML:1.0`, which is no YAML (opencv#22118), and tags its matrices; both are read, and written texts
+begin as YAML 1.1, which OpenCV takes as well. A number is written with the fewest digits that come back as the same
 number, and always with a point.
 """
 

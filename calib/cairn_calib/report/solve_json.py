@@ -30,7 +30,7 @@ MAP_COLUMNS = 8
 
 
 def examination_json(seen: Examination) -> bytes:
-    """The document, UTF-8; what is infinite is null."""
+    """The document, UTF-8; infinite numbers are null."""
     solution = seen.solution
     values, sigmas = solution.values(), solution.sigmas()
     document = {

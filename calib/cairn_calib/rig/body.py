@@ -1,10 +1,9 @@
-"""The robot's own body, as boxes: what a range camera sees of it is no part of the map.
+"""Body of the robot, as boxes: returns of a range camera from it are no part of the map.
 
     "body": {"frame": "robot", "boxes": [{"name": "mast", "low_m": [-0.1, -0.1, 0.3], "high_m": [0.1, 0.1, 1.2]}]}
 
-The boxes lie along the axes of the body's frame. Where that frame is, a scan says (`T_map_body`); a scan that does not
-say it has the body where the rig is, as with a head that is fixed on it. State boxes larger than the body by what the
-range camera's noise may add.
+The boxes lie along the axes of the body's frame, whose pose is the scan's `T_map_body`; without it that of the rig is
+taken, as for a head that is fixed on the body. State boxes larger than the body by the noise of the range camera.
 """
 
 from typing import Annotated, Self

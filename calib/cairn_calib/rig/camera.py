@@ -1,11 +1,11 @@
-"""A pinhole camera with Brown's distortion: its projection and its rays.
+"""Pinhole camera with Brown's distortion: its projection and its rays.
 
     ray (unit, camera frame)  --project-->  pixel (x, y)          Eq. 6 with distortion and principal point
     pixel (x, y)  --unproject-->  ray                             the inverse, by Newton's method (brown.py)
 
 Camera frame: x right, y down, z forward. The centre of the top-left pixel is (0, 0). Units: pixels
-for `focal_px` and `centre_px`; the distortion coefficients have none. CONVENTIONS.md says it once for all; what
-cameras with lenses share, derivatives above all, is in `lens.py`.
+for `focal_px` and `centre_px`; the distortion coefficients have none. CONVENTIONS.md is normative. The parts
+that all cameras with lenses share, derivatives above all, are in `lens.py`.
 """
 
 import numpy as np

@@ -30,7 +30,7 @@ STEPS = 30
 STEP_AGAIN = 1e-11
 """Error in radians beyond which another step is worth it; the step itself squares it."""
 TOLERANCE = 5e-13
-"""Error of theta' in radians: 3e-10 px at a focal length of 600 px. What is worse has no ray."""
+"""Error of theta' in radians: 3e-10 px at a focal length of 600 px. Pixels that stay worse have no ray."""
 
 
 class FisheyeCamera(Lens, frozen=True):

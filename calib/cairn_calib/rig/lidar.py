@@ -1,4 +1,4 @@
-"""A spinning lidar as a camera with a cylindrical lens: one sweep is a range image, one row a beam.
+"""Spinning lidar as a camera with a cylindrical lens: one sweep is a range image, one row a beam.
 
         x = 0        W/4        W/2       3W/4       W - 1
         back  ...    left  ...  forward ... right ...  back         row 0: the highest beam

@@ -1,4 +1,4 @@
-"""A pose as six numbers, for solvers: a rotation vector in radians and a translation in metres, and its derivatives.
+"""Poses as six numbers, for solvers: a rotation vector in radians and a translation in metres, and its derivatives.
 
     v_dst_src = (rx, ry, rz, tx, ty, tz)       T_dst_src = [exp(r) | t]        OpenCV's rvec and tvec, mrcal's rt
 

@@ -190,7 +190,7 @@ class Radiometry(BaseModel):
 
     @property
     def covariance(self) -> Floats:
-        """(3, 3) of the response's `names`; zeros where it is not known."""
+        """(3, 3) covariance of the response's `names`; zeros where it is unknown."""
         matrix = np.zeros((3, 3))
         for n, row in enumerate(self.covariance_lower or ()):
             matrix[n, : n + 1] = row

@@ -159,7 +159,7 @@ class RangeBias(BaseModel, frozen=True):
 
     @property
     def covariance(self) -> Floats:
-        """(B, B) in the order of `names`; 0 where it is not known."""
+        """(B, B) covariance in the order of `names`; 0 where it is unknown."""
         matrix = np.zeros((len(self.names), len(self.names)))
         for n, row in enumerate(self.covariance_lower or ()):
             matrix[n, : n + 1] = matrix[: n + 1, n] = row
@@ -175,7 +175,7 @@ class RangeBias(BaseModel, frozen=True):
         return self._sigma(d, np.full_like(d, MEAN_OFF_MIDDLE), of_pixels)
 
     def sigma_image(self, raster: Raster, range_m: npt.NDArray[np.floating]) -> Floats:
-        """(H, W) the same of each pixel, for what is known of it."""
+        """(H, W) standard deviation of the bias at (H, W) ranges, metres, with that of each pixel's own offset."""
         of_pixels = 0.0 if self.pixel_offsets is None else self.pixel_offsets.sigma_m**2
         return self._sigma(np.asarray(range_m, np.float64), off_middle_image(raster.width, raster.height), of_pixels)
 

@@ -7,7 +7,7 @@
 
 A phase is measured by a few samples of a wave that is no perfect sine: the range errs periodically with the phase
 phi = 4 pi f d / c, f the modulation frequency ("circular error", "wiggling"). Once and twice a wave are crosstalk and
-uneven gains; four times is what the odd harmonics of the light leave to four samples (Lange 2000, section 2.2).
+uneven gains; four times comes from the odd harmonics of the light in four samples (Lange 2000, section 2.2).
 
 Nodes are a coarse grid over the image, linear between them. They are solved for with the boards' places, which would
 otherwise absorb their part; in `rig.json` they are part of the map of the pixels (`pixel_offsets.py`).

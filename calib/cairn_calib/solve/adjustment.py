@@ -1,8 +1,8 @@
 """Joint least squares: Levenberg and Marquardt's damping, robust loss, outliers, and the noise of each sensor.
 
     1. Huber's loss (k = 1.5 sigma), noise from the median         -> close, whatever is wrong with some corners
-    2. least squares over what is within 4 sigma; noise of each sensor by its share of the redundancy (variance
-       components, Foerstner 1979); what fits again is let in again; until nothing changes
+    2. least squares over points within 4 sigma; noise of each sensor by its share of the redundancy (variance
+       components, Foerstner 1979); points that fit again are let in again; until nothing changes
 
 Residuals are whitened by their corners' covariances, and by one scale for each sensor: pixels of a time-of-flight and a
 colour camera cannot be compared otherwise.
@@ -25,7 +25,7 @@ STEPS_MAX = 100
 DAMPING, DAMPING_MIN, DAMPING_MAX = 1e-4, 1e-12, 1e10
 """Marquardt's damping at the start, and its bounds: shares of the normal equations' diagonal."""
 WARM = 1e-8
-"""Damping near a minimum, where it would only slow down what is weakly determined."""
+"""Damping near a minimum, where more would only slow down weakly determined parameters."""
 ROUNDING = 1e-12
 """Relative rise of the cost that counts as rounding, not as a rise."""
 SETTLED = 1e-10

@@ -8,7 +8,7 @@ a point of the rig, makes all columns.
 
 The predicted pixel of a disc is the centroid of its image (`disc_shift`). How that shift from the centre's image
 changes with the parameters is left out of the derivatives: it is a few thousandths of how the centre's image changes,
-and steps converge to the same place but for such a share of a standard deviation.
+and steps converge to the same place within such a share of a standard deviation.
 """
 
 from collections.abc import Sequence

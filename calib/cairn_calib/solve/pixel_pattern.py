@@ -96,11 +96,11 @@ class _Sound:
     """N residuals."""
 
     views: Indices
-    """(N,) of which image each is."""
+    """(N,) image of each residual."""
     pixels: Indices
-    """(N,) numbers of the pixels."""
+    """(N,) number of each residual's pixel, row by row."""
     left_m: Floats
-    """(N,)"""
+    """(N,) residuals, metres."""
 
 
 def _sound(data: RangeData, left_m: Floats, width: int, stray_m: float) -> _Sound:

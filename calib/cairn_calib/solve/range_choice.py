@@ -1,6 +1,6 @@
 """Choice of the range bias's shapes: those that the ranges and amplitudes of the boards' images determine.
 
-A wave of which only a piece was seen looks like an offset and a scale, a dependence on the amplitude that hardly
+A wave that was seen only in part looks like an offset and a scale, a dependence on the amplitude that hardly
 changed like an offset: both then fit, and both are wrong a metre further on. They are left out, and a warning says why.
 """
 

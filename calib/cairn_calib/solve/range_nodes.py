@@ -15,7 +15,7 @@ from cairn_map.arrays import Floats
 Indices = npt.NDArray[np.intp]
 
 NODES = (12, 9)
-"""Columns and rows: 16 pixels apart on 176 x 144, a fifth of what a board covers."""
+"""Columns and rows: 16 pixels apart on 176 x 144, a fifth of a board's image."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Result of a rig solve: the estimate, the problem that it solves, and how certain it is.
+"""Solution of a rig: the estimate, the problem that it solves, and its covariance.
 
 The pipeline that makes it is `solve.py`; diagnosis and report read it.
 """
@@ -32,7 +32,7 @@ class Solution:
     spans: RangeSpans | None = None
     """Distances and amplitudes that the range images covered; None without range images."""
     pattern: PixelPattern | None = None
-    """Range offset of each pixel of the range camera; None where it was not looked for."""
+    """Range offset of each pixel of the range camera; None where it was not estimated."""
 
     @property
     def ranges(self) -> RangeData | None:

@@ -14,7 +14,7 @@ the one before; 7 keeps its outliers and noise. `solved_rig.py` makes rig.json, 
 
 views = read_board_views({"tof": Path("corners/tof"), "left": Path("corners/left")})
 solution = solve_rig(views, usual_plan({"tof": Spectrum.RANGE, "left": Spectrum.COLOUR}))
-solution.rig, solution.sigmas()
+rig, sigmas = solved_rig(solution, made_s=time.time()), solution.sigmas()
 """
 
 from collections.abc import Mapping

@@ -42,7 +42,7 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraPlan:
-    """One camera: what it sees, its model, and the coefficients that are free."""
+    """Plan of one camera: its spectrum, its model, and the coefficients that are free."""
 
     spectrum: Spectrum
     model: str = "pinhole"

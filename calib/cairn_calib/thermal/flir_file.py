@@ -166,7 +166,7 @@ def _camera_info(record: bytes) -> tuple[Radiometry, Viewing, str]:
 
 
 def _air_and_window(response: PlanckResponse, through: float, air_k: float, window: float, window_k: float) -> float:
-    """The temperature of an air that sends what air and window send together, through both of which light passes."""
+    """Temperature of an air alone that emits as much as air and window together, with the transmission of both."""
     own = 1 - through * window
     if own <= 0:
         return air_k

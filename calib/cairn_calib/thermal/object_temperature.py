@@ -79,7 +79,7 @@ def temperatures(
     flat_field: FlatField | None = None,
     housing_k: float | None = None,
 ) -> Temperatures | NotRadiometric:
-    """Temperatures of what a thermal image shows.
+    """Temperatures of the surfaces in a thermal image.
 
     Args:
         counts: (H, W) as the camera gave them.

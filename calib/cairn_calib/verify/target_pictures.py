@@ -1,4 +1,4 @@
-"""Pictures of every target as each camera saw it, with what was found there and what was predicted."""
+"""Pictures of every target as each camera saw it, with the found and the predicted centroid."""
 
 import cv2
 import numpy as np
@@ -21,7 +21,7 @@ def target_tile(image: npt.NDArray[np.generic], sight: TargetSighting) -> Pictur
 
     Args:
         image: (H, W) or (H, W, 3) of the sight's camera; R, G, B.
-        sight: what was seen.
+        sight: the sighting.
     """
     scale = TILE_PX / (2 * REACH * sight.disc_px)
     middle = sight.found_px

@@ -1,9 +1,9 @@
-"""Table 2 of Kocmanova et al.: for each camera sigma_x, sigma_y and sigma of the differences, and more than the paper.
+"""Table 2 of Kocmanova et al.: for each camera sigma_x, sigma_y and sigma of the differences, with further columns.
 
     sigma = sqrt((sigma_x^2 + sigma_y^2) / 2)
 
-that is one axis, about the mean. Besides: the mean (bias), how many, a 95 % interval of sigma by bootstrap over images
-(what one image shows is not independent), and what was to be expected, by source and in total (root mean square, one
+that is one axis, about the mean. Besides: the mean (bias), the count, a 95 % interval of sigma by bootstrap over images
+(targets of one image are not independent), and the expected sigma, by source and in total (root mean square, one
 axis).
 """
 
