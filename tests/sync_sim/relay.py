@@ -17,7 +17,7 @@ from cairn_map.commits.version_vector import EMPTY
 from cairn_map.errors import CairnError, NotFoundError, UnreachableError
 from cairn_map.wire.relay_peer import Held, MapEnd, SignedCommit
 from cairn_server.access.auth import Caller, Role
-from cairn_server.operations.local_peer import OwnEnd
+from cairn_server.operations.upstream import OwnEnd
 
 FIELD = Caller(Role.RELAY, name="field")
 

@@ -1,4 +1,17 @@
-"""Copy a server's store into one file, while the server runs.
+"""Backups of a server's store: the commands `cairn serve backup` and `cairn serve restore`."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from cairn_map.errors import EXIT_CODES, DamagedDataError
+from cairn_map.progress import PercentLine
+from cairn_server.operations.check import check_all
+from cairn_server.settings import Settings
+from cairn_server.store.sqlite.archive import SqliteArchive
+from cairn_server.store.sqlite.backup import back_up, restore
+
+BACKUP = """Copy a server's store into one file, while the server runs.
 
     $ cairn serve backup --data ./cairn-data nightly.cairn
     nightly.cairn: 41.3 MB, the state of ./cairn-data
@@ -8,21 +21,28 @@ that name is there until the new one is whole. Run it as the user that the serve
 is not in it: `cairn serve --stable-after` must be longer than the age of the oldest backup that you may restore
 (docs/administrator.md).
 """
+RESTORE = """Make a server's folder out of a backup.
 
-import argparse
-import sys
-from pathlib import Path
+    $ cairn serve restore nightly.cairn --data ./restored
+    ./restored: restored and checked: 2 maps, 1204 commits, 56 cells
 
-from cairn_map.errors import EXIT_CODES
-from cairn_map.progress import PercentLine
-from cairn_server.settings import Settings
-from cairn_server.store.sqlite.backup import back_up
+The folder must be new or empty, and no server may work on it; everything is read and checked before it gets its
+name, and nothing is left of it if it is not sound. Then start `cairn serve --data ./restored` in the old one's place.
+
+Robots then do the rest by themselves: those whose cursor is newer than the backup cannot prove it, compare fingerprints
+cell by cell, and fetch what differs. They push again every commit that the server lost and they still keep, which are
+all that were not `stable`. A robot that was registered after the backup must register again (401). Retracts that robots
+kept come back in the same way; those that an operator made and no robot heard of must be made again.
+"""
+NEXT = """Start `cairn serve --data {folder}`. Robots notice by themselves: they compare their cells with the server's,
+fetch what differs, and push again what is newer than the backup. Those registered after it must register again.
+"""
 
 
-def main(argv: list[str]) -> int:
+def back_up_command(argv: list[str]) -> int:
     """Make a backup."""
     parser = argparse.ArgumentParser(
-        "cairn serve backup", description=__doc__, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
+        "cairn serve backup", description=BACKUP, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help="folder of the store")
     parser.add_argument("file", type=Path, metavar="FILE", help="the backup; an older one of that name is replaced")
@@ -32,3 +52,35 @@ def main(argv: list[str]) -> int:
     progress.finish()
     sys.stdout.write(f"{args.file}: {size_bytes / 1e6:.1f} MB, the state of {args.data}\n")
     return 0
+
+
+def restore_command(argv: list[str]) -> int:
+    """Restore a backup."""
+    parser = argparse.ArgumentParser(
+        "cairn serve restore", description=RESTORE, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("file", type=Path, metavar="FILE", help="a file that `cairn serve backup` made")
+    parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help="a new or empty folder")
+    args = parser.parse_args(argv)
+    progress = PercentLine("restore")
+    summary: list[str] = []
+    restore(args.file, args.data, progress.at, lambda path: summary.append(_verified(path)))
+    progress.finish()
+    sys.stdout.write(f"{args.data}: restored and checked: {summary[0]}\n{NEXT.format(folder=args.data)}")
+    return 0
+
+
+def _verified(path: Path) -> str:
+    """Summary of a copy of a store.
+
+    Raises:
+        DamagedDataError: kind `damaged_store`: something in it is not sound.
+    """
+    archive = SqliteArchive(path)
+    try:
+        outcome = check_all(archive, archive.complaints())
+    finally:
+        archive.close()
+    if outcome.findings:
+        raise DamagedDataError("damaged_store", f"the backup is damaged, take another one: {outcome.findings[0][1]}")
+    return outcome.summary

@@ -1,16 +1,16 @@
-"""Read a server's whole store and say what is damaged.
+"""Read a server's whole store and report what is damaged.
 
     $ cairn serve check --data ./cairn-data
     2 maps, 1204 commits, 56 cells: all sound
 
 It looks at the pages of the file, at the chain of every log, at every diff that is kept against its commit's SHA-256,
-at every cell against its digest and fingerprint, and at whether each cell is the sum of its commits. It may run beside
-the server. The exit code is 0 if all is sound and 6 if not.
+at every cell against its digest and fingerprint, and at whether each cell is the sum of its commits. It may run while
+the server does. The exit code is 0 if all is sound and 6 if not.
 
     $ cairn serve check --data ./cairn-data --repair
-    lab: cell 0,-1,2 at rest does not have its digest: made anew from its commits
+    lab: cell 0,-1,2 at rest does not have its digest: rebuilt from its commits
 
-With --repair, which needs the server stopped, damaged cells are made anew where the log still has all of their commits.
+With --repair, which needs the server stopped, damaged cells are rebuilt where the log still has all of their commits.
 Others stay set aside: the server answers 500 damaged_store for such a cell alone and goes on with all others; commits
 that touch it wait. The next robot that syncs and still has the cell as it was heals it by itself; or a backup from
 before the damage is restored, after which robots push again what is newer.
@@ -38,7 +38,7 @@ def main(argv: list[str]) -> int:
         "cairn serve check", description=__doc__, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help="folder of the store")
-    parser.add_argument("--repair", action="store_true", help="make damaged cells anew; the server must be stopped")
+    parser.add_argument("--repair", action="store_true", help="rebuild damaged cells; the server must be stopped")
     args = parser.parse_args(argv)
     if args.repair:
         store = SqliteStore(args.data)
@@ -71,7 +71,7 @@ def _complaints(folder: Path) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a check found."""
+    """Findings of a check, and its summary in one line."""
 
     findings: list[tuple[MapRow | None, Finding]]
     summary: str
@@ -95,10 +95,10 @@ def check_all(store: Store, complaints: Iterable[str] = ()) -> Outcome:
 
 
 def _healed(store: SqliteStore, row: MapRow | None, finding: Finding) -> list[str]:
-    """Put a cell in its place if the log told what it was; what is left, if not. Says either."""
+    """Write a damaged cell again if the log has all of it; the finding, if it has not. Reports either."""
     if row is not None and finding.sound is not None and store.health.heal(row, finding.sound):
-        store.audit("healed_cell", f"map {row.name}: {finding.what}: made anew from its commits")
-        sys.stdout.write(f"{finding}: made anew from its commits\n")
+        store.audit("healed_cell", f"map {row.name}: {finding.what}: rebuilt from its commits")
+        sys.stdout.write(f"{finding}: rebuilt from its commits\n")
         return []
     sys.stdout.write(f"{finding}\n")
     return [str(finding)]

@@ -1,9 +1,9 @@
-"""Whether the server of this machine answers, for a container's health check: exit code 0, or 1 and why.
+"""Probe for a container's health check: exit code 0 if the server of this machine answers, else 1 and the reason.
 
     $ python3 -m cairn_server.operations.health_probe /data
 
-The port is the one that the server of this folder wrote down. The probe speaks http, or https if the server does, with
-whatever certificate: it asks nothing but whether it is alive.
+The port is the one that the server of this folder wrote down. The probe speaks http, or https if the server does, and
+takes any certificate: all that it asks is whether the server is alive.
 """
 
 import http.client
@@ -17,7 +17,7 @@ TIMEOUT_S = 2.0
 
 
 def why_not(port: int) -> str | None:
-    """What is wrong with the server at a port of this machine; None: it is alive."""
+    """Reason why the server at a port of this machine counts as dead; None: it is alive."""
     secure = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     secure.check_hostname, secure.verify_mode = False, ssl.CERT_NONE
     said = ""

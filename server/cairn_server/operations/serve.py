@@ -32,6 +32,7 @@ Three more commands look after the folder (docs/administrator.md); each explains
     cairn serve check --data DIR            read everything and report what is damaged; --repair heals it
 """
 
+import ctypes
 import logging
 import signal
 import socket
@@ -49,10 +50,8 @@ from cairn_server.folding.fold_process import fork_folding
 from cairn_server.http.app import make_app
 from cairn_server.http.middleware.deadlines import protocol_of
 from cairn_server.http.middleware.log_format import LogForm, start_logging
-from cairn_server.operations import backup as backup_command
 from cairn_server.operations import check as check_command
-from cairn_server.operations import restore as restore_command
-from cairn_server.operations.allocator import keep_memory_small
+from cairn_server.operations.backup import back_up_command, restore_command
 from cairn_server.operations.serve_options import serve_parser, settings_of
 from cairn_server.operations.upstream import joined
 from cairn_server.service import Service
@@ -66,15 +65,18 @@ log = logging.getLogger(__name__)
 
 BACKLOG = 128
 GRACE_S = 6
-"""For answers under way, once the server is told to stop; the fold under way and closing the store come after it."""
+"""Time for answers under way after the signal to stop; the fold under way and closing the store come after it."""
 WEBSOCKETS: dict[str, Any] = {"ws": "websockets-sansio", "ws_max_size": 1 << 12, "ws_per_message_deflate": False}
-"""Listeners send next to nothing, and must cost little."""
+"""WebSockets of listeners, who send next to nothing and must cost little."""
 SWITCH_S = 0.0005
-"""How soon a thread that computes lets another one have the interpreter: a push needs it some ten times on its way, and
-would wait for the folder each time."""
+"""Longest time for which a thread that computes keeps the interpreter from another one that waits for it: a push needs
+the interpreter some ten times on its way, and with Python's 5 ms would wait for the folding thread each time."""
+ARENAS_MAX, MAPPED_FROM_BYTES = 2, 1 << 20
+M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8
+"""Parameters of glibc's `mallopt` (malloc.h)."""
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
-    "backup": backup_command.main,
-    "restore": restore_command.main,
+    "backup": back_up_command,
+    "restore": restore_command,
     "check": check_command.main,
 }
 
@@ -90,7 +92,8 @@ def main(argv: list[str]) -> int:
     settings.check_tls()
     signal.signal(signal.SIGTERM, _stop)
     sys.setswitchinterval(SWITCH_S)
-    folding, checking = fork_folding(settings.folder / FILE_NAME), fork_checking()  # before there are threads
+    # Forked before there are threads: a lock that another thread held at the fork would stay locked in the child.
+    folding, checking = fork_folding(settings.folder / FILE_NAME), fork_checking()
     keep_memory_small()
     with listen(settings.host, settings.port) as listener:
         try:
@@ -121,21 +124,21 @@ def _serve(service: Service, listener: socket.socket) -> None:
 
 
 class _Server(uvicorn.Server):
-    """At a signal it is not ready any more, and live streams, which have no end of their own, are told."""
+    """uvicorn's server, which at a signal says that it is not ready and ends live streams, as they never end alone."""
 
     def __init__(self, config: uvicorn.Config, service: Service) -> None:
         super().__init__(config)
         self._service = service
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """A signal to stop."""
+        """Close what is open for ever, then stop as uvicorn does."""
         self._service.readiness.is_closing = True
         self._service.live.close()
         super().handle_exit(sig, frame)
 
 
 def config_of(app: FastAPI, settings: Settings, *, log_level: str = "warning") -> uvicorn.Config:
-    """How the HTTP library serves the app.
+    """Configuration with which uvicorn serves the app.
 
     Raises:
         BadInputError: kind `bad_setting`: no certificate, or not with this key.
@@ -162,7 +165,7 @@ def config_of(app: FastAPI, settings: Settings, *, log_level: str = "warning") -
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
-    """After uvicorn finished its answers it raises the signal again; end as Ctrl-C does, with everything closed."""
+    """End as Ctrl-C does, with everything closed: uvicorn raises the signal again once its answers are finished."""
     raise KeyboardInterrupt
 
 
@@ -184,3 +187,17 @@ def listen(host: str, port: int) -> socket.socket:
         raise BadInputError("cannot_listen", message) from exc
     listener.listen(BACKLOG)
     return listener
+
+
+def keep_memory_small() -> None:
+    """Make glibc's allocator give freed memory back; to be called before there are threads.
+
+    Each of the forty threads of the web server would get an arena of its own, where pieces of answers long sent lie
+    between pieces of caches, and none can be given back; and each freed array of megabytes raises the size from which
+    on memory comes from the system and returns to it. With two hundred robots on one map that was a third of all
+    memory. Without glibc it does nothing.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(M_ARENA_MAX, ARENAS_MAX)
+        mallopt(M_MMAP_THRESHOLD, MAPPED_FROM_BYTES)

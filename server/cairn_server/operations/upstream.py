@@ -1,22 +1,31 @@
-"""Joining this server to another: the relay is a robot's program, found as `cairn` finds its commands."""
+"""Relay to an upstream server: both servers then hold the same commits.
+
+The relay is a robot's program, found through its entry point as `cairn` finds its commands; this server's own maps are
+handed to it without a detour through HTTP (`cairn_map.wire.relay_peer`).
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import entry_points
 from typing import Protocol
 
-from cairn_map.errors import BadInputError
-from cairn_server.operations.local_peer import OwnMaps
+from cairn_map.commits.ids import CommitId
+from cairn_map.errors import BadInputError, ConflictError
+from cairn_map.wire.messages import CreateMap, MapInfo
+from cairn_map.wire.relay_peer import Held, MapEnd, OwnServer, SignedCommit
+from cairn_server.access.auth import UPSTREAM
 from cairn_server.service import Service
+from cairn_server.store.store_rows import MapRow
+from cairn_server.sync.handing_over import found_commit
 
 GROUP = "cairn.upstream"
 
 
 class Relay(Protocol):
-    """What was started."""
+    """A running relay, as the entry point returns it."""
 
     def wake(self) -> None:
-        """There is something new here."""
+        """Note that this server has something new."""
         ...
 
     def stop(self) -> None:
@@ -38,7 +47,7 @@ def joined(service: Service) -> Iterator[None]:
     point = next(iter(entry_points(group=GROUP)), None)
     if point is None:
         raise BadInputError(
-            "bad_setting", f"--upstream: no package offers a relay (entry points {GROUP}); install anew"
+            "bad_setting", f"--upstream: no package offers a relay (entry points {GROUP}); install cairn again"
         )
     relay: Relay = point.load()(settings.upstream, settings.upstream_token, OwnMaps(service))
     service.joining.wake = relay.wake
@@ -46,3 +55,55 @@ def joined(service: Service) -> Iterator[None]:
         yield
     finally:
         relay.stop()
+
+
+class OwnEnd:
+    """One map of this server, as a relay's `MapEnd`."""
+
+    def __init__(self, service: Service, row: MapRow) -> None:
+        self._service = service
+        self._row = row
+
+    def held(self) -> Held:
+        """Commits that this server has now."""
+        return self._service.held.of(self._row)
+
+    def commit(self, commit: CommitId) -> SignedCommit:
+        """A commit with its signatures."""
+        found = found_commit(self._service.store, self._row, str(commit))
+        return SignedCommit(commit, found.data, found.signatures)
+
+    def push(self, commit: SignedCommit) -> None:
+        """Keep a commit; durable on return."""
+        try:
+            self._service.push(self._row, UPSTREAM, str(commit.id), commit.data, signatures=commit.signatures)
+        except ConflictError as exc:
+            self._service.pushes.note_conflict(self._row, UPSTREAM, exc)
+            raise
+
+
+class OwnMaps:
+    """All maps of this server, as a relay's `OwnServer`."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+
+    def map_names(self) -> list[str]:
+        """Names of the maps."""
+        return [row.name for row in self._service.store.maps()]
+
+    def open(self, upstream: MapInfo) -> MapEnd:
+        """The map of the same name as one of the upstream, created if it is not there."""
+        request = CreateMap(geometry=upstream.geometry, sensor_model=upstream.sensor_model)
+        _, is_new = self._service.create_map(upstream.name, request)
+        if is_new:
+            self._service.store.audit_log.add(UPSTREAM.name, "create_map", upstream.name)
+        return OwnEnd(self._service, self._service.store.map(upstream.name))
+
+    def handed_over(self, map_name: str, begun_s: float) -> None:
+        """Note that all of a map at this time (UTC seconds since 1970) was given to the upstream, if it can travel."""
+        self._service.joining.handed_over(map_name, begun_s)
+
+
+_IS_AN_OWN_SERVER: type[OwnServer] = OwnMaps
+"""Check of the protocol by the type checker."""

@@ -92,7 +92,7 @@ def test_a_damaged_cell_is_found_and_made_anew(check: Check, folder: Path, state
     assert said.startswith("map0: cell ")
     code, said = check("--repair")
     assert code == 0, said
-    assert "made anew from its commits" in said
+    assert "rebuilt from its commits" in said
     assert check()[0] == 0
     assert cells_of(folder, "map0") == sum_of([*COMMITS, RETRACT])
 
