@@ -24,8 +24,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from cairn_client.cli.arguments import add_token, parser, say
-from cairn_client.cli.doctor_checks import Check, CheckResult, disk_check, installation_checks
-from cairn_client.cli.doctor_link import folder_checks, server_checks
+from cairn_client.cli.doctor_checks import (
+    Check,
+    CheckResult,
+    disk_check,
+    folder_checks,
+    installation_checks,
+    server_checks,
+)
 from cairn_client.folders.state_folder import opened_replica
 from cairn_client.http.map_url import split_map_url
 from cairn_client.replica.replica_identity import URL_KEY

@@ -10,6 +10,7 @@ from cairn_client.sync.link_profile import LINKS
 from cairn_client.sync.scope import Scope
 from cairn_map.errors import BadInputError
 from cairn_map.render.pose_spread import PoseSpread
+from cairn_map.wire.messages import Mode
 
 
 def add_map(command: argparse.ArgumentParser) -> None:
@@ -34,9 +35,9 @@ def add_amount(command: argparse.ArgumentParser) -> None:
     add_token(command)
 
 
-def scope_of(args: argparse.Namespace) -> Scope:
+def scope_of(args: argparse.Namespace, mode: Mode) -> Scope:
     """Part of the map to fetch, as the options say."""
-    if args.reply_bytes is not None and args.mode == "low-end":
+    if args.reply_bytes is not None and mode == "low-end":
         raise BadInputError("bad_option", "--reply-bytes bounds the answers with differences; low-end fetches cells")
     return Scope(box_m=(args.box[:3], args.box[3:]) if args.box else None, reply_bytes_max=args.reply_bytes)
 

@@ -7,8 +7,7 @@ from tests.fixtures.client.made import A, opened, seen
 from tests.fixtures.server.live import Live
 
 from cairn_client.cli.doctor import main
-from cairn_client.cli.doctor_checks import CheckResult
-from cairn_client.cli.doctor_link import clock_check
+from cairn_client.cli.doctor_checks import CheckResult, clock_check
 from cairn_client.folders.map_copy import clone
 from cairn_client.robot.robot import Robot
 

@@ -19,7 +19,7 @@ import json
 from pathlib import Path
 
 from cairn_client.cli.arguments import add_token, parser, say, shown_bytes
-from cairn_client.cli.maps.map_sides import Difference, Side, difference, side_of
+from cairn_client.cli.maps.map_sides import Difference, MapSide, difference, side_of
 from cairn_client.folders.state_folder import url_of
 from cairn_map.evidence.grid import CellKey, cell_of_key
 
@@ -49,12 +49,12 @@ def main(argv: list[str]) -> int:
     return EQUAL if found.is_equal else DIFFERENT
 
 
-def _sides(args: argparse.Namespace) -> tuple[Side, Side]:
+def _sides(args: argparse.Namespace) -> tuple[MapSide, MapSide]:
     other = args.b or url_of(Path(args.a))
     return side_of(args.a, token=args.token), side_of(other, token=args.token)
 
 
-def _show(a: Side, b: Side, found: Difference) -> None:
+def _show(a: MapSide, b: MapSide, found: Difference) -> None:
     for letter, side in (("A", a), ("B", b)):
         commits = "" if side.commits is None else f", {len(side.commits)} commits"
         size = shown_bytes(side.size_bytes)
@@ -78,11 +78,11 @@ def _named(keys: list[CellKey]) -> str:
     return " ".join(str(cell_of_key(key)) for key in keys[:SHOWN]) + more
 
 
-def _as_json(a: Side, b: Side, found: Difference) -> dict[str, object]:
+def _as_json(a: MapSide, b: MapSide, found: Difference) -> dict[str, object]:
     def cells(keys: list[CellKey]) -> list[list[int]]:
         return [list(cell_of_key(key)) for key in keys]
 
-    def side(one: Side) -> dict[str, object]:
+    def side(one: MapSide) -> dict[str, object]:
         commits = None if one.commits is None else len(one.commits)
         sizes = {"voxels": one.voxels, "size_bytes": one.size_bytes}
         return {"name": one.name, "cells": len(one.cells), **sizes, "commits": commits}

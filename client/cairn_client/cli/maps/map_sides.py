@@ -31,7 +31,7 @@ class SideCell:
 
 
 @dataclass(frozen=True, slots=True)
-class Side:
+class MapSide:
     """One of two maps that are compared."""
 
     name: str
@@ -70,7 +70,7 @@ class Difference:
         return not (self.only_a or self.only_b or self.other)
 
 
-def side_of(place: str, *, token: str | None) -> Side:
+def side_of(place: str, *, token: str | None) -> MapSide:
     """The map at a place.
 
     Raises:
@@ -91,7 +91,7 @@ def side_of(place: str, *, token: str | None) -> Side:
     )
 
 
-def difference(a: Side, b: Side) -> Difference:
+def difference(a: MapSide, b: MapSide) -> Difference:
     """Difference of two sides, by the fingerprints of their cells.
 
     Raises:
@@ -115,7 +115,7 @@ def difference(a: Side, b: Side) -> Difference:
     )
 
 
-def _of_server(url: str, token: str | None) -> Side:
+def _of_server(url: str, token: str | None) -> MapSide:
     api, name = api_of(url, token)
     with api:
         geometry, index = api.map_info(name).geometry, index_of(api, name)
@@ -124,10 +124,10 @@ def _of_server(url: str, token: str | None) -> Side:
         for entry in index.cells
         if entry.voxels
     }
-    return Side(url, geometry, cells, index.header.coverage)
+    return MapSide(url, geometry, cells, index.header.coverage)
 
 
-def _of_state(folder: Path) -> Side:
+def _of_state(folder: Path) -> MapSide:
     with opened_replica(folder) as replica:
         geometry, packed = replica.geometry, replica.view.packed()
         folded = replica.header.coverage if replica.header else EMPTY
@@ -136,10 +136,10 @@ def _of_state(folder: Path) -> Side:
         key: SideCell(fingerprint(cell, key), len(cell), len(encode_cell(key, cell, geometry).data))
         for key, cell in packed.items()
     }
-    return Side(str(folder), geometry, cells, commits)
+    return MapSide(str(folder), geometry, cells, commits)
 
 
-def _of_cells(folder: Path) -> Side:
+def _of_cells(folder: Path) -> MapSide:
     geometry = read_head(folder).geometry
     cells = {
         cell.key: SideCell(
@@ -150,4 +150,4 @@ def _of_cells(folder: Path) -> Side:
         for cell in read_cells(folder, geometry)
         if len(cell.evidence)
     }
-    return Side(str(folder), geometry, cells, None)
+    return MapSide(str(folder), geometry, cells, None)

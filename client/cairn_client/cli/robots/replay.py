@@ -3,6 +3,7 @@
 import argparse
 import logging
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,7 @@ SYNC_EVERY_S = 2.0
 
 
 def _replay(args: argparse.Namespace) -> int:
+    # What to replay, and on which map.
     integrator = Integrator(min_range_m=args.min_range, max_range_m=args.max_range)
     options, size = frame_options(args), args.scans_per_measurement
     mapping = mapping_of(args.topics) if args.topics else None
@@ -47,9 +49,10 @@ def _replay(args: argparse.Namespace) -> int:
         raise BadInputError(
             "replayed_before", f"{state} has replayed this recording already; --again counts its evidence once more"
         )
+    # Map this robot's share, and take a note, so that the evidence is not counted twice.
     stops = source.measurements()[args.share[0] - 1 :: args.share[1]]
     start_s = time.monotonic()
-    commits = scans = 0
+    scans = sum(map(len, stops))
     with Robot(
         source.rig,
         args.map,
@@ -59,19 +62,11 @@ def _replay(args: argparse.Namespace) -> int:
         mode=args.mode,
         geometry=geometry,
         integrator=integrator,
-        scope=scope_of(args),
+        scope=scope_of(args, args.mode),
         link=args.link,
         stay=True,
     ) as robot:
-        last_sync_s = start_s
-        for stop in with_progress(stops, source.name, total=len(stops)):
-            for index in stop:
-                robot.observe(source.scan(index))
-                scans += 1
-            commits += _commit(robot, Profile(args.profile) if args.profile else None) is not None
-            if time.monotonic() - last_sync_s > SYNC_EVERY_S:
-                _try_sync(robot)
-                last_sync_s = time.monotonic()
+        commits = _map_stops(robot, source, stops, Profile(args.profile) if args.profile else None)
         with (state / REPLAYED_FILE).open("a") as file:
             file.write(f"{part}\n")
         mapped_s = time.monotonic() - start_s
@@ -85,6 +80,19 @@ def _replay(args: argparse.Namespace) -> int:
     if not is_linked:
         say(f"no link to {args.map}: `cairn robot sync {state} --map URL` pushes them when there is one")
     return 0
+
+
+def _map_stops(robot: Robot, source: ScanSource, stops: Sequence[range], profile: Profile | None) -> int:
+    """Map measurements one after the other, with a sync now and then; the number of commits made."""
+    commits, last_sync_s = 0, time.monotonic()
+    for stop in with_progress(stops, source.name, total=len(stops)):
+        for index in stop:
+            robot.observe(source.scan(index))
+        commits += _commit(robot, profile) is not None
+        if time.monotonic() - last_sync_s > SYNC_EVERY_S:
+            _try_sync(robot)
+            last_sync_s = time.monotonic()
+    return commits
 
 
 def _say_range(source: ScanSource) -> None:

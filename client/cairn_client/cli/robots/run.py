@@ -134,7 +134,7 @@ def _robot(args: argparse.Namespace, spool: Spool, stopping: threading.Event) ->
         mode=args.mode,
         geometry=ensure_map(args, source) if source else None,
         integrator=Integrator(min_range_m=args.min_range, max_range_m=args.max_range),
-        scope=scope_of(args),
+        scope=scope_of(args, args.mode),
         limits=limits_of(args),
         link=args.link,
         stay=args.stay,
@@ -170,7 +170,9 @@ def _leave_out(robot: Robot, stop: Stop, exc: BadInputError) -> None:
     log.error(
         "measurement %d of %s is left out: %s; put its scans into the spool again, under a new name and in smaller "
         "measurements",
-        *(stop.number, stop.folder, exc.message),
+        stop.number,
+        stop.folder,
+        exc.message,
     )
     robot.replica.outbox.beside = {}
     robot.discard()

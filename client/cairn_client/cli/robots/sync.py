@@ -32,7 +32,7 @@ from cairn_client.sync.near_cells import Wanted, within
 from cairn_map.errors import BadInputError
 from cairn_map.wire.messages import Mode
 
-NEW_COPY = "viewer"
+NEW_COPY: Mode = "viewer"
 """Name and mode of a new folder's robot, unless options say otherwise."""
 
 
@@ -94,25 +94,25 @@ def _robot(args: argparse.Namespace) -> Robot:
     url = args.map or (known.url if known else None)
     if url is None:
         raise BadInputError("no_url", f"{args.folder} does not say where its server is; give --map URL")
-    args.mode = args.mode or ((known.mode or "high-end") if known else NEW_COPY)
+    mode: Mode = args.mode or ((known.mode or "high-end") if known else NEW_COPY)
     return Robot(
         None,
         url,
         directory=args.folder,
         name=args.name or (known.robot if known else NEW_COPY),
         token=args.token,
-        mode=args.mode,
-        scope=replace(scope_of(args), wanted=_wanted(args, url)),
+        mode=mode,
+        scope=replace(scope_of(args, mode), wanted=_wanted(args, url, mode)),
         link=args.link,
         stay=True,
     )
 
 
-def _wanted(args: argparse.Namespace, url: str) -> Wanted | None:
+def _wanted(args: argparse.Namespace, url: str, mode: Mode) -> Wanted | None:
     """The cells around --near; None: all."""
     if args.near is None:
         return None
-    if args.mode != "low-end":
+    if mode != "low-end":
         raise BadInputError("bad_option", "--near goes with --mode low-end; a high-end copy holds the whole map")
     api, name = api_of(url, args.token)
     with api:
