@@ -42,7 +42,7 @@ class Board(BaseModel):
     """Diameter of its discs. None: a chessboard, or unknown; then centroids are taken for the images of centres."""
 
     @model_validator(mode="after")
-    def _discs_apart(self) -> Self:
+    def _check_disc(self) -> Self:
         if self.disc_m is None:
             return self
         apart = self.pitch_m * (2**0.5 if self.pattern == "asymmetric-circles" else 1.0)
@@ -56,7 +56,7 @@ class Board(BaseModel):
         return self.columns * self.rows
 
     @property
-    def turns_unseen(self) -> bool:
+    def has_turn_symmetry(self) -> bool:
         """True if the board looks the same after a half or a quarter turn, so that no image shows its first point."""
         if self.pattern == "asymmetric-circles":
             return self.rows % 2 == 0

@@ -78,7 +78,7 @@ def find_circles(
         homography = fit_homography(places, pointed)
         found = "the discs pointed at lie on a line" if homography is None else _measure(signed, board, homography)
         return _detection([], "by hand", 1.0, found)
-    if board.turns_unseen and not upright:
+    if board.has_turn_symmetry and not upright:
         raise BadInputError(
             "board_turns",
             f"{board.columns}x{board.rows} {board.pattern} look the same after half a turn, so that their first "

@@ -68,7 +68,7 @@ def find_chessboard(
             the array is no image.
     """
     # Without colours or a known way up the first corner cannot be named.
-    if board.turns_unseen and not upright:
+    if board.has_turn_symmetry and not upright:
         raise BadInputError(
             "board_turns",
             f"a board of {board.columns}x{board.rows} inner corners looks the same after half a turn, so that its "

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cairn_calib.cli.solve_options import add_solve_options, solve_as_asked
+from cairn_calib.cli.solve_options import add_solve_options, solve_by_options
 from cairn_calib.diagnosis.examination import examine
 from cairn_calib.report.report_files import refuse_overwriting, write_report
 from cairn_calib.report.report_images import report_images
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> None:
     """Solve again, compare, and write the report."""
     refuse_overwriting(args.output, args.rig)
     rig = load_rig(args.rig)
-    again = solve_as_asked(solve_arguments(rig, args.folders, shlex.split(args.solved_with), args.rig))
+    again = solve_by_options(solve_arguments(rig, args.folders, shlex.split(args.solved_with), args.rig))
     _refuse_other_inputs(rig, again.views, args.rig)
     off = sigmas_apart(rig, again)
     if not off < SAME_SIGMAS:

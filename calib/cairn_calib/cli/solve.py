@@ -37,7 +37,7 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from cairn_calib.cli.solve_options import add_solve_options, solve_as_asked
+from cairn_calib.cli.solve_options import add_solve_options, solve_by_options
 from cairn_calib.diagnosis.examination import examine
 from cairn_calib.report.range_report import told_ranges
 from cairn_calib.report.report_files import refuse_overwriting, write_file, write_report
@@ -66,12 +66,12 @@ def run(args: argparse.Namespace) -> None:
     """Solve, and write the rig and, if asked for, the report."""
     refuse_overwriting(args.report, args.output)
     with while_working("solving"):
-        solution = solve_as_asked(args)
+        solution = solve_by_options(args)
         rig = solved_rig(solution, made_s=time.time())
     with while_working("comparing halves of the images, and without each of them"):
         seen = examine(solution, rig)
     write_file(args.output, rig.to_json())
-    sys.stdout.write(told(statistics_of(solution)) + told_ranges(solution))
+    sys.stdout.write(statistics_lines(statistics_of(solution)) + told_ranges(solution))
     for each in seen.warnings:
         sys.stderr.write(f"warning: {each}\n")
     if seen.next_images and seen.warnings:
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> None:
         sys.stdout.write(write_report(args.report, seen, images))
 
 
-def told(statistics: Statistics) -> str:
+def statistics_lines(statistics: Statistics) -> str:
     """A line for each camera."""
     width = max(len(name) for name in statistics.cameras)
     return "".join(

@@ -39,7 +39,7 @@ def add_solve_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--modulation-mhz", type=float, metavar="F", help="of its light, by the data sheet")
 
 
-def solve_as_asked(args: argparse.Namespace) -> Solution:
+def solve_by_options(args: argparse.Namespace) -> Solution:
     """The solution of the corners, and ranges, that the options name, by the plan that they state.
 
     Raises:

@@ -186,7 +186,7 @@ def _write(args: argparse.Namespace, radiometry: Radiometry) -> None:
 
 def _read(args: argparse.Namespace) -> None:
     _check_camera(args)
-    radiometry, flat = _known(args)
+    radiometry, flat = _radiometry_and_maps(args)
     if (args.output or args.picture) and len(args.images) > 1:
         raise BadInputError("bad_arguments", "--output and --picture take one image at a time")
     housing_k = None if args.housing is None else args.housing + ZERO_C_K
@@ -226,7 +226,7 @@ def _read(args: argparse.Namespace) -> None:
             )
 
 
-def _known(args: argparse.Namespace) -> tuple[Radiometry | None, FlatField | None]:
+def _radiometry_and_maps(args: argparse.Namespace) -> tuple[Radiometry | None, FlatField | None]:
     """The radiometry that was named, if one was, with its maps."""
     if args.rig:
         radiometry, folder = load_rig(args.rig)[args.camera].radiometry, args.rig.parent

@@ -8,7 +8,7 @@ from cairn_calib.diagnosis.next_image import NextImage, next_images
 from cairn_calib.diagnosis.probe_points import Probes, probes_of
 from cairn_calib.diagnosis.range_warnings import range_warnings
 from cairn_calib.diagnosis.solve_warnings import SolveWarning, refuse_undetermined, warnings_of
-from cairn_calib.diagnosis.view_coverage import Coverage, coverage
+from cairn_calib.diagnosis.view_statistics import Coverage, coverage
 from cairn_calib.diagnosis.weak_modes import WeakMode, weak_modes
 from cairn_calib.rig.rig import Rig
 from cairn_calib.solve.solution import Solution

@@ -56,7 +56,7 @@ def next_images(solution: Solution, probes: Sequence[Probes], *, count: int = 3)
     candidates = [each for n in range(len(solution.plan.cameras)) for each in _candidates(solution, n)]
     poses = np.stack([T for _, T in candidates])
     seen, shares = _shares(solution, poses)
-    S, _, _, _ = solution.adjusted.normal.reduced()
+    S, _, _, _ = solution.adjusted.normal.reduce()
     noise = _noise_px(solution)
     # Rows in units of each camera's own noise: a colour pixel is no range camera's pixel.
     target = np.zeros_like(S)

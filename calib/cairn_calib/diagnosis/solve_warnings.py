@@ -12,7 +12,7 @@ import numpy as np
 
 from cairn_calib.diagnosis.cross_validation import Halves
 from cairn_calib.diagnosis.frame_influence import Influence
-from cairn_calib.diagnosis.view_coverage import Coverage
+from cairn_calib.diagnosis.view_statistics import Coverage
 from cairn_calib.diagnosis.weak_modes import WeakMode
 from cairn_calib.rig.rig import Spectrum
 from cairn_calib.solve.corner_residuals import CornerData
@@ -95,7 +95,7 @@ def warnings_of(
     found = [each for camera in covered for each in _of_coverage(camera, solution)]
     found += [*_of_priors(solution), *_of_coefficients(solution), *_of_noise(solution)]
     found += [*_of_discs(solution), *(each for mode in modes for each in _of_mode(mode))]
-    found += [*_of_turned(solution), *_of_influence(influences), *_of_halves(halves)]
+    found += [*_of_reversed(solution), *_of_influence(influences), *_of_halves(halves)]
     return found
 
 
@@ -190,7 +190,7 @@ def _of_mode(mode: WeakMode) -> Iterator[SolveWarning]:
         yield SolveWarning("weak_mode", mode.camera, mode.sigma_px, MODE_PX, "px where the gauge's pixels appear", text)
 
 
-def _of_turned(solution: Solution) -> Iterator[SolveWarning]:
+def _of_reversed(solution: Solution) -> Iterator[SolveWarning]:
     for name, frame in solution.turned:
         text = f"frame {frame} names the corners from the other end and was left out: look at its polarity"
         yield SolveWarning("reversed_order", name, 1, 0, "images", text)

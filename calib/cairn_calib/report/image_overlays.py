@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from cairn_calib.diagnosis.next_image import NextImage
-from cairn_calib.diagnosis.view_coverage import Coverage
+from cairn_calib.diagnosis.view_statistics import Coverage
 from cairn_map.arrays import Flags, Floats
 
 WIDTH = 420

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from cairn_calib.board.corner_file import CornerFile, read_corner_file
 from cairn_calib.board.corner_pictures import thumbnail
-from cairn_calib.diagnosis.view_residuals import ViewResiduals
+from cairn_calib.diagnosis.view_statistics import ViewResiduals
 
 IMAGES_MAX = 60
 """Images of one camera at most: a page of some megabytes."""

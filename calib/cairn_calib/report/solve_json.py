@@ -18,7 +18,7 @@ import numpy as np
 
 from cairn_calib.diagnosis.examination import Examination
 from cairn_calib.diagnosis.probe_points import RANGES_M
-from cairn_calib.diagnosis.view_residuals import view_residuals
+from cairn_calib.diagnosis.view_statistics import view_residuals
 from cairn_calib.diagnosis.world_uncertainty import sigma_map
 from cairn_calib.report.range_report import ranges_json
 from cairn_calib.report.report_radiometry import radiometry_json

@@ -7,7 +7,7 @@ import numpy as np
 
 from cairn_calib.diagnosis.examination import Examination
 from cairn_calib.diagnosis.probe_points import RANGES_M
-from cairn_calib.diagnosis.view_residuals import ViewResiduals, view_residuals
+from cairn_calib.diagnosis.view_statistics import ViewResiduals, view_residuals
 from cairn_calib.diagnosis.world_uncertainty import sigma_map, transfer_map
 from cairn_calib.report.image_overlays import coverage_picture, heat_legend, heat_map, quiver
 from cairn_calib.report.page import Figure, Table, page

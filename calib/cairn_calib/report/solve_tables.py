@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cairn_calib.diagnosis.examination import Examination
-from cairn_calib.diagnosis.view_residuals import ViewResiduals
+from cairn_calib.diagnosis.view_statistics import ViewResiduals
 from cairn_calib.report.page import Marked, Table
 from cairn_calib.rig.calibration import PIXEL_NAMES, Statistics
 from cairn_calib.solve.solve_plan import SHARED

@@ -74,8 +74,9 @@ class ByAmplitude(BaseModel):
     at: Amplitude
     """Usual amplitude, counts, at which the offset is 0, as it is where the amplitude is unknown."""
     low: Amplitude
+    """Lowest amplitude of the boards, counts."""
     high: Amplitude
-    """Amplitudes that the boards had, counts."""
+    """Highest amplitude of the boards, counts."""
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
@@ -206,7 +207,7 @@ class RangeBias(BaseModel, frozen=True):
             raster.check_image(amplitude, name="amplitude image")
             held = np.clip(amplitude.astype(np.float64), self.by_amplitude.low, self.by_amplitude.high)
             added_m = added_m + self.by_amplitude.faint_m * self.terms.faintness(held)
-        return self._unscaled(range_m.astype(np.float64) - added_m).astype(range_m.dtype)
+        return self._remove_scale_and_waves(range_m.astype(np.float64) - added_m).astype(range_m.dtype)
 
     def true_at(self, raster: Raster, pixels: Floats, range_m: Floats) -> Floats:
         """(N,) ranges without it, metres, of (N,) measured at (N, 2) pixels, at the usual amplitude."""
@@ -214,13 +215,13 @@ class RangeBias(BaseModel, frozen=True):
         if self.pixel_offsets is not None:
             x, y = np.clip(np.rint(pixels), 0, (raster.width - 1, raster.height - 1)).astype(np.intp).T
             added_m = added_m + self.pixel_offsets.offset_m[y, x]
-        return self._unscaled(range_m - added_m)
+        return self._remove_scale_and_waves(range_m - added_m)
 
     def _smooth(self, off: Floats) -> Floats:
         """(...) what does not depend on the range, metres."""
         return self.offset_m + self.radial_m * off + self.radial4_m * off**2
 
-    def _unscaled(self, level_m: Floats) -> Floats:
+    def _remove_scale_and_waves(self, level_m: Floats) -> Floats:
         """(...) true ranges where (1 + scale) true + waves(true) is `level_m`."""
         true_m = np.asarray(level_m / (1 + self.scale))
         if self.wiggle is None:

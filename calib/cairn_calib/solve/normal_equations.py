@@ -78,7 +78,7 @@ class NormalEquations:
     b: Floats
     cost: float
 
-    def reduced(self, damping: float = 0.0) -> tuple[Floats, Floats, Floats, Floats]:
+    def reduce(self, damping: float = 0.0) -> tuple[Floats, Floats, Floats, Floats]:
         """S (P, P) and s (P,) of the Schur complement, and C^-1 B^T (F, 6, P), C^-1 b (F, 6).
 
         With `damping`, diagonals are that much larger, relatively (Marquardt).
@@ -102,7 +102,7 @@ class NormalEquations:
             numpy.linalg.LinAlgError: it is singular.
         """
         # First what is shared, then each board from it.
-        S, s, by_shared, alone = self.reduced(damping)
+        S, s, by_shared, alone = self.reduce(damping)
         shared = solve_scaled(S, s)
         boards = alone - by_shared @ shared
         # 2 g.d - d.H.d with (H + damping D) d = g.
@@ -178,7 +178,7 @@ def uncertainty(normal: NormalEquations) -> Uncertainty:
     Raises:
         numpy.linalg.LinAlgError: something is not determined.
     """
-    S, _, by_shared, _ = normal.reduced()
+    S, _, by_shared, _ = normal.reduce()
     shared = solve_scaled(S, np.eye(len(S)))
     own = np.asarray(np.linalg.inv(normal.C), np.float64)
     return Uncertainty((shared + shared.T) / 2, by_shared, own)

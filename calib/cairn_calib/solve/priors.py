@@ -47,9 +47,9 @@ def usual_priors(
     if plan.usual_priors:
         for name, camera in plan.cameras.items():
             # With few views all coefficients and the principal point are held near usual values, and fx near fy.
-            known = _known(camera)
+            known = _usual_sigmas(camera)
             if view_counts[name] < FEW_VIEWS:
-                priors += _of_few_views(name, lenses[name])
+                priors += _few_view_priors(name, lenses[name])
                 known = {each: known.get(each, FEW_SIGMAS.get(each)) for each in camera.coefficients}
             priors += [single_prior(name, each, 0.0, sigma) for each, sigma in known.items() if sigma is not None]
         if plan.warp:
@@ -70,7 +70,7 @@ def single_prior(owner: str, name: str, value: float, sigma: float) -> Prior:
     return Prior(((owner, name, 1.0),), value, sigma)
 
 
-def _known(camera: CameraPlan) -> dict[str, float | None]:
+def _usual_sigmas(camera: CameraPlan) -> dict[str, float | None]:
     """Standard deviations of a lens's free coefficients from 0, as far as they are usual."""
     free = camera.coefficients
     if camera.model != "pinhole":
@@ -82,7 +82,7 @@ def _known(camera: CameraPlan) -> dict[str, float | None]:
     return known | ({"k2": RANGE_K2_SIGMA} if camera.spectrum is Spectrum.RANGE and "k2" in free else {})
 
 
-def _of_few_views(name: str, lens: Lens) -> list[Prior]:
+def _few_view_priors(name: str, lens: Lens) -> list[Prior]:
     cx, cy = (lens.width - 1) / 2, (lens.height - 1) / 2
     sigma = CENTRE_SIGMA * lens.width
     aspect = Prior(((name, "fx", 1.0), (name, "fy", -1.0)), 0.0, ASPECT_SIGMA * lens.focal_px[0])

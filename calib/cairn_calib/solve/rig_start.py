@@ -171,7 +171,7 @@ def _edge(
     T = T.reshape(count * 8, 4, 4)
     distance = float(np.median(np.linalg.norm(np.concatenate([one[:, 0], other[:, 0]])[:, :3, 3], axis=1)))
     # (F * 8, F, 8): distance of each reading from all eight of every frame.
-    apart = _apart(T, distance).reshape(len(T), count, 8)
+    apart = _pose_distances(T, distance).reshape(len(T), count, 8)
     # A board tilted about one spot fits mirrored and named from the other end as well: as it is, unless that is clear.
     doubts = np.minimum(apart.min(axis=2), AGREE_RAD).sum(axis=1) + TURNED_RAD * count * (np.arange(len(T)) % 8 >= 4)
     # The reading with the least doubt, then the mean of each frame's reading nearest to it, if that agrees.
@@ -185,7 +185,7 @@ def _edge(
     return _Edge(*names, mean, weight * max(float(agrees.mean()), 0.01), turned)
 
 
-def _apart(T: Floats, distance_m: float) -> Floats:
+def _pose_distances(T: Floats, distance_m: float) -> Floats:
     """(N, N) rotation between each two transforms, radians, plus translation over a distance."""
     R, t = T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]
     cosine = (R @ R.T - 1) / 2

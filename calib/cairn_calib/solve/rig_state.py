@@ -76,7 +76,7 @@ def parameter_layout(
     """Positions of all free parameters; `bias_names` are owner and name of those of the range bias."""
     names: list[tuple[str, str]] = []
 
-    def placed(owner: str, added: Sequence[str]) -> Indices:
+    def claim(owner: str, added: Sequence[str]) -> Indices:
         names.extend((owner, name) for name in added)
         return np.arange(len(names) - len(added), len(names))
 
@@ -86,10 +86,10 @@ def parameter_layout(
         every = lenses[name].intrinsic_names
         free = [each for each in every if each in ("fx", "fy", "cx", "cy", *camera.coefficients)]
         columns.append(np.array([every.index(each) for each in free], np.intp))
-        intrinsic_at.append(placed(name, free))
-        pose_at.append(placed(name, [] if name == plan.gauge else list(POSE_UNITS)))
-    warp_at = placed(SHARED, WARP if plan.warp else ())
-    scale_at = placed(SHARED, (SCALE,) if plan.pitch_sigma > 0 else ())
+        intrinsic_at.append(claim(name, free))
+        pose_at.append(claim(name, [] if name == plan.gauge else list(POSE_UNITS)))
+    warp_at = claim(SHARED, WARP if plan.warp else ())
+    scale_at = claim(SHARED, (SCALE,) if plan.pitch_sigma > 0 else ())
     start = len(names)
     names.extend(bias_names)
     return ParameterLayout(

@@ -104,7 +104,7 @@ def _solve_corners(views: BoardViews, plan: SolvePlan, state: RigState, scales: 
         sensors.append(Sensor(data, scales[name] if plan.noise.rounds else 1.0, data.seen))
     layout = parameter_layout(plan, dict(zip(plan.cameras, state.lenses, strict=True)), [])
     priors = _priors(views, plan, state, ranges=None)
-    return _adjusted(
+    return _adjust(
         AdjustmentProblem(views.board, layout, tuple(sensors), priors), replace(state, bias=np.zeros(0)), plan
     )
 
@@ -120,7 +120,7 @@ def _solve_ranges(
     ranged = ranged.with_terms(terms, state.lenses[ranged.camera])
     sensors = (*by_corners.problem.sensors, Sensor(ranged, 1.0, ranged.measured))
     problem = AdjustmentProblem(board, layout, sensors, priors)
-    return _adjusted(problem, replace(state, bias=np.zeros(len(terms.names))), plan)
+    return _adjust(problem, replace(state, bias=np.zeros(len(terms.names))), plan)
 
 
 def _solve_nodes(adjusted: Adjustment, plan: SolvePlan) -> Adjustment:
@@ -154,7 +154,7 @@ def _with_pixels(solution: Solution) -> Solution:
     return replace(solution, pattern=pattern)
 
 
-def _adjusted(problem: AdjustmentProblem, state: RigState, plan: SolvePlan) -> Adjustment:
+def _adjust(problem: AdjustmentProblem, state: RigState, plan: SolvePlan) -> Adjustment:
     try:
         return adjust(problem, state, plan.noise)
     except np.linalg.LinAlgError as exc:

@@ -85,11 +85,11 @@ def _guesses(homographies: Sequence[Floats], size_px: tuple[int, int]) -> Iterat
     width, height = size_px
     middle = np.array([width - 1, height - 1]) / 2
     found = False
-    full = _zhang(homographies, middle, width)
+    full = _zhang_matrix(homographies, middle, width)
     if full is not None and np.all(np.abs(full[:2, 2] - middle) < OFF_CENTRE * np.array(size_px)):
         found = True
         yield full
-    centred = _centred(homographies, middle)
+    centred = _centred_matrix(homographies, middle)
     if centred is not None and SANE[0] < centred[0, 0] / width < SANE[1]:
         found = True
         yield centred
@@ -97,7 +97,7 @@ def _guesses(homographies: Sequence[Floats], size_px: tuple[int, int]) -> Iterat
         yield _matrix(share * width, share * width, *middle)
 
 
-def _zhang(homographies: Sequence[Floats], middle: Floats, width: int) -> Floats | None:
+def _zhang_matrix(homographies: Sequence[Floats], middle: Floats, width: int) -> Floats | None:
     """Camera matrix with fx, fy, cx and cy, from three views or more; None where they come out impossible."""
     if len(homographies) < 3:
         return None
@@ -129,7 +129,7 @@ def _conic_row(a: Floats, b: Floats) -> Floats:
     return np.array([a[0] * b[0], a[1] * b[1], a[0] * b[2] + a[2] * b[0], a[1] * b[2] + a[2] * b[1], a[2] * b[2]])
 
 
-def _centred(homographies: Sequence[Floats], middle: Floats) -> Floats | None:
+def _centred_matrix(homographies: Sequence[Floats], middle: Floats) -> Floats | None:
     """Camera matrix with one focal length and the principal point in the middle, from one tilted view on."""
     rows, right = [], []
     for H in homographies:

@@ -15,7 +15,7 @@ from cairn_calib.diagnosis.examination import Examination, examine
 from cairn_calib.diagnosis.next_image import NextImage
 from cairn_calib.diagnosis.probe_points import probes_of
 from cairn_calib.diagnosis.solve_warnings import SolveWarning, refuse_undetermined, warnings_of
-from cairn_calib.diagnosis.view_coverage import coverage
+from cairn_calib.diagnosis.view_statistics import coverage
 from cairn_calib.diagnosis.world_uncertainty import pixel_covariance, world_covariance
 from cairn_calib.rig.projection_uncertainty import project_certain, transfer_certain
 from cairn_calib.solve.board_views import BoardView

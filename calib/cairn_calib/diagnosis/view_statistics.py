@@ -1,4 +1,4 @@
-"""Coverage of each camera's image and distances by the boards."""
+"""Statistics of views: coverage of each camera by the boards, and the residuals of each image's corners."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,10 @@ import numpy.typing as npt
 
 from cairn_calib.rig.poses import inverse
 from cairn_calib.solve.camera_alone import tilt_range_deg
+from cairn_calib.solve.corner_residuals import CornerData, corner_misses
+from cairn_calib.solve.rig_state import warp_shape
 from cairn_calib.solve.solution import Solution
+from cairn_map.arrays import Floats
 
 CELLS = (8, 6)
 """Columns and rows into which an image is divided."""
@@ -26,8 +29,9 @@ class Coverage:
     tilt_deg: float
     """Largest angle between two boards."""
     nearest_m: float
+    """Distance of the nearest board's middle."""
     farthest_m: float
-    """Distances of the boards' middles."""
+    """Distance of the farthest board's middle."""
 
     @property
     def cell_share(self) -> float:
@@ -58,3 +62,52 @@ def coverage(solution: Solution, camera: str) -> Coverage:
         float(distances.min()),
         float(distances.max()),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class ViewResiduals:
+    """Residuals of one image."""
+
+    camera: str
+    frame: str
+    image: str
+    pixels: Floats
+    """(M, 2) corners that were found."""
+    misses_px: Floats
+    """(M, 2) predicted minus found."""
+    kept: npt.NDArray[np.bool_]
+    """(M,) True for each corner that counts."""
+
+    @property
+    def outliers(self) -> int:
+        """Number of corners that were left out."""
+        return int(np.sum(~self.kept))
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square of one axis, over the corners that count."""
+        return float(np.sqrt(np.mean(self.misses_px[self.kept] ** 2))) if self.kept.any() else float("nan")
+
+
+def view_residuals(solution: Solution) -> list[ViewResiduals]:
+    """Residuals of every image, by camera and frame."""
+    board = (solution.views.board.points(), warp_shape(solution.views.board))
+    result = []
+    for sensor in solution.adjusted.problem.sensors:
+        if not isinstance(sensor.data, CornerData):
+            continue
+        misses = corner_misses(sensor.data, solution.state, *board)
+        views = solution.views.of_camera(solution.views.cameras[sensor.data.camera])
+        for n, view in enumerate(views):
+            seen = sensor.there[n]
+            result.append(
+                ViewResiduals(
+                    view.camera,
+                    view.frame,
+                    view.image,
+                    sensor.data.pixels[n, seen],
+                    misses[n, seen],
+                    sensor.kept[n, seen],
+                )
+            )
+    return result
