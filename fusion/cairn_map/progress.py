@@ -1,14 +1,15 @@
-"""Progress of a long command on standard error: bars, a spinner, and a line that is written again and again.
+"""Progress of a long command on standard error: bars, spinners, and a line that is written again and again.
 
     images ━━━━━━━━━━━━━━━━━━━━ 12/12 0:00:03 0:00:00          with_progress, with_passing_progress
-    checking cells: 40 %                                       PercentLine
+    ⠋ lab.bag: 4120 messages 0:00:02                           counting
+    check: 40 %                                                PercentLine
 
 On a terminal, bars and lines change in place; in a log, lines come every few seconds.
 """
 
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TextIO, TypeVar
 
@@ -43,6 +44,17 @@ def while_working(what: str) -> Iterator[None]:
         return
     with console.status(what):
         yield
+
+
+@contextmanager
+def counting(what: str, unit: str) -> Iterator[Callable[[], None]]:
+    """A spinner with a count of unknown end; call the function that it gives once for each unit."""
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn(f"{{task.description}}: {{task.completed:.0f}} {unit}"), TimeElapsedColumn())
+    with Progress(*columns, console=_console()) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda: bar.advance(task)
 
 
 class StatusLine:

@@ -4,7 +4,15 @@ import io
 
 import pytest
 
-from cairn_map.progress import CLEAR_LINE, PercentLine, StatusLine, while_working, with_passing_progress, with_progress
+from cairn_map.progress import (
+    CLEAR_LINE,
+    PercentLine,
+    StatusLine,
+    counting,
+    while_working,
+    with_passing_progress,
+    with_progress,
+)
 
 
 class Terminal(io.StringIO):
@@ -45,3 +53,10 @@ def test_a_percentage_comes_at_once_on_a_terminal_and_not_before_seconds_in_a_lo
         percent.finish()
     assert terminal.getvalue() == f"{CLEAR_LINE}check: 33 %{CLEAR_LINE}"
     assert log.getvalue() == ""
+
+
+def test_a_count_of_unknown_end_is_given_a_unit_at_a_time(capsys: pytest.CaptureFixture[str]) -> None:
+    with counting("lab.bag", "messages") as one:
+        for _ in range(3):
+            one()
+    assert "lab.bag: 3 messages" in capsys.readouterr().err

@@ -26,7 +26,7 @@ AddParser: TypeAlias = Callable[[Subparsers], None]
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser whose help, and that of its subcommands, is shown as written, and ends with the exit codes.
+    """A parser whose help, and that of its subcommands, is printed as written, and ends with the exit codes.
 
     It takes `-1,0,0` and `-5:40` for values, where argparse by itself does so with `-1` alone.
     """

@@ -27,7 +27,9 @@ def main(argv: list[str]) -> int:
     """Call every installed package's warm-up function, or those of the named ones."""
     options = parser("cairn compile", __doc__)
     known = [point.name for point in entry_points(group=GROUP)]
-    options.add_argument("packages", nargs="*", metavar="PACKAGE", help=f"of {', '.join(sorted(known))}; or all")
+    options.add_argument(
+        "packages", nargs="*", metavar="PACKAGE", help=f"one or more of {', '.join(sorted(known))} (all)"
+    )
     wanted = options.parse_args(argv).packages or known
     if unknown := set(wanted) - set(known):
         options.error(f"no package {', '.join(sorted(unknown))} has kernels; these have: {', '.join(sorted(known))}")

@@ -14,9 +14,9 @@
     ok    token         no token: map lab may be read; 34 cells, 15 commits
     ok    speed         48.1 MB/s down: a cell of 212.0 kB in 4 ms
 
-Without an argument, the installation alone; with a server's or a map's URL, the way there as well; with a state folder
-(of a robot, or of `cairn clone`), what is in it, and of a copy the way to its server. A line that is
-not `ok` has the next step below it. The exit code is 0 if nothing failed (there may be warnings), else 1.
+Without an argument the installation alone is checked; with a server's or a map's URL, the way there as well; with a
+state folder (of a robot, or of `cairn clone`), its content, and of a copy the way to its server. A line that is not
+`ok` has the next step below it. The exit code is 0 if nothing failed (there may be warnings), else 1.
 """
 
 import json

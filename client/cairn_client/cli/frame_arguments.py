@@ -8,7 +8,7 @@ from cairn_fusion.recording.frame_folder import FrameFolderOptions, PoseConventi
 from cairn_fusion.recording.recording_format import Convention
 from cairn_map.errors import BadInputError
 
-TEXT = """Any folder with one file per frame and image: give --depth, --pose and --intrinsics, and what else there is.
+TEXT = """Any folder with one file per frame and image: give --depth, --pose, --intrinsics, and options of other images.
 Patterns are relative to the folder and hold {id}, e.g. --depth 'frames/{id}.depth.png' --pose 'frames/{id}.pose.txt'.
 All images must be one raster (registered); a pose is a 4x4 matrix in text, without {id} one file for all frames."""
 OPTIONS = (
@@ -30,8 +30,8 @@ def add_frame_arguments(command: argparse.ArgumentParser) -> None:
     group.add_argument("--depth-units", type=float, metavar="N", help="depth units in a metre (1000)")
     group.add_argument("--depth-convention", choices=[c.value for c in Convention], help="along z or the beam (z)")
     group.add_argument("--pose-convention", choices=[c.value for c in PoseConvention], help="(camera_to_map)")
-    group.add_argument("--kelvin-per-count", type=float, metavar="K", help="of the thermal image (0.01)")
-    group.add_argument("--kelvin-at-zero", type=float, metavar="K", help="of the thermal image (0)")
+    group.add_argument("--kelvin-per-count", type=float, metavar="K", help="scale of the thermal image (0.01)")
+    group.add_argument("--kelvin-at-zero", type=float, metavar="K", help="offset of the thermal image (0)")
     group.add_argument("--frame-rate", type=float, metavar="HZ", help="frames in a second (1)")
     command.add_argument("--frames", type=lambda text: text.split(","), metavar="ID,ID,...", help="only these frames")
 

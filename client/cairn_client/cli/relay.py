@@ -1,6 +1,6 @@
 """Carry signed commits between servers that do not reach each other.
 
-    $ cairn relay http://field:8750/maps/lab ./carried        # at the field server: what it has
+    $ cairn relay http://field:8750/maps/lab ./carried        # at the field server: take its commits along
     map lab: 12 commits to ./carried, 0 from there
     $ cairn relay ./carried http://base:8750/maps/lab         # at the base, days later
     map lab: 12 commits to http://base:8750/maps/lab, 3 from there
@@ -82,7 +82,7 @@ def _once(here: MapEnd, there: MapEnd, resting: Resting, *, map_name: str, where
         total.kept_back |= report.kept_back
         total.refused += report.refused
         error = report.cut or report.later
-        if error:  # a commit at which this comes twice rests, so that what follows it has its turn
+        if error:  # a commit at which this happens twice rests, so that the next ones have their turn
             cuts = 1 if any(report.moved.values()) or error.kind == CAME_IN_PART else cuts + 1
             if cuts == CUTS_MAX or (error.retry_after_s or 0.0) > WAIT_MAX_S:
                 raise error
@@ -106,14 +106,16 @@ def _parser() -> argparse.ArgumentParser:
     added = parser("cairn relay", __doc__)
     added.add_argument("here", metavar="PLACE", help="a map's URL (http://HOST:PORT/maps/NAME) or a folder")
     added.add_argument("there", metavar="PLACE", help="another one")
-    added.add_argument("--token", default=os.environ.get(TOKENS[0]), help=f"of the first place (${TOKENS[0]})")
-    added.add_argument("--token-there", default=os.environ.get(TOKENS[1]), help=f"of the second (${TOKENS[1]})")
-    added.add_argument("--every", type=float, metavar="SECONDS", help="go on, with such a pause; without it: once")
+    added.add_argument("--token", default=os.environ.get(TOKENS[0]), help=f"token of the first place (${TOKENS[0]})")
+    added.add_argument(
+        "--token-there", default=os.environ.get(TOKENS[1]), help=f"token of the second place (${TOKENS[1]})"
+    )
+    added.add_argument("--every", type=float, metavar="SECONDS", help="go on, with this pause between rounds (once)")
     added.add_argument(
         "--folder-mb",
         type=float,
         default=FOLDER_MB,
         metavar="MB",
-        help=f"of a folder; when it is full, the oldest commits in it give way ({FOLDER_MB:.0f})",
+        help=f"size of a folder; when it is full, its oldest commits are dropped ({FOLDER_MB:.0f})",
     )
     return added

@@ -24,7 +24,10 @@ def add_amount(command: argparse.ArgumentParser) -> None:
     """Add options that bound the part of the map that is fetched, and the token."""
     command.add_argument("--box", type=box, metavar="X0,Y0,Z0,X1,Y1,Z1", help="fetch only cells in it, metres")
     command.add_argument(
-        "--reply-bytes", type=int, metavar="BYTES", help="of cells in one reply; the rest comes in the next ones"
+        "--reply-bytes",
+        type=int,
+        metavar="BYTES",
+        help="most bytes of cells in one reply; the rest comes in the next ones",
     )
     command.add_argument(
         "--link",
@@ -45,15 +48,15 @@ def scope_of(args: argparse.Namespace, mode: Mode) -> Scope:
 def add_limits(command: argparse.ArgumentParser) -> None:
     """Add options that bound what the robot keeps, in megabytes (10^6 bytes)."""
     for name, what in (
-        ("disk", "of the robot's file: then the server's farthest cells go"),
-        ("memory", "of the map in memory: likewise"),
-        ("outbox", "of commits that the server does not have for good: then no more are taken"),
+        ("disk", "size of the robot's file, above which the server's farthest cells are dropped"),
+        ("memory", "size of the map in memory, above which the server's farthest cells are dropped"),
+        ("outbox", "size of commits that the server does not have for good, above which no more are made"),
     ):
         command.add_argument(f"--{name}-max", type=float, metavar="MB", help=f"{what} (no limit)")
 
 
 def limits_of(args: argparse.Namespace) -> Limits:
-    """The limits that were given."""
+    """The limits that the options give."""
     disk, memory, outbox = (
         None if megabytes is None else round(megabytes * 1e6)
         for megabytes in (args.disk_max, args.memory_max, args.outbox_max)
@@ -81,8 +84,12 @@ def box(text: str) -> tuple[float, ...]:
 def add_spread_arguments(options: argparse.ArgumentParser) -> None:
     """Add `--sigma` and `--covariance`, of which one at most is given."""
     certain = options.add_mutually_exclusive_group()
-    certain.add_argument("--sigma", type=_sigma, default=(0.0, 0.0), metavar="M,DEG", help="of the pose (0,0)")
-    certain.add_argument("--covariance", type=_numbers, metavar="N,N,...", help="of the pose, 21 numbers: see above")
+    certain.add_argument(
+        "--sigma", type=_sigma, default=(0.0, 0.0), metavar="M,DEG", help="standard deviations of the pose (0,0)"
+    )
+    certain.add_argument(
+        "--covariance", type=_numbers, metavar="N,N,...", help="covariance of the pose, 21 numbers: see above"
+    )
 
 
 def spread_of(args: argparse.Namespace) -> PoseSpread:

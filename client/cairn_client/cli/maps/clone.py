@@ -18,11 +18,11 @@ from cairn_client.http.map_url import split_map_url
 
 
 def main(argv: list[str]) -> int:
-    """Clone."""
+    """Make the copy."""
     command = parser("cairn clone", __doc__)
     command.add_argument("url", help="http://HOST:PORT/maps/NAME")
     command.add_argument("folder", type=Path, nargs="?", metavar="DIR", help="new folder (the map's name)")
-    command.add_argument("--name", help="of this copy among the map's robots (copy-RANDOM)")
+    command.add_argument("--name", help="name of this copy among the map's robots (copy-RANDOM)")
     command.add_argument("--json", action="store_true", help="print JSON")
     add_token(command)
     args = command.parse_args(argv)

@@ -14,7 +14,7 @@
 
 A map's URL is http://HOST:PORT/maps/NAME. A retract takes exactly the evidence of the named commits out again, on
 the server and on every robot; everything else stays as it is. Results go to standard output, progress to standard
-error; --json prints what programs want.
+error; --json prints JSON for programs.
 """
 
 import argparse

@@ -46,7 +46,7 @@ def add_export_parser(commands: Subparsers) -> None:
     export.add_argument("--npz", type=Path, metavar="FILE", help="all known voxels as NumPy arrays")
     export.add_argument("--picture", type=Path, metavar="FILE", help="PNG: colour, temperature, probability")
     export.add_argument(
-        "--ceiling", type=float, metavar="METRES", help="leave out what is higher; with --picture, of the picture alone"
+        "--ceiling", type=float, metavar="METRES", help="leave out higher voxels; with --picture, in the picture alone"
     )
     _add_part_arguments(export)
 
@@ -58,15 +58,16 @@ def _add_part_arguments(export: argparse.ArgumentParser) -> None:
     export.add_argument("--ot", type=Path, metavar="FILE", help="OctoMap's octree with probability and colour")
     export.add_argument("--bt", type=Path, metavar="FILE", help="OctoMap's octree of occupied or not, small")
     part = export.add_argument_group(
-        "a part", "of what is occupied, as the console shows it: made by the server, as x, y, z, colour, p, temperature"
+        "a part",
+        "of the occupied space, as the console shows it: made by the server, as x, y, z, colour, p, temperature",
     )
     part.add_argument(
         "--box", type=str.strip, metavar="X,Y,Z,X,Y,Z", help="lowest and highest corner, metres: --box=0,0,0,8,6,3"
     )
-    part.add_argument("--floor", type=float, metavar="METRES", help="leave out what is lower")
+    part.add_argument("--floor", type=float, metavar="METRES", help="leave out lower voxels")
     part.add_argument("--p", type=float, metavar="P", help="least probability, 0 to 1")
-    part.add_argument("--hotter", type=float, metavar="CELSIUS", help="only what has a voxel as hot as this")
-    part.add_argument("--colder", type=float, metavar="CELSIUS", help="only what is as cold as this in the mean")
+    part.add_argument("--hotter", type=float, metavar="CELSIUS", help="only nodes with a voxel as hot as this")
+    part.add_argument("--colder", type=float, metavar="CELSIUS", help="only nodes as cold as this in the mean")
     part.add_argument("--depth", type=int, metavar="N", help="octree depth: fewer, larger nodes (that of voxels)")
 
 
@@ -93,7 +94,7 @@ def _get(args: argparse.Namespace) -> int:
 
 
 def _export(args: argparse.Namespace) -> int:
-    """Download all cells, and write what was asked for."""
+    """Download all cells, and write the files that the options name."""
     if _is_part(args):
         _check_outputs(*(getattr(args, form) for form in FORMATS))
         api, name = api_of(args.map, args.token)
@@ -208,7 +209,7 @@ def export_points(api: MapApi, name: str, asked: ExportRequest, path: Path) -> i
 
     Raises:
         UnreachableError: the link broke.
-        BadInputError: the server refuses what is asked for.
+        BadInputError: the server refuses the request.
     """
     query = urlencode(asked.model_dump(mode="json", exclude_none=True))
     part = path.with_name(f"{path.name}.part")

@@ -1,13 +1,13 @@
-"""`cairn map log`: what was folded and taken out, as a list or as a graph: lines from each entry to those it hangs on.
+"""`cairn map log`: commits folded and taken out, as a list, or as a graph with lines to the entries they depend on.
 
 *       1  +  mole.0123456789abcdef.0
 *       2  +  mole.0123456789abcdef.1         its author's last commit
 │ *     3  +  operator.89abcdef01234567.0     retracts mole.0123456789abcdef.1
-x─╯     4  -  mole.0123456789abcdef.1         what is taken out, and the retract that does it
+x─╯     4  -  mole.0123456789abcdef.1         taken out, by the retract above
 
 `draw` makes the lines of any graph of commits, one row each, oldest first, in lanes next to them:
 
-    draw([[1], [2], [3, 1], [4, 2, 3]])         a node, then the earlier ones that it hangs on
+    draw([[1], [2], [3, 1], [4, 2, 3]])         a node, then the earlier ones that it depends on
 
     *        1
     │ *      2
@@ -36,12 +36,12 @@ CROSSED = {" ": "─", "│": "┼", "╮": "┬", "╯": "┴", "┤": "┼", "
 
 def add_parser(commands: Subparsers) -> None:
     """Add the subcommand."""
-    text = "what was folded and taken out, oldest first"
+    text = "commits folded and taken out, oldest first"
     listing = add_map_parser(commands, "log", _log, text=text)
     listing.add_argument("--json", action="store_true", help="print JSON")
     listing.add_argument("--after", type=int, default=0, metavar="SEQ", help="entries after this one (0)")
-    listing.add_argument("--limit", type=int, default=100, help="at most so many (100)")
-    listing.add_argument("--graph", action="store_true", help="lines from each commit to those that it hangs on")
+    listing.add_argument("--limit", type=int, default=100, help="most entries (100)")
+    listing.add_argument("--graph", action="store_true", help="lines from each commit to those that it depends on")
 
 
 def _log(args: argparse.Namespace) -> int:
@@ -85,8 +85,8 @@ def draw(graph: Sequence[Sequence[int]], marks: Mapping[int, str] | None = None)
     """One row of lines for each node, in the order given.
 
     Args:
-        graph: for each node its number and those of earlier ones that it hangs on; unknown ones are left out.
-        marks: what stands for a node, if not `*`.
+        graph: for each node its number and those of earlier ones that it depends on; unknown ones are left out.
+        marks: the character of a node, if not `*`.
     """
     known = {node for node, *_ in graph}
     lanes: list[int | None] = []
@@ -99,7 +99,7 @@ def draw(graph: Sequence[Sequence[int]], marks: Mapping[int, str] | None = None)
 
 
 def _row(lanes: list[int | None], node: int, edges: list[int], mark: str) -> str:
-    """The row of one node; `lanes` becomes what it is above the row."""
+    """The row of one node; `lanes` is changed to the lanes above the row."""
     before = list(lanes)
     mine = [lane for lane, waits in enumerate(lanes) if waits == node]
     here = mine[0] if mine else _free(lanes)
@@ -145,9 +145,9 @@ def _free(lanes: list[int | None]) -> int:
 
 
 def graph_of(entries: Sequence[LogEntry]) -> list[list[int]]:
-    """For each entry its seq and those that it hangs on.
+    """For each entry its seq and those of the entries that it depends on.
 
-    A commit hangs on its parent; what is taken out on the commit that was, and on the one that retracts it.
+    A commit depends on its parent; an entry that takes a commit out on that commit, and on the one that retracts it.
     """
     folded: dict[str, int] = {}
     by_sha: dict[str, int] = {}

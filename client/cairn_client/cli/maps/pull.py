@@ -17,7 +17,7 @@ from cairn_client.folders.map_copy import pull
 
 
 def main(argv: list[str]) -> int:
-    """Pull."""
+    """Bring the copy up to date."""
     command = parser("cairn pull", __doc__)
     command.add_argument("folder", type=Path, nargs="?", default=Path(), metavar="DIR", help="the copy (here)")
     command.add_argument("--json", action="store_true", help="print JSON")

@@ -5,15 +5,15 @@
          x m     y m     z m  state     probability  colour        intensity  temperature
        1.020   2.500   0.400  occupied         0.97  (180 92 40)      1210.0  57.3 C +- 0.4
       -0.300   0.000   1.000  unknown             -  -                     -  -
-    $ cairn map query lab/ ray 1,2,0.4 0,1,0 --range 10      # what is in the way, and how far
+    $ cairn map query lab/ ray 1,2,0.4 0,1,0 --range 10      # the first obstacle, and its distance
     $ cairn map query lab/ nearest 1,2,0.4 --radius 3         # the nearest occupied voxel (--unknown: unknown)
     $ cairn map query lab/ hottest --count 5                  # where it is hot
     $ cairn map query lab/ slice 0.5                          # a horizontal layer: # occupied, . free
     $ cairn map query lab/ height --box=-5,-5,0,5,5,2         # the highest surface of each column, metres
 
-The folder is what `cairn map export --cells` wrote, or the state folder of a robot that is not running. All lengths are
-metres in the map's frame, temperatures degrees Celsius here and kelvin in JSON; what is unknown is `-`, in JSON null.
---json prints what programs want; `slice` and `height` then give all pixels, rows along y and columns along x.
+The folder is one of `cairn map export --cells`, or the state folder of a robot that is not running. All lengths are
+metres in the map's frame, temperatures degrees Celsius here and kelvin in JSON; unknown values are `-`, in JSON null.
+--json prints JSON for programs; `slice` and `height` then give all pixels, rows along y and columns along x.
 """
 
 import argparse
@@ -61,11 +61,13 @@ def add_parser(commands: Subparsers) -> None:
     points.add_argument("points", nargs="+", type=place, metavar="X,Y,Z", help="metres, map frame")
     ray = question("ray", "the first occupied voxel along a ray", _ray)
     ray.add_argument("origin", type=place, metavar="X,Y,Z", help="metres, map frame")
-    ray.add_argument("direction", type=place, metavar="DX,DY,DZ", help="of any length")
-    ray.add_argument("--range", type=float, default=math.inf, metavar="METRES", help="at most (as far as the map goes)")
+    ray.add_argument("direction", type=place, metavar="DX,DY,DZ", help="direction, of any length")
+    ray.add_argument(
+        "--range", type=float, default=math.inf, metavar="METRES", help="longest distance (as far as the map goes)"
+    )
     nearest = question("nearest", "the nearest occupied voxel of points", _nearest)
     nearest.add_argument("points", nargs="+", type=place, metavar="X,Y,Z", help="metres, map frame")
-    nearest.add_argument("--radius", type=float, default=5.0, metavar="METRES", help="look so far (5)")
+    nearest.add_argument("--radius", type=float, default=5.0, metavar="METRES", help="longest distance (5)")
     nearest.add_argument("--unknown", action="store_true", help="the nearest unknown voxel instead")
     hottest = question("hottest", "the occupied voxels with the highest temperature", _hottest)
     hottest.add_argument("--count", type=int, default=10, help="how many (10)")

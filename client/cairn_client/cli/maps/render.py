@@ -51,19 +51,21 @@ def add_parser(commands: Subparsers) -> None:
         "--npz",
         type=Path,
         metavar="FILE",
-        help="the values as arrays; with --over, `modes` tells where the image shows what the map does",
+        help="the values as arrays; with --over also `modes`, the agreement of image and map at each pixel",
     )
     render.add_argument("--from", dest="eye", type=place, metavar="X,Y,Z", help="where the eye is, metres, map frame")
-    render.add_argument("--to", dest="target", type=place, metavar="X,Y,Z", help="what is in the middle of the picture")
+    render.add_argument(
+        "--to", dest="target", type=place, metavar="X,Y,Z", help="the place in the middle of the picture"
+    )
     render.add_argument("--size", type=_size, default=(640, 480), metavar="WxH", help="pixels (640x480)")
-    render.add_argument("--fov", type=float, default=70.0, metavar="DEG", help="across the picture (70)")
+    render.add_argument("--fov", type=float, default=70.0, metavar="DEG", help="field of view across the picture (70)")
     render.add_argument("--layer", type=Layer, choices=list(Layer), default=Layer.TEMPERATURE, help="(temperature)")
     render.add_argument("--low", type=float, help="lower end of the scale (10 deg C)")
     render.add_argument("--high", type=float, help="upper end of the scale (50 deg C)")
-    render.add_argument("--range", type=float, default=20.0, metavar="METRES", help="look so far (20)")
-    render.add_argument("--over", metavar="RECORDING", help="draw over what a camera saw: a recording's folder")
-    render.add_argument("--scan", type=int, default=0, metavar="N", help="which of its scans (0)")
-    render.add_argument("--camera", metavar="NAME", help="which of its colour cameras (the first)")
+    render.add_argument("--range", type=float, default=20.0, metavar="METRES", help="longest range of sight (20)")
+    render.add_argument("--over", metavar="RECORDING", help="draw over a camera's image: a recording's folder")
+    render.add_argument("--scan", type=int, default=0, metavar="N", help="number of the scan (0)")
+    render.add_argument("--camera", metavar="NAME", help="name of the colour camera (the first)")
     add_spread_arguments(render)
     add_token(render)
     render.set_defaults(run=_run)

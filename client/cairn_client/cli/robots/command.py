@@ -10,14 +10,14 @@
     $ cairn robot sync mole/ --map http://127.0.0.1:8750/maps/shelf --mode low-end --near 4,2,0
 
 `replay` reads a recording folder (RECORDING.md), a bag of ROS 1 or ROS 2 (.bag, .mcap, .db3; `cairn robot inspect`
-says what is in it and proposes --topics), a known layout as it was published (apc_shelf_rgbd, mm5_rgbdt), or any
-folder of frames that options describe (--depth, --pose, --intrinsics, ...: `cairn robot replay --help`). It maps as a
-live robot would: each measurement becomes a commit, first kept in the state folder, then pushed.
-Without a link it goes on, and the next `replay` or `sync` with the same state folder pushes what waits. Two robots
-can share a recording: --share 1/2 takes every second measurement from the first on, --share 2/2 the others.
+lists its topics and proposes --topics), a known layout as it was published (apc_shelf_rgbd, mm5_rgbdt), or any folder
+of frames that options describe (--depth, --pose, --intrinsics, ...: `cairn robot replay --help`). It maps as a live
+robot would: each measurement becomes a commit, first kept in the state folder, then pushed. Without a link it goes on,
+and the next `replay` or `sync` with the same state folder pushes the commits that wait. Two robots can share a
+recording: --share 1/2 takes every second measurement from the first on, --share 2/2 the others.
 
-`sync` pushes what waits in a robot's folder and fetches what it misses, or makes a new folder of the map at --map. With
---mode low-end it fetches whole cells instead of differences, on request only those around a place (--near X,Y,Z
+`sync` pushes the commits that wait in a robot's folder and fetches changes, or makes a new folder of the map at --map.
+With --mode low-end it fetches whole cells instead of differences, on request only those around a place (--near X,Y,Z
 --radius METRES). For a copy to look at, there are `cairn clone` and `cairn pull`, which push nothing and need no robot.
 
 `replay`, `run` and `sync` can fetch a part of the map: --box X0,Y0,Z0,X1,Y1,Z1 (metres in the map's frame) only the

@@ -1,4 +1,4 @@
-"""`cairn robot inspect`: what is in a bag of ROS, and which of its topics to map."""
+"""`cairn robot inspect`: the topics of a bag of ROS, and a proposal of those to map."""
 
 import argparse
 import json
@@ -7,11 +7,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
 from cairn_client.cli.arguments import Subparsers, say, shown_bytes
 from cairn_map.errors import ConflictError
+from cairn_map.progress import counting
 
 if TYPE_CHECKING:
     from cairn_fusion.ros.bag_index import TopicIndex
@@ -23,8 +21,8 @@ that says which of them are depth, colour, thermal images and poses. It needs no
     $ cairn robot inspect lab.bag --output lab.yaml
     $ cairn robot replay lab.bag --topics lab.yaml --map URL --voxel 0.04
 
-What the file cannot know stands in its head as `DECIDE`; `replay` without --topics works where nothing is left to
-decide."""
+Facts that a bag does not hold stand at the head of the file as `DECIDE`; `replay` without --topics works where there is
+nothing to decide."""
 
 
 def _inspect(args: argparse.Namespace) -> int:
@@ -32,10 +30,8 @@ def _inspect(args: argparse.Namespace) -> int:
 
     if args.output is not None and args.output.exists() and not args.force:
         raise ConflictError("file_exists", f"{args.output} exists; --force writes over it")
-    columns = (SpinnerColumn(), TextColumn("{task.description}: {task.completed:.0f} messages"), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task(args.bag.name, total=None)
-        found = survey(args.bag, on_message=lambda: bar.advance(task))
+    with counting(args.bag.name, "messages") as on_message:
+        found = survey(args.bag, on_message=on_message)
     if args.output is not None:
         args.output.write_text(found.proposal.text, encoding="utf-8")
     if args.json:
@@ -118,7 +114,7 @@ def add_parser(commands: Subparsers) -> None:
     """Add the subcommand."""
     inspect = commands.add_parser(
         "inspect",
-        help="what is in a bag of ROS, and what to map of it",
+        help="list the topics of a bag of ROS, and propose those to map",
         description=TEXT,
     )
     inspect.add_argument("bag", type=Path, help="FILE.bag, FILE.mcap, FILE.db3, or a folder of rosbag2")

@@ -125,7 +125,7 @@ def _try_sync(robot: Robot) -> bool:
     except UnreachableError:
         return False
     except DamagedDataError as exc:
-        log.error("%s", exc.message)  # mapping goes on: what is sound came, and own commits are pushed
+        log.error("%s", exc.message)  # mapping goes on: sound cells have come, and own commits are pushed
     return True
 
 
@@ -178,20 +178,22 @@ def add_parser(commands: Subparsers) -> None:
     replay = commands.add_parser("replay", help="map a recording", description="map a recording")
     add_map(replay)
     replay.add_argument("recording", type=Path, help="recording folder, known published layout, or bag of ROS")
-    replay.add_argument("--topics", type=Path, metavar="YAML", help="which topics of a bag are what; see inspect")
+    replay.add_argument("--topics", type=Path, metavar="YAML", help="meaning of a bag's topics; see inspect")
     replay.add_argument("--voxel", type=float, metavar="METRES", help="make the map with this voxel edge if needed")
-    replay.add_argument("--again", action="store_true", help="replay what this robot has replayed before once more")
+    replay.add_argument(
+        "--again", action="store_true", help="replay a recording once more that this robot has replayed"
+    )
     replay.add_argument("--share", type=_share, default=(1, 1), metavar="I/N", help="every N-th measurement from I on")
     replay.add_argument("--scans-per-measurement", type=int, metavar="N", help="regroup the scans")
     replay.add_argument(
-        "--min-range", type=float, default=Integrator().min_range_m, metavar="METRES", help="ignore what is nearer"
+        "--min-range", type=float, default=Integrator().min_range_m, metavar="METRES", help="ignore nearer ranges"
     )
     replay.add_argument(
         "--max-range",
         type=float,
         default=Integrator().max_range_m,
         metavar="METRES",
-        help="ignore what is farther (10)",
+        help="ignore farther ranges (10)",
     )
     replay.add_argument("--state", type=Path, metavar="DIR", help="the robot's folder (cairn-NAME)")
     replay.add_argument("--mode", choices=("high-end", "low-end"), default="high-end")

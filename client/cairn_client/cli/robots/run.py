@@ -44,7 +44,7 @@ FLUSH_S = 8.0
 
 @dataclass(slots=True)
 class _Tally:
-    """Counts of what was mapped."""
+    """Counts of scans and commits."""
 
     scans: int = 0
     commits: int = 0
@@ -52,36 +52,38 @@ class _Tally:
 
 def add_parser(commands: Subparsers) -> None:
     """Add the subcommand."""
-    run = commands.add_parser("run", help="map what comes into a folder, until a signal", description=__doc__)
+    run = commands.add_parser(
+        "run", help="map the recordings that come into a folder, until a signal", description=__doc__
+    )
     run.add_argument("spool", type=Path, metavar="SPOOL", help="the folder that recordings come into")
     add_map(run)
     run.add_argument("--voxel", type=float, metavar="METRES", help="make the map with this voxel edge if needed")
     run.add_argument(
-        "--min-range", type=float, default=Integrator().min_range_m, metavar="METRES", help="ignore nearer"
+        "--min-range", type=float, default=Integrator().min_range_m, metavar="METRES", help="ignore nearer ranges"
     )
     run.add_argument(
-        "--max-range", type=float, default=Integrator().max_range_m, metavar="METRES", help="ignore farther"
+        "--max-range", type=float, default=Integrator().max_range_m, metavar="METRES", help="ignore farther ranges"
     )
     run.add_argument("--state", type=Path, metavar="DIR", help="the robot's folder (cairn-NAME)")
     run.add_argument("--mode", choices=("high-end", "low-end"), default="high-end")
     run.add_argument(
         "--profile", choices=list(Profile), default=Profile.FAST, help="small: fewer bytes, more work (fast)"
     )
-    run.add_argument("--every", type=float, default=5.0, metavar="SECONDS", help="sync at least so often (5)")
+    run.add_argument("--every", type=float, default=5.0, metavar="SECONDS", help="longest pause between syncs (5)")
     add_limits(run)
     run.add_argument(
         "--keep-scans",
         type=float,
         default=0.0,
         metavar="MB",
-        help="keep so much of the newest scans in the robot's folder, so that a program can correct their poses (0)",
+        help="size of the newest scans kept in the robot's folder, so that a program can correct their poses (0)",
     )
     run.add_argument(
         "--carry",
         type=float,
         default=0.0,
         metavar="MB",
-        help="room for what other robots mapped, taken along to the next server; needs a token of role relay (0)",
+        help="room for other robots' commits, taken along to the next server; needs a token of role relay (0)",
     )
     run.add_argument("--delete", action="store_true", help="delete recordings that are mapped")
     run.add_argument("--stay", action="store_true", help="stay on the map at the end")
@@ -117,7 +119,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _robot(args: argparse.Namespace, spool: Spool, stopping: threading.Event) -> Robot | None:
-    """The robot; one that knows no map yet waits for the first recording, which says what there is to map."""
+    """The robot; one that knows no map yet waits for the first recording, whose channels the map needs."""
     name = args.name or default_name(args.spool.resolve().name)
     state: Path = args.state or Path(f"cairn-{name}")
     source = spool.next_recording()

@@ -1,4 +1,4 @@
-"""`cairn robot sync`: push what waits in a robot's folder and fetch what it misses, once or again and again.
+"""`cairn robot sync`: push the commits that wait in a robot's folder and fetch changes, once or repeatedly.
 
     $ cairn robot sync state/
     14 cells, 81233 known voxels in state/

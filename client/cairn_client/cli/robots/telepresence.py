@@ -2,11 +2,11 @@
 
     $ cairn telepresence lab-1 --output view.png                        # scan 0, temperatures over colour
     $ cairn telepresence lab-1 --scan 12 --mode side-by-side --output view.png
-    $ cairn telepresence lab-1 --hotter 40 --scale 15:60 --output pictures/    # all scans; only what is hot
+    $ cairn telepresence lab-1 --hotter 40 --scale 15:60 --output pictures/    # all scans; only hot places
     $ cairn telepresence lab-1 --band 34:38 --mode stereo --serve 8760  # for a browser: http://127.0.0.1:8760/
     $ cairn telepresence lab-1 --mode colour-on-thermal --output view.png
     $ cairn telepresence lab-1 --publish http://127.0.0.1:8750/maps/lab --robot scout    # on the page, next to the map
-    $ cairn telepresence lab-1 --map lab/ --mode map --serve 8760       # what the map knows, over what the robot sees
+    $ cairn telepresence lab-1 --map lab/ --mode map --serve 8760       # the map, over the robot's view
 
 Range carries each temperature to the colour pixel of the same place; pixels that the thermal camera does not see from
 where it stands are taken from the second one. Where no temperature is known the picture is hatched: it is never shown
@@ -191,7 +191,7 @@ def _serve(source: ScanSource, telepresence: Telepresence | MapOverlay, args: ar
 
 
 def _publish(source: ScanSource, telepresence: Telepresence | MapOverlay, args: argparse.Namespace) -> None:
-    """Show each scan once to who follows the robot on the server's page."""
+    """Show each scan once on the server's page, to operators that follow the robot."""
     if args.robot is None:
         raise BadInputError("nothing_asked", "say whose view it is: --robot NAME, as it is registered with the map")
     api, map_name = api_of(args.publish, args.token)
@@ -204,7 +204,7 @@ def _publish(source: ScanSource, telepresence: Telepresence | MapOverlay, args: 
 
 
 def _paced(views: Iterator[View], rate_hz: float) -> Iterator[View]:
-    """The same, at most so many a second."""
+    """The views, at most `rate_hz` of them a second."""
     while True:
         due_s = time.monotonic() + 1 / rate_hz
         view = next(views, None)
@@ -263,20 +263,20 @@ def _parser() -> argparse.ArgumentParser:
         "--serve", type=_address, metavar="[HOST:]PORT", help="stream to browsers (host 127.0.0.1: this machine alone)"
     )
     where.add_argument("--publish", metavar="URL", help="show them on the page of a server: http://HOST:PORT/maps/NAME")
-    options.add_argument("--robot", metavar="NAME", help="whose view is published")
+    options.add_argument("--robot", metavar="NAME", help="the robot whose view is published")
     add_token(options)
     options.add_argument("--scan", type=int, metavar="N", help="only this scan, from 0")
     options.add_argument(
         "--mode", choices=[*(mode.value for mode in ViewMode), MAP], default=ViewMode.THERMAL_ON_COLOUR.value
     )
     options.add_argument("--map", metavar="FOLDER", help="a robot's state, a clone, or exported cells")
-    options.add_argument("--layer", type=Layer, choices=list(Layer), help="of the map (temperature)")
+    options.add_argument("--layer", type=Layer, choices=list(Layer), help="layer of the map (temperature)")
     add_spread_arguments(options)
-    options.add_argument("--camera", help="of the rig, to look through (the first that fits)")
-    options.add_argument("--alpha", type=float, help=f"of temperatures over colour, 0 to 1 ({ALPHA:g})")
+    options.add_argument("--camera", help="camera of the rig to look through (the first that fits)")
+    options.add_argument("--alpha", type=float, help=f"opacity of temperatures over colour, 0 to 1 ({ALPHA:g})")
     painted = options.add_mutually_exclusive_group()
-    painted.add_argument("--hotter", type=float, metavar="C", help="paint only what is hotter, deg C")
-    painted.add_argument("--band", type=_celsius, metavar="LOW:HIGH", help="paint only what is between, deg C")
+    painted.add_argument("--hotter", type=float, metavar="C", help="paint only hotter places, deg C")
+    painted.add_argument("--band", type=_celsius, metavar="LOW:HIGH", help="paint only places between the two, deg C")
     options.add_argument(
         "--scale", type=_celsius, metavar="LOW:HIGH", help="ends of the palette, deg C (first picture)"
     )
@@ -287,7 +287,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def publish_views(pictures: Iterable[Rgb], api: MapApi, map_name: str, branch: str) -> tuple[int, int]:
-    """Send pictures, (H, W, 3) uint8, R, G, B, as they come; how many went through, and how many did not.
+    """Send pictures, (H, W, 3) uint8, R, G, B, as they come; counts of those sent and of those lost.
 
     Raises:
         CairnError: the server refuses them: the robot is not registered, or this is not its token.

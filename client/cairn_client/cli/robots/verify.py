@@ -1,4 +1,4 @@
-"""Verify a calibrated rig with circle targets: how far off is in one camera what another one sees.
+"""Verify a calibrated rig with circle targets: the error of points that are carried from one camera to another.
 
     $ cairn calib verify rig.json drive-1 --output verified
     camera            n  sigma_x sigma_y   sigma  95 % interval  bias x bias y    rms expected = calibr. centroid  range
@@ -7,13 +7,13 @@
     180 targets in 60 images; look at verified/verification.html
 
 Heated discs of aluminium, 20 and 30 cm wide, with matt black paper in their middle (so that the time-of-flight camera
-has a range) and red reflecting tape on their rim, stand about; the robot drives, and records. Each disc's centroid in
+has a range) and red reflecting tape on their rim, are set up; the robot drives, and records. Each disc's centroid in
 the amplitude image is carried into every other camera's image, by its range and Eq. 1 to 6 of Kocmanova et al., and
-compared with the centroid there. What comes out is their Table 2, with what was to be expected by source: of the
-calibration (rig.json's own covariance, which `cairn calib solve` writes), of the centroids, of the range.
+compared with the centroid there. The result is their Table 2, with the errors expected from each source: calibration
+(rig.json's own covariance, which `cairn calib solve` writes), centroids, and range.
 
     rms above expected, sigma not       a bias: one camera has moved, or a range is off: see the figures by range
-    rms and sigma above expected        the calibration promises too much, or targets were taken for others
+    rms and sigma above expected        the calibration promises too much, or targets were confused
 
 `--method paper` takes centroids as the paper does; the default weighs pixels by their brightness. RECORDING is a folder
 as for `cairn robot replay`; of its own rig.json only the images' sizes must be those of RIG.
@@ -48,11 +48,16 @@ def main(argv: list[str]) -> int:
     """Run the subcommand."""
     options = parser("cairn calib verify", __doc__)
     options.add_argument("rig", type=Path, metavar="RIG", help="rig.json to verify")
-    options.add_argument("recording", type=Path, metavar="RECORDING", help="what its cameras saw of targets")
-    options.add_argument("--method", choices=("grey", "paper"), default="grey", help="of centroids (grey)")
+    options.add_argument("recording", type=Path, metavar="RECORDING", help="a recording with targets in view")
+    options.add_argument(
+        "--method", choices=("grey", "paper"), default="grey", help="method of finding centroids (grey)"
+    )
     options.add_argument("--output", type=Path, default=Path("verified"), metavar="DIR", help="(verified)")
     options.add_argument(
-        "--centroid-sigma", type=float, metavar="PX", help="of the range camera's centroids, if you know it better"
+        "--centroid-sigma",
+        type=float,
+        metavar="PX",
+        help="standard deviation of the range camera's centroids, if you know it better",
     )
     args = options.parse_args(argv)
     rig, recording = load_rig(args.rig), open_recording(args.recording)
