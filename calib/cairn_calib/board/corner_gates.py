@@ -193,6 +193,7 @@ def _spacing(grid: FittedGrid) -> str | None:
     turns = np.where(lattice % 2 == 0, 1.0, -1.0)
     # Least squares: the share of +1, -1, +1, ... along either axis in the misses of the homography.
     turns -= turns.mean(axis=0)
+    # Shift of the odd lines against the even ones, pixels; the larger of rows and columns.
     uneven = float(np.linalg.norm(turns.T @ off / (turns**2).sum(axis=0)[:, None], axis=1).max())
     limit = UNEVEN_PX + UNEVEN_CELLS * float(np.linalg.norm(grid.steps[grid.kept], axis=2).mean())
     return None if uneven < limit else f"every other line of corners is {uneven:.2f} px off, at most {limit:.2f}"

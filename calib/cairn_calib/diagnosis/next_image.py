@@ -116,6 +116,7 @@ def _shares(solution: Solution, poses: Floats) -> tuple[Floats, Floats]:
             continue
         c = sensor.data.camera
         T = state.T_rig_camera[c]
+        # Points of the board that are in this camera's image.
         inside = state.lenses[c].contains(state.lenses[c].project((p_rig - T[:3, 3]) @ T[:3, :3]))
         seen[:, c] = inside.mean(axis=1)
         frames = np.flatnonzero(seen[:, c] >= SEEN_SHARE)

@@ -107,6 +107,7 @@ class BoardViews:
 
 def frame_of(name: str) -> str:
     """The frame that an image belongs to, by its name without suffix."""
+    # Numbers with and without leading zeros name the same frame.
     numbers = re.findall(r"\d+", name)
     return numbers[-1].lstrip("0").zfill(6) if numbers else name
 
@@ -192,6 +193,7 @@ def add_ranges(
     Raises:
         BadInputError: there is no range camera, or no image, or one that cannot be read, or two are of one frame.
     """
+    # Ranges belong to the first range camera of the plan.
     owner = next((name for name, camera in plan.cameras.items() if camera.spectrum is Spectrum.RANGE), None)
     if owner is None or not units_per_m > 0:
         raise BadInputError("bad_arguments", "--range needs a camera of spectrum range, and units per metre above 0")

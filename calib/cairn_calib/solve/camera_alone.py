@@ -120,6 +120,7 @@ def _guess(seen: BoardViews, plan: CameraPlan) -> tuple[Lens, dict[str, Transfor
     usable = [(view, H) for view in seen.views if (H := homography_of(view.corners)) is not None]
     _refuse_too_few(name, len(usable))
     K = first_camera_matrix([view.corners for view, _ in usable], [H for _, H in usable], size)
+    # Without distortion: the least squares to come bend the lens and move the boards.
     poses = {view.frame: pose_from_homography(H, K) for view, H in usable}
     parts = {
         "width": size[0],

@@ -98,6 +98,7 @@ def range_data(
             continue
         lens.check_image(view.range_m, name=f"range image of frame {view.frame}")
         amplitude = _known_amplitude(view, lens)
+        # A saturated pixel has a range, but a wrong one.
         readable = np.isfinite(view.range_m) & ~(amplitude >= AMPLITUDE_FULL)
         pixels = _inside(readable, lens.rays(), state, camera, frames.index(view.frame), board, pixels_max)
         if len(pixels) >= PIXELS_MIN:
@@ -155,6 +156,7 @@ def range_block(data: RangeData, state: RigState, layout: ParameterLayout, board
     residuals = np.where(data.measured, missed / noise_m, 0.0)
     weights, cost = loss(residuals**2)
     root = np.sqrt(weights)
+    # Derivatives are NaN where a ray misses the board's plane or a pixel has no ray; those pixels do not count.
     J = np.nan_to_num(np.concatenate(columns, axis=-1) * (root / noise_m)[..., None])
     J_t = np.swapaxes(J, 1, 2)
     pull = -(J_t @ (root * residuals)[..., None])[..., 0]

@@ -181,6 +181,7 @@ def _edge(
     chosen = T[np.flatnonzero(agrees) * 8 + nearest[agrees]]
     mean = np.eye(4)
     mean[:3, :3], mean[:3, 3] = chordal_mean(chosen[:, :3, :3]), np.median(chosen[:, :3, 3], axis=0)
+    # Readings 4 to 7 are those with half a turn.
     turned = tuple(frame for n, frame in enumerate(frames) if agrees[n] and nearest[n] >= 4)
     return _Edge(*names, mean, weight * max(float(agrees.mean()), 0.01), turned)
 

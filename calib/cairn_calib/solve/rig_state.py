@@ -105,6 +105,7 @@ def parameter_layout(
 
 def shared_values(state: RigState, layout: ParameterLayout) -> Floats:
     """(P,) values of the shared parameters; 0 for poses, whose parameters are errors."""
+    # As in `parameter_layout`: intrinsics, warp, scale, bias.
     values = np.zeros(layout.size)
     for lens, columns, at in zip(state.lenses, layout.intrinsic_columns, layout.intrinsic_at, strict=True):
         values[at] = lens.intrinsics[columns]
@@ -139,6 +140,7 @@ def step_state(state: RigState, layout: ParameterLayout, shared: Floats, boards:
 
 def step_poses(T: Floats, step: Floats) -> Floats:
     """(..., 4, 4) transforms after (..., 6) steps: [exp(r) R | t + dt]."""
+    # About the axes of the rig, the frame that is mapped to: multiplied from the left.
     result = T.copy()
     result[..., :3, :3] = rotation_from_vector(step[..., :3]) @ T[..., :3, :3]
     result[..., :3, 3] += step[..., 3:]
@@ -155,5 +157,6 @@ def warp_shape(board: Board) -> Floats:
 
 def warp_at_places(board: Board, places_m: Floats) -> Floats:
     """(..., 2) `warp_shape` at (..., 2) places of the board's plane, metres."""
+    # From -1 at the first point to 1 at the last, along either axis.
     last = board.points()[:, :2].max(axis=0)
     return np.asarray(1 - (2 * places_m / last - 1) ** 2)

@@ -161,6 +161,7 @@ def fit_flat_field(stacks: Sequence[npt.NDArray[np.generic]]) -> FlatFieldFit:
 
 def write_flat_field(path: Path, flat_field: FlatField) -> MapsFile:
     """Write an .npz file of the maps; returns its entry in rig.json."""
+    # Written in memory first, for the digest that rig.json states.
     buffer = io.BytesIO()
     maps = {name: getattr(flat_field, name) for name in ("gain", "offset", "shading", "bad", *SIGMAS)}
     maps = {name: each for name, each in maps.items() if each is not None}

@@ -75,12 +75,14 @@ def _stream(data: bytes) -> bytes:
     parts: dict[int, bytes] = {}
     at = 2
     while True:
+        # JPEG segments up to the scan; struct raises where the file breaks off.
         prefix, marker, length = struct.unpack_from(">BBH", data, at)
         if prefix != 0xFF or length < 2:
             raise ValueError(f"a JPEG marker was expected at byte {at}")
         if marker in (0xDA, 0xD9):
             return b"".join(parts[n] for n in sorted(parts))
         body = data[at + 4 : at + 2 + length]
+        # APP1 of FLIR: byte 6 counts the parts, bytes from 8 on are the stream.
         if marker == 0xE1 and body[:5] == b"FLIR\0" and len(body) > 8:
             parts[body[6]] = body[8:]
         at += 2 + length
@@ -90,6 +92,7 @@ def _records(stream: bytes) -> dict[int, bytes]:
     """The records' bytes by kind."""
     if stream[:4] != b"FFF\0":
         return {}
+    # The version, about 100, shows the byte order of the table.
     endian: Endian = ">" if struct.unpack_from(">I", stream, 0x14)[0] < 1 << 16 else "<"
     start, count = struct.unpack_from(f"{endian}II", stream, 0x18)
     if count > RECORDS_MAX:
@@ -97,6 +100,7 @@ def _records(stream: bytes) -> dict[int, bytes]:
     found: dict[int, bytes] = {}
     for n in range(count):
         kind, _, _, _, offset, length = struct.unpack_from(f"{endian}HHIIII", stream, start + n * RECORD_BYTES)
+        # Every record must lie in the stream; of several of one kind the first counts.
         if kind and offset + length > len(stream):
             raise ValueError(f"record {kind:#x} goes beyond the end")
         found.setdefault(kind, stream[offset : offset + length])
@@ -115,12 +119,14 @@ def _counts(record: bytes) -> Counts:
         raise ValueError(f"counts of {width} x {height} pixels")
     body = record[32:]
     if body[:4] == b"\x89PNG":
+        # The PNG's own size is checked before it is decoded.
         size = struct.unpack_from(">II", body, 16)
         if size != (width, height):
             raise ValueError(f"a PNG of {size[0]} x {size[1]} pixels for {width} x {height}")
         image = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_UNCHANGED)
         if image is None or image.dtype != np.uint16 or image.shape != (height, width):
             raise ValueError("the PNG of its counts cannot be decoded")
+        # FLIR writes little-endian counts into a big-endian format.
         return np.asarray(image, np.uint16).byteswap()
     if len(body) < 2 * width * height:
         raise ValueError("its counts break off")
@@ -135,6 +141,7 @@ def _camera_info(record: bytes) -> tuple[Radiometry, Viewing, str]:
     def floats(at: int, count: int) -> list[float]:
         return [float(v) for v in struct.unpack_from(f"{endian}{count}f", record, at)]
 
+    # Offsets as in ExifTool's table of the record.
     emissivity, distance_m, reflected_k, air_k, window_k, window = floats(0x20, 6)
     (humidity,), (r1, b_k, f), air = floats(0x3C, 1), floats(0x58, 3), floats(0x70, 5)
     high_k, low_k = floats(0x90, 2)
@@ -145,6 +152,7 @@ def _camera_info(record: bytes) -> tuple[Radiometry, Viewing, str]:
         np.isfinite(numbers).all() and r2 > 0 and 0 < emissivity <= 1 and 0 < window <= 1 and 0 <= distance_m < 1e5
     ):
         raise ValueError("the camera's numbers cannot be")
+    # Some cameras write per cent.
     humidity = humidity / 100 if humidity > 2 else humidity
     a1, a2, b1, b2, x = air
     response = PlanckResponse(r=r1 / r2, b_k=b_k, f=f, o=-float(o))

@@ -195,6 +195,7 @@ def air_transmission(
     root = np.sqrt(distance_m)
     parts = (np.exp(-root * (a + b * water)) for a, b in ((alpha_1, beta_1), (alpha_2, beta_2)))
     first, second = (float(part) for part in parts)
+    # FLIR's usual x is 1.9, so the second share is negative; a transmission is at most 1.
     return min(1.0, x * first + (1 - x) * second)
 
 

@@ -77,10 +77,12 @@ def read_references(table: Path) -> ReferenceTable:
     seen: dict[bytes, str] = {}
     left_out = []
     for line in _lines(table):
+        # Spoilt by the table's own statement, before any image is read.
         if line.since_ffc_s is not None and line.since_ffc_s < FFC_SETTLE_S:
             when = f"{line.since_ffc_s:g} s after" if line.since_ffc_s > 0 else "during"
             left_out.append(f"{line.image.name}: {when} a flat-field correction")
             continue
+        # A repeated image has the same counts to the last bit.
         counts = read_grey(line.image)[0]
         if (twin := seen.setdefault(counts.tobytes(), line.image.name)) != line.image.name:
             left_out.append(f"{line.image.name}: {repetition_text(twin)}")
@@ -113,6 +115,7 @@ def _lines(table: Path) -> list[_Line]:
     if missing := [name for name in COLUMNS if name not in (reader.fieldnames or ())]:
         raise BadInputError("bad_references", f"{table} has no column {missing[0]}; its head line must name {COLUMNS}")
     lines = []
+    # Line 1 is the head.
     for number, row in enumerate(rows, start=2):
         try:
             lines.append(

@@ -89,6 +89,7 @@ def fit_response(references: Sequence[Reference], *, law: Law, source: str, nois
     sigma = np.hypot(sigma_k, sigma_u / response.slope(T))
     chi2, freedom = float(np.sum((residuals / sigma) ** 2)), len(T) - free
     covariance *= max(1.0, chi2 / freedom) if freedom > 0 else 1.0
+    # The response holds a little beyond its references, no further.
     margin = MARGIN_SHARE * (T[-1] - T[0])
     fitted = Radiometry(
         response=response,

@@ -146,6 +146,7 @@ def find_targets(rig: Rig, images: Mapping[str, Image], range_m: Image, *, name:
         name: name of the pose, for people.
         method: kind of centroid.
     """
+    # The same detector for every spectrum, on an image in which targets are bright.
     discs = {
         camera: find_discs(brightness_of(image, rig[camera].spectrum), rig[camera].spectrum, method=method)
         for camera, image in images.items()
