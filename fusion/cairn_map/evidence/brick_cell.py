@@ -1,9 +1,10 @@
-"""A cell that evidence can be added to: counts of all voxels in bricks, sums of the few with samples in rows.
+"""Sums of one cell in the form to which evidence is added: counts in bricks, samples in rows.
 
-`merge` and `unmerge` are exact inverses, in any order, because all of it is integer addition. Both ask first and
-change nothing when a sum would leave its range. `packed` gives the canonical form back.
+`merge` and `unmerge` are exact inverses, in any order, because both are integer addition. Both check first and change
+nothing when a sum would leave its range. `packed` gives the canonical form back.
 
-A `copy` costs nothing until one of the two is changed: they share their arrays, and who adds takes new ones first.
+A `copy` costs nothing until one of the two is changed: they share their arrays, and the one that adds copies them
+first.
 """
 
 from collections.abc import Iterable

@@ -2,8 +2,8 @@
 
     brick_of [Morton number of a brick] -> b or -1      pool [b, 512, 2] hits, misses of all its voxels
 
-The pool has 16 bits a count until it may need 32. When that is, a bound of the magnitudes tells: each diff's counts
-raise it while they are added, and only when it passes the limit are they taken back, and the sums looked at.
+The pool has 16 bits a count until a sum may need 32. A bound of all magnitudes decides: each diff's counts raise it
+while they are added; only when it passes the limit are they subtracted again, and the true sums examined.
 """
 
 import numpy as np
@@ -39,19 +39,19 @@ class BrickCounts:
         new = kernels.count_new_bricks(voxels, self._brick_of)
         if new:
             used = len(self._pool)
-            self._pool.resize((used + new, 512, 2), refcheck=False)  # in place where it can; nobody else has a view
+            self._pool.resize((used + new, 512, 2), refcheck=False)  # in place if possible; there is no other view
             kernels.number_bricks_into(voxels, self._brick_of, used)
         said = kernels.add_counts_into(voxels, counts, sign, self._brick_of, self._pool)
         if said >= 0 and self._bound + said <= self._limit:
             self._bound += said
             return
-        # A sum may have wrapped around. Taking the counts out again brings back what was, and then we look first.
+        # A sum may have wrapped around. Subtraction restores the sums exactly; then the bound is found first.
         kernels.add_counts_into(voxels, counts, -sign, self._brick_of, self._pool)
         self._bound = self._bound_after(voxels, counts, sign)
         kernels.add_counts_into(voxels, counts, sign, self._brick_of, self._pool)
 
     def packed(self, sampled: Voxels) -> tuple[Voxels, Int32s, Voxels]:
-        """Voxels with a count or listed in `sampled`, rising; their counts; and in which rows the listed ones are."""
+        """Voxels with a count or listed in `sampled`, rising; their counts; and the rows of the listed ones."""
         V = kernels.count_packed(self._brick_of, self._pool, sampled)
         out = np.empty(V, np.uint32), np.empty((V, 2), np.int32), np.empty(len(sampled), np.uint32)
         kernels.pack_into(self._brick_of, self._pool, sampled, *out)
@@ -64,7 +64,7 @@ class BrickCounts:
         return copied
 
     def zeros(self) -> "BrickCounts":
-        """The same bricks with no hits and no misses, in the memory of none; to be read only."""
+        """The same bricks without hits and misses, in the memory of one number; to be read only."""
         copied = BrickCounts.__new__(BrickCounts)
         copied._brick_of, copied._bound = self._brick_of, 0
         copied._pool = np.broadcast_to(np.int16(0), self._pool.shape)
@@ -90,7 +90,7 @@ class BrickCounts:
         return int(np.iinfo(self._pool.dtype).max)
 
     def _bound_after(self, voxels: Voxels, counts: Int32s, sign: int) -> int:
-        """No magnitude will be larger than this after adding sign * counts, for which there are bits enough now.
+        """Bound of all magnitudes after adding sign * counts; widens the pool if 16 bits may not be enough.
 
         Raises:
             BadInputError: kind `evidence_overflow`: a sum would leave its range.
@@ -102,6 +102,6 @@ class BrickCounts:
         bound = kernels.largest_count(self._pool) + largest
         if bound > COUNT_MAX and not kernels.counts_fit(voxels, counts, sign, self._brick_of, self._pool, COUNT_MAX):
             raise BadInputError("evidence_overflow", f"counts are at most {COUNT_MAX}; a sum would be more")
-        if bound > self._limit // 2:  # rather too early than to look again at each diff from now on
+        if bound > self._limit // 2:  # early, else every further diff would examine all sums again
             self._pool = self._pool.astype(np.int32, copy=False)
         return min(bound, COUNT_MAX)

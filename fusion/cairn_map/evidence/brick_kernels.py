@@ -1,6 +1,7 @@
-"""Adding packed counts into bricks of 8^3 voxels, and reading them back; all loops, no checks.
+"""Addition of packed counts into bricks of 8^3 voxels, and packing of the sums. No checks.
 
-Callers have seen to it that voxels rise and lie in the cell: so the voxels of a brick are one run of at most 512.
+Callers guarantee that voxels rise and lie in the cell: so the voxels of a brick are one run of at most 512. A Morton
+code without its lowest 9 bits is the number of its brick; these 9 bits are the voxel's place in the brick.
 """
 
 import numba as nb
@@ -16,18 +17,21 @@ Pool = npt.NDArray[np.int16] | npt.NDArray[np.int32]
 U = np.uint64
 """Type of the index in hot loops: a signed one is tested for being negative, which takes up to twice the time."""
 RUN = U(32)
-"""Voxels without a gap that are added side by side; half and twice as many were slower."""
+"""Voxels without a gap that are added in one vectorised loop; half and twice as many were slower."""
 
 
 @nb.njit(inline="always")
 def _brick_end(voxels: Voxels, start: int) -> int:
-    """Where the run of voxels in the brick of voxel `start` ends."""
+    """Index behind the last voxel of the run that lies in the brick of voxel `start`."""
     brick = voxels[start] >> np.uint32(9)
+    # A full brick needs no search.
     if start + 512 <= voxels.shape[0] and voxels[start + 511] >> np.uint32(9) == brick:
         return start + 512
+    # Binary search by falling steps, without a branch that the processor could mispredict. Invariant: `last` lies in
+    # the brick.
     last = start
     step = 256
-    while step > 0:  # without a branch that could be guessed wrong
+    while step > 0:
         ahead = min(last + step, voxels.shape[0] - 1)
         last = ahead if voxels[ahead] >> np.uint32(9) == brick else last
         step >>= 1
@@ -36,7 +40,7 @@ def _brick_end(voxels: Voxels, start: int) -> int:
 
 @nb.njit(cache=True, nogil=True)
 def count_new_bricks(voxels: Voxels, brick_of: BrickNumbers) -> int:
-    """How many bricks the voxels need that the index does not have."""
+    """Number of bricks of the voxels that the index lacks."""
     new = 0
     start = 0
     while start < voxels.shape[0]:
@@ -71,7 +75,7 @@ def largest_count(counts: Pool) -> int:
 
 @nb.njit(cache=True, nogil=True)
 def counts_fit(voxels: Voxels, counts: Int32s, sign: int, brick_of: BrickNumbers, pool: Pool, limit: int) -> bool:
-    """Whether adding sign * counts keeps every sum in [-limit, limit]; bricks that do not exist count as zero."""
+    """True if adding sign * counts keeps every sum in [-limit, limit]; bricks that do not exist count as zero."""
     for n in range(voxels.shape[0]):
         brick = brick_of[voxels[n] >> np.uint32(9)]
         for c in range(2):
@@ -89,15 +93,18 @@ def add_counts_into(voxels: Voxels, counts: Int32s, sign: int, brick_of: BrickNu
 
     Returns all counts or'ed together: negative if one is, else no less than the largest.
     """
+    # Flat arrays: entry 2 v is the hits, 2 v + 1 the misses of voxel v; a brick has 1024 entries.
     flat_counts, flat_pool = counts.reshape(-1), pool.reshape(-1)
     factor, said = np.int32(sign), np.int32(0)
     start = 0
     while start < voxels.shape[0]:
+        # One brick: the run [n, end) of voxels.
         brick = U(brick_of[voxels[start] >> np.uint32(9)]) << U(10)
         n = U(start)
         start = _brick_end(voxels, start)
         end = U(start)
         while n < end:
+            # RUN voxels without a gap are side by side in the pool, too.
             stop = n + RUN
             if stop <= end and voxels[stop - U(1)] - voxels[n] == np.uint32(RUN - U(1)):
                 first, voxel = n << U(1), brick + (U(voxels[n] & np.uint32(511)) << U(1))
@@ -106,6 +113,7 @@ def add_counts_into(voxels: Voxels, counts: Int32s, sign: int, brick_of: BrickNu
                     flat_pool[voxel + i] += factor * flat_counts[first + i]
                 n = stop
                 continue
+            # Else one by one.
             for m in range(n, min(stop, end)):
                 voxel = brick + (U(voxels[m] & np.uint32(511)) << U(1))
                 hits, misses = flat_counts[m << U(1)], flat_counts[(m << U(1)) + U(1)]
@@ -118,9 +126,10 @@ def add_counts_into(voxels: Voxels, counts: Int32s, sign: int, brick_of: BrickNu
 
 @nb.njit(cache=True, nogil=True)
 def count_packed(brick_of: BrickNumbers, pool: Pool, sampled: Voxels) -> int:
-    """Voxels with a count, or listed in `sampled`."""
+    """Number of voxels with a count, or listed in `sampled`."""
     V = 0
     flat = pool.reshape(-1)
+    # Voxels with a hit or a miss; then those listed that have neither.
     for i in range(U(0), U(flat.shape[0]), U(2)):
         V += (flat[i] | flat[i + U(1)]) != 0
     for n in range(sampled.shape[0]):
@@ -133,7 +142,8 @@ def count_packed(brick_of: BrickNumbers, pool: Pool, sampled: Voxels) -> int:
 def pack_into(
     brick_of: BrickNumbers, pool: Pool, sampled: Voxels, out_voxels: Voxels, out_counts: Int32s, out_rows: Voxels
 ) -> None:
-    """Write the voxels that `count_packed` counted, rising, their counts, and in which rows those of `sampled` are."""
+    """Write the voxels that `count_packed` counted, rising, their counts, and the rows of those of `sampled`."""
+    # A merge of two rising lists: bricks in order of their Morton numbers, and `sampled`, of which n is the next.
     V = U(0)
     n = U(0)
     for b in range(brick_of.shape[0]):

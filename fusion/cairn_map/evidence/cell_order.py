@@ -1,12 +1,12 @@
-"""Which cells come first: a link that is slow or breaks soon has carried what matters most by then.
+"""Order in which cells are sent: the most important ones first, because a link may be slow or break soon.
 
     rings from the robot   0  1  2  3  4  5  6 ...    cells along the farthest axis
     a hot cell counts as   0  1  1  1  1  2  2 ...    a quarter of that, rounded up
 
-So the robot's own surroundings come before all else, and then a fire four times as far away as a bare wall. That is
-all that heat buys: no cell waits for hot ones that are more than four times as far, however many there are. In the
-same place in the queue the really nearer comes first, then the hot one, then what changed last; without a robot's
-place, hot ones come first, then what changed last.
+So the robot's own surroundings come first, and then a fire counts as much as a bare wall at a quarter of its distance.
+No cell waits for hot ones that are more than four times as far, however many there are. Among cells with the same
+place in the queue the truly nearer comes first, then the hot one, then the one that changed last; without a robot's
+place, hot cells come first, then those that changed last.
 """
 
 import numpy as np
@@ -17,16 +17,16 @@ from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import Cell, Geometry
 
 HOT_ABOVE_K = 10.0
-"""A cell is hot if its hottest voxel is so much above that of the middle one of all cells that have temperatures.
+"""Kelvin by which a hot cell's hottest voxel is above the median cell's.
 
-Twice the +-5 K that makers of uncooled thermal cameras state, so that what two cameras make of the same wall is not
-hot; and never more than half of the cells are: heat is what stands out, not summer."""
+Twice the +-5 K that makers of uncooled thermal cameras state, so that the difference of two cameras on one wall is not
+heat. Relative to the median, never more than half of the cells are hot: a fire stands out, a summer's day does not."""
 HOT_RINGS = 4
-"""Rings of hot cells that count as one."""
+"""Rings of hot cells that count as one ring."""
 
 
 def hottest_k(evidence: Evidence, geometry: Geometry) -> float | None:
-    """Highest mean of a cell's voxels in the first temperature channel, kelvin (apparent); None: none has samples."""
+    """Highest mean of a cell's voxels in the first temperature channel, kelvin (apparent); None without samples."""
     channel = next((c for c in geometry.channels if c.kind is ChannelKind.TEMPERATURE), None)
     if channel is None:
         return None
@@ -45,13 +45,13 @@ def first_to_last(
     changed: npt.NDArray[np.int64],
     hottest_k: npt.NDArray[np.float64],
 ) -> npt.NDArray[np.intp]:
-    """The order of cells, as in the module's head.
+    """Rows of cells in the order in which they are sent, as the module's head explains it.
 
     Args:
-        cells: (N, 3) their numbers.
-        near: the cell that the robot is in.
+        cells: (N, 3) numbers.
+        near: cell of the robot; None: unknown.
         changed: (N,) log entry that last changed each.
-        hottest_k: (N,) kelvin; NaN where it has no temperature, or nobody says.
+        hottest_k: (N,) kelvin; NaN where it has no temperature, or it is unknown.
 
     Returns:
         (N,) rows of `cells`.

@@ -1,4 +1,4 @@
-"""What a voxel can hold besides occupancy, as sums of fixed-point integers.
+"""Channels: the quantities that a voxel can hold besides occupancy, as sums of fixed-point integers.
 
     kind          planes (one int64 sum each)            reading
     colour        red  green  blue            weight     mean sRGB = sum / weight
@@ -25,7 +25,7 @@ SAMPLE_MAX = (1 << 20) - 1
 
 
 class ChannelKind(StrEnum):
-    """Which sums a channel keeps."""
+    """Kind of a channel; it decides which sums are kept."""
 
     COLOUR = "colour"
     INTENSITY = "intensity"
@@ -49,7 +49,7 @@ PLANES = {
 
 
 class Channel(BaseModel, frozen=True):
-    """One kind of sample that a map's voxels can hold."""
+    """One quantity that a map's voxels can hold, and its fixed-point scale."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -100,7 +100,7 @@ STANDARD_CHANNELS = (COLOUR, INTENSITY, TEMPERATURE)
 
 
 def planes_and_squares(channels: tuple[Channel, ...]) -> npt.NDArray[np.int64]:
-    """(channels, 2) planes of each channel, and how many of them are sums of squares, as kernels want to know it."""
+    """(channels, 2) planes of each channel, and the number of those that are sums of squares: the form for kernels."""
     return _planes_and_squares(tuple(channel.kind for channel in channels))
 
 

@@ -1,4 +1,4 @@
-"""The evidence of one cell, packed: sorted rows, nothing that is zero. The form that is stored, sent and compared.
+"""Packed evidence of one cell: sorted rows without zeros. The form that is stored, sent and compared.
 
     voxels   (V,)   uint32  Morton codes inside the cell, rising
     counts   (V, 2) int32   hits, misses
@@ -63,13 +63,13 @@ class Evidence:
 
     @property
     def brick_count(self) -> int:
-        """Bricks of 8^3 voxels that it touches."""
+        """Number of bricks of 8^3 voxels that it touches."""
         bricks = self.voxels >> np.uint32(3 * BRICK_DEPTH)
         return int(np.count_nonzero(bricks[1:] != bricks[:-1])) + min(1, len(bricks))
 
     @property
     def is_signed(self) -> bool:
-        """Whether any number is negative: true only of differences."""
+        """True if any number is negative, which happens only in differences."""
         return bool((self.counts < 0).any() or (self.samples < 0).any())
 
 
@@ -124,7 +124,7 @@ def packed_evidence(
 
 
 def largest(counts: npt.NDArray[np.int32], samples: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """(2 + P,) largest number of each plane, of numbers at least 0; the server adds these up against overflow."""
+    """(2 + P,) largest number of each plane, all numbers at least 0; the server adds these up to exclude overflow."""
     tops = np.zeros(2 + samples.shape[1], np.int64)
     tops[:2] = bounds_of_counts(counts)[1:3]
     largest_into(samples, tops[2:])
@@ -132,7 +132,7 @@ def largest(counts: npt.NDArray[np.int32], samples: npt.NDArray[np.int64]) -> np
 
 
 def check_fits(evidence: Evidence, geometry: Geometry) -> None:
-    """Refuse evidence that is not packed, or of another geometry: kernels check nothing, and would write anywhere.
+    """Refuse evidence that is not packed, or of another geometry: kernels check nothing, and would write out of bounds.
 
     Raises:
         BadInputError: kind `bad_evidence`: voxels or sampled rows that do not rise, a voxel outside the cell, a sampled
@@ -156,5 +156,5 @@ def _rise(numbers: npt.NDArray[np.uint32]) -> bool:
 
 
 def every_sum_has_weight(samples: npt.NDArray[np.int64], geometry: Geometry) -> bool:
-    """Whether each channel's sums come with a weight, as every real sample does: means divide by it."""
+    """True if each channel's sums come with a weight, as those of real samples do; means divide by it."""
     return not sums_without_weight(samples, planes_and_squares(geometry.channels))

@@ -1,6 +1,8 @@
-"""Bounds of packed evidence in one pass; numpy's reductions over short rows take thirty times as long.
+"""Bounds, checks and fingerprint of packed evidence, in one pass each: NumPy takes thirty times as long on short rows.
 
-spec   (channels, 2) planes of each channel, and how many of them are sums of squares (`channels.planes_and_squares`)
+    spec   (channels, 2) planes of each channel, and how many of them are sums of squares (`planes_and_squares`)
+
+The planes of a channel are its sums, its sums of squares, and its weight, in this order.
 """
 
 import numba as nb
@@ -10,11 +12,13 @@ import numpy.typing as npt
 GAMMA = np.uint64(0x9E3779B97F4A7C15)
 MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 MIX_2 = np.uint64(0x94D049BB133111EB)
+"""Constants of SplitMix64: 2^64 over the golden ratio, and two multipliers."""
 
 
 @nb.njit(cache=True, nogil=True)
 def bounds_of_counts(counts: npt.NDArray[np.int32]) -> tuple[int, int, int, int]:
-    """Least count, and greatest hits, misses and sum of both in one row; zeros without rows, and at least zeros."""
+    """Least count, and greatest hits, misses and sum of both in one row; the first at most 0, the others at least 0."""
+    # int64: the sum of two counts may need 33 bits.
     low, hits, misses, total = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
     for n in range(len(counts)):
         hit, miss = np.int64(counts[n, 0]), np.int64(counts[n, 1])
@@ -35,7 +39,8 @@ def largest_into(samples: npt.NDArray[np.int64], tops: npt.NDArray[np.int64]) ->
 
 @nb.njit(cache=True, nogil=True)
 def sums_without_weight(samples: npt.NDArray[np.int64], spec: npt.NDArray[np.int64]) -> bool:
-    """Whether a row has a sum in a channel of which it has no weight."""
+    """True if a row has a sum in a channel of which it has no weight."""
+    # Columns of channel c: [first, weight) are its sums, `weight` is its weight.
     first = 0
     for c in range(spec.shape[0]):
         weight = first + spec[c, 0] - 1
@@ -50,16 +55,18 @@ def sums_without_weight(samples: npt.NDArray[np.int64], spec: npt.NDArray[np.int
 
 @nb.njit(cache=True, nogil=True)
 def channel_above(samples: npt.NDArray[np.int64], spec: npt.NDArray[np.int64], limit: int) -> int:
-    """The first channel of which a row has a mean beyond the limit, or a mean square beyond its square; -1 if none has.
+    """First channel of which a row has a mean beyond the limit, or a mean square beyond its square; -1 if none has.
 
     The products with the weights are in range.
     """
+    # Columns of channel c: sums from `first`, sums of squares from `squares`, then the weight.
     first = 0
     for c in range(spec.shape[0]):
         weight = first + spec[c, 0] - 1
         squares = weight - spec[c, 1]
         for n in range(samples.shape[0]):
             for p in range(first, weight):
+                # sum / weight > limit, without a division.
                 if samples[n, p] > samples[n, weight] * (limit * limit if p >= squares else limit):
                     return c
         first = weight + 1
@@ -83,12 +90,18 @@ def weighted_sums(
     sampled: npt.NDArray[np.uint32],
     samples: npt.NDArray[np.int64],
 ) -> tuple[np.uint64, np.uint64]:
-    """Two sums, mod 2^64, of value times the odd pseudo-random weight of (cell, voxel, plane)."""
+    """Two sums, mod 2^64, of value times the odd pseudo-random weight of (cell, voxel, plane).
+
+    Planes 0 and 1 are hits and misses, those of samples follow. Sums mod 2^64 add as evidence adds; two of them with
+    independent weights, because one of 64 bits would collide too often.
+    """
+    # The weight is odd, so that it has an inverse mod 2^64: no single change of a value is lost.
     first_cell = mix(cell)
     second_cell = mix(~cell)
     first = np.uint64(0)
     second = np.uint64(0)
     one = np.uint64(1)
+    # Counts; zeros add nothing.
     for n in range(voxels.shape[0]):
         place = np.uint64(voxels[n]) << np.uint64(8)
         for c in range(2):
@@ -96,6 +109,7 @@ def weighted_sums(
                 value = np.uint64(np.int64(counts[n, c]))
                 first += value * (mix(first_cell ^ (place | np.uint64(c))) | one)
                 second += value * (mix(second_cell ^ (place | np.uint64(c))) | one)
+    # Samples.
     for n in range(sampled.shape[0]):
         place = np.uint64(voxels[sampled[n]]) << np.uint64(8)
         for p in range(samples.shape[1]):

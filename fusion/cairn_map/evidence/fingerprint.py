@@ -1,7 +1,7 @@
-"""A 128-bit sum that adds as evidence adds: fingerprint(a + b) = fingerprint(a) + fingerprint(b).
+"""Fingerprints: 128-bit sums that add as evidence adds, fingerprint(a + b) = fingerprint(a) + fingerprint(b).
 
-After any frame a replica checks with it that its base is the server's, without encoding anything. It finds
-accidents, not forgers: a cell's identity is the SHA-256 of its canonical bytes.
+After any frame a replica checks with it that its base equals the server's, without encoding anything. It detects
+accidents, not forgery: a cell's identity is the SHA-256 of its canonical bytes. FORMAT.md section 8 is the norm.
 """
 
 import struct
@@ -40,17 +40,17 @@ class Fingerprint:
 
 
 ZERO = Fingerprint()
-"""Of a cell without evidence."""
+"""Fingerprint of a cell without evidence."""
 
 
 def fingerprint(evidence: Evidence, key: CellKey) -> Fingerprint:
-    """The fingerprint of one cell's evidence, signed or not."""
+    """Fingerprint of one cell's evidence, which may have negative numbers."""
     first, second = weighted_sums(np.uint64(key), evidence.voxels, evidence.counts, evidence.sampled, evidence.samples)
     return Fingerprint(int(first), int(second))
 
 
 def fingerprint_from_bytes(data: bytes) -> Fingerprint:
-    """The mirror of `Fingerprint.to_bytes`.
+    """Fingerprint of its 16 bytes; the mirror of `Fingerprint.to_bytes`.
 
     Raises:
         DamagedDataError: not 16 bytes.
@@ -61,7 +61,7 @@ def fingerprint_from_bytes(data: bytes) -> Fingerprint:
 
 
 def fingerprint_from_hex(text: str) -> Fingerprint:
-    """The mirror of `Fingerprint.hex`.
+    """Fingerprint of its 32 hex digits; the mirror of `Fingerprint.hex`.
 
     Raises:
         DamagedDataError: not 32 hex digits, in lower case.

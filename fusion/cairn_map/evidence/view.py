@@ -1,11 +1,11 @@
-"""What a map looks like: one cell read as probability, colour and temperature, at any octree depth.
+"""Views: one cell read as probability, colour and temperature, at any octree depth.
 
-A view is for eyes, exports and robots that only drive; it is never merged. It is exact in what it states: the nearest
-step of each value. At a depth above the voxels, a node has
+A view is for display, exports and robots that only drive; it is never merged. Each value is rounded to its nearest
+step. At a depth above the voxels, a node has
 
     probability   the highest of the known voxels below: obstacles never vanish
     colour        the mean of all samples below
-    temperature   the mean, and the hottest voxel below beside it
+    temperature   the mean of all samples below, and that of the hottest voxel below
 """
 
 from dataclasses import dataclass
@@ -27,15 +27,15 @@ LOG_ODDS_ZERO = 1 << 15
 
 
 class Extent(StrEnum):
-    """Which nodes are told."""
+    """Nodes that a view holds."""
 
     OCCUPIED = "occupied"
     KNOWN = "known"
-    """The occupied and the free: what a robot needs that plans a path."""
+    """Occupied and free nodes, which a robot needs to plan a path."""
 
 
 class Chance(StrEnum):
-    """How a probability is told."""
+    """Encoding of a probability."""
 
     BYTE = "byte"
     """p in 1/255."""
@@ -44,7 +44,7 @@ class Chance(StrEnum):
 
 
 class Colours(StrEnum):
-    """How many bits red, green and blue have."""
+    """Bits of red, green and blue."""
 
     NONE = "none"
     RGB_565 = "5-6-5"
@@ -52,20 +52,20 @@ class Colours(StrEnum):
 
 
 TOPS = {Colours.NONE: (), Colours.RGB_565: (31, 63, 31), Colours.RGB_888: (255, 255, 255)}
-"""The largest red, green and blue."""
+"""Largest values of red, green and blue."""
 
 
 @dataclass(frozen=True, slots=True)
 class ViewStyle:
-    """What a view tells, and how finely."""
+    """Selection of nodes and resolution of values of a view."""
 
     depth: int | None = None
-    """Octree depth, 1 to that of the cell; None: its voxels."""
+    """Octree depth of the nodes, 1 to that of the cell; None: its voxels."""
     extent: Extent = Extent.OCCUPIED
     chance: Chance = Chance.BYTE
     colours: Colours = Colours.RGB_888
     temperature_step_k: float | None = 0.1
-    """None: no temperatures."""
+    """Step of temperatures, kelvin; None: no temperatures."""
 
     def __post_init__(self) -> None:
         step = self.temperature_step_k
@@ -74,7 +74,7 @@ class ViewStyle:
 
 
 FULL_STYLE = ViewStyle(chance=Chance.LOG_ODDS, temperature_step_k=0.01)
-"""The paper's fields at full precision."""
+"""Style with all fields of the paper at full precision."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,44 +86,45 @@ class View:
     nodes: npt.NDArray[np.uint32]
     """(N,) Morton numbers at `depth`."""
     chances: Ints
-    """(N,)"""
+    """(N,) probabilities of occupancy, in the steps of `style.chance`."""
     coloured: Ints
     """(C,) rows of `nodes` that have a colour, rising."""
     rgb: Ints
-    """(C, 3) 0 to the largest; (C, 0) without colours."""
+    """(C, 3) colours, 0 to the largest value of the style; (C, 0) without colours."""
     warm: Ints
     """(W,) rows of `nodes` that have a temperature, rising."""
     temperatures: Ints
-    """(W, 1) means in steps, at the voxels' depth; else (W, 2) means and hottest voxels; (0, 0) where none are told."""
+    """(W, 1) means in steps, at the voxels' depth; else (W, 2) means and hottest voxels; (0, 0) without."""
 
     def __len__(self) -> int:
         return len(self.nodes)
 
     @property
     def probability(self) -> Floats:
-        """(N,) that the node is occupied."""
+        """(N,) probability that the node is occupied."""
         if self.style.chance is Chance.BYTE:
             return self.chances / 255
         return np.asarray(1 / (1 + np.exp((LOG_ODDS_ZERO - self.chances) * LOG_ODDS_STEP)))
 
     @property
     def colour(self) -> npt.NDArray[np.uint8]:
-        """(C, 3) 8-bit sRGB."""
+        """(C, 3) colours, 8-bit sRGB."""
         scaled: npt.NDArray[np.uint8] = np.rint(self.rgb * 255 / np.array(TOPS[self.style.colours])).astype(np.uint8)
         return scaled
 
     @property
     def temperature_k(self) -> Floats:
-        """(W, 1 or 2) kelvin."""
+        """(W, 1 or 2) mean temperatures, and of inner nodes the hottest voxels'; kelvin."""
         return self.temperatures.astype(np.float64) * (self.style.temperature_step_k or np.nan)
 
 
 def view_of(evidence: Evidence, geometry: Geometry, model: SensorModel, style: ViewStyle) -> View:
-    """The view of one cell's evidence.
+    """View of one cell's evidence.
 
     Raises:
         BadInputError: kind `bad_style`: deeper than the cell.
     """
+    # Nodes and their probabilities, from log-odds.
     depth = geometry.depth if style.depth is None else style.depth
     if not 1 <= depth <= geometry.depth:
         raise BadInputError("bad_style", f"a view's depth must be 1 to {geometry.depth}, got {depth}")
@@ -132,6 +133,7 @@ def view_of(evidence: Evidence, geometry: Geometry, model: SensorModel, style: V
         chances = np.rint(255 / (1 + np.exp(-highest)))
     else:
         chances = np.rint(highest / LOG_ODDS_STEP) + LOG_ODDS_ZERO
+    # The row of each sample's node; then the means of colours and temperatures by node.
     rows = _rows_of(evidence.voxels[evidence.sampled] >> np.uint32(3 * (geometry.depth - depth)), nodes)
     colour = next((c for c in geometry.channels if c.kind is ChannelKind.COLOUR), None)
     thermal = next((c for c in geometry.channels if c.kind is ChannelKind.TEMPERATURE), None)
@@ -148,13 +150,14 @@ def view_of(evidence: Evidence, geometry: Geometry, model: SensorModel, style: V
 
 
 def _nodes(evidence: Evidence, model: SensorModel, extent: Extent, *, up: int) -> tuple[npt.NDArray[np.uint32], Floats]:
-    """Nodes that are told, and their highest log-odds; `up` bits of places are left out."""
+    """Nodes of the extent, and their highest log-odds; a node's number is a voxel's without its lowest `up` bits."""
     least = log_odds(model.p_occupied) if extent is Extent.OCCUPIED else -np.inf
     hits, misses = evidence.counts.T
-    # Counts alone make a voxel known: one that holds scalar readings is not. And what was never hit is below a half.
-    told = np.nonzero(hits != 0 if least >= 0 else (hits | misses) != 0)[0]
-    nodes, odds = evidence.voxels[told], model.log_odds(evidence.counts[told])
+    # Only counts make a voxel known, scalar readings alone do not. A voxel without hits is below one half.
+    known = np.nonzero(hits != 0 if least >= 0 else (hits | misses) != 0)[0]
+    nodes, odds = evidence.voxels[known], model.log_odds(evidence.counts[known])
     if up and len(nodes):
+        # Voxels of one node are one run.
         nodes = nodes >> np.uint32(up)
         starts = np.nonzero(np.diff(nodes, prepend=~nodes[:1]))[0]
         nodes, odds = nodes[starts], np.maximum.reduceat(odds, starts)
@@ -172,7 +175,7 @@ def _colours(sums: Ints, channel: Channel, rows_of_samples: Ints, style: ViewSty
 
 
 def _temperatures(sums: Ints, channel: Channel, rows_of_samples: Ints) -> tuple[Ints, Floats]:
-    """Rows, and (W, 2) mean and hottest, kelvin."""
+    """Rows of nodes with temperatures, and (W, 2) their means and hottest voxels, kelvin."""
     rows, starts, mine = _by_node(sums, rows_of_samples)
     if not len(rows):
         return rows, np.empty((0, 2))
@@ -183,15 +186,15 @@ def _temperatures(sums: Ints, channel: Channel, rows_of_samples: Ints) -> tuple[
 
 
 def _rows_of(sampled: npt.NDArray[np.uint32], nodes: npt.NDArray[np.uint32]) -> Ints:
-    """(S,) the row of each sample's node; -1 where that is not told."""
+    """(S,) row of each sample's node in the view; -1 where the view does not hold the node."""
     rows = np.searchsorted(nodes, sampled)
-    is_told = rows < len(nodes)
-    is_told[is_told] = nodes[rows[is_told]] == sampled[is_told]
-    return np.where(is_told, rows, -1)
+    is_held = rows < len(nodes)
+    is_held[is_held] = nodes[rows[is_held]] == sampled[is_held]
+    return np.where(is_held, rows, -1)
 
 
 def _by_node(sums: Ints, rows: Ints) -> tuple[Ints, Ints, Ints]:
-    """Of a channel's (S, planes) sums those with a weight: rows of their nodes, where each begins, and the sums."""
+    """Rows of the nodes with a channel's samples, the first sum of each node, and all sums that have a weight."""
     there = (sums[:, -1] > 0) & (rows >= 0)
     mine = rows[there]
     starts = np.nonzero(np.diff(mine, prepend=-1))[0]

@@ -1,6 +1,6 @@
-"""Evidence read as physical values: one row per voxel, NaN where nothing is known.
+"""Evidence read as physical values: one row per voxel, NaN where a value is unknown.
 
-This is where floats begin: probability is clamped here, means are taken here, and nowhere earlier.
+Floats begin here: probabilities are clamped here, means are taken here, and nowhere earlier.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class Reading:
     """(N,) standard deviation of the samples, temperature only."""
 
     def rows(self, rows: npt.NDArray[np.int64]) -> "Reading":
-        """Of these voxels alone, in this order."""
+        """Reading of the voxels in these rows alone, in this order."""
         spread = None if self.spread is None else self.spread[rows]
         return Reading(self.channel, self.mean[rows], self.weight[rows], spread)
 
@@ -45,7 +45,7 @@ class Voxels:
         return len(self.numbers)
 
     def rows(self, rows: npt.NDArray[np.int64]) -> "Voxels":
-        """These voxels alone, in this order."""
+        """Voxels in these rows alone, in this order."""
         readings = {name: reading.rows(rows) for name, reading in self.readings.items()}
         return Voxels(self.numbers[rows], self.centres_m[rows], self.counts[rows], self.probability[rows], readings)
 
@@ -57,7 +57,7 @@ class Voxels:
 def voxels_of_evidence(
     key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel, *, occupied_only: bool
 ) -> Voxels:
-    """The voxels of one cell, all known ones or only the occupied."""
+    """Voxels of one cell: all with evidence, or only the occupied."""
     samples = np.zeros((len(evidence), geometry.plane_count), np.int64)
     samples[evidence.sampled] = evidence.samples
     keep = model.occupied(evidence.counts) if occupied_only else np.ones(len(evidence), np.bool_)
@@ -89,7 +89,8 @@ def joined_voxels(parts: list[Voxels]) -> Voxels:
 
 
 def reading_of_sums(channel: Channel, sums: npt.NDArray[np.int64]) -> Reading:
-    """What (N, planes) sums of one channel mean."""
+    """Reading of (N, planes) sums of one channel."""
+    # mean = sum / weight; spread^2 = sum of squares / weight - mean^2.
     weight = sums[:, -1]
     divisor = np.where(weight > 0, weight, np.nan)
     values = sums[:, : channel.value_count] / divisor[:, None]
