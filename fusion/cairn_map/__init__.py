@@ -1,5 +1,6 @@
-"""What a map is: grid, evidence, octree code, commits, and the frames and messages that carry them.
+"""The map: grid, evidence, octree code, commits, and the frames and messages that carry them.
 
-Sensors, networks and databases are left to the packages above. Start with `evidence.grid` (where things are numbered),
-`evidence.evidence` (what is counted there) and `codec.cell_code` (how a cell becomes bytes).
+Sensors, networks and databases are left to the packages above. Start with `evidence.grid` (numbers of cells and
+voxels), `evidence.evidence` (the counts and sums of one cell), `evidence.inverse_sensor_model` (their probability) and
+`codec.cell_code` (a cell as bytes).
 """

@@ -32,7 +32,7 @@ class CairnError(Exception):
 
 
 class BadInputError(CairnError):
-    """What was asked cannot be done as asked."""
+    """The request cannot be fulfilled as it is."""
 
 
 class DeniedError(BadInputError):
@@ -44,7 +44,7 @@ class NotFoundError(CairnError):
 
 
 class ConflictError(CairnError):
-    """What was asked contradicts what is already kept."""
+    """The request contradicts data that is already kept."""
 
 
 class DamagedDataError(CairnError):
@@ -63,7 +63,7 @@ class UnreachableError(CairnError):
 
 
 def first_error(exc: ValidationError) -> str:
-    """Where and what the first complaint of a model is, short; the others may be a million, and are not even listed."""
+    """Place and text of a model's first complaint, short; the others, perhaps a million, are not even listed."""
     if exc.error_count() > COMPLAINTS_MAX:
         return f"more than {COMPLAINTS_MAX} fields are wrong"
     first = exc.errors(include_url=False, include_context=False, include_input=False)[0]

@@ -1,7 +1,7 @@
-"""Every kernel of this package, run once on a few voxels, so that Numba compiles it ahead and keeps it.
+"""Warm-up: every kernel of this package is run once on a few voxels, so that Numba compiles it ahead and caches it.
 
-Through the public functions, because a kernel is compiled anew for each type of its arguments: read-only arrays, as
-decoding gives them, are another type than those that a robot made.
+The kernels are run through the public functions, because a kernel is compiled again for each type of its arguments:
+read-only arrays, as decoding gives them, are another type than those that a robot made.
 """
 
 from contextlib import suppress
@@ -78,7 +78,12 @@ def warm_up_pictures() -> None:
         renderer, read = MapRenderer(), read_cell(whole, geometry, model, layer)
         sight, T = pinhole(4, 4, focal_px=4), look_at((-1, 0.1, 0.1), (0, 0, 0))
         drawing = draw_as_needed(
-            *(renderer, geometry, model, {}, [key], lambda _, read=read: {key: read}),
+            renderer,
+            geometry,
+            model,
+            {},
+            [key],
+            lambda _, read=read: {key: read},
             sight=sight,
             T_map_camera=T,
             range_max_m=2.0,

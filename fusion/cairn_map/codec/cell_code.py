@@ -1,9 +1,10 @@
-"""A cell's evidence as bytes and back: one file per cell, lossless and canonical.
+"""The exact cell code: a cell's evidence as bytes and back, lossless and canonical. Start here.
 
     head | child masks | leaf masks | hits | misses | per channel: presence, weight, value planes
 
-FORMAT.md is the norm. The same evidence always gives the same canonical bytes (the streams uncompressed), and
-the SHA-256 over them is the cell's identity; so bytes at rest may be compressed anew without changing it.
+FORMAT.md sections 4 to 6 are the norm. The same evidence always gives the same canonical bytes (the streams
+uncompressed), and the SHA-256 over them is the cell's identity; so stored bytes may be recompressed without changing
+it. `cell_reading` decodes parts of a cell, `view_code` is the lossy code.
 """
 
 import hashlib
@@ -40,7 +41,7 @@ from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
 
 
 class Profile(StrEnum):
-    """How bytes are spent; both say the same, and have the same digest."""
+    """Coding of the streams; both profiles hold the same evidence, and have the same digest."""
 
     FAST = "fast"
     """Byte planes under zstd."""
@@ -58,7 +59,7 @@ class EncodedCell:
 
 @dataclass(frozen=True, slots=True)
 class CanonicalCell:
-    """What canonical bytes say, by leaf."""
+    """Content of canonical bytes, by leaf."""
 
     key: CellKey
     geometry: Geometry
@@ -67,13 +68,13 @@ class CanonicalCell:
 
     @property
     def evidence(self) -> Evidence:
-        """The same by voxel, made anew each time."""
+        """Content by voxel; computed at each call."""
         return evidence_of(self.content)
 
 
 @dataclass(frozen=True, slots=True)
 class DecodedCell:
-    """What a cell's bytes say."""
+    """Content of a cell's bytes, by voxel."""
 
     key: CellKey
     geometry: Geometry
@@ -84,16 +85,18 @@ class DecodedCell:
 def encode_cell(
     key: CellKey, evidence: Evidence, geometry: Geometry, *, profile: Profile = Profile.FAST
 ) -> EncodedCell:
-    """The bytes of one cell; signed evidence (a difference) is marked as such in the head, and coded fast.
+    """Bytes of one cell; signed evidence (a difference) is marked as such in the head, and always coded `FAST`.
 
     Raises:
         BadInputError: kind `bad_evidence`: it is not of this geometry.
     """
+    # The canonical streams, over which the digest is taken (FORMAT.md sections 4 and 5), each under zstd.
     check_fits(evidence, geometry)
     signed, content = evidence.is_signed, content_of(evidence, geometry)
     parts = channel_streams.split_samples(content.sampled, content.samples, geometry)
     head, streams = _canonical(key, content, parts, geometry, voxels=len(evidence), signed=signed)
     stored = {stream.number: stream for stream in stored_streams(streams)}
+    # Groups that a model makes shorter take the place of theirs (section 14): all bytes in the first stream.
     if Profile(profile) is Profile.SMALL and not signed:
         for first, data in _modelled(content, parts, geometry).items():
             group = [number for number in streams if _group(number) == _group(first)]
@@ -107,7 +110,7 @@ def encode_cell(
 def encode_cells(
     diff: Mapping[CellKey, Evidence], geometry: Geometry, *, profile: Profile = Profile.FAST, threads: int | None = None
 ) -> dict[CellKey, EncodedCell]:
-    """The bytes of many cells, rising in number, on as many threads as there are processors unless told otherwise.
+    """Bytes of many cells, rising in number; `threads` None: one for each processor.
 
     Raises:
         BadInputError: as `encode_cell`.
@@ -121,7 +124,7 @@ def encode_cells(
 
 
 def cell_digest(key: CellKey, evidence: Evidence, geometry: Geometry) -> bytes:
-    """The digest that `encode_cell` gives, without compressing anything.
+    """Digest of one cell's evidence, as `encode_cell` gives it, without compressing anything.
 
     Raises:
         BadInputError: kind `bad_evidence`: it is not of this geometry.
@@ -130,11 +133,11 @@ def cell_digest(key: CellKey, evidence: Evidence, geometry: Geometry) -> bytes:
 
 
 def decode_cell(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) -> DecodedCell:
-    """What a cell's bytes say, with every size checked before anything is allocated.
+    """Evidence of a cell's bytes; every size is checked before anything is allocated.
 
     The result is sound evidence, but the bytes might be another coding of it than the canonical one;
-    `decode_canonical_cell` refuses that. A hundred bytes can stand for 200 MB of evidence (collapsed air), so who
-    reads what strangers wrote sets `evidence_bytes_max`.
+    `decode_canonical_cell` refuses that. A hundred bytes can stand for 200 MB of evidence (collapsed air), so set
+    `evidence_bytes_max` for bytes from an untrusted source.
 
     Raises:
         DamagedDataError: cut off, contradictory or out of range.
@@ -146,7 +149,7 @@ def decode_cell(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) ->
 
 
 def decode_met(data: bytes) -> DecodedCell:
-    """`decode_cell`, but of the evidence only voxels that were hit or have samples: all that shows.
+    """`decode_cell`, restricted to voxels that were hit or have samples: all that are visible.
 
     Raises:
         DamagedDataError, BadInputError: as `decode_cell`.
@@ -157,7 +160,7 @@ def decode_met(data: bytes) -> DecodedCell:
 
 
 def decode_canonical_cell(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) -> DecodedCell:
-    """`decode_cell`, and refuse bytes that are not the canonical coding of what they say.
+    """`decode_cell`, but refuse bytes that are not the canonical coding of their evidence.
 
     Raises:
         DamagedDataError: kind `not_canonical`, or as `decode_cell`.
@@ -168,11 +171,12 @@ def decode_canonical_cell(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYT
 
 
 def read_canonical_cell(reader: CellReader) -> CanonicalCell:
-    """What a reader's bytes say, by leaf, if they are the canonical coding of it.
+    """Content of a reader's bytes, by leaf; refused unless they are its canonical coding.
 
     Raises:
         DamagedDataError, BadInputError: as `decode_canonical_cell`.
     """
+    # Plain cells are checked while they are read; others are encoded again and compared.
     head, content = reader.head, reader.content()
     is_canonical, data = reader.is_canonical(content), reader.canonical_bytes()
     if is_canonical is None:
@@ -193,7 +197,7 @@ def recompressed_cell(data: bytes, *, profile: Profile) -> bytes:
 
 
 def _encoded(key: CellKey, evidence: Evidence, geometry: Geometry) -> tuple[bytes, dict[int, bytes]]:
-    """Head and raw streams of evidence that may not fit."""
+    """Head and raw streams of evidence, which is checked to fit the geometry."""
     check_fits(evidence, geometry)
     content = content_of(evidence, geometry)
     parts = channel_streams.split_samples(content.sampled, content.samples, geometry)
@@ -213,13 +217,14 @@ def _canonical(
 
 
 def _modelled(content: CellContent, parts: list[ChannelRows], geometry: Geometry) -> dict[int, bytes | None]:
-    """By the number of its first stream, each group as its model says it; None where that does not pay."""
+    """By the number of its first stream: the bytes of each group under its model; None where they would be longer."""
     leaves = len(content.counts)
     ground = small_profile.ground_of(content.octree, depth=geometry.depth)
     groups = {
         CHILD_MASKS: small_profile.encode_masks(content.octree, depth=geometry.depth),
         HITS: small_profile.encode_counts(content, ground),
     }
+    # A channel is modelled on the weights of the channel before it.
     hits, before = content.counts[:, 0].copy(), np.zeros(leaves, np.int64)
     for c, (channel, rows) in enumerate(zip(geometry.channels, parts, strict=True)):
         groups[stream_of_channel(c)] = small_profile.encode_channel(channel, rows, hits, before, ground)
@@ -228,7 +233,7 @@ def _modelled(content: CellContent, parts: list[ChannelRows], geometry: Geometry
 
 
 def _group(number: int) -> int:
-    """The number of the first stream of the group that a stream belongs to."""
+    """Number of the first stream of a stream's group."""
     return {CHILD_MASKS: CHILD_MASKS, LEAF_MASKS: CHILD_MASKS, HITS: HITS, MISSES: HITS}.get(number, number & ~7)
 
 

@@ -1,7 +1,7 @@
-"""A whole cell's content from raw streams of unsigned numbers, all at once: the way of nearly all cells.
+"""Plain cells, which nearly all cells are: unsigned, not modelled, small. Their content is read in one pass.
 
-`CellReader` goes stream by stream, so that it can stop early; for a few hundred leaves that is thirty small arrays, and
-numpy takes longer to make them than to fill them. Both read the same, and refuse the same.
+`CellReader` reads stream by stream, so that it can stop early; for a few hundred leaves that is thirty small arrays,
+which NumPy takes longer to create than to fill. Both ways give the same content, and refuse the same bytes.
 """
 
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ from cairn_map.evidence.channels import PLANES, ChannelKind, planes_and_squares
 from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX
 
 PLAIN_BYTES_MAX = 1 << 22
-"""Raw bytes of a cell that are held a second time so that all of it can be read at once."""
+"""Raw bytes of a plain cell, at most: to read it in one pass, they are held a second time."""
 COMPLAINTS = {
     kernels.BAD_MASKS: ("bad_octree", "the octree's masks are cut off, left over, or contradict each other"),
     kernels.BAD_LEAVES: ("bad_cell", "the octree has other numbers of voxels or leaves than the head names"),
@@ -41,17 +41,17 @@ COMPLAINTS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlainCell:
-    """What was read at once."""
+    """Content of a plain cell, and the facts that decide whether its bytes are canonical."""
 
     content: CellContent
     canonical: bytes
-    """The canonical bytes of a cell with these streams."""
+    """Canonical bytes of a cell with these streams."""
     is_fewest: bool
-    """Whether each column has as few planes as it needs."""
+    """True if each column has as few planes as it needs."""
 
 
 def is_plain(head: CellHead, stored: Mapping[int, StoredStream]) -> bool:
-    """Whether all of a cell can be read at once."""
+    """True if a cell can be read in one pass."""
     streams = stored.values()
     return (
         not head.signed
@@ -62,17 +62,19 @@ def is_plain(head: CellHead, stored: Mapping[int, StoredStream]) -> bool:
 
 
 def plain_content(head: CellHead, head_bytes: bytes, raw: Mapping[int, bytes], *, sampled_max: int) -> PlainCell:
-    """What the raw streams of a plain cell say, given in the order of their numbers.
+    """Content of the raw streams of a plain cell, given in the order of their numbers.
 
     Raises:
         DamagedDataError: cut off, contradictory or out of range.
         BadInputError: kind `too_large`: more than `sampled_max` leaves have samples.
     """
+    # The streams lie in the canonical bytes, each behind a head of its own.
     geometry, leaves = head.geometry, head.leaves
     canonical = canonical_bytes(head_bytes, raw)
     size = np.array([len(stream) for stream in raw.values()], np.int64)
     at = np.cumsum(size + STREAM_HEAD.size) - size + len(head_bytes)
     data, spec = np.frombuffer(canonical, np.uint8), planes_and_squares(geometry.channels)
+    # First pass: all sizes and masks; then arrays of the right size, and the second pass.
     firsts = np.zeros(geometry.depth + 1, np.int64)
     wrong, count, is_fewest = kernels.measure_plain(data, at, size, spec, leaves, firsts)
     _check(wrong)

@@ -1,10 +1,11 @@
-"""A whole unsigned cell from its raw streams in two passes: how much there is and whether it can be, then the numbers.
+"""Kernels of plain cells: a whole unsigned cell from its raw streams, in two passes: sizes and checks, then numbers.
 
-    data   all raw streams, one after the other       at, size   where each begins, and its bytes
+    data   all raw streams, one after the other       at, size   first byte of each, and its length
     spec   (channels, 2) planes of each channel, and how many are sums of squares (`channels.planes_and_squares`)
 
-Streams stand as in FORMAT.md 4: child masks, leaf masks, hits, misses, and of each channel presence, weight, values.
-One pass of many columns at once takes a fraction of a pass for each: most cells of a diff have some hundred leaves.
+Streams are in the order of FORMAT.md section 6: child masks, leaf masks, hits, misses, and of each channel presence,
+weight, values. One pass over all columns takes a fraction of a pass for each: most cells of a diff have some hundred
+leaves.
 """
 
 import numba as nb
@@ -15,14 +16,17 @@ from cairn_map.codec.octree.octree_kernels import list_leaves_into, measure_mask
 from cairn_map.codec.octree.sum_kernels import square_guess, unzigzag
 
 SOUND, BAD_MASKS, BAD_LEAVES, BAD_COLUMN, BAD_PRESENCE, BAD_NUMBER = range(6)
-"""What is wrong with streams."""
+"""Results of the checks."""
 COLUMNS_FROM = 2
+"""Index of the first stream that is a column: hits."""
 CHANNELS_FROM = 4
+"""Index of the first stream of channels."""
 
 
 @nb.njit(nogil=True)
 def _column(data: Bytes, at: int, size: int, rows: int) -> tuple[bool, bool]:
-    """Whether a column has the length that its planes need, and no more planes than its largest number."""
+    """Two answers: True if a column has the length of its planes; True if its largest number needs all of them."""
+    # No more planes than needed: some number has its highest byte not 0.
     planes = np.int64(data[at]) if size > 0 else 9
     if planes > 8 or size != 1 + planes * rows:
         return False, False
@@ -37,10 +41,11 @@ def _column(data: Bytes, at: int, size: int, rows: int) -> tuple[bool, bool]:
 
 @nb.njit(cache=True, nogil=True)
 def measure_plain(data: Bytes, at: Ints, size: Ints, spec: Ints, leaves: int, firsts: Ints) -> tuple[int, int, bool]:
-    """What is wrong, if anything; how many leaves have samples; and whether every column has its fewest planes.
+    """SOUND or the first fault; the number of leaves with samples; and True if every column has its fewest planes.
 
-    `firsts` is filled as `measure_masks` does.
+    `firsts` is filled as by `measure_masks`.
     """
+    # Masks (section 4).
     child_masks, leaf_masks = data[at[0] : at[0] + size[0]], data[at[1] : at[1] + size[1]]
     masks, leaf_masks_read, found = measure_masks(child_masks, leaf_masks, firsts, firsts.shape[0] - 1)
     if masks < 0:
@@ -49,12 +54,14 @@ def measure_plain(data: Bytes, at: Ints, size: Ints, spec: Ints, leaves: int, fi
         return BAD_MASKS, 0, False
     if found != leaves:
         return BAD_LEAVES, 0, False
+    # Counts: columns of all leaves (section 5).
     fewest = True
     for s in range(COLUMNS_FROM, CHANNELS_FROM):
         fits, least = _column(data, at[s], size[s], leaves)
         if not fits:
             return BAD_COLUMN, 0, False
         fewest &= least
+    # Channels: presence, one bit a leaf with spare bits 0; then columns of as many rows as bits are set.
     row_bytes = (leaves + 7) // 8
     s = CHANNELS_FROM
     for c in range(spec.shape[0]):
@@ -71,6 +78,7 @@ def measure_plain(data: Bytes, at: Ints, size: Ints, spec: Ints, leaves: int, fi
                 return BAD_COLUMN, 0, False
             fewest &= least
         s += 1 + spec[c, 0]
+    # Leaves with samples of any channel.
     sampled = 0
     for n in range(row_bytes):
         sampled += ones(_any_presence(data, at, spec, n))
@@ -91,10 +99,11 @@ def read_plain_into(
     sampled: Ints,
     samples: Ints,
 ) -> int:
-    """Leaves, their counts and their samples, of streams that `measure_plain` found sound; or what is wrong.
+    """Write leaves, counts and samples of streams that `measure_plain` found sound; returns SOUND or a fault.
 
     `limits` are those of a count and of a sum; `starts` and `sizes` have room for one more; `samples` (S, P) is zeros.
     """
+    # Leaves and their counts.
     child_masks, leaf_masks = data[at[0] : at[0] + size[0]], data[at[1] : at[1] + size[1]]
     list_leaves_into(child_masks, leaf_masks, firsts, firsts.shape[0] - 1, starts, sizes)
     leaves = counts.shape[0]
@@ -102,6 +111,7 @@ def read_plain_into(
         s = COLUMNS_FROM + column
         if not _numbers_into(data, at[s], size[s], limits[0], counts, column):
             return BAD_NUMBER
+    # Leaves with samples of any channel, then the samples channel by channel.
     S = 0
     for n in range((leaves + 7) // 8):
         bits = _any_presence(data, at, spec, n)
@@ -122,9 +132,10 @@ def read_plain_into(
 
 @nb.njit(nogil=True)
 def _numbers_into(data: Bytes, at: int, size: int, limit: int, out: Int32s, column: int) -> bool:
-    """A column of numbers; False if one is beyond the limit."""
+    """Write a column of numbers; False if one is beyond the limit."""
     rows = out.shape[0]
     planes = np.int64(data[at])
+    # Nearly all counts are below 256.
     if planes == 1:
         for n in range(np.uint64(rows)):
             out[n, column] = data[np.uint64(at + 1) + n]
@@ -149,11 +160,12 @@ def _channel_into(
     sampled: Ints,
     samples: Ints,
 ) -> int:
-    """One channel's sums, in columns from `first` on; `at` and `size` begin with its own streams."""
+    """Write one channel's sums, in columns from `first` on; `at` and `size` begin with its own streams."""
     values = planes - 1 - squares
     rows = 0
     for n in range(size[0]):
         rows += ones(data[at[0] + n])  # pyright: ignore[reportArgumentType]
+    # Invariant: `row` rows of the channel are read; the last is sample `before` and has weight `weight_before`.
     row, before, weight_before = 0, 0, np.uint64(0)
     for s in range(sampled.shape[0]):
         leaf = sampled[s]
@@ -161,6 +173,7 @@ def _channel_into(
             continue
         weight = _word(data, at[1], row, rows)
         says, beyond = weight, weight > np.uint64(limit)
+        # Values, as residuals against the mean of the row before times this weight.
         for p in range(values):
             guess = np.uint64(0)
             if weight_before != 0:
@@ -170,6 +183,7 @@ def _channel_into(
             word = guess + unzigzag(_word(data, at[2 + p], row, rows))
             says, beyond = says | word, beyond | (word > np.uint64(limit))
             samples[s, first + p] = np.int64(word)
+        # The sum of squares, as a residual against that of equal samples.
         if squares:
             guess = square_guess(np.uint64(samples[s, first]), weight) if weight != 0 else np.uint64(0)
             word = guess + unzigzag(_word(data, at[2 + values], row, rows))
@@ -184,7 +198,7 @@ def _channel_into(
 
 @nb.njit(nogil=True, forceinline=True)
 def _word(data: Bytes, at: int, row: int, rows: int) -> np.uint64:
-    """A number of the column at `at`: how many planes, and these."""
+    """Number of a row in the column at `at`: a byte for the number of planes, then the planes."""
     word = np.uint64(0)
     for p in range(np.int64(data[at])):
         word |= np.uint64(data[at + 1 + p * rows + row]) << np.uint64(8 * p)
@@ -193,7 +207,7 @@ def _word(data: Bytes, at: int, row: int, rows: int) -> np.uint64:
 
 @nb.njit(nogil=True, forceinline=True)
 def _any_presence(data: Bytes, at: Ints, spec: Ints, n: int) -> np.uint8:
-    """Which of eight leaves have samples of any channel."""
+    """Bits of those of eight leaves that have samples of any channel."""
     bits = np.uint8(0)
     s = CHANNELS_FROM
     for c in range(spec.shape[0]):

@@ -1,8 +1,9 @@
-"""A view as bytes and back: octree, probabilities, colours and temperatures, each under a model of its neighbours.
+"""The view code: a view as bytes and back, its octree, probabilities, colours and temperatures each under a model.
 
     head | masks | palette | probabilities | colours | temperatures        FORMAT.md section 15
 
-A third of the exact cell: counts become one number, noise is rounded away, and what is free may be left out.
+A view has a third of the bytes of the exact cell: counts become one number, noise is rounded away, and free space may
+be left out.
 """
 
 import struct
@@ -30,15 +31,15 @@ HEAD = struct.Struct("<4sBBBBBBdIiiiIIII")
 LENGTH = struct.Struct("<I")
 GROUPS = 5
 EXTENTS, CHANCES, COLOURS = list(Extent), list(Chance), list(Colours)
-"""Codes in the head are places in these lists."""
+"""Styles by their codes in the head, which are indices of these lists."""
 VIEW_BYTES_MAX = 1 << 26
 NODES_MAX = 1 << 24
-"""Nodes that a reader takes unless told otherwise: all of the largest cell, some 500 MB."""
+"""Default limit of the nodes that a reader accepts: all of the largest cell, some 500 MB."""
 
 
 @dataclass(frozen=True, slots=True)
 class DecodedView:
-    """What a view's bytes say: which cell of which grid, and how it looks."""
+    """Content of a view's bytes: the cell, its grid, and its view."""
 
     key: CellKey
     voxel_edge_um: int
@@ -49,14 +50,16 @@ class DecodedView:
 def encode_view(
     key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel, *, style: ViewStyle | None = None
 ) -> bytes:
-    """The bytes of one cell's view.
+    """Bytes of one cell's view.
 
     Raises:
         BadInputError: kind `bad_style`: deeper than the cell.
     """
+    # The view, and its octree: nodes with equal probabilities and nothing else collapse.
     view = view_of(evidence, geometry, model, style or ViewStyle())
     octree, rows = build_octree(_as_evidence(view), depth=view.depth)
     child_masks, leaf_masks, N = octree.child_masks.copy(), octree.leaf_masks.copy(), len(rows)
+    # Values by leaf, and the coders that model them on the leaves' neighbours.
     chances = view.chances[rows]
     coloured = _flags(leaves_of_rows(rows, view.coloured.astype(np.uint32)), N)
     warm = _flags(leaves_of_rows(rows, view.warm.astype(np.uint32)), N)
@@ -73,21 +76,32 @@ def encode_view(
         _written(temperatures, N + view.temperatures.size),
     ]
     head = HEAD.pack(
-        *(MAGIC, VERSION, geometry.depth, view.depth),
-        *(EXTENTS.index(view.style.extent), CHANCES.index(view.style.chance), COLOURS.index(view.style.colours)),
-        *(view.style.temperature_step_k or 0.0, geometry.voxel_edge_um, *cell_of_key(key)),
-        *(N, len(view), len(child_masks), len(leaf_masks)),
+        MAGIC,
+        VERSION,
+        geometry.depth,
+        view.depth,
+        EXTENTS.index(view.style.extent),
+        CHANCES.index(view.style.chance),
+        COLOURS.index(view.style.colours),
+        view.style.temperature_step_k or 0.0,
+        geometry.voxel_edge_um,
+        *cell_of_key(key),
+        N,
+        len(view),
+        len(child_masks),
+        len(leaf_masks),
     )
     return head + b"".join(LENGTH.pack(len(group)) + group for group in groups)
 
 
 def decode_view(data: bytes, *, nodes_max: int = NODES_MAX) -> DecodedView:
-    """The mirror of `encode_view`, with every size checked before anything is allocated.
+    """View of a cell's bytes, every size checked before anything is allocated; the mirror of `encode_view`.
 
     Raises:
         DamagedDataError: cut off, contradictory or out of range.
         BadInputError: a version that this reader does not know, or too large.
     """
+    # Head, and the bytes of the five groups.
     head = _head(data)
     style, depth, N = head.style, head.depth, head.leaves
     if head.nodes > nodes_max or len(data) > VIEW_BYTES_MAX:
@@ -95,23 +109,27 @@ def decode_view(data: bytes, *, nodes_max: int = NODES_MAX) -> DecodedView:
             "too_large", f"a view of {len(data)} bytes, {head.nodes} nodes; at most {nodes_max} are read"
         )
     masks, palette_bytes, rank_bytes, colours, temperatures = _groups(data)
+    # Octree.
     child_masks, leaf_masks = np.zeros(head.child_masks, np.uint8), np.zeros(head.leaf_masks, np.uint8)
     read_modelled(_masks_coder(child_masks, leaf_masks, depth), masks)
     octree = parse_octree(child_masks, leaf_masks, depth=depth)
     if len(octree.starts) != N or int(octree.sizes.sum()) != head.nodes:
         raise DamagedDataError("bad_view", "the octree has other numbers of nodes or leaves than the head names")
+    # Probabilities: ranks in a palette.
     ground, ranks = ground_of(octree, depth=depth), np.zeros(N, np.int64)
     read_modelled(_ranks_coder(ranks, ground), rank_bytes)
     palette = _read_palette(palette_bytes, style)
     if N and int(ranks.max()) >= len(palette):
         raise DamagedDataError("bad_view", "a probability is not in the palette")
     found = palette[ranks]
+    # Colours, then temperatures, whose presence is modelled on that of colours.
     occupied, none = _occupied(found, style), np.zeros(N, np.bool_)
     coloured, rgb = _read_samples(colours, occupied, none, ground, columns=len(TOPS[style.colours]))
     columns = 0 if style.temperature_step_k is None else 1 if depth == head.cell_depth else 2
     warm, steps = _read_samples(temperatures, occupied, _flags(coloured, N), ground, columns=columns)
     if (rgb > np.array(TOPS[style.colours])).any():
         raise DamagedDataError("bad_view", "a colour is out of range")
+    # From leaves to nodes.
     nodes, spread = np.empty(head.nodes, np.uint32), np.empty((head.nodes, 2), np.int32)
     expand_into(octree.starts, octree.sizes, np.stack([found, found], axis=1).astype(np.int32), nodes, spread)
     rows = np.cumsum(octree.sizes) - octree.sizes
@@ -121,7 +139,7 @@ def decode_view(data: bytes, *, nodes_max: int = NODES_MAX) -> DecodedView:
 
 @dataclass(frozen=True, slots=True)
 class _Head:
-    """What the head says."""
+    """Fields of a view's head."""
 
     cell_depth: int
     depth: int
@@ -171,14 +189,14 @@ def _groups(data: bytes) -> list[bytes]:
 
 
 def _as_evidence(view: View) -> Evidence:
-    """Nodes that collapse where probabilities are equal and nothing else is known."""
+    """Evidence whose octree is the view's: nodes collapse where probabilities are equal and no other value is known."""
     counts = np.stack([view.chances + 1, np.zeros_like(view.chances)], axis=1).astype(np.int32)
     sampled = np.union1d(view.coloured, view.warm).astype(np.uint32)
     return Evidence(view.nodes, counts, sampled, np.zeros((len(sampled), 0), np.int64))
 
 
 def _occupied(chances: Ints, style: ViewStyle) -> npt.NDArray[np.int32]:
-    """(N,) 1 where the probability is above a half: what leaves with samples are told apart by."""
+    """(N,) 1 where the probability is above one half; the presence of samples is modelled on it."""
     return (chances > (127 if style.chance is Chance.BYTE else LOG_ODDS_ZERO)).astype(np.int32)
 
 
@@ -201,14 +219,14 @@ def _masks_coder(child_masks: Bytes, leaf_masks: Bytes, depth: int) -> Code:
 
 
 def _ranks_coder(ranks: Ints, ground: Ground) -> Code:
-    """Of all leaves' (N,) ranks in the palette."""
+    """Coder of all leaves' (N,) ranks in the palette."""
     where = (ground.brick_of, ground.leaf_of, ground.depth)
     near = earlier_rows(ground.octree.starts, np.arange(len(ranks)), *where)
     return lambda coder, data: code_ranks(coder, data, ranks, near)
 
 
 def _read_palette(data: bytes, style: ViewStyle) -> Ints:
-    """The different probabilities, the highest first."""
+    """Distinct probabilities of a view, the highest first."""
     palette = np.frombuffer(data[: len(data) & ~1], "<u2").astype(np.int64)
     top = 255 if style.chance is Chance.BYTE else 2 * LOG_ODDS_ZERO - 1
     if len(data) % 2 or (np.diff(palette) >= 0).any() or (palette > top).any():
@@ -219,7 +237,7 @@ def _read_palette(data: bytes, style: ViewStyle) -> Ints:
 def _samples_coder(
     present: Flags, values: Ints, occupied: npt.NDArray[np.int32], before: Flags, ground: Ground
 ) -> Code:
-    """Of which leaves have values, after those that have some of the kind before, and (S, C) values."""
+    """Coder of one kind of (S, C) values, and of the leaves that have them; `before`: leaves with the kind before."""
 
     def code(coder: Coder, data: Bytes) -> bool:
         _code_presence(coder, data, present, occupied, before, ground)
@@ -231,7 +249,7 @@ def _samples_coder(
 def _read_samples(
     data: bytes, occupied: npt.NDArray[np.int32], before: Flags, ground: Ground, *, columns: int
 ) -> tuple[Ints, Ints]:
-    """The mirror of `_samples_coder`: leaves that have values, and the values."""
+    """Leaves that have values of one kind, and the values; the mirror of `_samples_coder`."""
     found: list[Ints] = [np.empty(0, np.int64), np.empty((0, columns), np.int64)]
 
     def code(coder: Coder, read: Bytes) -> bool:

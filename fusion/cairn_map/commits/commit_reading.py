@@ -1,13 +1,13 @@
-"""A commit's bytes, read in two steps: what its head and its cells' heads claim, and then all of it, validated.
+"""Reading of a commit's bytes in two steps: first the claims of its meta and its cells' heads, then all of it.
 
-Between the two a server decides whether it wants a commit, and where so much is to be decoded.
+Between the two steps a server decides whether it accepts the commit, and in which process it is decoded.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from cairn_map.codec.cell_code import CanonicalCell, read_canonical_cell
-from cairn_map.codec.cell_reading import VOXEL_BYTES, CellReader, cell_reader, sampled_max_of
+from cairn_map.codec.cell_reading import VOXEL_BYTES, CellReader, cell_reader
 from cairn_map.commits.commit import (
     EVIDENCE_BYTES_MAX,
     Commit,
@@ -32,17 +32,17 @@ class CommitReader:
     text: bytes
     bodies: list[bytes]
     readers: list[CellReader]
-    """One for each of the bodies."""
+    """One reader for each of the bodies."""
 
     @property
     def cells(self) -> dict[CellKey, bytes]:
-        """Their bytes, which may not be sound."""
+        """Bytes of the cells, not validated yet."""
         return {reader.head.key: body for reader, body in zip(self.readers, self.bodies, strict=True)}
 
     def read(self, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) -> tuple[Commit, Mapping[CellKey, CanonicalCell]]:
-        """All of it, validated completely: canonical cells, rising, of one geometry.
+        """The commit and its cells, validated completely: canonical, rising, of one geometry.
 
-        Needs up to about twice `evidence_bytes_max` of memory, whatever the bytes say.
+        This needs up to about twice `evidence_bytes_max` of memory, whatever the bytes say.
 
         Raises:
             DamagedDataError: contradictory, not canonical.
@@ -51,8 +51,9 @@ class CommitReader:
         self._check_heads(evidence_bytes_max)
         cells: dict[CellKey, CanonicalCell] = {}
         left, bricks = evidence_bytes_max, 0
+        # One cell after the other, each with the memory that those before it left.
         for reader in self.readers:
-            reader.sampled_max = sampled_max_of(reader.head, left)
+            reader.limit_evidence(left)
             cell = read_canonical_cell(reader)
             check_samples(cell.content.samples, cell.geometry)
             left -= cell.content.evidence_bytes
@@ -64,7 +65,7 @@ class CommitReader:
         return Commit(self.meta, self.cells, sha, self.data), cells
 
     def _check_heads(self, evidence_bytes_max: int) -> None:
-        """Refuse by the heads alone what need not be decoded to be refused."""
+        """Refuse a commit by its cells' heads alone, before anything is decoded."""
         last, geometry = -1, None
         for reader in self.readers:
             head = reader.head
@@ -79,7 +80,7 @@ class CommitReader:
 
 
 def commit_reader(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) -> CommitReader:
-    """A reader of a commit's bytes; the heads and all sizes are checked.
+    """Reader of a commit's bytes; the heads and all sizes are checked.
 
     Raises:
         DamagedDataError: cut off or contradictory.
@@ -93,7 +94,7 @@ def commit_reader(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) 
 def open_commit(
     data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX
 ) -> tuple[Commit, Mapping[CellKey, CanonicalCell]]:
-    """The commit in bytes and all its evidence, validated completely.
+    """Commit of bytes and all its evidence, validated completely.
 
     Raises:
         DamagedDataError, BadInputError: as `commit_reader` and `CommitReader.read`.

@@ -1,15 +1,15 @@
-"""Adaptive binary arithmetic coding: one decision after the other, each under a probability that learns.
+"""Adaptive binary arithmetic coding: one bit after the other, each under a probability that learns.
 
     coder    low, high, code, position, decoding      the interval [low, high], 32 bits each
     data     uint8      what is written, or read
     odds     uint32     one per context: probability of a 1 in the upper 22 bits, times seen in the lower 10
 
 Encoding and decoding are one function: when encoding, `code_bit` writes the bit that it is given and returns it; when
-decoding, it ignores what it is given and returns what was written. So a model is written once, and cannot disagree
-with itself. Only integers: the same bytes on every machine. FORMAT.md section 14 is the norm.
+decoding, it ignores that bit and returns the one that was written. So a model is programmed once, and its two
+directions cannot disagree. Only integers: the same bytes on every machine. FORMAT.md section 14 is the norm.
 
-While it works a coder is a tuple, which the compiler keeps in registers: fifteen times as fast as one in an array.
-Between kernels it is an array.
+Inside a kernel a coder is a tuple, which the compiler keeps in registers: fifteen times as fast as an array. Between
+kernels it is an array.
 """
 
 import numba as nb
@@ -20,17 +20,18 @@ from cairn_map.kernels.integer_kernels import signed
 
 Coder = npt.NDArray[np.int64]
 Live = tuple[int, int, int, int, bool]
-"""A coder at work."""
+"""A coder inside a kernel."""
 Data = npt.NDArray[np.uint8]
 Odds = npt.NDArray[np.uint32]
 
 LOW, HIGH, CODE, AT, DECODING = 0, 1, 2, 3, 4
 TOP = 0xFFFFFFFF
 EVEN = np.uint32(1 << 31)
-"""Odds of a context that nothing is known of."""
+"""Odds of a context that is not used yet: one half, seen 0 times."""
 SEEN_MAX = 255
 STEPS = np.array([(1 << 17) // (2 * n + 3) for n in range(SEEN_MAX + 1)], np.int64)
-"""By times seen: how far a probability moves towards the bit, in 1/65536: 2/3, 2/5, 2/7, ... a mean, then a memory."""
+"""By times seen: the fraction by which a probability moves towards the bit, in 1/65536: 2/3, 2/5, 2/7, ... at first a
+mean of all bits, later one that forgets the oldest."""
 
 
 @nb.njit(cache=True, nogil=True)
@@ -54,20 +55,20 @@ def start_decoding(data: Data) -> Coder:
 
 @nb.njit(nogil=True, forceinline=True)
 def resumed(coder: Coder) -> Live:
-    """A coder at work, as it was left."""
+    """Coder inside a kernel, in the state of an array."""
     return coder[LOW], coder[HIGH], coder[CODE], coder[AT], coder[DECODING] == 1
 
 
 @nb.njit(nogil=True, forceinline=True)
 def suspend_into(coder: Coder, live: Live) -> None:
-    """Keep a coder for the next kernel."""
+    """Store a coder in its array, for the next kernel."""
     coder[LOW], coder[HIGH], coder[CODE], coder[AT] = live[0], live[1], live[2], live[3]
 
 
 @nb.njit(nogil=True, forceinline=True)
 def code_bit(live: Live, data: Data, odds: Odds, context: int, bit: int) -> tuple[int, Live]:
     """Code one bit under a context, and let the context learn it."""
-    # At least 1/65536: an interval must not become empty.
+    # At least 1/65536, else an interval could become empty.
     bit, live = split(live, data, max(signed(odds[context]) >> 16, 1), 16, bit)
     learn(odds, context, bit)
     return bit, live
@@ -77,8 +78,9 @@ def code_bit(live: Live, data: Data, odds: Odds, context: int, bit: int) -> tupl
 def split(live: Live, data: Data, chance: int, bits: int, bit: int) -> tuple[int, Live]:
     """Code one bit whose probability of being 1 is chance / 2^bits.
 
-    Behind the end of `data` zeros are read, and nothing is written: `finish_encoding` tells.
+    Behind the end of `data` zeros are read, and nothing is written: `finish_encoding` then returns -1.
     """
+    # A 1 takes the lower part of the interval [low, high], a 0 the upper one.
     low, high, code, at, decoding = live
     middle = low + (((high - low) * chance) >> bits)
     if decoding:
@@ -87,6 +89,7 @@ def split(live: Live, data: Data, chance: int, bits: int, bit: int) -> tuple[int
         high = middle
     else:
         low = middle + 1
+    # Bytes that both ends share are final: they are written, or left behind, and the interval grows by a byte.
     while (low ^ high) & 0xFF000000 == 0:
         if decoding:
             code = ((code << 8) & TOP) | byte_at(data, at)
@@ -118,7 +121,8 @@ def byte_at(data: Data, at: int) -> int:
 
 @nb.njit(cache=True, nogil=True)
 def finish_encoding(coder: Coder, data: Data) -> int:
-    """Write the fewest bytes that name the interval; returns bytes written, or -1 if there was no room."""
+    """Write the fewest bytes that name the interval; returns the number of all bytes, or -1 if there was no room."""
+    # The least number of `count` bytes, zeros behind them, that is not below the interval; some count fits into it.
     for count in range(1, 5):
         mask = TOP >> (8 * count)
         value = (coder[LOW] + mask) & ~mask
@@ -133,6 +137,6 @@ def finish_encoding(coder: Coder, data: Data) -> int:
 
 @nb.njit(cache=True, nogil=True)
 def finish_decoding(coder: Coder, data: Data) -> bool:
-    """Whether exactly the bytes that an encoder writes were read: of the four read ahead it leaves up to three away."""
+    """True if exactly an encoder's bytes were read: of the four bytes read ahead it omits up to three."""
     left: int = signed(coder[AT]) - data.shape[0]
     return left >= 0 and left <= 3

@@ -1,9 +1,9 @@
-"""Hits and misses of the leaves, modelled on the leaves beside them that come before.
+"""Model of counts: hits and misses of the leaves, under those of neighbours that come before (FORMAT.md section 14).
 
-Whether a leaf was hit, opinions of: hits beside it, what lies above, hits across edges. How often: the mean of the hits
-beside it. Misses are guessed as the median of the three beside its faces; what is coded is what differs from that,
-opinions of: how each neighbour differs from the guess; those across edges; the guess itself; how good the neighbours'
-guesses were.
+"Hit or not" has three opinions: of the neighbours across faces with the leaves above; of those across edges, too; and
+of the mean of their hits and misses. The number of hits is coded as the difference to that mean. Misses are guessed as
+the median of the three neighbours across faces; the difference has four opinions: how each of these neighbours differs
+from the guess; how those across edges do; the guess itself; and the errors of the neighbours' guesses.
 """
 
 import numba as nb
@@ -18,7 +18,7 @@ from cairn_map.kernels.integer_kernels import signed
 
 COUNT_MAX = (1 << 31) - 1
 HIT_TABLE = 1 << 14
-"""Contexts of one opinion on hits: first those of hit or not, then the numbers'."""
+"""Contexts of one opinion on hits: first those of hit or not, then those of numbers."""
 NUMBERS_FROM = 1 << 13
 MISS_TABLE = 1 << 14
 """Numbers of contexts of one opinion on misses, each of SLOTS."""
@@ -36,6 +36,7 @@ def code_counts(
     depth: int,
 ) -> bool:
     """Code (N, 2) hits and misses of the leaves; False if one that was read is out of range."""
+    # Tables of the models: odds, weights and tails of hits and of misses.
     live = resumed(coder)
     N = starts.shape[0]
     hit_odds, hit_weights = np.full(3 * HIT_TABLE, EVEN, np.uint32), start_weights(2 * SLOTS, 3)
@@ -44,6 +45,7 @@ def code_counts(
     near, hit_contexts, miss_contexts = np.empty(7, np.int64), np.empty(3, np.int64), np.empty(4, np.int64)
     errors = np.zeros(N + 1, np.uint8)
     for n in range(N):
+        # Neighbours: seven lower ones, which are coded already; and the presence of three upper ones.
         place = signed(starts[n])
         for i in range(7):
             near[i] = leaf_at(brick_of, leaf_of, beside(place, LOWER[i], depth))
@@ -51,6 +53,7 @@ def code_counts(
         for axis in range(3):
             up = stepped(place + sizes[n] - 1, axis, 1, depth)
             above = 2 * above + (1 if leaf_at(brick_of, leaf_of, up) != NONE else 0)
+        # Hits, then misses under the hits.
         hits, live = _code_hits(
             live, data, counts, n, near, above, sizes[n], hit_odds, hit_contexts, hit_weights, tails
         )
@@ -83,6 +86,7 @@ def _code_hits(
     tails: Words32,
 ) -> tuple[int, Live]:
     """Code leaf n's hits."""
+    # States of the neighbours as digits, 0 none, 1 without hits, 2 with; mean of their hits, and of the faces' misses.
     faces = edges = total = struck = seen = misses = 0
     for i in range(7):
         leaf = near[i]
@@ -101,6 +105,7 @@ def _code_hits(
             edges = 3 * edges + state
     mean = (2 * total + struck) // (2 * struck) if struck else 0
     misses = misses // seen if seen else 0
+    # Hit or not.
     large = 1 if size > 1 else 0
     contexts[0] = (faces * 8 + above) * 2 + large
     contexts[1] = HIT_TABLE + (faces * 81 + edges) * 2 + large
@@ -108,6 +113,7 @@ def _code_hits(
     struck_too, live = code_mixed(live, data, odds, contexts, 0, weights, 0, 1 if counts[n, 0] > 0 else 0)
     if not struck_too:
         return 0, live
+    # How often: the difference to the mean of the neighbours, from 1 on.
     contexts[0] = NUMBERS_FROM + min(mean, 60) * SLOTS
     contexts[1] = HIT_TABLE + NUMBERS_FROM + (struck * 8 + min(mean, 7)) * SLOTS
     contexts[2] = 2 * HIT_TABLE + NUMBERS_FROM + (min(misses, 20) * 8 + above) * SLOTS
@@ -120,7 +126,8 @@ def _code_hits(
 def _miss_contexts_into(
     contexts: Ints, counts: Int32s, n: int, near: Ints, above: int, size: int, errors: npt.NDArray[np.uint8]
 ) -> tuple[int, int]:
-    """Contexts of leaf n's misses; the guess, and which row of weights."""
+    """Write the contexts of leaf n's misses; returns the guess, and the row of weights."""
+    # Neighbours across faces: their misses, errors and states.
     known = error = faces = 0
     low, high, total, last = COUNT_MAX, 0, 0, 0
     for i in range(3):
@@ -131,6 +138,7 @@ def _miss_contexts_into(
             known += 1
             error += signed(errors[signed(near[i])])
             faces += 2 if counts[near[i], 0] > 0 else 1
+    # The guess: median of three, else the last of those that exist.
     guess = last
     if known == 3:
         guess = total - low - high
@@ -138,6 +146,7 @@ def _miss_contexts_into(
         for i in range(3, 7):
             if near[i] != NONE:
                 guess = signed(counts[near[i], 1])
+    # Differences of the neighbours to the guess, as digits.
     sides = corners = 0
     for i in range(7):
         if i < 3:
@@ -159,7 +168,7 @@ def _miss_contexts_into(
 
 @nb.njit(nogil=True)
 def _against(counts: Int32s, leaf: int, guess: int, most: int) -> int:
-    """By how much a neighbour's misses differ from the guess, 0 to 2 most; 2 most + 1 if there is none."""
+    """Difference of a neighbour's misses to the guess, clipped to 0 to 2 most; 2 most + 1 if there is no neighbour."""
     if leaf == NONE:
         return 2 * most + 1
     return min(max(signed(counts[leaf, 1]) - guess, -most), most) + most

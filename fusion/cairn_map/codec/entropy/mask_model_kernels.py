@@ -1,11 +1,11 @@
-"""The octree's masks, modelled: each child's state under what is known of its neighbours.
+"""Model of an octree's masks: each child's state under the known states of its neighbours (FORMAT.md section 14).
 
 A child is absent, inner or a leaf. Depth by depth, its lower neighbours are known, and so are its parent's upper
-ones. Surfaces and borders of what was seen are smooth, so these say most. Three opinions, of
+ones. Surfaces and borders of known space are smooth, so these predict most states. Three opinions, of
 
     faces     three lower neighbours, three upper ones (one depth above, where they lie outside the parent)
     edges     the lower neighbours across three edges and the corner, and the three across faces
-    family    which child it is, which children of this parent are there already, the parent's upper neighbours
+    family    the child's number, the parent's children that exist already, the parent's upper neighbours
 """
 
 import numba as nb
@@ -19,22 +19,23 @@ from cairn_map.codec.entropy.neighbour_kernels import LOWER, NONE, beside, stepp
 from cairn_map.kernels.integer_kernels import signed
 
 ABSENT, INNER, LEAF, SIBLING = 0, 1, 2, 3
-"""States; SIBLING: an upper neighbour inside the same parent, of which nothing is known yet."""
+"""States; SIBLING: an upper neighbour inside the same parent, which is unknown yet."""
 FACES = 27 * 64
 EDGES = 81 * 27
 FAMILY = 256 * 27 * 8
 GROUPS = 4
-"""Depths above the voxels that are told apart, the last for all further."""
+"""Depths above the voxels with contexts of their own; the last one is for all further depths."""
 
 
 @nb.njit(cache=True, nogil=True)
 def code_masks(
     coder: Coder, data: Data, child_masks: Bytes, leaf_masks: Bytes, depth: int, stop: int
 ) -> tuple[int, int]:
-    """Code an octree's masks down to depth `stop`; how many child and leaf masks, or -1, -1 if they find no room.
+    """Code an octree's masks down to depth `stop`; returns the numbers of child and leaf masks, -1, -1 without room.
 
     Encoding reads the masks, decoding writes them.
     """
+    # States of all nodes, depth by depth, those of the present depth from `offset` on; `keys`: the inner nodes.
     live = resumed(coder)
     odds = np.full(GROUPS * 2 * (FACES + EDGES + FAMILY), EVEN, np.uint32)
     weights = start_weights(2 * GROUPS, 3)
@@ -48,6 +49,7 @@ def code_masks(
         is_last = d == depth - 1
         group = min(depth - 1 - d, GROUPS - 1)
         found = last
+        # Inner nodes [first, last) of this depth; those of the next one are appended from `found` on.
         for n in range(first, last):
             if at >= child_masks.shape[0] or (not is_last and leaf_at >= leaf_masks.shape[0]):
                 return -1, -1
@@ -56,6 +58,7 @@ def code_masks(
             child_mask = signed(child_masks[at])
             leaf_mask = signed(leaf_masks[leaf_at]) if not is_last else 255
             children = leaves = 0
+            # Two questions about each child: does it exist, and is it a leaf?
             for c in range(8):
                 child = 8 * key + c
                 _contexts_into(contexts, states, offset + 8**d, child, d + 1, upper, children, group)
@@ -73,6 +76,7 @@ def code_masks(
                         return -1, -1
                     keys[found] = child
                     found += 1
+            # The masks, complete: the same when encoding, new when decoding.
             child_masks[at] = children
             at += 1
             if not is_last:
@@ -95,7 +99,8 @@ def _contexts_into(
     before: int,
     group: int,
 ) -> None:
-    """Contexts of a child at its depth, whose states begin at `offset`; `before`: the siblings that are there."""
+    """Write the contexts of a child at its depth, whose states begin at `offset`; `before`: siblings that exist."""
+    # States as digits: lower neighbours across faces and edges, upper ones of the parent.
     faces = edges = above = 0
     for i in LOWER[:3]:
         faces = 3 * faces + state_of(states, offset, beside(child, i, depth), depth)
@@ -114,7 +119,7 @@ def _contexts_into(
 
 @nb.njit(nogil=True)
 def upper_states(states: Bytes, offset: int, key: int, depth: int) -> int:
-    """States of the three neighbours one up, two bits each."""
+    """States of the three neighbours one step up, two bits each."""
     found = 0
     for axis in range(3):
         found |= state_of(states, offset, stepped(key, axis, 1, depth), depth) << (2 * axis)
@@ -126,6 +131,7 @@ def state_of(states: Bytes, offset: int, key: int, depth: int) -> int:
     """State of a node, whose depth's states begin at `offset`; LEAF in a larger leaf, ABSENT beyond the cell."""
     if key == NONE:
         return ABSENT
+    # A node inside a leaf has no state of its own: its ancestors are asked, up to the first that exists.
     state = signed(states[offset + key])
     while state == ABSENT and depth > 0:
         depth -= 1

@@ -1,9 +1,10 @@
-"""A bit under several contexts at once: their opinions are mixed, and whoever was right is heard more next time.
+"""Logistic mixing: a bit under several contexts at once, whose opinions are mixed by weights that learn.
 
     stretch(p) = ln(p / (1 - p)), in 1/256, p in 1/4096        squash: its inverse
     p = squash(sum of weight * stretch(opinion))                weight += opinion * error
 
-Logistic mixing, as in Mahoney's PAQ; one layer. A number takes a few such bits: zero or not, its sign, its length.
+As in Mahoney's PAQ, with one layer. A number takes a few such bits: zero or not, its sign, its length. FORMAT.md
+section 14, "Mixing" and "Number", is the norm.
 """
 
 import numba as nb
@@ -24,7 +25,7 @@ KNOTS = np.array(
 """4096 / (1 + exp(-x)) at x = -8, -7.5, ... 8; between them in straight lines."""
 STRETCH_MAX = 2047
 LEARNING = 16
-"""How fast weights move."""
+"""Learning rate of the weights."""
 ONE = 1 << 16
 """A weight of 1."""
 
@@ -50,7 +51,7 @@ STRETCH = np.minimum(np.searchsorted(SQUASH[1:], np.arange(4096)) - STRETCH_MAX,
 
 @nb.njit(nogil=True, forceinline=True)
 def start_weights(rows: int, opinions: int) -> Ints:
-    """(rows, opinions) weights: an average, half as loud again."""
+    """(rows, opinions) weights at the start: those of the mean, times 3/2."""
     return np.full((rows, opinions), ONE * 3 // (2 * opinions), np.int64)
 
 
@@ -59,12 +60,14 @@ def code_mixed(
     live: Live, data: Data, odds: Odds, contexts: Ints, slot: int, weights: Ints, row: int, bit: int
 ) -> tuple[int, Live]:
     """Code one bit under contexts[i] + slot of every opinion i, mixed by a row of weights; all of them learn."""
+    # The mixed probability: chance = squash(sum of weight * stretch(p)).
     opinions = contexts.shape[0]
     total = 0
     for i in range(opinions):
         total += STRETCH[signed(odds[signed(contexts[i]) + slot]) >> 20] * weights[row, i]
     chance = SQUASH[min(max(total >> 16, -STRETCH_MAX), STRETCH_MAX) + STRETCH_MAX + 1]
     bit, live = split(live, data, chance, 12, bit)
+    # Weights move along the gradient of the coding cost, stretch(p) * (bit - chance); then the contexts learn.
     error = ((bit << 12) - chance) * LEARNING
     for i in range(opinions):
         context = signed(contexts[i]) + slot
@@ -82,10 +85,12 @@ def code_number(
     Zero or not, sign, length of the magnitude in unary, then the bits below its first. Takes SLOTS contexts of every
     opinion, SLOTS rows of weights from `row` on, and TAILS contexts of `tails` from `tail` on.
     """
+    # Zero or not, and the sign.
     zero, live = code_mixed(live, data, odds, contexts, 0, weights, row, 1 if number == 0 else 0)
     if zero:
         return 0, live
     negative, live = code_mixed(live, data, odds, contexts, 1, weights, row + 1, 1 if number < 0 else 0)
+    # The number of bits below the first, in unary.
     magnitude = abs(number)
     length = 0
     while length < 62:
@@ -95,6 +100,7 @@ def code_number(
         if not longer:
             break
         length += 1
+    # These bits, upper ones first; the first three know those before them.
     found = 1
     for n in range(length):
         context = tail + 8 * length + (found if n < 3 else 0)

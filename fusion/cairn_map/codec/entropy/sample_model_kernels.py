@@ -1,8 +1,8 @@
-"""Samples, modelled: which leaves have some, their weights, and sums under what their neighbours' means let one guess.
+"""Model of samples: their presence, weights and sums, under those of neighbouring rows (FORMAT.md section 14).
 
-A sum is guessed as the mean of the rows beside it that come before, nearer ones counting more, times its own weight.
-How far off that will be is told by how far off it was there, by the plane before (colours change together), and by how
-the neighbours differ.
+A sum is guessed as the mean of the neighbouring rows that come before, nearer ones counting more, times its own weight.
+The error of that guess is predicted by the neighbours' errors, by the plane before (colours change together), and by
+the differences of the neighbours.
 """
 
 import numba as nb
@@ -16,13 +16,14 @@ from cairn_map.codec.octree.sum_kernels import square_guess
 from cairn_map.kernels.integer_kernels import signed
 
 NEARNESS = np.array([4, 4, 4, 2, 2, 2, 2, 2, 2, 2, 2, 2, 1], np.int64)
-"""What a neighbour counts, by `neighbour_kernels.STEPS`: faces, edges, the corner."""
+"""Weight of a neighbour in a guess, by `neighbour_kernels.STEPS`: faces, edges, the corner."""
 SUM_MAX = 1 << 62
 GUESSED_MAX = 1 << 40
-"""A sum from which on nothing is guessed: products of it would leave 64 bits."""
+"""Exclusive bound of sums that take part in guesses: products of larger ones would leave 64 bits."""
 WEIGHT_MAX = 1 << 16
-"""Likewise a weight."""
+"""Exclusive bound of weights that take part in guesses, for the same reason."""
 RANK_MAX = (1 << 16) - 1
+"""Largest rank in a view's palette."""
 TABLE = 2048
 """Numbers of contexts of one opinion, each of SLOTS."""
 
@@ -40,13 +41,14 @@ def code_presence(
     leaf_of: Int32s,
     depth: int,
 ) -> None:
-    """Code which leaves have a row; only voxels may. `references` are the weights of the channel before, by leaf."""
+    """Code the presence of rows by leaf; only voxels may have one. `references`: weights of the channel before."""
     live = resumed(coder)
     odds = np.full(4 * 2 * 8, EVEN, np.uint32)
     for n in range(starts.shape[0]):
         if sizes[n] > 1:
             present[n] = False
             continue
+        # One context: hits, a row of the channel before, and rows of the three neighbours across faces.
         near = 0
         for i in LOWER[:3]:
             leaf = leaf_at(brick_of, leaf_of, beside(signed(starts[n]), i, depth))
@@ -65,6 +67,7 @@ def code_weights(coder: Coder, data: Data, weights: Ints, references: Ints, near
     tails, contexts = np.full(TAILS, EVEN, np.uint32), np.empty(3, np.int64)
     errors = np.zeros(weights.shape[0], np.int64)
     for s in range(weights.shape[0]):
+        # The neighbours' mean error, in buckets.
         error = count = 0
         for i in range(near.shape[1]):
             row = signed(near[s, i])
@@ -87,11 +90,12 @@ def code_weights(coder: Coder, data: Data, weights: Ints, references: Ints, near
 
 @nb.njit(cache=True, nogil=True)
 def code_sums(coder: Coder, data: Data, sums: Ints, rests: Ints, weights: Ints, near: Int32s) -> bool:
-    """Code (S, C) sums; `rests` takes what the guesses left; False if a sum that was read is out of range."""
+    """Code (S, C) sums; `rests` takes the residuals of the guesses; False if a sum that was read is out of range."""
     planes = sums.shape[1]
     live = resumed(coder)
     odds, loud = np.full(planes * 3 * TABLE * SLOTS, EVEN, np.uint32), start_weights(planes * 4 * SLOTS, 3)
     tails, contexts = np.full(planes * TAILS, EVEN, np.uint32), np.empty(3, np.int64)
+    # Row by row, in a row plane by plane: `before` is the residual of the plane before, in buckets with its sign.
     for s in range(sums.shape[0]):
         weight = weights[s]
         size = min(half_log(weight), 11)
@@ -114,7 +118,8 @@ def code_sums(coder: Coder, data: Data, sums: Ints, rests: Ints, weights: Ints, 
 
 @nb.njit(nogil=True)
 def _guess(sums: Ints, rests: Ints, weights: Ints, near: Int32s, s: int, c: int) -> tuple[int, int, int, int]:
-    """Of row s and plane c: the guess, how far off the neighbours' were, how they differ, and how many there are."""
+    """Guess of row s and plane c; the neighbours' error and their spread, both in buckets; and their number."""
+    # Weighted sums over the neighbours that count.
     total = worth = error = count = 0
     low, high = SUM_MAX, 0
     for i in range(near.shape[1]):
@@ -129,6 +134,7 @@ def _guess(sums: Ints, rests: Ints, weights: Ints, near: Int32s, s: int, c: int)
         count += 1
     if count == 0 or weights[s] >= WEIGHT_MAX:
         return 0, 47, 40, 0
+    # guess = total / worth * weight, without leaving 64 bits.
     spread = min(half_log(high - low), 39) if count > 1 else 40
     return (
         total // worth * weights[s] + total % worth * weights[s] // worth,
@@ -142,14 +148,15 @@ def _guess(sums: Ints, rests: Ints, weights: Ints, near: Int32s, s: int, c: int)
 def code_squares(coder: Coder, data: Data, squares: Ints, sums: Ints, rests: Ints, weights: Ints, near: Int32s) -> bool:
     """Code (S,) sums of squares; False if one that was read is out of range.
 
-    What is coded is how much they exceed the squares of equal samples: the spread; opinions of the neighbours' spread,
-    of how far off the sum itself was, and of the weight.
+    Coded is the excess over the squares of equal samples, which is the spread; the opinions are of the neighbours'
+    spread, of the residual of the sum itself, and of the weight.
     """
     live = resumed(coder)
     odds, loud = np.full(3 * TABLE * SLOTS, EVEN, np.uint32), start_weights(4 * SLOTS, 3)
     tails, contexts = np.full(TAILS, EVEN, np.uint32), np.empty(3, np.int64)
     spreads = np.zeros(squares.shape[0], np.int64)
     for s in range(squares.shape[0]):
+        # The neighbours' mean spread.
         weight = weights[s]
         total = worth = count = 0
         for i in range(near.shape[1]):
@@ -181,7 +188,7 @@ def code_squares(coder: Coder, data: Data, squares: Ints, sums: Ints, rests: Int
 def code_ranks(coder: Coder, data: Data, ranks: Ints, near: Int32s) -> bool:
     """Code (S,) ranks, most of them low; False if one that was read is out of range.
 
-    Opinions: the mean of the neighbours' ranks; those across the faces; how many of them are the first.
+    Opinions: the mean of the neighbours' ranks; the ranks across the faces; the number of neighbours with rank 0.
     """
     live = resumed(coder)
     odds, loud = np.full(3 * TABLE * SLOTS, EVEN, np.uint32), start_weights(SLOTS, 3)
@@ -210,7 +217,7 @@ def code_ranks(coder: Coder, data: Data, ranks: Ints, near: Int32s) -> bool:
 
 @nb.njit(nogil=True)
 def half_log(x: int) -> int:
-    """Buckets that grow by half: 0, 1, 2, 3, 4 (4-5), 5 (6-7), 6 (8-11), 7 (12-15), ...; x is not negative."""
+    """Bucket of x, which is not negative; sizes grow by half: 0, 1, 2, 3, 4 (4-5), 5 (6-7), 6 (8-11), 7 (12-15), ..."""
     n = 0
     y = x
     while y >= 4:

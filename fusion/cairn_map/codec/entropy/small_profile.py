@@ -1,12 +1,12 @@
-"""Streams coded by groups, each under a model of what its neighbours in space say: the profile *small*.
+"""The profile *small*: groups of streams, each coded under a model of its neighbours in space (FORMAT.md section 14).
 
     group      its streams                        modelled on
     masks      1, 2                               states of neighbouring nodes
-    counts     3, 4                               leaves beside, and the octree
-    channel c  16 + 8c to 18 + 8c + planes        rows beside, hits, and the weights of the channel before
+    counts     3, 4                               neighbouring leaves, and the octree
+    channel c  16 + 8c to 18 + 8c + planes        neighbouring rows, hits, and the weights of the channel before
 
-The stored bytes of a group's first stream say all of it; the others of it are empty. What they mean is the same as
-ever: the raw streams, made anew from what was decoded, have the digest of the cell.
+The stored bytes of a group's first stream hold the whole group; those of its other streams are empty. Their meaning is
+unchanged: the raw streams, encoded again from the decoded numbers, have the digest of the cell.
 """
 
 from collections.abc import Callable
@@ -29,14 +29,14 @@ from cairn_map.evidence.channels import Channel
 
 Coder = npt.NDArray[np.int64]
 Code = Callable[[Coder, Bytes], bool]
-"""Runs kernels, which read or write the numbers that it has; False if one that was read is out of range."""
+"""Function that runs kernels, which read or write its own numbers; False if one that was read is out of range."""
 NUMBERS_PER_BYTE = 1024
-"""Leaves or masks that a stored byte may stand for: so a few bytes cannot keep a reader busy for minutes."""
+"""Leaves or masks for each stored byte, at most: so a few bytes cannot keep a reader busy for minutes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ground:
-    """Leaves of an octree and where they lie: what counts and samples are modelled on."""
+    """Leaves of an octree, and the index of their places, by which models find neighbours."""
 
     octree: Octree
     depth: int
@@ -45,12 +45,12 @@ class Ground:
 
 
 def ground_of(octree: Octree, *, depth: int) -> Ground:
-    """The ground of one octree."""
+    """Ground of one octree."""
     return Ground(octree, depth, *index_leaves(octree.starts, octree.sizes, depth))
 
 
 def encode_masks(octree: Octree, *, depth: int) -> bytes | None:
-    """All masks, or None if that would not be shorter than they are."""
+    """Masks under their model, or None if that would not be shorter than the masks."""
     child_masks, leaf_masks = octree.child_masks.copy(), octree.leaf_masks.copy()
     room = len(child_masks) + len(leaf_masks)
 
@@ -62,7 +62,7 @@ def encode_masks(octree: Octree, *, depth: int) -> bytes | None:
 
 
 def decode_masks(data: bytes, *, child_count: int, leaf_count: int, depth: int, stop: int) -> tuple[Bytes, Bytes]:
-    """The mirror of `encode_masks`, or with `stop` below `depth` the first ones of it.
+    """Child masks and leaf masks, with `stop` below `depth` only the first ones; the mirror of `encode_masks`.
 
     Raises:
         DamagedDataError: there are other numbers of masks.
@@ -78,13 +78,13 @@ def decode_masks(data: bytes, *, child_count: int, leaf_count: int, depth: int, 
 
 
 def encode_counts(content: CellContent, ground: Ground) -> bytes | None:
-    """Hits and misses, or None if that would not be shorter than they are."""
+    """Hits and misses under their model, or None if that would not be shorter than one byte each."""
     counts = content.counts.copy()
     return _encoded(_counts_coder(counts, ground), len(counts), 2 * len(counts))
 
 
 def decode_counts(data: bytes, ground: Ground) -> npt.NDArray[np.int32]:
-    """The mirror of `encode_counts`.
+    """(N, 2) hits and misses; the mirror of `encode_counts`.
 
     Raises:
         DamagedDataError: a count is out of range.
@@ -97,7 +97,7 @@ def decode_counts(data: bytes, ground: Ground) -> npt.NDArray[np.int32]:
 def encode_channel(
     channel: Channel, rows: ChannelRows, hits: npt.NDArray[np.int32], before: Ints, ground: Ground
 ) -> bytes | None:
-    """One channel's samples, or None if that would not be shorter than two bytes a number.
+    """One channel's samples under their model, or None if that would not be shorter than two bytes a number.
 
     `hits` (N,) are those of the leaves, `before` (N,) the weights of the channel before, all zeros for the first.
     """
@@ -121,7 +121,7 @@ def decode_channel(
     *,
     check_count: Callable[[int], None],
 ) -> ChannelRows:
-    """The mirror of `encode_channel`; `check_count` refuses too many rows, before they are made.
+    """Rows of one channel; the mirror of `encode_channel`. `check_count` refuses too many rows before they are decoded.
 
     Raises:
         DamagedDataError: a weight or sum is out of range.
@@ -176,9 +176,11 @@ def _code_rows(
     before: Ints,
     ground: Ground,
 ) -> bool:
-    """Code weights, sums and squares; `sums` is read, or written."""
+    """Code weights, sums and squares; `sums` is read when encoding, written when decoding."""
+    # Weights are guessed from those of the channel before, else from hits.
     near = earlier_rows(ground.octree.starts, leaves, ground.brick_of, ground.leaf_of, ground.depth)
     references = np.where(before[leaves] > 0, before[leaves], hits[leaves].astype(np.int64))
+    # Kernels take contiguous columns. `rests` are residuals of the sums, on which the squares are modelled.
     weights = sums[:, -1].copy()
     values = np.ascontiguousarray(sums[:, : channel.value_count])
     rests = np.zeros_like(values)
@@ -194,13 +196,13 @@ def _code_rows(
 
 
 def _encoded(code: Code, numbers: int, room: int) -> bytes | None:
-    """What a model writes, unless it needs more room or a reader would refuse so few bytes for so many numbers."""
+    """Bytes of a group under its model; None if they need more room, or are so few that a reader would refuse them."""
     data = write_modelled(code, room=room)
     return None if data is None or numbers > NUMBERS_PER_BYTE * len(data) else data
 
 
 def write_modelled(code: Code, *, room: int) -> bytes | None:
-    """What a model writes, or None if it would be more than `room` bytes."""
+    """Bytes that a model writes, or None if they would be more than `room`."""
     data, coder = np.empty(room, np.uint8), start_encoding()
     code(coder, data)
     size = finish_encoding(coder, data)
@@ -208,10 +210,10 @@ def write_modelled(code: Code, *, room: int) -> bytes | None:
 
 
 def read_modelled(code: Code, data: bytes) -> None:
-    """Let a model read what it has written.
+    """Let a model read the bytes that it wrote.
 
     Raises:
-        DamagedDataError: other bytes than it writes, or a number out of range.
+        DamagedDataError: bytes that it does not write, or a number out of range.
     """
     # A copy that may be written: kernels that code read and write through the same argument.
     read = np.frombuffer(data, np.uint8).copy()
@@ -221,7 +223,7 @@ def read_modelled(code: Code, data: bytes) -> None:
 
 
 def check_effort(numbers: int, data: bytes) -> None:
-    """Refuse few bytes that claim to say much.
+    """Refuse too few bytes for the numbers that they claim to hold.
 
     Raises:
         DamagedDataError: more than NUMBERS_PER_BYTE numbers for each byte.

@@ -1,7 +1,7 @@
-"""A cell's evidence by leaf: what its streams say, however they are coded.
+"""Content of a cell: its evidence by leaf of the octree, between evidence by voxel and streams of bytes.
 
 evidence  <->  content  <->  raw streams, which are canonical          `channel_streams` for samples
-                        <->  modelled streams, which are small         `small_code`
+                        <->  modelled streams, which are small         `small_profile`
 """
 
 import struct
@@ -24,12 +24,12 @@ BAD_LEAF = "bad_cell", "a leaf says nothing, or a collapsed one holds samples"
 STREAM_HEAD = struct.Struct("<BI")
 LARGE_PAGES_FROM_BYTES = 1 << 22
 WORTH_BYTES = 1 << 20
-"""Evidence smaller than this would hold more memory than it needs."""
+"""Bytes of evidence from which on large pages are worth it: smaller ones would hold more memory than they need."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CellContent:
-    """An octree, and what its N leaves hold."""
+    """An octree, and the counts and samples of its N leaves."""
 
     octree: Octree
     counts: npt.NDArray[np.int32]
@@ -41,14 +41,14 @@ class CellContent:
 
     @property
     def evidence_bytes(self) -> int:
-        """Memory that `evidence_of` it would hold."""
+        """Memory of the same content by voxel, as `evidence_of` makes it."""
         return 12 * int(self.octree.sizes.sum()) + 4 * len(self.sampled) + self.samples.nbytes
 
     def is_collapsed(self, geometry: Geometry) -> bool:
-        """Whether all leaves are collapsed that can be.
+        """True if no eight leaves are left that could be collapsed into one.
 
         Raises:
-            DamagedDataError: a leaf says nothing, or one of several voxels has samples.
+            DamagedDataError: a leaf is empty, or one of several voxels has samples.
         """
         octree = self.octree
         sound, collapsed = check_leaves(octree.starts, octree.sizes, self.counts, self.sampled, 8**geometry.depth)
@@ -67,10 +67,10 @@ def content_of(evidence: Evidence, geometry: Geometry) -> CellContent:
 
 
 def evidence_of(content: CellContent) -> Evidence:
-    """The mirror of `content_of`.
+    """Packed evidence of a content; the mirror of `content_of`.
 
     Raises:
-        DamagedDataError: a leaf says nothing, or one of several voxels has samples.
+        DamagedDataError: a leaf is empty, or one of several voxels has samples.
     """
     octree, counts, sampled = content.octree, content.counts, content.sampled
     V = int(octree.sizes.sum())
@@ -85,9 +85,9 @@ def evidence_of(content: CellContent) -> Evidence:
 
 
 def met_of(content: CellContent) -> CellContent:
-    """Of a content the leaves that were hit or have samples: where much is seen through, a hundredth of the voxels.
+    """Content restricted to leaves that were hit or have samples; where much is free, a hundredth of the voxels.
 
-    The masks stay those of the whole.
+    The masks stay those of the whole octree.
     """
     octree, sampled = content.octree, content.sampled
     is_met = content.counts[:, 0] != 0
@@ -98,16 +98,16 @@ def met_of(content: CellContent) -> CellContent:
 
 
 def _large_empty(count: int) -> npt.NDArray[np.uint32]:
-    """(count,) fresh memory, in large pages where it is large: else first touching it takes longer than writing it.
+    """(count,) fresh memory, in large pages if it is large: else the page faults take longer than writing it.
 
-    numpy asks for large pages from 4 MB on. What is left of such a block is never touched, and so costs nothing.
+    NumPy asks for large pages from 4 MB on. The rest of such a block is never touched, and so costs nothing.
     """
     whole = max(count, LARGE_PAGES_FROM_BYTES // 4) if 4 * count >= WORTH_BYTES else count
     return np.empty(whole, np.uint32)[:count]
 
 
 def canonical_bytes(head: bytes, streams: Mapping[int, bytes]) -> bytes:
-    """What a cell's digest is taken of: its head and its raw streams, each behind its number and length."""
+    """Bytes over which a cell's digest is taken: its head and its raw streams, each behind its number and length."""
     parts = [head]
     for number, raw in streams.items():
         parts += [STREAM_HEAD.pack(number, len(raw)), raw]
@@ -115,12 +115,12 @@ def canonical_bytes(head: bytes, streams: Mapping[int, bytes]) -> bytes:
 
 
 def topology_streams(octree: Octree) -> dict[int, bytes]:
-    """The masks, raw."""
+    """Raw streams of the masks."""
     return {CHILD_MASKS: octree.child_masks.tobytes(), LEAF_MASKS: octree.leaf_masks.tobytes()}
 
 
 def count_streams(counts: npt.NDArray[np.int32], *, signed: bool) -> dict[int, bytes]:
-    """Hits and misses of the leaves, raw."""
+    """Raw streams of the leaves' hits and misses."""
     return {
         number: encode_column(channel_streams.words(counts[:, column].astype(np.int64), signed))
         for number, column in ((HITS, 0), (MISSES, 1))
@@ -130,7 +130,7 @@ def count_streams(counts: npt.NDArray[np.int32], *, signed: bool) -> dict[int, b
 def counts_of_streams(
     streams: dict[int, bytes], *, leaves: int, signed: bool, part: slice | None = None
 ) -> npt.NDArray[np.int32]:
-    """The mirror of `count_streams`; of a part of the leaves, if one is given.
+    """(N, 2) counts of the leaves, or of a part of them; the mirror of `count_streams`.
 
     Raises:
         DamagedDataError: a stream is missing, of the wrong length, or a count is out of range.

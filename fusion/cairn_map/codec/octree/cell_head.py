@@ -1,7 +1,7 @@
-"""The head of a cell's file: which cell, on which grid, with which channels, and how much is to follow.
+"""The head of a cell's file: its cell number, its grid, its channels, and the sizes of the rest (FORMAT.md section 6).
 
-It is read before anything else is, and on its word alone a reader refuses what would be too large: `CellHead`
-bounds the voxels, the leaves and the raw bytes of all streams together.
+It is read first, and by its claims alone a reader refuses cells that would be too large: `CellHead` bounds the voxels,
+the leaves and the raw bytes of all streams together.
 """
 
 import struct
@@ -26,7 +26,7 @@ KIND_OF_CODE = {code: kind for kind, code in CODE_OF_KIND.items()}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CellHead:
-    """What the head says."""
+    """Fields of a cell's head."""
 
     key: CellKey
     geometry: Geometry
@@ -37,7 +37,7 @@ class CellHead:
 
     @property
     def raw_bytes_max(self) -> int:
-        """Most bytes that the streams of a cell with so many leaves can hold (FORMAT.md, Limits).
+        """Largest size of all raw streams together of a cell with so many leaves (FORMAT.md section 11).
 
         Every inner node has a leaf of its own below it at each depth, so no depth has more inner nodes than leaves.
         """
@@ -48,7 +48,7 @@ class CellHead:
 
 
 def encode_head(head: CellHead) -> bytes:
-    """The head's bytes."""
+    """Bytes of a head."""
     data = FIXED_PART.pack(
         MAGIC,
         VERSION,
@@ -75,7 +75,7 @@ def _channel_bytes(geometry: Geometry) -> bytes:
 
 
 def decode_head(data: bytes) -> tuple[CellHead, bytes]:
-    """The head at the start of a cell's bytes, and its own bytes.
+    """Head at the start of a cell's bytes, and the bytes of the head alone.
 
     Raises:
         DamagedDataError: cut off, contradictory or out of range.
@@ -86,6 +86,7 @@ def decode_head(data: bytes) -> tuple[CellHead, bytes]:
     _, version, kind, depth, flags, edge_um, i, j, k, voxels, leaves, channel_count, streams = FIXED_PART.unpack_from(
         data
     )
+    # The fixed part; then the channels, whose lengths are in their own heads.
     if version != VERSION or kind != KIND_EVIDENCE:
         raise BadInputError("unknown_version", f"this reader knows cells of version 1, kind 1; got {version}, {kind}")
     if flags & ~FLAG_SIGNED or not all(-CELL_LIMIT <= v < CELL_LIMIT for v in (i, j, k)):
@@ -112,19 +113,19 @@ def decode_head(data: bytes) -> tuple[CellHead, bytes]:
 
 
 def is_canonical_head(head: CellHead, data: bytes) -> bool:
-    """Whether a head's own bytes, as `decode_head` gave them, are those that `encode_head` makes of it."""
+    """True if a head's own bytes, as `decode_head` gave them, are those that `encode_head` makes of it."""
     return _is_canonical(head.geometry, data[FIXED_PART.size :])  # pyright: ignore[reportArgumentType]
 
 
 @lru_cache(maxsize=16)
 def _is_canonical(geometry: Geometry, data: bytes) -> bool:
-    """All numbers before the channels are read as they stand."""
+    """True for canonical channels; the numbers before them have one form only."""
     return _channel_bytes(geometry) == data
 
 
 @lru_cache(maxsize=16)
 def _geometry(edge_um: int, depth: int, channel_count: int, data: bytes) -> Geometry:
-    """The cells of a map, and of all that is pushed to it, have the same."""
+    """Geometry of a head; cached, because all cells of a map have the same one."""
     channels: list[Channel] = []
     at = 0
     for _ in range(channel_count):

@@ -1,10 +1,10 @@
-"""A cell's samples as streams: for each channel which leaves have some, their weights, and their sums.
+"""Streams of a cell's samples: for each channel the presence of samples by leaf, their weights, and their sums.
 
     presence  one bit per leaf, lowest bit first      weight  like a count
     sum       residual against the previous voxel's mean times this voxel's weight
-    square    residual against what it were if all samples were alike
+    square    residual against the sum of squares of equal samples
 
-Streams of channel c start at number 16 + 8 c: presence, weight, then the value planes in order.
+Streams of channel c start at number 16 + 8 c: presence, weight, then the value planes in order (FORMAT.md section 6).
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ Planes = npt.NDArray[np.uint8]
 FIRST_STREAM = 16
 STREAMS_PER_CHANNEL = 8
 SMALL_PLANES = 3
-"""So many bytes hold no number that is out of range."""
+"""Bytes of a number that is certainly in range."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +48,7 @@ def stream_of_channel(c: int) -> int:
 
 
 def split_samples(sampled: Ints, samples: Ints, geometry: Geometry) -> list[ChannelRows]:
-    """By channel: the (S, P) samples of the (S,) leaves."""
+    """Rows of each channel, of the (S, P) samples of (S,) leaves."""
     found: list[ChannelRows] = []
     for channel in geometry.channels:
         sums = samples[:, geometry.planes_of(channel.name)]
@@ -81,7 +81,7 @@ def join_samples(
 
 
 def encode_channel(number: int, channel: Channel, rows: ChannelRows, *, leaves: int, signed: bool) -> dict[int, bytes]:
-    """Streams of one channel, raw; the first has this number."""
+    """Raw streams of one channel; the first has this number."""
     bits = np.zeros(leaves, np.uint8)
     bits[rows.leaves] = 1
     planes = np.ascontiguousarray(rows.sums.T)
@@ -106,9 +106,10 @@ def decode_channel(
     sampled_max: int,
     stop: int | None = None,
 ) -> ChannelRows:
-    """The mirror of `encode_channel`; sums may still be out of range, which `join_samples` looks at.
+    """Rows of one channel's streams; the mirror of `encode_channel`. Sums may be out of range: `join_samples` checks.
 
-    With `stop`, of the leaves before that one: each row stands on the one before it, so nothing can be left out there.
+    With `stop`, only rows of the leaves before it: each row is a residual against the row before, so none before can
+    be skipped.
 
     Raises:
         DamagedDataError: a stream is missing or of the wrong length.
@@ -129,13 +130,13 @@ def decode_channel(
 
 
 def words(values: Ints, signed: bool) -> Words:
-    """Counts and weights as words: as they are, or zigzag where differences may be negative."""
+    """Counts and weights as words: unchanged, or zigzag where differences may be negative."""
     raw = values.astype(np.uint64)
     return _zigzag(raw) if signed else raw
 
 
 def numbers_into(out: npt.NDArray[np.signedinteger], planes: Planes, *, signed: bool, limit: int) -> None:
-    """The mirror of `words`, from (k, N) of `column_planes` to (N,).
+    """Write (N,) numbers of the (k, N) planes of `column_planes`; the mirror of `words`.
 
     Raises:
         DamagedDataError: a magnitude above `limit`, which is no less than three bytes hold.
@@ -164,7 +165,7 @@ def check_count(count: int, sampled_max: int) -> None:
 
 
 def _says_something(sums: Ints) -> npt.NDArray[np.bool_]:
-    """(S,) which rows are not all zeros: nearly always those with a weight."""
+    """(S,) True for rows that are not all zeros: nearly always those with a weight."""
     says = sums[:, -1] != 0
     return says if says.all() else np.asarray(says | sums.any(axis=1))
 

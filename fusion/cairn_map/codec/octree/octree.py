@@ -20,7 +20,7 @@ from cairn_map.evidence.evidence import Evidence
 
 @dataclass(frozen=True, slots=True)
 class Octree:
-    """Topology of a cell, and for each leaf its first voxel and its size in voxels."""
+    """Octree of a cell: its masks, and the first voxel and the size in voxels of each leaf."""
 
     child_masks: Bytes
     leaf_masks: Bytes
@@ -29,12 +29,12 @@ class Octree:
 
     @property
     def brick_count(self) -> int:
-        """Bricks of 8^3 voxels that its leaves touch."""
+        """Number of bricks of 8^3 voxels that its leaves touch."""
         return int(kernels.bricks_of_leaves(self.starts, self.sizes))
 
 
 def build_octree(evidence: Evidence, *, depth: int) -> tuple[Octree, npt.NDArray[np.int64]]:
-    """The octree of packed evidence, and the row of `evidence` at which each leaf starts."""
+    """Octree of packed evidence, and the row of `evidence` at which each leaf starts."""
     V = len(evidence)
     room = min(V, 8 ** (depth - 1))
     child_masks, leaf_masks = np.empty((depth, room), np.uint8), np.empty((depth, room), np.uint8)
@@ -56,12 +56,12 @@ def build_octree(evidence: Evidence, *, depth: int) -> tuple[Octree, npt.NDArray
 
 
 def parse_octree(child_masks: Bytes, leaf_masks: Bytes, *, depth: int, stop: int | None = None) -> Octree:
-    """The octree that masks describe; the mirror of `build_octree`.
+    """Octree of its masks; the mirror of `build_octree`.
 
     Memory is bounded by the masks' length: a byte names at most eight leaves.
 
-    With `stop`, 1 to `depth`, nothing deeper is looked at: inner nodes at that depth become leaves of their own size,
-    and masks of deeper ones may be missing.
+    With `stop`, 1 to `depth`, nothing deeper is read: inner nodes at that depth become leaves of their own size, and
+    masks of deeper ones may be missing.
 
     Raises:
         DamagedDataError: masks are missing, left over, empty, or mark a leaf that does not exist.
@@ -74,7 +74,7 @@ def parse_octree(child_masks: Bytes, leaf_masks: Bytes, *, depth: int, stop: int
     if stop == depth and (masks != len(child_masks) or leaf_count != len(leaf_masks)):
         raise DamagedDataError("bad_octree", "masks are left over after the last depth")
     if stop < depth:
-        # What is inner at the depth where reading stops is listed, too.
+        # Inner nodes at the depth where reading stops are listed as leaves, too.
         last = slice(firsts[stop - 1], masks)
         leaves += int(np.unpackbits(child_masks[last] & ~leaf_masks[last]).sum())
     starts, sizes = np.empty(leaves + 1, np.uint32), np.empty(leaves + 1, np.int64)

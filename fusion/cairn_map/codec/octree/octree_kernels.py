@@ -1,10 +1,10 @@
-"""Packed rows to octree and back: child masks, leaf masks, and which row each leaf stands for.
+"""Octrees from packed rows and back: child masks, leaf masks, and the first row of each leaf (FORMAT.md section 4).
 
 A node's eight children with equal counts and no samples collapse into one leaf, as far up as they can, but never
 the root. So the tree is a function of the evidence alone.
 
 Rows come in Morton order, so nodes of a depth are finished in the order in which their masks are written, and the
-leaves of a node that collapses are the last eight that were found. One pass does it.
+leaves of a node that collapses are the last eight that were found. One pass is enough.
 """
 
 import numba as nb
@@ -13,6 +13,7 @@ import numpy as np
 from cairn_map.arrays import Bytes, Int32s, Ints, Words32
 
 NO_ROW = -1
+"""In place of a row: an inner node."""
 
 
 @nb.njit(cache=True, nogil=True)
@@ -25,21 +26,23 @@ def build_into(
     masks: Ints,
     leaf_rows: Ints,
 ) -> int:
-    """Masks and leaves of the octree of V rows; returns how many leaves there are.
+    """Write masks and leaves of the octree of V rows; returns the number of leaves.
 
-    `child_masks` and `leaf_masks` are (depth, room), `masks` (depth,) zeros that take how many each depth has, and
-    `leaf_rows` (V,) takes the row at which each leaf begins.
+    `child_masks` and `leaf_masks` are (depth, room), `masks` (depth,) zeros that take the number of masks of each
+    depth, and `leaf_rows` (V,) takes the row at which each leaf begins.
     """
     depth = masks.shape[0]
     V = voxels.shape[0]
+    # One open node for each depth, on the way from the root to the present voxels: masks of its children so far.
     children = np.zeros(depth, np.uint8)
     leaves = np.zeros(depth, np.uint8)
-    # The row that the children of an open node stand for while they are all leaves with equal counts; else NO_ROW.
+    # First row of the children of an open node, while they are all leaves with equal counts; else NO_ROW.
     alike = np.full(depth, NO_ROW, np.int64)
     count = 0
     s = 0
     n = 0
     while n < V:
+        # The voxels [n, end) of one parent; `fixed` if one of them has samples.
         parent = voxels[n] >> np.uint32(3)
         end = n + 1
         while end < V and voxels[end] >> np.uint32(3) == parent:
@@ -47,6 +50,7 @@ def build_into(
         while s < sampled.shape[0] and sampled[s] < n:
             s += 1
         fixed = s < sampled.shape[0] and sampled[s] < end
+        # Either all eight are one leaf, or each is one.
         if depth > 1 and end - n == 8 and not fixed and _equal_counts(counts, n):
             leaf_rows[count] = n
             count += 1
@@ -62,29 +66,52 @@ def build_into(
             if depth > 1:
                 _add_child(children, leaves, alike, counts, depth - 2, np.int64(parent) & 7, NO_ROW)
         n = end
-        d = depth - 2
-        key = np.int64(parent) >> 3
         after = np.int64(voxels[n]) >> 6 if n < V else -1
-        while d >= 0 and key != after:
-            if d > 0 and alike[d] != NO_ROW and children[d] == 255:
-                count -= 7
-                _add_child(children, leaves, alike, counts, d - 1, key & 7, alike[d])  # pyright: ignore[reportArgumentType]
-            else:
-                child_masks[d, masks[d]] = children[d]
-                leaf_masks[d, masks[d]] = leaves[d]
-                masks[d] += 1
-                if d > 0:
-                    _add_child(children, leaves, alike, counts, d - 1, key & 7, NO_ROW)
-            children[d] = leaves[d] = 0
-            d -= 1
-            key >>= 3
-            after = after >> 3 if after >= 0 else -1
+        key = np.int64(parent) >> 3
+        count = _close_into(children, leaves, alike, counts, child_masks, leaf_masks, masks, key, after, count)
+    return count
+
+
+@nb.njit(nogil=True, forceinline=True)
+def _close_into(
+    children: Bytes,
+    leaves: Bytes,
+    alike: Ints,
+    counts: Int32s,
+    child_masks: Bytes,
+    leaf_masks: Bytes,
+    masks: Ints,
+    key: int | np.int64,
+    after: int | np.int64,
+    count: int,
+) -> int:
+    """Close the open nodes, from `key` above the voxels' parents upwards, that do not hold the next voxel.
+
+    `after` is the node of the next voxel at the depth of `key`, -1 if there is none. Returns the number of leaves.
+    """
+    d = masks.shape[0] - 2
+    while d >= 0 and key != after:
+        if d > 0 and alike[d] != NO_ROW and children[d] == 255:
+            # Eight equal leaves, the last eight, become one leaf of the node above.
+            count -= 7
+            _add_child(children, leaves, alike, counts, d - 1, key & 7, alike[d])  # pyright: ignore[reportArgumentType]
+        else:
+            # An inner node: its masks are complete.
+            child_masks[d, masks[d]] = children[d]
+            leaf_masks[d, masks[d]] = leaves[d]
+            masks[d] += 1
+            if d > 0:
+                _add_child(children, leaves, alike, counts, d - 1, key & 7, NO_ROW)
+        children[d] = leaves[d] = 0
+        d -= 1
+        key >>= 3
+        after = after >> 3 if after >= 0 else -1
     return count
 
 
 @nb.njit(nogil=True)
 def _equal_counts(counts: Int32s, n: int) -> bool:
-    """Whether eight rows from n on have equal counts."""
+    """True if the eight rows from n on have equal counts."""
     different = 0
     for m in range(n + 1, n + 8):
         different |= (counts[m, 0] ^ counts[n, 0]) | (counts[m, 1] ^ counts[n, 1])
@@ -95,7 +122,7 @@ def _equal_counts(counts: Int32s, n: int) -> bool:
 def _add_child(
     children: Bytes, leaves: Bytes, alike: Ints, counts: Int32s, d: int, c: int | np.int64, row: int | np.int64
 ) -> None:
-    """Add child c to the open node of depth d: a leaf that stands for a row, or an inner node (NO_ROW)."""
+    """Add child c to the open node of depth d: a leaf that begins at a row, or an inner node (NO_ROW)."""
     if children[d] == 0:
         alike[d] = row
     elif (
@@ -112,7 +139,8 @@ def _add_child(
 
 @nb.njit(nogil=True, forceinline=True)
 def ones(byte: np.uint8) -> int:
-    """Bits of a byte that are 1."""
+    """Number of bits of a byte that are 1."""
+    # Sums of pairs of bits, of fours, of eight.
     pairs = byte - ((byte >> 1) & 0x55)
     fours = (pairs & 0x33) + ((pairs >> 2) & 0x33)
     return np.int64((fours + (fours >> 4)) & 15)  # type: ignore[return-value]
@@ -122,11 +150,12 @@ def ones(byte: np.uint8) -> int:
 def measure_masks(child_masks: Bytes, leaf_masks: Bytes, firsts: Ints, stop: int) -> tuple[int, int, int]:
     """Numbers of child masks, leaf masks and leaves above depth `stop`, or -1 three times if the masks are not sound.
 
-    `firsts` (depth + 1,) takes the place of the first child mask of each depth, and where the last one ends.
+    `firsts` (depth + 1,) takes the index of the first child mask of each depth, and the end of the last one.
     """
     depth = firsts.shape[0] - 1
     nodes = min(1, child_masks.shape[0])
     at = leaf_at = leaves = 0
+    # Invariant: depth d has `nodes` inner nodes, of which the masks begin at `at` and `leaf_at`.
     for d in range(stop):
         firsts[d] = at
         if at + nodes > child_masks.shape[0] or (d < depth - 1 and leaf_at + nodes > leaf_masks.shape[0]):
@@ -151,11 +180,13 @@ def measure_masks(child_masks: Bytes, leaf_masks: Bytes, firsts: Ints, stop: int
 def list_leaves_into(
     child_masks: Bytes, leaf_masks: Bytes, firsts: Ints, stop: int, starts: Words32, sizes: Ints
 ) -> None:
-    """First voxel and size of each leaf, in Morton order; inner nodes at depth `stop` count as leaves there.
+    """Write first voxel and size of each leaf, in Morton order; inner nodes at depth `stop` count as leaves.
 
-    The masks are sound (`measure_masks`), and there is room for all and one more: a voxel is written before it is known
-    to be there, because what branches on each bit of a mask is guessed wrong half the time.
+    The masks are sound (`measure_masks`), and there is room for all leaves and one more: a voxel is written before its
+    bit is tested, because a branch on each bit of a mask would be mispredicted half the time.
     """
+    # Depth first, with one open node for each depth: its key, and the children that are not visited yet. `places` is
+    # the index of the next mask of each depth.
     depth = firsts.shape[0] - 1
     places = firsts.copy()
     keys = np.zeros(depth + 1, np.int64)
@@ -171,6 +202,7 @@ def list_leaves_into(
         if children[d] == 0:
             d -= 1
             continue
+        # The next child of the open node: its lowest bit, which is cleared.
         c = 0
         while (children[d] >> c) & 1 == 0:
             c += 1
@@ -182,6 +214,7 @@ def list_leaves_into(
             sizes[count] = 1 << shift
             count += 1
             continue
+        # An inner child: it is opened.
         d += 1
         at = places[d]
         places[d] = at + 1
@@ -217,10 +250,11 @@ def expand_into(starts: Words32, sizes: Ints, leaf_counts: Int32s, voxels: Words
 def expand_content_into(
     starts: Words32, sizes: Ints, leaf_counts: Int32s, sampled: Ints, voxels: Words32, counts: Int32s, rows: Words32
 ) -> bool:
-    """`expand_into`, and the row of each of the (S,) leaves `sampled`, which rise.
+    """`expand_into`, and write the row of each of the (S,) leaves `sampled`, which rise.
 
-    Returns False, and stops, where a leaf of several voxels has samples, or one without has no counts.
+    Returns False, and stops, where a leaf of several voxels has samples, or one without samples has no counts.
     """
+    # Unsigned indices: a signed one is tested for being negative.
     V, s = np.uint64(0), 0
     pairs, out = leaf_counts.reshape(-1), counts.reshape(-1)
     for n in range(starts.shape[0]):
@@ -242,10 +276,12 @@ def expand_content_into(
 
 @nb.njit(cache=True, nogil=True)
 def check_leaves(starts: Words32, sizes: Ints, counts: Int32s, sampled: Ints, whole: int) -> tuple[bool, bool]:
-    """Whether each leaf says something, none of several voxels has samples, and all that can be are collapsed.
+    """Two answers: True if no leaf is empty and none of several voxels has samples; True if all is collapsed.
 
-    The second is told apart from the first two. The cell has `whole` voxels.
+    The cell has `whole` voxels.
     """
+    # `alike`: length of the run of leaves without samples that agree in size, parent and counts. Eight of them fill
+    # their parent, which should have been one leaf, unless it is the root.
     collapsed = True
     s = alike = 0
     size_before, parent_before, hits_before, misses_before = np.int64(0), np.int64(0), np.int32(0), np.int32(0)
@@ -265,7 +301,8 @@ def check_leaves(starts: Words32, sizes: Ints, counts: Int32s, sampled: Ints, wh
 
 @nb.njit(cache=True, nogil=True)
 def bricks_of_leaves(starts: Words32, sizes: Ints) -> int:
-    """Bricks of 8^3 voxels that leaves, rising, touch."""
+    """Number of bricks of 8^3 voxels that leaves, rising, touch."""
+    # `after`: one beyond the last brick counted.
     bricks = 0
     after = np.int64(0)
     for n in range(starts.shape[0]):
@@ -277,7 +314,7 @@ def bricks_of_leaves(starts: Words32, sizes: Ints) -> int:
 
 @nb.njit(cache=True, nogil=True)
 def leaves_of_rows(leaf_rows: Ints, rows: Words32) -> Ints:
-    """(S,) the leaf at which each of the rows, rising, begins; every one of them begins a leaf."""
+    """(S,) leaf that begins at each of the rows, which rise; at every one of them a leaf begins."""
     out = np.empty(rows.shape[0], np.int64)
     leaf = 0
     for n in range(rows.shape[0]):

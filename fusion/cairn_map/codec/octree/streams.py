@@ -1,7 +1,7 @@
-"""Named byte streams, each coded on its own, and read back under a cap.
+"""Numbered byte streams, each compressed on its own, and decompressed under a limit (FORMAT.md sections 5 and 6).
 
-    stream on disk:  id u8 | coding u8 | raw length u32 | stored length u32 | bytes
-    coding           0 as it is, 1 zstd, 2 modelled: said by the stored bytes of its group's first stream (`small_code`)
+    stored stream    number u8 | coding u8 | raw length u32 | stored length u32 | bytes
+    coding           0 raw, 1 zstd, 2 modelled: held by the stored bytes of its group's first stream (`small_profile`)
 
 A column of integers becomes a stream of byte planes: `k u8`, then all lowest bytes, all second bytes, ... up to
 the k-th; k is the least that holds the largest value, so a column has one form only.
@@ -23,13 +23,14 @@ ZSTD_WINDOW_MAX = 1 << 23
 HEAD = struct.Struct("<BBII")
 STORED, ZSTD, MODELLED = 0, 1, 2
 _idle: deque[zstandard.ZstdDecompressor] = deque(maxlen=4)
-"""Each serves one reader at a time; to make one takes longer than to decompress a small stream. Its window stays."""
+"""Decompressors for reuse, with their windows: making one takes longer than decompressing a small stream. Each serves
+one reader at a time."""
 RAW_BYTES_MAX = 1 << 28
-"""Of all streams of a cell together: sixteen bytes for each voxel of the largest cell."""
+"""Raw bytes of all streams of a cell together, at most: sixteen for each voxel of the largest cell."""
 
 
 class StoredStream(NamedTuple):
-    """A stream as it stands in a cell's bytes: nothing of it is decoded, and `raw_bytes` is only claimed."""
+    """A stream of a cell's bytes, not decoded yet; `raw_bytes` is only a claim."""
 
     number: int
     coding: int
@@ -37,10 +38,10 @@ class StoredStream(NamedTuple):
     body: bytes
 
     def raw(self) -> bytes:
-        """The raw bytes.
+        """Raw bytes of the stream.
 
         Raises:
-            DamagedDataError: of an unknown coding, or not of the stated length.
+            DamagedDataError: an unknown coding, or not the stated length.
         """
         if self.coding == ZSTD:
             return bounded_zstd(self.body, size_bytes=self.raw_bytes)
@@ -112,7 +113,7 @@ def bounded_zstd(data: bytes, *, size_bytes: int) -> bytes:
 
 
 def zstd_prefix(data: bytes, *, size_bytes: int) -> bytes:
-    """The first `size_bytes` of what a zstd frame holds, or all of it if that is less.
+    """The first `size_bytes` of a zstd frame's content, or all of it if that is less.
 
     Raises:
         DamagedDataError: not zstd.
@@ -131,10 +132,10 @@ def zstd_prefix(data: bytes, *, size_bytes: int) -> bytes:
 
 
 def required(streams: Mapping[int, bytes], number: int) -> bytes:
-    """One stream.
+    """Stream of a number.
 
     Raises:
-        DamagedDataError: it is missing.
+        DamagedDataError: the stream is missing.
     """
     try:
         return streams[number]
@@ -143,7 +144,7 @@ def required(streams: Mapping[int, bytes], number: int) -> bytes:
 
 
 def encode_column(words: npt.NDArray[np.uint64]) -> bytes:
-    """Byte planes of (N,) uint64, lowest plane first, as many as the largest needs."""
+    """Column of (N,) uint64: its byte planes, lowest first, as many as the largest number needs."""
     top = int(words.max()) if len(words) else 0
     planes = (top.bit_length() + 7) // 8
     return bytes([planes]) + b"".join((words >> np.uint64(8 * p)).astype(np.uint8).tobytes() for p in range(planes))
@@ -162,7 +163,7 @@ def column_planes(stream: bytes, *, rows: int) -> npt.NDArray[np.uint8]:
 
 
 def words_of_planes(planes: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint64]:
-    """(rows,) of `column_planes`; the mirror of `encode_column`."""
+    """(rows,) numbers of the planes of `column_planes`; the mirror of `encode_column`."""
     words = np.zeros(planes.shape[1], np.uint64)
     for p, plane in enumerate(planes):
         words |= plane.astype(np.uint64) << np.uint64(8 * p)

@@ -1,4 +1,7 @@
-"""Columns of sums: what a row's neighbour lets one guess, and what remains to be said (FORMAT.md section 5)."""
+"""Prediction of columns of sums: each row is guessed from the row before, and the residual is stored.
+
+FORMAT.md section 5 is the norm. All arithmetic is on words mod 2^64, so that every number has a residual.
+"""
 
 import numba as nb
 import numpy as np
@@ -17,6 +20,7 @@ def predict_sums(values: Ints, weights: Ints) -> Words:
     """
     out = np.empty(values.shape[0], np.uint64)
     for n in range(values.shape[0]):
+        # guess = (value before * weight) div weight before: neighbours have like means.
         guess = np.uint64(0)
         if n > 0 and weights[n - 1] != 0:
             guess = np.uint64(values[n - 1]) * np.uint64(weights[n]) // np.uint64(weights[n - 1])
@@ -26,7 +30,8 @@ def predict_sums(values: Ints, weights: Ints) -> Words:
 
 @nb.njit(cache=True, nogil=True)
 def restore_sums_into(sums: Ints, p: int, planes: Planes) -> None:
-    """Decoder's half of `predict_sums`: column p of (N, P) sums, whose last holds the weights, from (k, N) planes."""
+    """Write column p of (N, P) sums, whose last holds the weights, from (k, N) planes; the mirror of `predict_sums`."""
+    # The row before is kept in two words, `value` and `weight`.
     last = sums.shape[1] - 1
     value, weight = np.uint64(0), np.uint64(0)
     for n in range(sums.shape[0]):
@@ -39,7 +44,7 @@ def restore_sums_into(sums: Ints, p: int, planes: Planes) -> None:
 
 @nb.njit(cache=True, nogil=True)
 def restore_squares_into(sums: Ints, planes: Planes) -> None:
-    """Column 1 of (N, 3) sums, of which the others are there, from the (k, N) planes of what `square_guesses` left."""
+    """Write column 1 of (N, 3) sums, whose other columns are complete, from the (k, N) planes of its residuals."""
     for n in range(sums.shape[0]):
         guess, weight = np.uint64(0), np.uint64(sums[n, 2])
         if weight != 0:
@@ -49,15 +54,16 @@ def restore_squares_into(sums: Ints, planes: Planes) -> None:
 
 @nb.njit(cache=True, nogil=True)
 def place_sums_into(leaves: Ints, sums: Ints, sampled: Ints, samples: Ints, low: int, high: int) -> bool:
-    """Write the (N, P) sums of leaves that rise into (S, P) samples, at their places among the leaves `sampled`.
+    """Write the (N, P) sums of leaves, which rise, into (S, P) samples, at their places among the leaves `sampled`.
 
-    Returns False where a row is all zeros, or a sum not in [low, high]; `sampled` rises and has them all.
+    Returns False if a row is all zeros, or a sum not in [low, high]; `sampled` rises and holds all the leaves.
     """
     row = np.uint64(0)
     sound = True
     for n in range(np.uint64(leaves.shape[0])):
         while sampled[row] != leaves[n]:
             row += np.uint64(1)
+        # `said`: all bits of the row.
         said = np.int64(0)
         for p in range(np.uint64(sums.shape[1])):
             value = sums[n, p]
@@ -70,7 +76,7 @@ def place_sums_into(leaves: Ints, sums: Ints, sampled: Ints, samples: Ints, low:
 
 @nb.njit(forceinline=True)
 def _word(planes: Planes, n: int) -> np.uint64:
-    """The number that the planes of `streams.column_planes` spell."""
+    """Number of row n in the planes of `streams.column_planes`: byte p is in plane p."""
     word = np.uint64(0)
     for p in range(planes.shape[0]):
         word |= np.uint64(planes[p, n]) << np.uint64(8 * p)
@@ -79,7 +85,7 @@ def _word(planes: Planes, n: int) -> np.uint64:
 
 @nb.njit(cache=True, nogil=True)
 def square_guesses(sums: Ints, weights: Ints) -> Words:
-    """What a sum of squares is if all samples were alike: q^2 w + 2 q (s - q w), q = s // w, in words mod 2^64."""
+    """Sums of squares of equal samples: q^2 w + 2 q (s - q w), q = s // w, in words mod 2^64."""
     out = np.zeros(sums.shape[0], np.uint64)
     for n in range(sums.shape[0]):
         if weights[n] != 0:
@@ -89,18 +95,19 @@ def square_guesses(sums: Ints, weights: Ints) -> Words:
 
 @nb.njit(nogil=True)
 def square_guess(s: np.uint64, w: np.uint64) -> np.uint64:
-    """One of `square_guesses`; w is not 0."""
+    """Sum of squares of w equal samples of sum s; w is not 0."""
+    # Nearly equal integers, r = s - q w of them q + 1 and the others q, have this sum of squares plus r.
     q = s // w
     return q * q * w + np.uint64(2) * q * (s - q * w)
 
 
 @nb.njit(inline="always")
 def zigzag(word: np.uint64) -> np.uint64:
-    """Two's complement word to a word that is small for small magnitudes: 0, -1, 1, -2 become 0, 1, 2, 3."""
+    """Word that is small for small magnitudes, of a two's complement word: 0, -1, 1, -2 become 0, 1, 2, 3."""
     return (word << np.uint64(1)) ^ (np.uint64(0) - (word >> np.uint64(63)))
 
 
 @nb.njit(inline="always")
 def unzigzag(word: np.uint64) -> np.uint64:
-    """The mirror of `zigzag`."""
+    """Two's complement word of a zigzag word; the mirror of `zigzag`."""
     return (word >> np.uint64(1)) ^ (np.uint64(0) - (word & np.uint64(1)))
