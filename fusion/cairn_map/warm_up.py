@@ -25,13 +25,13 @@ from cairn_map.evidence.evidence import (
 from cairn_map.evidence.evidence_kernels import channel_above
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.fingerprint import fingerprint
-from cairn_map.evidence.grid import BRICK_DEPTH, Geometry, cell_key, voxels_in_cell
+from cairn_map.evidence.grid import BRICK_DEPTH, CellKey, Geometry, cell_key, voxels_in_cell
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.queries.map_snapshot import snapshot_of
 from cairn_map.render.camera_rays import look_at, pinhole
 from cairn_map.render.map_picture import layer_picture, layer_values
 from cairn_map.render.map_render import MapRenderer
-from cairn_map.render.partial_map import draw_as_needed, read_cell
+from cairn_map.render.partial_map import ReadCell, draw_as_needed, read_cell
 from cairn_map.render.pose_spread import PoseSpread
 from cairn_map.render.render_kernels import blend_into
 from cairn_map.render.render_picture import SCALES, Layer
@@ -75,21 +75,24 @@ def warm_up_pictures() -> None:
     stored = encode_cell(key, _many_voxels(geometry), geometry).data
     whole = brick_cell(geometry, [decode_canonical_cell(stored).evidence])
     for layer in Layer:
-        renderer, read = MapRenderer(), read_cell(whole, geometry, model, layer)
-        sight, T = pinhole(4, 4, focal_px=4), look_at((-1, 0.1, 0.1), (0, 0, 0))
-        drawing = draw_as_needed(
-            renderer,
-            geometry,
-            model,
-            {},
-            [key],
-            lambda _, read=read: {key: read},
-            sight=sight,
-            T_map_camera=T,
-            range_max_m=2.0,
-        )
-        values = layer_values(renderer, drawing.snapshot, drawing.seen, layer)
-        layer_picture(values, drawing.seen, SCALES[layer], PoseSpread.of_sigmas(0.01, 0.01))
+        _draw(key, read_cell(whole, geometry, model, layer), geometry, model, layer)
+
+
+def _draw(key: CellKey, cell: ReadCell, geometry: Geometry, model: SensorModel, layer: Layer) -> None:
+    renderer = MapRenderer()
+    drawing = draw_as_needed(
+        renderer,
+        geometry,
+        model,
+        {},
+        [key],
+        lambda keys: dict.fromkeys(keys, cell),
+        sight=pinhole(4, 4, focal_px=4),
+        T_map_camera=look_at((-1, 0.1, 0.1), (0, 0, 0)),
+        range_max_m=2.0,
+    )
+    values = layer_values(renderer, drawing.snapshot, drawing.seen, layer)
+    layer_picture(values, drawing.seen, SCALES[layer], PoseSpread.of_sigmas(0.01, 0.01))
 
 
 def _ask(evidence: Evidence, geometry: Geometry) -> None:

@@ -153,6 +153,7 @@ class _Head:
 
 
 def _head(data: bytes) -> _Head:
+    # Fields in the order of the table in FORMAT.md section 15.
     if len(data) < HEAD.size or data[:4] != MAGIC:
         raise DamagedDataError("bad_view", "not a view of a cell: it must begin with CRNV and a whole head")
     fields = HEAD.unpack_from(data)
@@ -160,6 +161,7 @@ def _head(data: bytes) -> _Head:
     step_k, edge_um, i, j, k, N, V, children, leaves = fields[7:]
     if version != VERSION:
         raise BadInputError("unknown_version", f"this reader knows views of version {VERSION}, got {version}")
+    # Codes and numbers that exist.
     known = extent < len(EXTENTS) and chance < len(CHANCES) and colours < len(COLOURS)
     within = all(-CELL_LIMIT <= number < CELL_LIMIT for number in (i, j, k))
     if not known or not within or not 1 <= depth <= cell_depth <= DEPTH_MAX:
@@ -178,6 +180,7 @@ def _groups(data: bytes) -> list[bytes]:
     groups: list[bytes] = []
     at = HEAD.size
     for _ in range(GROUPS):
+        # A length that is cut off, or too large, leads to a wrong end.
         if at + LENGTH.size > len(data):
             break
         (size,) = LENGTH.unpack_from(data, at)
@@ -190,6 +193,7 @@ def _groups(data: bytes) -> list[bytes]:
 
 def _as_evidence(view: View) -> Evidence:
     """Evidence whose octree is the view's: nodes collapse where probabilities are equal and no other value is known."""
+    # Hits of 1 more than the probability, because a voxel without counts does not exist.
     counts = np.stack([view.chances + 1, np.zeros_like(view.chances)], axis=1).astype(np.int32)
     sampled = np.union1d(view.coloured, view.warm).astype(np.uint32)
     return Evidence(view.nodes, counts, sampled, np.zeros((len(sampled), 0), np.int64))
@@ -208,6 +212,7 @@ def _flags(rows: Ints, count: int) -> Flags:
 
 def _written(code: Code, numbers: int) -> bytes:
     data = write_modelled(code, room=64 + 8 * numbers)
+    # The coder's worst case is below this room: more would be an error of the program.
     if data is None:
         raise AssertionError("eight bytes a number were too few")
     return data
@@ -253,6 +258,7 @@ def _read_samples(
     found: list[Ints] = [np.empty(0, np.int64), np.empty((0, columns), np.int64)]
 
     def code(coder: Coder, read: Bytes) -> bool:
+        # The number of values is known only once the presence is decoded.
         present = np.zeros(len(before), np.bool_)
         _code_presence(coder, read, present, occupied, before, ground)
         leaves = np.nonzero(present)[0]

@@ -57,6 +57,7 @@ def number_bricks_into(voxels: Voxels, brick_of: BrickNumbers, used: int) -> Non
     while start < voxels.shape[0]:
         brick = voxels[start] >> np.uint32(9)
         if brick_of[brick] < 0:
+            # The next row of the pool.
             brick_of[brick] = used
             used += 1
         start = _brick_end(voxels, start)

@@ -173,6 +173,7 @@ def pack_rows_into(
             out_voxels[S] = known[n]
             for p in range(U(narrow.shape[1])):
                 out_samples[S, p] = narrow[row, p]
+            # Wide planes have all their bits elsewhere.
             for w in range(U(wide_planes.shape[0])):
                 out_samples[S, U(wide_planes[w])] = wide[row, w]
             S += U(1)

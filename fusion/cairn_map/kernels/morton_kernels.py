@@ -50,6 +50,7 @@ def interleave(xyz: npt.NDArray[np.int64]) -> UInts:
 @nb.njit(cache=True, nogil=True)
 def deinterleave(codes: UInts) -> npt.NDArray[np.int64]:
     """(N, 3) integers of (N,) Morton codes; the mirror of `interleave`."""
+    # y and z are shifted to where x is.
     out = np.empty((codes.shape[0], 3), np.int64)
     for n in range(codes.shape[0]):
         out[n, 0] = np.int64(squeeze(codes[n]))

@@ -30,7 +30,7 @@ PARALLEL = 1e-9
 """Slack of the edge tests: of edges that are nearly parallel the cross product is nearly 0, and no direction."""
 
 
-class Solid(NamedTuple):
+class CollisionBody(NamedTuple):
     """A box of half lengths `half` along the columns of R, or a sphere if `radius` is not 0."""
 
     centre: Floats
@@ -46,11 +46,11 @@ class Solid(NamedTuple):
 def body_states_into(grid: Grid, centres: Floats, R: Floats, half: Floats, radius: float, out: Bytes) -> None:
     """Write (N,) OCCUPIED, UNKNOWN or FREE, in this order of weight, for (N, 3) centres and (N, 3, 3) rotations."""
     for n in range(centres.shape[0]):
-        out[n] = body_state(grid, Solid(centres[n], R[n], half, radius))
+        out[n] = body_state(grid, CollisionBody(centres[n], R[n], half, radius))
 
 
 @nb.njit(nogil=True)
-def body_state(grid: Grid, body: Solid) -> np.uint8:
+def body_state(grid: Grid, body: CollisionBody) -> np.uint8:
     """OCCUPIED if the solid overlaps an occupied voxel, else UNKNOWN if it overlaps an unknown one, else FREE."""
     # Voxels of the box around the solid, aligned with the axes.
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
@@ -80,8 +80,9 @@ def body_state(grid: Grid, body: Solid) -> np.uint8:
 
 
 @nb.njit(nogil=True)
-def state_in_cell(grid: Grid, body: Solid, slot: int, low: Ints, high: Ints, meets_unknown: bool) -> np.uint8:
+def state_in_cell(grid: Grid, body: CollisionBody, slot: int, low: Ints, high: Ints, meets_unknown: bool) -> np.uint8:
     """State that the solid meets in the bricks of one cell, within its bounds `low` to `high`."""
+    # Bricks between the bounds of the solid and of the cell.
     side = 1 << grid.depth
     x0, y0, z0 = (
         signed(grid.cells[slot, 0]) * side,
@@ -106,7 +107,9 @@ def state_in_cell(grid: Grid, body: Solid, slot: int, low: Ints, high: Ints, mee
 
 
 @nb.njit(nogil=True)
-def state_in_brick(grid: Grid, body: Solid, brick: int, x0: int, y0: int, z0: int, meets_unknown: bool) -> np.uint8:
+def state_in_brick(
+    grid: Grid, body: CollisionBody, brick: int, x0: int, y0: int, z0: int, meets_unknown: bool
+) -> np.uint8:
     """State that the solid meets in the brick whose first voxel is (x0, y0, z0)."""
     for w in range(8):
         occupied, unknown = grid.words[brick, w, OCCUPIED_BITS], ~grid.words[brick, w, KNOWN_BITS]
@@ -115,6 +118,7 @@ def state_in_brick(grid: Grid, body: Solid, brick: int, x0: int, y0: int, z0: in
         x, y, z = x0 + 4 * (w & 1), y0 + 2 * (w & 2), z0 + (w & 4)
         if wanted == U(0) or not overlaps(body, x, y, z, 4):
             continue
+        # Voxel by voxel, but only those that could change the answer.
         for n in range(64):
             if (wanted >> U(n)) & U(1) == U(0):
                 continue
@@ -127,7 +131,7 @@ def state_in_brick(grid: Grid, body: Solid, brick: int, x0: int, y0: int, z0: in
 
 
 @nb.njit(nogil=True)
-def overlaps(body: Solid, x: int, y: int, z: int, size: int) -> bool:
+def overlaps(body: CollisionBody, x: int, y: int, z: int, size: int) -> bool:
     """True if the solid overlaps the cube of `size` whose lowest corner is (x, y, z), deeper than TOUCH."""
     half = size / 2
     tx, ty, tz = body.centre[0] - (x + half), body.centre[1] - (y + half), body.centre[2] - (z + half)

@@ -33,6 +33,7 @@ def frontier_into(grid: Grid, corners: Ints, frontier: Words) -> int:
             # Most blocks lie within known space: seven words tell, and no voxel is looked at.
             if free == U(0) or (known == ALL and are_known_beside(grid, beside, b, w)):
                 continue
+            # Else voxel by voxel.
             for n in range(64):
                 if (free >> U(n)) & U(1) and has_unknown_beside(grid, beside, b, w, n):
                     frontier[b, w] |= U(1) << U(n)
@@ -83,6 +84,7 @@ def tops_into(grid: Grid, corners: Ints, low: Ints, high: Ints, tops: Ints) -> N
             for n in range(64):
                 if (occupied >> U(n)) & U(1) == U(0):
                     continue
+                # Number of the voxel: of its brick, its block in the brick, and its place in the block.
                 x = corners[b, 0] + 4 * (w & 1) + x_in_block(n)
                 y = corners[b, 1] + 2 * (w & 2) + x_in_block(n >> 1)
                 z = corners[b, 2] + (w & 4) + x_in_block(n >> 2)

@@ -31,6 +31,7 @@ def nearest_into(
             own[axis] = voxel_of(points[n, axis], grid.edge_nm)
         voxels[n] = own
         distances[n] = np.inf
+        # A point outside may have any number, infinity too; the caller refuses all of them.
         if inside:
             distances[n] = search_into(grid, start, own, radius, unknown, voxels[n])
     return inside
@@ -45,7 +46,8 @@ def search_into(grid: Grid, start: Floats, own: Ints, radius: float, unknown: bo
     bx, by, bz = own[0] >> 3, own[1] >> 3, own[2] >> 3
     low_x, low_y, low_z = grid.low[0] >> 3, grid.low[1] >> 3, grid.low[2] >> 3
     high_x, high_y, high_z = (grid.high[0] >> 3) - 1, (grid.high[1] >> 3) - 1, (grid.high[2] >> 3) - 1
-    if unknown:  # all around the map as well
+    # Around the map all is unknown, one brick far at least.
+    if unknown:
         low_x, low_y, low_z = min(low_x, bx) - 1, min(low_y, by) - 1, min(low_z, bz) - 1
         high_x, high_y, high_z = max(high_x, bx) + 1, max(high_y, by) + 1, max(high_z, bz) + 1
     # Invariant: no brick of an earlier shell holds a voxel nearer than `best`.
@@ -89,6 +91,7 @@ def search_brick_into(
         words = grid.words[brick, w]
         bits = ~words[KNOWN_BITS] if unknown else words[OCCUPIED_BITS]
         x, y, z = 8 * bx + 4 * (w & 1), 8 * by + 2 * (w & 2), 8 * bz + (w & 4)
+        # Blocks without such a voxel, or farther away, are skipped.
         if bits == U(0) or box_distance_squared(start, x, y, z, 4) >= best:
             continue
         for n in range(64):

@@ -65,6 +65,7 @@ def _number_of(i: int, j: int, k: int) -> int:
 def fill_table_into(cells: Ints, numbers: Ints, slots: Int32s, hash_shift: int) -> None:
     """Enter (C, 3) cells into an empty hash table."""
     for c in range(cells.shape[0]):
+        # The first free place from the hash on.
         number = _number_of(cells[c, 0], cells[c, 1], cells[c, 2])
         at = (U(number) * HASH) >> U(hash_shift)
         while numbers[at] >= 0:
@@ -104,6 +105,7 @@ def brick_of(grid: Grid, x: int, y: int, z: int) -> int:
     slot = slot_of(grid, x >> grid.depth, y >> grid.depth, z >> grid.depth)
     if slot < 0:
         return NONE
+    # The place in the cell, without the 9 bits of a voxel in its brick.
     place = place_of(x, y, z, (1 << grid.depth) - 1)
     return signed(grid.bricks[U(slot), U(place >> 9)])
 
@@ -132,7 +134,8 @@ def voxel_of(position_m: float, edge_nm: int) -> int:
     The position is rounded to whole nanometres, half to even; then the floor is exact, in integers.
     """
     nanometres = int(np.rint(position_m * NANOMETRES))
-    voxel = int(np.floor(nanometres * (1.0 / edge_nm)))  # off by one at most; a division takes longer
+    # Off by one at most, which the rest corrects; an integer division takes longer.
+    voxel = int(np.floor(nanometres * (1.0 / edge_nm)))
     rest = nanometres - voxel * edge_nm
     return voxel + int(rest >= edge_nm) - int(rest < 0)
 
@@ -148,6 +151,8 @@ def states_of_counts_into(pool: Pool, of_hits: Floats, of_misses: Floats, least:
     for b in range(U(pool.shape[0])):
         for w in range(U(8)):
             occupied, known = U(0), U(0)
+            # One bit of each word a voxel; log-odds by OctoMap's Eq. 2, not clamped: the threshold lies between the
+            # clamps.
             for n in range(U(64)):
                 hits, misses = pool[b, w * U(64) + n, 0], pool[b, w * U(64) + n, 1]
                 seen = (hits | misses) != 0
@@ -187,6 +192,7 @@ def list_bits_into(words: Words, corners: Ints, out: Ints) -> None:
                 continue
             for n in range(64):
                 if (bits >> U(n)) & U(1):
+                    # Brick, block in the brick, place in the block.
                     out[m, 0] = corners[b, 0] + 4 * (w & 1) + x_in_block(n)
                     out[m, 1] = corners[b, 1] + 2 * (w & 2) + x_in_block(n >> 1)
                     out[m, 2] = corners[b, 2] + (w & 4) + x_in_block(n >> 2)

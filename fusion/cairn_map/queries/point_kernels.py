@@ -58,6 +58,7 @@ def locate_into(grid: Grid, points: Floats, reach_m: float, slots: Int32s, place
         slot = slot_of(grid, x >> grid.depth, y >> grid.depth, z >> grid.depth)
         place = place_of(x, y, z, (1 << grid.depth) - 1)
         places[n] = place
+        # A place in no brick has neither counts nor samples.
         if slot >= 0 and grid.bricks[U(slot), U(place >> 9)] < 0:
             slot = -1
         slots[n] = slot
@@ -87,6 +88,7 @@ def group_into(slots: Int32s, starts: Ints, order: Int32s) -> None:
 def counts_into(rows: Int32s, places: Places, bricks: npt.NDArray[np.int16], pool: Pool, out: Int32s) -> None:
     """Write (N, 2) hits and misses of the listed points of one cell, all in its bricks."""
     for n in range(U(rows.shape[0])):
+        # A place without its lowest 9 bits is the number of its brick.
         row = U(rows[n])
         place = U(places[row])
         brick = U(bricks[place >> U(9)])

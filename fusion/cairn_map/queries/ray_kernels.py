@@ -76,6 +76,7 @@ def cast_into(
         # Outside of the box all is unknown: that ends the ray at once, or is crossed in one step.
         at = 0.0 if unknown_ends else enter_box_into(grid, start, directions[n], 0.0, voxel)
         ranges[n], states[n] = walk_into(grid, start, directions[n], at, range_max, unknown_ends, voxel)
+        # `voxel` has become the one that ends the ray.
         voxels[n] = voxel
     return inside
 
@@ -185,7 +186,8 @@ def ray_through(start: Floats, direction: Floats, x: int, y: int, z: int) -> Ray
 def along(start: float, direction: float, voxel: int) -> tuple[float, float, int]:
     """One axis of a `Ray`: its start, inverse direction, and -1 if it rises, else 0."""
     if direction == 0:
-        return voxel + 0.5, np.inf, -1  # never on a border, where infinity times zero would be met
+        # No border is ever met: infinite ranges. In the middle of a voxel, because on a border 0 times infinity is NaN.
+        return voxel + 0.5, np.inf, -1
     return start, 1 / direction, -1 if direction > 0 else 0
 
 
@@ -206,7 +208,8 @@ def walk_block(
         to_y = (y + (ray.up[1] & 1) - ray.start[1]) * ray.inverse[1]
         to_z = (z + (ray.up[2] & 1) - ray.start[2]) * ray.inverse[2]
         leaves = min(to_x, to_y, to_z)
-        at = max(at, leaves)  # rounding must not lead back
+        # Rounding must not lead back.
+        at = max(at, leaves)
         # One step across each border that is met at that range: across an edge or a corner, too. `up | 1` is -1 or 1.
         x += (ray.up[0] | 1) * -int(to_x == leaves)
         y += (ray.up[1] | 1) * -int(to_y == leaves)
@@ -233,8 +236,10 @@ def leave_block(ray: Ray, x: int, y: int, z: int, at: float, size: int) -> tuple
 @nb.njit(nogil=True, forceinline=True)
 def beyond(voxel: int, size: int, up: int, reached: float, is_left: bool) -> int:
     """Voxel number along one axis when a block is left: the first beyond its border, or one inside it, not behind."""
+    # `-size` is all bits set but those inside a block.
     low = voxel & -size
     if is_left:
         return low + size if up else low - 1
+    # Within the block along this axis: rounding must lead neither behind the voxel nor out of the block.
     inside = int(np.floor(reached))
     return min(max(inside, voxel if up else low), low + size - 1 if up else voxel)

@@ -145,6 +145,7 @@ class MapRenderer:
 
     def changed(self, snapshot: MapSnapshot, seen: SurfaceImage, changes: Changes) -> Floats:
         """(H, W) time of the node's last change, in the unit of `changes`; NaN where that is unknown."""
+        # Cell by cell, because changes are held by cell.
         H, W = seen.slots.shape
         found, flat = np.full(H * W, np.nan), seen.slots.reshape(-1)
         places, nodes = seen.places.reshape(-1), seen.nodes.reshape(-1)
@@ -158,6 +159,7 @@ class MapRenderer:
         return found.reshape(H, W)
 
     def _mean(self, snapshot: MapSnapshot, seen: SurfaceImage, kind: ChannelKind, planes: int) -> Values:
+        # The channel is the key of its table.
         channel, geometry = first_of_kind(snapshot.geometry, kind), snapshot.geometry
         return self._read(
             snapshot,
@@ -215,6 +217,7 @@ class MapRenderer:
             )
 
         self._by_rows(H, look)
+        # Voxel edges to metres, in place.
         np.multiply(seen.range_m, np.float32(edge_m), out=seen.range_m)
         return seen
 
@@ -228,6 +231,7 @@ class MapRenderer:
     ) -> Values:
         # Tables of the cells in sight; slot -1, nothing, is the first bin.
         frozen = snapshot.frozen
+        # Cells that no pixel sees need no table: most of a map is never read.
         slots = np.flatnonzero(np.bincount(seen.slots.reshape(-1) + 1, minlength=1 + len(frozen.cells))[1:])
         tables = {slot: self._table(frozen.keys[slot], frozen.cells[slot], name, make) for slot in slots.tolist()}
         out = np.full((seen.sight.height, seen.sight.width, planes), np.nan, np.float32)
@@ -282,9 +286,11 @@ class MapRenderer:
             self._on_share()
             work(share)
 
+        # One thread needs no pool.
         if self._threads == 1:
             for share in shares:
                 do(share)
             return
+        # Kernels release Python's lock, and each share writes rows of its own.
         with ThreadPoolExecutor(self._threads) as pool:
             list(pool.map(do, shares))

@@ -56,6 +56,14 @@ class Replies:
         self.known: bytes | None = None
         """The last reply, if it had no cells; else None."""
 
+    def keep_begun(self, begun: tuple[CellKey, bytes] | None) -> None:
+        """Remember the beginning of a cell's payload; None: there is none."""
+        self.begun = begun
+
+    def keep_known(self, reply: bytes | None) -> None:
+        """Remember a reply without cells; None: the last one had some, or was cut."""
+        self.known = reply
+
     def reply_to(self, request: MissingRequest) -> "Reply":
         """Reader of the reply to a request."""
         return Reply(self, request)
@@ -90,7 +98,8 @@ class Reply:
             UnreachableError: kind `cut_off`: they end too early.
         """
         reader = FrameReader()
-        self._memory.known = None
+        self._memory.keep_known(None)
+        # `short`: the bytes so far, while they hold no cell and are few enough to be kept.
         short: bytearray | None = bytearray()
         try:
             for part in parts:
@@ -106,12 +115,12 @@ class Reply:
             self._note(reader)
         if not reader.is_empty:
             raise UnreachableError("cut_off", "the reply was cut off")
-        self._memory.known = bytes(short) if short is not None else None
+        self._memory.keep_known(bytes(short) if short is not None else None)
 
     def _whole(self, frame: CellFrame) -> CellFrame:
         """A frame, joined with the beginning of its payload from an earlier reply."""
         if self._memory.begun is not None and self._memory.begun[0] == frame.cell:
-            self._memory.begun = None
+            self._memory.keep_begun(None)
         if not frame.continues:
             return frame
         name = cell_of_key(frame.cell)
@@ -132,8 +141,8 @@ class Reply:
                 return
             # No cell is as large: a server that always continues must not fill the memory.
             if len(self._begun[1]) + len(payload) > CELL_BYTES_MAX:
-                self._memory.begun = None
+                self._memory.keep_begun(None)
                 return
             payload = self._begun[1] + payload
         if len(payload) >= BEGUN_BYTES_MIN:
-            self._memory.begun = key, payload
+            self._memory.keep_begun((key, payload))

@@ -104,6 +104,7 @@ def split(live: Live, data: Data, chance: int, bits: int, bit: int) -> tuple[int
 @nb.njit(nogil=True, forceinline=True)
 def learn(odds: Odds, context: int, bit: int) -> None:
     """Move a context's probability towards the bit that came."""
+    # chance += (bit - chance) * step, in 22 bits.
     odd = signed(odds[context])
     seen, chance = odd & 1023, odd >> 10
     if bit:

@@ -53,6 +53,7 @@ def code_masks(
         for n in range(first, last):
             if at >= child_masks.shape[0] or (not is_last and leaf_at >= leaf_masks.shape[0]):
                 return -1, -1
+            # The parent's upper neighbours serve all eight children.
             key = signed(keys[n])
             upper = upper_states(states, offset, key, d)
             child_mask = signed(child_masks[at])
@@ -111,6 +112,7 @@ def _contexts_into(
         state = (upper >> (2 * axis)) & 3
         near = 4 * near + (state if (child >> axis) & 1 else SIBLING)
         above = 3 * above + state
+    # The three opinions, each in a table of its own, two contexts each: one for each question.
     contexts[0] = 2 * (near * GROUPS + group)
     contexts[1] = 2 * (GROUPS * FACES + (edges * 27 + faces) * GROUPS + group)
     family = (above * 256 + before) * 8 + (child & 7)

@@ -75,6 +75,7 @@ def code_weights(coder: Coder, data: Data, weights: Ints, references: Ints, near
                 error += signed(errors[row])
                 count += 1
         error = min(half_log((4 * error) // count), 40) if count else 41
+        # Three opinions on the difference to the reference: the reference, the number of neighbours, their error.
         reference = references[s]
         contexts[0] = min(reference, 60) * SLOTS
         contexts[1] = (TABLE + min(count, 7) * 16 + min(reference, 15)) * SLOTS
@@ -101,6 +102,7 @@ def code_sums(coder: Coder, data: Data, sums: Ints, rests: Ints, weights: Ints, 
         size = min(half_log(weight), 11)
         before = 0
         for c in range(planes):
+            # Three opinions on the residual: the error, the residual of the plane before, the neighbours' spread.
             guess, error, spread, count = _guess(sums, rests, weights, near, s, c)
             contexts[0] = (3 * c * TABLE + min(weight, 23) * 48 + error) * SLOTS
             contexts[1] = ((3 * c + 1) * TABLE + before * 16 + min(error // 2, 15)) * SLOTS
@@ -172,6 +174,7 @@ def code_squares(coder: Coder, data: Data, squares: Ints, sums: Ints, rests: Int
         contexts[0] = (min(weight, 15) * 64 + expected) * SLOTS
         contexts[1] = (TABLE + off * 16 + min(weight, 15)) * SLOTS
         contexts[2] = (2 * TABLE + min(half_log(weight), 20) * 8 + min(count, 7)) * SLOTS
+        # The guess of equal samples (section 5), where it does not leave 64 bits.
         guess = 0
         if 0 < weight < WEIGHT_MAX and sums[s] // weight < 1 << 20:
             guess = signed(square_guess(np.uint64(sums[s]), np.uint64(weight)))

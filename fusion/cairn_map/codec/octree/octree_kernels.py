@@ -306,6 +306,7 @@ def bricks_of_leaves(starts: Words32, sizes: Ints) -> int:
     bricks = 0
     after = np.int64(0)
     for n in range(starts.shape[0]):
+        # Bricks [first, stop) of the leaf.
         first, stop = np.int64(starts[n]) >> 9, (np.int64(starts[n]) + sizes[n] + 511) >> 9
         bricks += stop - max(first, after)
         after = stop

@@ -88,6 +88,7 @@ def square_guesses(sums: Ints, weights: Ints) -> Words:
     """Sums of squares of equal samples: q^2 w + 2 q (s - q w), q = s // w, in words mod 2^64."""
     out = np.zeros(sums.shape[0], np.uint64)
     for n in range(sums.shape[0]):
+        # Without weight there are no samples: the residual is the number itself.
         if weights[n] != 0:
             out[n] = square_guess(np.uint64(sums[n]), np.uint64(weights[n]))
     return out
