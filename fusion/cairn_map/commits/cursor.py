@@ -1,9 +1,9 @@
-"""A place in a server's log that proves its own history: `(log_id, seq, chain)`, always compared as a whole.
+"""Cursors: positions in a server's log that prove its history, `(log_id, seq, chain)`, always compared as a whole.
 
     chain[0] = H(log_id, geometry)      chain[s] = H(chain[s - 1], kind, id, sha)
 
-A server that was restored from an older backup, and then folded other commits, has another chain at the same
-seq; so a cursor from before is noticed by itself.
+H is SHA-256, cut to 16 bytes (FORMAT.md section 9). A server that was restored from an older backup, and then folded
+other commits, has another chain at the same seq; so it recognises a cursor from before the restore.
 """
 
 import hashlib
@@ -19,7 +19,7 @@ ENTRY_UNFOLD = b"-"
 
 @dataclass(frozen=True, slots=True)
 class Cursor:
-    """A state of one server's map: everything folded up to and including `seq`."""
+    """State of one server's map: everything folded up to and including `seq`."""
 
     log_id: bytes
     seq: int
@@ -34,10 +34,10 @@ class Cursor:
 
 
 def cursor_from_text(text: str) -> Cursor:
-    """The cursor written `log_id.seq.chain` (hex, decimal, hex).
+    """Cursor of a text `log_id.seq.chain` (hex, decimal, hex).
 
     Raises:
-        BadInputError: it is not.
+        BadInputError: the text is not of that form.
     """
     parts = text.split(".")
     try:
@@ -52,10 +52,10 @@ def cursor_from_text(text: str) -> Cursor:
 
 
 def first_chain(log_id: bytes, geometry_digest: bytes) -> bytes:
-    """The chain of an empty log."""
+    """Chain of an empty log."""
     return hashlib.sha256(b"cairn-chain-0" + log_id + geometry_digest).digest()[:CHAIN_BYTES]
 
 
 def next_chain(chain: bytes, kind: bytes, commit: CommitId, sha: bytes) -> bytes:
-    """The chain after one more entry: a commit folded (`ENTRY_FOLD`) or taken out (`ENTRY_UNFOLD`)."""
+    """Chain after one more entry: a commit folded (`ENTRY_FOLD`) or taken out (`ENTRY_UNFOLD`)."""
     return hashlib.sha256(chain + kind + str(commit).encode() + b"\0" + sha).digest()[:CHAIN_BYTES]

@@ -48,7 +48,7 @@ class BrickCell:
         self._add(diff, -1)
 
     def copy(self) -> "BrickCell":
-        """The same sums; what either cell adds from here on goes into arrays of its own."""
+        """The same sums; the first of the two cells that changes copies the arrays."""
         copied = BrickCell.__new__(BrickCell)
         copied._geometry, copied._counts, copied._samples = self._geometry, self._counts, self._samples
         self._is_shared = copied._is_shared = True
@@ -86,8 +86,8 @@ class BrickCell:
         diff = _in_rows(diff)
         if self._is_shared:
             self._counts, self._samples, self._is_shared = self._counts.copy(), self._samples.copy(), False
-        # Negative sums are legal on the way (a delta may come before what it takes away); the caller that holds a
-        # finished state checks it by fingerprint.
+        # Negative sums are legal for a while (a delta may arrive before the evidence that it takes away); a caller that
+        # holds a finished state checks it by fingerprint.
         self._samples.add(diff, sign)
         try:
             self._counts.add(diff.voxels, diff.counts, sign)
@@ -105,7 +105,7 @@ def brick_cell(geometry: Geometry, diffs: Iterable[Evidence] = ()) -> BrickCell:
 
 
 def sum_evidence(diffs: Iterable[Evidence], geometry: Geometry) -> Evidence:
-    """Packed sum of diffs of one cell, in any order the same."""
+    """Packed sum of diffs of one cell; their order does not matter."""
     return brick_cell(geometry, diffs).packed()
 
 

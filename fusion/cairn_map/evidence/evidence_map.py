@@ -1,7 +1,7 @@
-"""A map in memory: cells by number, each a sum of evidence. What a robot sees, and what a server folds.
+"""A map in memory: cells by number, each a sum of evidence. Robots and servers use the same one.
 
 map.merge(diff)      add a measurement         map.unmerge(diff)      take it out again, exactly
-map.copy()           what it holds now, at the price of a list of its cells
+map.copy()           an unchanging copy, at the cost of a list of its cells
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -57,7 +57,7 @@ class EvidenceMap:
         self._cells[key] = cell
 
     def copy(self) -> "EvidenceMap":
-        """The same sums, unmoved by what is merged from here on; cells share their arrays until one is changed."""
+        """The same sums, unaffected by later merges; cells share their arrays until one of the two is changed."""
         copied = EvidenceMap(self.geometry)
         copied._cells = {key: cell.copy() for key, cell in self._cells.items()}
         return copied
@@ -67,7 +67,7 @@ class EvidenceMap:
         return self._cells.get(key)
 
     def evidence(self, key: CellKey) -> Evidence:
-        """Packed evidence of one cell; empty if nothing is known of it."""
+        """Packed evidence of one cell; empty if the map does not hold the cell."""
         cell = self._cells.get(key)
         return cell.packed() if cell else empty_evidence(self.geometry)
 
@@ -77,7 +77,7 @@ class EvidenceMap:
         return {key: evidence for key, evidence in everything if len(evidence)}
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Drop all cells."""
         self._cells.clear()
 
     @property

@@ -1,4 +1,4 @@
-"""Space, numbered: metres to voxels, voxels to cells, and back.
+"""The grid: from metres to numbers of voxels, from voxels to cells, and back (FORMAT.md section 2).
 
     point (m)  --round to nanometres, floor-->  voxel (3 x int64)
     voxel      --split at bit `depth`-->        cell (i, j, k) + place inside it (Morton code)
@@ -33,8 +33,9 @@ BRICK_DEPTH = 3
 """A brick is 8^3 voxels, the three lowest octree depths."""
 DEPTH_MAX = 8
 CELL_TEXT = re.compile(",".join([r"(0|-?[1-9][0-9]{0,6})"] * 3))
-"""One way to write each cell: `int` alone would also take " 1", "+1", "1_0" and other scripts' digits."""
+"""The only text of each cell: `int` alone would also take " 1", "+1", "1_0" and other scripts' digits."""
 NANOMETRES = 1e9
+"""Nanometres in a metre."""
 
 
 class Cell(NamedTuple):
@@ -49,12 +50,12 @@ class Cell(NamedTuple):
 
 
 class Geometry(BaseModel, frozen=True, extra="forbid"):
-    """Fixed at a map's creation: voxel edge, octree depth of a cell, channels."""
+    """Geometry of a map, fixed at its creation: voxel edge, octree depth of a cell, channels."""
 
     voxel_edge_um: Annotated[int, Field(ge=1000, le=1_000_000)] = 40_000
-    """Micrometres: an integer, so that borders are exact."""
+    """Edge of a voxel, micrometres: an integer, so that borders are exact."""
     depth: Annotated[int, Field(ge=BRICK_DEPTH, le=DEPTH_MAX)] = 7
-    """A cell has 2^depth voxels along an edge."""
+    """Octree depth of a cell, which has 2^depth voxels along an edge."""
     channels: Annotated[tuple[Channel, ...], Field(max_length=16), FailFast()] = STANDARD_CHANNELS
 
     @model_validator(mode="after")
@@ -149,7 +150,7 @@ def cell_of_key(key: int) -> Cell:
 
 
 def cell_from_text(text: str) -> Cell:
-    """The cell written `i,j,k`.
+    """Cell of a text `i,j,k`.
 
     Raises:
         BadInputError: not three integers, or beyond the numbered space.

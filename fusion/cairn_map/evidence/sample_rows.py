@@ -5,9 +5,9 @@
 
 The list, and not the rows, is kept in order: a few new voxels move 8 bytes of each that follows, not 50.
 
-A plane has 32 bits a sum until it may need 64; its column in `narrow` goes on as their low half. When that is, a bound
-of its magnitudes tells: each diff's samples raise it while they are added, and only when it passes the limit are they
-taken back, and the sums looked at.
+A plane has 32 bits a sum until a sum may need 64; its column in `narrow` then stays as their low half. A bound of its
+magnitudes decides: each diff's samples raise it while they are added; only when it passes the limit are they subtracted
+again, and the true sums examined.
 """
 
 import numpy as np
@@ -57,13 +57,13 @@ class SampleRows:
         if (said >= 0).all() and (bounds <= self._limits).all():
             self._bounds = bounds
             return
-        # A sum may have wrapped around. Taking the samples out again brings back what was, and then we look first.
+        # A sum may have wrapped around. Subtraction restores the sums exactly; then the bound is found first.
         self._add(diff, -sign, places)
         self._bounds = self._bounds_after(diff, sign, places)
         self._add(diff, sign, places)
 
     def packed(self) -> tuple[Voxels, Sums]:
-        """The voxels whose sums are not all zero, rising, and their sums."""
+        """Voxels whose sums are not all zero, rising, and their sums."""
         S = kernels.count_rows(self._row_of, self._narrow, self._wide)
         out = np.empty(S, np.uint32), np.empty((S, self._narrow.shape[1]), np.int64)
         kernels.pack_rows_into(self._known, self._row_of, self._narrow, self._wide_planes, self._wide, *out)
@@ -91,7 +91,7 @@ class SampleRows:
         return places, kernels.find_samples_into(diff.voxels, diff.sampled, self._known, places)
 
     def _add(self, diff: Evidence, sign: int, places: Places) -> Sums:
-        """Add sign * samples; (P,) the samples or'ed by plane: negative if one is, else no less than the largest."""
+        """Add sign * samples; returns (P,) samples or'ed by plane: negative if one is, else at least the largest."""
         said = np.zeros((8, diff.samples.shape[1]), np.int64)
         rows = (self._row_of, self._narrow, self._wide_planes, self._wide)
         kernels.add_samples_into(diff.samples, sign, places, *rows, said.reshape(-1))
@@ -99,7 +99,7 @@ class SampleRows:
         return together
 
     def _bounds_after(self, diff: Evidence, sign: int, places: Places) -> Magnitudes:
-        """(P,) no magnitude of a plane will be larger after adding sign * samples, for which there are bits enough now.
+        """(P,) bounds of all magnitudes after adding sign * samples; widens planes if 32 bits may not be enough.
 
         Raises:
             BadInputError: kind `evidence_overflow`: a sum would leave its range.
@@ -116,7 +116,7 @@ class SampleRows:
             (largest <= SUM_MAX).all() and kernels.samples_fit(diff.samples, sign, places, *rows, SUM_MAX)
         ):
             raise BadInputError("evidence_overflow", f"sums are at most {SUM_MAX}; one would be more")
-        # Rather too early than to look again at each diff from now on.
+        # Early, else every further diff would examine all sums again.
         self._widen(np.nonzero((bounds > NARROW_MAX // 2) & (self._limits == NARROW_MAX))[0])
         return np.minimum(bounds, SUM_MAX, dtype=np.uint64)
 

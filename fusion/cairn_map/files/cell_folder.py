@@ -3,7 +3,7 @@
     lab/map.json          geometry and sensor model
     lab/0_-1_0.cell       the cell i = 0, j = -1, k = 0, as FORMAT.md describes it
 
-It is what `cairn map export --cells` writes and `cairn map create --from` reads: prior data for a new map.
+`cairn map export --cells` writes such a folder and `cairn map create --from` reads it: prior data for a new map.
 """
 
 import os
@@ -25,7 +25,7 @@ CELL_NAME = re.compile(r"(-?[0-9]{1,7})_(-?[0-9]{1,7})_(-?[0-9]{1,7})\.cell")
 
 
 class FolderHead(BaseModel):
-    """`map.json`: what all cells of the folder share."""
+    """Contents of `map.json`: the geometry and the sensor model of all cells."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -46,7 +46,7 @@ def write_head(folder: Path, head: FolderHead) -> None:
 
 
 def write_cell(folder: Path, cell: Cell, data: bytes) -> Path:
-    """Write one cell's bytes; a reader never sees half of it."""
+    """Write one cell's bytes; a reader sees the whole file or none."""
     path = folder / f"{cell.i}_{cell.j}_{cell.k}.cell"
     _write(path, data)
     return path

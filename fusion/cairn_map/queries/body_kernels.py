@@ -60,7 +60,7 @@ def body_state(grid: Grid, body: CollisionBody) -> np.uint8:
             reach += abs(body.R[axis, side]) * body.half[side]
         low[axis] = int(np.floor(body.centre[axis] - reach))
         high[axis] = int(np.floor(body.centre[axis] + reach))
-    # Its cells. What is absent is unknown; an occupied voxel settles the answer.
+    # Cells of the box. An absent cell is unknown; an occupied voxel settles the answer.
     meets_unknown = False
     side = 1 << grid.depth
     for i in range(low[0] >> grid.depth, (high[0] >> grid.depth) + 1):

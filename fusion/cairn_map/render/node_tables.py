@@ -32,7 +32,7 @@ def probability_table(cell: BrickCell, model: SensorModel) -> Table:
     pool = cell.counts.pool.reshape(-1, 2)
     odds = np.where(known(pool), model.log_odds(pool), -np.inf)
     highest = _pyramid(odds[:, None], lambda parts: parts.max(axis=2))
-    with np.errstate(over="ignore"):  # of what is unknown
+    with np.errstate(over="ignore"):  # exp(inf), for unknown nodes
         return np.where(highest > -np.inf, 1 / (1 + np.exp(-highest)), np.nan).astype(np.float32)
 
 

@@ -1,7 +1,7 @@
 """Adaptive binary arithmetic coding: one bit after the other, each under a probability that learns.
 
     coder    low, high, code, position, decoding      the interval [low, high], 32 bits each
-    data     uint8      what is written, or read
+    data     uint8      the bytes written, or read
     odds     uint32     one per context: probability of a 1 in the upper 22 bits, times seen in the lower 10
 
 Encoding and decoding are one function: when encoding, `code_bit` writes the bit that it is given and returns it; when

@@ -1,4 +1,4 @@
-"""The octree of one cell as flat arrays: masks breadth-first, leaves in Morton order.
+"""The octree of one cell as flat arrays: masks breadth-first, leaves in Morton order (FORMAT.md section 4).
 
     child_masks  one byte per inner node, depth by depth, Morton order inside a depth: which children exist
     leaf_masks   likewise, but not for the last depth (all its children are voxels): which children are leaves
