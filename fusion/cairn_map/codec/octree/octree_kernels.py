@@ -66,9 +66,15 @@ def build_into(
             if depth > 1:
                 _add_child(children, leaves, alike, counts, depth - 2, np.int64(parent) & 7, NO_ROW)
         n = end
-        after = np.int64(voxels[n]) >> 6 if n < V else -1
+        # Close the open nodes that do not hold the next voxel, from the deepest up.
+        d = depth - 2
         key = np.int64(parent) >> 3
-        count = _close_into(children, leaves, alike, counts, child_masks, leaf_masks, masks, key, after, count)
+        after = np.int64(voxels[n]) >> 6 if n < V else -1
+        while d >= 0 and key != after:
+            count -= _close_into(children, leaves, alike, counts, child_masks, leaf_masks, masks, d, key & 7)
+            d -= 1
+            key >>= 3
+            after = after >> 3 if after >= 0 else -1
     return count
 
 
@@ -81,32 +87,24 @@ def _close_into(
     child_masks: Bytes,
     leaf_masks: Bytes,
     masks: Ints,
-    key: int | np.int64,
-    after: int | np.int64,
-    count: int,
+    d: int,
+    c: int | np.int64,
 ) -> int:
-    """Close the open nodes, from `key` above the voxels' parents upwards, that do not hold the next voxel.
-
-    `after` is the node of the next voxel at the depth of `key`, -1 if there is none. Returns the number of leaves.
-    """
-    d = masks.shape[0] - 2
-    while d >= 0 and key != after:
-        if d > 0 and alike[d] != NO_ROW and children[d] == 255:
-            # Eight equal leaves, the last eight, become one leaf of the node above.
-            count -= 7
-            _add_child(children, leaves, alike, counts, d - 1, key & 7, alike[d])  # pyright: ignore[reportArgumentType]
-        else:
-            # An inner node: its masks are complete.
-            child_masks[d, masks[d]] = children[d]
-            leaf_masks[d, masks[d]] = leaves[d]
-            masks[d] += 1
-            if d > 0:
-                _add_child(children, leaves, alike, counts, d - 1, key & 7, NO_ROW)
-        children[d] = leaves[d] = 0
-        d -= 1
-        key >>= 3
-        after = after >> 3 if after >= 0 else -1
-    return count
+    """Close the open node of depth d, which is child c of the one above; returns the number of leaves that vanish."""
+    vanished = 0
+    if d > 0 and alike[d] != NO_ROW and children[d] == 255:
+        # Eight equal leaves, the last eight, become one leaf of the node above.
+        _add_child(children, leaves, alike, counts, d - 1, c, alike[d])  # pyright: ignore[reportArgumentType]
+        vanished = 7
+    else:
+        # An inner node: its masks are complete.
+        child_masks[d, masks[d]] = children[d]
+        leaf_masks[d, masks[d]] = leaves[d]
+        masks[d] += 1
+        if d > 0:
+            _add_child(children, leaves, alike, counts, d - 1, c, NO_ROW)
+    children[d] = leaves[d] = 0
+    return vanished
 
 
 @nb.njit(nogil=True)
