@@ -47,6 +47,7 @@ def no_flush_and_no_threads() -> object:
         yield
 
 
+@pytest.mark.slow
 @settings(max_examples=100)
 @given(histories)
 def test_after_any_history_all_maps_are_equal_and_no_commit_is_lost(history: list[tuple]) -> None:  # type: ignore[type-arg]

@@ -73,6 +73,7 @@ def test_stops_beyond_the_path_are_refused_with_how_many_there_are(tmp_path: Pat
         main(["show", "small-room", "--stop", "50"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["calibration", "targets"])
 def test_board_and_discs_can_be_shown_and_recorded(scene: str, tmp_path: Path) -> None:
     assert (

@@ -6,6 +6,8 @@ import pytest
 from tests.crash.kills import killed_servers
 from tests.crash.lives import trial
 
+pytestmark = pytest.mark.slow
+
 TRIALS = 40
 KILLS = 10
 OTHER_LEVELS_TRIALS = 16

@@ -54,6 +54,7 @@ def verified(rig: Rig, drive: Path, folder: Path, *options: str) -> dict[str, di
     return {row["camera"]: row for row in document["cameras"]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["grey", "paper"])
 def test_a_true_rig_is_off_by_less_than_a_range_pixel_and_everything_is_written(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str
@@ -70,6 +71,7 @@ def test_a_true_rig_is_off_by_less_than_a_range_pixel_and_everything_is_written(
     assert sheet.shape[1] == 8 * 160 and sheet.max() == 255
 
 
+@pytest.mark.slow
 def test_a_camera_that_has_turned_shows_as_a_bias(drive: Path, tmp_path: Path) -> None:
     turned, angle_rad = RIG["thermal_left"], 0.01
     T = turned.transform @ placed((0, 0, 0), (0, angle_rad, 0))

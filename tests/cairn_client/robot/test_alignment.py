@@ -91,6 +91,7 @@ def building() -> EvidenceMap:
     return whole
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shift_m", "yaw_deg"), [((0.5, 0.0, 0.0), 10.0), ((-0.35, 0.35, 0.1), -10.0)])
 def test_a_robot_in_the_building_finds_its_place_from_half_a_metre_and_ten_degrees_off(
     building: EvidenceMap, shift_m: tuple[float, float, float], yaw_deg: float, tmp_path: Path

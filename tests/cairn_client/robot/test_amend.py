@@ -72,6 +72,7 @@ def poses_of(scans: Sequence[Scan]) -> np.ndarray[tuple[int, ...], np.dtype[np.f
 # The law
 
 
+@pytest.mark.slow
 def test_after_a_loop_closure_of_50_measurements_all_maps_are_those_of_the_corrected_poses(
     server: LiveServer, tmp_path: Path
 ) -> None:

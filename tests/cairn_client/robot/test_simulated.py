@@ -6,6 +6,8 @@
 import pytest
 from tests.sync_sim.history import failures, run_seed
 
+pytestmark = pytest.mark.slow
+
 SEEDS, PART = 800, 50
 
 

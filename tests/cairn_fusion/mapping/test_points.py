@@ -104,6 +104,7 @@ def sweeps(folder: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float6
     return first, second, np.array([float(v) for v in line.split(",")[1:]]).reshape(4, 4)
 
 
+@pytest.mark.slow
 @pytest.mark.recording
 def test_two_real_sweeps_agree_with_the_true_pose_and_not_with_its_inverse(test_data: Path) -> None:
     first, second, T = sweeps(test_data / "lpm_lidar")

@@ -67,6 +67,7 @@ def test_a_collapsed_leaf_and_an_inner_node_of_one_size_are_told_apart() -> None
     assert 0 < leaves < len(naive_octree.leaves_above(naive_octree.tree_of(as_dict(evidence), 3), 3, 2))
 
 
+@pytest.mark.slow
 @given(MADE)
 def test_the_index_of_leaves_finds_who_holds_each_place(made: Made) -> None:
     evidence, geometry = made

@@ -44,6 +44,7 @@ def full_evidence(geometry: Geometry) -> Evidence:
 # --- The twin ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @given(st.one_of(RANDOM, SMOOTH))
 def test_the_twin_reads_and_writes_the_same_bytes(made: Made) -> None:
     evidence, geometry = made

@@ -148,6 +148,7 @@ def test_cut_views_are_refused() -> None:
         decode_view(SOUND + b"\0")
 
 
+@pytest.mark.slow
 def test_flipped_bits_raise_or_say_something_else() -> None:
     for at in range(len(SOUND)):
         for bit in range(8):

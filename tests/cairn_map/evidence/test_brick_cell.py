@@ -92,6 +92,7 @@ def test_numbers_of_any_size_are_summed_or_refused_as_the_twin_says(steps: list[
         assert as_dict(cell.packed()) == total
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(st.integers(0, 1000), st.sampled_from([1, -1])), max_size=5))
 def test_bricks_and_runs_and_rows_are_summed_as_the_twin_says(steps: list[tuple[int, int]]) -> None:
     cell, total = BrickCell(MIDDLE), naive_evidence.Evidence()

@@ -117,6 +117,7 @@ def test_bytes_left_over_are_refused(read: Reader, sound: bytes) -> None:
         assert not survives(read, sound + more)
 
 
+@pytest.mark.slow
 @every_reader
 def test_any_flipped_byte_is_refused_or_gives_something_sound(read: Reader, sound: bytes) -> None:
     for at in range(len(sound)):

@@ -21,6 +21,8 @@ from tests.fuzz.wrapping_mutator import bytewise, mutated_commit
 
 from cairn_map.wire.messages import CreateMap, Problem, Register
 
+pytestmark = pytest.mark.fuzz
+
 KINDS = documented_kinds()
 BYTES = (
     "application/octet-stream",

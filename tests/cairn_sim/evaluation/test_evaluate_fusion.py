@@ -80,6 +80,7 @@ def test_each_step_of_fusion_is_worth_something() -> None:
     assert error_picture(scan, view.fused, view.truth, scale).shape == (240, 960, 3)
 
 
+@pytest.mark.slow
 def test_mapped_temperatures_of_the_building_are_true_edges_included() -> None:
     """Laboratories with people, hot and cold pipes, glass and a mirror, from every sixth image of two stops."""
     robot, scene = ROBOTS["orpheus"], load_scene("building")
@@ -107,6 +108,7 @@ def test_real_hot_cups_are_where_the_sets_own_registration_has_them() -> None:
         assert frame.fused_iou > frame.given_iou - 0.02 and frame.fused_iou > 0.7
 
 
+@pytest.mark.slow
 def test_the_command_prints_its_tables_and_writes_pictures_that_show_something(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

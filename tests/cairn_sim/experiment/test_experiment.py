@@ -34,6 +34,8 @@ from cairn_sim.robots.record import Plan, record
 from cairn_sim.robots.robots import ROBOTS
 from cairn_sim.scene.scene_file import load_scene, shipped_text
 
+pytestmark = pytest.mark.slow
+
 SHORT = ("--stops", "1", "--scale", "0.1", "--seed", "5")
 SECONDS_MAX = 120
 Json = dict[str, Any]

@@ -126,6 +126,7 @@ def test_the_best_is_judged_by_the_bars_and_by_what_was_expected() -> None:
     assert PAPER["c10"] == (2.8, 3.2, 1.1, 1.2) and len(CAMERAS) == 4
 
 
+@pytest.mark.slow
 def test_the_command_solves_verifies_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--only", "c1,c5", "--images", "4", "--scale", "0.5", "--output", str(tmp_path)]) == 0
     out = capsys.readouterr().out
