@@ -158,7 +158,7 @@ def _be_folder(link: Connection, store_file: Path) -> None:
     """What the process does."""
     for number in (signal.SIGINT, signal.SIGTERM):  # of a whole group: the server first finishes what it does
         signal.signal(number, signal.SIG_IGN)
-    logging.getLogger().handlers = [_FarLog(link)]
+    logging.basicConfig(handlers=[_FarLog(link)], force=True)
     answer_folds(link, Readers(store_file))
 
 

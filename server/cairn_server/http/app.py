@@ -64,7 +64,7 @@ def make_app(service: Service) -> FastAPI:
 
 
 def _middleware(service: Service) -> Iterator[Middleware]:
-    """What a request passes, in this order; its answer passes the same in reverse."""
+    """Middleware in the order in which a request passes it; the answer passes it in reverse."""
     yield Middleware(RequestTrail, figures=service.figures)
     if service.settings.admin_token is None:
         yield Middleware(OwnOrigin, host=service.settings.host)

@@ -1,4 +1,4 @@
-"""Options of `cairn serve`: flags for every day, a settings file and the environment for the rest.
+"""Options of `cairn serve`: flags for daily use, a settings file and the environment for the rest.
 
 A flag counts before the environment, the environment before the settings file, and the file before the default. The
 file is TOML and has the names of `cairn_server.settings`:
@@ -71,7 +71,7 @@ NOT_FROM_ENVIRONMENT = frozenset({"folder", "host", "port"})
 
 
 def serve_parser(description: str | None) -> argparse.ArgumentParser:
-    """Parser of the everyday flags, whose help lists the settings without a flag as well."""
+    """Parser of the flags for daily use; its help also lists the settings that have no flag."""
     parser = argparse.ArgumentParser(
         "cairn serve",
         description=description,
@@ -128,6 +128,7 @@ def settings_of(args: argparse.Namespace) -> Settings:
         BadInputError: kind `bad_setting`: a file that cannot be read, an unknown name, or a value out of its bounds;
             the message names the flag, the variable or the file.
     """
+    # Flags: only those given are in `args`.
     given = {name: value for name, value in vars(args).items() if name in Settings.model_fields}
     if "trusted_servers" in given:
         given["trusted_servers"] = " ".join(given["trusted_servers"])
@@ -135,6 +136,7 @@ def settings_of(args: argparse.Namespace) -> Settings:
         path = getattr(args, f"{name}_file", None)
         if path is not None:
             given[name] = _text_of(path).strip()
+    # The file is read once, and looked at last.
     file: Path | None = getattr(args, "settings", None)
     in_file = _table_of(file) if file is not None else {}
 
@@ -154,6 +156,7 @@ def settings_of(args: argparse.Namespace) -> Settings:
         ) -> tuple[PydanticBaseSettingsSource, ...]:
             return init_settings, _Environment(settings_cls), InitSettingsSource(settings_cls, in_file)
 
+    # Names and bounds are checked by the model, whatever source a value came from.
     try:
         return Sources(**given)
     except SettingsError as exc:

@@ -22,8 +22,8 @@ def cell_etag(row: MapRow, stored: CellRow, suffix: str, depth: int | None) -> s
 
 def asked_cell_view(
     cells: Cells, views: ViewCache, row: MapRow, key: CellKey, depth: int, *, known: str | None
-) -> tuple[CellRow | None, Head, bytes]:
-    """One cell (None: never seen), the state that it was read from, and its view; empty if `known` says its ETag.
+) -> tuple[CellRow | None, Head, bytes | None]:
+    """One cell (None: never seen), the state that it was read from, and its view (None: `known` names its ETag).
 
     Raises:
         DamagedCellError: kind `damaged_store`: the cell is damaged, and nothing here says what it was.
@@ -47,9 +47,9 @@ def view_of_stored(row: MapRow, stored: CellRow, depth: int) -> bytes:
     return encode_view(stored.key, read(stored), row.geometry, row.sensor_model, style=ViewStyle(depth=depth))
 
 
-def _view(views: ViewCache, row: MapRow, stored: CellRow | None, depth: int, known: str | None) -> bytes:
+def _view(views: ViewCache, row: MapRow, stored: CellRow | None, depth: int, known: str | None) -> bytes | None:
     if stored is None or is_same(cell_etag(row, stored, "view", depth), known):
-        return b""
+        return None
     return views.view(view_name(row, stored, depth), lambda: view_of_stored(row, stored, depth))
 
 

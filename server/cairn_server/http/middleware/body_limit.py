@@ -1,4 +1,4 @@
-"""A bound on request bodies, before anything reads them whole (plain ASGI, no framework)."""
+"""Bound on the size of request bodies, enforced before anything reads them whole. Plain ASGI."""
 
 import re
 from collections.abc import Awaitable, Callable, MutableMapping
@@ -15,7 +15,7 @@ Send = Callable[[Message], Awaitable[None]]
 App = Callable[[MutableMapping[str, Any], Receive, Send], Awaitable[None]]
 
 MISSING_BYTES_MAX = 16 << 20
-"""100 000 cells with a cursor each."""
+"""Room for 100 000 cells with a cursor each."""
 JSON_BYTES_MAX = 1 << 20
 STATUS_BYTES_MAX = 1 << 14
 LIMITS = (
@@ -32,13 +32,13 @@ class _TooLargeError(Exception):
 
 
 class BodyLimit:
-    """Answers 413 to a body that claims to be, or grows, larger than its path allows."""
+    """Middleware that answers 413 to a body that claims to be, or grows, larger than its path allows."""
 
     def __init__(self, app: App) -> None:
         self._app = app
 
     async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
-        """One request."""
+        """Pass a request on with its body counted, or refuse it."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -72,7 +72,7 @@ class BodyLimit:
 
 
 def limit_of(path: str) -> int:
-    """Most bytes of a body sent to a path."""
+    """Largest body that a path accepts, bytes."""
     return next((size for pattern, size in LIMITS if pattern.fullmatch(path)), JSON_BYTES_MAX)
 
 

@@ -1,12 +1,13 @@
-"""How long a connection may take to say what it wants, and to take what it asked for.
+"""Deadlines of connections: for a request's head, for its body, and for taking the answer.
 
-uvicorn waits for ever for a head or a body that comes a byte a minute, so a few thousand such connections would take
-the place of all robots. Here each has its time: a head a fixed one, a body some seconds and then a least rate, an
-answer the same. A slow radio link is served, a dribbling one is cut; a robot then simply asks again.
+uvicorn waits for ever for a head or a body that comes a byte a minute, so a few thousand such connections would leave
+no place for robots. Here a head has a fixed time, and a body and an answer have some seconds and then a lowest rate. A
+slow radio link is served; one that dribbles is cut, and its robot asks again.
 
     accepted -- head_s --> head -- body_grace_s + bytes / body_bytes_per_s --> body --> handled --> answer, as a body
 
-What the server itself delays (it reads no faster than it works) does not count against the other side.
+Delays by the server itself (it reads no faster than it works) do not count against the client. Both classes here rest
+on private parts of uvicorn: docs/decisions/012-private-hooks.md has the versions, the reasons, and how to upgrade.
 """
 
 import asyncio
@@ -20,15 +21,15 @@ from cairn_server.settings import Settings
 log = logging.getLogger(__name__)
 
 TICK_S = 1.0
-"""How often a connection is looked at."""
+"""Time between two looks at a connection."""
 JOINED_BYTES_MAX = 1 << 14
 Stage = Literal["head", "body", "answer"]
 
 
 class _Joined:
-    """A transport that sends at once what is written in one turn of the event loop: an answer's head and its body.
+    """Transport that sends all that is written in one turn of the event loop at once: an answer's head and its body.
 
-    A system call less, and the other side is woken once; for a small answer that is a tenth of its cost.
+    That saves a system call, and wakes the client once; for a small answer it is a tenth of the cost.
     """
 
     def __init__(self, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop) -> None:
@@ -40,7 +41,7 @@ class _Joined:
         return getattr(self._transport, name)
 
     def write(self, data: bytes) -> None:
-        """Send it soon, or at once if it is so large that copying it would cost more."""
+        """Send data at the end of this turn, or at once if it is so large that copying it would cost more."""
         if len(data) > JOINED_BYTES_MAX:
             self._flush()
             self._transport.write(data)
@@ -50,11 +51,11 @@ class _Joined:
             self._parts.append(data)
 
     def get_write_buffer_size(self) -> int:
-        """Bytes that wait."""
+        """Bytes that wait to be sent."""
         return self._transport.get_write_buffer_size() + sum(map(len, self._parts))
 
     def close(self) -> None:
-        """Send what was written, and close."""
+        """Send all that was written, and close."""
         self._flush()
         self._transport.close()
 
@@ -65,12 +66,12 @@ class _Joined:
 
 
 class PunctualProtocol(H11Protocol):
-    """uvicorn's connection, closed when it takes too long."""
+    """uvicorn's HTTP/1.1 connection, aborted when the client takes too long."""
 
     settings = Settings()
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """The other side connected; there are only so many places to wait in."""
+        """Start the clock of a new connection, or abort it if far too many are open."""
         super().connection_made(_Joined(transport, self.loop))  # type: ignore[arg-type]
         self._stage: tuple[Stage, RequestResponseCycle | None] = ("head", None)
         self._since_s = self._seen_s = self.loop.time()
@@ -78,33 +79,34 @@ class PunctualProtocol(H11Protocol):
         self._unsent: tuple[float, int] | None = None
         self._tick_s = min(TICK_S, self.settings.head_s / 4)
         self._timer = self.loop.call_later(self._tick_s, self._look)
-        # Up to `limit_concurrency` are served, some more are told so (503), the rest is cut before it costs anything.
+        # Up to `limit_concurrency` are served, a quarter more are answered 503, the rest is cut before it costs more.
         if len(self.connections) > self.settings.limit_concurrency * 5 // 4 + 1:
             transport.abort()
 
     def data_received(self, data: bytes) -> None:
-        """Bytes came."""
+        """Count the bytes, which extend the deadline of a body."""
         self._got_bytes += len(data)
         super().data_received(data)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The connection is over."""
+        """Stop the clock."""
         self._timer.cancel()
         super().connection_lost(exc)
 
     def handle_websocket_upgrade(self, event: object) -> None:
-        """From here on it is another protocol's, which has its own pings."""
+        """Stop the clock: the WebSocket has pings of its own."""
         self._timer.cancel()
         super().handle_websocket_upgrade(event)  # type: ignore[arg-type]
 
     def _look(self) -> None:
-        """Close it if its time is over, else look again later."""
+        """Abort the connection if its time is over, else look again later."""
         now_s = self.loop.time()
         stage = self._stage_now()
         unsent_bytes = self.transport.get_write_buffer_size()
         if stage != self._stage:
             self._stage, self._since_s, self._got_bytes = stage, self._seen_s, 0
         elif unsent_bytes or self.flow.read_paused:
+            # The client waits for the server: time that is not the client's moves the start of the stage along.
             self._since_s += now_s - self._seen_s
         self._seen_s = now_s
         if self._is_late(now_s) or self._is_stuck(now_s, unsent_bytes):
@@ -125,10 +127,11 @@ class PunctualProtocol(H11Protocol):
         return self._stage[0] == "body" and took_s > self._patience_s(self._got_bytes)
 
     def _is_stuck(self, now_s: float, unsent_bytes: int) -> bool:
-        """Whether the other side does not take its answer."""
+        """True if the client does not take its answer."""
         if not unsent_bytes:
             self._unsent = None
             return False
+        # The largest backlog counts: a link that keeps the lowest rate drains it within this patience.
         since_s, most_bytes = self._unsent or (now_s, 0)
         self._unsent = since_s, max(most_bytes, unsent_bytes)
         return now_s - since_s > self._patience_s(self._unsent[1])
@@ -138,5 +141,5 @@ class PunctualProtocol(H11Protocol):
 
 
 def protocol_of(settings: Settings) -> type[PunctualProtocol]:
-    """The protocol with these settings, as uvicorn wants it: a class."""
+    """Protocol class with these settings: uvicorn makes an instance of it for each connection, without arguments."""
     return type("PunctualProtocol", (PunctualProtocol,), {"settings": settings})

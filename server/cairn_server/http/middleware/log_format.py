@@ -14,27 +14,27 @@ from contextvars import ContextVar
 from enum import StrEnum
 
 REQUEST_ID: ContextVar[str] = ContextVar("request_id", default="")
-"""Of the request that this thread or task works for."""
+"""Id of the request that this thread or task works for."""
 Field = str | int | float | bool | None
 
 
 class LogForm(StrEnum):
-    """How a log line is written."""
+    """Form of log lines."""
 
     TEXT = "text"
     JSON = "json"
 
 
 def fields(**values: Field) -> dict[str, dict[str, Field]]:
-    """`extra` of a log call."""
+    """`extra` of a log call, with these fields."""
     return {"fields": values}
 
 
 class TextFormatter(logging.Formatter):
-    """Time, message, fields; one line, whatever a client put into a name."""
+    """Formatter of time, message and fields; always one line, even if a name that a client chose has line breaks."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """One record."""
+        """Line of a record."""
         parts = [self.formatTime(record), _one_line(record.getMessage())]
         parts += [f"{name}={_quoted(value)}" for name, value in _fields_of(record).items()]
         text = " ".join(parts)
@@ -42,10 +42,10 @@ class TextFormatter(logging.Formatter):
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object."""
+    """Formatter of one JSON object a line."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """One record."""
+        """Line of a record."""
         whole_s, ms = divmod(int(record.created * 1000), 1000)
         line: dict[str, Field] = {
             "time": f"{time.strftime('%Y-%m-%dT%H:%M:%S', time.gmtime(whole_s))}.{ms:03}Z",
@@ -60,7 +60,7 @@ class JsonFormatter(logging.Formatter):
 
 
 def start_logging(form: LogForm, level: int) -> None:
-    """Log to standard error in this form, what libraries log included."""
+    """Log to standard error in this form, including what libraries log."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter() if form is LogForm.JSON else TextFormatter())
     logging.basicConfig(level=level, handlers=[handler], force=True)

@@ -1,4 +1,4 @@
-"""Which version of PROTOCOL.md a request speaks: stated in a header, and refused where it is not ours."""
+"""Protocol version: a request of another version than the server's (header `Cairn-Protocol`) is refused."""
 
 from collections.abc import MutableMapping
 from typing import Any
@@ -10,13 +10,13 @@ HEADER = b"cairn-protocol"
 
 
 class ProtocolVersion:
-    """Answers 400 `unknown_protocol` to a request of another version; one that states none speaks this one."""
+    """Middleware that answers 400 `unknown_protocol` to another version; a request without the header is accepted."""
 
     def __init__(self, app: App) -> None:
         self._app = app
 
     async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
-        """One request."""
+        """Pass a request on, or refuse it."""
         stated = {value for name, value in scope.get("headers", ()) if name == HEADER}
         if stated <= {VERSION}:
             await self._app(scope, receive, send)

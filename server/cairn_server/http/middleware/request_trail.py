@@ -1,7 +1,7 @@
-"""What every request leaves behind: an id, a line in the log, and counts (plain ASGI, around everything else).
+"""Trail of every request: an id, a line in the log, and counts. Plain ASGI, around everything else.
 
-The id is the caller's own `X-Request-Id` if it is a sensible one, else a new one; it comes back with the answer, and
-every line that is logged meanwhile carries it.
+The id is the caller's own `X-Request-Id` if it is a sensible one, else a new one; the answer has it, and so has every
+line that is logged meanwhile.
 """
 
 import json
@@ -24,14 +24,14 @@ SENSIBLE = re.compile(rb"[A-Za-z0-9._-]{1,64}")
 METHODS = frozenset({"GET", "PUT", "POST", "DELETE", "HEAD", "OPTIONS", "PATCH"})
 PUSH = "/maps/{name}/commits/{commit}"
 QUIET = frozenset({"/healthz", "/readyz", "/metrics"})
-"""Asked every few seconds by machines."""
+"""Routes that machines ask every few seconds: logged at level DEBUG."""
 OUTCOMES = {201: "new", 200: "known"}
 TEXT_MAX = 96
 
 
 @dataclass(slots=True)
 class Trail:
-    """One request, as far as it has come."""
+    """State of one request so far."""
 
     status: int = 0
     kind: str = ""
@@ -41,14 +41,14 @@ class Trail:
 
 
 class RequestTrail:
-    """Counts and logs each request once it is answered."""
+    """Middleware that counts and logs each request once it is answered."""
 
     def __init__(self, app: App, *, figures: ServerFigures) -> None:
         self._app = app
         self._figures = figures
 
     async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
-        """One request."""
+        """Pass a request on, and count what comes and goes."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -101,7 +101,7 @@ class RequestTrail:
 
     def _note_push(self, name: str, trail: Trail) -> None:
         outcome = OUTCOMES.get(trail.status)
-        # Only then is it certain that there is a map of this name: names that strangers try are no labels.
+        # Only with an outcome does a map of this name exist for certain: names that a client guesses are no labels.
         self._figures.pushes.labels(name if outcome else "", outcome or trail.kind or "cut_off").inc()
         if outcome == "new":
             self._figures.push_bytes.labels(name).inc(trail.received_bytes)
@@ -113,7 +113,7 @@ def _request_id(headers: list[tuple[bytes, bytes]]) -> str:
 
 
 def _line(scope: MutableMapping[str, Any], method: str, route: str, trail: Trail, seconds: float) -> dict[str, Field]:
-    """The request's line; a path is told by its route and ids, and query and headers, where tokens are, not at all."""
+    """Fields of a request's line: of the path its route and ids; nothing of query and headers, where tokens are."""
     line: dict[str, Field] = {"method": method, "route": route}
     if route == "none":
         line["path"] = scope["path"][:TEXT_MAX]

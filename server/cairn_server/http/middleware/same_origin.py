@@ -1,8 +1,8 @@
-"""An open server's protection from browsers: a page elsewhere must not be able to change the maps.
+"""Same-origin check of an open server: a page of another site must not be able to change the maps.
 
-Without an admin token the server trusts whoever reaches it on this machine, and a browser on this machine reaches it
-on behalf of every page it shows. It says so, though: `Origin` names the page (cross-site requests), and `Host`
-the name that the page used (DNS rebinding). Plain ASGI.
+Without an admin token the server trusts every client on this machine, and a browser on this machine sends requests on
+behalf of every page that it shows. Two headers reveal this: `Origin` names the page (cross-site requests), and `Host`
+the name that the page used for the server (DNS rebinding). Plain ASGI.
 """
 
 from collections.abc import MutableMapping
@@ -14,14 +14,14 @@ from cairn_server.settings import LOOPBACK
 
 
 class OwnOrigin:
-    """Answers 403 to requests from other sites, and to those for other hosts."""
+    """Middleware that answers 403 to requests from pages of other sites, and to requests for other host names."""
 
     def __init__(self, app: App, *, host: str) -> None:
         self._app = app
         self._hosts = LOOPBACK | {host}
 
     async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
-        """One request."""
+        """Pass a request on, or refuse it."""
         if scope["type"] == "lifespan" or self._is_own(scope["scheme"], scope["headers"]):
             await self._app(scope, receive, send)
             return

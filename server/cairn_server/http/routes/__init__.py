@@ -1,4 +1,5 @@
 """Routes: one module for each part of PROTOCOL.md.
 
-Start with `sync`, the shortest; `callers` says who asks, `problems` how errors are answered.
+Start with `sync`, the busiest; `callers` finds out who asks, `problems` turns errors into answers, and `documentation`
+says in OpenAPI what types cannot.
 """

@@ -72,7 +72,7 @@ def deregister(branch: str, service: Operations, row: Map, caller: Annotated[Cal
     ),
 )
 def put_status(branch: str, body: RobotStatus, service: Operations, row: Map) -> None:
-    """Tell where a robot is and how it is doing; only the last one is kept."""
+    """Report where a robot is and how it is doing; only the latest report is kept."""
     service.reports.put_status(row, branch, body)
 
 
@@ -97,7 +97,7 @@ def get_view(
         "ETag": f'"{view.digest}"',
         "Last-Modified": formatdate(view.time_s, usegmt=True),
         "Cache-Control": "no-cache",
-        # Whatever else the bytes may be read as, a browser is to take them for a picture.
+        # A browser must take the bytes for a picture, whatever else they could be read as.
         "X-Content-Type-Options": "nosniff",
         "Content-Security-Policy": "default-src 'none'; sandbox",
     }

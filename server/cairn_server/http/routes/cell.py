@@ -30,7 +30,7 @@ ONE_RANGE = re.compile(r"bytes=[ \t]*(\d{0,18})-(\d{0,18})[ \t]*", re.ASCII | re
 CELL_TYPES = (CELL_MEDIA_TYPE, *MEDIA_TYPES.values())
 CELL_HEADERS = ("ETag", "Cairn-Cursor", "Cairn-Coverage", "Cairn-Coverage-Digest", "Cairn-Fingerprint")
 COVERAGE_BYTES_MAX = 4096
-"""Of the header `Cairn-Coverage`: a longer one would be refused by proxies and by small HTTP libraries."""
+"""Longest header `Cairn-Coverage`: a longer one would be refused by proxies and by small HTTP libraries."""
 
 router = APIRouter()
 
@@ -64,7 +64,7 @@ def cell_index(
     responses=answers({200: (VIEWS_MEDIA_TYPE,)}, headers=("Cairn-View-Depth",)),
 )
 def views(service: Operations, row: Map) -> Response:
-    """What all cells look like, at a coarse depth, as far as the server has it ready: for a page's first picture."""
+    """Views of all cells at a coarse depth, as far as the server has them ready: for a page's first picture."""
     depth, found = ready_views(service.store, service.cell_views, row)
     headers = {"Cache-Control": "no-store", "Cairn-View-Depth": str(depth)}
     return Response(found, media_type=VIEWS_MEDIA_TYPE, headers=headers)
@@ -117,11 +117,11 @@ def get_cell(
     key = cell_key(cell_from_text(number))
     _check_form(dot, suffix, depth, row)
     if depth is None:
-        (stored, head), view = service.cells.sound(row, key), b""
+        (stored, head), view = service.cells.sound(row, key), None
     else:
         stored, head, view = asked_cell_view(service.cells, service.cell_views, row, key, depth, known=if_none_match)
     if stored is None:
-        raise NotFoundError("no_cell", f"nobody has seen cell {number} of map {row.name}")
+        raise NotFoundError("no_cell", f"no robot has seen cell {number} of map {row.name}")
     etag = cell_etag(row, stored, suffix, depth)
     headers = {
         "ETag": etag,
@@ -131,13 +131,38 @@ def get_cell(
         "Cairn-Fingerprint": stored.fingerprint.hex(),
         **_coverage(head),
     }
-    if is_same(etag, if_none_match):
+    # Of a view that the client has, nothing was made: that decision is not taken a second time here.
+    if view is None if depth is not None else is_same(etag, if_none_match):
         return Response(status_code=304, headers=headers)
-    data, media_type = _file(suffix, key, stored, row) if depth is None else (view, MEDIA_TYPES["view"])
     if suffix:
         headers["Content-Disposition"] = f'attachment; filename="{row.name}_{number}.{suffix}"'
+    data, media_type = _file(suffix, key, stored, row) if view is None else (view, MEDIA_TYPES["view"])
+    return _whole_or_part(data, media_type, headers, range_ if request.method == "GET" else None, if_range)
+
+
+@router.put(
+    "/maps/{name}/main/cells/{cell}",
+    status_code=204,
+    responses=problems(409),
+    openapi_extra=body(CELL_MEDIA_TYPE),
+)
+def heal_cell(
+    cell: str,
+    service: Operations,
+    row: Map,
+    caller: Annotated[Caller, Depends(reader)],
+    data: Annotated[bytes, Depends(body_of)],
+) -> None:
+    """Restore a cell that the server's disk damaged: only exactly the bytes that it had are accepted."""
+    service.heal_cell(row, cell_key(cell_from_text(cell)), data, by=caller)
+
+
+def _whole_or_part(
+    data: bytes, media_type: str, headers: dict[str, str], range_: str | None, if_range: str | None
+) -> Response:
+    """Answer 200 with all bytes, 206 with the range that the client asks for, or 416 if there is no such range."""
     try:
-        part = part_of(len(data), range_ if request.method == "GET" else None, etag=etag, if_range=if_range)
+        part = part_of(len(data), range_, etag=headers["ETag"], if_range=if_range)
     except BadInputError as exc:
         refused = answer_to(exc)
         refused.headers["Content-Range"] = f"bytes */{len(data)}"
@@ -145,7 +170,7 @@ def get_cell(
     if part is None:
         return Response(data, media_type=media_type, headers=headers)
     start, stop = part
-    headers["Content-Range"] = f"bytes {start}-{stop - 1}/{len(data)}"
+    headers |= {"Content-Range": f"bytes {start}-{stop - 1}/{len(data)}"}
     return Response(data[start:stop], 206, media_type=media_type, headers=headers)
 
 
@@ -167,28 +192,11 @@ def _file(suffix: str, key: CellKey, stored: CellRow, row: MapRow) -> tuple[byte
 
 
 def _coverage(head: Head) -> dict[str, str]:
-    """The version vector at the cursor, or, if it is long, its digest: the asker may know it, or asks for it."""
+    """Header with the version vector at the cursor, or with its digest if the vector is long."""
     text = vector_text(head.vector)
     if len(text) <= COVERAGE_BYTES_MAX:
         return {"Cairn-Coverage": text}
     return {"Cairn-Coverage-Digest": vector_digest(head.vector)}
-
-
-@router.put(
-    "/maps/{name}/main/cells/{cell}",
-    status_code=204,
-    responses=problems(409),
-    openapi_extra=body(CELL_MEDIA_TYPE),
-)
-def heal_cell(
-    cell: str,
-    service: Operations,
-    row: Map,
-    caller: Annotated[Caller, Depends(reader)],
-    data: Annotated[bytes, Depends(body_of)],
-) -> None:
-    """Put right a cell that the server's disk damaged: only the very bytes that it had are taken."""
-    service.heal_cell(row, cell_key(cell_from_text(cell)), data, by=caller)
 
 
 def part_of(size_bytes: int, asked: str | None, *, etag: str, if_range: str | None) -> tuple[int, int] | None:

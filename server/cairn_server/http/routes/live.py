@@ -1,7 +1,7 @@
-"""The live streams: Server-Sent Events for programs, a WebSocket for browsers. The only async code of the server.
+"""Live streams: Server-Sent Events for programs, a WebSocket for browsers.
 
-A stream waits until its listener is woken, takes what there is, sends it, and rests a moment, so that what happens
-meanwhile goes into one. `send` waits while the other side does not read; nothing piles up but in the listener.
+A stream waits until its listener is woken, takes the events that there are, sends them, and pauses a moment, so that
+events of that moment go out together. `send` waits while the client does not read; only the listener holds events back.
 """
 
 import asyncio
@@ -34,19 +34,19 @@ from cairn_server.store.store_rows import MapRow
 log = logging.getLogger(__name__)
 
 SPACING_S = 0.1
-"""Least time between two sendings of one stream."""
+"""Shortest time between two sendings of one stream."""
 RETRY_MS = 2000
 PROTOCOL = "cairn.live.v1"
 TOKEN_PREFIX = "cairn.token."  # noqa: S105 - what stands before one
 GOING_AWAY, NOT_ALLOWED = 1001, 4401
-"""Codes with which a WebSocket is closed."""
+"""Codes with which a WebSocket is closed: the server stops; the token does not allow reading any more."""
 After = Annotated[str | None, Query(description="id of the last event seen")]
 
 router = APIRouter()
 
 
 class _Stream:
-    """A listener and what wakes it, in the event loop."""
+    """Listener of one client in the event loop, where other threads wake it."""
 
     def __init__(self, asker: Asker, row: MapRow) -> None:
         self._asker = asker
@@ -56,7 +56,7 @@ class _Stream:
         self._listener: Listener | None = None
 
     async def join(self, after: EventPosition | None) -> None:
-        """Begin to listen."""
+        """Begin to listen, after a position or from now on."""
         shown = self._asker.credentials.credentials if self._asker.credentials else ""
         token = hashlib.sha256(shown.encode(errors="replace")).digest()
         self._listener = await run_in_threadpool(
@@ -64,16 +64,18 @@ class _Stream:
         )
 
     async def pump(self, send: Callable[[LiveEvent], Awaitable[None]]) -> int:
-        """Send what happens until the server ends, or the token; the code to close with."""
+        """Send events until the server stops or the token ends; returns the code to close with."""
         listener = self._listener
         assert listener is not None, "join first"  # noqa: S101 - by its callers
         beat_at_s = time.monotonic() + listener.beat_s
         while not listener.is_over:
+            # Cleared before events are taken: one that comes in between wakes the stream again.
             self._woken.clear()
             if events := listener.take():
                 for event in events:
                     await send(event)
                 await asyncio.sleep(SPACING_S)
+            # Sleep until there is something new or a beat is due; with each beat the token is checked again.
             await self._wait(beat_at_s - time.monotonic())
             if time.monotonic() >= beat_at_s:
                 if not await run_in_threadpool(self._may_listen):
@@ -81,7 +83,7 @@ class _Stream:
                 await send(listener.beat())
                 beat_at_s = time.monotonic() + listener.beat_s
             elif not (listener.is_behind or listener.is_over):
-                # A robot was heard; what it pushed is folded in a moment, and is not to wait behind that.
+                # A robot pushed: its commit is folded in a moment, and that event goes out with this one.
                 self._woken.clear()
                 await self._wait(SPACING_S)
         return GOING_AWAY
@@ -97,19 +99,19 @@ class _Stream:
             self._listener.leave()
 
     def _may_listen(self) -> bool:
-        """Whether the token is still good."""
+        """True if the token still allows reading, or if that cannot be found out."""
         try:
             require(self._asker.caller(self._row), *READING)
         except DeniedError:
             return False
-        except CairnError as exc:  # not to know is not to be refused
+        except CairnError as exc:  # an unreadable store is no reason to cut a listener off
             log.warning("cannot look a listener's token up: %s", exc.message)
         return True
 
     def _wake(self) -> None:
-        if self._woken.is_set():  # `pump` clears it before it takes what there is
+        if self._woken.is_set():  # `pump` clears it before it takes events
             return
-        with suppress(RuntimeError):  # the loop is closed: nobody is left to be woken
+        with suppress(RuntimeError):  # the loop is closed, and the stream with it
             self._loop.call_soon_threadsafe(self._woken.set)
 
 
@@ -122,14 +124,14 @@ class EventStream(StreamingResponse):
         self._stream = stream
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer; whatever ends it, nobody listens here any more."""
+        """Answer, and stop listening however the answer ends."""
         try:
             await super().__call__(scope, receive, send)
         finally:
             self._stream.leave()
 
     async def stream_response(self, send: Send) -> None:
-        """Send until somebody ends it; Starlette cancels this when the other side is gone."""
+        """Send until the stream ends; Starlette cancels this when the client is gone."""
 
         async def send_text(text: str) -> None:
             await send({"type": "http.response.body", "body": text.encode(), "more_body": True})
@@ -185,7 +187,7 @@ async def live(socket: WebSocket, name: str, after: After = None) -> None:
 
 
 async def _converse(socket: WebSocket, stream: _Stream) -> None:
-    """Send what happens until one side ends it."""
+    """Send events until one side ends the conversation."""
     pumping = asyncio.create_task(stream.pump(lambda event: socket.send_text(event.model_dump_json())))
     leaving = asyncio.create_task(_until_left(socket))
     try:
@@ -200,13 +202,13 @@ async def _converse(socket: WebSocket, stream: _Stream) -> None:
 
 
 async def _until_left(socket: WebSocket) -> None:
-    """Read until the other side is gone; it has nothing to say."""
+    """Read until the client is gone; whatever it sends is ignored."""
     while (await socket.receive())["type"] != "websocket.disconnect":
         pass
 
 
 def _credentials(socket: WebSocket) -> HTTPAuthorizationCredentials | None:
-    """The token: of the header, or, as browsers cannot set one, of a subprotocol `cairn.token.BASE64URL`."""
+    """Token of the header or, since browsers cannot set one, of a subprotocol `cairn.token.BASE64URL`."""
     scheme, _, token = socket.headers.get("Authorization", "").partition(" ")
     if scheme.lower() == "bearer":
         return HTTPAuthorizationCredentials(scheme=scheme, credentials=token)
@@ -222,7 +224,7 @@ def _credentials(socket: WebSocket) -> HTTPAuthorizationCredentials | None:
 
 
 def _check_origin(socket: WebSocket) -> None:
-    """Refuse pages of other sites; browsers do not ask first for WebSockets, as they do for other requests.
+    """Refuse pages of other sites: for WebSockets browsers ask no permission first, as they do for other requests.
 
     Raises:
         DeniedError: kind `foreign_origin`.
@@ -233,6 +235,6 @@ def _check_origin(socket: WebSocket) -> None:
 
 
 def _as_text(event: LiveEvent) -> str:
-    """One event; only what ends a step moves the id that a browser gives back after a cut."""
+    """Text of one event; only the last event of a step moves the id that a browser returns after a cut."""
     id_line = "" if isinstance(event, Beat) or event.type in ("cells", "log") else f"id: {event.id}\n"
     return f"{id_line}event: {event.type}\ndata: {event.model_dump_json(exclude={'type'})}\n\n"

@@ -57,7 +57,7 @@ def put_token(token: str, body: CreateToken, service: Operations, caller: Admin)
 
 @router.post("/tokens/{token}/rotate")
 def rotate(token: str, service: Operations, caller: Admin) -> NewSecret:
-    """Another secret for a token; the old one is worth nothing at once."""
+    """Give a token another secret; the old one ends at once."""
     return rotate_token(service.store, token, by=caller)
 
 

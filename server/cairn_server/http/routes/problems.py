@@ -40,7 +40,7 @@ STATUS_OF_KIND = {
     "too_many_tickets": 429,
 }
 KIND_OF_STATUS = {404: "no_route", 405: "no_method"}
-"""Of what the framework refuses."""
+"""Kinds of the framework's own refusals."""
 DETAIL_CHARACTERS_MAX = 1000
 STATUS_OF_FAMILY = (
     (DeniedError, 403),
@@ -97,7 +97,7 @@ def _of_bug(request: Request, exc: Exception) -> JSONResponse:
 
 
 def _problem(status: int, kind: str, detail: str, headers: dict[str, str]) -> JSONResponse:
-    # A complaint may quote what came: half a surrogate pair, or megabytes.
+    # A complaint may quote the request: half a surrogate pair, or megabytes.
     detail = detail[:DETAIL_CHARACTERS_MAX].encode(errors="replace").decode()
     problem = Problem(title=kind.replace("_", " "), status=status, detail=detail, kind=kind)
     return JSONResponse(problem.model_dump(), status, headers, media_type=MEDIA_TYPE)

@@ -33,7 +33,7 @@ COMMIT_MEDIA_TYPE = "application/vnd.cairn.commit"
 REPLY_MEDIA_TYPE = "application/vnd.cairn.reply"
 
 AT_ONCE_BYTES = 1 << 16
-"""A body that is not larger is looked into at once."""
+"""Largest body that is examined on the event loop."""
 UPLOAD = "/maps/{name}/commits/{commit}/upload"
 Digest = Annotated[str, Query(pattern="^[0-9a-f]{64}$", description="SHA-256 of the whole body")]
 Count = Annotated[int, Query(ge=0, lt=1 << 53)]
@@ -88,7 +88,7 @@ def get_commit(commit: str, service: Operations, row: Map) -> Response:
 
 @router.get("/maps/{name}/commits", dependencies=READERS)
 def list_commits(service: Operations, row: Map) -> CommitList:
-    """Which commits are here, for relays."""
+    """Commits that the server has, for relays."""
     return commit_list(service.held.of(row))
 
 
@@ -99,7 +99,7 @@ def list_commits(service: Operations, row: Map) -> CommitList:
     openapi_extra=example({"author": "mole.1f2e3d4c5b6a7988", "kinds": ["delta", "full"]}),
 )
 def missing(branch: str, body: MissingRequest, visit: Annotated[Visit, Depends(visiting_owner)]) -> Response:
-    """The frames that bring the asker to the head; 204 if they are those of the last reply."""
+    """Frames that bring the caller to the head; 204 if they are those of the last reply."""
     reply = visit.service.missing(visit.row, branch, body)
     return Response(reply, media_type=REPLY_MEDIA_TYPE) if reply else Response(status_code=204)
 
@@ -121,7 +121,7 @@ def upload(
     caller: Author,
     digest: Digest,
 ) -> Upload:
-    """How many bytes of a commit came already, and whether it is kept."""
+    """State of an upload: bytes that came already, and whether the commit is kept."""
     return service.uploads.state(row, caller, commit, digest)
 
 
