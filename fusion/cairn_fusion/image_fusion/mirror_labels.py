@@ -2,6 +2,9 @@
 
     camera ----> wall on the map ---- 1 m or more ----> "surface": the reflection in the mirror on the wall
 
+A range pixel is labelled if a certain surface of the map cuts its beam a metre or more before its end, and most range
+pixels around it are cut too.
+
 Measured, at 8 cm and 5 mm to 3 cm of noise, with poses exact or off by 2 cm and 0.5 degrees alike:
 
 - Map by robots that saw the wall from behind: 77 % of the mirror's pixels are labelled on 10 views of it, no others.

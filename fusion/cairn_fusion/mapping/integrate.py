@@ -53,7 +53,7 @@ class Integrator:
     """Least range of a return, metres; nearer ones are ignored."""
     max_range_m: float = 10.0
     """Greatest range of a return, metres: beyond it a time-of-flight camera wraps round. A farther one is ignored, and
-    no proof of free space."""
+    is no proof of free space."""
     method: Method = Method.CARVE
     flying_step_m: float = 0.05
     """Difference from both neighbours, metres, beyond which a pixel of a carved image is a mixture of them

@@ -23,6 +23,7 @@ from cairn_fusion.ros.messages import (
     STAMPED,
     TRANSFORMS,
     RosCameraInfo,
+    RosHeader,
     RosTransform,
     read_camera_info,
     read_compressed_image,
@@ -77,6 +78,29 @@ class TopicIndex:
     def times(self) -> npt.NDArray[np.float64]:
         """(N,) `times_s`."""
         return np.array(self.times_s, dtype=np.float64)
+
+    def add(self, message: BagMessage, time_s: float) -> None:
+        """Add a message with the time of its header."""
+        self.log_ns.append(message.log_ns)
+        self.times_s.append(time_s)
+        self.size_bytes += len(message.data)
+
+    def describe(self, header: RosHeader, message: BagMessage, wire: Wire) -> None:
+        """Take over the properties that all messages of the topic share, from the first one."""
+        self.frame = header.frame
+        if self.topic.type == IMAGE:
+            image = read_image(message.data, wire)
+            self.encoding, self.image_size = image.encoding, (image.width, image.height)
+        elif self.topic.type == COMPRESSED:
+            self.encoding = encoding_of(read_compressed_image(message.data, wire))
+        elif self.topic.type == CAMERA_INFO:
+            self.info = read_camera_info(message.data, wire)
+            self.image_size = (self.info.width, self.info.height)
+        elif self.topic.type == POINTS:
+            points = read_points(message.data, wire)
+            self.elevations_deg, self.image_size = elevations_of(points), (points.width, points.height)
+            beams = len(self.elevations_deg or ()) or 1
+            self.columns = -(-points.width * points.height // beams)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,31 +177,11 @@ def _add(index: BagIndex, message: BagMessage, bag: Bag) -> None:
         with translate_message_damage(bag, message):
             if topic.type in STAMPED:
                 header = read_header(message.data, topic.wire)
-                time_s, is_first = header.time_s, not entry.log_ns
-                if is_first:
-                    entry.frame = header.frame
-                    _look_closer(entry, message, topic.wire)
+                time_s = header.time_s
+                if not len(entry):
+                    entry.describe(header, message, topic.wire)
             _add_poses(index, message, topic, topic.wire)
-    entry.log_ns.append(message.log_ns)
-    entry.times_s.append(time_s)
-    entry.size_bytes += len(message.data)
-
-
-def _look_closer(entry: TopicIndex, message: BagMessage, wire: Wire) -> None:
-    """Properties of all messages of a topic, from the first one."""
-    if entry.topic.type == IMAGE:
-        image = read_image(message.data, wire)
-        entry.encoding, entry.image_size = image.encoding, (image.width, image.height)
-    elif entry.topic.type == COMPRESSED:
-        entry.encoding = encoding_of(read_compressed_image(message.data, wire))
-    elif entry.topic.type == CAMERA_INFO:
-        entry.info = read_camera_info(message.data, wire)
-        entry.image_size = (entry.info.width, entry.info.height)
-    elif entry.topic.type == POINTS:
-        points = read_points(message.data, wire)
-        entry.elevations_deg, entry.image_size = elevations_of(points), (points.width, points.height)
-        beams = len(entry.elevations_deg or ()) or 1
-        entry.columns = -(-points.width * points.height // beams)
+    entry.add(message, time_s)
 
 
 def _add_poses(index: BagIndex, message: BagMessage, topic: Topic, wire: Wire) -> None:

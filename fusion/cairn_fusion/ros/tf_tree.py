@@ -36,6 +36,12 @@ class Edge:
     """Rows of time_s, x, y, z, qx, qy, qz, qw."""
     _trajectory: Trajectory | None = None
 
+    def add(self, found: RosTransform, *, is_static: bool) -> None:
+        """Add a pose; a static one replaces all others."""
+        if is_static:
+            self.poses, self.is_static = array("d"), True
+        self.poses.extend((found.time_s, *found.pose.tolist()))
+
     def trajectory(self, name: str) -> Trajectory:
         """All poses in order of time, each time once."""
         if self._trajectory is None:
@@ -80,8 +86,6 @@ class FrameTree:
                 f"{self.source}: frame {found.child} hangs on {edge.parent} and, at {found.time_s:.3f} s, on "
                 f"{found.parent}; only one of them may be published",
             )
-        if is_static:
-            edge.poses, edge.is_static = array("d"), True
         self._count += 1
         if self._count > POSES_MAX or len(self.edges) > EDGES_MAX:
             raise BadInputError(
@@ -89,7 +93,7 @@ class FrameTree:
                 f"{self.source} has more than {POSES_MAX} poses or {EDGES_MAX} frames; take the poses from an odometry "
                 "topic instead",
             )
-        edge.poses.extend((found.time_s, *found.pose.tolist()))
+        edge.add(found, is_static=is_static)
 
     def fixed_pose(self, target: str, source: str) -> Transform:
         """`T_target_source` of two frames that are rigid to each other.

@@ -43,7 +43,7 @@ class Proposal:
     """Decisions left to the user; with none the text can be used unchanged."""
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Guess:
     """Guess of one camera."""
 
@@ -100,13 +100,15 @@ def _cameras(index: BagIndex, questions: list[str]) -> list[Guess]:
     plain = {entry.topic.name for entry in images if entry.topic.type == IMAGE}
     images = [e for e in images if e.topic.type == IMAGE or e.topic.name.rsplit("/", 1)[0] not in plain]
     roles = {entry.topic.name: _role(entry) for entry in images}
+    amplitudes = [entry for entry in images if roles[entry.topic.name] == "amplitude"]
     guesses: list[Guess] = []
     for spectrum in Spectrum:
         found = [entry for entry in images if roles[entry.topic.name] == spectrum.value]
         for entry in _one_of_each_place(found):
             name = _unique("depth" if spectrum is Spectrum.RANGE else spectrum.value, {g.name for g in guesses})
             info = _info_of(entry, index)
-            guesses.append(Guess(name, spectrum, entry, info))
+            amplitude = _amplitude_of(entry, amplitudes) if spectrum is Spectrum.RANGE else None
+            guesses.append(Guess(name, spectrum, entry, info, amplitude))
             if info is None:
                 questions.append(f"camera {name}: no CameraInfo beside {entry.topic.name}; write its intrinsics")
     # Depth cameras first, so that the first range camera is one of them if there is any.
@@ -115,8 +117,6 @@ def _cameras(index: BagIndex, questions: list[str]) -> list[Guess]:
     if len(ranges) > 1:
         names = ", ".join(guess.entry.topic.name for guess in ranges)
         questions.append(f"{names} may be one sensor seen twice (aligned to another camera): keep one of such")
-    for guess in ranges:
-        guess.amplitude = _amplitude_of(guess, (e for e in images if roles[e.topic.name] == "amplitude"))
     questions += [
         f"camera {guess.name}: how many kelvin one count is, and at zero counts; 0.01 and 0 are only the usual"
         for guess in guesses
@@ -173,9 +173,9 @@ def _info_of(entry: TopicIndex, index: BagIndex) -> str | None:
     return found[0].topic.name if len(found) == 1 else None
 
 
-def _amplitude_of(guess: Guess, candidates: Iterable[TopicIndex]) -> str | None:
+def _amplitude_of(camera: TopicIndex, candidates: Iterable[TopicIndex]) -> str | None:
     """Topic of the range camera's own light: the only one with the same frame and raster, or None."""
-    mine = (guess.entry.frame, guess.entry.image_size)
+    mine = (camera.frame, camera.image_size)
     found = [entry for entry in candidates if (entry.frame, entry.image_size) == mine]
     return found[0].topic.name if len(found) == 1 else None
 

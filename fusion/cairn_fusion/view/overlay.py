@@ -1,11 +1,11 @@
 """The team's map drawn over a robot's live image: measurements of other robots in its view.
 
-    visible       the map agrees with the live depth: painted solid
+    visible       at the live depth: painted solid
     see-through   behind the live surface, beyond the next free space: in stripes, fainter the farther and older it is
-    map only      without a live depth: in dots
+    map only      where there is no live depth: in dots
 
     overlay = draw_overlay(renderer, snapshot, live, OverlayStyle(layer=Layer.TEMPERATURE))
-    overlay.picture                      (H, W, 3), with `legend()` below
+    overlay.picture                      (H, W, 3); `with_overlay_legend` puts the legend below it
 
 A map surface in front of the live depth is gone now, and is not drawn. A surface without a value is grey, never cold.
 Where the pose is uncertain the ink spreads as far as it may be off, while stripes and dots stay sharp; where it is too
@@ -252,6 +252,7 @@ def _front_covers(
     """(H, W) factors of the cover in front: less without a value, and of the map alone less with age."""
     # A visible surface is measured now, so its age does not count.
     covers = np.ones(is_fine.shape, np.float32)
+    # Outlines of the map alone fade as its dots do.
     if ages is not None and is_fine.any():
         as_dots = _covers(renderer, snapshot, front, np.full(is_fine.shape, np.nan, np.float32), style, ages)
         covers[is_fine] = as_dots[is_fine]
@@ -269,6 +270,7 @@ def _blended(rgb: Rgb, ink: Rgb) -> Rgb:
 
 def _ink(front: Layers, rest: Layers, step: int) -> Rgb:
     """(H, W, 4) ink of both layers: colours, covers and modes of each."""
+    # The kernel looks the coarse layer up itself: nothing is enlarged.
     ink = np.empty((*front[1].shape, 4), np.uint8)
     kernels.ink_into(*front, *rest, step, ink)
     return ink
@@ -300,6 +302,7 @@ def _rest(
     # Two queries: beyond the free space behind a live depth, and from the camera on where there is none.
     sight, far = live.sight.every(style.step_px), np.full_like(coarse_m, style.range_max_m)
     is_alone = np.isnan(coarse_m)
+    # A surface within the tolerance is the live one itself, so the search begins behind it.
     nowhere = np.float32(np.nan)
     behind_m = coarse_m + tolerance_m
     asked = {"range_max_m": style.range_max_m}
@@ -351,6 +354,7 @@ def _covers(
     if ages is not None:
         age = (ages.now - renderer.changed(snapshot, rest, ages.changes)).astype(np.float32)
         fade += np.nan_to_num(np.maximum(age, 0)) / np.float32(style.fade_s)
+    # Dots are opaque unless they fade; a hidden surface never covers the live image, and never vanishes.
     full = np.where(np.isnan(live_m), np.float32(1), np.float32(THROUGH_COVER))
     return np.asarray(np.maximum(full * np.exp(-fade), THROUGH_COVER_MIN), np.float32)
 
