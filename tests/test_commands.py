@@ -18,8 +18,8 @@ from tests.console.browsing import VIEW, browser, skip_without_page, tab
 from tests.console.casting import occupied, picks_met_first
 from tests.console.room import LOOPBACK, Room
 from tests.fixtures.client.live_server import wait_until
+from tests.fixtures.pages import DOCS, commands_of, programs_of
 from tests.fixtures.server.live import free_port
-from tests.test_documents import DOCS, commands_of, programs_of
 
 from cairn_client.cli.arguments import api_of
 from cairn_client.http.http_link import index_of

@@ -1,24 +1,18 @@
-"""The pages of docs/: their commands are accepted as written, their programs import the public door and run."""
+"""README and the pages of docs/: their commands are accepted as written, their programs use the public door alone."""
 
 import argparse
 import ast
-import re
-import shlex
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.fixtures.pages import PAGES, commands_of, programs_of
 
 import cairn
 from cairn_client.main import main
 
-DOCS = Path(__file__).resolve().parent.parent / "docs"
-PAGES = sorted([*DOCS.glob("*.md"), *(DOCS / "examples").glob("*.py")])
-COMMAND = re.compile(r"^(?: {4}(?:\$ )?|\$ )(cairn (?:[^\\\n]|\\\n|\\.)*)$", re.MULTILINE)
-"""A line of a block that runs cairn, with the lines that a backslash adds."""
-PROGRAM = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 PAGES_WITH_COMMANDS = {
+    "README.md",
     "administrator.md",
     "calibration-engineer.md",
     "operator.md",
@@ -31,18 +25,6 @@ PAGES_WITH_COMMANDS = {
 
 class AcceptedError(Exception):
     """Raised where a command has understood its arguments and would begin to work."""
-
-
-def commands_of(page: Path) -> Iterator[list[str]]:
-    """Arguments of every command on a page, as a shell would split them."""
-    for found in COMMAND.findall(PROGRAM.sub("", page.read_text(encoding="utf-8"))):
-        words = shlex.split(found.replace("\\\n", " "), comments=True)
-        words = [word for word in words if word != "..."]
-        yield words[1 : next((n for n, word in enumerate(words) if word in ("&", "|", ">")), None)]
-
-
-def programs_of(page: Path) -> list[str]:
-    return PROGRAM.findall(page.read_text(encoding="utf-8"))
 
 
 def test_pages_with_commands_are_found() -> None:

@@ -44,10 +44,12 @@ def test_type_checkers_see_every_name_and_no_other() -> None:
 
 
 @pytest.mark.processes
+@pytest.mark.processes
 def test_a_star_import_brings_all_names() -> None:
     assert fresh("from cairn import *; print('Robot' in dir(), 'open_map' in dir())") == "True True"
 
 
+@pytest.mark.processes
 @pytest.mark.processes
 def test_dir_lists_all_names_before_they_are_used() -> None:
     assert set(cairn.__all__) | {"__version__", "__all__", "__doc__"} <= set(dir(cairn))
@@ -64,6 +66,7 @@ def test_another_name_is_refused_and_the_list_of_names_pointed_to() -> None:
         _ = cairn.Robots  # type: ignore[attr-defined]
 
 
+@pytest.mark.processes
 @pytest.mark.processes
 def test_importing_the_door_imports_nothing_behind_it() -> None:
     heavy = "[m for m in sys.modules if m.partition('.')[0].startswith(('numpy', 'cairn_', 'numba', 'pydantic'))]"
