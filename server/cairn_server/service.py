@@ -245,10 +245,14 @@ class Service:
         upstream = upstream_metrics(self.joining.ages_s())
         return metrics_text(chain(self.figures.registry.collect(), store, upstream, process_metrics()))
 
+    def stop_streams(self) -> None:
+        """Count as not ready and end live streams, which never end alone; requests are still answered."""
+        self.readiness.close()
+        self.live.close()
+
     def close(self) -> None:
         """Stop folding and close the store; what was acknowledged is folded after the next start."""
-        self.readiness.is_closing = True
-        self.live.close()
+        self.stop_streams()
         self.pushes.close()
         self.tickets.close()
         self._folder.close()

@@ -66,12 +66,15 @@ class Readiness:
         self._lock = threading.Lock()
         self._looked_s = float("-inf")
         self._reasons: list[str] = []
-        self.is_closing = False
-        """Set once the server is told to stop."""
+        self._is_closing = False
+
+    def close(self) -> None:
+        """Count as not ready from now on: the server stops."""
+        self._is_closing = True
 
     def reasons(self) -> list[str]:
         """Why it is not ready, each as `code: what`; empty if it is. Names no map: strangers may ask."""
-        if self.is_closing:
+        if self._is_closing:
             return ["shutting_down: the server is told to stop"]
         with self._lock:
             if time.monotonic() - self._looked_s >= KEEP_S:

@@ -7,9 +7,8 @@ from fastapi.responses import HTMLResponse
 from starlette.middleware import Middleware
 
 from cairn_server.http.middleware.body_limit import BodyLimit
-from cairn_server.http.middleware.protocol_version import ProtocolVersion
+from cairn_server.http.middleware.head_checks import ProtocolVersion, SameOrigin
 from cairn_server.http.middleware.request_trail import RequestTrail
-from cairn_server.http.middleware.same_origin import OwnOrigin
 from cairn_server.http.middleware.token_first import TokenFirst
 from cairn_server.http.openapi import DocumentedApp, docs_page
 from cairn_server.http.routes import branch as branch_routes
@@ -67,7 +66,7 @@ def _middleware(service: Service) -> Iterator[Middleware]:
     """Middleware in the order in which a request passes it; the answer passes it in reverse."""
     yield Middleware(RequestTrail, figures=service.figures)
     if service.settings.admin_token is None:
-        yield Middleware(OwnOrigin, host=service.settings.host)
+        yield Middleware(SameOrigin, host=service.settings.host)
     yield Middleware(ProtocolVersion)
     yield Middleware(BodyLimit)
     yield Middleware(TokenFirst, service=service)

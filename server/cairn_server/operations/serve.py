@@ -131,9 +131,8 @@ class _Server(uvicorn.Server):
         self._service = service
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Close what is open for ever, then stop as uvicorn does."""
-        self._service.readiness.is_closing = True
-        self._service.live.close()
+        """End live streams, then stop as uvicorn does."""
+        self._service.stop_streams()
         super().handle_exit(sig, frame)
 
 

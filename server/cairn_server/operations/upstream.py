@@ -50,7 +50,7 @@ def joined(service: Service) -> Iterator[None]:
             "bad_setting", f"--upstream: no package offers a relay (entry points {GROUP}); install cairn again"
         )
     relay: Relay = point.load()(settings.upstream, settings.upstream_token, OwnMaps(service))
-    service.joining.wake = relay.wake
+    service.joining.connect(relay.wake)
     try:
         yield
     finally:

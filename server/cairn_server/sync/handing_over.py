@@ -91,18 +91,21 @@ def found_commit(store: Store, row: MapRow, id_text: str) -> FoundCommit:
     )
 
 
-def _nobody() -> None:
-    """There is no relay."""
-
-
 class Joining:
     """Of all maps; called from many threads."""
 
     def __init__(self, *, is_joined: bool) -> None:
         self._is_joined = is_joined
         self._handed_over_s: dict[str, float] = {}
-        self.wake: Callable[[], None] = _nobody
-        """Tells the relay that something came."""
+        self._wake_relay: Callable[[], None] = lambda: None
+
+    def connect(self, wake_relay: Callable[[], None]) -> None:
+        """Give the function that tells a running relay of new commits."""
+        self._wake_relay = wake_relay
+
+    def wake(self) -> None:
+        """Report new commits to the relay, if one runs."""
+        self._wake_relay()
 
     def handed_over(self, map_name: str, begun_s: float) -> None:
         """All that was in a map at this time (UTC seconds since 1970) was given to the upstream, if it can travel."""

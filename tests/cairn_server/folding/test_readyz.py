@@ -112,5 +112,5 @@ def test_threads_that_ended_make_it_not_ready(live: Live) -> None:
 
 
 def test_a_server_told_to_stop_is_not_ready(live: Live) -> None:
-    live.service.readiness.is_closing = True
+    live.service.readiness.close()
     assert reasons(live).startswith("shutting_down: ")
