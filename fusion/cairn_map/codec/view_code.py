@@ -211,8 +211,8 @@ def _flags(rows: Ints, count: int) -> Flags:
 
 
 def _written(code: Code, numbers: int) -> bytes:
+    # Room for any numbers: the coder's worst case is far below eight bytes each.
     data = write_modelled(code, room=64 + 8 * numbers)
-    # The coder's worst case is below this room: more would be an error of the program.
     if data is None:
         raise AssertionError("eight bytes a number were too few")
     return data
@@ -232,6 +232,7 @@ def _ranks_coder(ranks: Ints, ground: Ground) -> Code:
 
 def _read_palette(data: bytes, style: ViewStyle) -> Ints:
     """Distinct probabilities of a view, the highest first."""
+    # Canonical: each probability once, in falling order.
     palette = np.frombuffer(data[: len(data) & ~1], "<u2").astype(np.int64)
     top = 255 if style.chance is Chance.BYTE else 2 * LOG_ODDS_ZERO - 1
     if len(data) % 2 or (np.diff(palette) >= 0).any() or (palette > top).any():

@@ -1,7 +1,7 @@
-"""A map as it was at one instant, laid out for queries: what all of them read.
+"""Frozen maps: the cells and states of a map at one instant, in the layout that all queries read.
 
-Cells share their arrays with the map that goes on changing, which copies one before it adds to it. So freezing costs
-the states of the cells that changed since, and a reader needs no lock.
+Cells share their arrays with the live map, which copies an array before it adds to it. So freezing costs only the
+states of the cells that changed since the last time, and readers need no lock.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ Box = Sequence[Sequence[float]] | npt.NDArray[np.floating]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrozenMap:
-    """Cells by slot, the states of their voxels under a sensor model, and both as kernels read them."""
+    """Cells by slot, the states of their voxels under a sensor model, and the grid of these states for kernels."""
 
     geometry: Geometry
     model: SensorModel
@@ -46,7 +46,7 @@ class FrozenMap:
         return corners
 
     def voxels_of_box(self, box_m: Box | None) -> tuple[Ints, Ints]:
-        """The voxels whose centres lie in a box, low and high (3,), the latter exclusive, within that of all cells.
+        """Range of the voxels whose centres lie in a box: low and high (3,), high exclusive, within all cells' box.
 
         Raises:
             BadInputError: kind `bad_box`: not two corners, the lower first.
@@ -66,7 +66,7 @@ class FrozenMap:
 
 
 def freeze(whole: EvidenceMap, model: SensorModel, *, earlier: FrozenMap | None = None) -> FrozenMap:
-    """The map as it is now; what has not changed since `earlier` is taken over from it."""
+    """The map as it is now; states of cells that are unchanged since `earlier` are taken from it."""
     copied = whole.copy()
     keys = tuple(copied)
     cells = tuple(cell for key in keys if (cell := copied.cell(key)) is not None)
@@ -99,7 +99,7 @@ def as_points(values: npt.ArrayLike, what: str) -> Floats:
 
 
 def check_within(inside: bool, frozen: FrozenMap) -> None:
-    """Refuse what a kernel found outside.
+    """Refuse points that a kernel found outside of the numbered space.
 
     Raises:
         BadInputError: kind `point_range`.
