@@ -105,7 +105,7 @@ ROOMS = {
     "cairn_server": """
         settings processes
         store store.sqlite metrics access live folding sync.checks sync views
-        service
+        maps service
         http.middleware http.routes http operations
     """,
 }

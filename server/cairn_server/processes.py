@@ -13,13 +13,13 @@ PR_SET_PDEATHSIG = 1
 
 
 def send(channel: socket.socket, data: bytes) -> None:
-    """A length, and as many bytes."""
+    """Send a length, and as many bytes."""
     channel.sendall(LENGTH.pack(len(data)))
     channel.sendall(data)
 
 
 def received(channel: socket.socket) -> bytes | None:
-    """What `send` sent; None if the other side closed instead."""
+    """Bytes that `send` sent; None if the other side closed instead."""
     head = _exactly(channel, LENGTH.size)
     return None if head is None else _exactly(channel, LENGTH.unpack(head)[0])
 
@@ -36,9 +36,9 @@ def _exactly(channel: socket.socket, size_bytes: int) -> bytes | None:
 
 
 def die_with_parent(parent: int) -> None:
-    """End this process as soon as the one that forked it, and has this number, ends, however that does."""
+    """End this process as soon as its parent, the process of this number, ends in any way."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
         raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
     if os.getppid() != parent:
-        os._exit(0)  # it died meanwhile
+        os._exit(0)  # the parent died meanwhile

@@ -67,9 +67,9 @@ def _folded(store: SqliteStore, row: MapRow, bodies: Bodies, first: int, more: i
 def _age_rows(service: Service, row: MapRow, cursor: Cursor, age: int, last_bytes: int) -> Iterator[Row]:
     request = MissingRequest(cursor=str(cursor), kinds=["delta", "state", "full"])
     start_s = time.process_time()
-    answer = service.missing(row, "wren", request)
+    answer = service.sync.replies.missing(row, "wren", request)
     cold_s = time.process_time() - start_s
-    warm_s = cpu_s(lambda: service.missing(row, "wren", request), 3)
+    warm_s = cpu_s(lambda: service.sync.replies.missing(row, "wren", request), 3)
     frames = [frame for frame in frames_of(answer) if isinstance(frame, CellFrame)]
     kinds = {frame.kind.name.lower(): 0 for frame in frames}
     for frame in frames:

@@ -73,7 +73,7 @@ class SimServer:
         """Another server, with nothing on it, under the same name."""
         self._backup, self._stable.vector = None, EMPTY
         self._start(MemoryStore())
-        self.service.create_map(MAP, CreateMap(geometry=GEOMETRY))
+        self.service.maps.create(MAP, CreateMap(geometry=GEOMETRY))
         self._note_state()
 
     def restart(self) -> None:
@@ -95,7 +95,7 @@ class SimServer:
     def trust(self, keys: str) -> None:
         """Obey the operators of servers with these keys."""
         self.settings = self.service.settings.model_copy(update={"trusted_servers": keys})
-        self.service.settings = self.service.pushes._settings = self.settings
+        self.service.settings = self.service.sync.pushes._settings = self.settings
 
     def copy_of(self, other: "SimServer") -> None:
         """Another server in this one's place, that starts from a backup of a third."""
@@ -108,7 +108,7 @@ class SimServer:
 
     def hand_over(self, commit: SignedCommit, *, by: Caller) -> None:
         """A relay brings a commit."""
-        self.service.push(self.row, by, str(commit.id), commit.data, signatures=commit.signatures)
+        self.service.sync.pushes.keep(self.row, by, str(commit.id), commit.data, signatures=commit.signatures)
         meta, cells = split_commit(commit.data)
         self._evidence[commit.id] = meta.note, cells
 
@@ -127,14 +127,14 @@ class SimServer:
         match ask:
             case Push(commit, seal, signatures):
                 beside = {"seal": seal, "signatures": signatures}
-                service.push(row, Caller(Role.ROBOT, robot), str(commit.id), commit.data, **beside)
+                service.sync.pushes.keep(row, Caller(Role.ROBOT, robot), str(commit.id), commit.data, **beside)
                 self._evidence[commit.id] = commit.meta.note, commit.cells
                 return None
             case GetUpload(commit_id, digest):
-                return service.uploads.state(row, Caller(Role.ROBOT, robot), str(commit_id), digest)
+                return service.sync.uploads.state(row, Caller(Role.ROBOT, robot), str(commit_id), digest)
             case PutPart(commit_id, digest, total, offset, data, signatures):
                 part = Part(digest, total, offset, data, signatures)
-                upload, _ = service.uploads.add(row, Caller(Role.ROBOT, robot), str(commit_id), part)
+                upload, _ = service.sync.uploads.add(row, Caller(Role.ROBOT, robot), str(commit_id), part)
                 kept = service.store.commit(row, commit_id)
                 if kept is not None and not kept.gone:  # perhaps under an id that was another server's
                     meta, cells = split_commit(found_commit(service.store, row, str(commit_id)).data)
@@ -144,9 +144,11 @@ class SimServer:
                 found = found_commit(service.store, row, str(commit_id))
                 return found.data, found.seal
             case GetMissing(request):
-                return service.missing(row, robot, MissingRequest.model_validate_json(request.model_dump_json()))
+                return service.sync.replies.missing(
+                    row, robot, MissingRequest.model_validate_json(request.model_dump_json())
+                )
             case GetIndex(author):
-                return CellIndex.model_validate_json(service.cell_index(row, author).model_dump_json())
+                return CellIndex.model_validate_json(service.sync.replies.cell_index(row, author).model_dump_json())
             case GetCell(cell, etag):
                 stored, head = service.cells.sound(row, cell_key(cell))
                 if stored is None:
@@ -155,7 +157,7 @@ class SimServer:
                 body = None if etag == found_etag else stored.body
                 return FetchedCell(body, found_etag, head.cursor, head.vector, stored.fingerprint)
             case PutCell(cell, body):
-                return service.heal_cell(row, cell_key(cell), body)
+                return service.cells.heal(row, cell_key(cell), body)
         raise TypeError(ask)
 
     def fold(self, limit: int) -> None:
@@ -166,7 +168,7 @@ class SimServer:
     def retract(self, target: CommitId) -> None:
         """An operator takes out a commit that may or may not have come."""
         try:
-            self.service.retract(self.row, Retract(commits=[str(target)]), by=Caller(Role.ADMIN))
+            self.service.sync.retracts.retract(self.row, Retract(commits=[str(target)]), by=Caller(Role.ADMIN))
         except ConflictError as exc:
             assert exc.kind == "evidence_gone"
         except BadInputError as exc:
@@ -229,7 +231,7 @@ class SimServer:
     def _start(self, store: MemoryStore) -> None:
         self._store = store
         self.service = Service(store, self.settings)
-        self.service._stable = self._stable  # type: ignore[assignment]
+        self.service.sync.replies._stable = self._stable  # type: ignore[assignment]
         self._cache = CellCache(GEOMETRY)
 
     def _note_state(self) -> None:

@@ -1,14 +1,14 @@
-"""Who may do what: a bearer token stands for a role, on one map or on all.
+"""Roles and rights: a bearer token stands for a role, on one map or on all.
 
-admin     everything                           `admin_token`, or anybody while there is none (loopback only)
+admin     everything                           `admin_token`, or any client while there is none (loopback only)
 operator  read, retract
 robot     read, push its own commits, fetch    given at registration; of one map and one robot
 reader    read
 relay     read, hand over what robots signed   a robot's, too, if it names one
 enroller  register robots                      `enrolment_token`
 
-Whoever may read may do it with any of the first four. Tokens are kept as SHA-256 only (`store.Tokens`); the two secrets
-of the settings are kept by whoever starts the server.
+The first three roles and relays may read. Tokens are stored as SHA-256 only (`store.Tokens`); the two secrets of the
+settings are kept by the operator who starts the server.
 """
 
 import hashlib
@@ -25,7 +25,7 @@ from cairn_server.store.store_rows import MapRow, Token
 
 
 class Role(StrEnum):
-    """What a token stands for."""
+    """Role of a token."""
 
     ADMIN = "admin"
     OPERATOR = "operator"
@@ -36,32 +36,32 @@ class Role(StrEnum):
 
 
 READING = (Role.READER, Role.ROBOT, Role.OPERATOR, Role.RELAY)
-"""Who may read a map."""
+"""Roles that may read a map."""
 
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who makes a request."""
+    """Maker of a request: its role, and the robot or token that it stands for."""
 
     role: Role
     robot: str | None = None
     name: str = ""
-    """Of the token, for the audit log."""
+    """Name of the token, for the audit log."""
     map_number: int | None = None
-    """The one map that the token counts on; None: all."""
+    """Number of the one map that the token counts on; None: all maps."""
 
     def may_author(self, robot: str) -> bool:
-        """Whether commits of this robot may come from here."""
+        """True if this caller may push commits of this robot."""
         return self.role is Role.ADMIN or self.robot == robot
 
     def counts_on(self, map_number: int | None) -> bool:
-        """Whether the token counts on a map (None: on the server as a whole)."""
+        """True if the token counts on a map (None: on the server as a whole)."""
         return self.map_number in (None, map_number)
 
 
 ADMIN_FILE, ENROLLER_FILE, LOCAL = Caller(Role.ADMIN, name="admin"), Caller(Role.ENROLLER, name="enroller"), "local"
 UPSTREAM = Caller(Role.RELAY, name="upstream")
-"""This server's own relay, with what the upstream server has."""
+"""This server's own relay, which brings the upstream server's commits."""
 RESERVED_TOKEN_NAMES = frozenset({ADMIN_FILE.name, ENROLLER_FILE.name, LOCAL, UPSTREAM.name, "server"})
 
 
@@ -71,12 +71,12 @@ def new_token() -> str:
 
 
 def token_hash(token: str) -> bytes:
-    """What is kept of a token; random ones need no salt."""
+    """SHA-256 under which a token is stored; tokens are random and need no salt."""
     return hashlib.sha256(token.encode()).digest()
 
 
 def caller_of(token: str | None, row: MapRow | None, store: Store, settings: Settings) -> Caller:
-    """Who shows this token, to do something with a map, or (None) with none in particular.
+    """Caller that shows this token, on a map or (None) on the server as a whole.
 
     Raises:
         DeniedError: kind `no_token` or `bad_token`; the latter also on a map that the token is not for.
@@ -95,7 +95,7 @@ def caller_of(token: str | None, row: MapRow | None, store: Store, settings: Set
 
 
 def bad_token() -> DeniedError:
-    """The one answer to whoever shows a token that is worth nothing here."""
+    """Error for any token that is not valid here, the same in every case."""
     return DeniedError(
         "bad_token",
         "the token is wrong, of another map, or ended: expired, revoked, or replaced by a rotation or registration",
@@ -116,7 +116,7 @@ def require(caller: Caller, *roles: Role) -> None:
 
 
 def require_all_maps(caller: Caller) -> None:
-    """Refuse an admin of one map what concerns the server.
+    """Refuse an admin of one map, where the whole server is concerned.
 
     Raises:
         DeniedError: kind `not_allowed`.
@@ -126,7 +126,7 @@ def require_all_maps(caller: Caller) -> None:
 
 
 def has_ended(token: Token, settings: Settings, *, now_s: float) -> bool:
-    """Whether a token is over its time, or its robot was silent for longer than `branch_expiry_s`."""
+    """True if a token has expired, or its robot was silent for longer than `branch_expiry_s`."""
     if token.expires_s is not None:
         return now_s >= token.expires_s
     if token.role != "robot" or settings.branch_expiry_s is None:

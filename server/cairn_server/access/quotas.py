@@ -1,8 +1,9 @@
-"""How much a robot may push: a faulty or hostile one must not fill the disk or blow up the map for the others.
+"""Quotas of pushes: a faulty or hostile robot must not fill the disk or blow up the map for the others.
 
-Looked at after the commit's head was read and before its evidence is decoded; taken at once, so that a robot's
-parallel pushes share one quota, and given back if the commit is refused or was known. Windows that pass (429) are
-told from what no waiting mends (400). Days are those of UTC; what a day has seen is read from the store after a start.
+A quota is checked after the commit's head is read and before its evidence is decoded. It is taken at once, so that a
+robot's parallel pushes share it, and given back if the commit is refused or was known. An exceeded rate (429) passes
+with time; a commit that is too large (400) does not. Days are those of UTC; after a start, a day's use is read from the
+store.
 """
 
 import math
@@ -24,14 +25,14 @@ from cairn_server.store.store_rows import MapRow, Robot, Use, relay_of
 
 DAY_S = 86_400
 BOX_EVERY_S = 5.0
-"""How often a map's box is read anew while commits beyond it are refused: retracts make it smaller."""
+"""Time between two readings of a map's box while commits beyond it are refused: retracts make it smaller."""
 Corner = tuple[int, int, int]
 Box = tuple[Corner, Corner]
 """Lowest and highest cell."""
 
 
 class Meter:
-    """What every robot has used of its quotas; may be called from any thread."""
+    """Use of the quotas by every robot; called from many threads."""
 
     def __init__(
         self,
@@ -51,19 +52,14 @@ class Meter:
         self._minutes: dict[Robot, Allowance] = {}
         self._boxes: dict[int, tuple[Box | None, float]] = {}
 
-    def is_ready(self, row: MapRow) -> bool:
-        """Whether `spending` has no need to read from the store what was pushed today, or where the map is."""
-        knows_box = self._quotas.map_extent_m is None or row.number in self._boxes
-        return knows_box and self._day == int(self._wall_s() // DAY_S)
-
     @contextmanager
     def spending(
         self, row: MapRow, caller: Caller, *, size_bytes: int, cells: Collection[CellKey], via: str | None = None
     ) -> Iterator[Callable[[], None]]:
-        """Take a commit off its robot's quotas for the length of a `with`; call what it gives to keep it taken.
+        """Take a commit off its robot's quotas for the length of a `with`; the function it yields keeps it taken.
 
-        What a relay hands over (`via`: by this token) is taken off the relay's. What this server fetches itself from
-        its upstream is held to what one commit may be only: it may be all of a map that grew for years.
+        What a relay hands over (`via`: its token) is taken off the relay's quotas. What this server fetches itself
+        from its upstream is held to the limits of one commit only: it may be all of a map that grew for years.
 
         Raises:
             UnreachableError: kind `quota`: too much for now, with the seconds until it is not.
@@ -146,7 +142,7 @@ class Meter:
             self._minutes[robot].left += 1
 
     def _widened(self, row: MapRow, box: Box | None) -> Box | None:
-        """The box of a map and of a commit."""
+        """Box of a map and of a commit together."""
         if row.number not in self._boxes:
             self._read_box(row)
         known = self._boxes[row.number][0]
@@ -155,7 +151,7 @@ class Meter:
         return _corner(np.minimum(known[0], box[0])), _corner(np.maximum(known[1], box[1]))
 
     def _read_box(self, row: MapRow) -> None:
-        """The box of the map as it is folded; the known one stays while commits wait that may be at its corners."""
+        """Read the box of the folded map; the known box stays while commits wait that may be at its corners."""
         with self._store.snapshot(row) as snapshot:
             known, _ = self._boxes.get(row.number, (None, 0.0))
             box = known if known and len(snapshot.pending()) else snapshot.totals().corner_cells
@@ -175,7 +171,7 @@ def _corner(values: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Corner:
 
 
 def _edge_cells(box: Box | None) -> int:
-    """Cells along the longest edge."""
+    """Count of cells along the longest edge."""
     return max((high - low + 1 for low, high in zip(*box, strict=True)), default=0) if box else 0
 
 

@@ -1,4 +1,4 @@
-"""What administrators do with tokens: give, renew, revoke, list. Each is in the audit log before it is answered."""
+"""Administration of tokens: create, rotate, revoke, list; each change is in the audit log before it is answered."""
 
 import time
 
@@ -11,7 +11,7 @@ from cairn_server.store.store_rows import Token
 
 
 def create_token(store: Store, name: str, request: CreateToken, *, by: Caller) -> NewSecret:
-    """A new token of this name.
+    """Create a token of this name.
 
     Raises:
         BadInputError: kind `bad_name` or `reserved_name`.
@@ -37,7 +37,7 @@ def create_token(store: Store, name: str, request: CreateToken, *, by: Caller) -
 
 
 def rotate_token(store: Store, name: str, *, by: Caller) -> NewSecret:
-    """Another secret for a token; the old one is worth nothing at once.
+    """Give a token another secret; the old one is invalid at once.
 
     Raises:
         NotFoundError: kind `no_such_token`.

@@ -1,7 +1,7 @@
-"""Cells under change, within a bound of memory: `BrickCell`s that add fast, the oldest encoded when they are too many.
+"""Cells under change, within a memory bound: `BrickCell`s, which add fast, the oldest encoded when the bound is met.
 
-A cell that was changed and does not fit any more waits as a draft of its row; asked for again it is decoded from
-there. So one fold may touch any number of cells.
+A changed cell that no longer fits waits as a draft of its row, and is decoded from there when it is needed again. So
+one fold may touch any number of cells.
 """
 
 from collections import OrderedDict
@@ -28,10 +28,10 @@ Load = Callable[[CellKey], tuple[BrickCell, Stamps]]
 
 
 class CellCache:
-    """The cells of one map that were changed last, as they are at one cursor; not thread-safe."""
+    """Most recently changed cells of one map, in the state of one cursor; not thread-safe."""
 
     def __init__(self, geometry: Geometry, *, limit_bytes: int = CACHE_BYTES) -> None:
-        self.limit_bytes = limit_bytes
+        self._limit_bytes = limit_bytes
         self.size_bytes = 0
         self._geometry = geometry
         self._cursor: Cursor | None = None
@@ -41,13 +41,13 @@ class CellCache:
         self._drafts: dict[CellKey, CellRow] = {}
 
     def begin(self, cursor: Cursor) -> None:
-        """Work on the map as it is at this cursor; cells of any other state are forgotten."""
+        """Begin to work on the map's state at a cursor; cells of any other state are dropped."""
         if cursor != self._cursor:
             self.clear()
             self._cursor = cursor
 
     def change(self, key: CellKey, diff: Evidence, step: Step, load: Load) -> None:
-        """Merge or unmerge (`step`) a diff into a cell, which `load` brings if it is not here.
+        """Merge or unmerge (`step`) a diff into a cell, which `load` reads if it is not cached.
 
         Raises:
             BadInputError: a sum would leave its range; nothing was changed.
@@ -57,7 +57,8 @@ class CellCache:
         self._keep(key, cell, stamps)
 
     def stamp(self, key: CellKey, blocks: Blocks, seq: int, load: Load) -> None:
-        """Note that a log entry changed these blocks of a cell."""
+        """Stamp these blocks of a cell with the log entry that changed them."""
+        # A cell whose diff was just merged is cached and marked: stamping alone neither moves nor measures it again.
         is_here = key in self._cells and key in self._changed
         cell, stamps = self._taken(key, load)
         stamps[blocks] = seq
@@ -65,27 +66,32 @@ class CellCache:
             self._keep(key, cell, stamps)
 
     def rows(self, last_change: Mapping[CellKey, int]) -> tuple[CellRow, ...]:
-        """The changed cells encoded, rising in number, each with the log entry that last changed it."""
+        """Encoded rows of the changed cells, by rising number, each with the log entry that last changed it."""
         return tuple(
             replace(self._drafts.get(key) or self._encoded(key), lm=last_change[key]) for key in sorted(last_change)
         )
 
     def finish(self, cursor: Cursor) -> None:
-        """What was changed is written: the cells here are those of this cursor now."""
+        """Note that the changes are written: the cached cells are those of this cursor now."""
         self._cursor = cursor
         self._changed.clear()
         self._drafts.clear()
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Drop all cells."""
         self._cursor = None
         self.size_bytes = 0
         for kept in (self._cells, self._sizes, self._changed, self._drafts):
             kept.clear()
 
+    def limit(self, limit_bytes: int) -> None:
+        """Set the memory bound, and keep to it."""
+        self._limit_bytes = limit_bytes
+        self.trim()
+
     def trim(self) -> None:
-        """Put away the cells that were not changed for longest, all but the newest if need be."""
-        while self.size_bytes > self.limit_bytes and len(self._cells) > 1:
+        """Drop the cells changed longest ago until the bound holds, all but the newest cell if need be."""
+        while self.size_bytes > self._limit_bytes and len(self._cells) > 1:
             key = next(iter(self._cells))
             if key in self._changed:
                 self._drafts[key] = self._encoded(key)

@@ -13,26 +13,26 @@ from cairn_server.store.store_rows import CellRow
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IndexPage:
-    """Which entries are asked for."""
+    """Entries that a client asks for."""
 
     after: CellKey | None = None
-    """Those of a higher number; None: from the first on."""
+    """Number of the cell before the page; None: from the first cell on."""
     limit: int = INDEX_PAGE
     inside: Callable[[tuple[int, int, int]], bool] | None = None
-    """Only cells of which it says yes."""
+    """Test that a cell has to pass; None: all cells do."""
     is_hottest_asked: bool = False
-    """Whether each entry says how hot its cell is."""
+    """True if each entry has its cell's hottest temperature."""
     is_held_asked: bool = False
-    """Whether each entry says whose evidence is still in its cell."""
+    """True if each entry has the newest log entry whose evidence is still in its cell."""
 
 
 FIRST_PAGE = IndexPage()
 TOUCHES_MAX = 32
-"""Log entries of a cell that are looked at, the newest."""
+"""Newest log entries of a cell that are looked at."""
 
 
 def entries_of(snapshot: Snapshot, page: IndexPage) -> list[CellEntry]:
-    """Every cell that was ever touched, emptied ones included, rising in number; no more than the page takes."""
+    """Entries of the cells that were ever touched, emptied ones included, by rising number; one page of them."""
     found: list[CellEntry] = []
     after = -1 if page.after is None else page.after
     while len(found) < page.limit:
@@ -66,7 +66,7 @@ def _asked_entry(snapshot: Snapshot, row: CellRow, page: IndexPage) -> CellEntry
 
 
 def _held_lm(snapshot: Snapshot, key: CellKey) -> int | None:
-    """Newest entry that brought evidence which no later one took out; None: none of the newest did."""
+    """Newest log entry whose evidence no later one took out; None: there is none among the newest `TOUCHES_MAX`."""
     newest = snapshot.contributions(key, after_seq=0, newest=1)
     if newest and newest[0].kind == ENTRY_FOLD:  # nearly always
         return newest[0].seq
@@ -80,7 +80,7 @@ def _held_lm(snapshot: Snapshot, key: CellKey) -> int | None:
 
 
 def box_from_text(text: str) -> Callable[[tuple[int, int, int]], bool]:
-    """Whether a cell lies in the box written `i0,j0,k0,i1,j1,k1`, both corners included.
+    """Test of cells for the box written `i0,j0,k0,i1,j1,k1`, both corners included.
 
     Raises:
         BadInputError: kind `bad_box`, or of a cell that cannot be.

@@ -1,4 +1,4 @@
-"""Cells as the store has them, checked when they are read; and made anew from the log when they are damaged."""
+"""Stored cells, checked when they are read, and rebuilt from the log when they are damaged."""
 
 import logging
 import threading
@@ -22,11 +22,11 @@ from cairn_server.store.store_rows import CellRow, Contribution
 log = logging.getLogger(__name__)
 
 SOUND_MAX = 50_000
-"""Cells remembered as sound, some 300 bytes each."""
+"""Most cells remembered as sound, some 300 bytes each."""
 
 
 class DamagedCellError(DamagedDataError):
-    """A cell of the map is damaged, and nothing here says any more what it was."""
+    """A cell of the map is damaged, and the log cannot rebuild it."""
 
     def __init__(self, key: CellKey, message: str) -> None:
         super().__init__("damaged_store", message)
@@ -37,7 +37,7 @@ class DamagedCellError(DamagedDataError):
 
 
 def stored_evidence(stored: CellRow) -> Evidence:
-    """The evidence of a cell at rest.
+    """Evidence of a stored cell.
 
     Raises:
         DamagedDataError: kind `damaged_store`: its bytes are not sound, or do not have its digest.
@@ -49,7 +49,7 @@ def stored_evidence(stored: CellRow) -> Evidence:
 
 
 def stored_surfaces(stored: CellRow) -> Evidence:
-    """Of `stored_evidence` the voxels that were hit or have samples, in a third of the time.
+    """Voxels of `stored_evidence` that were hit or have samples, in a third of the time.
 
     Raises:
         DamagedDataError: kind `damaged_store`: its bytes are not sound, or do not have its digest.
@@ -65,13 +65,13 @@ def _as_it_was(stored: CellRow, decode: Callable[[bytes], DecodedCell]) -> Decod
 
 
 def sound_cell(snapshot: Snapshot, key: CellKey, geometry: Geometry, healed: list[CellRow]) -> CellRow | None:
-    """A cell whose bytes may be sent, made anew from the log if those at rest are damaged; None: never seen.
+    """A cell whose bytes may be sent, rebuilt from the log if the stored ones are damaged; None: never seen.
 
-    Bytes that were found sound are remembered by their checksum, so that only new ones are decoded. What was made anew
-    is added to `healed`, for the caller to write once nothing is read any more.
+    Bytes that were found sound are remembered by their checksum, so that only new ones are decoded. A rebuilt cell is
+    added to `healed`, for the caller to write once nothing is read any more.
 
     Raises:
-        DamagedCellError: it is damaged, and the log does not tell any more what it was.
+        DamagedCellError: it is damaged, and the log cannot rebuild it.
     """
     stored = row_of_cell(snapshot, key)
     if stored is None or _SOUND.knows(stored):
@@ -79,16 +79,16 @@ def sound_cell(snapshot: Snapshot, key: CellKey, geometry: Geometry, healed: lis
     try:
         stored_evidence(stored)
     except DamagedDataError as exc:
-        log.error("%s; making it anew from the log", exc.message)
-        anew = _proven_anew(snapshot, stored, geometry, exc)
-        healed.append(anew)
-        return anew
+        log.error("%s; rebuilding it from the log", exc.message)
+        rebuilt = _proven_rebuilt(snapshot, stored, geometry, exc)
+        healed.append(rebuilt)
+        return rebuilt
     _SOUND.note(stored)
     return stored
 
 
 def rebuilt_cell(snapshot: Snapshot, stored: CellRow, geometry: Geometry) -> CellRow:
-    """What the log says that a cell is.
+    """Cell as the log says that it is.
 
     Raises:
         DamagedDataError: kind `damaged_store`: a diff is not sound, or not kept any more.
@@ -131,7 +131,7 @@ def _decoded(key: CellKey, body: bytes, decode: Callable[[bytes], DecodedCell]) 
 def sum_of_contributions(
     snapshot: Snapshot, key: CellKey, contributions: Iterable[Contribution], geometry: Geometry
 ) -> BrickCell:
-    """What log entries did to a cell, all together.
+    """Sum of what log entries did to a cell.
 
     Raises:
         DamagedDataError: kind `damaged_store`: a diff is not sound, or not kept any more.
@@ -150,19 +150,19 @@ def sum_of_contributions(
 
 
 def stored_stamps(stored: CellRow, geometry: Geometry) -> Stamps:
-    """The stamps of a cell at rest; where they are damaged, more than was changed."""
+    """Stamps of a stored cell; if they are damaged, all blocks count as changed."""
     try:
         return decode_stamps(stored.stamps, depth=geometry.depth, lm=stored.lm)
     except DamagedDataError as exc:
-        log.error("cell %s: %s; taking all of it for changed", cell_of_key(stored.key), exc.message)
+        log.error("cell %s: %s; taking all of it as changed", cell_of_key(stored.key), exc.message)
         return decode_stamps(b"", depth=geometry.depth, lm=stored.lm)
 
 
 def cell_to_change(snapshot: Snapshot, key: CellKey, geometry: Geometry) -> tuple[BrickCell, Stamps]:
-    """A cell of the map, to be changed; a damaged one is summed up anew from all that the log says about it.
+    """A cell of the map, to be changed; a damaged one is rebuilt from the log.
 
     Raises:
-        DamagedCellError: it is damaged, and so is what it was made from.
+        DamagedCellError: it is damaged, and the log cannot rebuild it.
     """
     stored = row_of_cell(snapshot, key)
     cell = BrickCell(geometry)
@@ -172,16 +172,16 @@ def cell_to_change(snapshot: Snapshot, key: CellKey, geometry: Geometry) -> tupl
     try:
         cell.merge(stored_evidence(stored))
     except DamagedDataError as exc:
-        log.error("%s; making it anew from the log", exc.message)
-        cell.merge(stored_evidence(_proven_anew(snapshot, stored, geometry, exc)))
+        log.error("%s; rebuilding it from the log", exc.message)
+        cell.merge(stored_evidence(_proven_rebuilt(snapshot, stored, geometry, exc)))
     return cell, stamps
 
 
 def row_of_cell(snapshot: Snapshot, key: CellKey) -> CellRow | None:
-    """A cell as it is stored, not looked at; None: never seen.
+    """A cell as it is stored, unchecked; None: never seen.
 
     Raises:
-        DamagedCellError: not even that can be read.
+        DamagedCellError: its row cannot be read.
     """
     try:
         return snapshot.cell(key)
@@ -189,38 +189,38 @@ def row_of_cell(snapshot: Snapshot, key: CellKey) -> CellRow | None:
         raise DamagedCellError(key, exc.message) from exc
 
 
-def _proven_anew(snapshot: Snapshot, stored: CellRow, geometry: Geometry, why: DamagedDataError) -> CellRow:
-    """A damaged cell made anew, if its digest or its fingerprint says that the log still tells all of it."""
+def _proven_rebuilt(snapshot: Snapshot, stored: CellRow, geometry: Geometry, why: DamagedDataError) -> CellRow:
+    """A damaged cell rebuilt from the log, if its digest or its fingerprint proves that the log has all of it."""
     try:
-        anew = rebuilt_cell(snapshot, stored, geometry)
+        rebuilt = rebuilt_cell(snapshot, stored, geometry)
     except DamagedDataError as exc:
         raise DamagedCellError(
             stored.key,
-            f"{why.message}, and cannot be made anew: {exc.message}; send the cell as it was, or restore a backup",
+            f"{why.message}, and cannot be rebuilt: {exc.message}; send the cell as it was, or restore a backup",
         ) from exc
-    if anew.digest != stored.digest and anew.fingerprint != stored.fingerprint:
+    if rebuilt.digest != stored.digest and rebuilt.fingerprint != stored.fingerprint:
         raise DamagedCellError(
             stored.key,
             f"{why.message}, and its commits do not add up to it; send the cell as it was, or restore a backup",
         )
-    return anew
+    return rebuilt
 
 
 class _SoundBodies:
-    """Cells whose bytes were found to be what their digest says, by checksum; thread-safe."""
+    """Cells whose bytes were found to have their digest, by checksum; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._known: OrderedDict[tuple[bytes, Fingerprint, int, int], None] = OrderedDict()
 
     def knows(self, stored: CellRow) -> bool:
-        """Whether these very bytes were found sound."""
+        """True if these very bytes were found sound."""
         facts = _facts(stored)
         with self._lock:
             return facts in self._known
 
     def note(self, stored: CellRow) -> None:
-        """They were."""
+        """Note that these bytes were found sound."""
         facts = _facts(stored)
         with self._lock:
             self._known[facts] = None

@@ -1,6 +1,8 @@
-"""Which cells were found damaged for good, so that whoever still has one is asked for it.
+"""Damaged cells: the record of those that the log cannot rebuild, and the ways to heal one.
 
-It is not written anywhere: after a start a cell is found damaged again as soon as it is read or folded into.
+A cell's digest is a SHA-256 that is stored apart from its bytes: bytes of that digest are the cell, whether or not the
+client that sends them is trusted. The record is in memory only: after a start a cell is found damaged again as soon as
+it is read or folded into.
 """
 
 import logging
@@ -23,11 +25,11 @@ from cairn_server.store.store_rows import CellRow, MapRow
 log = logging.getLogger(__name__)
 
 Damaged = list[tuple[tuple[int, int, int], str]]
-"""As a header names them: the cell, and the fingerprint of what it was."""
+"""Damaged cells as a reply's header names them: each cell, and the fingerprint of its lost content."""
 
 
 class DamagedCells:
-    """Damaged cells of all maps; thread-safe."""
+    """Record of the damaged cells of all maps; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -35,29 +37,29 @@ class DamagedCells:
         self._healed: dict[str, int] = {}
 
     def note(self, map_name: str, keys: Iterable[CellKey]) -> None:
-        """These cells could not be read, nor made anew."""
+        """Record cells that can be neither read nor rebuilt."""
         with self._lock:
             self._found.setdefault(map_name, set()).update(keys)
 
     def forget(self, map_name: str, key: CellKey) -> None:
-        """The cell is sound."""
+        """Record that a cell is sound."""
         with self._lock:
             self._found.get(map_name, set()).discard(key)
             self._healed[map_name] = self._healed.get(map_name, 0) + 1
 
     def healed(self, map_name: str) -> int:
-        """How often a cell of a map was said to be sound: if it is more than before, look again."""
+        """Count of the times that a cell of a map became sound: when it grows, damaged cells are worth a new look."""
         with self._lock:
             return self._healed.get(map_name, 0)
 
     def of(self, map_name: str) -> frozenset[CellKey]:
-        """The damaged cells of a map, as far as anybody asked for them."""
+        """Damaged cells of a map, as far as they were read or folded into."""
         with self._lock:
             return frozenset(self._found.get(map_name, ()))
 
 
 def as_named(snapshot: Snapshot, keys: frozenset[CellKey]) -> Damaged:
-    """What a header says of damaged cells: what they were is kept apart from their bytes."""
+    """Damaged cells for a reply's header, at most `DAMAGED_MAX`; fingerprints are stored apart from the bytes."""
     if not keys:
         return []
     found = ((cell_of_key(cell.key), cell.fingerprint.hex()) for cell in snapshot.cells() if cell.key in keys)
@@ -65,7 +67,7 @@ def as_named(snapshot: Snapshot, keys: frozenset[CellKey]) -> Damaged:
 
 
 def keep_healed(store: Store, row: MapRow, cells: Iterable[CellRow]) -> None:
-    """Write cells that were made anew from the log in the place of damaged ones; a note only, if that fails."""
+    """Write cells that were rebuilt from the log over the damaged ones; a failure is logged only."""
     for cell in cells:
         try:
             if store.health.heal(row, cell):
@@ -75,13 +77,14 @@ def keep_healed(store: Store, row: MapRow, cells: Iterable[CellRow]) -> None:
 
 
 def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes, *, by: str) -> bool:
-    """Put these bytes in the place of a damaged cell; False if the cell is sound, and nothing is to be done.
+    """Replace a damaged cell by these bytes; False if the cell is sound and nothing is written.
 
     Raises:
-        NotFoundError: kind `no_cell`: nobody has seen the cell.
-        ConflictError: kind `other_cell`: they are not the cell as it was when it was damaged.
-        DamagedDataError, BadInputError: they are no cell of this map.
+        NotFoundError: kind `no_cell`: the cell was never seen.
+        ConflictError: kind `other_cell`: the bytes are not those of the lost cell.
+        DamagedDataError, BadInputError: the bytes are no cell of this map.
     """
+    # Sound, or rebuilt from the log: nothing to do. Else its row, without its bytes.
     with store.snapshot(row) as snapshot:
         healed: list[CellRow] = []
         try:
@@ -93,7 +96,7 @@ def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes, *, by: str) 
     if stored is None:
         keep_healed(store, row, healed)
         return False
-    # No cell of as many voxels needs more: what claims more is another one.
+    # Decode within the memory that a cell of as many voxels can need: what claims more is another cell.
     limit_bytes = stored.voxels * (VOXEL_BYTES + 4 + 8 * row.geometry.plane_count)
     decoded = decode_canonical_cell(data, evidence_bytes_max=limit_bytes)
     if decoded.key != key or decoded.geometry != row.geometry:
@@ -104,6 +107,7 @@ def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes, *, by: str) 
             f"cell {cell_of_key(key)} had digest {stored.digest.hex()} at entry {stored.lm}, the body has "
             f"{decoded.digest.hex()}",
         )
+    # Write it, unless a fold changed the cell meanwhile.
     sound = replace(
         stored,
         fingerprint=fingerprint(decoded.evidence, key),
@@ -119,5 +123,5 @@ def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes, *, by: str) 
 
 
 def _row_of(snapshot: Snapshot, key: CellKey) -> CellRow | None:
-    """What is known of a cell beside its bytes, which may not even be readable."""
+    """Row of a cell from the listing, without its bytes, which may be unreadable."""
     return next((cell for cell in snapshot.cells() if cell.key == key), None)

@@ -1,4 +1,4 @@
-"""Folding in a process of its own, which plans what the server then writes.
+"""Folding in a process of its own, which plans each fold; the server writes it.
 
     server ── fold a group of this map ──> process     reads the store
            <── cells, entries, new head ──             (`store_rows.Fold`)
@@ -8,7 +8,7 @@
 In a thread of the server, folding took the interpreter from those that answer robots, at each of their kernels and
 system calls: pushes were half as many. The process is forked before the server has threads or a store open, so it
 costs no start of its own. It holds no lock and writes nothing: it can be killed at any instant. Then the server folds
-in its own thread until it is started anew.
+in its own thread until its next start.
 """
 
 import logging
@@ -39,12 +39,12 @@ class LostProcessError(Exception):
 
 
 class BrokenFoldError(Exception):
-    """Something in the process that nobody expected; the message is its traceback."""
+    """An unexpected error in the process; the message is its traceback."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Ask:
-    """Fold a group of this map."""
+    """Request to fold a group of this map; `healed` is `Damage.healed` of it."""
 
     row: MapRow
     maps: int
@@ -53,20 +53,22 @@ class _Ask:
 
 @dataclass(frozen=True, slots=True)
 class _Write:
-    """Write this; answered with whether it was."""
+    """Request to write a fold; the answer is True if it was written, None if writing failed."""
 
     fold: Fold
 
 
 @dataclass(frozen=True, slots=True)
 class _Audit:
+    """Line for the audit log."""
+
     what: str
     detail: str
 
 
 @dataclass(frozen=True, slots=True)
 class _Note:
-    """Cells that are damaged, or (`is_sound`) are not any more."""
+    """Cells found damaged, or (`is_sound`) found sound again."""
 
     keys: tuple[CellKey, ...]
     is_sound: bool
@@ -74,6 +76,8 @@ class _Note:
 
 @dataclass(frozen=True, slots=True)
 class _Log:
+    """Line for the server's log."""
+
     name: str
     level: int
     text: str
@@ -81,30 +85,34 @@ class _Log:
 
 @dataclass(frozen=True, slots=True)
 class _Failed:
+    """Failure of the fold asked for."""
+
     error: CairnError | None
-    """None: the server's own, which it remembers."""
+    """Error of the fold; None: the server's own error while it wrote, or an unexpected one."""
     broken: str = ""
+    """Traceback of an unexpected error."""
 
 
 class FoldProcess:
-    """The server's end; one thread at a time."""
+    """The server's end of the link to the process; one thread at a time."""
 
     def __init__(self, link: Connection, *, pid: int | None) -> None:
         self.pid = pid
-        """None: the other end is no process of its own."""
+        """Number of the process; None: the other end is no process of its own."""
         self._link = link
 
     def fold(self, row: MapRow, store: FoldStore, damaged: Damage, *, maps: int) -> Folded:
-        """As `LocalFolding.fold`; what it makes is written to the store here.
+        """Fold one group as `LocalFolding.fold` does: planned in the process, written to the store here.
 
         Raises:
             CairnError: nothing was folded.
-            LostProcessError: the process is no more; what it had begun was not written.
-            BrokenFoldError: it met an error of its own.
+            LostProcessError: the process has ended; what it had begun was not written.
+            BrokenFoldError: the process met an unexpected error.
         """
         failure: BaseException | None = None
         try:
             self._link.send(_Ask(row, maps, damaged.healed(row.name)))
+            # Until the process says how it ended, it may ask to write, and report damage and log lines.
             while True:
                 match self._link.recv():
                     case Folded() as folded:
@@ -132,14 +140,14 @@ class FoldProcess:
         raise failure
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         self._link.close()
         if self.pid is not None:
             os.waitpid(self.pid, 0)
 
 
 def fork_folding(store_file: Path) -> FoldProcess:
-    """A process for the store in this file, which need not be there yet. Only before there are threads."""
+    """Fork a process that folds the store in this file, which may be made later; only before there are threads."""
     ours, theirs = socket.socketpair()
     server = os.getpid()
     pid = os.fork()
@@ -155,21 +163,21 @@ def fork_folding(store_file: Path) -> FoldProcess:
 
 
 def _be_folder(link: Connection, store_file: Path) -> None:
-    """What the process does."""
-    for number in (signal.SIGINT, signal.SIGTERM):  # of a whole group: the server first finishes what it does
+    """Run the process's side until the server is gone."""
+    for number in (signal.SIGINT, signal.SIGTERM):  # sent to the whole group: the server ends first, in order
         signal.signal(number, signal.SIG_IGN)
     logging.basicConfig(handlers=[_FarLog(link)], force=True)
     answer_folds(link, Readers(store_file))
 
 
 def answer_folds(link: Connection, readers: Readers) -> None:
-    """Plan what the other end asks for, until it is gone."""
+    """Plan the folds that the other end asks for, until it is gone."""
     far = _FarStore(readers, link)
     here = LocalFolding(far, far.damaged)
     with suppress(EOFError, OSError):
         while True:
             ask: _Ask = link.recv()
-            far.damaged.count = ask.healed
+            far.damaged.begin(ask.healed)
             link.send(_answer(here, ask))
 
 
@@ -182,16 +190,16 @@ def _answer(here: LocalFolding, ask: _Ask) -> Folded | _Failed:
         return _Failed(exc)
     except (EOFError, OSError):
         raise
-    except Exception:  # noqa: BLE001 - told to the server, which logs it and tries again
+    except Exception:  # noqa: BLE001 - reported to the server, which logs it and tries again
         return _Failed(None, traceback.format_exc())
 
 
 class _NotWrittenError(Exception):
-    """The server could not write; it knows why."""
+    """The server could not write; its side keeps the reason."""
 
 
 class _FarStore(SqliteReads):
-    """`FoldStore` that reads the file, and has the server write."""
+    """`FoldStore` that reads the file itself and has the server write."""
 
     def __init__(self, readers: Readers, link: Connection) -> None:
         super().__init__(readers)
@@ -210,12 +218,15 @@ class _FarStore(SqliteReads):
 
 
 class _FarDamage:
-    """`Damage` that the server hears of."""
+    """`Damage` that is reported to the server."""
 
     def __init__(self, link: Connection) -> None:
-        self.count = 0
-        """Healed cells when the server asked last."""
+        self._healed = 0
         self._link = link
+
+    def begin(self, healed: int) -> None:
+        """Take over the server's count of healed cells, with each request."""
+        self._healed = healed
 
     def note(self, map_name: str, keys: Iterable[CellKey]) -> None:
         self._link.send(_Note(tuple(keys), is_sound=False))
@@ -224,11 +235,11 @@ class _FarDamage:
         self._link.send(_Note((key,), is_sound=True))
 
     def healed(self, map_name: str) -> int:
-        return self.count
+        return self._healed
 
 
 class _FarLog(logging.Handler):
-    """Log lines, written by the server."""
+    """Handler that has the server write the process's log lines."""
 
     def __init__(self, link: Connection) -> None:
         super().__init__()

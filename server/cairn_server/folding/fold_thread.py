@@ -1,4 +1,4 @@
-"""The thread that folds: wakes up when a commit was accepted, and at start for what a crash left over."""
+"""The thread that folds: it wakes up when a commit is accepted, and at start for what a crash left over."""
 
 import logging
 import threading
@@ -16,19 +16,20 @@ from cairn_server.store.store_rows import MapRow
 log = logging.getLogger(__name__)
 
 REST_SHARE, REST_MAX_S = 3.0, 0.5
-"""While robots push, a fold is followed by a rest of so many times its length, at the longest this. What comes in it is
-folded together, each cell encoded once: 15 cells take 30 ms, for one scan or 200 of them; merging a scan takes 1 ms."""
+"""While robots push, each fold is followed by a rest of `REST_SHARE` times its length, at most `REST_MAX_S`. Commits
+that come in it are folded together, each cell encoded once: encoding 15 cells takes 30 ms, for one scan or for 200;
+merging a scan takes 1 ms."""
 FORGET_MAX = 64
-"""Commits whose evidence is dropped at once."""
+"""Most commits whose evidence is dropped in one transaction."""
 FORGET_EVERY_S = 60.0
-"""How often it is looked for evidence that need not be kept any more."""
+"""Time between two looks for evidence that need not be kept any longer."""
 RETRY_S = 5.0
-"""A fold that failed (a full disk) is tried again after this at the latest, the first time soon."""
+"""Longest wait before a failed fold (a full disk) is tried again; waits double from `FIRST_RETRY_S` on."""
 FIRST_RETRY_S = 0.2
 
 
 class FoldThread:
-    """Folds all maps of a store until closed."""
+    """Thread that folds all maps of a store until closed."""
 
     def __init__(
         self,
@@ -41,6 +42,17 @@ class FoldThread:
         may_forget_s: Callable[[str], float],
         process: FoldProcess | None = None,
     ) -> None:
+        """Start the thread.
+
+        Args:
+            store: its pending commits are folded.
+            health: notes each fold and failure.
+            damaged: record of damaged cells.
+            keep_evidence_s: age at which a folded commit's evidence is dropped.
+            on_fold: called after each group, with the map.
+            may_forget_s: by a map's name, UTC seconds before which evidence may be dropped.
+            process: plans the folds; without one, or once it has ended, this thread does.
+        """
         self._store = store
         self._health = health
         self._damaged = damaged
@@ -51,17 +63,17 @@ class FoldThread:
         self._wake = threading.Event()
         self._closing = threading.Event()
         self._process = process
-        self._here = LocalFolding(store, damaged)
+        self._local = LocalFolding(store, damaged)
         self._wake.set()
-        self._thread = threading.Thread(target=self._run, name="cairn-folder", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="cairn-fold", daemon=True)
         self._thread.start()
 
     def wake(self) -> None:
-        """Say that there may be something to fold."""
+        """Look for commits to fold now."""
         self._wake.set()
 
     def is_alive(self) -> bool:
-        """Whether anybody folds."""
+        """True while the thread runs."""
         return self._thread.is_alive()
 
     def close(self) -> None:
@@ -86,7 +98,7 @@ class FoldThread:
                 self._wake.set()
 
     def _fold_all(self) -> bool:
-        """Fold until nothing is pending, a group of each map in turn; False if a map failed."""
+        """Fold until nothing is pending, one group of each map in turn; False if a map failed."""
         failed: set[str] = set()
         maps: list[MapRow] = []
         busy = True
@@ -105,8 +117,8 @@ class FoldThread:
                 try:
                     busy |= self._fold_group(row, len(maps)) > 0
                 except Exception as exc:
-                    # Whatever it is, the other maps go on, and this thread must live: nobody else folds.
-                    # An error of ours says all in its message.
+                    # Whatever it is, the other maps go on, and this thread must live: there is no other one.
+                    # A `CairnError` says all in its message.
                     log.error("map %s: fold failed, to be tried again: %s", row.name, exc, exc_info=_unexpected(exc))
                     failed.add(row.name)
                     self._health.failed(row.name, exc)
@@ -115,13 +127,13 @@ class FoldThread:
         return not (failed or self._forget_old(maps))
 
     def _forget_old(self, maps: list[MapRow]) -> bool:
-        """Drop what need not be kept any more, now and then; whether that failed."""
+        """Drop evidence that need not be kept any longer, at most once in `FORGET_EVERY_S`; True if that failed."""
         if time.monotonic() < self._forget_next_s or self._closing.is_set():
             return False
         try:
             counts = [self._forget_group(row) for row in maps]
         except Exception:
-            # A full disk, or anything: dropping is no haste, and this thread must live.
+            # Whatever it is: dropping is not urgent, and this thread must live.
             log.exception("old evidence cannot be dropped")
             return True
         if max(counts, default=0) < FORGET_MAX:
@@ -155,13 +167,13 @@ class FoldThread:
                 log.error("the process that folds was killed; folding in the server's own until the next start")
                 self._process.close()
                 self._process = None
-        return self._here.fold(row, maps=maps)
+        return self._local.fold(row, maps=maps)
 
 
 def rest_s(took_s: float, *, is_pushed: bool) -> float:
-    """How long to rest after folding for a while, if commits came meanwhile.
+    """Seconds to rest after folding for `took_s`, if commits came meanwhile (`is_pushed`).
 
-    So whoever pushes has most of a processor, and one robot that pushes now and then is folded at once.
+    So pushes have most of a processor, and the commits of one robot that pushes now and then are folded at once.
     """
     return min(REST_SHARE * took_s, REST_MAX_S) if is_pushed else 0.0
 

@@ -1,8 +1,8 @@
-"""Folding: pending commits become log entries and new cells. Pure but for reading the store.
+"""Folding: pending commits become log entries and new cells. It reads the store and writes nothing.
 
     fold a commit                 entry +     its diff is added
     retract of a folded commit    entry -     its diff is subtracted, once per target for ever
-    a commit retracted before it came   both, one after the other (SYNC.md rule 11)
+    commit retracted before it came    both, one after the other (SYNC.md rule 11)
 
 A group of commits is folded at once, so that a cell is decoded and encoded once for all of them. A commit whose
 bytes are damaged at rest is set aside, so that it does not hold up the others; its robot will push it again.
@@ -32,89 +32,90 @@ from cairn_server.store.store_rows import Entry, Fold, Head, MapRow, StoredCommi
 log = logging.getLogger(__name__)
 
 GROUP_BYTES_MAX = 64 << 20
-"""Commits folded at once have no more bytes than this, or are one."""
+"""Most bytes of the commits folded at once; a single larger commit is folded alone."""
 
 
 class FoldStore(Protocol):
-    """The part of `store.Store` that folds are planned with, and written to."""
+    """Part of `store.Store` that folding needs: little enough to be served to another process."""
 
     def pending(
         self, row: MapRow, *, limit: int, size_bytes_max: int, skip: Collection[int] = ()
     ) -> list[StoredCommit]:
-        """As `Store.pending`."""
+        """`Store.pending`."""
         ...
 
     def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
-        """As `Store.folded`."""
+        """`Store.folded`."""
         ...
 
     def is_retracted(self, row: MapRow, commit: CommitId) -> bool:
-        """As `Store.is_retracted`."""
+        """`Store.is_retracted`."""
         ...
 
     def snapshot(self, row: MapRow) -> AbstractContextManager[Snapshot]:
-        """As `Store.snapshot`."""
+        """`Store.snapshot`."""
         ...
 
     def fold(self, row: MapRow, fold: Fold) -> bool:
-        """As `Store.fold`."""
+        """`Store.fold`."""
         ...
 
     def audit(self, what: str, detail: str) -> None:
-        """As `Store.audit`."""
+        """`Store.audit`."""
         ...
 
 
 class Damage(Protocol):
-    """The part of `damaged_cells.DamagedCells` that folding speaks to."""
+    """Part of `damaged_cells.DamagedCells` that folding needs."""
 
     def note(self, map_name: str, keys: Iterable[CellKey]) -> None:
-        """These cells could not be read, nor made anew."""
+        """`DamagedCells.note`."""
         ...
 
     def forget(self, map_name: str, key: CellKey) -> None:
-        """The cell is sound."""
+        """`DamagedCells.forget`."""
         ...
 
     def healed(self, map_name: str) -> int:
-        """How often a cell of a map was said to be sound."""
+        """`DamagedCells.healed`."""
         ...
 
 
 class DamagedCommitError(DamagedDataError):
-    """A commit at rest is not what was pushed."""
+    """A stored commit is not what was pushed."""
 
 
 def fold_pending(store: FoldStore, row: MapRow, cache: CellCache, *, limit: int) -> int:
-    """Fold up to `limit` pending commits; returns how many were.
+    """Fold up to `limit` pending commits; returns their count.
 
     Raises:
-        DamagedDataError: a cell at rest is not sound, and cannot be made anew.
+        DamagedDataError: a stored cell is damaged and cannot be rebuilt.
     """
     return fold_commits(store, row, cache, store.pending(row, limit=limit, size_bytes_max=GROUP_BYTES_MAX))
 
 
 def fold_commits(store: FoldStore, row: MapRow, cache: CellCache, commits: Sequence[StoredCommit]) -> int:
-    """Fold these pending commits; returns how many were.
+    """Fold these pending commits; returns their count.
 
     Raises:
-        DamagedCellError: a cell at rest is not sound, and cannot be made anew; nothing was folded.
+        DamagedCellError: a stored cell is damaged and cannot be rebuilt; nothing was folded.
     """
     if not commits:
         return 0
     with store.snapshot(row) as snapshot:
         head = snapshot.head
-    # Another folder may have taken some between these two looks: its head is our base, so nothing else would tell.
+    # Another folding may have taken some of them since `pending`: its head is our base, so only the vector tells.
     commits = [commit for commit in commits if commit.id not in head.vector]
     if not commits:
         return 0
+    # Plan in memory, and write all of it or nothing.
     cache.begin(head.cursor)
     written = False
     try:
         fold = plan_fold(store, row, head, commits, cache)
         written = store.fold(row, fold)
     finally:
-        if not written:  # it failed, or another folder was faster, whose result is as good as ours
+        if not written:  # it failed, or another folding was faster, whose result is as good
             cache.clear()
     cache.finish(fold.head)
     for number, why in fold.damaged:
@@ -123,7 +124,7 @@ def fold_commits(store: FoldStore, row: MapRow, cache: CellCache, commits: Seque
 
 
 def plan_fold(store: FoldStore, row: MapRow, head: Head, commits: Sequence[StoredCommit], cache: CellCache) -> Fold:
-    """What folding these commits on top of `head` changes; `cache` stands at `head`."""
+    """Plan of folding these commits on top of `head`, the state of the cells in `cache`."""
     plan = _Plan(store, row, cache, head.cursor)
     for commit in commits:
         plan.take(commit)
@@ -140,6 +141,8 @@ def plan_fold(store: FoldStore, row: MapRow, head: Head, commits: Sequence[Store
 
 @dataclass(slots=True)
 class _Plan:
+    """Log entries and changed cells of the commits taken so far, on top of `start`."""
+
     store: FoldStore
     row: MapRow
     cache: CellCache
@@ -155,6 +158,7 @@ class _Plan:
         self.chain = self.start.chain
 
     def take(self, commit: StoredCommit) -> None:
+        """Add a commit: its own entry, then its own retract if that came first, then what it retracts."""
         try:
             self._enter(ENTRY_FOLD, commit)
         except DamagedCommitError as exc:
@@ -191,12 +195,13 @@ class _Plan:
             self.cache.stamp(key, changed, seq, self._load)
 
     def _apply(self, kind: bytes, commit: StoredCommit) -> dict[CellKey, Blocks]:
-        """Add or subtract a commit's diff, all of it or nothing; the blocks that it touches."""
+        """Add or subtract a commit's diff, all of it or nothing; returns the blocks of each cell that it touches."""
         if commit.gone:
             raise DamagedCommitError("damaged_store", f"the evidence of commit {commit.id} is not kept any more")
         step, undo = BrickCell.merge, BrickCell.unmerge
         if kind == ENTRY_UNFOLD:
             step, undo = undo, step
+        # The diffs are applied before their SHA-256 is known: each is decoded once, and taken back if it is wrong.
         done: dict[CellKey, Blocks] = {}
         digests: list[bytes] = []
         try:

@@ -1,8 +1,8 @@
-"""Folding around damaged cells: commits that touch none of them go on, the others wait as if they had not come yet.
+"""Folding of one group of commits, around damaged cells: what touches one waits, the other commits are folded.
 
-A commit is one entry of the log, of all its cells or of none: chain, `lm`, coverage and what a later retract takes out
-know no half ones. So it waits as a whole, and so does a retract of a commit that is in a damaged cell. That is allowed,
-since any order of the same commits gives the same cells; and it is in `pending` meanwhile, so nobody pushes it again.
+A commit is one entry of the log, of all its cells or of none: chain, `lm`, coverage and later retracts know no half
+commits. So it waits as a whole, and so does a retract of a commit that is in a damaged cell. That is allowed, since any
+order of the same commits gives the same cells; and robots do not push a waiting commit again, since it is in `pending`.
 """
 
 import logging
@@ -16,57 +16,63 @@ from cairn_server.folding.cells_at_rest import DamagedCellError, cell_to_change
 from cairn_server.folding.folding import GROUP_BYTES_MAX, Damage, FoldStore, fold_commits
 from cairn_server.store.store_rows import MapRow, StoredCommit
 
-GROUP_MAX = 256
-"""Commits folded at once."""
-
 log = logging.getLogger(__name__)
 
+GROUP_MAX = 256
+"""Most commits in a group."""
 PROBE_S = 60.0
-"""How often it is looked whether a damaged cell can be read again, if nobody says that it was healed."""
+"""Time between two attempts to read a damaged cell again while none is reported as healed."""
 
 
 @dataclass(slots=True)
 class Waiting:
-    """What one map waits for."""
+    """Damaged cells of one map, and the commits that wait for them."""
 
     cells: set[CellKey] = field(default_factory=set)
     commits: set[int] = field(default_factory=set)
-    """Numbers of those that touch these cells, as far as was looked."""
+    """Numbers of the commits found to touch these cells."""
     why: DamagedCellError | None = None
-    """Of the cell found last; None: nothing is damaged."""
+    """Error of the cell found last; None: no cell is damaged."""
     healed: int = 0
-    """`DamagedCells.healed` when it was looked last; noted before the look, so that no healing falls between."""
+    """Count `Damage.healed` at the last look; taken before the look, so that no healing falls between."""
     probed_s: float = 0.0
+    """Steady time of the last attempt to read these cells."""
 
-    def forget(self) -> None:
-        """Try all of them again."""
-        self.cells.clear()
-        self.commits.clear()
-        self.why = None
+    def add(self, error: DamagedCellError) -> None:
+        """Wait for one more damaged cell."""
+        self.cells.add(error.key)
+        self.why, self.probed_s = error, time.monotonic()
+
+    def probe(self, store: FoldStore, row: MapRow, damaged: Damage) -> None:
+        """Read the damaged cells again if it is time; if one is sound, everything that waits is tried again."""
+        healed = damaged.healed(row.name)
+        if self.cells and (healed != self.healed or time.monotonic() - self.probed_s > PROBE_S):
+            self.probed_s = time.monotonic()
+            sound = [key for key in self.cells if _can_be_read(store, row, key)]
+            for key in sound:
+                damaged.forget(row.name, key)
+            if sound:
+                self.cells.clear()
+                self.commits.clear()
+                self.why = None
+        self.healed = healed
 
 
 def fold_around(
     store: FoldStore, row: MapRow, cache: CellCache, waiting: Waiting, damaged: Damage, *, limit: int
 ) -> int:
-    """Fold up to `limit` pending commits that touch no damaged cell; returns how many were.
+    """Fold up to `limit` pending commits that touch no damaged cell; returns their count.
 
     Args:
         store: of the map.
         row: the map.
         cache: of its cells.
         waiting: what was found damaged until now; changed here.
-        damaged: where it is said which cells are damaged, and by others that one was healed.
+        damaged: record of damaged cells, where clients report healed ones.
         limit: of one group.
     """
-    healed = damaged.healed(row.name)
-    if waiting.cells and (healed != waiting.healed or time.monotonic() - waiting.probed_s > PROBE_S):
-        waiting.probed_s = time.monotonic()
-        sound = [key for key in waiting.cells if _can_be_read(store, row, key)]
-        for key in sound:
-            damaged.forget(row.name, key)
-        if sound:
-            waiting.forget()
-    waiting.healed = healed
+    waiting.probe(store, row, damaged)
+    # Each turn folds, or sets commits or a cell aside, so the loop ends.
     while commits := store.pending(row, limit=limit, size_bytes_max=GROUP_BYTES_MAX, skip=waiting.commits):
         ready = [commit for commit in commits if not _touches(store, row, commit, waiting.cells)]
         waiting.commits.update({commit.number for commit in commits} - {commit.number for commit in ready})
@@ -78,14 +84,13 @@ def fold_around(
             if exc.key in waiting.cells:
                 raise
             log.error("map %s: what touches cell %s waits: %s", row.name, cell_of_key(exc.key), exc.message)
-            waiting.cells.add(exc.key)
-            waiting.why, waiting.probed_s = exc, time.monotonic()
+            waiting.add(exc)
             damaged.note(row.name, [exc.key])
     return 0
 
 
 def _touches(store: FoldStore, row: MapRow, commit: StoredCommit, cells: set[CellKey]) -> bool:
-    """Whether to fold a commit, or to take out what it retracts, changes one of these cells."""
+    """True if folding a commit, or taking out what it retracts, changes one of these cells."""
     if not cells:
         return False
     if not cells.isdisjoint(commit.diff):
@@ -105,15 +110,16 @@ def _can_be_read(store: FoldStore, row: MapRow, key: CellKey) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Folded:
-    """What became of one group."""
+    """Result of one group."""
 
     commits: int
+    """Count of the commits folded."""
     waits_for: CairnError | None
-    """Why some have to wait: a damaged cell."""
+    """Error of a damaged cell that other commits wait for; None: none waits."""
 
 
 class LocalFolding:
-    """Folds in the thread that asks; one thread at a time."""
+    """Folding in the calling thread, with the cells under change of all maps in memory; one thread at a time."""
 
     def __init__(self, store: FoldStore, damaged: Damage) -> None:
         self._store = store
@@ -122,13 +128,13 @@ class LocalFolding:
         self._waiting: dict[str, Waiting] = {}
 
     def fold(self, row: MapRow, *, maps: int) -> Folded:
-        """Fold a group of what is pending on a map, one of so many maps that share the memory.
+        """Fold one group of a map's pending commits; `maps` maps share the memory for cells.
 
         Raises:
             CairnError: nothing was folded.
         """
         cache = self._caches.setdefault(row.name, CellCache(row.geometry))
-        cache.limit_bytes = CACHE_BYTES // maps
+        cache.limit(CACHE_BYTES // maps)
         waiting = self._waiting.setdefault(row.name, Waiting())
         count = fold_around(self._store, row, cache, waiting, self._damaged, limit=GROUP_MAX)
         cache.trim()

@@ -1,9 +1,9 @@
-"""Cells as they were read last, and what was made of them: the same few are asked for by every robot of a team.
+"""Caches of cells that were read last and of changes made of them: every robot of a team asks for the same few.
 
 history     the newest log entries of a cell                 } of its state at one `lm`; each is made
-stamps      which entry changed which of its blocks          } once, however many ask at a time
-evidence    the whole of it, decoded: what is dear           }
-change      what who stood at an older entry needs           }
+stamps      entry that changed each of its blocks            } once for all concurrent requests
+evidence    all of it, decoded: the expensive part           }
+change      frame content for robots at an older entry       }
 """
 
 from dataclasses import dataclass
@@ -26,14 +26,14 @@ STAMPS_BYTES = 32 << 20
 CHANGES_BYTES = 64 << 20
 HISTORIES_BYTES = 16 << 20
 ENTRY_BYTES = 300
-"""Of one entry of a history, or one empty change, in memory."""
+"""Memory of one entry of a history, or of one empty change."""
 State = tuple[bytes, CellKey, bytes, int, int]
-"""One state of a cell: log, cell, digest, `lm`, `gone_seq`."""
+"""State of a cell: log, cell, digest, `lm`, `gone_seq`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A frame's content, the same for all who stand between the same two entries of a cell."""
+    """Content of a frame, the same for all robots between the same two log entries of a cell."""
 
     kind: FrameKind
     payload: bytes
@@ -42,17 +42,17 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class ChangeName:
-    """What a change depends on."""
+    """Key of a change: all that it depends on."""
 
     state: State
     after_seq: int
     own: Author | None
-    """Whose commits are left out, if there are any."""
+    """Author whose commits are left out; None: none are."""
     kinds: frozenset[str]
 
 
 class ReadCache:
-    """All of it for all maps; thread-safe. Nobody changes what it hands out."""
+    """Caches of all maps; thread-safe. Callers must not change the values."""
 
     def __init__(self, *, evidence_bytes: int = EVIDENCE_BYTES) -> None:
         self._evidence: MadeOnce[State, Evidence] = MadeOnce(
@@ -65,7 +65,7 @@ class ReadCache:
         self.changes: MadeOnce[ChangeName, Change | None] = MadeOnce(limit_bytes=CHANGES_BYTES, size_of=_change_bytes)
 
     def evidence(self, snapshot: Snapshot, listed: CellRow) -> Evidence:
-        """A listed cell's evidence.
+        """Evidence of a listed cell.
 
         Raises:
             DamagedDataError: kind `damaged_store`: the cell at rest is not sound.
@@ -73,7 +73,7 @@ class ReadCache:
         return self._evidence.get(state_of(snapshot, listed), lambda: stored_evidence(_stored(snapshot, listed)))
 
     def stamps(self, snapshot: Snapshot, listed: CellRow, geometry: Geometry) -> Stamps:
-        """A listed cell's stamps.
+        """Stamps of a listed cell.
 
         Raises:
             DamagedDataError: kind `damaged_store`: the cell is not there.
@@ -82,13 +82,13 @@ class ReadCache:
         return self._stamps.get(state, lambda: stored_stamps(_stored(snapshot, listed), geometry))
 
     def history(self, snapshot: Snapshot, listed: CellRow, *, limit: int) -> list[Contribution]:
-        """A listed cell's newest entries, oldest first; always with the same limit."""
+        """Newest log entries of a listed cell, oldest first; every call must have the same limit."""
         state = state_of(snapshot, listed)
         return self._histories.get(state, lambda: snapshot.contributions(listed.key, after_seq=0, newest=limit))
 
 
 def state_of(snapshot: Snapshot, listed: CellRow) -> State:
-    """What tells the states of all cells of all maps apart."""
+    """Key that tells the states of all cells of all maps apart."""
     return snapshot.head.cursor.log_id, listed.key, listed.digest, listed.lm, listed.gone_seq
 
 

@@ -1,7 +1,7 @@
-"""Whether the server can take a push and bring it into the map: what `GET /readyz` answers.
+"""Readiness of the server to take a push and fold it into the map: the answer to `GET /readyz`.
 
-A map that waits for a damaged cell does not count: the others go on, and a balancer that took the server away would
-stop those, too. It is a figure to watch instead (`cairn_fold_failures_total`).
+A map that waits for a damaged cell does not count: the other maps go on, and a balancer that took the server away
+would stop those, too. Damage is a figure to watch instead (`cairn_fold_failures_total`).
 """
 
 import threading
@@ -14,11 +14,11 @@ from cairn_server.settings import Settings
 from cairn_server.store.store import StoreHealth
 
 KEEP_S = 1.0
-"""An answer is good for so long: anybody may ask, and each look writes to the disk."""
+"""Lifetime of an answer: any client may ask, and each look writes to the disk."""
 
 
 class FoldHealth:
-    """Which maps could not be folded the last time, and why; thread-safe."""
+    """Maps whose last fold failed, and the errors; counts folds for the metrics; thread-safe."""
 
     def __init__(self, figures: ServerFigures) -> None:
         self._figures = figures
@@ -26,7 +26,7 @@ class FoldHealth:
         self._failing: dict[str, BaseException] = {}
 
     def folded(self, name: str, commits: int, seconds: float) -> None:
-        """A map has nothing to fold, or a group of it was folded."""
+        """Note that a group of a map's commits was folded, or that none waits."""
         with self._lock:
             self._failing.pop(name, None)
         if commits:
@@ -34,18 +34,18 @@ class FoldHealth:
             self._figures.folded.labels(name).inc(commits)
 
     def failed(self, name: str, error: BaseException) -> None:
-        """A map could not be folded."""
+        """Note that a map could not be folded."""
         with self._lock:
             self._failing[name] = error
         self._figures.fold_failures.labels(name).inc()
 
     def damaged(self) -> frozenset[str]:
-        """Maps of which something waits for a damaged cell to be healed: their own trouble, not the server's."""
+        """Maps with commits that wait for a damaged cell to be healed: no fault of the server as a whole."""
         with self._lock:
             return frozenset(name for name, error in self._failing.items() if isinstance(error, DamagedDataError))
 
     def complaint(self) -> str | None:
-        """Why folding fails, other than for damage; None if it does not."""
+        """Reason why folding fails, damage aside; None if it does not fail."""
         with self._lock:
             for error in self._failing.values():
                 if not isinstance(error, DamagedDataError):
@@ -54,26 +54,27 @@ class FoldHealth:
 
 
 class Readiness:
-    """Looks, at most every second."""
+    """Reasons why the server is not ready, looked up at most every second; thread-safe."""
 
     def __init__(
-        self, store: StoreHealth, folds: FoldHealth, settings: Settings, folder_is_alive: Callable[[], bool]
+        self, store: StoreHealth, folds: FoldHealth, settings: Settings, is_folding: Callable[[], bool]
     ) -> None:
+        """`is_folding` is True while the thread that folds is alive."""
         self._store = store
         self._folds = folds
         self._settings = settings
-        self._folder_is_alive = folder_is_alive
+        self._is_folding = is_folding
         self._lock = threading.Lock()
         self._looked_s = float("-inf")
         self._reasons: list[str] = []
         self._is_closing = False
 
     def close(self) -> None:
-        """Count as not ready from now on: the server stops."""
+        """Be not ready from now on: the server is stopping."""
         self._is_closing = True
 
     def reasons(self) -> list[str]:
-        """Why it is not ready, each as `code: what`; empty if it is. Names no map: strangers may ask."""
+        """Reasons, each as `code: what`; empty if the server is ready. They name no map: strangers may ask."""
         if self._is_closing:
             return ["shutting_down: the server is told to stop"]
         with self._lock:
@@ -100,8 +101,8 @@ class Readiness:
             found += self._lag()
         except UnreachableError as exc:
             found.append(f"{exc.kind}: {exc.message}")
-        if not self._folder_is_alive():
-            found.append("fold_dead: the thread that folds has ended; start the server anew")
+        if not self._is_folding():
+            found.append("fold_dead: the thread that folds has ended; restart the server")
         complaint = self._folds.complaint()
         if complaint:
             found.append(f"fold_failing: {complaint}")
@@ -111,4 +112,4 @@ class Readiness:
         limit_s, damaged = self._settings.fold_lag_max_s, self._folds.damaged()
         oldest = [b.oldest_s for b in self._store.backlogs() if b.oldest_s is not None and b.map not in damaged]
         lag_s = time.time() - min(oldest) if oldest else 0.0
-        return [f"fold_lag: a commit waits since {lag_s:.0f} s (at most {limit_s:.0f})"] if lag_s > limit_s else []
+        return [f"fold_lag: a commit has waited for {lag_s:.0f} s (at most {limit_s:.0f})"] if lag_s > limit_s else []

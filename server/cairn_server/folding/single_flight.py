@@ -1,4 +1,4 @@
-"""What many ask for at the same time is made once: the first one makes it, the others wait. What was made is kept."""
+"""Single-flight cache: concurrent requests for one key compute its value once, and it is kept for later ones."""
 
 import threading
 import time
@@ -11,13 +11,13 @@ K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 
 IDLE_S = 60.0
-"""What nobody asked for so long goes with the next value that is made: a state of a cell that is another's past now."""
+"""Time without a request after which a value is dropped, with the next one made: most are past states of cells."""
 
 
 class MadeOnce(Generic[K, V]):
-    """Values by name within bounds of memory and of idle time, what nobody asked for longest forgotten; thread-safe.
+    """Values by key, within bounds of memory and of idle time, the least recently used dropped first; thread-safe.
 
-    Nobody changes what it hands out. Whoever makes a value must not ask for another one here.
+    Callers must not change the values. A function that makes a value must not ask the same cache for another one.
     """
 
     def __init__(
@@ -32,7 +32,7 @@ class MadeOnce(Generic[K, V]):
         self._size_bytes = 0
 
     def here(self, name: K) -> V | None:
-        """The value of a name if it was made and kept; nobody makes one for this."""
+        """Value of a key if it is kept; it is not made otherwise."""
         with self._lock:
             kept = self._kept.get(name)
             if kept is None:
@@ -42,7 +42,7 @@ class MadeOnce(Generic[K, V]):
             return kept[0]
 
     def get(self, name: K, make: Callable[[], V]) -> V:
-        """The value of a name; what `make` raises is raised to all who wait for it, and not kept."""
+        """Value of a key, made unless it is kept; an error of `make` is raised to all that wait, and not kept."""
         mine: Future[V] = Future()
         with self._lock:
             if name in self._kept:

@@ -1,4 +1,4 @@
-"""Reading a whole store and saying what is not as it should be, map by map.
+"""Check of a whole store, map by map: every finding is something that is not as it should be.
 
     log       every chain follows from the one before, the head is the last, the vector names what was folded
     commits   every diff that is kept decodes, and all of a commit together have its SHA-256
@@ -26,41 +26,41 @@ from cairn_server.store.store_rows import CellRow, MapRow, StoredCommit
 
 PAGE = 500
 PENDING_BYTES_MAX = 256 << 20
-"""Of commits that wait, as many as this are looked at; the folder looks at each of them anyway."""
+"""Most bytes of the pending commits that are checked; folding checks each of them in any case."""
 Report = Callable[[int, int], None]
-"""Called with steps done and all steps."""
+"""Callback for progress: steps done, and all steps."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Something that is not sound."""
+    """Damage found in a store."""
 
     map: str
     what: str
-    """For people."""
+    """Description for people."""
     cell: CellRow | None = None
-    """The cell that it is about."""
+    """Cell that it is about; None: no single cell."""
     sound: CellRow | None = None
-    """What it should be, where the log still tells."""
+    """Same cell rebuilt from the log; None where the log cannot."""
 
     def __str__(self) -> str:
         return f"{self.map}: {self.what}"
 
 
 @dataclass(slots=True)
-class Checked:
-    """What was read."""
+class MapCheck:
+    """Result of checking one map."""
 
     commits: int = 0
     cells: int = 0
     not_kept: int = 0
-    """Commits of which evidence is not kept any more; nothing can be said about those."""
+    """Count of the commits whose evidence was dropped; they cannot be checked."""
     findings: list[Finding] = field(default_factory=list)
 
 
-def check_map(store: Store, row: MapRow, report: Report) -> Checked:
-    """Everything of one map."""
-    checked = Checked()
+def check_map(store: Store, row: MapRow, report: Report) -> MapCheck:
+    """Check the log, the commits and the cells of one map."""
+    checked = MapCheck()
     with store.snapshot(row) as snapshot:
         keys = [cell.key for cell in snapshot.cells()]
         total = snapshot.totals().commits + len(keys)
@@ -77,8 +77,8 @@ def check_map(store: Store, row: MapRow, report: Report) -> Checked:
     return checked
 
 
-def _commits(store: Store, row: MapRow, checked: Checked) -> Iterator[StoredCommit]:
-    """Every folded commit once, in the order of the log, which is checked on the way; then those that wait."""
+def _commits(store: Store, row: MapRow, checked: MapCheck) -> Iterator[StoredCommit]:
+    """Every folded commit once, in the order of the log, which is checked on the way; then the pending ones."""
     with store.snapshot(row) as snapshot:
         head = snapshot.head
         chain = snapshot.chain_at(0) or b""
@@ -115,7 +115,7 @@ def _log_page(store: Store, row: MapRow, *, after_seq: int) -> list[tuple[LogEnt
 
 
 def _of_commit(
-    row: MapRow, commit: StoredCommit, known: dict[bytes, Fingerprint], checked: Checked
+    row: MapRow, commit: StoredCommit, known: dict[bytes, Fingerprint], checked: MapCheck
 ) -> Iterator[Finding]:
     if commit.gone:
         checked.not_kept += 1
@@ -153,11 +153,11 @@ def _of_cell(snapshot: Snapshot, row: MapRow, key: CellKey, known: dict[bytes, F
     try:
         yield Finding(row.name, complaint, stored, rebuilt_cell(snapshot, stored, row.geometry))
     except DamagedDataError as exc:
-        yield Finding(row.name, f"{complaint}; it cannot be made anew from the log: {exc.message}", stored)
+        yield Finding(row.name, f"{complaint}; it cannot be rebuilt from the log: {exc.message}", stored)
 
 
 def _sum_of_diffs(snapshot: Snapshot, key: CellKey, known: dict[bytes, Fingerprint]) -> Fingerprint | None:
-    """What the log says that a cell's fingerprint is; None if it does not say any more, or not soundly."""
+    """Fingerprint of a cell as the log says; None if evidence was dropped or is damaged."""
     total = ZERO
     for entry in snapshot.contributions(key, after_seq=0):
         body = snapshot.diff(entry.diff)

@@ -1,11 +1,13 @@
-"""Who listens to which map, and what each has not been told yet. Knows no network; usable from every thread.
+"""Hub of live events: the listeners of each map, and the events that each has still to get.
+
+It knows no network, and is called from many threads.
 
     folder, routes  --- folded, robots.heard --->  hub  --- wake() --->  listener (an SSE or WebSocket stream)
                                                     ^                        |
                                                     +------- take() ---------+
 
-A listener that is slow is not sent more, but later: it holds its place only (`EventPosition`), and what it takes is the
-newest head and the union of the cells. So it costs the same however slow it is.
+A slow listener gets not more events, but later ones: it holds its place only (`EventPosition`), and it takes the newest
+head and the union of the changed cells. So it costs the same however slow it is.
 """
 
 import logging
@@ -39,7 +41,7 @@ class _LiveMap:
 
 
 class Hub:
-    """All listeners of a server."""
+    """Listeners of all maps of a server."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -51,12 +53,12 @@ class Hub:
 
     @property
     def listeners(self) -> int:
-        """Streams that listen now."""
+        """Count of the streams that listen now."""
         with self._lock:
             return self._of_token.total()
 
     def folded(self, row: MapRow) -> None:
-        """The map's head moved. Never fails: who is not told now is told with the next fold."""
+        """Note that a map's head moved. Never fails: after an error, listeners hear of it with the next fold."""
         live = self._maps.get(row.number)
         if live is None or not live.listeners:
             return
@@ -67,23 +69,23 @@ class Hub:
         self._wake(live)
 
     def robots(self, row: MapRow) -> LiveRobots:
-        """The robots of a map, to look at."""
+        """Robots of a map, with the last sign of each."""
         return self._live(row).robots
 
     def robot_heard(self, row: MapRow, branch: str, **news: object) -> None:
-        """A robot pushed, fetched, or said something; one that is not registered does not count."""
+        """Note that a robot pushed, fetched, or reported; one that is not registered does not count."""
         live = self._live(row)
         if live.robots.heard(branch, **news):
             self._wake(live)
 
     def robot_came(self, row: MapRow, sign: RobotSign) -> None:
-        """A robot was registered."""
+        """Note that a robot was registered."""
         live = self._live(row)
         live.robots.came(sign)
         self._wake(live)
 
     def robot_left(self, row: MapRow, branch: str) -> None:
-        """A robot was deregistered."""
+        """Note that a robot was deregistered."""
         live = self._live(row)
         live.robots.left(branch)
         self._wake(live)
@@ -93,9 +95,9 @@ class Hub:
 
         Args:
             row: the map.
-            token: what stands for who listens; one has a bounded number of listeners.
-            wake: called from any thread when there is something to take; must not fail or wait.
-            after: the id of the last event that was seen, to go on from there.
+            token: digest of the listener's token; each token has a bounded number of listeners.
+            wake: called from any thread when there are events to take; must not fail or wait.
+            after: id of the last event that the client saw, to go on from there.
 
         Raises:
             UnreachableError: kind `too_many_streams`; or the server is shutting down.
@@ -123,7 +125,7 @@ class Hub:
         return listener
 
     def close(self) -> None:
-        """Every listener is to end now."""
+        """End all listeners, now and from now on."""
         with self._lock:
             self.is_closed = True
             maps = list(self._maps.values())
@@ -131,7 +133,7 @@ class Hub:
             self._wake(live)
 
     def remove(self, listener: "Listener") -> None:
-        """Of `Listener.leave`."""
+        """Forget a listener that leaves."""
         with self._lock:
             if listener in listener.live.listeners:
                 listener.live.listeners.remove(listener)
@@ -153,7 +155,7 @@ class Hub:
 
 
 class Listener:
-    """One stream's place in what happens on one map."""
+    """Place of one stream in the events of one map."""
 
     def __init__(self, hub: Hub, live: _LiveMap, token: bytes, wake: Callable[[], None]) -> None:
         self.live = live
@@ -165,21 +167,21 @@ class Listener:
 
     @property
     def beat_s(self) -> float:
-        """How often it is to hear something."""
+        """Longest time without an event, after which a beat is sent."""
         return self._hub.beat_s
 
     @property
     def is_over(self) -> bool:
-        """The server is shutting down."""
+        """True if the server is shutting down."""
         return self._hub.is_closed
 
     @property
     def is_behind(self) -> bool:
-        """The map changed since it was told last."""
+        """True if the map changed since the last events were taken."""
         return self._hello is not None or self.live.changes.head.seq > self._seen.seq
 
     def start(self, after: EventPosition | None) -> None:
-        """Say hello, and go on behind an event that was seen, if it was one of this log."""
+        """Prepare the first event, and go on after the last event seen if it is one of this log."""
         head = self.live.changes.head
         tick, robots = self.live.robots.present()
         resumed = after is not None and self.live.changes.has_proof(after)
@@ -197,7 +199,7 @@ class Listener:
         )
 
     def take(self) -> list[LiveEvent]:
-        """All that was not told yet, put together; never waits for a disk."""
+        """Take all events since the last call, put together; never waits for a disk."""
         events: list[LiveEvent] = []
         if self._hello is not None:
             events.append(self._hello)
@@ -210,7 +212,7 @@ class Listener:
         return events
 
     def beat(self) -> Beat:
-        """A sign that the link is alive."""
+        """Event that says that the link is alive."""
         return Beat(id=str(self._seen), time_s=time.time())
 
     def leave(self) -> None:
@@ -233,7 +235,7 @@ def _signs(store: Store, row: MapRow) -> list[RobotSign]:
 
 
 def _status(text: str | None) -> RobotStatus | None:
-    """A kept status; None if there is none, or not one of this version."""
+    """Stored status; None if there is none, or it is of another version."""
     try:
         return RobotStatus.model_validate_json(text) if text else None
     except ValidationError:

@@ -1,6 +1,6 @@
-"""What was folded into one map of late: which cells changed and when, the newest log entries, the head. Bounded.
+"""Live state of one map: recent changes of its cells and log, and the last signs of its robots; all of it bounded.
 
-Kept for as long as there are listeners, so that each of them costs a number: how far it is.
+Changes are kept while there are listeners, so that each listener costs no more than its place among them.
 """
 
 import threading
@@ -28,15 +28,15 @@ from cairn_server.store.store_rows import MapRow
 Signs = OrderedDict[str, tuple[int, RobotSign]]
 """By branch, with the tick at which it was heard, rising."""
 GONE_MAX = 256
-"""Robots that left and are still told of to those who listen."""
+"""Most robots that left and are still reported to listeners as gone."""
 
 PAST_ENTRIES = 1000
-"""Who comes back after more entries than this is told `many`."""
+"""Most log entries that a returning listener gets in single changes; after more it gets `many`."""
 CELLS_KEPT = 1024
 
 
 class LiveChanges:
-    """The newest changes of one map, as read from its store; thread-safe."""
+    """Newest changes of one map, as read from its store; thread-safe."""
 
     def __init__(self, store: Store, row: MapRow) -> None:
         self._store = store
@@ -44,24 +44,24 @@ class LiveChanges:
         self._lock = threading.Lock()
         self._head: Cursor | None = None
         self._floor = 0
-        """Of what changed at or before this entry, not everything is known."""
+        """Log entry up to which changes may be missing here."""
         self._cells: OrderedDict[CellKey, int] = OrderedDict()
         self._entries: deque[LogEntry] = deque(maxlen=ENTRIES_MAX)
 
     @property
     def head(self) -> Cursor:
-        """The newest state that was read."""
+        """Newest state that was read."""
         with self._lock:
             assert self._head is not None, "read first"  # noqa: S101 - `Hub.join` does
             return self._head
 
     def read(self) -> None:
-        """Read what was folded since the last time."""
+        """Read what was folded since the last call."""
         with self._lock, self._store.snapshot(self._row) as snapshot:
             head = snapshot.head.cursor
             known = self._head.seq if self._head else -1
             start = max(known, head.seq - PAST_ENTRIES, 0)
-            if start > known:  # nobody listened for long
+            if start > known:  # no client listened for long
                 self._cells.clear()
                 self._entries.clear()
                 self._floor = start
@@ -75,13 +75,13 @@ class LiveChanges:
                 self._floor = self._cells.popitem(last=False)[1]
 
     def has_proof(self, seen: EventPosition) -> bool:
-        """Whether a listener's place is one of this log: no other server's, and not lost in a restore."""
+        """True if a listener's place is one of this log: not another server's, and not lost in a restore."""
         with self._store.snapshot(self._row) as snapshot:
             chain = snapshot.chain_at(seen.seq) if seen.seq <= snapshot.head.cursor.seq else None
         return chain is not None and chain.hex()[:CHAIN_DIGITS] == seen.chain
 
     def since(self, seen: EventPosition) -> tuple[list[LiveEvent], EventPosition]:
-        """What a listener at this place has not been told, and where it is once it was."""
+        """Events after a listener's place, and its place after them."""
         with self._lock:
             head = self._head
             if head is None or head.seq <= seen.seq:
@@ -103,29 +103,29 @@ class LiveChanges:
 
 
 class LiveRobots:
-    """Signs of the robots of one map; thread-safe."""
+    """Last sign of each robot of one map, in the order of hearing; thread-safe."""
 
     def __init__(self, load: Callable[[], list[RobotSign]]) -> None:
-        """`load` brings what the store knows, when it is first asked for."""
+        """`load` reads the store's signs, when they are first needed."""
         self._load = load
         self._lock = threading.Lock()
         self._signs: Signs | None = None
         self._tick = 0
 
     def present(self) -> tuple[int, list[RobotSign]]:
-        """The newest tick, and all robots that are there, by name."""
+        """Newest tick, and all registered robots by name."""
         with self._lock:
             signs = self._loaded()
             found = [sign for _, sign in signs.values() if not sign.gone]
             return self._tick, sorted(found, key=lambda sign: sign.branch)
 
     def of(self, branch: str) -> RobotSign | None:
-        """The last sign of one robot, if it is there."""
+        """Last sign of one robot, if it is registered."""
         with self._lock:
             return self._there(self._loaded(), branch)
 
     def since(self, tick: int) -> list[tuple[int, RobotSign]]:
-        """What was heard after a tick, oldest first, of each robot the last only."""
+        """Signs heard after a tick, oldest first; only the last of each robot."""
         found: list[tuple[int, RobotSign]] = []
         with self._lock:
             for heard, sign in reversed(self._signs.values() if self._signs else ()):
@@ -135,14 +135,14 @@ class LiveRobots:
         return found[::-1]
 
     def came(self, sign: RobotSign) -> None:
-        """A robot was registered, perhaps again; what it told before stays."""
+        """Note that a robot was registered, perhaps again; its earlier reports stay."""
         with self._lock:
             if self._signs is not None:
                 old = self._there(self._signs, sign.branch) or sign
                 self._hear(old.model_copy(update={"mode": sign.mode, "time_s": sign.time_s}))
 
     def heard(self, branch: str, **news: object) -> bool:
-        """Something was heard of a robot; False if none of that name is known to be there."""
+        """Note a sign of a robot; False if no robot of that name is registered."""
         with self._lock:
             sign = self._there(self._signs, branch)
             if sign is None:
@@ -151,7 +151,7 @@ class LiveRobots:
             return True
 
     def left(self, branch: str) -> None:
-        """A robot was deregistered."""
+        """Note that a robot was deregistered."""
         with self._lock:
             sign = self._there(self._signs, branch)
             if self._signs is None or sign is None:

@@ -1,7 +1,7 @@
-"""What robots report of themselves: their status, of which the last is kept; and a picture of what they see.
+"""Robots' reports of themselves: the last status of each, and a picture of what it sees.
 
-A status is told to listeners at once, and written at most every few seconds: a power cut loses no more. Pictures are
-in memory only, within a bound for all of them, the oldest dropped first; and so many a second of each robot.
+A status goes to listeners at once, and is written at most every few seconds: a power cut loses no more. Pictures are in
+memory only, within one bound, the oldest dropped first; each robot may send so many a second.
 """
 
 import hashlib
@@ -22,21 +22,21 @@ VIEW_BYTES_MAX = 1 << 20
 WRITE_EVERY_S = 10.0
 VIEWS_BYTES_MAX = 64 << 20
 VIEWS_PER_S = 30.0
-"""Of one robot: a camera's own rate."""
+"""Highest rate of one robot's pictures: a camera's own."""
 VIEWS_AT_ONCE = 60
-"""After a pause."""
+"""Most pictures of one robot in a row after a pause."""
 MEDIA_TYPES = {b"\xff\xd8\xff": "image/jpeg", b"\x89PNG\r\n\x1a\n": "image/png"}
-"""By the first bytes."""
+"""Media types by a file's first bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class RobotView:
-    """A robot's latest picture."""
+    """Latest picture of a robot."""
 
     data: bytes = field(repr=False)
     media_type: str
     time_s: float
-    """When it came."""
+    """Time of its arrival, UTC seconds."""
 
     @property
     def digest(self) -> str:
@@ -58,7 +58,7 @@ class RobotReports:
         self._view_rates: dict[tuple[int, str], Allowance] = {}
 
     def put_status(self, row: MapRow, branch: str, status: RobotStatus) -> None:
-        """Take a robot's status.
+        """Store a robot's status.
 
         Raises:
             NotFoundError: kind `no_branch`.
@@ -76,11 +76,11 @@ class RobotReports:
         self._store.notes.put_status(row, branch, status.model_dump_json())
 
     def put_view(self, row: MapRow, branch: str, data: bytes) -> None:
-        """Take a robot's picture.
+        """Store a robot's picture.
 
         Raises:
             NotFoundError: kind `no_branch`.
-            UnreachableError: kind `too_many_views`: sooner than it may; with the seconds until it may again.
+            UnreachableError: kind `too_many_views`: too soon; with the seconds until the next one is accepted.
             BadInputError: kind `bad_picture`, or `too_large`.
         """
         self._check(row, branch)
@@ -113,7 +113,7 @@ class RobotReports:
         return found
 
     def forget(self, row: MapRow, branch: str) -> None:
-        """The robot left."""
+        """Forget the reports of a robot that left."""
         key = (row.number, branch)
         with self._lock:
             self._drop(key)
@@ -122,7 +122,7 @@ class RobotReports:
             self._view_rates.pop(key, None)
 
     def close(self) -> None:
-        """Write what was told of late."""
+        """Write the latest statuses."""
         with self._lock:
             rest, self._unwritten = self._unwritten, {}
         for (_, branch), (row, status) in rest.items():

@@ -58,8 +58,7 @@ from cairn_server.service import Service
 from cairn_server.settings import LOOPBACK, Settings
 from cairn_server.store.folder_lock import tell_port
 from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
-from cairn_server.sync.checks.check_process import fork_checking
-from cairn_server.views.views_ahead import ViewsAhead
+from cairn_server.views.view_prefetch import ViewPrefetch
 
 log = logging.getLogger(__name__)
 
@@ -93,21 +92,16 @@ def main(argv: list[str]) -> int:
     signal.signal(signal.SIGTERM, _stop)
     sys.setswitchinterval(SWITCH_S)
     # Forked before there are threads: a lock that another thread held at the fork would stay locked in the child.
-    folding, checking = fork_folding(settings.folder / FILE_NAME), fork_checking()
+    folding = fork_folding(settings.folder / FILE_NAME)
     keep_memory_small()
     with listen(settings.host, settings.port) as listener:
         try:
-            service = Service(SqliteStore(settings.folder), settings, fold_process=folding, check_process=checking)
-            with closing(service), closing(_views_ahead(service)), joined(service):
+            service = Service(SqliteStore(settings.folder), settings, fold_process=folding)
+            with closing(service), closing(ViewPrefetch(service.store, service.views.cells.cache)), joined(service):
                 _serve(service, listener)
         except KeyboardInterrupt:
             pass
     return 0
-
-
-def _views_ahead(service: Service) -> ViewsAhead:
-    settings = service.settings
-    return ViewsAhead(service.store, service.cell_views, settings.folder, free_bytes_min=settings.disk_free_min_bytes)
 
 
 def _serve(service: Service, listener: socket.socket) -> None:

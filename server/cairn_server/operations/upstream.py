@@ -50,7 +50,7 @@ def joined(service: Service) -> Iterator[None]:
             "bad_setting", f"--upstream: no package offers a relay (entry points {GROUP}); install cairn again"
         )
     relay: Relay = point.load()(settings.upstream, settings.upstream_token, OwnMaps(service))
-    service.joining.connect(relay.wake)
+    service.sync.upstream.connect(relay.wake)
     try:
         yield
     finally:
@@ -66,7 +66,7 @@ class OwnEnd:
 
     def held(self) -> Held:
         """Commits that this server has now."""
-        return self._service.held.of(self._row)
+        return self._service.sync.held.of(self._row)
 
     def commit(self, commit: CommitId) -> SignedCommit:
         """A commit with its signatures."""
@@ -75,10 +75,11 @@ class OwnEnd:
 
     def push(self, commit: SignedCommit) -> None:
         """Keep a commit; durable on return."""
+        pushes = self._service.sync.pushes
         try:
-            self._service.push(self._row, UPSTREAM, str(commit.id), commit.data, signatures=commit.signatures)
+            pushes.keep(self._row, UPSTREAM, str(commit.id), commit.data, signatures=commit.signatures)
         except ConflictError as exc:
-            self._service.pushes.note_conflict(self._row, UPSTREAM, exc)
+            pushes.note_conflict(self._row, UPSTREAM, exc)
             raise
 
 
@@ -95,14 +96,14 @@ class OwnMaps:
     def open(self, upstream: MapInfo) -> MapEnd:
         """The map of the same name as one of the upstream, created if it is not there."""
         request = CreateMap(geometry=upstream.geometry, sensor_model=upstream.sensor_model)
-        _, is_new = self._service.create_map(upstream.name, request)
+        _, is_new = self._service.maps.create(upstream.name, request)
         if is_new:
             self._service.store.audit_log.add(UPSTREAM.name, "create_map", upstream.name)
         return OwnEnd(self._service, self._service.store.map(upstream.name))
 
     def handed_over(self, map_name: str, begun_s: float) -> None:
         """Note that all of a map at this time (UTC seconds since 1970) was given to the upstream, if it can travel."""
-        self._service.joining.handed_over(map_name, begun_s)
+        self._service.sync.upstream.handed_over(map_name, begun_s)
 
 
 _IS_AN_OWN_SERVER: type[OwnServer] = OwnMaps

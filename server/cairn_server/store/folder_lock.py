@@ -1,6 +1,6 @@
-"""One server for one data folder: an advisory lock that the operating system lets go when the process ends.
+"""Lock of a data folder for one server: advisory, and released by the operating system when the process ends.
 
-SQLite itself would let two servers share the file, but each believes that its cache of cells is the newest.
+SQLite itself would let two servers share the file, but each would take its cache of cells for the newest.
 """
 
 import fcntl
@@ -13,7 +13,7 @@ from cairn_map.errors import ConflictError
 log = logging.getLogger(__name__)
 
 LOCK_NAME = "cairn.lock"
-"""Its text is the port of the server that holds it, or held it last."""
+"""Name of the lock file; its text is the port of the server that holds it, or held it last."""
 
 
 def lock_folder(folder: Path) -> BinaryIO:
@@ -34,7 +34,7 @@ def lock_folder(folder: Path) -> BinaryIO:
 
 
 def tell_port(folder: Path, port: int) -> None:
-    """Write down where the server of a locked folder listens, for who asks whether it is alive."""
+    """Write down the port of a locked folder's server, for health checks."""
     try:
         (folder / LOCK_NAME).write_text(f"{port}\n")
     except OSError as exc:  # a full disk
@@ -42,7 +42,7 @@ def tell_port(folder: Path, port: int) -> None:
 
 
 def told_port(folder: Path) -> int | None:
-    """Where a folder's server listens; None: nobody told."""
+    """Port of a folder's server; None if it is not written down."""
     try:
         return int((folder / LOCK_NAME).read_text())
     except (OSError, ValueError):

@@ -8,33 +8,33 @@ from cairn_map.commits.version_vector import AUTHORS_MAX, INTERVALS_MAX
 from cairn_map.errors import BadInputError, ConflictError
 
 AUTHOR_INTERVALS_MAX = 1000
-"""Of one author's numbers. A robot pushes oldest first, so an honest one has a handful."""
+"""Most intervals of one author's numbers. A robot pushes oldest first, so an honest one has a handful."""
 
 
 AHEAD_MAX = 10_000
-"""How far a number may run ahead of its author's highest. An author's first may be any: a robot that comes to a new
-server does not keep its oldest commits."""
+"""Most that a number may run ahead of its author's highest. An author's first number may be any: a robot that comes to
+a new server may not have its oldest commits any more."""
 
 
 INCARNATIONS_MAX = 256
-"""Of one robot: disks lost or rolled back."""
+"""Most incarnations of one robot: disks lost or rolled back."""
 
 
 NAMED_MAX = 5
-"""Ids that a complaint names."""
+"""Most ids that an error message names."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Numbering:
-    """What is known of an author's numbers, and of the map's vector, before one more commit."""
+    """Facts of an author's numbers, and of the map's vector, before one more commit."""
 
     top: int | None
-    """The author's highest number; None before its first commit."""
+    """Highest number of the author; None before its first commit."""
     intervals: int
     neighbours: int
-    """How many of n - 1 and n + 1 are there."""
+    """Count of the numbers n - 1 and n + 1 that are known."""
     incarnations: int
-    """Of the same robot, this one included if it is known."""
+    """Count of the same robot's incarnations, this one included if it is known."""
     authors_in_map: int
     intervals_in_map: int
 
@@ -72,11 +72,11 @@ def check_number(commit: CommitId, numbering: Numbering) -> None:
 
 
 AGAIN_KEPT_S = 3600.0
-"""Evidence that was pushed again because a retract needs it is kept for this long, whatever the setting."""
+"""Least time for which evidence is kept that was pushed again because a retract needs it, whatever the setting."""
 
 
 class EvidenceGoneError(ConflictError):
-    """What a store says to a retract of commits whose evidence it does not keep any more."""
+    """A retract names commits whose evidence was dropped."""
 
     def __init__(self, commits: Sequence[CommitId]) -> None:
         names = ", ".join(map(str, commits[:NAMED_MAX])) + (" ..." if len(commits) > NAMED_MAX else "")

@@ -1,7 +1,8 @@
-"""Which log entry last changed each 4^3 block of a cell: what a branch of any age misses of it (SYNC.md rule 2).
+"""Stamps of a cell: the log entry that last changed each of its 4^3 blocks (SYNC.md rule 2).
 
-An index beside the cell, dense over its blocks in Morton order, and no part of its canonical bytes. A block whose
-voxels are all gone again keeps its stamp, so that whoever still has them hears of it (rule 10).
+They say which blocks a branch of any age misses. They are stored next to the cell, dense over its blocks in Morton
+order, and are no part of its canonical bytes. A block whose voxels are all gone again keeps its stamp, so that a robot
+that still has them is sent the empty block (rule 10).
 """
 
 import struct
@@ -20,17 +21,17 @@ HEAD = struct.Struct("<QI")
 
 
 def no_stamps(depth: int) -> Stamps:
-    """Of a cell that nobody has seen."""
+    """Stamps of a cell that was never seen."""
     return np.zeros(8 ** (depth - 2), np.int64)
 
 
 def blocks_after(stamps: Stamps, seq: int) -> Blocks:
-    """(B,) rising numbers of the blocks that an entry after `seq` changed."""
+    """Numbers (B,), rising, of the blocks that an entry after `seq` changed."""
     return np.flatnonzero(stamps > seq).astype(np.uint32)
 
 
 def encode_stamps(stamps: Stamps) -> bytes:
-    """Some 1 to 4 % of the cell's own bytes: 0 or the distance from the oldest stamp, in byte planes under zstd."""
+    """Encode stamps: 0 or the distance from the oldest stamp, in byte planes under zstd; 1 to 4 % of a cell's size."""
     known = stamps > 0
     before = int(stamps[known].min()) - 1 if known.any() else 0
     raw = encode_column(np.where(known, stamps - before, 0).astype(np.uint64))
@@ -38,8 +39,9 @@ def encode_stamps(stamps: Stamps) -> bytes:
 
 
 def decode_stamps(data: bytes, *, depth: int, lm: int) -> Stamps:
-    """The mirror of `encode_stamps`. Empty, as stores of version 1 have it, is every block at `lm`: more than changed,
-    which only costs bytes.
+    """Decode what `encode_stamps` made.
+
+    Empty data, as in stores of version 1, is every block at `lm`: more than changed, which only costs bytes.
 
     Raises:
         DamagedDataError: kind `damaged_store`: not the stamps of a cell of this depth.

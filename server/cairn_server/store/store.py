@@ -1,4 +1,4 @@
-"""What the server needs of a database: one protocol, so that every store passes one contract suite.
+"""Protocols of a store: all that the server needs of a database, so that every store passes one contract suite.
 
 append    a validated commit, durable when it returns; touches no cell
 pending   commits that are not folded yet, in order of arrival
@@ -99,7 +99,7 @@ class Snapshot(Protocol):
 
 
 class BranchNotes(Protocol):
-    """Reached as `Store.notes`; every method may be called from any thread."""
+    """Notes on branches (`Store.notes`); every method may be called from any thread."""
 
     def put_status(self, row: MapRow, branch: str, status: str) -> None:
         """Keep the last status of a branch, as JSON, if there is such a branch; may be written later.
@@ -109,35 +109,35 @@ class BranchNotes(Protocol):
         ...
 
     def statuses(self, row: MapRow) -> dict[str, str]:
-        """The last status of each branch that ever told one."""
+        """Last status of each branch that ever reported one."""
         ...
 
     def entry_sizes(self, row: MapRow, *, after_seq: int, limit: int) -> list[EntrySize]:
-        """Log entries after one, oldest first, at most `limit`."""
+        """Sizes of log entries after one, oldest first, at most `limit`."""
         ...
 
 
 class Uses(Protocol):
-    """What was accepted, as the commits themselves tell: nothing is counted twice or lost with the process."""
+    """Use of quotas, read from the stored commits: nothing is counted twice or lost with the process."""
 
     def since(self, time_s: float) -> Mapping[Robot, Use]:
-        """What each robot's commits took that came after a time, and what each relay handed over."""
+        """Use by each robot's commits that came after a time, and by what each relay handed over."""
         ...
 
 
 class StoreHealth(Protocol):
-    """How a store does."""
+    """State of a store, for administrators and probes."""
 
     def backlogs(self) -> list[Backlog]:
-        """What is not folded yet, of every map."""
+        """Commits of every map that are not folded yet."""
         ...
 
     def figures(self) -> StoreFigures:
-        """Sizes and counts."""
+        """Sizes now, and counts since the start."""
         ...
 
     def check_space(self, free_bytes_min: int) -> None:
-        """Refuse to take more while less than this is free: folding what was taken needs room, too.
+        """Refuse pushes while less than this is free: folding what was accepted needs room, too.
 
         Raises:
             UnreachableError: kind `disk_full`.
@@ -145,7 +145,7 @@ class StoreHealth(Protocol):
         ...
 
     def heal(self, row: MapRow, cell: CellRow) -> bool:
-        """Put sound bytes in the place of a damaged cell; False if it changed meanwhile. Durable on return."""
+        """Replace a damaged cell by a sound one; False if the cell changed meanwhile. Durable on return."""
         ...
 
     def probe(self) -> None:
@@ -161,7 +161,7 @@ class Tokens(Protocol):
     """All tokens, by name and by the SHA-256 of their secrets."""
 
     def add(self, token: Token, secret_hash: bytes) -> None:
-        """Keep a new token.
+        """Store a new token.
 
         Raises:
             ConflictError: kind `token_exists`.
@@ -169,7 +169,7 @@ class Tokens(Protocol):
         ...
 
     def renew(self, name: str, secret_hash: bytes) -> Token:
-        """Give a token another secret; the old one is worth nothing from then on.
+        """Give a token another secret; the old one is invalid from then on.
 
         Raises:
             NotFoundError: kind `no_such_token`.
@@ -177,7 +177,7 @@ class Tokens(Protocol):
         ...
 
     def remove(self, name: str) -> None:
-        """Forget a token.
+        """Remove a token.
 
         Raises:
             NotFoundError: kind `no_such_token`.
@@ -201,7 +201,7 @@ class AuditLog(Protocol):
     """Lines that are added and never changed, each with a hash over the one before; the newest are kept."""
 
     def add(self, who: str, what: str, detail: str) -> None:
-        """One more line; durable on return."""
+        """Add a line; durable on return."""
         ...
 
     def page(self, *, after: int, limit: int) -> list[AuditEntry]:
@@ -210,35 +210,35 @@ class AuditLog(Protocol):
 
 
 class Store(Protocol):
-    """A place for maps; every method may be called from any thread."""
+    """Store of maps; every method may be called from any thread."""
 
     @property
     def tokens(self) -> Tokens:
-        """Who may do what."""
+        """Tokens of the server."""
         ...
 
     @property
     def audit_log(self) -> AuditLog:
-        """Who did what."""
+        """Audit log of the server."""
         ...
 
     @property
     def health(self) -> StoreHealth:
-        """How it does."""
+        """State of the store."""
         ...
 
     @property
     def uses(self) -> Uses:
-        """How much was pushed."""
+        """Use of the quotas."""
         ...
 
     @property
     def notes(self) -> BranchNotes:
-        """What else is kept of branches."""
+        """Notes on branches."""
         ...
 
     def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:
-        """The map and whether it is new; an equal one may exist already.
+        """Create a map unless an equal one exists; the map, and whether it is new.
 
         Raises:
             ConflictError: one of that name exists with another geometry or sensor model.
@@ -258,7 +258,7 @@ class Store(Protocol):
         ...
 
     def append(self, row: MapRow, commit: NewCommit) -> bool:
-        """`submit`, and wait."""
+        """Keep a commit as `submit` does, and wait until it is durable."""
         ...
 
     def submit(self, row: MapRow, commit: NewCommit) -> Future[bool]:
@@ -296,14 +296,14 @@ class Store(Protocol):
         ...
 
     def forget_evidence(self, row: MapRow, *, before_s: float, limit: int) -> int:
-        """Drop the evidence and the meta of up to `limit` commits folded, and last pushed, before a time; how many.
+        """Drop the evidence and the meta of up to `limit` commits folded, and last pushed, before a time; their count.
 
         Not of those that a pending commit retracts. Cells note the newest entry that this concerns (`gone_seq`).
         """
         ...
 
     def is_retracted(self, row: MapRow, commit: CommitId) -> bool:
-        """Whether a retract of this id has taken effect, or waits for it to come."""
+        """True if a retract of this id has taken effect, or waits for the commit to come."""
         ...
 
     def fold(self, row: MapRow, fold: Fold) -> bool:
@@ -319,7 +319,7 @@ class Store(Protocol):
         ...
 
     def seen(self, row: MapRow, name: str, cursor: Cursor | None) -> None:
-        """Note that a branch was heard of, and where it stands; may be written later."""
+        """Note a sign of a branch, and its cursor if that is known; may be written later."""
         ...
 
     def deregister(self, row: MapRow, name: str) -> None:

@@ -1,4 +1,4 @@
-"""What a store holds, as rows: maps, commits, cells, the log, branches."""
+"""Rows of a store: maps, commits, cells, log entries, branches, tokens, and the sums over them."""
 
 import math
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ class MapRow:
     geometry: Geometry
     sensor_model: SensorModel
     seal_key: bytes = field(default=b"", repr=False)
-    """By which the server knows again the retracts that it made."""
+    """Key by which the server recognizes the retracts that it made."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,14 +46,14 @@ class NewCommit:
     rig: bytes | None = None
     """SHA-256 of the rig that its sensors were described by."""
     signatures: str | None = None
-    """Of whom it speaks for, checked; as in `Cairn-Signature`."""
+    """Checked signatures of the authors in whose names it speaks, as in `Cairn-Signature`."""
     via: str | None = None
     """Name of the token of the relay that handed it over."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredCommit:
-    """A commit as the folder reads it."""
+    """A commit as it is read for folding."""
 
     number: int
     id: CommitId
@@ -61,15 +61,15 @@ class StoredCommit:
     text: bytes
     retracts: tuple[CommitId, ...]
     diff: Mapping[CellKey, bytes]
-    """Empty if it is gone, too."""
+    """Evidence by cell; empty, too, if it was dropped."""
     gone: bool = False
-    """Its evidence and its meta are not kept any more."""
+    """True if its evidence and its meta were dropped."""
     signatures: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Contribution:
-    """What one log entry did to one cell."""
+    """Effect of one log entry on one cell."""
 
     seq: int
     kind: bytes
@@ -93,11 +93,11 @@ class CellRow:
     """Empty where a listing did not ask for it."""
     size_bytes: int
     stamps: bytes = b""
-    """Of `stamps`; empty where a listing did not ask for them."""
+    """Stamps as encoded by `stamps`; empty where a listing did not ask for them."""
     gone_seq: int = 0
-    """The newest log entry of which the evidence is not kept any more; a fold does not change it."""
+    """Newest log entry whose evidence was dropped; a fold does not change it."""
     hottest_k: float | None = None
-    """`cell_order.hottest_k`; None, too, of a cell that did not change since it is stored."""
+    """Hottest temperature (`cell_order.hottest_k`); None, too, of cells unchanged since before it was stored."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,7 +112,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fold:
-    """What one fold changes, made from the state at `base`."""
+    """Changes of one fold, made from the state at `base`."""
 
     base: Cursor
     head: Cursor
@@ -127,14 +127,14 @@ class Fold:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Selection:
-    """Which commits with evidence an operator means: all that fit every part that is not None."""
+    """Selection of commits with evidence by an operator: those that fit every part that is not None."""
 
     robot: str | None = None
     rig: bytes | None = None
     pushed_s: tuple[float, float] = (-math.inf, math.inf)
-    """When the server received it, UTC seconds since 1970."""
+    """Interval of the time of receipt, UTC seconds since 1970."""
     captured_s: tuple[float, float] = (-math.inf, math.inf)
-    """Some scan of it was taken then; commits that state no time only fit the default."""
+    """Interval in which some scan of it was taken; commits that state no time only fit the default."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +147,7 @@ class Branch:
     cursor: Cursor | None
     last_seen_s: float
     incarnation: str = ""
-    """With which it registered last; empty in stores of old."""
+    """Incarnation with which it registered last; empty in stores of early versions."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -170,17 +170,17 @@ class Head:
 
 
 class EntrySize(NamedTuple):
-    """What one log entry weighs."""
+    """Size of one log entry."""
 
     seq: int
     author: Author | None
-    """Whose evidence came; None: some was taken out, which is news to its author, too."""
+    """Author whose evidence was added; None: evidence was taken out, which its author has to fetch, too."""
     size_bytes: int
 
 
 @dataclass(frozen=True, slots=True)
 class Use:
-    """What a robot's commits took."""
+    """Use of quotas by a robot's commits."""
 
     size_bytes: int = 0
     cells: int = 0
@@ -193,7 +193,7 @@ class Use:
 
 
 def relay_of(token: str) -> str:
-    """What stands for a robot's name where a relay's token is meant; no robot has a space in its name."""
+    """Name under which a relay's token is counted; no robot has a space in its name."""
     return f"relay {token}"
 
 
@@ -204,23 +204,23 @@ class Backlog:
     map: str
     commits: int
     oldest_s: float | None
-    """When the oldest of them came, as a time; None without any."""
+    """Time of the oldest one's arrival, UTC seconds; None without any."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoreFigures:
-    """Sizes now, and counts since the start."""
+    """Sizes of a store now, and counts since the start."""
 
     size_bytes: int
-    """Of everything at rest, without what is written ahead."""
+    """Bytes of the store's file, without the write-ahead log."""
     ahead_bytes: int
-    """Written ahead, to be moved to its place."""
+    """Bytes of the write-ahead log."""
     free_bytes: int
-    """On the disk."""
+    """Free bytes of the disk."""
     queued: int
-    """Jobs that wait to be written."""
+    """Jobs that wait for the writer."""
     written: int
-    """Transactions."""
+    """Transactions written."""
     emptied: int
     """Times that the write-ahead log was emptied."""
     failures: dict[str, int]
@@ -229,12 +229,12 @@ class StoreFigures:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Token:
-    """A token as it is kept: everything but its secret."""
+    """Stored token: everything but its secret."""
 
     name: str
     role: RoleText
     map_number: int | None
-    """None: all maps."""
+    """Number of its only map; None: all maps."""
     map_name: str | None
     robot: str | None
     created_s: float
@@ -243,5 +243,5 @@ class Token:
 
 
 def registration_name(map_name: str, robot: str) -> str:
-    """Name of the token that a registration gives; no administrator can choose it, for its colon."""
+    """Name of a registration's token; no administrator can choose it, because of its colon."""
     return f"{map_name}:{robot}"

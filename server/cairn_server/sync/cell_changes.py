@@ -1,6 +1,6 @@
-"""What a cell needs to come from a state of its past to the present one: the smallest that says it (SYNC.md rule 4).
+"""Smallest frame that brings a cell from a past state to the present one (SYNC.md rule 4).
 
-delta   sum of what others did since            while all their evidence is kept, and they are few
+delta   sum of what others did since                while all their evidence is kept, and their commits are few
 state   present sums of the blocks changed since    always; finding them takes no history
 full    the whole cell                              always
 """
@@ -23,12 +23,13 @@ from cairn_server.store.store_rows import CellRow, Contribution
 log = logging.getLogger(__name__)
 
 DELTA_ENTRIES_MAX = 32
-"""A delta of more log entries than this is not tried: it would hardly be smaller than the changed blocks."""
+"""Most log entries summed to a delta: one of more would hardly be smaller than the changed blocks."""
 STATE_SHARE_MAX = 0.8
-"""Where more of a cell's blocks changed, the whole cell is sent as it lies there: it costs no time to encode."""
+"""Share of changed blocks above which the whole cell is sent: its stored bytes need no encoding."""
 STATE_HEAD_BYTES = 128
-"""Changed blocks are encoded only if their share of the cell's bytes, and this, is no more than the best so far. They
-take more: 1.13 to 1.7 times their share in scans of the simulated building, and hundreds of bytes if they are few."""
+"""Least overhead of a state frame: changed blocks are encoded only if their share of the cell's bytes plus this is no
+more than the best frame so far. They take more than their share: 1.13 to 1.7 times it in scans of the simulated
+building, and hundreds of bytes more if they are few."""
 BLOCK_NUMBER_BYTES = 4
 
 
@@ -47,24 +48,26 @@ def change_since(
     Args:
         snapshot: the state to come to.
         row: the cell, changed after `start`.
-        start: a proven cursor.
+        start: the asker's state of the cell; a proven cursor.
         geometry: of the map.
-        cache: of cells, and of changes made for others.
-        asker: whose own commits a delta leaves out.
+        cache: of cells, and of changes made for other askers.
+        asker: author whose own commits a delta leaves out.
         kinds: frames that the asker can use.
     """
+    # What happened to the cell since, as far as a delta could use it; one entry more shows that there are too many.
     history = cache.history(snapshot, row, limit=DELTA_ENTRIES_MAX + 1)
     entries = [entry for entry in history if entry.seq > start.seq]
     # What takes an own commit out again is not own: the asker must hear of it (SYNC.md rule 11).
     foreign = [entry for entry in entries if entry.kind != ENTRY_FOLD or entry.author != asker]
     is_told = start.seq >= row.gone_seq and len(entries) <= DELTA_ENTRIES_MAX
-    # Whoever stands before the same entry of the cell needs the same, and most of a team does.
+    # Key of the change: all askers before the same entry of the cell need the same frame, and most of a team do.
     name = ChangeName(
         state=state_of(snapshot, row),
         after_seq=entries[0].seq - 1 if is_told and entries else start.seq,
         own=asker if len(foreign) < len(entries) else None,
         kinds=kinds,
     )
+    # Made once for all of them.
     summed = foreign if is_told and "delta" in kinds else None
     change = cache.changes.get(name, lambda: _smallest(snapshot, row, summed, name, geometry, cache))
     if change is None:
@@ -89,7 +92,7 @@ def _smallest(
     geometry: Geometry,
     cache: ReadCache,
 ) -> Change | None:
-    """The smaller one of both, if it is smaller than the whole cell."""
+    """Smaller one of the delta and the state, if it is smaller than the whole cell."""
     delta = _delta(snapshot, row, summed, geometry) if summed is not None else None
     smallest = row.size_bytes if delta is None else min(len(delta), row.size_bytes)
     state = None
@@ -103,7 +106,8 @@ def _smallest(
 
 
 def _delta(snapshot: Snapshot, row: CellRow, foreign: list[Contribution], geometry: Geometry) -> bytes | None:
-    """Sum of what others did to a cell; None if that is not worth it, or cannot be said after all."""
+    """Encoded sum of what others did to a cell; None if it would be too large, or a diff is damaged."""
+    # Diffs that together have four times the cell's bytes hardly sum up to less than the cell.
     if sum(entry.size_bytes for entry in foreign) > 4 * row.size_bytes:
         return None
     if len(foreign) == 1 and foreign[0].kind == ENTRY_FOLD:
@@ -119,15 +123,16 @@ def _delta(snapshot: Snapshot, row: CellRow, foreign: list[Contribution], geomet
 def _state(
     snapshot: Snapshot, row: CellRow, after_seq: int, geometry: Geometry, cache: ReadCache, *, size_bytes_max: int
 ) -> Change | None:
-    """The changed blocks' present sums, if they can be less than `size_bytes_max`."""
+    """Frame of the changed blocks' present sums, if it can have less than `size_bytes_max`."""
     try:
+        # Estimate from the stamps alone whether it can be small enough, before the cell is decoded.
         stamps = cache.stamps(snapshot, row, geometry)
         blocks, known = blocks_after(stamps, after_seq), int((stamps > 0).sum())
         if len(blocks) > STATE_SHARE_MAX * known or BLOCK_NUMBER_BYTES * len(blocks) >= size_bytes_max:
             return None
         if STATE_HEAD_BYTES + row.size_bytes * len(blocks) / max(known, 1) > size_bytes_max:
             return None
-        evidence = cache.evidence(snapshot, row)  # last, as it is dear
+        evidence = cache.evidence(snapshot, row)  # last, since it is expensive
     except DamagedDataError as exc:
         log.error("cell %s: %s; no changed blocks of it", cell_of_key(row.key), exc.message)
         return None

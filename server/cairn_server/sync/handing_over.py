@@ -1,8 +1,8 @@
-"""Commits that somebody else brings: relays and robots that carry for others. Whose word they are is in the signatures.
+"""Commits that travel between servers: carried by relays and by robots, accepted by the signatures on them.
 
-Whoever has a token of role relay may hand over what robots signed, and nothing else. What a server itself says (its
-operators' retracts, prior data) is signed by the server that hands it out, and taken from servers that this one was
-told to trust.
+A token of role relay may hand over what robots signed, and nothing else. A server's own commits (its operators'
+retracts, prior data) are signed by the server that hands them out, and accepted from the servers that this one trusts
+(`--trust-server`).
 """
 
 import hashlib
@@ -26,28 +26,28 @@ SERVERS_OWN = frozenset({OPERATOR, INITIAL})
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FoundCommit:
-    """A commit as it is handed out."""
+    """A stored commit, ready to be handed to another server."""
 
     data: bytes
     sha: bytes
     seal: str | None
-    """On a retract of this server's operators, for the robots that keep it for this server."""
+    """Seal of a retract by this server's operators, for the robots that keep it; None on any other commit."""
     signatures: str | None
-    """As in `Cairn-Signature`; None: it cannot travel to another server."""
+    """Text of the header `Cairn-Signature`; None: the commit cannot travel to another server."""
 
 
 def server_key(row: MapRow) -> SigningKey:
-    """By which this server signs what it says itself on a map; as the seal's key, it is in each backup."""
+    """Key by which this server signs its own commits on a map; like the seal's key, it is in each backup."""
     return SigningKey(hashlib.sha256(b"cairn-server-1" + row.seal_key).digest())
 
 
 def speaker_of(row: MapRow, caller: Caller, meta: CommitMeta, signed: Collection[Signature], trusted: str) -> Caller:
-    """Whose rights a push has: the caller's, or those of whoever signed what a relay hands over.
+    """Caller whose rights a push has: the one who brings it, or the signer of what a relay hands over.
 
-    The signatures are still to be checked; until then nothing is kept.
+    The signatures themselves are checked later, before the commit is kept.
 
     Raises:
-        DeniedError: kind `not_allowed`: somebody in whose name the commit speaks did not sign it.
+        DeniedError: kind `not_allowed`: an author in whose name the commit speaks did not sign it.
     """
     author = meta.commit_id.author
     if caller.role is not Role.RELAY or not signed or caller.robot == author.robot:
@@ -68,7 +68,7 @@ def speaker_of(row: MapRow, caller: Caller, meta: CommitMeta, signed: Collection
 
 
 def found_commit(store: Store, row: MapRow, id_text: str) -> FoundCommit:
-    """A commit as it was pushed, with what proves whose it is.
+    """Stored commit as it was pushed, with the proofs of its author.
 
     Raises:
         NotFoundError: kind `no_commit`.
@@ -91,24 +91,25 @@ def found_commit(store: Store, row: MapRow, id_text: str) -> FoundCommit:
     )
 
 
-class Joining:
-    """Of all maps; called from many threads."""
+class UpstreamProgress:
+    """Progress of handing this server's commits to its upstream server, for all maps; called from many threads."""
 
     def __init__(self, *, is_joined: bool) -> None:
+        """`is_joined`: True if the server has an upstream server."""
         self._is_joined = is_joined
         self._handed_over_s: dict[str, float] = {}
         self._wake_relay: Callable[[], None] = lambda: None
 
     def connect(self, wake_relay: Callable[[], None]) -> None:
-        """Give the function that tells a running relay of new commits."""
+        """Give the function that tells a running relay of new commits; it neither fails nor waits."""
         self._wake_relay = wake_relay
 
     def wake(self) -> None:
-        """Report new commits to the relay, if one runs."""
+        """Tell the relay, if there is one, that a new commit came."""
         self._wake_relay()
 
     def handed_over(self, map_name: str, begun_s: float) -> None:
-        """All that was in a map at this time (UTC seconds since 1970) was given to the upstream, if it can travel."""
+        """Note that all of a map's commits as of this time (UTC seconds) that can travel are on the upstream."""
         self._handed_over_s[map_name] = begun_s
 
     def ages_s(self) -> dict[str, float]:
@@ -117,5 +118,5 @@ class Joining:
         return {name: max(0.0, now_s - begun_s) for name, begun_s in list(self._handed_over_s.items())}
 
     def may_forget_s(self, map_name: str) -> float:
-        """Evidence that was folded before this time is on the upstream, too; infinite without one."""
+        """UTC seconds before which evidence is on the upstream, too, and may be dropped; infinite without one."""
         return self._handed_over_s.get(map_name, -math.inf) if self._is_joined else math.inf

@@ -1,8 +1,11 @@
-"""Which commits are here: what relays compare. Vectors say which ids, sums of SHA-256 whether they are the same."""
+"""Commits that the server holds, as relays compare them, and those that it wants pushed again.
+
+Vectors compare the ids of what two servers hold; sums of SHA-256 compare the contents.
+"""
 
 import threading
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Iterable
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId, commit_id_from_text
@@ -16,23 +19,23 @@ ZERO = bytes(SUM_BYTES)
 
 
 class HeldCommits:
-    """Of all maps; the sums are kept, and only what was folded since is added to them. Thread-safe."""
+    """Holdings of all maps; sums are kept, and only what was folded since is added to them. Thread-safe."""
 
-    def __init__(self, store: Store, wanted_of: Callable[[str], Collection[CommitId]]) -> None:
+    def __init__(self, store: Store, wanted: "WantedCommits") -> None:
         self._store = store
-        self._wanted_of = wanted_of
+        self._wanted = wanted
         self._locks: dict[int, threading.Lock] = {}
         self._sums: dict[int, tuple[Cursor, dict[Author, bytes]]] = {}
 
     def of(self, row: MapRow) -> Held:
-        """What a map has now."""
+        """Holdings of a map now."""
         with self._store.snapshot(row) as snapshot:
             pending = snapshot.pending()
             with self._locks.setdefault(row.number, threading.Lock()):  # one log may take long to read
                 sums = self._sums_in(row, snapshot)
             return Held(
                 vector=snapshot.head.vector.with_commits(pending),
-                wanted=tuple(self._wanted_of(row.name)),
+                wanted=self._wanted.of(row.name),
                 sums={author: total for author, total in sums.items() if author not in pending.intervals},
             )
 
@@ -56,14 +59,18 @@ class HeldCommits:
 
 
 class WantedCommits:
-    """Wanted commits of all maps, the newest `WANTED_MAX` of each; thread-safe."""
+    """Commits whose evidence was dropped and which a retract needs again, so that robots are asked for them.
+
+    The newest `WANTED_MAX` of each map are kept, in memory only: after a start a retract is refused once more, and its
+    targets are wanted again. Thread-safe.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._wanted: dict[str, dict[CommitId, None]] = {}
 
     def note(self, map_name: str, commits: Iterable[CommitId]) -> None:
-        """A retract of these was refused."""
+        """Want these: a retract of them was refused."""
         with self._lock:
             wanted = self._wanted.setdefault(map_name, {})
             wanted.update(dict.fromkeys(commits))
@@ -71,11 +78,11 @@ class WantedCommits:
                 del wanted[commit]
 
     def forget(self, map_name: str, commit: CommitId) -> None:
-        """It came."""
+        """Stop wanting a commit: it came."""
         with self._lock:
             self._wanted.get(map_name, {}).pop(commit, None)
 
     def of(self, map_name: str) -> tuple[CommitId, ...]:
-        """Those of a map."""
+        """Wanted commits of a map."""
         with self._lock:
             return tuple(self._wanted.get(map_name, ()))

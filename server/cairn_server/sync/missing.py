@@ -1,12 +1,15 @@
 """Fetch-missing: main minus branch, as frames (SYNC.md rules 3 to 10).
 
-The server keeps nothing about a branch but its row: the request says which state the asker holds, the chain
-proves it, and `lm` of each cell says whether it changed since. Per cell the smallest kind of frame wins.
+    request  -->  MissingQuery    parsed, each cursor proven by the log or not
+    query    -->  reply_frames    header, a frame for each cell that the asker misses, end
+
+The server keeps nothing about a branch but its row: the request says which state the asker holds, the chain of the log
+proves it, and `lm` of each cell says whether it changed since. For each cell the smallest kind of frame is sent.
 """
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,6 +25,7 @@ from cairn_map.evidence.grid import CELL_LIMIT, Cell, CellKey, Geometry, cell_ke
 from cairn_map.kernels.morton_kernels import deinterleave
 from cairn_map.wire.frames import CELL_HEAD, CellFrame, Frame, FrameKind
 from cairn_map.wire.messages import CURSORS_MAX, Done, MissingRequest, More, ReplyHeader
+from cairn_server.folding.cells import CellFaults
 from cairn_server.folding.cells_at_rest import DamagedCellError, sound_cell
 from cairn_server.folding.damaged_cells import as_named
 from cairn_server.folding.read_cache import ReadCache
@@ -36,157 +40,175 @@ REPLY_BYTES_MAX = 64 << 20
 
 
 @dataclass(frozen=True, slots=True)
-class Besides:
-    """What a header says beside a snapshot's own state."""
+class HeaderFacts:
+    """Facts of a reply's header that are not part of the snapshot."""
 
     stable: VersionVector
+    """Commits that no restore can lose any more."""
     damaged: frozenset[CellKey] = frozenset()
+    """Cells that robots are asked for."""
     wanted: tuple[CommitId, ...] = ()
+    """Commits that robots are asked to push again."""
 
 
-@dataclass(slots=True)
-class Asker:
-    """What a request says the asker holds, with every cursor proven or not."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MissingQuery:
+    """Parsed request: what the asker holds, proven by the log or not, and what it wants."""
 
     author: Author | None
     cursor: Cursor | None
+    """State of every cell that is not listed; None: the asker holds none of them."""
     cells: dict[CellKey, Cursor | None]
+    """Cells that the request lists, each with its own state."""
+    unproven: frozenset[Cursor]
+    """Cursors of the request that this log does not prove."""
     kinds: frozenset[str]
+    """Kinds of frames that the asker can use."""
     compare: bool
-    box: tuple[Cell, Cell] | None = None
-    size_bytes_max: int = REPLY_BYTES_MAX
-    near: Cell | None = None
-    unproven: set[Cursor] = field(default_factory=set)
-    healed: list[CellRow] = field(default_factory=list)
-    """Damaged cells that were made anew for it."""
-    damaged: set[CellKey] = field(default_factory=set)
-    """Cells that could not be."""
+    """True if the asker wants a fingerprint of each cell only."""
+    box: tuple[Cell, Cell] | None
+    size_bytes_max: int
+    near: Cell | None
 
     def wants(self, key: CellKey) -> bool:
-        """Whether a cell lies in the box that is asked for."""
+        """True if a cell lies in the box asked for."""
         if self.box is None:
             return True
         low, high = self.box
         return all(a <= b <= c for a, b, c in zip(low, cell_of_key(key), high, strict=True))
 
+    def is_reset(self, start: Cursor | None) -> bool:
+        """True if a cell of this state is answered by its fingerprint: the asker finds out what it has to drop."""
+        return self.compare or start in self.unproven
 
-def asker_from_request(request: MissingRequest, snapshot: Snapshot) -> Asker:
-    """The asker, its cursors parsed and checked against the log.
+
+def query_of(request: MissingRequest, snapshot: Snapshot) -> MissingQuery:
+    """Parse a request, and check its cursors against the log.
 
     Raises:
         ConflictError: kind `other_log`: a cursor belongs to another server's log; drop it (HTTP 410).
         BadInputError: a malformed id, cursor or cell.
     """
-    asker = Asker(
+    cursor, cells = _cursor(request.cursor), _listed(request)
+    head = snapshot.head.cursor
+    unproven: set[Cursor] = set()
+    for stated in {stated for stated in (cursor, *cells.values()) if stated is not None}:
+        if stated.log_id != head.log_id:
+            raise ConflictError("other_log", "the cursor belongs to another server's log; start without one")
+        if not _is_proven(stated, snapshot):
+            unproven.add(stated)
+    return MissingQuery(
         author=author_from_text(request.author) if request.author else None,
-        cursor=_cursor(request.cursor),
-        cells=_listed(request),
+        cursor=cursor,
+        cells=cells,
+        unproven=frozenset(unproven),
         kinds=frozenset(request.kinds),
+        compare=request.compare,
         box=(Cell(*request.box[0]), Cell(*request.box[1])) if request.box else None,
         size_bytes_max=min(request.size_bytes_max or REPLY_BYTES_MAX, REPLY_BYTES_MAX),
         near=cell_of_key(cell_key(request.near)) if request.near else None,
-        compare=request.compare,
     )
-    head = snapshot.head.cursor
-    for cursor in {cursor for cursor in (asker.cursor, *asker.cells.values()) if cursor is not None}:
-        if cursor.log_id != head.log_id:
-            raise ConflictError("other_log", "the cursor belongs to another server's log; start without one")
-        if not _is_proven(cursor, snapshot):
-            asker.unproven.add(cursor)
-    return asker
 
 
-def reply_frames(
-    snapshot: Snapshot,
-    asker: Asker,
-    geometry: Geometry,
-    cache: ReadCache,
-    besides: Besides,
-) -> Iterator[Frame]:
-    """Header, frames of the cells that the asker misses, and the end; all from one snapshot."""
+def header_of(snapshot: Snapshot, author: Author | None, facts: HeaderFacts) -> ReplyHeader:
+    """State of a snapshot, as the author of some of its commits needs to know it."""
     head = snapshot.head
-    yield header_of(snapshot, asker.author, besides)
+    tip = snapshot.tip(author) if author else None
+    # Not validated again: with hundreds of authors that takes longer than the rest of a reply.
+    return ReplyHeader.model_construct(
+        to=str(head.cursor),
+        vector=head.vector.to_json(),
+        stable=facts.stable.to_json(),
+        pending=snapshot.pending().to_json(),
+        tip=(tip[0], tip[1].hex()) if tip else None,
+        retracts=[str(commit) for commit in snapshot.retracting() if commit not in facts.stable],
+        damaged=as_named(snapshot, facts.damaged),
+        wanted=[str(commit) for commit in facts.wanted],
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class CellFrames:
+    """Frames of single cells for one asker, all from one snapshot."""
+
+    snapshot: Snapshot
+    query: MissingQuery
+    geometry: Geometry
+    cache: ReadCache
+    faults: CellFaults
+    """Damaged cells met on the way; filled here."""
+
+    def frame_of(self, row: CellRow, start: Cursor | None) -> CellFrame | None:
+        """Smallest frame that brings a cell from the asker's state `start` to this one; None: it has that state."""
+        if self.query.is_reset(start):
+            return self._frame(FrameKind.RESET, row.key, start, row.fingerprint)
+        if start is not None and row.lm <= start.seq:
+            return None
+        if start is not None:
+            query = self.query
+            change = change_since(
+                self.snapshot, row, start, self.geometry, self.cache, asker=query.author, kinds=query.kinds
+            )
+            if change is not None:
+                return change
+        return self._frame(FrameKind.FULL, row.key, start, row.fingerprint, self._body(row.key))
+
+    def frame_of_unknown(self, key: CellKey, start: Cursor | None) -> CellFrame | None:
+        """Frame of a cell that the asker lists and the server never had: as good as empty."""
+        if self.query.is_reset(start):
+            return self._frame(FrameKind.RESET, key, start, ZERO)
+        if start is None:
+            empty = encode_cell(key, empty_evidence(self.geometry), self.geometry).data
+            return self._frame(FrameKind.FULL, key, None, ZERO, empty)
+        return None
+
+    def _body(self, key: CellKey) -> bytes:
+        """A cell's bytes; empty if they are lost, which the asker reports while it gets all other cells."""
+        try:
+            stored = sound_cell(self.snapshot, key, self.geometry, self.faults.healed)
+        except DamagedCellError as exc:
+            self.faults.damaged.add(key)
+            log.error("cell %s is sent without its bytes: %s", cell_of_key(key), exc.message)
+            return b""
+        return stored.body if stored else b""
+
+    def _frame(
+        self, kind: FrameKind, key: CellKey, start: Cursor | None, fingerprint: Fingerprint, payload: bytes = b""
+    ) -> CellFrame:
+        to = self.snapshot.head.cursor
+        return CellFrame(kind=kind, cell=key, from_cursor=start, to_cursor=to, fingerprint=fingerprint, payload=payload)
+
+
+def reply_frames(cells: CellFrames, facts: HeaderFacts) -> Iterator[Frame]:
+    """Header, frames of the cells that the asker misses, and the end of a reply."""
+    snapshot, query = cells.snapshot, cells.query
+    to = str(snapshot.head.cursor)
+    yield header_of(snapshot, query.author, facts)
+    # Every cell of main: a frame, or its fingerprint in `rest`, so that the asker can check the whole map.
     rest = ZERO
     sent_bytes = 0
-    listed = dict(asker.cells)
-    for row in in_order([row for row in snapshot.cells() if asker.wants(row.key)], asker.near):
-        start = listed.pop(row.key, asker.cursor)
-        frame = _frame_for(snapshot, asker, row, start, geometry, cache)
+    listed = dict(query.cells)
+    for row in in_order([row for row in snapshot.cells() if query.wants(row.key)], query.near):
+        start = listed.pop(row.key, query.cursor)
+        frame = cells.frame_of(row, start)
         if frame is None:
             rest += row.fingerprint
             continue
         sent_bytes += CELL_HEAD.size + len(frame.payload)
         yield frame
-        if sent_bytes > asker.size_bytes_max:
-            yield More(to=str(head.cursor))
+        if sent_bytes > query.size_bytes_max:
+            yield More(to=to)
             return
-    for key, start in ((key, start) for key, start in listed.items() if asker.wants(key)):
-        unknown = _unknown_cell(key, asker, start, head.cursor, geometry)
+    # What is left of the list is not in main.
+    for key, start in ((key, start) for key, start in listed.items() if query.wants(key)):
+        unknown = cells.frame_of_unknown(key, start)
         if unknown is not None:
             yield unknown
-    yield Done(to=str(head.cursor), rest=rest.hex())
-
-
-def header_of(snapshot: Snapshot, author: Author | None, besides: Besides) -> ReplyHeader:
-    """The state of a snapshot, as the author of some of its commits needs to know it."""
-    head = snapshot.head
-    tip = snapshot.tip(author) if author else None
-    # Not checked once more: of hundreds of authors that takes longer than all else in a reply.
-    return ReplyHeader.model_construct(
-        to=str(head.cursor),
-        vector=head.vector.to_json(),
-        stable=besides.stable.to_json(),
-        pending=snapshot.pending().to_json(),
-        tip=(tip[0], tip[1].hex()) if tip else None,
-        retracts=[str(commit) for commit in snapshot.retracting() if commit not in besides.stable],
-        damaged=as_named(snapshot, besides.damaged),
-        wanted=[str(commit) for commit in besides.wanted],
-    )
-
-
-def _frame_for(
-    snapshot: Snapshot, asker: Asker, row: CellRow, start: Cursor | None, geometry: Geometry, cache: ReadCache
-) -> CellFrame | None:
-    if asker.compare or start in asker.unproven:
-        return _frame(FrameKind.RESET, row.key, start, snapshot.head.cursor, row.fingerprint)
-    if start is not None and row.lm <= start.seq:
-        return None
-    if start is not None:
-        change = change_since(snapshot, row, start, geometry, cache, asker=asker.author, kinds=asker.kinds)
-        if change is not None:
-            return change
-    body = _body(snapshot, row.key, geometry, asker)
-    return _frame(FrameKind.FULL, row.key, start, snapshot.head.cursor, row.fingerprint, body)
-
-
-def _body(snapshot: Snapshot, key: CellKey, geometry: Geometry, asker: Asker) -> bytes:
-    """A cell's bytes; none if they are damaged for good, which its asker reports, while all other cells come."""
-    try:
-        stored = sound_cell(snapshot, key, geometry, asker.healed)
-    except DamagedCellError as exc:
-        asker.damaged.add(key)
-        log.error("cell %s is sent without its bytes: %s", cell_of_key(key), exc.message)
-        return b""
-    return stored.body if stored else b""
-
-
-def _unknown_cell(key: CellKey, asker: Asker, start: Cursor | None, to: Cursor, geometry: Geometry) -> CellFrame | None:
-    """A cell that the asker names and the server never had: as good as empty."""
-    if asker.compare or start in asker.unproven:
-        return _frame(FrameKind.RESET, key, start, to, ZERO)
-    if start is None:
-        return _frame(FrameKind.FULL, key, None, to, ZERO, encode_cell(key, empty_evidence(geometry), geometry).data)
-    return None
-
-
-def _frame(
-    kind: FrameKind, key: CellKey, start: Cursor | None, to: Cursor, fingerprint: Fingerprint, payload: bytes = b""
-) -> CellFrame:
-    return CellFrame(kind=kind, cell=key, from_cursor=start, to_cursor=to, fingerprint=fingerprint, payload=payload)
+    yield Done(to=to, rest=rest.hex())
 
 
 def _listed(request: MissingRequest) -> dict[CellKey, Cursor | None]:
-    """The cells that a request lists, one by one or by cursor."""
+    """Cells that a request lists, one by one or in groups by cursor."""
     groups = [*request.groups, *((entry.cursor, [entry.cell]) for entry in request.cells)]
     count = sum(len(cells) for _, cells in groups)
     if count > CURSORS_MAX:
@@ -209,7 +231,10 @@ def _is_proven(cursor: Cursor, snapshot: Snapshot) -> bool:
 
 
 def in_order(rows: Sequence[CellRow], near: Cell | None) -> list[CellRow]:
-    """The cells around a cell first, and hot ones before others (`cell_order`)."""
+    """Cells in the order of a reply: near the asker first, hot ones before others (`cell_order.first_to_last`).
+
+    Any order is right, since each frame stands alone.
+    """
     order = first_to_last(
         deinterleave(np.fromiter((row.key for row in rows), np.uint64, len(rows))) - CELL_LIMIT,
         near=near,

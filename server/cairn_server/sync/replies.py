@@ -1,24 +1,33 @@
-"""Which commits no restore can lose any more: without backups, those folded longer ago than a setting of time."""
+"""Answers about the state of main: replies to fetch-missing, the cell index, the version vector at a cursor."""
 
 import threading
 import time
 
 from cairn_map.commits.cursor import Cursor
-from cairn_map.commits.ids import commit_id_from_text
+from cairn_map.commits.ids import Author, commit_id_from_text
 from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.errors import ConflictError, NotFoundError
-from cairn_server.store.store import Snapshot
+from cairn_map.wire.frames import encode_frame, start_of_reply
+from cairn_map.wire.messages import CellIndex, MissingRequest
+from cairn_map.wire.resumed_replies import reply_digest, without_begun
+from cairn_server.folding.cell_index import FIRST_PAGE, IndexPage, entries_of
+from cairn_server.folding.cells import Cells
+from cairn_server.folding.read_cache import ReadCache
+from cairn_server.live.hub import Hub
+from cairn_server.metrics import ServerFigures
+from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import MapRow
+from cairn_server.sync.held_commits import WantedCommits
+from cairn_server.sync.missing import CellFrames, HeaderFacts, header_of, query_of, reply_frames
 
 ENTRIES_MAX = 10_000
-"""Who asks for a vector has just got its cursor; further back nobody looks."""
-
+"""Most log entries between the head and a cursor whose vector is asked for: clients ask for cursors just received."""
 KEEP_S = 10.0
-"""The answer is kept this long: it only ever grows, so an old one is safe."""
+"""Lifetime of a stable vector: it only ever grows, so an old one is safe."""
 
 
 class StableVectors:
-    """Stable vectors of all maps, computed at most every few seconds."""
+    """Commits that no restore can lose any more, of all maps: those folded longer ago than a setting; thread-safe."""
 
     def __init__(self, after_s: float) -> None:
         self._after_s = after_s
@@ -27,7 +36,7 @@ class StableVectors:
         self._kept: dict[int, tuple[float, VersionVector]] = {}
 
     def of(self, row: MapRow, snapshot: Snapshot) -> VersionVector:
-        """The stable vector of the map in this snapshot."""
+        """Stable vector of the map in this snapshot, at most `KEEP_S` old."""
         now_s = time.time()
         with self._lock:
             made_s, vector = self._kept.get(row.number, (float("-inf"), EMPTY))
@@ -38,19 +47,67 @@ class StableVectors:
             return vector
 
 
-def vector_at(snapshot: Snapshot, cursor: Cursor) -> VersionVector:
-    """The version vector at a cursor: that of the head without what was folded since.
+class Replies:
+    """Answers about main, for all maps of a store; each from one snapshot; called from many threads."""
 
-    Raises:
-        ConflictError: kind `other_log`: the cursor is another server's.
-        NotFoundError: kind `no_cursor`: it is not proven by the log, or too far back.
-    """
-    head = snapshot.head
-    if cursor.log_id != head.cursor.log_id:
-        raise ConflictError("other_log", "the cursor belongs to another server's log; start without one")
-    since = head.cursor.seq - cursor.seq
-    if not 0 <= since <= ENTRIES_MAX or snapshot.chain_at(cursor.seq) != cursor.chain:
-        raise NotFoundError("no_cursor", "the log has no such cursor, or not of late; ask for the cell again")
-    entries = snapshot.log(after_seq=cursor.seq, limit=ENTRIES_MAX)
-    folded = EMPTY.with_commits(commit_id_from_text(entry.id) for entry in entries if entry.kind == "+")
-    return head.vector.minus(folded)
+    def __init__(
+        self,
+        store: Store,
+        cells: Cells,
+        hub: Hub,
+        wanted: WantedCommits,
+        figures: ServerFigures,
+        *,
+        stable: StableVectors,
+    ) -> None:
+        self._store = store
+        self._cells = cells
+        self._hub = hub
+        self._wanted = wanted
+        self._figures = figures
+        self._stable = stable
+        self._cache = ReadCache()
+
+    def missing(self, row: MapRow, branch: str, request: MissingRequest) -> bytes:
+        """Frames that bring the asker to the head, wholly in memory before they are sent.
+
+        Empty if the asker says that it knows this very reply.
+        """
+        with self._cells.reading(row) as faults, self._store.snapshot(row) as snapshot:
+            query = query_of(request, snapshot)
+            cells = CellFrames(snapshot, query, row.geometry, self._cache, faults)
+            frames = without_begun(reply_frames(cells, self._facts(row, snapshot)), request.begun)
+            reply = b"".join([start_of_reply(), *map(encode_frame, self._figures.counted(frames))])
+        self._store.seen(row, branch, query.cursor)
+        if query.cursor is None:
+            self._hub.robot_heard(row, branch)
+        else:
+            self._hub.robot_heard(row, branch, cursor=str(query.cursor))
+        return b"" if request.known is not None and request.known == reply_digest(reply) else reply
+
+    def cell_index(self, row: MapRow, author: Author | None, page: IndexPage = FIRST_PAGE) -> CellIndex:
+        """One page of the cells that were ever touched, and the state that it was read from."""
+        with self._store.snapshot(row) as snapshot:
+            header = header_of(snapshot, author, self._facts(row, snapshot))
+            return CellIndex(header=header, cells=entries_of(snapshot, page))
+
+    def vector_at(self, row: MapRow, cursor: Cursor) -> VersionVector:
+        """Version vector at a recent cursor: that of the head without what was folded since.
+
+        Raises:
+            ConflictError: kind `other_log`: the cursor is another server's.
+            NotFoundError: kind `no_cursor`: it is not proven by the log, or too far back.
+        """
+        with self._store.snapshot(row) as snapshot:
+            head = snapshot.head
+            if cursor.log_id != head.cursor.log_id:
+                raise ConflictError("other_log", "the cursor belongs to another server's log; start without one")
+            since = head.cursor.seq - cursor.seq
+            if not 0 <= since <= ENTRIES_MAX or snapshot.chain_at(cursor.seq) != cursor.chain:
+                raise NotFoundError("no_cursor", "the log has no such recent cursor; ask for the cell again")
+            entries = snapshot.log(after_seq=cursor.seq, limit=ENTRIES_MAX)
+            folded = EMPTY.with_commits(commit_id_from_text(entry.id) for entry in entries if entry.kind == "+")
+            return head.vector.minus(folded)
+
+    def _facts(self, row: MapRow, snapshot: Snapshot) -> HeaderFacts:
+        return HeaderFacts(self._stable.of(row, snapshot), self._cells.damaged(row), self._wanted.of(row.name))

@@ -1,8 +1,8 @@
-"""Retracts that operators ask for: which commits they mean, the commits that say so, and the seal on them.
+"""Retracts that operators ask for: the commits they name or select, the commits that undo those, and their seal.
 
 A retract is a commit without evidence by `operator`. Robots fetch it, keep it until no restore can lose it, and push it
-back to a server that lost it (SYNC.md rule 11). So that no robot can make one up, the server seals it: an HMAC of its
-SHA-256 under a key that lies beside the map, and in every backup of it.
+back to a server that lost it (SYNC.md rule 11). So that no robot can forge one, the server seals it: an HMAC of its
+SHA-256 under a key that is stored with the map, and in every backup of it.
 """
 
 import hashlib
@@ -11,18 +11,61 @@ import math
 from collections.abc import Callable
 
 from cairn_map.commits.commit import RETRACTS_MAX, CommitMeta, make_commit, sha_without_evidence
-from cairn_map.commits.ids import OPERATOR, Author, CommitId, commit_id_from_text
+from cairn_map.commits.ids import OPERATOR, Author, CommitId, commit_id_from_text, new_incarnation
 from cairn_map.errors import BadInputError, NotFoundError
-from cairn_map.wire.messages import Retract
-from cairn_server.store.store import Snapshot
+from cairn_map.wire.messages import Retract, Retracted
+from cairn_server.access.auth import Caller
+from cairn_server.store.numbering import EvidenceGoneError
+from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import MapRow, NewCommit, Selection
+from cairn_server.sync.held_commits import WantedCommits
+
+
+class Retracts:
+    """Retracts of this server's operators, on all maps of a store; called from many threads."""
+
+    def __init__(self, store: Store, wanted: WantedCommits, *, on_new: Callable[[], None]) -> None:
+        """`on_new` is called after each retract."""
+        self._store = store
+        self._wanted = wanted
+        self._on_new = on_new
+        self.operator = new_incarnation()
+        """Incarnation of the author, new with every start: a restored server must not reuse the numbers it lost."""
+
+    def retract(self, row: MapRow, request: Retract, *, by: Caller) -> Retracted:
+        """Undo commits exactly; durable on return.
+
+        More targets than one commit can name become several commits; the id of the last one is answered.
+
+        Raises:
+            NotFoundError: kind `nothing_to_retract`: the request names no commit, or none fits.
+            BadInputError: kind `not_retractable`: a retract is not retracted.
+            ConflictError: kind `evidence_gone`: robots that have a commit's bytes must push them again first, and are
+                asked to from now on.
+        """
+        with self._store.snapshot(row) as snapshot:
+            targets = targets_of(request, snapshot)
+        names = [str(target) for target in targets]
+        if request.preview:
+            return Retracted(id=None, commits=names)
+        author = Author(OPERATOR, self.operator)
+        builders = retract_builders(row, author, targets, request.note)
+        try:
+            ids = [str(self._store.append_built(row, author, build).id) for build in builders]
+        except EvidenceGoneError as exc:
+            self._wanted.note(row.name, exc.commits)
+            raise
+        detail = f"map {row.name}: {ids[-1]} takes out {len(names)} commits: {request.note}"
+        self._store.audit_log.add(by.name, "retract", detail)
+        self._on_new()
+        return Retracted(id=ids[-1], commits=names)
 
 
 def targets_of(request: Retract, snapshot: Snapshot) -> list[CommitId]:
-    """The commits that a request names or means.
+    """Commits that a request names or selects.
 
     Raises:
-        NotFoundError: kind `nothing_to_retract`: none.
+        NotFoundError: kind `nothing_to_retract`: there are none.
         BadInputError: kind `not_retractable`: one of them is a retract.
     """
     targets = dict.fromkeys(commit_id_from_text(text) for text in request.commits)
@@ -39,18 +82,18 @@ def targets_of(request: Retract, snapshot: Snapshot) -> list[CommitId]:
 def retract_builders(
     row: MapRow, author: Author, targets: list[CommitId], note: str
 ) -> list[Callable[[int], NewCommit]]:
-    """For each commit that is needed to name them all, what makes it from its number."""
+    """Builders of the commits that name all targets, each from the number it is given."""
     parts = [targets[start : start + RETRACTS_MAX] for start in range(0, len(targets), RETRACTS_MAX)]
     return [_builder(row, author, part, note) for part in parts]
 
 
 def seal_of(row: MapRow, sha: bytes) -> str:
-    """What only this map's server can write on a retract."""
+    """Seal of a retract, which only this map's server can write."""
     return hmac.new(row.seal_key, sha, hashlib.sha256).hexdigest()
 
 
 def is_sealed(row: MapRow, data: bytes, seal: str | None) -> bool:
-    """Whether the commit in these bytes holds no evidence, and this server sealed it."""
+    """True if the commit in these bytes holds no evidence and bears this server's seal."""
     sha = sha_without_evidence(data) if seal is not None and row.seal_key else None
     return sha is not None and hmac.compare_digest(seal_of(row, sha).encode(), (seal or "").encode())
 

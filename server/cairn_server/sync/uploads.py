@@ -1,9 +1,9 @@
-"""Bodies of commits that come in parts, so that a link that breaks goes on where it stopped.
+"""Uploads: bodies of commits that come in parts, so that a broken link goes on where it stopped.
 
-In memory, and of no weight: losing them costs bytes, never evidence. A robot pushes its commits one after the other, so
-it has one upload here, and a second one while an amend waits for what it takes out; who comes next takes the room of
-whoever was quiet longest. Room is what came: announcing much takes none. Only the whole body is checked and
-acknowledged, and by the very steps of a push.
+They are in memory only: losing them costs bytes, never evidence. A robot pushes its commits one after the other, so it
+has one upload here, and a second one while an amend waits for what it takes out. A new upload displaces those that were
+idle longest. Only bytes received take room, not announced ones. Only the whole body is checked and acknowledged, by the
+steps of a push.
 """
 
 import hashlib
@@ -23,41 +23,47 @@ from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.pushes import Pushes
 
 STAGED_BYTES_MAX = 1 << 27
-"""Of all robots together."""
+"""Most bytes held, of all robots together."""
 BODIES_MAX = 2
-"""Of one robot on one map."""
+"""Most bodies of one robot on one map."""
 KEPT_S = 86_400.0
-"""Bytes that nobody added to for so long go."""
+"""Time without a new part after which an upload is dropped."""
 
 Place = tuple[int, str, CommitId]
-"""Map, robot or relay, and which commit."""
+"""Place of an upload: map, robot or relay, and commit."""
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Some bytes of a body."""
+    """Part of a body."""
 
     digest: str
-    """SHA-256 of the whole body, hex."""
+    """Hex of the whole body's SHA-256."""
     total_bytes: int
     offset_bytes: int
     data: bytes
     signatures: str | None = None
-    """As in `Cairn-Signature`; those that come with the last part count."""
+    """Text of the header `Cairn-Signature`; the one that comes with the last part counts."""
 
 
 @dataclass(slots=True)
 class _Staged:
-    """The beginning of a body."""
+    """Beginning of a body."""
 
     digest: str
     total_bytes: int
     used_s: float
     data: bytearray = field(default_factory=bytearray)
 
+    def add(self, part: Part, now_s: float) -> None:
+        """Append a part, if it begins where the last one ended."""
+        if part.offset_bytes == len(self.data):
+            self.data += part.data
+        self.used_s = now_s
+
 
 def uploaded_by(caller: Caller, id_text: str) -> tuple[CommitId, str]:
-    """The commit, and for whom its bytes are held: its robot, or the relay that brings it, which is no robot's name.
+    """Commit of an upload, and the name under which its bytes are held: its robot's, or one made of the relay's token.
 
     Raises:
         DeniedError: kind `not_allowed`: it is another robot's.
@@ -72,7 +78,7 @@ def uploaded_by(caller: Caller, id_text: str) -> tuple[CommitId, str]:
 
 
 class Uploads:
-    """All robots' uploads; called from many threads."""
+    """Uploads of all robots; called from many threads."""
 
     def __init__(self, store: Store, pushes: Pushes, *, steady_s: Callable[[], float] = time.monotonic) -> None:
         self._store = store
@@ -82,7 +88,7 @@ class Uploads:
         self._staged: dict[Place, _Staged] = {}
 
     def state(self, row: MapRow, caller: Caller, id_text: str, digest: str) -> Upload:
-        """How much of a body is here, and whether the commit is.
+        """State of an upload: the bytes received, and the SHA-256 of the commit if it is kept.
 
         Raises:
             DeniedError: kind `not_allowed`: it is another robot's.
@@ -96,9 +102,9 @@ class Uploads:
             )
 
     def add(self, row: MapRow, caller: Caller, id_text: str, part: Part) -> tuple[Upload, bool]:
-        """Add a part, and push the commit if that was the last one: where it stands, and whether it is a new commit.
+        """Add a part, and push the commit if it was the last one; the upload's state, and True if the commit is new.
 
-        A part that does not begin where the last one ended is not taken; the answer says where to go on.
+        A part that does not begin where the last one ended is ignored; the state says where to go on.
 
         Raises:
             BadInputError: kind `too_large`; or, with the last part, as a push.
@@ -113,7 +119,7 @@ class Uploads:
                 f"a commit has at most {COMMIT_BYTES_MAX} bytes, and its parts no more than it; got "
                 f"{part.offset_bytes} + {len(part.data)} of {part.total_bytes}",
             )
-        # What a push would refuse in any case need not come first, and nobody makes the server digest it for nothing.
+        # Refused at once where the push would be in any case, so that no client makes the server digest it in vain.
         self._pushes.check_room(row, caller, size_bytes=part.total_bytes)
         whole = self._take(place, part)
         if whole is None:
@@ -133,19 +139,17 @@ class Uploads:
         return Upload(size_bytes=len(whole), sha=kept.sha.hex() if kept else None), is_new
 
     def staged_bytes(self) -> int:
-        """What is held in memory."""
+        """Bytes held in memory."""
         with self._lock:
             return sum(len(found.data) for found in self._staged.values())
 
     def _take(self, place: Place, part: Part) -> bytes | None:
-        """The whole body, if this part was its last one."""
+        """Add a part to its upload; the whole body, if this was its last part."""
         with self._lock:
             found = self._at(place, part.digest)
             if found is None or found.total_bytes != part.total_bytes:
                 found = _Staged(part.digest, part.total_bytes, self._steady_s())
-            if part.offset_bytes == len(found.data):
-                found.data += part.data
-            found.used_s = self._steady_s()
+            found.add(part, self._steady_s())
             if found.data:
                 self._staged.pop(place, None)
                 self._make_room(place, len(found.data))
@@ -153,7 +157,7 @@ class Uploads:
             return bytes(found.data) if len(found.data) == found.total_bytes else None
 
     def _make_room(self, place: Place, size_bytes: int) -> None:
-        """Forget the robot's own beyond its two, what is too old, and of the rest those that were quiet longest."""
+        """Drop the robot's own uploads beyond `BODIES_MAX`, old ones, and of the rest those that were idle longest."""
         now_s = self._steady_s()
         own = [other for other in self._staged if other[:2] == place[:2]]
         for other in own[: 1 - BODIES_MAX]:

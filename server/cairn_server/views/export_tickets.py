@@ -38,7 +38,7 @@ class _Ticket:
     until_s: float
     """By the steady clock."""
     timer: threading.Timer
-    """Lets the file go if nobody comes."""
+    """Drops the file if no client comes for it."""
 
 
 class ExportTickets:
@@ -81,8 +81,8 @@ class ExportTickets:
         """The file of a ticket, which is worth nothing from now on, whatever comes of it.
 
         Raises:
-            DeniedError: kind `bad_ticket`: unknown, over, or for another map or file; `bad_token`: whoever asked for it
-                may not read the map any more.
+            DeniedError: kind `bad_ticket`: unknown, over, or for another map or file; `bad_token`: the
+                token that asked for it may not read the map any more.
         """
         kept = self._taken_out(token_hash(ticket))
         if kept is None:

@@ -21,17 +21,17 @@ from cairn_map.evidence.grid import CellKey
 from cairn_map.files.export_request import ExportRequest, cell_may_have, node_geometry
 from cairn_map.files.octomap import TREE_FORMATS, Subtree, branch_of_cell, tree_file
 from cairn_map.files.point_clouds import About, PointBounds, found_in_cell, point_file, points_of_cell, size_of_file
+from cairn_server.folding.cells import Cells
 from cairn_server.folding.cells_at_rest import DamagedCellError, decode_stored, sound_cell, stored_evidence
-from cairn_server.folding.damaged_cells import DamagedCells, keep_healed
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import CellRow, Head, MapRow
 
 VOXELS_EXPORTED_MAX = 1 << 28
-"""Known voxels of the cells that are looked at."""
+"""Most known voxels of the cells of an export."""
 COUNT_S = 60.0
 COUNTS_AT_ONCE = 2
 WAIT_S = 5.0
-"""For one that is being counted to end."""
+"""Longest wait for another export to be counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,23 +43,23 @@ class Export:
     size_bytes: int | None
     parts: Iterator[bytes]
     aside: IO[bytes]
-    """What they are made of, on the disk."""
+    """Temporary file that the bytes are made of."""
 
     def close(self) -> None:
-        """Let that go: nobody takes the file."""
+        """Drop the temporary file of an export that is not sent."""
         self.aside.close()
 
 
 class MapExports:
     """Exports of a store; thread-safe."""
 
-    def __init__(self, store: Store, damaged: DamagedCells) -> None:
+    def __init__(self, store: Store, cells: Cells) -> None:
         self._store = store
-        self._damaged = damaged
+        self._cells = cells
         self._room = threading.BoundedSemaphore(COUNTS_AT_ONCE)
 
     def asked(self, row: MapRow, asked: ExportRequest) -> Export:
-        """What is asked for, of the map as it is now.
+        """Export of the map in its present state.
 
         Raises:
             BadInputError: kind `bad_box`, `bad_style`; `too_large`: the cells have too many voxels; `too_costly`.
@@ -68,19 +68,15 @@ class MapExports:
         """
         asked.depth_in(row.geometry)
         asked.bounds_m()
-        healed: list[CellRow] = []
         file = _TreeFile(row, asked) if asked.format in TREE_FORMATS else _PointFile(row, asked)
-        with self._turn(), self._store.snapshot(row) as snapshot:
+        with self._turn(), self._cells.reading(row) as faults, self._store.snapshot(row) as snapshot:
             head = snapshot.head
             aside = tempfile.TemporaryFile()  # noqa: SIM115 - goes with its last reader
             try:
-                sizes = _laid_aside(aside, snapshot, file, healed)
-            except BaseException as exc:
+                sizes = _laid_aside(aside, snapshot, file, faults.healed)
+            except BaseException:
                 aside.close()
-                if isinstance(exc, DamagedCellError):
-                    self._damaged.note(row.name, [exc.key])
                 raise
-        keep_healed(self._store, row, healed)
         return Export(head, file.count, file.size_bytes, file.parts(_bodies(aside, sizes)), aside)
 
     @contextmanager
@@ -94,7 +90,7 @@ class MapExports:
 
 
 class _PointFile:
-    """Cells are laid aside as they are stored, and read a second time for their points."""
+    """Point file: cells are laid aside as they are stored, and read a second time for their points."""
 
     def __init__(self, row: MapRow, asked: ExportRequest) -> None:
         self.row, self.asked = row, asked
@@ -102,7 +98,7 @@ class _PointFile:
         self._about = About(row.name, node_geometry(row.geometry, asked).voxel_edge_m)
 
     def kept(self, stored: CellRow, evidence: Evidence) -> bytes:
-        """What of a cell is laid aside, if anything."""
+        """Bytes of a cell to be laid aside; empty if it has nothing that is asked for."""
         found = found_in_cell(stored.key, evidence, self.row.geometry, self.row.sensor_model, self.asked)
         self._found = self._found.joined(found)
         return stored.body if found.count else b""
@@ -124,7 +120,7 @@ class _PointFile:
 
 
 class _TreeFile:
-    """What is laid aside of a cell is its branch, as it will stand in the file."""
+    """Octree file: of each cell its subtree is laid aside, as it will stand in the file."""
 
     size_bytes = None
 
@@ -133,7 +129,7 @@ class _TreeFile:
         self._branches: list[Subtree] = []
 
     def kept(self, stored: CellRow, evidence: Evidence) -> bytes:
-        """What of a cell is laid aside, if anything."""
+        """Bytes of a cell to be laid aside; empty if it has nothing that is asked for."""
         found = branch_of_cell(stored.key, evidence, self.row.geometry, self.row.sensor_model, self.asked)
         if found is None:
             return b""

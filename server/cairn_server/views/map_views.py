@@ -11,12 +11,12 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-import numpy.typing as npt
 
+from cairn_map.arrays import Ints
 from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
 from cairn_map.evidence.brick_cell import brick_cell
 from cairn_map.evidence.grid import CellKey, cell_of_key
@@ -27,8 +27,8 @@ from cairn_map.render.partial_map import Drawing, ReadCell, draw_as_needed, read
 from cairn_map.render.render_picture import Layer, png_of
 from cairn_map.render.render_request import RenderRequest
 from cairn_map.warm_up import warm_up_pictures
+from cairn_server.folding.cells import Cells
 from cairn_server.folding.cells_at_rest import DamagedCellError, row_of_cell, sound_cell, stored_evidence
-from cairn_server.folding.damaged_cells import DamagedCells, keep_healed
 from cairn_server.folding.read_cache import State, state_of
 from cairn_server.folding.single_flight import MadeOnce
 from cairn_server.store.stamps import Stamps, decode_stamps, no_stamps
@@ -38,22 +38,22 @@ from cairn_server.store.store_rows import CellRow, Head, MapRow
 log = logging.getLogger(__name__)
 
 VERSION = 2
-"""Of what a picture looks like: part of its ETag."""
+"""Version of the looks of pictures: part of their ETags."""
 CELLS_IN_VIEW_MAX = 4096
 VOXELS_READ_MAX = 1 << 26
-"""Of all cells that one picture takes."""
+"""Most voxels of all cells that one picture reads."""
 RENDER_S = 10.0
 RENDERS_AT_ONCE = 2
 WAIT_S = 5.0
-"""For one that is being made to end."""
+"""Longest wait for another picture to be made."""
 THREADS = 2
 CELLS_BYTES = 256 << 20
-"""Memory for cells that are ready to be drawn, of all maps; and"""
+"""Memory for cells of all maps that are ready to be drawn."""
 LISTS_BYTES = 64 << 20
-"""for lists of cells."""
+"""Memory for lists of cells."""
 LISTED_BYTES = 500
 TIMES_MAX = 100_000
-Listing = tuple[dict[CellKey, CellRow], npt.NDArray[np.int64]]
+Listing = tuple[dict[CellKey, CellRow], Ints]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,11 +72,14 @@ class _Task:
     snapshot: Snapshot
     row: MapRow
     layer: Layer
-    """Whose values are read from cells; depths and ages need none."""
+    """Layer whose values are read from cells; depths and ages need none."""
     listed: dict[CellKey, CellRow]
+    """Cells of the snapshot that hold something."""
     until_s: float
+    healed: list[CellRow]
+    """Collects the cells that were rebuilt from the log."""
     voxels: int = 0
-    healed: list[CellRow] = field(default_factory=list)
+    """Voxels of the cells read so far."""
 
     def check_time(self) -> None:
         """End what takes too long.
@@ -93,11 +96,11 @@ class _Task:
 class MapViews:
     """Draws maps of a store; thread-safe."""
 
-    def __init__(self, store: Store, damaged: DamagedCells) -> None:
+    def __init__(self, store: Store, cells: Cells) -> None:
         self._store = store
-        self._damaged = damaged
+        self._cells = cells
         self._room = threading.BoundedSemaphore(RENDERS_AT_ONCE)
-        self._cells: MadeOnce[tuple[State, Layer], ReadCell] = MadeOnce(
+        self._read_cells: MadeOnce[tuple[State, Layer], ReadCell] = MadeOnce(
             limit_bytes=CELLS_BYTES, size_of=lambda read: read.size_bytes
         )
         self._lists: MadeOnce[tuple[bytes, int], Listing] = MadeOnce(
@@ -115,20 +118,15 @@ class MapViews:
             DamagedCellError: kind `damaged_store`: a cell in sight is damaged.
         """
         _get_ready()
-        with self._store.snapshot(row) as snapshot:
+        with self._cells.reading(row) as faults, self._store.snapshot(row) as snapshot:
             etag = _etag(snapshot.head, request)
             if known is not None and etag in known:
                 return AskedView(etag, snapshot.head, None)
             with self._turn():
-                task = _Task(snapshot, row, _read_of(request.layer), {}, time.monotonic() + RENDER_S)
-                try:
-                    body = self._body(task, request)
-                except DamagedCellError as exc:
-                    self._damaged.note(row.name, [exc.key])
-                    raise
-            head = snapshot.head
-        keep_healed(self._store, row, task.healed)
-        return AskedView(etag, head, body)
+                until_s = time.monotonic() + RENDER_S
+                listed, places = self._listing(snapshot)
+                task = _Task(snapshot, row, _read_of(request.layer), listed, until_s, faults.healed)
+                return AskedView(etag, snapshot.head, self._body(task, places, request))
 
     @contextmanager
     def _turn(self) -> Iterator[None]:
@@ -139,8 +137,8 @@ class MapViews:
         finally:
             self._room.release()
 
-    def _body(self, task: _Task, request: RenderRequest) -> bytes:
-        drawing, renderer = self._drawing(task, request)
+    def _body(self, task: _Task, places: Ints, request: RenderRequest) -> bytes:
+        drawing, renderer = self._drawing(task, places, request)
         snapshot, seen = drawing.snapshot, drawing.seen
         ages = self._ages(task, drawing) if request.layer is Layer.AGE else None
         values = layer_values(renderer, snapshot, seen, request.layer, ages)
@@ -149,17 +147,16 @@ class MapViews:
             return npz_of(arrays_of(values, seen, request.layer, request.spread))
         return png_of(layer_picture(values, seen, request.scale, request.spread))
 
-    def _drawing(self, task: _Task, request: RenderRequest) -> tuple[Drawing, MapRenderer]:
+    def _drawing(self, task: _Task, places: Ints, request: RenderRequest) -> tuple[Drawing, MapRenderer]:
         geometry, model, sight, T = task.row.geometry, task.row.sensor_model, request.sight, request.T_map_camera
-        task.listed, cells = self._listing(task.snapshot)
         edge_m = geometry.cell_edge_m
-        inside = cells_in_sight(cells, sight, T, edge_m=edge_m, range_max_m=request.range_m)
+        inside = cells_in_sight(places, sight, T, edge_m=edge_m, range_max_m=request.range_m)
         if inside.sum() > CELLS_IN_VIEW_MAX:
             raise BadInputError(
                 "too_large", f"{inside.sum()} cells are in sight, {CELLS_IN_VIEW_MAX} at most may be; lower range_m"
             )
         keys = [key for key, is_inside in zip(task.listed, inside, strict=True) if is_inside]
-        kept = {key: self._cells.here((state_of(task.snapshot, task.listed[key]), task.layer)) for key in keys}
+        kept = {key: self._read_cells.here((state_of(task.snapshot, task.listed[key]), task.layer)) for key in keys}
         here = {key: read for key, read in kept.items() if read is not None}
         renderer = MapRenderer(threads=THREADS, on_share=task.check_time)
         drawing = draw_as_needed(
@@ -197,7 +194,7 @@ class MapViews:
 
         def make(key: CellKey) -> ReadCell:
             state = state_of(task.snapshot, task.listed[key])
-            return self._cells.get((state, task.layer), lambda: _ready(stored[key], task))
+            return self._read_cells.get((state, task.layer), lambda: _ready(stored[key], task))
 
         found: dict[CellKey, ReadCell] = {}
         with ThreadPoolExecutor(THREADS) as pool:
@@ -211,7 +208,7 @@ class MapViews:
         return found
 
     def _ages(self, task: _Task, drawing: Drawing) -> Ages:
-        """When what is seen was measured last, UTC seconds, by the log's commits; now is when the newest one was.
+        """Times (UTC seconds) of the last measurement of everything seen, by the log's commits; now is the newest one.
 
         So the picture depends on the map alone. Where a commit states no time, the age is unknown.
         """
@@ -225,7 +222,7 @@ class MapViews:
         return Ages(changes, now=self._time_of(task, head.log_id, head.seq))
 
     def _stamps(self, task: _Task, key: CellKey) -> Stamps:
-        """When each block was changed last, by log entry; where that is damaged, never: its age is unknown."""
+        """Stamps of a cell; if they are damaged, none, so that its age is unknown."""
         stored, depth = row_of_cell(task.snapshot, key), task.row.geometry.depth
         if stored is None:
             raise DamagedCellError(key, "a cell is listed, but is not there")
@@ -236,7 +233,7 @@ class MapViews:
             return no_stamps(depth)
 
     def _time_of(self, task: _Task, log_id: bytes, seq: int) -> float:
-        """When the last scan of an entry's commit was taken; NaN where it states no time."""
+        """Time of the last scan of an entry's commit; NaN where it states none."""
         known = self._times.get((log_id, seq))
         if known is not None:
             return known
@@ -251,7 +248,7 @@ class MapViews:
 
 
 def _get_ready() -> None:
-    """Load the kernels that draw, or compile them, which takes a minute where nobody did: no picture's time or turn.
+    """Load the kernels that draw, or compile them, which takes a minute the first time and counts for no picture.
 
     Raises:
         UnreachableError: kind `busy`: another request is at it.

@@ -1,9 +1,9 @@
-"""What is known of one voxel: its numbers, and the commits that they are made of.
+"""Report on one voxel: its numbers, and the commits that they are made of.
 
     cell at rest  -->  hits, misses, means        exact
     diffs of the cell's newest log entries  -->  who saw the voxel, how often, when
 
-What a retract took out is not told of: it is as if it had never been.
+Retracted commits are left out, as if they had never come.
 """
 
 import re
@@ -23,16 +23,16 @@ from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import MapRow
 
 ENTRIES_MAX = 32
-"""Log entries of the cell that are looked at, the newest: to decode one takes some 10 ms."""
+"""Most of the cell's newest log entries that are decoded, some 10 ms each."""
 VOXEL = re.compile(r"(0|-?[1-9]\d{0,9}),(0|-?[1-9]\d{0,9}),(0|-?[1-9]\d{0,9})")
 
 
 def asked_voxel(store: Store, cells: Cells, row: MapRow, text: str) -> VoxelAnswer:
-    """What is known of the voxel `i,j,k` of the map's lattice (FORMAT.md 2).
+    """Report on the voxel `i,j,k` of the map's lattice (FORMAT.md 2).
 
     Raises:
         BadInputError: kind `bad_cell` or `cell_range`: no voxel is numbered so.
-        NotFoundError: kind `no_cell`: nobody has seen its cell.
+        NotFoundError: kind `no_cell`: its cell was never seen.
     """
     found = VOXEL.fullmatch(text)
     if found is None:
@@ -67,7 +67,7 @@ def asked_voxel(store: Store, cells: Cells, row: MapRow, text: str) -> VoxelAnsw
 
 
 def _only(evidence: Evidence, place: int) -> Evidence:
-    """Of one voxel alone, or of none."""
+    """Evidence of one voxel alone, empty if it has none."""
     at = int(np.searchsorted(evidence.voxels, place))
     rows = np.array([at]) if at < len(evidence) and evidence.voxels[at] == place else np.empty(0, np.int64)
     mine = np.isin(evidence.sampled, rows)
@@ -92,7 +92,7 @@ def _reading(reading: Reading, channel: Channel) -> ChannelReading:
 
 
 def _commits(snapshot: Snapshot, key: CellKey, place: int, *, until: int) -> tuple[list[VoxelCommit], bool]:
-    """Commits that saw a voxel, the newest first; and whether there are older ones of its cell."""
+    """Commits that saw a voxel, the newest first; and True if the cell has older ones."""
     found = [c for c in snapshot.contributions(key, after_seq=0, newest=ENTRIES_MAX + 1) if c.seq <= until]
     counts: dict[int, tuple[int, int]] = {}
     for contribution in found[-ENTRIES_MAX:]:

@@ -102,7 +102,7 @@ def test_an_operator_s_retract_at_base_or_field_reaches_all_that_trust_the_serve
     base.service.settings = base.service.settings.model_copy(
         update={"trusted_servers": " ".join(server.key for server in fields)}
     )
-    base.service.pushes._settings = base.service.settings
+    base.service.sync.pushes._settings = base.service.settings
     [target, kept] = sorted(base.ids())
     (base, fields[0])[at].retract(target)
     settled(base, *fields)
@@ -148,8 +148,8 @@ def test_a_field_server_forgets_nothing_that_its_upstream_has_not_got(base: Serv
         [commit] = field.ids()
 
         def is_gone() -> bool:
-            field.service._folder._forget_next_s = 0.0
-            assert not field.service._folder._forget_old([field.row])
+            field.service._fold_thread._forget_next_s = 0.0
+            assert not field.service._fold_thread._forget_old([field.row])
             found = field.service.store.commit(field.row, commit)
             return found is not None and found.gone
 

@@ -107,7 +107,7 @@ def test_what_was_refused_or_known_costs_nothing(tmp_path: Path) -> None:
 def test_a_quota_is_looked_at_before_evidence_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with guarded(tmp_path, cells_per_commit=1) as live:
         row = live.new_map()
-        monkeypatch.setattr(live.service.pushes.checks, "check", lambda commit: pytest.fail("decoded"))
+        monkeypatch.setattr(live.service.sync.pushes.checks, "check", lambda commit: pytest.fail("decoded"))
         answer = live.push(row, pushed(0, 0), headers=bearer(robot_token(live, row, "mole")))
         assert (answer.status_code, kind_of(answer)) == (400, "beyond_quota")
         assert "Retry-After" not in answer.headers
@@ -155,7 +155,9 @@ def test_what_a_relay_brings_is_not_larger_or_farther_than_what_a_robot_may(tmp_
             signed = signatures.signed(row, commit)
             answers.append(live.push(row, commit, headers=signed | relay))
             with pytest.raises(BadInputError) if n else nullcontext():
-                live.service.push(row, UPSTREAM, str(commit.id), commit.data, signatures=signed["Cairn-Signature"])
+                live.service.sync.pushes.keep(
+                    row, UPSTREAM, str(commit.id), commit.data, signatures=signed["Cairn-Signature"]
+                )
         assert answers[0].status_code == 201
         assert [kind_of(answer) for answer in answers[1:]] == ["beyond_quota"] * 2
 

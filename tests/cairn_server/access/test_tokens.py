@@ -304,7 +304,7 @@ def test_a_robot_cannot_push_others_lines_out_of_the_audit_log_by_refusals(
 
 def test_refusals_are_noted_again_in_the_next_hour() -> None:
     now_s = [7.0 * rate_limits.HOUR_S]
-    counter = rate_limits.Refusals(steady_s=lambda: now_s[0])
+    counter = rate_limits.AuditLimit(steady_s=lambda: now_s[0])
     assert [counter.is_worth_a_line("x") for _ in range(100)] == [True] * 60 + [False] * 40
     now_s[0] += rate_limits.HOUR_S
     assert counter.is_worth_a_line("x")

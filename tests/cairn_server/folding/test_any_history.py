@@ -17,12 +17,11 @@ from tests.fixtures.server.store_contract import Model
 from tests.naive.asker import NaiveAsker
 
 from cairn_map.commits.commit import Commit
-from cairn_map.commits.ids import Author, CommitId, Incarnation
+from cairn_map.commits.ids import OPERATOR, Author, CommitId, Incarnation
 from cairn_map.commits.version_vector import EMPTY
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.wire.frames import frames_of
 from cairn_map.wire.messages import CellIndex, CreateMap, MapInfo, Register, Retract
-from cairn_server.service import OPERATOR
 from cairn_server.store.store_rows import MapRow
 
 REBORN = Author(MOLE.robot, Incarnation("00000000000000bb"))
@@ -79,7 +78,7 @@ class AnyHistory(RuleBasedStateMachine):
         known = self.maps.get(name)
         if known is None:
             assert answer.status_code == 201
-            operator = None if other else Author(OPERATOR, self.live.service.operator)
+            operator = None if other else Author(OPERATOR, self.live.service.sync.retracts.operator)
             self.maps[name] = MapModel(operator)
             self.changed.add(name)
         elif other == (known.operator is None):
@@ -225,7 +224,7 @@ class AnyHistory(RuleBasedStateMachine):
         assert answer.status_code == 201, answer.text
         assert answer.json()["commits"] == [str(target) for target in targets]
         known = self.maps[name]
-        known.operator = Author(OPERATOR, self.live.service.operator)  # another one after each start
+        known.operator = Author(OPERATOR, self.live.service.sync.retracts.operator)  # another one after each start
         n = known.next_n(known.operator)
         assert answer.json()["id"] == str(CommitId(known.operator, n))
         named = [_Named(target) for target in targets]

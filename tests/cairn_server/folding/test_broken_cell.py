@@ -42,7 +42,7 @@ def test_an_answer_to_missing_brings_all_other_cells_and_names_the_damaged_one(l
 
 def test_other_maps_are_served_and_folded(live: Live) -> None:
     row, other = broken_map(live, keep_diffs=False), live.new_map()
-    live.service._folder._here._caches.clear()  # the folder still knows the cell, and would write it anew
+    live.service._fold_thread._local._caches.clear()  # the folder still knows the cell, and would write it anew
     assert live.push(row, pushed(1, 0)).status_code == 201
     live.push(other, pushed(0, 0))
     live.folded(other)
@@ -50,7 +50,7 @@ def test_other_maps_are_served_and_folded(live: Live) -> None:
     assert live.http.get(cell_path(row, SOUND)).status_code == 200
     assert live.http.get("/readyz").status_code == 200
     assert live.pending(row) == 1
-    until(lambda: live.service.folds.damaged() == {row.name}, "the fold of the damaged map failed")
+    until(lambda: live.service.readiness._folds.damaged() == {row.name}, "the fold of the damaged map failed")
 
 
 def body_of(key: CellKey) -> bytes:
@@ -60,9 +60,9 @@ def body_of(key: CellKey) -> bytes:
 
 def test_whoever_still_has_a_damaged_cell_heals_it_and_folding_goes_on(live: Live) -> None:
     row = broken_map(live, keep_diffs=False)
-    live.service._folder._here._caches.clear()
+    live.service._fold_thread._local._caches.clear()
     live.push(row, pushed(1, 0))
-    until(lambda: live.service.folds.damaged() >= {row.name}, "the fold of the damaged map failed")
+    until(lambda: live.service.readiness._folds.damaged() >= {row.name}, "the fold of the damaged map failed")
     wrong = live.http.put(cell_path(row, BROKEN), content=pushed(0, 0, scans=7).cells[SOUND])
     assert (wrong.status_code, kind_of(wrong)) == (400, "bad_cell")
     other = live.http.put(cell_path(row, BROKEN), content=pushed(5, 2).cells[BROKEN])

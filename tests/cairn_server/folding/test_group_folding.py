@@ -36,7 +36,7 @@ def broken_map(live: Live) -> tuple[MapRow, bytes]:
         BROKEN,
         row.number,
     )
-    live.service._folder._here._caches.clear()  # the folder still knows the cell, and would write it anew
+    live.service._fold_thread._local._caches.clear()  # the folder still knows the cell, and would write it anew
     return row, whole
 
 
@@ -72,12 +72,12 @@ def test_commits_elsewhere_are_folded_and_those_in_the_damaged_cell_wait_until_i
     elsewhere = sum_of([*BASE, *(commit for commit in commits if not touches(commit))])
     assert read({KEYS[2]: live.http.get(cell_path(row, KEYS[2])).content}) == {KEYS[2]: elsewhere[KEYS[2]]}
     assert live.http.get(cell_path(row, BROKEN)).status_code == 500
-    assert live.service.folds.damaged() == {row.name}
+    assert live.service.readiness._folds.damaged() == {row.name}
     damage(live, "UPDATE commits SET received_s = 0 WHERE folded_seq IS NULL")
     assert live.http.get("/readyz").status_code == 200  # however long they wait
     heal(live, row, whole)
     assert live.cells(row) == cells_of_a_sound_map(live, [*BASE, *commits])
-    until(lambda: live.service.folds.damaged() == frozenset(), "the map is well")
+    until(lambda: live.service.readiness._folds.damaged() == frozenset(), "the map is well")
 
 
 def test_a_retract_of_what_is_in_the_damaged_cell_waits_and_one_of_what_waits_does_not(live: Live) -> None:
@@ -121,7 +121,7 @@ def test_many_that_wait_do_not_stop_those_behind_them(tmp_path: Path) -> None:
 
 def _folds_what_comes_last(live: Live) -> None:
     row, _ = broken_map(live)
-    live.service._folder.close()
+    live.service._fold_thread.close()
     commits = [pushed(n, 0) for n in range(1, 8)] + [pushed(8, 1)]
     for commit in commits:
         live.push(row, commit)
@@ -137,7 +137,7 @@ def test_a_cell_that_the_log_tells_again_is_found_out_without_a_word(
 ) -> None:
     row, _ = broken_map(live)
     live.push(row, pushed(1, 0))
-    until(lambda: live.service.folds.damaged() == {row.name}, "the cell is found damaged")
+    until(lambda: live.service.readiness._folds.damaged() == {row.name}, "the cell is found damaged")
     damage(live, "UPDATE diff SET body = ? WHERE cell = ? AND body IS NULL", FIRST.cells[BROKEN], BROKEN)
     live.push(row, pushed(2, 1))
     until(lambda: len(ids_pending(live, row)) == 1, "what is elsewhere is folded")

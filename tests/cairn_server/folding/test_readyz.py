@@ -77,7 +77,7 @@ def test_a_map_with_a_damaged_cell_does_not_take_the_server_away_from_the_others
     row = live.new_map()
     monkeypatch.setattr(group_folding, "fold_around", raising(DamagedDataError("damaged_store", "one cell")))
     live.push(row, pushed(0, 0))
-    until(lambda: row.name in live.service.folds.damaged(), "the fold failed")
+    until(lambda: row.name in live.service.readiness._folds.damaged(), "the fold failed")
     store_of(live)._writer.run(lambda c: c.execute("UPDATE commits SET received_s = 0").fetchall())
     assert reasons(live) == ""
 
@@ -90,7 +90,7 @@ def test_a_commit_that_waits_too_long_makes_it_not_ready(live: Live, monkeypatch
     store_of(live)._writer.run(
         lambda c: c.execute("UPDATE commits SET received_s = received_s - 60 WHERE folded_seq IS NULL").fetchall()
     )
-    assert reasons(live).startswith("fold_lag: a commit waits since 6")
+    assert reasons(live).startswith("fold_lag: a commit has waited for 6")
 
 
 def test_a_disk_that_takes_nothing_makes_it_not_ready(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,8 +105,8 @@ def test_a_disk_that_takes_nothing_makes_it_not_ready(live: Live, monkeypatch: p
 
 
 def test_threads_that_ended_make_it_not_ready(live: Live) -> None:
-    live.service._folder.close()
-    assert reasons(live) == "fold_dead: the thread that folds has ended; start the server anew"
+    live.service._fold_thread.close()
+    assert reasons(live) == "fold_dead: the thread that folds has ended; restart the server"
     store_of(live)._writer.close()
     assert "store_failed: the store's writer has ended" in reasons(live)
 

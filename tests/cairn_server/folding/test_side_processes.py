@@ -1,10 +1,8 @@
 """The processes beside the server: what they do is what it does without them, and it can be without them."""
 
-import asyncio
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import threading
 from collections.abc import Iterator
@@ -28,8 +26,6 @@ from cairn_map.wire.messages import CreateMap, MapInfo
 from cairn_server.folding.damaged_cells import DamagedCells
 from cairn_server.folding.fold_process import FoldProcess, LostProcessError, answer_folds
 from cairn_server.store.sqlite.store import SqliteStore
-from cairn_server.sync.checks import check_process
-from cairn_server.sync.checks.check_process import CheckProcess, LostCheckError
 
 pytestmark = pytest.mark.processes
 
@@ -104,17 +100,17 @@ def test_they_work_for_the_first_process_of_a_container(tmp_path: Path) -> None:
         pytest.skip("this machine makes no namespace of processes for us")
     made = Process(tmp_path, under=alone)
     (server,) = children_of(made.pid)
-    assert len(children_of(server)) == 2
+    assert len(children_of(server)) == 1
     httpx.put(f"{made.url}/maps/lab", content=CreateMap(geometry=SMALL).model_dump_json().encode(), headers=JSON)
     push(made, *COMMITS)
     cells_when_folded(made, len(COMMITS))
-    assert len(children_of(server)) == 2
+    assert len(children_of(server)) == 1
     os.kill(server, signal.SIGTERM)
     assert "killed" not in made.end()[1]
 
 
 def test_what_the_process_refuses_is_refused_in_the_same_words(process: Process, live: Live) -> None:
-    live.service.create_map("lab", CreateMap(geometry=SMALL))
+    live.service.maps.create("lab", CreateMap(geometry=SMALL))
     row = live.service.store.map("lab")
     for at in range(0, len(COMMITS[0].data), 41):
         data = bytearray(COMMITS[0].data)
@@ -144,7 +140,7 @@ def test_a_fold_that_cannot_be_written_is_told_as_it_is_and_tried_again(
 ) -> None:
     store, process = far
     with Live(tmp_path, store=store) as served:
-        monkeypatch.setattr(served.service._folder, "_fold_group", lambda *arguments: 0)
+        monkeypatch.setattr(served.service._fold_thread, "_fold_group", lambda *arguments: 0)
         row = served.new_map()
         for commit in COMMITS:
             served.push(row, commit)
@@ -174,7 +170,7 @@ def test_damage_is_noted_and_folded_around_from_afar(
         row, damaged = served.new_map(), DamagedCells()
         served.push(row, COMMITS[0])
         served.folded(row)
-        monkeypatch.setattr(served.service._folder, "_fold_group", lambda *arguments: 0)
+        monkeypatch.setattr(served.service._fold_thread, "_fold_group", lambda *arguments: 0)
         for commit in COMMITS[1:]:
             served.push(row, commit)
         damage(served, "UPDATE cell SET body = x'00' WHERE map = ? AND cell = ?", row.number, BROKEN)
@@ -200,30 +196,5 @@ def test_robots_that_come_at_the_same_moment_do_not_end_the_process(process: Pro
         list(pool.map(lambda commit: push(process, commit), COMMITS[:8]))
     before = children_of(process.pid)
     push(process, *COMMITS[8:])
-    assert len(before) == len(children_of(process.pid)) == 2
+    assert len(before) == len(children_of(process.pid)) == 1
     assert "killed" not in process.said()
-
-
-def test_an_error_that_nobody_expected_is_of_one_commit_and_told(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(check_process, "answer_to", raising(RuntimeError("by chance")))
-    ours, theirs = socket.socketpair()
-    with ours, theirs:
-        thread = threading.Thread(target=check_process.answer_checks, args=(theirs,))
-        thread.start()
-        asking = CheckProcess(0, ours)
-
-        async def ask() -> None:
-            for _ in range(2):
-                with pytest.raises(LostCheckError):
-                    await asking.check(COMMITS[0].data)
-            assert not asking.is_lost
-            assert asking._writer is not None
-            assert asking._reading is not None
-            asking._writer.close()
-            await asking._reading
-
-        asyncio.run(ask())
-        assert "RuntimeError: by chance" in caplog.text
-        thread.join()

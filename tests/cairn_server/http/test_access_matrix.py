@@ -79,7 +79,7 @@ class Holders:
         """Robots registered and tokens given anew: what was just done may have ended them."""
         for row in self.rows.values():
             for robot, author in AUTHORS.items():
-                self.live.service.register(row, Register(robot=robot, incarnation=author.incarnation))
+                self.live.service.maps.register(row, Register(robot=robot, incarnation=author.incarnation))
         self._headers = {}
 
     def headers_of(self, holder: Holder) -> dict[str, str]:

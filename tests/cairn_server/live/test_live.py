@@ -118,10 +118,10 @@ def test_who_comes_back_hears_what_was_folded_meanwhile(live: Live, listen: List
 def test_who_comes_back_after_a_restart_goes_on_and_ids_still_rise(tmp_path: Path) -> None:
     with Live(tmp_path) as live:
         row = live.new_map()
-        live.service.register(row, REGISTRATION)
+        live.service.maps.register(row, REGISTRATION)
         with by_sse(live, row) as events:
             first = hello_of(events)
-            live.service.register(row, REGISTRATION)
+            live.service.maps.register(row, REGISTRATION)
             robot = next(events)
             push(live, row, 0)
             last = up_to_head(events, 1)[-1]
@@ -130,7 +130,7 @@ def test_who_comes_back_after_a_restart_goes_on_and_ids_still_rise(tmp_path: Pat
         hello = hello_of(events)
         assert hello.resumed
         found = up_to_head(events, 2)
-        live.service.register(row, REGISTRATION)
+        live.service.maps.register(row, REGISTRATION)
         heard = next(events)
     assert changed(found) == set(COMMITS[1].cells)
     order = [rank(event) for event in (first, robot, last, hello, found[-1], heard)]
@@ -181,7 +181,7 @@ def test_whatever_a_listener_misses_it_hears_of_every_cell_and_of_the_newest_hea
 
 def test_who_does_not_read_is_told_once_and_costs_no_more(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     row = live.new_map()
-    live.service.register(row, REGISTRATION)
+    live.service.maps.register(row, REGISTRATION)
     slow = joined(live, row)
     slow.take()
     for n in range(len(COMMITS)):
@@ -252,7 +252,7 @@ def test_what_a_robot_pushed_does_not_wait_behind_the_sign_of_the_robot(
     live: Live, listen: Listen, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     row = live.new_map()
-    live.service.register(row, REGISTRATION)
+    live.service.maps.register(row, REGISTRATION)
     with listen(live, row) as events:
         hello_of(events)
         time.sleep(3 * SPACING_S)  # streams pause so long after what they sent

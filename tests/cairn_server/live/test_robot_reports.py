@@ -13,7 +13,8 @@ from tests.fixtures.server.pushes import JPEG, MOLE, PNG, WREN, pushed
 
 from cairn_map.wire.live_events import RobotHeard
 from cairn_map.wire.messages import RobotStatus
-from cairn_server.live import branch_list, robot_reports
+from cairn_server import maps
+from cairn_server.live import robot_reports
 from cairn_server.store.store_rows import MapRow
 
 STATUS = RobotStatus.model_validate(
@@ -205,7 +206,7 @@ def test_lag_counts_entries_and_the_bytes_of_others(live: Live) -> None:
 
 
 def test_a_lag_beyond_the_bound_is_told_in_entries_only(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(branch_list, "LAG_ENTRIES_MAX", 1)
+    monkeypatch.setattr(maps, "LAG_ENTRIES_MAX", 1)
     row = live.new_map()
     start = live.http.get(f"/maps/{row.name}").json()["cursor"]
     for name in ("mole", "wren"):

@@ -153,7 +153,7 @@ def test_a_cell_whose_commits_are_gone_too_is_set_aside(check: Check, folder: Pa
     forget(folder)
     code, said = check("--repair")
     assert code == 6
-    assert "cannot be made anew from the log" in said
+    assert "cannot be rebuilt from the log" in said
     assert "not kept any more" in said
 
 

@@ -144,11 +144,11 @@ def test_evidence_that_a_waiting_commit_takes_out_is_kept(live: Live, monkeypatc
     row, commit = live.new_map(), pushed(0, 1)
     live.push(row, commit)
     live.folded(row)
-    monkeypatch.setattr(live.service._folder, "_fold_group", lambda *arguments: 0)
+    monkeypatch.setattr(live.service._fold_thread, "_fold_group", lambda *arguments: 0)
     live.push(row, pushed(1, 2, retracts=[commit]))
     assert live.service.store.forget_evidence(row, before_s=NOW, limit=100) == 0
     monkeypatch.undo()
-    live.service._folder.wake()
+    live.service._fold_thread.wake()
     assert read(live.cells(row)) == sum_of([commit, pushed(1, 2, retracts=[commit])])
 
 

@@ -35,7 +35,7 @@ LIMIT_S = 2.0
 def strict(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     """A server that sends everything to its one worker."""
     with Live(tmp_path_factory.mktemp("strict"), check_workers=1, check_cpu_s=LIMIT_S) as server:
-        server.service.pushes.checks.ordinary_s = 0.0
+        server.service.sync.pushes.checks.ordinary_s = 0.0
         yield server
 
 
@@ -146,7 +146,7 @@ def test_a_commit_that_takes_long_is_refused_and_the_worker_replaced(
 
 def test_a_commit_that_takes_much_memory_is_refused_and_large_workers_are_not_kept(tmp_path: Path) -> None:
     with Live(tmp_path, check_workers=1, check_memory_bytes=1 << 26) as server:
-        server.service.pushes.checks.ordinary_s = 0.0
+        server.service.sync.pushes.checks.ordinary_s = 0.0
         small, large = server.new_map(), server.new_map(LARGE)
         assert kind_of(server.push(large, of_cells(60))) == (400, "too_costly")
         assert server.push(small, pushed(0, 1)).status_code == 201
@@ -238,7 +238,7 @@ def test_workers_end_with_a_server_that_was_killed(tmp_path: Path) -> None:
 
 
 def pool_of(live: Live) -> check_pool.CheckPool:
-    return live.service.pushes.checks._pool
+    return live.service.sync.pushes.checks._pool
 
 
 def workers_of(live: Live) -> list[int]:

@@ -130,7 +130,7 @@ def test_a_server_hands_its_operators_retracts_on_under_its_own_key(live: Live, 
     target = pushed(0, 1, MOLE)
     hand_over(live, row, target)
     request = Retract(commits=[str(target.id)])
-    done = live.service.retract(row, request, by=ADMIN_FILE).id
+    done = live.service.sync.retracts.retract(row, request, by=ADMIN_FILE).id
     found = live.http.get(f"/maps/{row.name}/commits/{done}")
     key = live.http.get(f"/maps/{row.name}").json()["server_key"]
     assert found.headers["Cairn-Signature"].startswith(f"{key}.")

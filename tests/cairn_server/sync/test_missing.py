@@ -89,7 +89,7 @@ def test_what_is_pending_is_not_stable(tmp_path: Path, monkeypatch: pytest.Monke
         row = own.new_map()
         own.push(row, pushed(0, 0))
         own.folded(row)
-        monkeypatch.setattr(own.service._folder, "_fold_group", lambda *arguments: 0)
+        monkeypatch.setattr(own.service._fold_thread, "_fold_group", lambda *arguments: 0)
         own.push(row, pushed(1, 1))
         header = frames_of(ask_missing(own, row, NaiveAsker(MOLE).request()).content)[0]
         assert isinstance(header, ReplyHeader)
@@ -258,15 +258,15 @@ def test_the_header_tells_what_a_robot_may_conclude(live: Live, monkeypatch: pyt
     assert header.vector[str(MOLE)] == [[0, 1]]
     assert header.tip == (1, commits[1].sha.hex())
     assert header.stable == {}
-    assert header.retracts == [f"operator.{live.service.operator}.0"]
-    monkeypatch.setattr(live.service._folder, "_fold_group", lambda *arguments: 0)
+    assert header.retracts == [f"operator.{live.service.sync.retracts.operator}.0"]
+    monkeypatch.setattr(live.service._fold_thread, "_fold_group", lambda *arguments: 0)
     live.push(row, pushed(2, 2))
     header = frames_of(ask_missing(live, row, NaiveAsker(MOLE).request()).content)[0]
     assert isinstance(header, ReplyHeader)
     assert header.pending == {str(MOLE): [[2, 2]]}
     assert header.vector[str(MOLE)] == [[0, 1]]
     monkeypatch.undo()
-    live.service._folder.wake()
+    live.service._fold_thread.wake()
 
 
 def test_a_cell_named_twice_is_refused(live: Live) -> None:

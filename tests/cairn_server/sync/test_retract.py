@@ -124,7 +124,7 @@ def test_nothing_and_retracts_cannot_be_retracted(live: Live) -> None:
     row = live.new_map()
     assert kind_of(live.retract(row)) == "nothing_to_retract"
     assert kind_of(live.retract(row, robot="nobody")) == "nothing_to_retract"
-    target = f"operator.{live.service.operator}.0"
+    target = f"operator.{live.service.sync.retracts.operator}.0"
     answer = live.http.post(f"/maps/{row.name}/retracts", json={"commits": [target]})
     assert kind_of(answer) == "not_retractable"
 
@@ -169,11 +169,11 @@ def test_a_retract_may_be_pushed_back_by_anybody_with_this_map_s_seal_on_it_and_
     service, robot = live.service, Caller(Role.ROBOT, "mole")
     for wrong in (None, "0" * 64, seal_of(row, commit.sha)):
         with pytest.raises(DeniedError):
-            service.push(row, robot, name, answer.content, seal=wrong)
+            service.sync.pushes.keep(row, robot, name, answer.content, seal=wrong)
     other = live.new_map()
     with pytest.raises(DeniedError):
-        service.push(other, robot, name, answer.content, seal=seal)
+        service.sync.pushes.keep(other, robot, name, answer.content, seal=seal)
     evidence = pushed(0, 1, Author(OPERATOR, MOLE.incarnation))
     with pytest.raises(DeniedError):
-        service.push(row, robot, str(evidence.id), evidence.data, seal=seal_of(row, evidence.sha))
-    assert not service.push(row, robot, name, answer.content, seal=seal)
+        service.sync.pushes.keep(row, robot, str(evidence.id), evidence.data, seal=seal_of(row, evidence.sha))
+    assert not service.sync.pushes.keep(row, robot, name, answer.content, seal=seal)

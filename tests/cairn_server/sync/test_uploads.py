@@ -108,7 +108,7 @@ def test_after_a_quota_the_same_part_comes_again(tmp_path: Path) -> None:
         live.push(row, COMMIT, headers=headers)
         assert_waits(add(live, row, later.data[most:], most, commit=later, headers=headers), 1, 60)
         assert state(live, row, later, headers=headers)["size_bytes"] == most
-        live.service.pushes.meter._minutes.clear()  # a minute later
+        live.service.sync.pushes.meter._minutes.clear()  # a minute later
         assert add(live, row, later.data[most:], most, commit=later, headers=headers).status_code == 201
 
 
@@ -119,7 +119,7 @@ def test_where_the_push_must_wait_an_empty_part_tries_again(live: Live, monkeypa
         raise UnreachableError("busy", "later", 1.0)
 
     with monkeypatch.context() as patch:
-        patch.setattr(live.service.pushes, "keep", busy)
+        patch.setattr(live.service.sync.pushes, "keep", busy)
         assert add(live, row, COMMIT.data, 0).status_code == 503
     assert state(live, row)["size_bytes"] == len(COMMIT.data)
     assert add(live, row, b"", len(COMMIT.data)).status_code == 201
@@ -131,7 +131,7 @@ class Staging:
     def __init__(self, live: Live) -> None:
         self.now_s = 0.0
         self.row = live.new_map()
-        self.uploads = Uploads(live.service.store, live.service.pushes, steady_s=lambda: self.now_s)
+        self.uploads = Uploads(live.service.store, live.service.sync.pushes, steady_s=lambda: self.now_s)
 
     def add(self, robot: str, size_bytes: int, *, n: int = 0, total: int = COMMIT_BYTES_MAX, offset: int = 0) -> int:
         part = Part("0" * 64, total, offset, bytes(size_bytes))
@@ -200,4 +200,4 @@ def test_a_part_of_nothing_takes_no_place(live: Live) -> None:
 
 def test_a_bad_id_is_refused(live: Live) -> None:
     with pytest.raises(BadInputError):
-        live.service.uploads.add(live.new_map(), Caller(Role.ADMIN), "?", Part("0" * 64, 1, 0, b""))
+        live.service.sync.uploads.add(live.new_map(), Caller(Role.ADMIN), "?", Part("0" * 64, 1, 0, b""))

@@ -116,7 +116,7 @@ def test_a_damaged_cell_is_not_left_out(live: Live) -> None:
 
 def test_an_export_holds_one_cell_at_a_time(live: Live) -> None:
     row = mapped(live)
-    made = live.service.exports.asked(row, ExportRequest(format="pcd"))
+    made = live.service.views.exports.asked(row, ExportRequest(format="pcd"))
     assert made.size_bytes is not None
     tracemalloc.start()
     sizes = [len(part) for part in made.parts]

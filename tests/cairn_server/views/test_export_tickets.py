@@ -143,7 +143,7 @@ def test_a_ticket_is_good_for_half_a_minute(guarded: Live, row: MapRow, monkeypa
 
 
 def kept(live: Live) -> list[Export]:
-    return [ticket.export for ticket in live.service.tickets._kept.values()]
+    return [ticket.export for ticket in live.service.views.tickets._kept.values()]
 
 
 def test_a_file_that_nobody_comes_for_goes_by_itself(

@@ -85,7 +85,7 @@ def test_a_picture_is_what_the_same_map_shows_at_home(live: Live, layer: Layer) 
 def test_cells_that_were_drawn_are_not_read_again_and_weigh_what_their_layer_does(
     live: Live, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    row, views = mapped(live, 0, 1), live.service.views
+    row, views = mapped(live, 0, 1), live.service.views.pictures
     first = {layer: ask(live, row, asking(layer=layer)).content for layer in Layer}
     with live.service.store.snapshot(row) as snapshot:
         log_id = snapshot.head.cursor.log_id
@@ -223,7 +223,7 @@ def test_compiling_kernels_is_no_part_of_a_pictures_time(live: Live, monkeypatch
     def compile_for_long() -> None:
         with ExitStack() as all_turns:
             for _ in range(map_views.RENDERS_AT_ONCE):
-                all_turns.enter_context(live.service.views._turn())
+                all_turns.enter_context(live.service.views.pictures._turn())
         warm_up_pictures()
         now_s[0] += 2 * map_views.RENDER_S
 
@@ -245,7 +245,7 @@ def test_who_asks_while_another_ones_request_compiles_is_told_to_come_later(
 
 
 def test_only_so_many_are_made_at_once(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
-    row, views = mapped(live, 0), live.service.views
+    row, views = mapped(live, 0), live.service.views.pictures
     monkeypatch.setattr(map_views, "WAIT_S", 0.01)
     monkeypatch.setattr(views, "_room", threading.BoundedSemaphore(1))
     with views._turn():

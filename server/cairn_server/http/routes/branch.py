@@ -31,7 +31,7 @@ def register(
     body: Register, service: Operations, row: Map, caller: Annotated[Caller, Depends(allowed(Role.ENROLLER))]
 ) -> Registered:
     """Register a robot; registering again replaces its token."""
-    registered = service.register(row, body)
+    registered = service.maps.register(row, body)
     service.store.audit_log.add(caller.name, "register", f"map {row.name}: {body.robot}")
     return registered
 
@@ -39,13 +39,13 @@ def register(
 @router.get("/maps/{name}/branches", dependencies=READERS)
 def list_branches(service: Operations, row: Map) -> list[BranchInfo]:
     """All robots, and how far behind each is."""
-    return service.branches(row)
+    return service.maps.branches(row)
 
 
 @router.delete("/maps/{name}/branches/{branch}", status_code=204)
 def deregister(branch: str, service: Operations, row: Map, caller: Annotated[Caller, Depends(own_branch)]) -> None:
     """Deregister a robot; its evidence stays."""
-    service.deregister(row, branch)
+    service.maps.deregister(row, branch)
     service.store.audit_log.add(caller.name, "deregister", f"map {row.name}: {branch}")
 
 

@@ -8,21 +8,18 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from cairn_map.commits.cursor import cursor_from_text
 from cairn_map.commits.ids import author_from_text
 from cairn_map.commits.version_vector import vector_digest, vector_text
-from cairn_map.errors import BadInputError, NotFoundError
-from cairn_map.evidence.grid import CellKey, cell_from_text, cell_key
-from cairn_map.files.cell_files import CELL_MEDIA_TYPE, FORMS, MEDIA_TYPES, cell_file
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.grid import cell_from_text, cell_key
+from cairn_map.files.cell_files import CELL_MEDIA_TYPE, FORMS, MEDIA_TYPES
 from cairn_map.wire.messages import INDEX_PAGE, INDEX_PAGE_MAX, CellIndex
 from cairn_map.wire.voxel_messages import VoxelAnswer
 from cairn_server.access.auth import Caller
 from cairn_server.folding.cell_index import IndexPage, box_from_text
-from cairn_server.folding.cells_at_rest import stored_evidence
 from cairn_server.http.routes.callers import READERS, Map, Operations, body_of, reader
 from cairn_server.http.routes.documentation import answers, body, problems
 from cairn_server.http.routes.problems import answer_to
-from cairn_server.store.store_rows import CellRow, Head, MapRow
-from cairn_server.views.cell_view import asked_cell_view, cell_etag, is_same
-from cairn_server.views.view_bundle import MEDIA_TYPE as VIEWS_MEDIA_TYPE
-from cairn_server.views.view_bundle import ready_views
+from cairn_server.store.store_rows import Head, MapRow
+from cairn_server.views.cell_views import BUNDLE_MEDIA_TYPE, media_type_of
 from cairn_server.views.voxel_report import asked_voxel
 
 ONE_RANGE = re.compile(r"bytes=[ \t]*(\d{0,18})-(\d{0,18})[ \t]*", re.ASCII | re.IGNORECASE)
@@ -54,20 +51,20 @@ def cell_index(
         is_hottest_asked=hottest,
         is_held_asked=held,
     )
-    return service.cell_index(row, author_from_text(author) if author else None, page)
+    return service.sync.replies.cell_index(row, author_from_text(author) if author else None, page)
 
 
 @router.get(
     "/maps/{name}/main/views",
     dependencies=READERS,
     response_class=Response,
-    responses=answers({200: (VIEWS_MEDIA_TYPE,)}, headers=("Cairn-View-Depth",)),
+    responses=answers({200: (BUNDLE_MEDIA_TYPE,)}, headers=("Cairn-View-Depth",)),
 )
 def views(service: Operations, row: Map) -> Response:
     """Views of all cells at a coarse depth, as far as the server has them ready: for a page's first picture."""
-    depth, found = ready_views(service.store, service.cell_views, row)
+    depth, found = service.views.cells.ready(row)
     headers = {"Cache-Control": "no-store", "Cairn-View-Depth": str(depth)}
-    return Response(found, media_type=VIEWS_MEDIA_TYPE, headers=headers)
+    return Response(found, media_type=BUNDLE_MEDIA_TYPE, headers=headers)
 
 
 @router.get(
@@ -78,7 +75,7 @@ def views(service: Operations, row: Map) -> Response:
 )
 def vector(service: Operations, row: Map, at: Annotated[str, Query(max_length=128)]) -> Response:
     """The version vector at a cursor: what `Cairn-Coverage` says where it is short enough."""
-    found = service.vector_at(row, cursor_from_text(at))
+    found = service.sync.replies.vector_at(row, cursor_from_text(at))
     return Response(vector_text(found), media_type="application/json", headers={"ETag": f'"{vector_digest(found)}"'})
 
 
@@ -116,28 +113,21 @@ def get_cell(
     number, dot, suffix = cell.partition(".")
     key = cell_key(cell_from_text(number))
     _check_form(dot, suffix, depth, row)
-    if depth is None:
-        (stored, head), view = service.cells.sound(row, key), None
-    else:
-        stored, head, view = asked_cell_view(service.cells, service.cell_views, row, key, depth, known=if_none_match)
-    if stored is None:
-        raise NotFoundError("no_cell", f"no robot has seen cell {number} of map {row.name}")
-    etag = cell_etag(row, stored, suffix, depth)
+    found = service.views.cells.asked(row, key, suffix, depth, known=if_none_match)
     headers = {
-        "ETag": etag,
+        "ETag": found.etag,
         "Cache-Control": "no-cache",
         "Accept-Ranges": "bytes",
-        "Cairn-Cursor": str(head.cursor),
-        "Cairn-Fingerprint": stored.fingerprint.hex(),
-        **_coverage(head),
+        "Cairn-Cursor": str(found.head.cursor),
+        "Cairn-Fingerprint": found.stored.fingerprint.hex(),
+        **_coverage(found.head),
     }
-    # Of a view that the client has, nothing was made: that decision is not taken a second time here.
-    if view is None if depth is not None else is_same(etag, if_none_match):
+    if found.data is None:
         return Response(status_code=304, headers=headers)
     if suffix:
         headers["Content-Disposition"] = f'attachment; filename="{row.name}_{number}.{suffix}"'
-    data, media_type = _file(suffix, key, stored, row) if view is None else (view, MEDIA_TYPES["view"])
-    return _whole_or_part(data, media_type, headers, range_ if request.method == "GET" else None, if_range)
+    asked_range = range_ if request.method == "GET" else None
+    return _whole_or_part(found.data, media_type_of(suffix, depth), headers, asked_range, if_range)
 
 
 @router.put(
@@ -154,7 +144,7 @@ def heal_cell(
     data: Annotated[bytes, Depends(body_of)],
 ) -> None:
     """Restore a cell that the server's disk damaged: only exactly the bytes that it had are accepted."""
-    service.heal_cell(row, cell_key(cell_from_text(cell)), data, by=caller)
+    service.cells.heal(row, cell_key(cell_from_text(cell)), data, by=caller.name)
 
 
 def _whole_or_part(
@@ -183,12 +173,6 @@ def _check_form(dot: str, suffix: str, depth: int | None, row: MapRow) -> None:
         raise BadInputError("unknown_format", f"only a view has a depth, a .{suffix} has none")
     if depth > row.geometry.depth:
         raise BadInputError("bad_style", f"a view's depth must be 1 to {row.geometry.depth}, got {depth}")
-
-
-def _file(suffix: str, key: CellKey, stored: CellRow, row: MapRow) -> tuple[bytes, str]:
-    if not suffix:
-        return stored.body, CELL_MEDIA_TYPE
-    return cell_file(suffix, key, stored_evidence(stored), row.geometry, row.sensor_model)
 
 
 def _coverage(head: Head) -> dict[str, str]:

@@ -16,7 +16,7 @@ from fastapi import APIRouter, Header, Request, Response
 
 from cairn_map.errors import NotFoundError
 from cairn_server.http.routes.documentation import answers
-from cairn_server.views.cell_view import is_same
+from cairn_server.views.cell_views import is_same
 
 STATIC = Path(str(files("cairn_server"))) / "static"
 PAGE = "index.html"

@@ -29,7 +29,7 @@ def render(
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
     """The map as a camera at a pose would see it: PNG with a legend, or the values as NPZ; strong ETag."""
-    view = service.views.asked(row, asked, known=if_none_match)
+    view = service.views.pictures.asked(row, asked, known=if_none_match)
     headers = {"ETag": view.etag, "Cache-Control": "no-cache", "Cairn-Cursor": str(view.head.cursor)}
     if view.body is None:
         return Response(status_code=304, headers=headers)
@@ -55,9 +55,9 @@ def export(
 ) -> StreamingResponse:
     """Occupied nodes by box, heights, probability, temperature, octree depth: as points, or an octree of OctoMap's."""
     if row is None:
-        made = service.tickets.shown(asked.ticket or "", name, asked.request)
+        made = service.views.tickets.shown(asked.ticket or "", name, asked.request)
     else:
-        made = service.exports.asked(row, asked.request)
+        made = service.views.exports.asked(row, asked.request)
     headers = {
         "Cache-Control": "no-store",
         "Cairn-Cursor": str(made.head.cursor),
@@ -79,4 +79,4 @@ def export(
 )
 def ask_for_ticket(service: Operations, row: Map, asked: ExportRequest, credentials: Credentials) -> ExportTicket:
     """A ticket that stands for the token shown, once and for this export: what a link to save it by has instead."""
-    return service.tickets.give(row, asked, credentials.credentials if credentials else None)
+    return service.views.tickets.give(row, asked, credentials.credentials if credentials else None)

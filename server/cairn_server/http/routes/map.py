@@ -17,7 +17,7 @@ router = APIRouter()
 @router.get("/maps")
 def list_maps(service: Operations, caller: Annotated[Caller, Depends(reader_somewhere)]) -> list[MapInfo]:
     """The maps that the token counts on."""
-    return [service.map_info(row) for row in service.store.maps() if caller.counts_on(row.number)]
+    return [service.maps.info(row) for row in service.store.maps() if caller.counts_on(row.number)]
 
 
 @router.put(
@@ -36,7 +36,7 @@ def create_map(
     response: Response,
 ) -> MapInfo:
     """Create a map; 200 if an equal one exists."""
-    info, is_new = service.create_map(name, body)
+    info, is_new = service.maps.create(name, body)
     if is_new:
         service.store.audit_log.add(caller.name, "create_map", name)
     response.status_code = 201 if is_new else 200
@@ -46,7 +46,7 @@ def create_map(
 @router.get("/maps/{name}", dependencies=[Depends(allowed(*READING, Role.ENROLLER))])
 def get_map(service: Operations, row: Map) -> MapInfo:
     """One map's extent, sizes and head."""
-    return service.map_info(row)
+    return service.maps.info(row)
 
 
 @router.post(
@@ -59,7 +59,7 @@ def retract(
     body: Retract, service: Operations, row: Map, caller: Annotated[Caller, Depends(allowed(Role.OPERATOR))]
 ) -> Retracted:
     """Undo commits exactly."""
-    return service.retract(row, body, by=caller)
+    return service.sync.retracts.retract(row, body, by=caller)
 
 
 @router.get("/maps/{name}/log", dependencies=READERS)

@@ -1,15 +1,10 @@
-"""Routes of synchronisation: push, whole or in parts, and fetch-missing.
-
-A small push is checked on the event loop: that takes less time than to change to a thread and back, and another thread
-then waits for the disk. All that may take longer runs in a thread of its own.
-"""
+"""Routes of synchronisation: push, whole or in parts, and fetch-missing."""
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from fastapi import APIRouter, Depends, Header, Query, Response
 from starlette.concurrency import run_in_threadpool
 
-from cairn_map.commits.commit_reading import commit_reader
 from cairn_map.commits.signature import TEXT_MAX
 from cairn_map.errors import ConflictError
 from cairn_map.wire.messages import MissingRequest, Pushed, Upload
@@ -31,9 +26,6 @@ from cairn_server.sync.uploads import Part, uploaded_by
 
 COMMIT_MEDIA_TYPE = "application/vnd.cairn.commit"
 REPLY_MEDIA_TYPE = "application/vnd.cairn.reply"
-
-AT_ONCE_BYTES = 1 << 16
-"""Largest body that is examined on the event loop."""
 UPLOAD = "/maps/{name}/commits/{commit}/upload"
 Digest = Annotated[str, Query(pattern="^[0-9a-f]{64}$", description="SHA-256 of the whole body")]
 Count = Annotated[int, Query(ge=0, lt=1 << 53)]
@@ -46,26 +38,20 @@ router = APIRouter()
     responses=also(201, Pushed) | problems(409, 429, 507),
     openapi_extra=body(COMMIT_MEDIA_TYPE),
 )
-async def push(
+def push(
     commit: str,
     visit: Annotated[Visit, Depends(visiting_robot)],
-    request: Request,
+    data: Annotated[bytes, Depends(body_of)],
     response: Response,
     cairn_seal: Annotated[str | None, Header(max_length=64)] = None,
     cairn_signature: Annotated[str | None, Header(max_length=TEXT_MAX)] = None,
 ) -> Pushed:
     """Push a commit: 201 new, 200 seen before, 409 other bytes under this id."""
-    pushes, row, caller = visit.service.pushes, visit.row, visit.caller
-    beside = {"seal": cairn_seal, "signatures": cairn_signature}
-    data = await request.body()
-    pushed = commit_reader(data) if len(data) <= AT_ONCE_BYTES else None
+    pushes, row, caller = visit.service.sync.pushes, visit.row, visit.caller
     try:
-        if pushed is None or not pushes.is_quick(row, caller, pushed):
-            is_new = await run_in_threadpool(pushes.keep, row, caller, commit, data, **beside)
-        else:
-            is_new = await pushes.keep_soon(row, caller, commit, pushed, **beside)
+        is_new = pushes.keep(row, caller, commit, data, seal=cairn_seal, signatures=cairn_signature)
     except ConflictError as exc:
-        await run_in_threadpool(pushes.note_conflict, row, caller, exc)
+        pushes.note_conflict(row, caller, exc)
         raise
     response.status_code = 201 if is_new else 200
     return Pushed(id=commit, state="new" if is_new else "known")
@@ -89,7 +75,7 @@ def get_commit(commit: str, service: Operations, row: Map) -> Response:
 @router.get("/maps/{name}/commits", dependencies=READERS)
 def list_commits(service: Operations, row: Map) -> CommitList:
     """Commits that the server has, for relays."""
-    return commit_list(service.held.of(row))
+    return commit_list(service.sync.held.of(row))
 
 
 @router.post(
@@ -100,7 +86,7 @@ def list_commits(service: Operations, row: Map) -> CommitList:
 )
 def missing(branch: str, body: MissingRequest, visit: Annotated[Visit, Depends(visiting_owner)]) -> Response:
     """Frames that bring the caller to the head; 204 if they are those of the last reply."""
-    reply = visit.service.missing(visit.row, branch, body)
+    reply = visit.service.sync.replies.missing(visit.row, branch, body)
     return Response(reply, media_type=REPLY_MEDIA_TYPE) if reply else Response(status_code=204)
 
 
@@ -122,7 +108,7 @@ def upload(
     digest: Digest,
 ) -> Upload:
     """State of an upload: bytes that came already, and whether the commit is kept."""
-    return service.uploads.state(row, caller, commit, digest)
+    return service.sync.uploads.state(row, caller, commit, digest)
 
 
 @router.patch(
@@ -145,9 +131,9 @@ async def add_part(
     """Add a part of a commit's bytes; with the last one it is pushed."""
     part = Part(digest, total, offset, data, cairn_signature)
     try:
-        found, is_new = await run_in_threadpool(service.uploads.add, row, caller, commit, part)
+        found, is_new = await run_in_threadpool(service.sync.uploads.add, row, caller, commit, part)
     except ConflictError as exc:
-        await run_in_threadpool(service.pushes.note_conflict, row, caller, exc)
+        await run_in_threadpool(service.sync.pushes.note_conflict, row, caller, exc)
         raise
     response.status_code = 201 if is_new else 200
     return found

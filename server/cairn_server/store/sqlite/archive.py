@@ -34,7 +34,7 @@ class SqliteArchive(SqliteStore):
             )
 
     def complaints(self) -> list[str]:
-        """What SQLite itself finds wrong with the file: its pages and indexes, not what is in them."""
+        """Damage that SQLite itself finds in the file: in its pages and indexes, not in their contents."""
         with self._readers.reading() as reader:
             try:
                 found = [str(text) for (text,) in reader.execute(f"PRAGMA integrity_check({COMPLAINTS_MAX})")]

@@ -1,6 +1,6 @@
 """The embedded store as one file, copied while a server works on it; and a folder made out of such a file.
 
-SQLite's backup begins anew whenever another process writes, and would never end beside a busy server. So it copies
+SQLite's backup begins again whenever another process writes, and would never end while a server is busy. So it copies
 out of one read transaction: one state of all maps, however long it takes. What is written meanwhile waits in the
 write-ahead log. The copy has its name only when all of it is on the disk.
 """
@@ -70,7 +70,7 @@ def restore(source: Path, folder: Path, report: Report, verify: Callable[[Path],
 
 
 def is_store(path: Path) -> bool:
-    """Whether a file is a store of a version that this cairn knows, or knew."""
+    """True if a file is a store of this version of cairn, or of an earlier one."""
     try:
         connection = _opened(path)
         try:
@@ -86,7 +86,7 @@ def is_store(path: Path) -> bool:
 
 
 def _opened(path: Path) -> apsw.Connection:
-    """A connection that only reads; that of a store at work must be able to write beside it, not in it."""
+    """Connection that only reads; on a store at work it must be able to write next to the file, not in it."""
     connection = apsw.Connection(str(path), flags=apsw.SQLITE_OPEN_READWRITE)
     connection.set_busy_timeout(BUSY_MS)
     connection.execute("PRAGMA query_only = ON")
@@ -114,7 +114,7 @@ def _copy(source: Path, target: Path, report: Report) -> None:
 
 
 def _settle(path: Path) -> None:
-    """Make a copy one file, without a log beside it."""
+    """Make a copy one file, without a separate log."""
     connection = apsw.Connection(str(path))
     try:
         connection.execute("PRAGMA journal_mode = DELETE").fetchall()

@@ -1,4 +1,4 @@
-"""Branches in SQLite: their notes, and when each was last heard of."""
+"""Branches in SQLite: their notes, and the last sign of each, gathered so that a crowd's signs are one write."""
 
 import threading
 import time
@@ -13,16 +13,16 @@ from cairn_server.store.sqlite.writer import Writer, rows
 from cairn_server.store.store_rows import EntrySize, MapRow
 
 KEEP_S = 10.0
-"""A branch that only gives signs of life is written so often."""
+"""Time between two writes of a branch that only gives signs of life."""
 WRITE_EVERY_S = 1.0
-"""All that is news is written so often."""
+"""Time between two writes of all branches' signs."""
 ENTRIES_MAX = 10_000
 Key = tuple[int, str]
-"""Number of the map, and name."""
+"""Key of a branch: number of the map, and name."""
 
 
 class SqliteBranchNotes:
-    """Notes over a store's connections."""
+    """`store.BranchNotes` over a store's connections."""
 
     def __init__(self, writer: Writer, readers: Readers) -> None:
         self._writer = writer
@@ -38,7 +38,7 @@ class SqliteBranchNotes:
             self._writer.submit(lambda connection: rows(connection, query, (status, row.number, branch)))
 
     def statuses(self, row: MapRow) -> dict[str, str]:
-        """The last status of each branch that ever told one."""
+        """Last status of each branch that ever reported one."""
         with self._readers.reading() as reader:
             return dict(rows(reader, "SELECT name, status FROM branch_status WHERE map = ?", (row.number,)))
 
@@ -59,14 +59,14 @@ class SqliteBranchNotes:
 
 @dataclass(frozen=True, slots=True)
 class Sign:
-    """The last of one branch."""
+    """Last sign of one branch."""
 
     time_s: float
     cursor: str | None
 
 
 class LastSeen:
-    """Remembers what is to be written about each branch, and what was; thread-safe."""
+    """Signs of branches that are still to be written, and those that were; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -75,7 +75,7 @@ class LastSeen:
         self._written_s = float("-inf")
 
     def note(self, map_number: int, name: str, cursor: str | None) -> bool:
-        """Whether it is time to write what is `taken`: there is news, and the last time was a while ago."""
+        """Note a sign; True if it is time to write: there is news, and the last write was `WRITE_EVERY_S` ago."""
         now_s, key = time.monotonic(), (map_number, name)
         with self._lock:
             written_s, known = self._written.get(key, (float("-inf"), None))
@@ -85,7 +85,7 @@ class LastSeen:
             return bool(self._unwritten) and now_s - self._written_s >= WRITE_EVERY_S
 
     def taken(self) -> dict[Key, Sign]:
-        """What is to be written now; it counts as written."""
+        """Take the signs to be written now; they count as written."""
         now_s = time.monotonic()
         with self._lock:
             signs, self._unwritten = self._unwritten, {}
@@ -97,6 +97,6 @@ class LastSeen:
             return signs
 
     def forget(self, map_number: int, name: str) -> None:
-        """The branch's row is made anew, or is gone; what is to be written is `taken` before."""
+        """Forget a branch whose row is replaced or removed; its signs are `taken` before."""
         with self._lock:
             self._written.pop((map_number, name), None)

@@ -1,4 +1,4 @@
-"""What is written about commits, each function inside one transaction of the writer."""
+"""Writes of commits and folds, each function inside one transaction of the writer."""
 
 import json
 import time

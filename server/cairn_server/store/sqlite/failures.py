@@ -1,4 +1,4 @@
-"""What a failure of SQLite means to whoever asked: a full disk, damaged pages, or a store that cannot work now."""
+"""Errors of SQLite as errors of cairn: a full disk, damaged pages, or a store that cannot work now."""
 
 import errno
 from collections.abc import Iterator
@@ -36,7 +36,7 @@ def read_failure(exc: apsw.Error) -> CairnError:
 
 @contextmanager
 def damaged_pages() -> Iterator[None]:
-    """Reading one thing whose pages may be damaged, without giving up what can be read beside it.
+    """Read one row whose pages may be damaged, without giving up the rows that can be read.
 
     Raises:
         DamagedDataError: kind `damaged_store`.

@@ -15,8 +15,8 @@ from cairn_server.store.sqlite.failures import read_failure
 from cairn_server.store.sqlite.writer import connect
 
 IDLE_MAX = 48
-"""Connections that are kept open while nobody reads: one for each thread of the web server, and a few. To open one
-takes longer than most of what is read through it."""
+"""Most connections kept open while none reads: one for each thread of the web server, and a few. To open one takes
+longer than most reads."""
 
 
 class Readers:

@@ -1,4 +1,4 @@
-"""What is read of a SQLite store beside what a snapshot tells: maps, and commits with their evidence."""
+"""Reads of a SQLite store outside a snapshot: maps, and commits with their evidence."""
 
 import json
 from collections.abc import Collection, Iterator
@@ -42,7 +42,7 @@ class SqliteReads:
         return self._commit(clause, row, commit)
 
     def is_retracted(self, row: MapRow, commit: CommitId) -> bool:
-        """Whether a retract of this id has taken effect, or waits for it to come."""
+        """True if a retract of this id has taken effect, or waits for the commit to come."""
         query = "SELECT 1 FROM retracted WHERE map = ? AND id = ?"
         with self._readers.reading() as reader:
             return first(reader, query, (row.number, str(commit))) is not None

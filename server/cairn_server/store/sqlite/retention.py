@@ -46,7 +46,7 @@ def forget_evidence(connection: apsw.Connection, row: MapRow, before_s: float, l
 
 
 def remember_evidence(connection: apsw.Connection, number: int, commit: NewCommit) -> None:
-    """A commit whose evidence was gone came again; whoever retracts it has as long for that as after the first push."""
+    """Keep the evidence of a commit that was pushed again; it can be retracted for as long as after the first push."""
     connection.execute(
         "UPDATE commits SET gone = 0, meta = ?, received_s = ? WHERE number = ?", (commit.text, time.time(), number)
     )
@@ -70,7 +70,7 @@ def check_kept(connection: apsw.Connection, row: MapRow, targets: tuple[CommitId
 
 
 def is_retracted(connection: apsw.Connection, row: MapRow, commit: CommitId) -> bool:
-    """Whether a retract of this id has taken effect, or waits for it to come."""
+    """True if a retract of this id has taken effect, or waits for the commit to come."""
     query = "SELECT 1 FROM retracted WHERE map = ? AND id = ?"
     return first(connection, query, (row.number, str(commit))) is not None
 

@@ -22,7 +22,7 @@ PARENT, SEEN, PLACE = (
     f"CASE WHEN json_valid(CAST(meta AS TEXT)) THEN json_extract(CAST(meta AS TEXT), '$.{path}') END"
     for path in ("parent", "seen", "scans[#-1].t_map_rig")
 )
-"""Of a commit's meta; NULL, too, if that is damaged."""
+"""SQL of three fields of a commit's meta; NULL, too, if the meta is damaged."""
 LOG_COLUMNS = (
     "seq, kind, robot, incarnation, n, sha, size_bytes, cells, captured_first_s, captured_last_s, retracts,"
     f" {PARENT}, {SEEN}, {PLACE}, via"

@@ -48,9 +48,9 @@ from cairn_server.store.store_rows import (
 )
 
 PROBE_S = 5.0
-"""A writer that does not get to the probe in this time does not keep up."""
+"""Time in which the writer gets to a probe, unless it does not keep up."""
 MAPS_MAX = 1000
-"""Maps that are looked at one by one."""
+"""Most maps whose backlogs are listed."""
 
 log = logging.getLogger(__name__)
 
@@ -156,7 +156,7 @@ class SqliteStore(SqliteReads):
 
     def register(self, row: MapRow, branch: Branch, token_hash: bytes) -> None:
         """Make a branch, or give an existing one a new token."""
-        self._write_seen()  # before the row is made anew, in the order of the writer's jobs
+        self._write_seen()  # before the row is replaced, in the order of the writer's jobs
         self._seen.forget(row.number, branch.name)
         sensors = json.dumps(branch.sensors)
         values = (row.number, branch.name, branch.mode, sensors, branch.last_seen_s, branch.incarnation)
@@ -253,7 +253,7 @@ class SqliteUses:
         self._readers = readers
 
     def since(self, time_s: float) -> Mapping[Robot, Use]:
-        """What each robot's commits took that came at or after a time, and what each relay handed over."""
+        """Use by each robot's commits that came at or after a time, and by what each relay handed over."""
         found: defaultdict[Robot, Use] = defaultdict(Use)
         # Not from the newest back to the first older one: a clock may be set back, and so the order of the numbers
         # says nothing. Nor summed up by SQL, which would go through all commits to have them in groups.
@@ -273,7 +273,7 @@ class SqliteHealth:
         self._readers = readers
 
     def backlogs(self) -> list[Backlog]:
-        """What is not folded yet, of every map."""
+        """Commits of every map that are not folded yet."""
         # Both go along the index of what is pending: a folded log of any length costs nothing.
         query = (
             "SELECT name, (SELECT count(*) FROM commits WHERE map = map.number AND folded_seq IS NULL"

@@ -17,9 +17,9 @@ from cairn_server.store.store_rows import MapRow, Token, registration_name
 log = logging.getLogger(__name__)
 
 USED_EVERY_S = 10.0
-"""How often the times of last use are written, all together."""
+"""Time between two writes of all tokens' times of last use."""
 KNOWN_S, KNOWN_MAX = 1.0, 4096
-"""How long a token that was found is known without another look, and how many; a robot shows it with each push."""
+"""Time for which a found token is not looked up again, and most such tokens; robots show one with each push."""
 AUDIT_ROWS_MAX = 100_000
 _SELECT = (
     "SELECT t.name, t.role, t.map, m.name, t.robot, t.created_s, t.expires_s, t.last_used_s"
@@ -39,7 +39,7 @@ class SqliteTokens:
         self._known: dict[bytes, tuple[Token, float]] = {}
 
     def forget_known(self) -> None:
-        """Look at all tokens anew; called once a change is durable, before anybody is told of it."""
+        """Look all tokens up again; called once a change is durable, before it is answered."""
         self._known = {}
 
     def add(self, token: Token, secret_hash: bytes) -> None:

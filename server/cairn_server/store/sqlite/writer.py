@@ -2,6 +2,12 @@
 
 A job's result is handed out only after COMMIT with `synchronous=FULL`: what was acknowledged survives a power cut.
 A job that raises is rolled back alone (savepoint); the others of its group go through.
+
+The writer also keeps the write-ahead log short, since SQLite's own checkpoints never empty it while some connection
+always reads. A checkpoint copies the log into the database; only when no reader looks at the log any more may it begin
+again. With readers that overlap there is never such a moment by chance, so the writer makes one: it waits for the
+present readers, while later ones read the database alone. It waits little while the log is merely long, and longer once
+it is much too long.
 """
 
 import logging
@@ -22,24 +28,24 @@ from cairn_server.store.sqlite.failures import write_failure
 log = logging.getLogger(__name__)
 
 IDLE_S = 0.5
-"""Without a job for this long the writer is idle."""
+"""Time without a job after which the writer is idle."""
 IDLE_BYTES = 4 << 20
-"""An idle writer empties a log longer than this."""
+"""Length of the log above which an idle writer empties it."""
 LONG_BYTES = 64 << 20
-"""A writer at work empties a log longer than this ..."""
+"""Length of the log above which a writer at work empties it."""
 TOO_LONG_FACTOR = 4
-"""... and waits longer for readers if it is so many times longer."""
+"""Multiple of `LONG_BYTES` above which the writer waits longer for readers."""
 WAIT_MS = 50
 WAIT_LONG_MS = 2000
 RETRY_S = 1.0
-"""Between two attempts while at work, and five times the wait: readers who stay cost a sixth of the time at most."""
+"""Pause between two attempts, plus five times the wait: readers that stay cost a sixth of the time at most."""
 
 
 T = TypeVar("T")
 Job = tuple[Callable[[apsw.Connection], Any], "Future[Any]"]
 
 GROUP_MAX = 64
-"""Jobs in one transaction."""
+"""Most jobs in one transaction."""
 QUEUE_MAX = 1024
 BUSY_MS = 10_000
 Values = tuple[str | int | float | bytes | None, ...]
@@ -72,11 +78,11 @@ def first(connection: apsw.Connection, query: str, values: Values = ()) -> Any:
 
 
 class Checkpoints:
-    """When the writer empties its log; for the writer's thread."""
+    """Checkpoints that empty the write-ahead log; for the writer's thread."""
 
     def __init__(self, connection: apsw.Connection, path: Path, *, busy_ms: int) -> None:
         self.count = 0
-        """Logs emptied."""
+        """Count of the times that the log was emptied."""
         self._connection = connection
         self._wal = path.with_name(f"{path.name}-wal")
         self._busy_ms = busy_ms
@@ -90,7 +96,7 @@ class Checkpoints:
         self._try(WAIT_LONG_MS if size_bytes > LONG_BYTES * TOO_LONG_FACTOR else WAIT_MS)
 
     def when_idle(self) -> None:
-        """Empty a log while nobody waits for the writer."""
+        """Empty a log while no job waits for the writer."""
         if self.size_bytes() > IDLE_BYTES:
             self._try(WAIT_MS)
 
@@ -136,7 +142,7 @@ class Writer:
             UnreachableError: the server is shutting down, or its disk does not keep up.
         """
         future: Future[T] = Future()
-        future.set_running_or_notify_cancel()  # whoever waits may be gone at a shutdown, and this thread must live
+        future.set_running_or_notify_cancel()  # the thread that waits may be gone at a shutdown, and this one must live
         with self._lock:
             if self._closed:
                 raise UnreachableError("shutting_down", "the server is shutting down", retry_after_s=5.0)
@@ -152,12 +158,12 @@ class Writer:
 
     @property
     def queued(self) -> int:
-        """Jobs that wait."""
+        """Count of the jobs that wait."""
         return self._jobs.qsize()
 
     @property
     def is_alive(self) -> bool:
-        """Whether anybody works on them."""
+        """True while the writer's thread runs."""
         return self._thread.is_alive()
 
     def close(self) -> None:
@@ -205,14 +211,15 @@ class Writer:
 
 
 def _commit_group(connection: apsw.Connection, group: list[Job]) -> UnreachableError | None:
-    """Write a group and answer its threads; what went wrong, if nothing was written."""
+    """Write a group in one transaction and answer its threads; the failure if nothing was written."""
+    # Nothing is answered before COMMIT: until then every result may still be lost.
     results: list[tuple[Future[Any], Any, BaseException | None]] = []
     try:
         connection.execute("BEGIN IMMEDIATE")
         for job, future in group:
             results.append((future, *_run_job(connection, job)))
         connection.execute("COMMIT")
-    except (apsw.Error, MemoryError) as exc:  # whatever it is, this thread must live: nobody else writes
+    except (apsw.Error, MemoryError) as exc:  # whatever it is, this thread must live: it is the only writer
         failure = write_failure(exc, connection)
         with suppress(apsw.Error):
             if connection.in_transaction:
@@ -221,6 +228,7 @@ def _commit_group(connection: apsw.Connection, group: list[Job]) -> UnreachableE
         for _, future in group:
             future.set_exception(failure)
         return failure
+    # Durable: each thread gets its own job's result, or the error that rolled back that job alone.
     for future, value, error in results:
         if error is None:
             future.set_result(value)

@@ -1,7 +1,8 @@
-"""Worker processes that check dear commits, seen from the server: each commit within its processor time and memory.
+"""Pool of worker processes that check expensive commits, each within its processor time and memory.
 
-Workers are made when they are first needed, and anew when one was killed, ran over its limit or grew large. Whoever
-asks waits for a free one, within bounds: what cannot be checked soon is refused with "later", never left waiting.
+Workers are made when they are first needed, and replaced when one was killed, exceeded its limit or grew large. A
+caller waits for a free one, within bounds: a commit that cannot be checked soon is refused with "later", never left
+waiting.
 """
 
 import json
@@ -25,24 +26,24 @@ from cairn_server.sync.checks.worker_nursery import checked_from
 log = logging.getLogger(__name__)
 
 WAITING_MAX = 8
-"""Requests that wait for a worker, or for its answer; each holds a thread of the web server's forty."""
+"""Most requests that wait for a worker or its answer; each holds one of the web server's forty threads."""
 WAIT_S = 10.0
-"""For a free worker."""
+"""Longest wait for a free worker."""
 START_S = 120.0
-"""For a new worker: milliseconds, but for the first one on a machine without compiled kernels."""
+"""Longest wait for a new worker: milliseconds, but for the first one on a machine without compiled kernels."""
 LOOK_S = 0.05
-"""How often a worker's processor time is looked at."""
+"""Time between two looks at a worker's processor time."""
 STALL_FACTOR = 20.0
-"""A worker that got so little of the processor is given up after this many times its limit, by the clock."""
+"""Multiple of its limit, by the clock, after which a worker that got little of the processor is given up."""
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 class _LostError(Exception):
-    """The worker ended in the middle."""
+    """The worker ended before it answered."""
 
 
 class _Worker:
-    """One process and the socket to it."""
+    """One worker process and the socket to it."""
 
     def __init__(self, jobs: socket.socket) -> None:
         self.jobs = jobs
@@ -53,13 +54,14 @@ class _Worker:
         self.pid = int(LENGTH.unpack(hello)[0])
 
     def answer(self, data: bytes, limit_s: float) -> dict[str, object]:
-        """What it says of a commit.
+        """Answer of the worker to a commit.
 
         Raises:
             BadInputError: kind `too_costly`: it took more processor time.
             UnreachableError: kind `check_failed`: it was hardly given any.
-            _LostError: it ended in the middle.
+            _LostError: it ended before it answered.
         """
+        # Limited by the worker's processor time: `too_costly` is final, and must not depend on how busy the server is.
         start_s, end_s = self._cpu_s(), time.monotonic() + STALL_FACTOR * limit_s
         self.jobs.settimeout(end_s - time.monotonic())
         try:
@@ -78,7 +80,7 @@ class _Worker:
         return found
 
     def kill(self) -> None:
-        """End it; its socket tells whether it is still the process of that number."""
+        """Kill the worker; an open socket shows that its number is still its own."""
         with self.jobs, suppress(OSError):
             self.jobs.settimeout(0)
             try:
@@ -99,7 +101,7 @@ class _Worker:
         return True
 
     def _cpu_s(self) -> float:
-        """Processor time so far, of a process that may have ended."""
+        """Processor time of the worker so far; it may have ended."""
         try:
             fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
         except OSError as exc:
@@ -108,7 +110,7 @@ class _Worker:
 
 
 class CheckPool:
-    """Checks commits in worker processes; called from many threads."""
+    """Pool of workers; called from many threads."""
 
     def __init__(self, *, workers: int, limit_s: float, memory_bytes: int) -> None:
         self._limit_s = limit_s
@@ -120,10 +122,10 @@ class CheckPool:
         self._waiting = threading.BoundedSemaphore(workers + WAITING_MAX)
         self._idle: queue.LifoQueue[_Worker | None] = queue.LifoQueue()
         for _ in range(workers):
-            self._idle.put(None)  # a place where a worker may be
+            self._idle.put(None)  # a place for a worker, made when it is needed
 
     def check(self, data: bytes) -> Checked:
-        """What a worker found.
+        """Check a commit in a worker.
 
         Raises:
             BadInputError: kind `too_costly`, or what the worker found wrong.
@@ -134,7 +136,7 @@ class CheckPool:
         if not self._waiting.acquire(blocking=False):
             raise UnreachableError("busy", "many large commits are being checked", retry_after_s=5.0)
         try:
-            for _ in range(2):
+            for _ in range(2):  # a worker killed from outside costs one more try
                 with suppress(_LostError):
                     return self._checked(data)
                 log.warning("a worker that checked a commit of %d bytes was killed", len(data))

@@ -1,7 +1,7 @@
-"""What is checked of a commit before it is kept: all of it. Pure; runs in a thread, or in a worker process.
+"""Check of all of a commit before it is kept: pure, in a thread or in a worker process.
 
-Bytes go in; what comes out is small: the commit's SHA-256 and the largest number of each plane. Everything else that is
-kept of a commit stands in its bytes.
+Bytes go in, and a small result comes out: the commit's SHA-256 and the largest number of each plane. Everything else
+that is stored of a commit is in its bytes.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from cairn_server.sync.checks.push_policy import check_evidence
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """What is known of a commit once it was decoded, canonical and possible."""
+    """Result for a commit that decodes, is canonical, and has possible evidence."""
 
     sha: bytes
     tops: tuple[int, ...]
@@ -25,7 +25,7 @@ class Checked:
 
 
 def check_commit(reader: CommitReader) -> Checked:
-    """Decode a commit, and find it sound.
+    """Decode a commit and check all of it.
 
     Raises:
         DamagedDataError, BadInputError: as `CommitReader.read` and `push_policy.check_evidence`.
@@ -37,7 +37,7 @@ def check_commit(reader: CommitReader) -> Checked:
 
 
 def new_commit(commit: Commit, tops: tuple[int, ...]) -> NewCommit:
-    """A commit that was found sound, as a store keeps it."""
+    """Checked commit as a store keeps it."""
     return NewCommit(
         id=commit.id,
         sha=commit.sha,

@@ -1,11 +1,15 @@
-"""Where a commit is checked: a quick one beside the event loop, an ordinary one in the thread that brought it, and a
-dear one in a worker process.
+"""Checks of commits before they are acknowledged: most in the thread that brings them, expensive ones in a worker.
 
-What is ordinary is known beforehand, from the heads (`commit_cost`), and bounded: so no commit keeps the server's own
-process busy for longer than a blink, or makes it grow.
+The cost of a check is bounded by the heads of the commit's cells, before anything is decoded:
+
+    cell:  100 us  +  50 ns a leaf  +  30 ns a raw byte  +  800 ns a modelled number
+                   +  50 ns a voxel, of a cell that is proven canonical only by coding it again (modelled, or large)
+
+A reader never does more than the heads claim, so this is a bound and not a guess, and no commit keeps the server's own
+process busy for long or makes it grow. Each rate is twice the measured one
+(docs/decisions/007-where-commits-are-checked.md).
 """
 
-import logging
 import threading
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,7 +22,6 @@ from cairn_map.commits.commit_reading import CommitReader
 from cairn_map.errors import BadInputError
 from cairn_server.settings import Settings
 from cairn_server.sync.checks.check_pool import CheckPool
-from cairn_server.sync.checks.check_process import CheckProcess, LostCheckError
 from cairn_server.sync.checks.checking import Checked, check_commit
 
 CELL_S = 1e-4
@@ -28,43 +31,38 @@ NUMBER_S = 8e-7
 ALLOWANCE_BYTES = 1 << 22
 ALLOWANCE_NUMBERS = 1 << 20
 PER_BYTE = 64
-"""Raw bytes, or modelled numbers, that each byte pushed may stand for, beyond the allowance. Those of one scan or of 36
-are 3 to 13, whatever the voxel edge."""
+"""Raw bytes, or modelled numbers, that each byte pushed may stand for, beyond the allowance. Commits of one scan, or of
+36, have 3 to 13, at any voxel edge."""
 RAW_BYTES_MAX = 1 << 28
 NUMBERS_MAX = 1 << 25
-"""Of a whole commit, whatever its size; 36 scans of five cameras at 2 cm have 24 MB raw and 30 million numbers."""
-
-log = logging.getLogger(__name__)
-
+"""Most modelled numbers of a commit of any size; 36 scans of five cameras at 2 cm have 24 MB raw and 30 million."""
 ORDINARY_S = 0.05
-"""Commits that may cost no more are checked in threads."""
+"""Longest check that is made in the thread that brings the commit."""
 THREADS_MAX = 4
-"""Of them at once."""
-QUICK_S = 0.01
-"""Commits that may cost no more, as nearly all of one scan do, need no thread: one costs more than they do."""
+"""Most threads that check at once."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CommitCost:
-    """Sums over a commit's cells."""
+    """Cost of checking a commit, as sums over its cells."""
 
     cells: int = 0
     leaves: int = 0
     voxels: int = 0
-    """Of cells that are coded anew."""
+    """Voxels of the cells that are coded again."""
     raw_bytes: int = 0
     numbers: int = 0
-    """Modelled ones, each of which a mixture of opinions has to be asked for."""
+    """Modelled numbers, each of which takes a mixture of predictions to decode."""
 
     @property
     def seconds(self) -> float:
-        """Most processor time that checking takes."""
+        """Upper bound of the processor time that checking takes."""
         sizes = self.leaves * LEAF_S + self.voxels * VOXEL_S + self.raw_bytes * RAW_BYTE_S
         return self.cells * CELL_S + sizes + self.numbers * NUMBER_S
 
 
 def cost_of(readers: Iterable[CellReader]) -> CommitCost:
-    """The cost of a commit's cells."""
+    """Cost of a commit with these cells."""
     cells = leaves = voxels = raw_bytes = numbers = 0
     for reader in readers:
         cells += 1
@@ -76,7 +74,7 @@ def cost_of(readers: Iterable[CellReader]) -> CommitCost:
 
 
 def check_cost(cost: CommitCost, *, size_bytes: int) -> None:
-    """Refuse few bytes that stand for much, and too much altogether.
+    """Refuse a commit whose bytes claim too much content, for their count or altogether.
 
     Raises:
         BadInputError: kind `too_costly`.
@@ -101,18 +99,17 @@ def _modelled_numbers(reader: CellReader) -> int:
 
 
 class CommitChecks:
-    """Checks commits; called from many threads."""
+    """Checks of commits; called from many threads."""
 
-    def __init__(self, settings: Settings, process: CheckProcess | None = None) -> None:
+    def __init__(self, settings: Settings) -> None:
         self.ordinary_s = ORDINARY_S
-        self._process = process
         self._threads = threading.BoundedSemaphore(THREADS_MAX)
         self._pool = CheckPool(
             workers=settings.check_workers, limit_s=settings.check_cpu_s, memory_bytes=settings.check_memory_bytes
         )
 
     def check(self, commit: CommitReader) -> Checked:
-        """What a whole commit holds.
+        """Decode a whole commit and find it sound.
 
         Raises:
             BadInputError: kind `too_costly`; or as `check_commit`.
@@ -123,38 +120,9 @@ class CommitChecks:
         check_cost(cost, size_bytes=len(commit.data))
         if cost.seconds > self.ordinary_s:
             return self._pool.check(commit.data)
-        if cost.seconds <= QUICK_S:
-            return check_commit(commit)
         with self._threads:
             return check_commit(commit)
-
-    async def check_soon(self, commit: CommitReader) -> Checked:
-        """`check` for a quick commit, while the event loop does other things.
-
-        Raises:
-            BadInputError, DamagedDataError: as `check`.
-        """
-        if self._process is not None:
-            check_cost(cost_of(commit.readers), size_bytes=len(commit.data))
-            try:
-                return await self._process.check(commit.data)
-            except LostCheckError:
-                self._give_up_process()  # if it is gone
-        return self.check(commit)
-
-    def is_quick(self, commit: CommitReader) -> bool:
-        """Whether `check` will be done in a moment, and wait for nobody."""
-        return cost_of(commit.readers).seconds <= min(QUICK_S, self.ordinary_s)
 
     def close(self) -> None:
         """End the workers."""
         self._pool.close()
-        if self._process is not None:
-            self._process.close()
-
-    def _give_up_process(self) -> None:
-        process = self._process
-        if process is not None and process.is_lost:  # the first of those that waited for it
-            self._process = None
-            log.error("the process that checks small commits was killed; checking in the server's own from now on")
-            process.close()

@@ -1,4 +1,4 @@
-"""What a commit may claim, beyond being well-formed: whose it is, how much it can have seen, how it is numbered.
+"""Policy of pushes beyond well-formedness: whose a commit may be, and how much evidence its scans can have given.
 
 Evidence is refused before it can spoil a map: counts that no scan could give would outvote every honest robot,
 and use up the range of the sums for everybody; ids full of gaps would grow every version vector without bound.
@@ -21,11 +21,11 @@ from cairn_server.access.auth import Caller
 from cairn_server.store.store_rows import MapRow
 
 WEIGHT_MAX = 1024
-"""Of one scan's sample in one voxel; cairn's own integrator gives 1."""
+"""Largest weight of one scan's sample in one voxel; cairn's own integrator gives 1."""
 
 
 def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *, cells: int) -> None:
-    """Refuse by what a commit says of itself, before its evidence is decoded.
+    """Refuse a commit by its meta alone, before its evidence is decoded.
 
     Raises:
         BadInputError: kind `other_id` or `other_geometry`.
@@ -64,7 +64,7 @@ def check_evidence(
 
 
 def _excess(content: CellContent, geometry: Geometry, tops: npt.NDArray[np.int64], scans: int) -> str | None:
-    """What is too much, or None."""
+    """Description of the first excess in a cell; None: there is none."""
     counts = bounds_of_counts(content.counts)[3]
     if counts > scans:
         return f"{counts} counts in one voxel"

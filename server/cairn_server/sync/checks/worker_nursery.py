@@ -27,7 +27,7 @@ from cairn_server.sync.checks.checking import Checked, check_commit
 
 FAMILIES: dict[str, type[CairnError]] = {family.__name__: family for family in (BadInputError, DamagedDataError)}
 RETIRED_SHARE = 4
-"""A worker that ever held more than this part of its memory is replaced after its answer, so that memory goes back."""
+"""Divisor of the memory limit: a worker that ever held more than this part is replaced, so that memory goes back."""
 
 
 def main(control_fd: int, memory_bytes: int) -> None:
@@ -68,7 +68,7 @@ def _be_worker(fd: int, memory_bytes: int, nursery: int) -> None:
 
 
 def answer_to(data: bytes) -> dict[str, object]:
-    """What a check found, as JSON."""
+    """Result of a check, for JSON."""
     try:
         checked = check_commit(commit_reader(data))
     except CairnError as exc:
@@ -79,7 +79,7 @@ def answer_to(data: bytes) -> dict[str, object]:
 
 
 def checked_from(answer: dict[str, object]) -> Checked:
-    """What `answer_to` found, but for a lack of memory.
+    """Result that `answer_to` described; lack of memory excepted.
 
     Raises:
         BadInputError, DamagedDataError: what it found wrong.

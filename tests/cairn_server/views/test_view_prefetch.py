@@ -1,26 +1,22 @@
-"""Views of cells: made before anybody asks, kept over a restart, and right whatever happened to the bytes at rest."""
+"""Views of cells: made before a page asks, and right whatever happened to the stored bytes."""
 
 import json
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from tests.fixtures.server.answers import cell_path
 from tests.fixtures.server.damage import BROKEN, SOUND, broken_map
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import KEYS, pushed
-from tests.fixtures.server.tiny_disk import tiny_disk
 
 from cairn_map.codec.view_code import decode_view
 from cairn_map.evidence.grid import cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.store_rows import MapRow
-from cairn_server.views import view_bundle
-from cairn_server.views.cell_view import view_of_stored
-from cairn_server.views.view_cache import ViewCache, view_name
-from cairn_server.views.view_file import NAME, read_views, write_views
-from cairn_server.views.views_ahead import ViewsAhead, first_depth
+from cairn_server.views import cell_views
+from cairn_server.views.cell_views import ViewCache, first_depth, view_name, view_of_stored
+from cairn_server.views.view_prefetch import ViewPrefetch
 
 SOON_S = 0.01
 
@@ -33,10 +29,10 @@ def coarse_views(live: Live, row: MapRow) -> dict[str, bytes]:
     return {view_name(row, cell, depth): view_of_stored(row, cell, depth) for cell in cells if cell}
 
 
-def test_what_a_page_asks_for_first_is_there_before_it_asks(live: Live, tmp_path: Path) -> None:
+def test_what_a_page_asks_for_first_is_there_before_it_asks(live: Live) -> None:
     row = live.new_map()
-    views = live.service.cell_views
-    with closing(ViewsAhead(live.service.store, views, tmp_path, look_every_s=SOON_S)):
+    views = live.service.views.cells.cache
+    with closing(ViewPrefetch(live.service.store, views, look_every_s=SOON_S)):
         for number in range(2):
             live.push(row, pushed(number, 0))
             live.folded(row)
@@ -48,60 +44,6 @@ def test_what_a_page_asks_for_first_is_there_before_it_asks(live: Live, tmp_path
                 assert answer.content in wanted.values()
                 assert decode_view(answer.content).view.depth == first_depth(3)
             assert views.made == made
-
-
-def test_a_new_start_has_the_views_of_the_one_before(live: Live, tmp_path: Path) -> None:
-    row = live.new_map()
-    live.push(row, pushed(0, 0))
-    live.folded(row)
-    wanted = coarse_views(live, row)
-    first, second = ViewCache(), ViewCache()
-    for cache in (first, second):
-        with closing(ViewsAhead(live.service.store, cache, tmp_path, look_every_s=SOON_S)):
-            until(lambda cache=cache: all(cache.has(name) for name in wanted), "views are there")  # type: ignore[misc]
-        assert cache.newest(1 << 20).items() >= wanted.items()
-    assert second.made == first.made
-
-
-def test_the_first_views_are_in_the_file_long_before_the_end(live: Live, tmp_path: Path) -> None:
-    row = live.new_map()
-    live.push(row, pushed(0, 0))
-    live.folded(row)
-    wanted = coarse_views(live, row)
-    with closing(ViewsAhead(live.service.store, ViewCache(), tmp_path, look_every_s=SOON_S)):
-        until(lambda: read_views(tmp_path).items() >= wanted.items(), "the first views are in the file")
-
-
-def test_what_the_disk_keeps_free_for_pushes_is_not_taken_by_views(live: Live, tmp_path: Path) -> None:
-    row = live.new_map()
-    live.push(row, pushed(0, 0))
-    live.folded(row)
-    views, wanted = ViewCache(), coarse_views(live, row)
-    free = live.service.store.health.figures().free_bytes
-    with closing(ViewsAhead(live.service.store, views, tmp_path, look_every_s=SOON_S, free_bytes_min=2 * free + 1)):
-        until(lambda: all(views.has(name) for name in wanted), "views are made")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_file_that_was_cut_or_changed_gives_what_is_sound_of_it(tmp_path: Path) -> None:
-    views = {f"map/{n:064x}/4": bytes(range(n)) for n in range(5)}
-    write_views(tmp_path, views)
-    whole = (tmp_path / NAME).read_bytes()
-    assert read_views(tmp_path) == views
-    for at in range(len(whole)):
-        for data in (whole[:at], whole[:at] + bytes([whole[at] ^ 0x55]) + whole[at + 1 :]):
-            (tmp_path / NAME).write_bytes(data)
-            assert read_views(tmp_path).items() <= views.items()
-    assert read_views(tmp_path / "nowhere") == {}
-
-
-def test_on_a_full_disk_the_older_file_stays_and_nothing_is_left_beside_it(tmp_path: Path) -> None:
-    write_views(tmp_path, {"old": b"view"})
-    (tmp_path / f"{NAME}.partial").symlink_to("/dev/full")
-    with pytest.raises(OSError, match="No space left"):
-        write_views(tmp_path, {"new": bytes(1 << 20)})
-    assert [path.name for path in tmp_path.iterdir()] == [NAME]
-    assert read_views(tmp_path) == {"old": b"view"}
 
 
 def test_a_view_is_not_that_of_another_map_which_had_the_name_before(live: Live) -> None:
@@ -116,33 +58,24 @@ def test_a_view_is_not_that_of_another_map_which_had_the_name_before(live: Live)
     assert view_name(row, stored, 1) != view_name(anew, stored, 1)
 
 
-def test_the_views_used_last_are_kept_within_a_bound() -> None:
+def test_the_views_used_last_are_kept_within_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cell_views, "BYTES_MAX", 20)
     cache = ViewCache()
-    cache.put({name: bytes(10) for name in "abc"})
+    for name in "ab":
+        cache.view(name, lambda: bytes(10))
     cache.view("a", lambda: pytest.fail("it is here"))
-    assert list(cache.newest(20)) == ["c", "a"]
+    cache.view("c", lambda: bytes(10))
+    assert [cache.has(name) for name in "abc"] == [True, False, True]
 
 
 @pytest.mark.processes
-def test_a_full_disk_keeps_the_views_of_before_and_is_no_fuller(tmp_path: Path) -> None:
-    with tiny_disk(tmp_path / "disk", size_mb=1) as disk:
-        write_views(disk.folder, {"a": b"1"})
-        disk.fill()
-        with pytest.raises(OSError):
-            write_views(disk.folder, {"b": bytes(1 << 18)})
-        assert {path.name for path in disk.folder.iterdir()} == {"filler", NAME}
-        assert read_views(disk.folder) == {"a": b"1"}
-
-
-def test_a_map_that_cannot_be_read_leaves_the_others_theirs(
-    live: Live, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_map_that_cannot_be_read_leaves_the_others_theirs(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     broken, sound = live.new_map(), live.new_map()
     live.push(sound, pushed(0, 0))
     live.folded(sound)
-    store, views = live.service.store, live.service.cell_views
+    store, views = live.service.store, live.service.views.cells.cache
     monkeypatch.setattr(store, "maps", lambda: [replace(broken, number=-1), sound])
-    with closing(ViewsAhead(store, views, tmp_path, look_every_s=SOON_S)):
+    with closing(ViewPrefetch(store, views, look_every_s=SOON_S)):
         until(lambda: all(views.has(name) for name in coarse_views(live, sound)), "views of the sound map are made")
 
 
@@ -200,5 +133,5 @@ def test_views_that_are_ready_come_in_one_answer_as_they_come_one_by_one(
     told = {tuple(head["cell"]): (head["etag"], view) for head, view in zip(heads, parts[1::2], strict=True)}
     assert told == {cell: (one.headers["ETag"], one.content) for cell, one in asked.items()}
     assert len(told) > 1
-    monkeypatch.setattr(view_bundle, "SIZE_BYTES_MAX", 8 + len(parts[0]) + len(parts[1]))
+    monkeypatch.setattr(cell_views, "BUNDLE_BYTES_MAX", 8 + len(parts[0]) + len(parts[1]))
     assert parts_of(live.http.get(f"{main}/views").content) == parts[:2]
