@@ -27,7 +27,7 @@ from cairn_server.store.store import Store
 from cairn_server.sync.handing_over import UpstreamProgress
 from cairn_server.sync.held_commits import HeldCommits, WantedCommits
 from cairn_server.sync.pushes import Pushes
-from cairn_server.sync.replies import Replies, StableVectors
+from cairn_server.sync.replies import MainReplies, StableVectors
 from cairn_server.sync.retracting import Retracts
 from cairn_server.sync.uploads import Uploads
 from cairn_server.views.cell_views import CellViews
@@ -43,7 +43,7 @@ class SyncParts:
     pushes: Pushes
     uploads: Uploads
     retracts: Retracts
-    replies: Replies
+    replies: MainReplies
     held: HeldCommits
     upstream: UpstreamProgress
 
@@ -106,7 +106,7 @@ class Service:
             pushes,
             Uploads(store, pushes),
             Retracts(store, wanted, on_new=on_new),
-            Replies(store, self.cells, self.live, wanted, self.figures, stable=stable),
+            MainReplies(store, self.cells, self.live, wanted, self.figures, stable=stable),
             HeldCommits(store, wanted),
             upstream,
         )

@@ -92,6 +92,7 @@ class CellCache:
     def trim(self) -> None:
         """Drop the cells changed longest ago until the bound holds, all but the newest cell if need be."""
         while self.size_bytes > self._limit_bytes and len(self._cells) > 1:
+            # The first one was changed longest ago; what is not written yet stays as a draft of its row.
             key = next(iter(self._cells))
             if key in self._changed:
                 self._drafts[key] = self._encoded(key)
@@ -100,6 +101,7 @@ class CellCache:
 
     def _taken(self, key: CellKey, load: Load) -> tuple[BrickCell, Stamps]:
         kept, draft = self._cells.get(key), self._drafts.get(key)
+        # Cached, else drafted and dropped since, else in the store.
         if kept is None and draft is not None:
             cell = BrickCell(self._geometry)
             cell.merge(stored_evidence(draft))
@@ -107,6 +109,7 @@ class CellCache:
         return load(key) if kept is None else kept
 
     def _keep(self, key: CellKey, cell: BrickCell, stamps: Stamps) -> None:
+        # A draft is out of date with the first change after it.
         self._drafts.pop(key, None)
         self._changed.add(key)
         self._cells[key] = cell, stamps

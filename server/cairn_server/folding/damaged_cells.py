@@ -89,7 +89,7 @@ def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes, *, by: str) 
         healed: list[CellRow] = []
         try:
             if sound_cell(snapshot, key, row.geometry, healed) is None:
-                raise NotFoundError("no_cell", f"nobody has seen cell {cell_of_key(key)} of map {row.name}")
+                raise NotFoundError("no_cell", f"no robot has seen cell {cell_of_key(key)} of map {row.name}")
             stored = None
         except DamagedDataError:
             stored = _row_of(snapshot, key)

@@ -118,6 +118,7 @@ class FoldProcess:
                     case Folded() as folded:
                         return folded
                     case _Write(fold):
+                        # The process must hear of it in any case: it waits for this answer.
                         try:
                             is_written = store.fold(row, fold)
                         except Exception as exc:  # noqa: BLE001 - raised once the process knows
@@ -152,6 +153,7 @@ def fork_folding(store_file: Path) -> FoldProcess:
     server = os.getpid()
     pid = os.fork()
     if pid == 0:
+        # The child: never returns from here, whatever happens.
         ours.close()
         try:
             die_with_parent(server)
@@ -166,6 +168,7 @@ def _be_folder(link: Connection, store_file: Path) -> None:
     """Run the process's side until the server is gone."""
     for number in (signal.SIGINT, signal.SIGTERM):  # sent to the whole group: the server ends first, in order
         signal.signal(number, signal.SIG_IGN)
+    # Its log lines go to the server: two processes would write over each other's.
     logging.basicConfig(handlers=[_FarLog(link)], force=True)
     answer_folds(link, Readers(store_file))
 

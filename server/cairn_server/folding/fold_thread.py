@@ -90,6 +90,7 @@ class FoldThread:
         while not self._closing.is_set():
             self._wake.wait(FORGET_EVERY_S)
             self._wake.clear()
+            # A failure is retried without a new commit, after a growing pause.
             if self._fold_all():
                 retry_s = FIRST_RETRY_S
             else:
@@ -103,6 +104,7 @@ class FoldThread:
         maps: list[MapRow] = []
         busy = True
         while busy and not self._closing.is_set():
+            # Cleared before the look, so that a commit that comes during it wakes the thread again.
             busy = False
             start_s = time.monotonic()
             self._wake.clear()
@@ -111,6 +113,7 @@ class FoldThread:
             except Exception:
                 log.exception("cannot list the maps")
                 return False
+            # One group of each map in turn: a busy map does not hold up the others.
             for row in maps:
                 if row.name in failed or self._closing.is_set():
                     continue
@@ -143,6 +146,7 @@ class FoldThread:
         return False
 
     def _forget_group(self, row: MapRow) -> int:
+        # No evidence is dropped that the upstream server lacks.
         before_s = min(time.time() - self._keep_evidence_s, self._may_forget_s(row.name))
         return self._store.forget_evidence(row, before_s=before_s, limit=FORGET_MAX)
 

@@ -166,13 +166,16 @@ class _Plan:
             self.damaged.append((commit.number, exc.message))
             return
         self.folded[commit.id] = commit
+        # Retracted before it came: both entries stand in the log, so that every robot sees the same history.
         if self._is_retracted(commit.id):
             self._enter(ENTRY_UNFOLD, commit)
+        # Once for ever: a second retract of the same target, in this group or in the store, changes nothing.
         for target in commit.retracts:
             if not self._is_retracted(target):
                 self._retract(target)
 
     def _retract(self, target: CommitId) -> None:
+        # A target that did not come yet is only noted; `take` finds it when it comes.
         known = self.folded.get(target) or self.store.folded(self.row, target)
         try:
             if known is not None:
@@ -186,6 +189,7 @@ class _Plan:
         return commit in self.retracted or self.store.is_retracted(self.row, commit)
 
     def _enter(self, kind: bytes, commit: StoredCommit) -> None:
+        # All of the commit's cells or none: a damaged one raises before there is an entry.
         blocks = self._apply(kind, commit)
         self.chain = next_chain(self.chain, kind, commit.id, commit.sha)
         self.entries.append(Entry(kind=kind, commit=commit.number, chain=self.chain))
@@ -198,6 +202,7 @@ class _Plan:
         """Add or subtract a commit's diff, all of it or nothing; returns the blocks of each cell that it touches."""
         if commit.gone:
             raise DamagedCommitError("damaged_store", f"the evidence of commit {commit.id} is not kept any more")
+        # The sums are integers, so that taking a diff back gives exactly the cell of before.
         step, undo = BrickCell.merge, BrickCell.unmerge
         if kind == ENTRY_UNFOLD:
             step, undo = undo, step

@@ -45,6 +45,7 @@ class Waiting:
 
     def probe(self, store: FoldStore, row: MapRow, damaged: Damage) -> None:
         """Read the damaged cells again if it is time; if one is sound, everything that waits is tried again."""
+        # The count is taken before the look: a cell healed during it makes the next call look again.
         healed = damaged.healed(row.name)
         if self.cells and (healed != self.healed or time.monotonic() - self.probed_s > PROBE_S):
             self.probed_s = time.monotonic()
@@ -78,6 +79,7 @@ def fold_around(
         waiting.commits.update({commit.number for commit in commits} - {commit.number for commit in ready})
         if not ready:
             continue
+        # A cell found damaged only now joins the others, and the rest of the commits is tried without it.
         try:
             return fold_commits(store, row, cache, ready)
         except DamagedCellError as exc:
@@ -133,6 +135,7 @@ class LocalFolding:
         Raises:
             CairnError: nothing was folded.
         """
+        # The cells stay decoded from one group to the next: a robot's next scans touch the same ones.
         cache = self._caches.setdefault(row.name, CellCache(row.geometry))
         cache.limit(CACHE_BYTES // maps)
         waiting = self._waiting.setdefault(row.name, Waiting())

@@ -89,6 +89,7 @@ def query_of(request: MissingRequest, snapshot: Snapshot) -> MissingQuery:
         ConflictError: kind `other_log`: a cursor belongs to another server's log; drop it (HTTP 410).
         BadInputError: a malformed id, cursor or cell.
     """
+    # Each cursor once, however many cells name it: proving one reads the log.
     cursor, cells = _cursor(request.cursor), _listed(request)
     head = snapshot.head.cursor
     unproven: set[Cursor] = set()
@@ -140,10 +141,13 @@ class CellFrames:
 
     def frame_of(self, row: CellRow, start: Cursor | None) -> CellFrame | None:
         """Smallest frame that brings a cell from the asker's state `start` to this one; None: it has that state."""
+        # Compare only, or a state that this log does not prove: a fingerprint.
         if self.query.is_reset(start):
             return self._frame(FrameKind.RESET, row.key, start, row.fingerprint)
+        # The asker's state of the cell is the present one.
         if start is not None and row.lm <= start.seq:
             return None
+        # Delta or changed blocks, where one is smaller than the whole cell.
         if start is not None:
             query = self.query
             change = change_since(
@@ -151,6 +155,7 @@ class CellFrames:
             )
             if change is not None:
                 return change
+        # Whole, as it is stored: a first fetch, or no smaller frame.
         return self._frame(FrameKind.FULL, row.key, start, row.fingerprint, self._body(row.key))
 
     def frame_of_unknown(self, key: CellKey, start: Cursor | None) -> CellFrame | None:
@@ -194,6 +199,7 @@ def reply_frames(cells: CellFrames, facts: HeaderFacts) -> Iterator[Frame]:
         if frame is None:
             rest += row.fingerprint
             continue
+        # At least one frame in each reply, so that every reply brings the asker on.
         sent_bytes += CELL_HEAD.size + len(frame.payload)
         yield frame
         if sent_bytes > query.size_bytes_max:

@@ -72,6 +72,8 @@ class Pushes:
         # Parsed once, decoded nowhere yet: claims and quotas refuse by the heads alone.
         commit = commit_reader(data)
         self._store.health.check_space(self._settings.disk_free_min_bytes)
+
+        # Whose commit it is, by token, seal or signatures; and what it claims.
         signed = signatures_from_text(signatures) if signatures else ()
         speaker = self._speaker(row, caller, commit, signed, seal)
         check_claims(row, speaker, id_text, commit.meta, cells=len(commit.cells))
@@ -83,6 +85,7 @@ class Pushes:
             if is_new:
                 take()
 
+        # Durable from here on: tell those that wait for it.
         self._wanted.forget(row.name, commit.meta.commit_id)
         if is_new:
             self._on_new()
@@ -126,6 +129,7 @@ class Pushes:
             BadInputError: kind `bad_signature`.
         """
         checked = self.checks.check(commit)
+        # Signatures are over the SHA-256 of the decoded evidence, which only the check knows.
         check_signatures(signed, row.name, checked.sha)
         tops = checked.tops or (0,) * (2 + row.geometry.plane_count)
         new = new_commit(Commit(commit.meta, commit.cells, checked.sha, commit.data), tops)

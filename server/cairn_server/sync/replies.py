@@ -47,7 +47,7 @@ class StableVectors:
             return vector
 
 
-class Replies:
+class MainReplies:
     """Answers about main, for all maps of a store; each from one snapshot; called from many threads."""
 
     def __init__(

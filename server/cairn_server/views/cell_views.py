@@ -193,7 +193,7 @@ class CellViews:
         stored, head = found
         if stored is None:
             raise NotFoundError(
-                "no_cell", f"nobody has seen cell {','.join(map(str, cell_of_key(key)))} of map {row.name}"
+                "no_cell", f"no robot has seen cell {','.join(map(str, cell_of_key(key)))} of map {row.name}"
             )
         etag = cell_etag(row, stored, suffix, depth)
         data = None if is_same(etag, known) else self._data(row, stored, suffix, depth)

@@ -43,7 +43,7 @@ def asked_voxel(store: Store, cells: Cells, row: MapRow, text: str) -> VoxelAnsw
     key = cell_key(cell)
     stored, head = cells.sound(row, key)
     if stored is None:
-        raise NotFoundError("no_cell", f"nobody has seen cell {','.join(map(str, cell))} of map {row.name}")
+        raise NotFoundError("no_cell", f"no robot has seen cell {','.join(map(str, cell))} of map {row.name}")
     place = int(split_voxels(np.array([voxel]), row.geometry)[1][0])
     seen = _only(stored_evidence(stored), place)
     voxels = voxels_of_evidence(key, seen, row.geometry, row.sensor_model, occupied_only=False)

@@ -108,6 +108,7 @@ class Checkpoints:
             return 0
 
     def _try(self, wait_ms: int) -> None:
+        # TRUNCATE waits for the present readers within the busy timeout, and then empties the log.
         self._connection.set_busy_timeout(wait_ms)
         try:
             self._connection.wal_checkpoint(mode=apsw.SQLITE_CHECKPOINT_TRUNCATE)
@@ -176,6 +177,7 @@ class Writer:
 
     def _run(self) -> None:
         try:
+            # One transaction, one flush for each group of jobs; between groups, the log is kept short.
             while (group := self._group()) is not None:
                 if not group:
                     self.checkpoints.when_idle()
@@ -197,6 +199,7 @@ class Writer:
             return []
         if first is None:
             return None
+        # What came while the last group was written is written together.
         group = [first]
         while len(group) < GROUP_MAX:
             try:
@@ -238,6 +241,7 @@ def _commit_group(connection: apsw.Connection, group: list[Job]) -> UnreachableE
 
 
 def _run_job(connection: apsw.Connection, job: Callable[[apsw.Connection], Any]) -> tuple[Any, BaseException | None]:
+    # A job that raises is undone alone; an error of SQLite itself ends the whole group.
     connection.execute("SAVEPOINT job")
     try:
         value = job(connection)

@@ -133,6 +133,7 @@ class CheckPool:
             UnreachableError: kind `busy`: too many wait; kind `check_failed`: workers were killed, or starved;
                 kind `shutting_down`.
         """
+        # More would take the web server's threads from robots whose commits are cheap.
         if not self._waiting.acquire(blocking=False):
             raise UnreachableError("busy", "many large commits are being checked", retry_after_s=5.0)
         try:
@@ -154,6 +155,7 @@ class CheckPool:
             self._nursery = self._control = None
         if control is not None:
             control.close()
+        # Its workers die with it.
         if nursery is not None:
             nursery.kill()
             nursery.wait()
@@ -164,6 +166,7 @@ class CheckPool:
                     worker.jobs.close()
 
     def _checked(self, data: bytes) -> Checked:
+        # The place that is taken here goes back in every case, with a worker in it or without.
         try:
             worker = self._idle.get(timeout=WAIT_S)
         except queue.Empty:
@@ -175,6 +178,7 @@ class CheckPool:
                 worker.jobs.close()
                 worker = None
         except BaseException:
+            # Refused or lost in the middle of a commit: its process is in no known state.
             if worker is not None:
                 worker.kill()
                 worker = None
@@ -189,6 +193,7 @@ class CheckPool:
         return checked_from(answer)
 
     def _new_worker(self) -> _Worker:
+        # The nursery forks a worker for the other end of the pair, and the worker says its number through it.
         ours, theirs = socket.socketpair()
         with theirs:
             try:
@@ -213,6 +218,7 @@ class CheckPool:
     def _start_nursery(self) -> socket.socket:
         if self._control is not None:
             self._control.close()
+        # A program of its own: the server has threads, and must not fork.
         self._control, far = socket.socketpair()
         with far:
             self._nursery = subprocess.Popen(  # noqa: S603 - our own program, and two numbers
