@@ -1,4 +1,4 @@
-"""What a camera sees of a board's margin says whether it sees dark as bright, and cameras then agree on the order."""
+"""Polarity of a camera from a board's margin: whether it sees dark as bright; cameras then agree on the order."""
 
 from pathlib import Path
 

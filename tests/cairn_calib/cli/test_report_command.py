@@ -19,7 +19,7 @@ NAMES = ("tof", "thermal-left")
 
 @pytest.fixture(scope="module")
 def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
-    """A folder with rig.json, and the folders of its corners, with a picture beside each document."""
+    """A folder with rig.json, and the folders of its corners, with a picture next to each document."""
     folder = tmp_path_factory.mktemp("solved")
     folders = write_corner_files(views_of(world(6, seed=6, names=NAMES), seed=6), folder)
     for documents in folders.values():

@@ -1,4 +1,4 @@
-"""What is said of a solution is true: influence, next image, certainty of pixels, halves, warnings."""
+"""Examination of a solution against the truth: influence, next image, certainty of pixels, halves, warnings."""
 
 import re
 from collections.abc import Sequence
@@ -101,7 +101,7 @@ def board_at(solution: Solution, place: NextImage) -> Floats:
 
 
 def variance_of(solution: Solution, at: Solution) -> float:
-    """Of the probe points, in units of each camera's noise."""
+    """Variance of the probe points, in units of each camera's noise."""
     noise = {"tof": 0.1, "left": 0.15}
     probes = probes_of(solved_rig(at, made_s=0.0), "tof", at.layout)
     return float(sum(np.mean(each.sigmas_px(solution.covariance) ** 2) / noise[each.camera] ** 2 for each in probes))

@@ -1,6 +1,6 @@
 """mrcal 2.2, an independent solver, on the same corners: the same cameras, and the same uncertainty of every pixel.
 
-mrcal is a Debian package for Debian's own Python, so what it gave is kept beside this file, with its corners. Where
+mrcal is a Debian package for Debian's own Python, so what it gave is kept next to this file, with its corners. Where
 the package is installed (`apt-get install python3-mrcal`), it solves them again.
 """
 

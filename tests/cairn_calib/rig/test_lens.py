@@ -27,7 +27,7 @@ POSES = np.array([[0.3, -0.2, 0.1, 0.1, -0.2, 0.5], [0, 0, 0, 0, 0, 0.3], [2.0, 
 
 
 def points(seed: int = 3, count: int = 40) -> Floats:
-    """Of the source frame: in front of the camera of every one of `POSES`."""
+    """Points of the source frame, in front of the camera of every one of `POSES`."""
     return np.random.default_rng(seed).uniform([-0.8, -0.6, 1.6], [0.8, 0.6, 4], (count, 3))
 
 

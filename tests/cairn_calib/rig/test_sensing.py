@@ -1,4 +1,4 @@
-"""What a rig says of a range camera's noise, fullness and silence."""
+"""Statements of a rig about a range camera's noise, fullness and silence."""
 
 import json
 

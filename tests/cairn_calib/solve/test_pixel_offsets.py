@@ -1,4 +1,4 @@
-"""What each pixel of a range camera adds of its own: found with its uncertainty, stated, taken off, never made up."""
+"""Offset of each pixel of a range camera: found with its uncertainty, stated, taken off, never made up."""
 
 import json
 from dataclasses import replace

@@ -71,7 +71,7 @@ def opencv_views(detector: Callable[[npt.NDArray[np.uint8]], Floats] = classic) 
 
 
 def opencv_plan() -> SolvePlan:
-    """What stereoCalibrate solves: a flat board of known size, no priors."""
+    """Plan of what stereoCalibrate solves: a flat board of known size, no priors."""
     return SolvePlan(
         cameras={name: CameraPlan(spectrum=Spectrum.COLOUR) for name in ("left", "right")},
         gauge="left",
@@ -166,7 +166,7 @@ def test_points_that_fit_again_are_let_in_again() -> None:
 
 
 def probe_pixels(solution: Solution) -> Mapping[str, Floats]:
-    """Where points before the first frame's board appear in each camera."""
+    """Pixels in each camera of points before the first frame's board."""
     points = np.random.default_rng(0).uniform([0, 0, -0.3], [0.6, 0.5, 0.3], (50, 3))
     state = solution.state
     seen = {}

@@ -1,4 +1,4 @@
-"""Default coefficients of a lens: all five, with what is usual of them; what the images leave open is told."""
+"""Default coefficients of a lens: all five, with what is usual of them; what the images leave open is reported."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What the camera's own warmth adds, images near a flat-field correction, and how sure the maps of the pixels are."""
+"""The camera's own warmth, images near a flat-field correction, and the uncertainty of the maps of the pixels."""
 
 from pathlib import Path
 

@@ -11,7 +11,7 @@ from cairn_map.codec.cell_code import encode_cell
 from cairn_map.errors import BadInputError, ConflictError
 
 NOBODY = "http://127.0.0.1:9/maps/lab"
-"""Where nothing listens: a robot maps on without a link."""
+"""URL at which nothing listens: a robot maps on without a link."""
 
 
 @pytest.fixture(scope="module")

@@ -58,7 +58,7 @@ def process(spool: Path, url: str, *options: str) -> "subprocess.Popen[str]":
 
 
 def ended(running: "subprocess.Popen[str]", number: int = signal.SIGTERM) -> str:
-    """What it printed."""
+    """Output of a run that a signal ends."""
     running.send_signal(number)
     out, err = running.communicate(timeout=30)
     assert running.returncode == 0, err
@@ -196,7 +196,7 @@ def test_a_recording_under_an_old_name_is_not_deleted_before_it_is_mapped(spool:
         record(spool, "a", [1])
         (stop,) = watched.stops(mole.replica)
         remember(mole.replica, stop.mark())
-        (spool / "a").rename(tmp_path / "moved")  # by the driver, which begins to count anew
+        (spool / "a").rename(tmp_path / "moved")  # by the driver, which begins to count again
         record(spool, "a", [2])
         watched.delete_done(mole.replica)
         Spool(spool).delete_done(mole.replica)  # after a restart

@@ -1,4 +1,4 @@
-"""What a robot's program does not wait for when it starts."""
+"""Start of a robot's program: libraries that it loads only when they are needed."""
 
 import subprocess
 import sys

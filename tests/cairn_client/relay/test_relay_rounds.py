@@ -1,4 +1,4 @@
-"""What stands in a relay's way rests, and all else goes by: nothing is asked for ever, and no direction waits."""
+"""Rounds of a relay: an obstacle rests while all else passes, nothing is asked for ever, and no direction waits."""
 
 import pytest
 
@@ -66,7 +66,7 @@ def resting(clock: Clock) -> Resting:
 
 
 def rounds(here: Place, there: Place, resting: Resting, count: int = 1) -> RelayReport:
-    """Of the last one."""
+    """Report of the last of some rounds."""
     for _ in range(count):
         report = hold_between(relay_round(resting), here, there)
     return report

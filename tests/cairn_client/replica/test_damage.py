@@ -85,7 +85,7 @@ def test_a_damaged_cell_on_the_server_is_reported_and_the_others_come(
     team.push("mole")
     server.stop()
     (database,) = (tmp_path / "server").glob("*.sqlite")
-    for table in ("cell", "diff"):  # else it would be made anew from the log
+    for table in ("cell", "diff"):  # else it would be made again from the log
         flip_a_bit(database, table, "body", "cell = ?", (FIRST_CELL,))
     server.start()
     for _ in range(2):

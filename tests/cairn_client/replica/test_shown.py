@@ -1,4 +1,4 @@
-"""What a robot shows of what its own commits take out: at once, whatever the server has of both, and only once."""
+"""Cells shown without what a robot's own commits take out: at once, whatever the server has of both, and only once."""
 
 from collections.abc import Iterator
 from pathlib import Path

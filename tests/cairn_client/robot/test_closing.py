@@ -1,4 +1,4 @@
-"""How a robot ends: what waits is pushed, it leaves the map if it may come back, and nothing makes it wait for long."""
+"""Closing of a robot: what waits is pushed, it leaves the map if it may come back, and nothing holds it up for long."""
 
 import socket
 import threading
@@ -157,7 +157,7 @@ class Silent:
         self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}/maps/{MAP}"
         self.taken: list[socket.socket] = []
         self.heard = threading.Event()
-        """A request came, so that whoever asks waits for the answer."""
+        """A request came, so that its sender waits for the answer."""
         self._reads = reads
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()

@@ -1,4 +1,4 @@
-"""What a robot tells of itself when it syncs, and the table that people see of it."""
+"""Status that a robot reports when it syncs, and the table that people see of it."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What a robot tells of itself as it happens: each event once, in its order, and never at the price of mapping."""
+"""Events of a robot as they happen: each once, in its order, and never at the price of mapping."""
 
 import threading
 from collections.abc import Callable

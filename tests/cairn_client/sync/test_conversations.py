@@ -1,4 +1,4 @@
-"""What a robot asks next, given what was answered; no link, no server."""
+"""Next request of a robot after each answer; no link, no server."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -66,7 +66,7 @@ def test_a_link_that_breaks_ends_the_round_and_keeps_what_was_not_answered(mole:
 
 
 def refused(replica: Replica, *answers: CairnError | None) -> dict[CommitId, CairnError]:
-    """What a round reports as refused, in which the server answers so to as many pushes."""
+    """Commits that a round reports as refused, in which the server answers so to as many pushes."""
     conversation = push_commits(replica)
     with pytest.raises(StopIteration) as end:
         next(conversation)

@@ -1,4 +1,4 @@
-"""Cells that the server's disk damaged for good, sent back by whoever still has them: a real server, a real disk."""
+"""Cells that the server's disk damaged, sent back by robots that still have them: a real server, a real disk."""
 
 import sqlite3
 from collections.abc import Iterator
@@ -50,7 +50,7 @@ def change(server: LiveServer, statement: str) -> None:
 
 
 def cell_on(server: LiveServer, key: CellKey) -> bytes:
-    """What the server answers."""
+    """Answer of the server."""
     with MapApi(server.url) as api:
         return api.cell(MAP, cell_of_key(key)).body or b""
 
@@ -77,7 +77,7 @@ def test_a_robot_that_has_a_damaged_cell_heals_the_server_as_it_syncs(
     with robot_in(tmp_path, server.map_url, name="bat", mode=mode) as bat:
         bat.sync()
         damage(server, key)
-        assert bat.sync().healed == 0  # nobody has asked the server for the cell yet
+        assert bat.sync().healed == 0  # no robot has asked the server for the cell yet
         assert is_damaged(server, key)
         assert bat.sync().healed == 1
         assert cell_on(server, key) == before

@@ -328,7 +328,7 @@ def test_a_reset_of_an_emptied_cell_that_is_not_held_covers_what_was_taken_out(m
 
 
 class OtherServer:
-    """Another log, which says so to whoever comes with a cursor."""
+    """Another log, which says so to every robot that comes with a cursor."""
 
     def __init__(self, coverage: VersionVector) -> None:
         self.coverage = coverage
@@ -371,7 +371,7 @@ def test_an_acknowledged_commit_is_still_shown_and_still_kept(mole: Replica) -> 
 def kept_after(
     mole: Replica, *, cells: list[int], covered: list[int], is_stable: bool = True, is_acked: bool = True
 ) -> bool:
-    """Whether the outbox keeps a commit of some cells after a reply that covers it in some of them."""
+    """True if the outbox keeps a commit of some cells after a reply that covers it in some of them."""
     commit = mole.commit(dict.fromkeys(cells, Y))  # type: ignore[misc]
     if is_acked:
         mole.acknowledge(commit.id)

@@ -39,7 +39,7 @@ FIRE = Cell(5, 5, 0)
 
 
 def rings_between(cell: Cell, near: Cell) -> int:
-    """How far a cell is from one, in cells along the farthest axis."""
+    """Distance of a cell from another, in cells along the farthest axis."""
     return max(abs(a - b) for a, b in zip(cell, near, strict=True))
 
 

@@ -1,4 +1,4 @@
-"""What one camera sees on another's pixels: slow twins, OpenCV as a second opinion, and hidden places never painted."""
+"""Images of one camera on another's pixels: slow twins, OpenCV as a second opinion, and hidden places never painted."""
 
 import os
 from dataclasses import replace

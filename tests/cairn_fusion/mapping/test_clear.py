@@ -1,4 +1,4 @@
-"""How far beams are certainly clear: the kernel against its slow twin, and what noise, slant, edges and silence do."""
+"""Certainly clear lengths of beams: the kernel against its slow twin; noise, slant, edges and silence."""
 
 import math
 from dataclasses import replace
@@ -146,7 +146,7 @@ def test_a_grazing_surface_keeps_its_margin_across_it() -> None:
 
 
 def edge_scan() -> Floats:
-    """A post 1 m ahead, its right half of the image; the pixel beside it mixed; a wall at 3 m."""
+    """A post 1 m ahead, its right half of the image; the pixel next to it mixed; a wall at 3 m."""
     range_m = np.full((30, 40), 3.0)
     range_m[:, 20:] = 1.0
     range_m[:, 19] = 1.6
@@ -157,7 +157,7 @@ def test_a_mixed_pixel_is_no_hit_but_still_shields_its_neighbour() -> None:
     diff = integrated(scan_of(edge_scan()), rig_of())
     hits, free = seen(diff, 0), seen(diff, 1)
     assert not ((hits[:, 0] > 1.2) & (hits[:, 0] < 2.5)).any()
-    # Column u is at y = -(u - 19.5) / 60 of the depth: the second beside the post is 18, free from 17 on.
+    # Column u is at y = -(u - 19.5) / 60 of the depth: the second next to the post is 18, free from 17 on.
     beyond = free[free[:, 0] > 1.2]
     assert len(beyond) > 100
     assert (beyond[:, 1] / beyond[:, 0]).min() > 1.9 / 60

@@ -1,4 +1,4 @@
-"""What a scan says about voxels: the laws of evidence, samples, and real recordings."""
+"""Scans as evidence of voxels: the laws of evidence, samples, and real recordings."""
 
 import math
 from pathlib import Path
@@ -46,7 +46,7 @@ Voxels = dict[tuple[int, ...], tuple[int, int, tuple[int, ...]]]
 
 
 def at(x_m: float, *, camera: str = "thermal") -> Transform:
-    """A place beside the range camera."""
+    """A place next to the range camera."""
     T = np.eye(4)
     T[0, 3] = x_m
     return T
@@ -318,7 +318,7 @@ def test_limits_that_leave_nothing_are_refused(limits: tuple[float, float]) -> N
         Integrator(*limits)
 
 
-# Real recordings: what the numbers were when the integrator was made is beside each bound.
+# Real recordings: what the numbers were when the integrator was made stands next to each bound.
 
 
 def mapped(source: Recording, scans: list[int], geometry: Geometry) -> Diff:

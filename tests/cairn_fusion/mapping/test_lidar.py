@@ -50,7 +50,7 @@ def tower() -> npt.NDArray[np.float32]:
 
 @pytest.fixture(scope="module")
 def seen() -> tuple[Floats, npt.NDArray[np.int32], npt.NDArray[np.bool_]]:
-    """Of the voxels that a measurement of the tower saw: (N, 3) centres from the lidar in metres, (N, 2) hits and
+    """Voxels that a measurement of the tower saw: (N, 3) centres from the lidar in metres, (N, 2) hits and
     misses, (N,) with a colour."""
     measurement = Measurement(RIG, GEOMETRY, Integrator(min_range_m=0.1, max_range_m=5))
     colour = np.full((48, 64, 3), 200, np.uint8)

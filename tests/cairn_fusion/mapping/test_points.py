@@ -119,7 +119,7 @@ def test_two_real_sweeps_agree_with_the_true_pose_and_not_with_its_inverse(test_
     near = np.array([(x, y, z) for x in range(-2, 3) for y in range(-2, 3) for z in range(-2, 3)])
 
     def share(voxels: npt.NDArray[np.int64]) -> float:
-        """Of voxels with one of the first sweep's within 2, Chebyshev."""
+        """Fraction of voxels with one of the first sweep's within 2, Chebyshev."""
         return float(np.mean([any(tuple(v) in base for v in (voxel + near).tolist()) for voxel in voxels]))
 
     assert share(map_of(second, T)) >= 0.75

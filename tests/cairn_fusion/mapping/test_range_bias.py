@@ -1,4 +1,4 @@
-"""What a range camera adds to its ranges: solved, stated in the rig, and taken off wherever its ranges are used."""
+"""Bias of a range camera: solved, stated in the rig, and taken off wherever its ranges are used."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Means of pixels as samples: the kernel beside plain Python, and values that no sample can hold."""
+"""Means of pixels as samples: the kernel against plain Python, and values that no sample can hold."""
 
 import numpy as np
 import pytest

@@ -70,7 +70,7 @@ def opened(path: Path, source: Recording, **changes: object) -> ScanSource:
 
 
 def refused(path: Path, text: str) -> CairnError:
-    """What opening a bag by a mapping, or reading its scans, raises."""
+    """Error of opening a bag by a mapping, or of reading its scans."""
     with pytest.raises(CairnError) as caught:
         list(open_source(path, mapping=mapping_from_yaml(text, "bag.yaml")))
     return caught.value

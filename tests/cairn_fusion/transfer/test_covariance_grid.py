@@ -1,4 +1,4 @@
-"""How certain transferred pixels are with a rig's own covariance: differences, chi2 against truth, and the grid."""
+"""Covariance of transferred pixels by a rig's own: differences, chi2 against truth, and the grid."""
 
 import numpy as np
 import numpy.typing as npt

@@ -1,4 +1,4 @@
-"""How certain a transferred pixel is: its covariance against differences and against noise, and what is left out."""
+"""Covariance of a transferred pixel against differences and against noise, and what is left out."""
 
 import math
 from dataclasses import replace

@@ -20,7 +20,7 @@ COLOUR = Camera(width=160, height=120, focal_px=(140.0, 140.0), centre_px=(79.5,
 
 
 def rig(src: Camera = TOF, dst: Camera = COLOUR, *, shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Rig:
-    """A range camera at the rig's origin and a colour camera beside it."""
+    """A range camera at the rig's origin and a colour camera next to it."""
     T_rig_colour = np.eye(4)
     T_rig_colour[:3, 3] = shift_m
     cameras = {

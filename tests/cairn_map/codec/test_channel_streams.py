@@ -1,4 +1,4 @@
-"""The law: samples told apart by channel and joined again are the same, and no other sums come out of it."""
+"""The law: samples separated by channel and joined again are the same, and no other sums come out of it."""
 
 import numpy as np
 import numpy.typing as npt

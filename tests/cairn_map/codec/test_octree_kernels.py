@@ -105,7 +105,7 @@ def test_earlier_rows_are_those_beside_that_come_before(made: Made, data: st.Dat
 
 
 def test_the_steps_are_all_that_can_come_before() -> None:
-    """Of 26 neighbours the 13 whose Morton number is lower somewhere, and with them no other."""
+    """The 13 of 26 neighbours whose Morton number is lower somewhere, and no other."""
     lower = set()
     for corner in product((1, 2, 3, 4), repeat=3):
         for step in product((-1, 0, 1), repeat=3):

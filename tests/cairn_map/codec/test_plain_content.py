@@ -35,7 +35,7 @@ def arrays_of(content: CellContent) -> Arrays:
 
 
 def verdict(read: Callable[[CellReader], CellContent], reader: CellReader) -> Arrays | str:
-    """What the streams say, or that they are not sound."""
+    """Content of the streams, or the error that they are not sound."""
     try:
         return arrays_of(read(reader))
     except CairnError as exc:
@@ -44,7 +44,7 @@ def verdict(read: Callable[[CellReader], CellContent], reader: CellReader) -> Ar
 
 
 def is_canonical(data: bytes) -> bool:
-    """Whether coding what the bytes say gives them again."""
+    """True if coding the decoded content gives the bytes again."""
     cell = decode_cell(data)
     again = encode_cell(cell.key, cell.evidence, cell.geometry)
     return again.digest == cell.digest

@@ -60,7 +60,7 @@ def test_the_twin_reads_and_writes_the_same_bytes(made: Made) -> None:
 
 @given(st.one_of(EXTREME, RANDOM))
 def test_what_the_twin_writes_of_anything_is_read(made: Made) -> None:
-    """Of extremes, too, which the real encoder finds no shorter than they are and leaves raw."""
+    """Evidence with extremes, which the real encoder finds no shorter than they are and leaves raw."""
     evidence, geometry = made
     data, digest = naive_cell_code.encode_modelled_cell(header_of(geometry, CELL), as_dict(evidence))
     decoded = decode_canonical_cell(data)

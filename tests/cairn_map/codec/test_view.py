@@ -31,7 +31,7 @@ STYLES = st.builds(
 def naive_nodes(
     evidence: Evidence, geometry: Geometry, style: ViewStyle
 ) -> dict[int, list[tuple[float, tuple[int, ...]]]]:
-    """By node that is told the log-odds, minus infinity if unknown, and sums of its voxels."""
+    """Log-odds (minus infinity if unknown) and sums of the voxels of each node that a view stores."""
     low, high = log_odds(MODEL.p_min), log_odds(MODEL.p_max)
     depth = geometry.depth if style.depth is None else style.depth
     nodes: dict[int, list[tuple[float, tuple[int, ...]]]] = {}

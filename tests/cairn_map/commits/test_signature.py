@@ -1,4 +1,4 @@
-"""Signatures: who made a commit can be told by anybody, and nobody else can make it."""
+"""Signatures: anyone can verify the author of a commit, and only the author can sign it."""
 
 import hashlib
 

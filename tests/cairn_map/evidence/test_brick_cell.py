@@ -36,7 +36,7 @@ def voxels_as_given(voxels: list[int], *, sampled: list[int] | None = None) -> E
 
 
 def edges(limit: int) -> st.SearchStrategy[int]:
-    """Numbers beside those where 15, 16, 31 and 62 bits end, of either sign, within a limit."""
+    """Numbers next to those where 15, 16, 31 and 62 bits end, of either sign, within a limit."""
     tops = [1 << bits for bits in (0, 14, 15, 16, 30, 31, 61, 62)]
     near = sorted({sign * (top + step) for top in tops for sign in (1, -1) for step in (-1, 0, 1)})
     return st.sampled_from([number for number in near if abs(number) <= limit])

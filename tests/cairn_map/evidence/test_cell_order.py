@@ -1,4 +1,4 @@
-"""Which cells come first, and how hot a cell is."""
+"""Order of cells, and the temperature of a cell's hottest voxel."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What is said while kernels are compiled: one line on a terminal, few in a log, nothing when all are kept."""
+"""Messages while kernels are compiled: one line on a terminal, few in a log, nothing when all are kept."""
 
 import io
 import os

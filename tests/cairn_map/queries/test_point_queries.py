@@ -1,4 +1,4 @@
-"""What a snapshot says of points, and that it stays as it was."""
+"""Point queries of a snapshot, and its staying unchanged."""
 
 import math
 import tracemalloc

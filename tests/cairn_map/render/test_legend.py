@@ -10,7 +10,7 @@ NOTES = ("solid: visible", "stripes: behind that", "dots: from the map alone")
 
 
 def is_written(strip: np.ndarray[tuple[int, ...], np.dtype[np.uint8]], text: str) -> bool:
-    """Whether a text stands somewhere in a strip, whole."""
+    """True if a text stands somewhere in a strip, whole."""
     word = np.zeros((8, text_width_px(text), 3), np.uint8)
     write_text_into(word, text, (0, 0), TEXT)
     ink, wanted = (strip == TEXT).all(axis=2), (word == TEXT).all(axis=2)

@@ -1,4 +1,4 @@
-"""What a camera sees of a map, against twins that cut every ray with every voxel; and what its pixels read."""
+"""Rendered maps against twins that cut every ray with every voxel; and the readings of pixels."""
 
 import numpy as np
 import numpy.typing as npt

@@ -1,4 +1,4 @@
-"""How far a picture may be off: Jacobians against true motions, covariances against Monte Carlo, and the blur."""
+"""Pose uncertainty in a picture: Jacobians against true motions, covariances against Monte Carlo, and the blur."""
 
 import numpy as np
 import numpy.typing as npt

@@ -24,7 +24,7 @@ def cell(key: int, size: int, *, seed: int = 0) -> CellFrame:
 
 
 def reply_of(request: MissingRequest, frames: Iterable[Frame]) -> bytes:
-    """What a server that would send these frames sends to this request."""
+    """Reply to a request of a server that has these frames to send."""
     sent = [HEADER, *frames, REST[0]]
     return start_of_reply() + b"".join(map(encode_frame, without_begun(sent, request.begun)))
 
@@ -80,7 +80,7 @@ def test_a_frame_that_goes_on_from_what_is_not_here_is_refused() -> None:
 
 
 def going_on(replies: Replies, size: int, *, cut: int = 0) -> list[Frame]:
-    """What comes of a reply that goes on with so many bytes, whatever was here."""
+    """Result of a reply that continues with so many bytes, whatever was received before."""
     data = start_of_reply() + encode_frame(replace(cell(0, size), continues=True))
     return list(replies.reply_to(MissingRequest()).frames([data[: len(data) - cut]]))
 

@@ -49,7 +49,7 @@ MB = 1 << 20
 
 
 def check_evidence(evidence: Evidence, geometry: Geometry) -> None:
-    """What everybody does with evidence, done."""
+    """Run all that programs do with evidence."""
     fingerprint(evidence, KEY)
     assert brick_cell(geometry, [evidence]).packed() == evidence
     assert decode_cell(encode_cell(KEY, evidence, geometry).data).evidence == evidence
@@ -90,7 +90,7 @@ every_reader = pytest.mark.parametrize(("read", "sound"), READERS, ids=IDS)
 
 
 def survives(read: Reader, data: bytes) -> bool:
-    """Whether the bytes were taken; any error but ours goes through."""
+    """True if the bytes were taken; any error but ours goes through."""
     try:
         read(data)
     except CairnError as exc:
@@ -198,7 +198,7 @@ def test_a_bomb_is_refused_within_bounds(name: str) -> None:
 
 @pytest.mark.processes
 def test_all_bombs_together_stay_within_bounds_as_the_system_counts() -> None:
-    """What zstd and the JSON parser allocate, tracemalloc does not see."""
+    """Bound of the whole process: tracemalloc does not see what zstd and the JSON parser allocate."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     command = [sys.executable, "-m", "tests.fixtures.map.bombs"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)

@@ -1,4 +1,4 @@
-"""Who may do what besides the matrix (`test_access_matrix`): whose commits, whose tokens; and browsers."""
+"""Rights besides the matrix (`test_access_matrix`): whose commits, whose tokens; and browsers."""
 
 import socket
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""What a robot may push, and that what was refused, known or an administrator's costs nothing."""
+"""Quotas of a robot's pushes; commits that are refused, known or an administrator's cost nothing."""
 
 from contextlib import nullcontext
 from pathlib import Path

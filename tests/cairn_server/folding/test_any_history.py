@@ -38,14 +38,14 @@ class MapModel:
     """A map: what came, who is registered, and what askers hold of it."""
 
     operator: Author | None
-    """Who retracts for operators; None: the map has another grid, and nobody pushes to it."""
+    """Author of operators' retracts; None: the map has another grid, and no robot pushes to it."""
     commits: Model = field(default_factory=Model)
     branches: dict[str, str] = field(default_factory=dict)
     askers: dict[Author, NaiveAsker] = field(default_factory=dict)
 
     @property
     def ids(self) -> list[CommitId]:
-        """Of robots' commits."""
+        """Ids of robots' commits."""
         return [commit.id for commit in self.commits.arrived if commit.id.author.robot != OPERATOR]
 
     def next_n(self, author: Author) -> int:
@@ -54,7 +54,7 @@ class MapModel:
 
 
 class AnyHistory(RuleBasedStateMachine):
-    """Requests through a socket, beside the same on dictionaries."""
+    """Requests through a socket, and the same on dictionaries."""
 
     @initialize()
     def start(self) -> None:
@@ -199,7 +199,7 @@ class AnyHistory(RuleBasedStateMachine):
     # How it is asked for
 
     def is_ours(self, name: str) -> bool:
-        """Whether there is a map of that name that commits fit to."""
+        """True if there is a map of that name that commits fit to."""
         return name in self.maps and self.maps[name].operator is not None
 
     def row(self, name: str) -> MapRow:

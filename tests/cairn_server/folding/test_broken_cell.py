@@ -42,7 +42,7 @@ def test_an_answer_to_missing_brings_all_other_cells_and_names_the_damaged_one(l
 
 def test_other_maps_are_served_and_folded(live: Live) -> None:
     row, other = broken_map(live, keep_diffs=False), live.new_map()
-    live.service._fold_thread._local._caches.clear()  # the folder still knows the cell, and would write it anew
+    live.service._fold_thread._local._caches.clear()  # the folder still knows the cell, and would write it again
     assert live.push(row, pushed(1, 0)).status_code == 201
     live.push(other, pushed(0, 0))
     live.folded(other)

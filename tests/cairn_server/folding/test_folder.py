@@ -1,4 +1,4 @@
-"""When the folder folds: at once for one who pushes now and then, in groups while many do."""
+"""Times of folding: at once for one who pushes now and then, in groups while many do."""
 
 import threading
 

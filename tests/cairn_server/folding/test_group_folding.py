@@ -36,7 +36,7 @@ def broken_map(live: Live) -> tuple[MapRow, bytes]:
         BROKEN,
         row.number,
     )
-    live.service._fold_thread._local._caches.clear()  # the folder still knows the cell, and would write it anew
+    live.service._fold_thread._local._caches.clear()  # the folder still knows the cell, and would write it again
     return row, whole
 
 

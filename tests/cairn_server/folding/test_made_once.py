@@ -1,4 +1,4 @@
-"""What many ask for at a time is made once, and kept within a bound."""
+"""Single-flight cache: concurrent requests for one key compute its value once, and values are kept within a bound."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -28,7 +28,7 @@ def test_all_who_ask_meanwhile_get_what_the_first_one_makes() -> None:
 
     with ThreadPoolExecutor(ASKERS) as pool:
         asked = [pool.submit(values.get, "name", make) for _ in range(ASKERS)]
-        assert values.get("other", lambda: b"x") == b"x"  # nobody waits for what it did not ask for
+        assert values.get("other", lambda: b"x") == b"x"  # no request waits for a value that it did not ask for for
         go.set()
         assert [future.result() for future in asked] == [b"value"] * ASKERS
     assert made == [1]

@@ -18,7 +18,7 @@ from cairn_server.store.sqlite.store import SqliteStore
 
 @pytest.fixture
 def live(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Live]:
-    """A server that looks anew every time it is asked."""
+    """A server that looks again at every request."""
     monkeypatch.setattr(readiness, "KEEP_S", 0.0)
     monkeypatch.setattr(fold_thread, "RETRY_S", 0.01)
     with Live(tmp_path, fold_lag_max_s=30.0) as server:

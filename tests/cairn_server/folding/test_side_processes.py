@@ -1,4 +1,4 @@
-"""The processes beside the server: what they do is what it does without them, and it can be without them."""
+"""The server's side processes: what they do is what it does without them, and it can be without them."""
 
 import os
 import shutil

@@ -37,7 +37,7 @@ Worth = Literal["good", "none", "wrong", "expired", "revoked"]
 
 @dataclass(frozen=True)
 class Holder:
-    """Who asks."""
+    """Holder of a token that sends a request."""
 
     role: RoleText | None
     place: Place | None = None
@@ -76,7 +76,7 @@ class Holders:
         self._headers: dict[Holder, dict[str, str]] = {}
 
     def renew(self) -> None:
-        """Robots registered and tokens given anew: what was just done may have ended them."""
+        """Robots registered and tokens given again: what was just done may have ended them."""
         for row in self.rows.values():
             for robot, author in AUTHORS.items():
                 self.live.service.maps.register(row, Register(robot=robot, incarnation=author.incarnation))
@@ -118,7 +118,7 @@ def holders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Holders]:
 
 
 def statuses(route: tuple[str, str], holder: Holder, place: str, robot: str) -> set[int] | None:
-    """What the document lets the answer be; None: whatever the route itself says, as the holder is let in."""
+    """Status codes that the document prescribes; None: any of the route itself, as the holder is let in."""
     roles, is_of_a_map = set(ROLES_OF[route]), "{name}" in route[1] and route != CREATION
     if "anybody" in roles:
         return None

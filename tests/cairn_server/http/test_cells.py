@@ -61,7 +61,7 @@ def test_each_form_of_a_cell_has_its_own_etag(live: Live, row: MapRow) -> None:
 
 @pytest.mark.parametrize("suffix", ["", ".npz", ".ply", ".view?depth=2", ".view?depth=3"])
 def test_what_another_sensor_model_makes_of_a_cell_has_another_etag(live: Live, row: MapRow, suffix: str) -> None:
-    """As of a server that was started anew in an empty folder, where robots brought the same evidence."""
+    """As of a server that was started again in an empty folder, where robots brought the same evidence."""
     other = live.new_map(sensor_model=SensorModel(p_hit=0.6))
     live.push(other, pushed(0, 0))
     live.folded(other)

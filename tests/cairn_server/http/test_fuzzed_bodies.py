@@ -21,7 +21,7 @@ pytestmark = pytest.mark.fuzz
 BODIES = 150
 """For each route."""
 GROWTH_MB_MAX = 128
-"""Of the process's largest resident memory, above what it took when it had answered each route once."""
+"""Growth of the process's largest resident memory above what it took when it had answered each route once."""
 GROWTH_JSON_MB_MAX = 384
 """The framework parses 16 MB of JSON whole, at some 20 bytes for each byte of it."""
 ANSWER_S = 10.0

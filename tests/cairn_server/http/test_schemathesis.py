@@ -1,4 +1,4 @@
-"""What `openapi.json` promises, tried by schemathesis on a live server: every route, with what fits and what not."""
+"""Promises of `openapi.json`, tried by schemathesis on a live server: every route, with sound and unsound input."""
 
 import random
 from typing import Any
@@ -42,7 +42,7 @@ PLACES = {
     "token": ["looker"],
     "file": ["x.js"],
 }
-"""What is there, so that not every answer is 404."""
+"""Names of things that exist, so that not every answer is 404."""
 CONFORMANCE = (status_code_conformance, content_type_conformance, response_schema_conformance)
 ANSWER_S = 10.0
 PROBLEM = "application/problem+json"

@@ -33,7 +33,7 @@ def connected(live: Live) -> socket.socket:
 
 
 def is_open(link: socket.socket) -> bool:
-    """Whether the server still listens; what it says is dropped."""
+    """True if the server still listens; its answer is dropped."""
     link.setblocking(False)
     try:
         return bool(link.recv(1 << 16))

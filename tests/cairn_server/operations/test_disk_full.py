@@ -48,7 +48,7 @@ def push(http: httpx.Client, commit: Commit) -> httpx.Response:
 
 
 def push_until_full(http: httpx.Client, first: int) -> tuple[list[Commit], httpx.Response]:
-    """What was acknowledged, and the first refusal."""
+    """Acknowledged commits, and the first refusal."""
     acked: list[Commit] = []
     for n in range(first, first + 3000):
         answer = push(http, commit := pushed(n, n % 5))
@@ -101,7 +101,7 @@ def test_a_full_disk_refuses_pushes_keeps_what_was_acknowledged_and_recovers(dis
 
 
 def ready_reasons(http: httpx.Client) -> str:
-    """What `/readyz` complains of; it looks anew every second."""
+    """Complaints of `/readyz`, which looks again every second."""
     until(lambda: http.get("/readyz").status_code == 503, "it is not ready")
     answer = http.get("/readyz")
     assert kind_of(answer) == "not_ready"

@@ -1,4 +1,4 @@
-"""Backup beside a running server, and restore."""
+"""Backup next to a running server, and restore."""
 
 import os
 from collections.abc import Iterator

@@ -31,7 +31,7 @@ def test_an_older_store_opens_with_all_that_it_held_and_goes_on(name: str, tmp_p
             assert str(snapshot.head.cursor) == HEADS[name]
             seq = snapshot.head.cursor.seq
         assert read(live.cells(row)) == sum_of([*OLD_COMMITS, *OLD_RETRACTS])
-        assert {cell.hottest_k for cell in rows_of(live)} == {None}  # nobody wrote down how hot they are
+        assert {cell.hottest_k for cell in rows_of(live)} == {None}  # no version wrote down how hot they are
         assert [branch.name for branch in live.service.store.branches(row)] == ["mole"]
         assert live.push(row, OLD_COMMITS[2]).status_code == 200
         assert live.push(row, more).status_code == 201

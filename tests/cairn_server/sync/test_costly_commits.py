@@ -1,4 +1,4 @@
-"""Commits made to take long or much: refused by their heads, or in a worker that is replaced; nobody else is harmed."""
+"""Commits made to take long or much: refused by their heads, or in a worker that is replaced; no other is harmed."""
 
 import os
 import resource
@@ -28,7 +28,7 @@ from cairn_server.sync.checks import check_pool, worker_nursery
 
 LARGE = Geometry(depth=6, channels=())
 LIMIT_S = 2.0
-"""Of processor time in a worker: enough for every sound commit here."""
+"""Seconds of processor time in a worker: enough for every sound commit here."""
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def sparse_noise(geometry: Geometry) -> Evidence:
 
 
 def of_cells(cells: int, *, n: int = 0, profile: Profile = Profile.FAST, author: Author = MOLE) -> Commit:
-    """A commit of many dear cells."""
+    """A commit of many expensive cells."""
     pose = ScanPose(time_s=1.5e9, t_map_rig=(0.0, 0.0, 0.4), q_map_rig=(0.0, 0.0, 0.0, 1.0))
     meta = CommitMeta(id=str(CommitId(author, n)), geometry=LARGE.digest().hex(), scans=(pose,) * 2)
     evidence = sparse_noise(LARGE)

@@ -1,4 +1,4 @@
-"""What comes first in a reply, and what need not come at all."""
+"""Order of the frames of a reply, and frames that may be left out."""
 
 import numpy as np
 from tests.fixtures.map.made import SMALL, random_evidence

@@ -1,4 +1,4 @@
-"""What a relay may hand over: exactly what others signed, and nothing that it made or changed itself."""
+"""Commits that a relay may hand over: exactly what others signed, and nothing that it made or changed itself."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""`GET .../main/render`: the same picture as at home, made anew when the map changes, bounded, and honest."""
+"""`GET .../main/render`: the same picture as at home, rendered again when the map changes, bounded, and honest."""
 
 import io
 import threading

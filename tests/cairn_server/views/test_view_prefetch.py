@@ -22,7 +22,7 @@ SOON_S = 0.01
 
 
 def coarse_views(live: Live, row: MapRow) -> dict[str, bytes]:
-    """What a page asks for first, as the store has the cells now."""
+    """Views that a page requests first, of the cells as the store has them now."""
     depth = first_depth(row.geometry.depth)
     with live.service.store.snapshot(row) as snapshot:
         cells = [snapshot.cell(cell.key) for cell in list(snapshot.cells())]
@@ -47,7 +47,7 @@ def test_what_a_page_asks_for_first_is_there_before_it_asks(live: Live) -> None:
 
 
 def test_a_view_is_not_that_of_another_map_which_had_the_name_before(live: Live) -> None:
-    """As where somebody starts anew in the same folder, with other probabilities, and pushes the same commits."""
+    """As where somebody starts again in the same folder, with other probabilities, and pushes the same commits."""
     row = live.new_map()
     live.push(row, pushed(0, 0))
     live.folded(row)

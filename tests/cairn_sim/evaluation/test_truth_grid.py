@@ -70,7 +70,7 @@ def naive_masks(scene: Scene, box: VoxelBox) -> npt.NDArray[np.uint64]:
 def naive_marks(
     origin: Floats, directions: Floats, range_m: Floats, max_range_m: float, box: VoxelBox
 ) -> npt.NDArray[np.uint8]:
-    """Of each ray and each voxel the length of their overlap."""
+    """Length of the overlap of each ray and each voxel."""
     marks = np.zeros(box.shape, np.uint8)
     voxels = np.stack(np.meshgrid(*(np.arange(n) for n in box.shape), indexing="ij"), axis=-1) + np.array(box.low)
     low, high = voxels * box.voxel_edge_um / 1e6, (voxels + 1) * box.voxel_edge_um / 1e6
@@ -179,7 +179,7 @@ def test_classes_of_a_wall_seen_by_one_ray() -> None:
     box = VoxelBox((0, -1, 0), (20, 3, 1), 100_000)
     (truth,) = truths_of(wall(), [box], camera=ONE_RAY, T_map_cameras=[ALONG_X], fineness=1)
     assert truth.classes[:, 1, 0].tolist() == [TruthClass.FREE] * 10 + [TruthClass.SURFACE] + [TruthClass.SOLID] * 9
-    # Beside the ray nothing is seen; voxel 10 is exactly half solid.
+    # Off the ray nothing is seen; voxel 10 is exactly half solid.
     assert truth.classes[:, 0, 0].tolist() == truth.classes[:, 2, 0].tolist() == [0] * 10 + [3] * 10
     assert truth.solid_samples[9:12, 1, 0].tolist() == [0, 32, 64]
     assert truth.solid_fraction[9:12, 1, 0].tolist() == [0, 0.5, 1]

@@ -1,4 +1,4 @@
-"""`cairn experiment` as a user types it, small; its numbers are computed anew from the cells that it wrote."""
+"""`cairn experiment` as a user types it, small; its numbers are computed again from the cells that it wrote."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""The report of made-up figures: sums and ratios known by hand, sound HTML, the paper's numbers beside ours."""
+"""The report of made-up figures: sums and ratios known by hand, sound HTML, the paper's numbers next to ours."""
 
 import numpy as np
 import pytest

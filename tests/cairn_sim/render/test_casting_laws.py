@@ -1,4 +1,4 @@
-"""What the tree of boxes may never change: what is met, whichever way it is asked; and what a pattern depends on."""
+"""Laws of casting: the tree of boxes never changes what a ray meets; and all that a pattern depends on."""
 
 import itertools
 import math

@@ -202,7 +202,7 @@ def test_blooming_changes_no_image_in_which_no_pixel_is_full() -> None:
 # --- thermal ----------------------------------------------------------------------------------------------------
 
 STEP_K = ROUNDING / ThermalSensor().counts_per_kelvin
-"""What rounding to counts adds, kelvin."""
+"""Error by rounding to counts, kelvin."""
 
 
 @pytest.mark.parametrize("name", ["thermal_left", "thermal_right"])

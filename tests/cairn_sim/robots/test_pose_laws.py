@@ -1,4 +1,4 @@
-"""What a robot's idea of its way keeps of the true one, whatever it gets wrong; and how a drive takes its corners."""
+"""Laws of estimated poses: what they keep of the true ones at any error; and the corners of a drive."""
 
 import math
 from dataclasses import replace
@@ -66,7 +66,7 @@ def test_a_step_is_wrong_by_its_own_error_alone_however_far_the_way() -> None:
 
 
 def headings_rad(waypoints: tuple[tuple[float, float], ...], at_m: Floats) -> Floats:
-    """Where a robot looks at each of some lengths along a line on level ground."""
+    """Headings of a robot at some lengths along a line on level ground."""
     route = replace(PATHS["yard"]["loop"], waypoints=waypoints)
     poses = [on_ground(GROUND, route, float(at)) for at in at_m]
     return np.array([math.atan2(T[1, 0], T[0, 0]) for T in poses])

@@ -1,4 +1,4 @@
-"""What a recording and its truth must have of the plan: the robot's own sensors, its gears' play, its times, its scene.
+"""Laws of recordings and their truth: the plan's sensors, play of the gears, times and scene are in them.
 
 What these tests do not show: that the noise is right; test_sensors.py does.
 """
@@ -28,7 +28,7 @@ ROOM = load_scene("small-room")
 
 
 def pan_error_rad(true: Transform, told: Transform) -> float:
-    """How far the head is turned about the vertical from where it was told to look."""
+    """Angle about the vertical between the head's direction and the commanded one."""
     ahead = (math.atan2(T[1, 2], T[0, 2]) for T in (true, told))
     error = next(ahead) - next(ahead)
     return (error + math.pi) % (2 * math.pi) - math.pi

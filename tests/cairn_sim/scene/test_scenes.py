@@ -55,7 +55,7 @@ def name_at(name: str, x: float, y: float, z: float) -> str | None:
 
 
 def looks(eye: tuple[float, float, float]) -> Iterator[Floats]:
-    """Where to look to see all around, in six views of 90 degrees."""
+    """Directions of six views of 90 degrees that see all around."""
     for axis in range(3):
         for step in (-1.0, 1.0):
             yield look_at(eye, np.add(eye, step * np.eye(3)[axis]), up=np.eye(3)[axis - 1])
@@ -150,7 +150,7 @@ def test_building_has_signs_that_shine_back() -> None:
 
 @pytest.mark.parametrize("name", ["building", "yard"])
 def test_no_two_upright_boxes_share_a_visible_face(name: str) -> None:
-    """Which of the two a ray met would be rounding's to say. Turned boxes are not looked at."""
+    """Rounding would decide which of the two a ray meets. Turned boxes are not looked at."""
     boxes = [
         solid
         for solid in scene(name).solids
