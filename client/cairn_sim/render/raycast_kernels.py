@@ -70,6 +70,7 @@ def cast_rays(
         shapes: of the scene.
         opaque: whether glass and mirrors stop the ray, as they do in the far infrared.
     """
+    # Allocated outside of the kernel, which allocates nothing in its loop.
     n = len(rays)
     hits = Hits(
         range_m=np.empty(n),
@@ -130,10 +131,13 @@ def _cast_into(
             nx, ny, nz, u, v, along = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             while k >= 0:
                 x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+                # The surface at the hit, and the cosine between ray and normal.
                 nx, ny, nz, u, v = surface_at(x, y, z, k, face, kind, frame, half_m)
                 along = dx * nx + dy * ny + dz * nz
+                # Plain sight ends at the first surface that is no pane.
                 if gone_m == 0.0 and (opaque or optics[k] != GLASS):
                     straight_m[i] = t
+                # Light ends here: this surface is seen.
                 if opaque or optics[k] == 0:
                     break
                 behind = t
@@ -149,6 +153,8 @@ def _cast_into(
                     # Nothing is seen behind so many panes, nor is it in sight.
                     straight_m[i] = t if gone_m == 0.0 else straight_m[i]
                 else:
+                    # Behind the pane, or from the mirror on: the tree is asked ray by ray, for the bundle has come
+                    # apart.
                     t, k, face = first_entry(
                         ox, oy, oz, dx, dy, dz, behind, kind, frame, half_m, endless, nodes, links, leaves, stack, nears
                     )
@@ -215,6 +221,7 @@ def cast_each(origins: Floats, directions: Floats, shapes: Shapes) -> tuple[Floa
     for i in range(len(origins)):
         ox, oy, oz = origins[i, 0], origins[i, 1], origins[i, 2]
         dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
+        # A NaN ray meets nothing.
         if dx != dx:
             continue
         t, k, face = first_entry(

@@ -234,6 +234,7 @@ def grain_at(u: float, v: float, salt: int) -> float:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _lattice(u: float, v: float, salt: int) -> float:
     i, j = math.floor(u), math.floor(v)
+    # Bilinear between the four corners of the lattice cell.
     a, b = u - i, v - j
     # Smoothstep, so that the pattern has no creases at lattice lines.
     a, b = a * a * (3.0 - 2.0 * a), b * b * (3.0 - 2.0 * b)

@@ -85,6 +85,8 @@ class Integrator:
                 raise BadInputError("bad_range", f"{name} must be above 0, got {getattr(self, name)}")
 
     def __str__(self) -> str:
+        # The text goes into every commit, so that evidence can be found by how it was made; 5 is the version of the
+        # integrator.
         limits = f"min_range_m={self.min_range_m:g} max_range_m={self.max_range_m:g}"
         surfaces = f"flying_step_m={self.flying_step_m:g} noise_sigmas={self.noise_sigmas:g}"
         samples = f"sample_spread_voxels={self.sample_spread_voxels:g} temperature_step_k={self.temperature_step_k:g}"
@@ -110,6 +112,7 @@ class Integration:
                 beyond the numbered space; nothing was added.
         """
         limits, rig, camera = self._integrator, self._rig, self._rig[scan.range_camera].camera
+        # A camera with an image plane is carved through it; a lidar, or method CAST, goes ray by ray.
         window = window_of(camera) if limits.method is Method.CARVE else None  # pyright: ignore[reportArgumentType]
         # Stage 1: points (Eq. 1-5). A lidar's neighbours are too far apart to tell a flying pixel.
         returns = returns_of(
@@ -175,11 +178,14 @@ class Integration:
         """Count hits where beams ended, misses where the image looks through."""
         edge_m = self._geometry.voxel_edge_m
         mounted, sigmas = self._rig[scan.range_camera], self._integrator.noise_sigmas
+        # How far each pixel is certainly clear: its own range less a margin, and its neighbours' on slanted surfaces.
         clear_m = clear_image(returns, mounted, voxel_edge_m=edge_m, noise_sigmas=sigmas)
         # Hits are numbered once; samples and misses use the numbers.
         with self._tallies.around(returns.T_map_tof[:3, 3], returns.reach_m) as (tally, hits):
+            # Each voxel that was hit has one number within this scan, however many beams ended in it.
             voxel_of, count = hits.number(returns.points_map, tally)
             sums = self._sample_sums(scan, returns, voxel_of, count)
+            # Voxels that the image looks through: culled by bricks, then voxel by voxel.
             carving = carving_of(
                 window.shown(clear_m),
                 window,
@@ -190,12 +196,15 @@ class Integration:
                 min_range_m=self._integrator.min_range_m,
                 scratch=hits.scratch,
             )
+            # Hit before miss: a voxel that was hit is not counted as seen through by the same scan.
             tally.add_hits(hits, sums)
             tally.add_misses(hits, carving)
 
     def _cast(self, scan: Scan, returns: Returns) -> None:
         """Count hits where beams ended, misses along each beam."""
         mounted, origin_m = self._rig[scan.range_camera], returns.T_map_tof[:3, 3]
+        # Beams that returned end a margin before their point; beams without a return are clear as far as the sensor
+        # says.
         sigma_m = mounted.range_sigma_image(returns.range_m).ravel()[returns.pixels]
         clear_m = np.concatenate(
             [self._clear_ends(origin_m, returns.points_map, sigma_m), silent_ends(returns, mounted.camera.rays())]
@@ -207,6 +216,7 @@ class Integration:
         self._tallies.merge(beam_evidence(origin_m, returns.points_map, clear_m, self._geometry, sums_of=sums_of))
 
     def _sample_sums(self, scan: Scan, returns: Returns, voxel_of: npt.NDArray[np.integer], count: int) -> Ints:
+        # A sample whose place is less certain than this could be another voxel's.
         limit_m = self._integrator.sample_spread_voxels * self._geometry.voxel_edge_m
         return sample_sums(
             scan,
@@ -247,6 +257,7 @@ def integrate_scans(
     Raises:
         BadInputError: as `Integration.add`.
     """
+    # Threads share nothing but the tally, and integers commute: any number of them gives the same bits.
     count = max(1, min(threads or os.cpu_count() or 1, len(scans)))
     around_m = scans[0].T_map_rig[:3, 3] if scans else None
     integration = Integration(rig, geometry, integrator, around_m=around_m)
@@ -262,6 +273,7 @@ def _scalar_evidence(scan: Scan, geometry: Geometry) -> dict[CellKey, Evidence]:
         return {}
     samples = np.zeros((1, geometry.plane_count), np.int64)
     for name, value in scan.scalars.items():
+        # A reading without a channel of the map is refused before anything is counted.
         channel = geometry.channel(name)
         if channel is None or channel.kind is not ChannelKind.SCALAR:
             raise BadInputError("unknown_channel", f"the map has no scalar channel {name!r}; create it with one")
