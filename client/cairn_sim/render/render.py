@@ -120,6 +120,7 @@ def render_scan(
     """
     if rig[range_camera].spectrum is not Spectrum.RANGE:
         raise BadInputError("bad_scan", f"{range_camera} must be a range camera, it is {rig[range_camera].spectrum}")
+    # Other range cameras would disturb the one that measures: they stay dark.
     names = [name for name, m in rig.cameras.items() if m.spectrum is not Spectrum.RANGE or name == range_camera]
 
     def render(name: str) -> tuple[npt.NDArray[np.generic], ...]:
@@ -176,8 +177,10 @@ def colour_image(view: CameraView, sensor: ColourSensor, noise: ImageNoise | Non
     values = _shaded(view, shade, 1 if noise is None else sensor.fineness, opaque=False).reshape(*view.shape, 3)
     if noise is not None:
         if sensor.vignetting:
+            # cos^4 falls on light; sRGB is light to the power of 1 / gamma.
             cosine = np.nan_to_num(view.camera.rays()[..., 2:], nan=1.0).clip(0)
             values *= (cosine ** (4 * sensor.vignetting / SRGB_GAMMA)).astype(np.float32)
+        # Blur of the lens first, then the sensor's noise, which it does not blur.
         values = _blurred(values, sensor.blur_px)
         values += sensor.sigma(values) * noise.rng.standard_normal(values.shape, dtype=np.float32)
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
@@ -195,6 +198,7 @@ def thermal_counts(view: CameraView, sensor: ThermalSensor, noise: ImageNoise) -
     """(H, W) uint16 raw counts; 1 to 65535."""
     shade = _radiance(view.scene, sensor)
     counts = _blurred(_shaded(view, shade, sensor.fineness, opaque=True).reshape(view.shape), sensor.blur_px)
+    # Fixed pattern (the same in all images), then temporal noise (NETD).
     per_kelvin = np.float32(sensor.counts_per_kelvin)
     counts += np.float32(sensor.fixed_pattern_k) * per_kelvin * noise.pattern
     counts += np.float32(sensor.netd_k) * per_kelvin * noise.rng.standard_normal(view.shape, dtype=np.float32)
@@ -206,16 +210,21 @@ def range_images(view: CameraView, sensor: RangeSensor, noise: ImageNoise | None
     received = _returned(view, sensor, view.hits)
     range_m = view.hits.path_m.copy()
     if noise is None:
+        # A perfect camera: farther than one wrap nothing is said.
         range_m[range_m > sensor.wrap_m] = np.nan
         received[np.isnan(range_m)] = 0
     else:
+        # Stage 1: at edges the waves of all surfaces in a pixel add up.
         _mix_into(range_m, received, view, sensor)
+        # Stage 2: full pixels spill into their neighbours.
         spill = sensor.spill(received, noise.rng)
         range_m, clean = bloomed(range_m, received, spill, view.camera.width, sensor.wrap_m)
+        # Stage 3: noise of the amplitude, and pixels that are lost to too little or too much light.
         received = clean + np.float32(sensor.amplitude_sigma) * noise.rng.standard_normal(
             len(received), dtype=np.float32
         )
         lost = np.isinf(range_m) | (received < sensor.amplitude_min) | (received >= sensor.amplitude_max)
+        # Stage 4: noise of the range, by the amplitude without noise; then the phase wraps.
         range_m += sensor.range_sigma_m(clean) * noise.rng.standard_normal(len(range_m))
         range_m[lost] = np.nan
         range_m %= sensor.wrap_m
@@ -245,6 +254,7 @@ def _radiance(scene: Scene, sensor: ThermalSensor) -> Shade:
     s = scene.surfaces
     own = sensor.counts_of(s.temperature_k.astype(np.float64))
     mirrored = sensor.counts_of(np.array(scene.ambient_k))
+    # Kirchhoff: a surface that emits the share e mirrors the share 1 - e.
     sent = (s.emissivity * own + (1 - s.emissivity.astype(np.float64)) * mirrored).astype(np.float32)
     sky = float(sensor.counts_of(np.array(scene.sky_k)))
     return lambda hits: surface_values(hits, sent, sky)
@@ -255,6 +265,7 @@ def _shaded(view: CameraView, shade: Shade, fineness: int, *, opaque: bool) -> S
     values = shade(view.hits)
     edges, hits = _fine_hits(view, fineness, opaque=opaque)
     if len(edges):
+        # Only pixels at edges are cast on finer rays; all others show one surface.
         fine = shade(hits)
         values[edges] = fine.reshape(len(edges), fineness * fineness, *fine.shape[1:]).mean(axis=1)
     return values

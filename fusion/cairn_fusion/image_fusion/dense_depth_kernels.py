@@ -61,6 +61,7 @@ def densify_into(
     """
     f = np.float32
     rows, columns = nearness.shape
+    # Room for every drawn pixel that may vote in one block.
     middle_px, room = 0.5 * (step_px - 1), (2 * REACH + 2) ** 2
     voters = np.empty(room, f), np.empty(room, f), np.empty(room, f), np.empty(room, f), np.empty((room, 3), np.int32)
     for i in range(-1, rows):
