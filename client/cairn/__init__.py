@@ -7,7 +7,8 @@ they are; modules behind them may move. docs/python-api.md lists them.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING
+
+TYPE_CHECKING = False  # type checkers take it for true; importing `typing` would cost half of `import cairn`
 
 if TYPE_CHECKING:
     from cairn_calib.rig.rig import Rig, load_rig
