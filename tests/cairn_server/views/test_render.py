@@ -89,7 +89,7 @@ def test_cells_that_were_drawn_are_not_read_again_and_weigh_what_their_layer_doe
     first = {layer: ask(live, row, asking(layer=layer)).content for layer in Layer}
     with live.service.store.snapshot(row) as snapshot:
         log_id = snapshot.head.cursor.log_id
-    kept = {name: read for name, (read, _) in views._cells._kept.items() if name[0][0] == log_id}
+    kept = {name: read for name, (read, _) in views._read_cells._kept.items() if name[0][0] == log_id}
     assert {layer for _, layer in kept} == set(Layer) - {Layer.AGE}
     for (_, layer), read in kept.items():
         arrays = (read.cell.counts.brick_of, read.states.words, *read.tables.tables.values())
