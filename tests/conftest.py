@@ -1,4 +1,7 @@
-"""Which files come first: the slowest, one after the other, so that no worker has one left when the others are done."""
+"""Order of the files (the slowest first, so that no worker has one left when the others are done), and signals."""
+
+import signal
+from collections.abc import Iterator
 
 import pytest
 
@@ -23,3 +26,17 @@ SLOWEST = (
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     ranks = {path: rank for rank, path in enumerate(SLOWEST)}
     items.sort(key=lambda item: ranks.get(item.nodeid.partition("::")[0], len(SLOWEST)))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def children_hear_interrupts() -> Iterator[None]:
+    """Start tests' processes with SIGINT's default, also in a suite that a shell runs in the background.
+
+    There SIGINT is ignored, and ignoring outlives exec; a handler does not, so one that ignores it here is enough.
+    """
+    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    if ignored:
+        signal.signal(signal.SIGINT, lambda number, frame: None)
+    yield
+    if ignored:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
