@@ -158,7 +158,10 @@ def _propagate(rig: Rig, moves: Moves) -> Floats:
     # Parameters that the covariance does not list are certain.
     used = [n for n, parameter in enumerate(parameters) if parameter in moves]
     covariance = calibration.covariance.matrix[np.ix_(used, used)]
-    J = np.stack([moves[parameters[n]] for n in used], axis=-1)
+    # Without an uncertain parameter J has no columns, and all is certain.
+    J = np.empty((*next(iter(moves.values())).shape, len(used)))
+    for column, n in enumerate(used):
+        J[..., column] = moves[parameters[n]]
     return np.asarray(J @ covariance @ np.swapaxes(J, -1, -2))
 
 

@@ -7,9 +7,10 @@ import numpy.typing as npt
 import pytest
 from tests.fixtures.calib.simulated_views import SPECTRA, ranges_of, views_of, world
 
+from cairn_calib.rig.pose_vectors import transform_from_vector
 from cairn_calib.solve.adjustment import AdjustmentProblem, Sensor
 from cairn_calib.solve.corner_residuals import CornerData
-from cairn_calib.solve.normal_equations import Loss, NormalEquations, uncertainty
+from cairn_calib.solve.normal_equations import Loss, NormalEquations, solve_scaled, sum_blocks, uncertainty
 from cairn_calib.solve.rig_state import RigState, step_state
 from cairn_calib.solve.solution import Solution
 from cairn_calib.solve.solve import solve_rig
@@ -127,3 +128,45 @@ def test_corners_weigh_by_their_covariance(solution: Solution) -> None:
     n = int(np.flatnonzero(view.corners.seen)[0])
     W = data.whitening[0, n]
     np.testing.assert_allclose(W.T @ W, np.linalg.inv(view.corners.covariance_px2[n]), rtol=1e-9)
+
+
+def test_moving_rig_and_boards_together_moves_no_residual(solution: Solution) -> None:
+    G = transform_from_vector([0.3, -0.5, 1.1, 2.0, -1.0, 0.4])
+    state = solution.state
+    moved = replace(state, T_rig_camera=G @ state.T_rig_camera, T_rig_board=G @ state.T_rig_board)
+    for sensor in solution.adjusted.problem.sensors:
+        here, there = (residuals(sensor, solution.adjusted.problem, each) for each in (state, moved))
+        np.testing.assert_allclose(there, here, atol=1e-6)
+        assert np.abs(here).max() > 0.1
+
+
+def test_the_order_of_blocks_is_no_matter_and_equations_add_up(solution: Solution) -> None:
+    problem = solution.adjusted.problem
+    blocks = problem.blocks(solution.state)
+    sizes = (solution.layout.size, len(solution.state.T_rig_board))
+    forward, backward = sum_blocks(blocks, *sizes), sum_blocks(blocks[::-1], *sizes)
+    parts = [sum_blocks([block], *sizes) for block in blocks]
+    for name in ("A", "B", "C", "a", "b"):
+        whole = getattr(forward, name)
+        # At a minimum blocks pull against each other: what is left of them is rounding's.
+        scale = sum(np.abs(getattr(part, name)) for part in parts).max()
+        np.testing.assert_allclose(getattr(backward, name), whole, rtol=1e-12, atol=1e-12 * scale)
+        np.testing.assert_allclose(sum(getattr(part, name) for part in parts), whole, rtol=1e-12, atol=1e-12 * scale)
+    assert forward.cost == pytest.approx(sum(part.cost for part in parts))
+
+
+def test_other_units_of_the_parameters_scale_the_solution_and_nothing_else() -> None:
+    rng = np.random.default_rng(0)
+    J, right = rng.normal(size=(20, 6)), rng.normal(size=6)
+    units = 10.0 ** np.array([-6, -3, 0, 3, 6, 9])
+    S = J.T @ J
+    solved = solve_scaled(S, right)
+    np.testing.assert_allclose(S @ solved, right, atol=1e-10)
+    np.testing.assert_allclose(solve_scaled(units[:, None] * S * units, units * right) * units, solved, rtol=1e-9)
+    np.testing.assert_allclose(solve_scaled(S, np.eye(6)) @ S, np.eye(6), atol=1e-9)
+
+
+def test_what_has_no_effect_or_two_signs_is_refused() -> None:
+    for S in (np.diag([1.0, 0.0]), np.array([[1.0, 2.0], [2.0, 1.0]])):
+        with pytest.raises(np.linalg.LinAlgError):
+            solve_scaled(S, np.ones(2))
