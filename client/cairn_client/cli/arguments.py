@@ -35,7 +35,10 @@ class CommandParser(argparse.ArgumentParser):
         shown: dict[str, Any] = {"epilog": EXIT_CODES, "formatter_class": argparse.RawDescriptionHelpFormatter}
         super().__init__(*args, **(shown | options))
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+    # typeshed's overloads let `namespace` be given by name alone; one signature cannot say so.
+    def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, args: Any = None, namespace: Any = None
+    ) -> Any:
         """As argparse, which takes no word for an option that begins with a space; numbers may begin with one."""
         words = sys.argv[1:] if args is None else args
         return super().parse_known_args(
