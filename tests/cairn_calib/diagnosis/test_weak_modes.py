@@ -51,6 +51,11 @@ def test_no_change_that_is_as_likely_moves_the_probe_points_farther(solution: So
             v = G.T @ (G @ v)
             v /= np.linalg.norm(v)
         assert rms_px(each, root @ v) == pytest.approx(mode.sigma_px, rel=1e-6)
+        correlations = (root @ v) / sigmas
+        owner, name, strongest = mode.parameters[0]
+        at = solution.layout.index(owner, name)
+        assert at == int(np.argmax(np.abs(correlations)))
+        assert abs(strongest) == pytest.approx(np.abs(correlations).max(), rel=1e-3)
 
 
 def test_its_share_is_of_all_variance_of_the_probe_points(solution: Solution, probes: list[Probes]) -> None:

@@ -1,5 +1,6 @@
 """Physical values of evidence against sums taken voxel by voxel in exact fractions."""
 
+from collections.abc import Callable
 from fractions import Fraction
 from math import sqrt
 
@@ -9,6 +10,7 @@ from tests.fixtures.map.made import GEOMETRIES, KEY, SMALL, as_dict, random_evid
 from tests.naive import evidence as naive_evidence
 
 from cairn_map.evidence.channels import ChannelKind
+from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import Geometry, cell_key, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.voxels import joined_voxels, voxels_of_evidence
@@ -18,9 +20,11 @@ geometries = pytest.mark.parametrize("geometry", GEOMETRIES)
 
 
 @geometries
-@pytest.mark.parametrize("seed", range(3))
-def test_numbers_counts_means_and_spreads_are_those_of_the_sums(geometry: Geometry, seed: int) -> None:
-    evidence = random_evidence(seed, geometry)
+@pytest.mark.parametrize("made", [random_evidence, surface_evidence])
+def test_numbers_counts_means_and_spreads_are_those_of_the_sums(
+    geometry: Geometry, made: Callable[[int, Geometry], Evidence]
+) -> None:
+    evidence = made(2, geometry)
     found = voxels_of_evidence(KEY, evidence, geometry, MODEL, occupied_only=False)
     side, edge_m = 2**geometry.depth, geometry.voxel_edge_um / 1e6
     corner = np.array(cell_of_key(KEY)) * side
