@@ -69,7 +69,6 @@ MAY_NAME = {
     "apsw": [
         "cairn_server/store/sqlite/*.py",
         "cairn_client/folders/sqlite_glance.py",
-        "cairn_client/replica/sqlite_failures.py",
         "cairn_client/replica/replica_store.py",
         "cairn_fusion/ros/rosbags_bag.py",
     ],

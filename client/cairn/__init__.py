@@ -13,7 +13,7 @@ TYPE_CHECKING = False  # type checkers take it for true; importing `typing` woul
 if TYPE_CHECKING:
     from cairn_calib.rig.rig import Rig, load_rig
     from cairn_client.folders.map_folder import open_map
-    from cairn_client.robot.limits import Limits
+    from cairn_client.replica.limits import Limits
     from cairn_client.robot.robot import Robot
     from cairn_client.robot.robot_events import (
         CellsChanged,
@@ -85,7 +85,7 @@ __all__ = [
 _MODULES = {
     "cairn_calib.rig.rig": "Rig load_rig",
     "cairn_client.folders.map_folder": "open_map",
-    "cairn_client.robot.limits": "Limits",
+    "cairn_client.replica.limits": "Limits",
     "cairn_client.robot.robot": "Robot",
     "cairn_client.robot.robot_events": """
         Event Committed Pushed Refused CellsChanged CellsDropped OutboxNearlyFull LinkLost LinkBack SyncFailed

@@ -12,7 +12,7 @@ from pathlib import Path
 from random import Random
 
 from tests.bench.git_peer import GitPeer, missing, plain_file
-from tests.bench.pushing import Server, meta_of, served
+from tests.bench.pushing import Server, facts_of, served
 from tests.crowd.building import SCANS, Survey, survey
 from tests.fixtures.server.live import until
 from tests.links.proxy import Cut, Fault, FaultProxy
@@ -62,7 +62,7 @@ def _measurement_rows(
     for robot in (ant, bee):
         robot.sync()
     for n, diff in enumerate(seen.stops):
-        ant.replica.commit(diff, meta_of("ant", 0, seen.geometry, SCANS[0] * SCANS[1]))
+        ant.replica.commit(diff, facts_of(0, SCANS[0] * SCANS[1]))
         ant.sync()
         until(lambda n=n: server.folded() > n, "it is folded")  # type: ignore[misc]
         before = link.size_bytes

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import zstandard
 
+from cairn_client.replica.outbox import CommitFacts
 from cairn_map.codec.cell_code import cell_digest
 from cairn_map.codec.octree.cell_head import decode_head
 from cairn_map.commits.commit import HEAD, Commit, CommitMeta, ScanPose, commit_sha, make_commit
@@ -70,6 +71,12 @@ def meta_of(robot: str, n: int, geometry: Geometry, scans: int = 1) -> CommitMet
     """What the n-th commit of a robot says of itself."""
     pose = ScanPose(time_s=1.7e9 + n, t_map_rig=(1.0, 2.0, 0.4), q_map_rig=(0.0, 0.0, 0.0, 1.0))
     return CommitMeta(id=f"{robot}.{'0' * 16}.{n}", geometry=geometry.digest().hex(), scans=(pose,) * scans)
+
+
+def facts_of(n: int, scans: int = 1) -> CommitFacts:
+    """What a robot states in its n-th commit, as `meta_of`."""
+    pose = ScanPose(time_s=1.7e9 + n, t_map_rig=(1.0, 2.0, 0.4), q_map_rig=(0.0, 0.0, 0.0, 1.0))
+    return CommitFacts(scans=(pose,) * scans)
 
 
 def _text(robot: str, n: int, geometry: Geometry, scans: int) -> bytes:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from tests.bench.pushing import Diff, meta_of
+from tests.bench.pushing import Diff, facts_of
 
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
@@ -66,7 +66,7 @@ def live_whole(
             for n, robot in enumerate(robots):
                 if time.perf_counter() >= pushes_s[n]:
                     diff = diffs[(report.pushed * 11 + n) % len(diffs)]
-                    robot.replica.commit(diff, meta_of(robot.name, 0, geometry))
+                    robot.replica.commit(diff, facts_of(0))
                     pushes_s[n] += push_s
                     report.pushed += 1
                 _round(robot, report)

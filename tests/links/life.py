@@ -3,11 +3,11 @@
 import logging
 import pickle
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from random import Random
 
-from tests.bench.pushing import Diff, meta_of
+from tests.bench.pushing import Diff, facts_of
 
 from cairn_client.robot.robot import Robot
 from cairn_client.sync.link_profile import LinkName
@@ -63,8 +63,8 @@ def live(port: int, folder: str, name: str, seed: int, every_s: float, link: Lin
         pause = threading.Event()
         while True:
             index = random.randrange(len(building.diffs))
-            meta = meta_of(name, 0, building.geometry, building.scans).model_copy(update={"note": f"{index}"})
-            commit = robot.replica.commit(building.diffs[index], meta, profile=robot._profile.commits)
+            facts = replace(facts_of(0, building.scans), note=f"{index}")
+            commit = robot.replica.commit(building.diffs[index], facts, profile=robot._profile.commits)
             log.write(f"{commit.id}\n")
             log.flush()
             pause.wait(random.expovariate(1 / every_s))

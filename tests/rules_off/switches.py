@@ -13,9 +13,9 @@ READERS, CELLS = "server/cairn_server/store/sqlite/readers.py", "server/cairn_se
 CELL_VIEWS, STABLE = "server/cairn_server/views/cell_views.py", "server/cairn_server/sync/replies.py"
 PUSHES = "server/cairn_server/sync/pushes.py"
 HANDING_OVER = "server/cairn_server/sync/handing_over.py"
-APPLYING, OUTBOX = "client/cairn_client/sync/applying.py", "client/cairn_client/replica/outbox.py"
+APPLYING, OUTBOX = "client/cairn_client/sync/exchange.py", "client/cairn_client/replica/outbox.py"
 REPLICA, SYNC = "client/cairn_client/replica/replica.py", "client/cairn_client/sync/sync.py"
-SHOWN = "client/cairn_client/replica/view_of_cell.py"
+BASE = "client/cairn_client/replica/server_cells.py"
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,23 +246,23 @@ SWITCHES = (
         6,
         "a state frame's present zero means zero",
         APPLYING,
-        "kept = without_blocks(base, blocks)",
-        "kept = base",
+        "kept = without_blocks(before, blocks)",
+        "kept = before",
         "cairn_client/sync/test_rules.py::test_a_state_frame_overwrites_its_blocks_and_a_present_zero_means_zero",
     ),
     Switch(
         6,
         "a delta adds the own commits that it left out",
         APPLYING,
-        "sum_evidence([base, *own, self._payload(frame)], self._replica.geometry)",
-        "sum_evidence([base, self._payload(frame)], self._replica.geometry)",
+        "sum_evidence([before, *own, self._payload(frame)], self._replica.geometry)",
+        "sum_evidence([before, self._payload(frame)], self._replica.geometry)",
         "cairn_client/sync/test_rules.py::test_a_delta_adds_the_own_commits_that_it_leaves_out",
     ),
     Switch(
         6,
         "a delta adds only own commits that are new in it",
         APPLYING,
-        "news = self._coverage.minus(held.coverage) if held else self._coverage",
+        "news = self._coverage.minus(base.coverage(frame.cell))",
         "news = self._coverage",
         "cairn_client/sync/test_rules.py::test_a_delta_adds_only_the_own_commits_between_its_two_states",
     ),
@@ -286,16 +286,16 @@ SWITCHES = (
         6,
         "a full frame replaces",
         APPLYING,
-        "self._replica.hold(frame.cell, self._at_head(frame), evidence, body=frame.payload)",
-        "self._replica.hold(frame.cell, self._at_head(frame), sum_evidence([self._replica.base_evidence(frame.cell), evidence], self._replica.geometry))",
+        "base.hold(frame.cell, self._at_head(frame), evidence, body=frame.payload)",
+        "base.hold(frame.cell, self._at_head(frame), sum_evidence([base.evidence(frame.cell), evidence], self._replica.geometry))",
         "cairn_client/sync/test_rules.py::test_coverage_is_replaced_and_never_merged",
     ),
     Switch(
         6,
         "coverage is kept for each cell",
-        REPLICA,
+        BASE,
         "return self.cells[key].coverage if key in self.cells else EMPTY",
-        "return self.header.coverage if self.header else EMPTY",
+        "return self._state.header.coverage if self._state.header else EMPTY",
         "cairn_client/sync/test_rules.py::test_a_reset_to_the_same_fingerprint_takes_the_cursor_and_replaces_coverage",
     ),
     Switch(
@@ -303,7 +303,7 @@ SWITCHES = (
         "coverage is replaced, never merged",
         APPLYING,
         "return BaseCell(frame.to_cursor, self._coverage, frame.fingerprint)",
-        "old = self._replica.cells.get(frame.cell)\n        both = self._coverage.with_commits(old.coverage) if old else self._coverage\n        return BaseCell(frame.to_cursor, both, frame.fingerprint)",
+        "old = self._replica.cell(frame.cell)\n        both = self._coverage.with_commits(old.coverage) if old else self._coverage\n        return BaseCell(frame.to_cursor, both, frame.fingerprint)",
         "cairn_client/sync/test_rules.py::test_coverage_is_replaced_and_never_merged",
     ),
     Switch(
@@ -317,15 +317,15 @@ SWITCHES = (
     Switch(
         6,
         "the base on disk changes with its cursor",
-        REPLICA,
-        "self.store.put_cell(key, cell, body=data)",
-        "self.store.put_cell(key, cell, body=self.store.body(key) or b'')",
+        BASE,
+        "self._store.put_cell(key, cell, body=data)",
+        "self._store.put_cell(key, cell, body=self._store.body(key) or b'')",
         "cairn_client/sync/test_rules.py::test_a_frame_that_comes_twice_counts_once",
     ),
     Switch(
         7,
         "the view shows own commits that the base lacks",
-        SHOWN,
+        BASE,
         "    for commit in found.added:\n",
         "    for commit in ():\n",
         "cairn_client/sync/test_rules.py::test_the_view_is_the_base_and_the_commits_it_lacks",
@@ -333,7 +333,7 @@ SWITCHES = (
     Switch(
         7,
         "the view shows no commit that a kept one takes out",
-        SHOWN,
+        BASE,
         "if not _is_taken_out(outbox, kept, coverage)",
         "",
         "cairn_client/replica/test_shown.py::test_what_an_amend_names_is_not_shown_where_the_server_lacks_both",
@@ -341,7 +341,7 @@ SWITCHES = (
     Switch(
         7,
         "the view lacks what the base has and a kept commit takes out",
-        SHOWN,
+        BASE,
         "    for commit in found.taken:\n",
         "    for commit in ():\n",
         "cairn_client/replica/test_shown.py::test_what_an_amend_names_is_subtracted_where_the_server_has_it",
@@ -349,7 +349,7 @@ SWITCHES = (
     Switch(
         7,
         "a commit is taken out once",
-        SHOWN,
+        BASE,
         "by not in coverage and outbox.kept(by) is not None",
         "outbox.kept(by) is not None",
         "cairn_client/replica/test_shown.py::test_what_the_server_took_out_is_not_taken_out_again",
@@ -357,7 +357,7 @@ SWITCHES = (
     Switch(
         7,
         "the view shows no commit that the base has",
-        SHOWN,
+        BASE,
         "outbox.touching(key) if kept.id not in coverage]",
         "outbox.touching(key)]",
         "cairn_client/sync/test_rules.py::test_a_commit_in_the_coverage_of_its_cell_is_not_added_again",
@@ -422,8 +422,8 @@ SWITCHES = (
         9,
         "an equal fingerprint replaces the coverage",
         APPLYING,
-        "self._replica.move([frame.cell], to=frame.to_cursor, coverage=self._coverage)",
-        "self._replica.move([frame.cell], to=frame.to_cursor, coverage=None)",
+        "base.move([frame.cell], to=frame.to_cursor, coverage=self._coverage)",
+        "base.move([frame.cell], to=frame.to_cursor, coverage=None)",
         "cairn_client/sync/test_rules.py::test_a_reset_to_the_same_fingerprint_takes_the_cursor_and_replaces_coverage",
     ),
     Switch(
@@ -438,8 +438,8 @@ SWITCHES = (
         9,
         "another fingerprint keeps the base in the view",
         APPLYING,
-        'self._ask_whole(frame.cell, "the server has another state")',
-        "self._replica.hold_nothing(frame.cell, UNPROVEN)",
+        'self._ask_whole(base, frame.cell, "the server has another state")',
+        "base.hold_nothing(frame.cell, UNPROVEN)",
         "cairn_client/sync/test_rules.py::test_a_reset_to_another_fingerprint_keeps_showing_the_base_and_asks_for_the_whole",
     ),
     Switch(
@@ -549,7 +549,7 @@ SWITCHES = (
     Switch(
         12,
         "an acknowledgement is no coverage",
-        SHOWN,
+        BASE,
         "outbox.touching(key) if kept.id not in coverage]",
         "outbox.touching(key) if kept.id not in coverage and not kept.acked]",
         "cairn_client/sync/test_rules.py::test_an_acknowledged_commit_is_still_shown_and_still_kept",
@@ -638,7 +638,7 @@ SWITCHES = (
         14,
         "304 moves cursor and coverage",
         SYNC,
-        "replica.move([key], to=fetched.cursor, coverage=fetched.coverage)",
+        "base.move([key], to=fetched.cursor, coverage=fetched.coverage)",
         "pass",
         "cairn_client/sync/test_rules.py::test_an_answer_not_modified_moves_cursor_and_coverage",
     ),
@@ -646,7 +646,7 @@ SWITCHES = (
         14,
         "a cell that is the same in the index moves too",
         SYNC,
-        "replica.move(same, to=to, coverage=coverage)",
+        "base.move(same, to=to, coverage=coverage)",
         "pass",
         "cairn_client/sync/test_rules.py::test_a_cell_that_did_not_change_is_not_asked_for_again",
     ),
@@ -654,7 +654,7 @@ SWITCHES = (
         14,
         "a cell that a restored server forgot is emptied",
         SYNC,
-        "replica.hold_nothing(key, BaseCell(to, coverage, ZERO))",
+        "base.hold_nothing(key, BaseCell(to, coverage, ZERO))",
         "pass",
         "cairn_client/sync/test_rules.py::test_a_cell_that_a_restored_server_does_not_have_is_not_shown_for_ever",
     ),
@@ -685,7 +685,7 @@ SWITCHES = (
     Switch(
         15,
         "a cell is checked when it is loaded",
-        REPLICA,
+        BASE,
         "if fingerprint(base, key) == cell.fingerprint:",
         "if True:",
         "cairn_client/sync/test_rules.py::test_a_cell_that_was_damaged_at_rest_is_asked_for_anew",
@@ -821,7 +821,7 @@ SWITCHES = (
     Switch(
         16,
         "a robot signs by the keys of all its incarnations from which it takes something",
-        "client/cairn_client/replica/robot_keys.py",
+        "client/cairn_client/replica/replica_state.py",
         "dict.fromkeys([commit.id.author, *(target.author for target in commit.meta.retracted_ids)])",
         "dict.fromkeys([commit.id.author])",
         "cairn_client/relay/test_relay.py::test_a_robot_takes_back_what_an_older_incarnation_of_it_said_on_every_server",
@@ -838,7 +838,7 @@ SWITCHES = (
         16,
         "a relay notices other bytes under one id",
         "client/cairn_client/relay/round.py",
-        "report.split = _split(held[Side.HERE], held[Side.THERE])",
+        "report.split = _split(held[RelaySide.HERE], held[RelaySide.THERE])",
         "pass",
         "cairn_client/relay/test_relay.py::test_two_servers_with_other_bytes_under_one_id_are_told_apart_and_a_retract_makes_them_equal",
     ),

@@ -14,8 +14,8 @@ from tests.sync_sim.network import Network, Weather
 from tests.sync_sim.robot import SimRobot
 from tests.sync_sim.server import FoldOnRequest, SimServer
 
-from cairn_client.robot.cell_budget import drop_cells
-from cairn_client.sync.applying import MISFIT, Exchange
+from cairn_client.replica.server_cells import ServerCells
+from cairn_client.sync.exchange import MISFIT, Exchange
 from cairn_map.commits import ids
 from cairn_map.commits.ids import OPERATOR, CommitId
 from cairn_map.evidence.fingerprint import ZERO, fingerprint
@@ -170,7 +170,7 @@ class History:
     def _drop_cells(self) -> None:
         """A robot has no room for some cells of the server any more."""
         replica = self._random.choice(self._robots).replica
-        drop_cells(replica, [key for key in replica.cells if self._random.random() < 0.5])
+        replica.drop_cells([key for key in replica.cells if self._random.random() < 0.5])
 
     def _clock(self) -> None:
         """Somebody sets all clocks to another time."""
@@ -275,10 +275,10 @@ def _misfits(patch: pytest.MonkeyPatch) -> list[CellKey]:
     found: list[CellKey] = []
     ask_whole = Exchange._ask_whole
 
-    def heard(exchange: Exchange, key: CellKey, why: str) -> None:
+    def heard(exchange: Exchange, base: ServerCells, key: CellKey, why: str) -> None:
         if why == MISFIT:
             found.append(key)
-        ask_whole(exchange, key, why)
+        ask_whole(exchange, base, key, why)
 
     patch.setattr(Exchange, "_ask_whole", heard)
     return found

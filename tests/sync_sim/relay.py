@@ -9,7 +9,7 @@ from tests.sync_sim.network import TIMEOUT_S, Weather
 from tests.sync_sim.server import SimServer
 
 from cairn_client.relay.link import answer_of
-from cairn_client.relay.round import GiveCommit, RelayReport, Resting, Side, relay_round
+from cairn_client.relay.round import GiveCommit, RelayReport, RelaySide, Undelivered, relay_round
 from cairn_client.sync.requests import Ask, Conversation
 from cairn_map.commits.commit_reading import open_commit
 from cairn_map.commits.ids import CommitId
@@ -63,7 +63,7 @@ class SimRelay:
         self._events = events
         self._random = random
         self._weather = weather
-        self._ends = {Side.HERE: here, Side.THERE: there}
+        self._ends = {RelaySide.HERE: here, RelaySide.THERE: there}
         self._round: Conversation[RelayReport] | None = None
         self.report: RelayReport | None = None
         """Of the last whole round."""
@@ -76,7 +76,7 @@ class SimRelay:
     def start(self) -> None:
         """Begin a round, unless one is under way."""
         if self._round is None:
-            self._round = conversation = relay_round(Resting(rest_s=0.0, clock_s=lambda: self._events.now_s))
+            self._round = conversation = relay_round(Undelivered(rest_s=0.0, clock_s=lambda: self._events.now_s))
             self._advance(conversation, lambda: next(conversation))
 
     def stop(self) -> None:

@@ -4,22 +4,22 @@ Two at once, which a real robot does not have, so that answers of one come when 
 one does not push.
 """
 
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import apsw
 from tests.fixtures.client.made import GEOMETRY, MAP, B, random_diff
-from tests.sync_sim.server import meta_of
 
-from cairn_client.replica.outbox import UNNUMBERED
+from cairn_client.replica.outbox import CommitFacts
 from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_store import ReplicaStore
 from cairn_client.sync.requests import Ask, Conversation
 from cairn_client.sync.sync import fetch_cells, fetch_missing, push_commits
 from cairn_client.sync.uploads import PARTS, Parts
 from cairn_map.commits.commit import split_commit
-from cairn_map.commits.ids import CommitId, RobotName
+from cairn_map.commits.ids import CommitId, RobotName, commit_id_from_text
 from cairn_map.errors import CairnError
 from cairn_map.evidence.grid import cell_of_key
 
@@ -38,6 +38,7 @@ class MemoryDisk(ReplicaStore):
 
     def __init__(self, image: bytes = b"") -> None:
         self._folder = Path("in-memory")
+        self._lock = threading.RLock()
         self._connection = apsw.Connection(":memory:")
         if image:
             self._connection.deserialize("main", image)
@@ -74,8 +75,8 @@ class SimRobot:
 
     def commit(self, seed: int, *, note: str, retracts: tuple[str, ...] = ()) -> None:
         """Map something."""
-        unnumbered = CommitId(self.replica.author, UNNUMBERED)
-        self.replica.commit(random_diff(seed), meta_of(unnumbered, note=note, retracts=retracts))
+        facts = CommitFacts(retracts=tuple(map(commit_id_from_text, retracts)), note=note)
+        self.replica.commit(random_diff(seed), facts)
 
     def notes(self) -> dict[CommitId, str]:
         """Commits that are kept here, and their notes."""

@@ -34,7 +34,6 @@ from cairn_client.cli.doctor_checks import (
 )
 from cairn_client.folders.state_folder import opened_replica
 from cairn_client.http.map_url import split_map_url
-from cairn_client.replica.replica_identity import URL_KEY
 from cairn_map.errors import CairnError
 
 SOUND, ILL = 0, 1
@@ -79,7 +78,7 @@ def _link_of(folder: Path) -> tuple[str | None, str | None]:
     """The URL that a copy is from, and the token that it has; Nones where the folder cannot be opened."""
     try:
         with opened_replica(folder) as replica:
-            return replica.store.get(URL_KEY), replica.token()
+            return replica.state.url, replica.state.token
     except CairnError:  # said already
         return None, None
 

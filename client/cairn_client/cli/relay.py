@@ -24,10 +24,9 @@ from pathlib import Path
 from cairn_client.cli.arguments import parser, say
 from cairn_client.http.backoff import Backoff
 from cairn_client.http.map_url import split_map_url
-from cairn_client.relay.carried import CarriedCommits
+from cairn_client.relay.carried_commits import CarriedCommits
 from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
-from cairn_client.relay.log import tell
-from cairn_client.relay.round import REST_S, RelayReport, Resting, Side, relay_round
+from cairn_client.relay.round import REST_S, RelayReport, RelaySide, Undelivered, log_report, relay_round
 from cairn_client.sync.uploads import CAME_IN_PART
 from cairn_map.errors import BadInputError, UnreachableError
 from cairn_map.wire.relay_peer import MapEnd
@@ -55,7 +54,7 @@ def main(argv: list[str]) -> int:
             stack.enter_context(_place(text, token, name, size_bytes_max=int(args.folder_mb * MEGABYTE)))
             for text, token in ((args.here, args.token), (args.there, args.token_there))
         )
-        resting = Resting()
+        resting = Undelivered()
         report = _once(here, there, resting, map_name=name, where=args.there)
         backoff = Backoff()
         while args.every is not None:
@@ -67,17 +66,17 @@ def main(argv: list[str]) -> int:
                 wait_s = backoff.next_s(min(exc.retry_after_s or 0.0, REST_S))
                 log.warning("no link (%s); trying again in %.1f s", exc.message, wait_s)
                 time.sleep(wait_s)
-    return int(bool(report.kept_back or report.refused or report.split or any(map(resting.may_come_later, Side))))
+    return int(bool(report.kept_back or report.refused or report.split or any(map(resting.may_come_later, RelaySide))))
 
 
-def _once(here: MapEnd, there: MapEnd, resting: Resting, *, map_name: str, where: str) -> RelayReport:
+def _once(here: MapEnd, there: MapEnd, resting: Undelivered, *, map_name: str, where: str) -> RelayReport:
     """Rounds until there is nothing more to hand over; the sum of their reports."""
     total, backoff, cuts = RelayReport(has_more=True), Backoff(), 0
     while total.has_more:
         report = hold_between(relay_round(resting), here, there)
-        tell(report, map_name, there=where)
+        log_report(report, map_name, there=where)
         total.has_more, total.split = report.has_more, report.split
-        for side in Side:
+        for side in RelaySide:
             total.moved[side] += report.moved[side]
         total.kept_back |= report.kept_back
         total.refused += report.refused
@@ -88,7 +87,7 @@ def _once(here: MapEnd, there: MapEnd, resting: Resting, *, map_name: str, where
                 raise error
             time.sleep(backoff.next_s(error.retry_after_s))
             total.has_more = True
-    say(f"map {map_name}: {total.moved[Side.THERE]} commits to {where}, {total.moved[Side.HERE]} from there")
+    say(f"map {map_name}: {total.moved[RelaySide.THERE]} commits to {where}, {total.moved[RelaySide.HERE]} from there")
     return total
 
 

@@ -5,7 +5,7 @@ import argparse
 import numpy as np
 
 from cairn_client.cli.arguments import add_token
-from cairn_client.robot.limits import Limits
+from cairn_client.replica.limits import Limits
 from cairn_client.sync.link_profile import LINKS
 from cairn_client.sync.scope import Scope
 from cairn_map.errors import BadInputError

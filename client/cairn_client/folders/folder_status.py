@@ -1,21 +1,22 @@
-"""What a robot's folder says of it, while the robot is at work and while it is not: its place, its link, what waits."""
+"""Status of a robot as read from its folder, whether it is at work or not: its map, its last contact, what waits."""
 
 from pathlib import Path
+from typing import TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
 from cairn_client.folders.sqlite_glance import Glance, KeptBytes, commit_bytes, glance
 from cairn_client.replica.folder_lock import is_locked
-from cairn_client.replica.replica_identity import MODE_KEY, URL_KEY
-from cairn_client.robot.round_watch import CONTACT_KEY, Contact
+from cairn_client.replica.replica_state import Contact, Field, ReplicaState
 from cairn_map.commits.commit import split_commit
 from cairn_map.errors import DamagedDataError
-from cairn_map.evidence.grid import Geometry
 from cairn_map.wire.messages import Mode
+
+T = TypeVar("T")
 
 
 class FolderStatus(BaseModel):
-    """What `cairn robot status --json` prints; names are added, never changed."""
+    """Status of a robot, as `cairn robot status --json` prints it; names are added, never changed."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -25,27 +26,27 @@ class FolderStatus(BaseModel):
     """`http://HOST:PORT/maps/NAME`; None: the folder was never opened by a robot that remembers it."""
     mode: Mode | None
     is_open: bool
-    """Whether a robot works in the folder now."""
+    """True if a robot works in the folder now."""
     incarnation: str
     voxel_edge_m: float
     cursor: str | None
-    """The server's state that is here; None: nothing was fetched yet, or only a part."""
+    """Cursor of the server's state that is here; None: nothing was fetched yet, or only a part."""
     cells: int
-    """Held whole, as the server had them at `cursor` or later."""
+    """Number of cells that are held whole, as the server had them at `cursor` or later."""
     cells_bytes: int
     waiting: int
-    """Commits that the server has not acknowledged."""
+    """Number of commits that the server has not acknowledged."""
     waiting_bytes: int
     kept: int
-    """Those, and the acknowledged ones that a restore of the server could still lose."""
+    """Number of commits that wait, and of acknowledged ones that a restore of the server could still lose."""
     kept_bytes: int
     last_contact_s: float | None
     """End of the last whole round with the server, UTC, to ten seconds."""
     failing_since_s: float | None
-    """First failure since then, UTC; None: there was none."""
+    """Time of the first failure since the last whole round, UTC; None: there was none."""
     failure_kind: str
     failure: str
-    """The last one, for people; empty if there was none."""
+    """Message of the last failure since the last whole round; empty if there was none."""
     disk_bytes: int
 
 
@@ -56,41 +57,41 @@ class QueuedCommit(BaseModel):
 
     id: str
     captured_s: tuple[float, float] | None
-    """First and last scan, UTC; None for a commit without scans, or one that the disk damaged."""
+    """Times of the first and the last scan, UTC; None for a commit without scans, or one that the disk damaged."""
     cells: int
     size_bytes: int
     acknowledged: bool
-    """The server has it; it is kept until no restore of the server can lose it."""
+    """True if the server has the commit; it is kept until no restore of the server can lose it."""
     is_damaged: bool
     note: str
 
 
 class FolderQueue(BaseModel):
-    """What `cairn robot queue --json` prints; names are added, never changed."""
+    """Commits in a robot's folder, as `cairn robot queue --json` prints them; names are added, never changed."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     robot: str
     map: str
     commits: list[QueuedCommit]
-    """Oldest first."""
+    """Commits whose bytes are kept, oldest first."""
 
 
 def folder_status(folder: Path) -> FolderStatus:
-    """How the robot of a folder is doing; raises as `glance`."""
+    """Status of the robot of a folder; raises as `glance`."""
     seen = glance(folder)
-    meta = seen.meta
-    contact = Contact.model_validate_json(meta.get(CONTACT_KEY, "{}"))
+    text = seen.meta.get
+    contact = ReplicaState.contact.read(text) or Contact()
     waiting = [commit for commit in seen.commits if not commit.is_acked]
     return FolderStatus(
-        robot=_known(seen, "robot", folder),
-        map=_known(seen, "map", folder),
-        url=meta.get(URL_KEY),
-        mode=meta.get(MODE_KEY),  # type: ignore[arg-type] # checked by the model
+        robot=_known(seen, ReplicaState.robot, folder),
+        map=_known(seen, ReplicaState.map_name, folder),
+        url=ReplicaState.url.read(text),
+        mode=ReplicaState.mode.read(text),
         is_open=is_locked(folder),
-        incarnation=_known(seen, "incarnation", folder),
-        voxel_edge_m=Geometry.model_validate_json(_known(seen, "geometry", folder)).voxel_edge_m,
-        cursor=meta.get("default_cursor"),
+        incarnation=_known(seen, ReplicaState.incarnation, folder),
+        voxel_edge_m=_known(seen, ReplicaState.geometry, folder).voxel_edge_m,
+        cursor=text(ReplicaState.default_cursor.key),
         cells=seen.cells,
         cells_bytes=seen.cells_bytes,
         waiting=len(waiting),
@@ -109,8 +110,8 @@ def folder_queue(folder: Path) -> FolderQueue:
     """The commits that are kept in a folder; raises as `glance`."""
     seen = glance(folder)
     return FolderQueue(
-        robot=_known(seen, "robot", folder),
-        map=_known(seen, "map", folder),
+        robot=_known(seen, ReplicaState.robot, folder),
+        map=_known(seen, ReplicaState.map_name, folder),
         commits=[_queued(folder, commit) for commit in seen.commits],
     )
 
@@ -134,8 +135,13 @@ def _queued(folder: Path, commit: KeptBytes) -> QueuedCommit:
     )
 
 
-def _known(seen: Glance, key: str, folder: Path) -> str:
-    """Raises: DamagedDataError: kind `damaged_store`: it is not there."""
-    if key not in seen.meta:
-        raise DamagedDataError("damaged_store", f"the robot's folder {folder} does not say its {key}")
-    return seen.meta[key]
+def _known(seen: Glance, field: Field[T], folder: Path) -> T:
+    """A value that every robot's folder remembers.
+
+    Raises:
+        DamagedDataError: kind `damaged_store`: it is not there.
+    """
+    value = field.read(seen.meta.get)
+    if value is None:
+        raise DamagedDataError("damaged_store", f"the robot's folder {folder} does not say its {field.key}")
+    return value

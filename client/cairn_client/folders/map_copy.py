@@ -11,20 +11,20 @@ from cairn_map.errors import BadInputError, ConflictError
 
 @dataclass(frozen=True, slots=True)
 class Pulled:
-    """What a clone or pull did."""
+    """Result of a clone or a pull."""
 
     map_url: str
     folder: Path
     cells: int
-    """In the copy now."""
+    """Number of cells in the copy now."""
     voxels: int
-    """Known ones."""
+    """Number of known voxels in the copy now."""
     changed_cells: int
     new_commits: int
-    """That the copy did not have before."""
+    """Number of commits that the copy did not have before."""
     down_bytes: int
     cursor: str
-    """State of the server that the copy is."""
+    """Cursor of the server's state that the copy holds."""
 
     def as_json(self) -> dict[str, object]:
         """Its fields, for JSON."""
@@ -38,7 +38,7 @@ def clone(map_url: str, folder: Path, *, token: str | None, name: str | None = N
         map_url: `http://HOST:PORT/maps/NAME`.
         folder: new, or empty.
         token: to register by, where the server wants one.
-        name: of this copy among the robots of the map; None: one that nobody else has.
+        name: name of this copy among the robots of the map; None: a random one.
 
     Raises:
         ConflictError: kind `copy_exists`: there is something in the folder.
@@ -70,14 +70,12 @@ def pull(folder: Path, *, token: str | None = None) -> Pulled:
 def _pull(map_url: str, folder: Path, *, token: str | None, name: str) -> Pulled:
     with Robot(None, map_url, directory=folder, name=name, token=token, mode="viewer", stay=True) as robot:
         replica = robot.replica
-        with replica.lock:
-            before = {key: cell.fingerprint for key, cell in replica.cells.items()}
-            commits = len(replica.header.coverage) if replica.header else 0
+        before = replica.fingerprints()
+        commits = len(replica.header.coverage) if replica.header else 0
         robot.sync()
         robot.sync()  # tells the server where this copy stands now
-        with replica.lock:
-            after = {key: cell.fingerprint for key, cell in replica.cells.items()}
-            header, packed = replica.header, robot.map.packed()
+        after = replica.fingerprints()
+        header, packed = replica.header, robot.map.packed()
         return Pulled(
             map_url=map_url,
             folder=folder,

@@ -1,17 +1,22 @@
 """Maps to ask without a robot: on a server, in a folder of cells (`cairn map export --cells`), in a robot's state."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from cairn_client.folders.local_ages import ages_of
+import numpy as np
+import numpy.typing as npt
+
 from cairn_client.folders.state_folder import is_state_folder, opened_replica
 from cairn_client.http.api import MapApi
 from cairn_client.http.http_link import cells_with_evidence, download_cell
 from cairn_client.http.map_url import split_map_url
-from cairn_client.replica.map_model import stored_model
+from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_store import FILE_NAME
+from cairn_map.codec.cell_code import decode_cell
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.grid import CellKey
 from cairn_map.files.cell_folder import MAP_FILE, read_cells, read_head
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
 from cairn_map.render.map_picture import Ages
@@ -23,7 +28,7 @@ class FolderMap:
 
     snapshot: MapSnapshot
     ages: Ages | None
-    """Of what a robot measured itself; None: cells say nothing about when."""
+    """Ages of what the robot measured itself; None for a folder of cells, which have no times."""
 
 
 def open_map(place: Path | str, *, token: str | None = None) -> MapSnapshot:
@@ -61,7 +66,7 @@ def map_of_folder(folder: Path) -> FolderMap:
     """
     if is_state_folder(folder):
         with opened_replica(folder) as replica:
-            return FolderMap(replica.snapshot(stored_model(replica.store)), ages_of(replica))
+            return FolderMap(replica.snapshot(), ages_of(replica))
     if (folder / MAP_FILE).is_file():
         head = read_head(folder)
         whole = EvidenceMap(head.geometry)
@@ -84,3 +89,27 @@ def _downloaded_map(map_url: str, token: str | None) -> MapSnapshot:
             _, decoded = download_cell(api, name, cell)
             whole.replace(decoded.key, decoded.evidence)
     return snapshot_of(whole, info.sensor_model)
+
+
+def ages_of(replica: Replica) -> Ages | None:
+    """Ages of a robot's own map: the time of each block's last measurement, UTC seconds, and the newest of them as now.
+
+    None where no commit that is kept states a time. What was taken out, or amended, does not count.
+
+    Raises:
+        DamagedDataError: a commit at rest is not sound.
+    """
+    blocks = 8 ** (replica.geometry.depth - 2)
+    changes: dict[CellKey, npt.NDArray[np.float64]] = {}
+    newest_s = -math.inf
+    for commit_id in replica.unreplaced_commits():
+        commit = replica.kept_commit(commit_id)
+        if commit is None or commit.meta.captured_s is None:
+            continue
+        captured_s = commit.meta.captured_s[1]
+        newest_s = max(newest_s, captured_s)
+        for key, data in commit.cells.items():
+            touched = np.unique(decode_cell(data).evidence.voxels >> np.uint32(6))
+            known = changes.setdefault(key, np.full(blocks, np.nan))
+            known[touched] = np.fmax(known[touched], captured_s)
+    return Ages(changes, now=newest_s) if changes else None

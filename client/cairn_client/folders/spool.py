@@ -1,4 +1,4 @@
-"""A folder into which a driver puts recordings, and how far a robot is with each of them.
+"""Spool: a folder into which a driver puts recordings, and a robot's progress with each of them.
 
     spool/
       0001/  rig.json trajectory.txt tof.txt images/... recording.json     whole: recording.json is written last
@@ -27,11 +27,11 @@ log = logging.getLogger(__name__)
 GOING = ".going"
 """Ends the name, behind a dot, of a recording that is being deleted: whole or not, it is looked at no more."""
 Stamp = tuple[int, int]
-"""Which header file a recording has: its inode, and when it was written, ns."""
+"""Identity of a recording's header file: its inode, and the time when it was written, ns."""
 
 
 class Mark(BaseModel):
-    """How far a recording is mapped."""
+    """Progress of the mapping of a recording."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -41,17 +41,17 @@ class Mark(BaseModel):
     """Measurements that are commits, or gave no evidence."""
     is_done: bool
     left_out: int = 0
-    """Of these measurements, those that no commit can be made of; a recording with one is not deleted."""
+    """Number of these measurements of which no commit can be made; a recording with one is not deleted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """One measurement that is to be mapped."""
+    """A measurement of a recording, to be mapped."""
 
     folder: Path
     source: Recording
     number: int
-    """Of the recording's measurements, from 0."""
+    """Number of the measurement in its recording, from 0."""
     left_out: int
     """Measurements before it that were left out."""
 
@@ -61,11 +61,11 @@ class Stop:
         return self.source.measurements()[self.number]
 
     def mark(self) -> Mapping[str, str]:
-        """What is to be remembered when it is done."""
+        """Texts to remember when the measurement is done."""
         return self._mark(left_out=self.left_out)
 
     def mark_left_out(self) -> Mapping[str, str]:
-        """What is to be remembered when nothing can be made of it."""
+        """Texts to remember when no commit can be made of the measurement."""
         return self._mark(left_out=self.left_out + 1)
 
     def _mark(self, *, left_out: int) -> Mapping[str, str]:
@@ -76,7 +76,7 @@ class Stop:
 
 
 class Spool:
-    """A spool, without the robot that maps it."""
+    """A folder of recordings that come and go, without the robot that maps them."""
 
     def __init__(self, folder: Path) -> None:
         """Raises: BadInputError: kind `no_spool`: there is no such folder, or it is a recording itself."""
@@ -88,12 +88,12 @@ class Spool:
             )
         self._folder = folder
         self._settled: dict[Path, tuple[Stamp, float | None]] = {}
-        """What was in a folder when it was done, with the time of its first scan; None: no recording."""
+        """Stamp of each folder that is done, with the time of its first scan; None: no recording."""
         self._begin_badly: dict[Path, Stamp] = {}
-        """Recordings whose first scan is damaged, which was told."""
+        """Recordings whose first scan is damaged, as the log said."""
 
     def next_recording(self) -> Recording | None:
-        """The first recording that is whole and begins with a sound scan; None if there is none yet."""
+        """First recording that is whole and begins with a sound scan; None if there is none yet."""
         for path, stamp in self._whole():
             source = self._opened(path, stamp)
             if source is not None and self._begins_well(path, stamp, source):
@@ -134,7 +134,7 @@ class Spool:
         return [(path, stamp) for path, stamp in stamped if self._settled.get(path, (None, None))[0] != stamp]
 
     def _begins_well(self, path: Path, stamp: Stamp, source: Recording) -> bool:
-        """Whether its first scan, which says what there is to map, can be read; the others may be sound anyway."""
+        """True if the first scan, which says what there is to map, can be read; the others may be sound anyway."""
         if self._begin_badly.get(path) == stamp:
             return False
         try:
@@ -159,14 +159,14 @@ class Spool:
 
 
 def remember(replica: Replica, texts: Mapping[str, str | None]) -> None:
-    """Durably, at once."""
-    with replica.lock, replica.store.transaction():
+    """Keep texts by key in a robot's folder, durably; None removes one."""
+    with replica.store.transaction():
         for key, text in texts.items():
             replica.store.put(key, text)
 
 
 def _stamp(folder: Path) -> Stamp | None:
-    """None: it is no recording, or not whole."""
+    """Stamp of a recording; None if it is none, or not whole."""
     try:
         found = (folder / HEADER_FILE).stat()
     except (FileNotFoundError, NotADirectoryError):
@@ -175,9 +175,8 @@ def _stamp(folder: Path) -> Stamp | None:
 
 
 def _mark(replica: Replica, folder: Path, first_s: float) -> Mark:
-    """Of the recording that begins at this time; what was in the folder before it does not count."""
-    with replica.lock:
-        text = replica.store.get(_key(folder))
+    """Mark of the recording that begins at this time; another one's, under the same name, does not count."""
+    text = replica.store.get(_key(folder))
     mark = Mark.model_validate_json(text) if text else None
     return mark if mark is not None and mark.first_s == first_s else Mark(first_s=first_s, stops=0, is_done=False)
 

@@ -1,6 +1,6 @@
-"""A robot's folder as somebody sees it who only looks: read in one transaction, while the robot goes on.
+"""Glance into a robot's folder: read in one transaction, while the robot goes on.
 
-Nothing is locked, written or checked, so that looking neither waits for a robot nor holds one up.
+Nothing is locked, written or checked, so that a glance neither waits for a robot nor holds one up.
 """
 
 from collections.abc import Mapping
@@ -10,8 +10,7 @@ from typing import Any
 
 import apsw
 
-from cairn_client.replica.replica_store import BUSY_MS, FILE_NAME
-from cairn_client.replica.sqlite_failures import failure_of
+from cairn_client.replica.replica_store import BUSY_MS, FILE_NAME, failure_of
 from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName
 from cairn_map.errors import NotFoundError
 
@@ -28,17 +27,17 @@ class KeptBytes:
 
 @dataclass(frozen=True, slots=True)
 class Glance:
-    """What stood in the folder at one instant."""
+    """Contents of a robot's folder at one instant."""
 
     meta: Mapping[str, str]
-    """What is remembered, by key."""
+    """Texts that the folder remembers, by key (`replica_state`)."""
     commits: tuple[KeptBytes, ...]
-    """In the order in which they came."""
+    """Commits whose bytes are kept, in the order in which they came."""
     cells: int
-    """Held whole, as the server had them."""
+    """Number of cells that are held whole, as the server had them."""
     cells_bytes: int
     disk_bytes: int
-    """The file, and what is still in its log."""
+    """Bytes of the file, and of its log."""
 
 
 def glance(folder: Path) -> Glance:
@@ -88,7 +87,7 @@ class _Reader:
     def __enter__(self) -> "_Reader":
         try:
             self._connection = self._opened("mode=ro")
-        except apsw.CantOpenError:  # nothing may be written beside it, so no robot that could change it is at work
+        except apsw.CantOpenError:  # nothing may be written next to it, so no robot that could change it is at work
             self._connection = self._opened("immutable=1")
         except apsw.Error as exc:
             raise failure_of(exc, self._path) from exc

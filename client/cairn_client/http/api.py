@@ -1,10 +1,14 @@
-"""The server's routes as functions; the only file that knows HTTP.
+"""API of a map server: its routes as functions, over HTTP.
 
 Errors come out as the same `CairnError` that the server raised. What could not be asked at all, or should be asked
-again later, is `UnreachableError`. Every call is idempotent, so whoever calls may simply call again.
+again later, is `UnreachableError`. Every call is idempotent, so a caller may simply call again.
 httpx is loaded with the first `MapApi`: it is a seventh of the import of a robot, by processor time (tests/bench).
 """
 
+import contextlib
+import socket
+import threading
+import weakref
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,15 +17,13 @@ from typing import TYPE_CHECKING, Any, Self
 
 from pydantic import TypeAdapter, ValidationError
 
-from cairn_client.http.certificates import certificates
-from cairn_client.http.open_sockets import OpenSockets
 from cairn_client.sync.requests import Box, GetUpload, PutPart
 from cairn_client.sync.responses import Answer, FetchedCell, Traffic, error_of, list_of, unreachable
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import cursor_from_text
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import EMPTY, VersionVector, vector_digest, version_vector_from_json
-from cairn_map.errors import BadInputError, DamagedDataError
+from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
 from cairn_map.evidence.fingerprint import fingerprint_from_hex
 from cairn_map.evidence.grid import Cell
 from cairn_map.wire.access_messages import CreateToken, NewSecret, TokenInfo
@@ -46,6 +48,11 @@ from cairn_map.wire.messages import (
 )
 from cairn_map.wire.resumed_replies import Replies
 
+OPENED = ("connection.connect_tcp.complete", "connection.start_tls.complete")
+
+if TYPE_CHECKING:
+    import ssl
+
 if TYPE_CHECKING:
     import httpx
 
@@ -58,17 +65,74 @@ ERROR_BYTES_MAX = 1 << 16
 VECTOR: TypeAdapter[VectorJson] = TypeAdapter(VectorJson)
 
 
+def certificates(ca_file: Path | None) -> "ssl.SSLContext | bool":
+    """Those of a file (PEM), or True: those that are known everywhere.
+
+    Raises:
+        BadInputError: kind `bad_setting`: it is no such file.
+    """
+    import ssl
+
+    try:
+        return ssl.create_default_context(cafile=ca_file) if ca_file else True
+    except OSError as exc:  # ssl.SSLError is one
+        raise BadInputError("bad_setting", f"{ca_file} is no file of certificates: {exc}") from exc
+
+
+class OpenSockets:
+    """Sockets that a client opened; `watch` is to be called with each request (httpx's event hook)."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._sockets: weakref.WeakSet[socket.socket] = weakref.WeakSet()
+        self._is_cut = False
+
+    def watch(self, request: Any) -> None:
+        """Note the connection that a request makes, if it makes one.
+
+        Raises:
+            UnreachableError: kind `interrupted`: nothing is to be sent any more.
+        """
+        self._check()
+        request.extensions = {**request.extensions, "trace": self._trace}
+
+    def cut(self) -> None:
+        """End all that is under way, and let nothing begin until `mend`; by any thread."""
+        with self._lock:
+            self._is_cut = True
+            for found in list(self._sockets):
+                with contextlib.suppress(OSError):
+                    # The plain socket's: that of TLS would say goodbye first.
+                    socket.socket.shutdown(found, socket.SHUT_RDWR)
+
+    def mend(self) -> None:
+        """Requests may be sent again; each makes a connection of its own if it must."""
+        self._is_cut = False
+
+    def _trace(self, name: str, info: Mapping[str, Any]) -> None:
+        if name in OPENED:
+            found = info["return_value"].get_extra_info("socket")
+            with self._lock:
+                if isinstance(found, socket.socket):
+                    self._sockets.add(found)
+            self._check()
+
+    def _check(self) -> None:
+        if self._is_cut:
+            raise UnreachableError("interrupted", "the robot is being closed")
+
+
 class MapApi:
     """One server's routes; `server_url` such as `http://base:8750`.
 
-    Of https the certificate must be signed by `ca_file` (PEM), else by SSL_CERT_FILE, else by who is known everywhere.
+    Of https the certificate must be signed by `ca_file` (PEM), else by SSL_CERT_FILE, else by a public issuer.
     """
 
     def __init__(self, server_url: str, *, token: str | None = None, ca_file: Path | None = None) -> None:
         self.traffic = Traffic()
         self.sockets = OpenSockets()
         self._vector = EMPTY
-        """The last one that came whole: many cells come with the same."""
+        """The version vector that came whole last: many cells come with the same one."""
         if not server_url.startswith(("http://", "https://")) or "/maps/" in server_url:
             raise BadInputError("bad_url", f"a server's URL is http://HOST:PORT, got {server_url!r}")
         import httpx
@@ -89,6 +153,10 @@ class MapApi:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def use_token(self, token: str | None) -> None:
+        """Send this token with each request from here on; None: no token."""
+        self.token = token
 
     def close(self) -> None:
         """Close the connections."""
@@ -118,11 +186,11 @@ class MapApi:
         return list_of(BranchInfo, self._ask("GET", f"/maps/{name}/branches"))
 
     def put_status(self, name: str, branch: str, status: RobotStatus) -> None:
-        """Tell where a robot is and how it is doing."""
+        """Put a robot's status report."""
         self._ask("PUT", f"/maps/{name}/branches/{branch}/status", content=status.model_dump_json().encode())
 
     def put_view(self, name: str, branch: str, picture: bytes) -> None:
-        """Show what a robot sees: JPEG or PNG."""
+        """Put a picture of a robot's view: JPEG or PNG."""
         self._ask("PUT", f"/maps/{name}/branches/{branch}/view", content=picture)
 
     def view(self, name: str, branch: str) -> bytes:
@@ -140,7 +208,7 @@ class MapApi:
         return message_from_json(Pushed, self._ask("PUT", path, content=commit.data, headers=headers))
 
     def upload(self, name: str, ask: GetUpload | PutPart) -> Upload:
-        """How much of a commit's bytes came in parts, after this one if it is one; with the last it is pushed."""
+        """Progress of a commit that goes in parts, after this part if it is one; with the last part it is pushed."""
         path, params = f"/maps/{name}/commits/{ask.id}/upload", {"digest": ask.digest}
         if isinstance(ask, GetUpload):
             return message_from_json(Upload, self._ask("GET", path, params=params))
@@ -241,7 +309,7 @@ class MapApi:
         return self._send("GET", path)
 
     def _coverage(self, name: str, headers: Mapping[str, str]) -> VersionVector:
-        """The version vector that a cell came with: as it is, or by a digest, of the one known last or asked for."""
+        """Version vector of a cell's answer: as it is, or named by its digest, then known or requested."""
         if "Cairn-Coverage" in headers:
             return version_vector_from_json(VECTOR.validate_json(headers["Cairn-Coverage"]))
         digest = headers["Cairn-Coverage-Digest"]
@@ -275,7 +343,7 @@ class MapApi:
         headers: Mapping[str, str] | None = None,
         params: Mapping[str, str | int] | None = None,
     ) -> "Iterator[httpx.Response]":
-        """An answer that begins well and is still to be read; an error of the server or the link as ours."""
+        """Context of an answer that began well and is still to be read; errors come out as a `CairnError`."""
         import httpx
 
         sent = {"Cairn-Protocol": PROTOCOL_VERSION, **(headers or {})}

@@ -1,10 +1,10 @@
-"""How long to wait before asking again: exponential, with full jitter, never less than the server wishes."""
+"""Waits before a request is repeated: exponential, with full jitter, never less than the server wishes."""
 
 import random
 from dataclasses import dataclass, field
 
 RETRY_AFTER_MAX_S = 3600.0
-"""A server that asks for more is not believed: its clock or its settings may be broken."""
+"""Longest wait that a server may ask for: with a longer one, its clock or its settings may be broken."""
 
 
 @dataclass(slots=True)
@@ -23,5 +23,5 @@ class Backoff:
         return max(self._random.uniform(0.1, 1) * top_s, min(retry_after_s or 0.0, RETRY_AFTER_MAX_S))
 
     def reset(self) -> None:
-        """It worked: begin with the shortest wait again."""
+        """Begin with the shortest wait again, after a success."""
         self._tries = 0

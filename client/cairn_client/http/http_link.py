@@ -4,7 +4,6 @@ from collections.abc import Generator
 from typing import Any, TypeVar
 
 from cairn_client.http.api import MapApi
-from cairn_client.sync.cell_index import whole_index
 from cairn_client.sync.requests import (
     Ask,
     Conversation,
@@ -17,9 +16,11 @@ from cairn_client.sync.requests import (
     Push,
     PutCell,
     PutPart,
+    hold,
+    whole_index,
 )
 from cairn_map.codec.cell_code import DecodedCell, decode_cell
-from cairn_map.errors import CairnError, DamagedDataError
+from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import Cell, cell_key
 from cairn_map.wire.frames import Frame
@@ -30,7 +31,7 @@ T = TypeVar("T")
 
 
 class Link:
-    """One robot's way to one map."""
+    """HTTP link of one robot to one map: it holds conversations."""
 
     def __init__(self, api: MapApi, map_name: str, *, branch: str) -> None:
         self._api = api
@@ -40,23 +41,13 @@ class Link:
         self._replies = Replies()
 
     def hold(self, conversation: Conversation[T]) -> T:
-        """The result of a conversation with the server.
+        """Result of a conversation with the server.
 
         Raises:
-            CairnError: what the conversation does not deal with itself.
+            CairnError: an error of the server or the link that the conversation does not deal with itself.
         """
         try:
-            ask = next(conversation)
-            while True:
-                try:
-                    answer = self._answer(ask)
-                except CairnError as exc:
-                    ask = conversation.throw(exc)
-                else:
-                    ask = conversation.send(answer)
-        except StopIteration as end:
-            result: T = end.value
-            return result
+            return hold(conversation, self._answer)
         finally:
             self._stop_reading()
 

@@ -1,4 +1,4 @@
-"""What a server tells live, event by event, for as long as somebody listens (PROTOCOL.md 4.6).
+"""Listener to a server's live events, across broken links (PROTOCOL.md 4.6).
 
 connect -> events -> the link breaks -> Lost -> wait -> connect, from the last id on -> ...
 """
@@ -37,11 +37,11 @@ def listen(
         api: the server.
         map_name: the map.
         sleep: waits between two tries.
-        backoff: how long; None: half a second to half a minute.
+        backoff: the waits; None: half a second to half a minute.
 
     Raises:
         CairnError: the server refuses: no such map, or the token is not good (any more).
-        DamagedDataError: what it tells are no events.
+        DamagedDataError: its messages are no events.
     """
     waits, last_id = backoff or Backoff(), None
     while True:

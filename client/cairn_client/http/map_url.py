@@ -1,4 +1,4 @@
-"""Where a map is: `http://HOST:PORT/maps/NAME`."""
+"""URL of a map: `http://HOST:PORT/maps/NAME`."""
 
 from urllib.parse import urlsplit
 

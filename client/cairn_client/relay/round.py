@@ -3,12 +3,13 @@
 A round asks both places what they hold, and hands over the difference. Nothing is remembered from one round to the
 next that matters: so order, repetition, other relays, circles, and servers that were restored or replaced change
 nothing but how much there is to hand over. A relay cannot read what it hands over into being anything else: the
-signatures are checked by who takes it.
+signatures are checked by the side that takes it.
 """
 
+import logging
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from enum import Enum
 from itertools import islice
@@ -21,15 +22,21 @@ from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.errors import CairnError, ConflictError, DeniedError, NotFoundError, UnreachableError
 from cairn_map.wire.relay_peer import Held, SignedCommit
 
+log = logging.getLogger(__name__)
+
+NAMED_MAX = 3
+"""Commits that one line of the log names."""
+PAUSE_S = 60.0
+"""Pause from which on a server's wish for one is logged; a server that wants a shorter one is only busy."""
 AT_ONCE = 1000
-"""Commits handed over, in each direction, before both places are asked anew."""
+"""Commits handed over, in each direction, before both places are asked again."""
 REST_S = 600.0
-"""So often what could not be handed over is tried again, once all else was."""
+"""Seconds after which commits that could not be handed over are tried again, once all others were."""
 NOT_ITS_FAULT = ("quota", "disk_full")
-"""Why a server takes nothing for now, whatever it is."""
+"""Kinds of errors by which a server takes no commit at all for now."""
 
 
-class Side(Enum):
+class RelaySide(Enum):
     """The two places of a round."""
 
     HERE = "here"
@@ -38,63 +45,65 @@ class Side(Enum):
 
 @dataclass(frozen=True, slots=True)
 class AskHeld(Ask[Held]):
-    """What a place holds."""
+    """Question for what a place holds."""
 
-    side: Side
+    side: RelaySide
 
 
 @dataclass(frozen=True, slots=True)
 class TakeCommit(Ask[SignedCommit]):
-    """A commit, whole."""
+    """Question for a commit with its bytes and signatures."""
 
-    side: Side
+    side: RelaySide
     id: CommitId
 
 
 @dataclass(frozen=True, slots=True)
 class GiveCommit(Ask[None]):
-    """Keep this commit; answered when it is kept for good."""
+    """Push of a commit; answered when it is kept for good."""
 
-    side: Side
+    side: RelaySide
     commit: SignedCommit
 
 
 class Why(Enum):
-    """Why a commit was not handed over."""
+    """Reason for which a commit was not handed over."""
 
     GONE = "gone"
-    """Not kept any more where it was to come from."""
+    """The source does not keep its bytes any more."""
     UNSIGNED = "unsigned"
     REFUSED = "refused"
     BROKEN = "broken"
-    """Twice the link broke at it before any part of it came, or the server could not take it, though both places had
+    """The link broke at it twice before any part of it came, or the server could not take it, though both places had
     just answered."""
 
 
 FOR_GOOD = (Why.GONE, Why.UNSIGNED)
-"""Not asked for again while the place that it was to come from still names it."""
+"""Reasons for which a commit is not requested again while its source still names it."""
 
 
 @dataclass(slots=True)
-class Resting:
-    """What could not be handed over, and is left alone for a while; a few intervals for each author, however many.
+class Undelivered:
+    """Commits that could not be handed over, and are not tried for a while; a few intervals for each author.
 
-    It saves traffic, and lets what comes after it go by.
+    This saves traffic, and lets later commits pass.
     """
 
     rest_s: float = REST_S
     clock_s: Callable[[], float] = time.monotonic
-    _found: defaultdict[tuple[Side, Why], VersionVector] = field(default_factory=lambda: defaultdict(lambda: EMPTY))
-    _broke_at: dict[Side, CommitId] = field(default_factory=dict)
-    _pauses_until_s: dict[Side, float] = field(default_factory=dict)
-    _until_s: dict[Side, float] = field(default_factory=dict)
+    _found: defaultdict[tuple[RelaySide, Why], VersionVector] = field(
+        default_factory=lambda: defaultdict(lambda: EMPTY)
+    )
+    _broke_at: dict[RelaySide, CommitId] = field(default_factory=dict)
+    _pauses_until_s: dict[RelaySide, float] = field(default_factory=dict)
+    _until_s: dict[RelaySide, float] = field(default_factory=dict)
 
-    def add(self, to: Side, why: Why, commit: CommitId) -> None:
-        """It could not be handed over to this side."""
+    def add(self, to: RelaySide, why: Why, commit: CommitId) -> None:
+        """Note that a commit could not be handed over to this side."""
         self._found[to, why] = self._found[to, why].with_commits([commit])
 
-    def broke(self, to: Side, commit: CommitId, error: UnreachableError) -> None:
-        """The link broke at it, or the server said when it may be able to take more."""
+    def broke(self, to: RelaySide, commit: CommitId, error: UnreachableError) -> None:
+        """Note that the link broke at a commit, or that the server said when it may take more."""
         if error.kind == CAME_IN_PART:
             self._broke_at.pop(to, None)
         else:
@@ -104,16 +113,16 @@ class Resting:
         if error.retry_after_s:
             self._pauses_until_s[to] = self.clock_s() + min(error.retry_after_s, self.rest_s)
 
-    def pauses(self, to: Side) -> bool:
-        """Whether this side wants no more for now."""
+    def pauses(self, to: RelaySide) -> bool:
+        """True if this side wants no more for now."""
         return self._pauses_until_s.get(to, float("-inf")) > self.clock_s()
 
-    def may_come_later(self, to: Side) -> bool:
-        """Whether this side lacks what it might have once the link or the server is better."""
+    def may_come_later(self, to: RelaySide) -> bool:
+        """True if this side lacks commits that it might take once the link or the server is better."""
         return self.pauses(to) or bool(self._found[to, Why.BROKEN].intervals)
 
-    def lacking(self, source: Held, target: Held, to: Side) -> Iterator[CommitId]:
-        """What the source could give and is worth a try, each author's oldest first."""
+    def lacking(self, source: Held, target: Held, to: RelaySide) -> Iterator[CommitId]:
+        """Commits that the source could give and that are worth a try, each author's oldest first."""
         lacking = source.vector.minus(target.vector)
         for why in FOR_GOOD:  # of these, what the source still names: if it was replaced, it may have them again
             self._found[to, why] = known = lacking.minus(lacking.minus(self._found[to, why]))
@@ -126,8 +135,8 @@ class Resting:
             if commit in source.vector and not any(commit in known for known in tried):
                 yield commit
 
-    def all_tried(self, to: Side, report: "RelayReport") -> None:
-        """Nothing is left to hand over to this side; every `rest_s` say all that it lacks, and begin again."""
+    def all_tried(self, to: RelaySide, report: "RelayReport") -> None:
+        """Note that nothing is left to hand over to this side; every `rest_s` report what it lacks, and begin again."""
         if self._until_s.setdefault(to, self.clock_s() + self.rest_s) > self.clock_s():
             return
         del self._until_s[to]
@@ -138,49 +147,51 @@ class Resting:
 
 @dataclass(slots=True)
 class RelayReport:
-    """What one round did."""
+    """Counts of one relay round's work."""
 
-    moved: dict[Side, int] = field(default_factory=lambda: dict.fromkeys(Side, 0))
+    moved: dict[RelaySide, int] = field(default_factory=lambda: dict.fromkeys(RelaySide, 0))
     """Commits handed over, by the side that they came to."""
-    kept_back: dict[tuple[Side, Why], VersionVector] = field(default_factory=dict)
-    """What a side lacks for good: gone, or unsigned. Only what is new, and now and then all."""
+    kept_back: dict[tuple[RelaySide, Why], VersionVector] = field(default_factory=dict)
+    """Commits that a side lacks for good, gone or unsigned: only the new ones, and now and then all."""
     refused: list[tuple[CommitId, CairnError]] = field(default_factory=list)
     split: list[Author] = field(default_factory=list)
     """Authors of whom the two sides have other bytes under the same ids."""
     later: UnreachableError | None = None
-    """A server takes no more for now, and says when."""
+    """Error of a server that takes no more for now, and says when; None if none did."""
     cut: UnreachableError | None = None
-    """A link broke in the middle; whoever holds the rounds waits a little."""
+    """Error of a link that broke in the middle; the caller waits a little."""
     has_more: bool = False
-    """There was too much for one round."""
+    """True if there was too much for one round."""
     is_all_there: bool = False
-    """All that can travel from here came there."""
+    """True if all commits that can travel from here came there."""
 
-    def keep_back(self, to: Side, why: Why, commit: CommitId) -> None:
-        """A side lacks it."""
+    def keep_back(self, to: RelaySide, why: Why, commit: CommitId) -> None:
+        """Note that a side lacks a commit for good."""
         self.kept_back[to, why] = self.kept_back.get((to, why), EMPTY).with_commits([commit])
 
 
-def relay_round(resting: Resting) -> Conversation[RelayReport]:
+def relay_round(resting: Undelivered) -> Conversation[RelayReport]:
     """Hand over what either side lacks and the other has; where one direction breaks off, the other has its turn.
 
     Raises:
         UnreachableError: a place does not say what it holds.
         DeniedError: a server does not know this relay.
     """
+    # What both sides hold, and whether they hold other bytes under the same ids.
     report = RelayReport()
     held = {}
-    for side in Side:
+    for side in RelaySide:
         held[side] = yield from AskHeld(side)
-    report.split = _split(held[Side.HERE], held[Side.THERE])
-    yield from _hand_over(Side.HERE, Side.THERE, held, resting, report)
-    report.is_all_there = not (report.has_more or report.cut or resting.may_come_later(Side.THERE))
-    yield from _hand_over(Side.THERE, Side.HERE, held, resting, report)
+    report.split = _split(held[RelaySide.HERE], held[RelaySide.THERE])
+    # From here to there, then back; a direction that breaks off does not stop the other.
+    yield from _hand_over(RelaySide.HERE, RelaySide.THERE, held, resting, report)
+    report.is_all_there = not (report.has_more or report.cut or resting.may_come_later(RelaySide.THERE))
+    yield from _hand_over(RelaySide.THERE, RelaySide.HERE, held, resting, report)
     return report
 
 
 def _hand_over(
-    source: Side, target: Side, held: dict[Side, Held], resting: Resting, report: RelayReport
+    source: RelaySide, target: RelaySide, held: dict[RelaySide, Held], resting: Undelivered, report: RelayReport
 ) -> Conversation[None]:
     if resting.pauses(target):
         return
@@ -188,6 +199,7 @@ def _hand_over(
     for commit_id in islice(lacking, AT_ONCE):
         try:
             why = yield from _move(source, target, commit_id)
+        # A break ends this direction; a refusal, like a commit that is gone, lets the next one go by.
         except UnreachableError as exc:
             resting.broke(target, commit_id, exc)
             if exc.retry_after_s:
@@ -214,8 +226,8 @@ def _hand_over(
         report.has_more = True
 
 
-def _move(source: Side, target: Side, commit_id: CommitId) -> Conversation[Why | None]:
-    """Hand over one commit; or why it cannot be."""
+def _move(source: RelaySide, target: RelaySide, commit_id: CommitId) -> Conversation[Why | None]:
+    """Hand over one commit; the reason if it cannot be, else None."""
     try:
         commit = yield from TakeCommit(source, commit_id)
     except ConflictError as exc:
@@ -228,7 +240,7 @@ def _move(source: Side, target: Side, commit_id: CommitId) -> Conversation[Why |
     return None
 
 
-def _give(source: Side, target: Side, commit: SignedCommit) -> Conversation[None]:
+def _give(source: RelaySide, target: RelaySide, commit: SignedCommit) -> Conversation[None]:
     """Hand over one commit, and before it what it takes out, if the target forgot that (SYNC.md rule 11)."""
     try:
         yield from GiveCommit(target, commit)
@@ -251,3 +263,36 @@ def _split(here: Held, there: Held) -> list[Author]:
         if there.sums.get(author, total) != total
         and here.vector.intervals.get(author) == there.vector.intervals.get(author)
     ]
+
+
+SAID = {
+    Why.GONE: "are not kept any more where they are, so one of the two maps is without them; start the server that "
+    "lacks them from a copy of the other (cairn serve backup, restore)",
+    Why.UNSIGNED: "are not signed and stay where they are: their robots are of an older version",
+}
+
+
+def log_report(report: RelayReport, map_name: str, *, there: str) -> None:
+    """Log a round: one line for each thing that an operator may have to know, none if nothing happened."""
+    taken, given = report.moved[RelaySide.HERE], report.moved[RelaySide.THERE]
+    if taken or given:
+        log.info("map %s: %d commits to %s, %d from there", map_name, given, there, taken)
+    for (_, why), commits in report.kept_back.items():
+        log.error("map %s: %d commits (%s) %s", map_name, len(commits), _names(commits), SAID[why])
+    if report.later and (report.later.retry_after_s or 0.0) >= PAUSE_S:
+        log.warning("map %s: no more for now, %s", map_name, report.later.message)
+    if report.refused:
+        commit, error = report.refused[0]
+        log.error("map %s: %d commits refused, such as %s: %s", map_name, len(report.refused), commit, error.message)
+    if report.split:
+        log.error(
+            "map %s: the two servers have other commits under the same ids, of %s: such a robot's disk was rolled "
+            "back. Compare `cairn map log` of both; a retract of these ids makes the maps equal again",
+            map_name,
+            _names(report.split),
+        )
+
+
+def _names(found: Iterable[object]) -> str:
+    some = [str(one) for one in islice(found, NAMED_MAX + 1)]
+    return ", ".join(some[:NAMED_MAX]) + (" ..." if len(some) > NAMED_MAX else "")

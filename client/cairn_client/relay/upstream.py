@@ -1,4 +1,4 @@
-"""A server joined to another one: the thread that `cairn serve --upstream` starts.
+"""Upstream relay: the thread by which `cairn serve --upstream` keeps a server level with another one.
 
 All maps of the upstream server are made here if they are not, and from then on hold the same commits. Without a link
 both servers go on by themselves.
@@ -10,8 +10,7 @@ import time
 
 from cairn_client.http.backoff import Backoff
 from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
-from cairn_client.relay.log import tell
-from cairn_client.relay.round import Resting, relay_round
+from cairn_client.relay.round import Undelivered, log_report, relay_round
 from cairn_map.errors import CairnError, UnreachableError
 from cairn_map.wire.relay_peer import OwnServer
 
@@ -37,7 +36,7 @@ class Upstream:
         self._url = url
         self._server = server
         self._every_s = every_s
-        self._resting: dict[str, Resting] = {}
+        self._resting: dict[str, Undelivered] = {}
         self._said_s: dict[str, float] = {}
         self._stopping = threading.Event()
         self._woken = threading.Event()
@@ -45,7 +44,7 @@ class Upstream:
         self._thread.start()
 
     def wake(self) -> None:
-        """There is something new here."""
+        """Do a round soon: there is something new here."""
         self._woken.set()
 
     def stop(self) -> None:
@@ -77,7 +76,7 @@ class Upstream:
                     self._woken.wait(self._every_s)
 
     def _round(self) -> bool:
-        """All maps once; whether there is more to do at once."""
+        """Relay all maps once; True if there is more to do at once."""
         found = self._api.maps()
         for name in sorted(set(self._server.map_names()) - {info.name for info in found}):
             self._say(logging.WARNING, f"upstream {self._url} has no map {name} for this token; create it there")
@@ -91,9 +90,9 @@ class Upstream:
                 self._say(logging.ERROR, f"map {info.name} cannot be joined: {exc.message}")
                 continue
             begun_s = time.time()
-            resting = self._resting.setdefault(info.name, Resting())
+            resting = self._resting.setdefault(info.name, Undelivered())
             report = hold_between(relay_round(resting), here, ServerEnd(self._api, info.name))
-            tell(report, info.name, there=self._url)
+            log_report(report, info.name, there=self._url)
             has_more, cut = has_more or report.has_more, cut or report.cut
             if report.is_all_there:
                 self._server.handed_over(info.name, begun_s)

@@ -1,6 +1,6 @@
 """One robot for one folder: an advisory lock that the operating system lets go when the process ends.
 
-Two would give two commits the same number. Who only looks (`sqlite_glance`) needs no lock.
+Two robots would give two commits the same number. A glance (`sqlite_glance`) needs no lock.
 """
 
 import fcntl
@@ -15,7 +15,7 @@ LOOK_AGAIN_S = 0.02
 
 
 def make_folder(folder: Path, *, secret_file: str) -> None:
-    """A folder with a file that only its user reads: the robot's token and keys are in it.
+    """Make a folder with a file that only its user can read: the robot's token and keys are in it.
 
     Raises:
         BadInputError: kind `bad_folder`: it is not there and cannot be made.
@@ -55,7 +55,7 @@ def lock_folder(folder: Path, *, wait_s: float) -> BinaryIO:
 
 
 def is_locked(folder: Path) -> bool:
-    """Whether a robot works in a folder now."""
+    """True if a robot works in a folder now."""
     try:
         lock = (folder / LOCK_NAME).open("rb")
     except OSError:

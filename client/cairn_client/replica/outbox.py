@@ -8,55 +8,117 @@ All methods are called under the replica's lock.
 """
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 
-from cairn_client.replica.replica_store import KeptCommit, ReplicaStore
-from cairn_client.replica.robot_keys import RobotKeys
-from cairn_client.replica.successors import Successors
+from pydantic import ValidationError
+
+from cairn_client.replica.replica_state import ReplicaState, RobotKeys, Successors
+from cairn_client.replica.replica_store import KeptCommit
 from cairn_map.codec.cell_code import Profile, decode_cell
-from cairn_map.commits.commit import Commit, CommitMeta, make_commit, renamed_commit, split_commit
-from cairn_map.commits.ids import NUMBER_LIMIT, Author, CommitId, Incarnation, RobotName
+from cairn_map.commits.commit import Commit, CommitMeta, ScanPose, make_commit, renamed_commit, split_commit
+from cairn_map.commits.cursor import Cursor
+from cairn_map.commits.ids import Author, CommitId, RobotName
 from cairn_map.commits.version_vector import EMPTY, VersionVector
-from cairn_map.errors import BadInputError
+from cairn_map.errors import BadInputError, ConflictError, first_error
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.wire.messages import ReplyHeader
 
 log = logging.getLogger(__name__)
 
-UNNUMBERED = NUMBER_LIMIT - 1
-"""Number in a meta that has not got its own yet: one that no commit in it can be named to retract."""
+NO_NOTES: Mapping[str, str] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CommitFacts:
+    """Statements of a commit about itself that its author makes; the outbox adds id, grid, parent and cursor."""
+
+    captured_s: tuple[float, float] | None = None
+    """Times of the first and the last scan, UTC seconds since 1970; None for a commit without scans."""
+    scans: tuple[ScanPose, ...] = ()
+    """Poses of the scans, in their order."""
+    sensors: tuple[str, ...] = ()
+    """Names of the rig's cameras."""
+    rig: str | None = None
+    """Digest of the rig, hex."""
+    integrator: str = ""
+    """Name, version and parameters of the integrator."""
+    retracts: tuple[CommitId, ...] = ()
+    """Own commits that this one takes back and stands for."""
+    note: str = ""
+    """Up to 1024 characters for the map's log."""
+
+    def meta(self, commit: CommitId, geometry: Geometry, *, parent: str | None, seen: Cursor | None) -> CommitMeta:
+        """The commit's meta.
+
+        Raises:
+            BadInputError: kind `bad_meta`: a note that is too long, or more commits than one can take back.
+        """
+        try:
+            return CommitMeta(
+                id=str(commit),
+                geometry=geometry.digest().hex(),
+                parent=parent,
+                seen=None if seen is None else str(seen),
+                captured_s=self.captured_s,
+                scans=self.scans,
+                sensors=self.sensors,
+                rig=self.rig,
+                integrator=self.integrator,
+                retracts=tuple(str(target) for target in self.retracts),
+                note=self.note,
+            )
+        except ValidationError as exc:
+            raise BadInputError("bad_meta", f"the commit cannot say this of itself: {first_error(exc)}") from exc
+
+
+NO_FACTS = CommitFacts()
 
 
 class Outbox:
-    """The commits in a replica's store."""
+    """Own commits in a replica's store."""
 
-    def __init__(self, store: ReplicaStore, robot: RobotName, geometry: Geometry) -> None:
-        self._store = store
+    def __init__(
+        self,
+        state: ReplicaState,
+        robot: RobotName,
+        geometry: Geometry,
+        *,
+        make_room: Callable[[int], None],
+        amendable: Callable[[], Iterable[CommitId]],
+    ) -> None:
+        """Read the commits that are kept, and draw an incarnation if the folder has none that can sign.
+
+        Args:
+            state: the robot's folder.
+            robot: its name.
+            geometry: the map's grid.
+            make_room: called before a commit of so many bytes is kept; raises if there is no room for it.
+            amendable: returns commits that may still be amended: their bytes are kept, to subtract them at once.
+        """
+        self._state = state
+        self._store = state.store
         self._robot = robot
         self._geometry = geometry
-        self._keys = RobotKeys(store, robot)
-        known = store.get("incarnation")
-        if known is None or not self._keys.has(Incarnation(known)):  # a folder from before commits were signed
-            with store.transaction():
+        self._make_room = make_room
+        self._amendable = amendable
+        self._keys = RobotKeys(state, robot)
+        known = state.incarnation
+        if known is None or not self._keys.has(known):  # a folder from before commits were signed
+            with self._store.transaction():
                 known = self._keys.draw()
-                store.put("incarnation", known)
+                state.incarnation = known
                 self._set_next(0, None)
-        self._incarnation = Incarnation(known)
+        self._incarnation = known
         self._commits: dict[CommitId, KeptCommit] = {}
         self._touching: dict[CellKey, dict[CommitId, None]] = {}
         self._acked_since_header: set[CommitId] = set()
         self._retracts: dict[CommitId, tuple[CommitId, ...]] = {}
-        """What the kept commits take out, of those that somebody asked for."""
-        self.make_room: Callable[[int], None] = lambda size_bytes: None
-        """Called before a commit of so many bytes is kept; raises if there is no room (`room`)."""
-        self.beside: Mapping[str, str] = {}
-        """Texts to remember in the transaction of the next commit, and of no other."""
-        self.successors = Successors(store)
-        self.amendable: Callable[[], Iterable[CommitId]] = tuple
-        """Commits that may still be amended: their bytes are kept, to subtract them at once."""
-        for kept in store.commits():
+        """Commits that each kept commit takes out, as far as they were read."""
+        self.successors = Successors(self._store)
+        for kept in self._store.commits():
             self._note(kept)
 
     def __iter__(self) -> Iterator[KeptCommit]:
@@ -76,36 +138,38 @@ class Outbox:
     def add(
         self,
         diff: Mapping[CellKey, Evidence],
-        meta: CommitMeta | None,
+        facts: CommitFacts = NO_FACTS,
         *,
-        seen: str | None,
+        seen: Cursor | None,
         profile: Profile = Profile.FAST,
+        notes: Mapping[str, str] = NO_NOTES,
     ) -> Commit:
         """Keep evidence as the next commit; durable on return.
 
+        Args:
+            diff: packed evidence by cell.
+            facts: what the commit states about itself.
+            seen: cursor of the server's state that is here.
+            profile: effort spent on the size of its bytes.
+            notes: texts by key to remember in the same transaction.
+
         Raises:
-            BadInputError: kind `not_own`: it retracts another robot's commit; only an operator may.
+            BadInputError: kind `not_own`: it retracts another robot's commit; only an operator may. Kind `bad_meta`:
+                the facts are too many or too long.
         """
-        foreign = [target for target in (meta.retracted_ids if meta else ()) if target.author.robot != self._robot]
+        foreign = [target for target in facts.retracts if target.author.robot != self._robot]
         if foreign:
             raise BadInputError("not_own", f"{foreign[0]} is not {self._robot}'s own; an operator can retract it")
         n = self._next_n()
-        known = {
-            "id": str(CommitId(self.author, n)),
-            "geometry": self._geometry.digest().hex(),
-            "parent": self._store.get("tip_sha"),
-            "seen": seen,
-        }
-        meta = CommitMeta.model_validate({**dict(meta or ()), **known})
+        meta = facts.meta(CommitId(self.author, n), self._geometry, parent=self._state.tip_sha, seen=seen)
         commit = make_commit(meta, diff, self._geometry, profile=profile)
-        self.make_room(len(commit.data))
+        self._make_room(len(commit.data))
         with self._store.transaction():
             self._store.add_commit(commit)
             self._set_next(n + 1, commit)
-            for key, text in self.beside.items():
+            for key, text in notes.items():
                 self._store.put(key, text)
             self._put_successor(commit)
-        self.beside = {}
         self._note(_kept(commit))
         self._read_successors(commit.meta.retracted_ids)
         self._retracts[commit.id] = commit.meta.retracted_ids
@@ -120,7 +184,7 @@ class Outbox:
         self._read_successors(commit.meta.retracted_ids)
 
     def knows(self, commit: CommitId) -> bool:
-        """Whether it is here, or was."""
+        """True if a commit is here, or was."""
         return commit in self._commits
 
     def seal(self, commit: CommitId) -> str | None:
@@ -128,16 +192,15 @@ class Outbox:
         return self._commits[commit].seal
 
     def signatures(self, commit: Commit) -> str | None:
-        """Of this robot on a commit of its own, as `Cairn-Signature` has them; None for a server's retract."""
+        """The robot's signatures on its own commit, as `Cairn-Signature` has them; None for a server's retract."""
         return self._keys.signatures(commit)
 
     def push_set(self, header: ReplyHeader | None) -> list[CommitId]:
         """Commits that the server may lack, oldest first.
 
-        All minus what the newest header covers, unless it wants it again, minus what is on the server's desk or was
-        acknowledged since. A
-        commit that was never acknowledged is pushed even if its id is covered: after a roll-back of this robot's disk
-        another commit may have that id (rule 13).
+        All except those that the newest header covers (unless it wants them again), those that the server holds but has
+        not folded yet, and those acknowledged since. A commit that was never acknowledged is pushed even if its id is
+        covered: after a roll-back of this robot's disk another commit may have that id (rule 13).
         """
         covered = header.coverage if header else EMPTY
         pending = header.pending_vector if header else EMPTY
@@ -159,7 +222,7 @@ class Outbox:
         return Commit(meta, cells, self._commits[commit].sha, data)
 
     def acknowledge(self, commit: CommitId) -> None:
-        """The server has these bytes for good. It counts for nothing else: only coverage says what a cell holds."""
+        """Note that the server has these bytes for good; only coverage states which commits a cell holds."""
         with self._store.transaction():
             self._store.set_acked(commit)
         self._commits[commit] = replace(self._commits[commit], acked=True)
@@ -172,9 +235,11 @@ class Outbox:
             raise BadInputError("no_bytes", f"the bytes of {commit} are not kept any more")
         if commit.author == self.author:
             self.new_incarnation(f"the id {commit} is taken by other bytes")
+        # The renamed commit, and the commits that name it under its old id.
         n = self._next_n()
-        renamed = renamed_commit(data, commit=CommitId(self.author, n), parent=self._store.get("tip_sha"))
+        renamed = renamed_commit(data, commit=CommitId(self.author, n), parent=self._state.tip_sha)
         amends = list(self._naming(commit, renamed.id))
+        # All of them change on the disk at once, then in memory.
         with self._store.transaction():
             self._store.remove_commit(commit)
             self._store.add_commit(renamed)
@@ -190,7 +255,7 @@ class Outbox:
         return renamed
 
     def _naming(self, old: CommitId, new: CommitId) -> Iterator[Commit]:
-        """Commits that retract one which gets a new id, saying the new one; on the server the old is another's.
+        """Commits that retract a renamed one, with its new id in them; on the server the old id is another commit's.
 
         Commits are pushed oldest first, so none of these can have been pushed before the one they name.
         """
@@ -202,16 +267,16 @@ class Outbox:
                 yield renamed_commit(data, commit=kept.id, parent=meta.parent, retracts=targets)
 
     def new_incarnation(self, reason: str) -> None:
-        """Number commits anew under a fresh incarnation: this robot's disk was rolled back or lost."""
+        """Number commits from 0 under a fresh incarnation: this robot's disk was rolled back or lost."""
         log.warning("robot %s takes a new incarnation: %s", self._robot, reason)
         with self._store.transaction():
             fresh = self._keys.draw()
-            self._store.put("incarnation", fresh)
+            self._state.incarnation = fresh
             self._set_next(0, None)
         self._incarnation = fresh
 
     def check_tip(self, header: ReplyHeader, *, asked_by: Author) -> None:
-        """Note a newer header, and whether the server knows of commits that this disk forgot (rule 13)."""
+        """Note a newer header; a new incarnation if the server knows commits that this disk forgot (rule 13)."""
         self._acked_since_header.clear()
         if header.tip is None or asked_by != self.author:
             return
@@ -220,9 +285,22 @@ class Outbox:
         if n >= self._next_n() or (known is not None and known.sha.hex() != sha):
             self.new_incarnation(f"the server has commit {n} of it with bytes that are not here")
 
+    def original_of(self, commit: CommitId, originals: Collection[CommitId]) -> CommitId | None:
+        """Original of a commit: the one among `originals` that has the same successor; None if there is none.
+
+        Raises:
+            ConflictError: kind `taken_back`: it was taken back, and not by an amend.
+        """
+        latest = self.successors.latest(commit)
+        found = next((original for original in originals if self.successors.latest(original) == latest), None)
+        found = commit if commit in originals else found
+        if found not in (None, latest) and self.knows(found):  # unknown: it got a new id (SYNC.md rule 13)
+            raise ConflictError("taken_back", f"{found} was taken back by {latest}: there is nothing to amend")
+        return found
+
     def named(self) -> set[CommitId]:
-        """What the kept commits take out, for whoever holds an amend keeps what it names (rule 11); or may yet."""
-        amendable = {self.successors.latest(commit) for commit in self.amendable()}
+        """Commits that a kept commit takes out, or may yet: an amend keeps the bytes of what it names (rule 11)."""
+        amendable = {self.successors.latest(commit) for commit in self._amendable()}
         return amendable | {target for kept in self for target in self._retracts_of(kept.id)}
 
     def forget(self, gone: Iterable[CommitId]) -> None:
@@ -236,7 +314,7 @@ class Outbox:
             self._retracts.pop(commit, None)
 
     def reread(self) -> None:
-        """Take over what the store was changed to: whether commits are acknowledged."""
+        """Read again from the store which commits are acknowledged."""
         self._acked_since_header.clear()
         for kept in self._store.commits():
             self._note(kept)
@@ -251,14 +329,14 @@ class Outbox:
         return kept if kept is not None and kept.has_data else None
 
     def own_evidence(self, key: CellKey, news: VersionVector, author: Author) -> list[Evidence] | None:
-        """What an author's commits among `news` say about a cell; None if the bytes of one are not kept any more."""
+        """Evidence of a cell from an author's commits among `news`; None if the bytes of one are not kept any more."""
         mine = [commit for commit in self._touching.get(key, ()) if commit.author == author and commit in news]
         if not all(self._commits[commit].has_data for commit in mine):
             return None
         return [self.evidence(commit, key) for commit in mine]
 
     def evidence(self, commit: CommitId, key: CellKey) -> Evidence:
-        """What one commit says about a cell that it touches.
+        """Evidence of one commit for a cell that it touches.
 
         Raises:
             DamagedDataError: its bytes at rest are not sound any more.
@@ -287,11 +365,11 @@ class Outbox:
         return self._retracts[commit]
 
     def _next_n(self) -> int:
-        return int(self._store.get("next_n") or 0)
+        return self._state.next_n or 0
 
     def _set_next(self, n: int, tip: Commit | None) -> None:
-        self._store.put("next_n", str(n))
-        self._store.put("tip_sha", tip.sha.hex() if tip else None)
+        self._state.next_n = n
+        self._state.tip_sha = tip.sha.hex() if tip else None
 
 
 def _kept(commit: Commit) -> KeptCommit:

@@ -1,248 +1,338 @@
-"""A robot's map without the network: what it made itself, what it has from the server, and the sum that it sees.
+"""A robot's map without the network: its own commits, the server's cells as they are here, and the view of both.
 
     outbox   own commits, until no restore can lose them              (SYNC.md rule 12)
     base     per cell the server's state at a cursor, and its coverage: the ids in it
     view     base + the commits in the outbox that the cell's coverage lacks, without what they take out  (rule 7)
 
-Everything durable changes in one local transaction; everything is called under one lock.
+Every change is one local transaction. Any thread may call any method of `Replica`: it takes the lock. Several changes
+that must not be parted are made inside `with replica.changing()`. Locks are taken in this order: replica, store.
 """
 
 import logging
 import threading
-from collections.abc import Callable, Iterable, Mapping
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
+from typing import Protocol
 
-from cairn_client.replica.map_model import stored_model
-from cairn_client.replica.outbox import Outbox
-from cairn_client.replica.refused_commits import Resting
-from cairn_client.replica.replica_identity import identify
+from cairn_client.replica.outbox import NO_FACTS, NO_NOTES, CommitFacts, Outbox
+from cairn_client.replica.replica_state import ReplicaState
 from cairn_client.replica.replica_store import BaseCell, KeptCommit, ReplicaStore
-from cairn_client.replica.view_of_cell import changes, is_to_be_taken, shown_evidence, taken_back
-from cairn_map.codec.cell_code import Profile, decode_cell, encode_cell
-from cairn_map.commits.commit import Commit, CommitMeta
-from cairn_map.commits.cursor import Cursor, cursor_from_text
+from cairn_client.replica.server_cells import ServerCells, is_to_be_taken
+from cairn_map.codec.cell_code import Profile
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import OPERATOR, Author, CommitId, RobotName, commit_id_from_text
-from cairn_map.commits.version_vector import EMPTY, VersionVector
-from cairn_map.errors import CairnError
-from cairn_map.evidence.evidence import Evidence, empty_evidence
+from cairn_map.commits.version_vector import EMPTY
+from cairn_map.errors import BadInputError, CairnError
+from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
-from cairn_map.evidence.fingerprint import ZERO, fingerprint
+from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import Cell, CellKey, Geometry, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
-from cairn_map.wire.messages import ReplyHeader, message_from_json
+from cairn_map.wire.messages import ReplyHeader
 
 log = logging.getLogger(__name__)
 
-UNPROVEN = BaseCell(None, EMPTY, ZERO)
-"""An empty base that is to be replaced by the server's whole cell."""
+REST_S = 3600.0
+"""Time after which a refused commit is tried again."""
+KINDS_OF_ALL = ("http", "unknown_protocol")
+"""Kinds of refusals that say nothing about the commit: a portal's or proxy's, and those of every request."""
+
+
+class StorageBudget(Protocol):
+    """Bounds on what a replica keeps; asked while its lock is held."""
+
+    def admit_cell(self, key: CellKey, size_bytes: int) -> None:
+        """Raise if there is no room to hold a cell of so many bytes."""
+
+    def make_room(self, size_bytes: int) -> None:
+        """Drop what may be dropped for a commit of so many bytes; raise if that is not enough."""
+
+
+class RefusedPushes:
+    """RefusedPushes by the server of one robot's commits and cells, which are not sent again at once; for one thread.
+
+    A refused commit stays in the outbox. Some refusals pass (an admin gives more room, a newer server takes more), and
+    no server says so: after an hour, at the next start, and on another server a commit is tried again.
+    """
+
+    def __init__(self, *, steady_s: Callable[[], float] = time.monotonic) -> None:
+        self._steady_s = steady_s
+        self._commits: dict[CommitId, tuple[CairnError, float]] = {}
+        self.cells: set[tuple[CellKey, str]] = set()
+        """Cells, with their fingerprints, by which the server would not be healed."""
+
+    def note(self, commit: CommitId, refusal: CairnError) -> None:
+        """Note that the server refused a commit; it rests if that was for its bytes."""
+        if isinstance(refusal, BadInputError) and refusal.kind not in KINDS_OF_ALL:
+            self._commits[commit] = refusal, self._steady_s() + REST_S
+
+    def of(self, commit: CommitId) -> CairnError | None:
+        """The refusal for which a commit rests; None if it does not rest."""
+        refusal, until_s = self._commits.get(commit, (None, 0.0))
+        if refusal is not None and self._steady_s() >= until_s:
+            del self._commits[commit]
+            return None
+        return refusal
+
+    def forget_commits(self) -> None:
+        """Try all commits again: another server may take them."""
+        self._commits.clear()
 
 
 class Replica:
     """One robot's durable state and its view of the map."""
 
-    def __init__(self, store: ReplicaStore, *, robot: RobotName, map_name: str, geometry: Geometry) -> None:
+    def __init__(
+        self,
+        store: ReplicaStore,
+        *,
+        robot: RobotName,
+        map_name: str,
+        geometry: Geometry,
+        amendable: Callable[[], Iterable[CommitId]] = tuple,
+    ) -> None:
         """Open or make the state.
 
+        Args:
+            store: file of the robot.
+            robot: its name.
+            map_name: name of the map on its server.
+            geometry: grid of the map.
+            amendable: returns commits that may still be amended: their bytes are kept, to subtract them at once.
+
         Raises:
-            BadInputError: kind `other_replica`: it is of another robot, map or grid.
+            BadInputError: kind `other_replica`: the file is of another robot, map or grid.
         """
-        self.lock = threading.RLock()
+        self._lock = threading.RLock()
         self.store = store
+        self.state = ReplicaState(store)
         self.geometry = geometry
-        self.view = EvidenceMap(geometry)
+        self.state.identify(robot=robot, map_name=map_name, geometry=geometry)
+        self._budget: StorageBudget | None = None
+        self.outbox = Outbox(self.state, robot, geometry, make_room=self._make_room, amendable=amendable)
+        self._base = ServerCells(self.state, self.outbox, geometry, admit=self._admit)
+        self.header: ReplyHeader | None = self.state.header
+        """Newest state that the server reported."""
+        self.refusals = RefusedPushes()
         self._snapshot: MapSnapshot | None = None
-        identify(store, {"robot": robot, "map": map_name, "geometry": geometry.model_dump_json()})
-        self.outbox = Outbox(store, robot, geometry)
-        header = store.get("header")
-        self.header: ReplyHeader | None = message_from_json(ReplyHeader, header) if header else None
-        cursor = store.get("default_cursor")
-        self.default_cursor: Cursor | None = cursor_from_text(cursor) if cursor else None
-        """Cursor of every cell that is not held."""
-        self.cells: dict[CellKey, BaseCell] = store.cells()
-        self.refused_cells: set[tuple[CellKey, str]] = set()
-        """Cells, with their fingerprints, by which the server would not be healed: not sent again."""
-        self.resting = Resting()
-        """Commits that the server refused for their bytes: not sent again for a while."""
-        self.admit: Callable[[CellKey, int], None] = lambda key, size_bytes: None
-        """Asked before a cell of so many bytes is held; raises if there is no room (`room`)."""
-        self._load()
+
+    @contextmanager
+    def changing(self) -> Iterator[ServerCells]:
+        """The server's cells as they are held here, to read and change while no other thread does."""
+        with self._lock:
+            yield self._base
+
+    def obey(self, budget: StorageBudget) -> None:
+        """Keep to these bounds from here on."""
+        with self._lock:
+            self._budget = budget
 
     @property
     def author(self) -> Author:
         """The robot in its present incarnation."""
-        return self.outbox.author
+        with self._lock:
+            return self.outbox.author
+
+    @property
+    def view(self) -> EvidenceMap:
+        """Evidence that the robot shows; it changes with each commit and each frame."""
+        return self._base.view
+
+    @property
+    def default_cursor(self) -> Cursor | None:
+        """Cursor of every cell that is not held."""
+        with self._lock:
+            return self._base.default_cursor
+
+    @property
+    def cells(self) -> dict[CellKey, BaseCell]:
+        """Cells of the server that are held now, without their bytes."""
+        with self._lock:
+            return dict(self._base.cells)
 
     @property
     def commits(self) -> list[CommitId]:
         """Commits whose bytes are kept, oldest first."""
-        with self.lock:
+        with self._lock:
             return [kept.id for kept in self.outbox]
 
-    def token(self) -> str | None:
-        """The token that the server gave to this robot."""
-        with self.lock:
-            return self.store.get("token")
+    def cell(self, key: CellKey) -> BaseCell | None:
+        """A cell of the server, without its bytes; None if it is not held."""
+        with self._lock:
+            return self._base.cells.get(key)
 
-    def set_token(self, token: str | None) -> None:
-        """Remember a token, or forget it."""
-        with self.lock, self.store.transaction():
-            self.store.put("token", token)
+    def fingerprints(self) -> dict[CellKey, Fingerprint]:
+        """Fingerprints of the cells that are held now."""
+        with self._lock:
+            return {key: cell.fingerprint for key, cell in self._base.cells.items()}
+
+    def base_evidence(self, key: CellKey) -> Evidence:
+        """The server's evidence of a cell; empty if its bytes are damaged, which its fingerprint shows."""
+        with self._lock:
+            return self._base.evidence(key)
 
     def commit(
-        self, diff: Mapping[CellKey, Evidence], meta: CommitMeta | None = None, *, profile: Profile = Profile.FAST
+        self,
+        diff: Mapping[CellKey, Evidence],
+        facts: CommitFacts = NO_FACTS,
+        *,
+        profile: Profile = Profile.FAST,
+        notes: Mapping[str, str] = NO_NOTES,
     ) -> Commit:
         """Keep evidence as the next commit, durably, and see it in the view.
 
         Args:
             diff: packed evidence by cell.
-            meta: what to say about it; id, geometry, parent and cursor are filled in here.
-            profile: how its bytes are spent.
+            facts: what the commit states about itself.
+            profile: effort spent on the size of its bytes.
+            notes: texts by key to remember in the same transaction.
+
+        Raises:
+            BadInputError: the commit would be too large, its note too long, or it retracts what is not this robot's.
+            UnreachableError: there is no room for it.
         """
-        with self.lock:
-            seen = str(self.default_cursor) if self.default_cursor else None
-            commit = self.outbox.add(diff, meta, seen=seen, profile=profile)
-            self.view.merge({key: diff[key] for key in commit.cells})
-            for gone in taken_back(self.outbox, commit, self.geometry, coverage_of=self._coverage):
-                self.view.unmerge(gone)
+        with self._lock:
+            commit = self.outbox.add(diff, facts, seen=self.default_cursor, profile=profile, notes=notes)
+            self._base.show_commit(commit, {key: diff[key] for key in commit.cells})
             return commit
+
+    def amend(
+        self, target: CommitId, diff: Mapping[CellKey, Evidence], facts: CommitFacts, *, profile: Profile
+    ) -> Commit:
+        """Keep evidence as a commit that takes the place of another one, or of what stands for that; as `commit`."""
+        with self._lock:  # the sync may give the target another id, but not meanwhile
+            latest = self.outbox.successors.latest(target)
+            return self.commit(diff, replace(facts, retracts=(latest,)), profile=profile)
+
+    def original_of(self, commit: CommitId, originals: Collection[CommitId]) -> CommitId | None:
+        """Original of a commit: the one among `originals` that has the same successor; None if there is none.
+
+        Raises:
+            ConflictError: kind `taken_back`: it was taken back, and not by an amend.
+        """
+        with self._lock:
+            return self.outbox.original_of(commit, originals)
+
+    def unreplaced_commits(self) -> list[CommitId]:
+        """Commits with bytes and cells that no other commit took out, oldest first."""
+        with self._lock:
+            successor = self.outbox.successors.of
+            return [kept.id for kept in self.outbox if kept.cells and successor(kept.id) is None]
+
+    def own_cells(self) -> set[CellKey]:
+        """Cells that a kept commit touches."""
+        with self._lock:
+            return self.outbox.cells
 
     def push_set(self) -> list[CommitId]:
         """Commits that the server may lack, oldest first."""
-        with self.lock:
+        with self._lock:
             return self.outbox.push_set(self.header)
+
+    def backlog(self) -> tuple[int, int]:
+        """Number of the commits that the server may lack, and the size of their bytes."""
+        with self._lock:
+            waiting = self.push_set()
+            return len(waiting), self.store.data_bytes(waiting)
+
+    def kept_bytes(self) -> int:
+        """Size of the commits whose bytes are kept."""
+        with self._lock:
+            return self.store.data_bytes(self.commits)
 
     def commit_data(self, commit: CommitId) -> bytes | None:
         """Bytes of a commit of the outbox; None if they are not there any more."""
-        with self.lock:
+        with self._lock:
             return self.store.commit_data(commit)
 
     def kept_commit(self, commit: CommitId) -> Commit | None:
         """A commit of the outbox, whole; None if it is not there any more."""
-        with self.lock:
+        with self._lock:
             return self.outbox.whole(commit)
 
     def acknowledge(self, commit: CommitId) -> None:
-        """The server has this commit for good."""
-        with self.lock:
+        """Note that the server has this commit for good."""
+        with self._lock:
             self.outbox.acknowledge(commit)
-            if is_to_be_taken(self.outbox, commit, coverage_of=self._coverage):
-                self._refresh_views([commit])
+            if is_to_be_taken(self.outbox, commit, coverage_of=self._base.coverage):
+                self._base.refresh_commits([commit])
 
     def lacking_retracts(self) -> list[CommitId]:
         """The operator's retracts that a restore could still lose, and that are not kept here yet."""
-        with self.lock:
+        with self._lock:
             named = [commit_id_from_text(text) for text in (self.header.retracts if self.header else [])]
             return [commit for commit in named if commit.author.robot == OPERATOR and not self.outbox.knows(commit)]
 
     def keep_sealed(self, commit: Commit, seal: str) -> None:
         """Keep a server's own retract, to push it back if the server loses it."""
-        with self.lock:
+        with self._lock:
             if not self.outbox.knows(commit.id):
                 self.outbox.keep_sealed(commit, seal)
-                self._refresh_views(commit.meta.retracted_ids)
+                self._base.refresh_commits(commit.meta.retracted_ids)
 
     def seal(self, commit: CommitId) -> str | None:
         """The seal that a kept commit bears."""
-        with self.lock:
+        with self._lock:
             return self.outbox.seal(commit)
 
-    def forget_commit(self, commit: CommitId) -> None:
-        """Drop the bytes of a commit that is of no use any more."""
-        with self.lock:
-            self.outbox.forget([commit])
+    def signatures(self, commit: Commit) -> str | None:
+        """The robot's signatures on its own commit, as `Cairn-Signature` has them; None for a server's retract."""
+        with self._lock:
+            return self.outbox.signatures(commit)
 
     def rename(self, commit: CommitId) -> CommitId:
         """Give a commit whose id is taken on the server a new one; its coverage there was another commit's."""
-        with self.lock:
+        with self._lock:
             renamed = self.outbox.rename(commit)
             for key in renamed.cells:
-                self.refresh_view(key)
+                self._base.refresh(key)
             return renamed.id
 
     def take_header(self, header: ReplyHeader, *, asked_by: Author) -> None:
-        """Note the newest state that the server told of.
+        """Note the newest state that the server reported.
 
         Args:
             header: of a reply or an index.
-            asked_by: the author whose tip it tells.
+            asked_by: the author whose tip it states.
         """
-        with self.lock:
-            with self.store.transaction():
-                self.store.put("header", header.model_dump_json())
+        with self._lock:
+            self.state.header = header
             self.header = header
             self.outbox.check_tip(header, asked_by=asked_by)
 
-    def base_evidence(self, key: CellKey) -> Evidence:
-        """The server's evidence of a cell as it is held here; empty if it is damaged: its fingerprint tells then."""
-        body = self.store.body(key)
-        try:
-            return decode_cell(body).evidence if body else empty_evidence(self.geometry)
-        except CairnError as exc:
-            log.error("cell %s at rest is damaged: %s", cell_of_key(key), exc.message)
-            return empty_evidence(self.geometry)
-
-    def hold(self, key: CellKey, cell: BaseCell, evidence: Evidence, *, body: bytes | None = None) -> None:
-        """Make a cell's base this evidence, with its cursor and coverage, in one transaction, and show it."""
-        data = body or encode_cell(key, evidence, self.geometry).data
-        if len(evidence):
-            self.admit(key, len(data))
-        with self.store.transaction():
-            self.store.put_cell(key, cell, body=data)
-        self.cells[key] = cell
-        self.refresh_view(key, base=evidence)
-
-    def hold_nothing(self, key: CellKey, cell: BaseCell) -> None:
-        """Make a cell's base empty."""
-        self.hold(key, cell, empty_evidence(self.geometry))
-
-    def move(self, keys: Iterable[CellKey], *, to: Cursor | None, coverage: VersionVector | None) -> None:
-        """Give held cells another cursor, and coverage unless None; their evidence stays."""
-        moved = list(keys)
-        shown = {key: changes(self.outbox, key, self._coverage(key)) for key in moved}
-        with self.store.transaction():
-            self.store.move_cells(moved, to=to, coverage=coverage)
-        for key in moved:
-            cell = self.cells[key]
-            self.cells[key] = replace(cell, cursor=to, coverage=cell.coverage if coverage is None else coverage)
-            if changes(self.outbox, key, self._coverage(key)) != shown[key]:
-                self.refresh_view(key)
-
-    def set_default_cursor(self, cursor: Cursor) -> None:
-        """The cursor of every cell that is not held."""
-        with self.store.transaction():
-            self.store.put("default_cursor", str(cursor))
-        self.default_cursor = cursor
-
     def forget_server(self) -> None:
-        """The server's log is another one now: hold nothing of it, and offer it every commit (HTTP 410)."""
-        with self.lock:
+        """Forget a server whose log was replaced (HTTP 410): hold nothing of it, and offer the new one every commit."""
+        with self._lock:
             with self.store.transaction():
                 self.store.drop_cells()
                 self.store.clear_acked()
-                self.store.put("header", None)
-                self.store.put("default_cursor", None)
-            self.header = self.default_cursor = None
-            shown = {*self.cells, *self.outbox.cells}
-            self.cells.clear()
+                self.state.header = None
+                self.state.default_cursor = None
+            self.header = None
+            shown = {*self._base.cells, *self.outbox.cells}
+            self._base.forget()
             self.outbox.reread()
-            self.resting.end()
+            self.refusals.forget_commits()
             # Another server does not know the first one's seal.
             self.outbox.forget([kept.id for kept in self.outbox if kept.seal is not None])
             for key in shown:
-                self.refresh_view(key)
+                self._base.refresh(key)
 
     def forget_stable_commits(self, *, wanted: Callable[[Cell], bool] | None = None) -> int:
-        """Drop the bytes of commits that are stable and covered in every cell they touch (rule 12); how many.
+        """Drop the bytes of commits that are stable and covered in every cell they touch (rule 12); their number.
 
-        Not of what another kept commit takes out: the server may have forgotten its evidence, and asks for it again.
-        Only of acknowledged ones: after a roll-back of this robot's disk, the stable and covered commit may be another
-        one under the same id.
+        A commit that another kept commit takes out keeps its bytes: the server may have forgotten its evidence, and
+        asks for it again. So does one that was never acknowledged: after a roll-back of this robot's disk, the stable
+        and covered commit may be another one under the same id.
 
         Args:
             wanted: the cells that this robot keeps at all; default every one.
         """
-        with self.lock:
+        with self._lock:
             stable = self.header.stable_vector if self.header else EMPTY
             gone = [
                 kept.id for kept in self.outbox if kept.acked and kept.id in stable and self._is_covered(kept, wanted)
@@ -252,15 +342,15 @@ class Replica:
             self.outbox.forget(gone)
             return len(gone)
 
-    def refresh_view(self, key: CellKey, *, base: Evidence | None = None) -> None:
-        """Make the view of a cell its base, changed by the commits that are kept (rule 7)."""
-        base = self.base_evidence(key) if base is None else base
-        self.view.replace(key, shown_evidence(self.outbox, key, base, self.geometry, coverage=self._coverage(key)))
+    def drop_cells(self, keys: Iterable[CellKey]) -> None:
+        """Hold nothing of some held cells; the view shows of them what the robot made itself."""
+        with self._lock:
+            self._base.drop(keys)
 
     def snapshot(self, model: SensorModel | None = None) -> MapSnapshot:
         """The view as it is now, unmoved by what comes later, under the map's own sensor model or another one."""
-        with self.lock:
-            model = stored_model(self.store) if model is None else model
+        with self._lock:
+            model = self.state.map_model() if model is None else model
             if self._snapshot is not None and self._snapshot.model == model:
                 self._snapshot = self._snapshot.refreshed(self.view)
             else:
@@ -269,30 +359,18 @@ class Replica:
 
     def close(self) -> None:
         """Close the file."""
-        with self.lock:
+        with self._lock:
             self.store.close()
 
-    def _refresh_views(self, commits: Iterable[CommitId]) -> None:
-        """Show the cells of some commits anew."""
-        for key in {key for commit in commits if (kept := self.outbox.kept(commit)) for key in kept.cells}:
-            self.refresh_view(key)
+    def _make_room(self, size_bytes: int) -> None:
+        if self._budget is not None:
+            self._budget.make_room(size_bytes)
 
-    def _coverage(self, key: CellKey) -> VersionVector:
-        return self.cells[key].coverage if key in self.cells else EMPTY
+    def _admit(self, key: CellKey, size_bytes: int) -> None:
+        if self._budget is not None:
+            self._budget.admit_cell(key, size_bytes)
 
     def _is_covered(self, kept: KeptCommit, wanted: Callable[[Cell], bool] | None) -> bool:
         needed = [key for key in kept.cells if wanted is None or wanted(cell_of_key(key))]
-        cells = [self.cells.get(key) for key in needed]
+        cells = [self._base.cells.get(key) for key in needed]
         return all(cell is not None and cell.cursor is not None and kept.id in cell.coverage for cell in cells)
-
-    def _load(self) -> None:
-        """Show what is at rest; a cell whose bytes lost their fingerprint is to be fetched anew (rule 15)."""
-        for key, cell in list(self.cells.items()):
-            base = self.base_evidence(key)
-            if fingerprint(base, key) == cell.fingerprint:
-                self.refresh_view(key, base=base)
-            else:
-                log.error("cell %s at rest is not what it was; asking for it anew", cell_of_key(key))
-                self.hold_nothing(key, UNPROVEN)
-        for key in self.outbox.cells - self.cells.keys():
-            self.refresh_view(key)

@@ -1,10 +1,12 @@
-"""What a robot must not forget, in one SQLite file: its name and number, its commits, the server's cells it holds.
+"""SQLite file of a robot's durable state: its name and number, its commits, the server's cells that it holds.
 
 Every change is one transaction with `synchronous=FULL`, so that power may be cut between any two steps. One robot
-at a time has the file open; others may look at it (`sqlite_glance`). All methods are called under the replica's lock.
+at a time has the file open; others may look at it (`sqlite_glance`). Any thread may call any method: the store locks
+itself, for as long as a transaction lasts. It calls nothing else, so a thread that holds another lock may wait for it.
 """
 
 import json
+import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,19 +16,18 @@ from typing import Any, BinaryIO
 import apsw
 
 from cairn_client.replica.folder_lock import lock_folder, make_folder
-from cairn_client.replica.sqlite_failures import failure_of
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import VersionVector, version_vector_from_json
-from cairn_map.errors import BadInputError
+from cairn_map.errors import BadInputError, CairnError, ConflictError, DamagedDataError, UnreachableError
 from cairn_map.evidence.fingerprint import Fingerprint, fingerprint_from_bytes
 from cairn_map.evidence.grid import CellKey
 
 FILE_NAME = "robot.sqlite"
 VERSION = 2
 BUSY_MS = 1000
-"""How long a folder may still be held by a robot that is just closing."""
+"""Milliseconds for which a folder may still be held by a robot that is just closing."""
 PRAGMAS = (
     "page_size = 16384",
     "journal_mode = WAL",
@@ -81,15 +82,15 @@ class KeptCommit:
     cells: tuple[CellKey, ...]
     acked: bool = False
     has_data: bool = True
-    """False where only the SHA is remembered."""
+    """False if only the SHA is remembered."""
     seal: str | None = None
-    """Of a server's own retract, which is kept to be pushed back if the server loses it."""
+    """Seal of a server's own retract, which is kept to be pushed back if the server loses it."""
 
 
 class ReplicaStore:
     """The file behind a replica."""
 
-    _lock: BinaryIO | None = None
+    _folder_lock: BinaryIO | None = None
 
     def __init__(self, folder: Path) -> None:
         """Open or make the file.
@@ -100,11 +101,12 @@ class ReplicaStore:
             BadInputError: it is of another version, or the folder cannot be made.
         """
         self._folder = folder
+        self._lock = threading.RLock()
         make_folder(folder, secret_file=FILE_NAME)
         with self._translated():
             self._connection = apsw.Connection(str(folder / FILE_NAME))
         try:
-            self._lock = lock_folder(folder, wait_s=BUSY_MS / 1000)
+            self._folder_lock = lock_folder(folder, wait_s=BUSY_MS / 1000)
             self._prepare()
         except BaseException:
             self.close()
@@ -129,7 +131,7 @@ class ReplicaStore:
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """All or nothing of what is written inside.
+        """Context in which either all writes of this thread are kept or none; other threads wait.
 
         Raises:
             UnreachableError: kind `store_failed`: the disk is full or broken; nothing was written.
@@ -145,12 +147,12 @@ class ReplicaStore:
                 raise
 
     def get(self, key: str) -> str | None:
-        """A remembered text."""
+        """The text under a key; None if there is none."""
         value: str | None = self._first("SELECT value FROM meta WHERE key = ?", (key,))
         return value
 
     def put(self, key: str, value: str | None) -> None:
-        """Remember a text, or forget it."""
+        """Keep a text under a key; None removes it. A transaction of its own, or part of the open one."""
         if value is None:
             self._run("DELETE FROM meta WHERE key = ?", (key,))
         else:
@@ -169,7 +171,7 @@ class ReplicaStore:
         ]
 
     def data_bytes(self, commits: Iterable[CommitId]) -> int:
-        """How many bytes of these commits are kept."""
+        """Size of the bytes of these commits that are kept."""
         query = f"SELECT coalesce(sum(length(data)), 0) FROM commits WHERE {ONE_COMMIT}"  # noqa: S608
         return sum(int(self._first(query, _values(commit)) or 0) for commit in commits)
 
@@ -198,7 +200,7 @@ class ReplicaStore:
         self._run(f"UPDATE commits SET acked = 1 WHERE {ONE_COMMIT}", _values(commit))  # noqa: S608
 
     def clear_acked(self) -> None:
-        """Forget what the server said it has: it is another server now."""
+        """Take all acknowledgements back: the server was replaced."""
         self._run("UPDATE commits SET acked = 0")
 
     def forget_data(self, commits: Iterable[CommitId]) -> None:
@@ -266,9 +268,10 @@ class ReplicaStore:
 
     def close(self) -> None:
         """Close the file; may be called twice."""
-        self._connection.close()
-        if self._lock is not None:
-            self._lock.close()
+        with self._lock:
+            self._connection.close()
+            if self._folder_lock is not None:
+                self._folder_lock.close()
 
     def _coverage(self, coverage: VersionVector) -> int:
         """Name under which a coverage is kept: one row for all cells that share it."""
@@ -287,11 +290,21 @@ class ReplicaStore:
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
-        """SQLite's errors as ours."""
-        try:
-            yield
-        except apsw.Error as exc:
-            raise failure_of(exc, self._folder / FILE_NAME) from exc
+        """The lock, and SQLite's errors as a `CairnError`."""
+        with self._lock:
+            try:
+                yield
+            except apsw.Error as exc:
+                raise failure_of(exc, self._folder / FILE_NAME) from exc
+
+
+def failure_of(exc: apsw.Error, file: Path) -> CairnError:
+    """The `CairnError` of an error of SQLite about a robot's file."""
+    if isinstance(exc, apsw.BusyError):
+        return ConflictError("folder_in_use", f"another robot has {file} open; stop it, or choose another folder")
+    if isinstance(exc, apsw.CorruptError | apsw.NotADBError | apsw.SQLError):
+        return DamagedDataError("damaged_store", f"{file} is damaged: {exc}; move it away to start anew")
+    return UnreachableError("store_failed", f"cannot use {file}: {exc}")
 
 
 def _values(commit: CommitId) -> tuple[str, str, int]:

@@ -1,12 +1,12 @@
-"""Where a robot's own frame lies in the shared map: its scans laid onto the map's occupied voxels.
+"""Alignment of a robot's own frame with the shared map, by its scans laid onto the map's occupied voxels.
 
     starts     the guess, and places around it            a step of the search apart
     GICP       from each start to the nearest minimum     Segal et al. 2009; small_gicp (Koide 2024)
     fit        of the points in known space, how many lie on surfaces
     verdict    accepted, ambiguous or failed, with the reason in words: `alignment_verdict`
 
-A wrong place would be pushed to everybody, so what could as well be another place is refused: another minimum that fits
-nearly as well (rooms that are alike), or a motion that nothing holds (along a bare corridor).
+A wrong place would spread to all robots, so an ambiguous one is refused: another minimum that fits nearly as well
+(rooms that are alike), or a motion that nothing holds (along a bare corridor).
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from cairn_calib.rig.poses import Transform, check_transform, transform_points
 from cairn_calib.rig.rig import Rig
-from cairn_client.robot.alignment_verdict import Alignment, Matches, Minimum, Verdict, apart_m, failed, judged
+from cairn_client.robot.alignment_verdict import Alignment, AlignmentVerdict, Matches, Minimum, apart_m, failed, judged
 from cairn_fusion.mapping.beam_returns import returns_of
 from cairn_fusion.mapping.integrate import Integrator
 from cairn_fusion.recording.scan import Scan
@@ -31,20 +31,20 @@ from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.queries.occupancy_states import State
 
 STEP_M, STEP_RAD = 0.5, math.radians(15)
-"""Of the search: from half of it, and more, GICP comes home where there is anything to hold on to."""
+"""Steps of the search: from half a step, and more, GICP finds the place where there is anything to hold it."""
 STARTS_MAX = 1000
 COARSE_POINTS, FINE_POINTS = 1000, 20_000
-"""Of the scans, in the search and at its end."""
+"""Number of the scans' points that are used in the search and at its end."""
 COARSE_EDGE_M = 0.12
-"""Of the map's surfaces in the search; its voxels, if they are larger."""
+"""Edge of the map's surface cells in the search; its voxels' edge, if that is larger."""
 COARSE_STEPS, FINE_STEPS = 15, 50
-"""Of a GICP, likewise."""
+"""Iterations of a GICP in the search and at its end."""
 FOLLOWED = 32
-"""So many of the best minima of the search are found more closely, and compared."""
+"""Number of the best minima of the search that are refined and compared."""
 COMPARED, RIVALS_MAX = 0.7, 6
-"""Those of at least so much of the best one's worth, and so many, are found on all voxels."""
+"""Least fraction of the best minimum's worth, and largest number, of those that are refined on all voxels."""
 POINTS_MIN = 200
-"""Fewer, one a voxel, say too little."""
+"""Least number of points, one a voxel; fewer say too little."""
 NEIGHBOURS = 20
 """Voxels that make a surface's normal: a patch of 4 x 5."""
 
@@ -79,10 +79,12 @@ def align_points(
     """Lay (N, 3) points of a robot's own frame, metres, onto the map, as `Robot.align`; NaN is left out."""
     guess = check_transform(T_map_robot, name="T_map_robot")
     edge_m = snapshot.geometry.voxel_edge_m
+    # The scans' points, thinned to one a voxel.
     finite = np.asarray(points_robot, np.float64)[np.isfinite(points_robot).all(axis=1)]
     points = some(one_a_voxel(finite, edge_m), FINE_POINTS)
     if len(points) < POINTS_MIN:
         return failed(guess, f"the scans have {len(points)} points, one a voxel; {POINTS_MIN} are needed")
+    # The map's surfaces wherever a start may put the points.
     starts = list(starts_around(guess, reach_m=reach_m, reach_rad=reach_rad))
     corners = np.concatenate([transform_points(start, _corners(points)) for start in starts])
     box_m = np.stack([corners.min(axis=0) - STEP_M, corners.max(axis=0) + STEP_M])
@@ -90,23 +92,25 @@ def align_points(
     if len(surfaces) < POINTS_MIN:
         text = f"the map has {len(surfaces)} occupied voxels where the points may be"
         return failed(guess, f"{text}; {POINTS_MIN} are needed")
-    rough = _searched(snapshot, Surfaces(one_a_voxel(surfaces, max(edge_m, COARSE_EDGE_M))), points, starts)
-    all_surfaces = Surfaces(surfaces)
+    # From each start to a minimum, on coarse surfaces; the best ones again on all voxels.
+    rough = _searched(snapshot, MapSurfaces(one_a_voxel(surfaces, max(edge_m, COARSE_EDGE_M))), points, starts)
+    all_surfaces = MapSurfaces(surfaces)
     cloud = all_surfaces.cloud(points)
     fine = (all_surfaces.registered(cloud, minimum.T, 3 * edge_m, steps=FINE_STEPS) for minimum in rough)
     best, *others = _distinct([minimum_at(snapshot, points, T) for T in fine], points, edge_m)
+    # The verdict, and a last check: a place much farther off than was asked for is none.
     found = judged(best, others, points, all_surfaces.matches(points, best.T, 2 * edge_m), edge_m=edge_m)
     shift_m = float(np.linalg.norm(best.T[:3, 3] - guess[:3, 3]))
     if shift_m > math.sqrt(2) * reach_m + STEP_M:
         reason = f"it ended {shift_m:.2f} m from the guess: if that may be, give a larger reach_m"
-        return dataclasses.replace(found, verdict=Verdict.FAILED, reason=reason)
+        return dataclasses.replace(found, verdict=AlignmentVerdict.FAILED, reason=reason)
     return found
 
 
 def _searched(
-    snapshot: MapSnapshot, surfaces: "Surfaces", points: Floats, starts: Sequence[Transform]
+    snapshot: MapSnapshot, surfaces: "MapSurfaces", points: Floats, starts: Sequence[Transform]
 ) -> list[Minimum]:
-    """The minima that the starts lead to, each once, the best first; without those that are no match for it."""
+    """Minima that the starts lead to, each once, the best first, without those of much less worth."""
     edge_m = snapshot.geometry.voxel_edge_m
     cloud = surfaces.cloud(some(points, COARSE_POINTS))
     ends = (surfaces.registered(cloud, start, 2 * STEP_M, steps=COARSE_STEPS) for start in starts)
@@ -117,7 +121,7 @@ def _searched(
 
 
 def minimum_at(snapshot: MapSnapshot, points: Floats, T: Transform) -> Minimum:
-    """How well points in the robot's frame fit at a place."""
+    """Fit of points in the robot's frame at a place."""
     there = transform_points(T, points)
     hits = snapshot.nearest_occupied(there, radius_m=snapshot.geometry.voxel_edge_m).found
     known = hits | (snapshot.state_at(there) != State.UNKNOWN)
@@ -138,7 +142,7 @@ def _worth(minimum: Minimum) -> float:
     return minimum.worth
 
 
-class Surfaces:
+class MapSurfaces:
     """Points of a map's surfaces, as small_gicp takes them."""
 
     def __init__(self, points_m: Floats) -> None:

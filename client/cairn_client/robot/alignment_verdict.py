@@ -1,4 +1,4 @@
-"""What to think of an alignment: how well it fits, what holds it, and whether another place would do as well."""
+"""AlignmentVerdict on an alignment: its fit, the motions that nothing holds, and the places that would do as well."""
 
 import math
 from collections.abc import Sequence
@@ -21,11 +21,11 @@ APART_VOXELS = 3.0
 HELD_MIN = 0.02
 """Least information of any motion, 1 being all points' normals along it: a room has 0.1, a bare corridor 0.002."""
 SURFACES = 6
-"""Whose errors are independent: a wall lies anywhere in its voxels, all its points with it, and a room has six."""
+"""Surfaces with independent errors: a wall lies anywhere in its voxels with all its points, and a room has six."""
 
 
-class Verdict(StrEnum):
-    """Whether an alignment may be used."""
+class AlignmentVerdict(StrEnum):
+    """Usability of an alignment."""
 
     ACCEPTED = "accepted"
     AMBIGUOUS = "ambiguous"
@@ -34,11 +34,11 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """Where a robot's frame is on the map, how sure that is, and whether to use it."""
+    """Place of a robot's frame on the map, its covariance, and the verdict on it."""
 
-    verdict: Verdict
+    verdict: AlignmentVerdict
     reason: str
-    """In words, for people."""
+    """Reason for the verdict, in words for people."""
     T_map_robot: Transform
     """(4, 4), metres: the best that was found, also where it is not accepted; the guess, if nothing was."""
     covariance: Floats
@@ -51,8 +51,8 @@ class Alignment:
 
     @property
     def is_accepted(self) -> bool:
-        """Whether `T_map_robot` may be used."""
-        return self.verdict is Verdict.ACCEPTED
+        """True if `T_map_robot` may be used."""
+        return self.verdict is AlignmentVerdict.ACCEPTED
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,32 +82,34 @@ class Matches:
 
 
 def failed(guess: Transform, reason: str) -> Alignment:
-    """Nothing was found."""
-    return Alignment(Verdict.FAILED, reason, guess, np.diag(np.full(6, np.inf)))
+    """Alignment of scans for which nothing was found."""
+    return Alignment(AlignmentVerdict.FAILED, reason, guess, np.diag(np.full(6, np.inf)))
 
 
 def judged(best: Minimum, others: Sequence[Minimum], points: Floats, matches: Matches, *, edge_m: float) -> Alignment:
-    """The verdict on the best minimum beside all others, for (N, 3) points in the robot's frame."""
+    """AlignmentVerdict on the best minimum among all others, for (N, 3) points in the robot's frame."""
+    # What the matched surfaces say about the six motions, and the other minima that fit nearly as well.
     information, centre, scale_m = _information(matches)
     values, vectors = np.linalg.eigh(information)
     covariance = _covariance(information, centre, scale_m, matches, edge_m)
-    found = Alignment(Verdict.FAILED, "", best.T, covariance, best.fit, best.known)
+    found = Alignment(AlignmentVerdict.FAILED, "", best.T, covariance, best.fit, best.known)
     rivals = [
         other
         for other in others
         if other.worth >= RIVAL * best.worth and apart_m(best.T, other.T, points) > APART_VOXELS * edge_m
     ]
+    # In this order: too little known, no fit, a motion that nothing holds, a rival; else it is accepted.
     if best.known < KNOWN_MIN:
         return replace(found, reason=f"only {best.known:.0%} of the points lie in known space")
     if best.fit < FIT_MIN:
         return replace(found, reason=f"only {best.fit:.0%} of the points in known space lie on surfaces")
     if values[0] < HELD_MIN:
         reason = f"nothing holds it {_motion_in_words(vectors[:, 0], best.T)}"
-        return replace(found, verdict=Verdict.AMBIGUOUS, reason=reason)
+        return replace(found, verdict=AlignmentVerdict.AMBIGUOUS, reason=reason)
     if rivals:
-        return replace(found, verdict=Verdict.AMBIGUOUS, reason=_rivalry(best, rivals[0]))
+        return replace(found, verdict=AlignmentVerdict.AMBIGUOUS, reason=_rivalry(best, rivals[0]))
     reason = f"{best.fit:.0%} of the points in known space lie on surfaces, and no other place fits as well"
-    return replace(found, verdict=Verdict.ACCEPTED, reason=reason)
+    return replace(found, verdict=AlignmentVerdict.ACCEPTED, reason=reason)
 
 
 def _information(matches: Matches) -> tuple[Floats, Floats, float]:
@@ -148,7 +150,7 @@ def apart_m(one: Transform, other: Transform, points: Floats) -> float:
 
 
 def _motion_in_words(motion: Floats, T_map_robot: Transform) -> str:
-    """The motion that is held least, in the map's frame."""
+    """Words for the motion that is held least, in the map's frame."""
     turn, shift = np.linalg.norm(motion[:3]), np.linalg.norm(motion[3:])
     what, part = ("along", motion[3:]) if shift >= turn else ("around the axis", motion[:3])
     x, y, z = T_map_robot[:3, :3] @ part / max(turn, shift)

@@ -12,22 +12,23 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.rig.poses import check_transform
+from cairn_client.replica.outbox import CommitFacts
 from cairn_client.replica.replica import Replica
 from cairn_client.robot.kept_scans import KeptScans
 from cairn_fusion.mapping.measurement import Measurement
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.recording.scan_bytes import move_scan
 from cairn_map.codec.cell_code import Profile
-from cairn_map.commits.commit import Commit, CommitMeta
+from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import CommitId, commit_id_from_text
-from cairn_map.errors import BadInputError, ConflictError, NotFoundError
+from cairn_map.errors import BadInputError, NotFoundError
 
 AnyCommit = Commit | CommitId | str
 """A commit, its id, or that as text."""
 Move = Callable[[Iterator[Scan]], Iterator[Scan]]
-"""The scans of a measurement from other poses."""
-MetaOf = Callable[[Measurement, str, tuple[CommitId, ...]], CommitMeta]
-"""What the commit of a measurement says, with its note and what it takes out."""
+"""A change of the poses of a measurement's scans."""
+FactsOf = Callable[[Measurement, str], CommitFacts]
+"""Facts of a measurement's commit, with its note."""
 
 
 class Amending:
@@ -39,14 +40,14 @@ class Amending:
         kept: KeptScans,
         *,
         new_measurement: Callable[[], Measurement | None],
-        meta_of: MetaOf,
+        facts_of: FactsOf,
         on_commit: Callable[[Commit], None],
     ) -> None:
         """Args: new_measurement: returns an empty measurement; None without a rig."""
         self._replica = replica
         self._kept = kept
         self._new_measurement = new_measurement
-        self._meta_of = meta_of
+        self._facts_of = facts_of
         self._on_commit = on_commit
 
     def amend(
@@ -73,31 +74,24 @@ class Amending:
         measurement = self._new_measurement()
         if measurement is None:
             raise BadInputError("no_rig", "this robot was opened without a rig, so it cannot read scans")
+        # The measurement again, from the same scans at their corrected poses.
         for scan in move(self._kept.scans(found)):
             measurement.add(scan)
         diff = measurement.diff()
-        with self._replica.lock:  # the sync may give the commit another id, but not meanwhile
-            latest = self._replica.outbox.successors.latest(found)
-            meta = self._meta_of(measurement, note, (latest,))
-            commit = self._replica.commit(diff, meta, profile=profile)
+        commit = self._replica.amend(found, diff, self._facts_of(measurement, note), profile=profile)
+        # The scans are kept under the amend from here on: the next amend names it.
         self._kept.rename(found, commit.id)
         self._on_commit(commit)
         return commit
 
     def _scans_of(self, measurement: AnyCommit) -> CommitId:
-        """Under which commit a measurement's scans are kept."""
+        """Commit under which a measurement's scans are kept."""
         commit = _commit_id(measurement)
-        with self._replica.lock:
-            outbox = self._replica.outbox
-            latest = outbox.successors.latest(commit)
-            found = next((file for file in self._kept.commits if outbox.successors.latest(file) == latest), None)
-            found = commit if commit in self._kept.commits else found
-            if found is None:
-                raise NotFoundError(
-                    "no_scans", f"{commit} cannot be amended, its scans are not kept: {self._kept.why_gone()}"
-                )
-            if found != latest and outbox.knows(found):  # not known: it got a new id (SYNC.md rule 13)
-                raise ConflictError("taken_back", f"{found} was taken back by {latest}: there is nothing to amend")
+        found = self._replica.original_of(commit, self._kept.commits)
+        if found is None:
+            raise NotFoundError(
+                "no_scans", f"{commit} cannot be amended, its scans are not kept: {self._kept.why_gone()}"
+            )
         return found
 
 
@@ -108,7 +102,7 @@ def _commit_id(commit: AnyCommit) -> CommitId:
 
 
 def _move(T_map_rig: npt.ArrayLike | None, T_map_observed: npt.ArrayLike | None) -> Move:
-    """Scans to where they were taken: as given, or as observed and then corrected.
+    """Move of scans to where they were taken: to given poses, or from the observed ones by a correction.
 
     Raises:
         BadInputError: not exactly one of both, or another shape.

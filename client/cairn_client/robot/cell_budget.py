@@ -1,8 +1,11 @@
-"""What a robot with limits keeps of its server's map: the cells around it, as many as fit.
+"""Budget of a robot with limits: it keeps the cells of the server around the robot, as many as fit.
 
-Full is said by `NO_ROOM` out of whatever would hold one cell more. Then the index of the server's cells tells how far
-around the robot they fit, all farther ones are dropped, and the fetch begins anew with a box around the robot. The box
-goes with the robot. Dropped cells count as not held (`UNPROVEN`): the rules of sync need no exception for them.
+    hold one cell more     raises `NO_ROOM` when the limits are reached
+    tighten                the server's index tells how far around the robot cells fit; all farther ones are dropped
+    fetch                  begins again, with a box around the robot
+    keep_up                moves the box with the robot
+
+Dropped cells count as not held (`UNPROVEN`): the rules of sync need no exception for them.
 """
 
 import logging
@@ -10,13 +13,13 @@ import time
 from collections.abc import Callable, Iterable
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
-from cairn_client.replica.replica import UNPROVEN, Replica
-from cairn_client.robot.limits import Limits
+from cairn_client.replica.limits import NO_LIMITS, Limits
+from cairn_client.replica.replica import Replica
+from cairn_client.replica.replica_state import CellCube
+from cairn_client.replica.server_cells import UNPROVEN
 from cairn_client.robot.robot_events import CellsDropped, Events, OutboxNearlyFull
-from cairn_client.sync.cell_index import whole_index
-from cairn_client.sync.requests import Box, Conversation
+from cairn_client.sync.requests import Box, Conversation, whole_index
 from cairn_map.arrays import Ints
 from cairn_map.errors import UnreachableError
 from cairn_map.evidence.grid import CELL_LIMIT, Cell, CellKey, cell_of_key
@@ -24,39 +27,30 @@ from cairn_map.evidence.grid import CELL_LIMIT, Cell, CellKey, cell_of_key
 log = logging.getLogger(__name__)
 
 NO_ROOM = "no_room"
-ROOM_KEY = "room"
+"""Error kind of a cell for which there is no room."""
 FILL = 0.75
-"""Part of the limits that a box is chosen to fill; the rest is for what the map grows by."""
+"""Fraction of the limits that a box is chosen to fill; the rest is for the growth of the map."""
 TIGHTER = 0.7
-"""A box that was too large after all is chosen anew, to fill this part of what the one before was to fill."""
+"""Fraction by which the fill is reduced when a box was too large after all."""
 NEARLY = 0.8
-"""Part of the outbox's room from which on it is told."""
+"""Fraction of the outbox's budget above which a warning is sent."""
 CHOOSE_AGAIN_S = 300.0
-"""How often it is asked whether more fits, while half of the limits is free."""
+"""Least seconds between two tries of a larger box, while half of the limits is free."""
 ROW_BYTES = 8192
-"""What a cell takes on the disk beyond its bytes: half a page on average, and its row."""
+"""Bytes of a cell on the disk beyond its content: half a page on average, and its row."""
 VOXEL_BYTES = 16
+"""Memory of a known voxel: 9 to 13 bytes were measured with all channels."""
 CELL_BYTES = 8192
-"""Memory of a known voxel and of a cell: 9 to 13 bytes were measured with all channels."""
+"""Memory of a cell beyond its voxels."""
 SLACK_BYTES = 1 << 16
 """Pages that a transaction may need beyond what it writes."""
 
 Place = Callable[[], tuple[float, float, float] | None]
-"""Where the robot is, metres, map frame; None if nobody knows."""
+"""Returns the robot's position, metres, map frame; None if it is unknown."""
 
 
-class Kept(BaseModel):
-    """The cells that are kept, of a full robot; remembered."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    centre: tuple[int, int, int]
-    radius: int
-    """Of a cube of cells around the centre's: 0 is the centre alone."""
-
-
-class Room:
-    """One robot's room; without limits it does nothing."""
+class CellBudget:
+    """Budget of one robot's disk and memory (`replica.StorageBudget`); without limits it does nothing."""
 
     def __init__(
         self, replica: Replica, limits: Limits, events: Events, *, place: Place, scope_box: Box | None
@@ -64,34 +58,32 @@ class Room:
         """Watch over a replica from here on.
 
         Args:
-            replica: its `admit` and its outbox's `make_room` are set.
-            limits: see there.
-            events: told of what is dropped.
-            place: of the robot; the centre of what is kept.
-            scope_box: the cells that the robot fetches at all.
+            replica: the robot's state; it obeys this budget from here on.
+            limits: bytes on the disk, in the outbox and in memory.
+            events: streams to which dropped cells and a full outbox are reported.
+            place: returns the robot's position, around which cells are kept.
+            scope_box: cells that the robot fetches at all; None: all.
         """
         self._replica = replica
         self._limits = limits
         self._events = events
         self._place = place
         self._scope_box = scope_box
-        text = replica.store.get(ROOM_KEY) if limits.disk_bytes_max or limits.memory_bytes_max else None
-        self.kept: Kept | None = Kept.model_validate_json(text) if text else None
-        """None: the whole map fits, as far as is known."""
+        self._limits_cells = bool(limits.disk_bytes_max or limits.memory_bytes_max)
+        self.kept: CellCube | None = replica.state.kept_cube if self._limits_cells else None
+        """Cells of the server that are kept; None while the whole map fits."""
         self._is_old = self.kept is not None
-        """The box is to be chosen anew: there may be more room, or another map, than when it was chosen."""
+        """True if the box is to be chosen again: there may be more room, or another map, than when it was chosen."""
         self._fill = FILL
         self._chosen_s = float("-inf")
         self._is_nearly_full = False
         self._view_bytes = 0
         self._last: tuple[CellKey, int] | None = None
-        if limits.disk_bytes_max or limits.memory_bytes_max:
-            replica.admit = self._admit
-        if limits != Limits():
-            replica.outbox.make_room = self._make_room
+        if limits != NO_LIMITS:
+            replica.obey(self)
 
     def box(self) -> Box | None:
-        """The cells to fetch; None: those of the scope."""
+        """Box of the cells to fetch; None: those of the scope."""
         if self.kept is None:
             return None
         low, high = (np.array(self.kept.centre) + offset for offset in (-self.kept.radius, self.kept.radius))
@@ -101,7 +93,7 @@ class Room:
         return Cell(*low.tolist()), Cell(*high.tolist())
 
     def keep_up(self) -> Conversation[None]:
-        """Before a fetch: move the box if the robot has moved."""
+        """Move the box if the robot has moved; before each fetch."""
         self._view_bytes, self._last = self._measured(), None
         kept = self.kept
         if kept is None:
@@ -114,38 +106,47 @@ class Room:
             yield from self._choose()
 
     def tighten(self) -> Conversation[bool]:
-        """After `NO_ROOM`: a smaller box; False if there is none."""
+        """Choose a smaller box, after `NO_ROOM`; False if there is none."""
         before = self.kept
         yield from self._choose()
         self._fill *= TIGHTER
         return before is None or self.kept is None or self.kept != before
 
     def _choose(self) -> Conversation[None]:
-        """The largest cube around the robot whose cells fit, by the server's index; drop the others."""
+        """Choose the largest cube around the robot whose cells fit, by the server's index; drop the others."""
         index = yield from whole_index(self._replica.author, box=self._scope_box)
         self._chosen_s = time.monotonic()
-        with self._replica.lock:
+        with self._replica.changing():
             self._replica.forget_stable_commits(wanted=self._is_kept)
+            # Bytes of each cell that the server has, and its distance from the robot's cell.
             centre = self._centre()
             cells = np.array([entry.cell for entry in index.cells], np.int64).reshape(-1, 3)
             far = np.abs(cells - centre).max(axis=1, initial=0)
             disk = np.array([entry.size_bytes + ROW_BYTES for entry in index.cells], np.int64)
             memory = np.array([entry.voxels * VOXEL_BYTES + CELL_BYTES for entry in index.cells], np.int64)
+            # The first ring of cells with which the sum, from the centre outwards, breaks a limit is the first one out.
             disk_max, memory_max = self._for_cells()
             order = np.argsort(far, kind="stable")
             too_much = (disk[order].cumsum() > disk_max) | (memory[order].cumsum() > memory_max)
             self._is_old = False
             if too_much.any():
                 first_out = int(far[order][int(too_much.argmax())])
-                self._keep(Kept(centre=_triple(centre), radius=max(first_out - 1, 0)))
+                self._keep(CellCube(centre=_triple(centre), radius=max(first_out - 1, 0)))
                 self._drop(key for key in self._held() if self._distance(key, centre) >= max(first_out, 1))
             else:
                 self._keep(None)
 
-    def _admit(self, key: CellKey, size_bytes: int) -> None:
-        """May a cell of so many bytes be held? Raises: UnreachableError: kind `no_room`."""
+    def admit_cell(self, key: CellKey, size_bytes: int) -> None:
+        """Check that a cell of so many bytes may be held.
+
+        Raises:
+            UnreachableError: kind `no_room`.
+        """
         limits = self._limits
-        if self._last is not None:  # it is in the view by now
+        if not self._limits_cells:
+            return
+        # The memory of the view is kept as a sum: the cell admitted before this one has changed since, and no other.
+        if self._last is not None:
             last, before = self._last
             self._view_bytes += self._cell_bytes(last) - before
         self._last = (key, self._cell_bytes(key))
@@ -155,11 +156,11 @@ class Room:
         if limits.memory_bytes_max and self._view_bytes + CELL_BYTES > limits.memory_bytes_max:
             raise UnreachableError(NO_ROOM, f"the map takes {self._view_bytes} of {limits.memory_bytes_max} bytes")
 
-    def _make_room(self, size_bytes: int) -> None:
-        """For a commit: see the module's head of `limits`.
+    def make_room(self, size_bytes: int) -> None:
+        """Drop, in the order of `limits`, until a commit of so many bytes fits.
 
         Raises:
-            UnreachableError: kind `outbox_full`: there is no more to drop; try again after a sync.
+            UnreachableError: kind `outbox_full`: nothing is left to drop; try again after a sync.
         """
         replica = self._replica
         if self._complaint(size_bytes):
@@ -175,9 +176,9 @@ class Room:
                 f"commits that the server does not have for good, {waiting} of them unpushed; the measurement stays "
                 "open: sync, or raise the limit",
             )
-        self._tell_if_nearly_full(size_bytes)
+        self._warn_if_nearly_full(size_bytes)
 
-    def _tell_if_nearly_full(self, size_bytes: int) -> None:
+    def _warn_if_nearly_full(self, size_bytes: int) -> None:
         limits, store = self._limits, self._replica.store
         parts = []
         if limits.outbox_bytes_max:
@@ -185,12 +186,12 @@ class Room:
         if limits.disk_bytes_max:
             parts.append((store.used_bytes() - sum(store.cell_bytes().values()) + size_bytes, limits.disk_bytes_max))
         used, limit = max(parts, key=lambda part: part[0] / part[1], default=(0, 1))
-        was_told, self._is_nearly_full = self._is_nearly_full, used > NEARLY * limit
-        if self._is_nearly_full and not was_told:
-            self._events.tell(OutboxNearlyFull(size_bytes=used, max_bytes=limit))
+        was_warned, self._is_nearly_full = self._is_nearly_full, used > NEARLY * limit
+        if self._is_nearly_full and not was_warned:
+            self._events.send(OutboxNearlyFull(size_bytes=used, max_bytes=limit))
 
     def _complaint(self, size_bytes: int) -> tuple[str, int, int] | None:
-        """Which limit a commit of so many bytes would break, what is in use, and the limit."""
+        """Limit that a commit of so many bytes would break, the bytes in use, and the limit's; None if it fits."""
         limits, store = self._limits, self._replica.store
         if limits.outbox_bytes_max and (kept := self._outbox_bytes()) + size_bytes > limits.outbox_bytes_max:
             return "outbox", kept, limits.outbox_bytes_max
@@ -208,7 +209,7 @@ class Room:
         centre = self._centre()
         by_distance = sorted(held, key=lambda key: self._distance(key, centre))
         gone = by_distance[len(held) - (len(held) + 9) // 10 :]
-        self._keep(Kept(centre=_triple(centre), radius=max(self._distance(gone[0], centre) - 1, 0)))
+        self._keep(CellCube(centre=_triple(centre), radius=max(self._distance(gone[0], centre) - 1, 0)))
         self._drop(gone)
         return True
 
@@ -216,15 +217,14 @@ class Room:
         gone = list(keys)
         if not gone:
             return
-        drop_cells(self._replica, gone)
+        self._replica.drop_cells(gone)
         log.warning("%d cells of the server made room", len(gone))
-        self._events.tell(CellsDropped(cells=tuple(cell_of_key(key) for key in sorted(gone))))
+        self._events.send(CellsDropped(cells=tuple(cell_of_key(key) for key in sorted(gone))))
         self._view_bytes, self._last = self._measured(), None
 
-    def _keep(self, kept: Kept | None) -> None:
+    def _keep(self, kept: CellCube | None) -> None:
         self.kept = kept
-        with self._replica.store.transaction():
-            self._replica.store.put(ROOM_KEY, kept.model_dump_json() if kept else None)
+        self._replica.state.kept_cube = kept
 
     def _is_half_empty(self) -> bool:
         limits = self._limits
@@ -239,17 +239,17 @@ class Room:
         return box is None or all(a <= b <= c for a, b, c in zip(box[0], cell, box[1], strict=True))
 
     def _for_cells(self) -> tuple[float, float]:
-        """Bytes on the disk and in memory that cells of the server may take."""
+        """Bytes on the disk and in memory that are left for cells of the server."""
         limits, store = self._limits, self._replica.store
         sizes = store.cell_bytes()
         others = store.used_bytes() - sum(size + ROW_BYTES for size in sizes.values() if size)
         disk = limits.disk_bytes_max * self._fill - max(others, 0) if limits.disk_bytes_max else float("inf")
-        own = self._replica.outbox.cells - set(self._held())
+        own = self._replica.own_cells() - set(self._held())
         memory = limits.memory_bytes_max or float("inf")
         return disk, memory * self._fill - sum(map(self._cell_bytes, own))
 
     def _centre(self) -> Ints:
-        """The robot's cell, or where it was last, or the middle of what is held; within the scope."""
+        """The robot's cell, else the last centre, else the middle of the cells that are held; within the scope."""
         place = self._place()
         edge_m = self._replica.geometry.cell_edge_m
         if place is not None:
@@ -274,19 +274,7 @@ class Room:
         return self._replica.view.size_bytes if self._limits.memory_bytes_max else 0
 
     def _outbox_bytes(self) -> int:
-        return self._replica.store.data_bytes([kept.id for kept in self._replica.outbox])
-
-
-def drop_cells(replica: Replica, keys: Iterable[CellKey]) -> None:
-    """Hold nothing of some held cells; the view shows of them what the robot made itself."""
-    gone = list(keys)
-    with replica.lock:
-        with replica.store.transaction():
-            for key in gone:
-                replica.store.put_cell(key, UNPROVEN, body=b"")
-        for key in gone:
-            replica.cells[key] = UNPROVEN
-            replica.refresh_view(key)
+        return self._replica.kept_bytes()
 
 
 def _triple(cell: Ints) -> tuple[int, int, int]:

@@ -39,7 +39,7 @@ class ScanFile:
 
     number: int
     commit: CommitId
-    """Which it became, or the last amend of it."""
+    """Commit that the measurement became, or the last amend of it."""
     path: Path
     size_bytes: int
 
@@ -60,7 +60,7 @@ class KeptScans:
         self._open: BinaryIO | None = None
         self._open_bytes = 0
         self._is_given_up = False
-        """Of the open measurement: its scans are not kept."""
+        """True if the scans of the open measurement are not kept."""
         # Replaced whole at each change, because the thread that syncs asks which commits are in it.
         self._files: dict[CommitId, ScanFile] = {}
         try:
@@ -70,7 +70,7 @@ class KeptScans:
 
     @property
     def size_bytes(self) -> int:
-        """What is kept, the open measurement included."""
+        """Bytes of the scans that are kept, the open measurement included."""
         return sum(file.size_bytes for file in self._files.values()) + self._open_bytes
 
     @property
@@ -79,7 +79,7 @@ class KeptScans:
         return [file.commit for file in self._files.values()]
 
     def add(self, scan: Scan) -> None:
-        """Keep a scan of the open measurement; what cannot be kept is said in the log, and is no failure."""
+        """Keep a scan of the open measurement; a scan that cannot be kept is logged, and is no failure."""
         if not self.bytes_max or self._is_given_up:
             return
         data = encode_scan(scan)
@@ -100,7 +100,7 @@ class KeptScans:
             self._forget_open(is_given_up=True)
 
     def close_measurement(self, commit: CommitId) -> None:
-        """The open measurement became this commit."""
+        """Note that the open measurement became this commit."""
         if self._open is not None:
             number = max((file.number for file in self._files.values()), default=0) + 1
             path = self._folder / f"{number:06d}.{commit}.scans"
@@ -114,7 +114,7 @@ class KeptScans:
         self._is_given_up = False
 
     def rename(self, commit: CommitId, new: CommitId) -> None:
-        """The scans of a commit are another one's now, which amends it."""
+        """Note that the scans of a commit are those of its amend now."""
         file = self._files[commit]
         path = self._folder / f"{file.number:06d}.{new}.scans"
         try:
@@ -126,7 +126,7 @@ class KeptScans:
         self._files = {f.commit: f for f in files}
 
     def drop_measurement(self) -> None:
-        """The open measurement became nothing."""
+        """Forget the scans of the open measurement."""
         self._forget_open(is_given_up=False)
 
     def scans(self, commit: CommitId) -> Iterator[Scan]:
@@ -144,7 +144,7 @@ class KeptScans:
                 yield decode_scan(file.read(min(size, self._files[commit].size_bytes)))
 
     def why_gone(self) -> str:
-        """Why some scans are not kept, and what to do about it."""
+        """Reason why scans are not kept, with what to do about it."""
         if not self.bytes_max:
             return "this robot keeps none; open it with keep_scans_bytes=2_000_000_000, say, before it observes them"
         held = f"the newest {len(self._files)} measurements fill {self.size_bytes / 1e6:.1f} MB"
@@ -153,7 +153,7 @@ class KeptScans:
         )
 
     def _make_room(self, size_bytes: int) -> None:
-        """Remove the oldest files until so many bytes more fit, as far as that goes."""
+        """Remove the oldest files until so many more bytes fit, or none is left."""
         while self._files and self.size_bytes + size_bytes > self.bytes_max:
             oldest = next(iter(self._files.values()))
             oldest.path.unlink(missing_ok=True)

@@ -19,18 +19,18 @@ import numpy.typing as npt
 
 from cairn_calib.rig.rig import Rig
 from cairn_client.http.map_url import split_map_url
-from cairn_client.relay.carrying import Carrier, carrier_in
+from cairn_client.relay.carried_commits import Carrier, carrier_in
 from cairn_client.relay.link import RelayApi
+from cairn_client.replica.limits import NO_LIMITS, Limits
+from cairn_client.replica.outbox import NO_NOTES, CommitFacts
 from cairn_client.replica.replica import Replica
-from cairn_client.replica.replica_identity import note_use
+from cairn_client.replica.replica_state import ReplicaState
+from cairn_client.replica.replica_store import ReplicaStore
 from cairn_client.robot.alignment import STEP_M, STEP_RAD, align_points, points_of_scans
 from cairn_client.robot.alignment_verdict import Alignment
 from cairn_client.robot.amending import Amending, AnyCommit
-from cairn_client.robot.commit_meta import own_meta
 from cairn_client.robot.kept_scans import KeptScans
-from cairn_client.robot.limits import NO_LIMITS, Limits, limits_in
 from cairn_client.robot.membership import Membership
-from cairn_client.robot.opening import open_replica
 from cairn_client.robot.robot_events import SIZE, Committed, Events, EventStream
 from cairn_client.robot.rounds import Rounds
 from cairn_client.robot.status_report import OwnStatus
@@ -42,7 +42,7 @@ from cairn_fusion.mapping.integrate import Integrator
 from cairn_fusion.mapping.measurement import Measurement
 from cairn_fusion.recording.scan import Scan
 from cairn_map.codec.cell_code import Profile
-from cairn_map.commits.commit import Commit, CommitMeta
+from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import CommitId, robot_name
 from cairn_map.errors import BadInputError, CairnError
 from cairn_map.evidence.evidence_map import EvidenceMap
@@ -55,7 +55,7 @@ from cairn_map.wire.messages import Mode
 log = logging.getLogger(__name__)
 
 FLUSH_S = 60.0
-"""How long `close` may push before it leaves the rest for the next time."""
+"""Seconds that `close` may push before it leaves the rest for the next time."""
 
 
 class Robot:
@@ -120,20 +120,40 @@ class Robot:
         with ExitStack() as opened:  # what was opened is closed again if a later step fails
             opened.callback(self._api.close)
             self._kept_scans = KeptScans(Path(directory) / "scans", bytes_max=keep_scans_bytes)
-            self._replica = open_replica(
-                Path(directory), self._api, robot=self.name, map_name=self._map_name, geometry=geometry
-            )
+            self._replica = self._open_replica(Path(directory), geometry, limits)
             opened.callback(self._replica.close)
-            note_use(self._replica.store, url=map_url, mode=mode)
-            kept_limits = limits_in(self._replica.store, limits)
-            if kept_limits == NO_LIMITS:  # with limits, commits that the server has for good go first
-                self._replica.outbox.amendable = lambda: self._kept_scans.commits
+            self._replica.state.note_use(url=map_url, mode=mode)
             carrier = carrier_in(Path(directory), self._api, self._map_name, size_bytes_max=carry_bytes_max)
-            self._rounds = self._make_rounds(token, scope, kept_limits, carrier)
+            self._rounds = self._make_rounds(token, scope, carrier)
             self._measurement = self._new_measurement()
             opened.pop_all()  # from here on `close` does it
 
-    def _make_rounds(self, token: str | None, scope: Scope, limits: Limits, carrier: Carrier | None) -> Rounds:
+    def _open_replica(self, directory: Path, geometry: Geometry | None, limits: Limits | None) -> Replica:
+        """The directory's state; its grid is the given one, else the remembered one, else the server's."""
+        store = ReplicaStore(directory)
+        try:
+            state = ReplicaState(store)
+            self._limits = limits or state.limits or NO_LIMITS
+            geometry = geometry or state.geometry
+            if geometry is None:
+                info = self._api.map_info(self._map_name)
+                geometry = info.geometry
+                state.note_model(info.sensor_model)
+            replica = Replica(
+                store, robot=self.name, map_name=self._map_name, geometry=geometry, amendable=self._amendable_commits
+            )
+            if limits is not None:
+                state.limits = limits
+            return replica
+        except BaseException:
+            store.close()
+            raise
+
+    def _amendable_commits(self) -> list[CommitId]:
+        """Commits whose bytes stay for an amend; with limits none, as commits that the server has for good go first."""
+        return self._kept_scans.commits if self._limits == NO_LIMITS else []
+
+    def _make_rounds(self, token: str | None, scope: Scope, carrier: Carrier | None) -> Rounds:
         membership = Membership(
             self._api,
             self._replica,
@@ -151,7 +171,7 @@ class Robot:
             mode=self.mode,
             scope=scope,
             profile=self._profile,
-            limits=limits,
+            limits=self._limits,
             status=self._status,
             carrier=carrier,
         )
@@ -249,10 +269,10 @@ class Robot:
         self._status.place_at(self._measurement.poses[-1])
 
     def mount(self, rig: Rig) -> None:
-        """Take another head, whose scans come from here on.
+        """Mount another head, whose scans come from here on.
 
         Raises:
-            BadInputError: kind `open_measurement`: there are scans of the old one.
+            BadInputError: kind `open_measurement`: there are scans of the old head.
         """
         if self._measurement is not None and len(self._measurement):
             raise BadInputError("open_measurement", "commit or discard the scans of the old head first")
@@ -265,14 +285,20 @@ class Robot:
         self._kept_scans.drop_measurement()
 
     def commit(
-        self, *, note: str = "", retracts: tuple[CommitId, ...] = (), profile: Profile | None = None
+        self,
+        *,
+        note: str = "",
+        retracts: tuple[CommitId, ...] = (),
+        profile: Profile | None = None,
+        remember: Mapping[str, str] = NO_NOTES,
     ) -> Commit | None:
-        """Close the open measurement and keep it durably; None if there is nothing in it.
+        """Commit the open measurement, durably; None if there is no evidence in it.
 
         Args:
             note: up to 1024 characters for the map's log.
-            retracts: own commits that it takes back and stands for: here at once, elsewhere as they sync.
-            profile: small spends more work, up to a second, on four tenths fewer bytes; None: as the link wants it.
+            retracts: own commits that this one takes back and stands for: here at once, elsewhere as they sync.
+            profile: small spends up to a second of work on four tenths fewer bytes; None: the link's own profile.
+            remember: texts by key that the directory is to keep, in the same transaction as the commit.
 
         Raises:
             BadInputError: the commit would be too large, its note too long, or it retracts what is not this robot's.
@@ -285,8 +311,9 @@ class Robot:
                 log.warning("%d scans gave no evidence; nothing is committed", len(self._measurement))
                 self.discard()
             return None
-        meta = self._meta(self._measurement, note, retracts)
-        commit = self._replica.commit(diff, meta, profile=profile or self._profile.commits)
+        # Until the replica has the commit on its disk, the measurement stays open: the caller may try again.
+        facts = self._facts(self._measurement, note, retracts)
+        commit = self._replica.commit(diff, facts, profile=profile or self._profile.commits, notes=remember)
         self._measurement = self._new_measurement()
         self._kept_scans.close_measurement(commit.id)
         self._made(commit)
@@ -364,10 +391,10 @@ class Robot:
         self._rounds.leave()
 
     def close(self, *, stay: bool = False, flush_s: float = FLUSH_S) -> None:
-        """Commit what is open, push what waits if there is a link, deregister if nothing is left, and close.
+        """Commit the open measurement, push the commits that wait, deregister if none is left, and close.
 
-        What could not be pushed stays here, and the robot on the map. May be called twice. Where `commit` refuses,
-        the open measurement is lost; what waited is pushed all the same, and then its error is raised.
+        Without a link, the commits stay here, and the robot stays on the map. May be called twice. If `commit` refuses,
+        the open measurement is lost; the other commits are pushed all the same, and then its error is raised.
 
         Args:
             stay: only pause: do not deregister.
@@ -378,6 +405,7 @@ class Robot:
         self._is_closed = True
         try:
             self._rounds.stop()
+            # The last measurement first, then one push; a robot whose commit was refused does not leave the map.
             try:
                 self.commit()
             except CairnError:
@@ -398,14 +426,23 @@ class Robot:
             self._replica,
             self._kept_scans,
             new_measurement=self._new_measurement,
-            meta_of=self._meta,
+            facts_of=self._facts,
             on_commit=self._made,
         )
 
     def _made(self, commit: Commit) -> None:
         cells = tuple(cell_of_key(key) for key in sorted(commit.cells))
-        self._events.tell(Committed(commit=commit.id, cells=cells, size_bytes=len(commit.data)))
+        self._events.send(Committed(commit=commit.id, cells=cells, size_bytes=len(commit.data)))
         self._rounds.wake()
 
-    def _meta(self, measurement: Measurement | None, note: str, retracts: tuple[CommitId, ...]) -> CommitMeta:
-        return own_meta(self._replica, measurement, self._rig, self._integrator, note=note, retracts=retracts)
+    def _facts(self, measurement: Measurement | None, note: str, retracts: tuple[CommitId, ...] = ()) -> CommitFacts:
+        """Statements of a measurement's commit about itself."""
+        return CommitFacts(
+            captured_s=measurement.captured_s if measurement else None,
+            scans=tuple(measurement.poses) if measurement else (),
+            sensors=tuple(self._rig.cameras) if self._rig else (),
+            rig=self._rig.digest() if self._rig else None,
+            integrator=str(self._integrator),
+            retracts=retracts,
+            note=note,
+        )

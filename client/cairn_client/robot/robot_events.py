@@ -1,4 +1,4 @@
-"""What happens to a robot, told as it happens, by whichever thread it happens in.
+"""Events of a robot, sent as they happen, by the thread in which they happen.
 
     for event in robot.events():                 # in a thread of its own; ends when the robot is closed
         match event:
@@ -7,8 +7,7 @@
             case LinkLost(reason=reason, again_s=again_s):
                 ...
 
-Who reads slowly loses the oldest events, and can see how many (`EventStream.dropped`); the robot never waits for a
-reader.
+A slow reader loses the oldest events, and sees how many (`EventStream.dropped`); the robot never waits for a reader.
 """
 
 import threading
@@ -23,15 +22,15 @@ from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import Cell
 
 SIZE = 1000
-"""Events that wait for one reader."""
+"""Default number of events that wait for one reader."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Event:
-    """Something that happened."""
+    """An event of a robot."""
 
     time_s: float = field(default_factory=time.time)
-    """When, by this robot's clock: UTC, seconds since 1970."""
+    """Time of the event by this robot's clock: UTC, seconds since 1970."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,14 +60,14 @@ class Refused(Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CellsChanged(Event):
-    """The server's news of these cells is here; own evidence that it folded is news, too."""
+    """The server's newer state of these cells is here; own evidence that it folded counts, too."""
 
     cells: tuple[Cell, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CellsDropped(Event):
-    """These cells of the server had to make room (`limits.Limits`); they come again when the robot is near them."""
+    """These cells of the server were dropped to make room (`limits`); they come again when the robot is near them."""
 
     cells: tuple[Cell, ...]
 
@@ -83,14 +82,14 @@ class OutboxNearlyFull(Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkLost(Event):
-    """A round with the server failed for want of a link, or because the server wants to be left alone."""
+    """A round with the server failed because there is no link, or because the server asks to be called later."""
 
     kind: str
     reason: str
     tries: int
-    """How often in a row."""
+    """Rounds that failed in a row."""
     again_s: float | None
-    """When the background thread tries again, seconds from now; None after a round that somebody else called."""
+    """Seconds until the background thread tries again; None after a round that the program called."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,9 +99,9 @@ class SyncFailed(Event):
     kind: str
     reason: str
     tries: int
-    """How often in a row."""
+    """Rounds that failed in a row."""
     again_s: float | None
-    """As in `LinkLost`."""
+    """Seconds until the background thread tries again; None after a round that the program called."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,21 +109,21 @@ class LinkBack(Event):
     """A round with the server succeeded again."""
 
     away_s: float
-    """Since the first failure."""
+    """Seconds since the first failure."""
 
 
 class EventStream:
     """One reader's events, oldest first; iterate over it, or `take` what is there."""
 
     def __init__(self, size: int = SIZE) -> None:
-        """Room for `size` events."""
+        """Make a stream in which up to `size` events wait."""
         if size < 1:
             raise BadInputError("bad_option", f"a stream of events has room for at least 1, got {size}")
         self._news = threading.Condition()
         self._waiting: deque[Event] = deque(maxlen=size)
         self._is_closed = False
         self.dropped = 0
-        """Events that this reader was too slow for."""
+        """Events that were lost because this reader was too slow."""
 
     def __enter__(self) -> Self:
         return self
@@ -154,33 +153,33 @@ class EventStream:
                 self._news.notify_all()
 
     def close(self) -> None:
-        """No more events; those that wait can still be read."""
+        """End the stream; the events that wait can still be read."""
         with self._news:
             self._is_closed = True
             self._news.notify_all()
 
     @property
     def is_closed(self) -> bool:
-        """Whether nothing more will come."""
+        """True if nothing more will come."""
         return self._is_closed
 
 
 class Events:
-    """Where a robot tells its events, to any number of readers."""
+    """A robot's events, for any number of readers."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._streams: list[EventStream] = []
 
     def open(self, size: int = SIZE) -> EventStream:
-        """A stream of what happens from here on."""
+        """A stream of the events from here on."""
         stream = EventStream(size)
         with self._lock:
             self._streams = [known for known in self._streams if not known.is_closed] + [stream]
         return stream
 
-    def tell(self, event: Event) -> None:
-        """To all readers; waits for none."""
+    def send(self, event: Event) -> None:
+        """Put an event into all streams; no reader is waited for."""
         for stream in self._streams:
             stream.put(event)
 

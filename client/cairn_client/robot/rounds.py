@@ -1,20 +1,27 @@
-"""One robot's rounds with its server: called for, in the background, and the last one before the robot goes."""
+"""Rounds of one robot with its server: on call, in the background, and the last push before the robot closes.
+
+    sync, SyncThread -> Rounds.run: one round at a time
+                          watched (events, last contact), as a member of the map:
+                            push commits -> fetch cells -> carried commits -> status report
+
+The background thread does a round after each wake-up, one every so often, and after a failure only after a wait.
+"""
 
 import logging
 import threading
 from collections.abc import Callable
 
 from cairn_client.http.api import MapApi
+from cairn_client.http.backoff import Backoff
 from cairn_client.http.http_link import Link
-from cairn_client.relay.carrying import Carrier
+from cairn_client.relay.carried_commits import Carrier
+from cairn_client.replica.limits import Limits
 from cairn_client.replica.replica import Replica
-from cairn_client.robot.cell_budget import NO_ROOM, Room
-from cairn_client.robot.limits import Limits
+from cairn_client.robot.cell_budget import NO_ROOM, CellBudget
 from cairn_client.robot.membership import Membership
 from cairn_client.robot.robot_events import Events
 from cairn_client.robot.round_watch import RoundWatch
 from cairn_client.robot.status_report import OwnStatus
-from cairn_client.robot.sync_thread import SyncThread
 from cairn_client.sync.link_profile import LinkProfile
 from cairn_client.sync.near_cells import cell_at
 from cairn_client.sync.scope import Scope, fetch
@@ -28,8 +35,75 @@ log = logging.getLogger(__name__)
 OnPush = Callable[[CommitId], None]
 
 
+ROUND_END_S = 2.0
+"""Seconds that a round may go on by itself when the thread is to stop, before it is cut."""
+
+
+class SyncThread:
+    """A thread that does rounds until stopped; a failure is logged, reported and tried again, never raised."""
+
+    def __init__(
+        self, sync: Callable[[], object], *, every_s: float, on_failure: Callable[[CairnError, float], None]
+    ) -> None:
+        """Begin.
+
+        Args:
+            sync: does one round.
+            every_s: seconds between two rounds while nothing wakes the thread.
+            on_failure: called with the error of a round, and the seconds after which it is tried again.
+        """
+        self._sync = sync
+        self._every_s = every_s
+        self._on_failure = on_failure
+        self._stopping = threading.Event()
+        self._woken = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="cairn-sync", daemon=True)
+        self._thread.start()
+
+    def wake(self) -> None:
+        """Do a round soon: there is something to push. The wait after a failure is not cut short."""
+        self._woken.set()
+
+    def stop(self, cut: Callable[[], None]) -> None:
+        """Stop: a wait ends at once, a round under way at its end, or after two seconds by `cut`."""
+        self._stopping.set()
+        self._woken.set()
+        self._thread.join(ROUND_END_S)
+        if self._thread.is_alive():
+            cut()
+            self._thread.join()
+
+    def _run(self) -> None:
+        backoff = Backoff()
+        while not self._stopping.is_set():
+            self._woken.clear()
+            try:
+                self._sync()
+            except UnreachableError as exc:
+                wait_s = backoff.next_s(exc.retry_after_s)
+                log.info("no link (%s); trying again in %.1f s", exc.message, wait_s)
+                self._wait(exc, wait_s)
+            except CairnError as exc:
+                wait_s = backoff.next_s(None)
+                log.error("sync failed: %s: %s; trying again in %.1f s", exc.kind, exc.message, wait_s)
+                self._wait(exc, wait_s)
+            except Exception as exc:  # a fault of ours; uncaught, the robot would never sync again, and say nothing
+                wait_s = backoff.next_s(None)
+                log.exception("sync failed in a way that was not expected; trying again in %.1f s", wait_s)
+                self._wait(CairnError("internal", f"{type(exc).__name__}: {exc}; the log says more"), wait_s)
+            else:
+                backoff.reset()
+                if not self._stopping.is_set():
+                    self._woken.wait(self._every_s)
+
+    def _wait(self, exc: CairnError, wait_s: float) -> None:
+        if not self._stopping.is_set():
+            self._on_failure(exc, wait_s)
+            self._stopping.wait(wait_s)
+
+
 class Rounds:
-    """Push, then fetch; one round at a time, by whichever thread."""
+    """Rounds of one robot, one at a time, by any thread."""
 
     def __init__(
         self,
@@ -59,48 +133,48 @@ class Rounds:
         self._branch = replica.author.robot
         self._link = Link(api, map_name, branch=self._branch)
         scope_box = scope.box(replica.geometry.cell_edge_m)
-        self._room = Room(replica, limits, events, place=status.place, scope_box=scope_box)
+        self._budget = CellBudget(replica, limits, events, place=status.place, scope_box=scope_box)
         self._watch = RoundWatch(replica, events)
         self._lock = threading.Lock()
         self._thread: SyncThread | None = None
 
     def sync(self, on_push: OnPush | None = None) -> RoundReport:
-        """One round; raises what `Robot.sync` does."""
+        """Do one round; raises what `Robot.sync` does."""
         try:
-            return self._round(on_push)
+            return self._run(on_push)
         except CairnError as exc:
-            self._watch.failed(exc)
+            self._watch.failed(exc, None)
             raise
 
     def start(self, *, every_s: float) -> None:
-        """Rounds in the background, if there are none yet."""
+        """Do rounds in the background, if there are none yet."""
         if self._thread is None:
-            self._thread = SyncThread(self._round, every_s=every_s, on_failure=self._watch.failed)
+            self._thread = SyncThread(self._run, every_s=every_s, on_failure=self._watch.failed)
 
     def wake(self) -> None:
-        """There is something to push."""
+        """Do a round in the background soon: there is something to push."""
         if self._thread is not None:
             self._thread.wake()
 
     def stop(self) -> None:
-        """No more rounds in the background; one under way has two seconds to end."""
+        """End the rounds in the background; one under way has two seconds to end."""
         if self._thread is not None:
             self._thread.stop(self._api.sockets.cut)
             self._thread = None
             self._api.sockets.mend()
 
     def leave(self) -> None:
-        """Deregister."""
+        """Leave the map; no more rounds in the background."""
         self.stop()
         self._membership.leave()
 
     def finish(self, *, is_leaving: bool, within_s: float) -> None:
-        """Push what waits, and deregister if nothing is left; without a link all stays as it is."""
+        """Push the commits that wait, and deregister if none is left; without a link all stays as it is."""
         limit = threading.Timer(within_s, self._api.sockets.cut)
         limit.start()
         try:
             if self._mode != "viewer" and self._replica.push_set():
-                self._membership.as_member(lambda: self._push(None))
+                self._membership.as_member(self._push, None)
             if is_leaving and not self._replica.push_set():
                 self._membership.leave_if_welcome_back()
         except CairnError as exc:
@@ -109,35 +183,42 @@ class Rounds:
         finally:
             limit.cancel()
 
-    def _round(self, on_push: OnPush | None = None) -> RoundReport:
+    def _run(self, on_push: OnPush | None = None) -> RoundReport:
+        """One round; its failure is reported by the caller, who knows when it is tried again."""
         with self._lock:
-            return self._watch.round(lambda: self._membership.as_member(lambda: self._push_and_fetch(on_push)))
+            with self._watch.cell_changes():
+                report = self._membership.as_member(self._push_and_fetch, on_push)
+            self._watch.succeeded(report)
+            return report
 
     def _push_and_fetch(self, on_push: OnPush | None) -> RoundReport:
+        # Own commits first: the fetch may be long, and what it brings covers them then.
         pushes = self._push(on_push)
         report = self._fetch()
-        report.pushed, report.refused = pushes.pushed, pushes.refused
+        report.add_pushes(pushes)
+        # Then others' commits, and the status, which costs nothing if it is lost.
         if self._carrier is not None:
             self._carrier.exchange()
         if report.has_more:
             self.wake()
-        self._status.tell(self._replica, self._api, self._map_name, branch=self._branch, mode=self._mode)
+        self._status.send(self._replica, self._api, self._map_name, branch=self._branch, mode=self._mode)
         return report
 
     def _fetch(self) -> RoundReport:
-        """What fits: again with a smaller box when there is no room for it."""
+        """Fetch the cells that fit: again with a smaller box when there is no room for them."""
+        # The box of cells that fit goes with the robot, and is made smaller until its cells do fit.
         is_low_end, place = self._mode == "low-end", self._status.place()
         near = cell_at(place, self._replica.geometry.cell_edge_m) if place is not None else None
-        self._link.hold(self._room.keep_up())
+        self._link.hold(self._budget.keep_up())
         while True:
-            box = self._room.box()
+            box = self._budget.box()
             try:
-                fetching = fetch(self._replica, is_low_end=is_low_end, scope=self._scope, room=box, near=near)
+                fetching = fetch(self._replica, is_low_end=is_low_end, scope=self._scope, within=box, near=near)
                 return self._link.hold(fetching)
             except UnreachableError as exc:
                 if exc.kind != NO_ROOM:
                     raise
-                if not self._link.hold(self._room.tighten()):
+                if not self._link.hold(self._budget.tighten()):
                     raise BadInputError(NO_ROOM, f"not even the cell around the robot fits: {exc.message}") from exc
 
     def _push(self, on_push: OnPush | None) -> RoundReport:

@@ -1,4 +1,4 @@
-"""How a robot spends a link's bytes.
+"""Link profiles: how a robot divides a link's bytes between commits, cells and status.
 
     good     whole commits, fast to make; replies as long as they get; a status with every sync that has one to tell
     small    some ten kbit/s to some hundred, with losses: commits of few bytes, in small parts; short replies, so that
@@ -27,7 +27,7 @@ class LinkProfile:
     reply_bytes_max: int | None = None
     round_bytes_max: int | None = None
     tell_every_s: float = 0.0
-    """A status is told no more often."""
+    """Least seconds between two status reports."""
 
     def scope_of(self, scope: Scope) -> Scope:
         """A scope, with this link's limits where it names none."""

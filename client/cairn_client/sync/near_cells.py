@@ -1,4 +1,4 @@
-"""What is near: which cells a robot wants at all, and which first."""
+"""Cells near a robot: those that it wants at all, and their order."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -11,7 +11,7 @@ from cairn_map.evidence.grid import CELL_LIMIT, Cell
 from cairn_map.wire.messages import CellEntry
 
 Wanted = Callable[[Cell], bool]
-"""Which cells a low-end robot keeps."""
+"""True for a cell that a low-end robot keeps."""
 
 
 def within(position_m: npt.ArrayLike, *, radius_m: float, cell_edge_m: float) -> Wanted:

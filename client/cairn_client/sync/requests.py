@@ -1,23 +1,25 @@
-"""What a robot may ask of a server: messages, and no I/O.
+"""Requests of a robot to a server, as messages, and conversations made of them. No I/O.
 
 A conversation is a generator that yields asks, is sent the answers, and returns its result; errors of the server or
-the link are thrown into it. So the same rules run over HTTP (`link`) and in a simulator that keeps time itself.
+the link are thrown into it. So the same rules run over HTTP (`http_link`), between the two ends of a relay, and in a
+simulator that keeps time itself.
 
     def conversation() -> Conversation[int]:
         index = yield from GetIndex(author)
         return len(index.cells)
 """
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from cairn_client.sync.responses import FetchedCell
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import Author, CommitId
+from cairn_map.errors import CairnError, UnreachableError
 from cairn_map.evidence.grid import Cell
 from cairn_map.wire.frames import Frame
-from cairn_map.wire.messages import CellIndex, MissingRequest, Upload
+from cairn_map.wire.messages import INDEX_PAGE, CellIndex, MissingRequest, Upload
 
 A = TypeVar("A")
 T = TypeVar("T")
@@ -38,23 +40,43 @@ class Ask(Generic[A]):
 
 
 Conversation = Generator[Ask[Any], Any, T]
-"""Asks until it has a T."""
+"""A generator of asks that returns a T."""
+
+
+def hold(conversation: Conversation[T], answer: Callable[[Ask[Any]], Any]) -> T:
+    """Result of a conversation whose asks are answered by a function.
+
+    Raises:
+        CairnError: an error of `answer` that the conversation does not deal with itself.
+    """
+    try:
+        ask = next(conversation)
+        while True:
+            try:
+                found = answer(ask)
+            except CairnError as exc:
+                ask = conversation.throw(exc)
+            else:
+                ask = conversation.send(found)
+    except StopIteration as end:
+        result: T = end.value
+        return result
 
 
 @dataclass(frozen=True, slots=True)
 class Push(Ask[None]):
-    """Take this commit; answered when the server has it for good."""
+    """Push of a commit; answered when the server has it for good."""
 
     commit: Commit
     seal: str | None = None
-    """On a retract that is the server's own."""
+    """Seal of a retract that is the server's own; None for any other commit."""
     signatures: str | None = None
-    """Of those for whom it speaks, as in `Cairn-Signature`."""
+    """Signatures of those for whom the commit speaks, as in `Cairn-Signature`."""
 
 
 @dataclass(frozen=True, slots=True)
 class GetUpload(Ask[Upload]):
-    """How much of a commit's bytes (their SHA-256) came with earlier parts."""
+    """Question for how many of a commit's bytes (named by their SHA-256) came with earlier parts."""
 
     id: CommitId
     digest: str
@@ -62,7 +84,7 @@ class GetUpload(Ask[Upload]):
 
 @dataclass(frozen=True, slots=True)
 class PutPart(Ask[Upload]):
-    """Take these bytes of a commit; with the last of them, take the commit."""
+    """Push of a part of a commit's bytes; with the last of them, the commit is pushed."""
 
     id: CommitId
     digest: str
@@ -70,31 +92,31 @@ class PutPart(Ask[Upload]):
     offset_bytes: int
     data: bytes
     signatures: str | None = None
-    """On the commit, as in `Cairn-Signature`."""
+    """Signatures on the commit, as in `Cairn-Signature`."""
 
 
 @dataclass(frozen=True, slots=True)
 class GetCommit(Ask[tuple[bytes, str | None]]):
-    """A commit's bytes, and the seal on a retract that is the server's."""
+    """Question for a commit's bytes, and for the seal of a retract that is the server's."""
 
     id: CommitId
 
 
 @dataclass(frozen=True, slots=True)
 class GetMissing(Ask[Frame | None]):
-    """The first frame of what is missing; `NextFrame` asks for those after it."""
+    """Question for the first frame of what is missing; `NextFrame` asks for those after it."""
 
     request: MissingRequest
 
 
 @dataclass(frozen=True, slots=True)
 class NextFrame(Ask[Frame | None]):
-    """The next frame of the reply that is coming in; None after the last one."""
+    """Question for the next frame of the reply that is coming in; answered None after the last one."""
 
 
 @dataclass(frozen=True, slots=True)
 class GetIndex(Ask[CellIndex]):
-    """A page of all cells, or of those in a box, without their bytes."""
+    """Question for a page of the index of all cells, or of those in a box."""
 
     author: Author | None
     box: Box | None = None
@@ -104,7 +126,7 @@ class GetIndex(Ask[CellIndex]):
 
 @dataclass(frozen=True, slots=True)
 class GetCell(Ask[FetchedCell]):
-    """One cell, unless it is the one with this ETag."""
+    """Question for one cell, unless it is the one with this ETag."""
 
     cell: Cell
     etag: str | None = None
@@ -112,7 +134,26 @@ class GetCell(Ask[FetchedCell]):
 
 @dataclass(frozen=True, slots=True)
 class PutCell(Ask[None]):
-    """Take the bytes of a cell that the server had damaged."""
+    """Return of the bytes of a cell that the server had damaged."""
 
     cell: Cell
     body: bytes
+
+
+def whole_index(author: Author | None = None, *, box: Box | None = None) -> Conversation[CellIndex]:
+    """Index of all cells, page by page, under the header of the first page.
+
+    An entry whose `lm` is above the header's cursor changed between two pages.
+
+    Raises:
+        UnreachableError: kind `no_end`: the server was replaced or restored meanwhile; ask again.
+    """
+    index = page = yield from GetIndex(author, box)
+    cells, start = list(page.cells), index.header.to_cursor
+    while len(page.cells) >= INDEX_PAGE:
+        page = yield from GetIndex(author, box, after=Cell(*page.cells[-1].cell))
+        cells += page.cells
+        to = page.header.to_cursor
+        if to.log_id != start.log_id or to.seq < start.seq:
+            raise UnreachableError("no_end", "the server's map was replaced while its cells were listed")
+    return index.model_copy(update={"cells": cells})

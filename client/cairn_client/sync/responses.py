@@ -1,4 +1,4 @@
-"""What a server's answers become: lists, cells, errors."""
+"""Responses of a server as values: lists, cells, errors."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -38,11 +38,11 @@ class Traffic:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """A whole answer that is no error."""
+    """A complete answer that is no error."""
 
     status: int
     headers: Mapping[str, str]
-    """Names without regard to capitals."""
+    """Header fields; their names regardless of case."""
     body: bytes
 
 
@@ -71,7 +71,7 @@ def list_of(model: type[Message], data: bytes) -> list[Message]:
 
 
 def error_of(status: int, retry_after: str, body: bytes) -> CairnError:
-    """The server's problem as the error that it was there; `retry_after` is the header of that name, or empty."""
+    """The error that the server's problem body states; `retry_after` is the header of that name, or empty."""
     try:
         problem = Problem.model_validate_json(body)
     except ValidationError:
@@ -91,13 +91,13 @@ def error_of(status: int, retry_after: str, body: bytes) -> CairnError:
 
 
 def unreachable(exc: Any) -> UnreachableError:
-    """What a request failed by (httpx's `TransportError`), as ours."""
+    """The `UnreachableError` of a request that failed by httpx's `TransportError`."""
     try:
         where = str(exc.request.url.copy_with(path="/", query=None))
     except RuntimeError:
         where = "the server"
     if "CERTIFICATE_VERIFY_FAILED" in str(exc):
         return UnreachableError(
-            "no_link", f"{where} shows a certificate of nobody we know; name its issuer's file in SSL_CERT_FILE"
+            "no_link", f"{where} shows a certificate of an unknown issuer; name the issuer's file in SSL_CERT_FILE"
         )
     return UnreachableError("no_link", f"cannot reach {where} ({exc or type(exc).__name__}); is `cairn serve` running?")

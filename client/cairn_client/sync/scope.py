@@ -1,10 +1,10 @@
-"""What of a map a robot fetches, and in what helpings."""
+"""Scope of a robot's fetches: the cells that it wants, and how many bytes come in one reply and one round."""
 
 import math
 from dataclasses import dataclass
 
 from cairn_client.replica.replica import Replica
-from cairn_client.sync.applying import is_within
+from cairn_client.sync.exchange import is_within
 from cairn_client.sync.near_cells import Wanted
 from cairn_client.sync.requests import Box, Conversation
 from cairn_client.sync.sync import RoundReport, fetch_cells, fetch_missing
@@ -17,16 +17,16 @@ BoxMetres = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scope:
-    """All of it, unless something is said."""
+    """The part of a map that a robot fetches; by default all of it."""
 
     box_m: BoxMetres | None = None
-    """Only cells that share more than a face with this box."""
+    """Box in metres: only cells that share more than a face with it are fetched; None: all."""
     wanted: Wanted | None = None
-    """Low-end: only these cells, of those in the box."""
+    """Low-end: filter of the cells in the box; None: all."""
     reply_bytes_max: int | None = None
-    """High-end and viewer: after so many bytes of cells a reply ends, and the rest is asked for by another request."""
+    """High-end and viewer: bytes of cells after which a reply ends, and the rest is asked for by another request."""
     round_bytes_max: int | None = None
-    """After so many bytes of cells a round ends, and the next one goes on: a commit does not wait for the whole map."""
+    """Bytes of cells after which a round ends, and the next one goes on: a commit does not wait for the whole map."""
 
     def __post_init__(self) -> None:
         """Raises: BadInputError: the box is none, or there is no room for a cell in a reply."""
@@ -54,17 +54,17 @@ EVERYTHING = Scope()
 
 
 def fetch(
-    replica: Replica, *, is_low_end: bool, scope: Scope, room: Box | None = None, near: Cell | None = None
+    replica: Replica, *, is_low_end: bool, scope: Scope, within: Box | None = None, near: Cell | None = None
 ) -> Conversation[RoundReport]:
     """Bring what is in the scope to the server's head: whole cells for a low-end robot, else what is missing.
 
-    Of the scope only what is in `room`, if that is given. The cells next to `near` come first.
+    Only the cells in `within`, if that is given, in place of the scope's box. The cells next to `near` come first.
 
     Raises:
         UnreachableError: the link broke; what came is kept.
         DamagedDataError: the server's answer is not sound.
     """
-    box = room or scope.box(replica.geometry.cell_edge_m)
+    box = within or scope.box(replica.geometry.cell_edge_m)
     wanted = scope.wanted
 
     def is_in_scope(cell: Cell) -> bool:

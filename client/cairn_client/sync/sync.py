@@ -1,6 +1,7 @@
-"""One round with the server: push what it may lack, fetch what is missing. Repeating a round changes nothing.
+"""One round with the server: push the commits that it may lack, fetch what is missing. A repeat changes nothing.
 
-These are conversations (`asks`): what to ask next, given what was answered. There is no I/O but the replica's own.
+These are conversations (`requests`): generators that yield what to ask next, given what was answered. There is no I/O
+except the replica's own.
 
 high-end   push commits; frames that bring every held cell to the server's head
 low-end    push commits; the index of cells; whole cells that changed, all or those near a place
@@ -13,13 +14,21 @@ from dataclasses import dataclass, field
 
 from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_store import BaseCell
-from cairn_client.sync.applying import Exchange, is_within
-from cairn_client.sync.cell_index import whole_index
-from cairn_client.sync.heal import heal_damaged
+from cairn_client.sync.exchange import Exchange, is_within
 from cairn_client.sync.near_cells import Wanted, in_order
-from cairn_client.sync.requests import Box, Conversation, GetCell, GetCommit, GetMissing, NextFrame, Push
+from cairn_client.sync.requests import (
+    Box,
+    Conversation,
+    GetCell,
+    GetCommit,
+    GetMissing,
+    NextFrame,
+    Push,
+    PutCell,
+    whole_index,
+)
 from cairn_client.sync.uploads import PARTS, Parts, push_whole_or_in_parts
-from cairn_map.codec.cell_code import decode_cell
+from cairn_map.codec.cell_code import decode_cell, encode_cell
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.commit_reading import open_commit
 from cairn_map.commits.ids import CommitId
@@ -38,26 +47,33 @@ from cairn_map.wire.frames import CellFrame
 log = logging.getLogger(__name__)
 
 ROUNDS_MAX = 64
-"""Requests in one fetch: a reply may ask to come back, or to compare; it may not go on for ever."""
+"""Requests in one fetch: a reply may ask for another request, or for a comparison, but not for ever."""
 REPLIES_MAX = 4096
-"""The same with those that end before their cells do, by the asker's or the server's limit of bytes."""
+"""Requests in one fetch, with those whose reply ends before its cells do, by a limit of bytes."""
 
 
 @dataclass(slots=True)
 class RoundReport:
-    """What one round did."""
+    """Counts of one round's work."""
 
     pushed: int = 0
+    """Commits that the server took."""
     refused: dict[CommitId, CairnError] = field(default_factory=dict)
     """Commits that the server will not take, and why; they stay in the outbox."""
     frames: int = 0
+    """Frames that came; high-end and viewer."""
     cells_fetched: int = 0
+    """Whole cells that came; low-end."""
     size_bytes: int = 0
-    """Of cells that came."""
+    """Bytes of the cells that came."""
     has_more: bool = False
-    """The round ended at its limit of bytes: the next one goes on."""
+    """True if the round ended at its limit of bytes: the next one goes on."""
     healed: int = 0
-    """Cells that the server had damaged and has from here again."""
+    """Cells that the server had damaged and received from here."""
+
+    def add_pushes(self, pushes: "RoundReport") -> None:
+        """Take over the counts of the round's pushes."""
+        self.pushed, self.refused = pushes.pushed, pushes.refused
 
 
 def push_commits(
@@ -67,7 +83,13 @@ def push_commits(
     on_push: Callable[[CommitId], None] | None = None,
     parts: Parts = PARTS,
 ) -> Conversation[RoundReport]:
-    """Push every commit that the server may lack, oldest first; or of them only the server's own retracts.
+    """Push every commit that the server may lack, oldest first.
+
+    Args:
+        replica: the robot's state.
+        sealed_only: True to push only the server's own retracts.
+        on_push: called with each commit that the server has for good.
+        parts: sizes of the parts in which large commits go.
 
     Raises:
         UnreachableError: the link broke; what was acknowledged before stays so.
@@ -75,12 +97,14 @@ def push_commits(
     """
     report = RoundReport()
     for commit_id in replica.push_set():
-        if (refusal := replica.resting.refusal(commit_id)) is not None:
+        # What was refused lately, and what is no longer here, is left out.
+        if (refusal := replica.refusals.of(commit_id)) is not None:
             report.refused[commit_id] = refusal
             continue
         commit, seal = replica.kept_commit(commit_id), replica.seal(commit_id)
         if commit is None or (sealed_only and seal is None):
             continue
+        # A refusal of this commit must not hold up the others; a broken link or a bad token ends the round.
         try:
             pushed = yield from _push(replica, commit, seal, parts)
         except ConflictError as exc:
@@ -96,7 +120,7 @@ def push_commits(
         except (BadInputError, DamagedDataError) as exc:  # it must not hold up all that come after it
             log.error("the server refuses commit %s: %s: %s", commit_id, exc.kind, exc.message)
             report.refused[commit_id] = exc
-            replica.resting.note(commit_id, exc)
+            replica.refusals.note(commit_id, exc)
             continue
         replica.acknowledge(pushed)
         report.pushed += 1
@@ -106,12 +130,12 @@ def push_commits(
 
 
 def _push(replica: Replica, commit: Commit, seal: str | None, parts: Parts) -> Conversation[CommitId]:
-    """Push one commit; its id, which is a new one if the server has other bytes under the old (rule 13)."""
+    """Push one commit; its id, which is a new one if the server has other bytes under the old one (rule 13)."""
     try:
         yield from push_whole_or_in_parts(_signed(replica, commit, seal), parts)
     except ConflictError as exc:
         if exc.kind == "evidence_gone":
-            # The server forgot what this commit takes out: it takes it from whoever still has it (rule 11).
+            # The server forgot the commits that this one takes out: it takes their bytes from any robot (rule 11).
             for target in commit.meta.retracted_ids:
                 if (kept := replica.kept_commit(target)) is not None:
                     yield from push_whole_or_in_parts(_signed(replica, kept), parts)
@@ -127,8 +151,7 @@ def _push(replica: Replica, commit: Commit, seal: str | None, parts: Parts) -> C
 
 
 def _signed(replica: Replica, commit: Commit, seal: str | None = None) -> Push:
-    with replica.lock:
-        return Push(commit, seal, replica.outbox.signatures(commit))
+    return Push(commit, seal, replica.signatures(commit))
 
 
 def keep_retracts(replica: Replica) -> Conversation[None]:
@@ -150,6 +173,48 @@ def keep_retracts(replica: Replica) -> Conversation[None]:
             replica.keep_sealed(commit, seal)
 
 
+def heal_damaged(replica: Replica) -> Conversation[int]:
+    """Send back the cells that the server's disk damaged, of those that are here as they were; how many were sent.
+
+    The newest header names each cell and the fingerprint that it had; a base of that fingerprint is the cell. The
+    server takes it for its SHA-256 alone, so no robot has to be trusted, and one that is wrong changes nothing.
+
+
+    Raises:
+        UnreachableError: the link broke; the others are sent next time.
+        DeniedError: the server does not know this robot.
+    """
+    healed = 0
+    for cell, wanted in replica.header.damaged if replica.header else []:
+        key = cell_key(cell)
+        body = None if (key, wanted) in replica.refusals.cells else _sound_body(replica, key, wanted)
+        if body is None:
+            continue
+        try:
+            yield from PutCell(Cell(*cell), body)
+        except (UnreachableError, DeniedError):
+            raise
+        except CairnError as exc:
+            log.error("the server will not take cell %s, which it calls damaged: %s", Cell(*cell), exc.message)
+            replica.refusals.cells.add((key, wanted))
+        else:
+            log.warning("the server had damaged cell %s; sent it from here", Cell(*cell))
+            healed += 1
+    return healed
+
+
+def _sound_body(replica: Replica, key: CellKey, wanted: str) -> bytes | None:
+    """Bytes of a cell as the server had it; None if another state is held, or the bytes here are damaged too."""
+    with replica.changing() as base:
+        held = base.cells.get(key)
+        if held is None or held.fingerprint.hex() != wanted:
+            return None
+        evidence = base.evidence(key)
+    if fingerprint(evidence, key).hex() != wanted:
+        return None
+    return encode_cell(key, evidence, replica.geometry).data
+
+
 def fetch_missing(
     replica: Replica,
     *,
@@ -169,6 +234,7 @@ def fetch_missing(
         DamagedDataError: the server's answer is not sound.
     """
     report = RoundReport()
+    # Each turn asks for all that is still missing, until an answer brings all cells to the server's head.
     compare = False
     rounds = replies = 0
     while rounds < ROUNDS_MAX and replies < REPLIES_MAX:
@@ -188,6 +254,7 @@ def fetch_missing(
             replica.forget_server()
             rounds += 1
             continue
+        # Then the rest of the round: cells for the server, a complaint about damaged ones, and whether to ask again.
         report.healed += yield from heal_damaged(replica)
         _complain(exchange.damaged)
         compare = exchange.must_compare
@@ -209,10 +276,10 @@ def fetch_cells(
     round_bytes_max: int | None = None,
     near: Cell | None = None,
 ) -> Conversation[RoundReport]:
-    """Low-end: whole cells that changed since they were fetched last; all, or those in a box, or the wanted ones of it.
+    """Fetch the whole cells that changed since they were fetched last, for a low-end robot.
 
-    The index tells which did, so that cells that are still the same cost no request. Those next to `near` come first,
-    and hot ones before others (`cell_order`).
+    All cells, or those in a box, or the wanted ones of it. The index states which changed, so that equal cells cost no
+    request. Those next to `near` come first, and hot ones before others (`cell_order`).
 
     Raises:
         UnreachableError: the link broke; the cells before it are kept.
@@ -224,18 +291,20 @@ def fetch_cells(
     to, coverage = index.header.to_cursor, index.header.coverage
     digests = {cell_key(entry.cell): entry.digest for entry in index.cells}
     later = {cell_key(entry.cell) for entry in index.cells if entry.lm > to.seq}
-    with replica.lock:
+    # What the index alone settles: cells that did not change move along, and cells that are gone are emptied.
+    with replica.changing() as base:
         if replica.header and replica.header.to_cursor.log_id != to.log_id:
             log.warning("another server answers for this map; starting without its old state")
             replica.forget_server()
         replica.take_header(index.header, asked_by=author)
-        held = [key for key, cell in replica.cells.items() if cell.etag == f'"{digests.get(key)}"']
+        held = [key for key, cell in base.cells.items() if cell.etag == f'"{digests.get(key)}"']
         same = {key for key in held if key not in later}
-        replica.move(same, to=to, coverage=coverage)
-        for key in replica.cells.keys() - digests.keys():  # a server that was restored forgot them
+        base.move(same, to=to, coverage=coverage)
+        for key in base.cells.keys() - digests.keys():  # a server that was restored forgot them
             if is_within(key, box):
-                replica.hold_nothing(key, BaseCell(to, coverage, ZERO))
+                base.hold_nothing(key, BaseCell(to, coverage, ZERO))
     report.healed = yield from heal_damaged(replica)
+    # All other cells are fetched whole, the nearest first.
     damaged = []
     for entry in in_order(index.cells, near):
         key = cell_key(entry.cell)
@@ -260,35 +329,35 @@ def fetch_cells(
 
 
 def fetch_cell(replica: Replica, cell: Cell) -> Conversation[int]:
-    """Low-end: one cell, if it changed; the bytes that came.
+    """Fetch one cell, if it changed, for a low-end robot; the size of its bytes.
 
     Raises:
         DamagedDataError: the cell does not have the fingerprint that the server states.
     """
     key = cell_key(cell)
-    held = replica.cells.get(key)
+    held = replica.cell(key)
     fetched = yield from GetCell(cell, held.etag if held else None)
-    with replica.lock:
+    with replica.changing() as base:
         if fetched.body is None and held is not None:
-            replica.move([key], to=fetched.cursor, coverage=fetched.coverage)
+            base.move([key], to=fetched.cursor, coverage=fetched.coverage)
             return 0
+        # It is held only if it is the cell that was asked for, with the fingerprint that the server states.
         decoded = decode_cell(fetched.body or b"")
         is_ours = decoded.key == key and decoded.geometry == replica.geometry
         if not is_ours or fingerprint(decoded.evidence, key) != fetched.fingerprint:
             raise DamagedDataError("fingerprint_mismatch", f"cell {cell} is not what the server says it is")
-        base = BaseCell(fetched.cursor, fetched.coverage, fetched.fingerprint, fetched.etag)
-        replica.hold(key, base, decoded.evidence, body=fetched.body)
+        cell_here = BaseCell(fetched.cursor, fetched.coverage, fetched.fingerprint, fetched.etag)
+        base.hold(key, cell_here, decoded.evidence, body=fetched.body)
         return len(fetched.body or b"")
 
 
 def _complain(damaged: Sequence[CellKey]) -> None:
-    """Raises: DamagedDataError: for cells that came whole but not sound, or could not come; if there are any."""
+    """Raises: DamagedDataError: if there are cells that came whole but not sound, or that the server could not send."""
     if damaged:
         names = ", ".join(str(cell_of_key(key)) for key in damaged)
         raise DamagedDataError("fingerprint_mismatch", f"the server's cells {names} are damaged; all others came")
 
 
 def _has_unproven(replica: Replica, box: Box | None) -> bool:
-    """Whether a cell still waits to be fetched whole."""
-    with replica.lock:
-        return any(cell.cursor is None for key, cell in replica.cells.items() if is_within(key, box))
+    """True if a cell still waits to be fetched whole."""
+    return any(cell.cursor is None for key, cell in replica.cells.items() if is_within(key, box))

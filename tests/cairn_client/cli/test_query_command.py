@@ -10,7 +10,6 @@ from tests.fixtures.client.made import GEOMETRY, A, opened
 
 from cairn_client.cli.maps.command import main
 from cairn_client.folders.map_folder import open_map
-from cairn_client.replica.map_model import store_model
 from cairn_map.codec.cell_code import encode_cell
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError
 from cairn_map.evidence.evidence import Evidence, packed_evidence
@@ -120,7 +119,7 @@ def test_a_height_map_tells_the_highest_surfaces(folder: Path, capsys: pytest.Ca
 def test_a_robot_s_state_is_read_under_the_map_s_own_sensor_model(tmp_path: Path) -> None:
     replica = opened(tmp_path)
     replica.commit({A: evidence()})
-    store_model(replica.store, SensorModel(p_occupied=0.9))
+    replica.state.note_model(SensorModel(p_occupied=0.9))
     with pytest.raises(ConflictError):
         open_map(tmp_path)
     replica.close()

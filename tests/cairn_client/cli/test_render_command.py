@@ -11,7 +11,7 @@ from tests.fixtures.client.live_server import LiveServer
 
 from cairn_client.cli.maps.command import main
 from cairn_client.cli.robots.telepresence import main as telepresence
-from cairn_client.folders.local_ages import ages_of
+from cairn_client.folders.map_folder import ages_of
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
 from cairn_fusion.image_fusion.surface import live_range

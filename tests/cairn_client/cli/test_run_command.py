@@ -227,7 +227,7 @@ def test_a_mark_is_kept_with_its_commit_or_not_at_all(
         monkeypatch.setattr(mole.replica.store, "add_commit", full)
         monkeypatch.setattr("cairn_client.cli.robots.run.COMMIT_AGAIN_S", 0.0)
         assert not _commit(mole, stop, Profile.FAST, _Tally(), stopping)
-        assert mole.replica.outbox.beside == {}
+        assert mole.replica.store.get("spool/a") is None
         monkeypatch.undo()
     with robot_in(tmp_path) as mole:  # neither was kept, nor when the robot was closed
         assert mole.waiting == 0

@@ -15,7 +15,7 @@ from cairn_client.http.api import MapApi
 from cairn_client.http.http_link import Link
 from cairn_client.relay import link as relay_link
 from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
-from cairn_client.relay.round import Resting, Side, relay_round
+from cairn_client.relay.round import RelaySide, Undelivered, relay_round
 from cairn_client.robot.robot import Robot
 from cairn_client.sync.sync import push_commits
 from cairn_client.sync.uploads import Parts
@@ -281,7 +281,7 @@ def test_a_relay_between_two_folders_has_no_map(tmp_path: Path) -> None:
 def test_a_commit_that_comes_in_parts_is_signed_as_well(base: Server, fields: list[Server], tmp_path: Path) -> None:
     with opened(fields[0], tmp_path / "robot", "robot") as robot:
         commit = robot.replica.commit(random_diff(1))
-        with MapApi(fields[0].url, token=robot.replica.token() or robot._api.token) as api:
+        with MapApi(fields[0].url, token=robot.replica.state.token or robot._api.token) as api:
             small = Parts(above_bytes=1, part_bytes=len(commit.data) // 2)
             Link(api, MAP, branch="robot").hold(push_commits(robot.replica, parts=small))
     settled(base, *fields)
@@ -293,7 +293,7 @@ def test_a_commit_that_no_connection_carries_whole_goes_from_server_to_server_in
     base: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cut: Cut
 ) -> None:
     monkeypatch.setattr(relay_link, "PARTS", Parts(above_bytes=1000, part_bytes=1000))
-    random, resting, broken = Random(2), Resting(), 0
+    random, resting, broken = Random(2), Undelivered(), 0
     with Server(tmp_path / "field") as field:
         field.create_map()
         with opened(field, tmp_path / "robot", "robot") as robot:
@@ -309,12 +309,12 @@ def test_a_commit_that_no_connection_carries_whole_goes_from_server_to_server_in
                 report = hold_between(relay_round(resting), ServerEnd(here, MAP), ServerEnd(there, MAP))
                 broken += report.cut is not None
                 assert not report.refused
-                if report.moved[Side.THERE]:
+                if report.moved[RelaySide.THERE]:
                     break
             paid = link.up.size_bytes
         assert broken >= 3
-        assert report.moved[Side.THERE] == 1
-        assert not resting.may_come_later(Side.THERE)
+        assert report.moved[RelaySide.THERE] == 1
+        assert not resting.may_come_later(RelaySide.THERE)
         heads = len(link.requests) * HEAD_BYTES
         assert paid <= len(commit.data) + broken * (1000 + HEAD_BYTES) + heads
         settled(base, field)

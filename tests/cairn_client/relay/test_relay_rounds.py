@@ -5,7 +5,7 @@ import pytest
 from cairn_client.cli import relay as relay_command
 from cairn_client.relay import round as relay
 from cairn_client.relay.link import hold_between
-from cairn_client.relay.round import RelayReport, Resting, Side, Why, relay_round
+from cairn_client.relay.round import RelayReport, RelaySide, Undelivered, Why, relay_round
 from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName
 from cairn_map.commits.version_vector import EMPTY
 from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
@@ -61,11 +61,11 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def resting(clock: Clock) -> Resting:
-    return Resting(clock_s=clock)
+def resting(clock: Clock) -> Undelivered:
+    return Undelivered(clock_s=clock)
 
 
-def rounds(here: Place, there: Place, resting: Resting, count: int = 1) -> RelayReport:
+def rounds(here: Place, there: Place, resting: Undelivered, count: int = 1) -> RelayReport:
     """Report of the last of some rounds."""
     for _ in range(count):
         report = hold_between(relay_round(resting), here, there)
@@ -73,7 +73,7 @@ def rounds(here: Place, there: Place, resting: Resting, count: int = 1) -> Relay
 
 
 def test_what_is_gone_or_unsigned_is_asked_for_once_and_told_now_and_then(
-    resting: Resting, clock: Clock, monkeypatch: pytest.MonkeyPatch
+    resting: Undelivered, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(relay, "AT_ONCE", 2)
     here, there = Place(*range(8)), Place(9)
@@ -88,7 +88,7 @@ def test_what_is_gone_or_unsigned_is_asked_for_once_and_told_now_and_then(
     assert len(here.asked) == 8
 
 
-def test_a_place_that_was_replaced_is_asked_again(resting: Resting) -> None:
+def test_a_place_that_was_replaced_is_asked_again(resting: Undelivered) -> None:
     here, there = Place(0, 1), Place()
     here.gone = ids(0)
     rounds(here, there, resting)
@@ -100,7 +100,7 @@ def test_a_place_that_was_replaced_is_asked_again(resting: Resting) -> None:
 
 
 def test_a_commit_that_breaks_every_round_lets_others_go_by_and_is_not_forgotten(
-    resting: Resting, clock: Clock
+    resting: Undelivered, clock: Clock
 ) -> None:
     here, there = Place(0, 1, 2), Place(7)
     there.breaks_at = dict.fromkeys(ids(1), CUT)
@@ -115,7 +115,7 @@ def test_a_commit_that_breaks_every_round_lets_others_go_by_and_is_not_forgotten
     assert there.has == here.has
 
 
-def test_a_quota_pauses_its_direction_only_and_skips_nothing(resting: Resting, clock: Clock) -> None:
+def test_a_quota_pauses_its_direction_only_and_skips_nothing(resting: Undelivered, clock: Clock) -> None:
     here, there = Place(0, 1), Place()
     there.breaks_at = dict.fromkeys(ids(0), BUSY)
     assert rounds(here, there, resting).later is BUSY
@@ -129,7 +129,7 @@ def test_a_quota_pauses_its_direction_only_and_skips_nothing(resting: Resting, c
 
 
 def test_a_command_that_hands_over_once_ends_whatever_is_gone_or_breaks(
-    resting: Resting, monkeypatch: pytest.MonkeyPatch
+    resting: Undelivered, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(relay, "AT_ONCE", 2)
     monkeypatch.setattr(relay_command.time, "sleep", lambda seconds: None)
@@ -138,8 +138,8 @@ def test_a_command_that_hands_over_once_ends_whatever_is_gone_or_breaks(
     there.breaks_at = dict.fromkeys(ids(5), CUT)
     total = relay_command._once(here, there, resting, map_name="lab", where="there")
     assert there.has == ids(4, 6, 7, 8)
-    assert total.moved[Side.THERE] == 4
-    assert resting.may_come_later(Side.THERE)
+    assert total.moved[RelaySide.THERE] == 4
+    assert resting.may_come_later(RelaySide.THERE)
     with pytest.raises(UnreachableError):
         there.breaks_at = dict.fromkeys(ids(*range(20, 40)), CUT)
-        relay_command._once(Place(*range(20, 40)), there, Resting(), map_name="lab", where="there")
+        relay_command._once(Place(*range(20, 40)), there, Undelivered(), map_name="lab", where="there")

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 from tests.fixtures.client.live_server import LiveServer
-from tests.fixtures.client.made import GEOMETRY, A, B, added, cells_of, flip_a_bit, seen
+from tests.fixtures.client.made import A, B, added, cells_of, flip_a_bit, seen
 from tests.fixtures.client.team import Team
 
-from cairn_map.commits.commit import CommitMeta
+from cairn_client.replica.outbox import CommitFacts
 from cairn_map.commits.ids import CommitId
 from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence.grid import CellKey
@@ -25,8 +25,8 @@ def team(server: LiveServer, tmp_path: Path) -> Iterator[Team]:
     team.close()
 
 
-def meta_that_retracts(target: CommitId) -> CommitMeta:
-    return CommitMeta(id="x.0123456789abcdef.5", geometry=GEOMETRY.digest().hex(), retracts=(str(target),))
+def facts_that_retract(target: CommitId) -> CommitFacts:
+    return CommitFacts(retracts=(target,))
 
 
 def shut(team: Team, name: str) -> None:
@@ -49,7 +49,7 @@ def test_after_a_roll_back_an_amend_takes_out_the_renamed_commit_and_not_the_oth
     shutil.copytree(tmp_path / "backup", tmp_path / "mole")
     wrong = team["mole"].commit({A: Z})
     assert wrong.id == good.id
-    team["mole"].commit({A: W}, meta_that_retracts(wrong.id))
+    team["mole"].commit({A: W}, facts_that_retract(wrong.id))
     for _ in range(2):
         team.push("mole")
         team.fetch("mole")
@@ -108,5 +108,5 @@ def test_a_damaged_own_commit_does_not_hold_up_the_others(team: Team, tmp_path: 
 def test_a_robot_cannot_retract_what_is_not_its_own(team: Team) -> None:
     foreign = team["fox"].commit({A: X}).id
     with pytest.raises(BadInputError, match="not mole's own"):
-        team["mole"].commit({}, meta_that_retracts(foreign))
+        team["mole"].commit({}, facts_that_retract(foreign))
     assert team["mole"].commits == []

@@ -5,10 +5,9 @@ from pathlib import Path
 
 from tests.fixtures.client.made import MAP, A, committed, opened, seen
 
-from cairn_client.replica.outbox import UNNUMBERED
+from cairn_client.replica.outbox import CommitFacts
 from cairn_client.replica.replica_store import FILE_NAME
-from cairn_map.commits.commit import Commit, CommitMeta
-from cairn_map.commits.ids import CommitId
+from cairn_map.commits.commit import Commit
 from cairn_map.commits.signature import Signature, check_signatures, signatures_from_text, speaks_for
 
 X = seen(1, 2)
@@ -36,9 +35,7 @@ def test_what_takes_back_from_an_older_incarnation_is_signed_by_both(tmp_path: P
     mole = opened(tmp_path)
     old = committed(mole, X)
     mole.outbox.new_incarnation("its disk was rolled back")
-    unnumbered = str(CommitId(mole.author, UNNUMBERED))
-    meta = CommitMeta(id=unnumbered, geometry=mole.geometry.digest().hex(), retracts=(str(old.id),))
-    amend = mole.commit({A: X}, meta)
+    amend = mole.commit({A: X}, CommitFacts(retracts=(old.id,)))
     signed = checked(amend, mole.outbox.signatures(amend))
     assert [speaks_for(signed, author) for author in (old.id.author, amend.id.author)] == [True, True]
     assert len(checked(old, mole.outbox.signatures(old))) == 1

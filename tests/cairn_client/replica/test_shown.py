@@ -20,6 +20,7 @@ from tests.fixtures.client.made import (
     seen,
 )
 
+from cairn_client.replica.outbox import CommitFacts
 from cairn_client.replica.replica import Replica
 from cairn_map.commits.commit import Commit, CommitMeta, make_commit
 from cairn_map.commits.cursor import Cursor
@@ -46,9 +47,8 @@ def at(replica: Replica, to: Cursor, evidence: Evidence, coverage: VersionVector
     assert exchanged(replica, header(to, coverage), frame, done(to)).is_done
 
 
-def taking_out(*targets: CommitId) -> CommitMeta:
-    names = tuple(str(target) for target in targets)
-    return CommitMeta(id="x.0123456789abcdef.5", geometry=GEOMETRY.digest().hex(), retracts=names)
+def taking_out(*targets: CommitId) -> CommitFacts:
+    return CommitFacts(retracts=targets)
 
 
 def amended(replica: Replica, target: CommitId, diff: dict[CellKey, Evidence]) -> Commit:

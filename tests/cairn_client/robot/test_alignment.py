@@ -15,7 +15,7 @@ from cairn_calib.rig.poses import Transform, check_transform, inverse, transform
 from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_client.robot import alignment
 from cairn_client.robot.alignment import align_points, one_a_voxel, points_of_scans, starts_around
-from cairn_client.robot.alignment_verdict import Alignment, Verdict
+from cairn_client.robot.alignment_verdict import Alignment, AlignmentVerdict
 from cairn_client.robot.robot import Robot
 from cairn_fusion.mapping.integrate import Integrator, integrate_scans
 from cairn_fusion.mapping.measurement import Measurement
@@ -54,7 +54,7 @@ def motion_left(found: Alignment, T_true: Transform) -> Floats:
 
 
 def assert_right(found: Alignment, T_true: Transform, *, edge_m: float) -> None:
-    assert found.verdict is Verdict.ACCEPTED, found.reason
+    assert found.verdict is AlignmentVerdict.ACCEPTED, found.reason
     left = motion_left(found, T_true)
     assert np.linalg.norm(left[3:]) < edge_m
     assert np.linalg.norm(left[:3]) < math.radians(0.5)
@@ -117,10 +117,10 @@ def test_scans_of_another_place_are_not_found_on_the_map(building: EvidenceMap, 
     here = snapshot_of(building)
     guess = stops(load_scene("building"), "labs")[2]
     found = align_points(here, points_of_scans(in_own_frame(scans, T_true), rig, Integrator()), T_map_robot=guess)
-    assert found.verdict is not Verdict.ACCEPTED, found.reason
+    assert found.verdict is not AlignmentVerdict.ACCEPTED, found.reason
     points = points_of_scans(scans, rig, Integrator())
     far = align_points(here, points, T_map_robot=off_by((500, 0, 0), 0))
-    assert far.verdict is Verdict.FAILED
+    assert far.verdict is AlignmentVerdict.FAILED
     assert "0 occupied voxels" in far.reason
     assert np.isinf(np.diag(far.covariance)).all()
     nowhere = "http://127.0.0.1:9/maps/lab"
@@ -162,7 +162,7 @@ def test_along_a_bare_corridor_an_alignment_is_refused() -> None:
     points = seen_in_a_box(low, high, [3.3, 0.2, 1.1], reach_m=6, seed=5)
     T_true = off_by((3.3, 0.2, 1.1), 0)
     found = align_points(whole, points, T_map_robot=off_by((0.3, -0.2, 0), 5) @ T_true)
-    assert found.verdict is Verdict.AMBIGUOUS
+    assert found.verdict is AlignmentVerdict.AMBIGUOUS
     assert "nothing holds it along" in found.reason
     assert "1.00, " in found.reason.replace("-", "")
     left, sigma = motion_left(found, T_true), np.sqrt(np.diag(found.covariance))
@@ -186,7 +186,7 @@ def test_a_room_that_looks_the_same_from_both_ends_is_refused_if_any_heading_may
     T_true = off_by((0.2, 0.1, 1.1), 0)
     assert_right(align_points(whole, points, T_map_robot=T_true), T_true, edge_m=EDGE_M)
     found = align_points(whole, points, T_map_robot=T_true, reach_m=0, reach_rad=math.pi)
-    assert found.verdict is Verdict.AMBIGUOUS
+    assert found.verdict is AlignmentVerdict.AMBIGUOUS
     assert "another place" in found.reason
     assert "180 degrees" in found.reason
 
@@ -219,12 +219,12 @@ def test_a_real_lidar_sweep_finds_its_place_on_the_map_of_another(shift_m: float
 def test_too_few_points_and_an_empty_map_are_said(building: EvidenceMap) -> None:
     whole = snapshot_of(building)
     few = align_points(whole, np.full((500, 3), math.nan), T_map_robot=np.eye(4))
-    assert (few.verdict, few.reason.split(",")[0]) == (Verdict.FAILED, "the scans have 0 points")
+    assert (few.verdict, few.reason.split(",")[0]) == (AlignmentVerdict.FAILED, "the scans have 0 points")
     points = np.random.default_rng(1).uniform(0, 5, (1000, 3))
     empty = align_points(snapshot_of(EvidenceMap(building.geometry)), points, T_map_robot=np.eye(4))
     assert "the map has 0 occupied voxels" in empty.reason
     noise = align_points(whole, points + np.array([13, 6, 0]), T_map_robot=np.eye(4), reach_m=0, reach_rad=0)
-    assert noise.verdict is Verdict.FAILED
+    assert noise.verdict is AlignmentVerdict.FAILED
 
 
 @pytest.mark.parametrize(
@@ -246,7 +246,7 @@ def test_a_search_that_is_none_is_refused(building: EvidenceMap, options: dict[s
 def test_without_small_gicp_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "small_gicp", None)
     with pytest.raises(BadInputError, match=r"pip install .*\[robot\]"):
-        alignment.Surfaces(np.zeros((1, 3)))
+        alignment.MapSurfaces(np.zeros((1, 3)))
 
 
 def test_starts_cover_the_reach_and_each_heading_once() -> None:

@@ -16,6 +16,7 @@ from tests.fixtures.client.world import stored_commits
 from cairn_client.http.api import MapApi
 from cairn_client.http.backoff import Backoff
 from cairn_map.errors import BadInputError, DeniedError, UnreachableError
+from cairn_map.evidence.grid import CellKey
 from cairn_map.wire.access_messages import CreateToken
 
 Until = Callable[[Callable[[], bool]], None]
@@ -106,10 +107,14 @@ def test_where_the_last_commit_is_refused_those_before_it_are_pushed(server: Liv
     map_commit(robot, 1)
     robot.observe(scan_of(2))
 
-    def full(size_bytes: int) -> None:
-        raise UnreachableError("outbox_full", "no room")
+    class Full:
+        def admit_cell(self, key: CellKey, size_bytes: int) -> None:
+            """There is room for cells."""
 
-    robot.replica.outbox.make_room = full
+        def make_room(self, size_bytes: int) -> None:
+            raise UnreachableError("outbox_full", "no room")
+
+    robot.replica.obey(Full())
     with pytest.raises(UnreachableError, match="no room"):
         robot.close()
     assert len(stored_commits(tmp_path / "server")) == 1

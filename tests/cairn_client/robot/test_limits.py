@@ -11,8 +11,8 @@ from tests.fixtures.client.robot_program import scan_of
 from tests.fixtures.client.robots import evidence_of, map_commit, robot_in
 
 from cairn_client.replica import replica_store
-from cairn_client.robot.cell_budget import Kept
-from cairn_client.robot.limits import NO_LIMITS, Limits
+from cairn_client.replica.limits import NO_LIMITS, Limits
+from cairn_client.replica.replica_state import CellCube
 from cairn_client.robot.robot import Robot
 from cairn_client.robot.robot_events import CellsDropped, OutboxNearlyFull
 from cairn_map.commits.commit import ScanPose
@@ -192,7 +192,7 @@ def test_a_commit_drops_the_farthest_cells_and_then_refuses(row_server: LiveServ
 def test_a_full_outbox_refuses_and_the_measurement_stays_open(
     server: LiveServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cairn_client.robot.limits.LEAST_BYTES", 1)
+    monkeypatch.setattr("cairn_client.replica.limits.LEAST_BYTES", 1)
     with robot_in(tmp_path, server.map_url) as robot:
         size_bytes = 0
         map_commit(robot, 1)
@@ -229,7 +229,7 @@ def test_commits_that_are_stable_go_first(server: LiveServer, tmp_path: Path) ->
         server.wait_for_fold()
         # The robot hears that it is stable, and goes on without its cells, before it fetches again.
         robot.replica.take_header(robot._api.cell_index(MAP).header, asked_by=robot.replica.author)
-        robot._rounds._room.kept = Kept(centre=(0, 0, 0), radius=1)
+        robot._rounds._budget.kept = CellCube(centre=(0, 0, 0), radius=1)
         robot.replica.commit(far)
         assert len(robot.replica.commits) == 1
         with pytest.raises(UnreachableError, match="1 of them unpushed"):
@@ -254,9 +254,9 @@ def test_where_not_even_one_cell_fits_the_cause_is_told(row_server: LiveServer, 
     with robot_in(tmp_path, row_server.map_url, limits=Limits(memory_bytes_max=1 << 16)) as robot:
         at(robot, 0)
         robot.sync()
-        limits = robot._rounds._room._limits
+        limits = robot._rounds._budget._limits
         object.__setattr__(limits, "memory_bytes_max", 4096)
-        robot._rounds._room.kept = Kept(centre=(5, 0, 0), radius=0)
+        robot._rounds._budget.kept = CellCube(centre=(5, 0, 0), radius=0)
         at(robot, 5)
         with pytest.raises(BadInputError) as caught:
             robot.sync()

@@ -36,7 +36,7 @@ def test_a_robot_tells_its_status_with_every_sync(server: LiveServer, tmp_path: 
         mole.observe(scan_of(2))
         commit = mole.commit()
         assert commit is not None
-        mole.status.tell(mole.replica, mole._api, MAP, branch="mole", mode=mole.mode)
+        mole.status.send(mole.replica, mole._api, MAP, branch="mole", mode=mole.mode)
         status = branch_of(server).status
         assert status is not None
         assert (status.waiting, status.waiting_bytes) == (1, len(commit.data))

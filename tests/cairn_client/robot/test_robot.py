@@ -289,7 +289,7 @@ def test_a_robot_works_with_a_token_of_its_own_that_an_admin_gave_it(guarded: Li
         assert cells_of(robot.map) == cells_of(evidence_of(1))
     with robot_in(tmp_path, guarded.map_url, token=TOKEN) as robot:  # and may be enrolled all the same
         robot.sync()
-        assert robot.replica.token() not in (None, own)
+        assert robot.replica.state.token not in (None, own)
 
 
 def test_a_robot_whose_token_was_replaced_registers_anew_though_the_link_fails_between(

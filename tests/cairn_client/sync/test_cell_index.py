@@ -11,9 +11,8 @@ from tests.fixtures.client.team import Team
 from cairn_client.http import api as api_module
 from cairn_client.http.api import MapApi
 from cairn_client.http.http_link import Link, index_of
-from cairn_client.sync import cell_index as index_module
-from cairn_client.sync.cell_index import whole_index
-from cairn_client.sync.requests import Box
+from cairn_client.sync import requests as index_module
+from cairn_client.sync.requests import Box, whole_index
 from cairn_client.sync.sync import fetch_cells
 from cairn_map.commits.ids import Author
 from cairn_map.errors import UnreachableError

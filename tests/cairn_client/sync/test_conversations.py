@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from tests.fixtures.client.made import GEOMETRY, A, committed, covering, cursor, exchanged, header, opened, seen
 
-from cairn_client.replica.refused_commits import REST_S, Resting
-from cairn_client.replica.replica import Replica
+from cairn_client.replica.outbox import CommitFacts
+from cairn_client.replica.replica import REST_S, RefusedPushes, Replica
 from cairn_client.replica.replica_store import BaseCell
 from cairn_client.sync.requests import GetMissing, NextFrame, Push
 from cairn_client.sync.sync import fetch_missing, push_commits
@@ -34,10 +34,7 @@ def retract_of(*targets: CommitId) -> Commit:
 
 
 def amending(replica: Replica, target: CommitId) -> Commit:
-    meta = CommitMeta(
-        id=str(CommitId(replica.author, 99)), geometry=GEOMETRY.digest().hex(), retracts=(str(target),), note="amend"
-    )
-    return replica.commit({A: Z}, meta)
+    return replica.commit({A: Z}, CommitFacts(retracts=(target,), note="amend"))
 
 
 def signed(replica: Replica, commit: Commit) -> Push:
@@ -78,7 +75,7 @@ def refused(replica: Replica, *answers: CairnError | None) -> dict[CommitId, Cai
 
 def test_a_commit_that_is_refused_for_its_bytes_rests_for_an_hour(mole: Replica) -> None:
     now_s = 0.0
-    mole.resting = Resting(steady_s=lambda: now_s)
+    mole.refusals = RefusedPushes(steady_s=lambda: now_s)
     first, no = committed(mole, X), BadInputError("too_much_evidence", "no")
     assert refused(mole, no) == {first.id: no}
     second = committed(mole, Y)
@@ -154,13 +151,15 @@ def test_what_a_kept_amend_names_is_kept_though_it_is_stable_and_covered(
         mole = opened(tmp_path / "mole")
     vector = covering(first.id)
     exchanged(mole, header(cursor(1), vector, stable=vector))
-    mole.hold_nothing(A, BaseCell(cursor(1), vector, ZERO))
+    with mole.changing() as base:
+        base.hold_nothing(A, BaseCell(cursor(1), vector, ZERO))
     assert mole.forget_stable_commits() == 0
     assert mole.commits == [first.id, amend.id]
     mole.acknowledge(amend.id)
     vector = covering(first.id, amend.id)
     exchanged(mole, header(cursor(2), vector, stable=vector))
-    mole.hold_nothing(A, BaseCell(cursor(2), vector, ZERO))
+    with mole.changing() as base:
+        base.hold_nothing(A, BaseCell(cursor(2), vector, ZERO))
     assert mole.forget_stable_commits() == 1
     assert mole.forget_stable_commits() == 1
     assert mole.commits == []

@@ -141,11 +141,11 @@ def test_what_the_robots_own_disk_damaged_is_not_sent(team: Team, server: LiveSe
     team.fetch("mole")
     damage(server, FIRST)
     assert is_damaged(server, FIRST)
-    with team["mole"].lock, team["mole"].store.transaction():
+    with team["mole"].store.transaction():
         other = encode_cell(FIRST, Y, team["mole"].geometry).data
         team["mole"].store.put_cell(FIRST, team["mole"].cells[FIRST], body=other)
     team.fetch("mole")
-    assert not team["mole"].refused_cells
+    assert not team["mole"].refusals.cells
     assert is_damaged(server, FIRST)
 
 

@@ -24,7 +24,7 @@ from tests.fixtures.client.made import (
 
 from cairn_client.http.http_link import Link
 from cairn_client.replica.replica import Replica
-from cairn_client.sync.applying import Exchange
+from cairn_client.sync.exchange import Exchange
 from cairn_client.sync.responses import FetchedCell
 from cairn_client.sync.sync import fetch_cells, fetch_missing, push_commits
 from cairn_map.codec.cell_code import encode_cell
@@ -260,7 +260,8 @@ def test_the_end_moves_nothing_if_the_sum_does_not_agree(mole: Replica) -> None:
 def test_the_end_moves_nothing_if_a_cell_has_moved_since_the_request(mole: Replica) -> None:
     at(mole, C1, X)
     exchange = Exchange(mole)
-    mole.move([A], to=C3, coverage=EMPTY)
+    with mole.changing() as base:
+        base.move([A], to=C3, coverage=EMPTY)
     exchange.take(header(C2))
     exchange.take(done(C2, (A, X)))
     assert not exchange.is_done

@@ -16,6 +16,7 @@ from tests.links.proxy import Cut, Fault, FaultProxy
 from cairn_client.cli.robots import command as robot_command
 from cairn_client.http.api import MapApi
 from cairn_client.http.http_link import Link
+from cairn_client.replica.outbox import CommitFacts
 from cairn_client.robot import status_report
 from cairn_client.robot.robot import Robot
 from cairn_client.sync.link_profile import LINKS
@@ -23,7 +24,7 @@ from cairn_client.sync.near_cells import cell_at
 from cairn_client.sync.scope import Scope
 from cairn_client.sync.sync import push_commits
 from cairn_map.codec.cell_code import Profile
-from cairn_map.commits.commit import CommitMeta, ScanPose
+from cairn_map.commits.commit import ScanPose
 from cairn_map.errors import UnreachableError
 from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.grid import Cell, cell_key, cell_of_key
@@ -68,10 +69,9 @@ def built(server: LiveServer, folder: Path, *, kelvin: Callable[[Cell], int]) ->
             samples = np.tile([steps, steps**2, int(steps > 0)], (200, 1))
             cells[cell_key((i, j, 0))] = packed_evidence(voxels, counts, samples, GEOMETRY)
     pose = ScanPose(time_s=1.5e9, t_map_rig=(0.0, 0.0, 0.4), q_map_rig=(0.0, 0.0, 0.0, 1.0))
-    meta = CommitMeta(id=f"owl.{'0' * 16}.0", geometry=GEOMETRY.digest().hex(), scans=(pose,) * 64)
     with MapApi(server.url) as api:
         api.register(MAP, Register(robot="owl", incarnation=owl.author.incarnation))
-        owl.commit(cells, meta)
+        owl.commit(cells, CommitFacts(scans=(pose,) * 64))
         assert Link(api, MAP, branch="owl").hold(push_commits(owl)).pushed == 1
     server.wait_for_fold()
     owl.close()
@@ -200,7 +200,9 @@ def test_on_a_small_link_commits_take_few_bytes_and_statuses_are_seldom(
     ):
         commit = robot.replica.commit
         monkeypatch.setattr(
-            robot.replica, "commit", lambda *a, profile: (profiles.append(profile), commit(*a, profile=profile))[1]
+            robot.replica,
+            "commit",
+            lambda *a, profile, notes: (profiles.append(profile), commit(*a, profile=profile))[1],
         )
         for seed in range(6):
             robot.observe(scan_of(seed))

@@ -176,27 +176,22 @@ def _leave_out(robot: Robot, stop: Stop, exc: BadInputError) -> None:
         stop.folder,
         exc.message,
     )
-    robot.replica.outbox.beside = {}
     robot.discard()
     remember(robot.replica, stop.mark_left_out())
 
 
 def _commit(robot: Robot, stop: Stop, profile: Profile, tally: _Tally, stopping: threading.Event) -> bool:
     """Keep a measurement together with the mark that it is done; False, and nothing is kept, if it is to stop first."""
-    outbox = robot.replica.outbox
-    outbox.beside = stop.mark()
     while not stopping.is_set():
         try:
-            commit = robot.commit(note=stop.source.name, profile=profile)
+            commit = robot.commit(note=stop.source.name, profile=profile, remember=stop.mark())
         except UnreachableError as exc:  # a full disk or outbox: there may be room later
             log.error("%s; trying again in %.0f s", exc.message, COMMIT_AGAIN_S)
             stopping.wait(COMMIT_AGAIN_S)
             continue
         if commit is None:
-            outbox.beside = {}
             remember(robot.replica, stop.mark())
         tally.commits += commit is not None
         return True
-    outbox.beside = {}
     robot.discard()
     return False

@@ -115,7 +115,7 @@ class _Stream:
             self._loop.call_soon_threadsafe(self._woken.set)
 
 
-class EventStream(StreamingResponse):
+class ServerSentEvents(StreamingResponse):
     """Events in the format of Server-Sent Events (HTML, section 9.2)."""
 
     def __init__(self, stream: _Stream) -> None:
@@ -157,7 +157,7 @@ async def events(
     """Live changes as Server-Sent Events; `Last-Event-ID`, or `after`, goes on from there."""
     stream = _Stream(asker, row)
     await stream.join(position_from_text(last_event_id or after or ""))
-    return EventStream(stream)
+    return ServerSentEvents(stream)
 
 
 @router.get("/maps/{name}/live", dependencies=READERS, status_code=101, responses=answers({101: ()}) | problems(426))

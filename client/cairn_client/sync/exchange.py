@@ -1,4 +1,11 @@
-"""Frames onto a replica: SYNC.md rules 5 to 9, one function for each kind of frame. No I/O but the replica's own.
+"""One exchange: a request for what is missing, and the frames of its answer applied to a replica (SYNC.md rules 5-9).
+
+    header   the server's state that the answer leads to
+    frame    one cell's news: full, delta, state or reset          -> `_apply_*`, one function for each kind
+    more     the reply ended before its cells did
+    done     the cells without a frame move along                  -> `_finish`
+
+There is no I/O except the replica's own.
 
 A frame that does not fit is dropped, never forced: the cell then has no cursor, and the next request asks for it
 whole.
@@ -8,8 +15,9 @@ import logging
 
 import numpy as np
 
-from cairn_client.replica.replica import UNPROVEN, Replica
+from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_store import BaseCell
+from cairn_client.replica.server_cells import UNPROVEN, ServerCells
 from cairn_client.sync.requests import Box
 from cairn_map.codec.cell_code import decode_cell
 from cairn_map.commits.version_vector import EMPTY
@@ -28,7 +36,7 @@ MISFIT = "the frame does not lead to the server's fingerprint"
 
 
 def is_within(key: CellKey, box: Box | None) -> bool:
-    """Whether a cell lies in a box; None is everywhere."""
+    """True if a cell lies in a box; None is everywhere."""
     return box is None or all(a <= b <= c for a, b, c in zip(box[0], cell_of_key(key), box[1], strict=True))
 
 
@@ -44,15 +52,20 @@ class Exchange:
         reply_bytes_max: int | None = None,
         near: Cell | None = None,
     ) -> None:
-        """Ask for all cells, or for those in a box; at most so many bytes of cells, or as many as the server likes.
+        """Begin an exchange from the replica's cursors as they are now.
 
-        The cells next to `near` come first.
+        Args:
+            replica: the robot's state.
+            compare: True to ask for the fingerprint of every cell, and not for what changed since its cursor.
+            box: cells to ask for; None: all.
+            reply_bytes_max: bytes of cells after which the reply ends; None: as many as the server likes.
+            near: cell whose neighbours come first.
         """
         self._replica = replica
-        with replica.lock:
+        with replica.changing() as base:  # author and cursors are of one instant
             self._author = replica.author
-            self._default = replica.default_cursor
-            self._asked = {key: cell.cursor for key, cell in replica.cells.items() if is_within(key, box)}
+            self._default = base.default_cursor
+            self._asked = {key: cell.cursor for key, cell in base.cells.items() if is_within(key, box)}
         self._compare = compare
         self._box = box
         self._reply_bytes_max = reply_bytes_max
@@ -62,14 +75,16 @@ class Exchange:
         self._framed: set[CellKey] = set()
         self._has_dropped = False
         self.damaged: list[CellKey] = []
-        """Cells that came whole, but not sound: they are asked for again, and the others are not held up."""
+        """Cells that came whole, but not sound: they are requested again, and the others are not held up."""
         self.is_done = False
+        """True once all cells of the request stand at the server's state."""
         self.has_more = False
-        """The reply ended before its cells did: the next request asks for the rest."""
+        """True if the reply ended before its cells did: the next request asks for the rest."""
         self.must_compare = False
+        """True if the next request is to compare the fingerprints of all cells."""
 
     def request(self) -> MissingRequest:
-        """What this replica holds: the default cursor, and every cell that stands elsewhere."""
+        """The request: the replica's default cursor, and the cursors of the cells that stand elsewhere."""
         groups: dict[str | None, list[CellKey]] = {}
         for key, cursor in sorted(self._asked.items()):
             if self._compare or cursor != self._default:
@@ -91,7 +106,7 @@ class Exchange:
         Raises:
             DamagedDataError: frames in an impossible order.
         """
-        with self._replica.lock:
+        with self._replica.changing() as base:
             if isinstance(frame, ReplyHeader):
                 self._header = frame
                 self._coverage = frame.coverage
@@ -103,15 +118,15 @@ class Exchange:
             elif frame.to_cursor != self._header.to_cursor:
                 raise DamagedDataError("bad_frame", "a frame leads to another state than its header")
             elif isinstance(frame, CellFrame):
-                self._take_cell(frame)
+                self._take_cell(base, frame)
             else:
-                self._finish(frame)
+                self._finish(base, frame)
 
-    def _take_cell(self, frame: CellFrame) -> None:
+    def _take_cell(self, base: ServerCells, frame: CellFrame) -> None:
         self._framed.add(frame.cell)
-        held = self._replica.cells.get(frame.cell)
-        stands_at = held.cursor if held else self._replica.default_cursor
-        if frame.from_cursor != stands_at:  # rule 5: made for a state that this cell has left
+        # Rule 5: only a frame that was made for the cursor at which the cell stands fits.
+        stands_at = base.cursor(frame.cell)
+        if frame.from_cursor != stands_at:
             log.info("cell %s: frame for another cursor dropped", cell_of_key(frame.cell))
             self._has_dropped = True
             return
@@ -121,62 +136,64 @@ class Exchange:
             FrameKind.STATE: self._apply_state,
             FrameKind.RESET: self._apply_reset,
         }[frame.kind]
+        # A frame that leads to no sound cell changes nothing, and the cell is asked for whole.
         try:
-            apply(frame)
+            apply(base, frame)
         except DamagedDataError as exc:
             if frame.kind is FrameKind.FULL:
                 self.damaged.append(frame.cell)
-            if frame.kind is not FrameKind.FULL or held is None:
-                self._ask_whole(frame.cell, exc.message)
+            if frame.kind is not FrameKind.FULL or frame.cell not in base.cells:
+                self._ask_whole(base, frame.cell, exc.message)
 
-    def _apply_full(self, frame: CellFrame) -> None:
+    def _apply_full(self, base: ServerCells, frame: CellFrame) -> None:
         evidence = self._payload(frame)
         if fingerprint(evidence, frame.cell) != frame.fingerprint:
             raise DamagedDataError("fingerprint_mismatch", "it came whole, but not with its fingerprint")
-        self._replica.hold(frame.cell, self._at_head(frame), evidence, body=frame.payload)
+        base.hold(frame.cell, self._at_head(frame), evidence, body=frame.payload)
 
-    def _apply_delta(self, frame: CellFrame) -> None:
+    def _apply_delta(self, base: ServerCells, frame: CellFrame) -> None:
         own: list[Evidence] | None = []
         if frame.own_excluded:
-            held = self._replica.cells.get(frame.cell)
-            news = self._coverage.minus(held.coverage) if held else self._coverage
+            news = self._coverage.minus(base.coverage(frame.cell))
             own = self._replica.outbox.own_evidence(frame.cell, news, self._author)
         if own is None:
-            self._ask_whole(frame.cell, "own commits that a delta leaves out are not kept any more")
+            self._ask_whole(base, frame.cell, "own commits that a delta leaves out are not kept any more")
             return
-        base = self._replica.base_evidence(frame.cell)
-        self._hold_if_sound(frame, sum_evidence([base, *own, self._payload(frame)], self._replica.geometry))
+        before = base.evidence(frame.cell)
+        self._hold_if_sound(base, frame, sum_evidence([before, *own, self._payload(frame)], self._replica.geometry))
 
-    def _apply_state(self, frame: CellFrame) -> None:
-        base = self._replica.base_evidence(frame.cell)
+    def _apply_state(self, base: ServerCells, frame: CellFrame) -> None:
+        before = base.evidence(frame.cell)
         blocks = frame.blocks if frame.blocks is not None else np.empty(0, np.uint32)
-        kept = without_blocks(base, blocks)
-        self._hold_if_sound(frame, sum_evidence([kept, self._payload(frame)], self._replica.geometry))
+        kept = without_blocks(before, blocks)
+        self._hold_if_sound(base, frame, sum_evidence([kept, self._payload(frame)], self._replica.geometry))
 
-    def _apply_reset(self, frame: CellFrame) -> None:
-        held = self._replica.cells.get(frame.cell)
+    def _apply_reset(self, base: ServerCells, frame: CellFrame) -> None:
+        held = base.cells.get(frame.cell)
         if frame.fingerprint != (held.fingerprint if held else ZERO):
-            self._ask_whole(frame.cell, "the server has another state")
+            self._ask_whole(base, frame.cell, "the server has another state")
         elif held:
-            self._replica.move([frame.cell], to=frame.to_cursor, coverage=self._coverage)
+            base.move([frame.cell], to=frame.to_cursor, coverage=self._coverage)
         else:  # an empty cell has a coverage all the same: what was taken out again must not be shown as new
-            self._replica.hold_nothing(frame.cell, self._at_head(frame))
+            base.hold_nothing(frame.cell, self._at_head(frame))
 
-    def _finish(self, done: Done) -> None:
+    def _finish(self, base: ServerCells, done: Done) -> None:
         """Rule 8: cells without a frame move to `to`, only if they are where they were and their sum agrees."""
         if self._has_dropped:
             return
+        # The cells without a frame, as they stand now, add up to the sum that the server states.
         unframed = self._asked.keys() - self._framed
-        rest = {key: cell for key in unframed if (cell := self._replica.cells.get(key)) is not None}
+        rest = {key: cell for key in unframed if (cell := base.cells.get(key)) is not None}
         total = sum((cell.fingerprint for cell in rest.values()), ZERO)
         stands = {key: cell.cursor for key, cell in rest.items()}
         if stands != {key: self._asked[key] for key in unframed} or total != done.rest_fingerprint:
             log.warning("cells without a frame do not add up to the server's; comparing all fingerprints")
             self.must_compare = True
             return
-        self._replica.move(rest, to=done.to_cursor, coverage=self._coverage)
+        # All of them move at once; a cell that is not held moves with the default cursor, unless a box was asked for.
+        base.move(rest, to=done.to_cursor, coverage=self._coverage)
         if self._box is None:
-            self._replica.set_default_cursor(done.to_cursor)
+            base.set_default_cursor(done.to_cursor)
         self._replica.forget_stable_commits()
         self.is_done = True
 
@@ -191,16 +208,16 @@ class Exchange:
     def _at_head(self, frame: CellFrame) -> BaseCell:
         return BaseCell(frame.to_cursor, self._coverage, frame.fingerprint)
 
-    def _hold_if_sound(self, frame: CellFrame, evidence: Evidence) -> None:
+    def _hold_if_sound(self, base: ServerCells, frame: CellFrame, evidence: Evidence) -> None:
         if fingerprint(evidence, frame.cell) == frame.fingerprint:
-            self._replica.hold(frame.cell, self._at_head(frame), evidence)
+            base.hold(frame.cell, self._at_head(frame), evidence)
         else:
-            self._ask_whole(frame.cell, MISFIT)
+            self._ask_whole(base, frame.cell, MISFIT)
 
-    def _ask_whole(self, key: CellKey, why: str) -> None:
-        """The next request asks for the cell without a cursor; what is held of it is shown until then."""
+    def _ask_whole(self, base: ServerCells, key: CellKey, why: str) -> None:
+        """Take a cell's cursor away, so that the next request asks for it whole; its evidence is shown until then."""
         log.warning("cell %s: %s; asking for the whole cell", cell_of_key(key), why)
-        if key in self._replica.cells:
-            self._replica.move([key], to=None, coverage=None)
+        if key in base.cells:
+            base.move([key], to=None, coverage=None)
         else:
-            self._replica.hold_nothing(key, UNPROVEN)
+            base.hold_nothing(key, UNPROVEN)

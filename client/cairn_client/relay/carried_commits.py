@@ -1,15 +1,17 @@
-"""Commits of others that a robot has with it: a folder with a file for each, from one server on its way to the next.
+"""Carried commits: others' commits in a folder of a robot, with a file for each, on their way to the next server.
 
     mole.1f2e3d4c5b6a7988.7      the signatures, a line feed, the commit's bytes; empty once there was no room for it
 
-It is a relay's place like a server. What is in it is on some server, too, so when it is full the oldest give way;
-their names stay, so that they are not fetched again.
+The folder is one end of a relay, like a server. Its commits are on some server, too, so when it is full the oldest are
+emptied; their names stay, so that they are not fetched again.
 """
 
 import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
+from cairn_client.relay.round import RelayReport, Undelivered, log_report, relay_round
 from cairn_map.commits.commit_reading import open_commit
 from cairn_map.commits.ids import INITIAL, OPERATOR, CommitId, commit_id_from_text
 from cairn_map.commits.signature import TEXT_MAX, check_signatures, signatures_from_text, speaks_for
@@ -17,14 +19,16 @@ from cairn_map.commits.version_vector import EMPTY
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, NotFoundError, UnreachableError
 from cairn_map.wire.relay_peer import Held, SignedCommit
 
+FOLDER = "carried"
+
 SERVERS_OWN = (OPERATOR, INITIAL)
 """Authors in whose name servers speak, by keys that only a server knows whether to trust."""
 COMING = ".coming"
-"""Ends the name of a file that is not whole."""
+"""Suffix of the name of a file that is not whole."""
 
 
 class CarriedCommits:
-    """`relay_end.MapEnd` in a folder; of one program at a time."""
+    """A folder of commits as one end of a relay (`relay_peer.MapEnd`); for one program at a time."""
 
     def __init__(self, folder: Path, map_name: str, *, size_bytes_max: int) -> None:
         """Open or make the folder; for commits of this map.
@@ -41,7 +45,7 @@ class CarriedCommits:
             raise BadInputError("bad_folder", f"cannot make the folder {folder}: {exc.strerror}") from exc
 
     def held(self) -> Held:
-        """What is or was carried.
+        """Ids of the commits that are or were carried.
 
         Raises:
             UnreachableError: kind `store_failed`: the folder cannot be read.
@@ -103,7 +107,7 @@ class CarriedCommits:
             raise BadInputError("bad_signature", f"{commit.id} is not signed by its author")
 
     def _make_room(self, size_bytes: int) -> None:
-        """Let the oldest give way."""
+        """Empty the oldest files until so many bytes fit."""
         found = sorted((path.stat().st_mtime_ns, path) for _, path in self._files())
         total = sum(path.stat().st_size for _, path in found) + size_bytes
         for _, path in found:
@@ -126,3 +130,30 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+class Carrier:
+    """Commits of others that a robot carries: at each server it hands them over, and takes along what they lack."""
+
+    def __init__(self, directory: Path, api: RelayApi, map_name: str, *, size_bytes_max: int) -> None:
+        self._here = CarriedCommits(directory / FOLDER, map_name, size_bytes_max=size_bytes_max)
+        self._there = ServerEnd(api, map_name)
+        self._map_name = map_name
+        self._resting = Undelivered()
+
+    def exchange(self) -> RelayReport:
+        """One round with the server that the robot is at.
+
+        Raises:
+            UnreachableError: the link broke; what was handed over stays so.
+        """
+        report = hold_between(relay_round(self._resting), self._here, self._there)
+        log_report(report, self._map_name, there="the server")
+        if report.cut:
+            raise report.cut
+        return report
+
+
+def carrier_in(directory: Path, api: RelayApi, map_name: str, *, size_bytes_max: int) -> Carrier | None:
+    """Carrier of a robot with so many bytes for others' commits; None if it has none."""
+    return Carrier(directory, api, map_name, size_bytes_max=size_bytes_max) if size_bytes_max else None

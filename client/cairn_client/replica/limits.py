@@ -1,0 +1,43 @@
+"""Limits of what a robot keeps on the disk and in memory, and the order in which it is dropped when they are reached.
+
+    1. commits that the server has for good          (their bytes; they are in its map)
+    2. cells of the server, the farthest first       (they are a cache, and come again when the robot is near)
+    3. nothing more: `commit` refuses, and the measurement stays open
+
+What the server does not have for good is never dropped, nor is it left out of the robot's map. A dropped cell is one
+that is not held: the robot asks for it whole when it comes near, and until then shows of it only what it made itself.
+
+The robot's folder remembers the limits that were given last (`replica_state`), for a robot that opens it without any.
+"""
+
+from dataclasses import dataclass
+
+from cairn_map.errors import BadInputError
+
+LEAST_BYTES = 1 << 16
+"""Smallest limit that leaves room for anything."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """Limits of one robot, bytes each; None: as much as there is."""
+
+    disk_bytes_max: int | None = None
+    """Largest size of the pages in use in the robot's file: commits, cells, and some 200 bytes of each commit ever
+    made. Its write-ahead log, up to 64 MB, comes on top, and the file does not become smaller by itself: its free pages
+    are used again."""
+    outbox_bytes_max: int | None = None
+    """Largest size of the commits whose bytes are kept: those that wait, and those that a restore of the server could
+    lose."""
+    memory_bytes_max: int | None = None
+    """Largest size of the map in memory (`robot.map.size_bytes`). The measurement under way comes on top, and of
+    `snapshot()` what changed since it was taken, for as long as a caller holds it."""
+
+    def __post_init__(self) -> None:
+        """Raises: BadInputError: a limit that leaves no room for anything."""
+        for limit in (self.disk_bytes_max, self.outbox_bytes_max, self.memory_bytes_max):
+            if limit is not None and limit < LEAST_BYTES:
+                raise BadInputError("bad_option", f"a limit is at least {LEAST_BYTES} bytes, got {limit}")
+
+
+NO_LIMITS = Limits()

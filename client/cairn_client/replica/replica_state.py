@@ -1,0 +1,258 @@
+"""Texts that a robot's folder remembers between two runs, by key, with their types.
+
+    ReplicaState    whose folder it is, its place on the server, its limits: one text for each field
+    RobotKeys       keys that sign the robot's commits: one text for each incarnation
+    Successors      commits that stand for others: one text for each commit that was taken out
+
+A value that is set is durable on return, or with the transaction that this thread has open. The commits and cells have
+tables of their own in the store.
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any, Generic, Self, TypeVar, cast, overload
+
+from pydantic import BaseModel, ConfigDict
+
+from cairn_client.replica.limits import Limits
+from cairn_client.replica.replica_store import ReplicaStore
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.cursor import Cursor, cursor_from_text
+from cairn_map.commits.ids import CommitId, Incarnation, RobotName, commit_id_from_text
+from cairn_map.commits.signature import SIGNATURES_MAX, SigningKey, signatures_to_text
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_map.wire.messages import Mode, ReplyHeader, message_from_json
+
+T = TypeVar("T")
+Model = TypeVar("Model", bound=BaseModel)
+
+OPEN = "open"
+"""Text under the key "door" of a robot that registered without a token."""
+
+
+class Contact(BaseModel):
+    """Last contact with the server, and the failures since then."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    last_s: float | None = None
+    """End of the last whole round, UTC; None if there was none yet."""
+    failed_s: float | None = None
+    """Time of the first failure since the last whole round, UTC; None if there was none."""
+    kind: str = ""
+    """Error kind of the last failure since the last whole round; empty if there was none."""
+    reason: str = ""
+    """Message of the last failure since the last whole round; empty if there was none."""
+
+
+class CellCube(BaseModel):
+    """Cube of cells around a robot: those of the server that a full robot keeps."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    centre: tuple[int, int, int]
+    """The cell in the middle."""
+    radius: int
+    """Cells from the centre to each face; 0 is the centre alone."""
+
+
+class Field(Generic[T]):
+    """One remembered value: a descriptor that reads and writes the text under a key."""
+
+    def __init__(self, key: str, decode: Callable[[str], T], encode: Callable[[T], str | None] = str) -> None:
+        """Args: encode: the text of a value; None for a value that is remembered as no text."""
+        self.key = key
+        self.decode = decode
+        self.encode = encode
+
+    @overload
+    def __get__(self, state: None, owner: type[Any]) -> Self: ...
+    @overload
+    def __get__(self, state: "ReplicaState", owner: type[Any]) -> T | None: ...
+    def __get__(self, state: "ReplicaState | None", owner: type[Any]) -> Self | T | None:
+        return self if state is None else self.read(state.store.get)
+
+    def __set__(self, state: "ReplicaState", value: T | None) -> None:
+        state.store.put(self.key, None if value is None else self.encode(value))
+
+    def read(self, get: Callable[[str], str | None]) -> T | None:
+        """The value among texts by key, as `ReplicaStore.get` or a dict's `get` returns them; None if it is not set."""
+        text = get(self.key)
+        return None if text is None else self.decode(text)
+
+
+def _model_field(key: str, model: type[Model]) -> Field[Model]:
+    return Field(key, model.model_validate_json, lambda value: value.model_dump_json())
+
+
+class ReplicaState:
+    """Typed record of what a robot's folder remembers; each attribute is one stored text."""
+
+    robot = Field("robot", RobotName)
+    """Name of the robot whose folder it is."""
+    map_name = Field("map", str)
+    """Name of the map on its server."""
+    geometry = _model_field("geometry", Geometry)
+    """Grid of the map."""
+    url = Field("url", str)
+    """Map on its server, `http://HOST:PORT/maps/NAME`."""
+    mode = Field("mode", lambda text: cast(Mode, text))
+    """Mode in which the robot was opened last."""
+    limits = Field("limits", lambda text: Limits(**json.loads(text)), lambda limits: json.dumps(asdict(limits)))
+    """Limits that were given last."""
+    kept_cube = _model_field("room", CellCube)
+    """Cells of the server that the robot keeps; None while the whole map fits."""
+    sensor_model = _model_field("sensor_model", SensorModel)
+    """The map's own sensor model; None while no server has stated it."""
+    header = Field("header", lambda text: message_from_json(ReplyHeader, text), lambda header: header.model_dump_json())
+    """Newest state that the server reported."""
+    default_cursor = Field[Cursor]("default_cursor", cursor_from_text)
+    """Cursor of every cell that is not held."""
+    token = Field("token", str)
+    """Token that the server gave to the robot."""
+    may_register_openly = Field("door", lambda text: text == OPEN, lambda is_open: OPEN if is_open else None)
+    """True if the robot registered without any token, and so can register again."""
+    contact = _model_field("contact", Contact)
+    """Last contact with the server, to ten seconds."""
+    incarnation = Field("incarnation", Incarnation)
+    """Incarnation under which the robot numbers its commits."""
+    next_n = Field[int]("next_n", int)
+    """Number of the robot's next commit."""
+    tip_sha = Field("tip_sha", str)
+    """SHA-256, hex, of the robot's last commit; None before the first of an incarnation."""
+
+    def __init__(self, store: ReplicaStore) -> None:
+        self.store = store
+
+    def identify(self, *, robot: RobotName, map_name: str, geometry: Geometry) -> None:
+        """Make the folder this robot's, or check that it is.
+
+        Raises:
+            BadInputError: kind `other_replica`: it belongs to another robot, map or grid.
+        """
+        identity = {
+            ReplicaState.robot.key: robot,
+            ReplicaState.map_name.key: map_name,
+            ReplicaState.geometry.key: geometry.model_dump_json(),
+        }
+        with self.store.transaction():
+            for key, value in identity.items():
+                known = self.store.get(key)
+                if known is not None and known != value:
+                    raise BadInputError(
+                        "other_replica",
+                        f"the robot's folder belongs to another {key}: {known[:120]}; choose another (--state)",
+                    )
+                self.store.put(key, value)
+
+    def note_use(self, *, url: str, mode: Mode) -> None:
+        """Remember on which map, and in which mode, the robot works."""
+        with self.store.transaction():
+            self.url = url
+            self.mode = mode
+
+    def note_model(self, model: SensorModel) -> None:
+        """Remember the sensor model that the server stated, if it is new."""
+        if self.map_model() != model:
+            self.sensor_model = model
+
+    def map_model(self) -> SensorModel:
+        """The map's own sensor model; the default one while no server has stated it."""
+        return self.sensor_model or SensorModel()
+
+
+class RobotKeys:
+    """Keys by which a robot signs its commits: one for each of its incarnations, in its file next to its token.
+
+    A key and the incarnation that follows from it are drawn together. Older ones are kept: a commit of an older
+    incarnation may still wait, or be taken back.
+    """
+
+    def __init__(self, state: ReplicaState, robot: RobotName) -> None:
+        self._state = state
+        self._store = state.store
+        self._robot = robot
+
+    def has(self, incarnation: Incarnation) -> bool:
+        """True if this incarnation's commits can be signed."""
+        return self._key(incarnation) is not None
+
+    def draw(self) -> Incarnation:
+        """Draw a new key, in a transaction of the caller's; the incarnation that follows from it."""
+        key = SigningKey.drawn()
+        self._store.put(_signing_key(key.incarnation), key.seed.hex())
+        return key.incarnation
+
+    def signatures(self, commit: Commit) -> str | None:
+        """Signatures on an own commit, by its incarnation and those whose commits it takes out; None without a key."""
+        spoken_for = dict.fromkeys([commit.id.author, *(target.author for target in commit.meta.retracted_ids)])
+        own = [author.incarnation for author in spoken_for if author.robot == self._robot]
+        keys = [key for incarnation in own if (key := self._key(incarnation)) is not None]
+        if commit.id.author.robot != self._robot or not keys:
+            return None
+        map_name = self._state.map_name or ""
+        return signatures_to_text([key.sign(map_name, commit.sha) for key in keys[:SIGNATURES_MAX]])
+
+    def _key(self, incarnation: Incarnation) -> SigningKey | None:
+        seed = self._store.get(_signing_key(incarnation))
+        return SigningKey(bytes.fromhex(seed)) if seed else None
+
+
+def _signing_key(incarnation: Incarnation) -> str:
+    return f"signing_key.{incarnation}"
+
+
+class Successors:
+    """Successors of a robot's commits: the first commit that names a commit stands for it, for ever.
+
+        C  <- M1  <- M2         M1 amends C, M2 amends M1: M2 is what stands for C now
+
+    A retract takes effect once (SYNC.md rule 11), so a later commit that names the same one changes nothing. The texts
+    are part of the transaction that keeps the naming commit; they are read again after it, so that one that failed
+    leaves no trace.
+    """
+
+    def __init__(self, store: ReplicaStore) -> None:
+        self._store = store
+        self._of: dict[CommitId, CommitId] = {}
+
+    def of(self, commit: CommitId) -> CommitId | None:
+        """The commit that took a commit out, of those that were read; None if there is none."""
+        return self._of.get(commit)
+
+    def latest(self, commit: CommitId) -> CommitId:
+        """The commit that stands for a commit now; itself if none took it out."""
+        while (successor := self._stored(commit)) is not None:
+            commit = successor
+        return commit
+
+    def read(self, commit: CommitId) -> None:
+        """Read from the store which commit took a commit out."""
+        successor = self._stored(commit)
+        if successor is not None:
+            self._of[commit] = successor
+
+    def put(self, commit: CommitId, by: CommitId) -> None:
+        """Within a transaction, note that `by` takes a commit out, unless another did before."""
+        if self._stored(commit) is None:
+            self._store.put(_successor_key(commit), str(by))
+
+    def rename(self, old: CommitId, new: CommitId, *, takes_out: tuple[CommitId, ...]) -> None:
+        """Within a transaction, note that a commit, which takes out these, gets a new id; its successor stays."""
+        by = self._stored(old)
+        self._store.put(_successor_key(old), str(new) if by is None else str(by))
+        self._store.put(_successor_key(new), None if by is None else str(by))
+        for target in takes_out:
+            if self._stored(target) == old:
+                self._store.put(_successor_key(target), str(new))
+
+    def _stored(self, commit: CommitId) -> CommitId | None:
+        text = self._store.get(_successor_key(commit))
+        return None if text is None else commit_id_from_text(text)
+
+
+def _successor_key(commit: CommitId) -> str:
+    return f"successor:{commit}"
