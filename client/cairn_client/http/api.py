@@ -36,7 +36,7 @@ from cairn_map.wire.messages import (
     LogEntry,
     MapInfo,
     MissingRequest,
-    Pushed,
+    PushReceipt,
     Register,
     Registered,
     Retract,
@@ -201,11 +201,11 @@ class MapApi:
         """Deregister a robot."""
         self._ask("DELETE", f"/maps/{name}/branches/{branch}")
 
-    def push(self, name: str, commit: Commit, *, seal: str | None = None, signatures: str | None = None) -> Pushed:
+    def push(self, name: str, commit: Commit, *, seal: str | None = None, signatures: str | None = None) -> PushReceipt:
         """Push a commit; when this returns, the server has it for good. `seal`: of a retract that is the server's."""
         headers = {key: text for key, text in (("Cairn-Seal", seal), ("Cairn-Signature", signatures)) if text}
         path = f"/maps/{name}/commits/{commit.id}"
-        return message_from_json(Pushed, self._ask("PUT", path, content=commit.data, headers=headers))
+        return message_from_json(PushReceipt, self._ask("PUT", path, content=commit.data, headers=headers))
 
     def upload(self, name: str, ask: GetUpload | PutPart) -> Upload:
         """Progress of a commit that goes in parts, after this part if it is one; with the last part it is pushed."""

@@ -1,4 +1,4 @@
-"""Conversations held over HTTP."""
+"""Conversations of `sync.requests` held over HTTP: each request is sent, and its answer handed back."""
 
 from collections.abc import Generator
 from typing import Any, TypeVar

@@ -1,4 +1,4 @@
-"""Points in another camera's image, and their occlusion: the loops of `transfer`."""
+"""Points in another camera's image (Eq. 5-6), and their occlusion: the loops of `transfer`."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The exact cell code: a cell's evidence as bytes and back, lossless and canonical. Start here.
+"""Octree code of a cell, exact: its evidence as bytes and back, lossless and canonical. Start here.
 
     head | child masks | leaf masks | hits | misses | per channel: presence, weight, value planes
 

@@ -60,7 +60,7 @@ class Hello(_Model):
     """Longest time between two events, seconds; after twice as long without one, connect again."""
 
 
-class CellsChanged(_Model):
+class CellsEvent(_Model):
     """Cells that changed, each with the log entry that last changed it."""
 
     type: Literal["cells"] = "cells"
@@ -103,7 +103,7 @@ class Beat(_Model):
     time_s: float
 
 
-LiveEvent = Hello | CellsChanged | LogGrew | HeadMoved | RobotHeard | Beat
+LiveEvent = Hello | CellsEvent | LogGrew | HeadMoved | RobotHeard | Beat
 LIVE_EVENT: TypeAdapter[LiveEvent] = TypeAdapter(Annotated[LiveEvent, Field(discriminator="type")])
 
 

@@ -151,7 +151,7 @@ class BranchInfo(_Model):
     """Time at which its latest picture arrived, by the server's clock; None: there is none."""
 
 
-class Pushed(_Model):
+class PushReceipt(_Model):
     """Answer to a push: the commit is durable now (`new`), or was before (`known`)."""
 
     id: IdText

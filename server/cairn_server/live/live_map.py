@@ -14,7 +14,7 @@ from cairn_map.wire.live_events import (
     CELLS_MAX,
     CHAIN_DIGITS,
     ENTRIES_MAX,
-    CellsChanged,
+    CellsEvent,
     EventPosition,
     HeadMoved,
     LiveEvent,
@@ -97,7 +97,7 @@ class LiveChanges:
         moved = EventPosition(head.seq, head.chain.hex()[:CHAIN_DIGITS], seen.tick)
         events: list[LiveEvent] = []
         if cells or is_many:  # a retract of what never came changes no cell
-            events.append(CellsChanged(id=str(seen), cells="many" if is_many else cells))
+            events.append(CellsEvent(id=str(seen), cells="many" if is_many else cells))
         events.append(LogGrew(id=str(seen), entries=entries, left_out=head.seq - seen.seq - len(entries)))
         return [*events, HeadMoved(id=str(moved), cursor=str(head))], moved
 

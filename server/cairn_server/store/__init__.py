@@ -1,4 +1,5 @@
 """Store: the protocol that a database fulfils, its rows, and the embedded SQLite store.
 
-What is stored is decided above. Start with `store`, the protocol; `sqlite/` implements it.
+What is stored is decided above. Start with `store`, the protocol; `sqlite/` implements it, and its
+`writer` is the group commit.
 """

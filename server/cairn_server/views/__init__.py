@@ -1,4 +1,4 @@
 """Views: coarse cells, single voxels, pictures and exports, made on demand or ahead.
 
-Cells come from `folding`. Start with `cell_view`.
+Cells come from `folding`. Start with `cell_views`.
 """

@@ -13,7 +13,7 @@ from cairn_map.wire.live_events import (
     CHAIN_DIGITS,
     LIVE_EVENT,
     Beat,
-    CellsChanged,
+    CellsEvent,
     EventPosition,
     HeadMoved,
     Hello,
@@ -29,8 +29,8 @@ SIGN = RobotSign(branch="mole", mode="high-end", time_s=1.5e9, cursor=str(made_c
 ID = "7.0123abcd.3"
 EVENTS: list[LiveEvent] = [
     Hello(id=ID, map="lab", cursor=str(made_cursor()), resumed=True, robots=[SIGN], beat_s=15.0),
-    CellsChanged(id=ID, cells=[(0, -1, 2, 9)]),
-    CellsChanged(id=ID, cells="many"),
+    CellsEvent(id=ID, cells=[(0, -1, 2, 9)]),
+    CellsEvent(id=ID, cells="many"),
     LogGrew(id=ID, entries=[], left_out=4),
     HeadMoved(id=ID, cursor=str(made_cursor())),
     RobotHeard(id=ID, robot=SIGN),

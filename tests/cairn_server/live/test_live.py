@@ -21,7 +21,7 @@ from websockets.sync.client import connect
 from cairn_map.commits.cursor import cursor_from_text
 from cairn_map.errors import UnreachableError
 from cairn_map.evidence.grid import cell_key, cell_of_key
-from cairn_map.wire.live_events import CellsChanged, HeadMoved, LiveEvent, LogGrew, RobotHeard, position_from_text
+from cairn_map.wire.live_events import CellsEvent, HeadMoved, LiveEvent, LogGrew, RobotHeard, position_from_text
 from cairn_map.wire.messages import MissingRequest, Register
 from cairn_server.http.routes import live as live_routes
 from cairn_server.http.routes.live import NOT_ALLOWED, SPACING_S
@@ -68,7 +68,7 @@ def changed(events: list[LiveEvent]) -> set[int]:
     """Numbers of the cells that events name."""
     found: set[int] = set()
     for event in events:
-        if isinstance(event, CellsChanged):
+        if isinstance(event, CellsEvent):
             assert event.cells != "many"
             found |= {cell_key(cell[:3]) for cell in event.cells}
     return found
@@ -97,7 +97,7 @@ def test_who_listens_hears_of_the_head_the_cells_and_the_log(live: Live, listen:
     with live.service.store.snapshot(row) as snapshot:
         assert isinstance(found[2], HeadMoved) and found[2].cursor == str(snapshot.head.cursor)
         lms = {(*cell_of_key(cell.key), cell.lm) for cell in snapshot.cells()}
-    assert isinstance(found[0], CellsChanged) and set(found[0].cells) == lms
+    assert isinstance(found[0], CellsEvent) and set(found[0].cells) == lms
 
 
 @WAYS
@@ -201,7 +201,7 @@ def test_more_cells_than_are_remembered_are_many(live: Live, monkeypatch: pytest
     assert changed(listener.take()) == set(COMMITS[0].cells)
     push(live, row, 1)  # the third cell pushes the first one out
     assert changed(listener.take()) == set(COMMITS[1].cells)
-    assert [event.cells for event in late.take() if isinstance(event, CellsChanged)] == ["many"]
+    assert [event.cells for event in late.take() if isinstance(event, CellsEvent)] == ["many"]
 
 
 def test_who_was_away_for_too_many_entries_is_told_many_and_how_many(
@@ -214,7 +214,7 @@ def test_who_was_away_for_too_many_entries_is_told_many_and_how_many(
     listener.leave()
     push(live, row, 0, 1, 2)
     _, cells, log, _ = joined(live, row, after=start).take()
-    assert isinstance(cells, CellsChanged) and cells.cells == "many"
+    assert isinstance(cells, CellsEvent) and cells.cells == "many"
     assert isinstance(log, LogGrew)
     assert ([entry.seq for entry in log.entries], log.left_out) == ([3], 2)
 

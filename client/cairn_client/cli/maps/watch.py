@@ -23,7 +23,7 @@ from typing import TextIO
 from cairn_client.cli.arguments import add_token, api_of, parser, shown_bytes
 from cairn_client.http.live_listener import Lost, listen
 from cairn_map.commits.cursor import cursor_from_text
-from cairn_map.wire.live_events import CellsChanged, HeadMoved, Hello, LiveEvent, LogGrew, RobotHeard, RobotSign
+from cairn_map.wire.live_events import CellsEvent, HeadMoved, Hello, LiveEvent, LogGrew, RobotHeard, RobotSign
 
 
 def main(argv: list[str]) -> int:
@@ -64,7 +64,7 @@ def lines_of(event: LiveEvent | Lost) -> Iterator[str]:
             for entry in event.entries:
                 word = "folded" if entry.kind == "+" else "taken out"
                 yield f"{word}  {entry.id}  {entry.cells} cells, {shown_bytes(entry.size_bytes)}"
-        case CellsChanged():
+        case CellsEvent():
             yield f"{'many' if event.cells == 'many' else len(event.cells)} cells changed"
         case HeadMoved():
             yield f"head  {cursor_from_text(event.cursor).seq}"

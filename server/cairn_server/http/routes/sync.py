@@ -7,7 +7,7 @@ from starlette.concurrency import run_in_threadpool
 
 from cairn_map.commits.signature import TEXT_MAX
 from cairn_map.errors import ConflictError
-from cairn_map.wire.messages import MissingRequest, Pushed, Upload
+from cairn_map.wire.messages import MissingRequest, PushReceipt, Upload
 from cairn_map.wire.relay_peer import CommitList, commit_list
 from cairn_server.access.auth import Caller, Role
 from cairn_server.http.routes.callers import (
@@ -35,7 +35,7 @@ router = APIRouter()
 
 @router.put(
     "/maps/{name}/commits/{commit}",
-    responses=also(201, Pushed) | problems(409, 429, 507),
+    responses=also(201, PushReceipt) | problems(409, 429, 507),
     openapi_extra=body(COMMIT_MEDIA_TYPE),
 )
 def push(
@@ -45,7 +45,7 @@ def push(
     response: Response,
     cairn_seal: Annotated[str | None, Header(max_length=64)] = None,
     cairn_signature: Annotated[str | None, Header(max_length=TEXT_MAX)] = None,
-) -> Pushed:
+) -> PushReceipt:
     """Push a commit: 201 new, 200 seen before, 409 other bytes under this id."""
     pushes, row, caller = visit.service.sync.pushes, visit.row, visit.caller
     try:
@@ -54,7 +54,7 @@ def push(
         pushes.note_conflict(row, caller, exc)
         raise
     response.status_code = 201 if is_new else 200
-    return Pushed(id=commit, state="new" if is_new else "known")
+    return PushReceipt(id=commit, state="new" if is_new else "known")
 
 
 @router.get(

@@ -1,4 +1,4 @@
-"""The one connection that writes: jobs from all threads, many in one transaction, one flush for all of them.
+"""Group commit: the one connection that writes takes jobs from all threads, many in one transaction and one flush.
 
 A job's result is handed out only after COMMIT with `synchronous=FULL`: what was acknowledged survives a power cut.
 A job that raises is rolled back alone (savepoint); the others of its group go through.
