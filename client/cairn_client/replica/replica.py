@@ -53,7 +53,7 @@ class StorageBudget(Protocol):
 
 
 class RefusedPushes:
-    """RefusedPushes by the server of one robot's commits and cells, which are not sent again at once; for one thread.
+    """Commits and cells of one robot that the server refused, and that are not sent again at once; for one thread.
 
     A refused commit stays in the outbox. Some refusals pass (an admin gives more room, a newer server takes more), and
     no server says so: after an hour, at the next start, and on another server a commit is tried again.

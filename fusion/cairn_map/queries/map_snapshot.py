@@ -27,12 +27,12 @@ from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Cell, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.voxels import Reading, Voxels
-from cairn_map.queries import body_queries, distance_queries, layer_queries, point_queries, voxel_queries
+from cairn_map.queries import body_queries, distance_queries, point_queries, region_queries
 from cairn_map.queries.body_queries import PathStates
 from cairn_map.queries.distance_queries import Nearest, RayEnds
 from cairn_map.queries.frozen_map import Box, FrozenMap, freeze
-from cairn_map.queries.layer_queries import MapImage
 from cairn_map.queries.occupancy_states import State
+from cairn_map.queries.region_queries import MapImage
 
 STANDARD_MODEL = SensorModel()
 
@@ -168,11 +168,11 @@ class MapSnapshot:
 
         `grid.centres_of_voxels(numbers, snapshot.geometry)` are their centres.
         """
-        return voxel_queries.frontier(self._frozen, box_m)
+        return region_queries.frontier(self._frozen, box_m)
 
     def frontier_cells(self, *, box_m: Box | None = None) -> dict[Cell, int]:
         """The cells that hold frontier voxels, and how many: where to explore."""
-        return voxel_queries.frontier_cells(self._frozen, box_m)
+        return region_queries.frontier_cells(self._frozen, box_m)
 
     def layer_at(self, z_m: float, what: str = "probability", *, box_m: Box | None = None) -> MapImage:
         """The horizontal layer of voxels at a height, as an image.
@@ -186,7 +186,7 @@ class MapSnapshot:
         Raises:
             BadInputError: kind `too_large`: more than 67 million pixels.
         """
-        return layer_queries.layer(self._frozen, z_m, what, box_m)
+        return region_queries.layer(self._frozen, z_m, what, box_m)
 
     def height_map(self, *, box_m: Box | None = None) -> MapImage:
         """Height of the upper face of the highest occupied voxel of each column, metres; NaN where there is none.
@@ -196,7 +196,7 @@ class MapSnapshot:
         Raises:
             BadInputError: kind `too_large`: more than 67 million pixels.
         """
-        return layer_queries.height_map(self._frozen, box_m)
+        return region_queries.height_map(self._frozen, box_m)
 
     def hottest(self, n: int, *, min_probability: float = 0.5, box_m: Box | None = None) -> Voxels:
         """The n known voxels with the highest mean temperature, hottest first, fewer if there are no more.
@@ -206,15 +206,15 @@ class MapSnapshot:
             min_probability: only voxels that are occupied with at least this probability.
             box_m: only voxels in this box.
         """
-        return voxel_queries.hottest(self._frozen, n, min_probability=min_probability, box_m=box_m)
+        return region_queries.hottest(self._frozen, n, min_probability=min_probability, box_m=box_m)
 
     def voxels_in(self, box_m: Box | None = None) -> Voxels:
         """All voxels with evidence in a box, cell by cell in Morton order."""
-        return voxel_queries.voxels_in_box(self._frozen, box_m, occupied_only=False)
+        return region_queries.voxels_in_box(self._frozen, box_m, occupied_only=False)
 
     def occupied_in(self, box_m: Box | None = None) -> Voxels:
         """All occupied voxels in a box, cell by cell in Morton order."""
-        return voxel_queries.voxels_in_box(self._frozen, box_m, occupied_only=True)
+        return region_queries.voxels_in_box(self._frozen, box_m, occupied_only=True)
 
     def _first_at(self, points_m: npt.ArrayLike, kind: ChannelKind) -> Reading:
         return point_queries.reading_at(self._frozen, points_m, point_queries.first_of_kind(self.geometry, kind))

@@ -31,9 +31,9 @@ from cairn_client.cli.robot_arguments import box, place
 from cairn_client.folders.map_folder import open_map
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.voxels import Reading
-from cairn_map.queries.layer_queries import MapImage
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.queries.occupancy_states import State
+from cairn_map.queries.region_queries import MapImage
 
 ZERO_CELSIUS_K = 273.15
 WIDTH = 100

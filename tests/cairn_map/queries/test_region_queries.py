@@ -11,7 +11,7 @@ from tests.naive import queries as naive
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Geometry
-from cairn_map.queries import layer_queries, point_queries
+from cairn_map.queries import point_queries, region_queries
 from cairn_map.queries.map_snapshot import snapshot_of
 
 DEEPER = Geometry(voxel_edge_um=50_000, depth=4, channels=())
@@ -163,7 +163,7 @@ def test_images_as_large_as_a_country_are_refused() -> None:
             ask()  # type: ignore[no-untyped-call]
         assert refused.value.kind == "too_large"
     assert snapshot.height_map(box_m=[[49_999, 49_999, -1], [50_001, 50_001, 1]]).values.shape == (28, 28)
-    assert layer_queries.PIXELS_MAX >= 28 * 28
+    assert region_queries.PIXELS_MAX >= 28 * 28
 
 
 def test_other_nonsense_is_refused() -> None:
