@@ -121,9 +121,14 @@ def _cast_into(
             ox, oy, oz = origin[0], origin[1], origin[2]
             d = place - starts[bundle]
             dx, dy, dz = directions[d, 0], directions[d, 1], directions[d, 2]
-            t, k, face = _nearest_candidate(
-                ox, oy, oz, dx, dy, dz, candidates, candidate_nears, count, kind, frame, half_m
-            )
+            # First hit. Candidates come by range: those that begin behind the hit cannot be nearer.
+            t, k, face = FAR, -1, SIDE
+            for c in range(count if dx == dx else 0):  # a NaN ray meets nothing
+                if candidate_nears[c] > t:
+                    break
+                new, new_face = enter(ox, oy, oz, dx, dy, dz, candidates[c], kind, frame, half_m)
+                if new > 0.0 and (new < t or (new == t and candidates[c] < k)):
+                    t, k, face = new, candidates[c], new_face
             solid[i], range_m[i] = k, t if k >= 0 else np.inf
             # Last hit: through panes and round mirrors. `gone_m` is the way up to the last mirror, `behind` the
             # pane that the ray just crossed.
@@ -160,48 +165,27 @@ def _cast_into(
                     )
             # The surface that is seen: its range along the light's way, material, grain and normal.
             seen[i], way[i], passes[i], path_m[i] = k, path, crossed, gone_m + t if k >= 0 else np.inf
-            second[i] = turn_at(u, v, k, texture) if k >= 0 else 0
-            grain[i] = _texture_grain(u, v, k, face, texture)
-            if k < 0:
-                nx, ny, nz, along = 0.0, 0.0, 0.0, 0.0
-            normal[i, 0], normal[i, 1], normal[i, 2] = nx, ny, nz
-            incidence[i] = -along
+            second[i], grain[i] = turn_at(u, v, k, texture) if k >= 0 else 0, _texture_grain(u, v, k, face, texture)
+            _note_normal(normal, incidence, i, k, nx, ny, nz, along)
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy", forceinline=True)
+def _note_normal(
+    normal: Singles, incidence: Singles, i: int, k: int, nx: float, ny: float, nz: float, along: float
+) -> None:
+    """Note of ray i the normal of the surface that it shows, and the cosine on it; zeros without a surface."""
+    if k < 0:
+        nx, ny, nz, along = 0.0, 0.0, 0.0, 0.0
+    normal[i, 0], normal[i, 1], normal[i, 2] = nx, ny, nz
+    incidence[i] = -along
+
+
+@njit(nogil=True, error_model="numpy", forceinline=True)
 def _texture_grain(u: float, v: float, k: int, face: int, texture: Floats) -> float:
     """Irregular pattern of solid k at (u, v) metres on a face, -1 to 1; 0 without texture or solid."""
     if k < 0 or not texture[k, 4] > 0.0:
         return 0.0
     return grain_at(u * texture[k, 5], v * texture[k, 5], face + 7 * k)
-
-
-@njit(nogil=True, error_model="numpy")
-def _nearest_candidate(
-    ox: float,
-    oy: float,
-    oz: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    candidates: Int32s,
-    nears: Floats,
-    count: int,
-    kind: Bytes,
-    frame: Floats,
-    half_m: Floats,
-) -> tuple[float, int, int]:
-    """Range, solid and face of a ray's first hit among a bundle's candidates; FAR and -1 for none, or a NaN ray."""
-    t, k, face = FAR, -1, SIDE
-    if dx == dx:
-        for c in range(count):
-            # Candidates come by range: those that begin behind the hit cannot be nearer.
-            if nears[c] > t:
-                break
-            new, new_face = enter(ox, oy, oz, dx, dy, dz, candidates[c], kind, frame, half_m)
-            if new > 0.0 and (new < t or (new == t and candidates[c] < k)):
-                t, k, face = new, candidates[c], new_face
-    return t, k, face
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
