@@ -11,6 +11,7 @@ pytest.register_assert_rewrite("tests.fixtures")
 SLOWEST = (
     "tests/test_image.py",
     "tests/test_commands.py",
+    "tests/test_pages.py",
     "tests/console/test_page.py",
     "tests/fuzz/test_fuzz.py",
     "tests/cairn_sim/experiment/test_experiment.py",

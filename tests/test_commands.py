@@ -1,15 +1,12 @@
 """The commands as a user runs them: a real server, real files; each command once at least in a process of its own."""
 
-import io
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import chdir, redirect_stderr, redirect_stdout
-from dataclasses import replace
+from contextlib import chdir
 from pathlib import Path
 
 import numpy as np
@@ -17,17 +14,11 @@ import pytest
 from tests.console.browsing import VIEW, browser, skip_without_page, tab
 from tests.console.casting import occupied, picks_met_first
 from tests.console.room import LOOPBACK, Room
-from tests.fixtures.client.live_server import wait_until
+from tests.fixtures.commands import cairn, record_room, served, wait_for_fold
 from tests.fixtures.pages import DOCS, commands_of, programs_of
 from tests.fixtures.server.live import free_port
 
-from cairn_client.cli.arguments import api_of
-from cairn_client.http.http_link import index_of
-from cairn_client.main import main
 from cairn_map.files.cell_folder import read_cells, read_head
-from cairn_sim.robots.record import Plan, record
-from cairn_sim.robots.robots import ROBOTS
-from cairn_sim.scene.scene_file import load_scene
 
 pytestmark = pytest.mark.processes
 
@@ -35,14 +26,6 @@ COMMAND_S = 300
 PLACES, PICKS = 100, 50
 """That are asked for, and voxels that are found there at least."""
 VOXEL_M = "0.08"
-
-
-def cairn(*arguments: object, folder: Path, code: int = 0) -> str:
-    """Run a command in a folder; its standard output, or with another exit code what it complained about."""
-    with chdir(folder), redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
-        ended = main([*map(str, arguments)])
-    assert ended == code, out.getvalue() + err.getvalue()
-    return out.getvalue() if code == 0 else err.getvalue()
 
 
 def typed(*arguments: object, folder: Path, code: int = 0) -> str:
@@ -56,32 +39,13 @@ def typed(*arguments: object, folder: Path, code: int = 0) -> str:
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """One for all tests, each of which has maps of its own."""
-    data = tmp_path_factory.mktemp("server")
-    command = [sys.executable, "-m", "cairn_client.main", "serve", "--data", str(data), "--port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        found = re.search(r"http://\S+:\d+", process.stdout.readline())
-        assert found is not None
-        yield found.group(0)
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(timeout=30) == 0
+    with served("--data", tmp_path_factory.mktemp("server")) as url:
+        yield url
 
 
 @pytest.fixture(scope="module")
 def room_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two stops of four scans in the simulated room, all channels, as a recording on disk."""
-    folder = tmp_path_factory.mktemp("recording") / "room"
-    scene, robot = load_scene("small-room"), replace(ROBOTS["orpheus"], scans=(4, 1))
-    plan = Plan(scene=scene, robot=robot, path="west", seed=3, scale=0.1, truth="none", last_stop=2)
-    assert len(list(record(plan, folder, scene_text=""))) == 8
-    return folder
-
-
-def wait_for_fold(map_url: str) -> None:
-    """Wait until nothing is pending that the server has acknowledged."""
-    api, name = api_of(map_url, None)
-    with api:
-        wait_until(lambda: not index_of(api, name).header.pending)
+    return record_room(tmp_path_factory.mktemp("recording") / "room")
 
 
 def digests(map_url: str, folder: Path, name: str) -> dict[str, bytes]:

@@ -1,0 +1,200 @@
+"""The pages for newcomers: their commands run as written, in the page's order, against real servers and small inputs.
+
+The operator's page and the programs of the page about Python are run in tests/test_commands.py. Commands of the
+page for calibration engineers are parsed in tests/test_documents.py, and not run yet.
+"""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tests.fixtures.client.live_server import wait_until
+from tests.fixtures.commands import cairn, record_room, served
+from tests.fixtures.fusion.bags import recorded, small_recording, write_bag
+from tests.fixtures.pages import DOCS, ROOT, commands_of
+from tests.fixtures.server.live import free_port
+
+pytestmark = pytest.mark.processes
+
+Command = tuple[str, ...]
+Action = Callable[[], None]
+
+NEAR: Command = ("--max-range", "1.5")
+"""Fewer voxels of 1 cm to map."""
+SHORTENED: dict[str, Command] = {
+    "experiment --output experiment": ("--stops", "1", "--scale", "0.1", "--resolutions", "16", "4"),
+    "experiment --stops 2 --resolutions 8 4": ("--stops", "1", "--scale", "0.1", "--output", "short"),
+    "experiment --recording labs corridors": ("--resolutions", "16", "--output", "recorded"),
+    "sim record building lab-1 --robot tof --path experiment": ("--stops", "0:1", "--truth", "none"),
+    "robot replay lab-1 --map http://127.0.0.1:8750/maps/lab": ("--voxel", "0.16"),
+    "robot replay RECORDING --map http://127.0.0.1:8750/maps/shelf --voxel 0.01": NEAR,
+    "robot replay RECORDING --map http://127.0.0.1:8750/maps/shelf --share 1/2 --name left": NEAR,
+    "robot replay RECORDING --map http://127.0.0.1:8750/maps/shelf --share 2/2 --name right": NEAR,
+}
+"""Options added to commands that would take minutes; argparse takes the last of an option that is given twice."""
+
+
+class Page:
+    """One page's commands in a scratch folder, with live servers in the places that the page names.
+
+    `serve` starts a process that ends with the page, or when the page starts another server at the same address.
+    """
+
+    def __init__(self, folder: Path, servers: ExitStack) -> None:
+        self.folder = folder
+        self._servers = servers
+        self._hosts: dict[str, str] = {}
+        self._running: dict[str, ExitStack] = {}
+
+    def serve(self, host: str, *options: str, folder: Path | None = None) -> None:
+        """Start a server for a host of the page, in the place of the one that runs there."""
+        self.stop(host)
+        port = int(self._hosts[host].rpartition(":")[2]) if host in self._hosts else free_port("127.0.0.1")
+        self._hosts[host] = f"http://127.0.0.1:{port}"
+        running = self._running[host] = self._servers.enter_context(ExitStack())
+        running.enter_context(served(*options, folder=folder or self.folder, port=port))
+
+    def stop(self, host: str) -> None:
+        if host in self._running:
+            self._running.pop(host).close()
+
+    def name(self, host: str, other: str) -> None:
+        """Give a host a second name."""
+        self._hosts[other] = self._hosts[host]
+
+    def here(self, arguments: list[str]) -> list[str]:
+        """Arguments with the addresses of live servers and paths of the scratch folder."""
+        for host, address in self._hosts.items():
+            arguments = [word.replace(f"http://{host}:8750", address) for word in arguments]
+        return [f"{self.folder}{word}" if word.startswith("/") else word for word in arguments]
+
+    def run(self, path: Path, *, instead: Mapping[str, Action]) -> None:
+        """Run all commands of a page; `instead` is found by the whole command, as the page has it."""
+        todo = set(instead)
+        for arguments in commands_of(path):
+            command = " ".join(arguments)
+            todo.discard(command)
+            if command in instead:
+                instead[command]()
+            else:
+                cairn(*self.here(arguments), *SHORTENED.get(command, ()), folder=self.folder)
+        assert not todo, "commands that the page no longer has"
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Iterator[Page]:
+    with ExitStack() as servers:
+        yield Page(tmp_path, servers)
+
+
+def run_robot_until_pushed(page: Page, *arguments: str) -> None:
+    """`cairn robot run` as a process that a signal ends once a commit of it is on the server."""
+    command = [sys.executable, "-m", "cairn_client.main", *page.here(list(arguments))]
+    with subprocess.Popen(command, cwd=page.folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as run:
+        assert run.stdout is not None
+        lines = iter(run.stdout.readline, "")
+        assert any(line.startswith("pushed ") for line in lines)
+        run.send_signal(signal.SIGTERM)
+        rest = "".join(lines)
+    assert run.returncode == 0 and "0 commits wait" in rest, rest
+
+
+def write_frames(folder: Path) -> None:
+    """Two frames of a wall 1 m ahead, in colour and depth, as files of any other program."""
+    (folder / "frames").mkdir(parents=True)
+    for name in ("a", "b"):
+        cv2.imwrite(str(folder / f"frames/{name}.depth.png"), np.full((48, 64), 10_000, np.uint16))
+        cv2.imwrite(str(folder / f"frames/{name}.color.png"), np.full((48, 64, 3), 90, np.uint8))
+        np.savetxt(folder / f"frames/{name}.pose.txt", np.eye(4))
+    np.savetxt(folder / "K_color.txt", [[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]])
+
+
+def test_commands_of_the_readme_run(page: Page) -> None:
+    record_room(page.folder / "RECORDING")
+    serve = lambda: page.serve("127.0.0.1", "--data", "demo/server")  # noqa: E731
+    page.run(ROOT / "README.md", instead={"serve --data demo/server": serve})
+
+
+def test_commands_of_the_page_for_robot_developers_run(page: Page) -> None:
+    record_room(page.folder / "RECORDING")
+    shutil.copytree(page.folder / "RECORDING", page.folder / "SPOOL" / "one")
+    write_frames(page.folder / "FOLDER")
+    room = small_recording(page.folder / "bagged")
+    write_bag(page.folder / "bag", "mcap", lambda make: recorded(room, make)).rename(page.folder / "lab.mcap")
+    page.serve("127.0.0.1", "--data", "server")
+    run = "robot run SPOOL --map http://127.0.0.1:8750/maps/lab --name mole"
+    page.run(DOCS / "robot-developer.md", instead={run: lambda: run_robot_until_pushed(page, *run.split())})
+
+
+def test_commands_of_the_page_for_administrators_run(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = page.folder
+    for who in ("CAIRN_ADMIN_TOKEN", "CAIRN_ENROLMENT_TOKEN"):
+        monkeypatch.setenv(who, os.urandom(24).hex())
+    for who in ("CAIRN_TOKEN", "CAIRN_TOKEN_THERE"):
+        monkeypatch.setenv(who, os.environ["CAIRN_ADMIN_TOKEN"])
+    for name in ("backup", "field"):
+        (folder / name).mkdir()
+    settings = "keep_evidence_s = 604_800\ndisk_free_min_bytes = 1_000_000_000\nquotas.bytes_per_day = 1_000_000_000\n"
+    for line in settings.splitlines():
+        assert line in (DOCS / "administrator.md").read_text()
+    (folder / "server.toml").write_text(settings)
+    page.serve("HOST", "--data", "DIR")
+
+    def serve_restored() -> None:
+        page.serve("HOST", "--data", "NEW")
+        page.name("HOST", "base")
+
+    def create_relay() -> None:
+        command = page.here(["token", "create", "http://base:8750", "field1", "--role", "relay"])
+        (folder / "field" / "field1.secret").write_text(cairn(*command, folder=folder))
+
+    def serve_field() -> None:
+        command = page.here(upstream.removeprefix("serve ").split())
+        page.serve("field", *[word.replace("BASE_KEY", key_of_base()) for word in command], folder=folder / "field")
+        there = page.here(["map", "info", "http://field:8750/maps/lab"])
+        wait_until(lambda: _succeeds(there, folder))
+
+    def key_of_base() -> str:
+        info = cairn(*page.here(["map", "info", "http://base:8750/maps/lab", "--json"]), folder=folder)
+        return str(json.loads(info)["server_key"])
+
+    upstream = (
+        "serve --data DIR --upstream http://base:8750 --upstream-token-file field1.secret --trust-server BASE_KEY"
+    )
+    page.run(
+        DOCS / "administrator.md",
+        instead={
+            "serve --data DIR --settings server.toml": lambda: page.serve(
+                "HOST", "--data", "DIR", "--settings", "server.toml"
+            ),
+            "serve --data NEW": serve_restored,
+            "token create http://base:8750 field1 --role relay": create_relay,
+            upstream: serve_field,
+        },
+    )
+
+
+def _succeeds(command: list[str], folder: Path) -> bool:
+    """True if a command ends well."""
+    try:
+        cairn(*command, folder=folder)
+    except AssertionError:
+        return False
+    return True
+
+
+@pytest.mark.slow
+def test_commands_of_the_page_about_the_experiment_run(page: Page) -> None:
+    for name in ("labs", "corridors"):
+        record_room(page.folder / name)
+    page.serve("127.0.0.1", "--data", "server")
+    page.run(DOCS / "paper-experiment.md", instead={})
