@@ -84,7 +84,7 @@ export class TakeAwayPanel {
       this.lines,
       copied(`cairn map export ${server} --ply ${name}.ply${options}`),
       copied(
-        "import os\nfrom pathlib import Path\n\nfrom cairn_client.http.api import MapApi\nfrom cairn_client.cli.maps.part_export import export_points\n" +
+        "import os\nfrom pathlib import Path\n\nfrom cairn_client.http.api import MapApi\nfrom cairn_client.cli.maps.map_export import export_points\n" +
           "from cairn_map.files.export_request import ExportRequest\n\n" +
           `api = MapApi("${origin}", token=os.environ.get("CAIRN_TOKEN"))\n` +
           `export_points(api, "${name}", ExportRequest(${fields}), Path("${name}.ply"))`,
