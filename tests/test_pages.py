@@ -1,7 +1,6 @@
 """The pages for newcomers: their commands run as written, in the page's order, against real servers and small inputs.
 
-The operator's page and the programs of the page about Python are run in tests/test_commands.py. Commands of the
-page for calibration engineers are parsed in tests/test_documents.py, and not run yet.
+The operator's page and the programs of the page about Python are run in tests/test_commands.py.
 """
 
 import json
@@ -17,11 +16,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from tests.fixtures.calib.thermal_images import SIZE, black_bodies
 from tests.fixtures.client.live_server import wait_until
 from tests.fixtures.commands import cairn, record_room, served
 from tests.fixtures.fusion.bags import recorded, small_recording, write_bag
 from tests.fixtures.pages import DOCS, ROOT, commands_of
 from tests.fixtures.server.live import free_port
+from tests.fixtures.sim.drive import record_drive
+
+from cairn_calib.rig.camera import camera_from_field_of_view
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
+from cairn_sim.robots.heads import full_head
 
 pytestmark = pytest.mark.processes
 
@@ -41,6 +46,27 @@ SHORTENED: dict[str, Command] = {
     "robot replay RECORDING --map http://127.0.0.1:8750/maps/shelf --share 2/2 --name right": NEAR,
 }
 """Options added to commands that would take minutes; argparse takes the last of an option that is given twice."""
+ELSEWHERE = {
+    "calib study --output study": "takes minutes: tests/cairn_sim/study/test_study.py runs two configurations of ten",
+}
+"""Commands of the page for calibration engineers that are not run here: the reason, and the test that runs them."""
+CAMCHAIN = """cam0:
+  camera_model: pinhole
+  distortion_coeffs: [-0.28, 0.07, 0.0002, 1.8e-05]
+  distortion_model: radtan
+  intrinsics: [458.7, 457.3, 367.2, 248.4]
+  resolution: [752, 480]
+  rostopic: /cam0/image_raw
+cam1:
+  T_cn_cnm1: [[1, 0, 0, -0.11], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+  camera_model: pinhole
+  distortion_coeffs: [-0.28, 0.07, -0.0001, -3.6e-05]
+  distortion_model: radtan
+  intrinsics: [457.6, 456.1, 379.9, 255.2]
+  resolution: [752, 480]
+  rostopic: /cam1/image_raw
+"""
+"""Two cameras side by side as Kalibr writes them; both lenses are pinholes, since mrcal has no equidistant fisheye."""
 
 
 class Page:
@@ -72,17 +98,27 @@ class Page:
         self._hosts[other] = self._hosts[host]
 
     def here(self, arguments: list[str]) -> list[str]:
-        """Arguments with the addresses of live servers and paths of the scratch folder."""
+        """Arguments with the addresses of live servers, paths of the scratch folder, and names in the place of `*`."""
         for host, address in self._hosts.items():
             arguments = [word.replace(f"http://{host}:8750", address) for word in arguments]
-        return [f"{self.folder}{word}" if word.startswith("/") else word for word in arguments]
+        arguments = [f"{self.folder}{word}" if word.startswith("/") else word for word in arguments]
+        return [name for word in arguments for name in (self._matches(word) if "*" in word else [word])]
 
-    def run(self, path: Path, *, instead: Mapping[str, Action]) -> None:
-        """Run all commands of a page; `instead` is found by the whole command, as the page has it."""
-        todo = set(instead)
+    def _matches(self, pattern: str) -> list[str]:
+        """Paths of the scratch folder that a shell would put in the place of a pattern."""
+        found = sorted(path.relative_to(self.folder).as_posix() for path in self.folder.glob(pattern))
+        assert found, pattern
+        return found
+
+    def run(self, path: Path, *, instead: Mapping[str, Action], before: Mapping[str, Action] | None = None) -> None:
+        """Run all commands of a page; `instead` and `before` are found by the whole command, as the page has it."""
+        before = before or {}
+        todo = {*instead, *before}
         for arguments in commands_of(path):
             command = " ".join(arguments)
             todo.discard(command)
+            if command in before:
+                before[command]()
             if command in instead:
                 instead[command]()
             else:
@@ -198,3 +234,47 @@ def test_commands_of_the_page_about_the_experiment_run(page: Page) -> None:
         record_room(page.folder / name)
     page.serve("127.0.0.1", "--data", "server")
     page.run(DOCS / "paper-experiment.md", instead={})
+
+
+@pytest.mark.slow
+@pytest.mark.recording
+@pytest.mark.skipif("CAIRN_TEST_DATA" not in os.environ, reason="CAIRN_TEST_DATA names no folder of recordings")
+def test_commands_of_the_page_for_calibration_engineers_run(page: Page) -> None:
+    folder, chess = page.folder, Path(os.environ["CAIRN_TEST_DATA"]) / "opencv_stereo_chess"
+    (folder / "camchain.yaml").write_text(CAMCHAIN)
+    for name in ("shots", "left", "right"):
+        (folder / name).mkdir()
+    for number in (1, 2, 3, 4, 5, 6):
+        for side in ("left", "right"):
+            shutil.copy(chess / f"{side}{number:02}.jpg", folder / side)
+    for number in (1, 2):
+        image = cv2.imread(str(chess / f"left{number:02}.jpg"))
+        assert image is not None
+        cv2.imwrite(str(folder / f"shots/{number}.png"), image)
+    head = full_head(scale=0.5)
+    record_drive(folder / "drive-1", head, scans=2)
+    black_bodies(folder, np.random.default_rng(3), celsius=(10.0, 35.0, 60.0, 90.0)).rename(folder / "blackbody.csv")
+    thermal = camera_from_field_of_view(SIZE[1], SIZE[0], horizontal_deg=60)
+    camera = Rig(name="head", cameras={"thermal_left": mount_camera(Spectrum.THERMAL, thermal, np.eye(4))})
+
+    def find_corners_of_the_right() -> None:
+        assert "# and right/*.jpg" in (DOCS / "calibration-engineer.md").read_text()
+        options = ("--board", "9x6", "--square", "0.025", "--output", "corners/right")
+        cairn(*page.here(["calib", "corners", "right/*.jpg", *options]), folder=folder)
+
+    def write_rig(rig: Rig) -> None:
+        (folder / "rig.json").write_bytes(rig.to_json())
+
+    page.run(
+        DOCS / "calibration-engineer.md",
+        instead=dict.fromkeys(ELSEWHERE, lambda: None),
+        before={
+            "calib solve corners/left corners/right --spectrum colour --output rig.json --report report.html": (
+                find_corners_of_the_right
+            ),
+            "calib verify rig.json drive-1 --output verified": lambda: write_rig(head),
+            "calib thermal fit blackbody.csv calibrated.json --rig rig.json --camera thermal_left": (
+                lambda: write_rig(camera)
+            ),
+        },
+    )

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tests.fixtures.calib.thermal_images import RESPONSE, SIZE, images, scene
+from tests.fixtures.calib.thermal_images import RESPONSE, SIZE, black_bodies, images, scene
 
 from cairn_calib.cli.main import main
 from cairn_calib.rig.camera import camera_from_field_of_view
@@ -130,17 +130,6 @@ def test_maps_come_back_from_their_file_and_another_file_is_refused(tmp_path: Pa
         read_flat_field(tmp_path / "a.maps.npz", named)
     with pytest.raises(BadInputError, match="the maps are of"):
         back.level_counts(np.zeros((4, 4)))
-
-
-def black_bodies(folder: Path, rng: np.random.Generator, *, celsius: tuple[float, ...]) -> Path:
-    """Images of black bodies and their table."""
-    true, lines = scene(rng), ["image, celsius, sigma_k"]
-    for at in celsius:
-        for n, image in enumerate(images(true, float(RESPONSE.counts_of(at + 273.15)), 4, rng)):
-            cv2.imwrite(str(folder / f"b{at:g}-{n}.png"), np.rint(image).astype(np.uint16))
-            lines.append(f"b{at:g}-{n}.png, {at}, 0.1")
-    (folder / "table.csv").write_text("\n".join(lines) + "\n")
-    return folder / "table.csv"
 
 
 def test_the_command_goes_from_black_bodies_to_temperatures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from tests.fixtures.sim.drive import record_drive
 
 from cairn_calib.rig.rig import Rig
 from cairn_client.cli.robots.verify import main
@@ -15,10 +16,10 @@ from cairn_map.errors import BadInputError, NotFoundError
 from cairn_sim.render.render import render_scan
 from cairn_sim.render.sensors import Noise
 from cairn_sim.robots.heads import RANGE_CAMERA, full_head
-from cairn_sim.robots.targets import laboratory, target_scene
+from cairn_sim.robots.targets import laboratory
 from cairn_sim.scene.scene import scene_of
 from cairn_sim.scene.solids import placed
-from cairn_sim.study.run import T_MAP_HEAD, targets_in_view
+from cairn_sim.study.run import T_MAP_HEAD
 
 RIG = full_head(scale=0.5)
 SCANS = 4
@@ -26,24 +27,7 @@ SCANS = 4
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder, rng = tmp_path_factory.mktemp("drive") / "drive", np.random.default_rng(8)
-    with RecordingWriter(folder, RIG, name="drive", note="") as writer:
-        for number in range(SCANS):
-            targets = targets_in_view(RIG, rng)
-            scene = target_scene([(each.T_map_target, each.diameter_m) for each in targets])
-            writer.add(
-                render_scan(
-                    scene,
-                    RIG,
-                    T_map_rig=T_MAP_HEAD,
-                    range_camera=RANGE_CAMERA,
-                    time_s=1e9 + number,
-                    noise=Noise(1),
-                    number=number,
-                )
-            )
-            writer.end_measurement()
-    return folder
+    return record_drive(tmp_path_factory.mktemp("drive") / "drive", RIG, scans=SCANS)
 
 
 def verified(rig: Rig, drive: Path, folder: Path, *options: str) -> dict[str, dict[str, float]]:
