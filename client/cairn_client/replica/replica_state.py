@@ -97,9 +97,9 @@ class ReplicaState:
     """Name of the map on its server."""
     geometry = _model_field("geometry", Geometry)
     """Grid of the map."""
-    url = Field("url", str)
+    url: Field[str] = Field("url", str)
     """Map on its server, `http://HOST:PORT/maps/NAME`."""
-    mode = Field("mode", lambda text: cast(Mode, text))
+    mode: Field[Mode] = Field("mode", lambda text: cast(Mode, text))
     """Mode in which the robot was opened last."""
     limits = Field("limits", lambda text: Limits(**json.loads(text)), lambda limits: json.dumps(asdict(limits)))
     """Limits that were given last."""
