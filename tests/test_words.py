@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from tests.fixtures.sources import ROOT, docstrings, modules, tree_of
 
-OPENINGS = re.compile(r"(?:What|How|Whether|Which|Whose|Who|Whoever|Where|When|Why|Of|Nobody|A whole one)\b")
+OPENINGS = re.compile(r"(?:What|How|Whether|Which|Whose|Who|Whoever|Where|When|Why|Of|It|Nobody|A whole one)\b")
 """A docstring that begins so asks a question, or cannot be read without the line above it."""
 BANNED = re.compile(r"\b(?:anew|beside|dear|nobody|whoever|told|as before|by then|not known of)\b", re.IGNORECASE)
 """Words of a private dialect: say again, next to, expensive, no client, any caller, reported."""

@@ -53,7 +53,7 @@ class CheckResult(StrEnum):
 
     OK = "ok"
     WARN = "warn"
-    """It works, but badly or in part."""
+    """Outcome of a check that passed in part: usable, with something to mend."""
     FAIL = "fail"
 
 
