@@ -58,9 +58,9 @@ class Console:
         )
 
     def until(self, expression: str, what: str) -> float:
-        """Look again until it is so; seconds that took."""
+        """Look again until it is so; seconds that took. A page without its console yet has nothing to say."""
         start_s = time.monotonic()
-        while not self.tell(expression):
+        while not self.tell(f"c && ({expression})"):
             assert time.monotonic() < start_s + DEADLINE_S, f"not in {DEADLINE_S} s: {what}; {self.errors}"
             self.page.wait_for_timeout(20)
         return time.monotonic() - start_s
