@@ -15,8 +15,9 @@ unexport PYTHONDONTWRITEBYTECODE
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
-# By file, because the image is built once per worker that runs a test of it; in tests/conftest.py's order.
-WORKERS := --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+# One worker more than cores, for tests wait for servers and browsers a quarter of their time. By file, because the image is
+# built once per worker that runs a test of it; in tests/conftest.py's order.
+WORKERS := --numprocesses $(shell echo $$(( $$(getconf _NPROCESSORS_ONLN) + 1 ))) --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 # Of each target.
 SOAK_SECONDS ?= 600
 KERNELS := $(shell find */cairn_* -name "*_kernels.py" -o -name warm_up.py)

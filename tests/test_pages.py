@@ -37,7 +37,16 @@ NEAR: Command = ("--max-range", "1.5")
 """Fewer voxels of 1 cm to map."""
 SHORTENED: dict[str, Command] = {
     "experiment --output experiment": ("--stops", "1", "--scale", "0.1", "--resolutions", "16", "4"),
-    "experiment --stops 2 --resolutions 8 4": ("--stops", "1", "--scale", "0.1", "--output", "short"),
+    "experiment --stops 2 --resolutions 8 4": (
+        "--stops",
+        "1",
+        "--scale",
+        "0.05",
+        "--resolutions",
+        "16",
+        "--output",
+        "short",
+    ),
     "experiment --recording labs corridors": ("--resolutions", "16", "--output", "recorded"),
     "sim record building lab-1 --robot tof --path experiment": ("--stops", "0:1", "--truth", "none"),
     "robot replay lab-1 --map http://127.0.0.1:8750/maps/lab": ("--voxel", "0.16"),

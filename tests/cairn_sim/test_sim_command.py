@@ -48,6 +48,7 @@ def test_show_knows_every_robot(robot: str, tmp_path: Path) -> None:
     assert (tmp_path / "view.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_record_writes_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "lab"
     arguments = ["record", "building", str(folder), "--robot", "tof", "--path", "labs", "--stops", "3:4", "--seed", "7"]

@@ -15,6 +15,7 @@ REAL = int(os.environ.get("REAL_BOARDS", "10"))
 
 
 # 10573: so aslant that the nearest saddle along an edge is the one across a cell.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "seeds"), [("tof", (*range(20), 10573)), ("thermal", (0, 1, 4, 6, 7)), ("colour", (2,))]
 )
@@ -30,11 +31,13 @@ def test_grids_of_discs_are_found_near_far_tilted_blurred_and_reversed(name: str
     assert not missed
 
 
+@pytest.mark.slow
 def test_no_grid_is_found_in_images_without_a_board() -> None:
     images = (empty_image(seed, sizes=SMALL)[1] for seed in range(EMPTY))
     assert not [seed for seed, image in enumerate(images) if find_chessboard(image, BOARD).corners is not None]
 
 
+@pytest.mark.slow
 def test_what_was_once_a_board_or_an_error_is_neither() -> None:
     # 100310: windows without any edge. 103210: between blurred holes corners look like those of small cells.
     # 200834: an outer row that is hidden, proposed by strays. 504470: wires as wide as gaps are not, taken for cells.
@@ -46,6 +49,7 @@ def test_what_was_once_a_board_or_an_error_is_neither() -> None:
         assert find_chessboard(image, BOARD).corners is None
 
 
+@pytest.mark.slow
 @pytest.mark.recording
 def test_real_boards_keep_their_corners_turned_inverted_blurred_small_and_noisy() -> None:
     if not recorded():

@@ -166,6 +166,7 @@ def test_what_only_looks_like_a_board_is_refused(false: Callable[[np.random.Gene
     assert all(attempt.reason for attempt in detection.attempts)
 
 
+@pytest.mark.slow
 @pytest.mark.recording
 def test_real_boards_are_found_as_recorded_and_changed() -> None:
     folder = os.environ.get("CAIRN_TEST_DATA")

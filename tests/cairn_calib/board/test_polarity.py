@@ -15,6 +15,7 @@ from cairn_calib.board.polarity import Vote, count_votes, margin_polarity, rever
 from cairn_calib.cli.corners import main
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "count"), [("tof", 12), ("thermal", 3), ("colour", 1)])
 def test_margins_vote_for_the_polarity_whichever_way_the_board_is_held(name: str, count: int) -> None:
     assert name in SPECTRA

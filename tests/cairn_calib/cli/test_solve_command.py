@@ -17,6 +17,7 @@ from cairn_map.errors import BadInputError
 PAIR = ("tof", "left")
 
 
+@pytest.mark.slow
 def test_folders_of_corners_become_a_rig_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pattern_m = 0.006 * np.random.default_rng(0).normal(size=(144, 176))
     truth = world(8, seed=6, names=PAIR, bias=(0.02, 0.0, 0.0, 0.0), pattern_m=pattern_m, has_amplitude=True)

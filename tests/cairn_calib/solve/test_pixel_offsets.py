@@ -196,6 +196,7 @@ def test_range_images_without_a_board_are_told() -> None:
         assert (warned.kind, warned.measured, warned.threshold) == ("range_images", count, len(given))
 
 
+@pytest.mark.slow
 def test_ranges_of_other_units_other_places_or_along_the_axis_are_not_taken_for_a_bias() -> None:
     truth = world(6, seed=4, names=PAIR)
     views, right = views_of(truth, seed=4), ranges_of(truth, "tof", seed=4, sigma_m=NOISE_M)

@@ -110,6 +110,7 @@ def test_opencv_finds_the_same_rig_from_the_same_corners() -> None:
     assert np.sqrt(ours.adjusted.normal.cost / corners) == pytest.approx(rms, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_the_published_figures_of_opencvs_stereo_pairs_come_out() -> None:
     """As stereoCalibrate, mrcal 2.2 and a third solver gave them from these corners (OpenCV 5.0's detector)."""
     solution = solve_rig(opencv_views(sector_based), opencv_plan())

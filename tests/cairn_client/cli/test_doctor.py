@@ -66,6 +66,7 @@ def test_what_is_wrong_is_told_with_the_next_step(
     assert "damaged_store" in checks["folder"]["found"]
 
 
+@pytest.mark.slow
 def test_a_folder_in_use_is_no_failure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     replica = opened(tmp_path / "mole")
     code, checks = told(capsys, str(tmp_path / "mole"))

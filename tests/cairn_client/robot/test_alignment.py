@@ -107,6 +107,7 @@ def test_a_robot_in_the_building_finds_its_place_from_half_a_metre_and_ten_degre
         assert found.fit > 0.9
 
 
+@pytest.mark.slow
 def test_scans_of_another_place_are_not_found_on_the_map(building: EvidenceMap, tmp_path: Path) -> None:
     scene, robot = load_scene("small-room"), ROBOTS["tof"]
     rig, T_true = robot.rig_of(1.0), stops(scene, "west")[0]
@@ -156,6 +157,7 @@ def map_of_a_box(low: list[float], high: list[float], origins: list[list[float]]
     return snapshot_of(whole)
 
 
+@pytest.mark.slow
 def test_along_a_bare_corridor_an_alignment_is_refused() -> None:
     low, high = [-1e6, -1.0, 0.0], [1e6, 1.0, 2.5]
     whole = map_of_a_box(low, high, [[x, 0.1, 1.0] for x in range(8)], reach_m=8)
@@ -179,6 +181,7 @@ def test_a_corridor_with_an_end_in_sight_is_accepted() -> None:
     assert_right(found, T_true, edge_m=EDGE_M)
 
 
+@pytest.mark.slow
 def test_a_room_that_looks_the_same_from_both_ends_is_refused_if_any_heading_may_be() -> None:
     low, high = [-3.0, -2.0, 0.0], [3.0, 2.0, 2.5]
     whole = map_of_a_box(low, high, [[x, y, 1.0] for x in (-1, 1) for y in (-1, 1)], reach_m=20)
@@ -194,6 +197,7 @@ def test_a_room_that_looks_the_same_from_both_ends_is_refused_if_any_heading_may
 # Real recordings
 
 
+@pytest.mark.slow
 @pytest.mark.recording
 @pytest.mark.skipif(DATA is None, reason="CAIRN_TEST_DATA is not set")
 @pytest.mark.parametrize(("shift_m", "yaw_deg"), [(0.5, 10.0), (-0.5, -10.0)])

@@ -184,6 +184,7 @@ class Silent:
         self._thread.join()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reads", [True, False])
 def test_a_transfer_that_hangs_is_cut(tmp_path: Path, until: Until, reads: bool) -> None:
     silent = Silent(reads=reads)

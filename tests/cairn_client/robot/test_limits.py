@@ -82,6 +82,7 @@ def row_bytes() -> int:
     return whole.size_bytes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["high-end", "low-end", "viewer"])
 def test_a_full_disk_holds_the_cells_around_the_robot_and_they_go_with_it(
     row_server: LiveServer, tmp_path: Path, mode: str
@@ -158,6 +159,7 @@ def _fetch_only(robot: Robot) -> None:
     robot._rounds._fetch()
 
 
+@pytest.mark.slow
 def test_a_commit_drops_the_farthest_cells_and_then_refuses(row_server: LiveServer, tmp_path: Path) -> None:
     limits = Limits(disk_bytes_max=150_000)
     with robot_in(tmp_path, row_server.map_url, limits=limits) as robot, robot.events() as events:

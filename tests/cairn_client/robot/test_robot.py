@@ -62,6 +62,7 @@ def test_a_robot_asks_its_map_without_a_server_and_its_snapshot_stays(tmp_path: 
         assert len(robot.snapshot(wary).occupied_in()) < len(robot.snapshot().occupied_in())
 
 
+@pytest.mark.slow
 def test_a_snapshot_is_taken_and_asked_while_another_thread_syncs(server: LiveServer, tmp_path: Path) -> None:
     with (
         robot_in(tmp_path, server.map_url) as mole,
@@ -91,6 +92,7 @@ def test_a_snapshot_is_taken_and_asked_while_another_thread_syncs(server: LiveSe
         assert asked.result() > 0
 
 
+@pytest.mark.slow
 def test_two_robots_share_a_map(server: LiveServer, tmp_path: Path) -> None:
     with (
         robot_in(tmp_path, server.map_url) as mole,

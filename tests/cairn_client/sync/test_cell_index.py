@@ -70,6 +70,7 @@ def test_all_pages_together_are_the_index(team: Team) -> None:
         ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("page", "changed"), [(1, [FIRST]), (1, [LAST]), (3, KEYS)])
 def test_a_map_that_changes_between_two_pages_is_fetched_as_it_is(
     team: Team, page: int, changed: list[CellKey]

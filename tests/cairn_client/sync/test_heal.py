@@ -64,6 +64,7 @@ def is_damaged(server: LiveServer, key: CellKey) -> bool:
     return False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["high-end", "low-end", "viewer"])
 def test_a_robot_that_has_a_damaged_cell_heals_the_server_as_it_syncs(
     server: LiveServer, tmp_path: Path, mode: Mode

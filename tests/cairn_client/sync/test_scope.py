@@ -39,6 +39,7 @@ def cells_seen(robot: object) -> set[Cell]:
     return {cell_of_key(key) for key in robot.map.packed()}  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["high-end", "low-end", "viewer"])
 def test_a_robot_with_a_box_fetches_the_cells_in_it_and_no_others(
     large: LiveServer, tmp_path: Path, mode: Mode
@@ -75,6 +76,7 @@ def test_own_commits_outside_the_box_are_not_kept_for_ever(server: LiveServer, t
         assert cells_of(robot.map) == cells_of(evidence_of(1))
 
 
+@pytest.mark.slow
 def test_small_replies_bring_the_whole_map_however_many_they_are(large: LiveServer, tmp_path: Path) -> None:
     assert len(EVERY_CELL) > ROUNDS_MAX
     with robot_in(tmp_path, large.map_url, scope=Scope(reply_bytes_max=1)) as robot:

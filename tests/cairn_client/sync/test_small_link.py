@@ -88,6 +88,7 @@ def robot_at(folder: Path, link: FaultProxy, place: Cell, *, name: str = "fox", 
     return robot
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mode", "times"), [("high-end", 1), ("low-end", 10)])
 def test_at_64_kbit_and_5_percent_loss_the_cells_around_the_robot_come_first(
     city: LiveServer, tmp_path: Path, mode: str, times: int

@@ -96,6 +96,7 @@ def test_robots_refill_a_server_that_lost_everything(team: Team, tmp_path: Path)
         assert team[name].view.evidence(B) == Y
 
 
+@pytest.mark.slow
 def test_robots_refill_a_server_that_was_restored(team: Team, tmp_path: Path) -> None:
     team.server.stop()
     team.server.settings = team.server.settings.model_copy(update={"stable_after_s": 86400})

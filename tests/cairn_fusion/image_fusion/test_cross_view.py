@@ -158,6 +158,7 @@ def test_registered_depth_is_that_of_opencv() -> None:
     assert np.median(difference) < 0.002 and np.mean(difference < 0.02) > 0.95
 
 
+@pytest.mark.slow
 def test_without_noise_what_is_hidden_is_never_painted_away_from_edges() -> None:
     painted = hidden = called = missed = wrong = away = 0
     rig = HEAD.model_copy(update={"cameras": {n: m for n, m in HEAD.cameras.items() if n != "colour_right"}})

@@ -193,6 +193,7 @@ def test_a_tally_is_as_large_as_memory_allows_and_a_scan_too_far_is_refused() ->
         tally_around(np.zeros(3), 9.0, fine, max_range_m=10.0)
 
 
+@pytest.mark.slow
 def test_carving_keeps_the_surfaces_that_rays_erase() -> None:
     robot, geometry = replace(ROBOTS["tof"], scans=(6, 1)), geometry_for(voxel_edge_m=0.08, channels=())
     plan = Plan(scene=load_scene("building"), robot=robot, path="labs", truth="none", first_stop=8, last_stop=9)

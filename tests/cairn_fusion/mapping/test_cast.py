@@ -53,6 +53,7 @@ def check_against_twin(origin: tuple[float, ...], targets: list[tuple[float, ...
     assert surely <= misses <= perhaps
 
 
+@pytest.mark.slow
 @law
 @given(points, st.lists(points, max_size=5))
 def test_rays_mark_what_they_meet(origin: tuple[float, ...], targets: list[tuple[float, ...]]) -> None:

@@ -391,6 +391,7 @@ def in_cups(
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.recording
 def test_hot_cups_are_where_their_labels_are_and_are_seen_through_when_they_are_gone(test_data: Path) -> None:
     folder = test_data / "mm5_rgbdt"

@@ -38,6 +38,7 @@ def test_leaves_of_rows_are_the_leaves_that_begin_there(made: Made) -> None:
     assert len(leaves_of_rows(rows, np.empty(0, np.uint32))) == 0
 
 
+@pytest.mark.slow
 @given(MADE)
 def test_leaves_down_to_any_depth_are_those_of_the_slow_tree(made: Made) -> None:
     evidence, geometry = made
@@ -90,6 +91,7 @@ def test_the_index_of_leaves_finds_who_holds_each_place(made: Made) -> None:
     assert found == holders
 
 
+@pytest.mark.slow
 @given(MADE, st.data())
 def test_earlier_rows_are_those_beside_that_come_before(made: Made, data: st.DataObject) -> None:
     evidence, geometry = made

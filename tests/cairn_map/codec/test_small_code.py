@@ -58,6 +58,7 @@ def test_the_twin_reads_and_writes_the_same_bytes(made: Made) -> None:
             assert stream.body == groups.get(number, b"")
 
 
+@pytest.mark.slow
 @given(st.one_of(EXTREME, RANDOM))
 def test_what_the_twin_writes_of_anything_is_read(made: Made) -> None:
     """Evidence with extremes, which the real encoder finds no shorter than they are and leaves raw."""
@@ -69,6 +70,7 @@ def test_what_the_twin_writes_of_anything_is_read(made: Made) -> None:
     assert naive_cell_code.decode_cell(data)[1] == as_dict(evidence)
 
 
+@pytest.mark.slow
 def test_the_twin_agrees_on_a_larger_surface() -> None:
     evidence = surface_evidence(5, MIDDLE)
     encoded = encode_cell(KEY, evidence, MIDDLE, profile=Profile.SMALL)

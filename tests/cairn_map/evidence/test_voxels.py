@@ -19,6 +19,7 @@ MODEL = SensorModel()
 geometries = pytest.mark.parametrize("geometry", GEOMETRIES)
 
 
+@pytest.mark.slow
 @geometries
 @pytest.mark.parametrize("made", [random_evidence, surface_evidence])
 def test_numbers_counts_means_and_spreads_are_those_of_the_sums(

@@ -18,6 +18,7 @@ EDGE_M = 0.05
 DEEPER = Geometry(voxel_edge_um=50_000, depth=4, channels=())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("geometry", [PLAIN, DEEPER])
 @pytest.mark.parametrize("state", [State.OCCUPIED, State.UNKNOWN])
 @pytest.mark.parametrize("radius_m", [0.0, 0.07, 0.3])

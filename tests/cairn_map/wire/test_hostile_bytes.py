@@ -136,6 +136,7 @@ def test_random_damage_is_refused_or_gives_something_sound(read: Reader, sound: 
     survives(read, bytes(damaged))
 
 
+@pytest.mark.slow
 @every_reader
 @given(st.data())
 def test_bytes_taken_out_or_put_in_are_refused_or_give_something_sound(
@@ -182,6 +183,7 @@ def test_noise_in_place_of_modelled_bytes_is_refused_or_gives_something_sound(
     survives(read_cell, with_streams(MODELLED_CELL, stream._replace(body=stream.body[:kept] + noise)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOMBS)
 def test_a_bomb_is_refused_within_bounds(name: str) -> None:
     decode, made = BOMBS[name]

@@ -153,6 +153,7 @@ def ask(holders: Holders, route: tuple[str, str], holder: Holder, place: str, ro
     return holders.live.ask(method, path.format_map(parts), content=content, headers=headers)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("route", ROLES_OF, ids=" ".join)
 def test_each_token_may_do_what_the_document_says_and_no_more(holders: Holders, route: tuple[str, str]) -> None:
     method, path = route

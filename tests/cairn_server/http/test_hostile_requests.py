@@ -117,6 +117,7 @@ QUERIES = st.dictionaries(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=150)
 @given(st.data())
 def test_nothing_that_is_sent_makes_the_server_fail(live: Live, data: st.DataObject) -> None:

@@ -83,6 +83,7 @@ def test_a_body_that_comes_a_byte_at_a_time_is_cut(hasty: Live) -> None:
         assert GRACE_S / 2 < dribbled(link, b"x" * 500, every_s=0.02) < 8 * GRACE_S
 
 
+@pytest.mark.slow
 def test_a_slow_body_above_the_least_rate_takes_the_time_that_it_takes(hasty: Live) -> None:
     row, pause = hasty.new_map(), threading.Event()
     size, step = 120_000, 4_000
@@ -99,6 +100,7 @@ def test_a_slow_body_above_the_least_rate_takes_the_time_that_it_takes(hasty: Li
     assert time.monotonic() - start_s > 2 * GRACE_S
 
 
+@pytest.mark.slow
 def test_a_link_that_does_not_take_its_answer_is_cut(hasty: Live) -> None:
     with connected(hasty) as link:
         link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)

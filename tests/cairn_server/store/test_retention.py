@@ -47,6 +47,7 @@ def test_a_commit_is_read_as_it_was_pushed_until_its_evidence_goes(live: Live) -
     ]
 
 
+@pytest.mark.slow
 @settings(max_examples=12)
 @given(st.data())
 def test_whoever_comes_after_evidence_went_still_ends_with_the_map(live: Live, data: st.DataObject) -> None:

@@ -144,6 +144,7 @@ def test_a_commit_that_takes_long_is_refused_and_the_worker_replaced(
     assert worker not in workers_of(strict)
 
 
+@pytest.mark.slow
 def test_a_commit_that_takes_much_memory_is_refused_and_large_workers_are_not_kept(tmp_path: Path) -> None:
     with Live(tmp_path, check_workers=1, check_memory_bytes=1 << 26) as server:
         server.service.sync.pushes.checks.ordinary_s = 0.0
@@ -207,6 +208,7 @@ def test_workers_that_are_always_killed_are_told_of(strict: Live, monkeypatch: p
     assert strict.push(row, pushed(1, 1)).status_code == 201
 
 
+@pytest.mark.slow
 def test_a_nursery_that_was_killed_is_made_anew(strict: Live) -> None:
     row = strict.new_map()
     strict.push(row, pushed(0, 1))

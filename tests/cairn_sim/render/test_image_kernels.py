@@ -117,6 +117,7 @@ def all_hits(name: str) -> list[tuple[Look, Hits]]:
     return [*((one, one.hits) for one in (*clear, *others)), *((one, ugly(one, 1)) for one in (clear[0], others[0]))]
 
 
+@pytest.mark.slow
 def test_the_looks_show_all_that_may_happen() -> None:
     ways = {name: {int(w) for one, _ in all_hits(name)[:6] for w in one.hits.way} for name in SCENES}
     assert ways[PANES] == {0, 1, 2, 3} and 1 in ways["building"]

@@ -92,6 +92,7 @@ def test_kernel_agrees_with_its_slow_twin_along_the_axes_of_the_small_room() -> 
     np.testing.assert_allclose(hits.range_m[2:6:3], [1.5, 1.1], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_light_goes_through_glass_and_round_mirrors_as_step_by_step(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -142,6 +142,7 @@ def test_each_pixel_of_each_camera_shows_the_square_that_its_ray_meets(turn_rad:
         np.testing.assert_array_equal((values > middle)[inside], ((i + j) % 2 == 0)[inside])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn_rad", TURNS)
 @pytest.mark.parametrize("name", CAMERAS)
 def test_true_corners_are_where_a_detector_finds_the_squares_meet(
@@ -300,6 +301,7 @@ def centroid_errors(diameter_m: float, images: int, *, sensor: RangeSensor, dist
     return np.array(errors)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("diameter_m", [0.20, 0.30])
 def test_binary_centroid_at_three_metres_is_uncertain_by_a_quarter_of_a_pixel(diameter_m: float) -> None:
     errors = centroid_errors(diameter_m, 250, sensor=RangeSensor())

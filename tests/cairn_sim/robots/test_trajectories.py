@@ -156,6 +156,7 @@ def test_without_errors_a_robot_believes_the_truth() -> None:
     np.testing.assert_array_equal(believed(true, PoseErrors(), np.random.default_rng(1)), true)
 
 
+@pytest.mark.slow
 def test_pose_errors_have_their_sigmas_and_drift_grows_with_the_way() -> None:
     true = [np.eye(4)] * 4000
     shaken = np.array(believed(true, PoseErrors(sigma_m=0.02, sigma_rad=0.01), np.random.default_rng(1)))
