@@ -42,6 +42,7 @@ def test_show_writes_a_sheet_of_every_image_and_the_scene_from_above(tmp_path: P
             assert tile.std() > 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ["tof", "lidar", "handheld"])
 def test_show_knows_every_robot(robot: str, tmp_path: Path) -> None:
     assert main(["show", "yard", "--robot", robot, "--output", str(tmp_path / "view.png")]) == 0
@@ -86,6 +87,7 @@ def test_board_and_discs_can_be_shown_and_recorded(scene: str, tmp_path: Path) -
     assert len(list((tmp_path / "rec" / "raw" / "thermal_left").iterdir())) == 36
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -171,6 +171,7 @@ def test_the_tables_sigma_is_the_papers() -> None:
     assert row.source_pixel_px == pytest.approx(1340 / 128)
 
 
+@pytest.mark.slow
 def test_the_interval_holds_the_true_sigma_in_ninety_five_of_a_hundred_cases() -> None:
     rng, held = np.random.default_rng(3), 0
     for _ in range(200):

@@ -23,6 +23,7 @@ def shown(capsys: pytest.CaptureFixture[str]) -> str:
     return capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_clone_has_the_map_and_a_pull_what_changed(
     server: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -39,6 +40,7 @@ def test_a_clone_has_the_map_and_a_pull_what_changed(
         assert cells_of(pulled.view) == cells_of(mole.view)
 
 
+@pytest.mark.slow
 def test_diff_tells_a_copy_that_is_behind_from_one_that_is_not(
     server: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -153,6 +153,7 @@ def test_the_removed_command_names_the_one_that_replaces_it(capsys: pytest.Captu
     assert "`cairn robot sync DIR --map URL` does the same" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_folder_in_use_is_not_synced_by_another(server: LiveServer, tmp_path: Path) -> None:
     with robot_in(tmp_path, server.map_url):
         assert code_of("sync", tmp_path / "mole") == 4

@@ -116,6 +116,7 @@ def test_a_height_map_tells_the_highest_surfaces(folder: Path, capsys: pytest.Ca
     assert "height in m: 0.1 to 0.1 (2 of 64 values known" in asked(capsys, folder, "height")
 
 
+@pytest.mark.slow
 def test_a_robot_s_state_is_read_under_the_map_s_own_sensor_model(tmp_path: Path) -> None:
     replica = opened(tmp_path)
     replica.commit({A: evidence()})

@@ -129,6 +129,7 @@ def test_the_command_draws_over_a_recorded_image(
     assert "withheld" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_telepresence_draws_the_map_over_the_image_too(world: World, tmp_path: Path) -> None:
     """As `cairn map render --over` does; heat on colour takes the map for its mirrors."""
     cells, pictures, one = tmp_path / "cells", tmp_path / "pictures", tmp_path / "one.png"

@@ -172,6 +172,7 @@ def test_along_a_bare_corridor_an_alignment_is_refused() -> None:
     assert sigma[3] > 4 * sigma[4]  # and says what it does not know
 
 
+@pytest.mark.slow
 def test_a_corridor_with_an_end_in_sight_is_accepted() -> None:
     low, high = [-2.0, -1.0, 0.0], [6.0, 1.0, 2.5]
     whole = map_of_a_box(low, high, [[x, 0.1, 1.0] for x in range(6)], reach_m=8)

@@ -238,6 +238,7 @@ def test_commits_that_are_stable_go_first(server: LiveServer, tmp_path: Path) ->
             robot.replica.commit(far)
 
 
+@pytest.mark.slow
 def test_acknowledged_commits_that_a_restore_could_lose_stay(server: LiveServer, tmp_path: Path) -> None:
     server.stop()
     server.settings = server.settings.model_copy(update={"stable_after_s": 1e6})

@@ -108,6 +108,7 @@ def test_two_robots_share_a_map(server: LiveServer, tmp_path: Path) -> None:
             assert cells_of(robot.map) == cells_of(evidence_of(1, 2))
 
 
+@pytest.mark.slow
 def test_a_small_commit_says_the_same_in_fewer_bytes(server: LiveServer, tmp_path: Path) -> None:
     with robot_in(tmp_path, server.map_url) as mole, robot_in(tmp_path, name="bat") as bat:
         commits = []

@@ -89,6 +89,7 @@ def test_a_map_that_changes_between_two_pages_is_fetched_as_it_is(
     assert cells_of(fox.view) == cells_of(team["mole"].view)
 
 
+@pytest.mark.slow
 def test_a_cell_that_became_again_what_it_was_stands_where_it_became_so(team: Team) -> None:
     fox, plain = team["fox"], team.robots["fox"][1]
     Link(plain, MAP, branch="fox").hold(fetch_cells(fox))

@@ -88,6 +88,7 @@ def test_a_robot_that_has_a_damaged_cell_heals_the_server_as_it_syncs(
         assert cells_of(owl.map) == cells_of(evidence_of(1, 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("newcomer", ["high-end", "low-end"])
 def test_who_fetches_a_damaged_cell_gets_all_others_and_whoever_has_it_is_told(
     team: Team, server: LiveServer, newcomer: str

@@ -24,6 +24,7 @@ def team(server: LiveServer, tmp_path: Path) -> Iterator[Team]:
     robots.close()
 
 
+@pytest.mark.slow
 def test_robots_refill_a_server_that_was_restored_from_a_backup(team: Team, tmp_path: Path) -> None:
     folder, file = tmp_path / "server", tmp_path / "nightly.cairn"
     team["mole"].commit({A: X})

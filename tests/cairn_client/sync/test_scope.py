@@ -62,6 +62,7 @@ def test_low_end_a_box_and_a_wish_go_together(large: LiveServer, tmp_path: Path)
         assert cells_seen(robot) == {cell for cell in IN_BOX if cell.i == 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["high-end", "low-end"])
 def test_own_commits_outside_the_box_are_not_kept_for_ever(server: LiveServer, tmp_path: Path, mode: Mode) -> None:
     far_m = ((50.0, 50.0, 50.0), (51.0, 51.0, 51.0))

@@ -148,6 +148,7 @@ def test_a_robot_that_moves_gets_what_is_around_its_new_place(city: LiveServer, 
         assert max(rings_between(cell_of_key(key), Cell(5, 5, 0)) for key in second) <= 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cut", ["close", "half", "reset"])
 def test_at_30_percent_loss_and_with_cuts_nothing_breaks_and_nothing_is_paid_twice(
     city: LiveServer, tmp_path: Path, cut: Cut, monkeypatch: pytest.MonkeyPatch
@@ -181,6 +182,7 @@ def test_at_30_percent_loss_and_with_cuts_nothing_breaks_and_nothing_is_paid_twi
         assert link.size_bytes <= whole_bytes + link.cuts * 5000
 
 
+@pytest.mark.slow
 def test_on_a_small_link_commits_take_few_bytes_and_statuses_are_seldom(
     server: LiveServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

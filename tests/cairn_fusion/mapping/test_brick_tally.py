@@ -112,6 +112,7 @@ def test_a_tally_counts_as_a_dict_does(seed: int) -> None:
     assert {voxel: count for voxel, (_, count, _) in found.items() if count} == missed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("edge_um", [25_000, 50_000, 200_000])
 @pytest.mark.parametrize("seed", range(3))
 def test_culling_leaves_out_and_takes_as_free_only_what_is(seed: int, edge_um: int) -> None:

@@ -168,6 +168,7 @@ def wall_scan(T_map_rig: Transform, distance_m: float) -> Scan:
     return Scan(time_s=0.0, T_map_rig=T_map_rig, range_camera="tof", range_m=range_m.astype(np.float32))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slant", [0.0, 0.5, 1.0])
 def test_a_wall_is_not_looked_through_at_any_slant(slant: float) -> None:
     T = look_at((0.013, 0.021, 0.017), (1.0, slant, 0.2))

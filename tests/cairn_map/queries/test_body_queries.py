@@ -20,6 +20,7 @@ EDGE_M = 0.05
 DEEPER = Geometry(voxel_edge_um=50_000, depth=4, channels=())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("geometry", [PLAIN, DEEPER])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_boxes_meet_what_the_twin_says(geometry: Geometry, seed: int) -> None:

@@ -24,6 +24,7 @@ def in_box(voxel: tuple[int, int, int]) -> bool:
     return all(low <= v <= high for low, v, high in zip(LOW, voxel, HIGH, strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("geometry", [PLAIN, DEEPER, MIDDLE])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_frontier_is_that_of_the_twin(geometry: Geometry, seed: int) -> None:

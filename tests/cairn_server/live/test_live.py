@@ -115,6 +115,7 @@ def test_who_comes_back_hears_what_was_folded_meanwhile(live: Live, listen: List
     assert logged(found) == [str(COMMITS[1].id)]
 
 
+@pytest.mark.slow
 def test_who_comes_back_after_a_restart_goes_on_and_ids_still_rise(tmp_path: Path) -> None:
     with Live(tmp_path) as live:
         row = live.new_map()

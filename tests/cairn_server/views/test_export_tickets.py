@@ -146,6 +146,7 @@ def kept(live: Live) -> list[Export]:
     return [ticket.export for ticket in live.service.views.tickets._kept.values()]
 
 
+@pytest.mark.slow
 def test_a_file_that_nobody_comes_for_goes_by_itself(
     guarded: Live, row: MapRow, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -100,6 +100,7 @@ def test_the_page_has_the_papers_table_beside_ours() -> None:
         assert coding.name in words and coding.holds in words
 
 
+@pytest.mark.slow
 def test_a_resolution_that_the_paper_has_not_stands_alone() -> None:
     assert "paper" not in read_page(page_of(0.08)).words
     words = read_page(page_of(0.08, 0.04)).words
@@ -111,6 +112,7 @@ def test_what_was_not_finished_is_said() -> None:
     assert "Not finished: 4 cm, 2 cm was" in page_of(0.08, asked=("8 cm", "4 cm", "2 cm"))
 
 
+@pytest.mark.slow
 def test_without_a_truth_the_page_says_so() -> None:
     assert "90.0 %" in page_of(0.08)
     page = page_of(0.08, truth=False)

@@ -154,6 +154,7 @@ def test_true_poses_are_kept_where_the_robot_errs(tmp_path: Path) -> None:
         assert 0.001 < np.abs(shot.T_map_rig - shot.T_believed).max() < 0.4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tof", "lidar", "handheld"])
 def test_every_robot_records_standing_and_driving(name: str, tmp_path: Path) -> None:
     robot = ROBOTS[name] if ROBOTS[name].manipulator is None else replace(ROBOTS[name], scans=(2, 1))
