@@ -91,10 +91,13 @@ class Undelivered:
 
     rest_s: float = REST_S
     clock_s: Callable[[], float] = time.monotonic
+    # By side and reason: commits that were tried in vain.
     _found: defaultdict[tuple[RelaySide, Why], VersionVector] = field(
         default_factory=lambda: defaultdict(lambda: EMPTY)
     )
+    # Where the link to a side broke last: a second break at the same commit is blamed on the commit.
     _broke_at: dict[RelaySide, CommitId] = field(default_factory=dict)
+    # When a side takes commits again, as it said itself; and when `_found` is tried again.
     _pauses_until_s: dict[RelaySide, float] = field(default_factory=dict)
     _until_s: dict[RelaySide, float] = field(default_factory=dict)
 
@@ -104,12 +107,14 @@ class Undelivered:
 
     def broke(self, to: RelaySide, commit: CommitId, error: UnreachableError) -> None:
         """Note that the link broke at a commit, or that the server said when it may take more."""
+        # Something of it came, so the next try goes on from there: the commit is not to blame.
         if error.kind == CAME_IN_PART:
             self._broke_at.pop(to, None)
         else:
             if self._broke_at.get(to) == commit and error.kind not in NOT_ITS_FAULT:
                 self.add(to, Why.BROKEN, commit)
             self._broke_at[to] = commit
+        # No server's wish keeps commits back for longer than a failure would.
         if error.retry_after_s:
             self._pauses_until_s[to] = self.clock_s() + min(error.retry_after_s, self.rest_s)
 
@@ -131,12 +136,14 @@ class Undelivered:
         for known in tried:
             lacking = lacking.minus(known)
         yield from lacking
+        # Evidence that a server asks for again (rule 11) is in its vector, so no difference of vectors names it.
         for commit in target.wanted:
             if commit in source.vector and not any(commit in known for known in tried):
                 yield commit
 
     def all_tried(self, to: RelaySide, report: "RelayReport") -> None:
         """Note that nothing is left to hand over to this side; every `rest_s` report what it lacks, and begin again."""
+        # Only when nothing else is left, so that what failed never holds up what was not tried.
         if self._until_s.setdefault(to, self.clock_s() + self.rest_s) > self.clock_s():
             return
         del self._until_s[to]
@@ -195,6 +202,7 @@ def _hand_over(
 ) -> Conversation[None]:
     if resting.pauses(target):
         return
+    # A part of what lacks: both sides are asked again soon, because other relays work at the same time.
     lacking = resting.lacking(held[source], held[target], target)
     for commit_id in islice(lacking, AT_ONCE):
         try:
@@ -212,6 +220,7 @@ def _hand_over(
                 raise
             report.refused.append((commit_id, exc))
             why = Why.REFUSED
+        # The outcome of this commit: there; or not there, and then left alone until all others were tried.
         if why is None:
             report.moved[target] += 1
         elif commit_id in held[target].vector:  # only wanted again, and not lacking
@@ -220,6 +229,7 @@ def _hand_over(
             resting.add(target, why, commit_id)
             if why in FOR_GOOD:
                 report.keep_back(target, why, commit_id)
+    # The iterator goes on behind `islice`: one more commit means that this direction is not done.
     if next(lacking, None) is None:
         resting.all_tried(target, report)
     else:
@@ -247,6 +257,7 @@ def _give(source: RelaySide, target: RelaySide, commit: SignedCommit) -> Convers
     except ConflictError as exc:
         if exc.kind != "evidence_gone":
             raise
+        # First the evidence that this commit takes out, as far as the source still has it; then the commit again.
         for named in split_commit(commit.data)[0].retracted_ids:
             try:
                 yield from GiveCommit(target, (yield from TakeCommit(source, named)))
@@ -257,6 +268,7 @@ def _give(source: RelaySide, target: RelaySide, commit: SignedCommit) -> Convers
 
 def _split(here: Held, there: Held) -> list[Author]:
     """Authors of whom both have the same ids, and not the same commits."""
+    # Sums compare only where both have the same ids of an author; a difference is then one of bytes (rule 13).
     return [
         author
         for author, total in here.sums.items()

@@ -104,6 +104,7 @@ class Outbox:
         self._geometry = geometry
         self._make_room = make_room
         self._amendable = amendable
+        # Key and incarnation are drawn in one transaction: one without the other makes commits that cannot be signed.
         self._keys = RobotKeys(state, robot)
         known = state.incarnation
         if known is None or not self._keys.has(known):  # a folder from before commits were signed
@@ -112,8 +113,10 @@ class Outbox:
                 state.incarnation = known
                 self._set_next(0, None)
         self._incarnation = known
+        # In memory is every commit ever kept, oldest first, without its bytes.
         self._commits: dict[CommitId, KeptCommit] = {}
         self._touching: dict[CellKey, dict[CommitId, None]] = {}
+        # Acknowledged since the newest header was made, which cannot name them yet.
         self._acked_since_header: set[CommitId] = set()
         self._retracts: dict[CommitId, tuple[CommitId, ...]] = {}
         """Commits that each kept commit takes out, as far as they were read."""
@@ -157,19 +160,24 @@ class Outbox:
             BadInputError: kind `not_own`: it retracts another robot's commit; only an operator may. Kind `bad_meta`:
                 the facts are too many or too long.
         """
+        # A robot speaks for itself alone: the server would refuse it, and it would wait here for ever.
         foreign = [target for target in facts.retracts if target.author.robot != self._robot]
         if foreign:
             raise BadInputError("not_own", f"{foreign[0]} is not {self._robot}'s own; an operator can retract it")
+        # Number and parent continue the row of this incarnation, without a gap.
         n = self._next_n()
         meta = facts.meta(CommitId(self.author, n), self._geometry, parent=self._state.tip_sha, seen=seen)
         commit = make_commit(meta, diff, self._geometry, profile=profile)
+        # Before the transaction, because making room drops things in transactions of its own.
         self._make_room(len(commit.data))
+        # All of it or nothing: a commit kept without its number would share its id with the next one.
         with self._store.transaction():
             self._store.add_commit(commit)
             self._set_next(n + 1, commit)
             for key, text in notes.items():
                 self._store.put(key, text)
             self._put_successor(commit)
+        # Memory follows the disk, so that a transaction that failed leaves no trace.
         self._note(_kept(commit))
         self._read_successors(commit.meta.retracted_ids)
         self._retracts[commit.id] = commit.meta.retracted_ids
@@ -180,6 +188,7 @@ class Outbox:
         with self._store.transaction():
             self._store.add_commit(commit, seal=seal)
             self._put_successor(commit)
+        # Acknowledged from the start: the server that sealed it has it.
         self._note(replace(_kept(commit), acked=True, seal=seal))
         self._read_successors(commit.meta.retracted_ids)
 
@@ -233,6 +242,7 @@ class Outbox:
         data = self._store.commit_data(commit)
         if data is None:
             raise BadInputError("no_bytes", f"the bytes of {commit} are not kept any more")
+        # Other numbers of the present incarnation may be taken, too; an older one has nothing left to number.
         if commit.author == self.author:
             self.new_incarnation(f"the id {commit} is taken by other bytes")
         # The renamed commit, and the commits that name it under its old id.
@@ -269,6 +279,7 @@ class Outbox:
     def new_incarnation(self, reason: str) -> None:
         """Number commits from 0 under a fresh incarnation: this robot's disk was rolled back or lost."""
         log.warning("robot %s takes a new incarnation: %s", self._robot, reason)
+        # Older keys and commits stay: what waits under the old incarnation is still pushed under it.
         with self._store.transaction():
             fresh = self._keys.draw()
             self._state.incarnation = fresh
@@ -277,11 +288,14 @@ class Outbox:
 
     def check_tip(self, header: ReplyHeader, *, asked_by: Author) -> None:
         """Note a newer header; a new incarnation if the server knows commits that this disk forgot (rule 13)."""
+        # The header was asked for after those acknowledgements, so its vector and `pending` speak of them.
         self._acked_since_header.clear()
+        # The tip is that of one author: asked for before a rename, it is the older incarnation's.
         if header.tip is None or asked_by != self.author:
             return
         n, sha = header.tip
         known = self._commits.get(CommitId(self.author, n))
+        # Beyond the own numbers, or one of them with other bytes: this disk was rolled back.
         if n >= self._next_n() or (known is not None and known.sha.hex() != sha):
             self.new_incarnation(f"the server has commit {n} of it with bytes that are not here")
 
@@ -291,6 +305,7 @@ class Outbox:
         Raises:
             ConflictError: kind `taken_back`: it was taken back, and not by an amend.
         """
+        # An original and its amends are one chain, so they share the commit that stands for them now.
         latest = self.successors.latest(commit)
         found = next((original for original in originals if self.successors.latest(original) == latest), None)
         found = commit if commit in originals else found
@@ -309,12 +324,14 @@ class Outbox:
         if commits:
             with self._store.transaction():
                 self._store.forget_data(commits)
+        # The SHA-256 stays for `check_tip`, and the cells for `own_evidence`, which must notice that bytes are gone.
         for commit in commits:
             self._commits[commit] = replace(self._commits[commit], has_data=False)
             self._retracts.pop(commit, None)
 
     def reread(self) -> None:
         """Read again from the store which commits are acknowledged."""
+        # For another server, which has acknowledged nothing.
         self._acked_since_header.clear()
         for kept in self._store.commits():
             self._note(kept)
@@ -344,6 +361,7 @@ class Outbox:
         return decode_cell(split_commit(self._store.commit_data(commit) or b"")[1][key]).evidence
 
     def _note(self, kept: KeptCommit) -> None:
+        # Its bytes may be new ones: a rename changes what an amend names.
         self._retracts.pop(kept.id, None)
         self._commits[kept.id] = kept
         for key in kept.cells:
@@ -359,6 +377,7 @@ class Outbox:
             self.successors.read(commit)
 
     def _retracts_of(self, commit: CommitId) -> tuple[CommitId, ...]:
+        # Read when first needed: opening a folder must not read the bytes of every commit.
         if commit not in self._retracts:
             data = self._store.commit_data(commit)
             self._retracts[commit] = split_commit(data)[0].retracted_ids if data else ()

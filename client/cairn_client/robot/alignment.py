@@ -100,6 +100,7 @@ def align_points(
     best, *others = _distinct([minimum_at(snapshot, points, T) for T in fine], points, edge_m)
     # The verdict, and a last check: a place much farther off than was asked for is none.
     found = judged(best, others, points, all_surfaces.matches(points, best.T, 2 * edge_m), edge_m=edge_m)
+    # The reach counts along x and along y: a corner lies sqrt(2) of it off, and GICP may go a step beyond.
     shift_m = float(np.linalg.norm(best.T[:3, 3] - guess[:3, 3]))
     if shift_m > math.sqrt(2) * reach_m + STEP_M:
         reason = f"it ended {shift_m:.2f} m from the guess: if that may be, give a larger reach_m"
@@ -112,11 +113,14 @@ def _searched(
 ) -> list[Minimum]:
     """Minima that the starts lead to, each once, the best first, without those of much less worth."""
     edge_m = snapshot.geometry.voxel_edge_m
+    # Few points and wide matches from every start: enough to fall into the right valley.
     cloud = surfaces.cloud(some(points, COARSE_POINTS))
     ends = (surfaces.registered(cloud, start, 2 * STEP_M, steps=COARSE_STEPS) for start in starts)
     rough = _distinct([minimum_at(snapshot, points, T) for T in ends], points, edge_m)[:FOLLOWED]
+    # Closer matches from the best of them; starts that fell into one valley have become one minimum.
     closer = (surfaces.registered(cloud, minimum.T, 0.2 + 2 * edge_m, steps=FINE_STEPS) for minimum in rough)
     minima = _distinct([minimum_at(snapshot, points, T) for T in closer], points, edge_m)
+    # What is much worse is no rival by `alignment_verdict.RIVAL`, and need not be refined on all voxels.
     return [minimum for minimum in minima if minimum.worth >= COMPARED * minima[0].worth][:RIVALS_MAX]
 
 
@@ -124,6 +128,7 @@ def minimum_at(snapshot: MapSnapshot, points: Floats, T: Transform) -> Minimum:
     """Fit of points in the robot's frame at a place."""
     there = transform_points(T, points)
     hits = snapshot.nearest_occupied(there, radius_m=snapshot.geometry.voxel_edge_m).found
+    # Points in unknown space tell neither for nor against a place: they count as not known, not as misses.
     known = hits | (snapshot.state_at(there) != State.UNKNOWN)
     return Minimum(T, float(hits.sum() / max(known.sum(), 1)), float(known.mean()))
 
@@ -132,6 +137,7 @@ def _distinct(minima: Sequence[Minimum], points: Floats, edge_m: float) -> list[
     """The best first, without those that are within two voxels of a better one."""
     few = some(points, 100)
     kept: list[Minimum] = []
+    # Best first: a minimum gives way only to a better one.
     for minimum in sorted(minima, key=_worth, reverse=True):
         if all(apart_m(other.T, minimum.T, few) > 2 * edge_m for other in kept):
             kept.append(minimum)
@@ -190,6 +196,7 @@ class MapSurfaces:
         found = np.asarray(numbers)[near]
         normals, centres = self._cloud.normals()[found, :3], self._cloud.points()[found, :3]
         offsets_m = ((there[near] - centres) * normals).sum(axis=1)
+        # Rows n @ R are R^T n: the normals in the robot's frame.
         return Matches(points[near], normals @ T[:3, :3], offsets_m)
 
 
@@ -203,6 +210,7 @@ def starts_around(guess: Transform, *, reach_m: float, reach_rad: float) -> Iter
         raise BadInputError(
             "bad_option", f"reach_m must be 0 or more and reach_rad 0 to pi, got {reach_m}, {reach_rad}"
         )
+    # Roll, pitch and height are not searched: the guess knows them well enough for GICP to do the rest.
     shifts_m, turns_rad = (_steps(*pair) for pair in ((reach_m, STEP_M), (reach_rad, STEP_RAD)))
     if len(shifts_m) ** 2 * len(turns_rad) > STARTS_MAX:
         raise BadInputError("too_large", f"the search would have more than {STARTS_MAX} starts; give a smaller reach")
@@ -231,13 +239,16 @@ def some(points: Floats, count: int) -> Floats:
     """At most so many of the points, always the same ones."""
     if len(points) <= count:
         return points
+    # A fixed seed, and the points in their order: the same scans give the same place every time.
     return points[np.sort(np.random.default_rng(0).permutation(len(points))[:count])]
 
 
 def _steps(reach: float, step: float) -> list[float]:
     """0 and steps to both sides, as far as the reach; round the circle each heading once."""
+    # 1e-9: a reach of whole steps must not get one more by rounding.
     count = math.ceil(reach / step - 1e-9)
     steps = [n * reach / count for n in range(-count, count + 1)] if count else [0.0]
+    # -pi and pi are the same heading.
     return steps[1:] if reach == math.pi else steps
 
 

@@ -107,9 +107,11 @@ class Robot:
             UnreachableError: the geometry is unknown and the server cannot be asked.
         """
         show_compiling()
+        # URL and name are checked before anything is opened or written.
         server_url, self._map_name = split_map_url(map_url)
         self.name = robot_name(name)
         self.mode: Mode = mode
+        # What it senses with, and how it uses its link.
         self._rig = rig
         self._integrator = integrator or Integrator()
         self._profile = LINKS[link]
@@ -117,6 +119,7 @@ class Robot:
         self._status = OwnStatus(every_s=self._profile.tell_every_s)
         self._events = Events()
         self._api = RelayApi(server_url, token=token)
+        # The folder, scans first: the outbox asks them which commits must keep their bytes for an amend.
         with ExitStack() as opened:  # what was opened is closed again if a later step fails
             opened.callback(self._api.close)
             self._kept_scans = KeptScans(Path(directory) / "scans", bytes_max=keep_scans_bytes)
@@ -124,6 +127,7 @@ class Robot:
             opened.callback(self._replica.close)
             self._replica.state.note_use(url=map_url, mode=mode)
             carrier = carrier_in(Path(directory), self._api, self._map_name, size_bytes_max=carry_bytes_max)
+            # Then what works on it; nothing is sent before the first round.
             self._rounds = self._make_rounds(token, scope, carrier)
             self._measurement = self._new_measurement()
             opened.pop_all()  # from here on `close` does it
@@ -135,6 +139,7 @@ class Robot:
             state = ReplicaState(store)
             self._limits = limits or state.limits or NO_LIMITS
             geometry = geometry or state.geometry
+            # The one question that cannot wait for a link: without a grid no evidence has a place.
             if geometry is None:
                 info = self._api.map_info(self._map_name)
                 geometry = info.geometry
@@ -142,15 +147,18 @@ class Robot:
             replica = Replica(
                 store, robot=self.name, map_name=self._map_name, geometry=geometry, amendable=self._amendable_commits
             )
+            # Remembered only now that the folder has proven to be this robot's.
             if limits is not None:
                 state.limits = limits
             return replica
+        # The store holds the folder's lock: another try must get it.
         except BaseException:
             store.close()
             raise
 
     def _amendable_commits(self) -> list[CommitId]:
         """Commits whose bytes stay for an amend; with limits none, as commits that the server has for good go first."""
+        # Asked by the thread that syncs, too: `commits` is replaced whole at each change, never altered.
         return self._kept_scans.commits if self._limits == NO_LIMITS else []
 
     def _make_rounds(self, token: str | None, scope: Scope, carrier: Carrier | None) -> Rounds:
@@ -254,6 +262,7 @@ class Robot:
         if self._rig is None:
             raise BadInputError("no_rig", "this robot was opened without a rig, so it cannot read scans")
         points = points_of_scans(scans, self._rig, self._integrator)
+        # A snapshot, because a round in the background may change the view during the search.
         return align_points(self.snapshot(), points, T_map_robot=T_map_robot, reach_m=reach_m, reach_rad=reach_rad)
 
     def observe(self, scan: Scan) -> None:
@@ -264,6 +273,7 @@ class Robot:
         """
         if self._measurement is None:
             raise BadInputError("no_rig", "this robot was opened without a rig, so it cannot read scans")
+        # The measurement first: it refuses what does not fit, before anything else has the scan.
         self._measurement.add(scan)
         self._kept_scans.add(scan)
         self._status.place_at(self._measurement.poses[-1])
@@ -274,6 +284,7 @@ class Robot:
         Raises:
             BadInputError: kind `open_measurement`: there are scans of the old head.
         """
+        # A commit names one rig, by which an operator can retract it: scans of two heads must not share one.
         if self._measurement is not None and len(self._measurement):
             raise BadInputError("open_measurement", "commit or discard the scans of the old head first")
         self._rig = rig
@@ -306,6 +317,7 @@ class Robot:
                 and nothing is left to drop. The measurement stays open in any case.
         """
         diff = self._measurement.diff() if self._measurement else {}
+        # No evidence is no commit, except to take others out.
         if not diff and not retracts:
             if self._measurement:
                 log.warning("%d scans gave no evidence; nothing is committed", len(self._measurement))
@@ -314,6 +326,7 @@ class Robot:
         # Until the replica has the commit on its disk, the measurement stays open: the caller may try again.
         facts = self._facts(self._measurement, note, retracts)
         commit = self._replica.commit(diff, facts, profile=profile or self._profile.commits, notes=remember)
+        # It is durable. A power cut before the next two lines may cost the scans for an amend, never evidence.
         self._measurement = self._new_measurement()
         self._kept_scans.close_measurement(commit.id)
         self._made(commit)
@@ -402,8 +415,10 @@ class Robot:
         """
         if self._is_closed:
             return
+        # Before anything can fail: `close` by hand and again by `with` pushes once.
         self._is_closed = True
         try:
+            # The background ends first: from here on this thread alone talks to the server.
             self._rounds.stop()
             # The last measurement first, then one push; a robot whose commit was refused does not leave the map.
             try:
@@ -413,6 +428,7 @@ class Robot:
                 raise
             self._rounds.finish(is_leaving=not (stay or self._stay), within_s=flush_s)
         finally:
+            # Whatever failed: the folder's lock is given back, and the readers of events come to their end.
             self._api.close()
             self._replica.close()
             self._events.close()
@@ -422,6 +438,7 @@ class Robot:
         return Measurement(self._rig, self._replica.geometry, self._integrator) if self._rig else None
 
     def _amending(self) -> Amending:
+        # Made for each call: it works with the rig that is mounted now.
         return Amending(
             self._replica,
             self._kept_scans,
@@ -437,6 +454,7 @@ class Robot:
 
     def _facts(self, measurement: Measurement | None, note: str, retracts: tuple[CommitId, ...] = ()) -> CommitFacts:
         """Statements of a measurement's commit about itself."""
+        # By its rig and its times an operator finds the commit again, to retract what a bad calibration made.
         return CommitFacts(
             captured_s=measurement.captured_s if measurement else None,
             scans=tuple(measurement.poses) if measurement else (),

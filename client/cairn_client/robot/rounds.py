@@ -68,6 +68,7 @@ class SyncThread:
         """Stop: a wait ends at once, a round under way at its end, or after two seconds by `cut`."""
         self._stopping.set()
         self._woken.set()
+        # A round that waits for an answer cannot see the flag: its sockets are cut, and what was answered stays.
         self._thread.join(ROUND_END_S)
         if self._thread.is_alive():
             cut()
@@ -76,8 +77,10 @@ class SyncThread:
     def _run(self) -> None:
         backoff = Backoff()
         while not self._stopping.is_set():
+            # Cleared before the round: a commit made during it wakes the thread again, and no wake-up is lost.
             self._woken.clear()
             try:
+                # After a failure the wait grows, and no wake-up shortens it: else each commit would try a dead link.
                 self._sync()
             except UnreachableError as exc:
                 wait_s = backoff.next_s(exc.retry_after_s)
@@ -121,17 +124,20 @@ class Rounds:
         carrier: Carrier | None = None,
     ) -> None:
         """Nothing is sent before `sync` or `start`."""
+        # What a round talks to, and as whom.
         self._api = api
         self._replica = replica
         self._membership = membership
         self._map_name = map_name
         self._mode: Mode = mode
+        # What it fetches and pushes, as far as the link can carry it.
         self._scope = profile.scope_of(scope)
         self._parts = profile.parts
         self._status = status
         self._carrier = carrier
         self._branch = replica.author.robot
         self._link = Link(api, map_name, branch=self._branch)
+        # Cells that are held at all, by the limits; then the reports, and the lock that lets one round pass at a time.
         scope_box = scope.box(replica.geometry.cell_edge_m)
         self._budget = CellBudget(replica, limits, events, place=status.place, scope_box=scope_box)
         self._watch = RoundWatch(replica, events)
@@ -161,6 +167,7 @@ class Rounds:
         if self._thread is not None:
             self._thread.stop(self._api.sockets.cut)
             self._thread = None
+            # A cut lasts until it is mended, and the last push of `finish` needs the link.
             self._api.sockets.mend()
 
     def leave(self) -> None:
@@ -170,13 +177,16 @@ class Rounds:
 
     def finish(self, *, is_leaving: bool, within_s: float) -> None:
         """Push the commits that wait, and deregister if none is left; without a link all stays as it is."""
+        # Cut from outside, because a slow link gives the push no moment to look at a clock; what was answered stays.
         limit = threading.Timer(within_s, self._api.sockets.cut)
         limit.start()
         try:
             if self._mode != "viewer" and self._replica.push_set():
                 self._membership.as_member(self._push, None)
+            # Asked again after the push: a commit that is still only here must not lose its robot's place on the map.
             if is_leaving and not self._replica.push_set():
                 self._membership.leave_if_welcome_back()
+        # It is closing, so there is no later try to wait for: the next start pushes what waits.
         except CairnError as exc:
             waiting = len(self._replica.push_set())
             log.warning("still on the map, and %d commits wait in the directory: %s", waiting, exc.message)
@@ -185,6 +195,7 @@ class Rounds:
 
     def _run(self, on_push: OnPush | None = None) -> RoundReport:
         """One round; its failure is reported by the caller, who knows when it is tried again."""
+        # The background and a caller of `sync` share the replica and the link: their rounds take turns.
         with self._lock:
             with self._watch.cell_changes():
                 report = self._membership.as_member(self._push_and_fetch, on_push)
@@ -199,6 +210,7 @@ class Rounds:
         # Then others' commits, and the status, which costs nothing if it is lost.
         if self._carrier is not None:
             self._carrier.exchange()
+        # A round that ended at its limit of bytes goes on at once; commits made meanwhile have their turn first.
         if report.has_more:
             self.wake()
         self._status.send(self._replica, self._api, self._map_name, branch=self._branch, mode=self._mode)
@@ -218,6 +230,7 @@ class Rounds:
             except UnreachableError as exc:
                 if exc.kind != NO_ROOM:
                     raise
+                # Each try fills less of the limits, so it ends: with a box that fits, or with no smaller one left.
                 if not self._link.hold(self._budget.tighten()):
                     raise BadInputError(NO_ROOM, f"not even the cell around the robot fits: {exc.message}") from exc
 
@@ -232,5 +245,6 @@ class Rounds:
         try:
             return self._link.hold(pushing)
         except UnreachableError:
+            # From here on smaller commits go in parts, too: what came of one before a cut stays on the server.
             self._parts = self._parts.after_a_cut()
             raise

@@ -61,15 +61,18 @@ class Exchange:
             reply_bytes_max: bytes of cells after which the reply ends; None: as many as the server likes.
             near: cell whose neighbours come first.
         """
+        # Where every cell stands as the request is made: rules 5 and 8 hold the answer against it.
         self._replica = replica
         with replica.changing() as base:  # author and cursors are of one instant
             self._author = replica.author
             self._default = base.default_cursor
             self._asked = {key: cell.cursor for key, cell in base.cells.items() if is_within(key, box)}
+        # The request's bounds.
         self._compare = compare
         self._box = box
         self._reply_bytes_max = reply_bytes_max
         self._near = near
+        # What was taken of the answer so far; the coverage is the header's, one for all frames (rule 3).
         self._header: ReplyHeader | None = None
         self._coverage = EMPTY
         self._framed: set[CellKey] = set()
@@ -85,6 +88,7 @@ class Exchange:
 
     def request(self) -> MissingRequest:
         """The request: the replica's default cursor, and the cursors of the cells that stand elsewhere."""
+        # A cell at the default cursor is not listed: a round without news stays a few hundred bytes.
         groups: dict[str | None, list[CellKey]] = {}
         for key, cursor in sorted(self._asked.items()):
             if self._compare or cursor != self._default:
@@ -106,6 +110,7 @@ class Exchange:
         Raises:
             DamagedDataError: frames in an impossible order.
         """
+        # One frame in one hold of the lock: other threads commit between two frames, never within one.
         with self._replica.changing() as base:
             if isinstance(frame, ReplyHeader):
                 self._header = frame
@@ -114,6 +119,7 @@ class Exchange:
             elif self._header is None:
                 raise DamagedDataError("bad_frame", "a reply must begin with its header")
             elif isinstance(frame, More):
+                # Without a frame it brought nothing: it then counts as a round, of which there are few (`ROUNDS_MAX`).
                 self.has_more = bool(self._framed)
             elif frame.to_cursor != self._header.to_cursor:
                 raise DamagedDataError("bad_frame", "a frame leads to another state than its header")
@@ -153,6 +159,7 @@ class Exchange:
 
     def _apply_delta(self, base: ServerCells, frame: CellFrame) -> None:
         own: list[Evidence] | None = []
+        # Rule 6: own commits between the two vectors are left out of the sum, so they are added from here.
         if frame.own_excluded:
             news = self._coverage.minus(base.coverage(frame.cell))
             own = self._replica.outbox.own_evidence(frame.cell, news, self._author)
@@ -165,6 +172,7 @@ class Exchange:
     def _apply_state(self, base: ServerCells, frame: CellFrame) -> None:
         before = base.evidence(frame.cell)
         blocks = frame.blocks if frame.blocks is not None else np.empty(0, np.uint32)
+        # The blocks of the mask are replaced whole: where the payload has no voxel, there is none any more (rule 4).
         kept = without_blocks(before, blocks)
         self._hold_if_sound(base, frame, sum_evidence([kept, self._payload(frame)], self._replica.geometry))
 
@@ -179,6 +187,7 @@ class Exchange:
 
     def _finish(self, base: ServerCells, done: Done) -> None:
         """Rule 8: cells without a frame move to `to`, only if they are where they were and their sum agrees."""
+        # A cell moved under this exchange: it moves nothing more, and the next request begins from where all stand.
         if self._has_dropped:
             return
         # The cells without a frame, as they stand now, add up to the sum that the server states.
@@ -198,6 +207,7 @@ class Exchange:
         self.is_done = True
 
     def _payload(self, frame: CellFrame) -> Evidence:
+        # Nothing to add, or no block that still holds evidence.
         if not frame.payload:
             return empty_evidence(self._replica.geometry)
         cell = decode_cell(frame.payload)

@@ -96,6 +96,7 @@ def push_commits(
         DeniedError: the server does not know this robot.
     """
     report = RoundReport()
+    # Oldest first, so that a commit is there before those that take it out.
     for commit_id in replica.push_set():
         # What was refused lately, and what is no longer here, is left out.
         if (refusal := replica.refusals.of(commit_id)) is not None:
@@ -122,6 +123,7 @@ def push_commits(
             report.refused[commit_id] = exc
             replica.refusals.note(commit_id, exc)
             continue
+        # Durable on the server, but perhaps in no cell yet: only coverage lets the bytes go here (rule 12).
         replica.acknowledge(pushed)
         report.pushed += 1
         if on_push:
@@ -141,6 +143,7 @@ def _push(replica: Replica, commit: Commit, seal: str | None, parts: Parts) -> C
                     yield from push_whole_or_in_parts(_signed(replica, kept), parts)
             yield from push_whole_or_in_parts(_signed(replica, commit, seal), parts)
             return commit.id
+        # Other bytes under an own id: this disk was rolled back (rule 13). A server's own retract cannot be renamed.
         if exc.kind != "id_taken" or seal is not None:
             raise
         renamed = replica.kept_commit(replica.rename(commit.id))
@@ -169,6 +172,7 @@ def keep_retracts(replica: Replica) -> Conversation[None]:
                 raise
             log.error("the operator's retract %s cannot be kept: %s", commit_id, exc.message)
             continue
+        # Only with its seal does a server take it back, and an operator's retract has no evidence.
         if seal is not None and commit.id == commit_id and not commit.cells:
             replica.keep_sealed(commit, seal)
 
@@ -190,6 +194,7 @@ def heal_damaged(replica: Replica) -> Conversation[int]:
         body = None if (key, wanted) in replica.refusals.cells else _sound_body(replica, key, wanted)
         if body is None:
             continue
+        # A refusal is about these very bytes: it is remembered, so that no later round sends them again.
         try:
             yield from PutCell(Cell(*cell), body)
         except (UnreachableError, DeniedError):
@@ -210,6 +215,7 @@ def _sound_body(replica: Replica, key: CellKey, wanted: str) -> bytes | None:
         if held is None or held.fingerprint.hex() != wanted:
             return None
         evidence = base.evidence(key)
+    # Outside the lock, because the sum takes long; the evidence was decoded for this call alone.
     if fingerprint(evidence, key).hex() != wanted:
         return None
     return encode_cell(key, evidence, replica.geometry).data
@@ -251,6 +257,7 @@ def fetch_missing(
             if exc.kind != "other_log":
                 raise
             log.warning("another server answers for this map; starting without its old state")
+            # Cursors and coverage of the old log prove nothing here; every commit is offered to the new one (rule 9).
             replica.forget_server()
             rounds += 1
             continue
@@ -258,7 +265,9 @@ def fetch_missing(
         report.healed += yield from heal_damaged(replica)
         _complain(exchange.damaged)
         compare = exchange.must_compare
+        # A reply that ended at its limit of bytes brought cells, so it counts as a reply alone, not as a round.
         rounds += not exchange.has_more
+        # A cell whose frame did not fit has lost its cursor, also where all others moved: ask once more.
         if exchange.is_done and not _has_unproven(replica, box):
             yield from keep_retracts(replica)
             return report
@@ -290,6 +299,7 @@ def fetch_cells(
     index = yield from whole_index(author, box=box)
     to, coverage = index.header.to_cursor, index.header.coverage
     digests = {cell_key(entry.cell): entry.digest for entry in index.cells}
+    # Each page of the index is of a state of its own: a cell stamped beyond the first one's changed in between.
     later = {cell_key(entry.cell) for entry in index.cells if entry.lm > to.seq}
     # What the index alone settles: cells that did not change move along, and cells that are gone are emptied.
     with replica.changing() as base:
@@ -297,6 +307,7 @@ def fetch_cells(
             log.warning("another server answers for this map; starting without its old state")
             replica.forget_server()
         replica.take_header(index.header, asked_by=author)
+        # Equal bytes hold exactly the index's commits: cursor and coverage move without a request (rule 14).
         held = [key for key, cell in base.cells.items() if cell.etag == f'"{digests.get(key)}"']
         same = {key for key in held if key not in later}
         base.move(same, to=to, coverage=coverage)
@@ -339,6 +350,7 @@ def fetch_cell(replica: Replica, cell: Cell) -> Conversation[int]:
     fetched = yield from GetCell(cell, held.etag if held else None)
     with replica.changing() as base:
         if fetched.body is None and held is not None:
+            # An unchanged cell has a newer coverage all the same: own commits in it are no longer added (rule 14).
             base.move([key], to=fetched.cursor, coverage=fetched.coverage)
             return 0
         # It is held only if it is the cell that was asked for, with the fingerprint that the server states.
