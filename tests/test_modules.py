@@ -63,7 +63,13 @@ PIPELINES = (
     "cairn_map/codec/view_code.py",
     "cairn_map/files/octomap.py",
     "cairn_map/render/map_render.py",
+    "cairn_server/folding/folding.py",
+    "cairn_server/store/sqlite/writer.py",
     "cairn_server/sync/cell_changes.py",
+    "cairn_server/sync/checks/check_pool.py",
+    "cairn_server/sync/missing.py",
+    "cairn_server/sync/pushes.py",
+    "cairn_server/sync/replies.py",
 )
 """Long algorithms outside of kernels."""
 DIRECTIVE = re.compile(r"#\s*(?:noqa|type:|pyright|ruff)")

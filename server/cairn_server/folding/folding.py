@@ -178,6 +178,7 @@ class _Plan:
         # A target that did not come yet is only noted; `take` finds it when it comes.
         known = self.folded.get(target) or self.store.folded(self.row, target)
         try:
+            # The evidence of a folded target may be gone, or damaged: then the map keeps it, and an audit line says so.
             if known is not None:
                 self._enter(ENTRY_UNFOLD, known)
         except DamagedCommitError as exc:
@@ -191,10 +192,12 @@ class _Plan:
     def _enter(self, kind: bytes, commit: StoredCommit) -> None:
         # All of the commit's cells or none: a damaged one raises before there is an entry.
         blocks = self._apply(kind, commit)
+        # Rule 1: each entry's chain value hashes the one before it, so a cursor proves the history that led to it.
         self.chain = next_chain(self.chain, kind, commit.id, commit.sha)
         self.entries.append(Entry(kind=kind, commit=commit.number, chain=self.chain))
         seq = self.start.seq + len(self.entries)
         self.last_change.update(dict.fromkeys(commit.diff, seq))
+        # Rule 2: also where evidence was taken out, so that a state frame tells robots of the zeros (rule 10).
         for key, changed in blocks.items():
             self.cache.stamp(key, changed, seq, self._load)
 
@@ -230,6 +233,7 @@ class _Plan:
             raise DamagedCommitError("damaged_store", f"commit {commit.id} at rest: {exc.message}") from exc
 
     def _load(self, key: CellKey) -> tuple[BrickCell, Stamps]:
+        # A snapshot of its own: if another folding wrote since `start`, `store.fold` refuses the whole plan.
         with self.store.snapshot(self.row) as snapshot:
             return cell_to_change(snapshot, key, self.row.geometry)
 

@@ -98,6 +98,7 @@ def query_of(request: MissingRequest, snapshot: Snapshot) -> MissingQuery:
             raise ConflictError("other_log", "the cursor belongs to another server's log; start without one")
         if not _is_proven(stated, snapshot):
             unproven.add(stated)
+    # A reply is made in memory, so the asker may lower the server's bound on its bytes, and not raise it.
     return MissingQuery(
         author=author_from_text(request.author) if request.author else None,
         cursor=cursor,
@@ -113,6 +114,7 @@ def query_of(request: MissingRequest, snapshot: Snapshot) -> MissingQuery:
 
 def header_of(snapshot: Snapshot, author: Author | None, facts: HeaderFacts) -> ReplyHeader:
     """State of a snapshot, as the author of some of its commits needs to know it."""
+    # Rule 3: the vector is whole, for all ids; the tip shows an author that its disk was rolled back (rule 13).
     head = snapshot.head
     tip = snapshot.tip(author) if author else None
     # Not validated again: with hundreds of authors that takes longer than the rest of a reply.
@@ -162,6 +164,7 @@ class CellFrames:
         """Frame of a cell that the asker lists and the server never had: as good as empty."""
         if self.query.is_reset(start):
             return self._frame(FrameKind.RESET, key, start, ZERO)
+        # Asked for with nothing held: without an answer it is asked for again. At a proven state it is empty already.
         if start is None:
             empty = encode_cell(key, empty_evidence(self.geometry), self.geometry).data
             return self._frame(FrameKind.FULL, key, None, ZERO, empty)
@@ -188,6 +191,7 @@ def reply_frames(cells: CellFrames, facts: HeaderFacts) -> Iterator[Frame]:
     """Header, frames of the cells that the asker misses, and the end of a reply."""
     snapshot, query = cells.snapshot, cells.query
     to = str(snapshot.head.cursor)
+    # All from one snapshot (rule 3): what is folded meanwhile is wholly in the next reply.
     yield header_of(snapshot, query.author, facts)
     # Every cell of main: a frame, or its fingerprint in `rest`, so that the asker can check the whole map.
     rest = ZERO
@@ -217,11 +221,13 @@ def _listed(request: MissingRequest) -> dict[CellKey, Cursor | None]:
     """Cells that a request lists, one by one or in groups by cursor."""
     groups = [*request.groups, *((entry.cursor, [entry.cell]) for entry in request.cells)]
     count = sum(len(cells) for _, cells in groups)
+    # Counted before any number is parsed.
     if count > CURSORS_MAX:
         raise BadInputError("bad_message", f"{count} cells are listed, at most {CURSORS_MAX} may be")
     listed: dict[CellKey, Cursor | None] = {}
     for text, cells in groups:
         listed |= dict.fromkeys(map(cell_key, cells), _cursor(text))
+    # A cell under two cursors would have no right answer; the dict has dropped one of them.
     if len(listed) != count:
         raise BadInputError("bad_message", "a cell is named twice in the request")
     return listed
@@ -232,6 +238,7 @@ def _cursor(text: str | None) -> Cursor | None:
 
 
 def _is_proven(cursor: Cursor, snapshot: Snapshot) -> bool:
+    # By the chain and not by `seq` alone: a restored server has other entries under the same numbers (rule 1).
     head = snapshot.head.cursor
     return cursor.seq <= head.seq and snapshot.chain_at(cursor.seq) == cursor.chain
 

@@ -106,6 +106,7 @@ class Pushes:
 
     def note_conflict(self, row: MapRow, caller: Caller, conflict: ConflictError) -> None:
         """Add a line to the audit log for a refused push, within a bound for each token."""
+        # A robot that meets a conflict tries again, so without a bound one token could push out the older lines.
         if self._audit_limit.is_worth_a_line(caller.name):
             self._store.audit_log.add(caller.name, conflict.kind, f"map {row.name}: {conflict.message}")
 
@@ -117,6 +118,7 @@ class Pushes:
         self, row: MapRow, caller: Caller, commit: CommitReader, signed: tuple[Signature, ...], seal: str | None
     ) -> Caller:
         """Caller whose rights the push has: this server itself by its seal, the signers of a relay's, or `caller`."""
+        # The seal first: any robot may bring back the server's own retract, whatever its token allows (rule 11).
         if is_sealed(row, commit.data, seal):
             return Caller(Role.ADMIN)
         return speaker_of(row, caller, commit.meta, signed, self._settings.trusted_servers)
@@ -140,5 +142,6 @@ class Pushes:
         try:
             return self._store.append(row, new)
         except EvidenceGoneError as exc:
+            # Refused now and wanted from now on: robots that hold the evidence push it, and the retract succeeds later.
             self._wanted.note(row.name, exc.commits)
             raise

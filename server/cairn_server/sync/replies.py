@@ -37,6 +37,7 @@ class StableVectors:
 
     def of(self, row: MapRow, snapshot: Snapshot) -> VersionVector:
         """Stable vector of the map in this snapshot, at most `KEEP_S` old."""
+        # Many robots ask at once, and only one of them has the log read: the others wait for its result.
         now_s = time.time()
         with self._lock:
             made_s, vector = self._kept.get(row.number, (float("-inf"), EMPTY))
@@ -73,16 +74,20 @@ class MainReplies:
 
         Empty if the asker says that it knows this very reply.
         """
+        # All from one snapshot (rule 3), and joined before anything is sent: a slow link must not keep a snapshot open,
+        # which holds up the emptying of the store's log.
         with self._cells.reading(row) as faults, self._store.snapshot(row) as snapshot:
             query = query_of(request, snapshot)
             cells = CellFrames(snapshot, query, row.geometry, self._cache, faults)
             frames = without_begun(reply_frames(cells, self._facts(row, snapshot)), request.begun)
             reply = b"".join([start_of_reply(), *map(encode_frame, self._figures.counted(frames))])
+        # For the list of branches and their expiry: what the server sends never depends on it.
         self._store.seen(row, branch, query.cursor)
         if query.cursor is None:
             self._hub.robot_heard(row, branch)
         else:
             self._hub.robot_heard(row, branch, cursor=str(query.cursor))
+        # The digest is of the whole reply: this saves the link's bytes, not the work.
         return b"" if request.known is not None and request.known == reply_digest(reply) else reply
 
     def cell_index(self, row: MapRow, author: Author | None, page: IndexPage = FIRST_PAGE) -> CellIndex:
@@ -102,9 +107,11 @@ class MainReplies:
             head = snapshot.head
             if cursor.log_id != head.cursor.log_id:
                 raise ConflictError("other_log", "the cursor belongs to another server's log; start without one")
+            # Proven by its chain, and recent, so that few entries have to be read.
             since = head.cursor.seq - cursor.seq
             if not 0 <= since <= ENTRIES_MAX or snapshot.chain_at(cursor.seq) != cursor.chain:
                 raise NotFoundError("no_cursor", "the log has no such recent cursor; ask for the cell again")
+            # Only `+` puts an id into the vector; what is taken out again stays in it.
             entries = snapshot.log(after_seq=cursor.seq, limit=ENTRIES_MAX)
             folded = EMPTY.with_commits(commit_id_from_text(entry.id) for entry in entries if entry.kind == "+")
             return head.vector.minus(folded)

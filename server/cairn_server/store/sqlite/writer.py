@@ -60,7 +60,9 @@ def connect(path: Path) -> apsw.Connection:
     connection.set_busy_timeout(BUSY_MS)
     connection.execute("PRAGMA page_size = 16384")
     connection.execute("PRAGMA journal_mode = WAL")
+    # FULL: COMMIT returns only after the log is on the disk, and every acknowledgement rests on that.
     connection.execute("PRAGMA synchronous = FULL")
+    # 0: read through a map, a failing disk would end the process (SIGBUS) and not one request.
     connection.execute("PRAGMA mmap_size = 0")
     connection.execute("PRAGMA foreign_keys = ON")
     connection.execute("PRAGMA journal_size_limit = 67108864")
@@ -91,6 +93,7 @@ class Checkpoints:
     def after_work(self) -> None:
         """Empty a log that became too long, if that costs little."""
         size_bytes = self.size_bytes()
+        # A try that meets readers costs the jobs that wait, so the next one comes after a pause (`RETRY_S`).
         if size_bytes <= LONG_BYTES or time.monotonic() < self._next_s:
             return
         self._try(WAIT_LONG_MS if size_bytes > LONG_BYTES * TOO_LONG_FACTOR else WAIT_MS)
@@ -144,10 +147,12 @@ class Writer:
         """
         future: Future[T] = Future()
         future.set_running_or_notify_cancel()  # the thread that waits may be gone at a shutdown, and this one must live
+        # Under the lock no job gets behind the None with which `close` ends the queue.
         with self._lock:
             if self._closed:
                 raise UnreachableError("shutting_down", "the server is shutting down", retry_after_s=5.0)
             try:
+                # Never wait here: a disk that does not keep up is to show as `busy`, not as threads that pile up.
                 self._jobs.put_nowait((job, future))
             except queue.Full:
                 raise UnreachableError("busy", "the server's disk does not keep up", retry_after_s=1.0) from None
@@ -179,6 +184,7 @@ class Writer:
         try:
             # One transaction, one flush for each group of jobs; between groups, the log is kept short.
             while (group := self._group()) is not None:
+                # No job came for a while: an emptied log costs no push anything now.
                 if not group:
                     self.checkpoints.when_idle()
                     continue
@@ -218,6 +224,7 @@ def _commit_group(connection: apsw.Connection, group: list[Job]) -> UnreachableE
     # Nothing is answered before COMMIT: until then every result may still be lost.
     results: list[tuple[Future[Any], Any, BaseException | None]] = []
     try:
+        # IMMEDIATE takes the write lock at once, so that no job fails halfway for want of it.
         connection.execute("BEGIN IMMEDIATE")
         for job, future in group:
             results.append((future, *_run_job(connection, job)))

@@ -48,6 +48,7 @@ class _Worker:
     def __init__(self, jobs: socket.socket) -> None:
         self.jobs = jobs
         jobs.settimeout(START_S)
+        # The worker's first word is its process number: from itself, so that it surely runs.
         hello = jobs.recv(LENGTH.size)
         if len(hello) < LENGTH.size:
             raise _LostError
@@ -64,6 +65,7 @@ class _Worker:
         # Limited by the worker's processor time: `too_costly` is final, and must not depend on how busy the server is.
         start_s, end_s = self._cpu_s(), time.monotonic() + STALL_FACTOR * limit_s
         self.jobs.settimeout(end_s - time.monotonic())
+        # The clock bounds what processor time does not: a worker that is hardly ever run.
         try:
             send(self.jobs, data)
             while not self._is_readable():
@@ -87,12 +89,14 @@ class _Worker:
                 is_there = bool(self.jobs.recv(1, socket.MSG_PEEK))
             except BlockingIOError:
                 is_there = True
+            # The kernel buries dead workers at once, and then gives their number to others.
             if is_there:
                 os.kill(self.pid, signal.SIGKILL)
 
     def _is_readable(self) -> bool:
         self.jobs.settimeout(LOOK_S)
         try:
+            # Only looked at: the byte stays for `received`.
             self.jobs.recv(1, socket.MSG_PEEK)
         except TimeoutError:
             return False
@@ -106,6 +110,7 @@ class _Worker:
             fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
         except OSError as exc:
             raise _LostError from exc
+        # utime and stime: fields 14 and 15 of proc_pid_stat(5), of which the first two are cut off.
         return (int(fields[11]) + int(fields[12])) / TICKS_PER_S
 
 
@@ -120,6 +125,7 @@ class CheckPool:
         self._nursery: subprocess.Popen[bytes] | None = None
         self._control: socket.socket | None = None
         self._waiting = threading.BoundedSemaphore(workers + WAITING_MAX)
+        # Last in, first out: the same few workers serve a small load, and no others are made for it.
         self._idle: queue.LifoQueue[_Worker | None] = queue.LifoQueue()
         for _ in range(workers):
             self._idle.put(None)  # a place for a worker, made when it is needed
@@ -153,6 +159,7 @@ class CheckPool:
             self._closed = True
             nursery, control = self._nursery, self._control
             self._nursery = self._control = None
+        # With `_closed` set no nursery is started any more, so this is the last one.
         if control is not None:
             control.close()
         # Its workers die with it.
@@ -211,6 +218,7 @@ class CheckPool:
             if self._closed:
                 raise UnreachableError("shutting_down", "the server is shutting down", retry_after_s=5.0)
             control = self._control
+            # A nursery that was killed is replaced by the first commit that needs one.
             if control is None or self._nursery is None or self._nursery.poll() is not None:
                 control = self._start_nursery()
             socket.send_fds(control, [b"w"], [theirs.fileno()])
@@ -221,6 +229,8 @@ class CheckPool:
         # A program of its own: the server has threads, and must not fork.
         self._control, far = socket.socketpair()
         with far:
+            # It gets nothing of the server's: no CAIRN_ variable, for there are secrets in them; no terminal's Ctrl-C;
+            # and with -P no module from the folder that the server was started in.
             self._nursery = subprocess.Popen(  # noqa: S603 - our own program, and two numbers
                 [
                     sys.executable,
