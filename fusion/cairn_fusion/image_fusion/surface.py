@@ -130,14 +130,17 @@ class Drawn:
 
 def surface_of(scan: Scan, rig: Rig, beyond: Flags | None = None) -> RangeSurface:
     """Surface of a scan's range image, without reflections in mirrors that a map shows: (H, W) `mirror_pixels`."""
+    # Stage 1: labels, by the range image itself, and by the map where it proves a mirror.
     labels, mounted = range_labels(scan, rig), rig[scan.range_camera]
     if beyond is not None:
         labels[beyond & (labels == Label.OK)] = Label.BEYOND
+    # Stage 2: ranges to draw; gaps in a surface are filled from near pixels, so that few holes are seen.
     range_m = mounted.true_ranges(scan.range_m, scan.amplitude)
     noise_m = np.maximum(JOIN_SIGMAS * mounted.range_sigma_image(range_m), JOIN_STEP_M).astype(np.float32)
     shown_m = borrowed_ranges(range_m, labels, BORROW_PX)
     # A mirror may be larger than the borrowing reach; its reflection lies in about the same pixels for near cameras.
     shown_m = np.where(np.isnan(shown_m) & (labels == Label.BEYOND), range_m, shown_m)
+    # Stage 3: surfaces and their edges, by measured ranges alone: a borrowed one must join nothing.
     across, down = (joints(range_m, labels, noise_m, *step) for step in ((1, 0), (0, 1)))
     return RangeSurface(
         range_camera=scan.range_camera,
@@ -210,6 +213,7 @@ def places(range_m: Singles, rays: Singles, dst: AnyCamera, T_dst_src: Transform
         )
         run_in_bands(lambda first, last: places_into(u, v, q, range_m, *numbers, first, last), len(range_m))
         return u, v, q
+    # Any other camera projects by itself, in float64: Eq. 5 and 6 with its own lens.
     points = transform_points(T_dst_src, np.moveaxis(rays, 0, -1).astype(np.float64) * range_m[..., None])
     pixels = dst.project(points).astype(np.float32)
     nearness = (1 / np.linalg.norm(points, axis=-1)).astype(np.float32)
@@ -234,6 +238,7 @@ def _slack(nearness: Singles, hiding: Singles) -> Singles:
     """(h, w) difference of a slanted surface from its nearest neighbour, where the surface goes on."""
     steps = np.zeros_like(nearness)
     for axis in (0, 1):
+        # Of the steps to both sides the smaller: on a slope they are alike, at an edge one is large and no slant.
         ahead = np.abs(np.diff(nearness, axis=axis, append=np.float32(np.inf)))
         behind = np.abs(np.diff(nearness, axis=axis, prepend=np.float32(np.inf)))
         steps += np.minimum(ahead, behind)
@@ -251,6 +256,7 @@ def live_range(scan: Scan, rig: Rig, *, camera: str, beyond: npt.NDArray[np.bool
     Raises:
         BadInputError: kind `unknown_camera`, or images of another size.
     """
+    # Stage 1: trusted ranges; the range camera itself needs no more.
     seen_by, source = rig[camera], rig[scan.range_camera]
     labels = range_labels(scan, rig)
     trusted = (labels != Label.SATURATED) & (labels != Label.FLYING)
@@ -260,12 +266,14 @@ def live_range(scan: Scan, rig: Rig, *, camera: str, beyond: npt.NDArray[np.bool
     range_m = np.where(trusted, true_m, np.float32(np.nan)).astype(np.float32, copy=False)
     if camera == scan.range_camera:
         return range_m
+    # Stage 2: each range pixel in the camera (Eq. 1-6), as a square that reaches its neighbours' squares.
     at = places(range_m, beams(source.camera), seen_by.camera, inverse(seen_by.transform) @ source.transform)
     u, v, q = (each.astype(np.float64) for each in at)
     gap_px = _pixel_rad(source.camera.rays()) / _pixel_rad(seen_by.camera.rays())
     half_px = int(COVER * max(gap_px, 1.0) / 2) + 0.5
     nearness = np.zeros((seen_by.camera.height, seen_by.camera.width), np.float32)
     draw_squares_into(nearness, trusted, u, v, q, half_px)
+    # 0 is where nothing was drawn.
     with np.errstate(divide="ignore"):
         return np.where(nearness > 0, 1 / nearness, np.float32(np.nan))
 

@@ -103,6 +103,7 @@ class ImageTransfers:
         """Images of a kind, each with the pixels (N, 2) and labels (N,) of the points."""
         scan = self._scan
         if kind is ChannelKind.INTENSITY and scan.amplitude is not None:
+            # The range camera's own image: each point lies in its own pixel, and nothing there hides another.
             # `take`: indexing by rows takes ten times as long.
             pixels = np.take(_pixels_of(*scan.amplitude.shape), self._returns.pixels, axis=0)
             yield scan.amplitude, pixels, np.full(len(pixels), Label.OK, np.uint8)
@@ -133,6 +134,7 @@ class ImageTransfers:
         doubtful = np.nonzero(transfer.ok & ~certain)[0]
         if len(doubtful):
             spread = spread_m(points.tof[doubtful], points.sigma_m[doubtful], self._rig, src=src, dst=name)
+            # Written so that a spread of NaN is uncertain.
             transfer.labels[doubtful[~(spread <= limits.spread_max_m)]] = Label.UNCERTAIN
         # Stage 3: edges in the thermal image, within the area that the range pixel covers there.
         if name in self._scan.thermal and limits.step_max_k < math.inf:
@@ -145,6 +147,7 @@ class ImageTransfers:
         if self._points is None:
             mounted, returned = self._rig[self._scan.range_camera], self._returns.pixels
             range_m = self._returns.range_m.ravel()[returned].astype(np.float64)
+            # Eq. 1-4 for the whole image, because a slant takes the pixels around; then only the points that count.
             image_points = points_from_range(self._returns.range_m, mounted.camera)
             self._points = _Points(
                 tof=np.take(image_points.reshape(-1, 3), returned, axis=0),
@@ -157,9 +160,11 @@ class ImageTransfers:
 
 def _write_means_into(sums: Ints, geometry: Geometry, channel: Channel, totals: Floats, counts: Ints) -> None:
     """Write one sample of weight 1, the mean of its pixels, for every voxel that has none of this channel yet."""
+    # Weight 1 however many pixels there are: weight counts scans, and so stays below the voxel's hits.
     planes, is_squared = geometry.planes_of(channel.name), channel.kind is ChannelKind.TEMPERATURE
     ends = (planes.start, planes.stop - 1)
     if not write_means_into(sums, *ends, totals, counts, channel.zero, channel.step, is_squared):
+        # A kernel raises nothing, so the value out of range is found once more, in order to name it.
         seen = counts > 0
         channel.quantise(totals[seen] / counts[seen, None])  # raises: one is out of range
 

@@ -107,12 +107,14 @@ class Telepresence:
         pictures, places = [], self._hottest(fused)
         for each, place in zip(fused, places, strict=True):
             base, kelvin = scan.colour[each.camera], each.values[..., 0]
+            # Every fourth pixel each way: a scale is two percentiles, which need no more.
             scale = self._locked(np.where(each.ok, kelvin, np.float32(np.nan))[::4, ::4])
             if self._options.mode is ViewMode.SIDE_BY_SIDE:
                 pictures += [enlarge(base), self._finished(paint_alone(kelvin, each.labels, scale), place)]
             else:
                 picture = paint_over(base, kelvin, each.labels, scale, self._options.emphasis)
                 pictures.append(self._finished(picture, place))
+            # Without this line a picture in colour alone would look as if all were cold.
             if not each.sources:
                 write_into(pictures[-1], "no thermal image", (12, len(pictures[-1]) - 12))
         return pictures[0] if len(pictures) == 1 else np.hstack(pictures)
@@ -133,12 +135,14 @@ class Telepresence:
         return self._finished(picture, hottest(kelvin, labels))
 
     def _locked(self, kelvin: npt.NDArray[np.float32]) -> TemperatureScale:
+        # The first picture with a temperature decides: colours that change their meaning would mislead.
         if self._scale is None and np.isfinite(kelvin).any():
             self._scale = locked_scale(kelvin)
         return self._scale or TemperatureScale(273.15, 323.15, "no temperature yet")
 
     def _finished(self, picture: Rgb, place: Hottest | None) -> Rgb:
         """The picture with legend and marker; enlarged if it is small."""
+        # Enlarged before the legend is drawn, whose letters would become coarse; the marker goes to the block's middle.
         times, larger = enlargement(picture), enlarge(picture)
         end = draw_legend_into(larger, self._scale or self._locked(np.empty(0, np.float32)))
         if place is not None and self._options.marks_hottest:
@@ -176,6 +180,7 @@ def mask_mirrors(fused: CrossView) -> CrossView:
     """The same, without values where depth was filled in over a reflection."""
     step, (height, width) = fused.depth.drawn.step_px, fused.labels.shape
     marked = (fused.depth.drawn.marks == Label.BEYOND).repeat(step, axis=0).repeat(step, axis=1)[:height, :width]
+    # A measured range lies in front of the mirror, and stays; only filled-in depth may be the reflection's.
     marked &= fused.depth.origins != Origin.MEASURED
     labels = np.where(marked, np.uint8(Label.BEYOND), fused.labels)
     return replace(fused, labels=labels, values=np.where(marked[..., None], np.float32(np.nan), fused.values))
@@ -184,6 +189,7 @@ def mask_mirrors(fused: CrossView) -> CrossView:
 def source_order(scan: Scan, rig: Rig, camera: str) -> dict[str, Image]:
     """Images of the other spectrum than a camera's, that of the camera nearest to it first."""
     images: dict[str, Image] = dict(scan.thermal if camera in scan.colour else scan.colour)
+    # The nearest camera sees almost what this one sees: the fewest places are hidden from it.
     place_m = rig[camera].transform[:3, 3]
     order = sorted(images, key=lambda name: float(np.linalg.norm(rig[name].transform[:3, 3] - place_m)))
     return {name: images[name] for name in order}
