@@ -127,7 +127,9 @@ def test_the_limits_of_push_in_the_document_are_those_of_the_code() -> None:
         f"n at most {numbering.AHEAD_MAX:_} above".replace("_", " "),
         f"at most {numbering.AUTHOR_INTERVALS_MAX} gaps",
         f"{numbering.INCARNATIONS_MAX} incarnations",
-        f"{numbering.AUTHORS_MAX // 2:_} authors".replace("_", " "),
+        f"{numbering.AUTHORS_MAX} authors and {numbering.INTERVALS_MAX:_} intervals".replace("_", " "),
+        f"lists {missing.RETRACTS_MAX} of them",
+        f"those of {missing.PENDING_AUTHORS_MAX} authors",
         f"at most {cell_changes.DELTA_ENTRIES_MAX} entries",
     ):
         assert text in policy + DOCUMENT, text

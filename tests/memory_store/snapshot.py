@@ -73,10 +73,6 @@ class MemorySnapshot:
         """Commits folded before a time."""
         return EMPTY.with_commits(kept.new.id for kept in self._folded() if kept.folded_s < time_s)
 
-    def retracting(self) -> list[CommitId]:
-        """Commits that retract others."""
-        return [kept.new.id for kept in self._folded() if kept.new.retracts]
-
     def log(self, *, after_seq: int, limit: int) -> list[LogEntry]:
         """Log entries, oldest first."""
         found = self._state.entries[after_seq : after_seq + limit]

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import islice
 from typing import Protocol
 
 from cairn_client.replica.outbox import NO_FACTS, NO_NOTES, CommitFacts, Outbox
@@ -23,7 +24,7 @@ from cairn_client.replica.server_cells import ServerCells, is_to_be_taken
 from cairn_map.codec.cell_code import Profile
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import Cursor
-from cairn_map.commits.ids import OPERATOR, Author, CommitId, RobotName, commit_id_from_text
+from cairn_map.commits.ids import OPERATOR, Author, CommitId, RobotName
 from cairn_map.commits.version_vector import EMPTY
 from cairn_map.errors import BadInputError, CairnError
 from cairn_map.evidence.evidence import Evidence
@@ -40,6 +41,8 @@ REST_S = 3600.0
 """Time after which a refused commit is tried again."""
 KINDS_OF_ALL = ("http", "unknown_protocol")
 """Kinds of refusals that say nothing about the commit: a portal's or proxy's, and those of every request."""
+RETRACTS_AT_ONCE = 1024
+"""Most of the operator's retracts that one round fetches: the next one goes on."""
 
 
 class StorageBudget(Protocol):
@@ -262,10 +265,15 @@ class Replica:
                 self._base.refresh_commits([commit])
 
     def lacking_retracts(self) -> list[CommitId]:
-        """The operator's retracts that a restore could still lose, and that are not kept here yet."""
+        """The operator's retracts that a restore could still lose, and that are not kept here yet.
+
+        Everything that the operator says is a retract, so the vectors name them all; `RETRACTS_AT_ONCE` at most.
+        """
         with self._lock:
-            named = [commit_id_from_text(text) for text in (self.header.retracts if self.header else [])]
-            return [commit for commit in named if commit.author.robot == OPERATOR and not self.outbox.knows(commit)]
+            if self.header is None:
+                return []
+            unstable = self.header.coverage.of_robots((OPERATOR,)).minus(self.header.stable_vector)
+            return list(islice((commit for commit in unstable if not self.outbox.knows(commit)), RETRACTS_AT_ONCE))
 
     def keep_sealed(self, commit: Commit, seal: str) -> None:
         """Keep a server's own retract, to push it back if the server loses it."""

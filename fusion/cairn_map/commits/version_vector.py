@@ -8,7 +8,7 @@ A version vector is a value; adding makes a new one.
 import hashlib
 import json
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from cairn_map.commits.ids import NUMBER_LIMIT, Author, CommitId, author_from_text
@@ -61,6 +61,10 @@ class VersionVector:
             if rest:
                 left[author] = rest
         return VersionVector(left)
+
+    def of_robots(self, robots: Collection[str]) -> "VersionVector":
+        """Commits of these robots, in all their incarnations."""
+        return VersionVector({author: spans for author, spans in self.intervals.items() if author.robot in robots})
 
     def tip(self, author: Author) -> int | None:
         """The highest number of one author, or None."""

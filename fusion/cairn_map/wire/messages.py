@@ -198,13 +198,14 @@ class ReplyHeader(_Model):
     vector: VectorJson
     """Ids folded at or before `to`."""
     stable: VectorJson
-    """Ids that no restore can lose any more."""
+    """Ids of the asker's robot and of the operator that no restore can lose any more."""
     pending: VectorJson = {}
-    """Ids that are durable on the server but not folded yet: they need not be pushed, and count for nothing else."""
+    """Ids of the same that are durable but not folded yet: they need not be pushed, and count for nothing else. To an
+    asker without author: those of some authors, none if nothing is pending."""
     tip: tuple[Annotated[int, Field(ge=0, lt=NUMBER_LIMIT)], ShaText] | None = None
     """Highest folded number of the asker's own incarnation, and its SHA-256."""
     retracts: list[IdText] = []
-    """Retracting commits that are not yet stable."""
+    """The operator's newest retracts that are not yet stable, for older robots: `vector` and `stable` tell all."""
     damaged: Annotated[list[tuple[tuple[int, int, int], FingerprintText]], Field(max_length=DAMAGED_MAX)] = []
     """Cells that the server cannot read any more, and their fingerprints: any robot with an undamaged copy may send
     it."""

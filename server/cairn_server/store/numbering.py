@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from cairn_map.commits.ids import OPERATOR, CommitId
-from cairn_map.commits.version_vector import AUTHORS_MAX, INTERVALS_MAX
 from cairn_map.errors import BadInputError, ConflictError
 
 AUTHOR_INTERVALS_MAX = 1000
@@ -18,6 +17,14 @@ a new server may not have its oldest commits any more."""
 
 INCARNATIONS_MAX = 256
 """Most incarnations of one robot: disks lost or rolled back."""
+
+
+AUTHORS_MAX = 8192
+"""Most authors of one map. Its vector is in every reply: with the longest name and numbers an author takes 88 bytes."""
+
+
+INTERVALS_MAX = 10_240
+"""Most intervals of the numbers of all authors of a map: beyond the first of each author one takes 34 bytes at most."""
 
 
 NAMED_MAX = 5
@@ -60,14 +67,15 @@ def check_number(commit: CommitId, numbering: Numbering) -> None:
             f"the numbers of {commit.author} have {known.intervals} gaps, {commit} would open another; fill some first",
         )
     is_new = known.top is None
-    too_many = known.authors_in_map >= AUTHORS_MAX // 2 or known.intervals_in_map >= INTERVALS_MAX // 2
-    # A server's own retracts have an incarnation for each of its starts.
-    spent = is_new and known.incarnations >= INCARNATIONS_MAX and commit.author.robot != OPERATOR
-    if too_many or spent:
+    too_many = known.authors_in_map >= AUTHORS_MAX or known.intervals_in_map >= INTERVALS_MAX
+    spent = is_new and known.incarnations >= INCARNATIONS_MAX
+    # A server's own retracts have an incarnation for each of its starts, and no robot can be in their way.
+    if (too_many or spent) and commit.author.robot != OPERATOR:
         raise BadInputError(
             "too_many_authors",
             f"{commit.author} has {known.incarnations} incarnations (at most {INCARNATIONS_MAX}), the map "
-            f"{known.authors_in_map} authors and {known.intervals_in_map} gaps",
+            f"{known.authors_in_map} authors and {known.intervals_in_map} intervals of their numbers (at most "
+            f"{AUTHORS_MAX} and {INTERVALS_MAX}); keep the robots' folders, or begin a new map",
         )
 
 

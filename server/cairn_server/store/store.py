@@ -85,10 +85,6 @@ class Snapshot(Protocol):
         """Commits folded before a time."""
         ...
 
-    def retracting(self) -> list[CommitId]:
-        """Commits that retract others."""
-        ...
-
     def log(self, *, after_seq: int, limit: int) -> list[LogEntry]:
         """Log entries, oldest first."""
         ...

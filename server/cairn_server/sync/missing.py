@@ -10,12 +10,13 @@ proves it, and `lm` of each cell says whether it changed since. For each cell th
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
 from cairn_map.codec.cell_code import encode_cell
 from cairn_map.commits.cursor import Cursor, cursor_from_text
-from cairn_map.commits.ids import Author, CommitId, author_from_text
+from cairn_map.commits.ids import OPERATOR, Author, CommitId, author_from_text
 from cairn_map.commits.version_vector import VersionVector
 from cairn_map.errors import BadInputError, ConflictError
 from cairn_map.evidence.cell_order import first_to_last
@@ -37,6 +38,10 @@ log = logging.getLogger(__name__)
 
 REPLY_BYTES_MAX = 64 << 20
 """A longer reply ends with `more`, and the asker comes back for the rest."""
+RETRACTS_MAX = 1024
+"""Most retracts that a header lists, for robots that do not find them in its vectors: 64 kB."""
+PENDING_AUTHORS_MAX = 256
+"""Most authors whose pending commits are named to an asker without an author, who only sees that something is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,18 +118,25 @@ def query_of(request: MissingRequest, snapshot: Snapshot) -> MissingQuery:
 
 
 def header_of(snapshot: Snapshot, author: Author | None, facts: HeaderFacts) -> ReplyHeader:
-    """State of a snapshot, as the author of some of its commits needs to know it."""
+    """State of a snapshot, as the author of some of its commits needs to know it.
+
+    The vector alone speaks of all authors: what is stable or pending matters only of commits that the asker may hold,
+    its robot's own and the operator's. So no number of commits of other robots makes the rest of a header grow.
+    """
     # Rule 3: the vector is whole, for all ids; the tip shows an author that its disk was rolled back (rule 13).
     head = snapshot.head
     tip = snapshot.tip(author) if author else None
+    held = (OPERATOR, author.robot) if author else (OPERATOR,)
+    stable, pending = facts.stable.of_robots(held), snapshot.pending()
+    pending = pending.of_robots(held) if author else _first_authors(pending)
     # Not validated again: with hundreds of authors that takes longer than the rest of a reply.
     return ReplyHeader.model_construct(
         to=str(head.cursor),
         vector=head.vector.to_json(),
-        stable=facts.stable.to_json(),
-        pending=snapshot.pending().to_json(),
+        stable=stable.to_json(),
+        pending=pending.to_json(),
         tip=(tip[0], tip[1].hex()) if tip else None,
-        retracts=[str(commit) for commit in snapshot.retracting() if commit not in facts.stable],
+        retracts=_newest_retracts(head.vector, stable),
         damaged=as_named(snapshot, facts.damaged),
         wanted=[str(commit) for commit in facts.wanted],
     )
@@ -215,6 +227,24 @@ def reply_frames(cells: CellFrames, facts: HeaderFacts) -> Iterator[Frame]:
         if unknown is not None:
             yield unknown
     yield Done(to=to, rest=rest.hex())
+
+
+def _newest_retracts(vector: VersionVector, stable: VersionVector) -> list[str]:
+    """The operator's commits that a restore could lose, those of each incarnation from the newest on."""
+    spans = vector.of_robots((OPERATOR,)).minus(stable).intervals
+    newest = (
+        str(CommitId(author, n))
+        for author, each in spans.items()
+        for first, last in reversed(each)
+        for n in range(last, first - 1, -1)
+    )
+    return list(islice(newest, RETRACTS_MAX))
+
+
+def _first_authors(vector: VersionVector) -> VersionVector:
+    if len(vector.intervals) <= PENDING_AUTHORS_MAX:
+        return vector
+    return VersionVector(dict(islice(vector.intervals.items(), PENDING_AUTHORS_MAX)))
 
 
 def _listed(request: MissingRequest) -> dict[CellKey, Cursor | None]:

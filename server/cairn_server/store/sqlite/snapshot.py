@@ -139,16 +139,6 @@ class SqliteSnapshot:
         )
         return _vector(found)
 
-    def retracting(self) -> list[CommitId]:
-        """Commits that retract others."""
-        found = rows(
-            self._connection,
-            "SELECT robot, incarnation, n FROM commits WHERE map = ? AND retracts <> '' AND folded_seq IS NOT NULL"
-            " ORDER BY number",
-            (self._map,),
-        )
-        return [CommitId(Author(robot, incarnation), n) for robot, incarnation, n in found]
-
     def log(self, *, after_seq: int, limit: int) -> list[LogEntry]:
         """Log entries, oldest first."""
         found = rows(
