@@ -10,7 +10,7 @@ from tests.fixtures.server.protocol_document import DOCUMENT, ROOT, ROUTE, docum
 from cairn_map.commits.commit import COMMIT_BYTES_MAX, RETRACTS_MAX
 from cairn_map.render import render_request
 from cairn_map.wire import live_events
-from cairn_map.wire.messages import CURSORS_MAX
+from cairn_map.wire.messages import CURSORS_MAX, JSON_FIELDS_MAX, JSON_VALUES_MAX
 from cairn_server.http.middleware import body_limit
 from cairn_server.http.routes import cell as cell_routes
 from cairn_server.http.routes import problems
@@ -93,6 +93,7 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("until a ticket ends", export_tickets.TICKET_S),
         ("header `Cairn-Coverage`", cell_routes.COVERAGE_BYTES_MAX),
         ("cells in one live event", live_events.CELLS_MAX),
+        ("values in one JSON text", JSON_VALUES_MAX),
         ("problem's `detail`", problems.DETAIL_CHARACTERS_MAX),
         ("until a request's head is whole", Settings().head_s),
         ("until a body is whole, or an answer taken", Settings().body_grace_s),
@@ -117,6 +118,8 @@ def test_the_bounds_of_cost_in_the_document_are_those_of_the_code() -> None:
     assert f"| {defaults.check_cpu_s:.0f} s; 3 * 2^29 bytes (settings) |" in DOCUMENT
     assert commit_checks.NUMBERS_MAX == 2**25
     assert "; 2^25 modelled numbers |" in DOCUMENT
+    assert JSON_FIELDS_MAX == 2**18
+    assert "; 2^18 fields |" in DOCUMENT
     assert defaults.check_memory_bytes == 3 * 2**29
 
 

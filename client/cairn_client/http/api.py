@@ -17,17 +17,18 @@ from typing import TYPE_CHECKING, Any, Self
 
 from pydantic import TypeAdapter, ValidationError
 
+from cairn_client.http.answer_reading import CODING, body_of_error, header_text, parts_of, sent_again
 from cairn_client.sync.requests import Box, GetUpload, PutPart
 from cairn_client.sync.responses import Answer, FetchedCell, Traffic, error_of, list_of, unreachable
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import cursor_from_text
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import EMPTY, VersionVector, vector_digest, version_vector_from_json
-from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
+from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError, first_error
 from cairn_map.evidence.fingerprint import fingerprint_from_hex
 from cairn_map.evidence.grid import Cell
 from cairn_map.wire.access_messages import CreateToken, NewSecret, TokenInfo
-from cairn_map.wire.frames import Frame
+from cairn_map.wire.frames import FRAME_BYTES_MAX, JSON_BYTES_MAX, Frame
 from cairn_map.wire.messages import (
     INDEX_PAGE,
     BranchInfo,
@@ -44,6 +45,7 @@ from cairn_map.wire.messages import (
     RobotStatus,
     Upload,
     VectorJson,
+    check_json_size,
     message_from_json,
 )
 from cairn_map.wire.resumed_replies import Replies
@@ -60,8 +62,9 @@ PROTOCOL_VERSION = "1"
 TIMEOUT_S, CONNECT_S = 30.0, 5.0
 NO_CONTENT, NOT_MODIFIED = 204, 304
 ANSWER_BYTES_MAX = 64 << 20
-"""Longest JSON answer that is read."""
-ERROR_BYTES_MAX = 1 << 16
+"""Longest whole answer that is read."""
+REPLY_BYTES_MAX = (1 << 26) + FRAME_BYTES_MAX + JSON_BYTES_MAX
+"""Longest reply to `missing`: PROTOCOL.md 6, and its header."""
 VECTOR: TypeAdapter[VectorJson] = TypeAdapter(VectorJson)
 
 
@@ -144,7 +147,7 @@ class MapApi:
         except httpx.InvalidURL as exc:
             raise BadInputError("bad_url", f"{server_url!r} is not a URL: {exc}") from exc
         self._client.headers.clear()  # a robot that asks whether anything is new pays for each of them
-        self.token = token
+        self.use_token(token)
 
     def __enter__(self) -> Self:
         return self
@@ -155,8 +158,12 @@ class MapApi:
         self.close()
 
     def use_token(self, token: str | None) -> None:
-        """Send this token with each request from here on; None: no token."""
-        self.token = token
+        """Send this token with each request from here on; None: no token.
+
+        Raises:
+            BadInputError: kind `bad_header`: no token has such characters.
+        """
+        self.token = header_text(token, "a token") if token else None
 
     def close(self) -> None:
         """Close the connections."""
@@ -178,7 +185,7 @@ class MapApi:
         """Register a robot; later calls use the token that comes back."""
         body = self._ask("POST", f"/maps/{name}/branches", content=request.model_dump_json().encode())
         registered = message_from_json(Registered, body)
-        self.token = registered.token
+        self.use_token(registered.token)
         return registered
 
     def branches(self, name: str) -> list[BranchInfo]:
@@ -219,7 +226,8 @@ class MapApi:
     def commit(self, name: str, commit: CommitId) -> tuple[bytes, str | None]:
         """A commit's bytes as they were pushed, and the seal on a retract that is the server's."""
         answer = self._send("GET", f"/maps/{name}/commits/{commit}")
-        return answer.body, answer.headers.get("Cairn-Seal")
+        is_sealed = "Cairn-Seal" in answer.headers
+        return answer.body, sent_again(answer.headers, "Cairn-Seal") if is_sealed else None
 
     def retract(self, name: str, request: Retract) -> Retracted:
         """Undo commits exactly."""
@@ -262,7 +270,7 @@ class MapApi:
     def vector_at(self, name: str, cursor: str) -> VersionVector:
         """The ids that a server had folded at a cursor."""
         body = self._ask("GET", f"/maps/{name}/main/vector", params={"at": cursor})
-        return version_vector_from_json(VECTOR.validate_json(body))
+        return _vector_of(body)
 
     def cell(self, name: str, cell: Cell, *, etag: str | None = None) -> FetchedCell:
         """One cell's octree, unless it is the one with this ETag."""
@@ -271,13 +279,13 @@ class MapApi:
         try:
             return FetchedCell(
                 body=None if answer.status == NOT_MODIFIED else answer.body,
-                etag=answer.headers["ETag"],
+                etag=sent_again(answer.headers, "ETag"),
                 cursor=cursor_from_text(answer.headers["Cairn-Cursor"]),
                 coverage=self._coverage(name, answer.headers),
                 fingerprint=fingerprint_from_hex(answer.headers["Cairn-Fingerprint"]),
             )
-        except (KeyError, ValidationError) as exc:
-            raise DamagedDataError("bad_message", f"the answer for cell {cell} lacks its headers: {exc}") from exc
+        except KeyError as exc:
+            raise DamagedDataError("bad_message", f"the answer for cell {cell} lacks its header {exc}") from exc
 
     def put_cell(self, name: str, cell: Cell, data: bytes) -> None:
         """Put a damaged cell right; a sound one stays as it is, and of other bytes nothing is taken."""
@@ -297,12 +305,15 @@ class MapApi:
         body = reply.request.model_dump_json(exclude_defaults=True).encode()
         with self._open("POST", f"/maps/{name}/branches/{branch}/missing", content=body) as response:
             known = response.status_code == NO_CONTENT
-            yield from reply.again() if known else reply.frames(self.traffic.counted(response.iter_bytes()))
+            parts = parts_of(response, self.traffic, at_most_bytes=REPLY_BYTES_MAX)
+            yield from reply.again() if known else reply.frames(parts)
 
-    def stream(self, path: str, *, headers: Mapping[str, str] | None = None) -> Generator[bytes, None, None]:
-        """The parts of an answer that goes on as long as there is news, such as `/maps/{map}/events`."""
+    def stream(
+        self, path: str, *, headers: Mapping[str, str] | None = None, at_most_bytes: int | None = None
+    ) -> Generator[bytes, None, None]:
+        """The parts of a long answer; None: it goes on as long as there is news, such as `/maps/{map}/events`."""
         with self._open("GET", path, headers=headers) as response:
-            yield from response.iter_bytes()
+            yield from parts_of(response, self.traffic, at_most_bytes=at_most_bytes)
 
     def probe(self, path: str) -> Answer:
         """Any answer that is no error, to see what is at the other end."""
@@ -311,7 +322,7 @@ class MapApi:
     def _coverage(self, name: str, headers: Mapping[str, str]) -> VersionVector:
         """Version vector of a cell's answer: as it is, or named by its digest, then known or requested."""
         if "Cairn-Coverage" in headers:
-            return version_vector_from_json(VECTOR.validate_json(headers["Cairn-Coverage"]))
+            return _vector_of(headers["Cairn-Coverage"])
         digest = headers["Cairn-Coverage-Digest"]
         if vector_digest(self._vector) != digest:
             self._vector = self.vector_at(name, headers["Cairn-Cursor"])
@@ -326,11 +337,8 @@ class MapApi:
         """A whole answer, but never a longer one than a cell may have."""
         body = bytearray()
         with self._open(method, path, **options) as response:
-            for part in response.iter_bytes():
-                self.traffic.down_bytes += len(part)
+            for part in parts_of(response, self.traffic, at_most_bytes=ANSWER_BYTES_MAX):
                 body += part
-                if len(body) > ANSWER_BYTES_MAX:
-                    raise BadInputError("too_large", f"the server's answer is longer than {ANSWER_BYTES_MAX} bytes")
             return Answer(response.status_code, response.headers, bytes(body))
 
     @contextmanager
@@ -346,20 +354,33 @@ class MapApi:
         """Context of an answer that began well and is still to be read; errors come out as a `CairnError`."""
         import httpx
 
-        sent = {"Cairn-Protocol": PROTOCOL_VERSION, **(headers or {})}
+        sent = {"Cairn-Protocol": PROTOCOL_VERSION, "Accept-Encoding": CODING, **(headers or {})}
         if self.token:
             sent["Authorization"] = f"Bearer {self.token}"
         if content:
             is_json = content.startswith(b"{") and method != "PATCH"
             sent.setdefault("Content-Type", "application/json" if is_json else "application/vnd.cairn.commit")
+        for field, text in sent.items():
+            header_text(text, field)
         try:
             with self._client.stream(method, path, headers=sent, content=content, params=params) as response:
                 self.traffic.up_bytes += len(content)
                 if not response.is_success and response.status_code != NOT_MODIFIED:
-                    body = next(response.iter_bytes(ERROR_BYTES_MAX), b"")
-                    raise error_of(response.status_code, response.headers.get("Retry-After", ""), body)
+                    retry_after = response.headers.get("Retry-After", "")
+                    raise error_of(response.status_code, retry_after, body_of_error(response))
                 yield response
         except httpx.TransportError as exc:
             raise unreachable(exc) from exc
-        except httpx.DecodingError as exc:
-            raise DamagedDataError("bad_message", f"the server's answer cannot be decompressed: {exc}") from exc
+
+
+def _vector_of(text: bytes | str) -> VersionVector:
+    """Version vector of a text of an answer.
+
+    Raises:
+        DamagedDataError: it is none.
+    """
+    check_json_size(text)
+    try:
+        return version_vector_from_json(VECTOR.validate_json(text))
+    except ValidationError as exc:
+        raise DamagedDataError("bad_message", f"the server's version vector is not sound: {first_error(exc)}") from exc

@@ -3,8 +3,7 @@
 import random
 from dataclasses import dataclass, field
 
-RETRY_AFTER_MAX_S = 3600.0
-"""Longest wait that a server may ask for: with a longer one, its clock or its settings may be broken."""
+from cairn_client.sync.responses import RETRY_AFTER_MAX_S
 
 
 @dataclass(slots=True)

@@ -5,18 +5,18 @@ connect -> events -> the link breaks -> Lost -> wait -> connect, from the last i
 
 import json
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 
 from pydantic import ValidationError
 
 from cairn_client.http.api import MapApi
 from cairn_client.http.backoff import Backoff
+from cairn_client.http.event_stream import stream_events
 from cairn_map.errors import DamagedDataError, UnreachableError, first_error
 from cairn_map.wire.live_events import LIVE_EVENT, LiveEvent
+from cairn_map.wire.messages import check_json_size
 
-LINE_BYTES_MAX = 4 << 20
-"""More than 100 log entries and the signs of 10 000 robots take."""
 TYPES = frozenset(["hello", "cells", "log", "head", "robot", "beat"])
 
 
@@ -65,43 +65,12 @@ def events(api: MapApi, map_name: str, *, after: str | None = None) -> Generator
         CairnError: as `listen`.
     """
     headers = {"Accept": "text/event-stream"} | ({"Last-Event-ID": after} if after else {})
-    for kind, event_id, data in messages_of(api.stream(f"/maps/{map_name}/events", headers=headers)):
+    for kind, event_id, data in stream_events(api.stream(f"/maps/{map_name}/events", headers=headers)):
         if kind not in TYPES:
             continue
+        check_json_size(data)
         try:
             yield LIVE_EVENT.validate_python({"type": kind, "id": event_id, **json.loads(data)})
         except (ValidationError, ValueError, TypeError, RecursionError) as exc:
             said = first_error(exc) if isinstance(exc, ValidationError) else str(exc)
             raise DamagedDataError("bad_message", f"the server's {kind} event is not sound: {said}") from exc
-
-
-def messages_of(parts: Iterable[bytes]) -> Iterator[tuple[str, str, str]]:
-    """Type, id and data of each Server-Sent Event (WHATWG HTML 9.2.6); the id lasts until another one comes."""
-    kind, event_id, data = "message", "", list[str]()
-    for line in _lines(parts):
-        if not line:
-            if data:
-                yield kind, event_id, "\n".join(data)
-            kind, data = "message", []
-            continue
-        name, _, value = line.partition(":")
-        value = value.removeprefix(" ")
-        kind = value if name == "event" else kind
-        event_id = value if name == "id" else event_id
-        if name == "data":
-            data.append(value)
-            if sum(map(len, data)) > LINE_BYTES_MAX:
-                raise DamagedDataError("bad_message", f"the server's event is longer than {LINE_BYTES_MAX} bytes")
-
-
-def _lines(parts: Iterable[bytes]) -> Iterator[str]:
-    """Lines by LF or CR LF; a bare CR, which the standard allows, our server does not send."""
-    rest = bytearray()
-    for part in parts:
-        rest += part
-        *whole, tail = rest.split(b"\n")
-        for line in whole:
-            yield line.removesuffix(b"\r").decode(errors="replace")
-        rest = bytearray(tail)
-        if len(rest) > LINE_BYTES_MAX:
-            raise DamagedDataError("bad_message", f"the server's event is longer than {LINE_BYTES_MAX} bytes")

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
+from cairn_client.http.answer_reading import sent_again
 from cairn_client.http.api import MapApi
 from cairn_client.http.http_link import Link
 from cairn_client.relay.round import AskHeld, GiveCommit, RelaySide, TakeCommit
@@ -28,7 +29,8 @@ class RelayApi(MapApi):
     def signed_commit(self, name: str, commit: CommitId) -> SignedCommit:
         """A commit as it was pushed, with the signatures on it."""
         answer = self._send("GET", f"/maps/{name}/commits/{commit}")
-        return SignedCommit(commit, answer.body, answer.headers.get("Cairn-Signature"))
+        is_signed = "Cairn-Signature" in answer.headers
+        return SignedCommit(commit, answer.body, sent_again(answer.headers, "Cairn-Signature") if is_signed else None)
 
     def hand_over(self, name: str, commit: SignedCommit) -> None:
         """Push a commit that its author signed; when this returns, the server has it for good."""

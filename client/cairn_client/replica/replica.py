@@ -306,7 +306,11 @@ class Replica:
         Args:
             header: of a reply or an index.
             asked_by: the author whose tip it states.
+
+        Raises:
+            BadInputError: it holds a text that cannot be parsed; nothing of it is kept, or each later round would fail.
         """
+        header.check()
         with self._lock:
             self.state.header = header
             self.header = header

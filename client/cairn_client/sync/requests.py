@@ -9,23 +9,26 @@ simulator that keeps time itself.
         return len(index.cells)
 """
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from cairn_client.sync.responses import FetchedCell
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import Author, CommitId
-from cairn_map.errors import CairnError, UnreachableError
-from cairn_map.evidence.grid import Cell
+from cairn_map.errors import BadInputError, CairnError, DamagedDataError, UnreachableError
+from cairn_map.evidence.grid import Cell, cell_keys
 from cairn_map.wire.frames import Frame
-from cairn_map.wire.messages import INDEX_PAGE, CellIndex, MissingRequest, Upload
+from cairn_map.wire.messages import INDEX_PAGE, CellEntry, CellIndex, MissingRequest, Upload
 
 A = TypeVar("A")
 T = TypeVar("T")
 
 Box = tuple[Cell, Cell]
 """Lowest and highest cell, inclusive."""
+
+INDEX_CELLS_MAX = 1 << 20
+"""Cells of a map whose index is held: a gigabyte, and five times the largest map that was measured."""
 
 
 class Ask(Generic[A]):
@@ -147,13 +150,29 @@ def whole_index(author: Author | None = None, *, box: Box | None = None) -> Conv
 
     Raises:
         UnreachableError: kind `no_end`: the server was replaced or restored meanwhile; ask again.
+        DamagedDataError: kind `bad_message`: the cells do not rise in number, so the pages might never end.
+        BadInputError: kind `too_large`: more than `INDEX_CELLS_MAX` cells.
     """
     index = page = yield from GetIndex(author, box)
     cells, start = list(page.cells), index.header.to_cursor
+    last_key = _last_key(page.cells, after=-1)
     while len(page.cells) >= INDEX_PAGE:
         page = yield from GetIndex(author, box, after=Cell(*page.cells[-1].cell))
-        cells += page.cells
         to = page.header.to_cursor
         if to.log_id != start.log_id or to.seq < start.seq:
             raise UnreachableError("no_end", "the server's map was replaced while its cells were listed")
+        last_key = _last_key(page.cells, after=last_key)
+        cells += page.cells
+        if len(cells) > INDEX_CELLS_MAX:
+            raise BadInputError("too_large", f"the map has more than {INDEX_CELLS_MAX} cells here; ask for a box of it")
     return index.model_copy(update={"cells": cells})
+
+
+def _last_key(page: Sequence[CellEntry], *, after: int) -> int:
+    """Number of a page's last cell; the numbers must rise, from `after` on."""
+    if not page:
+        return after
+    keys = cell_keys([entry.cell for entry in page])
+    if int(keys[0]) <= after or (keys[1:] <= keys[:-1]).any():
+        raise DamagedDataError("bad_message", "the index names a cell twice, or its cells do not rise in number")
+    return int(keys[-1])

@@ -1,10 +1,11 @@
 """Responses of a server as values: lists, cells, errors."""
 
-from collections.abc import Iterable, Iterator, Mapping
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import FailFast, TypeAdapter, ValidationError
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.version_vector import VersionVector
@@ -19,7 +20,15 @@ from cairn_map.errors import (
     first_error,
 )
 from cairn_map.evidence.fingerprint import Fingerprint
-from cairn_map.wire.messages import Message, Problem
+from cairn_map.wire.messages import Message, Problem, check_json_size
+
+RETRY_AFTER_MAX_S = 3600.0
+"""Longest wait that a server may ask for: with a longer one, its clock or its settings may be broken."""
+KIND = re.compile(r"[a-z][a-z_]{0,63}")
+DETAIL_LENGTH_MAX = 1000
+"""Characters of a problem's detail: PROTOCOL.md 6."""
+CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+"""Control characters but tab and line feed, and marks that turn the direction of writing."""
 
 
 @dataclass(slots=True)
@@ -28,12 +37,6 @@ class Traffic:
 
     up_bytes: int = 0
     down_bytes: int = 0
-
-    def counted(self, parts: Iterable[bytes]) -> Iterator[bytes]:
-        """The parts of an answer, counted as they come."""
-        for part in parts:
-            self.down_bytes += len(part)
-            yield part
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,9 +66,10 @@ def list_of(model: type[Message], data: bytes) -> list[Message]:
     Raises:
         DamagedDataError: it is none.
     """
+    check_json_size(data)
     try:
-        found: list[Message] = TypeAdapter(list[model]).validate_json(data)  # type: ignore[valid-type]
-        return found
+        whole: TypeAdapter[list[Message]] = TypeAdapter(Annotated[list[model], FailFast()])  # type: ignore[valid-type, arg-type]
+        return whole.validate_json(data)
     except ValidationError as exc:
         raise DamagedDataError("bad_message", f"the server's list is not sound: {first_error(exc)}") from exc
 
@@ -74,11 +78,14 @@ def error_of(status: int, retry_after: str, body: bytes) -> CairnError:
     """The error that the server's problem body states; `retry_after` is the header of that name, or empty."""
     try:
         problem = Problem.model_validate_json(body)
-    except ValidationError:
+        if not KIND.fullmatch(problem.kind):
+            raise ValueError
+    except ValueError:  # pydantic's ValidationError is one
         problem = Problem(kind="http", detail=f"the server answered {status}: {body[:200].decode(errors='replace')}")
+    detail = shown_text(problem.detail[:DETAIL_LENGTH_MAX])
     if status in (429, 502, 503, 504, 507):
-        wait_s = float(retry_after) if retry_after.isdecimal() else None
-        return UnreachableError(problem.kind, problem.detail, wait_s)
+        wait_s = min(float(retry_after[:20]), RETRY_AFTER_MAX_S) if retry_after.isdecimal() else None
+        return UnreachableError(problem.kind, detail, wait_s)
     families: dict[int, type[CairnError]] = {
         401: DeniedError,
         403: DeniedError,
@@ -87,7 +94,12 @@ def error_of(status: int, retry_after: str, body: bytes) -> CairnError:
         410: ConflictError,
     }
     family = families.get(status, BadInputError if status < 500 else DamagedDataError)
-    return family(problem.kind, problem.detail)
+    return family(problem.kind, detail)
+
+
+def shown_text(text: str) -> str:
+    """A text of another program as it may be shown: without characters that a terminal would obey."""
+    return CONTROLS.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
 def unreachable(exc: Any) -> UnreachableError:

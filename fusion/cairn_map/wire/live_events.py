@@ -14,16 +14,17 @@ its chain as in a cursor, and a number that rises with each piece of news of a r
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import BaseModel, ConfigDict, FailFast, Field, TypeAdapter
 
-from cairn_map.wire.messages import CursorText, LogEntry, NameText, RobotStatus
+from cairn_map.wire.messages import Count, CursorText, LogEntry, NameText, RobotStatus
 
 CELLS_MAX = 256
 """Cells in one event, at most; more are `many`."""
 ENTRIES_MAX = 100
 """Log entries in one event, at most: the newest."""
 CHAIN_DIGITS = 8
-EventId = Annotated[str, Field(max_length=64)]
+EventId = Annotated[str, Field(pattern=r"^[!-~]{0,64}$")]
+"""A text that a header may hold: the listener shows it again when it comes back."""
 
 
 class _Model(BaseModel):
@@ -55,7 +56,7 @@ class Hello(_Model):
     cursor: CursorText
     resumed: bool
     """True if the listener's id is of this log: all changes folded since then follow."""
-    robots: list[RobotSign]
+    robots: Annotated[list[RobotSign], FailFast()]
     beat_s: float
     """Longest time between two events, seconds; after twice as long without one, connect again."""
 
@@ -65,7 +66,7 @@ class CellsEvent(_Model):
 
     type: Literal["cells"] = "cells"
     id: EventId
-    cells: list[tuple[int, int, int, int]] | Literal["many"]
+    cells: Annotated[list[tuple[int, int, int, int]], Field(max_length=CELLS_MAX)] | Literal["many"]
     """i, j, k, lm."""
 
 
@@ -74,8 +75,8 @@ class LogGrew(_Model):
 
     type: Literal["log"] = "log"
     id: EventId
-    entries: Annotated[list[LogEntry], Field(max_length=ENTRIES_MAX)]
-    left_out: int
+    entries: Annotated[list[LogEntry], Field(max_length=ENTRIES_MAX), FailFast()]
+    left_out: Count
     """Number of older new entries that are not listed; `GET .../log` has them."""
 
 

@@ -10,11 +10,11 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field, Va
 
 from cairn_map.commits.commit import ScanPose
 from cairn_map.commits.cursor import Cursor, cursor_from_text
-from cairn_map.commits.ids import NUMBER_LIMIT
+from cairn_map.commits.ids import NUMBER_LIMIT, commit_id_from_text
 from cairn_map.commits.version_vector import AUTHORS_MAX, VersionVector, version_vector_from_json
 from cairn_map.errors import DamagedDataError, first_error
 from cairn_map.evidence.fingerprint import Fingerprint, fingerprint_from_hex
-from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.grid import Geometry, cell_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 
 INDEX_PAGE = 1000
@@ -47,6 +47,9 @@ DAMAGED_MAX = 256
 SELECTING_PARTS = ("robot", "rig", "pushed_after_s", "pushed_before_s", "captured_after_s", "captured_before_s")
 FIELDS_MAX = 64
 """Fields of one object, at most: more than any message here has."""
+JSON_VALUES_MAX = 1 << 20
+JSON_FIELDS_MAX = 1 << 18
+"""Values and fields of one JSON text, counted by its marks: three version vectors of 65 536 robots have fewer."""
 
 
 class RobotStatus(BaseModel):
@@ -103,11 +106,11 @@ class MapInfo(_Model):
     geometry: Geometry
     sensor_model: SensorModel
     cursor: CursorText
-    cells: int
-    size_bytes: int
+    cells: Count
+    size_bytes: Count
     """Sum of the encoded cells."""
-    commits: int
-    branches: int
+    commits: Count
+    branches: Count
     box_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None
     """Lowest and highest corner of the cells that hold evidence; None while the map is empty."""
     server_key: ShaText | None = None
@@ -127,7 +130,7 @@ class Registered(_Model):
     """Answer to a registration; the token is shown once and kept only as a hash."""
 
     branch: NameText
-    token: str
+    token: Annotated[str, Field(pattern=r"^[!-~]{1,256}$")]
     map: MapInfo
 
 
@@ -136,11 +139,11 @@ class BranchInfo(_Model):
 
     branch: NameText
     mode: str
-    sensors: list[str]
+    sensors: Annotated[list[str], FailFast()]
     cursor: CursorText | None
-    behind: int | None
+    behind: Count | None
     """Log entries folded since the branch's cursor; None before its first fetch."""
-    behind_bytes: int | None = None
+    behind_bytes: Count | None = None
     """Bytes of others' commits in these entries; None before its first fetch, or if that was too long ago."""
     incarnation: str = ""
     """Incarnation of its latest registration."""
@@ -204,7 +207,7 @@ class ReplyHeader(_Model):
     asker without author: those of some authors, none if nothing is pending."""
     tip: tuple[Annotated[int, Field(ge=0, lt=NUMBER_LIMIT)], ShaText] | None = None
     """Highest folded number of the asker's own incarnation, and its SHA-256."""
-    retracts: list[IdText] = []
+    retracts: Annotated[list[IdText], FailFast()] = []
     """The operator's newest retracts that are not yet stable, for older robots: `vector` and `stable` tell all."""
     damaged: Annotated[list[tuple[tuple[int, int, int], FingerprintText]], Field(max_length=DAMAGED_MAX)] = []
     """Cells that the server cannot read any more, and their fingerprints: any robot with an undamaged copy may send
@@ -231,6 +234,18 @@ class ReplyHeader(_Model):
     def stable_vector(self) -> VersionVector:
         """`stable`, parsed."""
         return version_vector_from_json(self.stable)
+
+    def check(self) -> None:
+        """Parse every text once: for a reader who keeps the header.
+
+        Raises:
+            BadInputError: one of them cannot be parsed.
+        """
+        _ = self.to_cursor, self.coverage, self.pending_vector, self.stable_vector
+        for text in (*self.retracts, *self.wanted):
+            commit_id_from_text(text)
+        for cell, _fingerprint in self.damaged:
+            cell_key(cell)
 
 
 class Done(_Model):
@@ -284,20 +299,20 @@ class Retracted(_Model):
     """Answer to a retract: the retracting commit, None for a preview, and the commits that it names."""
 
     id: IdText | None
-    commits: list[IdText]
+    commits: Annotated[list[IdText], FailFast()]
 
 
 class LogEntry(_Model):
     """One row of the log: evidence folded in, or taken out again."""
 
-    seq: int
+    seq: Count
     kind: Literal["+", "-"]
     id: IdText
     sha: ShaText
-    size_bytes: int
-    cells: int
+    size_bytes: Count
+    cells: Count
     captured_s: tuple[float, float] | None
-    retracts: list[IdText]
+    retracts: Annotated[list[IdText], FailFast()]
     parent: ShaText | None = None
     seen: CursorText | None = None
     """SHA-256 of the author's commit before it, and the state of the server that the author had when it made it."""
@@ -319,12 +334,31 @@ class Problem(BaseModel):
     kind: str = "unknown"
 
 
+def check_json_size(text: bytes | str) -> None:
+    """Refuse JSON of more values or fields than a message may have, before any of them is made.
+
+    A value of two bytes takes some fifty in memory, and a field that no model knows a thousand, as an error of its own.
+
+    Raises:
+        DamagedDataError: kind `too_many_values`.
+    """
+    marks = (b"[", b"{", b",", b":") if isinstance(text, bytes) else ("[", "{", ",", ":")
+    *others, fields = (text.count(mark) for mark in marks)  # type: ignore[arg-type]
+    if fields > JSON_FIELDS_MAX or sum(others) + fields > JSON_VALUES_MAX:
+        raise DamagedDataError(
+            "too_many_values",
+            f"a message has at most {JSON_VALUES_MAX} values and {JSON_FIELDS_MAX} fields, "
+            f"got up to {sum(others) + fields} and {fields}",
+        )
+
+
 def message_from_json(model: type[Message], data: bytes | str) -> Message:
     """A message of a model, validated.
 
     Raises:
         DamagedDataError: not JSON, or a field is missing, unknown or out of range.
     """
+    check_json_size(data)
     try:
         return model.model_validate_json(data, strict=True)
     except ValidationError as exc:
@@ -337,16 +371,16 @@ class CellEntry(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     cell: tuple[int, int, int]
-    size_bytes: int
+    size_bytes: Count
     digest: ShaText
-    lm: int
+    lm: Count
     """Log entry that last changed the cell."""
     fingerprint: FingerprintText
-    voxels: int
+    voxels: Count
     hottest_k: float | None = None
     """Mean temperature of its hottest voxel, kelvin; None: it has none, or the server does not know it, or was not
     asked for it, because older robots refuse fields that they do not know."""
-    held_lm: int | None = None
+    held_lm: Count | None = None
     """Newest log entry whose evidence is still in the cell: `lm`, unless that took some out. None: the cell is empty,
     or the server does not know it any more, or was not asked for it."""
 
@@ -357,7 +391,7 @@ class CellIndex(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     header: ReplyHeader
-    cells: list[CellEntry]
+    cells: Annotated[list[CellEntry], FailFast()]
 
 
 class Upload(BaseModel):

@@ -1,7 +1,5 @@
 import json
 import threading
-from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -12,29 +10,10 @@ from cairn_client.cli.maps import watch as watch_command
 from cairn_client.cli.maps.watch import lines_of
 from cairn_client.http.api import MapApi
 from cairn_client.http.backoff import Backoff
-from cairn_client.http.live_listener import LINE_BYTES_MAX, Lost, listen, messages_of
+from cairn_client.http.live_listener import Lost, listen
 from cairn_client.robot.robot import Robot
-from cairn_map.errors import DamagedDataError, NotFoundError
+from cairn_map.errors import NotFoundError
 from cairn_map.wire.live_events import Hello, LiveEvent, LogGrew
-
-STREAM = b"retry: 500\n\nevent: head\nid: 5.aa\ndata: {\ndata: }\n\n: a comment\r\n\r\nevent: beat\r\ndata: {}\r\n\r\n"
-MESSAGES = [("head", "5.aa", "{\n}"), ("beat", "5.aa", "{}")]
-
-
-@pytest.mark.parametrize("size", range(1, 20))
-def test_events_are_the_same_however_their_bytes_are_cut(size: int) -> None:
-    cuts = range(0, len(STREAM) + size, size)
-    assert list(messages_of(STREAM[a:b] for a, b in pairwise(cuts))) == MESSAGES
-
-
-def test_an_event_without_an_end_is_refused() -> None:
-    def endless() -> Iterator[bytes]:
-        yield b"data: "
-        while True:
-            yield bytes(1 << 20)
-
-    with pytest.raises(DamagedDataError, match=str(LINE_BYTES_MAX)):
-        list(messages_of(endless()))
 
 
 def commit(server: LiveServer, folder: Path) -> None:

@@ -16,7 +16,7 @@ from cairn_client.sync.requests import Box, whole_index
 from cairn_client.sync.sync import fetch_cells
 from cairn_map.commits.ids import Author
 from cairn_map.errors import UnreachableError
-from cairn_map.evidence.grid import Cell, CellKey, cell_key
+from cairn_map.evidence.grid import Cell, CellKey, cell_key, cell_of_key
 from cairn_map.wire.messages import CellEntry, CellIndex, Retract
 
 PAGE = 2
@@ -122,8 +122,11 @@ class Replaced:
     def cell_index(
         self, name: str, author: Author | None = None, *, box: Box | None = None, after: Cell | None = None
     ) -> CellIndex:
-        entry = CellEntry(cell=(0, 0, 0), size_bytes=1, digest="0" * 64, lm=1, fingerprint="0" * 32, voxels=1)
-        return CellIndex(header=header(cursor(3 if after else 5)), cells=[entry] * PAGE)
+        cells = [
+            CellEntry(cell=cell_of_key(key), size_bytes=1, digest="0" * 64, lm=1, fingerprint="0" * 32, voxels=1)
+            for key in range(PAGE)
+        ]
+        return CellIndex(header=header(cursor(3 if after else 5)), cells=cells)
 
 
 def test_a_server_that_was_restored_between_two_pages_is_asked_again_later(monkeypatch: pytest.MonkeyPatch) -> None:
