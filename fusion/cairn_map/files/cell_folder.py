@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from cairn_map.codec.cell_code import DecodedCell, decode_canonical_cell
 from cairn_map.codec.cell_reading import CELL_BYTES_MAX
 from cairn_map.errors import BadInputError, DamagedDataError, first_error
-from cairn_map.evidence.grid import Cell, Geometry, cell_key
+from cairn_map.evidence.grid import Cell, CellKey, Geometry, cell_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 
 MAP_FILE = "map.json"
@@ -59,12 +59,9 @@ def read_head(folder: Path) -> FolderHead:
         BadInputError: it is missing or not a map's.
     """
     path = folder / MAP_FILE
+    text = _read(path, MAP_BYTES_MAX, kind="no_map_folder")
     try:
-        with path.open("rb") as file:
-            text = file.read(MAP_BYTES_MAX + 1)
         return FolderHead.model_validate_json(text)
-    except OSError as exc:
-        raise BadInputError("no_map_folder", f"{folder} is not a folder of cells: {path.name}: {exc.strerror}") from exc
     except ValidationError as exc:
         raise BadInputError("no_map_folder", f"{path} does not describe a map: {first_error(exc)}") from exc
 
@@ -74,22 +71,54 @@ def read_cells(folder: Path, geometry: Geometry) -> Iterator[DecodedCell]:
 
     Raises:
         DamagedDataError: a file is not the cell that its name says; the message names it.
-        BadInputError: a cell of another grid.
+        BadInputError: a cell of another grid, too large, or a file that cannot be read; the message names it.
     """
-    named = ((CELL_NAME.fullmatch(path.name), path) for path in folder.iterdir())
-    found = [(Cell(*(int(part) for part in match.groups())), path) for match, path in named if match]
-    for cell, path in sorted(found, key=lambda pair: cell_key(pair[0])):
-        if path.stat().st_size > CELL_BYTES_MAX:
-            raise BadInputError("too_large", f"{path} is larger than a cell may be ({CELL_BYTES_MAX} bytes)")
+    for key, path in sorted(_named_cells(folder)):
+        data = _read(path, CELL_BYTES_MAX, kind="bad_cell")
         try:
-            decoded = decode_canonical_cell(path.read_bytes())
-        except DamagedDataError as exc:
-            raise DamagedDataError(exc.kind, f"{path}: {exc.message}") from exc
-        if decoded.key != cell_key(cell):
+            decoded = decode_canonical_cell(data)
+        except (DamagedDataError, BadInputError) as exc:
+            raise type(exc)(exc.kind, f"{path}: {exc.message}") from exc
+        if decoded.key != key:
             raise DamagedDataError("bad_cell", f"{path} holds another cell than its name says")
         if decoded.geometry != geometry:
             raise BadInputError("other_geometry", f"{path} was made for another grid than {folder / MAP_FILE} says")
         yield decoded
+
+
+def _named_cells(folder: Path) -> Iterator[tuple[CellKey, Path]]:
+    """Numbers and files of a folder's cells; files with other names are no cells."""
+    try:
+        paths = list(folder.iterdir())
+    except OSError as exc:
+        raise BadInputError("no_map_folder", f"{folder} cannot be listed: {exc.strerror}") from exc
+    for path in paths:
+        if match := CELL_NAME.fullmatch(path.name):
+            cell = Cell(*(int(part) for part in match.groups()))
+            # A cell under two names, 0_0_0 and 00_0_0, would be added twice.
+            if path.name != f"{cell.i}_{cell.j}_{cell.k}.cell":
+                raise DamagedDataError("bad_cell", f"{path}: the file of cell {cell} has another name")
+            try:
+                yield cell_key(cell), path
+            except BadInputError as exc:
+                raise BadInputError(exc.kind, f"{path}: {exc.message}") from exc
+
+
+def _read(path: Path, size_bytes_max: int, *, kind: str) -> bytes:
+    """Bytes of a regular file.
+
+    Raises:
+        BadInputError: it cannot be read (`kind`), or is too large.
+    """
+    try:
+        if not path.is_file():  # a pipe would be waited for
+            raise BadInputError(kind, f"{path} is missing, or no file")
+        if path.stat().st_size > size_bytes_max:
+            raise BadInputError("too_large", f"{path} has more than {size_bytes_max} bytes")
+        with path.open("rb") as file:
+            return file.read(size_bytes_max)
+    except OSError as exc:
+        raise BadInputError(kind, f"{path} cannot be read: {exc.strerror}") from exc
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -23,6 +23,8 @@ from cairn_map.wire.messages import CreateMap, MapInfo
 
 CELLS_A_COMMIT = 16
 """Cells of prior data in one commit, which stays far below a commit's largest size."""
+CHECKED = CommitId(Author(INITIAL, Incarnation("0" * 16)), 0)
+"""Id of the commits that are only made to see that they can be."""
 CHANNELS = {"colour": COLOUR, "intensity": INTENSITY, "temperature": TEMPERATURE}
 
 
@@ -85,8 +87,15 @@ def push_prior_data(api: MapApi, name: str, source: str, *, token: str | None) -
 
 def _open(source: str, token: str | None) -> tuple[FolderHead, Iterable[DecodedCell]]:
     if "://" not in source:
-        head = read_head(Path(source))
-        return head, read_cells(Path(source), head.geometry)
+        folder = Path(source)
+        head = read_head(folder)
+        # All of it is read before the map is made: a damaged file must not leave a part of a map behind.
+        for group in _groups(read_cells(folder, head.geometry)):
+            try:
+                _commit(CHECKED, group, head.geometry)
+            except BadInputError as exc:
+                raise BadInputError(exc.kind, f"{folder}: {exc.message}") from exc
+        return head, read_cells(folder, head.geometry)
     api, name = api_of(source, token)
     info = api.map_info(name)
     return FolderHead(geometry=info.geometry, sensor_model=info.sensor_model), _fetched(api, name)
