@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 
 from cairn_client.http.api import MapApi
 from cairn_client.http.map_url import split_map_url
+from cairn_client.sync.responses import shown_text
 from cairn_map.errors import EXIT_CODES
 
 TOKEN_VARIABLE = "CAIRN_TOKEN"  # noqa: S105 - the variable's name
@@ -92,8 +93,8 @@ def api_of(map_url: str, token: str | None) -> tuple[MapApi, str]:
 
 
 def say(text: str = "") -> None:
-    """Write a line of the command's result."""
-    sys.stdout.write(text + "\n")
+    """Write a line of the command's result; texts that robots and servers chose cannot steer the terminal."""
+    sys.stdout.write(shown_text(text) + "\n")
 
 
 def shown_length(metres: float) -> str:

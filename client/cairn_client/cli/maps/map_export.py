@@ -10,6 +10,7 @@ import argparse
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 from urllib.parse import urlencode
 
 from pydantic import ValidationError
@@ -29,6 +30,11 @@ from cairn_map.wire.messages import MapInfo
 
 FORMATS = ("ply", "pcd", "laz", "npz", "ot", "bt")
 ZERO_CELSIUS_K = 273.15
+VOXEL_BYTES = 300
+"""Memory of a voxel on its way into a file: a row with all channels has 136, and is there twice while it is joined."""
+MEMORY_DIVISOR = 4
+EXPORT_BYTES_MAX = 64 << 28
+"""Bytes of a file of points: those of the 2^28 voxels that a server looks at for one (PROTOCOL.md 6)."""
 
 
 def add_get_parser(commands: Subparsers) -> None:
@@ -107,20 +113,19 @@ def _export(args: argparse.Namespace) -> int:
     api, name = api_of(args.map, args.token)
     with api:
         info = api.map_info(name)
-        cells = list(fetch_map(api, name))
+        if args.cells:
+            write_head(args.cells, FolderHead(geometry=info.geometry, sensor_model=info.sensor_model))
+        voxels, count = _downloaded(api, info, args)
     if args.cells:
-        write_head(args.cells, FolderHead(geometry=info.geometry, sensor_model=info.sensor_model))
-        for body, cell in cells:
-            write_cell(args.cells, cell_of_key(cell.key), body)
-        say(f"{len(cells)} cells in {args.cells}/")
+        say(f"{count} cells in {args.cells}/")
     if not (args.ply or args.npz or args.picture):
         return 0
-    if not cells:
+    if not count:
         raise NotFoundError("empty_map", f"map {name} holds nothing yet")
     if args.npz:
-        _write(args.npz, npz_file(_all_voxels(cells, info, occupied_only=False)))
+        _write(args.npz, npz_file(joined_voxels(voxels.known)))
     if args.ply or args.picture:
-        occupied = _all_voxels(cells, info, occupied_only=True)
+        occupied = joined_voxels(voxels.occupied)
         if args.ply:
             _write(args.ply, ply_file(occupied))
         if args.picture:
@@ -130,6 +135,45 @@ def _export(args: argparse.Namespace) -> int:
             write_map_picture(args.picture, occupied, voxel_edge_m=edge_m, ceiling_m=args.ceiling)
             say(f"{args.picture}: {len(occupied)} occupied voxels")
     return 0
+
+
+class _Kept(NamedTuple):
+    """Voxels by cell, as far as a file of them is asked for."""
+
+    known: list[Voxels]
+    occupied: list[Voxels]
+
+
+def _downloaded(api: MapApi, info: MapInfo, args: argparse.Namespace) -> tuple[_Kept, int]:
+    """Voxels of all cells, and how many cells there are; each is written to `--cells` as it comes, and then let go.
+
+    Raises:
+        BadInputError: kind `too_large`: the voxels do not fit into the memory. A few bytes may stand for millions.
+    """
+    kept, count, size_bytes = _Kept([], []), 0, 0
+    for body, cell in fetch_map(api, info.name):
+        count += 1
+        if args.cells:
+            write_cell(args.cells, cell_of_key(cell.key), body)
+        if args.npz:
+            size_bytes += VOXEL_BYTES * len(cell.evidence)
+            _check_memory(size_bytes)
+            kept.known.append(_voxels(cell, info, occupied_only=False))
+        if args.ply or args.picture:
+            kept.occupied.append(_voxels(cell, info, occupied_only=True))
+            size_bytes += VOXEL_BYTES * len(kept.occupied[-1])
+            _check_memory(size_bytes)
+    return kept, count
+
+
+def _check_memory(size_bytes: int) -> None:
+    limit_bytes = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // MEMORY_DIVISOR
+    if size_bytes > limit_bytes:
+        raise BadInputError(
+            "too_large",
+            f"the map's voxels need more than {shown_bytes(limit_bytes)} of memory, a quarter of this machine's; "
+            "ask for a part of it (--box, --depth), or for --cells, which are written one by one",
+        )
 
 
 def fetch_map(api: MapApi, name: str) -> Iterator[tuple[bytes, DecodedCell]]:
@@ -148,10 +192,6 @@ def _check_outputs(*paths: Path | None) -> None:
     for path in paths:
         if path is not None and (path.is_dir() or not os.access(path.absolute().parent, os.W_OK)):
             raise BadInputError("bad_output", f"cannot write {path}: is {path.absolute().parent} a folder to write in?")
-
-
-def _all_voxels(cells: list[tuple[bytes, DecodedCell]], info: MapInfo, *, occupied_only: bool) -> Voxels:
-    return joined_voxels([_voxels(cell, info, occupied_only=occupied_only) for _, cell in cells])
 
 
 def _voxels(cell: DecodedCell, info: MapInfo, *, occupied_only: bool) -> Voxels:
@@ -215,10 +255,12 @@ def export_points(api: MapApi, name: str, asked: ExportRequest, path: Path) -> i
     part = path.with_name(f"{path.name}.part")
     try:
         with part.open("wb") as file:
-            for data in api.stream(f"/maps/{name}/main/export?{query}"):
+            for data in api.stream(f"/maps/{name}/main/export?{query}", at_most_bytes=EXPORT_BYTES_MAX):
                 file.write(data)
         size_bytes = part.stat().st_size
         part.replace(path)
+    except OSError as exc:
+        raise BadInputError("bad_output", f"cannot write {path}: {exc.strerror}") from exc
     finally:
         part.unlink(missing_ok=True)
     return size_bytes

@@ -22,6 +22,7 @@ from typing import TextIO
 
 from cairn_client.cli.arguments import add_token, api_of, parser, shown_bytes
 from cairn_client.http.live_listener import Lost, listen
+from cairn_client.sync.responses import shown_text
 from cairn_map.commits.cursor import cursor_from_text
 from cairn_map.wire.live_events import CellsEvent, HeadMoved, Hello, LiveEvent, LogGrew, RobotHeard, RobotSign
 
@@ -96,5 +97,5 @@ def _as_json(event: LiveEvent | Lost) -> dict[str, object]:
 
 def _write(stream: TextIO, line: str) -> None:
     """Write a line and flush it, so that a program that reads a pipe gets it at once."""
-    stream.write(line + "\n")
+    stream.write(shown_text(line) + "\n")
     stream.flush()
