@@ -6,7 +6,6 @@ looked up when the page is asked for. The page is the text format 0.0.4.
 
 import os
 import threading
-import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -76,6 +75,9 @@ class ServerFigures:
             "cairn_fold_duration_seconds", "Time of one fold of a group of commits.", "map"
         )
         self.folded = self._counter("cairn_folded_commits_total", "Commits folded into cells.", "map")
+        self.clock_jumps = self._counter(
+            "cairn_clock_jumps_total", "Jumps of the machine's time of day by over a minute.", "direction"
+        )
         self.fold_failures = self._counter("cairn_fold_failures_total", "Folds that failed and are tried again.", "map")
 
     def _counter(self, name: str, help_text: str, *labels: str) -> Bounded[Counter]:
@@ -127,8 +129,7 @@ def store_metrics(found: StoreFigures, backlogs: list[Backlog]) -> Iterator[Metr
     for kind, count in (dict.fromkeys(("disk_full", "store_failed"), 0) | found.failures).items():
         failures.add_metric([kind], count)
     yield failures
-    now_s = time.time()
-    ages_s = {b.map: 0.0 if b.oldest_s is None else max(0.0, now_s - b.oldest_s) for b in backlogs}
+    ages_s = {b.map: b.waited_s or 0.0 for b in backlogs}
     yield _gauge_by_map(
         "cairn_pending_commits", "Commits that are durable but not folded.", {b.map: b.commits for b in backlogs}
     )

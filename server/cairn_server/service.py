@@ -70,7 +70,7 @@ class Service:
         self.reports = RobotReports(store, self.live)
         self.maps = Maps(store, self.live, self.reports)
 
-        upstream = UpstreamProgress(is_joined=settings.upstream is not None)
+        upstream = UpstreamProgress(store.age, is_joined=settings.upstream is not None)
         damaged, folds = DamagedCells(), FoldHealth(self.figures)
         self._fold_thread = FoldThread(
             store,
@@ -101,7 +101,7 @@ class Service:
             upstream.wake()
 
         pushes = Pushes(store, settings, self.live, wanted, on_new=on_new)
-        stable = StableVectors(settings.stable_after_s)
+        stable = StableVectors(store.age, settings.stable_after_s)
         return SyncParts(
             pushes,
             Uploads(store, pushes),

@@ -9,19 +9,21 @@ from tests.memory_store.maps import MemoryMaps
 
 from cairn_map.commits.cursor import ENTRY_FOLD
 from cairn_map.errors import UnreachableError
+from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_rows import Backlog, CellRow, EntrySize, MapRow, Robot, StoreFigures, Use, relay_of
 
 
 class MemoryHealth:
     """`store.StoreHealth` without a disk: nothing waits to be written, and nothing runs full but the process."""
 
-    def __init__(self, maps: MemoryMaps) -> None:
+    def __init__(self, maps: MemoryMaps, age: StoreAge) -> None:
         self._maps = maps
+        self._age = age
 
     def backlogs(self) -> list[Backlog]:
         """What is not folded yet, of every map."""
         with self._maps.locked() as maps:
-            return [_backlog(state) for state in maps.values()]
+            return [_backlog(state, self._age.now_s()) for state in maps.values()]
 
     def figures(self) -> StoreFigures:
         """Sizes and counts."""
@@ -97,9 +99,9 @@ class MemoryNotes:
         return found
 
 
-def _backlog(state: MemoryMap) -> Backlog:
+def _backlog(state: MemoryMap, age_s: float) -> Backlog:
     waiting = list(state.waiting())
-    return Backlog(state.row.name, len(waiting), waiting[0].received_s if waiting else None)
+    return Backlog(state.row.name, len(waiting), age_s - waiting[0].received_age_s if waiting else None)
 
 
 def _size_bytes(state: MemoryMap) -> int:

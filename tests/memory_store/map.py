@@ -25,7 +25,8 @@ class Kept:
     cells: int
     """That it touched, gone or not."""
     received_s: float
-    folded_s: float = 0.0
+    received_age_s: float
+    folded_age_s: float = 0.0
     folded_seq: int | None = None
     unfolded_seq: int = 0
     """Log entry that took it out again; 0 if none did."""
@@ -87,17 +88,23 @@ class MemoryMap:
                 setattr(other, name, value.copy())
         return other
 
-    def append(self, commit: NewCommit) -> bool:
-        """Keep a commit; False if the same one is known already."""
+    def append(self, commit: NewCommit, *, age_s: float) -> bool:
+        """Keep a commit at an age of the store; False if the same one is known already."""
         known = self.commits.get(commit.id)
         if known is not None:
-            return self._append_again(known, commit)
+            return self._append_again(known, commit, age_s)
         self._check_kept(commit.retracts)
         intervals = self._checked_intervals(commit.id)
         self.tops = self._checked_tops(commit.tops)
         top, _ = self.authors.get(commit.id.author, (0, 0))
         self.authors[commit.id.author] = max(top, commit.id.n), intervals
-        self.commits[commit.id] = Kept(number=len(self.ids), new=commit, cells=len(commit.diff), received_s=time.time())
+        self.commits[commit.id] = Kept(
+            number=len(self.ids),
+            new=commit,
+            cells=len(commit.diff),
+            received_s=time.time(),
+            received_age_s=age_s,
+        )
         self.ids.append(commit.id)
         self._number_diff(commit)
         return True
@@ -106,15 +113,14 @@ class MemoryMap:
         """The number after an author's highest."""
         return self.authors[author][0] + 1 if author in self.authors else 0
 
-    def fold(self, fold: Fold) -> bool:
-        """Cells, entries and head, if the head is still the fold's base."""
+    def fold(self, fold: Fold, *, age_s: float) -> bool:
+        """Cells, entries and head at an age of the store, if the head is still the fold's base."""
         if fold.base != self.head.cursor:
             return False
         self.head = Head(cursor=fold.head, vector=fold.vector)
-        now_s = time.time()
         for entry in fold.entries:
             self.entries.append(entry)
-            self._note_entry(entry, len(self.entries), now_s)
+            self._note_entry(entry, len(self.entries), age_s)
         self.retracted.update(fold.retracted)
         for number, _ in fold.damaged:
             aside = self.ids[number]
@@ -124,24 +130,25 @@ class MemoryMap:
             self.cells[cell.key] = replace(cell, gone_seq=before.gone_seq if before else 0)
         return True
 
-    def forget_evidence(self, *, before_s: float, limit: int) -> int:
-        """Drop the evidence and the meta of commits folded, and last pushed, before a time; how many.
+    def forget_evidence(self, *, before_s: float, limit: int, age_s: float) -> int:
+        """Drop the evidence and the meta of commits folded, and last pushed, before an age of the store; how many.
 
         What is left of a commit is its row in the log; see `sqlite_retention`.
         """
         pinned = {target for kept in self.commits.values() if kept.folded_seq is None for target in kept.new.retracts}
-        again_s = min(before_s, time.time() - AGAIN_KEPT_S)
+        again_s = min(before_s, age_s - AGAIN_KEPT_S)
         old = [
             kept
             for commit, kept in self.commits.items()
             if kept.folded_seq is not None
             and kept.cells
             and not kept.is_gone
-            and kept.folded_s < before_s
-            and kept.received_s < (again_s if kept.received_s > kept.folded_s and not kept.unfolded_seq else before_s)
+            and kept.folded_age_s < before_s
+            and kept.received_age_s
+            < (again_s if kept.received_age_s > kept.folded_age_s and not kept.unfolded_seq else before_s)
             and commit not in pinned
         ]
-        old.sort(key=lambda kept: kept.folded_s)
+        old.sort(key=lambda kept: kept.folded_age_s)
         for kept in old[:limit]:
             self._forget(kept)
         return len(old[:limit])
@@ -158,17 +165,19 @@ class MemoryMap:
         self.cells[cell.key] = replace(cell, stamps=known.stamps, gone_seq=known.gone_seq)
         return True
 
-    def _append_again(self, known: Kept, commit: NewCommit) -> bool:
+    def _append_again(self, known: Kept, commit: NewCommit, age_s: float) -> bool:
         if known.new.sha != commit.sha:
             raise ConflictError("id_taken", f"commit {commit.id} is already here with other bytes")
         if known.is_damaged:
             self.commits[commit.id] = replace(known, new=commit, is_damaged=False)
         elif known.is_gone and commit.id not in self.retracted:
-            self.commits[commit.id] = replace(known, new=commit, is_gone=False, received_s=time.time())
+            self.commits[commit.id] = replace(
+                known, new=commit, is_gone=False, received_s=time.time(), received_age_s=age_s
+            )
             self._number_diff(commit)
         return known.is_damaged
 
-    def _note_entry(self, entry: Entry, seq: int, now_s: float) -> None:
+    def _note_entry(self, entry: Entry, seq: int, age_s: float) -> None:
         commit = self.ids[entry.commit]
         kept = self.commits[commit]
         for key in kept.new.diff:
@@ -176,7 +185,7 @@ class MemoryMap:
         if entry.kind != ENTRY_FOLD:
             self.commits[commit] = replace(kept, unfolded_seq=seq)
         elif kept.folded_seq is None:
-            self.commits[commit] = replace(kept, folded_seq=seq, folded_s=now_s)
+            self.commits[commit] = replace(kept, folded_seq=seq, folded_age_s=age_s)
 
     def _forget(self, kept: Kept) -> None:
         seqs = (kept.folded_seq or 0, kept.unfolded_seq)

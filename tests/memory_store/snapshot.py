@@ -69,9 +69,9 @@ class MemorySnapshot:
         """Commits that are kept but not folded, without those that are set aside as damaged."""
         return EMPTY.with_commits(kept.new.id for kept in self._state.waiting())
 
-    def folded_before(self, time_s: float) -> VersionVector:
-        """Commits folded before a time."""
-        return EMPTY.with_commits(kept.new.id for kept in self._folded() if kept.folded_s < time_s)
+    def folded_before(self, age_s: float) -> VersionVector:
+        """Commits folded before an age of the store."""
+        return EMPTY.with_commits(kept.new.id for kept in self._folded() if kept.folded_age_s < age_s)
 
     def log(self, *, after_seq: int, limit: int) -> list[LogEntry]:
         """Log entries, oldest first."""

@@ -19,6 +19,7 @@ from cairn_map.errors import CairnError, ConflictError, NotFoundError, Unreachab
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.store import Store
+from cairn_server.store.store_age import CLOCKS, AgeMark, Clocks, StoreAge
 from cairn_server.store.store_rows import Branch, Fold, MapRow, NewCommit, StoredCommit
 
 log = logging.getLogger(__name__)
@@ -27,11 +28,12 @@ log = logging.getLogger(__name__)
 class MemoryStore:
     """`store.Store` without a disk: what it acknowledges lasts as long as the process."""
 
-    def __init__(self) -> None:
+    def __init__(self, clocks: Clocks = CLOCKS) -> None:
         self._maps = MemoryMaps()
-        self.tokens = MemoryTokens(self._maps)
+        self.age = StoreAge(AgeMark(), clocks)
+        self.tokens = MemoryTokens(self._maps, self.age)
         self.audit_log = MemoryAuditLog(self._maps)
-        self.health = MemoryHealth(self._maps)
+        self.health = MemoryHealth(self._maps, self.age)
         self.uses = MemoryUses(self._maps)
         self.notes = MemoryNotes(self._maps)
 
@@ -57,7 +59,7 @@ class MemoryStore:
     def append(self, row: MapRow, commit: NewCommit) -> bool:
         """Keep a commit; True if it is new, False if the same one is known already."""
         with self._maps.changing(row) as changed:
-            return changed.append(commit)
+            return changed.append(commit, age_s=self.age.now_s())
 
     def submit(self, row: MapRow, commit: NewCommit) -> Future[bool]:
         """Keep a commit, at once."""
@@ -72,7 +74,7 @@ class MemoryStore:
         """Keep a commit that `build(n)` makes for the author's next number n."""
         with self._maps.changing(row) as changed:
             commit = build(changed.next_number(author))
-            changed.append(commit)
+            changed.append(commit, age_s=self.age.now_s())
             return commit
 
     def pending(
@@ -102,9 +104,9 @@ class MemoryStore:
             return kept.stored() if kept and kept.folded_seq is not None else None
 
     def forget_evidence(self, row: MapRow, *, before_s: float, limit: int) -> int:
-        """Drop the evidence and the meta of up to `limit` commits folded, and last pushed, before a time; how many."""
+        """Drop the evidence and the meta of up to `limit` commits folded, and last pushed, before an age; how many."""
         with self._maps.changing(row) as changed:
-            return changed.forget_evidence(before_s=before_s, limit=limit)
+            return changed.forget_evidence(before_s=before_s, limit=limit, age_s=self.age.now_s())
 
     def is_retracted(self, row: MapRow, commit: CommitId) -> bool:
         """Whether a retract of this id has taken effect, or waits for it to come."""
@@ -114,7 +116,7 @@ class MemoryStore:
     def fold(self, row: MapRow, fold: Fold) -> bool:
         """Write a fold if the head is still its base; False (and nothing written) otherwise."""
         with self._maps.changing(row) as changed:
-            return changed.fold(fold)
+            return changed.fold(fold, age_s=self.age.now_s())
 
     @contextmanager
     def snapshot(self, row: MapRow) -> Iterator[MemorySnapshot]:
@@ -149,6 +151,9 @@ class MemoryStore:
         """All branches, by name."""
         with self._maps.reading(row) as state:
             return [state.branches[name] for name in sorted(state.branches)]
+
+    def keep_age(self) -> None:
+        """Keep nothing: the store ends with the process."""
 
     def audit(self, what: str, detail: str) -> None:
         """Note something that an administrator may have to look into."""

@@ -10,6 +10,7 @@ from tests.memory_store.maps import MemoryMaps
 
 from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
 from cairn_map.wire.access_messages import AuditEntry, audit_chain
+from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_rows import MapRow, Token, registration_name
 
 log = logging.getLogger(__name__)
@@ -20,8 +21,9 @@ AUDIT_LINES_MAX = 100_000
 class MemoryTokens:
     """`store.Tokens`, under the lock of the maps."""
 
-    def __init__(self, maps: MemoryMaps) -> None:
+    def __init__(self, maps: MemoryMaps, age: StoreAge) -> None:
         self._maps = maps
+        self._age = age
         self._tokens: dict[str, tuple[Token, bytes]] = {}
         self._names: dict[bytes, str] = {}
         """By the hash of the secret."""
@@ -31,7 +33,7 @@ class MemoryTokens:
         with self._maps.locked():
             if token.name in self._tokens:
                 raise ConflictError("token_exists", f"a token {token.name!r} exists; rotate it, or take another name")
-            self._put(token, secret_hash)
+            self._put(replace(token, created_age_s=self._age.now_s()), secret_hash)
 
     def renew(self, name: str, secret_hash: bytes) -> Token:
         """Give a token another secret."""
@@ -61,7 +63,10 @@ class MemoryTokens:
         with suppress(UnreachableError), self._maps.locked():  # it is only a note
             if name in self._tokens:
                 token, secret_hash = self._tokens[name]
-                self._tokens[name] = replace(token, last_used_s=time.time()), secret_hash
+                self._tokens[name] = self._shown(token), secret_hash
+
+    def _shown(self, token: Token) -> Token:
+        return replace(token, last_used_s=time.time(), used_age_s=self._age.now_s())
 
     def put_registration(self, row: MapRow, robot: str, secret_hash: bytes) -> None:
         """The token of a registration; the one of an earlier registration is worth nothing then."""
@@ -73,6 +78,7 @@ class MemoryTokens:
             robot=robot,
             created_s=time.time(),
             expires_s=None,
+            created_age_s=self._age.now_s(),
         )
         with self._maps.locked():
             if token.name in self._tokens:

@@ -846,8 +846,8 @@ SWITCHES = (
         16,
         "evidence that the upstream lacks is not forgotten",
         "server/cairn_server/folding/fold_thread.py",
-        "before_s = min(time.time() - self._keep_evidence_s, self._may_forget_s(row.name))",
-        "before_s = time.time() - self._keep_evidence_s",
+        "before_s = min(self._store.age.now_s() - self._keep_evidence_s, self._may_forget_s(row.name))",
+        "before_s = self._store.age.now_s() - self._keep_evidence_s",
         "cairn_client/relay/test_relay.py::test_a_field_server_forgets_nothing_that_its_upstream_has_not_got",
     ),
     Switch(

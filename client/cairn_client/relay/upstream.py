@@ -89,7 +89,7 @@ class Upstream:
             except CairnError as exc:
                 self._say(logging.ERROR, f"map {info.name} cannot be joined: {exc.message}")
                 continue
-            begun_s = time.time()
+            begun_s = self._server.clock_s()
             resting = self._resting.setdefault(info.name, Undelivered())
             report = hold_between(relay_round(resting), here, ServerEnd(self._api, info.name))
             log_report(report, info.name, there=self._url)

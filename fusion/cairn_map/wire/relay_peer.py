@@ -91,8 +91,12 @@ class OwnServer(Protocol):
         """
         ...
 
+    def clock_s(self) -> float:
+        """Seconds by the server's own clock for ages, which never jumps."""
+        ...
+
     def handed_over(self, map_name: str, begun_s: float) -> None:
-        """Note that all signed commits of a map at a time (UTC seconds since 1970) were handed to the upstream."""
+        """Note that all signed commits of a map at a time (`clock_s`) were handed to the upstream."""
         ...
 
 

@@ -125,19 +125,23 @@ def require_all_maps(caller: Caller) -> None:
         raise DeniedError("not_allowed", "this takes an admin token of all maps; the token shown is of one map")
 
 
-def has_ended(token: Token, settings: Settings, *, now_s: float) -> bool:
-    """True if a token has expired, or its robot was silent for longer than `branch_expiry_s`."""
+def has_ended(token: Token, settings: Settings, *, now_s: float, age_s: float) -> bool:
+    """True if a token has expired, or its robot was silent for longer than `branch_expiry_s`.
+
+    A date passes by the wall clock (`now_s`), or after as long an age of the store: the clock set back gives no more
+    life than the token was made with. Set ahead, it ends the token only until it is right again.
+    """
     if token.expires_s is not None:
-        return now_s >= token.expires_s
+        return now_s >= token.expires_s or age_s - token.created_age_s >= token.expires_s - token.created_s
     if token.role != "robot" or settings.branch_expiry_s is None:
         return False
-    return now_s >= max(token.created_s, token.last_used_s or 0.0) + settings.branch_expiry_s
+    return age_s >= max(token.created_age_s, token.used_age_s) + settings.branch_expiry_s
 
 
 def _holder(token: str, store: Store, settings: Settings) -> Caller | None:
     known = store.tokens.of_hash(token_hash(token))
     if known is not None:
-        if has_ended(known, settings, now_s=time.time()):
+        if has_ended(known, settings, now_s=time.time(), age_s=store.age.now_s()):
             return None
         store.tokens.used(known.name)
         return Caller(Role(known.role), known.robot, known.name, known.map_number)

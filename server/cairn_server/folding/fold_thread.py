@@ -22,7 +22,7 @@ merging a scan takes 1 ms."""
 FORGET_MAX = 64
 """Most commits whose evidence is dropped in one transaction."""
 FORGET_EVERY_S = 60.0
-"""Time between two looks for evidence that need not be kept any longer."""
+"""Time between two looks for evidence that need not be kept any longer, and between two looks at the clocks."""
 RETRY_S = 5.0
 """Longest wait before a failed fold (a full disk) is tried again; waits double from `FIRST_RETRY_S` on."""
 FIRST_RETRY_S = 0.2
@@ -50,7 +50,7 @@ class FoldThread:
             damaged: record of damaged cells.
             keep_evidence_s: age at which a folded commit's evidence is dropped.
             on_fold: called after each group, with the map.
-            may_forget_s: by a map's name, UTC seconds before which evidence may be dropped.
+            may_forget_s: by a map's name, age of the store before which evidence may be dropped.
             process: plans the folds; without one, or once it has ended, this thread does.
         """
         self._store = store
@@ -60,6 +60,7 @@ class FoldThread:
         self._may_forget_s = may_forget_s
         self._keep_evidence_s = keep_evidence_s
         self._forget_next_s = 0.0
+        self._clocks_next_s = 0.0
         self._wake = threading.Event()
         self._closing = threading.Event()
         self._process = process
@@ -108,6 +109,7 @@ class FoldThread:
             busy = False
             start_s = time.monotonic()
             self._wake.clear()
+            self._watch_clocks(start_s)
             try:
                 maps = self._store.maps()
             except Exception:
@@ -129,6 +131,22 @@ class FoldThread:
                 self._closing.wait(rest_s(time.monotonic() - start_s, is_pushed=self._wake.is_set()))
         return not (failed or self._forget_old(maps))
 
+    def _watch_clocks(self, now_s: float) -> None:
+        """Keep the store's age, and report a jump of the wall clock, at most once in `FORGET_EVERY_S`."""
+        if now_s < self._clocks_next_s:
+            return
+        self._clocks_next_s = now_s + FORGET_EVERY_S
+        jump_s = self._store.age.jump_s()
+        if jump_s:
+            self._health.clock_jumped(jump_s)
+            way = "ahead (or the machine slept)" if jump_s > 0 else "back (or it is not set yet)"
+            self._store.audit(
+                "clock_jump",
+                f"the time of day went {abs(jump_s):.0f} s {way}; nothing is forgotten or stable sooner or later by "
+                "it, but tokens with a date count by it: set the clock (NTP, chrony)",
+            )
+        self._store.keep_age()
+
     def _forget_old(self, maps: list[MapRow]) -> bool:
         """Drop evidence that need not be kept any longer, at most once in `FORGET_EVERY_S`; True if that failed."""
         if time.monotonic() < self._forget_next_s or self._closing.is_set():
@@ -147,7 +165,7 @@ class FoldThread:
 
     def _forget_group(self, row: MapRow) -> int:
         # No evidence is dropped that the upstream server lacks.
-        before_s = min(time.time() - self._keep_evidence_s, self._may_forget_s(row.name))
+        before_s = min(self._store.age.now_s() - self._keep_evidence_s, self._may_forget_s(row.name))
         return self._store.forget_evidence(row, before_s=before_s, limit=FORGET_MAX)
 
     def _fold_group(self, row: MapRow, maps: int) -> int:

@@ -39,6 +39,10 @@ class FoldHealth:
             self._failing[name] = error
         self._figures.fold_failures.labels(name).inc()
 
+    def clock_jumped(self, jump_s: float) -> None:
+        """Count a jump of the wall clock, ahead or (negative) back; a server is ready all the same."""
+        self._figures.clock_jumps.labels("ahead" if jump_s > 0 else "back").inc()
+
     def damaged(self) -> frozenset[str]:
         """Maps with commits that wait for a damaged cell to be healed: no fault of the server as a whole."""
         with self._lock:
@@ -110,6 +114,5 @@ class Readiness:
 
     def _lag(self) -> list[str]:
         limit_s, damaged = self._settings.fold_lag_max_s, self._folds.damaged()
-        oldest = [b.oldest_s for b in self._store.backlogs() if b.oldest_s is not None and b.map not in damaged]
-        lag_s = time.time() - min(oldest) if oldest else 0.0
+        lag_s = max((b.waited_s or 0.0 for b in self._store.backlogs() if b.map not in damaged), default=0.0)
         return [f"fold_lag: a commit has waited for {lag_s:.0f} s (at most {limit_s:.0f})"] if lag_s > limit_s else []

@@ -101,8 +101,12 @@ class OwnMaps:
             self._service.store.audit_log.add(UPSTREAM.name, "create_map", upstream.name)
         return OwnEnd(self._service, self._service.store.map(upstream.name))
 
+    def clock_s(self) -> float:
+        """Age of the store."""
+        return self._service.store.age.now_s()
+
     def handed_over(self, map_name: str, begun_s: float) -> None:
-        """Note that all of a map at this time (UTC seconds since 1970) was given to the upstream, if it can travel."""
+        """Note that all of a map at this age of the store was given to the upstream, if it can travel."""
         self._service.sync.upstream.handed_over(map_name, begun_s)
 
 

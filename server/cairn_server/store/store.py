@@ -18,6 +18,7 @@ from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.access_messages import AuditEntry
 from cairn_map.wire.messages import LogEntry
+from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_rows import (
     Backlog,
     Branch,
@@ -81,8 +82,8 @@ class Snapshot(Protocol):
         """Commits that are durable but not folded, without those that are set aside as damaged."""
         ...
 
-    def folded_before(self, time_s: float) -> VersionVector:
-        """Commits folded before a time."""
+    def folded_before(self, age_s: float) -> VersionVector:
+        """Commits folded before an age of the store."""
         ...
 
     def log(self, *, after_seq: int, limit: int) -> list[LogEntry]:
@@ -157,7 +158,7 @@ class Tokens(Protocol):
     """All tokens, by name and by the SHA-256 of their secrets."""
 
     def add(self, token: Token, secret_hash: bytes) -> None:
-        """Store a new token.
+        """Store a new token, whose life begins at the present age of the store.
 
         Raises:
             ConflictError: kind `token_exists`.
@@ -229,6 +230,11 @@ class Store(Protocol):
         ...
 
     @property
+    def age(self) -> StoreAge:
+        """Age of the store: the clock by which it forgets."""
+        ...
+
+    @property
     def notes(self) -> BranchNotes:
         """Notes on branches."""
         ...
@@ -292,7 +298,7 @@ class Store(Protocol):
         ...
 
     def forget_evidence(self, row: MapRow, *, before_s: float, limit: int) -> int:
-        """Drop the evidence and the meta of up to `limit` commits folded, and last pushed, before a time; their count.
+        """Drop the evidence and the meta of up to `limit` commits folded, and last pushed, before an age; their count.
 
         Not of those that a pending commit retracts. Cells note the newest entry that this concerns (`gone_seq`).
         """
@@ -328,6 +334,10 @@ class Store(Protocol):
 
     def branches(self, row: MapRow) -> list[Branch]:
         """All branches, by name."""
+        ...
+
+    def keep_age(self) -> None:
+        """Keep the age of the store, for the next start; may be written later."""
         ...
 
     def audit(self, what: str, detail: str) -> None:

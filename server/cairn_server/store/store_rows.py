@@ -203,8 +203,8 @@ class Backlog:
 
     map: str
     commits: int
-    oldest_s: float | None
-    """Time of the oldest one's arrival, UTC seconds; None without any."""
+    waited_s: float | None
+    """Seconds for which the oldest one has waited while a server ran; None without any."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -240,6 +240,10 @@ class Token:
     created_s: float
     expires_s: float | None
     last_used_s: float | None = None
+    created_age_s: float = field(default=0.0, compare=False)
+    """Age of the store when it was made; set by the store."""
+    used_age_s: float = field(default=0.0, compare=False)
+    """Age of the store when it was last shown, 0 if it never was; set by the store."""
 
 
 def registration_name(map_name: str, robot: str) -> str:

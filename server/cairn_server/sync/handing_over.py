@@ -7,7 +7,6 @@ retracts, prior data) are signed by the server that hands them out, and accepted
 
 import hashlib
 import math
-import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
@@ -17,6 +16,7 @@ from cairn_map.commits.signature import Signature, SigningKey, signatures_to_tex
 from cairn_map.errors import ConflictError, DeniedError, NotFoundError
 from cairn_server.access.auth import Caller, Role
 from cairn_server.store.store import Store
+from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.retracting import seal_of
 
@@ -94,8 +94,9 @@ def found_commit(store: Store, row: MapRow, id_text: str) -> FoundCommit:
 class UpstreamProgress:
     """Progress of handing this server's commits to its upstream server, for all maps; called from many threads."""
 
-    def __init__(self, *, is_joined: bool) -> None:
-        """`is_joined`: True if the server has an upstream server."""
+    def __init__(self, age: StoreAge, *, is_joined: bool) -> None:
+        """Args: age: of the server's store. is_joined: True if the server has an upstream server."""
+        self._age = age
         self._is_joined = is_joined
         self._handed_over_s: dict[str, float] = {}
         self._wake_relay: Callable[[], None] = lambda: None
@@ -109,14 +110,14 @@ class UpstreamProgress:
         self._wake_relay()
 
     def handed_over(self, map_name: str, begun_s: float) -> None:
-        """Note that all of a map's commits as of this time (UTC seconds) that can travel are on the upstream."""
+        """Note that all of a map's commits as of this age of the store that can travel are on the upstream."""
         self._handed_over_s[map_name] = begun_s
 
     def ages_s(self) -> dict[str, float]:
         """Seconds since all of a map was handed to the upstream server, by the map's name."""
-        now_s = time.time()
-        return {name: max(0.0, now_s - begun_s) for name, begun_s in list(self._handed_over_s.items())}
+        now_s = self._age.now_s()
+        return {name: now_s - begun_s for name, begun_s in list(self._handed_over_s.items())}
 
     def may_forget_s(self, map_name: str) -> float:
-        """UTC seconds before which evidence is on the upstream, too, and may be dropped; infinite without one."""
+        """Age of the store before which evidence is on the upstream, too, and may go; infinite without one."""
         return self._handed_over_s.get(map_name, -math.inf) if self._is_joined else math.inf

@@ -1,7 +1,6 @@
 """Answers about the state of main: replies to fetch-missing, the cell index, the version vector at a cursor."""
 
 import threading
-import time
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, commit_id_from_text
@@ -16,6 +15,7 @@ from cairn_server.folding.read_cache import ReadCache
 from cairn_server.live.hub import Hub
 from cairn_server.metrics import ServerFigures
 from cairn_server.store.store import Snapshot, Store
+from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.held_commits import WantedCommits
 from cairn_server.sync.missing import CellFrames, HeaderFacts, header_of, query_of, reply_frames
@@ -29,7 +29,9 @@ KEEP_S = 10.0
 class StableVectors:
     """Commits that no restore can lose any more, of all maps: those folded longer ago than a setting; thread-safe."""
 
-    def __init__(self, after_s: float) -> None:
+    def __init__(self, age: StoreAge, after_s: float) -> None:
+        """Args: age: of the store. after_s: age since its folding at which a commit is stable."""
+        self._age = age
         self._after_s = after_s
         self._keep_s = min(KEEP_S, after_s)
         self._lock = threading.Lock()
@@ -38,7 +40,7 @@ class StableVectors:
     def of(self, row: MapRow, snapshot: Snapshot) -> VersionVector:
         """Stable vector of the map in this snapshot, at most `KEEP_S` old."""
         # Many robots ask at once, and only one of them has the log read: the others wait for its result.
-        now_s = time.time()
+        now_s = self._age.now_s()
         with self._lock:
             made_s, vector = self._kept.get(row.number, (float("-inf"), EMPTY))
             if now_s - made_s < self._keep_s and made_s <= now_s:

@@ -160,7 +160,7 @@ def test_a_silent_robots_token_ends_and_another_registration_gives_a_new_one(tmp
         live.service.store.tokens.all()
         live.service.store._writer.run(  # type: ignore[attr-defined]
             lambda c: c.execute(
-                "UPDATE token SET created_s = created_s - 61, last_used_s = last_used_s - 61"
+                "UPDATE token SET created_age_s = created_age_s - 61, used_age_s = used_age_s - 61"
             ).fetchall()
         )
         live.service.store.tokens.forget_known()  # type: ignore[attr-defined]
@@ -179,8 +179,9 @@ def test_only_robots_tokens_without_an_end_of_their_own_end_by_silence() -> None
             created_s=0.0,
             expires_s=expires_s,
             last_used_s=50.0,
+            used_age_s=50.0,
         )  # type: ignore[arg-type]
-        return auth.has_ended(token, Settings(branch_expiry_s=expiry_s), now_s=200.0)
+        return auth.has_ended(token, Settings(branch_expiry_s=expiry_s), now_s=200.0, age_s=200.0)
 
     assert ended("robot", None, 100)
     assert not ended("robot", None, 160)

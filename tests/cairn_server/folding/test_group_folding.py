@@ -73,7 +73,7 @@ def test_commits_elsewhere_are_folded_and_those_in_the_damaged_cell_wait_until_i
     assert read({KEYS[2]: live.http.get(cell_path(row, KEYS[2])).content}) == {KEYS[2]: elsewhere[KEYS[2]]}
     assert live.http.get(cell_path(row, BROKEN)).status_code == 500
     assert live.service.readiness._folds.damaged() == {row.name}
-    damage(live, "UPDATE commits SET received_s = 0 WHERE folded_seq IS NULL")
+    damage(live, "UPDATE commits SET received_age_s = -1e9 WHERE folded_seq IS NULL")
     assert live.http.get("/readyz").status_code == 200  # however long they wait
     heal(live, row, whole)
     assert live.cells(row) == cells_of_a_sound_map(live, [*BASE, *commits])

@@ -78,7 +78,7 @@ def test_a_map_with_a_damaged_cell_does_not_take_the_server_away_from_the_others
     monkeypatch.setattr(group_folding, "fold_around", raising(DamagedDataError("damaged_store", "one cell")))
     live.push(row, pushed(0, 0))
     until(lambda: row.name in live.service.readiness._folds.damaged(), "the fold failed")
-    store_of(live)._writer.run(lambda c: c.execute("UPDATE commits SET received_s = 0").fetchall())
+    store_of(live)._writer.run(lambda c: c.execute("UPDATE commits SET received_age_s = -1e9").fetchall())
     assert reasons(live) == ""
 
 
@@ -88,7 +88,9 @@ def test_a_commit_that_waits_too_long_makes_it_not_ready(live: Live, monkeypatch
     live.push(row, pushed(0, 0))
     assert reasons(live) == ""
     store_of(live)._writer.run(
-        lambda c: c.execute("UPDATE commits SET received_s = received_s - 60 WHERE folded_seq IS NULL").fetchall()
+        lambda c: c.execute(
+            "UPDATE commits SET received_age_s = received_age_s - 60 WHERE folded_seq IS NULL"
+        ).fetchall()
     )
     assert reasons(live).startswith("fold_lag: a commit has waited for 6")
 

@@ -148,8 +148,10 @@ def test_one_job_that_fails_does_not_take_its_group_with_it(fresh: SqliteStore) 
     row, _ = fresh.create_map("lab", SMALL, SensorModel())
     gate = threading.Event()
     blocked = fresh._writer.submit(lambda _: gate.wait(60))
-    jobs = [fresh._writer.submit(partial(append_commit, row=row, commit=new_of(pushed(n, n)))) for n in (0, 1)]
-    bad = fresh._writer.submit(partial(append_commit, row=row, commit=new_of(pushed(0, 5))))
+    jobs = [
+        fresh._writer.submit(partial(append_commit, row=row, age_s=0.0, commit=new_of(pushed(n, n)))) for n in (0, 1)
+    ]
+    bad = fresh._writer.submit(partial(append_commit, row=row, age_s=0.0, commit=new_of(pushed(0, 5))))
     gate.set()
     assert blocked.result()
     assert [job.result() for job in jobs] == [True, True]

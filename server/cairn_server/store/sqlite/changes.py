@@ -15,8 +15,8 @@ from cairn_server.store.sqlite.writer import first
 from cairn_server.store.store_rows import Fold, MapRow, NewCommit
 
 
-def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit) -> bool:
-    """Keep a commit; False if the same one is kept already."""
+def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit, *, age_s: float) -> bool:
+    """Keep a commit at an age of the store; False if the same one is kept already."""
     key = (row.number, *commit.id.author, commit.id.n)
     query = "SELECT number, sha, damaged, gone FROM commits WHERE map = ? AND robot = ? AND incarnation = ? AND n = ?"
     known = first(connection, query, key)
@@ -27,7 +27,7 @@ def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit) -
         if damaged is not None:
             _repair(connection, number, commit)
         elif gone and not is_retracted(connection, row, commit.id):
-            remember_evidence(connection, number, commit)
+            remember_evidence(connection, number, commit, age_s=age_s)
             _insert_diff(connection, number, commit)
         return damaged is not None
     check_kept(connection, row, commit.retracts)
@@ -35,8 +35,8 @@ def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit) -
     _note_tops(connection, row, commit.tops)
     connection.execute(
         "INSERT INTO commits (map, robot, incarnation, n, sha, size_bytes, cells, meta, captured_first_s,"
-        " captured_last_s, retracts, received_s, rig, signatures, via)"
-        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        " captured_last_s, retracts, received_s, received_age_s, rig, signatures, via)"
+        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         (
             *key,
             commit.sha,
@@ -46,6 +46,7 @@ def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit) -
             *(commit.captured_s or (None, None)),
             " ".join(map(str, commit.retracts)),
             time.time(),
+            age_s,
             commit.rig,
             commit.signatures,
             commit.via,
@@ -61,8 +62,8 @@ def next_number(connection: apsw.Connection, row: MapRow, author: tuple[str, str
     return int(first(connection, query, (row.number, *author)) or 0)
 
 
-def write_fold(connection: apsw.Connection, row: MapRow, fold: Fold) -> bool:
-    """Cells, entries and head, if the head is still the fold's base."""
+def write_fold(connection: apsw.Connection, row: MapRow, fold: Fold, *, age_s: float) -> bool:
+    """Cells, entries and head at an age of the store, if the head is still the fold's base."""
     head = first(connection, "SELECT seq, chain FROM map WHERE number = ?", (row.number,))
     if head != (fold.base.seq, fold.base.chain):
         return False
@@ -70,7 +71,6 @@ def write_fold(connection: apsw.Connection, row: MapRow, fold: Fold) -> bool:
         "UPDATE map SET seq = ?, chain = ?, vector = ? WHERE number = ?",
         (fold.head.seq, fold.head.chain, json.dumps(fold.vector.to_json()), row.number),
     )
-    now_s = time.time()
     for seq, entry in enumerate(fold.entries, start=fold.base.seq + 1):
         connection.execute(
             "INSERT INTO log (map, seq, kind, commit_number, chain) VALUES (?, ?, ?, ?, ?)",
@@ -81,10 +81,10 @@ def write_fold(connection: apsw.Connection, row: MapRow, fold: Fold) -> bool:
             (row.number, seq, entry.commit),
         )
         connection.execute(
-            "UPDATE commits SET folded_seq = ?, folded_s = ? WHERE number = ? AND folded_seq IS NULL"
+            "UPDATE commits SET folded_seq = ?, folded_age_s = ? WHERE number = ? AND folded_seq IS NULL"
             if entry.kind == ENTRY_FOLD
             else "UPDATE commits SET unfolded_seq = ? WHERE number = ?",
-            (seq, now_s, entry.commit) if entry.kind == ENTRY_FOLD else (seq, entry.commit),
+            (seq, age_s, entry.commit) if entry.kind == ENTRY_FOLD else (seq, entry.commit),
         )
     connection.executemany(
         "INSERT INTO retracted (map, id) VALUES (?, ?)", [(row.number, str(target)) for target in fold.retracted]

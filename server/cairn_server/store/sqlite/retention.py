@@ -14,8 +14,8 @@ from cairn_server.store.sqlite.writer import first, rows
 from cairn_server.store.store_rows import MapRow, NewCommit
 
 
-def forget_evidence(connection: apsw.Connection, row: MapRow, before_s: float, limit: int) -> int:
-    """Drop the evidence of commits folded, and last pushed, before a time; how many.
+def forget_evidence(connection: apsw.Connection, row: MapRow, before_s: float, limit: int, *, age_s: float) -> int:
+    """Drop the evidence of commits folded, and last pushed, before an age of the store (now `age_s`); how many.
 
     What was pushed again and is not taken out stays for `AGAIN_KEPT_S` at least: a retract may need it.
     """
@@ -23,10 +23,10 @@ def forget_evidence(connection: apsw.Connection, row: MapRow, before_s: float, l
     found = rows(
         connection,
         "SELECT number, folded_seq, unfolded_seq, robot || '.' || incarnation || '.' || n FROM commits"
-        " WHERE map = ? AND gone = 0 AND cells > 0 AND folded_seq IS NOT NULL AND folded_s < ?"
-        " AND received_s < CASE WHEN received_s > folded_s AND coalesce(unfolded_seq, 0) = 0 THEN ? ELSE ? END"
-        " ORDER BY folded_s LIMIT ?",
-        (row.number, before_s, min(before_s, time.time() - AGAIN_KEPT_S), before_s, limit + len(pinned)),
+        " WHERE map = ? AND gone = 0 AND cells > 0 AND folded_seq IS NOT NULL AND folded_age_s < ?"
+        " AND received_age_s < CASE WHEN received_age_s > folded_age_s AND coalesce(unfolded_seq, 0) = 0"
+        " THEN ? ELSE ? END ORDER BY folded_age_s LIMIT ?",
+        (row.number, before_s, min(before_s, age_s - AGAIN_KEPT_S), before_s, limit + len(pinned)),
     )
     gone = [(number, *seqs) for number, *seqs, commit in found if commit not in pinned][:limit]
     for number, folded_seq, unfolded_seq in gone:
@@ -45,10 +45,11 @@ def forget_evidence(connection: apsw.Connection, row: MapRow, before_s: float, l
     return len(gone)
 
 
-def remember_evidence(connection: apsw.Connection, number: int, commit: NewCommit) -> None:
+def remember_evidence(connection: apsw.Connection, number: int, commit: NewCommit, *, age_s: float) -> None:
     """Keep the evidence of a commit that was pushed again; it can be retracted for as long as after the first push."""
     connection.execute(
-        "UPDATE commits SET gone = 0, meta = ?, received_s = ? WHERE number = ?", (commit.text, time.time(), number)
+        "UPDATE commits SET gone = 0, meta = ?, received_s = ?, received_age_s = ? WHERE number = ?",
+        (commit.text, time.time(), age_s, number),
     )
 
 

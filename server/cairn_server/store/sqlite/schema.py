@@ -180,7 +180,22 @@ CREATE INDEX cell_listed ON cell (map, cell, lm, digest, fingerprint, voxels, si
 DROP INDEX cell_changed;
 """
 
-STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS, RECEIVED, SIGNED, HOTTEST)
+AGES = """
+CREATE TABLE age (age_s REAL NOT NULL, wall_s REAL NOT NULL);       -- one row: `store_age.AgeMark`
+INSERT INTO age VALUES (0, 0);
+-- Ages of the store. Times of day in older stores may have jumped and prove nothing, so what is there counts from now.
+ALTER TABLE commits ADD COLUMN received_age_s REAL NOT NULL DEFAULT 0;      -- when it came, or came again
+ALTER TABLE commits ADD COLUMN folded_age_s REAL NOT NULL DEFAULT 0;        -- folded_s is NULL from now on
+UPDATE commits SET received_age_s = 1e-3 WHERE received_s > folded_s;       -- came again: after it was folded
+ALTER TABLE token ADD COLUMN created_age_s REAL NOT NULL DEFAULT 0;
+ALTER TABLE token ADD COLUMN used_age_s REAL NOT NULL DEFAULT 0;
+DROP INDEX commits_folded;
+CREATE INDEX commits_folded ON commits (map, folded_age_s) WHERE folded_seq IS NOT NULL;
+DROP INDEX commits_kept;
+CREATE INDEX commits_kept ON commits (map, folded_age_s) WHERE gone = 0 AND cells > 0 AND folded_seq IS NOT NULL;
+"""
+
+STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS, RECEIVED, SIGNED, HOTTEST, AGES)
 
 
 def ensure_schema(connection: apsw.Connection) -> None:

@@ -130,12 +130,12 @@ class SqliteSnapshot:
         )
         return _vector(found)
 
-    def folded_before(self, time_s: float) -> VersionVector:
-        """Commits folded before a time."""
+    def folded_before(self, age_s: float) -> VersionVector:
+        """Commits folded before an age of the store."""
         found = rows(
             self._connection,
-            "SELECT robot, incarnation, n FROM commits WHERE map = ? AND folded_s < ? AND folded_seq IS NOT NULL",
-            (self._map, time_s),
+            "SELECT robot, incarnation, n FROM commits WHERE map = ? AND folded_age_s < ? AND folded_seq IS NOT NULL",
+            (self._map, age_s),
         )
         return _vector(found)
 

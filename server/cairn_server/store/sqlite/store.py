@@ -34,6 +34,7 @@ from cairn_server.store.sqlite.tokens import (
     write_audit,
 )
 from cairn_server.store.sqlite.writer import Writer, connect, first, rows
+from cairn_server.store.store_age import CLOCKS, AgeMark, Clocks, StoreAge
 from cairn_server.store.store_rows import (
     Backlog,
     Branch,
@@ -60,8 +61,8 @@ FILE_NAME = "cairn.sqlite"
 class SqliteStore(SqliteReads):
     """`store.Store` in a folder."""
 
-    def __init__(self, folder: Path) -> None:
-        """Open or make the store.
+    def __init__(self, folder: Path, clocks: Clocks = CLOCKS) -> None:
+        """Open or make the store, whose age goes on by these clocks.
 
         Raises:
             ConflictError: kind `store_in_use`: another server works on it.
@@ -81,10 +82,12 @@ class SqliteStore(SqliteReads):
             raise
         super().__init__(Readers(path))
         self._seen = LastSeen()
-        self.tokens = SqliteTokens(self._writer, self._readers)
+        with self._readers.reading() as reader:
+            self.age = StoreAge(AgeMark(*first(reader, "SELECT age_s, wall_s FROM age")), clocks)
+        self.tokens = SqliteTokens(self._writer, self._readers, self.age)
         self.uses = SqliteUses(self._readers)
         self.audit_log = SqliteAuditLog(self._writer, self._readers)
-        self.health = SqliteHealth(path, self._writer, self._readers)
+        self.health = SqliteHealth(path, self._writer, self._readers, self.age)
         self._maps: dict[str, MapRow] = {}  # which never change
         self.notes = SqliteBranchNotes(self._writer, self._readers)
 
@@ -134,25 +137,27 @@ class SqliteStore(SqliteReads):
 
     def submit(self, row: MapRow, commit: NewCommit) -> Future[bool]:
         """Keep a commit, as `append` does; durable once the answer is there."""
-        return self._writer.submit(lambda connection: append_commit(connection, row, commit))
+        return self._writer.submit(lambda connection: append_commit(connection, row, commit, age_s=self.age.now_s()))
 
     def append_built(self, row: MapRow, author: Author, build: Callable[[int], NewCommit]) -> NewCommit:
         """Keep a commit that `build(n)` makes for the author's next number n."""
 
         def job(connection: apsw.Connection) -> NewCommit:
             commit = build(next_number(connection, row, author))
-            append_commit(connection, row, commit)
+            append_commit(connection, row, commit, age_s=self.age.now_s())
             return commit
 
         return self._writer.run(job)
 
     def forget_evidence(self, row: MapRow, *, before_s: float, limit: int) -> int:
-        """Drop the evidence and the meta of up to `limit` commits folded, and last pushed, before a time; how many."""
-        return self._writer.run(lambda connection: forget_evidence(connection, row, before_s, limit))
+        """Drop the evidence and the meta of up to `limit` commits folded, and last pushed, before an age; how many."""
+        return self._writer.run(
+            lambda connection: forget_evidence(connection, row, before_s, limit, age_s=self.age.now_s())
+        )
 
     def fold(self, row: MapRow, fold: Fold) -> bool:
         """Write a fold if the head is still its base; False (and nothing written) otherwise."""
-        return self._writer.run(lambda connection: write_fold(connection, row, fold))
+        return self._writer.run(lambda connection: write_fold(connection, row, fold, age_s=self.age.now_s()))
 
     def register(self, row: MapRow, branch: Branch, token_hash: bytes) -> None:
         """Make a branch, or give an existing one a new token."""
@@ -171,7 +176,7 @@ class SqliteStore(SqliteReads):
                 " incarnation = excluded.incarnation",
                 values,
             )
-            put_registration(connection, row, branch.name, token_hash)
+            put_registration(connection, row, branch.name, token_hash, age_s=self.age.now_s())
 
         self._writer.run(job)
         self.tokens.forget_known()
@@ -217,6 +222,14 @@ class SqliteStore(SqliteReads):
             for name, mode, sensors, cursor, seen_s, born in found
         ]
 
+    def keep_age(self) -> None:
+        """Keep the age of the store, for the next start; may be written later."""
+        mark = self.age.mark()
+        with suppress(UnreachableError):  # the next one comes soon, and a start goes on from the last one
+            self._writer.submit(
+                lambda connection: rows(connection, "UPDATE age SET age_s = ?, wall_s = ?", (mark.age_s, mark.wall_s))
+            )
+
     def audit(self, what: str, detail: str) -> None:
         """Note something that an administrator may have to look into; may be written later."""
         log.warning("%s: %r", what, detail)
@@ -228,6 +241,7 @@ class SqliteStore(SqliteReads):
         with suppress(UnreachableError):  # closed before
             self._write_seen()
             self.tokens.write_used()
+            self.keep_age()
         try:
             self._writer.close()
             self._readers.close()
@@ -267,21 +281,27 @@ class SqliteUses:
 class SqliteHealth:
     """`store.StoreHealth` over the writer and the readers of one file."""
 
-    def __init__(self, path: Path, writer: Writer, readers: Readers) -> None:
+    def __init__(self, path: Path, writer: Writer, readers: Readers, age: StoreAge) -> None:
         self._path = path
         self._writer = writer
         self._readers = readers
+        self._age = age
 
     def backlogs(self) -> list[Backlog]:
         """Commits of every map that are not folded yet."""
         # Both go along the index of what is pending: a folded log of any length costs nothing.
         query = (
             "SELECT name, (SELECT count(*) FROM commits WHERE map = map.number AND folded_seq IS NULL"
-            " AND damaged IS NULL), (SELECT received_s FROM commits WHERE map = map.number AND folded_seq IS NULL"
+            " AND damaged IS NULL), (SELECT received_age_s FROM commits WHERE map = map.number AND folded_seq IS NULL"
             " AND damaged IS NULL ORDER BY number LIMIT 1) FROM map ORDER BY map.number LIMIT ?"
         )
         with self._readers.reading() as reader:
-            return [Backlog(name, count, oldest_s) for name, count, oldest_s in rows(reader, query, (MAPS_MAX,))]
+            found = rows(reader, query, (MAPS_MAX,))
+        now_s = self._age.now_s()
+        return [
+            Backlog(name, count, None if oldest_s is None else max(0.0, now_s - oldest_s))
+            for name, count, oldest_s in found
+        ]
 
     def figures(self) -> StoreFigures:
         """Sizes and counts."""

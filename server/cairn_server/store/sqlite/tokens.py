@@ -12,6 +12,7 @@ from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
 from cairn_map.wire.access_messages import AuditEntry, audit_chain
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.writer import Writer, first, rows
+from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_rows import MapRow, Token, registration_name
 
 log = logging.getLogger(__name__)
@@ -22,7 +23,8 @@ KNOWN_S, KNOWN_MAX = 1.0, 4096
 """Time for which a found token is not looked up again, and most such tokens; robots show one with each push."""
 AUDIT_ROWS_MAX = 100_000
 _SELECT = (
-    "SELECT t.name, t.role, t.map, m.name, t.robot, t.created_s, t.expires_s, t.last_used_s"
+    "SELECT t.name, t.role, t.map, m.name, t.robot, t.created_s, t.expires_s, t.last_used_s, t.created_age_s,"
+    " t.used_age_s"
     " FROM token t LEFT JOIN map m ON m.number = t.map"
 )
 
@@ -30,11 +32,13 @@ _SELECT = (
 class SqliteTokens:
     """`store.Tokens`."""
 
-    def __init__(self, writer: Writer, readers: Readers) -> None:
+    def __init__(self, writer: Writer, readers: Readers, age: StoreAge) -> None:
         self._writer = writer
         self._readers = readers
+        self._age = age
         self._lock = threading.Lock()
-        self._used: dict[str, float] = {}
+        self._used: dict[str, tuple[float, float]] = {}
+        """By name: time and age of the store when the token was shown last."""
         self._written_s = float("-inf")
         self._known: dict[bytes, tuple[Token, float]] = {}
 
@@ -49,7 +53,8 @@ class SqliteTokens:
             if first(connection, "SELECT 1 FROM token WHERE name = ?", (token.name,)):
                 raise ConflictError("token_exists", f"a token {token.name!r} exists; rotate it, or take another name")
             connection.execute(
-                "INSERT INTO token (name, role, map, robot, hash, created_s, expires_s) VALUES (?, ?, ?, ?, ?, ?, ?)",
+                "INSERT INTO token (name, role, map, robot, hash, created_s, expires_s, created_age_s)"
+                " VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
                 (
                     token.name,
                     token.role,
@@ -58,6 +63,7 @@ class SqliteTokens:
                     secret_hash,
                     token.created_s,
                     token.expires_s,
+                    self._age.now_s(),
                 ),
             )
 
@@ -110,7 +116,7 @@ class SqliteTokens:
     def used(self, name: str) -> None:
         """Note that a token was shown just now; written some seconds later."""
         with self._lock:
-            self._used[name] = time.time()
+            self._used[name] = time.time(), self._age.now_s()
             if time.monotonic() - self._written_s < USED_EVERY_S:
                 return
         with suppress(UnreachableError):  # it is only a note
@@ -124,10 +130,10 @@ class SqliteTokens:
         with self._lock:
             noted, self._used = self._used, {}
             self._written_s = time.monotonic()
-        values = [(used_s, name) for name, used_s in noted.items()]
+        values = [(*used, name) for name, used in noted.items()]
         return self._writer.submit(
             lambda connection: connection.executemany(
-                "UPDATE token SET last_used_s = ? WHERE name = ?", values
+                "UPDATE token SET last_used_s = ?, used_age_s = ? WHERE name = ?", values
             ).fetchall()
         )
 
@@ -167,13 +173,13 @@ def write_audit(connection: apsw.Connection, who: str, what: str, detail: str) -
     connection.execute("DELETE FROM audit WHERE number <= ?", (number - AUDIT_ROWS_MAX,))
 
 
-def put_registration(connection: apsw.Connection, row: MapRow, robot: str, secret_hash: bytes) -> None:
+def put_registration(connection: apsw.Connection, row: MapRow, robot: str, secret_hash: bytes, *, age_s: float) -> None:
     """The token of a registration, inside its transaction; the one of an earlier registration is worth nothing then."""
     connection.execute(
-        "INSERT INTO token (name, role, map, robot, hash, created_s) VALUES (?, 'robot', ?, ?, ?, ?)"
+        "INSERT INTO token (name, role, map, robot, hash, created_s, created_age_s) VALUES (?, 'robot', ?, ?, ?, ?, ?)"
         " ON CONFLICT (name) DO UPDATE SET hash = excluded.hash, created_s = excluded.created_s,"
-        " expires_s = NULL, last_used_s = NULL",
-        (registration_name(row.name, robot), row.number, robot, secret_hash, time.time()),
+        " created_age_s = excluded.created_age_s, expires_s = NULL, last_used_s = NULL, used_age_s = 0",
+        (registration_name(row.name, robot), row.number, robot, secret_hash, time.time(), age_s),
     )
 
 
@@ -183,7 +189,7 @@ def remove_tokens_of(connection: apsw.Connection, row: MapRow, robot: str) -> No
 
 
 def _token(columns: tuple[Any, ...]) -> Token:
-    name, role, number, map_name, robot, created_s, expires_s, last_used_s = columns
+    name, role, number, map_name, robot, created_s, expires_s, last_used_s, created_age_s, used_age_s = columns
     return Token(
         name=name,
         role=role,
@@ -193,6 +199,8 @@ def _token(columns: tuple[Any, ...]) -> Token:
         created_s=created_s,
         expires_s=expires_s,
         last_used_s=last_used_s,
+        created_age_s=created_age_s,
+        used_age_s=used_age_s,
     )
 
 
