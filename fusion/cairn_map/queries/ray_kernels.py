@@ -70,6 +70,9 @@ def cast_into(
     start, voxel = np.empty(3), np.empty(3, np.int64)
     for n in range(origins.shape[0]):
         inside &= is_within(origins, n, reach_m)
+        # The caller refuses all rays if one begins outside; and from NaN a walk might never come to an end.
+        if not inside:
+            break
         for axis in range(3):
             start[axis] = np.rint(origins[n, axis] * NANOMETRES) / grid.edge_nm
             voxel[axis] = voxel_of(origins[n, axis], grid.edge_nm)

@@ -103,6 +103,9 @@ def see_into(
                 + T_map_camera[axis, 1] * rays[n, 1]
                 + T_map_camera[axis, 2] * rays[n, 2]
             )
+        # A pixel that looks nowhere: no comparison with NaN ends a walk, so none may begin.
+        if np.isnan(direction[0] + direction[1] + direction[2]):
+            continue
         at = float(starts[n])
         for axis in range(3):
             voxel[axis] = int(np.floor(start[axis] + at * direction[axis]))

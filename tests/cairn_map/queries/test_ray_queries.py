@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from tests.fixtures.bounded import result_within
 from tests.fixtures.map.made import MIDDLE, PLAIN
 from tests.fixtures.map.worlds import random_map, random_points, snapshot_with, world_of
 from tests.naive import queries as naive
@@ -160,6 +161,19 @@ def test_rays_that_are_none_are_refused(
     with pytest.raises(BadInputError) as refused:
         snapshot_with(PLAIN, WALL).cast_rays([origin], [direction], max_range_m=max_range_m)
     assert refused.value.kind == kind
+
+
+@pytest.mark.parametrize("ends_in_unknown", [False, True])
+@pytest.mark.parametrize("origin", [[math.nan, 0, 0], [math.nan] * 3, [math.inf, 0, 0]])
+def test_no_walk_begins_at_an_origin_that_is_none(origin: list[float], ends_in_unknown: bool) -> None:
+    snapshot = snapshot_with(PLAIN, WALL)
+    origins, directions = [[0, 0, 0], origin, [0, 0, 0]], [[1, 1, 1]] * 3
+    with pytest.raises(BadInputError) as refused:
+        result_within(
+            20.0,
+            lambda: snapshot.cast_rays(origins, directions, max_range_m=math.inf, ends_in_unknown=ends_in_unknown),
+        )
+    assert refused.value.kind == "point_range"
 
 
 def test_as_many_directions_as_origins() -> None:

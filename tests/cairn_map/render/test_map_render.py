@@ -1,8 +1,11 @@
 """Rendered maps against twins that cut every ray with every voxel; and the readings of pixels."""
 
+from functools import partial
+
 import numpy as np
 import numpy.typing as npt
 import pytest
+from tests.fixtures.bounded import result_within
 from tests.fixtures.map.made import PLAIN, SMALL
 from tests.fixtures.map.worlds import map_of, random_map, snapshot_with
 from tests.naive import sight as naive_sight
@@ -82,6 +85,25 @@ def test_each_pixel_sees_what_cutting_all_voxels_finds(geometry: Geometry, seed:
     assert seen.hit.any()
     assert not seen.hit.all()
     assert not seen.nodes.any()
+
+
+@pytest.mark.parametrize("axes", [[0], [2], [0, 1, 2]])
+@pytest.mark.parametrize("eye_m", [(0.1, 0.1, 0.1), (5, 5, 5)])
+def test_a_pixel_without_a_ray_sees_nothing_and_the_others_see_what_they_saw(
+    axes: list[int], eye_m: tuple[float, float, float]
+) -> None:
+    snapshot, renderer, T = snapshot_of(random_map(1, PLAIN)), MapRenderer(), look_at(eye_m, (0, 0, 0))
+    rays = SIGHT.rays.copy()
+    rays[:2, :3, axes] = np.nan  # in a corner: the angle between neighbours in the middle stays
+    there = ~np.isnan(rays).any(axis=2)
+    blind = CameraRays(rays)
+    zeros = np.zeros(there.shape, np.float32)
+    span_m = zeros, zeros + 30
+    for see in (renderer.nearest, renderer.beyond):
+        seen = result_within(20.0, partial(see, snapshot, blind, T, range_max_m=30, between_m=span_m))
+        whole = see(snapshot, SIGHT, T, range_max_m=30, between_m=span_m)
+        assert not seen.hit[~there].any()
+        np.testing.assert_array_equal(seen.range_m[there], whole.range_m[there])
 
 
 def test_what_is_seen_reads_as_the_map_at_that_place() -> None:
