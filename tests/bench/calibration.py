@@ -53,7 +53,7 @@ def calibration_rows(smoke: bool) -> Iterator[Row]:
     cpu = cpu_s(lambda: solve_from(ranged, plan, state, scales), repeats)
     yield "the same with 40 range images", f"{cpu:.2f}", "s of processor time"
     done = solve_from(ranged, plan, state, scales)
-    cpu = cpu_s(lambda: pixel_pattern(ranged, done.adjusted, done.covariance), repeats)
+    cpu = cpu_s(lambda: pixel_pattern(ranged, done.adjustment, done.covariance), repeats)
     yield "offsets of its 176 x 144 pixels, by all on boards", f"{cpu:.2f}", "s of processor time"
     whole = cpu_s(lambda: solve_rig(views, plan), repeats)
     yield "all stages, 5 cameras x 40 frames, from corners alone", f"{whole:.2f}", "s of processor time"

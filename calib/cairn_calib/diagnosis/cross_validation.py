@@ -81,7 +81,7 @@ def _half(solution: Solution, frames: Sequence[str]) -> Solution:
     state = replace(solution.state, T_rig_board=solution.state.T_rig_board[rows])
     scales = {
         solution.views.cameras[sensor.data.camera]: sensor.scale
-        for sensor in solution.adjusted.problem.sensors
+        for sensor in solution.adjustment.problem.sensors
         if isinstance(sensor.data, CornerData)
     }
     terms = None if solution.ranges is None else solution.ranges.terms

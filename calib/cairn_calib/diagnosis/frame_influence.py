@@ -50,7 +50,7 @@ def frame_shares(blocks: list[Block], size: int, frame_count: int, *, floor: flo
 
 def influences(solution: Solution, probes: list[Probes]) -> list[Influence]:
     """Influence of every frame, the strongest first; infinite for frames without which nothing is determined."""
-    done = solution.adjusted
+    done = solution.adjustment
     S, _, _, _ = done.normal.reduce()
     shares, pulls = frame_shares(done.blocks, solution.layout.size, len(solution.views.frames))
     sigmas = [each.sigmas_px(solution.covariance) for each in probes]

@@ -56,7 +56,7 @@ def next_images(solution: Solution, probes: Sequence[Probes], *, count: int = 3)
     candidates = [each for n in range(len(solution.plan.cameras)) for each in _candidates(solution, n)]
     poses = np.stack([T for _, T in candidates])
     seen, shares = _shares(solution, poses)
-    S, _, _, _ = solution.adjusted.normal.reduce()
+    S, _, _, _ = solution.adjustment.normal.reduce()
     noise = _noise_px(solution)
     # Rows in units of each camera's own noise: a colour pixel is no range camera's pixel.
     target = np.zeros_like(S)
@@ -111,7 +111,7 @@ def _shares(solution: Solution, poses: Floats) -> tuple[Floats, Floats]:
     board = (solution.views.board.points(), warp_shape(solution.views.board))
     p_rig = board_points(state, *board) @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
     blocks, seen = [], np.zeros((len(poses), len(state.lenses)))
-    for sensor in solution.adjusted.problem.sensors:
+    for sensor in solution.adjustment.problem.sensors:
         if not isinstance(sensor.data, CornerData):
             continue
         c = sensor.data.camera
@@ -135,6 +135,6 @@ def _shares(solution: Solution, poses: Floats) -> tuple[Floats, Floats]:
 def _noise_px(solution: Solution) -> dict[str, float]:
     return {
         solution.views.cameras[sensor.data.camera]: sensor.scale * sensor.data.sigma_px
-        for sensor in solution.adjusted.problem.sensors
+        for sensor in solution.adjustment.problem.sensors
         if isinstance(sensor.data, CornerData)
     }

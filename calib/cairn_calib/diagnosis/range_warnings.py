@@ -54,7 +54,7 @@ def _of_other_ranges(name: str, solution: Solution) -> Iterator[SolveWarning]:
     used, values = solution.ranges, solution.values()
     if used is None:
         return
-    noise_m = solution.adjusted.problem.sensors[-1].scale * used.sigma_m
+    noise_m = solution.adjustment.problem.sensors[-1].scale * used.sigma_m
     if noise_m > NOISE_M:
         text = "ranges miss the boards by far more than noise: are their images of other places of the board?"
         yield SolveWarning("range_noise", name, noise_m, NOISE_M, "m", text)

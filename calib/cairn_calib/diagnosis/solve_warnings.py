@@ -123,7 +123,7 @@ def _of_coverage(seen: Coverage, solution: Solution) -> Iterator[SolveWarning]:
 def _of_priors(solution: Solution) -> Iterator[SolveWarning]:
     sigmas = solution.sigmas()
     ruled: dict[str, list[tuple[float, str]]] = {}
-    for prior in solution.adjusted.problem.priors:
+    for prior in solution.adjustment.problem.priors:
         if len(prior.terms) != 1:
             continue
         owner, name, _ = prior.terms[0]
@@ -141,7 +141,7 @@ def _of_priors(solution: Solution) -> Iterator[SolveWarning]:
 
 def _of_coefficients(solution: Solution) -> Iterator[SolveWarning]:
     values, sigmas = solution.values(), solution.sigmas()
-    assumed = {prior.terms[0][:2] for prior in solution.adjusted.problem.priors}
+    assumed = {prior.terms[0][:2] for prior in solution.adjustment.problem.priors}
     for name, camera in solution.plan.cameras.items():
         # A good lens has a tangential part of 0; `_of_priors` warns about assumed coefficients.
         radial = [each for each in camera.coefficients if each.startswith("k") and (name, each) not in assumed]
@@ -154,7 +154,7 @@ def _of_coefficients(solution: Solution) -> Iterator[SolveWarning]:
 
 
 def _of_noise(solution: Solution) -> Iterator[SolveWarning]:
-    for sensor in solution.adjusted.problem.sensors:
+    for sensor in solution.adjustment.problem.sensors:
         if not isinstance(sensor.data, CornerData):
             continue
         name = solution.views.cameras[sensor.data.camera]
@@ -178,7 +178,7 @@ def _of_discs(solution: Solution) -> Iterator[SolveWarning]:
     board = solution.views.board
     if board.pattern != "chessboard" and board.disc_m is None:
         text = (
-            "the diameter of the discs is unknown: a tilted disc's image has its centroid beside its centre, which "
+            "the diameter of the discs is unknown: a tilted disc's image has its centroid off its centre, which "
             "biases the focal length; find the discs again and say it (cairn calib corners --disc)"
         )
         yield SolveWarning("disc_diameter", "", 0, 1, "known diameters", text)
@@ -191,7 +191,7 @@ def _of_mode(mode: WeakMode) -> Iterator[SolveWarning]:
 
 
 def _of_reversed(solution: Solution) -> Iterator[SolveWarning]:
-    for name, frame in solution.turned:
+    for name, frame in solution.reversed_views:
         text = f"frame {frame} names the corners from the other end and was left out: look at its polarity"
         yield SolveWarning("reversed_order", name, 1, 0, "images", text)
 

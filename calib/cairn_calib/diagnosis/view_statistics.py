@@ -93,7 +93,7 @@ def view_residuals(solution: Solution) -> list[ViewResiduals]:
     """Residuals of every image, by camera and frame."""
     board = (solution.views.board.points(), warp_shape(solution.views.board))
     result = []
-    for sensor in solution.adjusted.problem.sensors:
+    for sensor in solution.adjustment.problem.sensors:
         if not isinstance(sensor.data, CornerData):
             continue
         misses = corner_misses(sensor.data, solution.state, *board)

@@ -30,7 +30,7 @@ class WorldCovariance:
 
 def world_covariance(solution: Solution) -> WorldCovariance:
     """The joint covariance of the cameras and of the world that the boards make."""
-    known, boards = solution.known, solution.state.T_rig_board
+    known, boards = solution.uncertainty, solution.state.T_rig_board
     count, size = len(boards), solution.layout.size
     # Of each board's errors r and t: rho = r, tau = t - r x t_board = t + [t_board]x r; then their mean.
     to_world = np.zeros((count, 6, 6))

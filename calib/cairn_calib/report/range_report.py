@@ -27,7 +27,7 @@ def told_ranges(solution: Solution) -> str:
     used = solution.ranges
     if used is None:
         return ""
-    sensor, values = solution.adjusted.problem.sensors[-1], solution.values()
+    sensor, values = solution.adjustment.problem.sensors[-1], solution.values()
     name = solution.views.cameras[used.camera]
     more = [f", wave {k}" for k in used.terms.harmonics]
     more += [", amplitude"] if used.terms.amplitude_at is not None else []
@@ -43,7 +43,7 @@ def ranges_json(solution: Solution) -> dict[str, object] | None:
     used, spans, found = solution.ranges, solution.spans, solution.pattern
     if used is None or spans is None:
         return None
-    sensor = solution.adjusted.problem.sensors[-1]
+    sensor = solution.adjustment.problem.sensors[-1]
     return {
         "camera": solution.views.cameras[used.camera],
         "parameters": list(used.terms.document_names),

@@ -39,7 +39,7 @@ class RigStart:
     """Cameras and boards in the gauge's frame, and views whose corners are named from the wrong end."""
 
     T_rig_camera: Mapping[str, Transform]
-    turned: tuple[tuple[str, str], ...]
+    reversed_views: tuple[tuple[str, str], ...]
     """(camera, frame)"""
 
 
@@ -49,7 +49,7 @@ class _Edge:
     other: str
     T_one_other: Transform
     weight: float
-    turned: tuple[str, ...]
+    reversed_frames: tuple[str, ...]
     """Frames in which one of both cameras named the corners from the other end."""
 
 
@@ -80,7 +80,7 @@ def rig_start(
                 edges.append(_edge((one, other), common, pairs[0], pairs[1], half_turn(board), weight))
     # Prim's maximum spanning tree from the gauge: of all edges that leave the tree, the heaviest joins it.
     T_rig_camera: dict[str, Transform] = {gauge: np.eye(4)}
-    turned: dict[str, list[_Edge]] = {name: [] for name in names}
+    edges_to: dict[str, list[_Edge]] = {name: [] for name in names}
     while len(T_rig_camera) < len(names):
         open_edges = [edge for edge in edges if (edge.one in T_rig_camera) != (edge.other in T_rig_camera)]
         if not open_edges:
@@ -91,10 +91,11 @@ def rig_start(
         if known not in T_rig_camera:
             known, new, T = best.other, best.one, inverse(best.T_one_other)
         T_rig_camera[new] = T_rig_camera[known] @ T
-        turned[new].append(best)
+        edges_to[new].append(best)
         _refuse_reversed(new, known, best, len(set(poses[new]) & set(poses[known])))
     return RigStart(
-        T_rig_camera, tuple((name, frame) for name, found in turned.items() for edge in found for frame in edge.turned)
+        T_rig_camera,
+        tuple((name, frame) for name, found in edges_to.items() for edge in found for frame in edge.reversed_frames),
     )
 
 
@@ -182,8 +183,8 @@ def _edge(
     mean = np.eye(4)
     mean[:3, :3], mean[:3, 3] = chordal_mean(chosen[:, :3, :3]), np.median(chosen[:, :3, 3], axis=0)
     # Readings 4 to 7 are those with half a turn.
-    turned = tuple(frame for n, frame in enumerate(frames) if agrees[n] and nearest[n] >= 4)
-    return _Edge(*names, mean, weight * max(float(agrees.mean()), 0.01), turned)
+    reversed_frames = tuple(frame for n, frame in enumerate(frames) if agrees[n] and nearest[n] >= 4)
+    return _Edge(*names, mean, weight * max(float(agrees.mean()), 0.01), reversed_frames)
 
 
 def _pose_distances(T: Floats, distance_m: float) -> Floats:
@@ -204,10 +205,10 @@ def _refuse_unconnected(names: Sequence[str], placed: Mapping[str, Transform]) -
 
 
 def _refuse_reversed(new: str, known: str, edge: _Edge, common: int) -> None:
-    if 2 * len(edge.turned) > common:
+    if 2 * len(edge.reversed_frames) > common:
         raise BadInputError(
             "reversed_order",
-            f"{new} and {known} name the board's corners from opposite ends in {len(edge.turned)} of {common} frames: "
-            f"find the corners of one of them again with the other --polarity (a thermal camera that sees printed dark "
-            "bright is reversed)",
+            f"{new} and {known} name the board's corners from opposite ends in {len(edge.reversed_frames)} of {common} "
+            "frames: find the corners of one of them again with the other --polarity (a thermal camera that sees "
+            "printed dark bright is reversed)",
         )

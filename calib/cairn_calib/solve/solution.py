@@ -25,9 +25,9 @@ class Solution:
     views: BoardViews
     """The views that were used."""
     plan: SolvePlan
-    adjusted: Adjustment
-    known: Uncertainty
-    turned: tuple[tuple[str, str], ...] = ()
+    adjustment: Adjustment
+    uncertainty: Uncertainty
+    reversed_views: tuple[tuple[str, str], ...] = ()
     """(camera, frame) of each view that was left out because its corners were named from the wrong end."""
     spans: RangeSpans | None = None
     """Distances and amplitudes that the range images covered; None without range images."""
@@ -37,23 +37,23 @@ class Solution:
     @property
     def ranges(self) -> RangeData | None:
         """Ranges measured on the boards that were used; None without range images."""
-        last = self.adjusted.problem.sensors[-1].data
+        last = self.adjustment.problem.sensors[-1].data
         return last if isinstance(last, RangeData) else None
 
     @property
     def layout(self) -> ParameterLayout:
         """Position of each shared parameter in a step and in `covariance`."""
-        return self.adjusted.problem.layout
+        return self.adjustment.problem.layout
 
     @property
     def state(self) -> RigState:
         """The estimate: lenses, poses, board and range bias."""
-        return self.adjusted.state
+        return self.adjustment.state
 
     @property
     def covariance(self) -> Floats:
         """(P, P) covariance of the shared parameters, in the order of `layout.names`; board poses eliminated."""
-        return self.known.shared
+        return self.uncertainty.shared
 
     def sigmas(self) -> dict[tuple[str, str], float]:
         """Standard deviation of each shared parameter, by owner and name; poses: of the error, rad and m."""

@@ -60,13 +60,13 @@ def solve_rig(views: BoardViews, plan: SolvePlan) -> Solution:
     # 2. Cameras in the gauge's frame; a view counts by its corners.
     weights = {(view.camera, view.frame): float(view.corners.seen.sum()) for view in views.views}
     start = rig_start({name: each.T_camera_board for name, each in alone.items()}, views.board, plan.gauge, weights)
-    views = views.without(start.turned)
+    views = views.without(start.reversed_views)
     # 3. Boards in the gauge's frame.
     state = first_state(views, alone, start.T_rig_camera)
     # 4 to 7. Everything together.
     solution = solve_from(views, plan, state, {name: each.scale for name, each in alone.items()})
     # 8. Each pixel's own offset.
-    return replace(_with_pixels(solution), turned=start.turned)
+    return replace(_with_pixels(solution), reversed_views=start.reversed_views)
 
 
 def solve_from(views: BoardViews, plan: SolvePlan, state: RigState, scales: Mapping[str, float]) -> Solution:
@@ -146,10 +146,10 @@ def _solve_nodes(adjusted: Adjustment, plan: SolvePlan) -> Adjustment:
 
 def _with_pixels(solution: Solution) -> Solution:
     """Stage 8: the solution with each range pixel's own offset, solved on with nodes where these are smooth."""
-    pattern = pixel_pattern(solution.views, solution.adjusted, solution.covariance)
+    pattern = pixel_pattern(solution.views, solution.adjustment, solution.covariance)
     if pattern is not None and pattern.smooth_m >= SMOOTH_M:
-        adjusted = _solve_nodes(solution.adjusted, solution.plan)
-        solution = replace(solution, adjusted=adjusted, known=uncertainty(adjusted.normal))
+        adjusted = _solve_nodes(solution.adjustment, solution.plan)
+        solution = replace(solution, adjustment=adjusted, uncertainty=uncertainty(adjusted.normal))
         pattern = pixel_pattern(solution.views, adjusted, solution.covariance)
     return replace(solution, pattern=pattern)
 

@@ -59,7 +59,7 @@ def statistics_of(solution: Solution) -> Statistics:
     board = (solution.views.board.points(), warp_shape(solution.views.board))
     names = list(solution.plan.cameras)
     count = 0
-    for sensor in solution.adjusted.problem.sensors:
+    for sensor in solution.adjustment.problem.sensors:
         count += int(sensor.kept.sum()) * sensor.axes
         if isinstance(sensor.data, CornerData):
             misses = corner_misses(sensor.data, solution.state, *board)[sensor.kept]
@@ -71,8 +71,8 @@ def statistics_of(solution: Solution) -> Statistics:
                 sigma_px=float(sensor.scale * sensor.data.sigma_px),
             )
     unknown = solution.layout.size + 6 * len(solution.state.T_rig_board)
-    freedom = count + len(solution.adjusted.problem.priors) - unknown
-    return Statistics(chi2=solution.adjusted.normal.cost, degrees_of_freedom=max(freedom, 0), cameras=cameras)
+    freedom = count + len(solution.adjustment.problem.priors) - unknown
+    return Statistics(chi2=solution.adjustment.normal.cost, degrees_of_freedom=max(freedom, 0), cameras=cameras)
 
 
 def _version() -> str:

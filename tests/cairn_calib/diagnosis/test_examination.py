@@ -206,12 +206,12 @@ def test_warnings_name_what_the_images_lack() -> None:
 
 def test_warnings_name_corners_that_do_not_fit(solution: Solution) -> None:
     assert not {"noise", "outliers", "image_outliers"} & {each.kind for each in told_of(solution)}
-    spoilt = solution.adjusted.problem.sensors[1]
+    spoilt = solution.adjustment.problem.sensors[1]
     kept = spoilt.kept.copy()
     kept[2] = False
-    sensors = (solution.adjusted.problem.sensors[0], replace(spoilt, kept=kept, scale=40.0))
-    problem = replace(solution.adjusted.problem, sensors=sensors)
-    told = told_of(replace(solution, adjusted=replace(solution.adjusted, problem=problem)))
+    sensors = (solution.adjustment.problem.sensors[0], replace(spoilt, kept=kept, scale=40.0))
+    problem = replace(solution.adjustment.problem, sensors=sensors)
+    told = told_of(replace(solution, adjustment=replace(solution.adjustment, problem=problem)))
     assert {("noise", "left"), ("outliers", "left"), ("image_outliers", "left")} <= kinds(told)
     image = solution.views.of_camera("left")[2].image
     assert next(each for each in told if each.kind == "image_outliers").text.startswith(f"{image} does not fit")
@@ -235,7 +235,7 @@ def test_a_focal_length_that_is_open_is_refused(solution: Solution) -> None:
     assert at is not None
     covariance = solution.covariance.copy()
     covariance[at, at] = (0.3 * 1330) ** 2
-    open_ = replace(solution, known=replace(solution.known, shared=covariance))
+    open_ = replace(solution, uncertainty=replace(solution.uncertainty, shared=covariance))
     with pytest.raises(BadInputError, match=r"focal length of left open: 13.. px, give or take 30%"):
         refuse_undetermined(open_)
 

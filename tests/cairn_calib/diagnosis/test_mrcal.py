@@ -36,7 +36,7 @@ def test_mrcal_finds_the_same_cameras(solution: Solution, made: str) -> None:
     assert rt_right_left == pytest.approx(reference["rt_right_left"], abs=1e-7)
     assert solution.state.warp_m == pytest.approx(reference["warp_m"], abs=1e-8)
     count = 2 * sum(len(view.corners.pixels) for view in solution.views.views)
-    assert np.sqrt(solution.adjusted.normal.cost / count) == pytest.approx(reference["rms_px"], rel=1e-7)
+    assert np.sqrt(solution.adjustment.normal.cost / count) == pytest.approx(reference["rms_px"], rel=1e-7)
 
 
 def test_mrcal_states_the_same_uncertainty_of_every_pixel(solution: Solution) -> None:

@@ -73,7 +73,7 @@ def test_circular_error_and_dependence_on_amplitude_are_found_within_their_sigma
 
 def test_a_wave_that_is_not_looked_for_spoils_the_rest() -> None:
     solution = solved(ladder(14, bias=BIAS, terms=WAVY), modulation_hz=None)
-    assert 0.01 * solution.adjusted.problem.sensors[-1].scale > 1.3 * 0.005
+    assert 0.01 * solution.adjustment.problem.sensors[-1].scale > 1.3 * 0.005
 
 
 def test_shapes_that_the_images_do_not_determine_are_left_out_and_said() -> None:

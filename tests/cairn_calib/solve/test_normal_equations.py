@@ -45,7 +45,7 @@ def residuals(sensor: Sensor, problem: AdjustmentProblem, state: RigState) -> Fl
 
 
 def test_the_schur_complement_solves_the_whole_system(solution: Solution) -> None:
-    problem = solution.adjusted.problem
+    problem = solution.adjustment.problem
     away = step_state(solution.state, solution.layout, 1e-4 * np.ones(solution.layout.size), np.full((5, 6), 1e-4))
     normal = problem.normal(away, problem.blocks(away))
     H, g = dense(normal)
@@ -59,11 +59,11 @@ def test_the_schur_complement_solves_the_whole_system(solution: Solution) -> Non
 
 
 def test_covariances_are_those_of_the_whole_system(solution: Solution) -> None:
-    H, _ = dense(solution.adjusted.normal)
+    H, _ = dense(solution.adjustment.normal)
     scale = 1 / np.sqrt(np.diag(H))
     whole = np.linalg.inv(H * scale[:, None] * scale) * scale[:, None] * scale
     size = solution.layout.size
-    known = uncertainty(solution.adjusted.normal)
+    known = uncertainty(solution.adjustment.normal)
     sigmas = np.sqrt(np.diag(whole))
     pairs = np.outer(sigmas, sigmas)
     np.testing.assert_allclose(known.shared / pairs[:size, :size], whole[:size, :size] / pairs[:size, :size], atol=1e-6)
@@ -77,7 +77,7 @@ def test_covariances_are_those_of_the_whole_system(solution: Solution) -> None:
 
 
 def test_every_derivative_agrees_with_differences(solution: Solution) -> None:
-    problem, layout = solution.adjusted.problem, solution.layout
+    problem, layout = solution.adjustment.problem, solution.layout
     state, frames = solution.state, len(solution.state.T_rig_board)
     sigmas = np.sqrt(np.diag(solution.covariance))
     for sensor in problem.sensors:
@@ -104,7 +104,7 @@ def test_every_derivative_agrees_with_differences(solution: Solution) -> None:
 
 
 def test_a_minimum_has_no_slope(solution: Solution) -> None:
-    normal = solution.adjusted.normal
+    normal = solution.adjustment.normal
     assert np.abs(normal.a / np.sqrt(np.diag(normal.A))).max() < 1e-4
     assert np.abs(normal.b).max() / np.sqrt(np.einsum("fkk->fk", normal.C)).max() < 1e-4
 
@@ -122,7 +122,7 @@ def test_hubers_loss_grows_linearly_and_weights_are_its_slope() -> None:
 
 
 def test_corners_weigh_by_their_covariance(solution: Solution) -> None:
-    data = solution.adjusted.problem.sensors[0].data
+    data = solution.adjustment.problem.sensors[0].data
     assert isinstance(data, CornerData)
     view = solution.views.of_camera("left")[0]
     n = int(np.flatnonzero(view.corners.seen)[0])
@@ -134,14 +134,14 @@ def test_moving_rig_and_boards_together_moves_no_residual(solution: Solution) ->
     G = transform_from_vector([0.3, -0.5, 1.1, 2.0, -1.0, 0.4])
     state = solution.state
     moved = replace(state, T_rig_camera=G @ state.T_rig_camera, T_rig_board=G @ state.T_rig_board)
-    for sensor in solution.adjusted.problem.sensors:
-        here, there = (residuals(sensor, solution.adjusted.problem, each) for each in (state, moved))
+    for sensor in solution.adjustment.problem.sensors:
+        here, there = (residuals(sensor, solution.adjustment.problem, each) for each in (state, moved))
         np.testing.assert_allclose(there, here, atol=1e-6)
         assert np.abs(here).max() > 0.1
 
 
 def test_the_order_of_blocks_is_no_matter_and_equations_add_up(solution: Solution) -> None:
-    problem = solution.adjusted.problem
+    problem = solution.adjustment.problem
     blocks = problem.blocks(solution.state)
     sizes = (solution.layout.size, len(solution.state.T_rig_board))
     forward, backward = sum_blocks(blocks, *sizes), sum_blocks(blocks[::-1], *sizes)

@@ -123,7 +123,7 @@ def with_nodes(smooth_m: Floats) -> Solution:
 
 
 def test_a_range_image_s_share_is_the_slope_of_its_cost(with_nodes: Solution) -> None:
-    problem, layout = with_nodes.adjusted.problem, with_nodes.layout
+    problem, layout = with_nodes.adjustment.problem, with_nodes.layout
     used = with_nodes.ranges
     assert used is not None
     loss = Loss(1.0, used.measured, np.inf)

@@ -107,7 +107,7 @@ def test_opencv_finds_the_same_rig_from_the_same_corners() -> None:
     assert T_right_left[:3, :3] == pytest.approx(np.asarray(R), abs=1e-6)
     # Theirs is of two axes together, over both cameras.
     corners = sum(len(view.corners.pixels) for view in views.views)
-    assert np.sqrt(ours.adjusted.normal.cost / corners) == pytest.approx(rms, rel=1e-5)
+    assert np.sqrt(ours.adjustment.normal.cost / corners) == pytest.approx(rms, rel=1e-5)
 
 
 @pytest.mark.slow
@@ -119,7 +119,7 @@ def test_the_published_figures_of_opencvs_stereo_pairs_come_out() -> None:
     T_right_left = inverse(solution.state.T_rig_camera[1])
     assert 1000 * T_right_left[:3, 3] == pytest.approx([-82.911, 0.918, -0.174], abs=1e-3)
     corners = sum(len(view.corners.pixels) for view in solution.views.views)
-    assert np.sqrt(solution.adjusted.normal.cost / corners) == pytest.approx(0.2713, abs=1e-4)
+    assert np.sqrt(solution.adjustment.normal.cost / corners) == pytest.approx(0.2713, abs=1e-4)
 
 
 def test_a_simulated_rig_comes_back_within_its_uncertainty() -> None:
@@ -147,7 +147,7 @@ def test_noise_of_each_sensor_and_outliers_are_found() -> None:
     views = replace(views, views=(*others, replace(wrong, corners=replace(wrong.corners, pixels=pixels))))
     solution = solve_rig(views, pair_plan())
     fit = statistics_of(solution)
-    assert [sensor.scale for sensor in solution.adjusted.problem.sensors] == pytest.approx([2, 2], rel=0.15)
+    assert [sensor.scale for sensor in solution.adjustment.problem.sensors] == pytest.approx([2, 2], rel=0.15)
     assert fit.cameras["left"].outliers >= 3
     assert fit.cameras["left"].outliers + fit.cameras["tof"].outliers <= 6
     errors, sigmas = errors_of(solution, truth), solution.sigmas()
@@ -158,7 +158,7 @@ def test_points_that_fit_again_are_let_in_again() -> None:
     truth = world(8, seed=3, names=PAIR)
     views = views_of(truth, seed=3)
     solution = solve_rig(views, pair_plan())
-    problem = solution.adjusted.problem
+    problem = solution.adjustment.problem
     # As if a bad start had thrown out every second corner.
     fewer = tuple(replace(sensor, kept=sensor.kept & (np.arange(42) % 2 == 0)) for sensor in problem.sensors)
     done = adjust(replace(problem, sensors=fewer), solution.state, NoisePlan())
@@ -194,7 +194,7 @@ def test_ranges_show_their_bias() -> None:
     spread = [sigmas["tof", name] for name in BIAS_NAMES]
     assert np.abs((np.array(found) - bias) / spread).max() < 3
     assert spread[0] < 0.004
-    ranged = solution.adjusted.problem.sensors[-1]
+    ranged = solution.adjustment.problem.sensors[-1]
     assert 0.01 * ranged.scale == pytest.approx(0.006, rel=0.05)
 
 
@@ -218,7 +218,7 @@ def test_one_image_named_from_the_other_end_is_left_out_and_told() -> None:
     odd = views.of_camera("left")[3]
     wrong = replace(views, views=tuple(turned(view) if view is odd else view for view in views.views))
     solution = solve_rig(wrong, pair_plan())
-    assert solution.turned == (("left", odd.frame),)
+    assert solution.reversed_views == (("left", odd.frame),)
     right = solve_rig(views.without([("left", odd.frame)]), pair_plan())
     assert solution.state.T_rig_camera == pytest.approx(right.state.T_rig_camera, abs=1e-7)
 

@@ -71,5 +71,5 @@ def test_a_rational_lens_has_no_usual_k3() -> None:
     free = ("k1", "k2", "k3", "k4", "k5", "k6")
     views = views_of(world(8, seed=3, names=("left",)), seed=3)
     plan = SolvePlan(cameras={"left": CameraPlan(spectrum=Spectrum.COLOUR, free=free)}, gauge="left")
-    named = {term[1] for prior in solve_rig(views, plan).adjusted.problem.priors for term in prior.terms}
+    named = {term[1] for prior in solve_rig(views, plan).adjustment.problem.priors for term in prior.terms}
     assert not named & {"p1", "p2", "k3"}
