@@ -1,8 +1,10 @@
-"""STYLE.md's English, held by reading the sources: docstrings name what they document, in the field's own words.
+"""STYLE.md's English, held by reading the sources: docstrings name what they document, and they, comments and messages
+use the field's own words.
 
 $ python -m tests.test_words [PATH ...]      # every finding below these paths, a line each
 """
 
+import ast
 import re
 import sys
 import tokenize
@@ -47,7 +49,11 @@ def findings(path: Path) -> Iterator[Finding]:
     with path.open("rb") as file:
         tokens = list(tokenize.tokenize(file.readline))
     prose = [(token.start[0], token.string) for token in tokens if token.type == tokenize.COMMENT]
-    for docstring in docstrings(tree_of(path)):
+    tree = tree_of(path)
+    documents = list(docstrings(tree))
+    strings = {node for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    prose += [(node.lineno, str(node.value)) for node in strings - set(documents)]
+    for docstring in documents:
         line, text = docstring.lineno, str(docstring.value).strip()
         prose.append((line, text))
         if OPENINGS.match(text):
@@ -58,7 +64,7 @@ def findings(path: Path) -> Iterator[Finding]:
             yield Finding(where, line + text.count("\n", 0, found.start()), f"'{found[0]}' in: {around}")
 
 
-def test_docstrings_and_names_are_plain_english() -> None:
+def test_docstrings_comments_messages_and_names_are_plain_english() -> None:
     found = [one for _, path in modules() for one in findings(path)]
     assert [str(one) for one in found if f"{one.path}: {one.text}" not in EXCEPTIONS] == []
 

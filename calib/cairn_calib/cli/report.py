@@ -51,8 +51,8 @@ def add_parser(commands: "_SubParsersAction[argparse.ArgumentParser]") -> None:
     )
     added.add_argument("rig", type=Path, metavar="RIG", help="rig.json that cairn calib solve wrote")
     added.add_argument("folders", nargs="+", type=Path, metavar="DIR", help="of corner documents, as given to solve")
-    added.add_argument("--output", type=Path, required=True, metavar="REPORT.HTML", help="beside it the same as .json")
-    added.add_argument("--solved-with", default="", metavar="OPTIONS", help="what else solve was told, in quotes")
+    added.add_argument("--output", type=Path, required=True, metavar="REPORT.HTML", help="also as .json next to it")
+    added.add_argument("--solved-with", default="", metavar="OPTIONS", help="the other options of solve, in quotes")
     added.set_defaults(run=run)
 
 

@@ -18,7 +18,7 @@ def add_solve_options(parser: argparse.ArgumentParser) -> None:
         "--spectrum", required=True, metavar="[NAME=]SPECTRUM,...", help="range, colour or thermal, of all or by camera"
     )
     parser.add_argument("--output", type=Path, required=True, metavar="RIG.JSON")
-    parser.add_argument("--report", type=Path, metavar="REPORT.HTML", help="for people; beside it the same as .json")
+    parser.add_argument("--report", type=Path, metavar="REPORT.HTML", help="for people; also as .json next to it")
     parser.add_argument("--gauge", metavar="NAME", help="the camera whose frame is the rig's")
     parser.add_argument("--name", default="rig", help="of the rig (rig)")
     parser.add_argument(

@@ -74,7 +74,7 @@ def add_parser(commands: "_SubParsersAction[argparse.ArgumentParser]") -> None:
     fit = actions.add_parser("fit", help="the response of a camera, from black bodies")
     columns = f"{', '.join(COLUMNS)}[, {', '.join(REGION)}][, {HOUSING}][, {SINCE_FFC}]"
     fit.add_argument("table", type=Path, metavar="CSV", help=columns)
-    fit.add_argument("out", type=Path, metavar="OUT", help="JSON to write; maps go beside it")
+    fit.add_argument("out", type=Path, metavar="OUT", help="JSON to write; maps go next to it")
     fit.add_argument("--law", choices=("planck", "polynomial"), default="planck", help="(planck)")
     fit.add_argument("--rig", type=Path, metavar="FILE", help="OUT is this rig.json with the radiometry in it")
     fit.set_defaults(run=_fit)
@@ -168,7 +168,7 @@ def _tell_housing(radiometry: Radiometry, references: Sequence[Reference]) -> No
         sigma = float(np.sqrt(housing.covariance_row[3]))
         _say(
             f"housing: {housing.counts_per_k:.3g} +- {sigma:.2g} counts a kelvin of it, {low:.1f} to {high:.1f} C; "
-            f"if nobody says how warm it is, {abs(housing.counts_per_k) * housing.spread_k:.3g} counts are open"
+            f"if its temperature is not given, {abs(housing.counts_per_k) * housing.spread_k:.3g} counts are open"
         )
     elif any(each.housing_k is not None for each in references):
         _say("housing: it was nearly as warm all the time, or warmed with the black bodies: what it adds is not known")

@@ -303,7 +303,7 @@ def failure_of(exc: apsw.Error, file: Path) -> CairnError:
     if isinstance(exc, apsw.BusyError):
         return ConflictError("folder_in_use", f"another robot has {file} open; stop it, or choose another folder")
     if isinstance(exc, apsw.CorruptError | apsw.NotADBError | apsw.SQLError):
-        return DamagedDataError("damaged_store", f"{file} is damaged: {exc}; move it away to start anew")
+        return DamagedDataError("damaged_store", f"{file} is damaged: {exc}; move it away to start again")
     return UnreachableError("store_failed", f"cannot use {file}: {exc}")
 
 

@@ -62,7 +62,7 @@ class ServerCells:
             if fingerprint(base, key) == cell.fingerprint:
                 self.refresh(key, base=base)
             else:
-                log.error("cell %s at rest is not what it was; asking for it anew", cell_of_key(key))
+                log.error("cell %s at rest is not what it was; asking for it again", cell_of_key(key))
                 self.hold_nothing(key, UNPROVEN)
         for key in outbox.cells - self.cells.keys():
             self.refresh(key)

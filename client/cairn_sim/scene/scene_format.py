@@ -81,7 +81,7 @@ class SolidEntry(BaseModel):
             raise ValueError("expected one shape: from and to, box, cylinder, sphere or plane")
         if self.from_ is not None and self.to is not None:
             if self.at is not None or self.turn_deg is not None:
-                raise ValueError("expected no at and no turn_deg beside from and to; use box")
+                raise ValueError("expected no at and no turn_deg with from and to; use box")
             if not all(low < high for low, high in zip(self.from_, self.to, strict=True)):
                 raise ValueError(f"expected from below to on each axis, got {self.from_} and {self.to}")
         return self

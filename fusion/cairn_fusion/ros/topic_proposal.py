@@ -110,7 +110,7 @@ def _cameras(index: BagIndex, questions: list[str]) -> list[Guess]:
             amplitude = _amplitude_of(entry, amplitudes) if spectrum is Spectrum.RANGE else None
             guesses.append(Guess(name, spectrum, entry, info, amplitude))
             if info is None:
-                questions.append(f"camera {name}: no CameraInfo beside {entry.topic.name}; write its intrinsics")
+                questions.append(f"camera {name}: no CameraInfo next to {entry.topic.name}; write its intrinsics")
     # Depth cameras first, so that the first range camera is one of them if there is any.
     ranges = [guess for guess in guesses if guess.spectrum is Spectrum.RANGE]
     guesses += _lidars(index, questions)

@@ -71,9 +71,9 @@ def keep_healed(store: Store, row: MapRow, cells: Iterable[CellRow]) -> None:
     for cell in cells:
         try:
             if store.health.heal(row, cell):
-                store.audit("healed_cell", f"map {row.name}: {cell_of_key(cell.key)} made anew from its commits")
+                store.audit("healed_cell", f"map {row.name}: {cell_of_key(cell.key)} rebuilt from its commits")
         except CairnError as exc:
-            log.error("cell %s could not be written anew: %s", cell_of_key(cell.key), exc.message)
+            log.error("cell %s was rebuilt, but cannot be written: %s", cell_of_key(cell.key), exc.message)
 
 
 def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes, *, by: str) -> bool:

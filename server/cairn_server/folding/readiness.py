@@ -80,7 +80,7 @@ class Readiness:
     def reasons(self) -> list[str]:
         """Reasons, each as `code: what`; empty if the server is ready. They name no map: strangers may ask."""
         if self._is_closing:
-            return ["shutting_down: the server is told to stop"]
+            return ["shutting_down: the server is stopping"]
         with self._lock:
             if time.monotonic() - self._looked_s >= KEEP_S:
                 self._reasons = list(self._look())

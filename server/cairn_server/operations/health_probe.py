@@ -39,4 +39,4 @@ def why_not(port: int) -> str | None:
 
 if __name__ == "__main__":
     PORT = told_port(Path(sys.argv[1]))
-    sys.exit(f"no server told its port in {sys.argv[1]}" if PORT is None else why_not(PORT))
+    sys.exit(f"no server wrote its port to {sys.argv[1]}" if PORT is None else why_not(PORT))

@@ -76,7 +76,7 @@ def found_commit(store: Store, row: MapRow, id_text: str) -> FoundCommit:
     """
     found = store.commit(row, commit_id_from_text(id_text))
     if found is None:
-        raise NotFoundError("no_commit", f"nobody pushed {id_text[:96]} to map {row.name}")
+        raise NotFoundError("no_commit", f"no robot pushed {id_text[:96]} to map {row.name}")
     if found.gone:
         raise ConflictError("evidence_gone", f"the bytes of {found.id} are not kept any more")
     robot = found.id.author.robot

@@ -75,7 +75,7 @@ def targets_of(request: Retract, snapshot: Snapshot) -> list[CommitId]:
         meant = "no commit of this map fits" if request.selects else "no commit is named"
         raise NotFoundError("nothing_to_retract", f"{meant}; `cairn map log` shows what there is")
     if any(target.author.robot == OPERATOR for target in targets):
-        raise BadInputError("not_retractable", "a retract is not retracted; push the evidence anew")
+        raise BadInputError("not_retractable", "a retract is not retracted; push the evidence again")
     return list(targets)
 
 

@@ -343,7 +343,7 @@ class SqliteHealth:
     def probe(self) -> None:
         """Write something that changes nothing, as durably as a commit."""
         if not self._writer.is_alive:
-            raise UnreachableError("store_failed", "the store's writer has ended; start the server anew")
+            raise UnreachableError("store_failed", "the store's writer has ended; start the server again")
         try:
             self._writer.submit(_rewrite_version).result(PROBE_S)
         except FutureTimeoutError:
