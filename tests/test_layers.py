@@ -62,6 +62,7 @@ MAY_NAME = {
     "uvicorn": [
         "cairn_server/operations/serve.py",
         "cairn_server/http/middleware/deadlines.py",
+        "cairn_server/http/middleware/head_checks.py",
         "cairn_fusion/view/mjpeg_server.py",
     ],
     "httpx": ["cairn_client/http/api.py"],

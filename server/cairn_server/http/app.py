@@ -7,7 +7,7 @@ from fastapi.responses import HTMLResponse
 from starlette.middleware import Middleware
 
 from cairn_server.http.middleware.body_limit import BodyLimit
-from cairn_server.http.middleware.head_checks import ProtocolVersion, SameOrigin
+from cairn_server.http.middleware.head_checks import DeniedHandshakes, PlainPath, ProtocolVersion, SameOrigin
 from cairn_server.http.middleware.request_trail import RequestTrail
 from cairn_server.http.middleware.token_first import TokenFirst
 from cairn_server.http.openapi import DocumentedApp, docs_page
@@ -64,9 +64,11 @@ def make_app(service: Service) -> FastAPI:
 
 def _middleware(service: Service) -> Iterator[Middleware]:
     """Middleware in the order in which a request passes it; the answer passes it in reverse."""
+    yield Middleware(DeniedHandshakes)
     yield Middleware(RequestTrail, figures=service.figures)
     if service.settings.admin_token is None:
         yield Middleware(SameOrigin, host=service.settings.host)
     yield Middleware(ProtocolVersion)
+    yield Middleware(PlainPath)
     yield Middleware(BodyLimit)
     yield Middleware(TokenFirst, service=service)

@@ -160,6 +160,17 @@ def test_hostile_names_in_paths_are_refused(live: Live, place: str, hostile: str
 
 
 @pytest.mark.parametrize(
+    "path", ["/maps/{}%2flog", "/maps/{}%2Flog", "/maps/{}/main%2fcells", "/maps%2f{}/log", "/%2f"]
+)
+@pytest.mark.parametrize("method", ["GET", "PUT", "DELETE"])
+def test_an_encoded_slash_is_no_slash(live: Live, method: str, path: str) -> None:
+    name = live.new_map().name
+    answer = check(live, method, path.format(name), b"", {})
+    assert (answer.status_code, answer.json()["kind"]) == (400, "bad_path")
+    assert check(live, "GET", f"/maps/{name}/log", b"", {}).status_code == 200
+
+
+@pytest.mark.parametrize(
     "body",
     [
         b'{"\\ud800":1}',

@@ -1,5 +1,6 @@
 """Live events: the same by SSE and by WebSocket, put together, resumed, bounded, and not for everybody."""
 
+import logging
 import socket
 import threading
 import time
@@ -339,6 +340,26 @@ def test_pages_of_other_sites_may_not_listen(live: Live, guarded: Live) -> None:
             assert b"foreign_origin" in (refused.value.response.body or b"")
         with by_socket(server, row, token=token, origin=f"http://{own}") as events:
             hello_of(events)
+
+
+def test_refused_sockets_leave_no_error_in_the_log(live: Live, guarded: Live, caplog: pytest.LogCaptureFixture) -> None:
+    row, known = guarded.new_map(), live.new_map()
+    refusals = (
+        (guarded, row.name, 401),  # by the route, and below by the checks of a head
+        (live, "nothing", 404),
+        (live, f"{known.name}%2flive", 400),
+        (live, known.name, 403),
+    )
+    with caplog.at_level(logging.DEBUG, logger="uvicorn.error"):
+        for server, name, status in refusals:
+            origin = "http://evil.example" if status == 403 else None
+            url = f"ws://127.0.0.1:{server.port}/maps/{name}/live"
+            with pytest.raises(InvalidStatus) as refused, connect(url, origin=origin):  # type: ignore[arg-type]
+                pass
+            assert refused.value.response.status_code == status
+        with by_socket(live, known) as events:
+            hello_of(events)
+    assert [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING] == []
 
 
 @pytest.mark.parametrize("origin", [None, "http://evil.example"])

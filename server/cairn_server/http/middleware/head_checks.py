@@ -1,12 +1,16 @@
-"""Checks of a request's head: same origin, where the server is open, and the version of the protocol. Plain ASGI."""
+"""Checks of a request's head: same origin, where the server is open, version of the protocol, path. Plain ASGI."""
 
+import re
 from collections.abc import MutableMapping
 from typing import Any
-from urllib.parse import urlsplit
 
-from cairn_server.http.middleware.body_limit import App, Receive, Send, send_problem
+from uvicorn.protocols.utils import ClientDisconnected
+
+from cairn_server.http.middleware.body_limit import App, Message, Receive, Send, send_problem
 from cairn_server.settings import LOOPBACK
 
+HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:[0-9]{0,5})?", re.IGNORECASE)
+"""`Host` as RFC 9110 has it: a name or address, and a port; no user, no fragment, which a parser of URLs would skip."""
 VERSION = b"1"
 HEADER = b"cairn-protocol"
 
@@ -40,17 +44,15 @@ class SameOrigin:
     def _is_own(self, scheme: str, headers: list[tuple[bytes, bytes]]) -> bool:
         hosts = {value.decode("latin-1") for name, value in headers if name == b"host"}
         origins = {value.decode("latin-1") for name, value in headers if name == b"origin"}
-        if len(hosts) != 1 or _name(f"//{next(iter(hosts))}") not in self._hosts:
+        if len(hosts) != 1 or _name(next(iter(hosts))) not in self._hosts:
             return False
         page = {"ws": "http", "wss": "https"}.get(scheme, scheme)
         return origins <= {f"{page}://{host}" for host in hosts}
 
 
-def _name(url: str) -> str | None:
-    try:
-        return urlsplit(url).hostname
-    except ValueError:
-        return None
+def _name(host: str) -> str | None:
+    found = HOST.fullmatch(host)
+    return found[1].strip("[]").lower() if found else None
 
 
 class ProtocolVersion:
@@ -72,3 +74,58 @@ class ProtocolVersion:
             f"this server speaks version {VERSION.decode()} of the protocol; update the older of the two",
             answer_to=scope["type"],
         )
+
+
+class PlainPath:
+    """Middleware that answers 400 `bad_path` to a path with an encoded slash.
+
+    No name has a slash, and the framework decodes a path before it looks for a route: `/maps/lab%2flog` would be
+    `/maps/lab/log` here, and another page for a proxy with rules by path.
+    """
+
+    def __init__(self, app: App) -> None:
+        self._app = app
+
+    async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
+        """Pass a request on, or refuse it."""
+        if b"%2f" not in scope.get("raw_path", b"").lower():
+            await self._app(scope, receive, send)
+            return
+        await send_problem(
+            send,
+            400,
+            "bad_path",
+            "the path has an encoded slash (%2F); no name has one: send / between the parts of a path",
+            answer_to=scope["type"],
+        )
+
+
+class DeniedHandshakes:
+    """Middleware that ends a WebSocket whose handshake was refused as uvicorn expects of one that the client left.
+
+    uvicorn takes an app that answered a handshake with a problem, and returned, for a broken one, and writes an error
+    to the log: any stranger could fill it.
+    """
+
+    def __init__(self, app: App) -> None:
+        self._app = app
+
+    async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
+        """Pass a request on.
+
+        Raises:
+            ClientDisconnected: for uvicorn, once a handshake was refused and the answer is sent.
+        """
+        if scope["type"] != "websocket":
+            await self._app(scope, receive, send)
+            return
+        is_denied = False
+
+        async def noted(message: Message) -> None:
+            nonlocal is_denied
+            await send(message)
+            is_denied |= message["type"] == "websocket.http.response.body" and not message.get("more_body", False)
+
+        await self._app(scope, receive, noted)
+        if is_denied:
+            raise ClientDisconnected
