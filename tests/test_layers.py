@@ -94,7 +94,7 @@ MAY_NAME = {
 
 ROOMS = {
     "cairn_map": """
-        errors arrays progress
+        errors arrays progress machine_memory
         kernels evidence codec.octree codec.entropy codec commits wire files queries render
         warm_up
     """,

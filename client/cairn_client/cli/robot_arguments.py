@@ -47,12 +47,13 @@ def scope_of(args: argparse.Namespace, mode: Mode) -> Scope:
 
 def add_limits(command: argparse.ArgumentParser) -> None:
     """Add options that bound what the robot keeps, in megabytes (10^6 bytes)."""
-    for name, what in (
-        ("disk", "size of the robot's file, above which the server's farthest cells are dropped"),
-        ("memory", "size of the map in memory, above which the server's farthest cells are dropped"),
-        ("outbox", "size of commits that the server does not have for good, above which no more are made"),
+    quarter = "a quarter of the machine's, or of its container's; 0: no limit"
+    for name, what, standard in (
+        ("disk", "size of the robot's file, above which the server's farthest cells are dropped", "no limit"),
+        ("memory", "size of the map in memory, above which the server's farthest cells are dropped", quarter),
+        ("outbox", "size of commits that the server does not have for good, above which no more are made", "no limit"),
     ):
-        command.add_argument(f"--{name}-max", type=float, metavar="MB", help=f"{what} (no limit)")
+        command.add_argument(f"--{name}-max", type=float, metavar="MB", help=f"{what} ({standard})")
 
 
 def limits_of(args: argparse.Namespace) -> Limits:

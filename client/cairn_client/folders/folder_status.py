@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict
 
 from cairn_client.folders.sqlite_glance import Glance, KeptBytes, commit_bytes, glance
 from cairn_client.replica.folder_lock import is_locked
+from cairn_client.replica.limits import STANDARD_LIMITS
 from cairn_client.replica.replica_state import Contact, Field, ReplicaState
 from cairn_map.commits.commit import split_commit
 from cairn_map.errors import DamagedDataError
@@ -48,6 +49,8 @@ class FolderStatus(BaseModel):
     failure: str
     """Message of the last failure since the last whole round; empty if there was none."""
     disk_bytes: int
+    memory_bytes_max: int | None
+    """Memory that its map may take, bytes; None: all."""
 
 
 class QueuedCommit(BaseModel):
@@ -103,6 +106,7 @@ def folder_status(folder: Path) -> FolderStatus:
         failure_kind=contact.kind,
         failure=contact.reason,
         disk_bytes=seen.disk_bytes,
+        memory_bytes_max=(ReplicaState.limits.read(text) or STANDARD_LIMITS).map_bytes_max,
     )
 
 

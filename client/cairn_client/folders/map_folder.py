@@ -13,11 +13,11 @@ from cairn_client.http.http_link import cells_with_evidence, download_cell
 from cairn_client.http.map_url import split_map_url
 from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_store import FILE_NAME
-from cairn_map.codec.cell_code import decode_cell
+from cairn_map.codec.cell_code import coding_of, decode_cell
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence_map import EvidenceMap
-from cairn_map.evidence.grid import CellKey
-from cairn_map.files.cell_folder import MAP_FILE, read_cells, read_head
+from cairn_map.evidence.grid import CellKey, cell_of_key
+from cairn_map.files.cell_folder import MAP_FILE, cell_path, read_cells, read_head
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
 from cairn_map.render.map_picture import Ages
 
@@ -69,9 +69,10 @@ def map_of_folder(folder: Path) -> FolderMap:
             return FolderMap(replica.snapshot(), ages_of(replica))
     if (folder / MAP_FILE).is_file():
         head = read_head(folder)
-        whole = EvidenceMap(head.geometry)
+        whole = EvidenceMap(head.geometry, coding=coding_of(head.geometry))
         for cell in read_cells(folder, head.geometry):
-            whole.replace(cell.key, cell.evidence)
+            size_bytes = cell_path(folder, cell_of_key(cell.key)).stat().st_size
+            whole.replace(cell.key, cell.evidence, came_bytes=size_bytes)
         return FolderMap(snapshot_of(whole, head.sensor_model), None)
     raise BadInputError(
         "no_map_folder",
@@ -84,10 +85,10 @@ def _downloaded_map(map_url: str, token: str | None) -> MapSnapshot:
     server_url, name = split_map_url(map_url)
     with MapApi(server_url, token=token) as api:
         info = api.map_info(name)
-        whole = EvidenceMap(info.geometry)
+        whole = EvidenceMap(info.geometry, coding=coding_of(info.geometry))
         for cell in cells_with_evidence(api, name):
-            _, decoded = download_cell(api, name, cell)
-            whole.replace(decoded.key, decoded.evidence)
+            body, decoded = download_cell(api, name, cell)
+            whole.replace(decoded.key, decoded.evidence, body=body)
     return snapshot_of(whole, info.sensor_model)
 
 

@@ -13,6 +13,7 @@ The robot's folder remembers the limits that were given last (`replica_state`), 
 from dataclasses import dataclass
 
 from cairn_map.errors import BadInputError
+from cairn_map.machine_memory import standard_limit_bytes
 
 LEAST_BYTES = 1 << 16
 """Smallest limit that leaves room for anything."""
@@ -20,7 +21,7 @@ LEAST_BYTES = 1 << 16
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """Limits of one robot, bytes each; None: as much as there is."""
+    """Limits of one robot, bytes each; None: as much as there is, but for the memory."""
 
     disk_bytes_max: int | None = None
     """Largest size of the pages in use in the robot's file: commits, cells, and some 200 bytes of each commit ever
@@ -30,14 +31,27 @@ class Limits:
     """Largest size of the commits whose bytes are kept: those that wait, and those that a restore of the server could
     lose."""
     memory_bytes_max: int | None = None
-    """Largest size of the map in memory (`robot.map.size_bytes`). The measurement under way comes on top, and of
-    `snapshot()` what changed since it was taken, for as long as a caller holds it."""
+    """Largest size of the map in memory (`robot.map.size_bytes`) and of its last `snapshot()`; None: a quarter of the
+    memory of the machine, or of its container; 0: as much as there is. The measurement under way and the cell that is
+    being decoded come on top, and of older snapshots what changed since, for as long as a caller holds them."""
 
     def __post_init__(self) -> None:
         """Raises: BadInputError: a limit that leaves no room for anything."""
-        for limit in (self.disk_bytes_max, self.outbox_bytes_max, self.memory_bytes_max):
+        for limit in (self.disk_bytes_max, self.outbox_bytes_max, self.memory_bytes_max or None):
             if limit is not None and limit < LEAST_BYTES:
                 raise BadInputError("bad_option", f"a limit is at least {LEAST_BYTES} bytes, got {limit}")
 
+    @property
+    def map_bytes_max(self) -> int | None:
+        """Largest size of the map in memory, bytes; None: as much as there is."""
+        return standard_limit_bytes() if self.memory_bytes_max is None else self.memory_bytes_max or None
 
-NO_LIMITS = Limits()
+    @property
+    def keeps_commits(self) -> bool:
+        """True if commits that the server has for good need not go: nothing bounds the disk."""
+        return self.disk_bytes_max is None and self.outbox_bytes_max is None
+
+
+STANDARD_LIMITS = Limits()
+"""Limits of a robot that is given none."""
+NO_LIMITS = Limits(memory_bytes_max=0)

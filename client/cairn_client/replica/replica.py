@@ -97,6 +97,7 @@ class Replica:
         map_name: str,
         geometry: Geometry,
         amendable: Callable[[], Iterable[CommitId]] = tuple,
+        memory_bytes_max: int | None = None,
     ) -> None:
         """Open or make the state.
 
@@ -106,6 +107,8 @@ class Replica:
             map_name: name of the map on its server.
             geometry: grid of the map.
             amendable: returns commits that may still be amended: their bytes are kept, to subtract them at once.
+            memory_bytes_max: size of the view from which on no more cells of the server are read from the disk; None:
+                any.
 
         Raises:
             BadInputError: kind `other_replica`: the file is of another robot, map or grid.
@@ -117,7 +120,9 @@ class Replica:
         self.state.identify(robot=robot, map_name=map_name, geometry=geometry)
         self._budget: StorageBudget | None = None
         self.outbox = Outbox(self.state, robot, geometry, make_room=self._make_room, amendable=amendable)
-        self._base = ServerCells(self.state, self.outbox, geometry, admit=self._admit)
+        self._base = ServerCells(
+            self.state, self.outbox, geometry, admit=self._admit, memory_bytes_max=memory_bytes_max
+        )
         self.header: ReplyHeader | None = self.state.header
         """Newest state that the server reported."""
         self.refusals = RefusedPushes()
@@ -358,6 +363,7 @@ class Replica:
         """Hold nothing of some held cells; the view shows of them what the robot made itself."""
         with self._lock:
             self._base.drop(keys)
+            self._snapshot = None
 
     def snapshot(self, model: SensorModel | None = None) -> MapSnapshot:
         """The view as it is now, unmoved by what comes later, under the map's own sensor model or another one."""
@@ -368,6 +374,11 @@ class Replica:
             else:
                 self._snapshot = snapshot_of(self.view, model)
             return self._snapshot
+
+    def memory_bytes(self) -> int:
+        """Memory of the view, and of the last snapshot besides the cells that they share."""
+        with self._lock:
+            return self.view.size_bytes + (self._snapshot.frozen.size_bytes if self._snapshot else 0)
 
     def close(self) -> None:
         """Close the file."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from cairn_client.replica.outbox import Outbox
 from cairn_client.replica.replica_state import ReplicaState
 from cairn_client.replica.replica_store import BaseCell, KeptCommit
-from cairn_map.codec.cell_code import decode_cell, encode_cell
+from cairn_map.codec.cell_code import coding_of, decode_cell, encode_cell
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import CommitId
@@ -36,7 +36,13 @@ class ServerCells:
     """The server's cells as a robot holds them, and its view; called under the replica's lock."""
 
     def __init__(
-        self, state: ReplicaState, outbox: Outbox, geometry: Geometry, *, admit: Callable[[CellKey, int], None]
+        self,
+        state: ReplicaState,
+        outbox: Outbox,
+        geometry: Geometry,
+        *,
+        admit: Callable[[CellKey, int], None],
+        memory_bytes_max: int | None = None,
     ) -> None:
         """Show what is in the store; a cell whose bytes lost their fingerprint is to be fetched again (rule 15).
 
@@ -45,22 +51,28 @@ class ServerCells:
             outbox: its own commits.
             geometry: the map's grid.
             admit: called before a cell of so many bytes is held; raises if there is no room for it.
+            memory_bytes_max: size of the view from which on no more cells are read; None: any. The others are to be
+                fetched again where the robot is.
         """
         self._state = state
         self._store = state.store
         self._outbox = outbox
         self._geometry = geometry
         self._admit = admit
-        self.view = EvidenceMap(geometry)
+        self.view = EvidenceMap(geometry, coding=coding_of(geometry))
         """Evidence that the robot shows."""
         self.default_cursor = state.default_cursor
         """Cursor of every cell that is not held."""
         self.cells: dict[CellKey, BaseCell] = self._store.cells()
         """Cells that are held, without their bytes."""
         for key, cell in list(self.cells.items()):
-            base = self.evidence(key)
+            if memory_bytes_max is not None and self.view.size_bytes > memory_bytes_max:
+                self.hold_nothing(key, UNPROVEN)
+                continue
+            body = self._store.body(key)
+            base = self._decoded(key, body)
             if fingerprint(base, key) == cell.fingerprint:
-                self.refresh(key, base=base)
+                self._show(key, base, body)
             else:
                 log.error("cell %s at rest is not what it was; asking for it again", cell_of_key(key))
                 self.hold_nothing(key, UNPROVEN)
@@ -78,7 +90,9 @@ class ServerCells:
 
     def evidence(self, key: CellKey) -> Evidence:
         """The server's evidence of a cell; empty if its bytes are damaged, which its fingerprint shows."""
-        body = self._store.body(key)
+        return self._decoded(key, self._store.body(key))
+
+    def _decoded(self, key: CellKey, body: bytes | None) -> Evidence:
         try:
             return decode_cell(body).evidence if body else empty_evidence(self._geometry)
         except CairnError as exc:
@@ -93,7 +107,7 @@ class ServerCells:
         with self._store.transaction():
             self._store.put_cell(key, cell, body=data)
         self.cells[key] = cell
-        self.refresh(key, base=evidence)
+        self._show(key, evidence, data)
 
     def hold_nothing(self, key: CellKey, cell: BaseCell) -> None:
         """Make a cell's base empty."""
@@ -131,11 +145,14 @@ class ServerCells:
         self.cells.clear()
         self.default_cursor = None
 
-    def refresh(self, key: CellKey, *, base: Evidence | None = None) -> None:
+    def refresh(self, key: CellKey) -> None:
         """Make the view of a cell its base, changed by the commits that are kept (rule 7)."""
-        base = self.evidence(key) if base is None else base
+        body = self._store.body(key)
+        self._show(key, self._decoded(key, body), body)
+
+    def _show(self, key: CellKey, base: Evidence, body: bytes | None) -> None:
         shown = shown_evidence(self._outbox, key, base, self._geometry, coverage=self.coverage(key))
-        self.view.replace(key, shown)
+        self.view.replace(key, shown, body=body if shown is base else None, came_bytes=len(body or b""))
 
     def refresh_commits(self, commits: Iterable[CommitId]) -> None:
         """Make the view of all cells that some kept commits touch their base, changed by the commits that are kept."""
@@ -144,7 +161,7 @@ class ServerCells:
 
     def show_commit(self, commit: Commit, diff: dict[CellKey, Evidence]) -> None:
         """Add a commit that was just kept to the view, and take out what it takes out."""
-        self.view.merge(diff)
+        self.view.merge(diff, bodies=commit.cells)
         for gone in taken_back(self._outbox, commit, self._geometry, coverage_of=self.coverage):
             self.view.unmerge(gone)
 

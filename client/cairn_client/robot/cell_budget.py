@@ -22,7 +22,9 @@ from cairn_client.robot.robot_events import CellsDropped, Events, OutboxNearlyFu
 from cairn_client.sync.requests import Box, Conversation, whole_index
 from cairn_map.arrays import Ints
 from cairn_map.errors import UnreachableError
+from cairn_map.evidence.compact_cell import HELD_PER_BYTE
 from cairn_map.evidence.grid import CELL_LIMIT, Cell, CellKey, cell_of_key
+from cairn_map.wire.messages import CellEntry
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +71,8 @@ class CellBudget:
         self._events = events
         self._place = place
         self._scope_box = scope_box
-        self._limits_cells = bool(limits.disk_bytes_max or limits.memory_bytes_max)
+        self._memory_max = limits.map_bytes_max
+        self._limits_cells = bool(limits.disk_bytes_max or self._memory_max)
         self.kept: CellCube | None = replica.state.kept_cube if self._limits_cells else None
         """Cells of the server that are kept; None while the whole map fits."""
         self._is_old = self.kept is not None
@@ -94,6 +97,8 @@ class CellBudget:
 
     def keep_up(self) -> Conversation[None]:
         """Move the box if the robot has moved; before each fetch."""
+        while self._memory_max and self._measured() > self._memory_max and self._drop_farthest():
+            pass
         self._view_bytes, self._last = self._measured(), None
         kept = self.kept
         if kept is None:
@@ -123,7 +128,7 @@ class CellBudget:
             cells = np.array([entry.cell for entry in index.cells], np.int64).reshape(-1, 3)
             far = np.abs(cells - centre).max(axis=1, initial=0)
             disk = np.array([entry.size_bytes + ROW_BYTES for entry in index.cells], np.int64)
-            memory = np.array([entry.voxels * VOXEL_BYTES + CELL_BYTES for entry in index.cells], np.int64)
+            memory = np.array([_memory_of(entry) for entry in index.cells], np.int64)
             # The first ring of cells with which the sum, from the centre outwards, breaks a limit is the first one out.
             disk_max, memory_max = self._for_cells()
             order = np.argsort(far, kind="stable")
@@ -153,8 +158,8 @@ class CellBudget:
         used = self._replica.store.used_bytes() if limits.disk_bytes_max else 0
         if limits.disk_bytes_max and used + size_bytes + SLACK_BYTES > limits.disk_bytes_max:
             raise UnreachableError(NO_ROOM, f"{used} bytes of {limits.disk_bytes_max} on the disk are in use")
-        if limits.memory_bytes_max and self._view_bytes + CELL_BYTES > limits.memory_bytes_max:
-            raise UnreachableError(NO_ROOM, f"the map takes {self._view_bytes} of {limits.memory_bytes_max} bytes")
+        if self._memory_max and self._view_bytes + CELL_BYTES > self._memory_max:
+            raise UnreachableError(NO_ROOM, f"the map takes {self._view_bytes} of {self._memory_max} bytes")
 
     def make_room(self, size_bytes: int) -> None:
         """Drop, in the order of `limits`, until a commit of so many bytes fits.
@@ -197,8 +202,8 @@ class CellBudget:
             return "outbox", kept, limits.outbox_bytes_max
         if limits.disk_bytes_max and (used := store.used_bytes()) + size_bytes + SLACK_BYTES > limits.disk_bytes_max:
             return "disk", used, limits.disk_bytes_max
-        if limits.memory_bytes_max and (view := self._measured()) > limits.memory_bytes_max:
-            return "memory", view, limits.memory_bytes_max
+        if self._memory_max and (view := self._measured()) > self._memory_max:
+            return "memory", view, self._memory_max
         return None
 
     def _drop_farthest(self) -> bool:
@@ -229,7 +234,7 @@ class CellBudget:
     def _is_half_empty(self) -> bool:
         limits = self._limits
         used = self._replica.store.used_bytes() if limits.disk_bytes_max else 0
-        return used * 2 < (limits.disk_bytes_max or 1) and self._view_bytes * 2 < (limits.memory_bytes_max or 1)
+        return used * 2 < (limits.disk_bytes_max or 1) and self._view_bytes * 2 < (self._memory_max or 1)
 
     def _held(self) -> list[CellKey]:
         return [key for key, cell in self._replica.cells.items() if cell != UNPROVEN]
@@ -245,7 +250,7 @@ class CellBudget:
         others = store.used_bytes() - sum(size + ROW_BYTES for size in sizes.values() if size)
         disk = limits.disk_bytes_max * self._fill - max(others, 0) if limits.disk_bytes_max else float("inf")
         own = self._replica.own_cells() - set(self._held())
-        memory = limits.memory_bytes_max or float("inf")
+        memory = self._memory_max or float("inf")
         return disk, memory * self._fill - sum(map(self._cell_bytes, own))
 
     def _centre(self) -> Ints:
@@ -267,14 +272,18 @@ class CellBudget:
         return int(np.abs(np.array(cell_of_key(key)) - centre).max())
 
     def _cell_bytes(self, key: CellKey) -> int:
-        cell = self._replica.view.cell(key)
-        return cell.size_bytes if cell else 0
+        return self._replica.view.cell_bytes(key)
 
     def _measured(self) -> int:
-        return self._replica.view.size_bytes if self._limits.memory_bytes_max else 0
+        return self._replica.memory_bytes() if self._memory_max else 0
 
     def _outbox_bytes(self) -> int:
         return self._replica.kept_bytes()
+
+
+def _memory_of(entry: CellEntry) -> int:
+    """Memory that a listed cell takes at most: few bytes never take much."""
+    return min(entry.voxels * VOXEL_BYTES, entry.size_bytes * HELD_PER_BYTE) + CELL_BYTES
 
 
 def _triple(cell: Ints) -> tuple[int, int, int]:

@@ -21,7 +21,7 @@ from cairn_calib.rig.rig import Rig
 from cairn_client.http.map_url import split_map_url
 from cairn_client.relay.carried_commits import Carrier, carrier_in
 from cairn_client.relay.link import RelayApi
-from cairn_client.replica.limits import NO_LIMITS, Limits
+from cairn_client.replica.limits import STANDARD_LIMITS, Limits
 from cairn_client.replica.outbox import NO_NOTES, CommitFacts
 from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_state import ReplicaState
@@ -137,7 +137,7 @@ class Robot:
         store = ReplicaStore(directory)
         try:
             state = ReplicaState(store)
-            self._limits = limits or state.limits or NO_LIMITS
+            self._limits = limits or state.limits or STANDARD_LIMITS
             geometry = geometry or state.geometry
             # The one question that cannot wait for a link: without a grid no evidence has a place.
             if geometry is None:
@@ -145,7 +145,18 @@ class Robot:
                 geometry = info.geometry
                 state.note_model(info.sensor_model)
             replica = Replica(
-                store, robot=self.name, map_name=self._map_name, geometry=geometry, amendable=self._amendable_commits
+                store,
+                robot=self.name,
+                map_name=self._map_name,
+                geometry=geometry,
+                amendable=self._amendable_commits,
+                memory_bytes_max=self._limits.map_bytes_max,
+            )
+            most = self._limits.map_bytes_max
+            log.info(
+                "robot %s: its map may take %s of memory",
+                self.name,
+                "all" if most is None else f"at most {most / 1e6:.0f} MB",
             )
             # Remembered only now that the folder has proven to be this robot's.
             if limits is not None:
@@ -157,9 +168,9 @@ class Robot:
             raise
 
     def _amendable_commits(self) -> list[CommitId]:
-        """Commits whose bytes stay for an amend; with limits none, as commits that the server has for good go first."""
+        """Commits whose bytes stay for an amend; none if the disk is bounded, as they go first there."""
         # Asked by the thread that syncs, too: `commits` is replaced whole at each change, never altered.
-        return self._kept_scans.commits if self._limits == NO_LIMITS else []
+        return self._kept_scans.commits if self._limits.keeps_commits else []
 
     def _make_rounds(self, token: str | None, scope: Scope, carrier: Carrier | None) -> Rounds:
         membership = Membership(

@@ -36,6 +36,7 @@ from cairn_map.codec.octree.cell_head import CellHead, encode_head
 from cairn_map.codec.octree.channel_streams import ChannelRows, stream_of_channel
 from cairn_map.codec.octree.streams import MODELLED, StoredStream, join_streams, stored_streams
 from cairn_map.errors import DamagedDataError
+from cairn_map.evidence.compact_cell import CellCoding
 from cairn_map.evidence.evidence import Evidence, check_fits
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
 
@@ -121,6 +122,14 @@ def encode_cells(
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
         encoded = pool.map(lambda key: encode_cell(key, diff[key], geometry, profile=profile), keys)
         return dict(zip(keys, encoded, strict=True))
+
+
+def coding_of(geometry: Geometry) -> CellCoding:
+    """Code by which a map of this geometry holds cells as bytes."""
+    return CellCoding(
+        encode=lambda key, evidence: encode_cell(key, evidence, geometry).data,
+        decode=lambda data: decode_cell(data).evidence,
+    )
 
 
 def cell_digest(key: CellKey, evidence: Evidence, geometry: Geometry) -> bytes:

@@ -2,25 +2,45 @@
 
 map.merge(diff)      add a measurement         map.unmerge(diff)      take it out again, exactly
 map.copy()           an unchanging copy, at the cost of a list of its cells
+
+A map that is given a `coding` holds no cell in more than `HELD_PER_BYTE` times the bytes that came for it: beyond that
+it keeps the cell's bytes, and decodes them where they are read or changed, one cell at a time.
 """
 
 from collections.abc import Callable, Iterator, Mapping
+from types import MappingProxyType
+from typing import NamedTuple
 
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.brick_cell import BrickCell
+from cairn_map.evidence.compact_cell import HELD_PER_BYTE, CellCoding, CompactCell, HeldCell, opened
 from cairn_map.evidence.evidence import Evidence, empty_evidence
 from cairn_map.evidence.grid import CellKey, Geometry
 
 Diff = Mapping[CellKey, Evidence]
+Bodies = Mapping[CellKey, bytes]
 Step = Callable[[BrickCell, Evidence], None]
+NO_BODIES: Bodies = MappingProxyType({})
+
+
+class _Entry(NamedTuple):
+    """One cell of a map."""
+
+    cell: HeldCell
+    came_bytes: int
+    """Bytes that came for it, at least."""
+    size_bytes: int
 
 
 class EvidenceMap:
     """Sums of evidence over any number of cells; not thread-safe."""
 
-    def __init__(self, geometry: Geometry) -> None:
+    def __init__(self, geometry: Geometry, *, coding: CellCoding | None = None) -> None:
+        """Make an empty map; without a `coding` every cell is held as sums, however few bytes came for it."""
         self.geometry = geometry
-        self._cells: dict[CellKey, BrickCell] = {}
+        self._coding = coding
+        self._cells: dict[CellKey, _Entry] = {}
+        self._size_bytes = 0
 
     def __iter__(self) -> Iterator[CellKey]:
         return iter(sorted(self._cells))
@@ -31,13 +51,17 @@ class EvidenceMap:
     def __contains__(self, key: CellKey) -> bool:
         return key in self._cells
 
-    def merge(self, diff: Diff) -> None:
+    def merge(self, diff: Diff, *, bodies: Bodies = NO_BODIES) -> None:
         """Add a diff.
+
+        Args:
+            diff: packed evidence by cell.
+            bodies: bytes of the same cells, as far as the caller has them: they need not be encoded again.
 
         Raises:
             BadInputError: kind `evidence_overflow`; nothing was changed.
         """
-        self._apply(diff, BrickCell.merge, BrickCell.unmerge)
+        self._apply(diff, BrickCell.merge, BrickCell.unmerge, bodies)
 
     def unmerge(self, diff: Diff) -> None:
         """Take a diff out again; it must have been merged before, else sums become negative.
@@ -45,55 +69,109 @@ class EvidenceMap:
         Raises:
             BadInputError: kind `evidence_overflow`; nothing was changed.
         """
-        self._apply(diff, BrickCell.unmerge, BrickCell.merge)
+        self._apply(diff, BrickCell.unmerge, BrickCell.merge, NO_BODIES)
 
-    def replace(self, key: CellKey, evidence: Evidence) -> None:
-        """Make one cell hold exactly this evidence; one that holds none takes no memory."""
-        if not len(evidence):
-            self._cells.pop(key, None)
-            return
-        cell = BrickCell(self.geometry)
-        cell.merge(evidence)
-        self._cells[key] = cell
+    def replace(self, key: CellKey, evidence: Evidence, *, body: bytes | None = None, came_bytes: int = 0) -> None:
+        """Make one cell hold exactly this evidence; one that holds none takes no memory.
+
+        Args:
+            key: the cell's number.
+            evidence: its evidence from here on.
+            body: bytes of this very evidence, if the caller has them.
+            came_bytes: bytes that came for the evidence, if it is a sum.
+        """
+        self._forget(key)
+        if len(evidence):
+            cell = BrickCell(self.geometry)
+            cell.merge(evidence)
+            self._hold(key, cell, body=body, came_bytes=came_bytes)
 
     def copy(self) -> "EvidenceMap":
         """The same sums, unaffected by later merges; cells share their arrays until one of the two is changed."""
-        copied = EvidenceMap(self.geometry)
-        copied._cells = {key: cell.copy() for key, cell in self._cells.items()}
+        copied = EvidenceMap(self.geometry, coding=self._coding)
+        for key, entry in self._cells.items():
+            cell = entry.cell.copy() if isinstance(entry.cell, BrickCell) else entry.cell
+            copied._cells[key] = entry._replace(cell=cell)
+        copied._size_bytes = self._size_bytes
         return copied
+
+    def held(self, key: CellKey) -> HeldCell | None:
+        """One cell as it is held, to be read; None if there is none."""
+        entry = self._cells.get(key)
+        return entry.cell if entry else None
 
     def cell(self, key: CellKey) -> BrickCell | None:
         """One cell's sums, to be read; None if there is none."""
-        return self._cells.get(key)
+        entry = self._cells.get(key)
+        return opened(entry.cell) if entry else None
+
+    def cell_bytes(self, key: CellKey) -> int:
+        """Memory held by one cell; 0 if there is none."""
+        entry = self._cells.get(key)
+        return entry.size_bytes if entry else 0
 
     def evidence(self, key: CellKey) -> Evidence:
         """Packed evidence of one cell; empty if the map does not hold the cell."""
-        cell = self._cells.get(key)
-        return cell.packed() if cell else empty_evidence(self.geometry)
+        entry = self._cells.get(key)
+        return entry.cell.packed() if entry else empty_evidence(self.geometry)
 
     def packed(self) -> dict[CellKey, Evidence]:
         """Packed evidence of all cells that hold any, rising in number."""
-        everything = ((key, self._cells[key].packed()) for key in sorted(self._cells))
+        everything = ((key, self._cells[key].cell.packed()) for key in sorted(self._cells))
         return {key: evidence for key, evidence in everything if len(evidence)}
 
     def clear(self) -> None:
         """Drop all cells."""
         self._cells.clear()
+        self._size_bytes = 0
 
     @property
     def size_bytes(self) -> int:
-        """Memory held by the cells' arrays."""
-        return sum(cell.size_bytes for cell in list(self._cells.values()))
+        """Memory held by the cells' arrays and bytes."""
+        return self._size_bytes
 
-    def _apply(self, diff: Diff, step: Step, undo: Step) -> None:
-        cells = {key: self._cells.get(key) or BrickCell(self.geometry) for key in diff}
-        done: list[CellKey] = []
+    def _apply(self, diff: Diff, step: Step, undo: Step, bodies: Bodies) -> None:
+        # Cell by cell, so that of the cells held as bytes no more than one is open.
+        before: dict[CellKey, _Entry | None] = {}
         try:
             for key, evidence in diff.items():
-                step(cells[key], evidence)
-                done.append(key)
+                entry = self._cells.get(key)
+                sums = opened(entry.cell) if entry else BrickCell(self.geometry)
+                step(sums, evidence)
+                before[key] = entry
+                body = bodies.get(key)
+                came_bytes = (entry.came_bytes if entry else 0) + len(body or b"")
+                is_all = entry is None and step is BrickCell.merge
+                self._hold(key, sums, body=body if is_all else None, came_bytes=came_bytes)
         except BadInputError:
-            for key in done:
-                undo(cells[key], diff[key])
+            for key, entry in before.items():
+                self._take_back(key, entry, diff[key], undo)
             raise
-        self._cells.update(cells)
+
+    def _take_back(self, key: CellKey, before: _Entry | None, evidence: Evidence, undo: Step) -> None:
+        """Make a changed cell what it was."""
+        self._forget(key)
+        if before is not None:
+            if isinstance(before.cell, BrickCell):
+                undo(before.cell, evidence)
+            self._put(key, before.cell, before.came_bytes)
+
+    def _hold(self, key: CellKey, sums: BrickCell, *, body: bytes | None, came_bytes: int) -> None:
+        """Hold a cell's sums, or its bytes if too few came for them; `body` are those of just these sums."""
+        came_bytes = max(came_bytes, len(body or b""))
+        cell: HeldCell = sums
+        if self._coding is not None and sums.size_bytes > HELD_PER_BYTE * came_bytes:
+            body = self._coding.encode(key, sums.packed()) if body is None else body
+            came_bytes = max(came_bytes, len(body))
+            if sums.size_bytes > HELD_PER_BYTE * came_bytes:
+                cell = CompactCell(body, self.geometry, self._coding)
+        self._put(key, cell, came_bytes)
+
+    def _put(self, key: CellKey, cell: HeldCell, came_bytes: int) -> None:
+        before = self._cells.get(key)
+        self._cells[key] = _Entry(cell, came_bytes, cell.size_bytes)
+        self._size_bytes += cell.size_bytes - (before.size_bytes if before else 0)
+
+    def _forget(self, key: CellKey) -> None:
+        entry = self._cells.pop(key, None)
+        self._size_bytes -= entry.size_bytes if entry else 0

@@ -47,9 +47,14 @@ def write_head(folder: Path, head: FolderHead) -> None:
 
 def write_cell(folder: Path, cell: Cell, data: bytes) -> Path:
     """Write one cell's bytes; a reader sees the whole file or none."""
-    path = folder / f"{cell.i}_{cell.j}_{cell.k}.cell"
+    path = cell_path(folder, cell)
     _write(path, data)
     return path
+
+
+def cell_path(folder: Path, cell: Cell) -> Path:
+    """File of a cell."""
+    return folder / f"{cell.i}_{cell.j}_{cell.k}.cell"
 
 
 def read_head(folder: Path) -> FolderHead:

@@ -5,7 +5,7 @@ states of the cells that changed since the last time, and readers need no lock.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -13,11 +13,12 @@ import numpy.typing as npt
 from cairn_map.arrays import Floats, Ints
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.brick_cell import BrickCell
+from cairn_map.evidence.compact_cell import HeldCell, has_sums, opened
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import CELL_LIMIT, NANOMETRES, CellKey, Geometry, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.queries.occupancy_kernels import Grid, brick_corners_into
-from cairn_map.queries.occupancy_states import CellStates, state_grid, states_of_counts
+from cairn_map.queries.occupancy_states import CellStates, state_grid, states_of_cell
 
 Box = Sequence[Sequence[float]] | npt.NDArray[np.floating]
 """(2, 3) lowest and highest corner, metres, map frame; infinite where a side is open."""
@@ -30,7 +31,7 @@ class FrozenMap:
     geometry: Geometry
     model: SensorModel
     keys: tuple[CellKey, ...]
-    cells: tuple[BrickCell, ...]
+    cells: tuple[HeldCell, ...]
     states: tuple[CellStates, ...]
     grid: Grid
 
@@ -38,6 +39,16 @@ class FrozenMap:
     def reach_m(self) -> float:
         """Points must be nearer to the origin than this along every axis."""
         return (CELL_LIMIT - 1) * self.geometry.cell_edge_m
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory held besides the cells, which it shares with the live map."""
+        # The cells' states are parts of the grid's words; each brick has its number besides.
+        return self.grid.bricks.nbytes + self.grid.words.nbytes + 2 * len(self.grid.words)
+
+    def sums(self, slot: int) -> BrickCell:
+        """Sums of the cell in a slot, to be read; of one that is held as bytes, decoded now."""
+        return opened(self.cells[slot])
 
     def brick_corners(self) -> Ints:
         """(B, 3) first voxels of all bricks."""
@@ -69,18 +80,19 @@ def freeze(whole: EvidenceMap, model: SensorModel, *, earlier: FrozenMap | None 
     """The map as it is now; states of cells that are unchanged since `earlier` are taken from it."""
     copied = whole.copy()
     keys = tuple(copied)
-    cells = tuple(cell for key in keys if (cell := copied.cell(key)) is not None)
+    cells = tuple(cell for key in keys if (cell := copied.held(key)) is not None)
     known: dict[CellKey, CellStates] = {}
     if earlier is not None and earlier.model == model:
         known = dict(zip(earlier.keys, earlier.states, strict=True))
     states = tuple(
-        old
-        if (old := known.get(key)) is not None and old.counts is cell.counts
-        else states_of_counts(cell.counts, model)
+        old if (old := known.get(key)) is not None and has_sums(cell, old.sums) else states_of_cell(cell, model)
         for key, cell in zip(keys, cells, strict=True)
     )
     grid = state_grid([cell_of_key(key) for key in keys], states, whole.geometry)
-    return FrozenMap(whole.geometry, model, keys, cells, states, grid)
+    # Each cell's states are a part of the grid's from here on: else all of them would be held twice.
+    parts = np.split(grid.words, np.cumsum([len(state.words) for state in states[:-1]], dtype=np.int64))
+    shared = tuple(replace(state, words=words) for state, words in zip(states, parts, strict=False))
+    return FrozenMap(whole.geometry, model, keys, cells, shared, grid)
 
 
 def as_points(values: npt.ArrayLike, what: str) -> Floats:

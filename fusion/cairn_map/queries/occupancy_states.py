@@ -9,9 +9,11 @@ from enum import IntEnum
 from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
 from cairn_map.arrays import Floats, Words
 from cairn_map.evidence.brick_counts import BrickCounts
+from cairn_map.evidence.compact_cell import HeldCell, opened, sums_of
 from cairn_map.evidence.grid import Cell, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel, known, log_odds
 from cairn_map.queries import occupancy_kernels as kernels
@@ -31,15 +33,37 @@ class State(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CellStates:
-    """States of one cell's bricks, and the counts from which they were made."""
+    """States of one cell's bricks, and the sums from which they were made."""
 
-    counts: BrickCounts
+    sums: tuple[object, ...]
+    """`compact_cell.sums_of` the cell."""
+    bricks: npt.NDArray[np.uint16]
+    """(B,) Morton numbers of the bricks."""
     words: Words
     """(B, 8, 2) bits, laid out as in `occupancy_kernels.Grid`."""
 
+    @property
+    def size_bytes(self) -> int:
+        """Memory held."""
+        return self.bricks.nbytes + self.words.nbytes
 
-def states_of_counts(counts: BrickCounts, model: SensorModel) -> CellStates:
-    """The states of one cell; exactly those of `model.occupied`."""
+
+def states_of_cell(cell: HeldCell, model: SensorModel) -> CellStates:
+    """The states of one cell; one that is held as bytes is decoded for it."""
+    counts = opened(cell).counts
+    return CellStates(sums_of(cell), bricks_of(counts), words_of_counts(counts, model))
+
+
+def bricks_of(counts: BrickCounts) -> npt.NDArray[np.uint16]:
+    """(B,) Morton numbers of the bricks, in the order of the pool."""
+    (numbers,) = np.nonzero(counts.brick_of >= 0)
+    bricks = np.empty(len(counts.pool), np.uint16)
+    bricks[counts.brick_of[numbers]] = numbers
+    return bricks
+
+
+def words_of_counts(counts: BrickCounts, model: SensorModel) -> Words:
+    """(B, 8, 2) states of one cell, as bits; exactly those of `model.occupied`."""
     pool = counts.pool
     words = np.empty((len(pool), 8, 2), np.uint64)
     if pool.dtype == np.int16:
@@ -49,7 +73,7 @@ def states_of_counts(counts: BrickCounts, model: SensorModel) -> CellStates:
         rows = pool.reshape(-1, 2)
         for n, bits in ((kernels.OCCUPIED_BITS, model.occupied(rows)), (kernels.KNOWN_BITS, known(rows))):
             words[..., n] = np.packbits(bits, bitorder="little").view("<u8").reshape(-1, 8)
-    return CellStates(counts, words)
+    return words
 
 
 def state_grid(cells: Sequence[Cell], states: Sequence[CellStates], geometry: Geometry) -> Grid:
@@ -59,13 +83,11 @@ def state_grid(cells: Sequence[Cell], states: Sequence[CellStates], geometry: Ge
     hash_bits = max(HASH_BITS_MIN, (4 * C).bit_length())
     numbers, slots = np.full(1 << hash_bits, -1, np.int64), np.zeros(1 << hash_bits, np.int32)
     kernels.fill_table_into(numbers_of_cells, numbers, slots, 64 - hash_bits)
-    bricks = np.empty((C, 8 ** (geometry.depth - 3)), np.int32)
+    bricks = np.full((C, 8 ** (geometry.depth - 3)), kernels.NONE, np.int32)
     first = 0
     for slot, cell in enumerate(states):
-        brick_of = cell.counts.brick_of
-        np.add(brick_of, first, out=bricks[slot], where=brick_of >= 0, dtype=np.int32)
-        bricks[slot, brick_of < 0] = kernels.NONE
-        first += len(cell.counts.pool)
+        bricks[slot, cell.bricks] = np.arange(first, first + len(cell.bricks), dtype=np.int32)
+        first += len(cell.bricks)
     words = np.concatenate([np.empty((0, 8, 2), np.uint64), *(cell.words for cell in states)])
     nothing = np.zeros(3, np.int64)
     low, high = (numbers_of_cells.min(axis=0), numbers_of_cells.max(axis=0) + 1) if C else (nothing, nothing)

@@ -112,5 +112,5 @@ def _located(frozen: FrozenMap, points: Floats) -> Iterator[Located]:
         slots, places, order = np.empty(N, np.int32), np.empty(N, np.uint32), np.empty(N, np.int32)
         check_within(kernels.locate_into(frozen.grid, points[part], frozen.reach_m, slots, places), frozen)
         kernels.group_into(slots, starts, order)
-        for slot in np.nonzero(starts[1:] != starts[:-1])[0]:
-            yield part, frozen.cells[slot], order[starts[slot] : starts[slot + 1]], places
+        for slot in np.nonzero(starts[1:] != starts[:-1])[0].tolist():
+            yield part, frozen.sums(slot), order[starts[slot] : starts[slot + 1]], places

@@ -20,10 +20,10 @@ import numpy.typing as npt
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.brick_cell import BrickCell
-from cairn_map.evidence.brick_counts import BrickCounts
+from cairn_map.evidence.brick_counts import BrickNumbers
 from cairn_map.evidence.channels import ChannelKind
+from cairn_map.evidence.compact_cell import HeldCell, has_sums, opened, sums_of
 from cairn_map.evidence.grid import CellKey
-from cairn_map.evidence.sample_rows import SampleRows
 from cairn_map.queries.frozen_map import FrozenMap
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.queries.point_kernels import group_into
@@ -70,8 +70,9 @@ class SurfaceImage:
 class CellTables:
     """Tables of the readings of one cell's nodes; valid while the cell's sums are these objects."""
 
-    counts: BrickCounts
-    samples: SampleRows
+    sums: tuple[object, ...]
+    brick_of: BrickNumbers
+    """Row of a table by a brick's Morton number."""
     tables: dict[Hashable, Table] = field(default_factory=dict)
     """By what they show: a sensor model, or a channel."""
 
@@ -241,13 +242,13 @@ class MapRenderer:
             flat = seen.slots[rows].reshape(-1)
             starts, order = np.empty(len(frozen.cells) + 1, np.int64), np.empty(len(flat), np.int32)
             group_into(flat, starts, order)
-            for slot, table in tables.items():
+            for slot, kept in tables.items():
                 read_nodes_into(
                     order[starts[slot] : starts[slot + 1]],
                     seen.places[rows].reshape(-1),
                     seen.nodes[rows].reshape(-1),
-                    frozen.cells[slot].counts.brick_of,
-                    table,
+                    kept.brick_of,
+                    kept.tables[name],
                     out[rows].reshape(-1, planes),
                 )
 
@@ -255,16 +256,18 @@ class MapRenderer:
         return out
 
     def _table(
-        self, key: CellKey, cell: BrickCell, name: Hashable, make: Callable[[CellKey, BrickCell], Table]
-    ) -> Table:
-        """A cell's table, kept until the cell's sums are other objects."""
+        self, key: CellKey, cell: HeldCell, name: Hashable, make: Callable[[CellKey, BrickCell], Table]
+    ) -> CellTables:
+        """A cell's tables, this one among them, kept until the cell's sums are other objects."""
         # Merging into a frozen cell copies its sums first, so the same object means the same sums.
         kept = self.kept.get(key)
-        if kept is None or kept.counts is not cell.counts or kept.samples is not cell.samples:
-            kept = self.kept[key] = CellTables(cell.counts, cell.samples)
-        if name not in kept.tables:
-            kept.tables[name] = make(key, cell)
-        return kept.tables[name]
+        if kept is not None and name in kept.tables and has_sums(cell, kept.sums):
+            return kept
+        sums = opened(cell)
+        if kept is None or not has_sums(cell, kept.sums):
+            kept = self.kept[key] = CellTables(sums_of(cell), sums.counts.brick_of)
+        kept.tables[name] = make(key, sums)
+        return kept
 
     def _skips_of(self, frozen: FrozenMap) -> npt.NDArray[np.uint8]:
         # A new snapshot of a changed map has new words; tables of cells that are gone go with the old ones.

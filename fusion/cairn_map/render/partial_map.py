@@ -12,11 +12,12 @@ import numpy as np
 from cairn_map.arrays import Floats
 from cairn_map.evidence.brick_cell import BrickCell
 from cairn_map.evidence.channels import ChannelKind
+from cairn_map.evidence.compact_cell import sums_of
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.queries.frozen_map import FrozenMap
 from cairn_map.queries.map_snapshot import MapSnapshot
-from cairn_map.queries.occupancy_states import CellStates, state_grid, states_of_counts
+from cairn_map.queries.occupancy_states import CellStates, bricks_of, state_grid, words_of_counts
 from cairn_map.queries.point_queries import first_of_kind
 from cairn_map.render.camera_rays import CameraRays
 from cairn_map.render.map_render import CellTables, MapRenderer, SurfaceImage
@@ -44,7 +45,7 @@ class ReadCell:
     def size_bytes(self) -> int:
         """Memory held."""
         tables = sum(table.nbytes for table in self.tables.tables.values())
-        return self.cell.counts.brick_of.nbytes + self.states.words.nbytes + tables
+        return self.cell.counts.brick_of.nbytes + self.states.size_bytes + tables
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,8 +70,9 @@ def read_cell(cell: BrickCell, geometry: Geometry, model: SensorModel, layer: La
             kind = ChannelKind.TEMPERATURE if layer is Layer.TEMPERATURE else ChannelKind.COLOUR
             channel = first_of_kind(geometry, kind)
             table = {channel: mean_table(cell, channel, geometry)}
-    zeros, words = cell.zeros(), states_of_counts(cell.counts, model).words
-    return ReadCell(zeros, CellStates(zeros.counts, words), CellTables(zeros.counts, zeros.samples, table))
+    zeros = cell.zeros()
+    states = CellStates(sums_of(zeros), bricks_of(cell.counts), words_of_counts(cell.counts, model))
+    return ReadCell(zeros, states, CellTables(sums_of(zeros), zeros.counts.brick_of, table))
 
 
 def draw_as_needed(

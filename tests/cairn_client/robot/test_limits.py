@@ -257,8 +257,7 @@ def test_where_not_even_one_cell_fits_the_cause_is_told(row_server: LiveServer, 
     with robot_in(tmp_path, row_server.map_url, limits=Limits(memory_bytes_max=1 << 16)) as robot:
         at(robot, 0)
         robot.sync()
-        limits = robot._rounds._budget._limits
-        object.__setattr__(limits, "memory_bytes_max", 4096)
+        robot._rounds._budget._memory_max = 4096
         robot._rounds._budget.kept = CellCube(centre=(5, 0, 0), radius=0)
         at(robot, 5)
         with pytest.raises(BadInputError) as caught:

@@ -104,6 +104,8 @@ def _status(args: argparse.Namespace) -> int:
     place = f"at cursor {status.cursor}" if status.cursor else "not all of the server's"
     say(f"  map            {status.cells} cells, {shown_bytes(status.cells_bytes)}, {place}")
     say(f"  disk           {shown_bytes(status.disk_bytes)}")
+    most = "no limit" if status.memory_bytes_max is None else f"{shown_bytes(status.memory_bytes_max)} at most"
+    say(f"  memory of map  {most}")
     return 0
 
 
