@@ -39,9 +39,10 @@ check: .venv/dev.stamp .venv/kernels.stamp  ## laws and units only, in minutes: 
 test: .venv/dev.stamp .venv/kernels.stamp .venv/console.stamp | system  ## all tests, which CI runs (PYTEST_ARGS="...")
 	$(BIN)/python -m pytest $(WORKERS) $(PYTEST_ARGS)
 
-soak: .venv/dev.stamp .venv/kernels.stamp  ## crash, crowd, simulate sync, fuzz (SOAK_SECONDS=600 of each, SOAK_ARGS="cell"), bad links, kills, calibrations
+soak: .venv/dev.stamp .venv/kernels.stamp  ## crash, crowd, siege, simulate sync, fuzz (SOAK_SECONDS=600 of each, SOAK_ARGS="cell"), bad links, kills, calibrations
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.crash --trials 1000 --kills 200)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.crowd --robots 200 --seconds $(SOAK_SECONDS))
+	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.siege --seconds 30)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.sync_sim --seeds 100000)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.links --minutes 30)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.links --minutes 15 --kill)

@@ -13,6 +13,7 @@ many threads.
 from dataclasses import dataclass
 from itertools import chain
 
+from cairn_server.access.cancellation import StopTime
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.damaged_cells import DamagedCells
 from cairn_server.folding.fold_process import FoldProcess
@@ -34,6 +35,9 @@ from cairn_server.views.cell_views import CellViews
 from cairn_server.views.export_tickets import ExportTickets
 from cairn_server.views.map_exports import MapExports
 from cairn_server.views.map_views import MapViews
+
+WORK_GRACE_S = 4.0
+"""Time after the signal to stop for which requests that compute for long go on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +70,8 @@ class Service:
         self.store = store
         self.settings = settings
         self.figures = ServerFigures()
-        self.live = Hub(store)
+        self.stop_time = StopTime()
+        self.live = Hub(store, connections=settings.limit_concurrency)
         self.reports = RobotReports(store, self.live)
         self.maps = Maps(store, self.live, self.reports)
 
@@ -118,7 +123,8 @@ class Service:
         return metrics_text(chain(self.figures.registry.collect(), store, upstream, process_metrics()))
 
     def stop_streams(self) -> None:
-        """Count as not ready and end live streams, which never end alone; requests are still answered."""
+        """Count as not ready and end live streams, which never end alone; requests are still answered for a while."""
+        self.stop_time.set(WORK_GRACE_S)
         self.readiness.close()
         self.live.close()
 

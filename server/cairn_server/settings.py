@@ -4,10 +4,11 @@ The sentence below a field is also its help in `cairn serve --help`; the flags, 
 (`cairn_server.operations.serve_options`) take names, types and bounds from here.
 """
 
+from ipaddress import ip_network
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from cairn_map.errors import BadInputError
 
@@ -16,6 +17,12 @@ LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 
 def _none_if_zero(value: Any) -> Any:
     return None if value in (0, "0") else value
+
+
+def _networks(value: str) -> str:
+    for part in value.split():
+        ip_network(part)
+    return value
 
 
 Count = Annotated[Annotated[int, Field(ge=1)] | None, BeforeValidator(_none_if_zero)]
@@ -78,7 +85,11 @@ class Settings(BaseModel):
     quotas: Quotas = Quotas()
     """Bounds on what each robot may push."""
     limit_concurrency: Annotated[int, Field(ge=2, le=100_000)] = 500
-    """Connections that are served at once; some more are answered 503."""
+    """Connections of holders of tokens that are served at once, a sixteenth of them of one token (admins: all), and
+    half of them live streams; strangers have a quarter as many places of their own."""
+    trusted_proxies: Annotated[str, AfterValidator(_networks)] = ""
+    """Addresses or networks of proxies, separated by spaces, whose `X-Forwarded-For` and `X-Forwarded-Proto` are
+    believed; those of others are not."""
     head_s: Annotated[float, Field(gt=0)] = 15.0
     """Seconds from the connection, or from the answer before, until a request's head must be whole."""
     body_grace_s: Annotated[float, Field(gt=0)] = 30.0
@@ -90,6 +101,9 @@ class Settings(BaseModel):
     acknowledged is folded into it."""
     fold_lag_max_s: Annotated[float, Field(gt=0)] = 600.0
     """Seconds that a commit may wait to be folded while the server counts as ready."""
+    body_memory_bytes: Annotated[int, Field(ge=1 << 20)] = 1 << 28
+    """Memory for bodies of requests on their way, bytes; beyond it they are answered 503. One token may fill half; a
+    commit has up to 2^26 bytes."""
     check_workers: Annotated[int, Field(ge=1)] = 2
     """Processes that check expensive commits, started when the first one comes."""
     check_cpu_s: Annotated[float, Field(gt=0)] = 60.0

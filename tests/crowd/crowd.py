@@ -19,7 +19,8 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import WebSocketException
 from websockets.typing import Subprotocol
 
-from cairn_server.http.routes.live import PROTOCOL, TOKEN_PREFIX
+from cairn_server.http.middleware.token_first import TOKEN_PREFIX
+from cairn_server.http.routes.live import PROTOCOL
 from cairn_server.http.routes.sync import COMMIT_MEDIA_TYPE
 
 INCARNATION = "0" * 16  # what `Bodies` writes

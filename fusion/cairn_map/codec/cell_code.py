@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import lru_cache
 
 import numpy as np
 
@@ -37,7 +38,7 @@ from cairn_map.codec.octree.channel_streams import ChannelRows, stream_of_channe
 from cairn_map.codec.octree.streams import MODELLED, StoredStream, join_streams, stored_streams
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.compact_cell import CellCoding
-from cairn_map.evidence.evidence import Evidence, check_fits
+from cairn_map.evidence.evidence import Evidence, check_fits, empty_evidence
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
 
 
@@ -106,6 +107,20 @@ def encode_cell(
                     body = data if number == first else b""
                     stored[number] = StoredStream(number, MODELLED, len(streams[number]), body)
     return EncodedCell(head + join_streams(list(stored.values())), _digest(canonical_bytes(head, streams)))
+
+
+def encode_empty_cell(key: CellKey, geometry: Geometry) -> bytes:
+    """Bytes of a cell without evidence, those that `encode_cell` gives; the streams are coded once for a geometry."""
+    streams, joined = _empty_streams(geometry)
+    head = CellHead(key=key, geometry=geometry, voxels=0, leaves=0, streams=streams, signed=False)
+    return encode_head(head) + joined
+
+
+@lru_cache(maxsize=16)
+def _empty_streams(geometry: Geometry) -> tuple[int, bytes]:
+    """Number of streams of an empty cell, and their stored bytes."""
+    _, streams = _encoded(CellKey(0), empty_evidence(geometry), geometry)
+    return len(streams), join_streams(stored_streams(streams))
 
 
 def encode_cells(

@@ -6,10 +6,14 @@ from fastapi import APIRouter, FastAPI, Request
 from fastapi.responses import HTMLResponse
 from starlette.middleware import Middleware
 
+from cairn_server.access.body_budget import BodyBudget
+from cairn_server.access.connection_places import ConnectionPlaces
 from cairn_server.http.middleware.body_limit import BodyLimit
+from cairn_server.http.middleware.connection_shares import ConnectionShares
 from cairn_server.http.middleware.head_checks import DeniedHandshakes, PlainPath, ProtocolVersion, SameOrigin
 from cairn_server.http.middleware.request_trail import RequestTrail
 from cairn_server.http.middleware.token_first import TokenFirst
+from cairn_server.http.middleware.work_turns import Lanes, WorkTurns
 from cairn_server.http.openapi import DocumentedApp, docs_page
 from cairn_server.http.routes import branch as branch_routes
 from cairn_server.http.routes import cell as cell_routes
@@ -45,6 +49,9 @@ def docs(request: Request) -> HTMLResponse:
 
 def make_app(service: Service) -> FastAPI:
     """The app over a service, which the caller closes."""
+    settings = service.settings
+    lanes, bodies = Lanes(), BodyBudget(settings.body_memory_bytes)
+    places = ConnectionPlaces(settings.limit_concurrency, trusted_proxies=settings.trusted_proxies)
     app = DocumentedApp(
         title="cairn map server",
         version="1",
@@ -52,17 +59,18 @@ def make_app(service: Service) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,
-        middleware=list(_middleware(service)),
+        middleware=list(_middleware(service, lanes, bodies, places)),
         exception_handlers=PROBLEM_HANDLERS,
     )
     app.state.service = service
+    app.state.lanes, app.state.bodies, app.state.places = lanes, bodies, places
     app.state.console_files = console_routes.ConsoleFiles()
     for part in ROUTERS:
         app.include_router(part)
     return app
 
 
-def _middleware(service: Service) -> Iterator[Middleware]:
+def _middleware(service: Service, lanes: Lanes, bodies: BodyBudget, places: ConnectionPlaces) -> Iterator[Middleware]:
     """Middleware in the order in which a request passes it; the answer passes it in reverse."""
     yield Middleware(DeniedHandshakes)
     yield Middleware(RequestTrail, figures=service.figures)
@@ -70,5 +78,7 @@ def _middleware(service: Service) -> Iterator[Middleware]:
         yield Middleware(SameOrigin, host=service.settings.host)
     yield Middleware(ProtocolVersion)
     yield Middleware(PlainPath)
-    yield Middleware(BodyLimit)
     yield Middleware(TokenFirst, service=service)
+    yield Middleware(ConnectionShares, places=places)
+    yield Middleware(BodyLimit, budget=bodies)
+    yield Middleware(WorkTurns, lanes=lanes, stop=service.stop_time)

@@ -10,9 +10,10 @@ from html import escape
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
+from pydantic.json_schema import models_json_schema
 
 from cairn_map.wire.messages import Problem
-from cairn_server.http.routes.documentation import Json, problems
+from cairn_server.http.routes.documentation import JSON_BODIES, SCHEMAS_AT, Json, problems
 
 Route = tuple[str, str]
 STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem}
@@ -37,12 +38,24 @@ class DocumentedApp(FastAPI):
             parts = document.setdefault("components", {})
             schemas = parts.setdefault("schemas", {})
             schemas["Problem"] = Problem.model_json_schema()
+            _add_bodies(schemas)
             for name in ("HTTPValidationError", "ValidationError"):
                 schemas.pop(name, None)
             for scheme in parts.get("securitySchemes", {}).values():
                 scheme["description"] = "A token, as PROTOCOL.md section 2 says; a server without tokens takes none."
             self.openapi_schema = document
         return self.openapi_schema
+
+
+def _add_bodies(schemas: Json) -> None:
+    """Add the messages that requests bring, and those in them; of what answers bring, too, the request's form counts.
+
+    The two forms differ in one way: an answer has all fields, and of a request those with a default may be left out.
+    """
+    _, found = models_json_schema(
+        [(model, "validation") for model in JSON_BODIES.values()], ref_template=SCHEMAS_AT + "{model}"
+    )
+    schemas.update(found["$defs"])
 
 
 def operations(document: Json) -> Iterator[tuple[Route, Json]]:

@@ -43,8 +43,10 @@ class _LiveMap:
 class Hub:
     """Listeners of all maps of a server."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, *, connections: int = 2 * LISTENERS_MAX) -> None:
+        """Streams take at most half of a server's `connections`: the others are for requests."""
         self._store = store
+        self._streams_max = connections // 2
         self._lock = threading.Lock()
         self._maps: dict[int, _LiveMap] = {}
         self._of_token: Counter[bytes] = Counter()
@@ -106,10 +108,11 @@ class Hub:
         with self._lock:
             if self.is_closed:
                 raise UnreachableError("shutting_down", "the server is shutting down", retry_after_s=5.0)
-            if self._of_token.total() >= LISTENERS_MAX or self._of_token[token] >= LISTENERS_OF_TOKEN_MAX:
+            most = min(LISTENERS_MAX, self._streams_max)
+            if self._of_token.total() >= most or self._of_token[token] >= LISTENERS_OF_TOKEN_MAX:
                 raise UnreachableError(
                     "too_many_streams",
-                    f"at most {LISTENERS_OF_TOKEN_MAX} streams for one token and {LISTENERS_MAX} in all; close another",
+                    f"at most {LISTENERS_OF_TOKEN_MAX} streams for one token and {most} in all; close another",
                     retry_after_s=30.0,
                 )
             listener = Listener(self, live, token, wake)

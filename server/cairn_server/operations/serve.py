@@ -34,6 +34,7 @@ Three more commands look after the folder (docs/administrator.md); each explains
 
 import ctypes
 import logging
+import resource
 import signal
 import socket
 import sys
@@ -50,6 +51,7 @@ from cairn_server.folding.fold_process import fork_folding
 from cairn_server.http.app import make_app
 from cairn_server.http.middleware.deadlines import protocol_of
 from cairn_server.http.middleware.log_format import LogForm, start_logging
+from cairn_server.http.middleware.secure_start import secured
 from cairn_server.operations import check as check_command
 from cairn_server.operations.backup import back_up_command, restore_command
 from cairn_server.operations.serve_options import serve_parser, settings_of
@@ -73,6 +75,10 @@ the interpreter some ten times on its way, and with Python's 5 ms would wait for
 ARENAS_MAX, MAPPED_FROM_BYTES = 2, 1 << 20
 M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8
 """Parameters of glibc's `mallopt` (malloc.h)."""
+OTHER_DESCRIPTORS = 300
+"""Descriptors besides those of connections: three for each thread that reads the store, workers, exports, and the
+connections that are accepted in one turn of the event loop before those that give way are closed."""
+STRANGERS_SHARE = 4
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "backup": back_up_command,
     "restore": restore_command,
@@ -89,6 +95,7 @@ def main(argv: list[str]) -> int:
     settings = settings_of(args)
     settings.check_reach()
     settings.check_tls()
+    settings = settings.model_copy(update={"limit_concurrency": connections_within(settings.limit_concurrency)})
     signal.signal(signal.SIGTERM, _stop)
     sys.setswitchinterval(SWITCH_S)
     # Forked before there are threads: a lock that another thread held at the fork would stay locked in the child.
@@ -136,16 +143,19 @@ def config_of(app: FastAPI, settings: Settings, *, log_level: str = "warning") -
     Raises:
         BadInputError: kind `bad_setting`: no certificate, or not with this key.
     """
+    places = app.state.places
+    proxies = settings.trusted_proxies.split()
     config = uvicorn.Config(
         app,
-        http=protocol_of(settings),
+        http=protocol_of(settings, places),
+        proxy_headers=bool(proxies),
+        forwarded_allow_ips=proxies,
         log_config=None,
         log_level=log_level,
         access_log=False,
         server_header=False,
         timeout_graceful_shutdown=GRACE_S,
         lifespan="off",
-        limit_concurrency=settings.limit_concurrency,
         ssl_certfile=settings.tls_cert,
         ssl_keyfile=settings.tls_key,
         **WEBSOCKETS,
@@ -154,6 +164,10 @@ def config_of(app: FastAPI, settings: Settings, *, log_level: str = "warning") -
         config.load()
     except OSError as exc:  # ssl.SSLError is one
         raise BadInputError("bad_setting", f"--tls-cert {settings.tls_cert}, --tls-key: {exc}") from exc
+    if config.ssl is not None:
+        # Not by uvicorn: it would count a connection only after its handshake.
+        config.http_protocol_class = secured(config.http_protocol_class, config.ssl, places, settings.head_s)  # type: ignore[assignment,arg-type]
+        config.ssl = None
     return config
 
 
@@ -194,3 +208,32 @@ def keep_memory_small() -> None:
     if mallopt is not None:
         mallopt(M_ARENA_MAX, ARENAS_MAX)
         mallopt(M_MMAP_THRESHOLD, MAPPED_FROM_BYTES)
+
+
+def connections_within(limit: int) -> int:
+    """Most connections of holders of tokens, `limit` if there are descriptors for all; the soft limit is raised.
+
+    Raises:
+        BadInputError: kind `bad_setting`: there are too few for any.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = limit + limit // STRANGERS_SHARE + OTHER_DESCRIPTORS
+    if soft == resource.RLIM_INFINITY or soft >= wanted:
+        return limit
+    most = wanted if hard == resource.RLIM_INFINITY else min(hard, wanted)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+    if most == wanted:
+        return limit
+    fewer = (most - OTHER_DESCRIPTORS) * STRANGERS_SHARE // (STRANGERS_SHARE + 1)
+    if fewer < 2:
+        raise BadInputError(
+            "bad_setting", f"{most} file descriptors are too few for a server; raise the limit (ulimit -n {wanted})"
+        )
+    log.warning(
+        "limit_concurrency is %d, not %d: there are %d file descriptors (ulimit -n %d would do)",
+        fewer,
+        limit,
+        most,
+        wanted,
+    )
+    return fewer

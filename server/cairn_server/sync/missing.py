@@ -14,18 +14,18 @@ from itertools import islice
 
 import numpy as np
 
-from cairn_map.codec.cell_code import encode_cell
+from cairn_map.codec.cell_code import encode_empty_cell
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.commits.ids import OPERATOR, Author, CommitId, author_from_text
 from cairn_map.commits.version_vector import VersionVector
 from cairn_map.errors import BadInputError, ConflictError
 from cairn_map.evidence.cell_order import first_to_last
-from cairn_map.evidence.evidence import empty_evidence
 from cairn_map.evidence.fingerprint import ZERO, Fingerprint
-from cairn_map.evidence.grid import CELL_LIMIT, Cell, CellKey, Geometry, cell_key, cell_of_key
+from cairn_map.evidence.grid import CELL_LIMIT, Cell, CellKey, Geometry, cell_key, cell_keys, cell_of_key
 from cairn_map.kernels.morton_kernels import deinterleave
 from cairn_map.wire.frames import CELL_HEAD, CellFrame, Frame, FrameKind
 from cairn_map.wire.messages import CURSORS_MAX, Done, MissingRequest, More, ReplyHeader
+from cairn_server.access.cancellation import CANCELLATION
 from cairn_server.folding.cells import CellFaults
 from cairn_server.folding.cells_at_rest import DamagedCellError, sound_cell
 from cairn_server.folding.damaged_cells import as_named
@@ -42,6 +42,8 @@ RETRACTS_MAX = 1024
 """Most retracts that a header lists, for robots that do not find them in its vectors: 64 kB."""
 PENDING_AUTHORS_MAX = 256
 """Most authors whose pending commits are named to an asker without an author, who only sees that something is."""
+EMPTY_CELLS_MAX = 4096
+"""Cells that a reply sends as empty since the server never had them; then it ends with `more`, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +100,9 @@ def query_of(request: MissingRequest, snapshot: Snapshot) -> MissingQuery:
     cursor, cells = _cursor(request.cursor), _listed(request)
     head = snapshot.head.cursor
     unproven: set[Cursor] = set()
+    cancellation = CANCELLATION.get()
     for stated in {stated for stated in (cursor, *cells.values()) if stated is not None}:
+        cancellation.check()
         if stated.log_id != head.log_id:
             raise ConflictError("other_log", "the cursor belongs to another server's log; start without one")
         if not _is_proven(stated, snapshot):
@@ -178,8 +182,7 @@ class CellFrames:
             return self._frame(FrameKind.RESET, key, start, ZERO)
         # Asked for with nothing held: without an answer it is asked for again. At a proven state it is empty already.
         if start is None:
-            empty = encode_cell(key, empty_evidence(self.geometry), self.geometry).data
-            return self._frame(FrameKind.FULL, key, None, ZERO, empty)
+            return self._frame(FrameKind.FULL, key, None, ZERO, encode_empty_cell(key, self.geometry))
         return None
 
     def _body(self, key: CellKey) -> bytes:
@@ -209,7 +212,9 @@ def reply_frames(cells: CellFrames, facts: HeaderFacts) -> Iterator[Frame]:
     rest = ZERO
     sent_bytes = 0
     listed = dict(query.cells)
+    cancellation = CANCELLATION.get()
     for row in in_order([row for row in snapshot.cells() if query.wants(row.key)], query.near):
+        cancellation.check()
         start = listed.pop(row.key, query.cursor)
         frame = cells.frame_of(row, start)
         if frame is None:
@@ -222,10 +227,18 @@ def reply_frames(cells: CellFrames, facts: HeaderFacts) -> Iterator[Frame]:
             yield More(to=to)
             return
     # What is left of the list is not in main.
+    empty_cells = 0
     for key, start in ((key, start) for key, start in listed.items() if query.wants(key)):
+        cancellation.check()
         unknown = cells.frame_of_unknown(key, start)
-        if unknown is not None:
-            yield unknown
+        if unknown is None:
+            continue
+        yield unknown
+        # Fingerprints alone are cheap, and must all come: the asker takes them as the answer to all that it listed.
+        empty_cells += unknown.kind is FrameKind.FULL
+        if empty_cells >= EMPTY_CELLS_MAX:
+            yield More(to=to)
+            return
     yield Done(to=to, rest=rest.hex())
 
 
@@ -250,15 +263,14 @@ def _first_authors(vector: VersionVector) -> VersionVector:
 def _listed(request: MissingRequest) -> dict[CellKey, Cursor | None]:
     """Cells that a request lists, one by one or in groups by cursor."""
     groups = [*request.groups, *((entry.cursor, [entry.cell]) for entry in request.cells)]
-    count = sum(len(cells) for _, cells in groups)
-    # Counted before any number is parsed.
-    if count > CURSORS_MAX:
-        raise BadInputError("bad_message", f"{count} cells are listed, at most {CURSORS_MAX} may be")
-    listed: dict[CellKey, Cursor | None] = {}
-    for text, cells in groups:
-        listed |= dict.fromkeys(map(cell_key, cells), _cursor(text))
+    named = [cell for _, cells in groups for cell in cells]
+    # Counted before any number is computed.
+    if len(named) > CURSORS_MAX:
+        raise BadInputError("bad_message", f"{len(named)} cells are listed, at most {CURSORS_MAX} may be")
+    cursors = [cursor for text, cells in groups for cursor in [_cursor(text)] * len(cells)]
+    listed = dict(zip(map(CellKey, cell_keys(named).tolist()), cursors, strict=True))
     # A cell under two cursors would have no right answer; the dict has dropped one of them.
-    if len(listed) != count:
+    if len(listed) != len(named):
         raise BadInputError("bad_message", "a cell is named twice in the request")
     return listed
 

@@ -1,14 +1,17 @@
 """Uploads: bodies of commits that come in parts, so that a broken link goes on where it stopped.
 
 They are in memory only: losing them costs bytes, never evidence. A robot pushes its commits one after the other, so it
-has one upload here, and a second one while an amend waits for what it takes out. A new upload displaces those that were
-idle longest. Only bytes received take room, not announced ones. Only the whole body is checked and acknowledged, by the
-steps of a push.
+has one upload here, and a second one while an amend waits for what it takes out. Only bytes received take room, not
+announced ones. Only the whole body is checked and acknowledged, by the steps of a push.
+
+Where there is no room, who holds most gives way: the robot of the largest share loses what it left idle longest, and if
+that is the robot that sends, it waits. So no upload goes for one whose robot holds more, and small ones never go.
 """
 
 import hashlib
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -28,6 +31,8 @@ BODIES_MAX = 2
 """Most bodies of one robot on one map."""
 KEPT_S = 86_400.0
 """Time without a new part after which an upload is dropped."""
+IDLE_S = 900.0
+"""Time without a new part after which an upload gives way to any other: on the slowest link parts come every 260 s."""
 
 Place = tuple[int, str, CommitId]
 """Place of an upload: map, robot or relay, and commit."""
@@ -144,29 +149,60 @@ class Uploads:
             return sum(len(found.data) for found in self._staged.values())
 
     def _take(self, place: Place, part: Part) -> bytes | None:
-        """Add a part to its upload; the whole body, if this was its last part."""
+        """Add a part to its upload; the whole body, if this was its last part.
+
+        Raises:
+            UnreachableError: kind `busy`: there is no room for it; what came before stays.
+        """
         with self._lock:
             found = self._at(place, part.digest)
             if found is None or found.total_bytes != part.total_bytes:
                 found = _Staged(part.digest, part.total_bytes, self._steady_s())
-            found.add(part, self._steady_s())
-            if found.data:
+            is_next = part.offset_bytes == len(found.data)
+            size_bytes = len(found.data) + (len(part.data) if is_next else 0)
+            if size_bytes:
+                self._make_room(place, size_bytes)
                 self._staged.pop(place, None)
-                self._make_room(place, len(found.data))
                 self._staged[place] = found  # the one used last stands last
+            found.add(part, self._steady_s())
             return bytes(found.data) if len(found.data) == found.total_bytes else None
 
     def _make_room(self, place: Place, size_bytes: int) -> None:
-        """Drop the robot's own uploads beyond `BODIES_MAX`, old ones, and of the rest those that were idle longest."""
+        """Drop the robot's own uploads beyond `BODIES_MAX`, old ones, and of the rest as many as must give way.
+
+        Raises:
+            UnreachableError: kind `busy`: this robot itself holds most.
+        """
         now_s = self._steady_s()
-        own = [other for other in self._staged if other[:2] == place[:2]]
-        for other in own[: 1 - BODIES_MAX]:
+        own = [other for other in self._staged if other[:2] == place[:2] and other != place]
+        for other in own[: max(0, len(own) + 1 - BODIES_MAX)]:
             del self._staged[other]
-        held_bytes = sum(len(found.data) for found in self._staged.values())
         for other, found in list(self._staged.items()):
-            if held_bytes + size_bytes > STAGED_BYTES_MAX or now_s - found.used_s > KEPT_S:
-                held_bytes -= len(found.data)
+            if now_s - found.used_s > KEPT_S:
                 del self._staged[other]
+        while sum((sizes := self._sizes(place, size_bytes)).values()) > STAGED_BYTES_MAX:
+            del self._staged[self._giving_way(place, sizes, now_s)]
+
+    def _sizes(self, place: Place, size_bytes: int) -> dict[Place, int]:
+        """Bytes of every upload, of the one at `place` those that it is to have."""
+        return {other: len(found.data) for other, found in self._staged.items()} | {place: size_bytes}
+
+    def _giving_way(self, place: Place, sizes: dict[Place, int], now_s: float) -> Place:
+        """Upload to drop next, other than the one at `place`."""
+        others = [other for other in self._staged if other != place]  # longest idle first
+        if others and now_s - self._staged[others[0]].used_s > IDLE_S:
+            return others[0]
+        of_robot: Counter[tuple[int, str]] = Counter()
+        for other, size in sizes.items():
+            of_robot[other[:2]] += size
+        # Of equal ones any gives way, but never the robot that sends.
+        most = max(of_robot[other[:2]] for other in sizes)
+        found = next((other for other in others if of_robot[other[:2]] == most), None)
+        if found is None:
+            raise UnreachableError(
+                "busy", "no room for more parts of this commit: other robots' uploads are here", retry_after_s=30.0
+            )
+        return found
 
     def _size(self, place: Place, digest: str) -> int:
         with self._lock:

@@ -21,6 +21,7 @@ from cairn_map.evidence.grid import CellKey
 from cairn_map.files.export_request import ExportRequest, cell_may_have, node_geometry
 from cairn_map.files.octomap import TREE_FORMATS, Subtree, branch_of_cell, tree_file
 from cairn_map.files.point_clouds import About, PointBounds, found_in_cell, point_file, points_of_cell, size_of_file
+from cairn_server.access.cancellation import CANCELLATION
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.cells_at_rest import DamagedCellError, decode_stored, sound_cell, stored_evidence
 from cairn_server.store.store import Snapshot, Store
@@ -152,7 +153,9 @@ def _laid_aside(
     """Cells that have what is asked for, rising in number, with the sizes of their bytes."""
     until_s, row = math.inf, file.row
     voxels, sizes = 0, list[tuple[CellKey, int]]()
+    cancellation = CANCELLATION.get()
     for listed in snapshot.cells():
+        cancellation.check()
         if not listed.voxels or not cell_may_have(listed.key, row.geometry, file.asked):
             continue
         voxels += listed.voxels

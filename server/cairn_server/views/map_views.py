@@ -27,6 +27,7 @@ from cairn_map.render.partial_map import Drawing, ReadCell, draw_as_needed, read
 from cairn_map.render.render_picture import Layer, png_of
 from cairn_map.render.render_request import RenderRequest
 from cairn_map.warm_up import warm_up_pictures
+from cairn_server.access.cancellation import CANCELLATION, Cancellation
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.cells_at_rest import DamagedCellError, row_of_cell, sound_cell, stored_evidence
 from cairn_server.folding.read_cache import State, state_of
@@ -76,17 +77,20 @@ class _Task:
     listed: dict[CellKey, CellRow]
     """Cells of the snapshot that hold something."""
     until_s: float
+    cancellation: Cancellation
     healed: list[CellRow]
     """Collects the cells that were rebuilt from the log."""
     voxels: int = 0
     """Voxels of the cells read so far."""
 
     def check_time(self) -> None:
-        """End what takes too long.
+        """End what takes too long, or is not wanted any more.
 
         Raises:
-            BadInputError: kind `too_costly`.
+            BadInputError: kind `too_costly`, `cut_off`.
+            UnreachableError: kind `shutting_down`.
         """
+        self.cancellation.check()
         if time.monotonic() > self.until_s:
             raise BadInputError(
                 "too_costly", f"the picture takes more than {RENDER_S:g} s; ask for fewer pixels, or less range_m"
@@ -125,7 +129,8 @@ class MapViews:
             with self._turn():
                 until_s = time.monotonic() + RENDER_S
                 listed, places = self._listing(snapshot)
-                task = _Task(snapshot, row, _read_of(request.layer), listed, until_s, faults.healed)
+                layer, cancellation = _read_of(request.layer), CANCELLATION.get()
+                task = _Task(snapshot, row, layer, listed, until_s, cancellation, faults.healed)
                 return AskedView(etag, snapshot.head, self._body(task, places, request))
 
     @contextmanager

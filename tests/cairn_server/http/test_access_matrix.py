@@ -24,7 +24,8 @@ from cairn_map.wire.access_messages import RoleText
 from cairn_map.wire.messages import Register
 from cairn_server.access.auth import new_token, token_hash
 from cairn_server.http.app import ROUTERS
-from cairn_server.http.routes.live import PROTOCOL, TOKEN_PREFIX
+from cairn_server.http.middleware.token_first import TOKEN_PREFIX
+from cairn_server.http.routes.live import PROTOCOL
 from cairn_server.store.store_rows import MapRow, Token
 
 READING = {"reader", "robot", "operator", "relay"}

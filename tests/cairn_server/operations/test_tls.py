@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tests.fixtures.server.certificate import certificate
 from tests.fixtures.server.live import Process
 
 from cairn_client.http.api import MapApi
@@ -17,28 +18,12 @@ from cairn_map.errors import UnreachableError
 from cairn_map.wire.messages import CreateMap
 from cairn_server.operations.health_probe import why_not
 
+__all__ = ["certificate"]
+
 pytestmark = [
     pytest.mark.processes,
     pytest.mark.skipif(not shutil.which("openssl"), reason="the openssl command makes the certificate"),
 ]
-
-
-@pytest.fixture(scope="module")
-def certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with `cert.pem` of 127.0.0.1, signed by itself, and `key.pem`."""
-    folder: Path = tmp_path_factory.mktemp("tls")
-    subprocess.run(
-        [
-            *("openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"),
-            *("-days", "2", "-subj", "/CN=cairn", "-addext", "subjectAltName=IP:127.0.0.1"),
-            *("-keyout", "key.pem", "-out", "cert.pem"),
-        ],
-        cwd=folder,
-        check=True,
-        capture_output=True,
-        timeout=60,
-    )
-    return folder
 
 
 @pytest.fixture(scope="module")

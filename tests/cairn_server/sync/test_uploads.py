@@ -1,5 +1,6 @@
 """Commits that come in parts: where they go on, what is refused before it comes, how little a hostile robot holds."""
 
+from contextlib import suppress
 from pathlib import Path
 from random import Random
 
@@ -173,7 +174,8 @@ def test_all_robots_together_hold_no_more_than_the_limit(live: Live, monkeypatch
     random = Random(1)
     for _ in range(200):
         total = random.randint(1000, 5000)
-        staging.add(f"r{random.randrange(20)}", random.randint(1, 999), n=random.randrange(3), total=total)
+        with suppress(UnreachableError):
+            staging.add(f"r{random.randrange(20)}", random.randint(1, 999), n=random.randrange(3), total=total)
         assert staging.uploads.staged_bytes() <= 10_000
 
 
@@ -182,13 +184,42 @@ def test_who_was_quiet_longest_goes_first_and_what_is_old_goes(live: Live, monke
     staging = Staging(live)
     for robot in ("a", "b"):
         staging.add(robot, 150)
-    staging.add("a", 100, offset=150)
+    staging.add("a", 50, offset=150)
+    staging.add("b", 50, offset=150)
     staging.add("c", 150)
-    assert staging.add("b", 1, offset=150) == 0
-    assert staging.add("a", 1, offset=250) == 251
-    staging.now_s = uploads.KEPT_S + 1
+    assert staging.add("a", 1, offset=200) == 0
+    assert staging.add("b", 1, offset=200) == 201
+    staging.now_s = uploads.IDLE_S + 1
+    staging.add("b", 1, offset=201)
+    staging.add("d", 200)
+    assert staging.add("b", 0, offset=202) == 202
+    assert staging.add("c", 1, offset=150) == 0
+    staging.now_s += uploads.KEPT_S + 1
     staging.add("d", 10, total=1000)
     assert staging.uploads.staged_bytes() == 10
+
+
+def test_another_robots_upload_survives_two_full_ones(live: Live) -> None:
+    staging = Staging(live)
+    staging.add("wren", 1 << 18)
+    for _ in range(3):
+        for n in range(2):
+            with suppress(UnreachableError):  # room for both is only without wren's
+                staging.add("mole", COMMIT_BYTES_MAX - 1, n=n)
+    assert staging.add("wren", 1 << 18, offset=1 << 18) == 1 << 19
+    assert staging.uploads.staged_bytes() <= uploads.STAGED_BYTES_MAX
+
+
+def test_who_holds_most_waits_and_loses_nothing(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(uploads, "STAGED_BYTES_MAX", 500)
+    staging = Staging(live)
+    staging.add("mole", 300)
+    staging.add("wren", 150)
+    with pytest.raises(UnreachableError) as told:
+        staging.add("mole", 100, offset=300)
+    assert told.value.kind == "busy" and told.value.retry_after_s
+    assert staging.add("mole", 50, offset=300) == 350
+    assert staging.add("wren", 1, offset=150) == 151
 
 
 def test_a_part_of_nothing_takes_no_place(live: Live) -> None:

@@ -1,18 +1,16 @@
-"""Bound on the size of request bodies, enforced before anything reads them whole. Plain ASGI."""
+"""Bounds on request bodies, of each and of all in memory, enforced before anything reads them whole. Plain ASGI."""
 
 import re
-from collections.abc import Awaitable, Callable, MutableMapping
-from contextlib import suppress
+from collections.abc import Hashable, MutableMapping
+from dataclasses import dataclass
 from typing import Any
 
 from cairn_map.commits.commit import COMMIT_BYTES_MAX
-from cairn_map.wire.messages import Problem
+from cairn_map.errors import BadInputError, CairnError, UnreachableError
+from cairn_server.access.body_budget import BodyBudget
+from cairn_server.http.middleware.asgi import App, Message, Receive, Send, send_error
+from cairn_server.http.middleware.token_first import caller_key
 from cairn_server.live.robot_reports import VIEW_BYTES_MAX
-
-Message = MutableMapping[str, Any]
-Receive = Callable[[], Awaitable[Message]]
-Send = Callable[[Message], Awaitable[None]]
-App = Callable[[MutableMapping[str, Any], Receive, Send], Awaitable[None]]
 
 MISSING_BYTES_MAX = 16 << 20
 """Room for 100 000 cells with a cursor each."""
@@ -27,48 +25,82 @@ LIMITS = (
 )
 
 
-class _TooLargeError(Exception):
-    pass
-
-
 class BodyLimit:
-    """Middleware that answers 413 to a body that claims to be, or grows, larger than its path allows."""
+    """Middleware that answers 413 to a body larger than its path allows, and 503 to one for which there is no room.
 
-    def __init__(self, app: App) -> None:
+    What a body claims to be is looked at first, then what comes.
+    """
+
+    def __init__(self, app: App, *, budget: BodyBudget) -> None:
         self._app = app
+        self._budget = budget
 
     async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
         """Pass a request on with its body counted, or refuse it."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        limit_bytes = limit_of(scope["path"])
+        limit_bytes, caller = limit_of(scope["path"]), caller_key(scope)
         claimed = dict(scope["headers"]).get(b"content-length", b"0")
         if not claimed.isdigit() or len(claimed) > 18 or int(claimed) > limit_bytes:
-            await _refuse(send, limit_bytes)
+            await send_error(send, 413, _too_large(limit_bytes))
             return
-        got_bytes = 0
-        started = False
+        try:
+            self._budget.check(caller, int(claimed))
+        except UnreachableError as exc:
+            await send_error(send, 503, exc)
+            return
+        body = _Body(limit_bytes, self._budget, caller, receive, send)
+        try:
+            await self._app(scope, body.receive, body.send)
+        except (BadInputError, UnreachableError):
+            if body.refusal is None:
+                raise
+        finally:
+            self._budget.give_back(caller, body.held_bytes)
+        if body.refusal is not None and not body.is_answered:
+            await send_error(send, *body.refusal)
 
-        async def counted() -> Message:
-            nonlocal got_bytes
-            message = await receive()
-            got_bytes += len(message.get("body", b""))
-            if got_bytes > limit_bytes:
-                raise _TooLargeError
-            return message
 
-        async def noted(message: Message) -> None:
-            nonlocal started
-            # The framework turns what is raised while it reads JSON into an answer of its own: drop that one.
-            if got_bytes <= limit_bytes or started:
-                started = True
-                await send(message)
+@dataclass(slots=True)
+class _Body:
+    """Body of one request: counted, and kept within its limit and the budget."""
 
-        with suppress(_TooLargeError):
-            await self._app(scope, counted, noted)
-        if got_bytes > limit_bytes and not started:
-            await _refuse(send, limit_bytes)
+    limit_bytes: int
+    budget: BodyBudget
+    caller: Hashable
+    asgi_receive: Receive
+    asgi_send: Send
+    held_bytes: int = 0
+    refusal: tuple[int, CairnError] | None = None
+    """Status and error, once the body was refused."""
+    is_answered: bool = False
+
+    async def receive(self) -> Message:
+        """The next part.
+
+        Raises:
+            BadInputError: kind `too_large`.
+            UnreachableError: kind `busy`.
+        """
+        message = await self.asgi_receive()
+        size_bytes = len(message.get("body", b""))
+        if self.held_bytes + size_bytes > self.limit_bytes:
+            self.refusal = 413, _too_large(self.limit_bytes)
+            raise self.refusal[1]
+        try:
+            self.budget.take(self.caller, size_bytes)
+        except UnreachableError as exc:
+            self.refusal = 503, exc
+            raise
+        self.held_bytes += size_bytes
+        return message
+
+    async def send(self, message: Message) -> None:
+        """Pass the answer on; what the framework makes of a refused body is dropped: another answer follows."""
+        if self.refusal is None or self.is_answered:
+            self.is_answered = True
+            await self.asgi_send(message)
 
 
 def limit_of(path: str) -> int:
@@ -76,16 +108,5 @@ def limit_of(path: str) -> int:
     return next((size for pattern, size in LIMITS if pattern.fullmatch(path)), JSON_BYTES_MAX)
 
 
-async def send_problem(send: Send, status: int, kind: str, detail: str, *, answer_to: str = "http") -> None:
-    """Answer a request, or a WebSocket's handshake, with a problem, and close: the body was not read."""
-    problem = Problem(title=kind.replace("_", " "), status=status, detail=detail, kind=kind)
-    headers = [(b"content-type", b"application/problem+json"), (b"connection", b"close")]
-    if status == 401:
-        headers.append((b"www-authenticate", b"Bearer"))
-    prefix = "" if answer_to == "http" else "websocket."
-    await send({"type": f"{prefix}http.response.start", "status": status, "headers": headers})
-    await send({"type": f"{prefix}http.response.body", "body": problem.model_dump_json().encode()})
-
-
-async def _refuse(send: Send, limit_bytes: int) -> None:
-    await send_problem(send, 413, "too_large", f"a body has at most {limit_bytes} bytes here")
+def _too_large(limit_bytes: int) -> BadInputError:
+    return BadInputError("too_large", f"a body has at most {limit_bytes} bytes here")

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 
+from cairn_server.access.connection_places import ConnectionPlace, ConnectionPlaces
 from cairn_server.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -23,6 +24,8 @@ log = logging.getLogger(__name__)
 TICK_S = 1.0
 """Time between two looks at a connection."""
 JOINED_BYTES_MAX = 1 << 14
+PLACE = "place"
+"""Name of a connection's place in the state of its requests; it has none if it is a proxy's."""
 Stage = Literal["head", "body", "answer"]
 
 
@@ -69,9 +72,18 @@ class PunctualProtocol(H11Protocol):
     """uvicorn's HTTP/1.1 connection, aborted when the client takes too long."""
 
     settings = Settings()
+    places = ConnectionPlaces(2)
+    _place: ConnectionPlace | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Start the clock of a new connection, or abort it if far too many are open."""
+        """Take a place for a new connection, and begin."""
+        self.begin(transport, self.places.enter(address_of(transport), transport.abort))
+
+    def begin(self, transport: asyncio.Transport, place: ConnectionPlace | None) -> None:
+        """Start the clock of a new connection, which has a place or is a trusted proxy's."""
+        self._place = place
+        # Requests find it in their state: a good token makes the connection its own.
+        self.app_state = {**self.app_state, PLACE: place}
         super().connection_made(_Joined(transport, self.loop))  # type: ignore[arg-type]
         self._stage: tuple[Stage, RequestResponseCycle | None] = ("head", None)
         self._since_s = self._seen_s = self.loop.time()
@@ -79,9 +91,6 @@ class PunctualProtocol(H11Protocol):
         self._unsent: tuple[float, int] | None = None
         self._tick_s = min(TICK_S, self.settings.head_s / 4)
         self._timer = self.loop.call_later(self._tick_s, self._look)
-        # Up to `limit_concurrency` are served, a quarter more are answered 503, the rest is cut before it costs more.
-        if len(self.connections) > self.settings.limit_concurrency * 5 // 4 + 1:
-            transport.abort()
 
     def data_received(self, data: bytes) -> None:
         """Count the bytes, which extend the deadline of a body."""
@@ -89,14 +98,26 @@ class PunctualProtocol(H11Protocol):
         super().data_received(data)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Stop the clock."""
+        """Stop the clock, and give the place back."""
         self._timer.cancel()
+        if self._place is not None:
+            self.places.leave(self._place)
         super().connection_lost(exc)
 
     def handle_websocket_upgrade(self, event: object) -> None:
-        """Stop the clock: the WebSocket has pings of its own."""
+        """Stop the clock: the WebSocket has pings of its own, and the place until it is closed."""
         self._timer.cancel()
         super().handle_websocket_upgrade(event)  # type: ignore[arg-type]
+        self._await_close()
+
+    def _await_close(self) -> None:
+        """Give the place of a WebSocket back at its end, of which uvicorn tells another protocol."""
+        if self._place is None:
+            return
+        if self.transport.is_closing():
+            self.places.leave(self._place)
+        else:
+            self.loop.call_later(self._tick_s, self._await_close)
 
     def _look(self) -> None:
         """Abort the connection if its time is over, else look again later."""
@@ -140,6 +161,12 @@ class PunctualProtocol(H11Protocol):
         return self.settings.body_grace_s + size_bytes / self.settings.body_bytes_per_s
 
 
-def protocol_of(settings: Settings) -> type[PunctualProtocol]:
+def protocol_of(settings: Settings, places: ConnectionPlaces) -> type[PunctualProtocol]:
     """Protocol class with these settings: uvicorn makes an instance of it for each connection, without arguments."""
-    return type("PunctualProtocol", (PunctualProtocol,), {"settings": settings})
+    return type("PunctualProtocol", (PunctualProtocol,), {"settings": settings, "places": places})
+
+
+def address_of(transport: asyncio.BaseTransport) -> str:
+    """Address at the other end."""
+    peer = transport.get_extra_info("peername")
+    return str(peer[0]) if peer else ""

@@ -6,7 +6,7 @@ from typing import Any
 
 from uvicorn.protocols.utils import ClientDisconnected
 
-from cairn_server.http.middleware.body_limit import App, Message, Receive, Send, send_problem
+from cairn_server.http.middleware.asgi import App, Message, Receive, Send, send_problem
 from cairn_server.settings import LOOPBACK
 
 HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:[0-9]{0,5})?", re.IGNORECASE)

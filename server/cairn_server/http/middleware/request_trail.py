@@ -13,7 +13,7 @@ from collections.abc import MutableMapping
 from dataclasses import dataclass
 from typing import Any
 
-from cairn_server.http.middleware.body_limit import App, Message, Receive, Send
+from cairn_server.http.middleware.asgi import App, Message, Receive, Send
 from cairn_server.http.middleware.log_format import REQUEST_ID, Field, fields
 from cairn_server.metrics import ServerFigures
 

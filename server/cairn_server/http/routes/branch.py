@@ -8,7 +8,8 @@ from fastapi import APIRouter, Depends, Header, Response
 from cairn_map.wire.messages import BranchInfo, Register, Registered, RobotStatus
 from cairn_server.access.auth import Caller, Role
 from cairn_server.http.routes.callers import OWNERS, READERS, Map, Operations, allowed, body_of, own_branch
-from cairn_server.http.routes.documentation import answers, body, example
+from cairn_server.http.routes.documentation import answers, body, json_body
+from cairn_server.http.routes.json_bodies import json_of
 
 PICTURES = ("image/jpeg", "image/png")
 
@@ -18,17 +19,21 @@ router = APIRouter()
 @router.post(
     "/maps/{name}/branches",
     status_code=201,
-    openapi_extra=example(
-        {
+    openapi_extra=json_body(
+        Register,
+        example={
             "robot": "mole",
             "mode": "high-end",
             "incarnation": "1f2e3d4c5b6a7988",
             "sensors": ["tof", "colour", "thermal"],
-        }
+        },
     ),
 )
 def register(
-    body: Register, service: Operations, row: Map, caller: Annotated[Caller, Depends(allowed(Role.ENROLLER))]
+    service: Operations,
+    row: Map,
+    caller: Annotated[Caller, Depends(allowed(Role.ENROLLER))],
+    body: Annotated[Register, json_of(Register)],
 ) -> Registered:
     """Register a robot; registering again replaces its token."""
     registered = service.maps.register(row, body)
@@ -53,8 +58,9 @@ def deregister(branch: str, service: Operations, row: Map, caller: Annotated[Cal
     "/maps/{name}/branches/{branch}/status",
     status_code=204,
     dependencies=OWNERS,
-    openapi_extra=example(
-        {
+    openapi_extra=json_body(
+        RobotStatus,
+        example={
             "time_s": 1795253400.0,
             "pose": {
                 "time_s": 1795253400.0,
@@ -68,10 +74,10 @@ def deregister(branch: str, service: Operations, row: Map, caller: Annotated[Cal
             "waiting_bytes": 1500000,
             "battery": 0.8,
             "note": "at the stairs",
-        }
+        },
     ),
 )
-def put_status(branch: str, body: RobotStatus, service: Operations, row: Map) -> None:
+def put_status(branch: str, service: Operations, row: Map, body: Annotated[RobotStatus, json_of(RobotStatus)]) -> None:
     """Report where a robot is and how it is doing; only the latest report is kept."""
     service.reports.put_status(row, branch, body)
 

@@ -2,6 +2,7 @@
 
 @router.get(PATH, response_class=Response, responses=answers({200: ("image/png",), 304: ()}) | problems(413))
 @router.put(PATH, openapi_extra=body("image/jpeg", "image/png"))
+@router.put(PATH, openapi_extra=json_body(RobotStatus, example={...}))
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,6 +15,7 @@ from cairn_server.http.routes.problems import MEDIA_TYPE as PROBLEM_MEDIA_TYPE
 Json = dict[str, Any]
 Entries = dict[int | str, Json]
 
+SCHEMAS_AT = "#/components/schemas/"
 BYTES: Json = {"schema": {"type": "string", "format": "binary"}}
 TEXT: Json = {"schema": {"type": "string"}}
 SCHEMAS: dict[str, Json] = {"application/json": {"schema": {}}, "text/event-stream": TEXT}
@@ -49,6 +51,14 @@ def body(*media_types: str) -> Json:
     return {"requestBody": {"required": True, "content": {name: dict(BYTES) for name in media_types}}}
 
 
-def example(value: Json) -> Json:
-    """Example of a JSON body; it must be one that the server takes."""
-    return {"requestBody": {"content": {"application/json": {"example": value}}}}
+JSON_BODIES: dict[str, type[BaseModel]] = {}
+"""Messages that are bodies of requests, by name: `openapi` adds their schemas to the document."""
+
+
+def json_body(model: type[BaseModel], *, example: Json | None = None) -> Json:
+    """Request body of JSON; an example must be one that the server takes."""
+    JSON_BODIES[model.__name__] = model
+    content: Json = {"schema": {"$ref": f"{SCHEMAS_AT}{model.__name__}"}}
+    if example is not None:
+        content["example"] = example
+    return {"requestBody": {"required": True, "content": {"application/json": content}}}

@@ -8,7 +8,8 @@ from fastapi.responses import StreamingResponse
 from cairn_map.files.export_request import EXPORT_TYPES, ExportRequest, ExportTicket, TicketedExport
 from cairn_map.render.render_request import RenderRequest
 from cairn_server.http.routes.callers import READERS, Asking, Credentials, Map, Operations
-from cairn_server.http.routes.documentation import answers, example, problems
+from cairn_server.http.routes.documentation import answers, json_body, problems
+from cairn_server.http.routes.json_bodies import json_of
 from cairn_server.store.store_rows import MapRow
 
 PICTURES = {"png": "image/png", "npz": "application/x-npz"}
@@ -75,8 +76,13 @@ def export(
     dependencies=READERS,
     status_code=201,
     responses=problems(429),
-    openapi_extra=example({"format": "laz", "box": "-4,-4,0,4,4,2.5", "p": 0.7}),
+    openapi_extra=json_body(ExportRequest, example={"format": "laz", "box": "-4,-4,0,4,4,2.5", "p": 0.7}),
 )
-def ask_for_ticket(service: Operations, row: Map, asked: ExportRequest, credentials: Credentials) -> ExportTicket:
+def ask_for_ticket(
+    service: Operations,
+    row: Map,
+    credentials: Credentials,
+    asked: Annotated[ExportRequest, json_of(ExportRequest)],
+) -> ExportTicket:
     """A ticket that stands for the token shown, once and for this export: what a link to save it by has instead."""
     return service.views.tickets.give(row, asked, credentials.credentials if credentials else None)

@@ -5,13 +5,12 @@ events of that moment go out together. `send` waits while the client does not re
 """
 
 import asyncio
-import base64
-import binascii
 import hashlib
 import logging
 import time
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
+from dataclasses import replace
 from typing import Annotated
 from urllib.parse import urlsplit
 
@@ -24,6 +23,7 @@ from starlette.types import Receive, Scope, Send
 from cairn_map.errors import BadInputError, CairnError, DeniedError
 from cairn_map.wire.live_events import Beat, EventPosition, LiveEvent, position_from_text
 from cairn_server.access.auth import READING, require
+from cairn_server.http.middleware.token_first import offered_token
 from cairn_server.http.routes.callers import READERS, Asker, Asking, Map
 from cairn_server.http.routes.documentation import answers, problems
 from cairn_server.http.routes.problems import answer_to
@@ -37,7 +37,6 @@ SPACING_S = 0.1
 """Shortest time between two sendings of one stream."""
 RETRY_MS = 2000
 PROTOCOL = "cairn.live.v1"
-TOKEN_PREFIX = "cairn.token."  # noqa: S105 - what stands before one
 GOING_AWAY, NOT_ALLOWED = 1001, 4401
 """Codes with which a WebSocket is closed: the server stops; the token does not allow reading any more."""
 After = Annotated[str | None, Query(description="id of the last event seen")]
@@ -49,7 +48,7 @@ class _Stream:
     """Listener of one client in the event loop, where other threads wake it."""
 
     def __init__(self, asker: Asker, row: MapRow) -> None:
-        self._asker = asker
+        self._asker = replace(asker, noted=None)  # asked again with each beat: the token may have ended
         self._row = row
         self._loop = asyncio.get_running_loop()
         self._woken = asyncio.Event()
@@ -212,15 +211,8 @@ def _credentials(socket: WebSocket) -> HTTPAuthorizationCredentials | None:
     scheme, _, token = socket.headers.get("Authorization", "").partition(" ")
     if scheme.lower() == "bearer":
         return HTTPAuthorizationCredentials(scheme=scheme, credentials=token)
-    for offered in socket.scope["subprotocols"]:
-        if offered.startswith(TOKEN_PREFIX):
-            text = offered.removeprefix(TOKEN_PREFIX)
-            try:
-                token = base64.b64decode(text + "=" * (-len(text) % 4), altchars=b"-_", validate=True).decode()
-            except (binascii.Error, ValueError):
-                token = ""  # as wrong as any other
-            return HTTPAuthorizationCredentials(scheme="Bearer", credentials=token)
-    return None
+    offered = offered_token(socket.scope["subprotocols"])
+    return None if offered is None else HTTPAuthorizationCredentials(scheme="Bearer", credentials=offered)
 
 
 def _check_origin(socket: WebSocket) -> None:

@@ -7,7 +7,8 @@ from fastapi import APIRouter, Depends, Query, Response
 from cairn_map.wire.messages import CreateMap, LogEntry, MapInfo, Retract, Retracted
 from cairn_server.access.auth import READING, Caller, Role
 from cairn_server.http.routes.callers import READERS, Map, Operations, admin, allowed, reader_somewhere
-from cairn_server.http.routes.documentation import also, example, problems
+from cairn_server.http.routes.documentation import also, json_body, problems
+from cairn_server.http.routes.json_bodies import json_of
 
 LOG_PAGE_MAX = 1000
 
@@ -24,15 +25,16 @@ def list_maps(service: Operations, caller: Annotated[Caller, Depends(reader_some
     "/maps/{name}",
     status_code=201,
     responses=also(200, MapInfo) | problems(409),
-    openapi_extra=example(
-        {"geometry": {"voxel_edge_um": 40_000, "depth": 7}, "sensor_model": {"p_hit": 0.7, "p_miss": 0.4}}
+    openapi_extra=json_body(
+        CreateMap,
+        example={"geometry": {"voxel_edge_um": 40_000, "depth": 7}, "sensor_model": {"p_hit": 0.7, "p_miss": 0.4}},
     ),
 )
 def create_map(
     name: str,
-    body: CreateMap,
     service: Operations,
     caller: Annotated[Caller, Depends(admin)],
+    body: Annotated[CreateMap, json_of(CreateMap)],
     response: Response,
 ) -> MapInfo:
     """Create a map; 200 if an equal one exists."""
@@ -53,10 +55,13 @@ def get_map(service: Operations, row: Map) -> MapInfo:
     "/maps/{name}/retracts",
     status_code=201,
     responses=problems(409),
-    openapi_extra=example({"commits": ["mole.1f2e3d4c5b6a7988.12"], "note": "wrong calibration"}),
+    openapi_extra=json_body(Retract, example={"commits": ["mole.1f2e3d4c5b6a7988.12"], "note": "wrong calibration"}),
 )
 def retract(
-    body: Retract, service: Operations, row: Map, caller: Annotated[Caller, Depends(allowed(Role.OPERATOR))]
+    service: Operations,
+    row: Map,
+    caller: Annotated[Caller, Depends(allowed(Role.OPERATOR))],
+    body: Annotated[Retract, json_of(Retract)],
 ) -> Retracted:
     """Undo commits exactly."""
     return service.sync.retracts.retract(row, body, by=caller)

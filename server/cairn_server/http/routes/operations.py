@@ -9,7 +9,8 @@ from cairn_map.wire.access_messages import AuditEntry, CreateToken, NewSecret, T
 from cairn_server.access.auth import Caller
 from cairn_server.access.tokens import create_token, list_tokens, revoke_token, rotate_token
 from cairn_server.http.routes.callers import ADMIN, Asking, Operations, admin
-from cairn_server.http.routes.documentation import problems
+from cairn_server.http.routes.documentation import json_body, problems
+from cairn_server.http.routes.json_bodies import json_of
 from cairn_server.metrics import MEDIA_TYPE
 
 AUDIT_PAGE_MAX = 1000
@@ -19,8 +20,9 @@ Admin = Annotated[Caller, Depends(admin)]
 
 
 @router.get("/healthz")
-def healthz() -> dict[str, str]:
+async def healthz() -> dict[str, str]:
     """The process answers."""
+    # On the event loop, without a lock or a thread: it says that the server can be reached, and nothing else.
     return {"status": "ok"}
 
 
@@ -49,8 +51,10 @@ def get_tokens(service: Operations) -> list[TokenInfo]:
     return list_tokens(service.store)
 
 
-@router.put("/tokens/{token}", status_code=201, responses=problems(409))
-def put_token(token: str, body: CreateToken, service: Operations, caller: Admin) -> NewSecret:
+@router.put("/tokens/{token}", status_code=201, responses=problems(409), openapi_extra=json_body(CreateToken))
+def put_token(
+    token: str, service: Operations, caller: Admin, body: Annotated[CreateToken, json_of(CreateToken)]
+) -> NewSecret:
     """Create a token; its secret is shown this once."""
     return create_token(service.store, token, body, by=caller)
 

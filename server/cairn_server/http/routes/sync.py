@@ -20,7 +20,8 @@ from cairn_server.http.routes.callers import (
     visiting_owner,
     visiting_robot,
 )
-from cairn_server.http.routes.documentation import also, answers, body, example, problems
+from cairn_server.http.routes.documentation import also, answers, body, json_body, problems
+from cairn_server.http.routes.json_bodies import json_of
 from cairn_server.sync.handing_over import found_commit
 from cairn_server.sync.uploads import Part, uploaded_by
 
@@ -82,9 +83,13 @@ def list_commits(service: Operations, row: Map) -> CommitList:
     "/maps/{name}/branches/{branch}/missing",
     response_class=Response,
     responses=answers({200: (REPLY_MEDIA_TYPE,), 204: ()}) | problems(410),
-    openapi_extra=example({"author": "mole.1f2e3d4c5b6a7988", "kinds": ["delta", "full"]}),
+    openapi_extra=json_body(MissingRequest, example={"author": "mole.1f2e3d4c5b6a7988", "kinds": ["delta", "full"]}),
 )
-def missing(branch: str, body: MissingRequest, visit: Annotated[Visit, Depends(visiting_owner)]) -> Response:
+def missing(
+    branch: str,
+    visit: Annotated[Visit, Depends(visiting_owner)],
+    body: Annotated[MissingRequest, json_of(MissingRequest)],
+) -> Response:
     """Frames that bring the caller to the head; 204 if they are those of the last reply."""
     reply = visit.service.sync.replies.missing(visit.row, branch, body)
     return Response(reply, media_type=REPLY_MEDIA_TYPE) if reply else Response(status_code=204)

@@ -1,0 +1,133 @@
+"""Places of connections, so that no client takes those of the others.
+
+    stranger  showed no good token yet       a quarter as many places as `limit`, for all strangers together
+    known     showed a good token            `limit` places, a sixteenth of them for one token; admins have no share
+    proxy     comes from a trusted proxy     not counted; each of its requests is, as a connection is
+
+A new stranger always finds a place: where all are taken, the address that has most of them loses its oldest one. So
+silent connections push out each other, and a robot that shows its token within a round trip stays. A whole team behind
+one radio is one address only until then. An IPv6 address counts as its network of 64 bits, as one customer has
+them all. For one event loop.
+"""
+
+import ipaddress
+from collections import Counter
+from collections.abc import Callable, Hashable
+from functools import lru_cache
+
+from cairn_map.errors import UnreachableError
+
+STRANGERS_MIN, SHARE_MIN = 4, 4
+KNOWN_PER_STRANGER, TOKENS = 4, 16
+"""Known places for each stranger's; tokens that together fill all known places."""
+Network = ipaddress.IPv4Network | ipaddress.IPv6Network
+
+
+class ConnectionPlace:
+    """Place of one connection."""
+
+    def __init__(self, address: str, cut: Callable[[], None]) -> None:
+        self.address = address
+        self.cut = cut
+        self.holder: Hashable = None
+        """Token that was seen on it; None: a stranger's."""
+
+
+class ConnectionPlaces:
+    """Places of all connections of a server."""
+
+    def __init__(self, limit: int, *, trusted_proxies: str = "") -> None:
+        self._limit = limit
+        self._strangers_max = max(STRANGERS_MIN, limit // KNOWN_PER_STRANGER)
+        self._share = max(SHARE_MIN, limit // TOKENS)
+        self._proxies = networks(trusted_proxies)
+        self._strangers: dict[ConnectionPlace, None] = {}  # oldest first
+        self._of: Counter[Hashable] = Counter()
+
+    @property
+    def taken(self) -> tuple[int, int]:
+        """Places of strangers and of holders of tokens that are taken."""
+        return len(self._strangers), self._of.total()
+
+    def enter(self, address: str, cut: Callable[[], None]) -> ConnectionPlace | None:
+        """Place of a new connection, which `cut` ends; None: it comes from a trusted proxy."""
+        group = network_of(address)
+        if self._is_proxy(address):
+            return None
+        if len(self._strangers) >= self._strangers_max:
+            self._cut_one()
+        place = ConnectionPlace(group, cut)
+        self._strangers[place] = None
+        return place
+
+    def note(self, place: ConnectionPlace, holder: Hashable) -> None:
+        """A good token was seen on a connection: from now on it is the token's.
+
+        Raises:
+            UnreachableError: kind `busy`: the token has its share, or all places are taken.
+        """
+        if place.holder == holder:
+            return
+        if self._of[holder] >= self._share:
+            message = f"{self._share} connections showed this token; close one of them"
+            raise UnreachableError("busy", message, retry_after_s=5.0)
+        if self._of.total() - (place.holder is not None) >= self._limit:
+            raise UnreachableError("busy", f"all {self._limit} connections are taken", retry_after_s=5.0)
+        self._forget(place)
+        place.holder = holder
+        self._of[holder] += 1
+
+    def begin(self, holder: Hashable) -> ConnectionPlace:
+        """Place of one request that comes through a proxy.
+
+        Raises:
+            UnreachableError: kind `busy`, as `note`.
+        """
+        place = ConnectionPlace("", lambda: None)
+        self.note(place, holder)
+        return place
+
+    def leave(self, place: ConnectionPlace) -> None:
+        """A connection is lost, or a proxy's request is answered; may be called twice."""
+        self._forget(place)
+        place.holder = None
+
+    def _forget(self, place: ConnectionPlace) -> None:
+        self._strangers.pop(place, None)
+        if place.holder is not None:
+            self._of[place.holder] -= 1
+            if not self._of[place.holder]:
+                del self._of[place.holder]
+
+    def _cut_one(self) -> None:
+        """Cut the oldest connection of the address that has most; of equal ones, the oldest of all."""
+        counts = Counter(place.address for place in self._strangers)
+        most = max(counts.values())
+        place = next(place for place in self._strangers if counts[place.address] == most)
+        del self._strangers[place]
+        place.cut()
+
+    def _is_proxy(self, address: str) -> bool:
+        return bool(self._proxies) and any(_parsed(address) in network for network in self._proxies)
+
+
+def networks(text: str) -> tuple[Network, ...]:
+    """Addresses and networks of a text, separated by spaces."""
+    return tuple(ipaddress.ip_network(part) for part in text.split())
+
+
+@lru_cache(maxsize=4096)
+def network_of(address: str) -> str:
+    """Address that strangers have in common: of IPv6 the first 64 bits."""
+    found = _parsed(address)
+    if isinstance(found, ipaddress.IPv6Address):
+        return str(ipaddress.ip_network((int(found) >> 64 << 64, 64)))
+    return str(found)
+
+
+def _parsed(address: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
+    try:
+        found = ipaddress.ip_address(address.partition("%")[0])
+    except ValueError:
+        return ipaddress.IPv4Address(0)
+    return getattr(found, "ipv4_mapped", None) or found

@@ -1,0 +1,104 @@
+"""Places of connections: bounded, and never full for a newcomer."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cairn_map.errors import UnreachableError
+from cairn_server.access.connection_places import ConnectionPlace, ConnectionPlaces, network_of
+
+LIMIT, STRANGERS, SHARE = 64, 16, 4
+
+
+class Door:
+    """Places, and the connections that are open."""
+
+    def __init__(self, **options: str) -> None:
+        self.places = ConnectionPlaces(LIMIT, **options)
+        self.open: dict[ConnectionPlace, str] = {}
+
+    def enter(self, address: str) -> ConnectionPlace:
+        place = self.places.enter(address, lambda: self.open.pop(place) and None)
+        assert place is not None
+        self.open[place] = address
+        return place
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.sampled_from(["come", "go", "a", "b", "c"])), max_size=200))
+def test_a_newcomer_has_a_place_after_anything(steps: list[tuple[int, str]]) -> None:
+    door = Door()
+    for n, what in steps:
+        if what == "come":
+            door.enter(f"10.0.0.{n}")
+        elif door.open:
+            place = list(door.open)[n % len(door.open)]
+            if what == "go":
+                door.open.pop(place)
+                door.places.leave(place)
+            else:
+                try:
+                    door.places.note(place, what)
+                except UnreachableError as exc:
+                    assert exc.kind == "busy"
+        strangers, known = door.places.taken
+        assert strangers == sum(place.holder is None for place in door.open) <= STRANGERS
+        assert known == sum(place.holder is not None for place in door.open) <= 3 * SHARE
+    newest = door.enter("10.0.0.9")
+    door.places.note(newest, "new")
+    assert newest in door.open
+    for place in list(door.open):
+        door.places.leave(place)
+        door.places.leave(place)
+    assert door.places.taken == (0, 0)
+
+
+def test_silent_ones_push_out_each_other_and_neither_other_addresses_nor_who_showed_a_token() -> None:
+    door = Door()
+    elsewhere, known = door.enter("10.0.0.2"), door.enter("10.0.0.1")
+    door.places.note(known, "mole")
+    for _ in range(700):
+        door.enter("10.0.0.1")
+    assert {elsewhere, known} <= door.open.keys() and len(door.open) == STRANGERS + 1
+
+
+def test_two_hundred_robots_behind_one_address_all_find_a_place_one_after_the_other() -> None:
+    places = ConnectionPlaces(500)
+    for n in range(200):
+        place = places.enter("10.0.0.1", lambda: pytest.fail("cut"))
+        assert place is not None
+        places.note(place, f"robot{n}")
+    assert places.taken == (0, 200)
+
+
+def test_one_token_has_its_share_and_admins_have_all() -> None:
+    door = Door()
+    for n in range(SHARE + 1):
+        place = door.enter("10.0.0.1")
+        if n == SHARE:
+            with pytest.raises(UnreachableError):
+                door.places.note(place, "mole")
+        else:
+            door.places.note(place, "mole")
+    for _ in range(LIMIT - SHARE):
+        door.places.note(door.enter("10.0.0.1"), object())
+    with pytest.raises(UnreachableError):
+        door.places.note(door.enter("10.0.0.1"), object())
+
+
+def test_a_proxy_has_no_place_and_its_requests_have() -> None:
+    places = ConnectionPlaces(LIMIT, trusted_proxies="172.30.87.2 fd00::/8")
+    assert places.enter("172.30.87.2", pytest.fail) is places.enter("fd00::2", pytest.fail) is None
+    assert places.enter("::ffff:172.30.87.2", pytest.fail) is None
+    assert places.enter("172.30.87.1", pytest.fail) is not None
+    begun = [places.begin("mole") for _ in range(SHARE)]
+    with pytest.raises(UnreachableError):
+        places.begin("mole")
+    places.begin("wren")
+    places.leave(begun[0])
+    places.begin("mole")
+
+
+def test_an_ipv6_network_is_one_address() -> None:
+    assert network_of("2001:db8::1") == network_of("2001:db8::ffff:2") != network_of("2001:db8:0:1::1")
+    assert network_of("::ffff:10.0.0.1") == network_of("10.0.0.1")
+    assert network_of("fe80::1%eth0") == network_of("fe80::2")
