@@ -65,10 +65,6 @@ class MemoryMap:
     """In order of arrival."""
     ids: list[CommitId] = field(default_factory=list)
     """By number."""
-    diffs: dict[int, tuple[CommitId, CellKey]] = field(default_factory=dict)
-    """Of what is kept, by the number of the diff."""
-    diff_numbers: dict[tuple[CommitId, CellKey], int] = field(default_factory=dict)
-    diffs_made: int = 0
     authors: dict[Author, tuple[int, int]] = field(default_factory=dict)
     """Highest number, and intervals of the numbers."""
     entries: list[Entry] = field(default_factory=list)
@@ -106,7 +102,6 @@ class MemoryMap:
             received_age_s=age_s,
         )
         self.ids.append(commit.id)
-        self._number_diff(commit)
         return True
 
     def next_number(self, author: Author) -> int:
@@ -174,7 +169,6 @@ class MemoryMap:
             self.commits[commit.id] = replace(
                 known, new=commit, is_gone=False, received_s=time.time(), received_age_s=age_s
             )
-            self._number_diff(commit)
         return known.is_damaged
 
     def _note_entry(self, entry: Entry, seq: int, age_s: float) -> None:
@@ -194,14 +188,7 @@ class MemoryMap:
                 cell = self.cells[key]
                 self.cells[key] = replace(cell, gone_seq=max(cell.gone_seq, *seqs))
             self.touched[key] = tuple(seq for seq in self.touched.get(key, ()) if seq not in seqs)
-            del self.diffs[self.diff_numbers.pop((kept.new.id, key))]
         self.commits[kept.new.id] = replace(kept, new=replace(kept.new, text=b"", diff={}), is_gone=True)
-
-    def _number_diff(self, commit: NewCommit) -> None:
-        for key in commit.diff:
-            self.diffs[self.diffs_made] = (commit.id, key)
-            self.diff_numbers[commit.id, key] = self.diffs_made
-            self.diffs_made += 1
 
     def _check_kept(self, targets: tuple[CommitId, ...]) -> None:
         """Refuse to retract what cannot be subtracted any more."""

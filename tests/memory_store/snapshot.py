@@ -47,10 +47,10 @@ class MemorySnapshot:
         seqs = [seq for seq in self._state.touched.get(key, ()) if seq > after_seq]
         return [self._contribution(key, seq) for seq in seqs[-(newest or len(seqs)) :]]
 
-    def diff(self, number: int) -> bytes | None:
-        """The bytes of a contribution; None if they are not kept any more."""
-        found = self._state.diffs.get(number)
-        return self._state.commits[found[0]].new.diff[found[1]] if found else None
+    def diff(self, commit: CommitId, key: CellKey) -> bytes | None:
+        """The bytes of a commit's evidence in a cell; None if they are not kept any more."""
+        kept = self._state.commits.get(commit)
+        return kept.new.diff.get(key) if kept else None
 
     def tip(self, author: Author) -> tuple[int, bytes] | None:
         """Highest folded number of an author and its SHA-256."""
@@ -99,7 +99,7 @@ class MemorySnapshot:
         entry = self._state.entries[seq - 1]
         commit = self._state.ids[entry.commit]
         size_bytes = len(self._state.commits[commit].new.diff[key])
-        return Contribution(seq, entry.kind, commit.author, self._state.diff_numbers[commit, key], size_bytes)
+        return Contribution(seq, entry.kind, commit, size_bytes)
 
     def _log_entry(self, seq: int, entry: Entry) -> LogEntry:
         kept = self._state.commits[self._state.ids[entry.commit]]

@@ -12,6 +12,7 @@ CHANGES, SNAPSHOT = "server/cairn_server/store/sqlite/changes.py", "server/cairn
 READERS, CELLS = "server/cairn_server/store/sqlite/readers.py", "server/cairn_server/http/routes/cell.py"
 CELL_VIEWS, STABLE = "server/cairn_server/views/cell_views.py", "server/cairn_server/sync/replies.py"
 PUSHES = "server/cairn_server/sync/pushes.py"
+HISTORY, READ_CACHE = "server/cairn_server/store/history.py", "server/cairn_server/folding/read_cache.py"
 HANDING_OVER = "server/cairn_server/sync/handing_over.py"
 APPLYING, OUTBOX = "client/cairn_client/sync/exchange.py", "client/cairn_client/replica/outbox.py"
 REPLICA, SYNC = "client/cairn_client/replica/replica.py", "client/cairn_client/sync/sync.py"
@@ -37,7 +38,7 @@ SWITCHES = (
     Switch(
         1,
         "a cursor is proven by its chain, not by its seq alone",
-        MISSING,
+        HISTORY,
         "return cursor.seq <= head.seq and snapshot.chain_at(cursor.seq) == cursor.chain",
         "return cursor.seq <= head.seq",
         "cairn_server/sync/test_missing.py::test_a_cursor_that_cannot_be_proven_is_answered_with_resets_for_every_cell",
@@ -45,7 +46,7 @@ SWITCHES = (
     Switch(
         1,
         "a cursor beyond the head is not proven",
-        MISSING,
+        HISTORY,
         "return cursor.seq <= head.seq and snapshot.chain_at(cursor.seq) == cursor.chain",
         "return snapshot.chain_at(cursor.seq) in (cursor.chain, None)",
         "cairn_server/sync/test_missing.py::test_a_cursor_that_cannot_be_proven_is_answered_with_resets_for_every_cell",
@@ -169,6 +170,22 @@ SWITCHES = (
         "if entry.kind != ENTRY_FOLD or entry.author != asker]",
         "]",
         "cairn_server/sync/test_missing.py::test_own_commits_are_left_out_of_a_delta_but_not_their_retract",
+    ),
+    Switch(
+        4,
+        "a kept delta is sent to who has the commits that it leaves out, and to no other",
+        CELLS_CHANGED,
+        "own=asker if len(foreign) < len(entries) else None,",
+        "own=None,",
+        "cairn_server/sync/test_missing.py::test_a_delta_that_leaves_one_asker_s_commits_out_is_sent_to_no_other",
+    ),
+    Switch(
+        4,
+        "what is kept of a cell's state is named by its history, not by its digest alone",
+        READ_CACHE,
+        "return snapshot.chain_at(listed.lm), listed.key",
+        "return snapshot.head.cursor.log_id, listed.key",
+        "cairn_server/sync/test_restored_under_readers.py::test_a_delta_of_a_lost_history_is_not_sent",
     ),
     Switch(
         4,
@@ -409,6 +426,22 @@ SWITCHES = (
         "rest += row.fingerprint",
         "pass",
         "cairn_server/sync/test_missing.py::test_done_sums_the_fingerprints_of_the_cells_without_a_frame",
+    ),
+    Switch(
+        8,
+        "the end of a box leaves the cursor of what is outside and not held",
+        APPLYING,
+        "        if self._box is None:\n            base.set_default_cursor(done.to_cursor)",
+        "        base.set_default_cursor(done.to_cursor)",
+        "cairn_client/sync/test_rules.py::test_the_end_of_a_box_moves_no_cell_outside_of_it",
+    ),
+    Switch(
+        8,
+        "the end of a box leaves the cells that are held outside",
+        APPLYING,
+        "for key, cell in base.cells.items() if is_within(key, box)}",
+        "for key, cell in base.cells.items()}",
+        "cairn_client/sync/test_rules.py::test_the_end_of_a_box_moves_no_cell_outside_of_it",
     ),
     Switch(
         9,

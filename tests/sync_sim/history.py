@@ -143,7 +143,7 @@ class History:
         self._server.back_up()
 
     def _restore(self) -> None:
-        self._server.restore()
+        self._random.choice((self._server.restore, self._server.restore_under_readers))()
 
     def _replace(self) -> None:
         self._server.replace()

@@ -173,7 +173,8 @@ class JoinedHistory:
         self._random.choice(self._servers).back_up()
 
     def _restore(self) -> None:
-        self._random.choice(self._servers).restore()
+        server = self._random.choice(self._servers)
+        self._random.choice((server.restore, server.restore_under_readers))()
 
     def _replace(self) -> None:
         """Another server in the place of one: empty, or, where evidence is not kept for ever, from a copy."""

@@ -86,11 +86,16 @@ class SimServer:
         self._backup, self._stable.vector = state, state.head.vector
 
     def restore(self) -> None:
-        """Put the backup in the place of the store."""
+        """Put the backup in the place of the store, and start on it."""
+        if self._backup is not None:
+            self.restore_under_readers()
+            self._start(self._store)
+
+    def restore_under_readers(self) -> None:
+        """Put the backup in the place of the store while the server goes on, as a failover to an old copy does."""
         if self._backup is not None:
             with self._store._maps.locked() as maps:
                 maps[MAP] = self._backup.copied()
-            self._start(self._store)
 
     def trust(self, keys: str) -> None:
         """Obey the operators of servers with these keys."""

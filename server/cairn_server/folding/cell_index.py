@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from cairn_map.commits.cursor import ENTRY_FOLD
+from cairn_map.commits.ids import CommitId
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import CellKey, cell_from_text, cell_key, cell_of_key
 from cairn_map.wire.messages import INDEX_PAGE, CellEntry
@@ -70,11 +71,11 @@ def _held_lm(snapshot: Snapshot, key: CellKey) -> int | None:
     newest = snapshot.contributions(key, after_seq=0, newest=1)
     if newest and newest[0].kind == ENTRY_FOLD:  # nearly always
         return newest[0].seq
-    out: set[int] = set()
+    out: set[CommitId] = set()
     for touch in reversed(snapshot.contributions(key, after_seq=0, newest=TOUCHES_MAX)):
         if touch.kind != ENTRY_FOLD:
-            out.add(touch.diff)
-        elif touch.diff not in out:
+            out.add(touch.commit)
+        elif touch.commit not in out:
             return touch.seq
     return None
 

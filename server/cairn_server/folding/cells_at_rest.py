@@ -138,7 +138,7 @@ def sum_of_contributions(
     """
     total = BrickCell(geometry)
     for contribution in contributions:
-        body = snapshot.diff(contribution.diff)
+        body = snapshot.diff(contribution.commit, key)
         if body is None:
             raise DamagedDataError("damaged_store", f"a diff of cell {cell_of_key(key)} is not there")
         evidence = decode_stored(key, body).evidence

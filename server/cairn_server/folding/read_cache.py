@@ -27,8 +27,8 @@ CHANGES_BYTES = 64 << 20
 HISTORIES_BYTES = 16 << 20
 ENTRY_BYTES = 300
 """Memory of one entry of a history, or of one empty change."""
-State = tuple[bytes, CellKey, bytes, int, int]
-"""State of a cell: log, cell, digest, `lm`, `gone_seq`."""
+State = tuple[bytes | None, CellKey, bytes, int]
+"""State of a cell: chain at its `lm`, cell, digest, `gone_seq`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +88,8 @@ class ReadCache:
 
 
 def state_of(snapshot: Snapshot, listed: CellRow) -> State:
-    """Key that tells the states of all cells of all maps apart."""
-    return snapshot.head.cursor.log_id, listed.key, listed.digest, listed.lm, listed.gone_seq
+    """Key that tells the states of all cells of all maps apart, those of histories that a restore took away, too."""
+    return snapshot.chain_at(listed.lm), listed.key, listed.digest, listed.gone_seq
 
 
 def _stored(snapshot: Snapshot, listed: CellRow) -> CellRow:

@@ -160,7 +160,7 @@ def _sum_of_diffs(snapshot: Snapshot, key: CellKey, known: dict[bytes, Fingerpri
     """Fingerprint of a cell as the log says; None if evidence was dropped or is damaged."""
     total = ZERO
     for entry in snapshot.contributions(key, after_seq=0):
-        body = snapshot.diff(entry.diff)
+        body = snapshot.diff(entry.commit, key)
         if body is None:
             return None
         sums = known.get(hashlib.sha256(body).digest())

@@ -166,6 +166,7 @@ class Listener:
         self.wake = wake
         self._hub = hub
         self._seen = EventPosition(0, "0" * CHAIN_DIGITS, 0)
+        self._losses = 0
         self._hello: Hello | None = None
 
     @property
@@ -175,8 +176,8 @@ class Listener:
 
     @property
     def is_over(self) -> bool:
-        """True if the server is shutting down."""
-        return self._hub.is_closed
+        """True if the server is shutting down, or the map's log lost entries: then a listener begins again."""
+        return self._hub.is_closed or self.live.changes.losses != self._losses
 
     @property
     def is_behind(self) -> bool:
@@ -185,7 +186,7 @@ class Listener:
 
     def start(self, after: EventPosition | None) -> None:
         """Prepare the first event, and go on after the last event seen if it is one of this log."""
-        head = self.live.changes.head
+        head, self._losses = self.live.changes.place()
         tick, robots = self.live.robots.present()
         resumed = after is not None and self.live.changes.has_proof(after)
         seq, chain = head.seq, head.chain.hex()[:CHAIN_DIGITS]
@@ -207,7 +208,7 @@ class Listener:
         if self._hello is not None:
             events.append(self._hello)
             self._hello = None
-        changes, self._seen = self.live.changes.since(self._seen)
+        changes, self._seen = self.live.changes.since(self._seen, losses=self._losses)
         events += changes
         for tick, sign in self.live.robots.since(self._seen.tick):
             self._seen = EventPosition(self._seen.seq, self._seen.chain, tick)

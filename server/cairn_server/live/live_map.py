@@ -22,6 +22,7 @@ from cairn_map.wire.live_events import (
     RobotSign,
 )
 from cairn_map.wire.messages import LogEntry
+from cairn_server.store.history import is_proven
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow
 
@@ -43,6 +44,8 @@ class LiveChanges:
         self._row = row
         self._lock = threading.Lock()
         self._head: Cursor | None = None
+        self._losses = 0
+        """Count of the times that the log lost entries."""
         self._floor = 0
         """Log entry up to which changes may be missing here."""
         self._cells: OrderedDict[CellKey, int] = OrderedDict()
@@ -51,14 +54,26 @@ class LiveChanges:
     @property
     def head(self) -> Cursor:
         """Newest state that was read."""
+        return self.place()[0]
+
+    @property
+    def losses(self) -> int:
+        """Count of the times that the log lost entries which were read: the store was restored."""
+        return self.place()[1]
+
+    def place(self) -> tuple[Cursor, int]:
+        """Newest state that was read, and `losses` before it."""
         with self._lock:
             assert self._head is not None, "read first"  # noqa: S101 - `Hub.join` does
-            return self._head
+            return self._head, self._losses
 
     def read(self) -> None:
         """Read what was folded since the last call."""
         with self._lock, self._store.snapshot(self._row) as snapshot:
             head = snapshot.head.cursor
+            if self._head is not None and not is_proven(self._head, snapshot):
+                self._head = None
+                self._losses += 1
             known = self._head.seq if self._head else -1
             start = max(known, head.seq - PAST_ENTRIES, 0)
             if start > known:  # no client listened for long
@@ -80,11 +95,11 @@ class LiveChanges:
             chain = snapshot.chain_at(seen.seq) if seen.seq <= snapshot.head.cursor.seq else None
         return chain is not None and chain.hex()[:CHAIN_DIGITS] == seen.chain
 
-    def since(self, seen: EventPosition) -> tuple[list[LiveEvent], EventPosition]:
-        """Events after a listener's place, and its place after them."""
+    def since(self, seen: EventPosition, *, losses: int) -> tuple[list[LiveEvent], EventPosition]:
+        """Events after a listener's place, and its place after them; none if the log lost entries since."""
         with self._lock:
             head = self._head
-            if head is None or head.seq <= seen.seq:
+            if head is None or head.seq <= seen.seq or losses != self._losses:
                 return [], seen
             entries = [entry for entry in self._entries if entry.seq > seen.seq]
             cells: list[tuple[int, int, int, int]] = []

@@ -66,8 +66,8 @@ class Snapshot(Protocol):
         """
         ...
 
-    def diff(self, number: int) -> bytes | None:
-        """The bytes of a contribution; None if they are not kept any more."""
+    def diff(self, commit: CommitId, key: CellKey) -> bytes | None:
+        """The bytes of a commit's evidence in a cell; None if they are not kept any more."""
         ...
 
     def tip(self, author: Author) -> tuple[int, bytes] | None:

@@ -73,10 +73,14 @@ class Contribution:
 
     seq: int
     kind: bytes
-    author: Author
-    diff: int
-    """Number of the diff in the store."""
+    commit: CommitId
     size_bytes: int
+    """Size of what the commit adds to the cell."""
+
+    @property
+    def author(self) -> Author:
+        """Author of the commit."""
+        return self.commit.author
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

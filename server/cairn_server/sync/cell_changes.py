@@ -111,7 +111,7 @@ def _delta(snapshot: Snapshot, row: CellRow, foreign: list[Contribution], geomet
     if sum(entry.size_bytes for entry in foreign) > 4 * row.size_bytes:
         return None
     if len(foreign) == 1 and foreign[0].kind == ENTRY_FOLD:
-        return snapshot.diff(foreign[0].diff)  # one commit's diff is its own sum
+        return snapshot.diff(foreign[0].commit, row.key)  # one commit's diff is its own sum
     try:
         evidence = sum_of_contributions(snapshot, row.key, foreign, geometry).packed()
     except DamagedDataError as exc:

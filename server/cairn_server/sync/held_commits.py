@@ -11,6 +11,7 @@ from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId, commit_id_from_text
 from cairn_map.wire.messages import WANTED_MAX
 from cairn_map.wire.relay_peer import SUM_BYTES, Held, sum_of_shas
+from cairn_server.store.history import is_proven
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import MapRow
 
@@ -43,7 +44,7 @@ class HeldCommits:
         head = snapshot.head.cursor
         known, sums = self._sums.get(row.number, (None, {}))
         # A store that was restored has another history behind the same number.
-        if known is None or known.log_id != head.log_id or snapshot.chain_at(known.seq) != known.chain:
+        if known is None or not is_proven(known, snapshot):
             known, sums = None, {}
         after_seq = known.seq if known else 0
         sums = dict(sums)

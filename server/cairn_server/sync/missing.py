@@ -30,6 +30,7 @@ from cairn_server.folding.cells import CellFaults
 from cairn_server.folding.cells_at_rest import DamagedCellError, sound_cell
 from cairn_server.folding.damaged_cells import as_named
 from cairn_server.folding.read_cache import ReadCache
+from cairn_server.store.history import is_proven
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import CellRow
 from cairn_server.sync.cell_changes import change_since
@@ -105,7 +106,7 @@ def query_of(request: MissingRequest, snapshot: Snapshot) -> MissingQuery:
         cancellation.check()
         if stated.log_id != head.log_id:
             raise ConflictError("other_log", "the cursor belongs to another server's log; start without one")
-        if not _is_proven(stated, snapshot):
+        if not is_proven(stated, snapshot):
             unproven.add(stated)
     # A reply is made in memory, so the asker may lower the server's bound on its bytes, and not raise it.
     return MissingQuery(
@@ -277,12 +278,6 @@ def _listed(request: MissingRequest) -> dict[CellKey, Cursor | None]:
 
 def _cursor(text: str | None) -> Cursor | None:
     return cursor_from_text(text) if text is not None else None
-
-
-def _is_proven(cursor: Cursor, snapshot: Snapshot) -> bool:
-    # By the chain and not by `seq` alone: a restored server has other entries under the same numbers (rule 1).
-    head = snapshot.head.cursor
-    return cursor.seq <= head.seq and snapshot.chain_at(cursor.seq) == cursor.chain
 
 
 def in_order(rows: Sequence[CellRow], near: Cell | None) -> list[CellRow]:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from cairn_map.commits.commit import RETRACTS_MAX, CommitMeta, make_commit, sha_without_evidence
 from cairn_map.commits.ids import OPERATOR, Author, CommitId, commit_id_from_text, new_incarnation
-from cairn_map.errors import BadInputError, NotFoundError
+from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_map.wire.messages import Retract, Retracted
 from cairn_server.access.auth import Caller
 from cairn_server.store.numbering import EvidenceGoneError
@@ -31,6 +31,8 @@ class Retracts:
         self._on_new = on_new
         self.operator = new_incarnation()
         """Incarnation of the author, new with every start: a restored server must not reuse the numbers it lost."""
+        self._next: dict[tuple[int, Author], int] = {}
+        """Next number, by map and author; a lower one says that the store was restored while this server ran."""
 
     def retract(self, row: MapRow, request: Retract, *, by: Caller) -> Retracted:
         """Undo commits exactly; durable on return.
@@ -48,10 +50,9 @@ class Retracts:
         names = [str(target) for target in targets]
         if request.preview:
             return Retracted(id=None, commits=names)
-        author = Author(OPERATOR, self.operator)
-        builders = retract_builders(row, author, targets, request.note)
+        parts = [targets[start : start + RETRACTS_MAX] for start in range(0, len(targets), RETRACTS_MAX)]
         try:
-            ids = [str(self._store.append_built(row, author, build).id) for build in builders]
+            ids = [str(self._append(row, part, request.note)) for part in parts]
         except EvidenceGoneError as exc:
             self._wanted.note(row.name, exc.commits)
             raise
@@ -59,6 +60,27 @@ class Retracts:
         self._store.audit_log.add(by.name, "retract", detail)
         self._on_new()
         return Retracted(id=ids[-1], commits=names)
+
+    def _append(self, row: MapRow, targets: list[CommitId], note: str) -> CommitId:
+        """Keep the commit that names these targets, under a number that this server never used; durable on return."""
+        author = Author(OPERATOR, self.operator)
+        build = _builder(row, author, targets, note)
+
+        def build_next(n: int) -> NewCommit:
+            if n < self._next.get((row.number, author), 0):
+                raise _LostNumberError("id_taken", f"{CommitId(author, n)} was another retract, which was lost")
+            self._next[row.number, author] = n + 1
+            return build(n)
+
+        try:
+            return self._store.append_built(row, author, build_next).id
+        except _LostNumberError:
+            self.operator = new_incarnation()
+            return self._append(row, targets, note)
+
+
+class _LostNumberError(ConflictError):
+    """The next number of an author is one that this server has used."""
 
 
 def targets_of(request: Retract, snapshot: Snapshot) -> list[CommitId]:
@@ -77,14 +99,6 @@ def targets_of(request: Retract, snapshot: Snapshot) -> list[CommitId]:
     if any(target.author.robot == OPERATOR for target in targets):
         raise BadInputError("not_retractable", "a retract is not retracted; push the evidence again")
     return list(targets)
-
-
-def retract_builders(
-    row: MapRow, author: Author, targets: list[CommitId], note: str
-) -> list[Callable[[int], NewCommit]]:
-    """Builders of the commits that name all targets, each from the number it is given."""
-    parts = [targets[start : start + RETRACTS_MAX] for start in range(0, len(targets), RETRACTS_MAX)]
-    return [_builder(row, author, part, note) for part in parts]
 
 
 def seal_of(row: MapRow, sha: bytes) -> str:

@@ -17,6 +17,7 @@ from functools import cache
 import numpy as np
 
 from cairn_map.arrays import Ints
+from cairn_map.commits.cursor import Cursor
 from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
 from cairn_map.evidence.brick_cell import brick_cell
 from cairn_map.evidence.grid import CellKey, cell_of_key
@@ -107,10 +108,11 @@ class MapViews:
         self._read_cells: MadeOnce[tuple[State, Layer], ReadCell] = MadeOnce(
             limit_bytes=CELLS_BYTES, size_of=lambda read: read.size_bytes
         )
-        self._lists: MadeOnce[tuple[bytes, int], Listing] = MadeOnce(
+        self._lists: MadeOnce[Cursor, Listing] = MadeOnce(
             limit_bytes=LISTS_BYTES, size_of=lambda listing: LISTED_BYTES * (1 + len(listing[0]))
         )
-        self._times: dict[tuple[bytes, int], float] = {}
+        self._times: dict[bytes, float] = {}
+        """By the chain at the entry."""
 
     def asked(self, row: MapRow, request: RenderRequest, *, known: str | None) -> AskedView:
         """A picture of the map as it is now, or None for its bytes if the asker `known`s them by `If-None-Match`.
@@ -179,13 +181,12 @@ class MapViews:
 
     def _listing(self, snapshot: Snapshot) -> Listing:
         """Cells that hold something, by number, and where they are (C, 3)."""
-        cursor = snapshot.head.cursor
 
         def make() -> Listing:
             listed = {cell.key: cell for cell in snapshot.cells() if cell.voxels}
             return listed, np.array([cell_of_key(key) for key in listed], np.int64).reshape(-1, 3)
 
-        return self._lists.get((cursor.log_id, cursor.seq), make)
+        return self._lists.get(snapshot.head.cursor, make)
 
     def _read(self, task: _Task, wanted: Sequence[CellKey]) -> dict[CellKey, ReadCell]:
         """Cells from the store, decoded side by side."""
@@ -221,10 +222,10 @@ class MapViews:
         stamps = {key: self._stamps(task, key) for key in (drawing.snapshot.frozen.keys[slot] for slot in slots)}
         entries = {int(seq) for each in stamps.values() for seq in np.unique(each)} - {0}
         head = task.snapshot.head.cursor
-        times = {seq: self._time_of(task, head.log_id, seq) for seq in sorted(entries)}
+        times = {seq: self._time_of(task, seq) for seq in sorted(entries)}
         numbers, moments = np.array([0, *times]), np.array([np.nan, *times.values()])
         changes = {key: moments[np.searchsorted(numbers, each)] for key, each in stamps.items()}
-        return Ages(changes, now=self._time_of(task, head.log_id, head.seq))
+        return Ages(changes, now=self._time_of(task, head.seq))
 
     def _stamps(self, task: _Task, key: CellKey) -> Stamps:
         """Stamps of a cell; if they are damaged, none, so that its age is unknown."""
@@ -237,9 +238,10 @@ class MapViews:
             log.error("cell %s: %s; its age is unknown", cell_of_key(key), exc.message)
             return no_stamps(depth)
 
-    def _time_of(self, task: _Task, log_id: bytes, seq: int) -> float:
+    def _time_of(self, task: _Task, seq: int) -> float:
         """Time of the last scan of an entry's commit; NaN where it states none."""
-        known = self._times.get((log_id, seq))
+        chain = task.snapshot.chain_at(seq) or b""
+        known = self._times.get(chain)
         if known is not None:
             return known
         task.check_time()
@@ -248,7 +250,7 @@ class MapViews:
         time_s = captured_s[1] if captured_s else np.nan
         if len(self._times) >= TIMES_MAX:
             self._times.clear()  # another picture may look at the same time
-        self._times[log_id, seq] = time_s
+        self._times[chain] = time_s
         return time_s
 
 

@@ -12,8 +12,10 @@ import logging
 import threading
 import time
 
+from cairn_map.commits.cursor import Cursor
 from cairn_map.errors import CairnError, DamagedDataError
 from cairn_map.evidence.grid import CellKey, cell_key, cell_of_key
+from cairn_server.store.history import is_proven
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow
 from cairn_server.views.cell_views import ViewCache, first_depth, view_name, view_of_stored
@@ -34,8 +36,8 @@ class ViewPrefetch:
         self._store = store
         self._views = views
         self._look_every_s = look_every_s
-        self._seen: dict[int, tuple[bytes, int]] = {}
-        """By map: log and entry up to which all cells' views were made."""
+        self._seen: dict[int, Cursor] = {}
+        """By map: state up to which all cells' views were made."""
         self._at_once = AT_ONCE
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="cairn-views", daemon=True)
@@ -77,10 +79,10 @@ class ViewPrefetch:
         depth = first_depth(row.geometry.depth)
         with self._store.snapshot(row) as snapshot:
             cursor = snapshot.head.cursor
-            log_id, seq = self._seen.get(row.number, (cursor.log_id, -1))
-            if (log_id, seq) == (cursor.log_id, cursor.seq):
+            seen = self._seen.get(row.number)
+            if seen == cursor:
                 return
-            changed = snapshot.cells(after_seq=seq if log_id == cursor.log_id else -1)
+            changed = snapshot.cells(after_seq=seen.seq if seen and is_proven(seen, snapshot) else -1)
             keys = [cell.key for cell in changed if cell.voxels and not self._views.has(view_name(row, cell, depth))]
         for key in keys:
             if self._closing.is_set():
@@ -90,7 +92,7 @@ class ViewPrefetch:
             self._at_once -= 1
             if self._at_once < 0:
                 self._closing.wait(PAUSE_SHARE * (time.monotonic() - start_s))
-        self._seen[row.number] = (cursor.log_id, cursor.seq)
+        self._seen[row.number] = cursor
 
     def _make_one(self, row: MapRow, key: CellKey, depth: int) -> None:
         try:

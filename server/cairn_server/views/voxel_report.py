@@ -10,6 +10,7 @@ import re
 
 import numpy as np
 
+from cairn_map.commits.ids import CommitId
 from cairn_map.errors import BadInputError, NotFoundError
 from cairn_map.evidence.channels import Channel
 from cairn_map.evidence.evidence import Evidence
@@ -18,7 +19,7 @@ from cairn_map.evidence.voxels import Reading, voxels_of_evidence
 from cairn_map.wire.messages import LogEntry
 from cairn_map.wire.voxel_messages import ChannelReading, VoxelAnswer, VoxelCommit
 from cairn_server.folding.cells import Cells
-from cairn_server.folding.cells_at_rest import decode_stored, stored_evidence
+from cairn_server.folding.cells_at_rest import decode_stored, sound_cell, stored_evidence
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import MapRow
 
@@ -41,14 +42,15 @@ def asked_voxel(store: Store, cells: Cells, row: MapRow, text: str) -> VoxelAnsw
     depth = row.geometry.depth
     cell = voxel[0] >> depth, voxel[1] >> depth, voxel[2] >> depth
     key = cell_key(cell)
-    stored, head = cells.sound(row, key)
-    if stored is None:
-        raise NotFoundError("no_cell", f"no robot has seen cell {','.join(map(str, cell))} of map {row.name}")
     place = int(split_voxels(np.array([voxel]), row.geometry)[1][0])
+    with cells.reading(row) as faults, store.snapshot(row) as snapshot:
+        stored = sound_cell(snapshot, key, row.geometry, faults.healed)
+        if stored is None:
+            raise NotFoundError("no_cell", f"no robot has seen cell {','.join(map(str, cell))} of map {row.name}")
+        commits, more = _commits(snapshot, key, place)
+        cursor = snapshot.head.cursor
     seen = _only(stored_evidence(stored), place)
     voxels = voxels_of_evidence(key, seen, row.geometry, row.sensor_model, occupied_only=False)
-    with store.snapshot(row) as snapshot:
-        commits, more = _commits(snapshot, key, place, until=head.cursor.seq)
     x, y, z = centres_of_voxels(np.array([voxel]), row.geometry)[0].tolist()
     return VoxelAnswer(
         voxel=voxel,
@@ -59,7 +61,7 @@ def asked_voxel(store: Store, cells: Cells, row: MapRow, text: str) -> VoxelAnsw
         probability=float(voxels.probability[0]) if len(seen) and seen.counts.any() else None,
         channels=_readings(voxels.readings, row.geometry),
         lm=stored.lm,
-        cursor=str(head.cursor),
+        cursor=str(cursor),
         commits=commits,
         more=more,
         gone=stored.gone_seq > 0,
@@ -91,19 +93,19 @@ def _reading(reading: Reading, channel: Channel) -> ChannelReading:
     )
 
 
-def _commits(snapshot: Snapshot, key: CellKey, place: int, *, until: int) -> tuple[list[VoxelCommit], bool]:
+def _commits(snapshot: Snapshot, key: CellKey, place: int) -> tuple[list[VoxelCommit], bool]:
     """Commits that saw a voxel, the newest first; and True if the cell has older ones."""
-    found = [c for c in snapshot.contributions(key, after_seq=0, newest=ENTRIES_MAX + 1) if c.seq <= until]
-    counts: dict[int, tuple[int, int]] = {}
+    found = snapshot.contributions(key, after_seq=0, newest=ENTRIES_MAX + 1)
+    counts: dict[CommitId, tuple[int, int]] = {}
     for contribution in found[-ENTRIES_MAX:]:
-        body = snapshot.diff(contribution.diff)
+        body = snapshot.diff(contribution.commit, key)
         if body is not None:
             hits, misses = _only(decode_stored(key, body).evidence, place).counts.sum(axis=0).tolist()
             sign = 1 if contribution.kind == b"+" else -1
-            before = counts.get(contribution.diff, (0, 0))
-            counts[contribution.diff] = (before[0] + sign * hits, before[1] + sign * misses)
-    seqs = {contribution.diff: contribution.seq for contribution in found}
-    told = sorted((seqs[diff], counted) for diff, counted in counts.items() if any(number > 0 for number in counted))
+            before = counts.get(contribution.commit, (0, 0))
+            counts[contribution.commit] = (before[0] + sign * hits, before[1] + sign * misses)
+    seqs = {contribution.commit: contribution.seq for contribution in found}
+    told = sorted((seqs[commit], counted) for commit, counted in counts.items() if any(n > 0 for n in counted))
     commits = [_commit(_entry(snapshot, seq), *counted) for seq, counted in reversed(told)]
     return commits, len(found) > ENTRIES_MAX
 

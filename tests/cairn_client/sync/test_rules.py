@@ -268,6 +268,19 @@ def test_the_end_moves_nothing_if_a_cell_has_moved_since_the_request(mole: Repli
     assert mole.cells[A].cursor == C3
 
 
+def test_the_end_of_a_box_moves_no_cell_outside_of_it(mole: Replica) -> None:
+    at(mole, C1, X)
+    exchanged(mole, header(C1), cell_frame(FrameKind.FULL, C1, Y, key=B, start=C1), done(C1, (A, X)))
+    exchange = Exchange(mole, box=(cell_of_key(A), cell_of_key(A)))
+    exchange.take(header(C2, covering(foreign(1))))
+    exchange.take(done(C2, (A, X)))
+    assert exchange.is_done
+    assert (mole.cells[A].cursor, mole.cells[B].cursor, mole.default_cursor) == (C2, C1, C1)
+    assert (foreign(1) in mole.cells[A].coverage, foreign(1) in mole.cells[B].coverage) == (True, False)
+    request = Exchange(mole).request()
+    assert (request.cursor, request.groups) == (str(C1), [(str(C2), [cell_of_key(A)])])
+
+
 def test_a_cut_reply_keeps_its_frames_and_no_more(mole: Replica) -> None:
     at(mole, C1, X)
     exchange = exchanged(mole, header(C2), cell_frame(FrameKind.FULL, C2, Y, key=B, start=C1))

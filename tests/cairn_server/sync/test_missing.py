@@ -110,6 +110,25 @@ def test_own_commits_are_left_out_of_a_delta_but_not_their_retract(live: Live) -
     assert asker.map() == sum_of([pushed(0, 1, WREN)])
 
 
+def test_a_delta_that_leaves_one_asker_s_commits_out_is_sent_to_no_other(live: Live) -> None:
+    row = live.new_map()
+    askers = {author: NaiveAsker(author) for author in (MOLE, WREN, None)}
+    commits = [pushed(n, n, author) for n in range(6) for author in (MOLE, WREN)]
+    for commit in commits:
+        live.push(row, commit)
+    for asker in askers.values():
+        fetch(live, row, asker)
+        asker.kinds.clear()
+    news = [pushed(6, 0, MOLE), pushed(6, 3, WREN)]
+    for commit in news:
+        live.push(row, commit)
+        askers[commit.id.author].own[commit.id.n] = commit
+    for asker in askers.values():
+        fetch(live, row, asker)
+        assert set(asker.kinds) == {FrameKind.DELTA}
+        assert asker.map() == sum_of([*commits, *news])
+
+
 def test_the_same_robot_in_another_incarnation_gets_its_old_evidence_back(live: Live) -> None:
     row = live.new_map()
     live.push(row, pushed(0, 1, WREN))

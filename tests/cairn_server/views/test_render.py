@@ -88,8 +88,8 @@ def test_cells_that_were_drawn_are_not_read_again_and_weigh_what_their_layer_doe
     row, views = mapped(live, 0, 1), live.service.views.pictures
     first = {layer: ask(live, row, asking(layer=layer)).content for layer in Layer}
     with live.service.store.snapshot(row) as snapshot:
-        log_id = snapshot.head.cursor.log_id
-    kept = {name: read for name, (read, _) in views._read_cells._kept.items() if name[0][0] == log_id}
+        chains = {snapshot.chain_at(cell.lm) for cell in snapshot.cells()}
+    kept = {name: read for name, (read, _) in views._read_cells._kept.items() if name[0][0] in chains}
     assert {layer for _, layer in kept} == set(Layer) - {Layer.AGE}
     for (_, layer), read in kept.items():
         arrays = (read.cell.counts.brick_of, read.states.words, *read.tables.tables.values())

@@ -79,7 +79,7 @@ class SqliteSnapshot:
         """Entries after `after_seq` that touch a cell, oldest first, at most so many of the newest."""
         found = rows(
             self._connection,
-            "SELECT touched.seq, log.kind, robot, incarnation, diff.number, length(diff.body) FROM touched"
+            "SELECT touched.seq, log.kind, robot, incarnation, n, length(diff.body) FROM touched"
             " JOIN log ON log.map = touched.map AND log.seq = touched.seq"
             " JOIN commits ON commits.number = log.commit_number"
             " JOIN diff ON diff.commit_number = commits.number AND diff.cell = touched.cell"
@@ -87,14 +87,19 @@ class SqliteSnapshot:
             (self._map, key, after_seq, -1 if newest is None else newest),
         )
         return [
-            Contribution(seq, kind, Author(robot, incarnation), number, size_bytes)
-            for seq, kind, robot, incarnation, number, size_bytes in reversed(found)
+            Contribution(seq, kind, CommitId(Author(robot, incarnation), n), size_bytes)
+            for seq, kind, robot, incarnation, n, size_bytes in reversed(found)
         ]
 
-    def diff(self, number: int) -> bytes | None:
-        """The bytes of a contribution; None if they are not kept any more."""
+    def diff(self, commit: CommitId, key: CellKey) -> bytes | None:
+        """The bytes of a commit's evidence in a cell; None if they are not kept any more."""
         with damaged_pages():
-            body: bytes | None = first(self._connection, "SELECT body FROM diff WHERE number = ?", (number,))
+            body: bytes | None = first(
+                self._connection,
+                "SELECT body FROM commits JOIN diff ON diff.commit_number = commits.number"
+                " WHERE map = ? AND robot = ? AND incarnation = ? AND n = ? AND cell = ?",
+                (self._map, *commit.author, commit.n, key),
+            )
         return body
 
     def tip(self, author: Author) -> tuple[int, bytes] | None:
