@@ -636,6 +636,22 @@ SWITCHES = (
         "cairn_server/sync/test_missing.py::test_the_header_tells_what_a_robot_may_conclude",
     ),
     Switch(
+        12,
+        "a stable vector is kept for seconds that pass, whatever the time of day",
+        STABLE,
+        "now_s = self._age.now_s()",
+        "now_s = self._age.mark().wall_s",
+        "cairn_server/store/test_store_age.py::test_a_kept_stable_vector_grows_with_time_that_passes_though_the_clock_was_set_back",
+    ),
+    Switch(
+        12,
+        "a stable vector is kept while the log has the entries of its state",
+        STABLE,
+        "if now_s - made_s < self._keep_s and is_proven(cursor, snapshot):",
+        "if now_s - made_s < self._keep_s:",
+        "cairn_server/sync/test_restored_under_readers.py::test_what_was_stable_in_a_lost_history_is_not_called_stable",
+    ),
+    Switch(
         13,
         "a number taken on the server means a new incarnation",
         OUTBOX,

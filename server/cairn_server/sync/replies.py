@@ -14,6 +14,7 @@ from cairn_server.folding.cells import Cells
 from cairn_server.folding.read_cache import ReadCache
 from cairn_server.live.hub import Hub
 from cairn_server.metrics import ServerFigures
+from cairn_server.store.history import is_proven
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_rows import MapRow
@@ -35,18 +36,20 @@ class StableVectors:
         self._after_s = after_s
         self._keep_s = min(KEEP_S, after_s)
         self._lock = threading.Lock()
-        self._kept: dict[int, tuple[float, VersionVector]] = {}
+        self._kept: dict[int, tuple[float, Cursor, VersionVector]] = {}
 
     def of(self, row: MapRow, snapshot: Snapshot) -> VersionVector:
         """Stable vector of the map in this snapshot, at most `KEEP_S` old."""
         # Many robots ask at once, and only one of them has the log read: the others wait for its result.
         now_s = self._age.now_s()
         with self._lock:
-            made_s, vector = self._kept.get(row.number, (float("-inf"), EMPTY))
-            if now_s - made_s < self._keep_s and made_s <= now_s:
-                return vector
+            if row.number in self._kept:
+                made_s, cursor, vector = self._kept[row.number]
+                # A vector of entries that a restore took away would end the only copies of their commits.
+                if now_s - made_s < self._keep_s and is_proven(cursor, snapshot):
+                    return vector
             vector = snapshot.folded_before(now_s - self._after_s)
-            self._kept[row.number] = (now_s, vector)
+            self._kept[row.number] = (now_s, snapshot.head.cursor, vector)
             return vector
 
 

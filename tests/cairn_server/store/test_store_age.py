@@ -108,6 +108,19 @@ def test_a_jump_of_the_clock_forgets_nothing_and_makes_nothing_stable_and_is_rep
         assert live.http.get("/readyz").status_code == 200
 
 
+def test_a_kept_stable_vector_grows_with_time_that_passes_though_the_clock_was_set_back(tmp_path: Path) -> None:
+    clocks = TestClocks()
+    with served(tmp_path, clocks) as live:
+        row, commit, vectors = live.new_map(), pushed(0, 1), live.service.sync.replies._stable
+        live.push(row, commit)
+        live.folded(row)
+        with live.service.store.snapshot(row) as snapshot:
+            assert set(vectors.of(row, snapshot)) == set()
+            clocks.wall_s -= 400 * DAY_S
+            clocks.pass_s(DAY_S + 1)
+            assert set(vectors.of(row, snapshot)) == {commit.id}
+
+
 def test_time_without_a_server_does_not_count_and_a_clock_behind_it_is_reported(tmp_path: Path) -> None:
     clocks, commits = TestClocks(), [pushed(0, 1)]
     with served(tmp_path, clocks) as live:

@@ -20,8 +20,9 @@ from cairn_map.render.render_request import RenderRequest, request_from
 from cairn_map.wire.frames import FrameKind
 from cairn_map.wire.live_events import Hello
 from cairn_server.store.sqlite.backup import back_up
-from cairn_server.store.sqlite.store import FILE_NAME
+from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
 from cairn_server.store.sqlite.writer import connect
+from cairn_server.store.store_age import Clocks
 from cairn_server.store.store_rows import MapRow
 from cairn_server.views.cell_views import first_depth, view_name
 from cairn_server.views.map_views import MapViews
@@ -127,6 +128,23 @@ def test_a_picture_shows_no_cell_and_no_time_of_a_lost_history(own: Live) -> Non
     shown = own.service.views.pictures.asked(row, request, known=lost.etag)
     fresh = MapViews(own.service.store, own.service.cells).asked(row, request, known=None)
     assert shown.body == fresh.body != lost.body
+
+
+def test_what_was_stable_in_a_lost_history_is_not_called_stable(tmp_path: Path) -> None:
+    seconds = [100.0]
+    store = SqliteStore(tmp_path, Clocks(steady_s=lambda: seconds[0]))
+    with Live(tmp_path, store=store, stable_after_s=5.0) as own:
+        row = own.new_map()
+        push(own, row, BEFORE[0])
+        put_back = saved(own)
+        push(own, row, X)
+        seconds[0] += 6.0
+        stable = own.service.sync.replies._stable
+        with own.service.store.snapshot(row) as snapshot:
+            assert set(stable.of(row, snapshot)) == {BEFORE[0].id, X.id}
+        put_back()
+        with own.service.store.snapshot(row) as snapshot:
+            assert set(stable.of(row, snapshot)) == {BEFORE[0].id}
 
 
 def test_streams_end_and_who_comes_again_hears_that_its_place_is_lost(own: Live) -> None:
