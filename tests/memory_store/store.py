@@ -2,6 +2,7 @@
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
@@ -80,11 +81,18 @@ class MemoryStore:
     def pending(
         self, row: MapRow, *, limit: int, size_bytes_max: int, skip: Collection[int] = ()
     ) -> list[StoredCommit]:
-        """Commits to be folded, in order of arrival, with their diffs: at most `limit`, and one or within the size."""
+        """Commits to be folded, in turn of their robots, with their diffs: at most `limit`; one or within the size."""
         found: list[StoredCommit] = []
         total_bytes = 0
         with self._maps.reading(row) as state:
-            for kept in (kept for kept in state.waiting() if kept.number not in skip):
+            waiting = [kept for kept in state.waiting() if kept.number not in skip]
+            turns: Counter[str] = Counter()
+            turn_of: dict[int, int] = {}
+            for kept in waiting:
+                robot = kept.new.id.author.robot
+                turns[robot] += 1
+                turn_of[kept.number] = turns[robot]
+            for kept in sorted(waiting, key=lambda kept: (turn_of[kept.number], kept.number)):
                 total_bytes += kept.new.size_bytes
                 if len(found) >= limit or (found and total_bytes > size_bytes_max):
                     break

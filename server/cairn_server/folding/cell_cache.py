@@ -1,7 +1,8 @@
 """Cells under change, within a memory bound: `BrickCell`s, which add fast, the oldest encoded when the bound is met.
 
 A changed cell that no longer fits waits as a draft of its row, and is decoded from there when it is needed again. So
-one fold may touch any number of cells.
+one fold may touch any number of cells. Between two folds no cell stays that takes more than `HELD_PER_BYTE` times its
+bytes at rest.
 """
 
 from collections import OrderedDict
@@ -13,6 +14,7 @@ from cairn_map.commits.cursor import Cursor
 from cairn_map.evidence.blocks import Blocks
 from cairn_map.evidence.brick_cell import BrickCell
 from cairn_map.evidence.cell_order import hottest_k
+from cairn_map.evidence.compact_cell import HELD_PER_BYTE
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry
@@ -39,6 +41,8 @@ class CellCache:
         self._sizes: dict[CellKey, int] = {}
         self._changed: set[CellKey] = set()
         self._drafts: dict[CellKey, CellRow] = {}
+        self._costly: list[CellKey] = []
+        """Cells that take too much memory for their bytes: they do not stay once they are written."""
 
     def begin(self, cursor: Cursor) -> None:
         """Begin to work on the map's state at a cursor; cells of any other state are dropped."""
@@ -67,21 +71,26 @@ class CellCache:
 
     def rows(self, last_change: Mapping[CellKey, int]) -> tuple[CellRow, ...]:
         """Encoded rows of the changed cells, by rising number, each with the log entry that last changed it."""
-        return tuple(
+        rows = tuple(
             replace(self._drafts.get(key) or self._encoded(key), lm=last_change[key]) for key in sorted(last_change)
         )
+        self._costly = [row.key for row in rows if self._sizes.get(row.key, 0) > HELD_PER_BYTE * row.size_bytes]
+        return rows
 
     def finish(self, cursor: Cursor) -> None:
         """Note that the changes are written: the cached cells are those of this cursor now."""
         self._cursor = cursor
         self._changed.clear()
         self._drafts.clear()
+        for key in self._costly:
+            self._drop(key)
+        self._costly.clear()
 
     def clear(self) -> None:
         """Drop all cells."""
         self._cursor = None
         self.size_bytes = 0
-        for kept in (self._cells, self._sizes, self._changed, self._drafts):
+        for kept in (self._cells, self._sizes, self._changed, self._drafts, self._costly):
             kept.clear()
 
     def limit(self, limit_bytes: int) -> None:
@@ -96,8 +105,11 @@ class CellCache:
             key = next(iter(self._cells))
             if key in self._changed:
                 self._drafts[key] = self._encoded(key)
-            del self._cells[key]
-            self.size_bytes -= self._sizes.pop(key)
+            self._drop(key)
+
+    def _drop(self, key: CellKey) -> None:
+        del self._cells[key]
+        self.size_bytes -= self._sizes.pop(key)
 
     def _taken(self, key: CellKey, load: Load) -> tuple[BrickCell, Stamps]:
         kept, draft = self._cells.get(key), self._drafts.get(key)

@@ -9,7 +9,7 @@ bytes are damaged at rest is set aside, so that it does not hold up the others; 
 """
 
 import logging
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -31,6 +31,8 @@ from cairn_server.store.store_rows import Entry, Fold, Head, MapRow, StoredCommi
 
 log = logging.getLogger(__name__)
 
+Order = Callable[[Sequence[StoredCommit]], Iterable[StoredCommit]]
+"""Order in which the commits of a group are folded; it may leave some for the next group."""
 GROUP_BYTES_MAX = 64 << 20
 """Most bytes of the commits folded at once; a single larger commit is folded alone."""
 
@@ -94,8 +96,10 @@ def fold_pending(store: FoldStore, row: MapRow, cache: CellCache, *, limit: int)
     return fold_commits(store, row, cache, store.pending(row, limit=limit, size_bytes_max=GROUP_BYTES_MAX))
 
 
-def fold_commits(store: FoldStore, row: MapRow, cache: CellCache, commits: Sequence[StoredCommit]) -> int:
-    """Fold these pending commits; returns their count.
+def fold_commits(
+    store: FoldStore, row: MapRow, cache: CellCache, commits: Sequence[StoredCommit], *, order: Order = iter
+) -> int:
+    """Fold these pending commits, or those of them that `order` yields; returns their count.
 
     Raises:
         DamagedCellError: a stored cell is damaged and cannot be rebuilt; nothing was folded.
@@ -112,7 +116,7 @@ def fold_commits(store: FoldStore, row: MapRow, cache: CellCache, commits: Seque
     cache.begin(head.cursor)
     written = False
     try:
-        fold = plan_fold(store, row, head, commits, cache)
+        fold = plan_fold(store, row, head, order(commits), cache)
         written = store.fold(row, fold)
     finally:
         if not written:  # it failed, or another folding was faster, whose result is as good
@@ -120,10 +124,10 @@ def fold_commits(store: FoldStore, row: MapRow, cache: CellCache, commits: Seque
     cache.finish(fold.head)
     for number, why in fold.damaged:
         store.audit("damaged_commit", f"map {row.name}: commit number {number} is set aside: {why}")
-    return len(commits) if written else 0
+    return len(fold.damaged) + sum(commit.id in fold.vector for commit in commits) if written else 0
 
 
-def plan_fold(store: FoldStore, row: MapRow, head: Head, commits: Sequence[StoredCommit], cache: CellCache) -> Fold:
+def plan_fold(store: FoldStore, row: MapRow, head: Head, commits: Iterable[StoredCommit], cache: CellCache) -> Fold:
     """Plan of folding these commits on top of `head`, the state of the cells in `cache`."""
     plan = _Plan(store, row, cache, head.cursor)
     for commit in commits:

@@ -13,7 +13,8 @@ from cairn_map.errors import CairnError
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_server.folding.cell_cache import CACHE_BYTES, CellCache
 from cairn_server.folding.cells_at_rest import DamagedCellError, cell_to_change
-from cairn_server.folding.folding import GROUP_BYTES_MAX, Damage, FoldStore, fold_commits
+from cairn_server.folding.fold_turns import FoldTurns
+from cairn_server.folding.folding import GROUP_BYTES_MAX, Damage, FoldStore, Order, fold_commits
 from cairn_server.store.store_rows import MapRow, StoredCommit
 
 log = logging.getLogger(__name__)
@@ -60,7 +61,14 @@ class Waiting:
 
 
 def fold_around(
-    store: FoldStore, row: MapRow, cache: CellCache, waiting: Waiting, damaged: Damage, *, limit: int
+    store: FoldStore,
+    row: MapRow,
+    cache: CellCache,
+    waiting: Waiting,
+    damaged: Damage,
+    *,
+    limit: int,
+    order: Order = iter,
 ) -> int:
     """Fold up to `limit` pending commits that touch no damaged cell; returns their count.
 
@@ -71,6 +79,7 @@ def fold_around(
         waiting: what was found damaged until now; changed here.
         damaged: record of damaged cells, where clients report healed ones.
         limit: of one group.
+        order: of the commits in it; it may leave some for the next group.
     """
     waiting.probe(store, row, damaged)
     # Each turn folds, or sets commits or a cell aside, so the loop ends.
@@ -81,7 +90,7 @@ def fold_around(
             continue
         # A cell found damaged only now joins the others, and the rest of the commits is tried without it.
         try:
-            return fold_commits(store, row, cache, ready)
+            return fold_commits(store, row, cache, ready, order=order)
         except DamagedCellError as exc:
             if exc.key in waiting.cells:
                 raise
@@ -128,6 +137,7 @@ class LocalFolding:
         self._damaged = damaged
         self._caches: dict[str, CellCache] = {}
         self._waiting: dict[str, Waiting] = {}
+        self._turns: dict[str, FoldTurns] = {}
 
     def fold(self, row: MapRow, *, maps: int) -> Folded:
         """Fold one group of a map's pending commits; `maps` maps share the memory for cells.
@@ -139,6 +149,8 @@ class LocalFolding:
         cache = self._caches.setdefault(row.name, CellCache(row.geometry))
         cache.limit(CACHE_BYTES // maps)
         waiting = self._waiting.setdefault(row.name, Waiting())
-        count = fold_around(self._store, row, cache, waiting, self._damaged, limit=GROUP_MAX)
+        turns, start_s = self._turns.setdefault(row.name, FoldTurns()), time.monotonic()
+        count = fold_around(self._store, row, cache, waiting, self._damaged, limit=GROUP_MAX, order=turns.in_turn)
+        turns.end_group(time.monotonic() - start_s)
         cache.trim()
         return Folded(count, waiting.why)

@@ -283,9 +283,9 @@ class Store(Protocol):
     def pending(
         self, row: MapRow, *, limit: int, size_bytes_max: int, skip: Collection[int] = ()
     ) -> list[StoredCommit]:
-        """Commits to be folded, in order of arrival, with their diffs: at most `limit`, and one or within the size.
+        """Commits to be folded, in turn of their robots, with their diffs: at most `limit`, and one or within the size.
 
-        None whose number is in `skip`.
+        First the oldest of each robot, then the second of each; none whose number is in `skip`.
         """
         ...
 

@@ -159,7 +159,7 @@ def test_a_map_that_cannot_be_folded_holds_up_no_other_and_is_tried_again(
 ) -> None:
     broken: list[str] = ["map0"]
 
-    def fold(store: SqliteStore, row: MapRow, cache: CellCache, *rest: object, limit: int) -> int:
+    def fold(store: SqliteStore, row: MapRow, cache: CellCache, *rest: object, limit: int, order: object) -> int:
         if row.name in broken:
             raise MemoryError
         return fold_pending(store, row, cache, limit=limit)
