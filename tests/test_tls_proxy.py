@@ -148,10 +148,12 @@ def test_the_compose_file_names_what_is_there() -> None:
     assert (COMPOSE.parent / server["build"]["context"] / server["build"]["dockerfile"]).exists()
     assert proxy["profiles"] == ["tls"]
     for service in (server, proxy):
-        assert service["cap_drop"] == ["ALL"]
+        assert service["cap_drop"] == ["ALL"] and service["read_only"]
+        assert service["mem_limit"] and service["pids_limit"]
         for place in service["volumes"]:
             source = place.partition(":")[0]
             assert source in compose["volumes"] or source.startswith(("./Caddyfile", "${CAIRN_CERTS"))
+    assert server["ports"] == ["${CAIRN_PUBLISH:-127.0.0.1:8750}:8750"], "only this machine reaches it unless told"
     assert set(compose["volumes"]) == {"data", "proxy", "certs"}
     asked = {word.partition("}")[0].partition(":")[0] for word in CADDYFILE.read_text().split("{$")[1:]}
     assert set(proxy["environment"]) <= asked

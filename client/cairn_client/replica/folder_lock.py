@@ -17,11 +17,13 @@ LOOK_AGAIN_S = 0.02
 def make_folder(folder: Path, *, secret_file: str) -> None:
     """Make a folder with a file that only its user can read: the robot's token and keys are in it.
 
+    A new folder is its user's alone, too; one that was there may hold other things, and stays as open as it is.
+
     Raises:
         BadInputError: kind `bad_folder`: it is not there and cannot be made.
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(0o700, parents=True, exist_ok=True)
         (folder / secret_file).touch()
         (folder / secret_file).chmod(0o600)
     except OSError as exc:

@@ -64,3 +64,11 @@ def test_the_file_with_token_and_keys_is_its_user_s_alone(tmp_path: Path) -> Non
     files = [path for path in tmp_path.iterdir() if path.name.startswith(FILE_NAME)]
     assert {stat.S_IMODE(path.stat().st_mode) for path in files} == {0o600}
     mole.close()
+
+
+def test_a_new_folder_is_its_user_s_alone_and_one_that_was_there_stays_as_it_is(tmp_path: Path) -> None:
+    old, new = tmp_path / "old", tmp_path / "robots" / "mole"
+    old.mkdir(0o755)
+    for folder in (old, new):
+        opened(folder).close()
+    assert [stat.S_IMODE(folder.stat().st_mode) for folder in (old, new)] == [0o755, 0o700]

@@ -3,6 +3,7 @@
 import shutil
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
@@ -94,6 +95,34 @@ def test_robots_refill_a_server_that_lost_everything(team: Team, tmp_path: Path)
         team.fetch(name)
         assert team[name].view.evidence(A) == added(X, Y)
         assert team[name].view.evidence(B) == Y
+
+
+DAY_S = 86_400.0
+
+
+@pytest.mark.parametrize(
+    "jump_s", [40 * DAY_S, -400 * DAY_S, 56 * 365.25 * DAY_S], ids=["+40d", "-400d", "1970 to now"]
+)
+def test_a_jump_of_all_clocks_costs_a_robot_nothing(team: Team, monkeypatch: pytest.MonkeyPatch, jump_s: float) -> None:
+    team.server.stop()
+    team.server.settings = team.server.settings.model_copy(update={"stable_after_s": DAY_S})
+    clock_s = [0.0 if jump_s < 1e9 else -jump_s]
+    real_s = time.time
+    monkeypatch.setattr(time, "time", lambda: real_s() + clock_s[0])
+    team.server.start()
+    pushed = team["mole"].commit({A: X}).id
+    team.push("mole")
+    waiting = team["mole"].commit({B: Y}).id
+    for shift_s in (jump_s, -jump_s):
+        clock_s[0] += shift_s
+        team.fetch("mole")  # drops what is stable
+        known = team["mole"].header
+        assert known and pushed in known.coverage and pushed not in known.stable_vector
+        assert team["mole"].commits == [pushed, waiting]
+        assert waiting in team["mole"].push_set()
+    team.push("mole")
+    team.fetch("fox")
+    assert cells_of(team["fox"].view) == cells_of(team["mole"].view)
 
 
 @pytest.mark.slow
