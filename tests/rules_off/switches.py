@@ -907,4 +907,22 @@ SWITCHES = (
         "pass",
         "cairn_client/relay/test_relay.py::test_two_servers_with_other_bytes_under_one_id_are_told_apart_and_a_retract_makes_them_equal",
     ),
+    Switch(
+        12,
+        "what is stable is told by time that was seen to pass",
+        "server/cairn_server/store/store_age.py",
+        "return self._clocks.steady_s() - self._start_s",
+        "return self._clocks.wall_s() - self._start_s",
+        "cairn_server/store/test_store_age.py::"
+        "test_a_jump_of_the_clock_forgets_nothing_and_makes_nothing_stable_and_is_reported",
+    ),
+    Switch(
+        12,
+        "time without a server does not count",
+        "server/cairn_server/store/store_age.py",
+        "self._start_s = clocks.steady_s() - last.age_s",
+        "self._start_s = clocks.steady_s() - last.age_s - max(0.0, clocks.wall_s() - last.wall_s)",
+        "cairn_server/store/test_store_age.py::"
+        "test_time_without_a_server_does_not_count_and_a_clock_behind_it_is_reported",
+    ),
 )
