@@ -1,39 +1,60 @@
 """Every route with every kind of token on every map and robot: PROTOCOL.md's table is the norm.
 
-A route that is added to the app must be in the table (`test_protocol_document`), and so it is asked for here.
+A route that is added to the app must be in the table, and whatever a path names must be among the objects here: what
+the running server says of itself is compared with both. Objects are a holder's own, another's, and unknown ones.
 """
 
 import base64
+import re
 import time
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import httpx
 import pytest
 from starlette.routing import WebSocketRoute
+from tests.fixtures.server.access import bearer
 from tests.fixtures.server.live import DEADLINE_S, Live
 from tests.fixtures.server.protocol_document import ROLES_OF
 from tests.fixtures.server.pushes import MOLE, WREN, pushed
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from cairn_map.commits.ids import Author, Incarnation, RobotName
 from cairn_map.wire.access_messages import RoleText
 from cairn_map.wire.messages import Register
 from cairn_server.access.auth import new_token, token_hash
 from cairn_server.http.app import ROUTERS
 from cairn_server.http.middleware.token_first import TOKEN_PREFIX
+from cairn_server.http.openapi import operations
 from cairn_server.http.routes.live import PROTOCOL
 from cairn_server.store.store_rows import MapRow, Token
 
 READING = {"reader", "robot", "operator", "relay"}
 ADMIN, ENROLLER = "a" * 20, "e" * 20
+GHOST = Author(RobotName("ghost"), Incarnation("00000000000000bb"))
 AUTHORS = {"mole": MOLE, "wren": WREN}
+"""Robots that are registered on both maps, with a commit on each."""
+UNKNOWN = {"ghost": GHOST}
+"""A robot of which no server knows anything."""
+OBJECTS = {
+    "name": "a map here, another one, none",
+    "branch": "mole's, wren's, ghost's",
+    "commit": "mole's, wren's, ghost's",
+    "token": "a token, none",
+    "cell": "one that holds evidence",
+    "voxel": "one of that cell",
+    "file": "none",
+}
+"""Objects that the routes' paths name, and which of each are asked for."""
 CREATION = ("PUT", "/maps/{name}")
+NAMES = re.compile(rb"mole|wren|ghost|[0-9a-f]{16}|nobody|known")
+"""Names of objects, as a refusal may repeat them."""
 Place = Literal["here", "there"]
-Worth = Literal["good", "none", "wrong", "expired", "revoked"]
+Worth = Literal["good", "none", "wrong", "expired", "revoked", "rotated", "replaced", "deregistered"]
 
 
 @dataclass(frozen=True)
@@ -59,7 +80,8 @@ HOLDERS = [
     Holder(None, worth="none"),
     Holder(None, worth="wrong"),
     *(Holder("admin", worth=worth) for worth in ("expired", "revoked")),
-    *(Holder("robot", "here", "mole", worth=worth) for worth in ("expired", "revoked")),
+    *(Holder("robot", "here", "mole", worth=worth) for worth in ("expired", "revoked", "rotated")),
+    *(Holder("robot", "here", "vole", worth=worth) for worth in ("replaced", "deregistered")),
     Holder("admin", file=ADMIN),
     Holder("enroller", file=ENROLLER),
     *(Holder(role, place) for role in ROLES for place in (None, *PLACES)),
@@ -74,6 +96,11 @@ class Holders:
     def __init__(self, live: Live) -> None:
         self.live = live
         self.rows = {place: live.new_map() for place in PLACES}
+        for row in self.rows.values():
+            for author in AUTHORS.values():
+                live.push(row, pushed(0, 0, author), headers=bearer(ADMIN)).raise_for_status()
+            live.folded(row)
+        self._ask("PUT", "/tokens/known", json={"role": "reader"})
         self._headers: dict[Holder, dict[str, str]] = {}
 
     def renew(self) -> None:
@@ -94,6 +121,8 @@ class Holders:
         if holder.file or holder.worth == "wrong":
             return holder.file or "x" * 43
         assert holder.role
+        if holder.worth in ("rotated", "replaced", "deregistered"):
+            return self._ended_secret(holder)
         store, secret, row = self.live.service.store, new_token(), self.rows[holder.place] if holder.place else None
         token = Token(
             name=secret[:30],
@@ -108,6 +137,27 @@ class Holders:
         if holder.worth == "revoked":
             store.tokens.remove(token.name)
         return secret
+
+    def _ended_secret(self, holder: Holder) -> str:
+        """A secret that was good until its token got another one, or its robot left."""
+        assert holder.place
+        row = self.rows[holder.place]
+        if holder.worth == "rotated":
+            name = new_token()[:30]
+            fields = {"role": holder.role, "map": row.name, "robot": holder.robot}
+            secret = str(self._ask("PUT", f"/tokens/{name}", json=fields).json()["token"])
+            self._ask("POST", f"/tokens/{name}/rotate")
+            return secret
+        body = {"robot": holder.robot, "incarnation": MOLE.incarnation}
+        secret = str(self._ask("POST", f"/maps/{row.name}/branches", json=body).json()["token"])
+        if holder.worth == "replaced":
+            self._ask("POST", f"/maps/{row.name}/branches", json=body)
+        self._ask("DELETE", f"/maps/{row.name}/branches/{holder.robot}")
+        return secret
+
+    def _ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+        answer = self.live.http.request(method, path, headers=bearer(ADMIN), **options)
+        return answer.raise_for_status()
 
 
 @pytest.fixture(scope="module")
@@ -140,14 +190,15 @@ def statuses(route: tuple[str, str], holder: Holder, place: str, robot: str) -> 
 def ask(holders: Holders, route: tuple[str, str], holder: Holder, place: str, robot: str) -> httpx.Response:
     """A sound request where that matters for who is let in, an empty message elsewhere."""
     method, path = route
-    commit = pushed(0, 0, AUTHORS[robot])
+    commit = pushed(0, 0, (AUTHORS | UNKNOWN)[robot])
     row = holders.rows[place].name if place in holders.rows else place  # type: ignore[index]
     parts = defaultdict(lambda: "0") | {
         "name": row,
         "branch": robot,
         "commit": str(commit.id),
         "cell": "0,0,0",
-        "token": "nobody",
+        "voxel": "0,0,0",
+        "token": "nobody" if robot in UNKNOWN else "known",
     }
     content = commit.data if "{commit}" in path else b"{}"
     headers = {"Content-Type": "application/json", **holders.headers_of(holder)}
@@ -159,14 +210,17 @@ def ask(holders: Holders, route: tuple[str, str], holder: Holder, place: str, ro
 def test_each_token_may_do_what_the_document_says_and_no_more(holders: Holders, route: tuple[str, str]) -> None:
     method, path = route
     holders.renew()
-    robots = tuple(AUTHORS) if "{branch}" in path or "{commit}" in path else ("mole",)
+    has_objects = any(part in path for part in ("{branch}", "{commit}", "{token}"))
+    robots = (*UNKNOWN, *AUTHORS) if has_objects else ("mole",)
     places = ("here", "there", *(["nowhere"] if route != CREATION else []))
     wrong = []
     for holder in HOLDERS:
-        refusals = set()
+        refusals, denials = set(), set()
         for place in places if "{name}" in path else ("here",):
             for robot in robots:
-                if method == "DELETE":
+                if robot in UNKNOWN and place != "here":
+                    continue
+                if method == "DELETE" and robot not in UNKNOWN:
                     holders.renew()
                 answer = ask(holders, route, holder, place, robot)
                 expected = statuses(route, holder, place, robot)
@@ -176,8 +230,46 @@ def test_each_token_may_do_what_the_document_says_and_no_more(holders: Holders, 
                 if answer.status_code == 401:
                     assert answer.headers["WWW-Authenticate"] == "Bearer"
                     refusals.add(answer.content)
+                if answer.status_code == 403 and place == "here":
+                    denials.add(NAMES.sub(b"*", answer.content))
         assert len(refusals) <= 1, f"{holder} learns from refusals which names there are"
+        assert len(denials) <= 1, f"{holder} learns from denials which objects there are: {denials}"
     assert wrong == []
+
+
+def test_the_matrix_has_every_route_and_object_of_the_running_server(holders: Holders) -> None:
+    document = holders.live.http.get("/openapi.json").json()
+    routes = {(method.upper(), path) for (method, path), _ in operations(document)}
+    assert routes | {("GET", "/openapi.json")} == ROLES_OF.keys()
+    named = {name for _, path in routes for name in re.findall(r"{(\w+)}", path)}
+    assert named == OBJECTS.keys()
+
+
+@pytest.mark.parametrize(
+    "shown",
+    [
+        ["Bearer"],
+        ["Basic " + base64.b64encode(f"admin:{ADMIN}".encode()).decode()],
+        [ADMIN],
+        [f"Bearer {ADMIN} x"],
+        [f"Bearer {ADMIN[:-1]}"],
+        [f"Bearer {ADMIN}{ADMIN}"],
+        [f"Bearer {ADMIN.upper()}"],
+        ["Bearer " + "x" * 9000],
+        ["Bearer \u00e9"],
+        [f"Bearer {'x' * 43}", f"Bearer {ADMIN}"],
+        [f"Token {ADMIN}"],
+    ],
+    ids=repr,
+)
+def test_what_is_not_exactly_one_good_token_opens_nothing(holders: Holders, shown: list[str]) -> None:
+    for method, path in ROLES_OF:
+        if "anybody" not in ROLES_OF[method, path]:
+            parts = defaultdict(lambda: "0") | {"name": holders.rows["here"].name, "branch": "mole", "token": "known"}
+            headers = [(b"Authorization", text.encode("latin-1")) for text in shown]
+            url = holders.live.http.base_url.copy_with(raw_path=path.format_map(parts).encode())
+            answer = holders.live.answer_to(holders.live.http.build_request(method, url, headers=headers))
+            assert answer.status_code == 401, (method, path)
 
 
 def shake_hands(holders: Holders, path: str, holder: Holder, place: str, *, offers: bool) -> tuple[int, bytes]:
