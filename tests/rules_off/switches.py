@@ -36,6 +36,30 @@ class Switch:
 # ruff: noqa: E501 - sources, as they are
 SWITCHES = (
     Switch(
+        3,
+        "of a header that cannot be read nothing is kept",
+        REPLICA,
+        "        header.check()\n",
+        "",
+        "cairn_client/http/test_hostile_answers.py::test_of_a_header_that_cannot_be_read_nothing_is_kept",
+    ),
+    Switch(
+        12,
+        "an acknowledgement names the commit that was pushed",
+        "client/cairn_client/http/api.py",
+        "if receipt.id != str(commit.id):",
+        "if False:",
+        "cairn_client/http/test_hostile_answers.py::test_an_answer_to_a_push_that_is_no_receipt_acknowledges_nothing",
+    ),
+    Switch(
+        14,
+        "the cells of an index rise in number, from page to page",
+        "client/cairn_client/sync/requests.py",
+        "if int(keys[0]) <= after or (keys[1:] <= keys[:-1]).any():",
+        "if False:",
+        "cairn_client/http/test_hostile_answers.py::test_an_index_whose_pages_do_not_rise_is_refused",
+    ),
+    Switch(
         1,
         "a cursor is proven by its chain, not by its seq alone",
         HISTORY,

@@ -212,7 +212,10 @@ class MapApi:
         """Push a commit; when this returns, the server has it for good. `seal`: of a retract that is the server's."""
         headers = {key: text for key, text in (("Cairn-Seal", seal), ("Cairn-Signature", signatures)) if text}
         path = f"/maps/{name}/commits/{commit.id}"
-        return message_from_json(PushReceipt, self._ask("PUT", path, content=commit.data, headers=headers))
+        receipt = message_from_json(PushReceipt, self._ask("PUT", path, content=commit.data, headers=headers))
+        if receipt.id != str(commit.id):
+            raise DamagedDataError("bad_message", f"the server acknowledges {receipt.id}, not {commit.id}")
+        return receipt
 
     def upload(self, name: str, ask: GetUpload | PutPart) -> Upload:
         """Progress of a commit that goes in parts, after this part if it is one; with the last part it is pushed."""

@@ -37,6 +37,7 @@ from cairn_map.wire.messages import (
     CellIndex,
     CreateMap,
     MissingRequest,
+    PushReceipt,
     Register,
     ReplyHeader,
     Retract,
@@ -337,7 +338,8 @@ def test_an_answer_to_a_push_that_is_no_receipt_acknowledges_nothing(
     api: RelayApi, mouth: Mouth, mole: Replica
 ) -> None:
     commit = committed(mole, seen(1))
-    for said in (answer(b"<html>"), answer(BOMB, "Content-Encoding: gzip"), answer(b"{}")):
+    other = PushReceipt(id=str(foreign(0)), state="new").model_dump_json().encode()
+    for said in (answer(b"<html>"), answer(BOMB, "Content-Encoding: gzip"), answer(b"{}"), answer(other)):
         mouth.says(said)
         report = Link(api, MAP, branch="mole").hold(push_commits(mole))
         assert (report.pushed, list(report.refused)) == (0, [commit.id])
