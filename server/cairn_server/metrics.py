@@ -6,7 +6,7 @@ looked up when the page is asked for. The page is the text format 0.0.4.
 
 import os
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -18,7 +18,8 @@ from prometheus_client.metrics import MetricWrapperBase
 from prometheus_client.registry import Collector
 
 from cairn_map.wire.frames import CELL_HEAD, CellFrame, Frame
-from cairn_server.store.store_rows import Backlog, StoreFigures
+from cairn_server.store.shares import ALARM_PART, ROBOTS_MAX, used_bounds
+from cairn_server.store.store_rows import Backlog, RobotShares, StoreFigures
 
 MEDIA_TYPE = CONTENT_TYPE_PLAIN_0_0_4
 SERIES_MAX = 2000
@@ -147,6 +148,28 @@ def _gauge_by_map(name: str, help_text: str, values: Mapping[str, float]) -> Gau
     for map_name, value in values.items():
         gauge.add_metric([map_name], value)
     return gauge
+
+
+def share_metrics(shares: Mapping[str, Sequence[RobotShares]]) -> Iterator[Metric]:
+    """Parts above a half of what robots may use of each map's bounds, fullest first; the reserve has no robot."""
+    gauge = GaugeMetricFamily(
+        "cairn_share_used_ratio",
+        "Used part of a robot's share of a map's bound, from a half on.",
+        labels=["map", "robot", "bound"],
+    )
+    found = [
+        (part, map_name, share.robot, bound)
+        for map_name, of_map in shares.items()
+        for share in of_map
+        for bound, part in used_bounds(share).items()
+    ]
+    for map_name, of_map in shares.items():
+        robots = sum(1 for share in of_map if share.robot)
+        found.append((robots / ROBOTS_MAX, map_name, "", "robots"))
+    for part, *labels in sorted(found, reverse=True)[:SERIES_MAX]:
+        if part > ALARM_PART:
+            gauge.add_metric(labels, part)
+    yield gauge
 
 
 def process_metrics() -> Iterator[Metric]:

@@ -22,7 +22,14 @@ from cairn_server.folding.readiness import FoldHealth, Readiness
 from cairn_server.live.hub import Hub
 from cairn_server.live.robot_reports import RobotReports
 from cairn_server.maps import Maps
-from cairn_server.metrics import ServerFigures, metrics_text, process_metrics, store_metrics, upstream_metrics
+from cairn_server.metrics import (
+    ServerFigures,
+    metrics_text,
+    process_metrics,
+    share_metrics,
+    store_metrics,
+    upstream_metrics,
+)
 from cairn_server.settings import Settings
 from cairn_server.store.store import Store
 from cairn_server.sync.handing_over import UpstreamProgress
@@ -120,7 +127,8 @@ class Service:
         """All metrics for Prometheus."""
         store = store_metrics(self.store.health.figures(), self.store.health.backlogs())
         upstream = upstream_metrics(self.sync.upstream.ages_s())
-        return metrics_text(chain(self.figures.registry.collect(), store, upstream, process_metrics()))
+        shares = share_metrics({row.name: self.store.shares.of(row) for row in self.store.maps()})
+        return metrics_text(chain(self.figures.registry.collect(), store, shares, upstream, process_metrics()))
 
     def stop_streams(self) -> None:
         """Count as not ready and end live streams, which never end alone; requests are still answered for a while."""

@@ -44,7 +44,8 @@ class Quotas(BaseModel):
     cells_per_commit: Count = None
     """Cells that one commit may touch; FORMAT.md allows 4096 in any case."""
     map_extent_m: Metres = 100_000.0
-    """Longest edge of the box of all cells of a map, metres: a robot that lost its way must not put cells far away."""
+    """Longest edge of the box of one robot's cells in a map, metres: a robot that lost its way must not put cells far
+    away."""
 
 
 class Settings(BaseModel):

@@ -59,7 +59,7 @@ class Bodies:
             captured_s=None,
             retracts=(),
             diff=made.cells,
-            tops=(1, 1) + (0,) * self.geometry.plane_count,
+            tops=dict.fromkeys(made.cells, (1, 1) + (0,) * self.geometry.plane_count),
         )
 
     def _with_text(self, made: Commit, text: bytes) -> bytes:

@@ -17,10 +17,10 @@ from cairn_server.http.routes import problems
 from cairn_server.live import hub as live
 from cairn_server.live import robot_reports
 from cairn_server.settings import Quotas, Settings
-from cairn_server.store import numbering
+from cairn_server.store import numbering, shares
 from cairn_server.store.sqlite import tokens as sqlite_tokens
 from cairn_server.sync import cell_changes, missing, uploads
-from cairn_server.sync.checks import check_pool, commit_checks, push_policy
+from cairn_server.sync.checks import check_pool, commit_checks
 from cairn_server.views import export_tickets, map_exports, map_views
 
 KIND = re.compile(r"[a-z]+(_[a-z]+)*")
@@ -101,7 +101,12 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("commits a minute", Quotas().commits_per_minute),
         ("bytes a day", Quotas().bytes_per_day),
         ("cells a day, of all commits together", Quotas().cells_per_day),
-        ("longest edge of the box of a map's cells, this commit's included", Quotas().map_extent_m),
+        ("longest edge of the box of a robot's cells in a map, this commit's included", Quotas().map_extent_m),
+        ("robots with commits, those closed not counted", shares.ROBOTS_MAX),
+        ("`incarnations`", shares.INCARNATIONS_MAX),
+        ("`intervals` of the numbers of all its incarnations", shares.INTERVALS_OF_ROBOT_MAX),
+        ("`sums`: per region of 4^3 cells, hits and misses", shares.limits_of("mole", 3)[0]),
+        ("`sums`: per region of 4^3 cells, every other plane", shares.limits_of("mole", 3)[2]),
         ("audit log", sqlite_tokens.AUDIT_ROWS_MAX),
     ],
 )
@@ -126,13 +131,12 @@ def test_the_bounds_of_cost_in_the_document_are_those_of_the_code() -> None:
 def test_the_limits_of_push_in_the_document_are_those_of_the_code() -> None:
     policy = DOCUMENT.split("### 4.1 Push")[1].split("**Folding**")[0]
     for text in (
-        f"<= {push_policy.WEIGHT_MAX} S",
         f"n at most {numbering.AHEAD_MAX:_} above".replace("_", " "),
-        f"at most {numbering.AUTHOR_INTERVALS_MAX} gaps",
-        f"{numbering.INCARNATIONS_MAX} incarnations",
-        f"{numbering.AUTHORS_MAX} authors and {numbering.INTERVALS_MAX:_} intervals".replace("_", " "),
         f"lists {missing.RETRACTS_MAX} of them",
         f"those of {missing.PENDING_AUTHORS_MAX} authors",
+        f"| {shares.INTERVALS_OF_RESERVE_MAX:_} |".replace("_", " "),
+        f"| {shares.limits_of(shares.RESERVE, 3)[0]:_} |".replace("_", " "),
+        f"| 2^{int(shares.limits_of(shares.RESERVE, 3)[2]).bit_length() - 1} |",
         f"at most {cell_changes.DELTA_ENTRIES_MAX} entries",
     ):
         assert text in policy + DOCUMENT, text

@@ -10,7 +10,18 @@ from tests.memory_store.maps import MemoryMaps
 from cairn_map.commits.cursor import ENTRY_FOLD
 from cairn_map.errors import UnreachableError
 from cairn_server.store.store_age import StoreAge
-from cairn_server.store.store_rows import Backlog, CellRow, EntrySize, MapRow, Robot, StoreFigures, Use, relay_of
+from cairn_server.store.store_rows import (
+    Backlog,
+    CellRow,
+    ClosedRobot,
+    EntrySize,
+    MapRow,
+    Robot,
+    RobotShares,
+    StoreFigures,
+    Use,
+    relay_of,
+)
 
 
 class MemoryHealth:
@@ -69,6 +80,28 @@ class MemoryUses:
                         who = relay_of(kept.new.via) if kept.new.via else commit.author.robot
                         found[state.row.number, who] += Use(kept.new.size_bytes, kept.cells)
         return found
+
+
+class MemoryShares:
+    """`store.Shares`, added up from the commits whenever it is asked."""
+
+    def __init__(self, maps: MemoryMaps) -> None:
+        self._maps = maps
+
+    def of(self, row: MapRow) -> list[RobotShares]:
+        """Use of its shares by every robot, and of the reserve, by name."""
+        with self._maps.reading(row) as state:
+            return state.shares()
+
+    def regions(self, row: MapRow, robot: str) -> list[int]:
+        """Regions in which a robot has evidence, pending or in the map, rising."""
+        with self._maps.reading(row) as state:
+            return sorted(state.held(robot))
+
+    def close(self, row: MapRow, robot: str) -> ClosedRobot:
+        """Close all authors of a robot."""
+        with self._maps.changing(row) as changed:
+            return changed.close(robot)
 
 
 class MemoryNotes:

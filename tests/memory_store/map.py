@@ -2,17 +2,40 @@
 
 import secrets
 import time
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from cairn_map.commits.cursor import ENTRY_FOLD, Cursor, first_chain
-from cairn_map.commits.ids import Author, CommitId
-from cairn_map.errors import BadInputError, ConflictError
-from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX
+from cairn_map.commits.ids import SERVERS_OWN, Author, CommitId
+from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.numbering import AGAIN_KEPT_S, EvidenceGoneError, Numbering, check_number
-from cairn_server.store.store_rows import Branch, CellRow, Entry, Fold, Head, MapRow, NewCommit, StoredCommit
+from cairn_server.store.shares import (
+    ALARM_PART,
+    INTERVALS_OF_RESERVE_MAX,
+    RESERVE,
+    Tops,
+    account_of,
+    check_sums,
+    tops_by_region,
+    used_parts,
+)
+from cairn_server.store.store_rows import (
+    Branch,
+    CellRow,
+    ClosedRobot,
+    Entry,
+    Fold,
+    Head,
+    MapRow,
+    NewCommit,
+    RobotShares,
+    StoredCommit,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,7 +81,6 @@ class MemoryMap:
 
     row: MapRow
     head: Head
-    tops: tuple[int, ...]
     is_shared: bool = False
     """A snapshot has these dictionaries: copy them before they are changed."""
     commits: dict[CommitId, Kept] = field(default_factory=dict)
@@ -67,6 +89,7 @@ class MemoryMap:
     """By number."""
     authors: dict[Author, tuple[int, int]] = field(default_factory=dict)
     """Highest number, and intervals of the numbers."""
+    closed: set[Author] = field(default_factory=set)
     entries: list[Entry] = field(default_factory=list)
     touched: dict[CellKey, tuple[int, ...]] = field(default_factory=dict)
     """Log entries that concern a cell."""
@@ -91,7 +114,7 @@ class MemoryMap:
             return self._append_again(known, commit, age_s)
         self._check_kept(commit.retracts)
         intervals = self._checked_intervals(commit.id)
-        self.tops = self._checked_tops(commit.tops)
+        self._check_sums(commit)
         top, _ = self.authors.get(commit.id.author, (0, 0))
         self.authors[commit.id.author] = max(top, commit.id.n), intervals
         self.commits[commit.id] = Kept(
@@ -201,22 +224,74 @@ class MemoryMap:
         author = commit.author
         top, intervals = self.authors.get(author, (None, 0))
         neighbours = sum(CommitId(author, n) in self.commits for n in (commit.n - 1, commit.n + 1))
+        accounts = {share.robot: share for share in self.shares()}
+        own = accounts.get(account_of(author.robot, is_closed=False))
         numbering = Numbering(
             top=top,
-            intervals=intervals,
             neighbours=neighbours,
-            incarnations=sum(known.robot == author.robot for known in self.authors),
-            authors_in_map=len(self.authors),
-            intervals_in_map=sum(count for _, count in self.authors.values()),
+            is_closed=author in self.closed,
+            incarnations=own.incarnations if own else 0,
+            intervals=own.intervals if own else 0,
+            robots=len(accounts.keys() - {RESERVE}),
         )
         check_number(commit, numbering)
         return intervals + 1 - neighbours
 
-    def _checked_tops(self, tops: tuple[int, ...]) -> tuple[int, ...]:
-        sums = tuple(total + top for total, top in zip(self.tops, tops, strict=True))
-        if max(sums[:2]) > COUNT_MAX or max(sums[2:], default=0) > SUM_MAX:
-            raise BadInputError("evidence_overflow", "the map could not take this much evidence without an overflow")
-        return sums
+    def shares(self) -> list[RobotShares]:
+        """What every robot, and the reserve, has of its shares."""
+        found: defaultdict[str, list[int]] = defaultdict(list)
+        for author, (_, intervals) in self.authors.items():
+            found[self._account(author)].append(intervals)
+        parts = {account: self._fullest(account) for account in found}
+        return [
+            RobotShares(robot=account, incarnations=len(counts), intervals=sum(counts), sums=parts[account])
+            for account, counts in sorted(found.items())
+        ]
+
+    def held(self, account: str) -> dict[int, Tops]:
+        """Largest numbers of an account's commits that are pending or in the map, added up by region."""
+        found: dict[int, Tops] = {}
+        for commit, kept in self.commits.items():
+            if not kept.unfolded_seq and self._account(commit.author) == account and kept.new.tops:
+                for region, tops in _by_region(kept.new).items():
+                    found[region] = found.get(region, 0) + tops
+        return found
+
+    def close(self, robot: str) -> ClosedRobot:
+        """Close a robot's authors."""
+        own = [author for author in self.authors if author.robot == robot and author not in self.closed]
+        if not own or robot in SERVERS_OWN:
+            raise NotFoundError("no_author", f"robot {robot!r} has no commits in map {self.row.name} to close")
+        intervals = sum(self.authors[author][1] for author in own)
+        reserved = sum(share.intervals for share in self.shares() if share.robot == RESERVE)
+        if reserved + intervals > INTERVALS_OF_RESERVE_MAX:
+            raise ConflictError("reserve_full", "there is no room for more closed authors")
+        reserve = self.held(RESERVE)
+        try:
+            for key, tops in self.held(robot).items():
+                check_sums(RESERVE, [key], (tops + reserve.get(key, 0))[None], self.row.geometry)
+        except BadInputError as exc:
+            raise ConflictError("reserve_full", exc.message) from exc
+        self.closed.update(own)
+        return ClosedRobot(authors=len(own), intervals=intervals)
+
+    def _account(self, author: Author) -> str:
+        return account_of(author.robot, is_closed=author in self.closed)
+
+    def _fullest(self, account: str) -> float | None:
+        held = self.held(account)
+        part = float(used_parts(account, np.stack(list(held.values()))).max()) if held else 0.0
+        return part if part > ALARM_PART else None
+
+    def _check_sums(self, commit: NewCommit) -> None:
+        account = account_of(commit.id.author.robot, is_closed=False)
+        held = self.held(account)
+        for region, tops in _by_region(commit).items():
+            check_sums(account, [region], (tops + held.get(region, 0))[None], self.row.geometry)
+
+
+def _by_region(commit: NewCommit) -> dict[int, Tops]:
+    return dict(zip(*map(list, tops_by_region(commit.tops)), strict=True)) if commit.tops else {}
 
 
 def new_memory_map(number: int, name: str, geometry: Geometry, sensor_model: SensorModel) -> MemoryMap:
@@ -226,4 +301,4 @@ def new_memory_map(number: int, name: str, geometry: Geometry, sensor_model: Sen
     )
     log_id = secrets.token_bytes(16)
     head = Head(cursor=Cursor(log_id, 0, first_chain(log_id, geometry.digest())))
-    return MemoryMap(row, head, tops=(0,) * (2 + geometry.plane_count))
+    return MemoryMap(row, head)

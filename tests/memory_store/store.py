@@ -8,7 +8,7 @@ from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 
-from tests.memory_store.figures import MemoryHealth, MemoryNotes, MemoryUses
+from tests.memory_store.figures import MemoryHealth, MemoryNotes, MemoryShares, MemoryUses
 from tests.memory_store.map import new_memory_map
 from tests.memory_store.maps import MemoryMaps
 from tests.memory_store.snapshot import MemorySnapshot
@@ -36,6 +36,7 @@ class MemoryStore:
         self.audit_log = MemoryAuditLog(self._maps)
         self.health = MemoryHealth(self._maps, self.age)
         self.uses = MemoryUses(self._maps)
+        self.shares = MemoryShares(self._maps)
         self.notes = MemoryNotes(self._maps)
 
     def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:

@@ -27,7 +27,7 @@ from cairn_map.commits.version_vector import EMPTY, VersionVector, vector_digest
 from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError, first_error
 from cairn_map.evidence.fingerprint import fingerprint_from_hex
 from cairn_map.evidence.grid import Cell
-from cairn_map.wire.access_messages import CreateToken, NewSecret, TokenInfo
+from cairn_map.wire.access_messages import CreateToken, NewSecret, RobotClosed, RobotUse, TokenInfo
 from cairn_map.wire.frames import FRAME_BYTES_MAX, JSON_BYTES_MAX, Frame
 from cairn_map.wire.messages import (
     INDEX_PAGE,
@@ -207,6 +207,14 @@ class MapApi:
     def deregister(self, name: str, branch: str) -> None:
         """Deregister a robot."""
         self._ask("DELETE", f"/maps/{name}/branches/{branch}")
+
+    def robot_uses(self, name: str) -> list[RobotUse]:
+        """Use of their shares of a map's bounds by all robots."""
+        return list_of(RobotUse, self._ask("GET", f"/maps/{name}/robots"))
+
+    def close_robot(self, name: str, robot: str) -> RobotClosed:
+        """Close all incarnations of a robot: they take no new commits, and its shares are whole again."""
+        return message_from_json(RobotClosed, self._ask("POST", f"/maps/{name}/robots/{robot}/close"))
 
     def push(self, name: str, commit: Commit, *, seal: str | None = None, signatures: str | None = None) -> PushReceipt:
         """Push a commit; when this returns, the server has it for good. `seal`: of a retract that is the server's."""

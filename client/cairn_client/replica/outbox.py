@@ -238,13 +238,13 @@ class Outbox:
         self._acked_since_header.add(commit)
 
     def rename(self, commit: CommitId) -> Commit:
-        """Give a commit whose id is taken on the server a new one, in a new incarnation (rule 13)."""
+        """Give a commit whose id the server does not take a new one, in a new incarnation (rule 13)."""
         data = self._store.commit_data(commit)
         if data is None:
             raise BadInputError("no_bytes", f"the bytes of {commit} are not kept any more")
         # Other numbers of the present incarnation may be taken, too; an older one has nothing left to number.
         if commit.author == self.author:
-            self.new_incarnation(f"the id {commit} is taken by other bytes")
+            self.new_incarnation(f"the server takes these bytes under another id than {commit} only")
         # The renamed commit, and the commits that name it under its old id.
         n = self._next_n()
         renamed = renamed_commit(data, commit=CommitId(self.author, n), parent=self._state.tip_sha)

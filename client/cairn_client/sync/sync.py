@@ -132,7 +132,10 @@ def push_commits(
 
 
 def _push(replica: Replica, commit: Commit, seal: str | None, parts: Parts) -> Conversation[CommitId]:
-    """Push one commit; its id, which is a new one if the server has other bytes under the old one (rule 13)."""
+    """Push one commit; its id, which is a new one if the server has other bytes under the old one (rule 13).
+
+    It gets a new one, too, if an administrator closed the incarnation.
+    """
     try:
         yield from push_whole_or_in_parts(_signed(replica, commit, seal), parts)
     except ConflictError as exc:
@@ -143,8 +146,12 @@ def _push(replica: Replica, commit: Commit, seal: str | None, parts: Parts) -> C
                     yield from push_whole_or_in_parts(_signed(replica, kept), parts)
             yield from push_whole_or_in_parts(_signed(replica, commit, seal), parts)
             return commit.id
-        # Other bytes under an own id: this disk was rolled back (rule 13). A server's own retract cannot be renamed.
-        if exc.kind != "id_taken" or seal is not None:
+        # Other bytes under an own id: this disk was rolled back (rule 13). Or an administrator closed the author, which
+        # takes nothing new; what the server once had, another server may have under its id. A server's own retract
+        # cannot be renamed.
+        entry = replica.outbox.kept(commit.id)
+        is_closed = exc.kind == "author_closed" and entry is not None and not entry.acked
+        if not (is_closed or exc.kind == "id_taken") or seal is not None:
             raise
         renamed = replica.kept_commit(replica.rename(commit.id))
         assert renamed is not None  # noqa: S101 - it was just kept

@@ -23,6 +23,8 @@ INITIAL = RobotName("initial")
 """Author of the evidence that a map starts from."""
 OPERATOR = RobotName("operator")
 """Author of the retracts that a server makes for its operators."""
+SERVERS_OWN = frozenset({OPERATOR, INITIAL})
+"""Authors in whose name servers speak."""
 
 
 class Author(NamedTuple):

@@ -51,6 +51,26 @@ class TokenInfo(_Model):
     """Time of its last use, UTC seconds since 1970; updated every few seconds at most."""
 
 
+class RobotUse(_Model):
+    """Use of its shares of a map's bounds by one robot."""
+
+    robot: NameText | None
+    """None: the reserve, of the servers' own commits and of closed robots."""
+    incarnations: int
+    intervals: int
+    """Intervals of the numbers of its commits, in all incarnations."""
+    used: dict[str, float]
+    """Part that is used of each bound: `sums` (0 up to a half), `incarnations`, `intervals`."""
+
+
+class RobotClosed(_Model):
+    """Answer to closing a robot: what went into the reserve."""
+
+    robot: NameText
+    incarnations: int
+    intervals: int
+
+
 class NewSecret(_Model):
     """Answer to a creation or rotation: the secret, shown this once."""
 

@@ -20,12 +20,16 @@ from cairn_map.kernels.morton_kernels import deinterleave
 from cairn_server.access.auth import UPSTREAM, Caller, Role
 from cairn_server.access.rate_limits import Allowance, allowance
 from cairn_server.settings import Quotas
+from cairn_server.store.shares import REGION_BITS
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow, Robot, Use, relay_of
 
 DAY_S = 86_400
 BOX_EVERY_S = 5.0
-"""Time between two readings of a map's box while commits beyond it are refused: retracts make it smaller."""
+"""Least time between two readings of a robot's box while its commits beyond it are refused: retracts make it smaller.
+"""
+BOX_PAUSE_FACTOR = 50.0
+"""Pause after a reading, in times of what it took: a robot with millions of cells must not keep the server busy."""
 Corner = tuple[int, int, int]
 Box = tuple[Corner, Corner]
 """Lowest and highest cell."""
@@ -50,13 +54,23 @@ class Meter:
         self._day = -1
         self._used: dict[Robot, Use] = {}
         self._minutes: dict[Robot, Allowance] = {}
-        self._boxes: dict[int, tuple[Box | None, float]] = {}
+        self._reaches: dict[Robot, _Reach] = {}
 
     @contextmanager
     def spending(
-        self, row: MapRow, caller: Caller, *, size_bytes: int, cells: Collection[CellKey], via: str | None = None
+        self,
+        row: MapRow,
+        caller: Caller,
+        *,
+        size_bytes: int,
+        cells: Collection[CellKey],
+        author: str = "",
+        via: str | None = None,
     ) -> Iterator[Callable[[], None]]:
         """Take a commit off its robot's quotas for the length of a `with`; the function it yields keeps it taken.
+
+        Where it lies is compared with the other cells of `author`, the robot that made it: what another robot has
+        pushed, however far away, is no reason to refuse it.
 
         What a relay hands over (`via`: its token) is taken off the relay's quotas. What this server fetches itself
         from its upstream is held to the limits of one commit only: it may be all of a map that grew for years.
@@ -70,7 +84,7 @@ class Meter:
             return
         robot = row.number, relay_of(via) if via else caller.robot or caller.name
         use, box, is_metered = Use(size_bytes, len(cells)), _box_of(cells), caller != UPSTREAM
-        self._check_commit(row, use, box)
+        reach = self._check_commit(row, use, author, box)
         with self._lock:
             if is_metered:
                 self._take(robot, use)
@@ -84,30 +98,36 @@ class Meter:
         try:
             yield keep
         finally:
+            if is_kept and reach is not None and box is not None:
+                reach.widen(box)
             with self._lock:
-                if is_kept and self._quotas.map_extent_m is not None:
-                    self._boxes[row.number] = self._widened(row, box), self._boxes[row.number][1]
                 if is_metered and not is_kept:
                     self._give_back(robot, use, day)
 
-    def _check_commit(self, row: MapRow, use: Use, box: Box | None) -> None:
+    def _check_commit(self, row: MapRow, use: Use, author: str, box: Box | None) -> "_Reach | None":
+        """Refuse what no waiting mends; the reach of the author's cells, if the commit may widen it."""
         most = self._quotas.cells_per_commit
         if most is not None and use.cells > most:
             raise BadInputError("beyond_quota", f"a commit may touch {most} cells here, this one touches {use.cells}")
         most_m = self._quotas.map_extent_m
         if most_m is None or box is None:
-            return
+            return None
         with self._lock:
-            wide_m = _edge_cells(self._widened(row, box)) * row.geometry.cell_edge_m
-            if wide_m > most_m and self._steady_s() - self._boxes[row.number][1] >= BOX_EVERY_S:
-                self._read_box(row)
-                wide_m = _edge_cells(self._widened(row, box)) * row.geometry.cell_edge_m
+            reach = self._reaches.setdefault((row.number, author), _Reach())
+        edge_m = row.geometry.cell_edge_m
+
+        def regions() -> Box | None:
+            return _box_of_regions(self._store.shares.regions(row, author))
+
+        wide_m = reach.edge_cells(box, within=most_m / edge_m, read=regions, steady_s=self._steady_s) * edge_m
         if wide_m > most_m:
             raise BadInputError(
                 "beyond_quota",
-                f"with this commit's cells map {row.name} would span {wide_m:.0f} m, and it may span {most_m:.0f} m: "
-                "is the robot where it believes to be?",
+                f"with this commit all cells of {author} in map {row.name} would span {wide_m:.0f} m, and they may "
+                f"span {most_m:.0f} m: is the robot where it believes to be? If it was not before, an operator can "
+                "retract what lies too far away",
             )
+        return reach
 
     def _take(self, robot: Robot, use: Use) -> None:
         now_s = self._wall_s()
@@ -141,21 +161,39 @@ class Meter:
         if robot in self._minutes:
             self._minutes[robot].left += 1
 
-    def _widened(self, row: MapRow, box: Box | None) -> Box | None:
-        """Box of a map and of a commit together."""
-        if row.number not in self._boxes:
-            self._read_box(row)
-        known = self._boxes[row.number][0]
-        if known is None or box is None:
-            return known or box
-        return _corner(np.minimum(known[0], box[0])), _corner(np.maximum(known[1], box[1]))
 
-    def _read_box(self, row: MapRow) -> None:
-        """Read the box of the folded map; the known box stays while commits wait that may be at its corners."""
-        with self._store.snapshot(row) as snapshot:
-            known, _ = self._boxes.get(row.number, (None, 0.0))
-            box = known if known and len(snapshot.pending()) else snapshot.totals().corner_cells
-            self._boxes[row.number] = box, self._steady_s()
+class _Reach:
+    """Box of the cells in which one robot has evidence, folded or not; thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._box: Box | None = None
+        self._next_s = -math.inf
+        """Steady time before which the box is not read again."""
+
+    def edge_cells(
+        self, box: Box, *, within: float, read: Callable[[], Box | None], steady_s: Callable[[], float]
+    ) -> int:
+        """Longest edge of the robot's box and another one together, in cells; read again if it exceeds `within`."""
+        with self._lock:
+            is_known = self._next_s > -math.inf
+            edge = _edge_cells(_widened(self._box, box)) if is_known else math.inf
+            begun_s = steady_s()
+            if edge > within and begun_s >= self._next_s:
+                self._box = read()
+                self._next_s = begun_s + max(BOX_EVERY_S, BOX_PAUSE_FACTOR * (steady_s() - begun_s))
+            return _edge_cells(_widened(self._box, box))
+
+    def widen(self, box: Box) -> None:
+        """Note that the robot has evidence in this box, too."""
+        with self._lock:
+            self._box = _widened(self._box, box)
+
+
+def _widened(known: Box | None, box: Box) -> Box:
+    if known is None:
+        return box
+    return _corner(np.minimum(known[0], box[0])), _corner(np.maximum(known[1], box[1]))
 
 
 def _box_of(cells: Collection[CellKey]) -> Box | None:
@@ -165,14 +203,24 @@ def _box_of(cells: Collection[CellKey]) -> Box | None:
     return _corner(found.min(axis=0)), _corner(found.max(axis=0))
 
 
+def _box_of_regions(regions: Collection[int]) -> Box | None:
+    """Box that all cells of a robot reach, by a side of a region less than they may: it is no reason to refuse one."""
+    box = _box_of([CellKey(region << REGION_BITS) for region in regions])
+    if box is None:
+        return None
+    low, high = box
+    last = (1 << REGION_BITS // 3) - 1
+    return (low[0] + last, low[1] + last, low[2] + last), high
+
+
 def _corner(values: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Corner:
     i, j, k = values.tolist()
     return i, j, k
 
 
-def _edge_cells(box: Box | None) -> int:
+def _edge_cells(box: Box) -> int:
     """Count of cells along the longest edge."""
-    return max((high - low + 1 for low, high in zip(*box, strict=True)), default=0) if box else 0
+    return max(high - low + 1 for low, high in zip(*box, strict=True))
 
 
 def _quota(message: str, wait_s: float) -> UnreachableError:

@@ -3,56 +3,54 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from cairn_map.commits.ids import OPERATOR, CommitId
+from cairn_map.commits.ids import OPERATOR, SERVERS_OWN, CommitId
 from cairn_map.errors import BadInputError, ConflictError
-
-AUTHOR_INTERVALS_MAX = 1000
-"""Most intervals of one author's numbers. A robot pushes oldest first, so an honest one has a handful."""
-
+from cairn_server.store.shares import (
+    INCARNATIONS_MAX,
+    INTERVALS_OF_RESERVE_MAX,
+    INTERVALS_OF_ROBOT_MAX,
+    ROBOTS_MAX,
+)
 
 AHEAD_MAX = 10_000
 """Most that a number may run ahead of its author's highest. An author's first number may be any: a robot that comes to
 a new server may not have its oldest commits any more."""
-
-
-INCARNATIONS_MAX = 256
-"""Most incarnations of one robot: disks lost or rolled back."""
-
-
-AUTHORS_MAX = 8192
-"""Most authors of one map. Its vector is in every reply: with the longest name and numbers an author takes 88 bytes."""
-
-
-INTERVALS_MAX = 10_240
-"""Most intervals of the numbers of all authors of a map: beyond the first of each author one takes 34 bytes at most."""
-
-
 NAMED_MAX = 5
 """Most ids that an error message names."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Numbering:
-    """Facts of an author's numbers, and of the map's vector, before one more commit."""
+    """Facts of an author's numbers, and of what its robot's share has left, before one more commit."""
 
     top: int | None
     """Highest number of the author; None before its first commit."""
-    intervals: int
     neighbours: int
     """Count of the numbers n - 1 and n + 1 that are known."""
-    incarnations: int
-    """Count of the same robot's incarnations, this one included if it is known."""
-    authors_in_map: int
-    intervals_in_map: int
+    is_closed: bool = False
+    """True if an administrator closed the author."""
+    incarnations: int = 0
+    """Count of the robot's authors that are not closed; of the reserve's for a server's own commit."""
+    intervals: int = 0
+    """Count of the intervals of their numbers."""
+    robots: int = 0
+    """Count of the robots with such authors; only counted for a robot that has none."""
 
 
-def check_number(commit: CommitId, numbering: Numbering) -> None:
+def check_number(commit: CommitId, known: Numbering) -> None:
     """Refuse a number that would tear the version vector apart.
 
     Raises:
+        ConflictError: kind `author_closed`.
         BadInputError: kind `number_gap` or `too_many_authors`.
     """
-    known = numbering
+    robot = commit.author.robot
+    if known.is_closed:
+        raise ConflictError(
+            "author_closed",
+            f"an administrator closed {commit.author}, which takes no new commits; the robot goes on with a new "
+            "incarnation",
+        )
     if known.top is not None and commit.n > known.top + AHEAD_MAX:
         raise BadInputError(
             "number_gap",
@@ -61,21 +59,39 @@ def check_number(commit: CommitId, numbering: Numbering) -> None:
         )
     if known.neighbours:
         return
-    if known.intervals >= AUTHOR_INTERVALS_MAX:
-        raise BadInputError(
-            "number_gap",
-            f"the numbers of {commit.author} have {known.intervals} gaps, {commit} would open another; fill some first",
-        )
+    if robot in SERVERS_OWN:
+        # A server's own retracts have an incarnation for each of its starts, and nothing can be in their way.
+        if robot != OPERATOR:
+            _check_reserve(commit, known)
+        return
+    closing = f"an administrator can begin its numbers again with `cairn map robots close MAP {robot}`"
     is_new = known.top is None
-    too_many = known.authors_in_map >= AUTHORS_MAX or known.intervals_in_map >= INTERVALS_MAX
-    spent = is_new and known.incarnations >= INCARNATIONS_MAX
-    # A server's own retracts have an incarnation for each of its starts, and no robot can be in their way.
-    if (too_many or spent) and commit.author.robot != OPERATOR:
+    if is_new and not known.incarnations and known.robots >= ROBOTS_MAX:
         raise BadInputError(
             "too_many_authors",
-            f"{commit.author} has {known.incarnations} incarnations (at most {INCARNATIONS_MAX}), the map "
-            f"{known.authors_in_map} authors and {known.intervals_in_map} intervals of their numbers (at most "
-            f"{AUTHORS_MAX} and {INTERVALS_MAX}); keep the robots' folders, or begin a new map",
+            f"{known.robots} robots have commits in this map, which has {ROBOTS_MAX} places: there is none for {robot} "
+            "before an administrator closes one that does not come any more (`cairn map robots close MAP NAME`)",
+        )
+    if is_new and known.incarnations >= INCARNATIONS_MAX:
+        raise BadInputError(
+            "too_many_authors",
+            f"robot {robot} has {known.incarnations} incarnations in this map, at most {INCARNATIONS_MAX}; {closing}",
+        )
+    if known.intervals >= INTERVALS_OF_ROBOT_MAX:
+        raise BadInputError(
+            "too_many_authors" if is_new else "number_gap",
+            f"the numbers of robot {robot} have {known.intervals} intervals in all its incarnations, and may have "
+            f"{INTERVALS_OF_ROBOT_MAX}: {commit} would begin another; push the commits between them first, or "
+            f"{closing}",
+        )
+
+
+def _check_reserve(commit: CommitId, known: Numbering) -> None:
+    if known.intervals >= INTERVALS_OF_RESERVE_MAX:
+        raise BadInputError(
+            "too_many_authors",
+            f"the servers' own and closed authors have {known.intervals} intervals, and may have "
+            f"{INTERVALS_OF_RESERVE_MAX}: there is no place for {commit}; begin a new map",
         )
 
 

@@ -23,6 +23,7 @@ from cairn_server.store.store_rows import (
     Backlog,
     Branch,
     CellRow,
+    ClosedRobot,
     Contribution,
     EntrySize,
     Fold,
@@ -30,6 +31,7 @@ from cairn_server.store.store_rows import (
     MapRow,
     NewCommit,
     Robot,
+    RobotShares,
     Selection,
     StoredCommit,
     StoreFigures,
@@ -119,6 +121,27 @@ class Uses(Protocol):
 
     def since(self, time_s: float) -> Mapping[Robot, Use]:
         """Use by each robot's commits that came after a time, and by what each relay handed over."""
+        ...
+
+
+class Shares(Protocol):
+    """Accounts of what each robot holds of a map's bounds (`shares`)."""
+
+    def of(self, row: MapRow) -> list[RobotShares]:
+        """Use of its shares by every robot, and of the reserve, by name."""
+        ...
+
+    def regions(self, row: MapRow, robot: str) -> list[int]:
+        """Regions (`shares.REGION_BITS`) in which a robot has evidence, pending or in the map, rising."""
+        ...
+
+    def close(self, row: MapRow, robot: str) -> ClosedRobot:
+        """Close all authors of a robot, and move what they hold into the reserve. Durable on return.
+
+        Raises:
+            NotFoundError: kind `no_author`: it has none that is open.
+            ConflictError: kind `reserve_full`; nothing was changed.
+        """
         ...
 
 
@@ -235,6 +258,11 @@ class Store(Protocol):
         ...
 
     @property
+    def shares(self) -> Shares:
+        """Accounts of robots."""
+        ...
+
+    @property
     def notes(self) -> BranchNotes:
         """Notes on branches."""
         ...
@@ -271,8 +299,8 @@ class Store(Protocol):
         Raises:
             ConflictError: kind `id_taken`: the id is kept with other bytes; or `evidence_gone`: it retracts a commit
                 whose evidence is not kept any more. Pushed again, with the same bytes, that is kept again.
-            BadInputError: kind `evidence_overflow`: a sum could leave its range; or its number is refused by
-                `push_policy.check_number`.
+            BadInputError: kind `evidence_overflow`: its robot's share of the sums is taken; or its number is refused
+                by `numbering.check_number`.
         """
         ...
 

@@ -41,8 +41,8 @@ class NewCommit:
     captured_s: tuple[float, float] | None
     retracts: tuple[CommitId, ...]
     diff: Mapping[CellKey, bytes]
-    tops: tuple[int, ...]
-    """Largest number of each plane; their sums over all commits bound every sum in the map."""
+    tops: Mapping[CellKey, tuple[int, ...]]
+    """Largest number of each plane in each cell; they bound every sum in the map (`shares`)."""
     rig: bytes | None = None
     """SHA-256 of the rig that its sensors were described by."""
     signatures: str | None = None
@@ -194,6 +194,28 @@ class Use:
 
     def __sub__(self, less: "Use") -> "Use":
         return Use(self.size_bytes - less.size_bytes, self.cells - less.cells)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RobotShares:
+    """Use of its shares of a map's bounds by one robot, or of the reserve."""
+
+    robot: str
+    """Its name; empty for the reserve."""
+    incarnations: int
+    """Count of its authors that are not closed; for the reserve of the servers' own and closed ones."""
+    intervals: int
+    """Count of the intervals of their numbers."""
+    sums: float | None
+    """Part of its share of the sums that is taken in its fullest region; None: not more than half."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClosedRobot:
+    """Result of closing a robot."""
+
+    authors: int
+    intervals: int
 
 
 def relay_of(token: str) -> str:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 from cairn_map.commits.commit import CommitMeta, commit_bytes
-from cairn_map.commits.ids import INITIAL, OPERATOR, commit_id_from_text
+from cairn_map.commits.ids import OPERATOR, SERVERS_OWN, commit_id_from_text
 from cairn_map.commits.signature import Signature, SigningKey, signatures_to_text, speaks_for
 from cairn_map.errors import ConflictError, DeniedError, NotFoundError
 from cairn_server.access.auth import Caller, Role
@@ -19,9 +19,6 @@ from cairn_server.store.store import Store
 from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.retracting import seal_of
-
-SERVERS_OWN = frozenset({OPERATOR, INITIAL})
-"""Authors in whose name servers speak."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

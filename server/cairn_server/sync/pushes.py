@@ -80,7 +80,8 @@ class Pushes:
         via = caller.name if speaker is not caller and caller.role is Role.RELAY else None
 
         # The quota is taken while the commit is checked and written, and given back unless it is new.
-        with self.meter.spending(row, caller, size_bytes=len(data), cells=commit.cells, via=via) as take:
+        author = commit.meta.commit_id.author.robot
+        with self.meter.spending(row, caller, size_bytes=len(data), cells=commit.cells, author=author, via=via) as take:
             is_new = self._append(row, replace(self._checked(row, commit, signed), via=via))
             if is_new:
                 take()
@@ -133,8 +134,7 @@ class Pushes:
         checked = self.checks.check(commit)
         # Signatures are over the SHA-256 of the decoded evidence, which only the check knows.
         check_signatures(signed, row.name, checked.sha)
-        tops = checked.tops or (0,) * (2 + row.geometry.plane_count)
-        new = new_commit(Commit(commit.meta, commit.cells, checked.sha, commit.data), tops)
+        new = new_commit(Commit(commit.meta, commit.cells, checked.sha, commit.data), checked.tops)
         return replace(new, signatures=signatures_to_text(signed) or None)
 
     def _append(self, row: MapRow, new: NewCommit) -> bool:

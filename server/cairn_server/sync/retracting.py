@@ -137,7 +137,7 @@ def _builder(row: MapRow, author: Author, targets: list[CommitId], note: str) ->
             captured_s=None,
             retracts=meta.retracted_ids,
             diff={},
-            tops=(0,) * (2 + row.geometry.plane_count),
+            tops={},
         )
 
     return build

@@ -170,7 +170,9 @@ def test_a_server_s_own_upstream_may_bring_all_of_an_old_map_at_once(tmp_path: P
                     kept()
 
 
-def test_a_map_grows_to_its_extent_and_a_retract_makes_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_robot_s_cells_span_the_map_s_extent_and_a_retract_makes_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(quotas, "BOX_EVERY_S", 0.0)
     edge_m = SMALL.cell_edge_m
     with guarded(tmp_path, map_extent_m=10 * edge_m) as live:
@@ -178,6 +180,9 @@ def test_a_map_grows_to_its_extent_and_a_retract_makes_room(tmp_path: Path, monk
         mole = bearer(robot_token(live, row, "mole"))
         assert live.push(row, far(0, 900), headers=mole).status_code == 201
         assert live.push(row, far(1, 891), headers=mole).status_code == 201
+        wren = bearer(robot_token(live, row, "wren"))
+        near = {cell_key((0, 0, 0)): random_evidence(1, SMALL, voxels=3, air=1)}
+        assert live.push(row, pushed(0, 0, WREN, cells=near), headers=wren).status_code == 201, "another's is its own"
         for distance in (890, 901, 0):
             answer = live.push(row, far(2, distance), headers=mole)
             assert (answer.status_code, kind_of(answer)) == (400, "beyond_quota"), distance
@@ -188,13 +193,13 @@ def test_a_map_grows_to_its_extent_and_a_retract_makes_room(tmp_path: Path, monk
         assert live.push(row, far(2, 0), headers=mole).status_code == 201
 
 
-def test_the_box_of_a_map_is_not_read_anew_for_every_refusal(tmp_path: Path) -> None:
+def test_the_box_of_a_robot_is_not_read_anew_for_every_refusal(tmp_path: Path) -> None:
     clock = Clock()
     with metered(tmp_path, clock, map_extent_m=SMALL.cell_edge_m * 3) as (meter, row):
         assert spend(meter, row, cells=3) is None
         reads = []
-        snapshot = meter._store.snapshot
-        meter._store.snapshot = lambda row: (reads.append(row), snapshot(row))[1]  # type: ignore[method-assign]
+        regions = meter._store.shares.regions
+        meter._store.shares.regions = lambda row, robot: (reads.append(row), regions(row, robot))[1]  # type: ignore[method-assign]
         for _ in range(50):
             with pytest.raises(BadInputError):
                 spend(meter, row, cells=4)

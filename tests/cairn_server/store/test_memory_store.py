@@ -16,6 +16,7 @@ from tests.fixtures.server.evidence_contract import EvidenceContract
 from tests.fixtures.server.fetching import fetch
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import MOLE, WREN, pushed, read, sum_of
+from tests.fixtures.server.shares_contract import SharesContract
 from tests.fixtures.server.store_contract import StoreContract
 from tests.memory_store import tokens as memory_tokens
 from tests.memory_store.store import MemoryStore
@@ -35,7 +36,9 @@ def store() -> Iterator[MemoryStore]:
     made.close()
 
 
-class TestMemoryStore(StoreContract, CommitContract, CrowdContract, EvidenceContract, BranchContract, AccessContract):
+class TestMemoryStore(
+    StoreContract, CommitContract, SharesContract, CrowdContract, EvidenceContract, BranchContract, AccessContract
+):
     """All of the contract."""
 
 

@@ -14,6 +14,7 @@ from tests.fixtures.server.commit_contract import CommitContract
 from tests.fixtures.server.crowd_contract import CrowdContract
 from tests.fixtures.server.evidence_contract import EvidenceContract
 from tests.fixtures.server.pushes import pushed
+from tests.fixtures.server.shares_contract import SharesContract
 from tests.fixtures.server.store_contract import StoreContract, new_of
 
 from cairn_map.errors import BadInputError, ConflictError, UnreachableError
@@ -42,7 +43,9 @@ def fresh(tmp_path: Path) -> Iterator[SqliteStore]:
     made.close()
 
 
-class TestSqliteStore(StoreContract, CommitContract, CrowdContract, EvidenceContract, BranchContract, AccessContract):
+class TestSqliteStore(
+    StoreContract, CommitContract, SharesContract, CrowdContract, EvidenceContract, BranchContract, AccessContract
+):
     """All of the contract."""
 
 

@@ -12,13 +12,13 @@ from cairn_map.commits.version_vector import VersionVector
 from cairn_map.evidence.grid import CELL_LIMIT, Cell, cell_key
 from cairn_map.wire.frames import encode_frame, frames_of
 from cairn_map.wire.messages import DAMAGED_MAX, WANTED_MAX, CellIndex, MissingRequest, ReplyHeader, message_from_json
-from cairn_server.store import numbering
+from cairn_server.store import shares
 
 HEADER_BYTES_MAX = 1_000_000
 RETRACTS = 62_500
 LAST = NUMBER_LIMIT - 1
-AUTHORS = [long_author(n // numbering.INCARNATIONS_MAX, n) for n in range(numbering.AUTHORS_MAX - 2)]
-SPLIT = numbering.INTERVALS_MAX - numbering.AUTHORS_MAX
+AUTHORS = [long_author(n // shares.INCARNATIONS_MAX, n) for n in range(shares.AUTHORS_MAX - 2)]
+SPLIT = shares.INTERVALS_MAX - shares.AUTHORS_MAX
 """Authors whose numbers have a gap."""
 ASKER = AUTHORS[0]
 DESK = Author(OPERATOR, Incarnation("f" * 16))  # type: ignore[arg-type]
@@ -63,8 +63,8 @@ def test_the_header_of_a_map_as_full_as_may_be_is_read_and_is_below_a_megabyte(c
     for author in (ASKER, None):
         header = header_for(crowded, author)
         assert len(encode_frame(header)) <= HEADER_BYTES_MAX
-        assert len(header.coverage.intervals) == numbering.AUTHORS_MAX
-        assert sum(map(len, header.coverage.intervals.values())) == numbering.INTERVALS_MAX
+        assert len(header.coverage.intervals) == shares.AUTHORS_MAX
+        assert sum(map(len, header.coverage.intervals.values())) == shares.INTERVALS_MAX
         assert (len(header.damaged), len(header.wanted)) == (DAMAGED_MAX, WANTED_MAX)
     path = "/maps/map0/main/cells?limit=1"
     index = message_from_json(CellIndex, crowded.http.get(path).raise_for_status().content)

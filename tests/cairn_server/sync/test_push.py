@@ -15,8 +15,7 @@ from cairn_map.commits.ids import INITIAL, Author, Incarnation
 from cairn_map.evidence.channels import SAMPLE_MAX
 from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.grid import Geometry
-from cairn_server.store import numbering
-from cairn_server.sync.checks import push_policy
+from cairn_server.store import numbering, shares
 
 
 def test_push_twice_changes_nothing(live: Live) -> None:
@@ -87,7 +86,7 @@ def test_samples_are_not_heavier_or_larger_than_a_scan_can_give(live: Live, plan
     weights = [SMALL.planes_of(channel.name).stop - 1 for channel in SMALL.channels]
     samples[0, weights] = 2
     squares = [SMALL.planes_of("temperature").start + 1]
-    most = 2 * push_policy.WEIGHT_MAX if plane in weights else 2 * SAMPLE_MAX ** (2 if plane in squares else 1)
+    most = 2 if plane in weights else 2 * SAMPLE_MAX ** (2 if plane in squares else 1)
     for excess, status in ((0, 201), (1, 400)):
         samples[0, plane] = most + excess
         evidence = packed_evidence(np.array([3], np.uint32), np.array([[1, 0]]), samples, SMALL)
@@ -101,7 +100,7 @@ def test_prior_data_may_hold_the_counts_of_many_scans(live: Live) -> None:
 
 
 def test_numbers_may_come_in_any_order_but_not_full_of_gaps(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(numbering, "AUTHOR_INTERVALS_MAX", 3)
+    monkeypatch.setattr(numbering, "INTERVALS_OF_ROBOT_MAX", 3)
     row = live.new_map()
     assert [live.push(row, pushed(n, 1)).status_code for n in (8, 0, 4)] == [201] * 3
     refused = live.push(row, pushed(2, 1))
@@ -139,8 +138,8 @@ def test_evidence_for_another_grid_is_refused_before_it_is_decoded(live: Live, m
     assert kind_of(live.push(row, pushed(0, 0, cells={}))) == "empty_commit"
 
 
-def test_a_map_that_would_overflow_takes_no_more(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cairn_server.store.sqlite.changes.COUNT_MAX", 12)
+def test_a_robot_s_share_of_a_cell_takes_no_more_than_fits(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shares, "COUNT_MAX", 2 * shares.ROBOTS_MAX * 12)
     row = live.new_map(PLAIN)
     one = with_counts(6, 0)
     assert live.push(row, one).status_code == 201

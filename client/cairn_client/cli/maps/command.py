@@ -9,6 +9,7 @@
     $ cairn map log http://127.0.0.1:8750/maps/lab --graph
     $ cairn map branches http://127.0.0.1:8750/maps/lab
     $ cairn map retract http://127.0.0.1:8750/maps/lab --robot mole --pushed-after 14:05 --dry-run
+    $ cairn map robots list http://127.0.0.1:8750/maps/lab
     $ cairn map query lab/ ray 1,2,0.4 0,1,0
     $ cairn map render lab/ --from 1,2,1.4 --to 4,2,1 -o view.png
 
@@ -32,7 +33,7 @@ from cairn_client.cli.arguments import (
     shown_bytes,
     shown_length,
 )
-from cairn_client.cli.maps import branch_table, create, map_export, map_log, query, render
+from cairn_client.cli.maps import branch_table, create, map_export, map_log, query, render, robots
 from cairn_client.http.api import MapApi
 from cairn_map.errors import BadInputError
 from cairn_map.wire.messages import Retract
@@ -53,6 +54,7 @@ def main(argv: list[str]) -> int:
         query.add_parser,
         render.add_parser,
         _add_retract,
+        robots.add_parser,
     )
     return run_subcommand("cairn map", __doc__, parts, argv)
 

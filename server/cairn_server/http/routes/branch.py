@@ -1,15 +1,17 @@
-"""Routes of branches, one for each robot of a map: registration, and a robot's status and latest picture."""
+"""Routes of a map's robots: registration, status and latest picture of each one's branch, and shares of bounds."""
 
 from email.utils import formatdate
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Response
 
+from cairn_map.wire.access_messages import RobotClosed, RobotUse
 from cairn_map.wire.messages import BranchInfo, Register, Registered, RobotStatus
 from cairn_server.access.auth import Caller, Role
 from cairn_server.http.routes.callers import OWNERS, READERS, Map, Operations, allowed, body_of, own_branch
-from cairn_server.http.routes.documentation import answers, body, json_body
+from cairn_server.http.routes.documentation import answers, body, json_body, problems
 from cairn_server.http.routes.json_bodies import json_of
+from cairn_server.store.shares import used_bounds
 
 PICTURES = ("image/jpeg", "image/png")
 
@@ -110,3 +112,27 @@ def get_view(
     if if_none_match and (if_none_match.strip() == "*" or headers["ETag"] in if_none_match):
         return Response(status_code=304, headers=headers)
     return Response(view.data, media_type=view.media_type, headers=headers)
+
+
+@router.get("/maps/{name}/robots", dependencies=[Depends(allowed(Role.OPERATOR))])
+def robot_uses(service: Operations, row: Map) -> list[RobotUse]:
+    """Use of their shares by all robots, and of the reserve."""
+    return [
+        RobotUse(
+            robot=share.robot or None,
+            incarnations=share.incarnations,
+            intervals=share.intervals,
+            used=used_bounds(share),
+        )
+        for share in service.store.shares.of(row)
+    ]
+
+
+@router.post("/maps/{name}/robots/{robot}/close", responses=problems(409))
+def close_robot(
+    robot: str, service: Operations, row: Map, caller: Annotated[Caller, Depends(allowed())]
+) -> RobotClosed:
+    """Close all incarnations of a robot: they take no new commits, and its shares are whole again."""
+    closed = service.store.shares.close(row, robot)
+    service.store.audit_log.add(caller.name, "close_robot", f"map {row.name}: {robot}, {closed.authors} incarnations")
+    return RobotClosed(robot=robot, incarnations=closed.authors, intervals=closed.intervals)

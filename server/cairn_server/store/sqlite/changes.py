@@ -6,11 +6,9 @@ import time
 import apsw
 
 from cairn_map.commits.cursor import ENTRY_FOLD
-from cairn_map.commits.ids import CommitId
-from cairn_map.errors import BadInputError, ConflictError
-from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX
-from cairn_server.store.numbering import Numbering, check_number
+from cairn_map.errors import ConflictError
 from cairn_server.store.sqlite.retention import check_kept, is_retracted, remember_evidence
+from cairn_server.store.sqlite.shares import give_back_sums, note_number, take_sums
 from cairn_server.store.sqlite.writer import first
 from cairn_server.store.store_rows import Fold, MapRow, NewCommit
 
@@ -31,12 +29,12 @@ def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit, *
             _insert_diff(connection, number, commit)
         return damaged is not None
     check_kept(connection, row, commit.retracts)
-    _note_number(connection, row, commit.id)
-    _note_tops(connection, row, commit.tops)
+    note_number(connection, row, commit.id)
+    charged = take_sums(connection, row, commit)
     connection.execute(
         "INSERT INTO commits (map, robot, incarnation, n, sha, size_bytes, cells, meta, captured_first_s,"
-        " captured_last_s, retracts, received_s, received_age_s, rig, signatures, via)"
-        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        " captured_last_s, retracts, received_s, received_age_s, rig, signatures, via, charged)"
+        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         (
             *key,
             commit.sha,
@@ -50,6 +48,7 @@ def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit, *
             commit.rig,
             commit.signatures,
             commit.via,
+            charged,
         ),
     )
     _insert_diff(connection, connection.last_insert_rowid(), commit)
@@ -86,6 +85,8 @@ def write_fold(connection: apsw.Connection, row: MapRow, fold: Fold, *, age_s: f
             else "UPDATE commits SET unfolded_seq = ? WHERE number = ?",
             (seq, age_s, entry.commit) if entry.kind == ENTRY_FOLD else (seq, entry.commit),
         )
+        if entry.kind != ENTRY_FOLD:
+            give_back_sums(connection, row, entry.commit)
     connection.executemany(
         "INSERT INTO retracted (map, id) VALUES (?, ?)", [(row.number, str(target)) for target in fold.retracted]
     )
@@ -111,47 +112,6 @@ def _write_cells(connection: apsw.Connection, row: MapRow, fold: Fold) -> None:
             for c in fold.cells
         ],
     )
-
-
-def _note_number(connection: apsw.Connection, row: MapRow, commit: CommitId) -> None:
-    """Count the author's intervals as they are with this commit, if `push_policy` lets it in."""
-    author = (row.number, *commit.author)
-    known = first(
-        connection, "SELECT top, intervals FROM author WHERE map = ? AND robot = ? AND incarnation = ?", author
-    )
-    query = "SELECT count(*) FROM commits WHERE map = ? AND robot = ? AND incarnation = ? AND n IN (?, ?)"
-    neighbours: int = first(connection, query, (*author, commit.n - 1, commit.n + 1))
-    top, intervals = known or (None, 0)
-    incarnations = authors = spans = 0
-    if not neighbours:  # only then does anything grow but a number
-        of_robot = "SELECT count(*) FROM author WHERE map = ? AND robot = ?"
-        incarnations = first(connection, of_robot, (row.number, commit.author.robot))
-        totals = "SELECT count(*), coalesce(sum(intervals), 0) FROM author WHERE map = ?"
-        authors, spans = first(connection, totals, (row.number,))
-    check_number(
-        commit,
-        Numbering(
-            top=top,
-            intervals=intervals,
-            neighbours=neighbours,
-            incarnations=incarnations,
-            authors_in_map=authors,
-            intervals_in_map=spans,
-        ),
-    )
-    connection.execute(
-        "INSERT INTO author (map, robot, incarnation, top, intervals) VALUES (?, ?, ?, ?, ?)"
-        " ON CONFLICT DO UPDATE SET top = max(top, excluded.top), intervals = excluded.intervals",
-        (*author, commit.n, intervals + 1 - neighbours),
-    )
-
-
-def _note_tops(connection: apsw.Connection, row: MapRow, tops: tuple[int, ...]) -> None:
-    sums = json.loads(first(connection, "SELECT tops FROM map WHERE number = ?", (row.number,)))
-    sums = [total + top for total, top in zip(sums, tops, strict=True)]
-    if max(sums[:2]) > COUNT_MAX or max(sums[2:], default=0) > SUM_MAX:
-        raise BadInputError("evidence_overflow", "the map could not take this much evidence without an overflow")
-    connection.execute("UPDATE map SET tops = ? WHERE number = ?", (json.dumps(sums), row.number))
 
 
 def _repair(connection: apsw.Connection, number: int, commit: NewCommit) -> None:

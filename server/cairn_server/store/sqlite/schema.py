@@ -195,7 +195,25 @@ DROP INDEX commits_kept;
 CREATE INDEX commits_kept ON commits (map, folded_age_s) WHERE gone = 0 AND cells > 0 AND folded_seq IS NOT NULL;
 """
 
-STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS, RECEIVED, SIGNED, HOTTEST, AGES)
+SHARES = """
+-- map.tops is from here on of the commits that came before: what comes later is on its robot's account.
+CREATE TABLE held (
+    map INTEGER NOT NULL REFERENCES map,
+    account TEXT NOT NULL,          -- robot; empty: the reserve
+    region INTEGER NOT NULL,        -- of 4^3 cells: their numbers without the last 6 bits
+    tops BLOB NOT NULL,             -- per plane an int64: largest numbers of its commits in the region, added up
+    part REAL NOT NULL,             -- of the account's share, of the fullest plane
+    PRIMARY KEY (map, account, region)
+) WITHOUT ROWID;
+CREATE INDEX held_much ON held (map, account, part) WHERE part > 0.5;
+ALTER TABLE commits ADD COLUMN charged BLOB;    -- per region: its number and what is on the account; NULL: before accounts
+ALTER TABLE author ADD COLUMN closed INTEGER NOT NULL DEFAULT 0;    -- takes no new commits, and is the reserve's
+-- More robots than there are shares begin again, each with its next incarnation.
+UPDATE author SET closed = 1 WHERE robot NOT IN ('operator', 'initial') AND map IN (
+    SELECT map FROM author WHERE robot NOT IN ('operator', 'initial') GROUP BY map HAVING count(DISTINCT robot) > 256);
+"""
+
+STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS, RECEIVED, SIGNED, HOTTEST, AGES, SHARES)
 
 
 def ensure_schema(connection: apsw.Connection) -> None:

@@ -22,10 +22,12 @@ from cairn_server.store.folder_lock import lock_folder
 from cairn_server.store.sqlite.branches import LastSeen, SqliteBranchNotes
 from cairn_server.store.sqlite.changes import append_commit, next_number, write_fold
 from cairn_server.store.sqlite.failures import disk_full
+from cairn_server.store.sqlite.old_sums import measure_old_sums
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.reads import SqliteReads
 from cairn_server.store.sqlite.retention import forget_evidence
 from cairn_server.store.sqlite.schema import ensure_schema
+from cairn_server.store.sqlite.shares import SqliteShares
 from cairn_server.store.sqlite.tokens import (
     SqliteAuditLog,
     SqliteTokens,
@@ -86,6 +88,7 @@ class SqliteStore(SqliteReads):
             self.age = StoreAge(AgeMark(*first(reader, "SELECT age_s, wall_s FROM age")), clocks)
         self.tokens = SqliteTokens(self._writer, self._readers, self.age)
         self.uses = SqliteUses(self._readers)
+        self.shares = SqliteShares(self._writer, self._readers)
         self.audit_log = SqliteAuditLog(self._writer, self._readers)
         self.health = SqliteHealth(path, self._writer, self._readers, self.age)
         self._maps: dict[str, MapRow] = {}  # which never change
@@ -254,6 +257,7 @@ def _prepare(path: Path) -> None:
         connection = connect(path)
         try:
             ensure_schema(connection)
+            measure_old_sums(connection)
         finally:
             connection.close()
     except apsw.Error as exc:

@@ -4,13 +4,13 @@ Bytes go in, and a small result comes out: the commit's SHA-256 and the largest 
 that is stored of a commit is in its bytes.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-
-import numpy as np
 
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.commit_reading import CommitReader
 from cairn_map.evidence.evidence import largest
+from cairn_map.evidence.grid import CellKey
 from cairn_server.store.store_rows import NewCommit
 from cairn_server.sync.checks.push_policy import check_evidence
 
@@ -20,8 +20,8 @@ class Checked:
     """Result for a commit that decodes, is canonical, and has possible evidence."""
 
     sha: bytes
-    tops: tuple[int, ...]
-    """Largest number of each plane; none for a commit without cells."""
+    tops: Mapping[CellKey, tuple[int, ...]]
+    """Largest number of each plane in each cell."""
 
 
 def check_commit(reader: CommitReader) -> Checked:
@@ -33,10 +33,10 @@ def check_commit(reader: CommitReader) -> Checked:
     commit, cells = reader.read()
     tops = {key: largest(cell.content.counts, cell.content.samples) for key, cell in cells.items()}
     check_evidence(commit.meta, cells, tops)
-    return Checked(commit.sha, tuple(np.max(list(tops.values()), axis=0).tolist()) if tops else ())
+    return Checked(commit.sha, {key: tuple(top.tolist()) for key, top in tops.items()})
 
 
-def new_commit(commit: Commit, tops: tuple[int, ...]) -> NewCommit:
+def new_commit(commit: Commit, tops: Mapping[CellKey, tuple[int, ...]]) -> NewCommit:
     """Checked commit as a store keeps it."""
     return NewCommit(
         id=commit.id,

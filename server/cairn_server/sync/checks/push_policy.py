@@ -20,9 +20,6 @@ from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
 from cairn_server.access.auth import Caller
 from cairn_server.store.store_rows import MapRow
 
-WEIGHT_MAX = 1024
-"""Largest weight of one scan's sample in one voxel; cairn's own integrator gives 1."""
-
 
 def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *, cells: int) -> None:
     """Refuse a commit by its meta alone, before its evidence is decoded.
@@ -70,8 +67,8 @@ def _excess(content: CellContent, geometry: Geometry, tops: npt.NDArray[np.int64
         return f"{counts} counts in one voxel"
     for channel in geometry.channels:
         weight = int(tops[1 + geometry.planes_of(channel.name).stop])
-        if weight > WEIGHT_MAX * scans:
-            return f"weight {weight} of {channel.name} in one voxel (at most {WEIGHT_MAX} a scan)"
-    # Weights are below 2^22 here and a square below 2^40, so that the products fit.
+        if weight > scans:  # one sample of weight 1 a scan, as there is one count (decision 002)
+            return f"weight {weight} of {channel.name} in one voxel"
+    # Weights are at most 2^12 here and a square below 2^40, so that the products fit.
     above = channel_above(content.samples, planes_and_squares(geometry.channels), SAMPLE_MAX)
     return None if above < 0 else f"samples of {geometry.channels[above].name} above {SAMPLE_MAX} steps"

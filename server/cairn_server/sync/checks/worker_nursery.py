@@ -21,6 +21,7 @@ from pathlib import Path
 
 from cairn_map.commits.commit_reading import commit_reader
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError
+from cairn_map.evidence.grid import CellKey
 from cairn_map.warm_up import warm_up
 from cairn_server.processes import LENGTH, die_with_parent, received, send
 from cairn_server.sync.checks.checking import Checked, check_commit
@@ -75,7 +76,7 @@ def answer_to(data: bytes) -> dict[str, object]:
         return {"family": type(exc).__name__, "kind": exc.kind, "message": exc.message}
     except MemoryError:
         return {"memory": True}
-    return {"sha": checked.sha.hex(), "tops": checked.tops}
+    return {"sha": checked.sha.hex(), "tops": list(checked.tops.items())}
 
 
 def checked_from(answer: dict[str, object]) -> Checked:
@@ -87,7 +88,8 @@ def checked_from(answer: dict[str, object]) -> Checked:
     if "family" in answer:
         raise FAMILIES[str(answer["family"])](str(answer["kind"]), str(answer["message"]))
     tops = answer["tops"]
-    return Checked(bytes.fromhex(str(answer["sha"])), tuple(tops) if isinstance(tops, list) else ())
+    assert isinstance(tops, list)  # noqa: S101 - `answer_to` wrote it
+    return Checked(bytes.fromhex(str(answer["sha"])), {CellKey(key): tuple(top) for key, top in tops})
 
 
 def _address_space_bytes() -> int:

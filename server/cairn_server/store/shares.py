@@ -1,0 +1,138 @@
+"""Shares: the part of each bound of a map that one robot may take, so that no robot can take another's.
+
+    bound of the map  =  ROBOTS_MAX shares of equal size, one for each robot's name
+                      +  the reserve: the servers' own commits, and authors that an administrator closed
+
+A bound that all robots drew from could be used up by one of them for all. A share is the robot's own, with all its
+incarnations, and all shares and the reserve together fit the bound: so nothing that one robot pushes can make the
+server refuse another's commit. What is taken out of the map again is given back to the share.
+
+    sums         per region of 4^3 cells, and plane: the largest numbers of the robot's commits there that are in the
+                 map, added up; no voxel can hold more of the robot's, and so no sum can overflow
+    authors      incarnations of a robot, and the intervals of their numbers: what a version vector has to list
+
+Closing a robot moves what it holds into the reserve; its name begins again with an empty share.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.commits.ids import SERVERS_OWN
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX
+from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
+from cairn_server.store.store_rows import RobotShares
+
+Tops = npt.NDArray[np.int64]
+"""(regions, 2 + P): largest number of each plane in each region."""
+REGION_BITS = 6
+"""Bits of a cell number below its region's: 4^3 cells. By cell the accounts would be as long as the lists of cells that
+commits touch, and half of the store's work."""
+
+ROBOTS_MAX = 256
+"""Most robots with authors that are not closed, in one map."""
+INCARNATIONS_MAX = 16
+"""Most incarnations of one robot that are not closed: disks lost or rolled back."""
+INTERVALS_OF_ROBOT_MAX = 24
+"""Most intervals of the numbers of one robot, all incarnations together. Robots push oldest first, so that each
+incarnation has one interval, and one more for each commit that the server refused for good."""
+INTERVALS_MAX = 10_240
+"""Most intervals of the numbers of all authors of a map. Its vector is in every reply: with the longest name and numbers
+an author takes 88 bytes, and each of its intervals beyond the first 34."""
+INTERVALS_OF_RESERVE_MAX = INTERVALS_MAX - ROBOTS_MAX * INTERVALS_OF_ROBOT_MAX
+"""Most intervals, and so most authors, of the servers' own and of closed robots."""
+AUTHORS_MAX = ROBOTS_MAX * INCARNATIONS_MAX + INTERVALS_OF_RESERVE_MAX
+"""Most authors of a map."""
+ALARM_PART = 0.5
+"""Part of a share above which it is reported."""
+
+RESERVE = ""
+"""Account of what belongs to no robot's share; no robot has an empty name."""
+
+
+def account_of(robot: str, *, is_closed: bool) -> str:
+    """Account that bears an author's commits: its robot's name, or the reserve."""
+    return RESERVE if is_closed or robot in SERVERS_OWN else robot
+
+
+def limits_of(account: str, planes: int) -> npt.NDArray[np.int64]:
+    """(planes,) most that an account may hold in a voxel: half of the range is for all robots, half for the reserve."""
+    most = np.full(planes, SUM_MAX // 2, np.int64)
+    most[:2] = COUNT_MAX // 2
+    return most if account == RESERVE else most // ROBOTS_MAX
+
+
+def tops_by_region(tops: Mapping[CellKey, Sequence[int]]) -> tuple[npt.NDArray[np.int64], Tops]:
+    """Regions, rising, and the largest numbers of a commit's cells in each; without those that hold nothing."""
+    cells = np.fromiter(tops, np.int64, len(tops))
+    order = np.argsort(cells)
+    regions, firsts = np.unique(cells[order] >> REGION_BITS, return_index=True)
+    most: Tops = np.maximum.reduceat(np.array([tops[cell] for cell in tops], np.int64)[order], firsts, axis=0)
+    holds = most.any(axis=1)
+    return regions[holds], most[holds]
+
+
+def used_parts(account: str, totals: Tops) -> npt.NDArray[np.float64]:
+    """(regions,) part of the account's share that is taken in each region, of the plane that is fullest."""
+    parts: npt.NDArray[np.float64] = (totals / limits_of(account, totals.shape[1])).max(axis=1)
+    return parts
+
+
+def check_sums(account: str, regions: Sequence[int], totals: Tops, geometry: Geometry) -> None:
+    """Refuse totals beyond an account's share.
+
+    Raises:
+        BadInputError: kind `evidence_overflow`.
+    """
+    most = limits_of(account, totals.shape[1])
+    over = np.argwhere(totals > most)
+    if not len(over):
+        return
+    index, plane = over[0].tolist()
+    first_cell = int(regions[index]) << REGION_BITS
+    low, high = (cell_of_key(CellKey(cell)) for cell in (first_cell, first_cell + (1 << REGION_BITS) - 1))
+    whose = f"robot {account}'s evidence" if account else "prior data and closed robots' evidence"
+    remedy = (
+        f"an operator can retract evidence of {account} there (`cairn map retract --robot {account}`), or an "
+        f"administrator give it a new share (`cairn map robots close`)"
+        if account
+        else "retract some of it, or begin a new map"
+    )
+    raise BadInputError(
+        "evidence_overflow",
+        f"with this commit {whose} in a voxel of the cells {low} to {high} could sum up to {totals[index, plane]} in "
+        f"the plane {_plane_name(geometry, plane)}, and its share is {most[plane]}; {remedy}",
+    )
+
+
+def used_bounds(share: RobotShares) -> dict[str, float]:
+    """Part that is used of each bound, by its name."""
+    most = INTERVALS_OF_ROBOT_MAX if share.robot else INTERVALS_OF_RESERVE_MAX
+    incarnations = {"incarnations": share.incarnations / INCARNATIONS_MAX} if share.robot else {}
+    return {"sums": share.sums or 0.0, **incarnations, "intervals": share.intervals / most}
+
+
+def check_old_sums(old: npt.NDArray[np.int64]) -> None:
+    """Refuse evidence for a map whose sums from before there were shares leave no room for them.
+
+    Raises:
+        BadInputError: kind `evidence_overflow`.
+    """
+    if (old > limits_of(RESERVE, len(old))).any():
+        raise BadInputError(
+            "evidence_overflow",
+            "this map took so much evidence before robots had shares of their own that its sums could overflow; "
+            "retract what is too much of it and start the server anew, which measures again what the cells hold",
+        )
+
+
+def _plane_name(geometry: Geometry, plane: int) -> str:
+    if plane < 2:
+        return ("hits", "misses")[plane]
+    for channel in geometry.channels:
+        planes = geometry.planes_of(channel.name)
+        if plane - 2 < planes.stop:
+            return f"{channel.name} {plane - 2 - planes.start}"
+    return str(plane)

@@ -1,0 +1,207 @@
+"""Accounts of what each robot holds of a map's bounds (`store.shares`), each function inside one transaction.
+
+A commit is charged when it is kept, and its charge goes back when the log takes it out again. So an account is, at any
+time, the sum over the account's commits that are pending or in the map.
+"""
+
+import json
+
+import apsw
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.commits.ids import SERVERS_OWN, CommitId
+from cairn_map.errors import BadInputError, ConflictError, NotFoundError
+from cairn_server.store.numbering import Numbering, check_number
+from cairn_server.store.shares import (
+    ALARM_PART,
+    INTERVALS_OF_RESERVE_MAX,
+    RESERVE,
+    Tops,
+    account_of,
+    check_old_sums,
+    check_sums,
+    tops_by_region,
+    used_parts,
+)
+from cairn_server.store.sqlite.old_sums import old_sums
+from cairn_server.store.sqlite.readers import Readers
+from cairn_server.store.sqlite.writer import Writer, first, rows
+from cairn_server.store.store_rows import ClosedRobot, MapRow, NewCommit, RobotShares
+
+Regions = npt.NDArray[np.int64]
+SERVERS_IN_SQL = ", ".join(f"'{robot}'" for robot in sorted(SERVERS_OWN))
+IS_RESERVE = f"(closed = 1 OR robot IN ({SERVERS_IN_SQL}))"
+"""SQL of the authors whose commits are the reserve's."""
+OF_ROBOT = "map = ? AND robot = ? AND closed = 0"
+COUNTS = "SELECT count(*), coalesce(sum(intervals), 0) FROM author WHERE"
+
+
+def note_number(connection: apsw.Connection, row: MapRow, commit: CommitId) -> None:
+    """Count the author's intervals as they are with this commit, if `numbering` lets it in.
+
+    Raises:
+        BadInputError, ConflictError: as `check_number`.
+    """
+    author = (row.number, *commit.author)
+    query = "SELECT top, intervals, closed FROM author WHERE map = ? AND robot = ? AND incarnation = ?"
+    top, intervals, is_closed = first(connection, query, author) or (None, 0, 0)
+    query = "SELECT count(*) FROM commits WHERE map = ? AND robot = ? AND incarnation = ? AND n IN (?, ?)"
+    neighbours: int = first(connection, query, (*author, commit.n - 1, commit.n + 1))
+    counted, spans, robots = 0, 0, 0
+    if not neighbours:  # only then does anything grow but a number
+        counted, spans, robots = _uses(connection, row, commit.author.robot)
+    known = Numbering(
+        top=top,
+        neighbours=neighbours,
+        is_closed=bool(is_closed),
+        incarnations=counted,
+        intervals=spans,
+        robots=robots,
+    )
+    check_number(commit, known)
+    connection.execute(
+        "INSERT INTO author (map, robot, incarnation, top, intervals) VALUES (?, ?, ?, ?, ?)"
+        " ON CONFLICT DO UPDATE SET top = max(top, excluded.top), intervals = excluded.intervals",
+        (*author, commit.n, intervals + 1 - neighbours),
+    )
+
+
+def take_sums(connection: apsw.Connection, row: MapRow, commit: NewCommit) -> bytes:
+    """Charge a new commit's largest numbers to its robot's account; what was charged, as `give_back_sums` reads it.
+
+    Raises:
+        BadInputError: kind `evidence_overflow`: the robot's share does not allow it; nothing was changed.
+    """
+    if not commit.tops:
+        return b""
+    regions, tops = tops_by_region(commit.tops)
+    account = account_of(commit.id.author.robot, is_closed=False)
+    totals = _held(connection, row, account, regions) + tops
+    _check(connection, row, account, regions, totals)
+    _put(connection, row, account, regions, totals)
+    return np.column_stack([regions, tops]).astype("<i8").tobytes()
+
+
+def give_back_sums(connection: apsw.Connection, row: MapRow, number: int) -> None:
+    """Take a commit off its account: the log has taken it out."""
+    query = "SELECT robot, closed, charged FROM commits JOIN author USING (map, robot, incarnation) WHERE number = ?"
+    robot, is_closed, charged = first(connection, query, (number,))
+    if not charged:  # it came before there were accounts, or has no evidence
+        return
+    account = account_of(robot, is_closed=bool(is_closed))
+    regions, tops = _parted(charged, row)
+    _put(connection, row, account, regions, _held(connection, row, account, regions) - tops)
+
+
+def close_robot(connection: apsw.Connection, row: MapRow, robot: str) -> ClosedRobot:
+    """Close all authors of a robot, and move what they hold into the reserve.
+
+    Raises:
+        NotFoundError: kind `no_author`: it has none that is open.
+        ConflictError: kind `reserve_full`; nothing was changed.
+    """
+    authors, intervals = first(connection, f"{COUNTS} {OF_ROBOT}", (row.number, robot))
+    if not authors or robot in SERVERS_OWN:
+        raise NotFoundError("no_author", f"robot {robot!r} has no commits in map {row.name} that are its own to close")
+    reserved = first(connection, f"{COUNTS} map = ? AND {IS_RESERVE}", (row.number,))[1]
+    if reserved + intervals > INTERVALS_OF_RESERVE_MAX:
+        raise ConflictError(
+            "reserve_full",
+            f"closed authors and the server's own have {reserved} intervals of numbers, {robot} has {intervals}, and "
+            f"{INTERVALS_OF_RESERVE_MAX} is the most of a map: begin a new one",
+        )
+    query = "SELECT region, tops FROM held WHERE map = ? AND account = ? ORDER BY region"
+    held = rows(connection, query, (row.number, robot))
+    if held:
+        regions = np.array([region for region, _ in held], np.int64)
+        tops = np.frombuffer(b"".join(top for _, top in held), "<i8").reshape(len(held), -1)
+        totals = _held(connection, row, RESERVE, regions) + tops
+        try:
+            _check(connection, row, RESERVE, regions, totals)
+        except BadInputError as exc:
+            raise ConflictError("reserve_full", f"{robot} cannot be closed: {exc.message}") from exc
+        _put(connection, row, RESERVE, regions, totals)
+    connection.execute("DELETE FROM held WHERE map = ? AND account = ?", (row.number, robot))
+    connection.execute("UPDATE author SET closed = 1 WHERE map = ? AND robot = ?", (row.number, robot))
+    return ClosedRobot(authors=authors, intervals=intervals)
+
+
+class SqliteShares:
+    """`store.Shares`."""
+
+    def __init__(self, writer: Writer, readers: Readers) -> None:
+        self._writer = writer
+        self._readers = readers
+
+    def of(self, row: MapRow) -> list[RobotShares]:
+        """Use of its shares by every robot, and of the reserve, by name."""
+        accounts = f"CASE WHEN {IS_RESERVE} THEN '{RESERVE}' ELSE robot END"
+        authors = f"SELECT {accounts}, count(*), sum(intervals) FROM author WHERE map = ? GROUP BY 1 ORDER BY 1"  # noqa: S608 - our own clause
+        much = f"SELECT account, max(part) FROM held WHERE map = ? AND part > {ALARM_PART} GROUP BY account"  # noqa: S608 - our own number
+        with self._readers.transaction() as reader:
+            found = rows(reader, authors, (row.number,))
+            parts = dict(rows(reader, much, (row.number,)))
+        return [
+            RobotShares(robot=account, incarnations=count, intervals=intervals, sums=parts.get(account))
+            for account, count, intervals in found
+        ]
+
+    def regions(self, row: MapRow, robot: str) -> list[int]:
+        """Regions in which a robot has evidence, pending or in the map, rising."""
+        query = "SELECT region FROM held WHERE map = ? AND account = ? ORDER BY region"
+        with self._readers.reading() as reader:
+            return [int(region) for (region,) in rows(reader, query, (row.number, robot))]
+
+    def close(self, row: MapRow, robot: str) -> ClosedRobot:
+        """Close all authors of a robot, and move what they hold into the reserve. Durable on return."""
+        return self._writer.run(lambda connection: close_robot(connection, row, robot))
+
+
+def _uses(connection: apsw.Connection, row: MapRow, robot: str) -> tuple[int, int, int]:
+    """Authors and intervals of an account, and for a robot without any the count of the robots that have some."""
+    if robot in SERVERS_OWN:
+        return (*first(connection, f"{COUNTS} map = ? AND {IS_RESERVE}", (row.number,)), 0)
+    authors, intervals = first(connection, f"{COUNTS} {OF_ROBOT}", (row.number, robot))
+    robots = f"SELECT count(DISTINCT robot) FROM author WHERE map = ? AND NOT {IS_RESERVE}"  # noqa: S608 - our own clause
+    return authors, intervals, 0 if authors else first(connection, robots, (row.number,))
+
+
+def _held(connection: apsw.Connection, row: MapRow, account: str, regions: Regions) -> Tops:
+    """(regions, 2 + P) numbers on an account; zeros where it holds nothing."""
+    planes = 2 + row.geometry.plane_count
+    query = "SELECT region, tops FROM held WHERE map = ? AND account = ? AND region IN (SELECT value FROM json_each(?))"
+    wanted = regions.tolist()
+    known: dict[int, bytes] = dict(rows(connection, query, (row.number, account, json.dumps(wanted))))
+    nothing = bytes(8 * planes)
+    return np.frombuffer(b"".join(known.get(region, nothing) for region in wanted), "<i8").reshape(-1, planes)
+
+
+def _parted(charged: bytes, row: MapRow) -> tuple[Regions, Tops]:
+    """Regions and their numbers, of what a commit was charged."""
+    table = np.frombuffer(charged, "<i8").reshape(-1, 3 + row.geometry.plane_count)
+    return table[:, 0], table[:, 1:]
+
+
+def _check(connection: apsw.Connection, row: MapRow, account: str, regions: Regions, totals: Tops) -> None:
+    old = old_sums(connection, row.number)
+    check_old_sums(old)
+    # What came before there were accounts may be anywhere, and is the reserve's.
+    check_sums(account, regions.tolist(), totals + old if account == RESERVE else totals, row.geometry)
+
+
+def _put(connection: apsw.Connection, row: MapRow, account: str, regions: Regions, totals: Tops) -> None:
+    """Write what an account holds in some regions."""
+    parts = used_parts(account, totals).tolist()
+    values = [
+        (row.number, account, region, total.astype("<i8").tobytes(), part)
+        for region, total, part in zip(regions.tolist(), totals, parts, strict=True)
+    ]
+    connection.executemany(
+        "INSERT OR REPLACE INTO held (map, account, region, tops, part) VALUES (?, ?, ?, ?, ?)",
+        [value for value in values if value[-1] > 0.0],
+    )
+    connection.executemany(
+        "DELETE FROM held WHERE map = ? AND account = ? AND region = ?",
+        [value[:3] for value in values if value[-1] <= 0.0],
+    )
