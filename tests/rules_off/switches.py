@@ -581,6 +581,14 @@ SWITCHES = (
     ),
     Switch(
         11,
+        "what is taken out is given back to its robot's share",
+        CHANGES,
+        "give_back_sums(connection, row, entry.commit)",
+        "pass",
+        "cairn_server/sync/test_shares.py::test_a_robot_fills_its_own_share_of_sums_and_hears_what_to_do",
+    ),
+    Switch(
+        11,
         "a retracted id pushed again changes nothing",
         CHANGES,
         "return damaged is not None",
@@ -703,7 +711,7 @@ SWITCHES = (
         13,
         "commits whose ids are taken are renamed",
         SYNC,
-        'if exc.kind != "id_taken" or seal is not None:',
+        'if not (is_closed or exc.kind == "id_taken") or seal is not None:',
         "if True:",
         "cairn_client/sync/test_rules.py::test_commits_whose_ids_are_taken_are_renamed_and_pushed_and_the_others_keep_theirs",
     ),

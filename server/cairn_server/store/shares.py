@@ -39,8 +39,8 @@ INTERVALS_OF_ROBOT_MAX = 24
 """Most intervals of the numbers of one robot, all incarnations together. Robots push oldest first, so that each
 incarnation has one interval, and one more for each commit that the server refused for good."""
 INTERVALS_MAX = 10_240
-"""Most intervals of the numbers of all authors of a map. Its vector is in every reply: with the longest name and numbers
-an author takes 88 bytes, and each of its intervals beyond the first 34."""
+"""Most intervals of the numbers of all authors of a map. Its vector is in every reply: with the longest name and
+numbers an author takes 88 bytes, and each of its intervals beyond the first 34."""
 INTERVALS_OF_RESERVE_MAX = INTERVALS_MAX - ROBOTS_MAX * INTERVALS_OF_ROBOT_MAX
 """Most intervals, and so most authors, of the servers' own and of closed robots."""
 AUTHORS_MAX = ROBOTS_MAX * INCARNATIONS_MAX + INTERVALS_OF_RESERVE_MAX

@@ -457,16 +457,17 @@ def test_a_tip_that_is_known_means_nothing(mole: Replica) -> None:
 
 
 class TakenIds:
-    """A server that has other bytes under some ids."""
+    """A server that takes nothing under some ids, because it has other bytes there or an administrator closed them."""
 
-    def __init__(self, taken: set[CommitId]) -> None:
+    def __init__(self, taken: set[CommitId], kind: str = "id_taken") -> None:
         self.taken = taken
+        self.kind = kind
         self.pushed: list[CommitId] = []
 
     def push(self, name: str, commit: object, **beside: str | None) -> None:
         commit_id: CommitId = commit.id  # type: ignore[attr-defined]
         if commit_id in self.taken:
-            raise ConflictError("id_taken", "other bytes")
+            raise ConflictError(self.kind, "other bytes")
         self.pushed.append(commit_id)
 
 
@@ -478,6 +479,16 @@ def test_commits_whose_ids_are_taken_are_renamed_and_pushed_and_the_others_keep_
     assert server.pushed == [CommitId(mole.author, 0), CommitId(mole.author, 1), CommitId(old, 2)]
     assert mole.view.evidence(A) == added(X, Y, Z)
     assert mole.push_set() == []
+
+
+def test_commits_of_a_closed_incarnation_get_new_ids_but_not_those_that_a_server_once_had(mole: Replica) -> None:
+    commits = [committed(mole, evidence) for evidence in (X, Y)]
+    mole.acknowledge(commits[0].id)
+    at(mole, C1, NOTHING)  # the server was restored, and lacks it again
+    report = linked(server := TakenIds({commit.id for commit in commits}, "author_closed")).hold(push_commits(mole))
+    assert {commit: error.kind for commit, error in report.refused.items()} == {commits[0].id: "author_closed"}
+    assert server.pushed == [CommitId(mole.author, 0)] and mole.author != commits[0].id.author
+    assert mole.view.evidence(A) == added(X, Y)
 
 
 def test_an_unacknowledged_commit_is_pushed_though_another_one_of_its_id_is_covered(mole: Replica) -> None:

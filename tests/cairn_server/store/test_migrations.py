@@ -1,16 +1,23 @@
 """Stores of older versions, as they were written then, open and go on."""
 
+import json
 from pathlib import Path
 
 import apsw
+import numpy as np
 import pytest
+from tests.fixtures.map.made import SMALL
+from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.old_stores import FORMATS, OLD_COMMITS, OLD_RETRACTS, unpacked
-from tests.fixtures.server.pushes import MOLE, pushed, read, sum_of
+from tests.fixtures.server.pushes import KEYS, MOLE, pushed, read, sum_of
+from tests.fixtures.server.shares_contract import author_of
 
 from cairn_map.errors import BadInputError
+from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX, packed_evidence
+from cairn_server.store import shares
 from cairn_server.store.sqlite.schema import STEPS, ensure_schema
-from cairn_server.store.sqlite.store import SqliteStore
+from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
 from cairn_server.store.store_rows import CellRow
 
 HEADS = {"v1.sqlite.zst": "4243ca94aa4e5ac2bca4157d97a5ba33.10.0c13ae5711ebe0d9d9c007e2badf0262"}
@@ -53,6 +60,63 @@ def test_a_store_of_any_version_gets_the_tables_of_a_new_one(version: int, tmp_p
     ensure_schema(old)
     schemas = [list(c.execute("SELECT type, name, sql FROM sqlite_master ORDER BY name")) for c in (new, old)]
     assert schemas[0] == schemas[1] and schemas[0]
+
+
+def test_a_map_of_an_older_store_that_only_seemed_full_takes_commits_and_gives_back_what_is_new(tmp_path: Path) -> None:
+    connection = apsw.Connection(str(unpacked("v1.sqlite.zst", tmp_path)))
+    [(tops,)] = connection.execute("SELECT tops FROM map")
+    full = [COUNT_MAX, *json.loads(tops)[1:-1], SUM_MAX]  # as after commits that were taken out long ago
+    connection.execute("UPDATE map SET tops = ?", (json.dumps(full),))
+    connection.close()
+    with Live(tmp_path) as live:
+        row = live.service.store.map("lab")
+        assert live.service.store.shares.cells(row, "mole") == []
+        more = pushed(4, 2, MOLE)
+        assert live.push(row, more).status_code == 201
+        assert live.service.store.shares.cells(row, "mole") == sorted(more.cells)
+        old = next(
+            commit for commit in OLD_COMMITS if commit.id not in {t for r in OLD_RETRACTS for t in r.meta.retracted_ids}
+        )
+        assert live.retract(row, more, old).status_code == 201
+        live.folded(row)
+        assert live.service.store.shares.cells(row, "mole") == []
+    connection = apsw.Connection(str(tmp_path / FILE_NAME))
+    [(measured,)] = connection.execute("SELECT tops FROM map")
+    assert all(0 < now < before for now, before in zip(json.loads(measured)[::12], full[::12], strict=True))
+
+
+def test_a_map_of_an_older_store_that_is_full_takes_no_evidence_until_some_is_retracted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    connection = apsw.Connection(str(unpacked("v1.sqlite.zst", tmp_path)))
+    connection.execute("UPDATE map SET tops = ?", (json.dumps([COUNT_MAX] * (2 + SMALL.plane_count)),))
+    connection.close()
+    monkeypatch.setattr(shares, "ROBOTS_MAX", 1)
+    monkeypatch.setattr(shares, "COUNT_MAX", 2)  # half of it is less than what the cells hold
+    seen_once = packed_evidence(np.array([9], np.uint32), np.array([[1, 0]]), np.zeros((1, SMALL.plane_count)), SMALL)
+    small = pushed(4, 2, MOLE, cells={KEYS[0]: seen_once})
+    with Live(tmp_path) as live:
+        row = live.service.store.map("lab")
+        refused = live.push(row, small)
+        assert kind_of(refused) == "evidence_overflow" and "start the server anew" in refused.json()["detail"]
+        assert live.retract(row, *OLD_COMMITS).status_code == 201
+        live.folded(row)
+    with Live(tmp_path) as live:
+        assert live.push(row, small).status_code == 201
+
+
+def test_a_store_with_more_robots_than_there_are_shares_begins_their_numbers_again(tmp_path: Path) -> None:
+    connection = apsw.Connection(str(unpacked("v1.sqlite.zst", tmp_path)))
+    connection.executemany(
+        "INSERT INTO author (map, robot, incarnation, top, intervals) VALUES (1, ?, '00', 0, 1)",
+        [(f"robot{n}",) for n in range(shares.ROBOTS_MAX)],
+    )
+    connection.close()
+    with Live(tmp_path) as live:
+        row = live.service.store.map("lab")
+        assert [share.robot for share in live.service.store.shares.of(row)] == [shares.RESERVE]
+        assert kind_of(live.push(row, pushed(4, 2, MOLE))) == "author_closed"
+        assert live.push(row, pushed(0, 2, author_of("mole", 9))).status_code == 201
 
 
 def test_a_store_of_a_newer_version_is_refused_and_left_alone(tmp_path: Path) -> None:

@@ -2,27 +2,37 @@
 
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
 import apsw
+import numpy as np
+import numpy.typing as npt
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from tests.fixtures.map.made import SMALL
 from tests.fixtures.server.access_contract import AccessContract
 from tests.fixtures.server.branch_contract import BranchContract, branch, token
 from tests.fixtures.server.commit_contract import CommitContract
 from tests.fixtures.server.crowd_contract import CrowdContract
 from tests.fixtures.server.evidence_contract import EvidenceContract
-from tests.fixtures.server.pushes import pushed
-from tests.fixtures.server.shares_contract import SharesContract
-from tests.fixtures.server.store_contract import StoreContract, new_of
+from tests.fixtures.server.pushes import MOLE, WREN, pushed
+from tests.fixtures.server.shares_contract import SharesContract, author_of
+from tests.fixtures.server.store_contract import NAMES, StoreContract, new_of
 
-from cairn_map.errors import BadInputError, ConflictError, UnreachableError
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.ids import OPERATOR, Author, CommitId
+from cairn_map.errors import BadInputError, ConflictError, NotFoundError, UnreachableError
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.folding import fold_pending
 from cairn_server.store.sqlite import readers as sqlite_readers
 from cairn_server.store.sqlite import tokens as sqlite_tokens
 from cairn_server.store.sqlite.changes import append_commit
 from cairn_server.store.sqlite.schema import ensure_schema
+from cairn_server.store.sqlite.shares import IS_RESERVE
 from cairn_server.store.sqlite.snapshot import CELL_COLUMNS
 from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
 
@@ -47,6 +57,52 @@ class TestSqliteStore(
     StoreContract, CommitContract, SharesContract, CrowdContract, EvidenceContract, BranchContract, AccessContract
 ):
     """All of the contract."""
+
+
+STEPS = [
+    *(pushed(n, n, author) for author in (MOLE, WREN) for n in range(3)),
+    pushed(3, 0, MOLE, cells={}, retracts=[pushed(0, 0)]),
+    pushed(4, 4, MOLE, retracts=[pushed(1, 1), pushed(5, 0)]),
+    pushed(5, 0, MOLE),
+    pushed(0, 0, author_of(OPERATOR), cells={}, retracts=[pushed(1, 1, WREN), pushed(0, 0)]),
+    *("fold", "forget", "close"),
+]
+
+
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(steps=st.lists(st.sampled_from(STEPS), max_size=14))
+def test_accounts_are_at_any_time_the_sum_of_what_is_pending_or_in_the_map(
+    fresh: SqliteStore, steps: list[Commit | str]
+) -> None:
+    row, _ = fresh.create_map(next(NAMES), SMALL, SensorModel())
+    tops = {commit.id: new_of(commit).tops for commit in STEPS if not isinstance(commit, str)}
+    for step in steps:
+        if isinstance(step, str):
+            with suppress(NotFoundError):
+                {
+                    "fold": lambda: fold_pending(fresh, row, CellCache(SMALL), limit=9),
+                    "forget": lambda: fresh.forget_evidence(row, before_s=1e12, limit=2),
+                    "close": lambda: fresh.shares.close(row, "mole"),
+                }[step]()
+        else:
+            with suppress(ConflictError):  # of a closed author, or `evidence_gone`
+                fresh.append(row, new_of(step))
+        with fresh._readers.reading() as reader:
+            accounts = f"CASE WHEN {IS_RESERVE} THEN '' ELSE robot END"
+            counted = list(
+                reader.execute(
+                    f"SELECT {accounts}, robot, incarnation, n FROM commits JOIN author USING (map, robot, incarnation)"
+                    " WHERE map = ? AND unfolded_seq IS NULL",
+                    (row.number,),
+                )
+            )
+            held = list(reader.execute("SELECT account, cell, tops FROM held WHERE map = ?", (row.number,)))
+        expected: dict[tuple[str, int], npt.NDArray[np.int64]] = {}
+        for account, robot, incarnation, n in counted:
+            for cell, top in tops[CommitId(Author(robot, incarnation), n)].items():
+                expected[account, cell] = expected.get((account, cell), np.int64(0)) + np.array(top)
+        found = {(account, cell): np.frombuffer(top, "<i8").tolist() for account, cell, top in held}
+        assert found == {key: total.tolist() for key, total in expected.items()}
 
 
 CROWD = sqlite_readers.IDLE_MAX + 10
