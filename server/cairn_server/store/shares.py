@@ -124,7 +124,7 @@ def check_old_sums(old: npt.NDArray[np.int64]) -> None:
         raise BadInputError(
             "evidence_overflow",
             "this map took so much evidence before robots had shares of their own that its sums could overflow; "
-            "retract what is too much of it and start the server anew, which measures again what the cells hold",
+            "retract what is too much of it and start the server again: it then measures what the cells hold",
         )
 
 

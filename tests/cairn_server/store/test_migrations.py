@@ -98,7 +98,7 @@ def test_a_map_of_an_older_store_that_is_full_takes_no_evidence_until_some_is_re
     with Live(tmp_path) as live:
         row = live.service.store.map("lab")
         refused = live.push(row, small)
-        assert kind_of(refused) == "evidence_overflow" and "start the server anew" in refused.json()["detail"]
+        assert kind_of(refused) == "evidence_overflow" and "start the server again" in refused.json()["detail"]
         assert live.retract(row, *OLD_COMMITS).status_code == 201
         live.folded(row)
     with Live(tmp_path) as live:
