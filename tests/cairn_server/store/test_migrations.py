@@ -11,7 +11,7 @@ from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.old_stores import FORMATS, OLD_COMMITS, OLD_RETRACTS, unpacked
 from tests.fixtures.server.pushes import KEYS, MOLE, pushed, read, sum_of
-from tests.fixtures.server.shares_contract import author_of
+from tests.fixtures.server.shares_contract import author_of, regions_of
 
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX, packed_evidence
@@ -70,16 +70,16 @@ def test_a_map_of_an_older_store_that_only_seemed_full_takes_commits_and_gives_b
     connection.close()
     with Live(tmp_path) as live:
         row = live.service.store.map("lab")
-        assert live.service.store.shares.cells(row, "mole") == []
+        assert live.service.store.shares.regions(row, "mole") == []
         more = pushed(4, 2, MOLE)
         assert live.push(row, more).status_code == 201
-        assert live.service.store.shares.cells(row, "mole") == sorted(more.cells)
+        assert live.service.store.shares.regions(row, "mole") == regions_of(more)
         old = next(
             commit for commit in OLD_COMMITS if commit.id not in {t for r in OLD_RETRACTS for t in r.meta.retracted_ids}
         )
         assert live.retract(row, more, old).status_code == 201
         live.folded(row)
-        assert live.service.store.shares.cells(row, "mole") == []
+        assert live.service.store.shares.regions(row, "mole") == []
     connection = apsw.Connection(str(tmp_path / FILE_NAME))
     [(measured,)] = connection.execute("SELECT tops FROM map")
     assert all(0 < now < before for now, before in zip(json.loads(measured)[::12], full[::12], strict=True))

@@ -206,7 +206,7 @@ CREATE TABLE held (
     PRIMARY KEY (map, account, region)
 ) WITHOUT ROWID;
 CREATE INDEX held_much ON held (map, account, part) WHERE part > 0.5;
-ALTER TABLE commits ADD COLUMN charged BLOB;    -- per region: its number and what is on the account; NULL: before accounts
+ALTER TABLE commits ADD COLUMN charged BLOB;    -- per region its number and tops; NULL: before accounts
 ALTER TABLE author ADD COLUMN closed INTEGER NOT NULL DEFAULT 0;    -- takes no new commits, and is the reserve's
 -- More robots than there are shares begin again, each with its next incarnation.
 UPDATE author SET closed = 1 WHERE robot NOT IN ('operator', 'initial') AND map IN (
