@@ -26,6 +26,7 @@ from cairn_map.commits.commit import HEAD, Commit, CommitMeta, ScanPose, commit_
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.wire.messages import CreateMap, MapInfo
+from cairn_server.store.shares import region_of
 from cairn_server.store.store_rows import NewCommit
 
 Diff = dict[CellKey, Evidence]
@@ -59,7 +60,7 @@ class Bodies:
             captured_s=None,
             retracts=(),
             diff=made.cells,
-            tops=dict.fromkeys(made.cells, (1, 1) + (0,) * self.geometry.plane_count),
+            tops=dict.fromkeys(map(region_of, made.cells), (1, 1) + (0,) * self.geometry.plane_count),
         )
 
     def _with_text(self, made: Commit, text: bytes) -> bytes:

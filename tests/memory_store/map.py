@@ -6,8 +6,6 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from cairn_map.commits.cursor import ENTRY_FOLD, Cursor, first_chain
 from cairn_map.commits.ids import SERVERS_OWN, Author, CommitId
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
@@ -21,8 +19,7 @@ from cairn_server.store.shares import (
     Tops,
     account_of,
     check_sums,
-    tops_by_region,
-    used_parts,
+    used_part,
 )
 from cairn_server.store.store_rows import (
     Branch,
@@ -252,9 +249,9 @@ class MemoryMap:
         """Largest numbers of an account's commits that are pending or in the map, added up by region."""
         found: dict[int, Tops] = {}
         for commit, kept in self.commits.items():
-            if not kept.unfolded_seq and self._account(commit.author) == account and kept.new.tops:
-                for region, tops in _by_region(kept.new).items():
-                    found[region] = found.get(region, 0) + tops
+            if not kept.unfolded_seq and self._account(commit.author) == account:
+                for region, tops in kept.new.tops.items():
+                    found[region] = _sum(tops, found.get(region))
         return found
 
     def close(self, robot: str) -> ClosedRobot:
@@ -269,7 +266,7 @@ class MemoryMap:
         reserve = self.held(RESERVE)
         try:
             for key, tops in self.held(robot).items():
-                check_sums(RESERVE, [key], (tops + reserve.get(key, 0))[None], self.row.geometry)
+                check_sums(RESERVE, key, _sum(tops, reserve.get(key)), self.row.geometry)
         except BadInputError as exc:
             raise ConflictError("reserve_full", exc.message) from exc
         self.closed.update(own)
@@ -280,18 +277,18 @@ class MemoryMap:
 
     def _fullest(self, account: str) -> float | None:
         held = self.held(account)
-        part = float(used_parts(account, np.stack(list(held.values()))).max()) if held else 0.0
+        part = max((used_part(account, total) for total in held.values()), default=0.0)
         return part if part > ALARM_PART else None
 
     def _check_sums(self, commit: NewCommit) -> None:
         account = account_of(commit.id.author.robot, is_closed=False)
         held = self.held(account)
-        for region, tops in _by_region(commit).items():
-            check_sums(account, [region], (tops + held.get(region, 0))[None], self.row.geometry)
+        for region, tops in commit.tops.items():
+            check_sums(account, region, _sum(tops, held.get(region)), self.row.geometry)
 
 
-def _by_region(commit: NewCommit) -> dict[int, Tops]:
-    return dict(zip(*map(list, tops_by_region(commit.tops)), strict=True)) if commit.tops else {}
+def _sum(tops: Tops, more: Tops | None) -> Tops:
+    return tuple(a + b for a, b in zip(tops, more, strict=True)) if more else tops
 
 
 def new_memory_map(number: int, name: str, geometry: Geometry, sensor_model: SensorModel) -> MemoryMap:

@@ -14,10 +14,7 @@ server refuse another's commit. What is taken out of the map again is given back
 Closing a robot moves what it holds into the reserve; its name begins again with an empty share.
 """
 
-from collections.abc import Mapping, Sequence
-
-import numpy as np
-import numpy.typing as npt
+from operator import gt, truediv
 
 from cairn_map.commits.ids import SERVERS_OWN
 from cairn_map.errors import BadInputError
@@ -25,8 +22,8 @@ from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
 from cairn_server.store.store_rows import RobotShares
 
-Tops = npt.NDArray[np.int64]
-"""(regions, 2 + P): largest number of each plane in each region."""
+Tops = tuple[int, ...]
+"""(2 + P) largest number of each plane. No array: a commit has few regions, and the thread that writes little time."""
 REGION_BITS = 6
 """Bits of a cell number below its region's: 4^3 cells. By cell the accounts would be as long as the lists of cells that
 commits touch, and half of the store's work."""
@@ -57,41 +54,33 @@ def account_of(robot: str, *, is_closed: bool) -> str:
     return RESERVE if is_closed or robot in SERVERS_OWN else robot
 
 
-def limits_of(account: str, planes: int) -> npt.NDArray[np.int64]:
-    """(planes,) most that an account may hold in a voxel: half of the range is for all robots, half for the reserve."""
-    most = np.full(planes, SUM_MAX // 2, np.int64)
-    most[:2] = COUNT_MAX // 2
-    return most if account == RESERVE else most // ROBOTS_MAX
+def limits_of(account: str, planes: int) -> Tops:
+    """Most that an account may hold in a voxel: half of the range is for all robots, half for the reserve."""
+    shares = 1 if account == RESERVE else ROBOTS_MAX
+    return (COUNT_MAX // 2 // shares,) * 2 + (SUM_MAX // 2 // shares,) * (planes - 2)
 
 
-def tops_by_region(tops: Mapping[CellKey, Sequence[int]]) -> tuple[npt.NDArray[np.int64], Tops]:
-    """Regions, rising, and the largest numbers of a commit's cells in each; without those that hold nothing."""
-    cells = np.fromiter(tops, np.int64, len(tops))
-    order = np.argsort(cells)
-    regions, firsts = np.unique(cells[order] >> REGION_BITS, return_index=True)
-    most: Tops = np.maximum.reduceat(np.array([tops[cell] for cell in tops], np.int64)[order], firsts, axis=0)
-    holds = most.any(axis=1)
-    return regions[holds], most[holds]
+def region_of(key: CellKey) -> int:
+    """Region in which a cell lies."""
+    return int(key) >> REGION_BITS
 
 
-def used_parts(account: str, totals: Tops) -> npt.NDArray[np.float64]:
-    """(regions,) part of the account's share that is taken in each region, of the plane that is fullest."""
-    parts: npt.NDArray[np.float64] = (totals / limits_of(account, totals.shape[1])).max(axis=1)
-    return parts
+def used_part(account: str, total: Tops) -> float:
+    """Part of the account's share that is taken in a region, of the plane that is fullest."""
+    return float(max(map(truediv, total, limits_of(account, len(total)))))
 
 
-def check_sums(account: str, regions: Sequence[int], totals: Tops, geometry: Geometry) -> None:
-    """Refuse totals beyond an account's share.
+def check_sums(account: str, region: int, total: Tops, geometry: Geometry) -> None:
+    """Refuse a total beyond an account's share.
 
     Raises:
         BadInputError: kind `evidence_overflow`.
     """
-    most = limits_of(account, totals.shape[1])
-    over = np.argwhere(totals > most)
-    if not len(over):
+    most = limits_of(account, len(total))
+    plane = next((plane for plane, number in enumerate(total) if number > most[plane]), None)
+    if plane is None:
         return
-    index, plane = over[0].tolist()
-    first_cell = int(regions[index]) << REGION_BITS
+    first_cell = region << REGION_BITS
     low, high = (cell_of_key(CellKey(cell)) for cell in (first_cell, first_cell + (1 << REGION_BITS) - 1))
     whose = f"robot {account}'s evidence" if account else "prior data and closed robots' evidence"
     remedy = (
@@ -102,7 +91,7 @@ def check_sums(account: str, regions: Sequence[int], totals: Tops, geometry: Geo
     )
     raise BadInputError(
         "evidence_overflow",
-        f"with this commit {whose} in a voxel of the cells {low} to {high} could sum up to {totals[index, plane]} in "
+        f"with this commit {whose} in a voxel of the cells {low} to {high} could sum up to {total[plane]} in "
         f"the plane {_plane_name(geometry, plane)}, and its share is {most[plane]}; {remedy}",
     )
 
@@ -114,13 +103,13 @@ def used_bounds(share: RobotShares) -> dict[str, float]:
     return {"sums": share.sums or 0.0, **incarnations, "intervals": share.intervals / most}
 
 
-def check_old_sums(old: npt.NDArray[np.int64]) -> None:
+def check_old_sums(old: Tops) -> None:
     """Refuse evidence for a map whose sums from before there were shares leave no room for them.
 
     Raises:
         BadInputError: kind `evidence_overflow`.
     """
-    if (old > limits_of(RESERVE, len(old))).any():
+    if any(map(gt, old, limits_of(RESERVE, len(old)))):
         raise BadInputError(
             "evidence_overflow",
             "this map took so much evidence before robots had shares of their own that its sums could overflow; "

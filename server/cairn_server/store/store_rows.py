@@ -41,8 +41,8 @@ class NewCommit:
     captured_s: tuple[float, float] | None
     retracts: tuple[CommitId, ...]
     diff: Mapping[CellKey, bytes]
-    tops: Mapping[CellKey, tuple[int, ...]]
-    """Largest number of each plane in each cell; they bound every sum in the map (`shares`)."""
+    tops: Mapping[int, tuple[int, ...]]
+    """Largest number of each plane in each region (`shares.region_of`); they bound every sum in the map (`shares`)."""
     rig: bytes | None = None
     """SHA-256 of the rig that its sensors were described by."""
     signatures: str | None = None

@@ -28,7 +28,6 @@ from cairn_map.errors import BadInputError, ConflictError, NotFoundError, Unreac
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.folding import fold_pending
-from cairn_server.store.shares import tops_by_region
 from cairn_server.store.sqlite import readers as sqlite_readers
 from cairn_server.store.sqlite import tokens as sqlite_tokens
 from cairn_server.store.sqlite.changes import append_commit
@@ -77,7 +76,7 @@ def test_accounts_are_at_any_time_the_sum_of_what_is_pending_or_in_the_map(
 ) -> None:
     row, _ = fresh.create_map(next(NAMES), SMALL, SensorModel())
     commits = [commit for commit in STEPS if not isinstance(commit, str) and commit.cells]
-    tops = {commit.id: tops_by_region(new_of(commit).tops) for commit in commits}
+    tops = {commit.id: new_of(commit).tops for commit in commits}
     for step in steps:
         if isinstance(step, str):
             with suppress(NotFoundError):
@@ -101,8 +100,8 @@ def test_accounts_are_at_any_time_the_sum_of_what_is_pending_or_in_the_map(
             held = list(reader.execute("SELECT account, region, tops FROM held WHERE map = ?", (row.number,)))
         expected: dict[tuple[str, int], npt.NDArray[np.int64]] = {}
         for account, robot, incarnation, n in counted:
-            for region, top in zip(*tops[CommitId(Author(robot, incarnation), n)], strict=True):
-                expected[account, int(region)] = expected.get((account, int(region)), np.int64(0)) + top
+            for region, top in tops[CommitId(Author(robot, incarnation), n)].items():
+                expected[account, region] = expected.get((account, region), np.int64(0)) + np.array(top)
         found = {(account, region): np.frombuffer(top, "<i8").tolist() for account, region, top in held}
         assert found == {key: total.tolist() for key, total in expected.items()}
 

@@ -6,6 +6,7 @@ Evidence is never negative: the largest number of a plane in any cell of the map
 
 import json
 import logging
+from operator import gt
 
 import apsw
 import numpy as np
@@ -14,15 +15,15 @@ import numpy.typing as npt
 from cairn_map.codec.cell_code import decode_cell
 from cairn_map.errors import CairnError
 from cairn_map.evidence.evidence import largest
-from cairn_server.store.shares import RESERVE, limits_of
+from cairn_server.store.shares import RESERVE, Tops, limits_of
 from cairn_server.store.sqlite.writer import first
 
 log = logging.getLogger(__name__)
 
 
-def old_sums(connection: apsw.Connection, map_number: int) -> npt.NDArray[np.int64]:
-    """(2 + P,) bound of what these commits hold in any voxel of a map."""
-    return np.array(json.loads(first(connection, "SELECT tops FROM map WHERE number = ?", (map_number,))), np.int64)
+def old_sums(connection: apsw.Connection, map_number: int) -> Tops:
+    """Bound of what these commits hold in any voxel of a map, by plane."""
+    return tuple(json.loads(first(connection, "SELECT tops FROM map WHERE number = ?", (map_number,))))
 
 
 def measure_old_sums(connection: apsw.Connection) -> None:
@@ -32,7 +33,7 @@ def measure_old_sums(connection: apsw.Connection) -> None:
     """
     for number, name in list(connection.execute("SELECT number, name FROM map")):
         old = old_sums(connection, number)
-        if not (old > limits_of(RESERVE, len(old))).any():
+        if not any(map(gt, old, limits_of(RESERVE, len(old)))):
             continue
         log.warning("map %s seems full of evidence: measuring what its cells hold", name)
         try:

@@ -5,10 +5,11 @@ time, the sum over the account's commits that are pending or in the map.
 """
 
 import json
+from collections.abc import Mapping, Sequence
+from operator import add, sub
+from struct import Struct, pack, unpack
 
 import apsw
-import numpy as np
-import numpy.typing as npt
 
 from cairn_map.commits.ids import SERVERS_OWN, CommitId
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
@@ -21,15 +22,13 @@ from cairn_server.store.shares import (
     account_of,
     check_old_sums,
     check_sums,
-    tops_by_region,
-    used_parts,
+    used_part,
 )
 from cairn_server.store.sqlite.old_sums import old_sums
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.writer import Writer, first, rows
 from cairn_server.store.store_rows import ClosedRobot, MapRow, NewCommit, RobotShares
 
-Regions = npt.NDArray[np.int64]
 SERVERS_IN_SQL = ", ".join(f"'{robot}'" for robot in sorted(SERVERS_OWN))
 IS_RESERVE = f"(closed = 1 OR robot IN ({SERVERS_IN_SQL}))"
 """SQL of the authors whose commits are the reserve's."""
@@ -73,14 +72,15 @@ def take_sums(connection: apsw.Connection, row: MapRow, commit: NewCommit) -> by
     Raises:
         BadInputError: kind `evidence_overflow`: the robot's share does not allow it; nothing was changed.
     """
-    if not commit.tops:
+    tops = commit.tops
+    if not tops:
         return b""
-    regions, tops = tops_by_region(commit.tops)
     account = account_of(commit.id.author.robot, is_closed=False)
-    totals = _held(connection, row, account, regions) + tops
-    _check(connection, row, account, regions, totals)
-    _put(connection, row, account, regions, totals)
-    return np.column_stack([regions, tops]).astype("<i8").tobytes()
+    held = _held(connection, row, account, list(tops))
+    totals = {region: tuple(map(add, top, held[region])) if region in held else top for region, top in tops.items()}
+    _check(connection, row, account, totals)
+    _put(connection, row, account, totals)
+    return b"".join(_packed((region, *top)) for region, top in tops.items())
 
 
 def give_back_sums(connection: apsw.Connection, row: MapRow, number: int) -> None:
@@ -90,8 +90,9 @@ def give_back_sums(connection: apsw.Connection, row: MapRow, number: int) -> Non
     if not charged:  # it came before there were accounts, or has no evidence
         return
     account = account_of(robot, is_closed=bool(is_closed))
-    regions, tops = _parted(charged, row)
-    _put(connection, row, account, regions, _held(connection, row, account, regions) - tops)
+    tops = {region: top for region, *top in Struct(f"<{3 + row.geometry.plane_count}q").iter_unpack(charged)}
+    held = _held(connection, row, account, list(tops))
+    _put(connection, row, account, {region: tuple(map(sub, held[region], top)) for region, top in tops.items()})
 
 
 def close_robot(connection: apsw.Connection, row: MapRow, robot: str) -> ClosedRobot:
@@ -111,17 +112,14 @@ def close_robot(connection: apsw.Connection, row: MapRow, robot: str) -> ClosedR
             f"closed authors and the server's own have {reserved} intervals of numbers, {robot} has {intervals}, and "
             f"{INTERVALS_OF_RESERVE_MAX} is the most of a map: begin a new one",
         )
-    query = "SELECT region, tops FROM held WHERE map = ? AND account = ? ORDER BY region"
-    held = rows(connection, query, (row.number, robot))
-    if held:
-        regions = np.array([region for region, _ in held], np.int64)
-        tops = np.frombuffer(b"".join(top for _, top in held), "<i8").reshape(len(held), -1)
-        totals = _held(connection, row, RESERVE, regions) + tops
-        try:
-            _check(connection, row, RESERVE, regions, totals)
-        except BadInputError as exc:
-            raise ConflictError("reserve_full", f"{robot} cannot be closed: {exc.message}") from exc
-        _put(connection, row, RESERVE, regions, totals)
+    tops = _all_held(connection, row, robot)
+    held = _all_held(connection, row, RESERVE)
+    totals = {region: tuple(map(add, top, held[region])) if region in held else top for region, top in tops.items()}
+    try:
+        _check(connection, row, RESERVE, totals)
+    except BadInputError as exc:
+        raise ConflictError("reserve_full", f"{robot} cannot be closed: {exc.message}") from exc
+    _put(connection, row, RESERVE, totals)
     connection.execute("DELETE FROM held WHERE map = ? AND account = ?", (row.number, robot))
     connection.execute("UPDATE author SET closed = 1 WHERE map = ? AND robot = ?", (row.number, robot))
     return ClosedRobot(authors=authors, intervals=intervals)
@@ -167,41 +165,48 @@ def _uses(connection: apsw.Connection, row: MapRow, robot: str) -> tuple[int, in
     return authors, intervals, 0 if authors else first(connection, robots, (row.number,))
 
 
-def _held(connection: apsw.Connection, row: MapRow, account: str, regions: Regions) -> Tops:
-    """(regions, 2 + P) numbers on an account; zeros where it holds nothing."""
-    planes = 2 + row.geometry.plane_count
+def _held(connection: apsw.Connection, row: MapRow, account: str, regions: list[int]) -> dict[int, Tops]:
+    """Numbers on an account in those of these regions in which it holds something."""
     query = "SELECT region, tops FROM held WHERE map = ? AND account = ? AND region IN (SELECT value FROM json_each(?))"
-    wanted = regions.tolist()
-    known: dict[int, bytes] = dict(rows(connection, query, (row.number, account, json.dumps(wanted))))
-    nothing = bytes(8 * planes)
-    return np.frombuffer(b"".join(known.get(region, nothing) for region in wanted), "<i8").reshape(-1, planes)
+    found = connection.execute(query, (row.number, account, json.dumps(regions)))
+    return {region: _unpacked(tops) for region, tops in found}
 
 
-def _parted(charged: bytes, row: MapRow) -> tuple[Regions, Tops]:
-    """Regions and their numbers, of what a commit was charged."""
-    table = np.frombuffer(charged, "<i8").reshape(-1, 3 + row.geometry.plane_count)
-    return table[:, 0], table[:, 1:]
+def _all_held(connection: apsw.Connection, row: MapRow, account: str) -> dict[int, Tops]:
+    """Numbers on an account by region."""
+    found = connection.execute("SELECT region, tops FROM held WHERE map = ? AND account = ?", (row.number, account))
+    return {region: _unpacked(tops) for region, tops in found}
 
 
-def _check(connection: apsw.Connection, row: MapRow, account: str, regions: Regions, totals: Tops) -> None:
+def _packed(numbers: Sequence[int]) -> bytes:
+    return pack(f"<{len(numbers)}q", *numbers)
+
+
+def _unpacked(numbers: bytes) -> Tops:
+    return unpack(f"<{len(numbers) // 8}q", numbers)
+
+
+def _check(connection: apsw.Connection, row: MapRow, account: str, totals: Mapping[int, Tops]) -> None:
     old = old_sums(connection, row.number)
     check_old_sums(old)
-    # What came before there were accounts may be anywhere, and is the reserve's.
-    check_sums(account, regions.tolist(), totals + old if account == RESERVE else totals, row.geometry)
+    for region, total in totals.items():
+        # What came before there were accounts may be anywhere, and is the reserve's.
+        check_sums(account, region, tuple(map(add, total, old)) if account == RESERVE else total, row.geometry)
 
 
-def _put(connection: apsw.Connection, row: MapRow, account: str, regions: Regions, totals: Tops) -> None:
+def _put(connection: apsw.Connection, row: MapRow, account: str, totals: Mapping[int, Tops]) -> None:
     """Write what an account holds in some regions."""
-    parts = used_parts(account, totals).tolist()
-    values = [
-        (row.number, account, region, total.astype("<i8").tobytes(), part)
-        for region, total, part in zip(regions.tolist(), totals, parts, strict=True)
+    holding = [
+        (row.number, account, region, _packed(total), used_part(account, total))
+        for region, total in totals.items()
+        if any(total)
     ]
-    connection.executemany(
-        "INSERT OR REPLACE INTO held (map, account, region, tops, part) VALUES (?, ?, ?, ?, ?)",
-        [value for value in values if value[-1] > 0.0],
-    )
-    connection.executemany(
-        "DELETE FROM held WHERE map = ? AND account = ? AND region = ?",
-        [value[:3] for value in values if value[-1] <= 0.0],
-    )
+    if holding:
+        connection.executemany(
+            "INSERT OR REPLACE INTO held (map, account, region, tops, part) VALUES (?, ?, ?, ?, ?)", holding
+        )
+    if len(holding) < len(totals):
+        connection.executemany(
+            "DELETE FROM held WHERE map = ? AND account = ? AND region = ?",
+            [(row.number, account, region) for region, total in totals.items() if not any(total)],
+        )

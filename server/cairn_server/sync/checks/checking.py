@@ -7,10 +7,14 @@ that is stored of a commit is in its bytes.
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+import numpy.typing as npt
+
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.commit_reading import CommitReader
 from cairn_map.evidence.evidence import largest
 from cairn_map.evidence.grid import CellKey
+from cairn_server.store.shares import region_of
 from cairn_server.store.store_rows import NewCommit
 from cairn_server.sync.checks.push_policy import check_evidence
 
@@ -20,8 +24,8 @@ class Checked:
     """Result for a commit that decodes, is canonical, and has possible evidence."""
 
     sha: bytes
-    tops: Mapping[CellKey, tuple[int, ...]]
-    """Largest number of each plane in each cell."""
+    tops: Mapping[int, tuple[int, ...]]
+    """Largest number of each plane in each region (`shares.region_of`)."""
 
 
 def check_commit(reader: CommitReader) -> Checked:
@@ -33,10 +37,10 @@ def check_commit(reader: CommitReader) -> Checked:
     commit, cells = reader.read()
     tops = {key: largest(cell.content.counts, cell.content.samples) for key, cell in cells.items()}
     check_evidence(commit.meta, cells, tops)
-    return Checked(commit.sha, {key: tuple(top.tolist()) for key, top in tops.items()})
+    return Checked(commit.sha, _by_region(tops))
 
 
-def new_commit(commit: Commit, tops: Mapping[CellKey, tuple[int, ...]]) -> NewCommit:
+def new_commit(commit: Commit, tops: Mapping[int, tuple[int, ...]]) -> NewCommit:
     """Checked commit as a store keeps it."""
     return NewCommit(
         id=commit.id,
@@ -49,3 +53,12 @@ def new_commit(commit: Commit, tops: Mapping[CellKey, tuple[int, ...]]) -> NewCo
         tops=tops,
         rig=bytes.fromhex(commit.meta.rig) if commit.meta.rig else None,
     )
+
+
+def _by_region(tops: Mapping[CellKey, npt.NDArray[np.int64]]) -> dict[int, tuple[int, ...]]:
+    """Largest numbers of all cells of each region."""
+    found: dict[int, npt.NDArray[np.int64]] = {}
+    for key, top in tops.items():
+        region = region_of(key)
+        found[region] = np.maximum(found[region], top) if region in found else top
+    return {region: tuple(top.tolist()) for region, top in found.items()}

@@ -21,7 +21,6 @@ from pathlib import Path
 
 from cairn_map.commits.commit_reading import commit_reader
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError
-from cairn_map.evidence.grid import CellKey
 from cairn_map.warm_up import warm_up
 from cairn_server.processes import LENGTH, die_with_parent, received, send
 from cairn_server.sync.checks.checking import Checked, check_commit
@@ -89,7 +88,7 @@ def checked_from(answer: dict[str, object]) -> Checked:
         raise FAMILIES[str(answer["family"])](str(answer["kind"]), str(answer["message"]))
     tops = answer["tops"]
     assert isinstance(tops, list)  # noqa: S101 - `answer_to` wrote it
-    return Checked(bytes.fromhex(str(answer["sha"])), {CellKey(key): tuple(top) for key, top in tops})
+    return Checked(bytes.fromhex(str(answer["sha"])), {region: tuple(top) for region, top in tops})
 
 
 def _address_space_bytes() -> int:
