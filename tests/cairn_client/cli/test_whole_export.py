@@ -21,7 +21,7 @@ def test_more_voxels_than_the_memory_holds_are_refused_before_they_are_made(
     server: LiveServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     push_diffs(server, tmp_path / "mole", {A: seen(1, 2, 3)}, {B: seen(5)})
-    monkeypatch.setattr(map_export, "MEMORY_DIVISOR", 1 << 62)
+    monkeypatch.setattr(map_export, "standard_limit_bytes", lambda: 100)
     for form in ("npz", "ply"):
         path = tmp_path / f"lab.{form}"
         assert main(["export", server.map_url, "--cells", str(tmp_path / "cells")]) == 0

@@ -12,6 +12,7 @@ from tests.fixtures.client.made import MAP, A, committed, cursor, foreign, heade
 
 from cairn_client.http.api import ANSWER_BYTES_MAX, REPLY_BYTES_MAX
 from cairn_client.http.backoff import RETRY_AFTER_MAX_S
+from cairn_client.http.event_stream import EVENT_BYTES_MAX
 from cairn_client.http.http_link import Link, index_of
 from cairn_client.http.live_listener import events
 from cairn_client.relay.link import RelayApi
@@ -232,6 +233,20 @@ def test_json_that_no_server_sends_is_damaged(api: RelayApi, mouth: Mouth, name:
         except (DamagedDataError, UnreachableError):
             continue
         assert name == "events", "it was taken for an answer"
+
+
+@pytest.mark.parametrize("name", [name for name in CALLS if name != "missing"])
+@pytest.mark.parametrize("text", ["many lists", "many fields"])
+def test_json_of_too_many_values_is_refused_before_one_is_made(
+    api: RelayApi, mouth: Mouth, name: str, text: str
+) -> None:
+    start, end = (b"event: hello\ndata: ", b"\n\n") if name == "events" else (b"", b"")
+    mouth.says(answer(start + UNSOUND[text] + end))
+    with pytest.raises(DamagedDataError) as caught:
+        CALLS[name](api)
+    assert caught.value.kind == (
+        "too_many_values" if len(UNSOUND[text]) < EVENT_BYTES_MAX or not end else "bad_message"
+    )
 
 
 POISON = ["", " ", "é", "x\x7f", "\x01", "x" * 5000]

@@ -25,6 +25,7 @@ from cairn_map.evidence.voxels import Voxels, joined_voxels, voxels_of_evidence
 from cairn_map.files.cell_files import cell_file, npz_file, ply_file
 from cairn_map.files.cell_folder import FolderHead, write_cell, write_head
 from cairn_map.files.export_request import ExportRequest
+from cairn_map.machine_memory import standard_limit_bytes
 from cairn_map.progress import with_progress
 from cairn_map.wire.messages import MapInfo
 
@@ -32,7 +33,6 @@ FORMATS = ("ply", "pcd", "laz", "npz", "ot", "bt")
 ZERO_CELSIUS_K = 273.15
 VOXEL_BYTES = 300
 """Memory of a voxel on its way into a file: a row with all channels has 136, and is there twice while it is joined."""
-MEMORY_DIVISOR = 4
 EXPORT_BYTES_MAX = 64 << 28
 """Bytes of a file of points: those of the 2^28 voxels that a server looks at for one (PROTOCOL.md 6)."""
 
@@ -167,7 +167,7 @@ def _downloaded(api: MapApi, info: MapInfo, args: argparse.Namespace) -> tuple[_
 
 
 def _check_memory(size_bytes: int) -> None:
-    limit_bytes = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // MEMORY_DIVISOR
+    limit_bytes = standard_limit_bytes()
     if size_bytes > limit_bytes:
         raise BadInputError(
             "too_large",
