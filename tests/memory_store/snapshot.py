@@ -12,7 +12,7 @@ from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.wire.messages import LogEntry
-from cairn_server.store.store_rows import CellRow, Contribution, Entry, Head, Selection, Totals
+from cairn_server.store.store_rows import CellRow, ChainedEntry, Contribution, Entry, Head, Selection, Totals
 
 
 class MemorySnapshot:
@@ -73,10 +73,19 @@ class MemorySnapshot:
         """Commits folded before an age of the store."""
         return EMPTY.with_commits(kept.new.id for kept in self._folded() if kept.folded_age_s < age_s)
 
-    def log(self, *, after_seq: int, limit: int) -> list[LogEntry]:
-        """Log entries, oldest first."""
+    def log(self, *, after_seq: int, limit: int, names_max: int | None = None) -> list[LogEntry]:
+        """Log entries, oldest first: the first one, and as many more as name so many commits together at most."""
         found = self._state.entries[after_seq : after_seq + limit]
-        return [self._log_entry(seq, entry) for seq, entry in enumerate(found, start=after_seq + 1)]
+        entries = [self._log_entry(seq, entry) for seq, entry in enumerate(found, start=after_seq + 1)]
+        while names_max is not None and len(entries) > 1 and sum(len(e.retracts) for e in entries) > names_max:
+            entries.pop()
+        return entries
+
+    def chained(self, *, after_seq: int, limit: int) -> list[ChainedEntry]:
+        """Log entries, oldest first, without what they say."""
+        found = enumerate(self._state.entries[after_seq : after_seq + limit], start=after_seq + 1)
+        commits = ((seq, entry, self._state.commits[self._state.ids[entry.commit]].new) for seq, entry in found)
+        return [ChainedEntry(seq, entry.kind, new.id, new.sha, entry.chain) for seq, entry, new in commits]
 
     def totals(self) -> Totals:
         """Sizes."""

@@ -188,6 +188,14 @@ SWITCHES = (
         "cairn_client/sync/test_many_retracts.py::test_a_round_still_works_after_a_whole_team_amended_all_it_measured",
     ),
     Switch(
+        3,
+        "behind many waiting commits of a robot its later ones wait, so that the vector keeps few gaps",
+        "server/cairn_server/folding/group_folding.py",
+        "if is_held or _touches(",
+        "if _touches(",
+        "cairn_server/folding/test_group_folding.py::test_of_a_robot_of_which_many_wait_later_commits_wait_so_that_the_vector_has_few_gaps",
+    ),
+    Switch(
         4,
         "a delta leaves the asker's own commits out",
         CELLS_CHANGED,

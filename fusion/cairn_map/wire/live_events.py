@@ -20,6 +20,8 @@ from cairn_map.wire.messages import Count, CursorText, LogEntry, NameText, Robot
 
 CELLS_MAX = 256
 """Cells in one event, at most; more are `many`."""
+NAMES_MAX = 16_384
+"""Most commits that the log entries of one event, or of one page of the log, name together, unless it is one entry."""
 ENTRIES_MAX = 100
 """Log entries in one event, at most: the newest."""
 CHAIN_DIGITS = 8

@@ -3,12 +3,16 @@
 A commit is one entry of the log, of all its cells or of none: chain, `lm`, coverage and later retracts know no half
 commits. So it waits as a whole, and so does a retract of a commit that is in a damaged cell. That is allowed, since any
 order of the same commits gives the same cells; and robots do not push a waiting commit again, since it is in `pending`.
+Each commit that is passed by leaves a gap in the version vector, which every robot reads: so of a robot of which many
+wait, and of a map where very many do, the later commits wait, too.
 """
 
 import logging
 import time
+from collections import Counter
 from dataclasses import dataclass, field
 
+from cairn_map.commits.ids import RobotName
 from cairn_map.errors import CairnError
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_server.folding.cell_cache import CACHE_BYTES, CellCache
@@ -21,6 +25,10 @@ log = logging.getLogger(__name__)
 
 GROUP_MAX = 256
 """Most commits in a group."""
+WAITING_OF_ROBOT_MAX = 64
+"""Most commits of a robot that wait while later ones of it are folded."""
+WAITING_MAX = 2048
+"""Most commits of a map that wait while later ones of the same robots are folded: 70 kB in each reply's vector."""
 PROBE_S = 60.0
 """Time between two attempts to read a damaged cell again while none is reported as healed."""
 
@@ -31,7 +39,9 @@ class Waiting:
 
     cells: set[CellKey] = field(default_factory=set)
     commits: set[int] = field(default_factory=set)
-    """Numbers of the commits found to touch these cells."""
+    """Numbers of the commits found to touch these cells, and of those held back behind them."""
+    of_robot: Counter[RobotName] = field(default_factory=Counter)
+    """Count of these commits, by robot."""
     why: DamagedCellError | None = None
     """Error of the cell found last; None: no cell is damaged."""
     healed: int = 0
@@ -43,6 +53,20 @@ class Waiting:
         """Wait for one more damaged cell."""
         self.cells.add(error.key)
         self.why, self.probed_s = error, time.monotonic()
+
+    def take(self, store: FoldStore, row: MapRow, commits: list[StoredCommit]) -> list[StoredCommit]:
+        """Those of these commits that may be folded; the others wait from now on."""
+        ready: list[StoredCommit] = []
+        for commit in commits:
+            robot = commit.id.author.robot
+            waits = self.of_robot[robot]
+            is_held = waits >= WAITING_OF_ROBOT_MAX or (waits > 0 and len(self.commits) >= WAITING_MAX)
+            if is_held or _touches(store, row, commit, self.cells):
+                self.commits.add(commit.number)
+                self.of_robot[robot] += 1
+            else:
+                ready.append(commit)
+        return ready
 
     def probe(self, store: FoldStore, row: MapRow, damaged: Damage) -> None:
         """Read the damaged cells again if it is time; if one is sound, everything that waits is tried again."""
@@ -56,6 +80,7 @@ class Waiting:
             if sound:
                 self.cells.clear()
                 self.commits.clear()
+                self.of_robot.clear()
                 self.why = None
         self.healed = healed
 
@@ -84,8 +109,7 @@ def fold_around(
     waiting.probe(store, row, damaged)
     # Each turn folds, or sets commits or a cell aside, so the loop ends.
     while commits := store.pending(row, limit=limit, size_bytes_max=GROUP_BYTES_MAX, skip=waiting.commits):
-        ready = [commit for commit in commits if not _touches(store, row, commit, waiting.cells)]
-        waiting.commits.update({commit.number for commit in commits} - {commit.number for commit in ready})
+        ready = waiting.take(store, row, commits)
         if not ready:
             continue
         # A cell found damaged only now joins the others, and the rest of the commits is tried without it.

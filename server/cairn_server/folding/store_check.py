@@ -14,15 +14,13 @@ from dataclasses import dataclass, field
 from cairn_map.codec.cell_code import DecodedCell
 from cairn_map.commits.commit import commit_sha
 from cairn_map.commits.cursor import ENTRY_FOLD, next_chain
-from cairn_map.commits.ids import commit_id_from_text
 from cairn_map.commits.version_vector import EMPTY
 from cairn_map.errors import CairnError, DamagedDataError
 from cairn_map.evidence.fingerprint import ZERO, Fingerprint, fingerprint
 from cairn_map.evidence.grid import CellKey, cell_of_key
-from cairn_map.wire.messages import LogEntry
 from cairn_server.folding.cells_at_rest import decode_stored, rebuilt_cell, stored_evidence
 from cairn_server.store.store import Snapshot, Store
-from cairn_server.store.store_rows import CellRow, MapRow, StoredCommit
+from cairn_server.store.store_rows import CellRow, ChainedEntry, MapRow, StoredCommit
 
 PAGE = 500
 PENDING_BYTES_MAX = 256 << 20
@@ -84,23 +82,22 @@ def _commits(store: Store, row: MapRow, checked: MapCheck) -> Iterator[StoredCom
         chain = snapshot.chain_at(0) or b""
     vector, seq = EMPTY, 0
     while page := _log_page(store, row, after_seq=seq):
-        for entry, stated in page:
-            commit_id = commit_id_from_text(entry.id)
+        for entry in page:
             if entry.seq > head.cursor.seq:  # folded while we read
                 continue
             if entry.seq != seq + 1:
                 checked.findings.append(Finding(row.name, f"log: entry {seq + 1} is not there"))
             seq = entry.seq
-            chain = next_chain(chain, entry.kind.encode(), commit_id, bytes.fromhex(entry.sha))
-            if chain != stated:
+            chain = next_chain(chain, entry.kind, entry.commit, entry.sha)
+            if chain != entry.chain:
                 checked.findings.append(Finding(row.name, f"log: entry {seq} does not continue the chain"))
-                chain = stated
-            if entry.kind.encode() == ENTRY_FOLD:
-                vector = vector.with_commits([commit_id])
-                commit = store.folded(row, commit_id)
+                chain = entry.chain
+            if entry.kind == ENTRY_FOLD:
+                vector = vector.with_commits([entry.commit])
+                commit = store.folded(row, entry.commit)
                 if commit is not None:
                     yield commit
-        if seq >= head.cursor.seq or page[-1][0].seq > head.cursor.seq:
+        if seq >= head.cursor.seq or page[-1].seq > head.cursor.seq:
             break
     if (seq, chain) != (head.cursor.seq, head.cursor.chain):
         checked.findings.append(Finding(row.name, f"log: it ends at {seq}, the head is {head.cursor}"))
@@ -109,9 +106,9 @@ def _commits(store: Store, row: MapRow, checked: MapCheck) -> Iterator[StoredCom
     yield from store.pending(row, limit=PAGE, size_bytes_max=PENDING_BYTES_MAX)
 
 
-def _log_page(store: Store, row: MapRow, *, after_seq: int) -> list[tuple[LogEntry, bytes]]:
+def _log_page(store: Store, row: MapRow, *, after_seq: int) -> list[ChainedEntry]:
     with store.snapshot(row) as snapshot:
-        return [(entry, snapshot.chain_at(entry.seq) or b"") for entry in snapshot.log(after_seq=after_seq, limit=PAGE)]
+        return snapshot.chained(after_seq=after_seq, limit=PAGE)
 
 
 def _of_commit(

@@ -167,6 +167,8 @@ class Listener:
         self._hub = hub
         self._seen = EventPosition(0, "0" * CHAIN_DIGITS, 0)
         self._losses = 0
+        self._heard = 0
+        """Tick up to which robots' signs were taken."""
         self._hello: Hello | None = None
 
     @property
@@ -187,7 +189,7 @@ class Listener:
     def start(self, after: EventPosition | None) -> None:
         """Prepare the first event, and go on after the last event seen if it is one of this log."""
         head, self._losses = self.live.changes.place()
-        tick, robots = self.live.robots.present()
+        tick, self._heard, robots = self.live.robots.present()
         resumed = after is not None and self.live.changes.has_proof(after)
         seq, chain = head.seq, head.chain.hex()[:CHAIN_DIGITS]
         if after is not None and resumed and after.seq <= head.seq:
@@ -210,8 +212,9 @@ class Listener:
             self._hello = None
         changes, self._seen = self.live.changes.since(self._seen, losses=self._losses)
         events += changes
-        for tick, sign in self.live.robots.since(self._seen.tick):
-            self._seen = EventPosition(self._seen.seq, self._seen.chain, tick)
+        for heard, sign in self.live.robots.since(self._heard):
+            self._heard = heard
+            self._seen = EventPosition(self._seen.seq, self._seen.chain, max(heard, self._seen.tick))
             events.append(RobotHeard(id=str(self._seen), robot=sign))
         return events
 

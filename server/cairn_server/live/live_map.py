@@ -14,6 +14,7 @@ from cairn_map.wire.live_events import (
     CELLS_MAX,
     CHAIN_DIGITS,
     ENTRIES_MAX,
+    NAMES_MAX,
     CellsEvent,
     EventPosition,
     HeadMoved,
@@ -31,6 +32,8 @@ Signs = OrderedDict[str, tuple[int, RobotSign]]
 GONE_MAX = 256
 """Most robots that left and are still reported to listeners as gone."""
 
+SIGNS_MAX = 1000
+"""Most robots in a `hello`, some 2 kB each at most; events of their own tell of the others."""
 PAST_ENTRIES = 1000
 """Most log entries that a returning listener gets in single changes; after more it gets `many`."""
 CELLS_KEPT = 1024
@@ -84,7 +87,11 @@ class LiveChanges:
                 self._cells[cell.key] = cell.lm
                 self._cells.move_to_end(cell.key)
             after = max(start, head.seq - ENTRIES_MAX)
-            self._entries.extend(snapshot.log(after_seq=after, limit=ENTRIES_MAX))
+            while after < head.seq:
+                self._entries.extend(snapshot.log(after_seq=after, limit=ENTRIES_MAX, names_max=NAMES_MAX))
+                after = self._entries[-1].seq
+                while len(self._entries) > 1 and sum(len(entry.retracts) for entry in self._entries) > NAMES_MAX:
+                    self._entries.popleft()
             self._head = head
             while len(self._cells) > CELLS_KEPT:
                 self._floor = self._cells.popitem(last=False)[1]
@@ -127,12 +134,15 @@ class LiveRobots:
         self._signs: Signs | None = None
         self._tick = 0
 
-    def present(self) -> tuple[int, list[RobotSign]]:
-        """Newest tick, and all registered robots by name."""
+    def present(self) -> tuple[int, int, list[RobotSign]]:
+        """Newest tick, and all registered robots by name, heard up to a tick: the newest one, too.
+
+        Of more than `SIGNS_MAX` robots those that are silent longest; the others were heard after the second tick.
+        """
         with self._lock:
-            signs = self._loaded()
-            found = [sign for _, sign in signs.values() if not sign.gone]
-            return self._tick, sorted(found, key=lambda sign: sign.branch)
+            heard = [(tick, sign) for tick, sign in self._loaded().values() if not sign.gone]
+            up_to = self._tick if len(heard) <= SIGNS_MAX else heard[SIGNS_MAX - 1][0]
+            return self._tick, up_to, sorted((sign for _, sign in heard[:SIGNS_MAX]), key=lambda sign: sign.branch)
 
     def of(self, branch: str) -> RobotSign | None:
         """Last sign of one robot, if it is registered."""

@@ -23,6 +23,7 @@ from cairn_server.store.store_rows import (
     Backlog,
     Branch,
     CellRow,
+    ChainedEntry,
     ClosedRobot,
     Contribution,
     EntrySize,
@@ -88,8 +89,12 @@ class Snapshot(Protocol):
         """Commits folded before an age of the store."""
         ...
 
-    def log(self, *, after_seq: int, limit: int) -> list[LogEntry]:
-        """Log entries, oldest first."""
+    def log(self, *, after_seq: int, limit: int, names_max: int | None = None) -> list[LogEntry]:
+        """Log entries, oldest first: the first one, and as many more as name so many commits together at most."""
+        ...
+
+    def chained(self, *, after_seq: int, limit: int) -> list[ChainedEntry]:
+        """Log entries, oldest first, without what they say."""
         ...
 
     def totals(self) -> Totals:

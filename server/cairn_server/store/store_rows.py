@@ -173,6 +173,16 @@ class Head:
     vector: VersionVector = field(default=EMPTY)
 
 
+class ChainedEntry(NamedTuple):
+    """One log entry, as the chain hashes it: what is read of many entries, however much each of them says."""
+
+    seq: int
+    kind: bytes
+    commit: CommitId
+    sha: bytes
+    chain: bytes
+
+
 class EntrySize(NamedTuple):
     """Size of one log entry."""
 

@@ -7,8 +7,8 @@ import threading
 from collections import defaultdict
 from collections.abc import Iterable
 
-from cairn_map.commits.cursor import Cursor
-from cairn_map.commits.ids import Author, CommitId, commit_id_from_text
+from cairn_map.commits.cursor import ENTRY_FOLD, Cursor
+from cairn_map.commits.ids import Author, CommitId
 from cairn_map.wire.messages import WANTED_MAX
 from cairn_map.wire.relay_peer import SUM_BYTES, Held, sum_of_shas
 from cairn_server.store.history import is_proven
@@ -48,11 +48,11 @@ class HeldCommits:
             known, sums = None, {}
         after_seq = known.seq if known else 0
         sums = dict(sums)
-        while entries := snapshot.log(after_seq=after_seq, limit=PAGE):
+        while entries := snapshot.chained(after_seq=after_seq, limit=PAGE):
             shas = defaultdict(list)
             for entry in entries:
-                if entry.kind == "+":
-                    shas[commit_id_from_text(entry.id).author].append(bytes.fromhex(entry.sha))
+                if entry.kind == ENTRY_FOLD:
+                    shas[entry.commit.author].append(entry.sha)
             sums |= {author: sum_of_shas(sums.get(author, ZERO), found) for author, found in shas.items()}
             after_seq = entries[-1].seq
         self._sums[row.number] = head, sums

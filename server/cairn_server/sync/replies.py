@@ -2,8 +2,8 @@
 
 import threading
 
-from cairn_map.commits.cursor import Cursor
-from cairn_map.commits.ids import Author, commit_id_from_text
+from cairn_map.commits.cursor import ENTRY_FOLD, Cursor
+from cairn_map.commits.ids import Author
 from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.errors import ConflictError, NotFoundError
 from cairn_map.wire.frames import encode_frame, start_of_reply
@@ -117,8 +117,8 @@ class MainReplies:
             if not 0 <= since <= ENTRIES_MAX or snapshot.chain_at(cursor.seq) != cursor.chain:
                 raise NotFoundError("no_cursor", "the log has no such recent cursor; ask for the cell again")
             # Only `+` puts an id into the vector; what is taken out again stays in it.
-            entries = snapshot.log(after_seq=cursor.seq, limit=ENTRIES_MAX)
-            folded = EMPTY.with_commits(commit_id_from_text(entry.id) for entry in entries if entry.kind == "+")
+            entries = snapshot.chained(after_seq=cursor.seq, limit=ENTRIES_MAX)
+            folded = EMPTY.with_commits(entry.commit for entry in entries if entry.kind == ENTRY_FOLD)
             return head.vector.minus(folded)
 
     def _facts(self, row: MapRow, snapshot: Snapshot) -> HeaderFacts:

@@ -53,7 +53,8 @@ export class LogBook {
     for (let after = Math.max(head - Math.min(count, KEPT), 0); ; after = found[found.length - 1].seq) {
       const entries = await this.page(after);
       found.push(...entries);
-      if (entries.length < PAGE) return found;
+      // A page ends early where its entries name very many commits.
+      if (!entries.length || (entries.length < PAGE && entries[entries.length - 1].seq >= head)) return found;
     }
   }
 

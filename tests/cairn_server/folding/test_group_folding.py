@@ -8,7 +8,7 @@ import pytest
 from tests.fixtures.server.answers import cell_path
 from tests.fixtures.server.damage import BROKEN, damage
 from tests.fixtures.server.live import Live, until
-from tests.fixtures.server.pushes import KEYS, WREN, pushed, read, sum_of
+from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 
 from cairn_map.commits.commit import Commit
 from cairn_server.folding import group_folding as module
@@ -130,6 +130,26 @@ def _folds_what_comes_last(live: Live) -> None:
     assert ids_pending(live, row) == {str(commit.id) for commit in commits[:-1]}
     assert len(waiting.commits) == 7
     assert fold_around(live.service.store, row, cache, waiting, damaged, limit=2) == 0
+
+
+@pytest.mark.parametrize(("limit", "folded"), [("WAITING_OF_ROBOT_MAX", 4), ("WAITING_MAX", 4), ("GROUP_MAX", 6)])
+def test_of_a_robot_of_which_many_wait_later_commits_wait_so_that_the_vector_has_few_gaps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, folded: int
+) -> None:
+    monkeypatch.setattr(module, limit, 2)
+    with Live(tmp_path) as live:
+        row, whole = broken_map(live)
+        ours = [pushed(n, n % 2, MOLE) for n in range(1, 9)]  # every other one in the damaged cell
+        theirs = [pushed(n, 1, WREN) for n in range(10, 12)]
+        for commit in (*ours, *theirs):
+            live.push(row, commit)
+        until(lambda: live.pending(row) == len(ours) + len(theirs) - folded, "the others are folded")
+        with live.service.store.snapshot(row) as snapshot:
+            gaps = len(snapshot.head.vector.intervals[MOLE])
+            assert {commit.id for commit in theirs} <= set(snapshot.head.vector)
+        assert gaps == folded - len(theirs)
+        heal(live, row, whole)
+        assert read(live.cells(row)) == sum_of([*BASE, *ours, *theirs])
 
 
 def test_a_cell_that_the_log_tells_again_is_found_out_without_a_word(

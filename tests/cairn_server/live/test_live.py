@@ -13,16 +13,29 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.fixtures.server.access import ADMIN, ENROLLER, bearer, robot_token
 from tests.fixtures.server.answers import kind_of
+from tests.fixtures.server.crowded_map import add_log, long_author
 from tests.fixtures.server.listening import by_socket, by_sse, hello_of, socket_url, up_to_head
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import MOLE, WREN, pushed
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from cairn_client.http.event_stream import EVENT_BYTES_MAX
+from cairn_map.commits.commit import RETRACTS_MAX
 from cairn_map.commits.cursor import cursor_from_text
+from cairn_map.commits.ids import NUMBER_LIMIT, CommitId
 from cairn_map.errors import UnreachableError
 from cairn_map.evidence.grid import cell_key, cell_of_key
-from cairn_map.wire.live_events import CellsEvent, HeadMoved, LiveEvent, LogGrew, RobotHeard, position_from_text
+from cairn_map.wire.live_events import (
+    ENTRIES_MAX,
+    CellsEvent,
+    HeadMoved,
+    Hello,
+    LiveEvent,
+    LogGrew,
+    RobotHeard,
+    position_from_text,
+)
 from cairn_map.wire.messages import MissingRequest, Register
 from cairn_server.http.routes import live as live_routes
 from cairn_server.http.routes.live import NOT_ALLOWED, SPACING_S
@@ -219,6 +232,56 @@ def test_who_was_away_for_too_many_entries_is_told_many_and_how_many(
     assert isinstance(cells, CellsEvent) and cells.cells == "many"
     assert isinstance(log, LogGrew)
     assert ([entry.seq for entry in log.entries], log.left_out) == ([3], 2)
+
+
+def test_an_event_lists_the_newest_entries_that_name_few_commits_together(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live_map, "NAMES_MAX", 5)
+    row = live.new_map()
+    listener = joined(live, row)
+    listener.take()
+    for n in range(1, 6):
+        names = [pushed(100 + 3 * n + m, 0) for m in range(3)] if n < 5 else []
+        live.push(row, pushed(n, 0, retracts=names))
+    live.folded(row)
+    live.service.live.folded(row)
+    (grown,) = (event for event in listener.take() if isinstance(event, LogGrew))
+    assert ([entry.seq for entry in grown.entries], grown.left_out) == ([4, 5], 3)
+
+
+def test_an_event_as_long_as_one_robot_can_make_it_is_read_by_every_client(live: Live) -> None:
+    row, author = live.new_map(), long_author(1)
+    listener = joined(live, row)
+    listener.take()
+    last = NUMBER_LIMIT - 1 - RETRACTS_MAX
+    names = " ".join(str(CommitId(author, last + n)) for n in range(RETRACTS_MAX))
+    add_log(live.service.store, row, [CommitId(author, last - n) for n in range(2 * ENTRIES_MAX)], retracts=names)
+    live.service.live.folded(row)
+    (grown,) = (event for event in listener.take() if isinstance(event, LogGrew))
+    assert (len(grown.entries), grown.left_out) == (4, 2 * ENTRIES_MAX - 4)
+    assert len(grown.model_dump_json()) <= EVENT_BYTES_MAX // 2
+    seqs: list[int] = []
+    while page := live.http.get(f"/maps/{row.name}/log?limit=1000&after={len(seqs)}").json():
+        assert 0 < len(page) <= 4
+        seqs += [entry["seq"] for entry in page]
+    assert seqs == list(range(1, 2 * ENTRIES_MAX + 1))
+
+
+def test_hello_lists_some_robots_and_events_of_their_own_tell_of_the_others(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live_map, "SIGNS_MAX", 2)
+    row = live.new_map()
+    for n in range(5):
+        register = Register(robot=f"r{n}", incarnation=f"{n:016x}")
+        live.http.post(f"/maps/{row.name}/branches", json=register.model_dump()).raise_for_status()
+    hello, *others = joined(live, row).take()
+    assert isinstance(hello, Hello) and len(hello.robots) == 2
+    heard = [event.robot.branch for event in others if isinstance(event, RobotHeard)]
+    assert sorted([*heard, *(sign.branch for sign in hello.robots)]) == [f"r{n}" for n in range(5)]
+    ticks = [position_from_text(event.id).tick for event in (hello, *others)]
+    assert ticks == sorted(ticks)
 
 
 @WAYS

@@ -48,6 +48,12 @@ def _log(args: argparse.Namespace) -> int:
     api, name = api_of(args.map, args.token)
     with api:
         entries = api.log(name, after=args.after, limit=args.limit)
+        # A page ends early where its entries name very many commits.
+        while 0 < len(entries) < args.limit:
+            more = api.log(name, after=entries[-1].seq, limit=args.limit - len(entries))
+            if not more:
+                break
+            entries += more
     if args.json:
         say(json.dumps([entry.model_dump(mode="json") for entry in entries]))
         return 0

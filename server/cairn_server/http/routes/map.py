@@ -4,6 +4,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Response
 
+from cairn_map.wire.live_events import NAMES_MAX
 from cairn_map.wire.messages import CreateMap, LogEntry, MapInfo, Retract, Retracted
 from cairn_server.access.auth import READING, Caller, Role
 from cairn_server.http.routes.callers import READERS, Map, Operations, admin, allowed, reader_somewhere
@@ -76,4 +77,4 @@ def log(
 ) -> list[LogEntry]:
     """Log entries, oldest first."""
     with service.store.snapshot(row) as snapshot:
-        return snapshot.log(after_seq=after, limit=limit)
+        return snapshot.log(after_seq=after, limit=limit, names_max=NAMES_MAX)

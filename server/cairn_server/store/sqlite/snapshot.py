@@ -15,7 +15,7 @@ from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.wire.messages import LogEntry
 from cairn_server.store.sqlite.failures import damaged_pages
 from cairn_server.store.sqlite.writer import first, rows
-from cairn_server.store.store_rows import CellRow, Contribution, Head, Selection, Totals
+from cairn_server.store.store_rows import CellRow, ChainedEntry, Contribution, Head, Selection, Totals
 
 CELL_COLUMNS = "cell, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k"
 PARENT, SEEN, PLACE = (
@@ -144,15 +144,34 @@ class SqliteSnapshot:
         )
         return _vector(found)
 
-    def log(self, *, after_seq: int, limit: int) -> list[LogEntry]:
-        """Log entries, oldest first."""
-        found = rows(
-            self._connection,
+    def log(self, *, after_seq: int, limit: int, names_max: int | None = None) -> list[LogEntry]:
+        """Log entries, oldest first: the first one, and as many more as name so many commits together at most."""
+        found: list[LogEntry] = []
+        names = 0
+        for row in self._connection.execute(
             f"SELECT {LOG_COLUMNS} FROM log JOIN commits ON commits.number = log.commit_number"  # noqa: S608 - constants
             " WHERE log.map = ? AND seq > ? ORDER BY seq LIMIT ?",
             (self._map, after_seq, limit),
+        ):
+            entry = _log_entry(*row)
+            names += len(entry.retracts)
+            if found and names_max is not None and names > names_max:
+                break
+            found.append(entry)
+        return found
+
+    def chained(self, *, after_seq: int, limit: int) -> list[ChainedEntry]:
+        """Log entries, oldest first, without what they say."""
+        found = rows(
+            self._connection,
+            "SELECT seq, kind, robot, incarnation, n, sha, chain FROM log"
+            " JOIN commits ON commits.number = log.commit_number WHERE log.map = ? AND seq > ? ORDER BY seq LIMIT ?",
+            (self._map, after_seq, limit),
         )
-        return [_log_entry(*row) for row in found]
+        return [
+            ChainedEntry(seq, kind, CommitId(Author(robot, incarnation), n), sha, chain)
+            for seq, kind, robot, incarnation, n, sha, chain in found
+        ]
 
     def totals(self) -> Totals:
         """Sizes."""
