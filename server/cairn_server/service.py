@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from itertools import chain
 
 from cairn_server.access.cancellation import StopTime
+from cairn_server.folding.cell_cache import CACHE_BYTES
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.damaged_cells import DamagedCells
 from cairn_server.folding.fold_process import FoldProcess
@@ -92,6 +93,7 @@ class Service:
             on_fold=self.live.folded,
             may_forget_s=upstream.may_forget_s,
             process=fold_process,
+            cells_bytes=int(settings.cache_share * CACHE_BYTES),
         )
         self.readiness = Readiness(store.health, folds, settings, self._fold_thread.is_alive)
         self.cells = Cells(store, damaged, on_heal=self._fold_thread.wake)
@@ -100,7 +102,7 @@ class Service:
         exports = MapExports(store, self.cells)
         self.views = ViewParts(
             CellViews(store, self.cells),
-            MapViews(store, self.cells),
+            MapViews(store, self.cells, cache_share=settings.cache_share),
             exports,
             ExportTickets(store, settings, exports),
         )
@@ -118,7 +120,9 @@ class Service:
             pushes,
             Uploads(store, pushes),
             Retracts(store, wanted, on_new=on_new),
-            MainReplies(store, self.cells, self.live, wanted, self.figures, stable=stable),
+            MainReplies(
+                store, self.cells, self.live, wanted, self.figures, stable=stable, cache_share=settings.cache_share
+            ),
             HeldCommits(store, wanted),
             upstream,
         )

@@ -11,7 +11,10 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from cairn_map.errors import BadInputError
+from cairn_map.machine_memory import standard_limit_bytes
 
+CACHES_BYTES = 1200 << 20
+"""Sum of the standard sizes of all caches: cells under change, cells read, their changes, pictures' cells and lists."""
 LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 
 
@@ -111,6 +114,20 @@ class Settings(BaseModel):
     """Processor time that the check of one commit may take, seconds; what its heads may claim takes some 20 s."""
     check_memory_bytes: Annotated[int, Field(ge=1 << 24)] = 3 << 29
     """Memory that the check of one commit may take; 2^29 bytes of evidence need twice their size."""
+
+    memory_bytes: Annotated[int, Field(ge=1 << 26)] | None = None
+    """Memory for the decoded cells of all caches, bytes; more than 1.26 GB is not taken. Default: a quarter of the
+    memory of the machine, or of its container."""
+
+    @property
+    def caches_bytes(self) -> int:
+        """Memory of all caches of decoded cells together."""
+        return min(CACHES_BYTES, standard_limit_bytes() if self.memory_bytes is None else self.memory_bytes)
+
+    @property
+    def cache_share(self) -> float:
+        """Part of its standard size that each cache takes."""
+        return self.caches_bytes / CACHES_BYTES
 
     def check_tls(self) -> None:
         """Refuse a certificate without its key, and a key without its certificate.

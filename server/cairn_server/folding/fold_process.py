@@ -24,6 +24,7 @@ from pathlib import Path
 
 from cairn_map.errors import CairnError
 from cairn_map.evidence.grid import CellKey
+from cairn_server.folding.cell_cache import CACHE_BYTES
 from cairn_server.folding.folding import Damage, FoldStore
 from cairn_server.folding.group_folding import Folded, LocalFolding
 from cairn_server.processes import die_with_parent
@@ -147,7 +148,7 @@ class FoldProcess:
             os.waitpid(self.pid, 0)
 
 
-def fork_folding(store_file: Path) -> FoldProcess:
+def fork_folding(store_file: Path, *, cells_bytes: int = CACHE_BYTES) -> FoldProcess:
     """Fork a process that folds the store in this file, which may be made later; only before there are threads."""
     ours, theirs = socket.socketpair()
     server = os.getpid()
@@ -157,26 +158,26 @@ def fork_folding(store_file: Path) -> FoldProcess:
         ours.close()
         try:
             die_with_parent(server)
-            _be_folder(Connection(theirs.detach()), store_file)
+            _be_folder(Connection(theirs.detach()), store_file, cells_bytes)
         finally:
             os._exit(0)
     theirs.close()
     return FoldProcess(Connection(ours.detach()), pid=pid)
 
 
-def _be_folder(link: Connection, store_file: Path) -> None:
+def _be_folder(link: Connection, store_file: Path, cells_bytes: int) -> None:
     """Run the process's side until the server is gone."""
     for number in (signal.SIGINT, signal.SIGTERM):  # sent to the whole group: the server ends first, in order
         signal.signal(number, signal.SIG_IGN)
     # Its log lines go to the server: two processes would write over each other's.
     logging.basicConfig(handlers=[_FarLog(link)], force=True)
-    answer_folds(link, Readers(store_file))
+    answer_folds(link, Readers(store_file), cells_bytes=cells_bytes)
 
 
-def answer_folds(link: Connection, readers: Readers) -> None:
+def answer_folds(link: Connection, readers: Readers, *, cells_bytes: int = CACHE_BYTES) -> None:
     """Plan the folds that the other end asks for, until it is gone."""
     far = _FarStore(readers, link)
-    here = LocalFolding(far, far.damaged)
+    here = LocalFolding(far, far.damaged, cells_bytes=cells_bytes)
     with suppress(EOFError, OSError):
         while True:
             ask: _Ask = link.recv()

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 
 from cairn_map.errors import CairnError
+from cairn_server.folding.cell_cache import CACHE_BYTES
 from cairn_server.folding.damaged_cells import DamagedCells
 from cairn_server.folding.fold_process import FoldProcess, LostProcessError
 from cairn_server.folding.group_folding import Folded, LocalFolding
@@ -41,6 +42,7 @@ class FoldThread:
         on_fold: Callable[[MapRow], None],
         may_forget_s: Callable[[str], float],
         process: FoldProcess | None = None,
+        cells_bytes: int = CACHE_BYTES,
     ) -> None:
         """Start the thread.
 
@@ -52,6 +54,7 @@ class FoldThread:
             on_fold: called after each group, with the map.
             may_forget_s: by a map's name, age of the store before which evidence may be dropped.
             process: plans the folds; without one, or once it has ended, this thread does.
+            cells_bytes: memory for the cells under change.
         """
         self._store = store
         self._health = health
@@ -64,7 +67,7 @@ class FoldThread:
         self._wake = threading.Event()
         self._closing = threading.Event()
         self._process = process
-        self._local = LocalFolding(store, damaged)
+        self._local = LocalFolding(store, damaged, cells_bytes=cells_bytes)
         self._wake.set()
         self._thread = threading.Thread(target=self._run, name="cairn-fold", daemon=True)
         self._thread.start()

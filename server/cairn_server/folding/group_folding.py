@@ -156,7 +156,9 @@ class Folded:
 class LocalFolding:
     """Folding in the calling thread, with the cells under change of all maps in memory; one thread at a time."""
 
-    def __init__(self, store: FoldStore, damaged: Damage) -> None:
+    def __init__(self, store: FoldStore, damaged: Damage, *, cells_bytes: int = CACHE_BYTES) -> None:
+        """Fold what waits in a store, with so much memory for the cells under change of all maps."""
+        self._cells_bytes = cells_bytes
         self._store = store
         self._damaged = damaged
         self._caches: dict[str, CellCache] = {}
@@ -171,7 +173,7 @@ class LocalFolding:
         """
         # The cells stay decoded from one group to the next: a robot's next scans touch the same ones.
         cache = self._caches.setdefault(row.name, CellCache(row.geometry))
-        cache.limit(CACHE_BYTES // maps)
+        cache.limit(self._cells_bytes // maps)
         waiting = self._waiting.setdefault(row.name, Waiting())
         turns, start_s = self._turns.setdefault(row.name, FoldTurns()), time.monotonic()
         count = fold_around(self._store, row, cache, waiting, self._damaged, limit=GROUP_MAX, order=turns.in_turn)

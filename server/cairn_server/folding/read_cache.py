@@ -54,15 +54,20 @@ class ChangeName:
 class ReadCache:
     """Caches of all maps; thread-safe. Callers must not change the values."""
 
-    def __init__(self, *, evidence_bytes: int = EVIDENCE_BYTES) -> None:
+    def __init__(self, *, share: float = 1.0) -> None:
+        """Make empty caches, each of this part of its standard size."""
         self._evidence: MadeOnce[State, Evidence] = MadeOnce(
-            limit_bytes=evidence_bytes, size_of=lambda evidence: evidence.size_bytes
+            limit_bytes=int(share * EVIDENCE_BYTES), size_of=lambda evidence: evidence.size_bytes
         )
-        self._stamps: MadeOnce[State, Stamps] = MadeOnce(limit_bytes=STAMPS_BYTES, size_of=lambda stamps: stamps.nbytes)
+        self._stamps: MadeOnce[State, Stamps] = MadeOnce(
+            limit_bytes=int(share * STAMPS_BYTES), size_of=lambda stamps: stamps.nbytes
+        )
         self._histories: MadeOnce[State, list[Contribution]] = MadeOnce(
-            limit_bytes=HISTORIES_BYTES, size_of=lambda entries: ENTRY_BYTES * (1 + len(entries))
+            limit_bytes=int(share * HISTORIES_BYTES), size_of=lambda entries: ENTRY_BYTES * (1 + len(entries))
         )
-        self.changes: MadeOnce[ChangeName, Change | None] = MadeOnce(limit_bytes=CHANGES_BYTES, size_of=_change_bytes)
+        self.changes: MadeOnce[ChangeName, Change | None] = MadeOnce(
+            limit_bytes=int(share * CHANGES_BYTES), size_of=_change_bytes
+        )
 
     def evidence(self, snapshot: Snapshot, listed: CellRow) -> Evidence:
         """Evidence of a listed cell.

@@ -2,6 +2,7 @@
 
     $ cairn serve --data ./cairn-data
     cairn map server on http://127.0.0.1:8750, data in cairn-data
+    memory for decoded cells: at most 1258 MB
 
 Robots push their measurements to it and fetch what they miss; stop it with Ctrl-C or SIGTERM. Everything
 that it acknowledged is in DIR/cairn.sqlite, so a crash or a power cut loses nothing.
@@ -47,6 +48,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from cairn_map.errors import BadInputError
+from cairn_server.folding.cell_cache import CACHE_BYTES
 from cairn_server.folding.fold_process import fork_folding
 from cairn_server.http.app import make_app
 from cairn_server.http.middleware.deadlines import protocol_of
@@ -99,7 +101,7 @@ def main(argv: list[str]) -> int:
     signal.signal(signal.SIGTERM, _stop)
     sys.setswitchinterval(SWITCH_S)
     # Forked before there are threads: a lock that another thread held at the fork would stay locked in the child.
-    folding = fork_folding(settings.folder / FILE_NAME)
+    folding = fork_folding(settings.folder / FILE_NAME, cells_bytes=int(settings.cache_share * CACHE_BYTES))
     keep_memory_small()
     with listen(settings.host, settings.port) as listener:
         try:
@@ -120,6 +122,7 @@ def _serve(service: Service, listener: socket.socket) -> None:
         log.warning("tokens and maps travel in the clear: give --tls-cert and --tls-key, or put a TLS proxy before it")
     tell_port(service.settings.folder, port)
     sys.stdout.write(f"cairn map server on {scheme}://{shown}:{port}, data in {service.settings.folder}\n")
+    sys.stdout.write(f"memory for decoded cells: at most {service.settings.caches_bytes / 1e6:.0f} MB\n")
     sys.stdout.flush()
     _Server(config, service).run(sockets=[listener])
 

@@ -65,6 +65,7 @@ class MainReplies:
         figures: ServerFigures,
         *,
         stable: StableVectors,
+        cache_share: float = 1.0,
     ) -> None:
         self._store = store
         self._cells = cells
@@ -72,7 +73,7 @@ class MainReplies:
         self._wanted = wanted
         self._figures = figures
         self._stable = stable
-        self._cache = ReadCache()
+        self._cache = ReadCache(share=cache_share)
 
     def missing(self, row: MapRow, branch: str, request: MissingRequest) -> bytes:
         """Frames that bring the asker to the head, wholly in memory before they are sent.

@@ -101,15 +101,16 @@ class _Task:
 class MapViews:
     """Draws maps of a store; thread-safe."""
 
-    def __init__(self, store: Store, cells: Cells) -> None:
+    def __init__(self, store: Store, cells: Cells, *, cache_share: float = 1.0) -> None:
+        """Draw the maps of a store, with caches of this part of their standard size."""
         self._store = store
         self._cells = cells
         self._room = threading.BoundedSemaphore(RENDERS_AT_ONCE)
         self._read_cells: MadeOnce[tuple[State, Layer], ReadCell] = MadeOnce(
-            limit_bytes=CELLS_BYTES, size_of=lambda read: read.size_bytes
+            limit_bytes=int(cache_share * CELLS_BYTES), size_of=lambda read: read.size_bytes
         )
         self._lists: MadeOnce[Cursor, Listing] = MadeOnce(
-            limit_bytes=LISTS_BYTES, size_of=lambda listing: LISTED_BYTES * (1 + len(listing[0]))
+            limit_bytes=int(cache_share * LISTS_BYTES), size_of=lambda listing: LISTED_BYTES * (1 + len(listing[0]))
         )
         self._times: dict[bytes, float] = {}
         """By the chain at the entry."""

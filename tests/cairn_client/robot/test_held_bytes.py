@@ -5,6 +5,7 @@ import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
@@ -13,10 +14,15 @@ from tests.fixtures.client.made import cells_of
 from tests.fixtures.client.robots import evidence_of, robot_in
 from tests.fixtures.map.costly import air, costly_evidence, dust
 
+from cairn_calib.rig.lidar import SpinningLidar
+from cairn_calib.rig.poses import look_at
+from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_client.folders.folder_status import folder_status
 from cairn_client.http.api import MapApi
 from cairn_client.replica.limits import NO_LIMITS, Limits
 from cairn_client.robot.robot import Robot
+from cairn_fusion.mapping.integrate import Integrator, integrate_scans
+from cairn_fusion.recording.scan import Scan
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry, cell_key
 from cairn_map.machine_memory import memory_bytes, standard_limit_bytes
@@ -24,6 +30,8 @@ from cairn_map.wire.messages import CreateMap
 
 DEEP = Geometry(voxel_edge_um=40_000, depth=7, channels=())
 FLAT = Geometry(voxel_edge_um=40_000, depth=5, channels=())
+SWEEPING = SpinningLidar(width=96, height=64, elevations_deg=tuple(np.linspace(15, -25, 64).tolist()))
+MAST = Rig(name="mast", cameras={"lidar": mount_camera(Spectrum.RANGE, SWEEPING, np.eye(4))})
 PER_BYTE = 200
 """Bytes held for each byte downloaded, at most."""
 
@@ -150,3 +158,28 @@ def test_the_memory_of_a_container_counts_and_not_its_machine_s(tmp_path: Path) 
     (groups / "memory/docker/1").mkdir(parents=True)
     (groups / "memory/docker/1/memory.limit_in_bytes").write_text("128000000\n")
     assert memory_bytes(tmp_path) == 128_000_000
+
+
+def sweep_of_80_m() -> Scan:
+    """A sweep of 64 beams over flat ground, walls all round at 80 m."""
+    slopes = np.radians(SWEEPING.elevations_deg)
+    ranges = np.minimum(79.0 / np.cos(slopes), np.where(slopes < 0, 1.5 / np.maximum(np.sin(-slopes), 1e-9), np.inf))
+    image = np.repeat(ranges[:, None], SWEEPING.width, axis=1).astype(np.float32)
+    return Scan(time_s=0.0, T_map_rig=look_at((0, 0, 1.5), (1, 0, 1.5)), range_camera="lidar", range_m=image)
+
+
+def test_an_honest_sweep_of_80_m_and_open_air_at_2_cm_are_accepted_and_held(server: LiveServer, tmp_path: Path) -> None:
+    wide, fine = (
+        Geometry(voxel_edge_um=400_000, depth=6, channels=()),
+        DEEP.model_copy(update={"voxel_edge_um": 20_000}),
+    )
+    sweep = integrate_scans([sweep_of_80_m()], MAST, wide, integrator=Integrator(max_range_m=81))
+    clear = {cell_key((i, 0, 0)): air(fine) for i in range(1)}
+    for name, geometry, diff in (("sweep", wide, sweep), ("clear", fine, clear)):
+        url = make_map(server, name, geometry)
+        push(url, tmp_path, diff, name=f"mole-{name}")
+        wait_for_fold(server, name)
+        with Robot(None, url, directory=tmp_path / f"wren-{name}", name="wren") as robot:
+            robot.sync()
+            assert robot.map.packed() == dict(sorted(diff.items()))
+            assert robot.map.size_bytes <= PER_BYTE * robot.traffic.down_bytes
