@@ -15,6 +15,9 @@ MAP = "lab"
 AUTHOR = "mole.0123456789abcdef"
 PATIENCE_S = 5.0
 """So long an attacker waits for an answer before it cuts its link."""
+PAUSE_S, SILENT_PAUSE_S = 1.0, 15.0
+"""Between two requests of one link: an attack is to cost the server more than the attacker, who shares its processors.
+Who only connects does so again when a server that counts nothing would cut it."""
 
 
 async def talk(port: int, data: bytes, *, wait_s: float) -> None:
@@ -111,7 +114,7 @@ async def attack(name: str, port: int, token: str) -> None:
     async def again_and_again() -> None:
         while True:
             await once(port, token)
-            await asyncio.sleep(0.1)
+            await asyncio.sleep(SILENT_PAUSE_S if once in (silent, handshake) else PAUSE_S)
 
     await asyncio.gather(*(again_and_again() for _ in range(count)))
 

@@ -4,13 +4,15 @@
     known     showed a good token            `limit` places, a sixteenth of them for one token; admins have no share
     proxy     comes from a trusted proxy     not counted; each of its requests is, as a connection is
 
-A new stranger always finds a place: where all are taken, the address that has most of them loses its oldest one. So
-silent connections push out each other, and a robot that shows its token within a round trip stays. A whole team behind
-one radio is one address only until then. An IPv6 address counts as its network of 64 bits, as one customer has
-them all. For one event loop.
+A new stranger finds a place: where all are taken, the address that has most of them loses its oldest one. So silent
+connections push out each other, and a robot that shows its token within a round trip stays. Each stays for half a
+second at least: an address that opens them faster has its new ones cut, before a handshake is computed for each. A
+whole team behind one radio is one address only until then. An IPv6 address counts as its network of 64 bits, as one
+customer has them all. For one event loop.
 """
 
 import ipaddress
+import time
 from collections import Counter
 from collections.abc import Callable, Hashable
 from functools import lru_cache
@@ -18,6 +20,8 @@ from functools import lru_cache
 from cairn_map.errors import UnreachableError
 
 STRANGERS_MIN, SHARE_MIN = 4, 4
+STAY_S = 0.5
+"""Time for which a stranger's connection stays at least, when only its own address wants its place."""
 KNOWN_PER_STRANGER, TOKENS = 4, 16
 """Known places for each stranger's; tokens that together fill all known places."""
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
@@ -26,9 +30,10 @@ Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 class ConnectionPlace:
     """Place of one connection."""
 
-    def __init__(self, address: str, cut: Callable[[], None]) -> None:
+    def __init__(self, address: str, cut: Callable[[], None], now_s: float) -> None:
         self.address = address
         self.cut = cut
+        self.since_s = now_s
         self.holder: Hashable = None
         """Token that was seen on it; None: a stranger's."""
 
@@ -36,7 +41,10 @@ class ConnectionPlace:
 class ConnectionPlaces:
     """Places of all connections of a server."""
 
-    def __init__(self, limit: int, *, trusted_proxies: str = "") -> None:
+    def __init__(
+        self, limit: int, *, trusted_proxies: str = "", steady_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._steady_s = steady_s
         self._limit = limit
         self._strangers_max = max(STRANGERS_MIN, limit // KNOWN_PER_STRANGER)
         self._share = max(SHARE_MIN, limit // TOKENS)
@@ -50,14 +58,13 @@ class ConnectionPlaces:
         return len(self._strangers), self._of.total()
 
     def enter(self, address: str, cut: Callable[[], None]) -> ConnectionPlace | None:
-        """Place of a new connection, which `cut` ends; None: it comes from a trusted proxy."""
-        group = network_of(address)
+        """Place of a new connection, which `cut` ends, perhaps at once; None: it comes from a trusted proxy."""
         if self._is_proxy(address):
             return None
-        if len(self._strangers) >= self._strangers_max:
-            self._cut_one()
-        place = ConnectionPlace(group, cut)
+        place = ConnectionPlace(network_of(address), cut, self._steady_s())
         self._strangers[place] = None
+        if len(self._strangers) > self._strangers_max:
+            self._cut_one(place)
         return place
 
     def note(self, place: ConnectionPlace, holder: Hashable) -> None:
@@ -83,7 +90,7 @@ class ConnectionPlaces:
         Raises:
             UnreachableError: kind `busy`, as `note`.
         """
-        place = ConnectionPlace("", lambda: None)
+        place = ConnectionPlace("", lambda: None, self._steady_s())
         self.note(place, holder)
         return place
 
@@ -99,11 +106,13 @@ class ConnectionPlaces:
             if not self._of[place.holder]:
                 del self._of[place.holder]
 
-    def _cut_one(self) -> None:
+    def _cut_one(self, newest: ConnectionPlace) -> None:
         """Cut the oldest connection of the address that has most; of equal ones, the oldest of all."""
         counts = Counter(place.address for place in self._strangers)
         most = max(counts.values())
-        place = next(place for place in self._strangers if counts[place.address] == most)
+        oldest = next(place for place in self._strangers if counts[place.address] == most)
+        is_flood = oldest.address == newest.address and newest.since_s - oldest.since_s < STAY_S
+        place = newest if is_flood else oldest
         del self._strangers[place]
         place.cut()
 

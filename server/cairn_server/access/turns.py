@@ -11,6 +11,7 @@ loop, so there are no locks; who waits costs no thread.
 import asyncio
 from collections import Counter, OrderedDict, deque
 from collections.abc import Hashable
+from itertools import chain
 
 from cairn_map.errors import UnreachableError
 
@@ -27,6 +28,7 @@ class Turns:
         self._wait_s = wait_s
         self._of: Counter[Hashable] = Counter()
         self._waiting: OrderedDict[Hashable, Waiting] = OrderedDict()
+        self._is_closed = False
 
     @property
     def taken(self) -> int:
@@ -37,8 +39,10 @@ class Turns:
         """Take a turn, which `give_back` ends.
 
         Raises:
-            UnreachableError: kind `busy`: it did not come in time.
+            UnreachableError: kind `busy`: it did not come in time; kind `shutting_down`.
         """
+        if self._is_closed:
+            raise _closed()
         if self._may_take(caller) and caller not in self._waiting:
             self._of[caller] += 1
             return
@@ -55,6 +59,14 @@ class Turns:
                 f"no turn in {self._wait_s:g} s: {self.taken} requests are at work, of this caller {self._of[caller]}"
             )
             raise UnreachableError("busy", message, retry_after_s=2.0) from None
+
+    def close(self) -> None:
+        """Refuse all that wait, and all that come; those at work go on."""
+        self._is_closed = True
+        waiting, self._waiting = self._waiting, OrderedDict()
+        for mine in chain.from_iterable(waiting.values()):
+            if not mine.done():
+                mine.set_exception(_closed())
 
     def give_back(self, caller: Hashable) -> None:
         """End a turn; the next one that waits has it."""
@@ -84,5 +96,9 @@ class Turns:
             queue.remove(mine)
             if not queue:
                 del self._waiting[caller]
-        elif mine.done() and not mine.cancelled():
+        elif mine.done() and not mine.cancelled() and mine.exception() is None:
             self.give_back(caller)
+
+
+def _closed() -> UnreachableError:
+    return UnreachableError("shutting_down", "the server is shutting down", retry_after_s=5.0)

@@ -54,6 +54,7 @@ from cairn_server.http.app import make_app
 from cairn_server.http.middleware.deadlines import protocol_of
 from cairn_server.http.middleware.log_format import LogForm, start_logging
 from cairn_server.http.middleware.secure_start import secured
+from cairn_server.http.middleware.work_turns import Lanes
 from cairn_server.operations import check as check_command
 from cairn_server.operations.backup import back_up_command, restore_command
 from cairn_server.operations.serve_options import serve_parser, settings_of
@@ -114,7 +115,8 @@ def main(argv: list[str]) -> int:
 
 
 def _serve(service: Service, listener: socket.socket) -> None:
-    config = config_of(make_app(service), service.settings)
+    app = make_app(service)
+    config = config_of(app, service.settings)
     host, port = listener.getsockname()[:2]
     shown = f"[{host}]" if ":" in host else host
     scheme = "https" if config.is_ssl else "http"
@@ -124,20 +126,26 @@ def _serve(service: Service, listener: socket.socket) -> None:
     sys.stdout.write(f"cairn map server on {scheme}://{shown}:{port}, data in {service.settings.folder}\n")
     sys.stdout.write(f"memory for decoded cells: at most {service.settings.caches_bytes / 1e6:.0f} MB\n")
     sys.stdout.flush()
-    _Server(config, service).run(sockets=[listener])
+    _Server(config, service, app.state.lanes).run(sockets=[listener])
 
 
 class _Server(uvicorn.Server):
-    """uvicorn's server, which at a signal says that it is not ready and ends live streams, as they never end alone."""
+    """uvicorn's server, which at a signal says that it is not ready and ends what would not end alone or in time."""
 
-    def __init__(self, config: uvicorn.Config, service: Service) -> None:
+    def __init__(self, config: uvicorn.Config, service: Service, lanes: Lanes) -> None:
         super().__init__(config)
         self._service = service
+        self._lanes = lanes
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """End live streams, then stop as uvicorn does."""
         self._service.stop_streams()
         super().handle_exit(sig, frame)
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Answer what is at work, and refuse what waits for its turn."""
+        self._lanes.close()
+        await super().shutdown(sockets)
 
 
 def config_of(app: FastAPI, settings: Settings, *, log_level: str = "warning") -> uvicorn.Config:

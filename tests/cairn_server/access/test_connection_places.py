@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cairn_map.errors import UnreachableError
-from cairn_server.access.connection_places import ConnectionPlace, ConnectionPlaces, network_of
+from cairn_server.access.connection_places import STAY_S, ConnectionPlace, ConnectionPlaces, network_of
 
 LIMIT, STRANGERS, SHARE = 64, 16, 4
 
@@ -14,27 +14,40 @@ class Door:
     """Places, and the connections that are open."""
 
     def __init__(self, **options: str) -> None:
-        self.places = ConnectionPlaces(LIMIT, **options)
-        self.open: dict[ConnectionPlace, str] = {}
+        self.now_s = 0.0
+        self.places = ConnectionPlaces(LIMIT, steady_s=lambda: self.now_s, **options)
+        self.links: list[ConnectionPlace | None] = []
+        self.cut: set[int] = set()
 
     def enter(self, address: str) -> ConnectionPlace:
-        place = self.places.enter(address, lambda: self.open.pop(place) and None)
+        link = len(self.links)
+        self.links.append(None)
+        place = self.places.enter(address, lambda: self.cut.add(link))
         assert place is not None
-        self.open[place] = address
+        self.links[link] = place
         return place
+
+    @property
+    def open(self) -> list[ConnectionPlace]:
+        """Connections that are neither cut nor left."""
+        return [place for link, place in enumerate(self.links) if place is not None and link not in self.cut]
+
+    def leave(self, place: ConnectionPlace) -> None:
+        self.places.leave(place)
+        self.cut.add(self.links.index(place))
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.sampled_from(["come", "go", "a", "b", "c"])), max_size=200))
 def test_a_newcomer_has_a_place_after_anything(steps: list[tuple[int, str]]) -> None:
     door = Door()
     for n, what in steps:
+        door.now_s += 0.1 * n
         if what == "come":
             door.enter(f"10.0.0.{n}")
         elif door.open:
-            place = list(door.open)[n % len(door.open)]
+            place = door.open[n % len(door.open)]
             if what == "go":
-                door.open.pop(place)
-                door.places.leave(place)
+                door.leave(place)
             else:
                 try:
                     door.places.note(place, what)
@@ -46,8 +59,8 @@ def test_a_newcomer_has_a_place_after_anything(steps: list[tuple[int, str]]) -> 
     newest = door.enter("10.0.0.9")
     door.places.note(newest, "new")
     assert newest in door.open
-    for place in list(door.open):
-        door.places.leave(place)
+    for place in door.open:
+        door.leave(place)
         door.places.leave(place)
     assert door.places.taken == (0, 0)
 
@@ -58,7 +71,11 @@ def test_silent_ones_push_out_each_other_and_neither_other_addresses_nor_who_sho
     door.places.note(known, "mole")
     for _ in range(700):
         door.enter("10.0.0.1")
-    assert {elsewhere, known} <= door.open.keys() and len(door.open) == STRANGERS + 1
+    assert {elsewhere, known} <= set(door.open) and len(door.open) == STRANGERS + 1
+    robot = door.enter("10.0.0.1")
+    assert robot not in door.open, "whoever floods keeps out its own address, half a second long"
+    door.now_s += STAY_S
+    assert door.enter("10.0.0.1") in door.open
 
 
 def test_two_hundred_robots_behind_one_address_all_find_a_place_one_after_the_other() -> None:

@@ -77,3 +77,19 @@ def test_who_is_gone_while_waiting_takes_no_place() -> None:
         return turns.taken
 
     assert asyncio.run(everybody()) == 0
+
+
+def test_who_waits_is_refused_when_the_server_stops_and_who_works_goes_on() -> None:
+    async def everybody() -> int:
+        turns = Turns(places=1, share=1, wait_s=60)
+        await turns.take("mole")
+        waiting = asyncio.gather(*(turns.take(who) for who in "abc"), return_exceptions=True)
+        await asyncio.sleep(0)
+        turns.close()
+        refused = [await waiting, await asyncio.gather(turns.take("late"), return_exceptions=True)]
+        kinds = [exc.kind for each in refused for exc in each if isinstance(exc, UnreachableError)]
+        assert kinds == ["shutting_down"] * 4
+        turns.give_back("mole")
+        return turns.taken
+
+    assert asyncio.run(everybody()) == 0

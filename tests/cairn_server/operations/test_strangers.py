@@ -62,6 +62,13 @@ def fresh(live: Live, method: str, path: str, token: str, **options: object) -> 
     return live.http.request(method, path, headers={**bearer(token), "Connection": "close"}, **options)  # type: ignore[arg-type]
 
 
+def is_served(live: Live) -> bool:
+    try:
+        return live.http.get("/healthz").status_code == 200
+    except httpx.TransportError:
+        return False
+
+
 @pytest.mark.processes  # openssl makes the certificate
 def test_robots_and_probes_are_served_beside_any_number_of_silent_connections(door: Live) -> None:
     row = door.new_map()
@@ -69,6 +76,7 @@ def test_robots_and_probes_are_served_beside_any_number_of_silent_connections(do
     with ExitStack() as links:
         silent(door, links)
         until(lambda: door.app.state.places.taken[0] == 4, "all places of strangers are taken")
+        until(lambda: is_served(door), "the newest of them has been there for a moment")
         for n in range(3):
             assert door.http.get("/healthz", headers={"Connection": "close"}).status_code == 200
             for token in tokens.values():

@@ -36,6 +36,8 @@ class SecureStart(asyncio.Protocol):
         assert isinstance(transport, asyncio.Transport)  # noqa: S101 - of TCP
         transport.pause_reading()  # until the upgrade reads
         self._place = self._places.enter(address_of(transport), transport.abort)
+        if transport.is_closing():
+            return  # cut at once: there are too many of its address
         self._task = asyncio.get_running_loop().create_task(self._shake_hands(transport))
 
     def data_received(self, data: bytes) -> None:

@@ -52,6 +52,11 @@ class Lanes:
         }
         self._rest = Lane(Turns(places=24, share=8, wait_s=WAIT_S), is_long=False)
 
+    def close(self) -> None:
+        """Refuse requests that wait; to be called when the server stops."""
+        for lane in (*self._by_path.values(), self._rest):
+            lane.turns.close()
+
     def of(self, path: str) -> Lane:
         """Lane of the requests of a path."""
         return next((lane for pattern, lane in self._by_path.items() if pattern.fullmatch(path)), self._rest)
