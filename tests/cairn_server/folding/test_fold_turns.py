@@ -1,6 +1,7 @@
 """Turns of robots in folding: one robot's costly commits hold up another's by one of them, and no longer."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import pytest
 from tests.fixtures.map.costly import air
@@ -108,3 +109,12 @@ def test_no_cell_stays_in_the_cache_that_takes_far_more_than_its_bytes() -> None
     with store.snapshot(row) as snapshot:
         stored = snapshot.cell(KEYS[0])
         assert stored is not None and stored.voxels == 8**WIDE.depth
+
+
+def test_a_commit_that_takes_far_more_than_its_bytes_ends_its_group() -> None:
+    clock = Clock()
+    turns = FoldTurns(steady_s=clock)
+    bodies = {KEYS[0]: bytes(500_000)}
+    large = [replace(commit, diff=bodies) for commit in waiting(MOLE, 3, first=0)]
+    assert len(fold(turns, clock, large, costs_s={"mole": 0.3})) == 3
+    assert len(fold(turns, clock, waiting(WREN, 3, first=0), costs_s={"wren": 0.3})) == 1
