@@ -140,7 +140,7 @@ def _diffs(scene: str, geometry: Geometry, scans: int) -> list[Diff]:
 def _fill(url: str, geometry: Geometry, diffs: list[Diff], made: Path | None) -> None:
     api = MapApi(url)
     if made:
-        push_prior_data(api, MAP, str(made), token=None)
+        push_prior_data(api, MAP, str(made))
     else:
         api.create_map(MAP, CreateMap(geometry=geometry))
     scout = _robot(url, "scout")

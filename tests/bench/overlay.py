@@ -127,7 +127,7 @@ def _server_rows(folder: Path, rig: Rig, scans: Sequence[Scan]) -> Iterator[Row]
         try:
             assert server.url
             api = MapApi(server.url)
-            push_prior_data(api, "lab", str(folder), token=None)
+            push_prior_data(api, "lab", str(folder))
             wait_until_folded(api, "lab")
             views = [_view(scan.T_map_rig @ rig[CAMERA].transform) for scan in scans]
             cold_s, warm_s = [], []

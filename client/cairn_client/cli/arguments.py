@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 
 from cairn_client.http.api import MapApi
 from cairn_client.http.map_url import split_map_url
+from cairn_client.http.origin_tokens import NO_TOKENS, OriginTokens
 from cairn_client.sync.responses import shown_text
 from cairn_map.errors import EXIT_CODES
 
@@ -79,17 +80,42 @@ def add_map_parser(commands: Subparsers, name: str, run: Run, *, text: str) -> a
     return added
 
 
-def add_token(parser: argparse.ArgumentParser) -> None:
-    """Add `--token`."""
+class AddTokens(argparse.Action):
+    """Action of `--token`: a token for the command's first URL, or for the server that it names."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """Add the option's text to the tokens so far."""
+        known: OriginTokens = getattr(namespace, self.dest)
+        setattr(namespace, self.dest, known.with_text(values))
+
+
+def add_token(
+    parser: argparse.ArgumentParser,
+    option: str = "--token",
+    *,
+    variable: str = TOKEN_VARIABLE,
+    text: str = "admin, enrolment or robot token",
+) -> None:
+    """Add `--token`: the parsed value is an `OriginTokens`."""
     parser.add_argument(
-        "--token", default=os.environ.get(TOKEN_VARIABLE), help=f"admin, enrolment or robot token (${TOKEN_VARIABLE})"
+        option,
+        action=AddTokens,
+        metavar="TOKEN",
+        default=NO_TOKENS.with_text(os.environ.get(variable, "")),
+        help=f"{text}; of another server ORIGIN=TOKEN, such as http://base:8750=TOKEN (${variable})",
     )
 
 
-def api_of(map_url: str, token: str | None) -> tuple[MapApi, str]:
-    """The server of a map's URL, and the map's name."""
+def api_of(map_url: str, tokens: OriginTokens) -> tuple[MapApi, str]:
+    """The server of a map's URL, with the token that is for it, and the map's name."""
     server, name = split_map_url(map_url)
-    return MapApi(server, token=token), name
+    return MapApi(server, token=tokens.of(server)), name
 
 
 def say(text: str = "") -> None:

@@ -34,6 +34,8 @@ from cairn_client.cli.doctor_checks import (
 )
 from cairn_client.folders.state_folder import opened_replica
 from cairn_client.http.map_url import split_map_url
+from cairn_client.http.origin_tokens import OriginTokens
+from cairn_client.robot.membership import own_token
 from cairn_map.errors import CairnError
 
 SOUND, ILL = 0, 1
@@ -56,17 +58,17 @@ def main(argv: list[str]) -> int:
     return ILL if any(check.verdict is CheckResult.FAIL for check in checks) else SOUND
 
 
-def _checks(target: str | None, token: str | None) -> Iterator[Check]:
+def _checks(target: str | None, tokens: OriginTokens) -> Iterator[Check]:
     yield from installation_checks()
     if target is None or "://" in target:
         yield disk_check(Path())
     if target is not None and "://" in target:
-        yield from _of_url(target, token)
+        yield from _of_url(target, tokens.of(target))
     elif target is not None:
         yield from folder_checks(Path(target))
-        url, own_token = _link_of(Path(target))
+        url, kept_token = _link_of(Path(target))
         if url is not None:
-            yield from _of_url(url, own_token or token)
+            yield from _of_url(url, kept_token or tokens.of(url))
 
 
 def _of_url(url: str, token: str | None) -> Iterator[Check]:
@@ -78,7 +80,8 @@ def _link_of(folder: Path) -> tuple[str | None, str | None]:
     """The URL that a copy is from, and the token that it has; Nones where the folder cannot be opened."""
     try:
         with opened_replica(folder) as replica:
-            return replica.state.url, replica.state.token
+            url = replica.state.url
+            return url, own_token(replica.state, url) if url else None
     except CairnError:  # said already
         return None, None
 

@@ -15,15 +15,15 @@ if something could not be handed over; the log gives the reason.
 
 import argparse
 import logging
-import os
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from cairn_client.cli.arguments import parser, say
+from cairn_client.cli.arguments import add_token, parser, say
 from cairn_client.http.backoff import Backoff
 from cairn_client.http.map_url import split_map_url
+from cairn_client.http.origin_tokens import OriginTokens
 from cairn_client.relay.carried_commits import CarriedCommits
 from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
 from cairn_client.relay.round import REST_S, RelayReport, RelaySide, Undelivered, log_report, relay_round
@@ -33,7 +33,7 @@ from cairn_map.wire.relay_peer import MapEnd
 
 log = logging.getLogger(__name__)
 
-TOKENS = ("CAIRN_TOKEN", "CAIRN_TOKEN_THERE")
+TOKEN_THERE = "CAIRN_TOKEN_THERE"  # noqa: S105 - the variable's name
 CUTS_MAX = 6
 """Most rounds in a row that break without moving a commit or a part of one."""
 WAIT_MAX_S = 60.0
@@ -51,8 +51,8 @@ def main(argv: list[str]) -> int:
     name = Path((args.here if "://" in args.here else args.there).rstrip("/")).name
     with ExitStack() as stack:
         here, there = (
-            stack.enter_context(_place(text, token, name, size_bytes_max=int(args.folder_mb * MEGABYTE)))
-            for text, token in ((args.here, args.token), (args.there, args.token_there))
+            stack.enter_context(_place(text, tokens, name, size_bytes_max=int(args.folder_mb * MEGABYTE)))
+            for text, tokens in ((args.here, args.token), (args.there, args.token_there.with_named_of(args.token)))
         )
         resting = Undelivered()
         report = _once(here, there, resting, map_name=name, where=args.there)
@@ -92,12 +92,12 @@ def _once(here: MapEnd, there: MapEnd, resting: Undelivered, *, map_name: str, w
 
 
 @contextmanager
-def _place(text: str, token: str | None, map_name: str, *, size_bytes_max: int) -> Iterator[MapEnd]:
+def _place(text: str, tokens: OriginTokens, map_name: str, *, size_bytes_max: int) -> Iterator[MapEnd]:
     if "://" not in text:
         yield CarriedCommits(Path(text), map_name, size_bytes_max=size_bytes_max)
         return
     server_url, map_name = split_map_url(text)
-    with RelayApi(server_url, token=token) as api:
+    with RelayApi(server_url, token=tokens.of(server_url)) as api:
         yield ServerEnd(api, map_name)
 
 
@@ -105,10 +105,8 @@ def _parser() -> argparse.ArgumentParser:
     added = parser("cairn relay", __doc__)
     added.add_argument("here", metavar="PLACE", help="a map's URL (http://HOST:PORT/maps/NAME) or a folder")
     added.add_argument("there", metavar="PLACE", help="another one")
-    added.add_argument("--token", default=os.environ.get(TOKENS[0]), help=f"token of the first place (${TOKENS[0]})")
-    added.add_argument(
-        "--token-there", default=os.environ.get(TOKENS[1]), help=f"token of the second place (${TOKENS[1]})"
-    )
+    add_token(added, text="token of the first place")
+    add_token(added, "--token-there", variable=TOKEN_THERE, text="token of the second place")
     added.add_argument("--every", type=float, metavar="SECONDS", help="go on, with this pause between rounds (once)")
     added.add_argument(
         "--folder-mb",

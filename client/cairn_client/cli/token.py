@@ -80,13 +80,13 @@ def _create(args: argparse.Namespace) -> int:
         request = CreateToken(role=args.role, map=args.map, robot=args.robot, lifetime_s=lifetime_s)
     except ValidationError as exc:
         raise BadInputError("bad_message", first_error(exc)) from exc
-    with MapApi(args.server, token=args.token) as api:
+    with MapApi(args.server, token=args.token.of(args.server)) as api:
         say(api.create_token(robot_name(args.name), request).token)
     return 0
 
 
 def _list(args: argparse.Namespace) -> int:
-    with MapApi(args.server, token=args.token) as api:
+    with MapApi(args.server, token=args.token.of(args.server)) as api:
         infos = api.tokens()
     if args.json:
         say(json.dumps([info.model_dump(mode="json") for info in infos]))
@@ -105,13 +105,13 @@ def _line(info: TokenInfo) -> str:
 
 
 def _rotate(args: argparse.Namespace) -> int:
-    with MapApi(args.server, token=args.token) as api:
+    with MapApi(args.server, token=args.token.of(args.server)) as api:
         say(api.rotate_token(_name(args.name)).token)
     return 0
 
 
 def _revoke(args: argparse.Namespace) -> int:
-    with MapApi(args.server, token=args.token) as api:
+    with MapApi(args.server, token=args.token.of(args.server)) as api:
         api.revoke_token(_name(args.name))
     return 0
 

@@ -18,13 +18,14 @@ from typing import TYPE_CHECKING, Any, Self
 from pydantic import TypeAdapter, ValidationError
 
 from cairn_client.http.answer_reading import CODING, body_of_error, header_text, parts_of, sent_again
+from cairn_client.http.origin_tokens import origin_of, without_token
 from cairn_client.sync.requests import Box, GetUpload, PutPart
 from cairn_client.sync.responses import Answer, FetchedCell, Traffic, error_of, list_of, unreachable
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import cursor_from_text
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import EMPTY, VersionVector, vector_digest, version_vector_from_json
-from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError, first_error
+from cairn_map.errors import BadInputError, CairnError, DamagedDataError, UnreachableError, first_error
 from cairn_map.evidence.fingerprint import fingerprint_from_hex
 from cairn_map.evidence.grid import Cell
 from cairn_map.wire.access_messages import CreateToken, NewSecret, RobotClosed, RobotUse, TokenInfo
@@ -147,6 +148,8 @@ class MapApi:
         except httpx.InvalidURL as exc:
             raise BadInputError("bad_url", f"{server_url!r} is not a URL: {exc}") from exc
         self._client.headers.clear()  # a robot that asks whether anything is new pays for each of them
+        self.origin = origin_of(server_url)
+        """Origin of the server, the only one that the token is sent to: redirects are not followed."""
         self.use_token(token)
 
     def __enter__(self) -> Self:
@@ -352,6 +355,10 @@ class MapApi:
                 body += part
             return Answer(response.status_code, response.headers, bytes(body))
 
+    def _lacks_token(self, error: CairnError) -> bool:
+        """True if the server wants a token, and this client has none for it."""
+        return self.token is None and error.kind == "no_token"
+
     @contextmanager
     def _open(
         self,
@@ -378,7 +385,8 @@ class MapApi:
                 self.traffic.up_bytes += len(content)
                 if not response.is_success and response.status_code != NOT_MODIFIED:
                     retry_after = response.headers.get("Retry-After", "")
-                    raise error_of(response.status_code, retry_after, body_of_error(response))
+                    error = error_of(response.status_code, retry_after, body_of_error(response))
+                    raise without_token(self.origin, error.message) if self._lacks_token(error) else error
                 yield response
         except httpx.TransportError as exc:
             raise unreachable(exc) from exc

@@ -112,7 +112,9 @@ class ReplicaState:
     default_cursor = Field[Cursor]("default_cursor", cursor_from_text)
     """Cursor of every cell that is not held."""
     token = Field("token", str)
-    """Token that the server gave to the robot."""
+    """Token that a server gave to the robot."""
+    token_origin = Field("token_origin", str)
+    """Origin of the server that gave the token, `http://base:8750`; None in a folder of an earlier version."""
     may_register_openly = Field("door", lambda text: text == OPEN, lambda is_open: OPEN if is_open else None)
     """True if the robot registered without any token, and so can register again."""
     contact = _model_field("contact", Contact)

@@ -4,12 +4,26 @@ from collections.abc import Callable, Sequence
 from typing import ParamSpec, TypeVar
 
 from cairn_client.http.api import MapApi
+from cairn_client.http.origin_tokens import origin_of
 from cairn_client.replica.replica import Replica
+from cairn_client.replica.replica_state import ReplicaState
 from cairn_map.errors import BadInputError, DeniedError
 from cairn_map.wire.messages import Mode, Register
 
 P = ParamSpec("P")
 T = TypeVar("T")
+
+
+def own_token(state: ReplicaState, url: str) -> str | None:
+    """Token that a robot has from the server of this URL; None if it has none, or one of another server."""
+    origin = state.token_origin or origin_of(state.url or url)
+    return state.token if origin == origin_of(url) else None
+
+
+def bind_token(state: ReplicaState, url: str) -> None:
+    """Note whose token a folder of an earlier version has: it is of the server of its last use, else of this URL's."""
+    if state.token is not None and state.token_origin is None:
+        state.token_origin = origin_of(state.url or url)
 
 
 class Membership:
@@ -33,14 +47,18 @@ class Membership:
         self._sensors = list(sensors)
         self._enrolment_token = enrolment_token
         self._is_known_by_token = False
-        api.use_token(replica.state.token or enrolment_token)
+        api.use_token(self._own_token or enrolment_token)
+
+    @property
+    def _own_token(self) -> str | None:
+        return own_token(self._replica.state, self._api.origin)
 
     def as_member(self, action: Callable[P, T], *args: P.args, **options: P.kwargs) -> T:
         """Result of an action as a robot that the server knows; it registers first if it must.
 
         If the server does not take the token, it registers again, and does the action again.
         """
-        if self._replica.state.token is None and not self._is_known_by_token:
+        if self._own_token is None and not self._is_known_by_token:
             self._register()
         try:
             return action(*args, **options)
@@ -63,7 +81,7 @@ class Membership:
         A robot whose token came from an admin stays, and so does one that has nothing but the token in its folder.
         """
         may_return = self._enrolment_token is not None or self._replica.state.may_register_openly
-        if self._replica.state.token is None or not may_return:
+        if self._own_token is None or not may_return:
             return False
         self.leave()
         return True
@@ -82,5 +100,7 @@ class Membership:
         if registered.map.geometry != self._replica.geometry:
             raise BadInputError("other_geometry", f"map {self._map_name} has another grid than this robot's directory")
         self._replica.state.note_model(registered.map.sensor_model)
-        self._replica.state.token = registered.token
-        self._replica.state.may_register_openly = self._enrolment_token is None
+        with self._replica.state.store.transaction():
+            self._replica.state.token = registered.token
+            self._replica.state.token_origin = self._api.origin
+            self._replica.state.may_register_openly = self._enrolment_token is None

@@ -30,7 +30,7 @@ from cairn_client.robot.alignment import STEP_M, STEP_RAD, align_points, points_
 from cairn_client.robot.alignment_verdict import Alignment
 from cairn_client.robot.amending import Amending, AnyCommit
 from cairn_client.robot.kept_scans import KeptScans
-from cairn_client.robot.membership import Membership
+from cairn_client.robot.membership import Membership, bind_token
 from cairn_client.robot.robot_events import SIZE, Committed, Events, EventStream
 from cairn_client.robot.rounds import Rounds
 from cairn_client.robot.status_report import OwnStatus
@@ -125,6 +125,7 @@ class Robot:
             self._kept_scans = KeptScans(Path(directory) / "scans", bytes_max=keep_scans_bytes)
             self._replica = self._open_replica(Path(directory), geometry, limits)
             opened.callback(self._replica.close)
+            bind_token(self._replica.state, map_url)
             self._replica.state.note_use(url=map_url, mode=mode)
             carrier = carrier_in(Path(directory), self._api, self._map_name, size_bytes_max=carry_bytes_max)
             # Then what works on it; nothing is sent before the first round.

@@ -27,7 +27,7 @@ def main(argv: list[str]) -> int:
     add_token(command)
     args = command.parse_args(argv)
     folder = args.folder or Path(split_map_url(args.url)[1])
-    pulled = clone(args.url, folder, token=args.token, name=args.name)
+    pulled = clone(args.url, folder, token=args.token.of(args.url), name=args.name)
     if args.json:
         say(json.dumps(pulled.as_json()))
         return 0

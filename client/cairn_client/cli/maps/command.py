@@ -69,7 +69,7 @@ def _add_ls(commands: Subparsers) -> None:
 
 
 def _ls(args: argparse.Namespace) -> int:
-    with MapApi(args.server, token=args.token) as api:
+    with MapApi(args.server, token=args.token.of(args.server)) as api:
         infos = api.maps()
     if args.json:
         say(json.dumps([info.model_dump(mode="json") for info in infos]))

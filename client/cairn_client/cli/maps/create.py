@@ -12,6 +12,7 @@ from pathlib import Path
 from cairn_client.cli.arguments import Subparsers, add_map_parser, api_of, say, shown_length
 from cairn_client.cli.maps.map_export import fetch_map
 from cairn_client.http.api import MapApi
+from cairn_client.http.origin_tokens import NO_TOKENS, OriginTokens
 from cairn_map.codec.cell_code import DecodedCell
 from cairn_map.commits.commit import Commit, CommitMeta, make_commit
 from cairn_map.commits.ids import INITIAL, Author, CommitId, Incarnation
@@ -37,11 +38,12 @@ def add_parser(commands: Subparsers) -> None:
 
 
 def _create(args: argparse.Namespace) -> int:
-    api, name = api_of(args.map, args.token)
+    tokens = args.token.bound_to(args.map)
+    api, name = api_of(args.map, tokens)
     geometry = _geometry(args)
     if args.source is not None:
         with api:
-            info, count, added = push_prior_data(api, name, args.source, token=args.token)
+            info, count, added = push_prior_data(api, name, args.source, tokens=tokens)
         say_map(info)
         say(f"started from {args.source}: {count} cells, as the commit of author `initial`")
         if added < count:
@@ -63,17 +65,20 @@ def say_map(info: MapInfo) -> None:
     )
 
 
-def push_prior_data(api: MapApi, name: str, source: str, *, token: str | None) -> tuple[MapInfo, int, int]:
+def push_prior_data(
+    api: MapApi, name: str, source: str, *, tokens: OriginTokens = NO_TOKENS
+) -> tuple[MapInfo, int, int]:
     """Create a map with the grid and the evidence of a folder or another map; returns it, the
     count of cells, and how many of them were added.
 
-    It may be repeated after a cut link: evidence that is there already is not added again.
+    A source that is a URL is read with the token that `tokens` has for its server. It may be repeated after a cut
+    link: evidence that is there already is not added again.
 
     Raises:
         BadInputError: the source is neither a folder of cells nor a map's URL.
         ConflictError: the map exists with another grid.
     """
-    head, cells = _open(source, token)
+    head, cells = _open(source, tokens)
     api.create_map(name, CreateMap(geometry=head.geometry, sensor_model=head.sensor_model))
     count = added = 0
     author: Author | None = None
@@ -85,7 +90,7 @@ def push_prior_data(api: MapApi, name: str, source: str, *, token: str | None) -
     return api.map_info(name), count, added
 
 
-def _open(source: str, token: str | None) -> tuple[FolderHead, Iterable[DecodedCell]]:
+def _open(source: str, tokens: OriginTokens) -> tuple[FolderHead, Iterable[DecodedCell]]:
     if "://" not in source:
         folder = Path(source)
         head = read_head(folder)
@@ -96,7 +101,7 @@ def _open(source: str, token: str | None) -> tuple[FolderHead, Iterable[DecodedC
             except BadInputError as exc:
                 raise BadInputError(exc.kind, f"{folder}: {exc.message}") from exc
         return head, read_cells(folder, head.geometry)
-    api, name = api_of(source, token)
+    api, name = api_of(source, tokens)
     info = api.map_info(name)
     return FolderHead(geometry=info.geometry, sensor_model=info.sensor_model), _fetched(api, name)
 

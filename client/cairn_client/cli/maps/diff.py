@@ -11,7 +11,8 @@
 
 A and B are a map's URL, a folder of `cairn clone`, a robot's state folder (commits that wait are part of its map), or a
 folder of `cairn map export --cells`. Cells are compared by their fingerprints: none is downloaded.
-As with diff, the exit code is 0 if they are equal, and 1 if they are not or if they cannot be compared.
+A token is sent to its own server only: `--token TOKEN` is that of the first URL, `--token http://base:8750=TOKEN` of
+another. As with diff, the exit code is 0 if they are equal, and 1 if they are not or if they cannot be compared.
 """
 
 import argparse
@@ -51,7 +52,9 @@ def main(argv: list[str]) -> int:
 
 def _sides(args: argparse.Namespace) -> tuple[MapSide, MapSide]:
     other = args.b or url_of(Path(args.a))
-    return side_of(args.a, token=args.token), side_of(other, token=args.token)
+    first = next((place for place in (args.a, other) if "://" in place), other)
+    tokens = args.token.bound_to(first)
+    return side_of(args.a, tokens=tokens), side_of(other, tokens=tokens)
 
 
 def _show(a: MapSide, b: MapSide, found: Difference) -> None:

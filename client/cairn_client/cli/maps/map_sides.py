@@ -12,6 +12,7 @@ from pathlib import Path
 from cairn_client.cli.arguments import api_of
 from cairn_client.folders.state_folder import is_state_folder, opened_replica
 from cairn_client.http.http_link import index_of
+from cairn_client.http.origin_tokens import OriginTokens
 from cairn_map.codec.cell_code import encode_cell
 from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.errors import BadInputError
@@ -70,7 +71,7 @@ class Difference:
         return not (self.only_a or self.only_b or self.other)
 
 
-def side_of(place: str, *, token: str | None) -> MapSide:
+def side_of(place: str, *, tokens: OriginTokens) -> MapSide:
     """The map at a place.
 
     Raises:
@@ -78,7 +79,7 @@ def side_of(place: str, *, token: str | None) -> MapSide:
         CairnError: it cannot be read, or is damaged.
     """
     if "://" in place:
-        return _of_server(place, token)
+        return _of_server(place, tokens)
     folder = Path(place)
     if is_state_folder(folder):
         return _of_state(folder)
@@ -115,8 +116,8 @@ def difference(a: MapSide, b: MapSide) -> Difference:
     )
 
 
-def _of_server(url: str, token: str | None) -> MapSide:
-    api, name = api_of(url, token)
+def _of_server(url: str, tokens: OriginTokens) -> MapSide:
+    api, name = api_of(url, tokens)
     with api:
         geometry, index = api.map_info(name).geometry, index_of(api, name)
     cells = {

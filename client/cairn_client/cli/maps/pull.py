@@ -14,6 +14,7 @@ from pathlib import Path
 
 from cairn_client.cli.arguments import add_token, parser, say, shown_bytes
 from cairn_client.folders.map_copy import pull
+from cairn_client.folders.state_folder import url_of
 
 
 def main(argv: list[str]) -> int:
@@ -23,7 +24,7 @@ def main(argv: list[str]) -> int:
     command.add_argument("--json", action="store_true", help="print JSON")
     add_token(command)
     args = command.parse_args(argv)
-    pulled = pull(args.folder, token=args.token)
+    pulled = pull(args.folder, token=args.token.of(url_of(args.folder)))
     if args.json:
         say(json.dumps(pulled.as_json()))
     elif not pulled.changed_cells and not pulled.new_commits:

@@ -58,7 +58,7 @@ def _replay(args: argparse.Namespace) -> int:
         args.map,
         directory=state,
         name=name,
-        token=args.token,
+        token=args.token.of(args.map),
         mode=args.mode,
         geometry=geometry,
         integrator=integrator,

@@ -132,7 +132,7 @@ def _robot(args: argparse.Namespace, spool: Spool, stopping: threading.Event) ->
         args.map,
         directory=state,
         name=name,
-        token=args.token,
+        token=args.token.of(args.map),
         mode=args.mode,
         geometry=ensure_map(args, source) if source else None,
         integrator=Integrator(min_range_m=args.min_range, max_range_m=args.max_range),

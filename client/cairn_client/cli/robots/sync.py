@@ -100,7 +100,7 @@ def _robot(args: argparse.Namespace) -> Robot:
         url,
         directory=args.folder,
         name=args.name or (known.robot if known else NEW_COPY),
-        token=args.token,
+        token=args.token.of(url),
         mode=mode,
         scope=replace(scope_of(args, mode), wanted=_wanted(args, url, mode)),
         link=args.link,
