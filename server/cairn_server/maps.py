@@ -19,6 +19,7 @@ from cairn_server.access.auth import new_token, token_hash
 from cairn_server.live.hub import Hub
 from cairn_server.live.live_map import LiveRobots
 from cairn_server.live.robot_reports import RobotReports
+from cairn_server.store.admission import OWN_WORD, Grounds
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import Branch, EntrySize, MapRow
 from cairn_server.sync.handing_over import server_key
@@ -66,11 +67,12 @@ class Maps:
             server_key=server_key(row).public_key.hex(),
         )
 
-    def register(self, row: MapRow, request: Register) -> Registered:
+    def register(self, row: MapRow, request: Register, grounds: Grounds = OWN_WORD) -> Registered:
         """Register a robot: its branch and a new token; registering again replaces the old token.
 
         Raises:
             BadInputError: kind `reserved_name`.
+            DeniedError: kind `not_admitted`: the name is bound to another key.
         """
         if request.robot in RESERVED_NAMES:
             raise BadInputError(
@@ -78,7 +80,7 @@ class Maps:
             )
         token = new_token()
         branch = Branch(request.robot, request.mode, tuple(request.sensors), None, time.time(), request.incarnation)
-        self._store.register(row, branch, token_hash(token))
+        self._store.register(row, branch, token_hash(token), grounds)
         self._hub.robot_came(row, RobotSign(branch=branch.name, mode=branch.mode, time_s=branch.last_seen_s))
         return Registered(branch=request.robot, token=token, map=self.info(row))
 

@@ -33,6 +33,7 @@ from cairn_server.metrics import (
 )
 from cairn_server.settings import Settings
 from cairn_server.store.store import Store
+from cairn_server.sync.admissions import Admissions
 from cairn_server.sync.handing_over import UpstreamProgress
 from cairn_server.sync.held_commits import HeldCommits, WantedCommits
 from cairn_server.sync.pushes import Pushes
@@ -52,6 +53,7 @@ WORK_GRACE_S = 4.0
 class SyncParts:
     """Parts of the sync protocol."""
 
+    admissions: Admissions
     pushes: Pushes
     uploads: Uploads
     retracts: Retracts
@@ -114,9 +116,11 @@ class Service:
             self._fold_thread.wake()
             upstream.wake()
 
-        pushes = Pushes(store, settings, self.live, wanted, on_new=on_new)
+        admissions = Admissions(store, settings.quotas)
+        pushes = Pushes(store, settings, self.live, wanted, admissions, on_new=on_new)
         stable = StableVectors(store.age, settings.stable_after_s)
         return SyncParts(
+            admissions,
             pushes,
             Uploads(store, pushes),
             Retracts(store, wanted, on_new=on_new),

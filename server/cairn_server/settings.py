@@ -44,6 +44,8 @@ class Quotas(BaseModel):
     """Bytes that a robot may push in a day (UTC)."""
     cells_per_day: Count = 4_000_000
     """Cells that a robot's commits may touch in a day, together."""
+    registrations_per_hour: Count = 600
+    """Robots that one enrolment token may register in an hour, all at once or one by one."""
     cells_per_commit: Count = None
     """Cells that one commit may touch; FORMAT.md allows 4096 in any case."""
     map_extent_m: Metres = 100_000.0

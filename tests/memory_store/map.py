@@ -6,11 +6,14 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
+from tests.memory_store.robot_keys import admit_commit
+
 from cairn_map.commits.cursor import ENTRY_FOLD, Cursor, first_chain
 from cairn_map.commits.ids import SERVERS_OWN, Author, CommitId
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.store.admission import RobotKey
 from cairn_server.store.numbering import AGAIN_KEPT_S, EvidenceGoneError, Numbering, check_number
 from cairn_server.store.shares import (
     ALARM_PART,
@@ -94,6 +97,8 @@ class MemoryMap:
     cells: dict[CellKey, CellRow] = field(default_factory=dict)
     branches: dict[str, Branch] = field(default_factory=dict)
     statuses: dict[str, str] = field(default_factory=dict)
+    keys: dict[Author, RobotKey] = field(default_factory=dict)
+    """That names are bound to."""
 
     def copied(self) -> "MemoryMap":
         """The same in other dictionaries."""
@@ -112,6 +117,7 @@ class MemoryMap:
         self._check_kept(commit.retracts)
         intervals = self._checked_intervals(commit.id)
         self._check_sums(commit)
+        admit_commit(self.keys, commit.id.author, commit.grounds)
         top, _ = self.authors.get(commit.id.author, (0, 0))
         self.authors[commit.id.author] = max(top, commit.id.n), intervals
         self.commits[commit.id] = Kept(

@@ -11,14 +11,16 @@ from dataclasses import replace
 from tests.memory_store.figures import MemoryHealth, MemoryNotes, MemoryShares, MemoryUses
 from tests.memory_store.map import new_memory_map
 from tests.memory_store.maps import MemoryMaps
+from tests.memory_store.robot_keys import MemoryRobotKeys, admit_registration
 from tests.memory_store.snapshot import MemorySnapshot
 from tests.memory_store.tokens import MemoryAuditLog, MemoryTokens
 
 from cairn_map.commits.cursor import Cursor
-from cairn_map.commits.ids import Author, CommitId
+from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName
 from cairn_map.errors import CairnError, ConflictError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.store.admission import OWN_WORD, Grounds
 from cairn_server.store.store import Store
 from cairn_server.store.store_age import CLOCKS, AgeMark, Clocks, StoreAge
 from cairn_server.store.store_rows import Branch, Fold, MapRow, NewCommit, StoredCommit
@@ -33,6 +35,7 @@ class MemoryStore:
         self._maps = MemoryMaps()
         self.age = StoreAge(AgeMark(), clocks)
         self.tokens = MemoryTokens(self._maps, self.age)
+        self.keys = MemoryRobotKeys(self._maps)
         self.audit_log = MemoryAuditLog(self._maps)
         self.health = MemoryHealth(self._maps, self.age)
         self.uses = MemoryUses(self._maps)
@@ -132,9 +135,11 @@ class MemoryStore:
         """One state of the map."""
         yield MemorySnapshot(self._maps.shared(row))
 
-    def register(self, row: MapRow, branch: Branch, token_hash: bytes) -> None:
+    def register(self, row: MapRow, branch: Branch, token_hash: bytes, grounds: Grounds = OWN_WORD) -> None:
         """Make a branch and its token, or give an existing one another secret."""
         with self._maps.changing(row) as changed:
+            author = Author(RobotName(branch.name), Incarnation(branch.incarnation))
+            admit_registration(changed.keys, author, grounds)
             known = changed.branches.get(branch.name)
             # A new incarnation may have lost its disk: where it stands is not known before it fetches.
             cursor = known.cursor if known and known.incarnation == branch.incarnation else None

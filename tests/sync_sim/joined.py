@@ -44,6 +44,7 @@ SELDOM = (
     "roll_back_disk",
     "lose_disk",
     "level_and_forget",
+    "admit",
 )
 
 
@@ -217,6 +218,10 @@ class JoinedHistory:
             if self._random.random() < 0.5:
                 server.forget_evidence()
 
+    def _admit(self) -> None:
+        """An operator of one server lets in the robots that came to it with another key."""
+        self._random.choice(self._servers).admit_all()
+
     # What must hold
 
     def _check_bases(self) -> None:
@@ -264,6 +269,8 @@ class JoinedHistory:
             for robot in self._robots:
                 robot.start_round()
                 self._finish(robot)
+            for server in self._servers:
+                server.admit_all()
             self._level()
             self._check_bases()
         reports = [relay.report for relay in self._relays if relay.report is not None]

@@ -11,7 +11,7 @@ from cairn_client.sync.responses import FetchedCell
 from cairn_map.codec.cell_code import decode_cell
 from cairn_map.commits.commit import CommitMeta, split_commit
 from cairn_map.commits.cursor import Cursor
-from cairn_map.commits.ids import OPERATOR, CommitId
+from cairn_map.commits.ids import OPERATOR, CommitId, author_from_text
 from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_map.evidence.evidence_map import EvidenceMap
@@ -178,6 +178,12 @@ class SimServer:
             assert exc.kind == "evidence_gone"
         except BadInputError as exc:
             assert exc.kind == "not_retractable"
+
+    def admit_all(self) -> None:
+        """An operator says that all robots which were refused for their key are those that they say."""
+        admissions = self.service.sync.admissions
+        for robot in admissions.list(self.row).asking:
+            admissions.admit(self.row, author_from_text(robot.author), by=Caller(Role.OPERATOR))
 
     def forget_evidence(self) -> None:
         """Drop the evidence of all that was folded."""

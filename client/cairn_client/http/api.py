@@ -28,7 +28,15 @@ from cairn_map.commits.version_vector import EMPTY, VersionVector, vector_digest
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError, UnreachableError, first_error
 from cairn_map.evidence.fingerprint import fingerprint_from_hex
 from cairn_map.evidence.grid import Cell
-from cairn_map.wire.access_messages import CreateToken, NewSecret, RobotClosed, RobotUse, TokenInfo
+from cairn_map.wire.access_messages import (
+    Challenge,
+    CreateToken,
+    NewSecret,
+    RobotClosed,
+    RobotKeyList,
+    RobotUse,
+    TokenInfo,
+)
 from cairn_map.wire.frames import FRAME_BYTES_MAX, JSON_BYTES_MAX, Frame
 from cairn_map.wire.messages import (
     INDEX_PAGE,
@@ -184,12 +192,29 @@ class MapApi:
         """One map."""
         return message_from_json(MapInfo, self._ask("GET", f"/maps/{name}"))
 
-    def register(self, name: str, request: Register) -> Registered:
-        """Register a robot; later calls use the token that comes back."""
-        body = self._ask("POST", f"/maps/{name}/branches", content=request.model_dump_json().encode())
+    def register(self, name: str, request: Register, *, proof: str | None = None) -> Registered:
+        """Register a robot; later calls use the token that comes back. `proof`: text of a `KeyProof`."""
+        headers = {"Cairn-Proof": proof} if proof else {}
+        body = self._ask("POST", f"/maps/{name}/branches", content=request.model_dump_json().encode(), headers=headers)
         registered = message_from_json(Registered, body)
         self.use_token(registered.token)
         return registered
+
+    def challenge(self) -> str:
+        """A text for a robot's keys to sign; good for a minute. No token is sent."""
+        token, self.token = self.token, None
+        try:
+            return message_from_json(Challenge, self._ask("GET", "/challenge")).challenge
+        finally:
+            self.token = token
+
+    def keys(self, name: str) -> RobotKeyList:
+        """Keys that a map's robots are bound to, and the robots that were refused for theirs."""
+        return message_from_json(RobotKeyList, self._ask("GET", f"/maps/{name}/keys"))
+
+    def admit(self, name: str, author: Author) -> None:
+        """Admit a robot's other key, by an operator's word."""
+        self._ask("PUT", f"/maps/{name}/keys/{author}")
 
     def branches(self, name: str) -> list[BranchInfo]:
         """All robots of a map."""

@@ -216,7 +216,7 @@ def _hand_over(
                 report.cut = exc
             return
         except CairnError as exc:
-            if isinstance(exc, DeniedError) and exc.kind != "not_allowed":
+            if isinstance(exc, DeniedError) and exc.kind not in ("not_allowed", "not_admitted"):
                 raise
             report.refused.append((commit_id, exc))
             why = Why.REFUSED

@@ -20,6 +20,7 @@ from cairn_map.codec.cell_code import Profile, decode_cell
 from cairn_map.commits.commit import Commit, CommitMeta, ScanPose, make_commit, renamed_commit, split_commit
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId, RobotName
+from cairn_map.commits.signature import Signature
 from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.errors import BadInputError, ConflictError, first_error
 from cairn_map.evidence.evidence import Evidence
@@ -203,6 +204,10 @@ class Outbox:
     def signatures(self, commit: Commit) -> str | None:
         """The robot's signatures on its own commit, as `Cairn-Signature` has them; None for a server's retract."""
         return self._keys.signatures(commit)
+
+    def sign_bytes(self, message: bytes) -> tuple[Signature, ...]:
+        """Signatures on a message by all keys of the robot, the present one first."""
+        return self._keys.sign_bytes(self._incarnation, message)
 
     def push_set(self, header: ReplyHeader | None) -> list[CommitId]:
         """Commits that the server may lack, oldest first.

@@ -25,6 +25,7 @@ from cairn_map.codec.cell_code import Profile
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import OPERATOR, Author, CommitId, RobotName
+from cairn_map.commits.signature import Signature
 from cairn_map.commits.version_vector import EMPTY
 from cairn_map.errors import BadInputError, CairnError
 from cairn_map.evidence.evidence import Evidence
@@ -296,6 +297,11 @@ class Replica:
         """The robot's signatures on its own commit, as `Cairn-Signature` has them; None for a server's retract."""
         with self._lock:
             return self.outbox.signatures(commit)
+
+    def sign_bytes(self, message: bytes) -> tuple[Signature, ...]:
+        """Signatures on a message by all keys of the robot, the present one first."""
+        with self._lock:
+            return self.outbox.sign_bytes(message)
 
     def rename(self, commit: CommitId) -> CommitId:
         """Give a commit whose id is taken on the server a new one; its coverage there was another commit's."""

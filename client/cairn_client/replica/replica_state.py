@@ -20,7 +20,7 @@ from cairn_client.replica.replica_store import ReplicaStore
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.commits.ids import CommitId, Incarnation, RobotName, commit_id_from_text
-from cairn_map.commits.signature import SIGNATURES_MAX, SigningKey, signatures_to_text
+from cairn_map.commits.signature import SIGNATURES_MAX, Signature, SigningKey, signatures_to_text
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -121,6 +121,8 @@ class ReplicaState:
     """Last contact with the server, to ten seconds."""
     incarnation = Field("incarnation", Incarnation)
     """Incarnation under which the robot numbers its commits."""
+    drawn = Field[list[Incarnation]]("drawn", json.loads, json.dumps)
+    """Incarnations that were drawn with a key, the oldest first."""
     next_n = Field[int]("next_n", int)
     """Number of the robot's next commit."""
     tip_sha = Field("tip_sha", str)
@@ -185,25 +187,47 @@ class RobotKeys:
     def draw(self) -> Incarnation:
         """Draw a new key, in a transaction of the caller's; the incarnation that follows from it."""
         key = SigningKey.drawn()
+        self._state.drawn = [*(self._state.drawn or []), key.incarnation]
         self._store.put(_signing_key(key.incarnation), key.seed.hex())
         return key.incarnation
 
+    def _drawn(self) -> tuple[list[Incarnation], list[Incarnation]]:
+        """Incarnations with a key from before a list of them was kept, in no order; and that list, oldest first."""
+        drawn = self._state.drawn or []
+        found = [Incarnation(text.removeprefix(_signing_key(""))) for text in self._store.keys(_signing_key(""))]
+        return [incarnation for incarnation in found if incarnation not in drawn], drawn
+
+    def _keys(self, incarnations: list[Incarnation]) -> list[SigningKey]:
+        """Keys of these incarnations that are here: as many as may sign."""
+        known = (self._key(incarnation) for incarnation in dict.fromkeys(incarnations))
+        return [key for key in known if key is not None][:SIGNATURES_MAX]
+
     def signatures(self, commit: Commit) -> str | None:
-        """Signatures on an own commit, by its incarnation and those whose commits it takes out; None without a key."""
+        """Signatures on an own commit; None without a key.
+
+        By its incarnation, by those whose commits it takes out, and by the robot's first and present keys: whichever a
+        server knows vouches for the author, wherever the commit goes.
+        """
         spoken_for = dict.fromkeys([commit.id.author, *(target.author for target in commit.meta.retracted_ids)])
         own = [author.incarnation for author in spoken_for if author.robot == self._robot]
-        keys = [key for incarnation in own if (key := self._key(incarnation)) is not None]
-        if commit.id.author.robot != self._robot or not keys:
+        older, drawn = self._drawn()
+        keys = self._keys([*own, *older, *drawn[:1], *drawn[-1:]])
+        if commit.id.author.robot != self._robot or not self.has(commit.id.author.incarnation):
             return None
         map_name = self._state.map_name or ""
-        return signatures_to_text([key.sign(map_name, commit.sha) for key in keys[:SIGNATURES_MAX]])
+        return signatures_to_text([key.sign(map_name, commit.sha) for key in keys])
+
+    def sign_bytes(self, incarnation: Incarnation, message: bytes) -> tuple[Signature, ...]:
+        """Signatures on a message by the key of an incarnation, and by the robot's other keys, the oldest first."""
+        older, drawn = self._drawn()
+        return tuple(key.sign_bytes(message) for key in self._keys([incarnation, *older, *drawn]))
 
     def _key(self, incarnation: Incarnation) -> SigningKey | None:
         seed = self._store.get(_signing_key(incarnation))
         return SigningKey(bytes.fromhex(seed)) if seed else None
 
 
-def _signing_key(incarnation: Incarnation) -> str:
+def _signing_key(incarnation: str) -> str:
     return f"signing_key.{incarnation}"
 
 

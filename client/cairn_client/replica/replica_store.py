@@ -151,6 +151,11 @@ class ReplicaStore:
         value: str | None = self._first("SELECT value FROM meta WHERE key = ?", (key,))
         return value
 
+    def keys(self, prefix: str) -> list[str]:
+        """Keys of texts that begin so, in order."""
+        found = self._run("SELECT key FROM meta WHERE key >= ? AND key < ? ORDER BY key", (prefix, prefix + "\x7f"))
+        return [key for (key,) in found]
+
     def put(self, key: str, value: str | None) -> None:
         """Keep a text under a key; None removes it. A transaction of its own, or part of the open one."""
         if value is None:

@@ -1,4 +1,12 @@
-"""Membership of a robot on a map: it registers when it must, and holds the token that the server gives it."""
+"""Membership of a robot on a map: it registers when it must, and holds the token that the server gives it.
+
+    no token of this server's      register by the enrolment token: it is sent once, to the server that the URL names
+    name bound to another key      register by the token and a proof of the robot's keys; else an operator must say so
+    token refused                  register by a proof of the key alone, which an operator lets in
+
+A server that refuses a token may be a stranger in the right one's place, so no secret answers it: neither the enrolment
+token nor anything that could be used elsewhere.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import ParamSpec, TypeVar
@@ -7,8 +15,9 @@ from cairn_client.http.api import MapApi
 from cairn_client.http.origin_tokens import origin_of
 from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_state import ReplicaState
-from cairn_map.errors import BadInputError, DeniedError
-from cairn_map.wire.messages import Mode, Register
+from cairn_map.commits.key_proof import KeyProof, proof_bytes
+from cairn_map.errors import BadInputError, CairnError, DeniedError, UnreachableError
+from cairn_map.wire.messages import Mode, Register, Registered
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -56,18 +65,19 @@ class Membership:
     def as_member(self, action: Callable[P, T], *args: P.args, **options: P.kwargs) -> T:
         """Result of an action as a robot that the server knows; it registers first if it must.
 
-        If the server does not take the token, it registers again, and does the action again.
+        If the server does not take the robot's own token, it shows its key instead, and does the action again.
+
+        Raises:
+            DeniedError: kind `not_admitted`: an operator must let the robot in; or `bad_token`, and others.
         """
         if self._own_token is None and not self._is_known_by_token:
             self._register()
         try:
             return action(*args, **options)
         except DeniedError as exc:
-            if exc.kind != "bad_token":
+            if exc.kind != "bad_token" or self._own_token is None:
                 raise
-            self._replica.state.token = None  # the server was replaced, or another robot registered under this name
-            self._is_known_by_token = False
-            self._register()
+            self._return(exc)
             return action(*args, **options)
 
     def leave(self) -> None:
@@ -87,20 +97,65 @@ class Membership:
         return True
 
     def _register(self) -> None:
+        """Register by the token that was given, and by a proof of the keys where the name is known."""
         self._api.use_token(self._enrolment_token)
-        author = self._replica.author
-        request = Register(robot=author.robot, mode=self._mode, incarnation=author.incarnation, sensors=self._sensors)
         try:
-            registered = self._api.register(self._map_name, request)
+            self._keep(self._api.register(self._map_name, self._request()))
         except DeniedError as exc:
-            if exc.kind != "not_allowed":
+            if exc.kind == "not_allowed":
+                self._is_known_by_token = True  # perhaps an admin gave the robot a token; else the next ask says
+                return
+            if exc.kind != "not_admitted":
                 raise
-            self._is_known_by_token = True  # perhaps an admin gave the robot a token of its own; else the next ask says
-            return
+            self._keep(self._proven_registration(refusal=exc))
+
+    def _return(self, refusal: DeniedError) -> None:
+        """Register again where the robot's own token is refused, without showing any token."""
+        token, self._api.token = self._api.token, None
+        try:
+            if self._replica.state.may_register_openly:
+                try:  # it needed no token before
+                    self._keep(self._api.register(self._map_name, self._request()))
+                    return
+                except DeniedError:
+                    pass
+            self._keep(self._proven_registration(refusal=refusal))
+        except BaseException:
+            self._api.use_token(token)
+            raise
+
+    def _proven_registration(self, *, refusal: DeniedError) -> Registered:
+        """Registration with a proof of the robot's keys.
+
+        Raises:
+            DeniedError: the server says no for another reason than that of the refusal, or asks for an operator.
+        """
+        author = self._replica.author
+        try:
+            challenge = self._api.challenge()
+            signed = self._replica.sign_bytes(proof_bytes(self._map_name, author, challenge))
+            proof = KeyProof(author, challenge, signed).to_text()
+            return self._api.register(self._map_name, self._request(), proof=proof)
+        except UnreachableError:
+            raise
+        except CairnError as exc:
+            raise DeniedError(
+                refusal.kind,
+                f"the server does not let this robot in: {refusal.message}. The robot maps on, and keeps its commits. "
+                f"If {self._api.origin} is the right server, ask an operator for: cairn map robots admit "
+                f"{self._api.origin}/maps/{self._map_name} {author}",
+            ) from exc
+
+    def _request(self) -> Register:
+        author = self._replica.author
+        return Register(robot=author.robot, mode=self._mode, incarnation=author.incarnation, sensors=self._sensors)
+
+    def _keep(self, registered: Registered) -> None:
         if registered.map.geometry != self._replica.geometry:
             raise BadInputError("other_geometry", f"map {self._map_name} has another grid than this robot's directory")
-        self._replica.state.note_model(registered.map.sensor_model)
-        with self._replica.state.store.transaction():
-            self._replica.state.token = registered.token
-            self._replica.state.token_origin = self._api.origin
-            self._replica.state.may_register_openly = self._enrolment_token is None
+        state = self._replica.state
+        state.note_model(registered.map.sensor_model)
+        with state.store.transaction():
+            state.token = registered.token
+            state.token_origin = self._api.origin
+            state.may_register_openly = self._enrolment_token is None

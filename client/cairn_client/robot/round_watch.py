@@ -56,7 +56,13 @@ class RoundWatch:
         now_s = time.time()
         if self._tries:
             self._events.send(LinkBack(away_s=max(0.0, now_s - (self._contact.failed_s or now_s))))
-        self._remember(Contact(last_s=now_s), at_once=self._tries > 0)
+        # A robot that the server knows by another key fetches, and goes on failing to push until an operator says so.
+        shut_out = next((exc for exc in report.refused.values() if exc.kind == "not_admitted"), None)
+        contact = Contact(last_s=now_s)
+        if shut_out is not None:
+            since_s = self._contact.failed_s or now_s
+            contact = Contact(last_s=now_s, failed_s=since_s, kind=shut_out.kind, reason=shut_out.message[:1000])
+        self._remember(contact, at_once=self._tries > 0 or contact.kind != self._contact.kind)
         self._tries = 0
 
     def pushed(self, commit: CommitId) -> None:

@@ -31,7 +31,7 @@ from cairn_client.sync.uploads import PARTS, Parts, push_whole_or_in_parts
 from cairn_map.codec.cell_code import decode_cell, encode_cell
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.commit_reading import open_commit
-from cairn_map.commits.ids import CommitId
+from cairn_map.commits.ids import Author, CommitId
 from cairn_map.errors import (
     BadInputError,
     CairnError,
@@ -96,11 +96,14 @@ def push_commits(
         DeniedError: the server does not know this robot.
     """
     report = RoundReport()
+    shut_out: set[Author] = set()  # by the server, which knows the robot by another key: one try a round
     # Oldest first, so that a commit is there before those that take it out.
     for commit_id in replica.push_set():
         # What was refused lately, and what is no longer here, is left out.
         if (refusal := replica.refusals.of(commit_id)) is not None:
             report.refused[commit_id] = refusal
+            continue
+        if commit_id.author in shut_out:
             continue
         commit, seal = replica.kept_commit(commit_id), replica.seal(commit_id)
         if commit is None or (sealed_only and seal is None):
@@ -113,10 +116,12 @@ def push_commits(
             report.refused[commit_id] = exc
             continue
         except DeniedError as exc:
-            if exc.kind != "not_allowed":  # the token is not good: that is no fault of the commit
+            if exc.kind not in ("not_allowed", "not_admitted"):  # the token is not good: no fault of the commit
                 raise
             log.error("the server refuses commit %s: %s", commit_id, exc.message)
             report.refused[commit_id] = exc
+            if exc.kind == "not_admitted":
+                shut_out.add(commit_id.author)
             continue
         except (BadInputError, DamagedDataError) as exc:  # it must not hold up all that come after it
             log.error("the server refuses commit %s: %s: %s", commit_id, exc.kind, exc.message)

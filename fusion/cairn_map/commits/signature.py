@@ -61,7 +61,11 @@ class SigningKey:
 
     def sign(self, map_name: str, sha: bytes) -> Signature:
         """A signature on the commit of this SHA-256, for the map of this name and no other."""
-        return Signature(self.public_key, self._secret.sign(signed_bytes(map_name, sha)))
+        return self.sign_bytes(signed_bytes(map_name, sha))
+
+    def sign_bytes(self, message: bytes) -> Signature:
+        """A signature on any message, which is to name its purpose first, so that it counts for no other."""
+        return Signature(self.public_key, self._secret.sign(message))
 
     @cached_property
     def _secret(self) -> Ed25519PrivateKey:
@@ -85,14 +89,22 @@ def check_signatures(signatures: Collection[Signature], map_name: str, sha: byte
         BadInputError: kind `bad_signature`.
     """
     for signature in signatures:
-        try:
-            Ed25519PublicKey.from_public_bytes(signature.key).verify(signature.mark, signed_bytes(map_name, sha))
-        except (InvalidSignature, ValueError) as exc:
+        if not are_valid([signature], signed_bytes(map_name, sha)):
             raise BadInputError(
                 "bad_signature",
                 f"the signature of key {signature.key.hex()[:16]}... is not one of this commit on map {map_name}: "
                 "somebody changed it on its way, or it was made for another map",
-            ) from exc
+            )
+
+
+def are_valid(signatures: Collection[Signature], message: bytes) -> bool:
+    """True if all signatures are ones of a message."""
+    try:
+        for signature in signatures:
+            Ed25519PublicKey.from_public_bytes(signature.key).verify(signature.mark, message)
+    except (InvalidSignature, ValueError):
+        return False
+    return True
 
 
 def speaks_for(signatures: Collection[Signature], author: Author) -> bool:

@@ -23,7 +23,7 @@ class CreateToken(_Model):
     map: NameText | None = None
     """The one map for which it is valid; None: all maps, future ones included."""
     robot: NameText | None = None
-    """Robot that holds the token; only for role robot, or for a relay that is a robot, too."""
+    """Robot that holds the token (role robot, or a relay that is a robot, too), or the one robot that it enrols."""
     lifetime_s: Annotated[float, Field(gt=0, le=LIFETIME_MAX_S)] | None = None
     """Seconds for which it is valid; None: until it is revoked."""
 
@@ -33,7 +33,9 @@ class CreateToken(_Model):
             raise ValueError("a robot's token names its map and its robot")
         if self.role == "relay" and self.robot and not self.map:
             raise ValueError("a relay that is a robot names its map, too")
-        if self.role not in ("robot", "relay") and self.robot:
+        if self.role == "enroller" and self.robot and not self.map:
+            raise ValueError("an enrolment token for one robot names its map, too")
+        if self.role not in ("robot", "relay", "enroller") and self.robot:
             raise ValueError(f"a token of role {self.role} names no robot")
         return self
 
@@ -76,6 +78,44 @@ class NewSecret(_Model):
 
     token: str
     info: TokenInfo
+
+
+class KeyInfo(_Model):
+    """An admitted key of a robot."""
+
+    author: str
+    """`robot.incarnation`: the incarnation follows from the key."""
+    since_s: float
+    """Time at which it came, UTC seconds since 1970."""
+    by: str
+    """Name of the token that brought it."""
+    may_return: bool
+    """True from an operator's word until the robot has registered by it."""
+
+
+class AskingRobot(_Model):
+    """A robot that was refused, because its name is bound to another key."""
+
+    author: str
+    asked_s: float
+    """Time of its last try, UTC seconds since 1970."""
+    by: str
+    """Name of the token that it showed, or of the relay that brought its commit."""
+
+
+class RobotKeyList(_Model):
+    """Answer to `GET /maps/{map}/keys`."""
+
+    admitted: list[KeyInfo]
+    asking: list[AskingRobot]
+    """Refused lately, oldest first; forgotten with each start of the server."""
+
+
+class Challenge(_Model):
+    """Answer to `GET /challenge`."""
+
+    challenge: str
+    """Text that a robot's keys sign (`commits.key_proof`); good for a minute."""
 
 
 class AuditEntry(_Model):

@@ -12,12 +12,13 @@ from contextlib import AbstractContextManager
 from typing import Protocol
 
 from cairn_map.commits.cursor import Cursor
-from cairn_map.commits.ids import Author, CommitId
+from cairn_map.commits.ids import Author, CommitId, Incarnation
 from cairn_map.commits.version_vector import VersionVector
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.access_messages import AuditEntry
 from cairn_map.wire.messages import LogEntry
+from cairn_server.store.admission import OWN_WORD, Grounds, RobotKey
 from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_rows import (
     Backlog,
@@ -222,6 +223,22 @@ class Tokens(Protocol):
         ...
 
 
+class RobotKeys(Protocol):
+    """Keys that robots' names are bound to, by map (`admission`); commits and registrations add to them."""
+
+    def all(self, row: MapRow) -> list[RobotKey]:
+        """All admitted keys, by robot and incarnation."""
+        ...
+
+    def of(self, row: MapRow, robot: str) -> dict[Incarnation, RobotKey]:
+        """Admitted keys of a robot, by incarnation."""
+        ...
+
+    def admit(self, row: MapRow, author: Author, *, by: str) -> None:
+        """Admit a key by an operator's word, with which the robot may register; durable on return."""
+        ...
+
+
 class AuditLog(Protocol):
     """Lines that are added and never changed, each with a hash over the one before; the newest are kept."""
 
@@ -240,6 +257,11 @@ class Store(Protocol):
     @property
     def tokens(self) -> Tokens:
         """Tokens of the server."""
+        ...
+
+    @property
+    def keys(self) -> RobotKeys:
+        """Keys of the robots."""
         ...
 
     @property
@@ -304,6 +326,7 @@ class Store(Protocol):
         Raises:
             ConflictError: kind `id_taken`: the id is kept with other bytes; or `evidence_gone`: it retracts a commit
                 whose evidence is not kept any more. Pushed again, with the same bytes, that is kept again.
+            DeniedError: kind `not_admitted`: its author's name is bound to another key (`admission.check_commit`).
             BadInputError: kind `evidence_overflow`: its robot's share of the sums is taken; or its number is refused
                 by `numbering.check_number`.
         """
@@ -349,8 +372,12 @@ class Store(Protocol):
         """One state of the map."""
         ...
 
-    def register(self, row: MapRow, branch: Branch, token_hash: bytes) -> None:
-        """Make a branch and its token (`registration_name`), or give an existing one another secret."""
+    def register(self, row: MapRow, branch: Branch, token_hash: bytes, grounds: Grounds = OWN_WORD) -> None:
+        """Make a branch and its token (`registration_name`), or give an existing one another secret.
+
+        Raises:
+            DeniedError: kind `not_admitted`: the name is bound to another key (`admission.check_registration`).
+        """
         ...
 
     def seen(self, row: MapRow, name: str, cursor: Cursor | None) -> None:

@@ -12,6 +12,7 @@ from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.access_messages import RoleText
+from cairn_server.store.admission import OWN_WORD, Grounds
 
 Robot = tuple[int, str]
 """Number of the map, and the robot's name, or `relay_of` a token."""
@@ -49,6 +50,8 @@ class NewCommit:
     """Checked signatures of the authors in whose names it speaks, as in `Cairn-Signature`."""
     via: str | None = None
     """Name of the token of the relay that handed it over."""
+    grounds: Grounds = OWN_WORD
+    """Grounds on which it speaks for its author."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

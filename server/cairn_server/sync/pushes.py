@@ -8,16 +8,25 @@ from dataclasses import replace
 
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.commit_reading import CommitReader, commit_reader
-from cairn_map.commits.signature import Signature, check_signatures, signatures_from_text, signatures_to_text
-from cairn_map.errors import ConflictError
-from cairn_server.access.auth import Caller, Role
+from cairn_map.commits.ids import Author
+from cairn_map.commits.signature import (
+    Signature,
+    check_signatures,
+    incarnation_of,
+    signatures_from_text,
+    signatures_to_text,
+)
+from cairn_map.errors import ConflictError, DeniedError
+from cairn_server.access.auth import UPSTREAM, Caller, Role
 from cairn_server.access.quotas import Meter
 from cairn_server.access.rate_limits import AuditLimit
 from cairn_server.live.hub import Hub
 from cairn_server.settings import Settings
+from cairn_server.store.admission import Grounds
 from cairn_server.store.numbering import EvidenceGoneError
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow, NewCommit
+from cairn_server.sync.admissions import Admissions
 from cairn_server.sync.checks.checking import new_commit
 from cairn_server.sync.checks.commit_checks import CommitChecks
 from cairn_server.sync.checks.push_policy import check_claims
@@ -35,6 +44,7 @@ class Pushes:
         settings: Settings,
         hub: Hub,
         wanted: WantedCommits,
+        admissions: Admissions,
         *,
         on_new: Callable[[], None],
     ) -> None:
@@ -45,6 +55,7 @@ class Pushes:
         self._settings = settings
         self._hub = hub
         self._wanted = wanted
+        self._admissions = admissions
         self._on_new = on_new
         self._audit_limit = AuditLimit()
 
@@ -66,6 +77,7 @@ class Pushes:
             DamagedDataError: the bytes are no sound commit.
             BadInputError: not a commit for this map, not by this caller, or against `push_policy` or `quotas`.
             UnreachableError: kind `quota`: more than the robot may push now; or `disk_full`.
+            DeniedError: kind `not_admitted`: its author's name is bound to another key (`store.admission`).
             ConflictError: kind `id_taken`: the id is known with other bytes; or `evidence_gone`: the commits that it
                 retracts are wanted from now on.
         """
@@ -80,9 +92,12 @@ class Pushes:
         via = caller.name if speaker is not caller and caller.role is Role.RELAY else None
 
         # The quota is taken while the commit is checked and written, and given back unless it is new.
-        author = commit.meta.commit_id.author.robot
-        with self.meter.spending(row, caller, size_bytes=len(data), cells=commit.cells, author=author, via=via) as take:
-            is_new = self._append(row, replace(self._checked(row, commit, signed), via=via))
+        author = commit.meta.commit_id.author
+        with self.meter.spending(
+            row, caller, size_bytes=len(data), cells=commit.cells, author=author.robot, via=via
+        ) as take:
+            grounds = _grounds(caller, speaker, author, signed)
+            is_new = self._append(row, replace(self._checked(row, commit, signed), via=via, grounds=grounds), caller)
             if is_new:
                 take()
 
@@ -137,7 +152,7 @@ class Pushes:
         new = new_commit(Commit(commit.meta, commit.cells, checked.sha, commit.data), checked.tops)
         return replace(new, signatures=signatures_to_text(signed) or None)
 
-    def _append(self, row: MapRow, new: NewCommit) -> bool:
+    def _append(self, row: MapRow, new: NewCommit, caller: Caller) -> bool:
         """Write a commit; True if it is new. Durable on return."""
         try:
             return self._store.append(row, new)
@@ -145,3 +160,15 @@ class Pushes:
             # Refused now and wanted from now on: robots that hold the evidence push it, and the retract succeeds later.
             self._wanted.note(row.name, exc.commits)
             raise
+        except DeniedError:
+            self._admissions.refused(row, new.id.author, by=caller)
+            raise
+
+
+def _grounds(caller: Caller, speaker: Caller, author: Author, signed: tuple[Signature, ...]) -> Grounds:
+    """Grounds of a push: what it is signed by, once that is checked, and the token of the one who brings it."""
+    signers = frozenset(incarnation_of(signature.key) for signature in signed)
+    is_own = speaker is caller and caller.robot == author.robot
+    # What comes from the upstream was admitted there, by operators that this server's own administrator trusts.
+    has_word = caller.role is Role.ADMIN or caller == UPSTREAM
+    return Grounds(signers=signers, is_own=is_own, has_word=has_word, by=caller.name)

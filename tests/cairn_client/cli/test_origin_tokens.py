@@ -1,21 +1,17 @@
 """A token is sent to its own server only, by every command that meets two; a second listener writes down what came."""
 
 import argparse
-import json
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from contextlib import suppress
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
 
 import pytest
 from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import MAP
 from tests.fixtures.client.robots import ADMIN, TOKEN, map_commit, robot_in
+from tests.fixtures.client.strangers import Stranger, stranger
 from tests.fixtures.commands import cairn
 
 from cairn_client.cli.arguments import AddTokens, CommandParser
@@ -24,50 +20,6 @@ from cairn_client.http.origin_tokens import NO_TOKENS, origin_of
 from cairn_map.errors import BadInputError, CairnError, DeniedError
 
 OTHER = "token-of-the-other-server"
-
-
-@dataclass
-class Stranger:
-    """A server on another port that knows no token, and what it was sent."""
-
-    url: str
-    shown: list[str | None] = field(default_factory=list)
-    """`Authorization` of each request."""
-
-    @property
-    def map_url(self) -> str:
-        return f"{self.url}/maps/{MAP}"
-
-
-@contextmanager
-def stranger(*, redirects_to: str | None = None) -> Iterator[Stranger]:
-    class Handler(BaseHTTPRequestHandler):
-        def answer(self) -> None:
-            found.shown.append(self.headers.get("Authorization"))
-            self.rfile.read(int(self.headers.get("Content-Length", 0)))
-            kind = "bad_token" if self.headers.get("Authorization") else "no_token"
-            body = json.dumps({"status": 401, "kind": kind, "title": "no", "detail": "who are you?"}).encode()
-            self.send_response(307 if redirects_to else 401)
-            if redirects_to:
-                self.send_header("Location", redirects_to + self.path)
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
-
-        do_GET = do_PUT = do_POST = do_PATCH = do_DELETE = answer
-
-        def log_message(self, *_: Any) -> None:
-            pass
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
-        found = Stranger(f"http://127.0.0.1:{server.server_address[1]}")
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        try:
-            yield found
-        finally:
-            server.shutdown()
-            thread.join()
 
 
 @pytest.fixture

@@ -38,8 +38,24 @@ def test_what_takes_back_from_an_older_incarnation_is_signed_by_both(tmp_path: P
     amend = mole.commit({A: X}, CommitFacts(retracts=(old.id,)))
     signed = checked(amend, mole.outbox.signatures(amend))
     assert [speaks_for(signed, author) for author in (old.id.author, amend.id.author)] == [True, True]
-    assert len(checked(old, mole.outbox.signatures(old))) == 1
     mole.close()
+
+
+def test_a_new_key_is_vouched_for_by_the_first_and_older_commits_by_the_new_one(tmp_path: Path) -> None:
+    mole = opened(tmp_path)
+    commits = [committed(mole, X)]
+    for _ in range(3):
+        mole.outbox.new_incarnation("its disk was rolled back")
+        commits.append(committed(mole, X))
+    mole.close()
+    again = opened(tmp_path)
+    first, last = commits[0].id.author, commits[-1].id.author
+    for commit in commits:
+        signed = checked(commit, again.outbox.signatures(commit))
+        own = {author for author in {first, last, commit.id.author} if speaks_for(signed, author)}
+        assert own == {first, last, commit.id.author}
+        assert len(signed) == len(own)
+    again.close()
 
 
 def test_a_folder_of_an_older_version_goes_on_in_a_new_incarnation_and_keeps_what_waits(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, Den
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.queries.occupancy_states import State
 from cairn_map.wire.access_messages import CreateToken
-from cairn_map.wire.messages import CreateMap, Register
+from cairn_map.wire.messages import CreateMap
 
 Until = Callable[[Callable[[], bool]], None]
 
@@ -293,26 +293,6 @@ def test_a_robot_works_with_a_token_of_its_own_that_an_admin_gave_it(guarded: Li
     with robot_in(tmp_path, guarded.map_url, token=TOKEN) as robot:  # and may be enrolled all the same
         robot.sync()
         assert robot.replica.state.token not in (None, own)
-
-
-def test_a_robot_whose_token_was_replaced_registers_anew_though_the_link_fails_between(
-    guarded: LiveServer, tmp_path: Path
-) -> None:
-    with robot_in(tmp_path, guarded.map_url, token=TOKEN) as robot:
-        robot.sync()
-        with MapApi(guarded.url, token=ADMIN) as admin:
-            admin.register(MAP, Register(robot="mole", incarnation="0" * 16))
-        register = robot._api.register
-
-        def no_link(name: str, request: Register) -> object:
-            raise UnreachableError("no_link", "gone")
-
-        robot._api.register = no_link  # type: ignore[assignment, method-assign]
-        with pytest.raises(UnreachableError):
-            robot.sync()
-        robot._api.register = register  # type: ignore[method-assign]
-        map_commit(robot, 1)
-        assert robot.sync().pushed == 1
 
 
 def test_a_robot_that_left_the_map_comes_back_when_it_syncs(server: LiveServer, tmp_path: Path) -> None:

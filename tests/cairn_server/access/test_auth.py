@@ -14,8 +14,10 @@ from tests.fixtures.server.pushes import MOLE, WREN, pushed
 
 from cairn_map.commits.ids import INITIAL, Author, Incarnation
 from cairn_map.errors import BadInputError
+from cairn_server.access.auth import new_token, token_hash
 from cairn_server.operations.serve import main
 from cairn_server.settings import Settings
+from cairn_server.store.store_rows import Token
 
 
 @pytest.fixture(scope="module")
@@ -30,6 +32,7 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
 def test_an_open_server_lets_everybody_without_a_token_do_everything(live: Live, route: tuple[str, str]) -> None:
     method, path = route
     place = {"branch": "mole", "commit": "x", "cell": "0,0,0", "voxel": "0,0,0", "token": "nobody", "file": "x.js"}
+    place["author"] = str(MOLE)
     answer = live.ask(method, path.format(name=live.new_map().name, **place), content=b"{}")
     assert answer.status_code not in (401, 403)
 
@@ -181,3 +184,27 @@ def test_a_token_that_was_good_a_moment_ago_opens_no_door(guarded: Live) -> None
     assert guarded.push(row, pushed(0, 0), headers=mole).status_code == 201
     robot_token(guarded, row, "mole")
     assert guarded.push(row, pushed(1, 1), headers=mole).status_code == 401
+
+
+@pytest.mark.parametrize("path", ["commits/{commit}", "retracts"])
+def test_a_token_that_ends_while_a_body_comes_does_not_count(guarded: Live, path: str) -> None:
+    row, commit = guarded.new_map(), pushed(0, 0)
+    secret = new_token()
+    token = Token(
+        name=secret[:30], role="admin", map_number=None, map_name=None, robot=None, created_s=1.0, expires_s=None
+    )
+    guarded.service.store.tokens.add(token, token_hash(secret))
+    data = commit.data if "commit" in path else b'{"commits": ["%s"]}' % str(commit.id).encode()
+
+    def slowly() -> Iterator[bytes]:
+        yield data[:5]
+        assert guarded.http.get("/maps", headers=bearer(secret)).status_code == 200
+        guarded.service.store.tokens.remove(token.name)
+        yield data[5:]
+
+    method, headers = ("PUT", {}) if "commit" in path else ("POST", {"Content-Type": "application/json"})
+    url = f"/maps/{row.name}/{path.format(commit=commit.id)}"
+    with httpx.Client(base_url=guarded.http.base_url) as other:
+        answer = other.request(method, url, content=slowly(), headers=headers | bearer(secret))
+    assert (answer.status_code, kind_of(answer)) == (401, "bad_token")
+    assert guarded.cells(row) == {}

@@ -133,6 +133,7 @@ def test_a_relay_has_quotas_of_its_own_by_its_token_after_a_new_start_too(tmp_pa
                 names = ("field", "other")
                 made = [create_token(live.service.store, n, CreateToken(role="relay"), by=ADMIN_FILE) for n in names]
                 mole = bearer(robot_token(live, row, "mole"))
+                live.service.store.keys.admit(row, signatures.MOLE, by="operator")
             field, other = (bearer(token.token) for token in made)
             signed = [signatures.signed(row, commit) for commit in commits]
             if not start:

@@ -67,7 +67,7 @@ def test_every_error_is_a_problem(document: dict[str, Any]) -> None:
             if status == "default" or int(status) >= 400:
                 assert list(answer["content"]) == [PROBLEM], (method, path, status)
         assert {"500", "default"} <= operation["responses"].keys()
-        is_open = path in ("/", "/assets/{file}", "/healthz", "/readyz", "/docs")
+        is_open = path in ("/", "/assets/{file}", "/healthz", "/readyz", "/docs", "/challenge")
         assert ("401" in operation["responses"]) != is_open
         assert bool(operation.get("security")) != is_open
     assert document["components"]["schemas"]["Problem"]["properties"]["kind"]

@@ -40,6 +40,7 @@ PLACES = {
     "cell": ["0,0,0", "-1,0,2", "0,0,0.ply", "0,0,0.npz", "0,0,0.view"],
     "voxel": ["0,0,0", "-1,0,2"],
     "token": ["looker"],
+    "author": [f"mole.{'5' * 16}"],
     "file": ["x.js"],
 }
 """Names of things that exist, so that not every answer is 404."""

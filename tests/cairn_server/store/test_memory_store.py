@@ -8,6 +8,7 @@ import pytest
 from tests.fixtures.map.made import SMALL
 from tests.fixtures.server.access import ADMIN, ENROLLER, bearer, robot_token
 from tests.fixtures.server.access_contract import AccessContract
+from tests.fixtures.server.admission_contract import AdmissionContract
 from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.branch_contract import BranchContract
 from tests.fixtures.server.commit_contract import CommitContract
@@ -37,7 +38,14 @@ def store() -> Iterator[MemoryStore]:
 
 
 class TestMemoryStore(
-    StoreContract, CommitContract, SharesContract, CrowdContract, EvidenceContract, BranchContract, AccessContract
+    StoreContract,
+    CommitContract,
+    SharesContract,
+    CrowdContract,
+    EvidenceContract,
+    BranchContract,
+    AccessContract,
+    AdmissionContract,
 ):
     """All of the contract."""
 

@@ -1,21 +1,27 @@
 """Stores of older versions, as they were written then, open and go on."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import apsw
 import numpy as np
 import pytest
 from tests.fixtures.map.made import SMALL
+from tests.fixtures.server import signatures
 from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.old_stores import FORMATS, OLD_COMMITS, OLD_RETRACTS, unpacked
-from tests.fixtures.server.pushes import KEYS, MOLE, pushed, read, sum_of
+from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 from tests.fixtures.server.shares_contract import author_of, regions_of
+from tests.fixtures.server.store_contract import new_of
 
-from cairn_map.errors import BadInputError
+from cairn_map.commits.ids import Author, Incarnation
+from cairn_map.errors import BadInputError, DeniedError
 from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX, packed_evidence
 from cairn_server.store import shares
+from cairn_server.store.admission import Grounds
+from cairn_server.store.sqlite import schema
 from cairn_server.store.sqlite.schema import STEPS, ensure_schema
 from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
 from cairn_server.store.store_rows import CellRow
@@ -140,4 +146,36 @@ def test_a_robot_of_an_older_store_keeps_its_token(tmp_path: Path) -> None:
     assert (token.name, token.role, token.map_name, token.robot) == ("lab:mole", "robot", "lab", "mole")
     store.deregister(store.map("lab"), "mole")
     assert store.tokens.of_hash(kept) is None
+    store.close()
+
+
+def test_the_names_of_an_older_store_are_bound_to_the_keys_that_they_have(tmp_path: Path) -> None:
+    unpacked("v1.sqlite.zst", tmp_path)
+    store = SqliteStore(tmp_path)
+    row = store.map("lab")
+    known = {key.author for key in store.keys.all(row)}
+    assert known >= {MOLE, WREN}
+    assert not any(key.is_proven or key.may_return for key in store.keys.all(row))  # no commit was signed then
+    stranger = Author(MOLE.robot, Incarnation("e" * 16))
+    relayed = replace(new_of(pushed(0, 0, stranger)), grounds=Grounds(signers=frozenset({stranger.incarnation})))
+    with pytest.raises(DeniedError):
+        store.append(row, relayed)
+    own = replace(relayed, grounds=Grounds(is_own=True))  # of a robot that did not sign, and begins to
+    assert store.append(row, own)
+    store.close()
+
+
+def test_a_key_that_signed_is_bound_as_one_when_the_store_is_brought_up_to_date(tmp_path: Path) -> None:
+    with Live(tmp_path) as live:
+        row = live.new_map()
+        live.push(row, pushed(0, 0, signatures.MOLE), headers=signatures.signed(row, pushed(0, 0, signatures.MOLE)))
+        live.push(row, pushed(0, 0, WREN))
+    connection = apsw.Connection(str(tmp_path / FILE_NAME))
+    connection.execute(f"DROP TABLE robot_key; PRAGMA user_version = {STEPS.index(schema.KEYS)}")
+    connection.close()
+    store = SqliteStore(tmp_path)
+    assert {key.author: key.is_proven for key in store.keys.all(store.map(row.name))} == {
+        signatures.MOLE: True,
+        WREN: False,
+    }
     store.close()

@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tests.fixtures.map.made import SMALL
 from tests.fixtures.server.access_contract import AccessContract
+from tests.fixtures.server.admission_contract import AdmissionContract
 from tests.fixtures.server.branch_contract import BranchContract, branch, token
 from tests.fixtures.server.commit_contract import CommitContract
 from tests.fixtures.server.crowd_contract import CrowdContract
@@ -54,7 +55,14 @@ def fresh(tmp_path: Path) -> Iterator[SqliteStore]:
 
 
 class TestSqliteStore(
-    StoreContract, CommitContract, SharesContract, CrowdContract, EvidenceContract, BranchContract, AccessContract
+    StoreContract,
+    CommitContract,
+    SharesContract,
+    CrowdContract,
+    EvidenceContract,
+    BranchContract,
+    AccessContract,
+    AdmissionContract,
 ):
     """All of the contract."""
 

@@ -182,3 +182,25 @@ def test_a_bad_signature_on_an_own_commit_is_refused_too(live: Live, row: MapRow
     commit = pushed(0, 1, MOLE)
     headers = signed(row, pushed(0, 2, MOLE)) | bearer(ADMIN)
     assert kind_of(live.push(row, commit, headers=headers)) == "bad_signature"
+
+
+def test_a_name_that_is_known_is_not_a_relay_s_to_speak_in_under_another_key(live: Live, row: MapRow) -> None:
+    body = {"robot": "mole", "incarnation": MOLE.incarnation}
+    live.http.post(f"/maps/{row.name}/branches", json=body, headers=bearer(ADMIN)).raise_for_status()
+    forged = pushed(0, 1, OLD_MOLE)
+    answer = hand_over(live, row, forged)
+    assert (answer.status_code, kind_of(answer)) == (403, "not_admitted")
+    assert entries(live, row) == []
+    assert hand_over(live, row, pushed(0, 1, MOLE)).status_code == 201
+    assert hand_over(live, row, forged).status_code == 403
+    asking = live.http.get(f"/maps/{row.name}/keys", headers=bearer(ADMIN)).json()["asking"]
+    assert [(robot["author"], robot["by"]) for robot in asking] == [(str(OLD_MOLE), "field")]
+    answer = live.http.put(f"/maps/{row.name}/keys/{OLD_MOLE}", headers=bearer(ADMIN))
+    assert answer.status_code == 204
+    assert hand_over(live, row, forged).status_code == 201
+
+
+def test_a_new_key_that_the_old_one_signs_is_taken_from_a_relay(live: Live, row: MapRow) -> None:
+    assert hand_over(live, row, pushed(0, 1, OLD_MOLE)).status_code == 201
+    assert hand_over(live, row, pushed(0, 2, MOLE), *KEYS[:2]).status_code == 201
+    assert hand_over(live, row, pushed(1, 3, MOLE)).status_code == 201

@@ -1,4 +1,4 @@
-"""Look after the robots of a map: what each uses of the map's bounds, and robots that are to begin again.
+"""Look after the robots of a map: what each uses of the map's bounds, robots that are to begin again, their keys.
 
     $ cairn map robots list http://127.0.0.1:8750/maps/lab
     robot  incarnations  intervals  fullest
@@ -6,10 +6,14 @@
     wren              2          3  incarnations 6 %
     $ cairn map robots close http://127.0.0.1:8750/maps/lab mole
     mole: 1 incarnations closed; its next commits count from nothing
+    $ cairn map robots keys http://127.0.0.1:8750/maps/lab
+    $ cairn map robots admit http://127.0.0.1:8750/maps/lab mole
 
 Each robot has shares of its own of what a map can hold, so that no robot can use up another's. `list` shows how full
 the fullest of them is, and what closed robots and the server itself use together. `close` takes nothing out of the map:
 the robot's incarnations take no more commits, the robot goes on with a new one, and all its shares are whole again.
+A robot's name is bound to its first key: `keys` shows them, and robots that come with another one, as after the loss of
+a disk; `admit` says that it is the same robot.
 """
 
 import argparse
@@ -17,6 +21,7 @@ import json
 from collections.abc import Iterator
 
 from cairn_client.cli.arguments import Subparsers, add_map_parser, api_of, say
+from cairn_client.cli.maps.robot_keys import add_admit, add_keys
 from cairn_map.wire.access_messages import RobotUse
 
 HEAD = ("robot", "incarnations", "intervals", "fullest")
@@ -28,7 +33,7 @@ def add_parser(commands: Subparsers) -> None:
     parts = commands.add_parser("robots", help=text, description=__doc__).add_subparsers(
         required=True, metavar="COMMAND"
     )
-    for add_part in (_add_list, _add_close):
+    for add_part in (_add_list, _add_close, add_keys, add_admit):
         add_part(parts)
 
 

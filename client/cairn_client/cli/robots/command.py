@@ -44,6 +44,7 @@ STATUS = """`cairn robot status`: state of the robot of a folder, whether or not
 
 $ cairn robot status state/
 mole on map lab (http://base:8750/maps/lab), high-end, at work
+key            mole.1f2e3d4c5b6a7988
 last contact   12 s ago; failing for 8 s: cannot reach http://base:8750/ [no_link]
 waiting        2 commits, 81.3 kB; 5 kept, 203.1 kB
 map            14 cells, 1.2 MB, at cursor 6f...
@@ -98,6 +99,7 @@ def _status(args: argparse.Namespace) -> int:
     state = "at work" if status.is_open else "not at work"
     server = status.url or "server unknown"
     say(f"{status.robot} on map {status.map} ({server}), {status.mode or 'mode unknown'}, {state}")
+    say(f"  key            {status.robot}.{status.incarnation}")
     say(f"  last contact   {_contact(status)}")
     waiting = f"{status.waiting} commits, {shown_bytes(status.waiting_bytes)}"
     say(f"  waiting        {waiting}; {status.kept} kept, {shown_bytes(status.kept_bytes)}")

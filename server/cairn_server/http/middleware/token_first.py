@@ -1,15 +1,14 @@
 """Authentication before a body is read: a request that brings one shows a known token, or is refused at its head.
 
 Without this, any client could send 64 MiB on every connection. The caller found is noted in the request's state: what
-it may take of the server's memory and threads is counted by it, and the route asks no second time. What the caller may
-do is checked by the route (`routes.callers`). Plain ASGI.
+it may take of the server's memory and threads is counted by it. Who the caller is, and what it may do, the route finds
+out by itself (`routes.callers`), so that a token that ended while the request waited does not count. Plain ASGI.
 """
 
 import base64
 import binascii
-import time
+import re
 from collections.abc import Hashable, Iterable, MutableMapping
-from dataclasses import dataclass
 from typing import Any
 
 from cairn_map.errors import CairnError, DeniedError
@@ -18,17 +17,13 @@ from cairn_server.http.middleware.asgi import App, Receive, Send, send_problem
 from cairn_server.service import Service
 
 WITHOUT_BODY = frozenset({"GET", "HEAD", "OPTIONS"})
-NOTED_S = 1.0
-"""Time for which a caller counts as authenticated: a body that takes longer comes under a token that may have ended."""
+REGISTRATION = re.compile(r"/maps/([^/]*)/branches")
+"""Path where the proof of a robot's key may stand for a token."""
+DROPPED_BYTES_MAX = 1 << 14
+"""Largest body that is read of a request which is refused at its head."""
 TOKEN_PREFIX = "cairn.token."  # noqa: S105 - what stands before one
 STATE = "caller"
-"""Name of the note in the request's state."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Noted:
-    caller: Caller
-    at_s: float
+"""Name of the caller's note in the request's state."""
 
 
 class TokenFirst:
@@ -41,26 +36,40 @@ class TokenFirst:
     async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
         """Pass a request on, or refuse it."""
         if scope["type"] in ("http", "websocket"):
-            token = _token_in(scope["headers"]) or offered_token(scope.get("subprotocols", ()))
             try:
-                # On the event loop, as in the routes: a look-up by key takes 40 us, a change of threads longer.
-                caller = caller_of(token, None, self._service.store, self._service.settings)
+                caller = self._caller(scope)
             except DeniedError as exc:
                 # What needs no body may need no token either: that is the route's to know.
                 if scope["type"] == "http" and scope["method"] not in WITHOUT_BODY:
+                    await _drop_small_body(scope, receive)
                     await send_problem(send, 401, exc.kind, exc.message)
                     return
             except CairnError:
                 pass  # a store that cannot be asked is the route's to report
             else:
-                scope.setdefault("state", {})[STATE] = _Noted(caller, time.monotonic())
+                scope.setdefault("state", {})[STATE] = caller
         await self._app(scope, receive, send)
 
+    def _caller(self, scope: MutableMapping[str, Any]) -> Caller:
+        """Caller of a request, by its token, or where it registers a robot by the proof of the robot's key."""
+        token = _token_in(scope["headers"]) or offered_token(scope.get("subprotocols", ()))
+        try:
+            # On the event loop, as in the routes: a look-up by key takes 40 us, a change of threads longer.
+            return caller_of(token, None, self._service.store, self._service.settings)
+        except DeniedError:
+            proof, path = _first(scope["headers"], b"cairn-proof"), REGISTRATION.fullmatch(scope["path"])
+            if token is not None or not proof or path is None:
+                raise
+            return self._service.sync.admissions.returning(path[1], proof)
 
-def noted_caller(scope: MutableMapping[str, Any]) -> Caller | None:
-    """Caller of a request that was authenticated less than `NOTED_S` ago; None: it is to be authenticated."""
-    noted: _Noted | None = scope.get("state", {}).get(STATE)
-    return noted.caller if noted is not None and time.monotonic() - noted.at_s < NOTED_S else None
+
+async def _drop_small_body(scope: MutableMapping[str, Any], receive: Receive) -> None:
+    """Read what is on its way, if it is little: a connection that closes before would take the answer with it."""
+    length = _first(scope["headers"], b"content-length")
+    while length.isdigit() and int(length) <= DROPPED_BYTES_MAX:
+        message = await receive()
+        if message["type"] != "http.request" or not message.get("more_body", False):
+            return
 
 
 def is_known(scope: MutableMapping[str, Any]) -> bool:
@@ -68,16 +77,16 @@ def is_known(scope: MutableMapping[str, Any]) -> bool:
 
     The enrolment token is a whole fleet's: robots show it together, and each has one of its own a moment later.
     """
-    noted: _Noted | None = scope.get("state", {}).get(STATE)
-    return noted is not None and noted.caller.role is not Role.ENROLLER
+    noted: Caller | None = scope.get("state", {}).get(STATE)
+    return noted is not None and noted.role is not Role.ENROLLER
 
 
 def caller_key(scope: MutableMapping[str, Any]) -> Hashable:
     """Holder of shares of the server: a token, or a stranger's address. Each request of an admin counts for itself."""
-    noted: _Noted | None = scope.get("state", {}).get(STATE)
+    noted: Caller | None = scope.get("state", {}).get(STATE)
     if noted is None:
         return f"address {scope['client'][0]}" if scope.get("client") else "no address"
-    return object() if noted.caller.role is Role.ADMIN else noted.caller.name
+    return object() if noted.role is Role.ADMIN else noted.name
 
 
 def offered_token(subprotocols: Iterable[str]) -> str | None:
@@ -94,6 +103,9 @@ def offered_token(subprotocols: Iterable[str]) -> str | None:
 
 def _token_in(headers: list[tuple[bytes, bytes]]) -> str | None:
     """Bearer token of the first `Authorization`, as the framework reads it."""
-    shown = next((value.decode("latin-1") for name, value in headers if name == b"authorization"), "")
-    scheme, _, token = shown.partition(" ")
+    scheme, _, token = _first(headers, b"authorization").partition(" ")
     return token.strip() if scheme.lower() == "bearer" and token.strip() else None
+
+
+def _first(headers: list[tuple[bytes, bytes]], name: bytes) -> str:
+    return next((value.decode("latin-1") for key, value in headers if key == name), "")

@@ -5,10 +5,12 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Response
 
+from cairn_map.commits.ids import Author, Incarnation, RobotName
+from cairn_map.commits.key_proof import PROOF_TEXT_MAX
 from cairn_map.wire.access_messages import RobotClosed, RobotUse
 from cairn_map.wire.messages import BranchInfo, Register, Registered, RobotStatus
 from cairn_server.access.auth import Caller, Role
-from cairn_server.http.routes.callers import OWNERS, READERS, Map, Operations, allowed, body_of, own_branch
+from cairn_server.http.routes.callers import OWNERS, READERS, Map, Operations, allowed, body_of, own_branch, registrar
 from cairn_server.http.routes.documentation import answers, body, json_body, problems
 from cairn_server.http.routes.json_bodies import json_of
 from cairn_server.store.shares import used_bounds
@@ -34,11 +36,14 @@ router = APIRouter()
 def register(
     service: Operations,
     row: Map,
-    caller: Annotated[Caller, Depends(allowed(Role.ENROLLER))],
+    caller: Annotated[Caller, Depends(registrar)],
     body: Annotated[Register, json_of(Register)],
+    cairn_proof: Annotated[str | None, Header(max_length=PROOF_TEXT_MAX)] = None,
 ) -> Registered:
-    """Register a robot; registering again replaces its token."""
-    registered = service.maps.register(row, body)
+    """Register a robot; registering again replaces its token, and takes a proof that it is the same robot."""
+    author = Author(RobotName(body.robot), Incarnation(body.incarnation))
+    with service.sync.admissions.registering(row, caller, author, cairn_proof) as grounds:
+        registered = service.maps.register(row, body, grounds)
     service.store.audit_log.add(caller.name, "register", f"map {row.name}: {body.robot}")
     return registered
 

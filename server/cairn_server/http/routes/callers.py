@@ -9,13 +9,13 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Annotated
 
-from fastapi import Depends, Request
+from fastapi import Depends, Header, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.requests import HTTPConnection
 
-from cairn_map.errors import NotFoundError
+from cairn_map.commits.key_proof import PROOF_TEXT_MAX
+from cairn_map.errors import DeniedError, NotFoundError
 from cairn_server.access.auth import READING, Caller, Role, bad_token, caller_of, require, require_all_maps
-from cairn_server.http.middleware.token_first import noted_caller
 from cairn_server.service import Service
 from cairn_server.store.store_rows import MapRow
 
@@ -38,8 +38,6 @@ class Asker:
 
     service: Service
     credentials: HTTPAuthorizationCredentials | None
-    noted: Caller | None = None
-    """Caller, if the request was authenticated at its head."""
 
     def map(self, name: str) -> MapRow:
         """The map of a name; clients without access to all maps cannot find out which names exist."""
@@ -52,12 +50,8 @@ class Asker:
 
     def caller(self, row: MapRow | None) -> Caller:
         """The caller, on a map or (None) where none is named; a token of one map counts on that map only."""
-        if self.noted is None:
-            token = self.credentials.credentials if self.credentials else None
-            return caller_of(token, row, self.service.store, self.service.settings)
-        if row is not None and not self.noted.counts_on(row.number):
-            raise bad_token()
-        return self.noted
+        token = self.credentials.credentials if self.credentials else None
+        return caller_of(token, row, self.service.store, self.service.settings)
 
     def reader(self, name: str) -> MapRow:
         """The map of a name, if the caller may read it."""
@@ -72,7 +66,7 @@ async def asker_of(request: Request, credentials: Credentials) -> Asker:
 
 
 def _asker(request: HTTPConnection, credentials: HTTPAuthorizationCredentials | None) -> Asker:
-    return Asker(request.app.state.service, credentials, noted_caller(request.scope))
+    return Asker(request.app.state.service, credentials)
 
 
 Asking = Annotated[Asker, Depends(asker_of)]
@@ -107,6 +101,20 @@ def allowed(*roles: Role) -> Callable[[Caller], Awaitable[Caller]]:
         return caller
 
     return check
+
+
+async def registrar(
+    row: Map, asker: Asking, cairn_proof: Annotated[str | None, Header(max_length=PROOF_TEXT_MAX)] = None
+) -> Caller:
+    """The caller, if it may register robots: by a token, or without one by a key that an operator lets in."""
+    try:
+        caller = asker.caller(row)
+    except DeniedError:
+        if asker.credentials is not None or cairn_proof is None:
+            raise
+        return asker.service.sync.admissions.returning(row.name, cairn_proof)
+    require(caller, Role.ENROLLER)
+    return caller
 
 
 def admin(caller: Annotated[Caller, Depends(caller_anywhere)]) -> Caller:
@@ -166,8 +174,16 @@ def _visit(name: str, request: Request, credentials: HTTPAuthorizationCredential
 
 
 async def body_of(request: Request) -> bytes:
-    """The whole body; `BodyLimit` bounds it."""
-    return await request.body()
+    """The whole body; `BodyLimit` bounds it. A token that ended while it came does not count.
+
+    Raises:
+        DeniedError: kind `bad_token`.
+    """
+    data = await request.body()
+    credentials = await bearer(request)
+    if credentials is not None:
+        _asker(request, credentials).caller(None)
+    return data
 
 
 reader = allowed(*READING)

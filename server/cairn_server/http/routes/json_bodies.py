@@ -15,6 +15,7 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ValidationError
 
 from cairn_map.wire.messages import CURSORS_MAX
+from cairn_server.http.routes.callers import body_of
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -29,7 +30,7 @@ def json_of(model: type[M]) -> Any:
     """Dependency of a route: its body as a message."""
 
     async def read(request: Request) -> M:
-        data = await request.body()
+        data = await body_of(request)
         _check_media_type(request)
         if len(data) <= SHORT_BYTES:
             return parsed(model, data)

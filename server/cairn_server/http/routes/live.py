@@ -10,7 +10,6 @@ import logging
 import time
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
-from dataclasses import replace
 from typing import Annotated
 from urllib.parse import urlsplit
 
@@ -48,7 +47,7 @@ class _Stream:
     """Listener of one client in the event loop, where other threads wake it."""
 
     def __init__(self, asker: Asker, row: MapRow) -> None:
-        self._asker = replace(asker, noted=None)  # asked again with each beat: the token may have ended
+        self._asker = asker  # asked again with each beat: the token may have ended
         self._row = row
         self._loop = asyncio.get_running_loop()
         self._woken = asyncio.Event()

@@ -8,6 +8,7 @@ import apsw
 from cairn_map.commits.cursor import ENTRY_FOLD
 from cairn_map.errors import ConflictError
 from cairn_server.store.sqlite.retention import check_kept, is_retracted, remember_evidence
+from cairn_server.store.sqlite.robot_keys import admit_commit
 from cairn_server.store.sqlite.shares import give_back_sums, note_number, take_sums
 from cairn_server.store.sqlite.writer import first
 from cairn_server.store.store_rows import Fold, MapRow, NewCommit
@@ -29,6 +30,7 @@ def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit, *
             _insert_diff(connection, number, commit)
         return damaged is not None
     check_kept(connection, row, commit.retracts)
+    admit_commit(connection, row, commit.id.author, commit.grounds)
     note_number(connection, row, commit.id)
     charged = take_sums(connection, row, commit)
     connection.execute(

@@ -213,7 +213,27 @@ UPDATE author SET closed = 1 WHERE robot NOT IN ('operator', 'initial') AND map 
     SELECT map FROM author WHERE robot NOT IN ('operator', 'initial') GROUP BY map HAVING count(DISTINCT robot) > 256);
 """
 
-STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS, RECEIVED, SIGNED, HOTTEST, AGES, SHARES)
+KEYS = """
+CREATE TABLE robot_key (                            -- incarnations that may speak for a robot's name
+    map INTEGER NOT NULL REFERENCES map,
+    robot TEXT NOT NULL,
+    incarnation TEXT NOT NULL,
+    is_proven INTEGER NOT NULL,     -- it signed something here, so it is a key
+    may_return INTEGER NOT NULL,    -- an operator's word waits for its registration
+    since_s REAL NOT NULL,
+    by TEXT NOT NULL,               -- name of the token that brought it
+    PRIMARY KEY (map, robot, incarnation)
+) WITHOUT ROWID;
+INSERT INTO robot_key
+    SELECT map, robot, incarnation, EXISTS (
+        SELECT 1 FROM commits WHERE commits.map = author.map AND commits.robot = author.robot
+        AND commits.incarnation = author.incarnation AND signatures IS NOT NULL
+    ), 0, unixepoch(), 'server' FROM author WHERE robot NOT IN ('operator', 'initial');
+INSERT OR IGNORE INTO robot_key
+    SELECT map, name, incarnation, 0, 0, unixepoch(), 'server' FROM branch WHERE incarnation <> '';
+"""
+
+STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS, RECEIVED, SIGNED, HOTTEST, AGES, SHARES, KEYS)
 
 
 def ensure_schema(connection: apsw.Connection) -> None:

@@ -14,10 +14,11 @@ from pathlib import Path
 import apsw
 
 from cairn_map.commits.cursor import Cursor, cursor_from_text, first_chain
-from cairn_map.commits.ids import Author, new_incarnation
+from cairn_map.commits.ids import Author, Incarnation, RobotName, new_incarnation
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.store.admission import OWN_WORD, Grounds
 from cairn_server.store.folder_lock import lock_folder
 from cairn_server.store.sqlite.branches import LastSeen, SqliteBranchNotes
 from cairn_server.store.sqlite.changes import append_commit, next_number, write_fold
@@ -26,6 +27,7 @@ from cairn_server.store.sqlite.old_sums import measure_old_sums
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.reads import SqliteReads
 from cairn_server.store.sqlite.retention import forget_evidence
+from cairn_server.store.sqlite.robot_keys import SqliteRobotKeys, admit_registration
 from cairn_server.store.sqlite.schema import ensure_schema
 from cairn_server.store.sqlite.shares import SqliteShares
 from cairn_server.store.sqlite.tokens import (
@@ -87,6 +89,7 @@ class SqliteStore(SqliteReads):
         with self._readers.reading() as reader:
             self.age = StoreAge(AgeMark(*first(reader, "SELECT age_s, wall_s FROM age")), clocks)
         self.tokens = SqliteTokens(self._writer, self._readers, self.age)
+        self.keys = SqliteRobotKeys(self._writer, self._readers)
         self.uses = SqliteUses(self._readers)
         self.shares = SqliteShares(self._writer, self._readers)
         self.audit_log = SqliteAuditLog(self._writer, self._readers)
@@ -162,14 +165,16 @@ class SqliteStore(SqliteReads):
         """Write a fold if the head is still its base; False (and nothing written) otherwise."""
         return self._writer.run(lambda connection: write_fold(connection, row, fold, age_s=self.age.now_s()))
 
-    def register(self, row: MapRow, branch: Branch, token_hash: bytes) -> None:
-        """Make a branch, or give an existing one a new token."""
+    def register(self, row: MapRow, branch: Branch, token_hash: bytes, grounds: Grounds = OWN_WORD) -> None:
+        """Make a branch, or give an existing one a new token, if its name is not bound to another key."""
+        author = Author(RobotName(branch.name), Incarnation(branch.incarnation))
         self._write_seen()  # before the row is replaced, in the order of the writer's jobs
         self._seen.forget(row.number, branch.name)
         sensors = json.dumps(branch.sensors)
         values = (row.number, branch.name, branch.mode, sensors, branch.last_seen_s, branch.incarnation)
 
         def job(connection: apsw.Connection) -> None:
+            admit_registration(connection, row, author, grounds)
             connection.execute(
                 "INSERT INTO branch (map, name, mode, sensors, last_seen_s, incarnation) VALUES (?, ?, ?, ?, ?, ?)"
                 " ON CONFLICT (map, name) DO UPDATE SET mode = excluded.mode, sensors = excluded.sensors,"

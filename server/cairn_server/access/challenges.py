@@ -1,0 +1,51 @@
+"""Challenges for proofs of robots' keys, and the check of a proof.
+
+A challenge is the time of its making and a code over it by a secret of this process, so that none is kept: it is good
+for a minute, and not after a new start.
+"""
+
+import hashlib
+import hmac
+import secrets
+import time
+from collections.abc import Callable
+
+from cairn_map.commits.ids import Incarnation
+from cairn_map.commits.key_proof import KeyProof, proof_bytes
+from cairn_map.commits.signature import are_valid, incarnation_of
+from cairn_map.errors import BadInputError
+
+LIFETIME_S = 60.0
+TIME_DIGITS = 16
+
+
+class Challenges:
+    """Challenges of one process; called from many threads."""
+
+    def __init__(self, *, steady_s: Callable[[], float] = time.monotonic) -> None:
+        self._secret = secrets.token_bytes(32)
+        self._steady_s = steady_s
+
+    def new(self) -> str:
+        """A challenge, in hex."""
+        made = f"{round(self._steady_s() * 1000):0{TIME_DIGITS}x}"
+        return made + self._code(made)
+
+    def signers(self, proof: KeyProof, *, map_name: str) -> frozenset[Incarnation]:
+        """Incarnations whose keys a proof shows.
+
+        Raises:
+            BadInputError: kind `bad_signature`: the challenge is none of this server's or too old, or a signature is
+                not one of it.
+        """
+        made, code = proof.challenge[:TIME_DIGITS], proof.challenge[TIME_DIGITS:]
+        if not hmac.compare_digest(code, self._code(made)):
+            raise BadInputError("bad_signature", "the proof answers no challenge of this server; ask for a new one")
+        if self._steady_s() - int(made, 16) / 1000 > LIFETIME_S:
+            raise BadInputError("bad_signature", f"the challenge is older than {LIFETIME_S:.0f} s; ask for a new one")
+        if not are_valid(proof.signatures, proof_bytes(map_name, proof.author, proof.challenge)):
+            raise BadInputError("bad_signature", f"a signature of the proof is not one for {proof.author} on this map")
+        return frozenset(incarnation_of(signature.key) for signature in proof.signatures)
+
+    def _code(self, made: str) -> str:
+        return hmac.new(self._secret, made.encode(), hashlib.sha256).hexdigest()

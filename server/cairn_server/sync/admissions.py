@@ -1,0 +1,136 @@
+"""Admission of robots' keys: proofs that robots show, an operator's word, and those that wait for it.
+
+The rule is that of `store.admission`; the store holds it, in the transaction of each commit and registration. Robots
+that were refused are remembered for the operator, the newest of each map, in memory: they ask again.
+"""
+
+import math
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+
+from cairn_map.commits.ids import SERVERS_OWN, Author, Incarnation
+from cairn_map.commits.key_proof import KeyProof
+from cairn_map.errors import BadInputError, CairnError, DeniedError, UnreachableError
+from cairn_map.wire.access_messages import AskingRobot, KeyInfo, RobotKeyList
+from cairn_server.access.auth import Caller, Role
+from cairn_server.access.challenges import Challenges
+from cairn_server.access.rate_limits import HOUR_S, Allowance, allowance
+from cairn_server.settings import Quotas
+from cairn_server.store.admission import Grounds
+from cairn_server.store.store import Store
+from cairn_server.store.store_rows import MapRow
+
+ASKING_MAX = 64
+"""Refused robots of one map that are remembered."""
+
+
+class Admissions:
+    """Keys of the robots of a store's maps; called from many threads."""
+
+    def __init__(self, store: Store, quotas: Quotas, *, steady_s: Callable[[], float] = time.monotonic) -> None:
+        self.challenges = Challenges(steady_s=steady_s)
+        self._store = store
+        self._per_hour = quotas.registrations_per_hour
+        self._steady_s = steady_s
+        self._lock = threading.Lock()
+        self._registrations: dict[str, Allowance] = {}
+        """Registrations left to each enrolment token, by its name."""
+        self._asking: dict[int, OrderedDict[Author, AskingRobot]] = {}
+
+    def returning(self, map_name: str, proof_text: str) -> Caller:
+        """Caller that shows no token, but the key of a robot that an operator lets in: it may register this robot.
+
+        Raises:
+            DeniedError: kind `no_token`: no operator said so, or the proof does not hold. It does not say which, nor
+                whether there is such a map.
+        """
+        with suppress(CairnError):
+            proof = KeyProof.from_text(proof_text)
+            row = self._store.map(map_name)
+            key = self._store.keys.of(row, proof.author.robot).get(proof.author.incarnation)
+            may_return = key is not None and key.may_return
+            if may_return and proof.author.incarnation in self.challenges.signers(proof, map_name=row.name):
+                return Caller(Role.ENROLLER, proof.author.robot, str(proof.author), row.number)
+        raise DeniedError(
+            "no_token",
+            "this takes a token, or the key of a robot that an operator let in: cairn map robots admit URL NAME.KEY",
+        )
+
+    @contextmanager
+    def registering(self, row: MapRow, caller: Caller, author: Author, proof_text: str | None) -> Iterator[Grounds]:
+        """Context of a registration, with the grounds of its caller; one that fails costs no quota.
+
+        Raises:
+            DeniedError: kind `not_allowed`: the token is for another robot.
+            BadInputError: kind `bad_signature`: the proof does not hold.
+            UnreachableError: kind `quota`: the enrolment token registered too many for now.
+        """
+        is_for_robot = caller.robot == author.robot
+        if not is_for_robot and caller.robot is not None:
+            raise DeniedError("not_allowed", f"the token shown is not for {author.robot}")
+        signers: frozenset[Incarnation] = frozenset()
+        if proof_text is not None:
+            proof = KeyProof.from_text(proof_text)
+            signers = self.challenges.signers(proof, map_name=row.name) if proof.author == author else signers
+        has_word = caller.role is Role.ADMIN or (caller.role is Role.ENROLLER and is_for_robot)
+        self._take(caller)
+        try:
+            yield Grounds(signers=signers, has_word=has_word, by=caller.name)
+        except CairnError as exc:
+            if exc.kind == "not_admitted":
+                self.refused(row, author, by=caller)
+            self._give_back(caller)
+            raise
+
+    def admit(self, row: MapRow, author: Author, *, by: Caller) -> None:
+        """Admit a key by an operator's word; durable on return.
+
+        Raises:
+            BadInputError: kind `reserved_name`: servers speak in this name.
+        """
+        if author.robot in SERVERS_OWN:
+            raise BadInputError("reserved_name", f"{author.robot} is not a robot's name")
+        self._store.keys.admit(row, author, by=by.name)
+        self._store.audit_log.add(by.name, "admit", f"map {row.name}: {author}")
+        with self._lock:
+            self._asking.get(row.number, OrderedDict()).pop(author, None)
+
+    def refused(self, row: MapRow, author: Author, *, by: Caller) -> None:
+        """Remember a robot that was refused for its key."""
+        with self._lock:
+            asking = self._asking.setdefault(row.number, OrderedDict())
+            asking[author] = AskingRobot(author=str(author), asked_s=time.time(), by=by.name)
+            asking.move_to_end(author)
+            if len(asking) > ASKING_MAX:
+                asking.popitem(last=False)
+
+    def list(self, row: MapRow) -> RobotKeyList:
+        """Admitted keys, and the robots that ask to be."""
+        keys = [
+            KeyInfo(author=str(key.author), since_s=key.since_s, by=key.by, may_return=key.may_return)
+            for key in self._store.keys.all(row)
+        ]
+        with self._lock:
+            asking = list(self._asking.get(row.number, {}).values())
+        return RobotKeyList(admitted=keys, asking=asking)
+
+    def _take(self, caller: Caller) -> None:
+        if caller.role is not Role.ENROLLER or self._per_hour is None:
+            return
+        now_s = self._steady_s()
+        with self._lock:
+            left = self._registrations.setdefault(
+                caller.name, allowance(self._per_hour, self._per_hour / HOUR_S, now_s=now_s)
+            )
+            wait_s = left.take(now_s)
+        if wait_s:
+            message = f"the token {caller.name} may register {self._per_hour} robots an hour"
+            raise UnreachableError("quota", message, retry_after_s=math.ceil(wait_s))
+
+    def _give_back(self, caller: Caller) -> None:
+        with self._lock:
+            if caller.name in self._registrations:
+                self._registrations[caller.name].left += 1
