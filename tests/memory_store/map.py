@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
-from tests.memory_store.robot_keys import admit_commit
+from tests.memory_store.admission import admit_commit
 
 from cairn_map.commits.cursor import ENTRY_FOLD, Cursor, first_chain
 from cairn_map.commits.ids import SERVERS_OWN, Author, CommitId

@@ -1,23 +1,17 @@
-"""Robots' keys in memory (`store.RobotKeys`)."""
+"""Robots' keys in memory (`store.AdmittedKeys`)."""
 
-import time
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from tests.memory_store.admission import known, put_key
+from tests.memory_store.maps import MemoryMaps
 
-from cairn_map.commits.ids import SERVERS_OWN, Author, Incarnation
-from cairn_server.store.admission import Grounds, RobotKey, check_commit, check_registration
+from cairn_map.commits.ids import Author, Incarnation
+from cairn_server.store.admission import RobotKey
 from cairn_server.store.store_rows import MapRow
 
-if TYPE_CHECKING:
-    from tests.memory_store.maps import MemoryMaps
 
-Keys = dict[Author, RobotKey]
+class MemoryAdmittedKeys:
+    """`store.AdmittedKeys`, under the lock of the maps."""
 
-
-class MemoryRobotKeys:
-    """`store.RobotKeys`, under the lock of the maps."""
-
-    def __init__(self, maps: "MemoryMaps") -> None:
+    def __init__(self, maps: MemoryMaps) -> None:
         self._maps = maps
 
     def all(self, row: MapRow) -> list[RobotKey]:
@@ -33,33 +27,4 @@ class MemoryRobotKeys:
     def admit(self, row: MapRow, author: Author, *, by: str) -> None:
         """Admit a key by an operator's word."""
         with self._maps.changing(row) as changed:
-            _put(changed.keys, author, may_return=True, by=by)
-
-
-def admit_commit(keys: Keys, author: Author, grounds: Grounds) -> None:
-    """Admit the author of a new commit, or refuse it."""
-    if author.robot in SERVERS_OWN:
-        return
-    check_commit(author, grounds, known(keys, author.robot))
-    _put(keys, author, is_proven=author.incarnation in grounds.signers, by=grounds.by)
-
-
-def admit_registration(keys: Keys, author: Author, grounds: Grounds) -> None:
-    """Admit a registration, or refuse it."""
-    check_registration(author, grounds, known(keys, author.robot))
-    _put(keys, author, is_proven=author.incarnation in grounds.signers, by=grounds.by)
-    for other, key in keys.items():
-        if other.robot == author.robot:
-            keys[other] = replace(key, may_return=False)
-
-
-def known(keys: Keys, robot: str) -> dict[Incarnation, RobotKey]:
-    """Admitted keys of a robot."""
-    return {author.incarnation: key for author, key in keys.items() if author.robot == robot}
-
-
-def _put(keys: Keys, author: Author, *, is_proven: bool = False, may_return: bool = False, by: str) -> None:
-    key = keys.get(author)
-    if key is None:
-        key = RobotKey(author=author, is_proven=is_proven, may_return=may_return, since_s=time.time(), by=by)
-    keys[author] = replace(key, is_proven=key.is_proven or is_proven, may_return=key.may_return or may_return)
+            put_key(changed.keys, author, may_return=True, by=by)

@@ -8,10 +8,11 @@ from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 
+from tests.memory_store.admission import admit_registration
 from tests.memory_store.figures import MemoryHealth, MemoryNotes, MemoryShares, MemoryUses
 from tests.memory_store.map import new_memory_map
 from tests.memory_store.maps import MemoryMaps
-from tests.memory_store.robot_keys import MemoryRobotKeys, admit_registration
+from tests.memory_store.robot_keys import MemoryAdmittedKeys
 from tests.memory_store.snapshot import MemorySnapshot
 from tests.memory_store.tokens import MemoryAuditLog, MemoryTokens
 
@@ -35,7 +36,7 @@ class MemoryStore:
         self._maps = MemoryMaps()
         self.age = StoreAge(AgeMark(), clocks)
         self.tokens = MemoryTokens(self._maps, self.age)
-        self.keys = MemoryRobotKeys(self._maps)
+        self.keys = MemoryAdmittedKeys(self._maps)
         self.audit_log = MemoryAuditLog(self._maps)
         self.health = MemoryHealth(self._maps, self.age)
         self.uses = MemoryUses(self._maps)

@@ -47,6 +47,13 @@ class MemoryTokens:
         with self._maps.locked():
             self._removed(name)
 
+    def confirm(self, name: str) -> Token:
+        """Let a restored token count again; here nothing is restored."""
+        with self._maps.locked():
+            if name not in self._tokens:
+                raise NotFoundError("no_such_token", f"there is no token {name!r}")
+            return self._tokens[name][0]
+
     def all(self) -> list[Token]:
         """All tokens, by name."""
         with self._maps.locked():

@@ -33,7 +33,7 @@ DAY_S = 86_400.0
 
 def main(argv: list[str]) -> int:
     """Run one of the subcommands."""
-    parts = (_add_create, _add_list, _add_rotate, _add_revoke)
+    parts = (_add_create, _add_list, _add_rotate, _add_revoke, _add_confirm)
     return run_subcommand("cairn token", __doc__, parts, argv)
 
 
@@ -57,6 +57,14 @@ def _add_rotate(commands: Subparsers) -> None:
 
 def _add_revoke(commands: Subparsers) -> None:
     _token_parser(commands, "revoke", _revoke, text="end a token")
+
+
+def _add_confirm(commands: Subparsers) -> None:
+    text = "let tokens count again that a restore of the server switched off"
+    confirm = _server_parser(commands, "confirm", _confirm, text=text)
+    confirm.add_argument("names", metavar="NAME", nargs="*", help="tokens, as `cairn token list` shows them")
+    confirm.add_argument("--all", action="store_true", help="all that are off: none was ended since the backup")
+    add_token(confirm)
 
 
 def _token_parser(commands: Subparsers, name: str, run: Run, *, text: str) -> argparse.ArgumentParser:
@@ -100,7 +108,8 @@ def _list(args: argparse.Namespace) -> int:
 def _line(info: TokenInfo) -> str:
     scope = info.map or "all maps"
     where = f"{scope}, {info.robot}" if info.robot else scope
-    until, used = _shown_time(info.expires_s, "no end"), _shown_time(info.last_used_s, "never")
+    end = _shown_time(info.expires_s, "no end") if info.confirmed else "OFF: confirm it"
+    until, used = end, _shown_time(info.last_used_s, "never")
     return f"{info.name:<24} {info.role:<8} {where:<22} {until:<17} {used}"
 
 
@@ -113,6 +122,16 @@ def _rotate(args: argparse.Namespace) -> int:
 def _revoke(args: argparse.Namespace) -> int:
     with MapApi(args.server, token=args.token.of(args.server)) as api:
         api.revoke_token(_name(args.name))
+    return 0
+
+
+def _confirm(args: argparse.Namespace) -> int:
+    with MapApi(args.server, token=args.token.of(args.server)) as api:
+        off = [info.name for info in api.tokens() if not info.confirmed] if args.all else []
+        names = off or [_name(text) for text in args.names]
+        for name in names:
+            api.confirm_token(name)
+    say(f"{len(names)} tokens count again" + (f": {', '.join(names)}" if names else ""))
     return 0
 
 

@@ -286,6 +286,10 @@ class MapApi:
         """End a token."""
         self._ask("DELETE", f"/tokens/{token}")
 
+    def confirm_token(self, token: str) -> TokenInfo:
+        """Let a token count again that a restore brought back."""
+        return message_from_json(TokenInfo, self._ask("POST", f"/tokens/{token}/confirm"))
+
     def tokens(self) -> list[TokenInfo]:
         """All tokens, without their secrets."""
         return list_of(TokenInfo, self._ask("GET", "/tokens"))

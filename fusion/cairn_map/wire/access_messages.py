@@ -51,6 +51,8 @@ class TokenInfo(_Model):
     expires_s: float | None
     last_used_s: float | None
     """Time of its last use, UTC seconds since 1970; updated every few seconds at most."""
+    confirmed: bool = True
+    """False after a restore, until an admin confirms that the token still counts."""
 
 
 class RobotUse(_Model):

@@ -79,7 +79,7 @@ def caller_of(token: str | None, row: MapRow | None, store: Store, settings: Set
     """Caller that shows this token, on a map or (None) on the server as a whole.
 
     Raises:
-        DeniedError: kind `no_token` or `bad_token`; the latter also on a map that the token is not for.
+        DeniedError: kind `no_token`, `bad_token`, also on a map that the token is not for, or `unconfirmed_token`.
     """
     if token is None:
         if settings.admin_token is None:
@@ -143,6 +143,12 @@ def _holder(token: str, store: Store, settings: Settings) -> Caller | None:
     if known is not None:
         if has_ended(known, settings, now_s=time.time(), age_s=store.age.now_s()):
             return None
+        if not known.is_confirmed:
+            raise DeniedError(
+                "unconfirmed_token",
+                f"the server was restored from a backup, and the token {known.name} is off until an admin says that it "
+                f"was not ended meanwhile: cairn token confirm SERVER {known.name}",
+            )
         store.tokens.used(known.name)
         return Caller(Role(known.role), known.robot, known.name, known.map_number)
     if _is(token, settings.admin_token):

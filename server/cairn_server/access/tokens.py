@@ -58,6 +58,17 @@ def revoke_token(store: Store, name: str, *, by: Caller) -> None:
     store.audit_log.add(by.name, "revoke_token", name)
 
 
+def confirm_token(store: Store, name: str, *, by: Caller) -> TokenInfo:
+    """Let a token count again that a restore brought back, unless it was ended meanwhile.
+
+    Raises:
+        NotFoundError: kind `no_such_token`.
+    """
+    token = store.tokens.confirm(name)
+    store.audit_log.add(by.name, "confirm_token", name)
+    return _info(token)
+
+
 def list_tokens(store: Store) -> list[TokenInfo]:
     """All tokens, by name, without their secrets."""
     return [_info(token) for token in store.tokens.all()]
@@ -72,4 +83,5 @@ def _info(token: Token) -> TokenInfo:
         created_s=token.created_s,
         expires_s=token.expires_s,
         last_used_s=token.last_used_s,
+        confirmed=token.is_confirmed,
     )

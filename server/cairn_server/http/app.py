@@ -22,7 +22,6 @@ from cairn_server.http.routes import export as export_routes
 from cairn_server.http.routes import live as live_routes
 from cairn_server.http.routes import map as map_routes
 from cairn_server.http.routes import operations as operations_routes
-from cairn_server.http.routes import robot_keys as key_routes
 from cairn_server.http.routes import sync as sync_routes
 from cairn_server.http.routes.problems import PROBLEM_HANDLERS
 from cairn_server.service import Service
@@ -32,7 +31,6 @@ ROUTERS = (
     router,
     map_routes.router,
     branch_routes.router,
-    key_routes.router,
     sync_routes.router,
     cell_routes.router,
     export_routes.router,

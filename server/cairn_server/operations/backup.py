@@ -2,6 +2,8 @@
 
 import argparse
 import sys
+from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 
 from cairn_map.errors import EXIT_CODES, DamagedDataError
@@ -9,7 +11,7 @@ from cairn_map.progress import PercentLine
 from cairn_server.operations.check import check_all
 from cairn_server.settings import Settings
 from cairn_server.store.sqlite.archive import SqliteArchive
-from cairn_server.store.sqlite.backup import back_up, restore
+from cairn_server.store.sqlite.backup import Restored, back_up, restore
 
 BACKUP = """Copy a server's store into one file, while the server runs.
 
@@ -23,11 +25,18 @@ is not in it: `cairn serve --stable-after` must be longer than the age of the ol
 """
 RESTORE = """Make a server's folder out of a backup.
 
-    $ cairn serve restore nightly.cairn --data ./restored
+    $ cairn serve restore nightly.cairn --data ./restored --old ./cairn-data
     ./restored: restored and checked: 2 maps, 1204 commits, 56 cells
+    tokens: 14 count at once, 2 ended since the backup and stay so
+    not in the backup: 31 commits, 7 audit lines, 1 tokens of ./cairn-data
 
 The folder must be new or empty, and no server may work on it; everything is read and checked before it gets its
 name, and nothing is left of it if it is not sound. Then start `cairn serve --data ./restored` in the old one's place.
+
+Next to each store lies `ended-tokens`, a list of the tokens that were revoked, rotated or deregistered; it is in no
+backup. --old names the folder with it: what ended since the backup stays ended. Where that folder is lost, put the file
+into the new folder, or leave it: then all tokens of the backup are off until an admin confirms them (`cairn token
+confirm`; admins by --admin-token-file always count).
 
 Robots then do the rest by themselves: those whose cursor is newer than the backup cannot prove it, compare fingerprints
 cell by cell, and fetch what differs. They push again every commit that the server lost and they still keep, which are
@@ -61,13 +70,35 @@ def restore_command(argv: list[str]) -> int:
     )
     parser.add_argument("file", type=Path, metavar="FILE", help="a file that `cairn serve backup` made")
     parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help="a new or empty folder")
+    parser.add_argument("--old", type=Path, metavar="DIR", help="folder of the server that it replaces")
     args = parser.parse_args(argv)
     progress = PercentLine("restore")
     summary: list[str] = []
-    restore(args.file, args.data, progress.at, lambda path: summary.append(_verified(path)))
+    restored = restore(args.file, args.data, progress.at, lambda path: summary.append(_verified(path)), old=args.old)
     progress.finish()
-    sys.stdout.write(f"{args.data}: restored and checked: {summary[0]}\n{NEXT.format(folder=args.data)}")
+    sys.stdout.write(f"{args.data}: restored and checked: {summary[0]}\n")
+    for line in _told(restored, args.old):
+        sys.stdout.write(f"{line}\n")
+    sys.stdout.write(NEXT.format(folder=args.data))
     return 0
+
+
+def _told(restored: Restored, old: Path | None) -> Iterator[str]:
+    """Lines on the tokens of a restored store, and on what the backup has not."""
+    if restored.unconfirmed:
+        yield (
+            f"tokens: ALL {restored.unconfirmed} ARE OFF: nothing says which of them were revoked since the backup. "
+            "Look at `cairn token list SERVER`, and let those count that should: `cairn token confirm SERVER NAME`"
+        )
+    else:
+        yield f"tokens: {restored.tokens} count at once, {restored.ended} ended since the backup and stay so"
+    if restored.lost is not None:
+        lost = ", ".join(f"{count} {what}" for what, count in restored.lost.items())
+        yield f"not in the backup: {lost} of {old}"
+        return
+    newest = datetime.fromtimestamp(restored.newest_s, UTC).strftime("%Y-%m-%d %H:%M:%S")
+    when = f"after {newest} UTC" if restored.newest_s else "ever"
+    yield f"not in the backup: commits, audit lines and tokens that came {when}; --old DIR would count them"
 
 
 def _verified(path: Path) -> str:

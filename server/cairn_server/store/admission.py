@@ -1,11 +1,11 @@
-"""Admission of keys: a robot's name on a map is bound to its first key, and another one needs somebody's word.
+"""Admission of keys: a robot's name on a map is bound to its first key, and another one needs a word for it.
 
-    a name that is new                     any key, and the name is bound to it
-    a key that is admitted                 as before
+    a name that is new                     nothing: the name is bound to the key
+    a key that is admitted                 nothing else
     any other key                          a signature by an admitted key of the same name, an operator's word
                                            (`cairn map robots admit`), or an enrolment token that names the robot
 
-One rule for commits, whoever brings them, and for registrations. A key goes by its incarnation, which follows from it
+One rule for commits, from any caller, and for registrations. A key goes by its incarnation, which follows from it
 (`commits.signature`). A name of which no incarnation has proven a key yet is bound to its token alone.
 """
 
@@ -64,7 +64,7 @@ def check_commit(author: Author, grounds: Grounds, known: Mapping[Incarnation, R
 
 
 def check_registration(author: Author, grounds: Grounds, known: Mapping[Incarnation, RobotKey]) -> None:
-    """Refuse a registration that nobody vouches for under a name that is known; arguments as of `check_commit`.
+    """Refuse a registration under a known name for which nothing speaks; arguments as of `check_commit`.
 
     Raises:
         DeniedError: kind `not_admitted`.

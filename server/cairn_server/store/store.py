@@ -210,6 +210,14 @@ class Tokens(Protocol):
         """
         ...
 
+    def confirm(self, name: str) -> Token:
+        """Let a restored token count again.
+
+        Raises:
+            NotFoundError: kind `no_such_token`.
+        """
+        ...
+
     def all(self) -> list[Token]:
         """All tokens, by name, ended ones included."""
         ...
@@ -223,7 +231,7 @@ class Tokens(Protocol):
         ...
 
 
-class RobotKeys(Protocol):
+class AdmittedKeys(Protocol):
     """Keys that robots' names are bound to, by map (`admission`); commits and registrations add to them."""
 
     def all(self, row: MapRow) -> list[RobotKey]:
@@ -260,7 +268,7 @@ class Store(Protocol):
         ...
 
     @property
-    def keys(self) -> RobotKeys:
+    def keys(self) -> AdmittedKeys:
         """Keys of the robots."""
         ...
 

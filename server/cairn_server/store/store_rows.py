@@ -279,6 +279,8 @@ class Token:
     created_s: float
     expires_s: float | None
     last_used_s: float | None = None
+    is_confirmed: bool = True
+    """False after a restore without a list of what ended since, until an admin says that it still counts."""
     created_age_s: float = field(default=0.0, compare=False)
     """Age of the store when it was made; set by the store."""
     used_age_s: float = field(default=0.0, compare=False)

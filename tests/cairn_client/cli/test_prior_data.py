@@ -96,7 +96,7 @@ def check_all_or_none(folder: Path, api: MapApi) -> CairnError | None:
     """Create a map from a folder: all its cells are in it or, with the error that comes back, there is no map."""
     name = f"map{next(NAMES)}"
     try:
-        _, cells, added = push_prior_data(api, name, str(folder), token=None)
+        _, cells, added = push_prior_data(api, name, str(folder))
     except CairnError as exc:
         assert str(folder) in exc.message
         with pytest.raises(NotFoundError):

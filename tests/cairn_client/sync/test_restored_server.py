@@ -1,6 +1,5 @@
 """A server restored by its own commands: robots notice, and bring back what it lost."""
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -37,8 +36,8 @@ def test_robots_refill_a_server_that_was_restored_from_a_backup(team: Team, tmp_
     for name in ("mole", "fox"):
         team.fetch(name)
     team.server.stop()
-    shutil.rmtree(folder)
-    assert main(["restore", str(file), "--data", str(folder)]) == 0
+    old = folder.rename(tmp_path / "old")
+    assert main(["restore", str(file), "--data", str(folder), "--old", str(old)]) == 0
     team.server.start()
     team["fox"].commit({B: Y})
     for name in ("fox", "mole") * 3:

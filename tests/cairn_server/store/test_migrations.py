@@ -171,7 +171,7 @@ def test_a_key_that_signed_is_bound_as_one_when_the_store_is_brought_up_to_date(
         live.push(row, pushed(0, 0, signatures.MOLE), headers=signatures.signed(row, pushed(0, 0, signatures.MOLE)))
         live.push(row, pushed(0, 0, WREN))
     connection = apsw.Connection(str(tmp_path / FILE_NAME))
-    connection.execute(f"DROP TABLE robot_key; PRAGMA user_version = {STEPS.index(schema.KEYS)}")
+    connection.execute(f"DROP TABLE robot_key; {schema.KEYS}")
     connection.close()
     store = SqliteStore(tmp_path)
     assert {key.author: key.is_proven for key in store.keys.all(store.map(row.name))} == {

@@ -1,13 +1,13 @@
-"""Routes of a map's robots: registration, status and latest picture of each one's branch, and shares of bounds."""
+"""Routes of a map's robots: registration, keys, status and latest picture of each one's branch, shares of bounds."""
 
 from email.utils import formatdate
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Response
 
-from cairn_map.commits.ids import Author, Incarnation, RobotName
+from cairn_map.commits.ids import Author, Incarnation, RobotName, author_from_text
 from cairn_map.commits.key_proof import PROOF_TEXT_MAX
-from cairn_map.wire.access_messages import RobotClosed, RobotUse
+from cairn_map.wire.access_messages import Challenge, RobotClosed, RobotKeyList, RobotUse
 from cairn_map.wire.messages import BranchInfo, Register, Registered, RobotStatus
 from cairn_server.access.auth import Caller, Role
 from cairn_server.http.routes.callers import OWNERS, READERS, Map, Operations, allowed, body_of, own_branch, registrar
@@ -18,6 +18,7 @@ from cairn_server.store.shares import used_bounds
 PICTURES = ("image/jpeg", "image/png")
 
 router = APIRouter()
+Operator = Annotated[Caller, Depends(allowed(Role.OPERATOR))]
 
 
 @router.post(
@@ -141,3 +142,21 @@ def close_robot(
     closed = service.store.shares.close(row, robot)
     service.store.audit_log.add(caller.name, "close_robot", f"map {row.name}: {robot}, {closed.authors} incarnations")
     return RobotClosed(robot=robot, incarnations=closed.authors, intervals=closed.intervals)
+
+
+@router.get("/challenge")
+def challenge(service: Operations) -> Challenge:
+    """A text for a robot to sign by its key, so that it may register under a name that is known."""
+    return Challenge(challenge=service.sync.admissions.challenges.new())
+
+
+@router.get("/maps/{name}/keys", dependencies=[Depends(allowed(Role.OPERATOR))])
+def list_keys(service: Operations, row: Map) -> RobotKeyList:
+    """Keys that robots' names are bound to, and the robots that were refused for theirs."""
+    return service.sync.admissions.list(row)
+
+
+@router.put("/maps/{name}/keys/{author}", status_code=204)
+def admit(author: str, service: Operations, row: Map, caller: Operator) -> None:
+    """Admit a robot's other key, by an operator's word."""
+    service.sync.admissions.admit(row, author_from_text(author), by=caller)

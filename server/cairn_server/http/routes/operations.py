@@ -7,7 +7,7 @@ from fastapi.responses import PlainTextResponse
 
 from cairn_map.wire.access_messages import AuditEntry, CreateToken, NewSecret, TokenInfo
 from cairn_server.access.auth import Caller
-from cairn_server.access.tokens import create_token, list_tokens, revoke_token, rotate_token
+from cairn_server.access.tokens import confirm_token, create_token, list_tokens, revoke_token, rotate_token
 from cairn_server.http.routes.callers import ADMIN, Asking, Operations, admin
 from cairn_server.http.routes.documentation import json_body, problems
 from cairn_server.http.routes.json_bodies import json_of
@@ -63,6 +63,12 @@ def put_token(
 def rotate(token: str, service: Operations, caller: Admin) -> NewSecret:
     """Give a token another secret; the old one ends at once."""
     return rotate_token(service.store, token, by=caller)
+
+
+@router.post("/tokens/{token}/confirm")
+def confirm(token: str, service: Operations, caller: Admin) -> TokenInfo:
+    """Let a token that a restore brought back count again."""
+    return confirm_token(service.store, token, by=caller)
 
 
 @router.delete("/tokens/{token}", status_code=204)

@@ -27,6 +27,7 @@ MEDIA_TYPE = "application/problem+json"
 STATUS_OF_KIND = {
     "no_token": 401,
     "bad_token": 401,
+    "unconfirmed_token": 401,
     "bad_ticket": 401,
     "too_large": 413,
     "other_log": 410,

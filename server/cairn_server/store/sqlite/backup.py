@@ -6,14 +6,16 @@ write-ahead log. The copy has its name only when all of it is on the disk.
 """
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import apsw
 
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, NotFoundError
 from cairn_server.store.folder_lock import LOCK_NAME, lock_folder
+from cairn_server.store.sqlite.ended_tokens import LIST_NAME, copy_list, ended_since
 from cairn_server.store.sqlite.schema import STEPS, ensure_schema
 from cairn_server.store.sqlite.store import FILE_NAME
 from cairn_server.store.sqlite.writer import BUSY_MS
@@ -44,8 +46,29 @@ def back_up(folder: Path, target: Path, report: Report) -> int:
     return target.stat().st_size
 
 
-def restore(source: Path, folder: Path, report: Report, verify: Callable[[Path], None]) -> None:
+@dataclass(frozen=True, slots=True)
+class Restored:
+    """Outcome of a restore: tokens that count, and losses against the store that it replaces."""
+
+    tokens: int
+    """Tokens that count at once."""
+    unconfirmed: int
+    """Tokens that are off until an admin confirms them: no list says which of them ended since the backup."""
+    ended: int
+    """Tokens of the backup that ended since, and stay so."""
+    lost: Mapping[str, int] | None
+    """Count of what the store that it replaces has and the backup has not, by name; None: it cannot be read."""
+    newest_s: float
+    """Time of the newest commit and audit line in the backup, UTC seconds since 1970; 0: there is none."""
+
+
+def restore(
+    source: Path, folder: Path, report: Report, verify: Callable[[Path], None], *, old: Path | None = None
+) -> Restored:
     """Make a folder's store out of a backup; `verify` raises if the copy is not sound, and then nothing is left of it.
+
+    The list of ended tokens is that of the folder `old`, which the new one takes the place of, or one that lies in the
+    new folder.
 
     Raises:
         NotFoundError: kind `no_store`: the file is not there.
@@ -59,14 +82,19 @@ def restore(source: Path, folder: Path, report: Report, verify: Callable[[Path],
         raise BadInputError("bad_backup", f"{source} is no backup of a cairn server")
     folder.mkdir(0o700, parents=True, exist_ok=True)
     with lock_folder(folder):
-        found = sorted(path.name for path in folder.iterdir() if path.name != LOCK_NAME)
+        found = sorted(path.name for path in folder.iterdir() if path.name not in (LOCK_NAME, LIST_NAME))
         if found:
             raise ConflictError("not_empty", f"{folder} is not empty, it has {found[0]}; restore into a new folder")
         with _partial(folder / FILE_NAME) as partial:
             _copy(source, partial, report)
             _migrate(partial)
             verify(partial)
+            ended = ended_since((old or folder) / LIST_NAME, partial)
+            restored = _without_ended(partial, ended, old)
             _settle(partial)
+            if old is not None and ended is not None:
+                copy_list(old / LIST_NAME, folder / LIST_NAME)
+    return restored
 
 
 def is_store(path: Path) -> bool:
@@ -111,6 +139,48 @@ def _copy(source: Path, target: Path, report: Report) -> None:
         from_store.close()
         to_file.close()
     _settle(target)
+
+
+def _without_ended(path: Path, ended: Collection[bytes] | None, old: Path | None) -> Restored:
+    """End again what ended since the backup, or without a list of it switch all tokens off."""
+    connection = apsw.Connection(str(path))
+    try:
+        with connection:
+            connection.execute("UPDATE robot_key SET may_return = 0")  # an operator's word may have been used since
+            if ended is None:
+                connection.execute("UPDATE token SET confirmed = 0")
+            before = connection.execute("SELECT count(*) FROM token").get
+            connection.executemany("DELETE FROM token WHERE hash = ?", [(each,) for each in ended or ()])
+        counts, off = connection.execute("SELECT coalesce(sum(confirmed), 0), count(*) FROM token").get
+        newest_s = connection.execute(
+            "SELECT max(coalesce((SELECT max(received_s) FROM commits), 0),"
+            " coalesce((SELECT max(time_s) FROM audit), 0))"
+        ).get
+        lost = _lost(connection, old / FILE_NAME) if old is not None else None
+        return Restored(counts, off - counts, before - off, lost, newest_s)
+    finally:
+        connection.close()
+
+
+LOST = {
+    "commits": "SELECT count(*) FROM old.commits AS theirs JOIN old.map AS m ON m.number = theirs.map WHERE NOT EXISTS"
+    " (SELECT 1 FROM main.map JOIN main.commits AS ours ON ours.map = main.map.number WHERE main.map.name = m.name"
+    " AND ours.robot = theirs.robot AND ours.incarnation = theirs.incarnation AND ours.n = theirs.n)",
+    "audit lines": "SELECT count(*) FROM old.audit WHERE number > coalesce((SELECT max(number) FROM main.audit), 0)",
+    "tokens": "SELECT count(*) FROM old.token WHERE hash NOT IN (SELECT hash FROM main.token)",
+}
+"""Queries of what an old store has and a backup has not."""
+
+
+def _lost(connection: apsw.Connection, old: Path) -> dict[str, int] | None:
+    """Count of what the store that a backup replaces has and the backup has not; None if it cannot be read."""
+    if not old.is_file():
+        return None
+    try:
+        connection.execute("ATTACH ? AS old", (str(old),))
+        return {what: connection.execute(query).get for what, query in LOST.items()}
+    except apsw.Error:
+        return None
 
 
 def _settle(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Robots' keys in the embedded store (`store.RobotKeys`): which a name is bound to, and by whose word."""
+"""Robots' keys in the embedded store (`store.AdmittedKeys`): which a name is bound to, and by whose word."""
 
 import time
 
@@ -13,8 +13,8 @@ from cairn_server.store.store_rows import MapRow
 _SELECT = "SELECT robot, incarnation, is_proven, may_return, since_s, by FROM robot_key WHERE map = ?"
 
 
-class SqliteRobotKeys:
-    """`store.RobotKeys`."""
+class SqliteAdmittedKeys:
+    """`store.AdmittedKeys`."""
 
     def __init__(self, writer: Writer, readers: Readers) -> None:
         self._writer = writer

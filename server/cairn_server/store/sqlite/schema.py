@@ -233,7 +233,12 @@ INSERT OR IGNORE INTO robot_key
     SELECT map, name, incarnation, 0, 0, unixepoch(), 'server' FROM branch WHERE incarnation <> '';
 """
 
-STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS, RECEIVED, SIGNED, HOTTEST, AGES, SHARES, KEYS)
+ENDED = """
+CREATE TABLE ended_list (id TEXT NOT NULL);         -- one row: of the list next to the store (`ended_tokens`)
+ALTER TABLE token ADD COLUMN confirmed INTEGER NOT NULL DEFAULT 1;  -- 0: restored, and off until an admin confirms it
+"""
+
+STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS, RECEIVED, SIGNED, HOTTEST, AGES, SHARES, KEYS, ENDED)
 
 
 def ensure_schema(connection: apsw.Connection) -> None:

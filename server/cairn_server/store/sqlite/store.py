@@ -22,12 +22,13 @@ from cairn_server.store.admission import OWN_WORD, Grounds
 from cairn_server.store.folder_lock import lock_folder
 from cairn_server.store.sqlite.branches import LastSeen, SqliteBranchNotes
 from cairn_server.store.sqlite.changes import append_commit, next_number, write_fold
+from cairn_server.store.sqlite.ended_tokens import LIST_NAME, EndedTokens
 from cairn_server.store.sqlite.failures import disk_full
 from cairn_server.store.sqlite.old_sums import measure_old_sums
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.reads import SqliteReads
 from cairn_server.store.sqlite.retention import forget_evidence
-from cairn_server.store.sqlite.robot_keys import SqliteRobotKeys, admit_registration
+from cairn_server.store.sqlite.robot_keys import SqliteAdmittedKeys, admit_registration
 from cairn_server.store.sqlite.schema import ensure_schema
 from cairn_server.store.sqlite.shares import SqliteShares
 from cairn_server.store.sqlite.tokens import (
@@ -49,6 +50,7 @@ from cairn_server.store.store_rows import (
     Robot,
     StoreFigures,
     Use,
+    registration_name,
     relay_of,
 )
 
@@ -79,7 +81,7 @@ class SqliteStore(SqliteReads):
         except OSError as exc:
             raise BadInputError("bad_store", f"cannot keep a store in {folder}: {exc.strerror}") from exc
         try:
-            _prepare(path)
+            self._ended = _prepare(path)
             self._writer = Writer(path)
         except BaseException:
             self._lock.close()
@@ -88,8 +90,8 @@ class SqliteStore(SqliteReads):
         self._seen = LastSeen()
         with self._readers.reading() as reader:
             self.age = StoreAge(AgeMark(*first(reader, "SELECT age_s, wall_s FROM age")), clocks)
-        self.tokens = SqliteTokens(self._writer, self._readers, self.age)
-        self.keys = SqliteRobotKeys(self._writer, self._readers)
+        self.tokens = SqliteTokens(self._writer, self._readers, self.age, self._ended)
+        self.keys = SqliteAdmittedKeys(self._writer, self._readers)
         self.uses = SqliteUses(self._readers)
         self.shares = SqliteShares(self._writer, self._readers)
         self.audit_log = SqliteAuditLog(self._writer, self._readers)
@@ -184,6 +186,7 @@ class SqliteStore(SqliteReads):
                 " incarnation = excluded.incarnation",
                 values,
             )
+            self._ended.note_named(connection, registration_name(row.name, branch.name))
             put_registration(connection, row, branch.name, token_hash, age_s=self.age.now_s())
 
         self._writer.run(job)
@@ -212,6 +215,7 @@ class SqliteStore(SqliteReads):
             connection.execute("DELETE FROM branch WHERE map = ? AND name = ?", (row.number, name))
             if not connection.changes():
                 raise NotFoundError("no_branch", f"map {row.name} has no branch {name!r}")
+            self._ended.note_robot(connection, row.number, name)
             remove_tokens_of(connection, row, name)
 
         self._writer.run(job)
@@ -257,12 +261,14 @@ class SqliteStore(SqliteReads):
             self._lock.close()
 
 
-def _prepare(path: Path) -> None:
+def _prepare(path: Path) -> EndedTokens:
+    """Bring the tables up to date, and open the list of ended tokens next to the store."""
     try:
         connection = connect(path)
         try:
             ensure_schema(connection)
             measure_old_sums(connection)
+            return EndedTokens(path.with_name(LIST_NAME), connection)
         finally:
             connection.close()
     except apsw.Error as exc:

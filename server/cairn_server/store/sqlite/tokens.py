@@ -10,6 +10,7 @@ import apsw
 
 from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
 from cairn_map.wire.access_messages import AuditEntry, audit_chain
+from cairn_server.store.sqlite.ended_tokens import EndedTokens
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.writer import Writer, first, rows
 from cairn_server.store.store_age import StoreAge
@@ -24,7 +25,7 @@ KNOWN_S, KNOWN_MAX = 1.0, 4096
 AUDIT_ROWS_MAX = 100_000
 _SELECT = (
     "SELECT t.name, t.role, t.map, m.name, t.robot, t.created_s, t.expires_s, t.last_used_s, t.created_age_s,"
-    " t.used_age_s"
+    " t.used_age_s, t.confirmed"
     " FROM token t LEFT JOIN map m ON m.number = t.map"
 )
 
@@ -32,8 +33,9 @@ _SELECT = (
 class SqliteTokens:
     """`store.Tokens`."""
 
-    def __init__(self, writer: Writer, readers: Readers, age: StoreAge) -> None:
+    def __init__(self, writer: Writer, readers: Readers, age: StoreAge, ended: EndedTokens) -> None:
         self._writer = writer
+        self._ended = ended
         self._readers = readers
         self._age = age
         self._lock = threading.Lock()
@@ -73,7 +75,8 @@ class SqliteTokens:
         """Give a token another secret."""
 
         def job(connection: apsw.Connection) -> Token:
-            connection.execute("UPDATE token SET hash = ? WHERE name = ?", (secret_hash, name))
+            self._ended.note_named(connection, name)
+            connection.execute("UPDATE token SET hash = ?, confirmed = 1 WHERE name = ?", (secret_hash, name))
             _check_changed(connection, name)
             return _token(connection.execute(f"{_SELECT} WHERE t.name = ?", (name,)).fetchall()[0])
 
@@ -85,11 +88,24 @@ class SqliteTokens:
         """Forget a token."""
 
         def job(connection: apsw.Connection) -> None:
+            self._ended.note_named(connection, name)
             connection.execute("DELETE FROM token WHERE name = ?", (name,))
             _check_changed(connection, name)
 
         self._writer.run(job)
         self.forget_known()
+
+    def confirm(self, name: str) -> Token:
+        """Let a restored token count again."""
+
+        def job(connection: apsw.Connection) -> Token:
+            connection.execute("UPDATE token SET confirmed = 1 WHERE name = ?", (name,))
+            _check_changed(connection, name)
+            return _token(connection.execute(f"{_SELECT} WHERE t.name = ?", (name,)).fetchall()[0])
+
+        token = self._writer.run(job)
+        self.forget_known()
+        return token
 
     def all(self) -> list[Token]:
         """All tokens, by name."""
@@ -178,7 +194,7 @@ def put_registration(connection: apsw.Connection, row: MapRow, robot: str, secre
     connection.execute(
         "INSERT INTO token (name, role, map, robot, hash, created_s, created_age_s) VALUES (?, 'robot', ?, ?, ?, ?, ?)"
         " ON CONFLICT (name) DO UPDATE SET hash = excluded.hash, created_s = excluded.created_s,"
-        " created_age_s = excluded.created_age_s, expires_s = NULL, last_used_s = NULL, used_age_s = 0",
+        " created_age_s = excluded.created_age_s, expires_s = NULL, last_used_s = NULL, used_age_s = 0, confirmed = 1",
         (registration_name(row.name, robot), row.number, robot, secret_hash, time.time(), age_s),
     )
 
@@ -189,7 +205,8 @@ def remove_tokens_of(connection: apsw.Connection, row: MapRow, robot: str) -> No
 
 
 def _token(columns: tuple[Any, ...]) -> Token:
-    name, role, number, map_name, robot, created_s, expires_s, last_used_s, created_age_s, used_age_s = columns
+    *known, created_age_s, used_age_s, is_confirmed = columns
+    name, role, number, map_name, robot, created_s, expires_s, last_used_s = known
     return Token(
         name=name,
         role=role,
@@ -201,6 +218,7 @@ def _token(columns: tuple[Any, ...]) -> Token:
         last_used_s=last_used_s,
         created_age_s=created_age_s,
         used_age_s=used_age_s,
+        is_confirmed=bool(is_confirmed),
     )
 
 
