@@ -965,4 +965,22 @@ SWITCHES = (
         "cairn_server/store/test_store_age.py::"
         "test_time_without_a_server_does_not_count_and_a_clock_behind_it_is_reported",
     ),
+    Switch(
+        16,
+        "a robot's name is bound to its first key",
+        "server/cairn_server/store/admission.py",
+        "    if author.incarnation not in known:\n",
+        "    if False:\n",
+        "cairn_server/sync/test_handing_over.py::"
+        "test_a_name_that_is_known_is_not_a_relay_s_to_speak_in_under_another_key",
+    ),
+    Switch(
+        13,
+        "a robot's first key vouches for the ones after it",
+        "client/cairn_client/replica/replica_state.py",
+        "keys = self._keys([*own, *older, *drawn[:1], *drawn[-1:]])",
+        "keys = self._keys(own)",
+        "cairn_client/replica/test_robot_keys.py::"
+        "test_a_new_key_is_vouched_for_by_the_first_and_older_commits_by_the_new_one",
+    ),
 )
