@@ -44,6 +44,8 @@ OBJECTS = {
     "name": "a map here, another one, none",
     "branch": "mole's, wren's, ghost's",
     "commit": "mole's, wren's, ghost's",
+    "robot": "mole, wren, ghost",
+    "author": "mole's, wren's, ghost's",
     "token": "a token, none",
     "cell": "one that holds evidence",
     "voxel": "one of that cell",
@@ -195,6 +197,8 @@ def ask(holders: Holders, route: tuple[str, str], holder: Holder, place: str, ro
     parts = defaultdict(lambda: "0") | {
         "name": row,
         "branch": robot,
+        "robot": robot,
+        "author": str((AUTHORS | UNKNOWN)[robot]),
         "commit": str(commit.id),
         "cell": "0,0,0",
         "voxel": "0,0,0",
@@ -210,7 +214,7 @@ def ask(holders: Holders, route: tuple[str, str], holder: Holder, place: str, ro
 def test_each_token_may_do_what_the_document_says_and_no_more(holders: Holders, route: tuple[str, str]) -> None:
     method, path = route
     holders.renew()
-    has_objects = any(part in path for part in ("{branch}", "{commit}", "{token}"))
+    has_objects = any(part in path for part in ("{branch}", "{commit}", "{token}", "{robot}", "{author}"))
     robots = (*UNKNOWN, *AUTHORS) if has_objects else ("mole",)
     places = ("here", "there", *(["nowhere"] if route != CREATION else []))
     wrong = []
