@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 
 import cv2
@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from tests.fixtures.calib.thermal_images import SIZE, black_bodies
 from tests.fixtures.client.live_server import wait_until
+from tests.fixtures.client.robots import robot_in
 from tests.fixtures.commands import cairn, record_room, served
 from tests.fixtures.fusion.bags import recorded, small_recording, write_bag
 from tests.fixtures.pages import DOCS, ROOT, commands_of
@@ -26,6 +27,8 @@ from tests.fixtures.sim.drive import record_drive
 
 from cairn_calib.rig.camera import camera_from_field_of_view
 from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
+from cairn_map.errors import DeniedError
+from cairn_map.evidence.grid import Geometry
 from cairn_sim.robots.heads import full_head
 
 pytestmark = pytest.mark.processes
@@ -194,6 +197,14 @@ def test_commands_of_the_page_for_administrators_run(page: Page, monkeypatch: py
     (folder / "server.toml").write_text(settings)
     page.serve("HOST", "--data", "DIR")
 
+    def lose_a_disk() -> None:
+        """A robot that registers, and again from an empty folder: under another key, so it has to ask."""
+        url = page.here(["http://HOST:8750/maps/lab"])[0]
+        for disk, refused in (("disk", nullcontext()), ("new-disk", pytest.raises(DeniedError))):
+            token = os.environ["CAIRN_ENROLMENT_TOKEN"]
+            with robot_in(folder / disk, url, token=token, geometry=Geometry(), stay=True) as robot, refused:
+                robot.sync()
+
     def serve_restored() -> None:
         page.serve("HOST", "--data", "NEW")
         page.name("HOST", "base")
@@ -225,6 +236,7 @@ def test_commands_of_the_page_for_administrators_run(page: Page, monkeypatch: py
             "token create http://base:8750 field1 --role relay": create_relay,
             upstream: serve_field,
         },
+        before={"map robots admit http://HOST:8750/maps/lab mole": lose_a_disk},
     )
 
 

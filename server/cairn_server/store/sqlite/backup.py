@@ -145,11 +145,11 @@ def _without_ended(path: Path, ended: Collection[bytes] | None, old: Path | None
     """End again what ended since the backup, or without a list of it switch all tokens off."""
     connection = apsw.Connection(str(path))
     try:
+        before = connection.execute("SELECT count(*) FROM token").get
         with connection:
             connection.execute("UPDATE robot_key SET may_return = 0")  # an operator's word may have been used since
             if ended is None:
                 connection.execute("UPDATE token SET confirmed = 0")
-            before = connection.execute("SELECT count(*) FROM token").get
             connection.executemany("DELETE FROM token WHERE hash = ?", [(each,) for each in ended or ()])
         counts, off = connection.execute("SELECT coalesce(sum(confirmed), 0), count(*) FROM token").get
         newest_s = connection.execute(
