@@ -36,6 +36,7 @@ COMMITS = [pushed(n, n) for n in range(4)]
 PLACES = {
     "name": ["lab"],
     "branch": ["mole"],
+    "robot": ["mole"],
     "commit": [str(commit.id) for commit in COMMITS],
     "cell": ["0,0,0", "-1,0,2", "0,0,0.ply", "0,0,0.npz", "0,0,0.view"],
     "voxel": ["0,0,0", "-1,0,2"],

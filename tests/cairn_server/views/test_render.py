@@ -92,7 +92,7 @@ def test_cells_that_were_drawn_are_not_read_again_and_weigh_what_their_layer_doe
     kept = {name: read for name, (read, _) in views._read_cells._kept.items() if name[0][0] in chains}
     assert {layer for _, layer in kept} == set(Layer) - {Layer.AGE}
     for (_, layer), read in kept.items():
-        arrays = (read.cell.counts.brick_of, read.states.words, *read.tables.tables.values())
+        arrays = (read.cell.counts.brick_of, read.states.bricks, read.states.words, *read.tables.tables.values())
         assert read.size_bytes == sum(array.nbytes for array in arrays)
         assert len(read.tables.tables) == (layer is not Layer.DEPTH)
         assert read.cell.counts.pool.strides == (0, 0, 0) and not len(read.cell.samples.packed()[0])
