@@ -36,6 +36,7 @@ def test_each_cache_has_its_share(tmp_path: Path) -> None:
         assert service.views.pictures._read_cells._limit_bytes == map_views.CELLS_BYTES // 4
 
 
+@pytest.mark.processes
 def test_the_limit_is_said_at_the_start(tmp_path: Path) -> None:
     server = Process(tmp_path / "data")
     try:
