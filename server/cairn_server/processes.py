@@ -5,11 +5,39 @@ import os
 import signal
 import socket
 import struct
+from collections.abc import Callable
+from multiprocessing.connection import Connection
 
 LENGTH = struct.Struct("<Q")
 
 
 PR_SET_PDEATHSIG = 1
+STANDARD_STREAMS = 3
+
+
+def fork(work: Callable[[Connection], None]) -> tuple[Connection, int]:
+    """Fork a process that does this work over a link until it returns; only before there are threads.
+
+    Returns:
+        This end of the link, and the number of the process.
+    """
+    ours, theirs = socket.socketpair()
+    parent = os.getpid()
+    pid = os.fork()
+    if pid == 0:
+        # The child: never returns from here, whatever happens.
+        try:
+            die_with_parent(parent)
+            # Ends of the links to other children: a link must end when its owner closes it.
+            os.closerange(STANDARD_STREAMS, theirs.fileno())
+            os.closerange(theirs.fileno() + 1, os.sysconf("SC_OPEN_MAX"))
+            for number in (signal.SIGINT, signal.SIGTERM):  # sent to the whole group: the server ends first, in order
+                signal.signal(number, signal.SIG_IGN)
+            work(Connection(theirs.detach()))
+        finally:
+            os._exit(0)
+    theirs.close()
+    return Connection(ours.detach()), pid
 
 
 def send(channel: socket.socket, data: bytes) -> None:

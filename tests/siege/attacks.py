@@ -51,7 +51,7 @@ def request(method: str, path: str, token: str, body: bytes = b"", *, size_bytes
 
 @cache
 def long_list(first: int, *, compare: bool) -> bytes:
-    """Body that lists 100 000 cells that nobody ever saw; made once, since the server is to pay and not the attacker."""
+    """Body that lists 100 000 cells that nobody ever saw; made once: the server is to pay, not who attacks."""
     cells = [[n % 300 + first, n // 300, 7] for n in range(100_000)]
     return json.dumps({"groups": [[None, cells]], "compare": compare}).encode()
 

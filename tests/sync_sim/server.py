@@ -24,6 +24,7 @@ from cairn_server.folding.folding import fold_pending
 from cairn_server.service import Service
 from cairn_server.settings import Settings
 from cairn_server.store.store_rows import MapRow
+from cairn_server.sync.asked_cells import asked_of
 from cairn_server.sync.handing_over import found_commit
 from cairn_server.sync.uploads import Part
 
@@ -149,9 +150,8 @@ class SimServer:
                 found = found_commit(service.store, row, str(commit_id))
                 return found.data, found.seal
             case GetMissing(request):
-                return service.sync.replies.missing(
-                    row, robot, MissingRequest.model_validate_json(request.model_dump_json())
-                )
+                sent = MissingRequest.model_validate_json(request.model_dump_json())
+                return service.sync.replies.missing(row, robot, asked_of(sent))
             case GetIndex(author):
                 return CellIndex.model_validate_json(service.sync.replies.cell_index(row, author).model_dump_json())
             case GetCell(cell, etag):

@@ -13,12 +13,11 @@ in its own thread until its next start.
 
 import logging
 import os
-import signal
-import socket
 import traceback
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -27,7 +26,7 @@ from cairn_map.evidence.grid import CellKey
 from cairn_server.folding.cell_cache import CACHE_BYTES
 from cairn_server.folding.folding import Damage, FoldStore
 from cairn_server.folding.group_folding import Folded, LocalFolding
-from cairn_server.processes import die_with_parent
+from cairn_server.processes import fork
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.reads import SqliteReads
 from cairn_server.store.store_rows import Fold, MapRow
@@ -150,25 +149,12 @@ class FoldProcess:
 
 def fork_folding(store_file: Path, *, cells_bytes: int = CACHE_BYTES) -> FoldProcess:
     """Fork a process that folds the store in this file, which may be made later; only before there are threads."""
-    ours, theirs = socket.socketpair()
-    server = os.getpid()
-    pid = os.fork()
-    if pid == 0:
-        # The child: never returns from here, whatever happens.
-        ours.close()
-        try:
-            die_with_parent(server)
-            _be_folder(Connection(theirs.detach()), store_file, cells_bytes)
-        finally:
-            os._exit(0)
-    theirs.close()
-    return FoldProcess(Connection(ours.detach()), pid=pid)
+    link, pid = fork(partial(_be_folder, store_file=store_file, cells_bytes=cells_bytes))
+    return FoldProcess(link, pid=pid)
 
 
 def _be_folder(link: Connection, store_file: Path, cells_bytes: int) -> None:
     """Run the process's side until the server is gone."""
-    for number in (signal.SIGINT, signal.SIGTERM):  # sent to the whole group: the server ends first, in order
-        signal.signal(number, signal.SIG_IGN)
     # Its log lines go to the server: two processes would write over each other's.
     logging.basicConfig(handlers=[_FarLog(link)], force=True)
     answer_folds(link, Readers(store_file), cells_bytes=cells_bytes)

@@ -23,6 +23,7 @@ from cairn_server.http.routes import live as live_routes
 from cairn_server.http.routes import map as map_routes
 from cairn_server.http.routes import operations as operations_routes
 from cairn_server.http.routes import sync as sync_routes
+from cairn_server.http.routes.long_bodies import LongBodies
 from cairn_server.http.routes.problems import PROBLEM_HANDLERS
 from cairn_server.service import Service
 
@@ -47,8 +48,8 @@ def docs(request: Request) -> HTMLResponse:
     return HTMLResponse(docs_page(request.app.openapi()), headers=headers)
 
 
-def make_app(service: Service) -> FastAPI:
-    """The app over a service, which the caller closes."""
+def make_app(service: Service, *, long_bodies: LongBodies | None = None) -> FastAPI:
+    """The app over a service, which the caller closes; without `long_bodies` they are parsed in threads."""
     settings = service.settings
     lanes, bodies = Lanes(), BodyBudget(settings.body_memory_bytes)
     places = ConnectionPlaces(settings.limit_concurrency, trusted_proxies=settings.trusted_proxies)
@@ -64,6 +65,7 @@ def make_app(service: Service) -> FastAPI:
     )
     app.state.service = service
     app.state.lanes, app.state.bodies, app.state.places = lanes, bodies, places
+    app.state.long_bodies = long_bodies or LongBodies()
     app.state.console_files = console_routes.ConsoleFiles()
     for part in ROUTERS:
         app.include_router(part)

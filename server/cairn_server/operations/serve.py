@@ -34,6 +34,7 @@ Three more commands look after the folder (docs/administrator.md); each explains
 """
 
 import ctypes
+import gc
 import logging
 import resource
 import signal
@@ -55,6 +56,7 @@ from cairn_server.http.middleware.deadlines import protocol_of
 from cairn_server.http.middleware.log_format import LogForm, start_logging
 from cairn_server.http.middleware.secure_start import secured
 from cairn_server.http.middleware.work_turns import Lanes
+from cairn_server.http.routes.long_bodies import LongBodies, fork_long_bodies
 from cairn_server.operations import check as check_command
 from cairn_server.operations.backup import back_up_command, restore_command
 from cairn_server.operations.serve_options import serve_parser, settings_of
@@ -103,19 +105,22 @@ def main(argv: list[str]) -> int:
     sys.setswitchinterval(SWITCH_S)
     # Forked before there are threads: a lock that another thread held at the fork would stay locked in the child.
     folding = fork_folding(settings.folder / FILE_NAME, cells_bytes=int(settings.cache_share * CACHE_BYTES))
+    long_bodies = fork_long_bodies()
     keep_memory_small()
     with listen(settings.host, settings.port) as listener:
         try:
             service = Service(SqliteStore(settings.folder), settings, fold_process=folding)
             with closing(service), closing(ViewPrefetch(service.store, service.views.cells.cache)), joined(service):
-                _serve(service, listener)
+                _serve(service, listener, long_bodies)
         except KeyboardInterrupt:
             pass
+        finally:
+            long_bodies.close()
     return 0
 
 
-def _serve(service: Service, listener: socket.socket) -> None:
-    app = make_app(service)
+def _serve(service: Service, listener: socket.socket, long_bodies: LongBodies) -> None:
+    app = make_app(service, long_bodies=long_bodies)
     config = config_of(app, service.settings)
     host, port = listener.getsockname()[:2]
     shown = f"[{host}]" if ":" in host else host
@@ -126,6 +131,8 @@ def _serve(service: Service, listener: socket.socket) -> None:
     sys.stdout.write(f"cairn map server on {scheme}://{shown}:{port}, data in {service.settings.folder}\n")
     sys.stdout.write(f"memory for decoded cells: at most {service.settings.caches_bytes / 1e6:.0f} MB\n")
     sys.stdout.flush()
+    # What is there by now stays: a sweep of the garbage collector need not look at it, 0.1 s in which all wait.
+    gc.freeze()
     _Server(config, service, app.state.lanes).run(sockets=[listener])
 
 

@@ -18,13 +18,13 @@ from cairn_map.codec.cell_code import encode_empty_cell
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.commits.ids import OPERATOR, Author, CommitId, author_from_text
 from cairn_map.commits.version_vector import VersionVector
-from cairn_map.errors import BadInputError, ConflictError
+from cairn_map.errors import ConflictError
 from cairn_map.evidence.cell_order import first_to_last
 from cairn_map.evidence.fingerprint import ZERO, Fingerprint
-from cairn_map.evidence.grid import CELL_LIMIT, Cell, CellKey, Geometry, cell_key, cell_keys, cell_of_key
+from cairn_map.evidence.grid import CELL_LIMIT, Cell, CellKey, Geometry, cell_key, cell_of_key
 from cairn_map.kernels.morton_kernels import deinterleave
 from cairn_map.wire.frames import CELL_HEAD, CellFrame, Frame, FrameKind
-from cairn_map.wire.messages import CURSORS_MAX, Done, MissingRequest, More, ReplyHeader
+from cairn_map.wire.messages import Done, More, ReplyHeader
 from cairn_server.access.cancellation import CANCELLATION
 from cairn_server.folding.cells import CellFaults
 from cairn_server.folding.cells_at_rest import DamagedCellError, sound_cell
@@ -33,6 +33,7 @@ from cairn_server.folding.read_cache import ReadCache
 from cairn_server.store.history import is_proven
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import CellRow
+from cairn_server.sync.asked_cells import Asked
 from cairn_server.sync.cell_changes import change_since
 
 log = logging.getLogger(__name__)
@@ -90,7 +91,7 @@ class MissingQuery:
         return self.compare or start in self.unproven
 
 
-def query_of(request: MissingRequest, snapshot: Snapshot) -> MissingQuery:
+def query_of(asked: Asked, snapshot: Snapshot) -> MissingQuery:
     """Parse a request, and check its cursors against the log.
 
     Raises:
@@ -98,16 +99,18 @@ def query_of(request: MissingRequest, snapshot: Snapshot) -> MissingQuery:
         BadInputError: a malformed id, cursor or cell.
     """
     # Each cursor once, however many cells name it: proving one reads the log.
-    cursor, cells = _cursor(request.cursor), _listed(request)
+    request, cursor, cursors = asked.request, _cursor(asked.request.cursor), [_cursor(text) for text in asked.cursors]
     head = snapshot.head.cursor
     unproven: set[Cursor] = set()
     cancellation = CANCELLATION.get()
-    for stated in {stated for stated in (cursor, *cells.values()) if stated is not None}:
+    for stated in {stated for stated in (cursor, *cursors) if stated is not None}:
         cancellation.check()
         if stated.log_id != head.log_id:
             raise ConflictError("other_log", "the cursor belongs to another server's log; start without one")
         if not is_proven(stated, snapshot):
             unproven.add(stated)
+    # From arrays to objects one by one: other threads run meanwhile.
+    cells = {CellKey(key): cursors[n] for key, n in zip(asked.keys.tolist(), asked.states.tolist(), strict=True)}
     # A reply is made in memory, so the asker may lower the server's bound on its bytes, and not raise it.
     return MissingQuery(
         author=author_from_text(request.author) if request.author else None,
@@ -259,21 +262,6 @@ def _first_authors(vector: VersionVector) -> VersionVector:
     if len(vector.intervals) <= PENDING_AUTHORS_MAX:
         return vector
     return VersionVector(dict(islice(vector.intervals.items(), PENDING_AUTHORS_MAX)))
-
-
-def _listed(request: MissingRequest) -> dict[CellKey, Cursor | None]:
-    """Cells that a request lists, one by one or in groups by cursor."""
-    groups = [*request.groups, *((entry.cursor, [entry.cell]) for entry in request.cells)]
-    named = [cell for _, cells in groups for cell in cells]
-    # Counted before any number is computed.
-    if len(named) > CURSORS_MAX:
-        raise BadInputError("bad_message", f"{len(named)} cells are listed, at most {CURSORS_MAX} may be")
-    cursors = [cursor for text, cells in groups for cursor in [_cursor(text)] * len(cells)]
-    listed = dict(zip(map(CellKey, cell_keys(named).tolist()), cursors, strict=True))
-    # A cell under two cursors would have no right answer; the dict has dropped one of them.
-    if len(listed) != len(named):
-        raise BadInputError("bad_message", "a cell is named twice in the request")
-    return listed
 
 
 def _cursor(text: str | None) -> Cursor | None:

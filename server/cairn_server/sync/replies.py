@@ -7,7 +7,7 @@ from cairn_map.commits.ids import Author
 from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.errors import ConflictError, NotFoundError
 from cairn_map.wire.frames import encode_frame, start_of_reply
-from cairn_map.wire.messages import CellIndex, MissingRequest
+from cairn_map.wire.messages import CellIndex
 from cairn_map.wire.resumed_replies import reply_digest, without_begun
 from cairn_server.folding.cell_index import FIRST_PAGE, IndexPage, entries_of
 from cairn_server.folding.cells import Cells
@@ -18,6 +18,7 @@ from cairn_server.store.history import is_proven
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_rows import MapRow
+from cairn_server.sync.asked_cells import Asked
 from cairn_server.sync.held_commits import WantedCommits
 from cairn_server.sync.missing import CellFrames, HeaderFacts, header_of, query_of, reply_frames
 
@@ -75,7 +76,7 @@ class MainReplies:
         self._stable = stable
         self._cache = ReadCache(share=cache_share)
 
-    def missing(self, row: MapRow, branch: str, request: MissingRequest) -> bytes:
+    def missing(self, row: MapRow, branch: str, asked: Asked) -> bytes:
         """Frames that bring the asker to the head, wholly in memory before they are sent.
 
         Empty if the asker says that it knows this very reply.
@@ -83,9 +84,9 @@ class MainReplies:
         # All from one snapshot (rule 3), and joined before anything is sent: a slow link must not keep a snapshot open,
         # which holds up the emptying of the store's log.
         with self._cells.reading(row) as faults, self._store.snapshot(row) as snapshot:
-            query = query_of(request, snapshot)
+            query = query_of(asked, snapshot)
             cells = CellFrames(snapshot, query, row.geometry, self._cache, faults)
-            frames = without_begun(reply_frames(cells, self._facts(row, snapshot)), request.begun)
+            frames = without_begun(reply_frames(cells, self._facts(row, snapshot)), asked.request.begun)
             reply = b"".join([start_of_reply(), *map(encode_frame, self._figures.counted(frames))])
         # For the list of branches and their expiry: what the server sends never depends on it.
         self._store.seen(row, branch, query.cursor)
@@ -94,7 +95,8 @@ class MainReplies:
         else:
             self._hub.robot_heard(row, branch, cursor=str(query.cursor))
         # The digest is of the whole reply: this saves the link's bytes, not the work.
-        return b"" if request.known is not None and request.known == reply_digest(reply) else reply
+        known = asked.request.known
+        return b"" if known is not None and known == reply_digest(reply) else reply
 
     def cell_index(self, row: MapRow, author: Author | None, page: IndexPage = FIRST_PAGE) -> CellIndex:
         """One page of the cells that were ever touched, and the state that it was read from."""

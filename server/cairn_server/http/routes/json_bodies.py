@@ -7,6 +7,8 @@ not even use the route, hold up everybody. Here a body is a dependency like any 
 """
 
 import email.message
+from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 from fastapi import Depends, Request
@@ -16,6 +18,7 @@ from pydantic import BaseModel, ValidationError
 
 from cairn_map.wire.messages import CURSORS_MAX
 from cairn_server.http.routes.callers import body_of
+from cairn_server.http.routes.long_bodies import LongBodies
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -23,20 +26,27 @@ VALUES_MAX = 6 * CURSORS_MAX + 10_000
 """Commas and brackets of a body: what the longest list of cells, each with a cursor, has. They, not the bytes, are what
 parsing takes time for, during which no other thread runs: 0.2 us each."""
 SHORT_BYTES = 1 << 14
-"""Longest body that is parsed on the event loop: a change of threads would take longer."""
+"""Longest body that is parsed on the event loop: a change of threads would take longer. Longer ones are parsed in a
+process of their own."""
 
 
-def json_of(model: type[M]) -> Any:
-    """Dependency of a route: its body as a message."""
+def json_of(model: type[M], made_into: Callable[[M], Any] | None = None) -> Any:
+    """Dependency of a route: its body as a message, or what a function makes of it."""
+    parse = partial(_made, model, made_into) if made_into else partial(parsed, model)
 
-    async def read(request: Request) -> M:
+    async def read(request: Request) -> Any:
         data = await body_of(request)
         _check_media_type(request)
         if len(data) <= SHORT_BYTES:
-            return parsed(model, data)
-        return await run_in_threadpool(parsed, model, data)
+            return parse(data)
+        bodies: LongBodies = request.app.state.long_bodies
+        return await run_in_threadpool(bodies.read, parse, data)
 
     return Depends(read)
+
+
+def _made(model: type[M], made_into: Callable[[M], Any], data: bytes) -> Any:
+    return made_into(parsed(model, data))
 
 
 def parsed(model: type[M], data: bytes) -> M:
@@ -52,9 +62,8 @@ def parsed(model: type[M], data: bytes) -> M:
     try:
         return model.model_validate_json(data)
     except ValidationError as exc:
-        raise RequestValidationError(
-            [{**error, "loc": ("body", *error["loc"])} for error in exc.errors(include_url=False)]
-        ) from exc
+        complaints = exc.errors(include_url=False, include_context=False, include_input=False)
+        raise RequestValidationError([{**each, "loc": ("body", *each["loc"])} for each in complaints]) from exc
 
 
 def _check_media_type(request: Request) -> None:

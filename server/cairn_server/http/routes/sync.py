@@ -22,6 +22,7 @@ from cairn_server.http.routes.callers import (
 )
 from cairn_server.http.routes.documentation import also, answers, body, json_body, problems
 from cairn_server.http.routes.json_bodies import json_of
+from cairn_server.sync.asked_cells import Asked, asked_of
 from cairn_server.sync.handing_over import found_commit
 from cairn_server.sync.uploads import Part, uploaded_by
 
@@ -88,10 +89,10 @@ def list_commits(service: Operations, row: Map) -> CommitList:
 def missing(
     branch: str,
     visit: Annotated[Visit, Depends(visiting_owner)],
-    body: Annotated[MissingRequest, json_of(MissingRequest)],
+    asked: Annotated[Asked, json_of(MissingRequest, asked_of)],
 ) -> Response:
     """Frames that bring the caller to the head; 204 if they are those of the last reply."""
-    reply = visit.service.sync.replies.missing(visit.row, branch, body)
+    reply = visit.service.sync.replies.missing(visit.row, branch, asked)
     return Response(reply, media_type=REPLY_MEDIA_TYPE) if reply else Response(status_code=204)
 
 

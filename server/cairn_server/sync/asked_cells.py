@@ -1,0 +1,49 @@
+"""Request to fetch-missing as it is worked with: the cells that it lists as arrays.
+
+A request may list 100 000 cells. As objects of Python they take 0.1 s to parse, and as long again for each sweep of the
+garbage collector; no other thread runs meanwhile. So a long request is parsed and made into arrays in another process
+(`http.routes.long_bodies`), and nothing but arrays comes back.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.grid import cell_keys
+from cairn_map.wire.messages import CURSORS_MAX, MissingRequest
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Asked:
+    """One request, and the cells that it lists."""
+
+    request: MissingRequest
+    """All but the lists of cells, which are empty here."""
+    keys: npt.NDArray[np.uint64]
+    """Numbers of the cells listed, shape (n,), none twice."""
+    states: npt.NDArray[np.int64]
+    """Index in `cursors` of each of these cells, shape (n,)."""
+    cursors: tuple[str | None, ...]
+    """States at which the cells stand; None: the asker holds nothing of them."""
+
+
+def asked_of(request: MissingRequest) -> Asked:
+    """Request with its lists as arrays.
+
+    Raises:
+        BadInputError: kind `bad_message`: too many cells are listed, or one twice, or one outside all maps.
+    """
+    groups = [*request.groups, *((entry.cursor, [entry.cell]) for entry in request.cells)]
+    sizes = [len(cells) for _, cells in groups]
+    # Counted before any number is computed.
+    if sum(sizes) > CURSORS_MAX:
+        raise BadInputError("bad_message", f"{sum(sizes)} cells are listed, at most {CURSORS_MAX} may be")
+    keys = cell_keys([cell for _, cells in groups for cell in cells])
+    # A cell under two cursors would have no right answer.
+    if len(np.unique(keys)) != len(keys):
+        raise BadInputError("bad_message", "a cell is named twice in the request")
+    places = {cursor: n for n, cursor in enumerate(dict.fromkeys(cursor for cursor, _ in groups))}
+    states = np.repeat(np.array([places[cursor] for cursor, _ in groups], np.int64), sizes)
+    return Asked(request.model_copy(update={"groups": [], "cells": []}), keys, states, tuple(places))
