@@ -77,6 +77,8 @@ WEBSOCKETS: dict[str, Any] = {"ws": "websockets-sansio", "ws_max_size": 1 << 12,
 SWITCH_S = 0.0005
 """Longest time for which a thread that computes keeps the interpreter from another one that waits for it: a push needs
 the interpreter some ten times on its way, and with Python's 5 ms would wait for the folding thread each time."""
+FULL_SWEEPS_AFTER = 100
+"""Sweeps of the middle generation after which all objects are looked at; 10 by default."""
 ARENAS_MAX, MAPPED_FROM_BYTES = 2, 1 << 20
 M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8
 """Parameters of glibc's `mallopt` (malloc.h)."""
@@ -131,8 +133,10 @@ def _serve(service: Service, listener: socket.socket, long_bodies: LongBodies) -
     sys.stdout.write(f"cairn map server on {scheme}://{shown}:{port}, data in {service.settings.folder}\n")
     sys.stdout.write(f"memory for decoded cells: at most {service.settings.caches_bytes / 1e6:.0f} MB\n")
     sys.stdout.flush()
-    # What is there by now stays: a sweep of the garbage collector need not look at it, 0.1 s in which all wait.
+    # A full sweep of the garbage collector takes 0.1 to 0.3 s, in which all wait. What is there by now stays, so none
+    # looks at it; and what survived two sweeps of young objects is seldom a cycle.
     gc.freeze()
+    gc.set_threshold(*gc.get_threshold()[:2], FULL_SWEEPS_AFTER)
     _Server(config, service, app.state.lanes).run(sockets=[listener])
 
 
