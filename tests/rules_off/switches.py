@@ -887,7 +887,7 @@ SWITCHES = (
         11,
         "evidence that a retract needs is wanted",
         "server/cairn_server/sync/pushes.py",
-        "self._wanted.note(row.name, exc.commits)",
+        "self._wanted.note(row.name, exc.commits, asker=new.id.author.robot)",
         "pass",
         "cairn_server/store/test_retention.py::test_evidence_that_a_refused_retract_needs_is_wanted_until_it_comes",
     ),

@@ -99,6 +99,8 @@ class AskingRobot(_Model):
     """A robot that was refused, because its name is bound to another key."""
 
     author: str
+    since_s: float
+    """Time of its first try that is remembered, UTC seconds since 1970."""
     asked_s: float
     """Time of its last try, UTC seconds since 1970."""
     by: str

@@ -1,13 +1,14 @@
 """Admission of robots' keys: proofs that robots show, an operator's word, and those that wait for it.
 
 The rule is that of `store.admission`; the store holds it, in the transaction of each commit and registration. Robots
-that were refused are remembered for the operator, the newest of each map, in memory: they ask again.
+that were refused are remembered for the operator, in memory: they ask again. Names share the places on this list
+(`access.shared_places`): a thief that asks with key after key hides no other robot that asks.
 """
 
 import math
 import threading
 import time
-from collections import OrderedDict
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
@@ -18,6 +19,7 @@ from cairn_map.wire.access_messages import AskingRobot, KeyInfo, RobotKeyList
 from cairn_server.access.auth import Caller, Role
 from cairn_server.access.challenges import Challenges
 from cairn_server.access.rate_limits import HOUR_S, Allowance, allowance
+from cairn_server.access.shared_places import SharedPlaces
 from cairn_server.settings import Quotas
 from cairn_server.store.admission import Grounds
 from cairn_server.store.store import Store
@@ -25,6 +27,7 @@ from cairn_server.store.store_rows import MapRow
 
 ASKING_MAX = 64
 """Refused robots of one map that are remembered."""
+_Asking = SharedPlaces[Author, AskingRobot]
 
 
 class Admissions:
@@ -38,7 +41,8 @@ class Admissions:
         self._lock = threading.Lock()
         self._registrations: dict[str, Allowance] = {}
         """Registrations left to each enrolment token, by its name."""
-        self._asking: dict[int, OrderedDict[Author, AskingRobot]] = {}
+        self._asking: defaultdict[int, _Asking] = defaultdict(lambda: _Asking(ASKING_MAX))
+        """By map; the asker is the name."""
 
     def returning(self, map_name: str, proof_text: str) -> Caller:
         """Caller that shows no token, but the key of a robot that an operator lets in: it may register this robot.
@@ -84,6 +88,8 @@ class Admissions:
                 self.refused(row, author, by=caller)
             self._give_back(caller)
             raise
+        with self._lock:
+            self._asking[row.number].remove(author)
 
     def admit(self, row: MapRow, author: Author, *, by: Caller) -> None:
         """Admit a key by an operator's word; durable on return.
@@ -96,25 +102,27 @@ class Admissions:
         self._store.keys.admit(row, author, by=by.name)
         self._store.audit_log.add(by.name, "admit", f"map {row.name}: {author}")
         with self._lock:
-            self._asking.get(row.number, OrderedDict()).pop(author, None)
+            self._asking[row.number].remove(author)
 
     def refused(self, row: MapRow, author: Author, *, by: Caller) -> None:
         """Remember a robot that was refused for its key."""
         with self._lock:
-            asking = self._asking.setdefault(row.number, OrderedDict())
-            asking[author] = AskingRobot(author=str(author), asked_s=time.time(), by=by.name)
-            asking.move_to_end(author)
-            if len(asking) > ASKING_MAX:
-                asking.popitem(last=False)
+            asking, now_s = self._asking[row.number], time.time()
+            before = asking.get(author.robot, author)
+            since_s = before.since_s if before else now_s
+            robot = AskingRobot(author=str(author), since_s=since_s, asked_s=now_s, by=by.name)
+            asking.put(author.robot, author, robot)
 
     def list(self, row: MapRow) -> RobotKeyList:
-        """Admitted keys, and the robots that ask to be."""
+        """Admitted keys, and the robots that ask to be; not those that were let in since they asked."""
         keys = [
             KeyInfo(author=str(key.author), since_s=key.since_s, by=key.by, may_return=key.may_return)
             for key in self._store.keys.all(row)
         ]
+        since_s = {key.author: key.since_s for key in keys}
         with self._lock:
-            asking = list(self._asking.get(row.number, {}).values())
+            asking = sorted(self._asking[row.number].values(), key=lambda robot: robot.asked_s)
+        asking = [robot for robot in asking if robot.asked_s >= since_s.get(robot.author, 0.0)]
         return RobotKeyList(admitted=keys, asking=asking)
 
     def _take(self, caller: Caller) -> None:

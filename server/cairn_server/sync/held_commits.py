@@ -8,9 +8,10 @@ from collections import defaultdict
 from collections.abc import Iterable
 
 from cairn_map.commits.cursor import ENTRY_FOLD, Cursor
-from cairn_map.commits.ids import Author, CommitId
+from cairn_map.commits.ids import Author, CommitId, RobotName
 from cairn_map.wire.messages import WANTED_MAX
 from cairn_map.wire.relay_peer import SUM_BYTES, Held, sum_of_shas
+from cairn_server.access.shared_places import SharedPlaces
 from cairn_server.store.history import is_proven
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import MapRow
@@ -62,28 +63,28 @@ class HeldCommits:
 class WantedCommits:
     """Commits whose evidence was dropped and which a retract needs again, so that robots are asked for them.
 
-    The newest `WANTED_MAX` of each map are kept, in memory only: after a start a retract is refused once more, and its
-    targets are wanted again. Thread-safe.
+    `WANTED_MAX` of each map are kept, and robots share these places (`access.shared_places`): no robot's retracts make
+    the server forget what another's, or an operator's, need. In memory only: after a start a retract is refused once
+    more, and its targets are wanted again. Thread-safe.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._wanted: dict[str, dict[CommitId, None]] = {}
+        self._wanted: defaultdict[str, SharedPlaces[CommitId, None]] = defaultdict(lambda: SharedPlaces(WANTED_MAX))
 
-    def note(self, map_name: str, commits: Iterable[CommitId]) -> None:
-        """Want these: a retract of them was refused."""
+    def note(self, map_name: str, commits: Iterable[CommitId], *, asker: RobotName) -> None:
+        """Want these: a retract of them was refused, by this author's robot or `operator`."""
         with self._lock:
-            wanted = self._wanted.setdefault(map_name, {})
-            wanted.update(dict.fromkeys(commits))
-            for commit in list(wanted)[:-WANTED_MAX]:
-                del wanted[commit]
+            for commit in commits:
+                self._wanted[map_name].put(asker, commit, None)
 
     def forget(self, map_name: str, commit: CommitId) -> None:
         """Stop wanting a commit: it came."""
         with self._lock:
-            self._wanted.get(map_name, {}).pop(commit, None)
+            if map_name in self._wanted:
+                self._wanted[map_name].remove(commit)
 
     def of(self, map_name: str) -> tuple[CommitId, ...]:
         """Wanted commits of a map."""
         with self._lock:
-            return tuple(self._wanted.get(map_name, ()))
+            return tuple(self._wanted[map_name].keys()) if map_name in self._wanted else ()

@@ -158,7 +158,7 @@ class Pushes:
             return self._store.append(row, new)
         except EvidenceGoneError as exc:
             # Refused now and wanted from now on: robots that hold the evidence push it, and the retract succeeds later.
-            self._wanted.note(row.name, exc.commits)
+            self._wanted.note(row.name, exc.commits, asker=new.id.author.robot)
             raise
         except DeniedError:
             self._admissions.refused(row, new.id.author, by=caller)

@@ -54,7 +54,7 @@ class Retracts:
         try:
             ids = [str(self._append(row, part, request.note)) for part in parts]
         except EvidenceGoneError as exc:
-            self._wanted.note(row.name, exc.commits)
+            self._wanted.note(row.name, exc.commits, asker=OPERATOR)
             raise
         detail = f"map {row.name}: {ids[-1]} takes out {len(names)} commits: {request.note}"
         self._store.audit_log.add(by.name, "retract", detail)

@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -12,7 +13,7 @@ from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import pushed
 from tests.fixtures.server.signatures import KEY_OF, MOLE, OLD_MOLE, WREN, signed
 
-from cairn_map.commits.ids import Author
+from cairn_map.commits.ids import Author, Incarnation
 from cairn_map.commits.key_proof import KeyProof, proof_bytes
 from cairn_map.errors import BadInputError
 from cairn_map.wire.access_messages import CreateToken
@@ -22,6 +23,7 @@ from cairn_server.access.challenges import Challenges
 from cairn_server.access.tokens import create_token
 from cairn_server.settings import Quotas
 from cairn_server.store.store_rows import MapRow
+from cairn_server.sync.admissions import ASKING_MAX
 
 
 @pytest.fixture(scope="module")
@@ -115,6 +117,33 @@ def test_without_a_token_only_the_key_that_an_operator_lets_in_registers_and_onc
     for name in ("operator", "initial"):
         answer = guarded.http.put(f"/maps/{row.name}/keys/{name}.{MOLE.incarnation}", headers=bearer(ADMIN))
         assert kind_of(answer) == "reserved_name"
+
+
+def test_one_who_asks_with_key_after_key_hides_no_other_robot_that_asks(guarded: Live) -> None:
+    row, _ = known_mole(guarded)
+    assert register(guarded, row, WREN, bearer(ENROLLER)).status_code == 201
+    keys = f"/maps/{row.name}/keys"
+
+    def asking() -> list[dict[str, Any]]:
+        found: list[dict[str, Any]] = guarded.http.get(keys, headers=bearer(ADMIN)).json()["asking"]
+        return found
+
+    lost = Author(WREN.robot, OLD_MOLE.incarnation)
+    assert register(guarded, row, lost, bearer(ENROLLER)).status_code == 403
+    (first,) = asking()
+    assert first["author"] == str(lost)
+    assert first["since_s"] == first["asked_s"]
+    for n in range(ASKING_MAX + 1):
+        drawn = MOLE._replace(incarnation=Incarnation(f"{n:016x}"))
+        assert register(guarded, row, drawn, bearer(ENROLLER)).status_code == 403
+    assert asking()[0] == first
+    assert register(guarded, row, lost, bearer(ENROLLER)).status_code == 403
+    *others, last = asking()
+    assert len(others) == ASKING_MAX - 1
+    assert (last["author"], last["since_s"]) == (str(lost), first["since_s"])
+    assert last["asked_s"] >= first["asked_s"]
+    assert guarded.http.put(f"{keys}/{lost}", headers=bearer(ADMIN)).status_code == 204
+    assert str(lost) not in {robot["author"] for robot in asking()}
 
 
 def test_an_enrolment_token_for_one_robot_registers_it_under_any_key_and_no_other(guarded: Live) -> None:

@@ -5,14 +5,16 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.fixtures.map.made import SMALL, random_evidence
 from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.fetching import fetch
 from tests.fixtures.server.live import Live, until
-from tests.fixtures.server.pushes import MOLE, WREN, pushed, read, sum_of
+from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 from tests.naive.asker import NaiveAsker, cell_frames
 
 from cairn_map.commits.commit import Commit
 from cairn_map.wire.frames import FrameKind
+from cairn_map.wire.messages import WANTED_MAX
 from cairn_server.store.store_rows import MapRow
 
 NOW = float("inf")
@@ -124,6 +126,25 @@ def test_evidence_that_a_refused_retract_needs_is_wanted_until_it_comes(live: Li
     assert wanted(live, row) == [str(commits[2].id)]
     assert forget(live, row) == 0, "whoever needs it comes soon"
     assert live.push(row, amend).status_code == 201
+
+
+def test_what_one_robot_s_retracts_need_does_not_push_out_what_another_s_and_an_operator_s_need(live: Live) -> None:
+    row, tiny = live.new_map(), {KEYS[0]: random_evidence(0, SMALL, voxels=1, air=0)}
+    many = [pushed(n, 0, WREN, cells=tiny) for n in range(WANTED_MAX + 1)]
+    needed, asked = pushed(0, 1, MOLE), many[0]
+    for commit in (needed, *many):
+        assert live.push(row, commit).status_code == 201
+    while forget(live, row):
+        pass
+    assert kind_of(live.retract(row, asked)) == "evidence_gone"
+    assert kind_of(live.push(row, pushed(1, 1, MOLE, retracts=[needed]))) == "evidence_gone"
+    assert kind_of(live.push(row, pushed(len(many), 1, WREN, retracts=many))) == "evidence_gone"
+    told = wanted(live, row)
+    assert {str(needed.id), str(asked.id)} < set(told)
+    assert str(many[-1].id) in told
+    assert len(told) <= WANTED_MAX
+    live.push(row, asked)
+    assert str(asked.id) not in wanted(live, row)
 
 
 def test_bytes_that_come_again_count_as_new_and_those_of_a_retracted_commit_change_nothing(live: Live) -> None:

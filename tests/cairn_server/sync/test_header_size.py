@@ -43,7 +43,7 @@ def crowded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Live:
         add_cells(store, row, damaged)
         own.service.cells._damaged.note(row.name, damaged)
         own.service.sync.retracts._wanted.note(
-            row.name, [CommitId(author, LAST) for author in AUTHORS[: WANTED_MAX + 1]]
+            row.name, [CommitId(author, LAST) for author in AUTHORS[: WANTED_MAX + 1]], asker=OPERATOR
         )
         yield own
 

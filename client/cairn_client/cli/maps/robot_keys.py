@@ -2,7 +2,7 @@
 
     $ cairn map robots keys http://127.0.0.1:8750/maps/lab
     mole.1f2e3d4c5b6a7988             since 2026-11-20 09:10, by enroller
-    mole.77a0c4f1d2e36b58  asks       last  2026-11-22 18:24, by enroller
+    mole.77a0c4f1d2e36b58  asks       since 2026-11-22 17:02, last 2026-11-22 18:24, by enroller
     $ cairn map robots admit http://127.0.0.1:8750/maps/lab mole
     mole.77a0c4f1d2e36b58 may speak for mole from now on
 
@@ -46,7 +46,8 @@ def _list(args: argparse.Namespace) -> int:
         waits = "may return" if key.may_return else ""
         say(f"{key.author:<50} {waits:<10} since {_shown(key.since_s)}, by {key.by}")
     for robot in found.asking:
-        say(f"{robot.author:<50} {'asks':<10} last  {_shown(robot.asked_s)}, by {robot.by}")
+        when = f"since {_shown(robot.since_s)}, last {_shown(robot.asked_s)}"
+        say(f"{robot.author:<50} {'asks':<10} {when}, by {robot.by}")
     if not found.admitted and not found.asking:
         say("(none yet; a name is bound to the first key that comes)")
     return 0
