@@ -35,6 +35,11 @@ class Turns:
         """Turns that are taken now."""
         return self._of.total()
 
+    @property
+    def waiting(self) -> int:
+        """Requests that wait for a turn now."""
+        return sum(map(len, self._waiting.values()))
+
     async def take(self, caller: Hashable) -> None:
         """Take a turn, which `give_back` ends.
 

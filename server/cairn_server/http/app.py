@@ -8,7 +8,8 @@ from starlette.middleware import Middleware
 
 from cairn_server.access.body_budget import BodyBudget
 from cairn_server.access.connection_places import ConnectionPlaces
-from cairn_server.http.middleware.body_limit import BodyLimit
+from cairn_server.access.turns import Turns
+from cairn_server.http.middleware.body_limit import BodyLimit, turns_of_long_bodies
 from cairn_server.http.middleware.connection_shares import ConnectionShares
 from cairn_server.http.middleware.head_checks import DeniedHandshakes, PlainPath, ProtocolVersion, SameOrigin
 from cairn_server.http.middleware.request_trail import RequestTrail
@@ -52,6 +53,7 @@ def make_app(service: Service, *, long_bodies: LongBodies | None = None) -> Fast
     """The app over a service, which the caller closes; without `long_bodies` they are parsed in threads."""
     settings = service.settings
     lanes, bodies = Lanes(), BodyBudget(settings.body_memory_bytes)
+    reading = turns_of_long_bodies()
     places = ConnectionPlaces(settings.limit_concurrency, trusted_proxies=settings.trusted_proxies)
     app = DocumentedApp(
         title="cairn map server",
@@ -60,11 +62,11 @@ def make_app(service: Service, *, long_bodies: LongBodies | None = None) -> Fast
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,
-        middleware=list(_middleware(service, lanes, bodies, places)),
+        middleware=list(_middleware(service, lanes, bodies, reading, places)),
         exception_handlers=PROBLEM_HANDLERS,
     )
     app.state.service = service
-    app.state.lanes, app.state.bodies, app.state.places = lanes, bodies, places
+    app.state.lanes, app.state.bodies, app.state.reading, app.state.places = lanes, bodies, reading, places
     app.state.long_bodies = long_bodies or LongBodies()
     app.state.console_files = console_routes.ConsoleFiles()
     for part in ROUTERS:
@@ -72,7 +74,9 @@ def make_app(service: Service, *, long_bodies: LongBodies | None = None) -> Fast
     return app
 
 
-def _middleware(service: Service, lanes: Lanes, bodies: BodyBudget, places: ConnectionPlaces) -> Iterator[Middleware]:
+def _middleware(
+    service: Service, lanes: Lanes, bodies: BodyBudget, reading: Turns, places: ConnectionPlaces
+) -> Iterator[Middleware]:
     """Middleware in the order in which a request passes it; the answer passes it in reverse."""
     yield Middleware(DeniedHandshakes)
     yield Middleware(RequestTrail, figures=service.figures)
@@ -82,5 +86,5 @@ def _middleware(service: Service, lanes: Lanes, bodies: BodyBudget, places: Conn
     yield Middleware(PlainPath)
     yield Middleware(TokenFirst, service=service)
     yield Middleware(ConnectionShares, places=places)
-    yield Middleware(BodyLimit, budget=bodies)
+    yield Middleware(BodyLimit, budget=bodies, turns=reading)
     yield Middleware(WorkTurns, lanes=lanes, stop=service.stop_time)

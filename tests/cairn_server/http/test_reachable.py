@@ -5,6 +5,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
+from pathlib import Path
 
 import pytest
 from tests.fixtures.server.access import ADMIN, ENROLLER, bearer, robot_token
@@ -16,6 +17,7 @@ from cairn_map.codec.cell_code import encode_cell
 from cairn_map.evidence.evidence import empty_evidence
 from cairn_map.wire.frames import CellFrame, frames_of
 from cairn_map.wire.messages import CURSORS_MAX, Done, More
+from cairn_server.http.middleware.body_limit import LONG_AT_ONCE, LONG_BYTES
 from cairn_server.http.routes.json_bodies import VALUES_MAX
 from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.missing import EMPTY_CELLS_MAX
@@ -152,6 +154,28 @@ def test_open_bodies_of_one_token_leave_room_for_others_and_are_forgotten_with_t
         answer = link.makefile("rb").read()
         assert answer.startswith(b"HTTP/1.1 503") and b"retry-after: 2" in answer and b'"busy"' in answer
     until(lambda: bodies.held_bytes == 0, "all is given back")
+
+
+def test_few_long_bodies_of_one_token_are_read_at_once_and_others_do_not_wait(tmp_path: Path) -> None:
+    with ExitStack() as links:
+        server = links.enter_context(Live(tmp_path, admin_token=ADMIN, enrolment_token=ENROLLER))
+        row = server.new_map()
+        mole, wren = (robot_token(server, row, name) for name in ("mole", "wren"))
+        bodies, reading, size = server.app.state.bodies, server.app.state.reading, 1 << 20
+        ours = links.enter_context(ExitStack())
+        for n in range(12):
+            link = ours.enter_context(socket.create_connection(("127.0.0.1", server.port), timeout=60))
+            path = f"/maps/{row.name}/commits/mole.{MOLE.incarnation}.{n}"
+            fields = f"Authorization: Bearer {mole}", f"Content-Length: {size}"
+            threading.Thread(target=_send, args=(link, head(server, "PUT", path, *fields) + bytes(size - 1))).start()
+        until(lambda: (reading.taken, reading.waiting) == (LONG_AT_ONCE, 12 - LONG_AT_ONCE), "four are read")
+        until(lambda: bodies.held_bytes >= LONG_AT_ONCE * (size - 1), "all of them that came")
+        path, body = long_request(row, "wren", 10_000)
+        assert len(body) > LONG_BYTES
+        headers = {**bearer(wren), "Content-Type": "application/json"}
+        assert server.http.post(path, content=body, headers=headers).status_code == 200
+        ours.close()
+        until(lambda: (reading.taken, reading.waiting, bodies.held_bytes) == (0, 0, 0), "all ends with its link")
 
 
 def _send(link: socket.socket, data: bytes) -> None:

@@ -1,6 +1,9 @@
-"""Bounds on request bodies, of each and of all in memory, enforced before anything reads them whole. Plain ASGI."""
+"""Bounds on request bodies, of each and of all in memory, enforced before anything reads them whole; of one caller only
+a few long ones are read at once. Plain ASGI.
+"""
 
 import re
+import sys
 from collections.abc import Hashable, MutableMapping
 from dataclasses import dataclass
 from typing import Any
@@ -8,6 +11,7 @@ from typing import Any
 from cairn_map.commits.commit import COMMIT_BYTES_MAX
 from cairn_map.errors import BadInputError, CairnError, UnreachableError
 from cairn_server.access.body_budget import BodyBudget
+from cairn_server.access.turns import Turns
 from cairn_server.http.middleware.asgi import App, Message, Receive, Send, send_error
 from cairn_server.http.middleware.token_first import caller_key
 from cairn_server.live.robot_reports import VIEW_BYTES_MAX
@@ -16,6 +20,12 @@ MISSING_BYTES_MAX = 16 << 20
 """Room for 100 000 cells with a cursor each."""
 JSON_BYTES_MAX = 1 << 20
 STATUS_BYTES_MAX = 1 << 14
+LONG_BYTES = 1 << 16
+"""Bytes of a body that come without a turn."""
+LONG_AT_ONCE = 4
+"""Long bodies of one caller that are read at once: the event loop reads in turn from all links, and 44 of one caller
+would have forty times the share of it that a robot has."""
+LONG_WAIT_S = 30.0
 LIMITS = (
     (re.compile(r"/maps/[^/]*/commits/[^/]*"), COMMIT_BYTES_MAX),
     (re.compile(r"/maps/[^/]*/main/cells/[^/]*"), COMMIT_BYTES_MAX),
@@ -25,15 +35,21 @@ LIMITS = (
 )
 
 
+def turns_of_long_bodies() -> Turns:
+    """Turns at which long bodies are read: as many as there are callers, a few of each."""
+    return Turns(places=sys.maxsize, share=LONG_AT_ONCE, wait_s=LONG_WAIT_S)
+
+
 class BodyLimit:
     """Middleware that answers 413 to a body larger than its path allows, and 503 to one for which there is no room.
 
     What a body claims to be is looked at first, then what comes.
     """
 
-    def __init__(self, app: App, *, budget: BodyBudget) -> None:
+    def __init__(self, app: App, *, budget: BodyBudget, turns: Turns) -> None:
         self._app = app
         self._budget = budget
+        self._turns = turns
 
     async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
         """Pass a request on with its body counted, or refuse it."""
@@ -50,13 +66,14 @@ class BodyLimit:
         except UnreachableError as exc:
             await send_error(send, 503, exc)
             return
-        body = _Body(limit_bytes, self._budget, caller, receive, send)
+        body = _Body(limit_bytes, self._budget, self._turns, caller, receive, send)
         try:
             await self._app(scope, body.receive, body.send)
         except (BadInputError, UnreachableError):
             if body.refusal is None:
                 raise
         finally:
+            body.end_turn()
             self._budget.give_back(caller, body.held_bytes)
         if body.refusal is not None and not body.is_answered:
             await send_error(send, *body.refusal)
@@ -68,6 +85,7 @@ class _Body:
 
     limit_bytes: int
     budget: BodyBudget
+    turns: Turns
     caller: Hashable
     asgi_receive: Receive
     asgi_send: Send
@@ -75,6 +93,8 @@ class _Body:
     refusal: tuple[int, CairnError] | None = None
     """Status and error, once the body was refused."""
     is_answered: bool = False
+    has_turn: bool = False
+    is_whole: bool = False
 
     async def receive(self) -> Message:
         """The next part.
@@ -83,7 +103,11 @@ class _Body:
             BadInputError: kind `too_large`.
             UnreachableError: kind `busy`.
         """
+        await self._take_turn()
         message = await self.asgi_receive()
+        if not message.get("more_body", False):
+            self.is_whole = True
+            self.end_turn()
         size_bytes = len(message.get("body", b""))
         if self.held_bytes + size_bytes > self.limit_bytes:
             self.refusal = 413, _too_large(self.limit_bytes)
@@ -95,6 +119,23 @@ class _Body:
             raise
         self.held_bytes += size_bytes
         return message
+
+    def end_turn(self) -> None:
+        """Let another body be read; may be called twice."""
+        if self.has_turn:
+            self.has_turn = False
+            self.turns.give_back(self.caller)
+
+    async def _take_turn(self) -> None:
+        """Wait before a body goes on that has become long; what was not read yet waits in the sender's machine."""
+        if self.has_turn or self.is_whole or self.held_bytes < LONG_BYTES:
+            return
+        try:
+            await self.turns.take(self.caller)
+        except UnreachableError as exc:
+            self.refusal = 503, exc
+            raise
+        self.has_turn = True
 
     async def send(self, message: Message) -> None:
         """Pass the answer on; what the framework makes of a refused body is dropped: another answer follows."""
