@@ -26,7 +26,7 @@ LET_GO = """() => {
     const answer = await ask(path, options);
     if (path.includes("/main/render")) {
       team.follow(null);
-      team.tick("colour", 0);
+      team.tick("colour", 0, []);
       window.letGo = true;
     }
     return answer;

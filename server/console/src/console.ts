@@ -3,6 +3,7 @@
 import { NONE_READY, type Api } from "./api.ts";
 import { Appearance } from "./appearance.ts";
 import { h } from "./dom.ts";
+import { Duties } from "./duties.ts";
 import { LogBook } from "./log_book.ts";
 import { LiveLink, type LinkState } from "./live.ts";
 import { toHash, type CameraView, type Field, type Look } from "./look.ts";
@@ -15,6 +16,8 @@ import { Stage } from "./scene/stage.ts";
 import { Team } from "./team.ts";
 import { CameraPanel } from "./ui/camera_panel.ts";
 import { CommitStrip, SHOWN } from "./ui/commit_strip.ts";
+import { openAsking, openFull } from "./ui/duty_dialogs.ts";
+import { DutyPanel } from "./ui/duty_panel.ts";
 import { LookPanel } from "./ui/look_panel.ts";
 import { mapFacts } from "./ui/map_facts.ts";
 import { MeasurePanel } from "./ui/measure_panel.ts";
@@ -36,6 +39,7 @@ export class Console {
   readonly link: LiveLink;
   readonly team: Team;
   readonly book: LogBook;
+  readonly duties: Duties;
   readonly strip = new CommitStrip();
   readonly voxel: VoxelPanel;
   readonly measure: MeasurePanel;
@@ -46,6 +50,7 @@ export class Console {
   private readonly look: Look;
   private readonly bar: TopBar;
   private readonly panel: LookPanel;
+  private readonly dutyPanel = new DutyPanel();
   private readonly takeAway: TakeAwayPanel;
   private readonly grid = new CellGrid();
   /** Cells that changed since the robot that is followed fetched last. */
@@ -70,6 +75,7 @@ export class Console {
     const host = h("div", { class: "host" });
     const labels = h("div", { class: "labels", "aria-hidden": "true" });
     this.book = new LogBook(api, info.name);
+    this.duties = new Duties(api, info.name);
     this.voxel = new VoxelPanel(api, info.name, (seq) => this.book.robotAt(seq));
     this.takeAway = new TakeAwayPanel(api, info, look);
     this.panel = new LookPanel(look);
@@ -87,7 +93,7 @@ export class Console {
     this.picker = new Picker(this.stage, this.cells);
     this.stage.add(this.cells.group, this.grid.lines, this.unseen.lines, this.outline.lines, this.measure.lines, this.team.group);
     this.camera = new CameraPanel(this.stage, this.cells, this.team, info, camera);
-    left.append(this.camera.element, this.team.panel.element, mapFacts(info));
+    left.append(this.dutyPanel.element, this.camera.element, this.team.panel.element, mapFacts(info));
     this.appearance = new Appearance(look, this.stage, this.cells, this.book);
     view.append(this.appearance.legend.element);
     this.connect(onRefused);
@@ -208,6 +214,8 @@ export class Console {
       this.apply();
     };
     this.strip.onChoose = (entry) => openCommit(this.api, this.info.name, entry);
+    this.dutyPanel.onAsking = (asking) => openAsking(this.duties, asking);
+    this.dutyPanel.onFull = (robot) => openFull(this.api, this.info.name, this.duties, robot);
     this.team.onFollow = () => this.stage.draw();
     this.camera.onGo = () => this.say("");
     this.camera.onNoFloor = () => this.say("Nobody could stand there: no floor is known.");
@@ -291,7 +299,9 @@ export class Console {
     this.grid.lines.visible = this.look.cells;
     this.grid.update([...this.cells.all.values()].filter(({ points }) => points).map(({ box }) => box));
     this.bar.showLink(this.state, this.cells.waiting, this.cells.error);
-    this.team.tick(this.look.field, this.cells.head);
+    this.duties.tick();
+    this.dutyPanel.show(this.duties);
+    this.team.tick(this.look.field, this.cells.head, this.duties.full);
     this.strip.show(this.team.names);
     const { lastSeq } = this.team;
     const missed = lastSeq === null ? [] : [...this.cells.all.values()].filter(({ points, lm }) => points && lm > lastSeq);

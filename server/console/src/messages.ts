@@ -116,3 +116,31 @@ export type LiveEvent =
   | { type: "head"; id: string; cursor: string }
   | { type: "robot"; id: string; robot: RobotSign }
   | { type: "beat"; id: string; time_s: number };
+
+/** Keys that robots' names are bound to, and robots that were refused for theirs: PROTOCOL.md section 4.11. */
+export interface RobotKeys {
+  admitted: { author: string; since_s: number; by: string; may_return: boolean }[];
+  asking: AskingRobot[];
+}
+
+export interface AskingRobot {
+  /** `robot.key`: 16 hex digits stand for the key. */
+  author: string;
+  since_s: number;
+  asked_s: number;
+  by: string;
+}
+
+/** What a robot uses of its shares of the map's bounds; null: the reserve. */
+export interface RobotUse {
+  robot: string | null;
+  incarnations: number;
+  intervals: number;
+  used: Record<string, number>;
+}
+
+export interface RobotClosed {
+  robot: string;
+  incarnations: number;
+  intervals: number;
+}

@@ -3,6 +3,7 @@
 import { Group, Vector3 } from "three";
 import type { Api } from "./api.ts";
 import { h } from "./dom.ts";
+import type { FullShare } from "./duties.ts";
 import type { LogBook } from "./log_book.ts";
 import type { Field } from "./look.ts";
 import type { Branch, RobotSign, Triple } from "./messages.ts";
@@ -32,6 +33,7 @@ export class Team {
   readonly fromPose: RobotMap;
   onFollow: () => void = () => {};
   private branches: Branch[] = [];
+  private full: readonly FullShare[] = [];
   private readonly signs = new Map<string, RobotSign>();
   private readonly marks = new Map<string, RobotMark>();
   private readonly labels = new Map<string, HTMLElement>();
@@ -78,7 +80,7 @@ export class Team {
     else this.signs.set(sign.branch, sign);
     this.mark(sign);
     this.refresh();
-    this.panel.show(this.branches, this.signs, this.names, this.followed);
+    this.show();
     this.stage.draw();
   }
 
@@ -102,7 +104,7 @@ export class Team {
       const eye = this.behind(mark.position, mark.ahead.setZ(0));
       this.stage.fly({ eye: eye.toArray() as Triple, target: mark.position.toArray() as Triple });
     }
-    this.panel.show(this.branches, this.signs, this.names, this.followed);
+    this.show();
     this.onFollow();
   }
 
@@ -122,8 +124,9 @@ export class Team {
     return places[0]?.clone() ?? null;
   }
 
-  /** A few times a second: what the map is coloured by, and the newest log entry that is drawn. */
-  tick(field: Field, head: number): void {
+  /** A few times a second: what the map is coloured by, the newest log entry that is drawn, and shares that are half used. */
+  tick(field: Field, head: number, full: readonly FullShare[]): void {
+    this.full = full;
     const followed = this.followed === null ? undefined : this.signs.get(this.followed);
     this.picture.show(this.followed, followed?.view_s ?? null);
     this.fromPose.show(this.followed, followed?.status?.pose ?? null, field, head);
@@ -139,7 +142,7 @@ export class Team {
         this.stage.draw();
       }
     }
-    this.panel.show(this.branches, this.signs, this.names, this.followed);
+    this.show();
   }
 
   /** Labels beside the robots, where these are in the picture now; by name, so that a stack keeps its order. */
@@ -157,13 +160,17 @@ export class Team {
     seen.forEach(({ label, x }, n) => (label.style.transform = `translate(${x}px, ${tops[n]}px)`));
   }
 
+  private show(): void {
+    this.panel.show(this.branches, this.signs, this.names, this.followed, this.full);
+  }
+
   private async ask(): Promise<void> {
     try {
       this.branches = await this.api.json<Branch[]>(`maps/${this.map}/branches`);
     } catch {
       return; // the bar says that there is no link
     }
-    this.panel.show(this.branches, this.signs, this.names, this.followed);
+    this.show();
     for (const sign of this.signs.values()) this.mark(sign);
     this.stage.draw();
   }

@@ -1,6 +1,7 @@
 /** The team: who is where, how far behind, and when each was last heard of. */
 
 import { fill, h } from "../dom.ts";
+import type { FullShare } from "../duties.ts";
 import type { Branch, RobotSign } from "../messages.ts";
 import { robotColour } from "../palettes.ts";
 import { serverNowS } from "../server_time.ts";
@@ -23,7 +24,10 @@ export class TeamPanel {
     this.element.append(h("h2", {}, "Robots"), this.list);
   }
 
-  show(branches: readonly Branch[], signs: ReadonlyMap<string, RobotSign>, names: readonly string[], followed: string | null): void {
+  show(
+    branches: readonly Branch[], signs: ReadonlyMap<string, RobotSign>, names: readonly string[], followed: string | null,
+    full: readonly FullShare[],
+  ): void {
     const rows = branches.map((branch) => {
       const sign = signs.get(branch.branch);
       const lastSeenS = Math.max(branch.last_seen_s, sign?.time_s ?? 0);
@@ -36,6 +40,7 @@ export class TeamPanel {
         waiting: status?.waiting ? `${status.waiting} commits (${bytes(status.waiting_bytes)}) still on board` : "",
         battery: status?.battery == null ? "" : `battery ${Math.round(status.battery * 100)} %`,
         note: status?.note ?? "", hasPose: pose !== null, followed: followed === branch.branch,
+        full: full.find(({ robot }) => robot === branch.branch)?.said ?? "",
         sigma: pose?.sigma_m ? `pose ± ${pose.sigma_m.toFixed(2)} m` : "",
       };
     });
@@ -49,7 +54,7 @@ export class TeamPanel {
 
   private row(
     row: { name: string; offline: boolean; mode: string; seen: string; lag: string; missing: string; waiting: string; battery: string;
-      note: string; hasPose: boolean; followed: boolean; sigma: string },
+      note: string; hasPose: boolean; followed: boolean; full: string; sigma: string },
     names: readonly string[],
   ): HTMLElement {
     const dot = h("span", { class: "dot", "aria-hidden": "true" });
@@ -66,7 +71,8 @@ export class TeamPanel {
     );
     const lines = [row.lag, `seen ${row.seen}`, row.missing, row.waiting, [row.sigma, row.battery].filter(Boolean).join(" · "), row.note];
     const said = lines.filter(Boolean).map((line) => h("p", {}, line));
-    return h("li", { class: row.offline ? "robot offline" : "robot" }, button, ...said);
+    const full = row.full && h("p", { class: "full" }, `uses more than half of its share: ${row.full}`);
+    return h("li", { class: row.offline ? "robot offline" : "robot" }, button, full || null, ...said);
   }
 }
 
