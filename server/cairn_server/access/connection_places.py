@@ -7,19 +7,22 @@
 A new stranger finds a place: where all are taken, the address that has most of them loses its oldest one. So silent
 connections push out each other, and a robot that shows its token within a round trip stays. Each stays for half a
 second at least: an address that opens them faster has its new ones cut, before a handshake is computed for each. A
-whole team behind one radio is one address only until then. An IPv6 address counts as its network of 64 bits, as one
-customer has them all. For one event loop.
+whole team behind one radio is one address only until then; of an address from which a good token came before, the first
+few connections do not count, or strangers from many addresses would push out the team's. An IPv6 address counts as its
+network of 64 bits, as one customer has them all. For one event loop.
 """
 
 import ipaddress
 import time
-from collections import Counter
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Hashable
 from functools import lru_cache
 
 from cairn_map.errors import UnreachableError
 
 STRANGERS_MIN, SHARE_MIN = 4, 4
+GOOD_ADDRESSES, GOOD_SHARE = 1024, 8
+"""Addresses that are remembered since a good token came from them, and the connections of each that do not count."""
 STAY_S = 0.5
 """Time for which a stranger's connection stays at least, when only its own address wants its place."""
 KNOWN_PER_STRANGER, TOKENS = 4, 16
@@ -50,6 +53,7 @@ class ConnectionPlaces:
         self._share = max(SHARE_MIN, limit // TOKENS)
         self._proxies = networks(trusted_proxies)
         self._strangers: dict[ConnectionPlace, None] = {}  # oldest first
+        self._good: OrderedDict[str, None] = OrderedDict()  # longest ago first
         self._of: Counter[Hashable] = Counter()
 
     @property
@@ -81,6 +85,7 @@ class ConnectionPlaces:
         if self._of.total() - (place.holder is not None) >= self._limit:
             raise UnreachableError("busy", f"all {self._limit} connections are taken", retry_after_s=5.0)
         self._forget(place)
+        self._note_good(place.address)
         place.holder = holder
         self._of[holder] += 1
 
@@ -106,9 +111,17 @@ class ConnectionPlaces:
             if not self._of[place.holder]:
                 del self._of[place.holder]
 
+    def _note_good(self, address: str) -> None:
+        self._good[address] = None
+        self._good.move_to_end(address)
+        if len(self._good) > GOOD_ADDRESSES:
+            self._good.popitem(last=False)
+
     def _cut_one(self, newest: ConnectionPlace) -> None:
         """Cut the oldest connection of the address that has most; of equal ones, the oldest of all."""
         counts = Counter(place.address for place in self._strangers)
+        for address in counts.keys() & self._good.keys():
+            counts[address] -= GOOD_SHARE
         most = max(counts.values())
         oldest = next(place for place in self._strangers if counts[place.address] == most)
         is_flood = oldest.address == newest.address and newest.since_s - oldest.since_s < STAY_S

@@ -52,7 +52,7 @@ from cairn_map.errors import BadInputError
 from cairn_server.folding.cell_cache import CACHE_BYTES
 from cairn_server.folding.fold_process import fork_folding
 from cairn_server.http.app import make_app
-from cairn_server.http.middleware.deadlines import protocol_of
+from cairn_server.http.middleware.deadlines import ListenerProtocol, protocol_of
 from cairn_server.http.middleware.log_format import LogForm, start_logging
 from cairn_server.http.middleware.secure_start import secured
 from cairn_server.http.middleware.work_turns import Lanes
@@ -72,7 +72,7 @@ log = logging.getLogger(__name__)
 BACKLOG = 128
 GRACE_S = 6
 """Time for answers under way after the signal to stop; the fold under way and closing the store come after it."""
-WEBSOCKETS: dict[str, Any] = {"ws": "websockets-sansio", "ws_max_size": 1 << 12, "ws_per_message_deflate": False}
+WEBSOCKETS: dict[str, Any] = {"ws": ListenerProtocol, "ws_max_size": 1 << 12, "ws_per_message_deflate": False}
 """WebSockets of listeners, who send next to nothing and must cost little."""
 SWITCH_S = 0.0005
 """Longest time for which a thread that computes keeps the interpreter from another one that waits for it: a push needs

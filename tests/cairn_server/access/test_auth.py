@@ -203,6 +203,7 @@ def test_a_token_that_ends_while_a_body_comes_does_not_count(guarded: Live, path
         yield data[5:]
 
     method, headers = ("PUT", {}) if "commit" in path else ("POST", {"Content-Type": "application/json"})
+    headers |= {"Content-Length": str(len(data))}
     url = f"/maps/{row.name}/{path.format(commit=commit.id)}"
     with httpx.Client(base_url=guarded.http.base_url) as other:
         answer = other.request(method, url, content=slowly(), headers=headers | bearer(secret))

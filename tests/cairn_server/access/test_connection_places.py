@@ -87,6 +87,18 @@ def test_two_hundred_robots_behind_one_address_all_find_a_place_one_after_the_ot
     assert places.taken == (0, 200)
 
 
+def test_strangers_from_many_addresses_do_not_push_out_a_team_behind_one() -> None:
+    door = Door()
+    known = door.enter("10.0.0.1")
+    door.places.note(known, "mole")
+    door.leave(known)
+    team = [door.enter("10.0.0.1") for _ in range(3)]
+    for n in range(3 * STRANGERS):
+        door.now_s += STAY_S
+        door.enter(f"10.0.1.{n}")
+    assert all(place in door.open for place in team)
+
+
 def test_one_token_has_its_share_and_admins_have_all() -> None:
     door = Door()
     for n in range(SHARE + 1):

@@ -498,3 +498,15 @@ def test_what_a_listener_sends_is_ignored_but_not_if_it_is_long(live: Live) -> N
             while True:
                 stream.recv()
         assert closed.value.rcvd is not None and closed.value.rcvd.code == 1009
+
+
+def test_a_listener_that_sends_more_than_it_has_to_say_is_cut(live: Live) -> None:
+    # An empty frame takes as long to parse as one of kilobytes: sixteen sockets full of them stopped all others.
+    row = live.new_map()
+    with connect(socket_url(live, row)) as listener:
+        listener.recv()
+        listener.socket.sendall(bytes.fromhex("818000000000") * 2000)
+        with pytest.raises(ConnectionClosed):
+            while True:
+                listener.recv()
+    assert live.http.get("/healthz").status_code == 200

@@ -93,7 +93,7 @@ def test_a_slow_body_above_the_least_rate_takes_the_time_that_it_takes(hasty: Li
             pause.wait(step / RATE * 0.7)
 
     start_s = time.monotonic()
-    headers = {"Content-Type": "application/json"}
+    headers = {"Content-Type": "application/json", "Content-Length": str(size)}
     answer = hasty.http.post(f"/maps/{row.name}/retracts", content=slowly(), headers=headers)
     assert answer.status_code == 422  # it came whole, and is no message
     assert time.monotonic() - start_s > 2 * GRACE_S

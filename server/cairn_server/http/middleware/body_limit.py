@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from cairn_map.commits.commit import COMMIT_BYTES_MAX
-from cairn_map.errors import BadInputError, CairnError, UnreachableError
+from cairn_map.errors import BadInputError, UnreachableError
 from cairn_server.access.body_budget import BodyBudget
 from cairn_server.access.turns import Turns
 from cairn_server.http.middleware.asgi import App, Message, Receive, Send, send_error
@@ -43,7 +43,7 @@ def turns_of_long_bodies() -> Turns:
 class BodyLimit:
     """Middleware that answers 413 to a body larger than its path allows, and 503 to one for which there is no room.
 
-    What a body claims to be is looked at first, then what comes.
+    What a body claims is looked at first; its connection brings no more (`deadlines`). Then what comes is counted.
     """
 
     def __init__(self, app: App, *, budget: BodyBudget, turns: Turns) -> None:
@@ -66,32 +66,31 @@ class BodyLimit:
         except UnreachableError as exc:
             await send_error(send, 503, exc)
             return
-        body = _Body(limit_bytes, self._budget, self._turns, caller, receive, send)
+        body = _Body(self._budget, self._turns, caller, receive, send)
         try:
             await self._app(scope, body.receive, body.send)
-        except (BadInputError, UnreachableError):
+        except UnreachableError:
             if body.refusal is None:
                 raise
         finally:
             body.end_turn()
             self._budget.give_back(caller, body.held_bytes)
         if body.refusal is not None and not body.is_answered:
-            await send_error(send, *body.refusal)
+            await send_error(send, 503, body.refusal)
 
 
 @dataclass(slots=True)
 class _Body:
-    """Body of one request: counted, and kept within its limit and the budget."""
+    """Body of one request: counted, and kept within the budget."""
 
-    limit_bytes: int
     budget: BodyBudget
     turns: Turns
     caller: Hashable
     asgi_receive: Receive
     asgi_send: Send
     held_bytes: int = 0
-    refusal: tuple[int, CairnError] | None = None
-    """Status and error, once the body was refused."""
+    refusal: UnreachableError | None = None
+    """Once there was no room for the body."""
     is_answered: bool = False
     has_turn: bool = False
     is_whole: bool = False
@@ -100,7 +99,6 @@ class _Body:
         """The next part.
 
         Raises:
-            BadInputError: kind `too_large`.
             UnreachableError: kind `busy`.
         """
         await self._take_turn()
@@ -109,13 +107,10 @@ class _Body:
             self.is_whole = True
             self.end_turn()
         size_bytes = len(message.get("body", b""))
-        if self.held_bytes + size_bytes > self.limit_bytes:
-            self.refusal = 413, _too_large(self.limit_bytes)
-            raise self.refusal[1]
         try:
             self.budget.take(self.caller, size_bytes)
         except UnreachableError as exc:
-            self.refusal = 503, exc
+            self.refusal = exc
             raise
         self.held_bytes += size_bytes
         return message
@@ -133,7 +128,7 @@ class _Body:
         try:
             await self.turns.take(self.caller)
         except UnreachableError as exc:
-            self.refusal = 503, exc
+            self.refusal = exc
             raise
         self.has_turn = True
 

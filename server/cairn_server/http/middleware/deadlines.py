@@ -6,16 +6,23 @@ slow radio link is served; one that dribbles is cut, and its robot asks again.
 
     accepted -- head_s --> head -- body_grace_s + bytes / body_bytes_per_s --> body --> handled --> answer, as a body
 
-Delays by the server itself (it reads no faster than it works) do not count against the client. Both classes here rest
+Delays by the server itself (it reads no faster than it works) do not count against the client. What is read in one go
+is parsed in one go, so nothing that costs much for each byte may be in it: no body in chunks, which may have a byte
+each, and few frames from who listens at a WebSocket. The classes here rest
 on private parts of uvicorn: docs/decisions/012-private-hooks.md has the versions, the reasons, and how to upgrade.
 """
 
 import asyncio
+import json
 import logging
 from typing import Any, Literal
 
+import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
+from cairn_map.errors import BadInputError
+from cairn_map.wire.messages import Problem
 from cairn_server.access.connection_places import ConnectionPlace, ConnectionPlaces
 from cairn_server.settings import Settings
 
@@ -24,6 +31,8 @@ log = logging.getLogger(__name__)
 TICK_S = 1.0
 """Time between two looks at a connection."""
 JOINED_BYTES_MAX = 1 << 14
+HEARD_BYTES, HEARD_BYTES_PER_S = 1 << 13, 1 << 10
+"""What a listener at a WebSocket may send at once, and for each second: answers to pings, and little else."""
 PLACE = "place"
 """Name of a connection's place in the state of its requests; it has none if it is a proxy's."""
 Stage = Literal["head", "body", "answer"]
@@ -68,8 +77,28 @@ class _Joined:
             self._transport.write(b"".join(parts))
 
 
+class _SizedBodies(h11.Connection):
+    """Parser that refuses a body without `Content-Length` at its head."""
+
+    is_unsized = False
+
+    def next_event(self) -> Any:
+        """Next part of a request.
+
+        Raises:
+            h11.RemoteProtocolError: the body comes in chunks, or the request is none.
+        """
+        event = super().next_event()
+        if isinstance(event, h11.Request) and any(name == b"transfer-encoding" for name, _ in event.headers):
+            self.is_unsized = True
+            raise h11.RemoteProtocolError("a body without Content-Length")
+        return event
+
+
 class PunctualProtocol(H11Protocol):
     """uvicorn's HTTP/1.1 connection, aborted when the client takes too long."""
+
+    conn: _SizedBodies
 
     settings = Settings()
     places = ConnectionPlaces(2)
@@ -82,6 +111,7 @@ class PunctualProtocol(H11Protocol):
     def begin(self, transport: asyncio.Transport, place: ConnectionPlace | None) -> None:
         """Start the clock of a new connection, which has a place or is a trusted proxy's."""
         self._place = place
+        self.conn = _SizedBodies(h11.SERVER, self.conn._max_incomplete_event_size)
         # Requests find it in their state: a good token makes the connection its own.
         self.app_state = {**self.app_state, PLACE: place}
         super().connection_made(_Joined(transport, self.loop))  # type: ignore[arg-type]
@@ -103,6 +133,24 @@ class PunctualProtocol(H11Protocol):
         if self._place is not None:
             self.places.leave(self._place)
         super().connection_lost(exc)
+
+    def send_400_response(self, msg: str) -> None:
+        """Refuse what is no request, or has a body of unknown length, and close; what was read of it is dropped."""
+        if not self.conn.is_unsized:
+            super().send_400_response(msg)
+            return
+        error = BadInputError("no_length", "send a body with Content-Length, not in chunks")
+        problem = Problem(title="no length", status=411, detail=error.message, kind=error.kind)
+        body = json.dumps(problem.model_dump()).encode()
+        length = b"content-length", str(len(body)).encode()
+        headers = [(b"content-type", b"application/problem+json"), (b"connection", b"close"), length]
+        for event in (
+            h11.Response(status_code=411, headers=headers, reason=b"Length Required"),
+            h11.Data(data=body),
+            h11.EndOfMessage(),
+        ):
+            self.transport.write(self.conn.send(event) or b"")
+        self.transport.close()
 
     def handle_websocket_upgrade(self, event: object) -> None:
         """Stop the clock: the WebSocket has pings of its own, and the place until it is closed."""
@@ -159,6 +207,30 @@ class PunctualProtocol(H11Protocol):
 
     def _patience_s(self, size_bytes: int) -> float:
         return self.settings.body_grace_s + size_bytes / self.settings.body_bytes_per_s
+
+
+class ListenerProtocol(WebSocketsSansIOProtocol):
+    """uvicorn's WebSocket, aborted when the client sends more than a listener has to say.
+
+    An empty frame of six bytes takes 10 us to parse: 6 MB a second of them, and nobody else is answered.
+    """
+
+    _may_send_bytes: float = HEARD_BYTES
+    _seen_s = 0.0
+
+    def data_received(self, data: bytes) -> None:
+        """Parse what came, or cut the link."""
+        # uvicorn hands the request on as the first data: it was parsed before, and is not counted.
+        if self._seen_s:
+            now_s = self.loop.time()
+            grown = self._may_send_bytes + HEARD_BYTES_PER_S * (now_s - self._seen_s)
+            self._may_send_bytes, self._seen_s = min(grown, HEARD_BYTES) - len(data), now_s
+            if self._may_send_bytes < 0:
+                log.info("%s: cut, a listener sends too much", self.client)
+                self.transport.abort()
+                return
+        self._seen_s = self._seen_s or self.loop.time()
+        super().data_received(data)
 
 
 def protocol_of(settings: Settings, places: ConnectionPlaces) -> type[PunctualProtocol]:
