@@ -32,6 +32,8 @@ from cairn_map.queries.point_kernels import is_within
 
 NOWHERE = 1 << 62
 """A number that no cell has."""
+LEAST_DIRECTION = 1e-30
+"""A smaller part of a unit direction counts as 0: its inverse could be infinite, and a walk of NaN never ends."""
 Axes = tuple[float, float, float]
 
 
@@ -188,7 +190,7 @@ def ray_through(start: Floats, direction: Floats, x: int, y: int, z: int) -> Ray
 @nb.njit(nogil=True, forceinline=True)
 def along(start: float, direction: float, voxel: int) -> tuple[float, float, int]:
     """One axis of a `Ray`: its start, inverse direction, and -1 if it rises, else 0."""
-    if direction == 0:
+    if abs(direction) < LEAST_DIRECTION:
         # No border is ever met: infinite ranges. In the middle of a voxel, because on a border 0 times infinity is NaN.
         return voxel + 0.5, np.inf, -1
     return start, 1 / direction, -1 if direction > 0 else 0

@@ -49,6 +49,8 @@ class Caller:
     """Name of the token, for the audit log."""
     map_number: int | None = None
     """Number of the one map that the token counts on; None: all maps."""
+    is_returning: bool = False
+    """True if there is no token, but a robot's key that an operator lets in."""
 
     def may_author(self, robot: str) -> bool:
         """True if this caller may push commits of this robot."""

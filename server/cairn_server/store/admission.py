@@ -40,6 +40,8 @@ class Grounds:
     """True if the caller shows the robot's own token."""
     has_word: bool = False
     """True if an admin, this server itself, or an enrolment token for this robot speaks."""
+    is_return: bool = False
+    """True if the caller shows no token, but a key that may return: that counts once."""
     by: str = ""
     """Name of the token that is shown."""
 
@@ -67,8 +69,12 @@ def check_registration(author: Author, grounds: Grounds, known: Mapping[Incarnat
     """Refuse a registration under a known name for which nothing speaks; arguments as of `check_commit`.
 
     Raises:
-        DeniedError: kind `not_admitted`.
+        DeniedError: kind `not_admitted`; kind `no_token`: the key returned already.
     """
+    if grounds.is_return:
+        if author.incarnation in known and known[author.incarnation].may_return:
+            return
+        raise DeniedError("no_token", f"{author} came back by its key already; an operator's word counts once")
     if not known or grounds.has_word or grounds.signers & known.keys():
         return
     if grounds.is_own and not any(key.is_proven for key in known.values()):

@@ -57,7 +57,7 @@ class Admissions:
             key = self._store.keys.of(row, proof.author.robot).get(proof.author.incarnation)
             may_return = key is not None and key.may_return
             if may_return and proof.author.incarnation in self.challenges.signers(proof, map_name=row.name):
-                return Caller(Role.ENROLLER, proof.author.robot, str(proof.author), row.number)
+                return Caller(Role.ENROLLER, proof.author.robot, str(proof.author), row.number, is_returning=True)
         raise DeniedError(
             "no_token",
             "this takes a token, or the key of a robot that an operator let in: cairn map robots admit URL NAME.KEY",
@@ -82,7 +82,7 @@ class Admissions:
         has_word = caller.role is Role.ADMIN or (caller.role is Role.ENROLLER and is_for_robot)
         self._take(caller)
         try:
-            yield Grounds(signers=signers, has_word=has_word, by=caller.name)
+            yield Grounds(signers=signers, has_word=has_word, is_return=caller.is_returning, by=caller.name)
         except CairnError as exc:
             if exc.kind == "not_admitted":
                 self.refused(row, author, by=caller)

@@ -176,6 +176,15 @@ def test_no_walk_begins_at_an_origin_that_is_none(origin: list[float], ends_in_u
     assert refused.value.kind == "point_range"
 
 
+@pytest.mark.parametrize("part", [5e-324, 1e-310, 1e-300, -1e-310])
+def test_a_ray_that_nearly_lies_in_a_plane_ends_as_one_that_does(part: float) -> None:
+    snapshot = snapshot_with(PLAIN, WALL)
+    for direction in ([1, part, 0], [part, 1, 0], [part, part, 1]):
+        flat = [round(number) for number in direction]
+        ends = result_within(20.0, lambda d=direction: snapshot.cast_rays([[0, 0, 0]], [d], max_range_m=10))  # type: ignore[misc]
+        assert ends.distance_m.tolist() == snapshot.cast_rays([[0, 0, 0]], [flat], max_range_m=10).distance_m.tolist()
+
+
 def test_as_many_directions_as_origins() -> None:
     with pytest.raises(BadInputError):
         snapshot_with(PLAIN, WALL).cast_rays([[0, 0, 0]] * 2, [[1, 0, 0]], max_range_m=1)

@@ -121,3 +121,15 @@ def test_settings_that_serve_nobody_are_refused(line: str, tmp_path: Path) -> No
     with pytest.raises(BadInputError) as refused:
         main(["--port", "0", "--settings", str(tmp_path / "settings.toml")])
     assert refused.value.kind == "bad_setting"
+
+
+@pytest.mark.parametrize(
+    "rest", ["Content-Length: 5\r\n\r\nhello", "X: " + "a" * 20_000 + "\r\n\r\n"], ids=["body", "long"]
+)
+def test_a_websocket_whose_handshake_is_none_is_cut(hasty: Live, rest: str) -> None:
+    key = "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA=="
+    start = head(hasty, "GET", "/maps/lab/live", "Upgrade: websocket", "Connection: Upgrade", *key)
+    with connected(hasty) as link:
+        link.sendall(start[:-2] + rest.encode())
+        while link.recv(1 << 16):  # b"" once it is cut; its time is up otherwise
+            pass

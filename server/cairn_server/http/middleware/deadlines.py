@@ -153,10 +153,17 @@ class PunctualProtocol(H11Protocol):
         self.transport.close()
 
     def handle_websocket_upgrade(self, event: object) -> None:
-        """Stop the clock: the WebSocket has pings of its own, and the place until it is closed."""
+        """Hand the connection over: the WebSocket has pings of its own, and the place until it is closed."""
         self._timer.cancel()
         super().handle_websocket_upgrade(event)  # type: ignore[arg-type]
+        self.loop.call_later(self.settings.head_s, self._cut_if_undecided)
         self._await_close()
+
+    def _cut_if_undecided(self) -> None:
+        """Abort a WebSocket that was neither accepted nor refused: what came of its handshake is not whole."""
+        protocol = self.transport.get_protocol()
+        if isinstance(protocol, ListenerProtocol) and not protocol.handshake_complete:
+            self.transport.abort()
 
     def _await_close(self) -> None:
         """Give the place of a WebSocket back at its end, of which uvicorn tells another protocol."""
