@@ -30,6 +30,7 @@ import { celsius, thousands } from "./units.ts";
 const UNSEEN_COLOUR = 0xffb000;
 const SOFTWARE_BUDGET = 150_000;
 const TICK_MS = 250;
+const AGAIN_MS = 3000;
 
 export class Console {
   readonly element: HTMLElement;
@@ -65,6 +66,8 @@ export class Console {
   private loading: Promise<void>;
   /** State that the index was last taken from. */
   private cursor = "";
+  /** When to load again what could not be loaded, as of performance.now(). */
+  private againAtMs = Infinity;
   private readonly timer: number;
 
   constructor(api: Api, info: MapInfo, look: Look, camera: CameraView | null, bar: TopBar, onRefused: () => void) {
@@ -229,7 +232,7 @@ export class Console {
   private heard(event: LiveEvent): void {
     if (event.type === "hello") {
       this.team.greet(event.robots);
-      if (!event.resumed) void this.loading.then(() => (this.cursor === event.cursor ? undefined : this.reload()));
+      if (!event.resumed) void this.loading.then(() => (this.cursor === event.cursor ? undefined : this.reloadAll()));
     } else if (event.type === "cells") {
       if (event.cells === "many") void this.reload();
       else {
@@ -244,6 +247,13 @@ export class Console {
     } else if (event.type === "robot") {
       this.team.hear(event.robot);
     }
+  }
+
+  /** The same where the server cannot prove that its log is the one that is known here: a part of that may be lost. */
+  private reloadAll(): Promise<void> {
+    this.book.forget();
+    this.strip.forget();
+    return this.reload();
   }
 
   /** Everything anew: what the page has of it stays. */
@@ -264,6 +274,7 @@ export class Console {
       await this.book.reachBack(entries.reduce((least, { lm, voxels }) => (voxels ? Math.min(least, lm) : least), Infinity));
     } catch (error) {
       this.cells.error = (error as Error).message;
+      this.againAtMs = performance.now() + AGAIN_MS;
     }
   }
 
@@ -299,6 +310,10 @@ export class Console {
     this.grid.lines.visible = this.look.cells;
     this.grid.update([...this.cells.all.values()].filter(({ points }) => points).map(({ box }) => box));
     this.bar.showLink(this.state, this.cells.waiting, this.cells.error);
+    if (performance.now() >= this.againAtMs) {
+      this.againAtMs = Infinity;
+      void this.reload();
+    }
     this.duties.tick();
     this.dutyPanel.show(this.duties);
     this.team.tick(this.look.field, this.cells.head, this.duties.full);

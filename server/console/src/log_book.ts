@@ -1,7 +1,8 @@
 /** What the page knows of the map's log: whose commits changed what, when that was measured, and from where.
  *
  * The newest entries come first and are enough for most maps; older ones are read as far back as a shown cell needs
- * them, within a bound. */
+ * them, within a bound. What is known for sure is the run without a gap that ends at the newest entry: a page of the
+ * log may end early, a link may break, and entries may be left out of an event, so there may be gaps before it. */
 
 import type { Api } from "./api.ts";
 import type { LogEntry, Triple } from "./messages.ts";
@@ -37,8 +38,9 @@ export class LogBook {
   /** Rising in number; only of entries that state a time. */
   private timed: { seq: number; timeS: number }[] = [];
   private newestS = 0;
-  /** Oldest entry that is known, with a time or without. */
+  /** Oldest entry of the run without a gap that ends at the newest one; 0: none is known. */
   private firstSeq = 0;
+  private newestSeq = 0;
   private readonly api: Api;
   private readonly map: string;
 
@@ -65,8 +67,13 @@ export class LogBook {
     try {
       do {
         const before = this.firstSeq;
-        if (before <= 1 || this.known.size + PAGE > KEPT) return;
-        await this.page(Math.max(before - 1 - PAGE, 0));
+        if (before <= 1 || this.newestSeq - before + PAGE >= KEPT) return;
+        // Forward to where the run begins, however few entries a page has.
+        for (let after = Math.max(before - 1 - PAGE, 0); after < before - 1; ) {
+          const entries = await this.page(after);
+          if (!entries.length) return; // this log ends before what was known of it: the server was restored
+          after = entries[entries.length - 1].seq;
+        }
         if (this.firstSeq >= before) return;
       } while (this.firstSeq > seq);
     } finally {
@@ -75,13 +82,21 @@ export class LogBook {
     }
   }
 
+  /** Forget all: the log may be another one. */
+  forget(): void {
+    this.known.clear();
+    this.add([]);
+  }
+
   add(entries: readonly LogEntry[]): void {
     for (const { seq, id, kind, captured_s, place_m } of entries) {
       this.known.set(seq, { seq, id, isOut: kind === "-", timeS: captured_s && captured_s[1], at: place_m });
     }
     const sorted = [...this.known.values()].sort((a, b) => a.seq - b.seq);
     for (const { seq } of sorted.splice(0, sorted.length - KEPT)) this.known.delete(seq);
-    this.firstSeq = sorted[0]?.seq ?? 0;
+    this.newestSeq = sorted[sorted.length - 1]?.seq ?? 0;
+    const gap = sorted.findLastIndex(({ seq }, n) => n > 0 && sorted[n - 1].seq !== seq - 1);
+    this.firstSeq = sorted[Math.max(gap, 0)]?.seq ?? 0;
     this.timed = sorted.flatMap(({ seq, timeS }) => (timeS ? [{ seq, timeS }] : []));
     this.newestS = this.timed.reduce((most, { timeS }) => Math.max(most, timeS), 0);
     this.onChange();
@@ -112,7 +127,7 @@ export class LogBook {
     return this.newestS - this.timed[at].timeS;
   }
 
-  /** Whether an entry is older than all that are known, and so may be older than is told. */
+  /** Whether an entry is from before the run without a gap, and so may be older than is told. */
   isBefore(seq: number): boolean {
     return seq < this.firstSeq;
   }

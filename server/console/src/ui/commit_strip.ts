@@ -33,6 +33,12 @@ export class CommitStrip {
     this.waiting = true;
   }
 
+  /** Forget all: the log may be another one. */
+  forget(): void {
+    this.entries.clear();
+    this.add([]);
+  }
+
   get robots(): string[] {
     return [...new Set([...this.entries.values()].map(({ id }) => robotOf(id)))].sort();
   }
