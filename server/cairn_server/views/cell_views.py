@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from cairn_map.codec.view_code import VERSION, encode_view
-from cairn_map.errors import DamagedDataError, NotFoundError
+from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.view import ViewStyle
@@ -29,6 +29,8 @@ BYTES_MAX = 1 << 26
 """Most bytes of all views kept; 56 cells of 4 cm have 2 MB of views at their voxels, 3 MB at all depths."""
 DEPTHS_ABOVE_VOXELS = 3
 """Depth above the voxels of the views that pages ask for first: COARSE in console/src/scene/detail.ts."""
+FILE_VOXELS_MAX = 1 << 22
+"""Known voxels of a cell that is made into an NPZ or PLY file: some 330 bytes of memory each."""
 BUNDLE_MEDIA_TYPE = "application/vnd.cairn.views"
 BUNDLE_CELLS_MAX = 10_000
 BUNDLE_BYTES_MAX = 8 << 20
@@ -147,6 +149,7 @@ class CellViews:
 
         Raises:
             NotFoundError: kind `no_cell`: it was never seen.
+            BadInputError: kind `too_costly`: the file would be too large to be made in memory.
             DamagedCellError: kind `damaged_store`: it is damaged and cannot be rebuilt.
         """
         if depth is not None:
@@ -204,6 +207,12 @@ class CellViews:
             return self.cache.view(view_name(row, stored, depth), lambda: view_of_stored(row, stored, depth))
         if not suffix:
             return stored.body
+        if suffix != "view" and stored.voxels > FILE_VOXELS_MAX:
+            raise BadInputError(
+                "too_costly",
+                f"a cell of at most {FILE_VOXELS_MAX} known voxels comes as .{suffix[:16]}, this one has "
+                f"{stored.voxels}; take the cell itself, or an export of its box, which is made piece by piece",
+            )
         return cell_file(suffix, stored.key, stored_evidence(stored), row.geometry, row.sensor_model)[0]
 
 

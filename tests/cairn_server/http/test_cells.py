@@ -20,6 +20,7 @@ from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.files.cell_files import CELL_MEDIA_TYPE
 from cairn_map.wire.messages import CellIndex
 from cairn_server.store.store_rows import MapRow
+from cairn_server.views import cell_views
 
 
 @pytest.fixture
@@ -77,6 +78,20 @@ def test_a_changed_cell_has_another_etag(live: Live, row: MapRow) -> None:
     live.push(row, pushed(1, 0))
     live.folded(row)
     assert live.http.get(first_cell_path(row), headers={"If-None-Match": etag}).status_code == 200
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".ply"])
+def test_a_cell_of_too_many_voxels_comes_as_no_file_and_files_are_made_one_by_one(
+    live: Live, row: MapRow, suffix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = first_cell_path(row, suffix)
+    assert live.http.get(path).status_code == 200
+    monkeypatch.setattr(cell_views, "FILE_VOXELS_MAX", 3)
+    answer = live.http.get(path)
+    assert (answer.status_code, kind_of(answer)) == (400, "too_costly")
+    assert live.http.get(first_cell_path(row)).status_code == 200
+    lanes = live.app.state.lanes
+    assert lanes.of(path) is not lanes.of(first_cell_path(row))
 
 
 def test_npz_is_read_by_numpy(live: Live, row: MapRow) -> None:
