@@ -115,7 +115,7 @@ class MemoryMap:
         if known is not None:
             return self._append_again(known, commit, age_s)
         self._check_kept(commit.retracts)
-        intervals = self._checked_intervals(commit.id)
+        intervals = self._checked_intervals(commit.id, is_carried=commit.via is not None)
         self._check_sums(commit)
         admit_commit(self.keys, commit.id.author, commit.grounds)
         top, _ = self.authors.get(commit.id.author, (0, 0))
@@ -222,7 +222,7 @@ class MemoryMap:
         if gone := [target for target in known if self.commits[target].is_gone]:
             raise EvidenceGoneError(gone)
 
-    def _checked_intervals(self, commit: CommitId) -> int:
+    def _checked_intervals(self, commit: CommitId, *, is_carried: bool) -> int:
         """Intervals of the author's numbers with this one, if `numbering` lets it in."""
         author = commit.author
         top, intervals = self.authors.get(author, (None, 0))
@@ -236,6 +236,7 @@ class MemoryMap:
             incarnations=own.incarnations if own else 0,
             intervals=own.intervals if own else 0,
             robots=len(accounts.keys() - {RESERVE}),
+            is_carried=is_carried,
         )
         check_number(commit, numbering)
         return intervals + 1 - neighbours

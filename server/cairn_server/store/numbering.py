@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from cairn_map.commits.ids import OPERATOR, SERVERS_OWN, CommitId
 from cairn_map.errors import BadInputError, ConflictError
 from cairn_server.store.shares import (
+    CARRIED_ROBOTS_MAX,
     INCARNATIONS_MAX,
     INTERVALS_OF_RESERVE_MAX,
     INTERVALS_OF_ROBOT_MAX,
@@ -35,6 +36,8 @@ class Numbering:
     """Count of the intervals of their numbers."""
     robots: int = 0
     """Count of the robots with such authors; only counted for a robot that has none."""
+    is_carried: bool = False
+    """True if somebody else than the robot brings the commit."""
 
 
 def check_number(commit: CommitId, known: Numbering) -> None:
@@ -66,6 +69,13 @@ def check_number(commit: CommitId, known: Numbering) -> None:
         return
     closing = f"an administrator can begin its numbers again with `cairn map robots close MAP {robot}`"
     is_new = known.top is None
+    if is_new and not known.incarnations and known.is_carried and known.robots >= CARRIED_ROBOTS_MAX:
+        raise BadInputError(
+            "too_many_authors",
+            f"{known.robots} robots have commits in this map: from {CARRIED_ROBOTS_MAX} on {robot} has to come with a "
+            "token of its own, or an administrator closes some that do not come any more (`cairn map robots close MAP "
+            "NAME`)",
+        )
     if is_new and not known.incarnations and known.robots >= ROBOTS_MAX:
         raise BadInputError(
             "too_many_authors",

@@ -30,12 +30,15 @@ commits touch, and half of the store's work."""
 
 ROBOTS_MAX = 256
 """Most robots with authors that are not closed, in one map."""
+CARRIED_ROBOTS_MAX = 192
+"""Number of such robots from which on a new one must come with a token of its own: who carries commits (a relay, the
+upstream server) can invent names, and would take the last places from robots that come themselves."""
 INCARNATIONS_MAX = 16
 """Most incarnations of one robot that are not closed: disks lost or rolled back."""
 INTERVALS_OF_ROBOT_MAX = 24
 """Most intervals of the numbers of one robot, all incarnations together. Robots push oldest first, so that each
 incarnation has one interval, and one more for each commit that the server refused for good."""
-INTERVALS_MAX = 10_240
+INTERVALS_MAX = 11_264
 """Most intervals of the numbers of all authors of a map. Its vector is in every reply: with the longest name and
 numbers an author takes 88 bytes, and each of its intervals beyond the first 34."""
 INTERVALS_OF_RESERVE_MAX = INTERVALS_MAX - ROBOTS_MAX * INTERVALS_OF_ROBOT_MAX

@@ -31,7 +31,7 @@ def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit, *
         return damaged is not None
     check_kept(connection, row, commit.retracts)
     admit_commit(connection, row, commit.id.author, commit.grounds)
-    note_number(connection, row, commit.id)
+    note_number(connection, row, commit.id, is_carried=commit.via is not None)
     charged = take_sums(connection, row, commit)
     connection.execute(
         "INSERT INTO commits (map, robot, incarnation, n, sha, size_bytes, cells, meta, captured_first_s,"

@@ -36,7 +36,7 @@ OF_ROBOT = "map = ? AND robot = ? AND closed = 0"
 COUNTS = "SELECT count(*), coalesce(sum(intervals), 0) FROM author WHERE"
 
 
-def note_number(connection: apsw.Connection, row: MapRow, commit: CommitId) -> None:
+def note_number(connection: apsw.Connection, row: MapRow, commit: CommitId, *, is_carried: bool) -> None:
     """Count the author's intervals as they are with this commit, if `numbering` lets it in.
 
     Raises:
@@ -57,6 +57,7 @@ def note_number(connection: apsw.Connection, row: MapRow, commit: CommitId) -> N
         incarnations=counted,
         intervals=spans,
         robots=robots,
+        is_carried=is_carried,
     )
     check_number(commit, known)
     connection.execute(
