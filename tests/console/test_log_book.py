@@ -146,6 +146,17 @@ def test_what_lies_beyond_the_log_that_is_read_is_said(console: Console) -> None
     console.page.get_by_role("region", name="Legend").get_by_text("20\u202f000 entries of the log").wait_for()
 
 
+def test_entries_that_a_restored_server_lost_are_shown_no_more(console: Console) -> None:
+    lost = LOG + 50
+    console.tell(
+        "((e) => (c.book.add([e]), c.strip.add([e])))({ ...c.strip.entries.get(c.cells.head), seq: a[0] })", lost
+    )
+    assert console.tell("[c.book.known.has(a[0]), c.strip.entries.has(a[0])]", lost) == [True, True]
+    console.tell("c.heard({ type: 'hello', resumed: false, cursor: 'of another log', robots: [] })")
+    console.until(f"!c.book.known.has({lost}) && !c.strip.entries.has({lost})", "the log that was known is forgotten")
+    console.until(f"c.book.known.size === {LOG} && c.strip.entries.size && !c.book.isReading", "and read again")
+
+
 def test_a_log_is_read_to_its_beginning_when_a_page_of_it_did_not_come(console: Console) -> None:
     refused = []
     back = re.compile(rf"/maps/{LONG}/log\?after=0&")
