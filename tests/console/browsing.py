@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
+from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 from tests.console.room import ADMIN_TOKEN, Room
 
@@ -28,6 +29,11 @@ VIEW = {"width": 1280, "height": 720}
 SMALL_VIEW = {"width": 480, "height": 360}
 TABLET = {"width": 1024, "height": 768}
 UPRIGHT = {"width": 768, "height": 1024}
+OVERFLOWING = """() => [...document.querySelectorAll("header, aside, footer, main, button, .legend")]
+    .filter((e) => e.offsetParent && (e.getBoundingClientRect().right > innerWidth + 1
+        || (e.matches("aside, button, .legend") && e.scrollWidth > e.clientWidth + 1)))
+    .map((e) => `${e.tagName} ${e.className} ${e.textContent.slice(0, 40)}`)"""
+"""Parts of the page that are wider than their place."""
 
 
 class Console:
@@ -112,3 +118,13 @@ def skip_without_page() -> None:
         pytest.skip("the console is not built: `make console` where npm's packages can be had")
     if CHROMIUM is None and not os.environ.get("CAIRN_REQUIRE_BROWSER"):
         pytest.skip("no chromium here: apt-get install chromium")
+
+
+def serious(console: Console, where: str) -> list[str]:
+    """What axe-core holds against the page as it is."""
+    violations = Axe().run(console.page).response["violations"]
+    return [
+        f"{where}: {each['id']}, {each['impact']}, at {len(each['nodes'])}: {each['nodes'][0]['html'][:160]}"
+        for each in violations
+        if each["impact"] in ("serious", "critical")
+    ]

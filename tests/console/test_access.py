@@ -4,9 +4,8 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Route
-from tests.console.browsing import TABLET, UPRIGHT, VIEW, Console, tab
+from tests.console.browsing import OVERFLOWING, TABLET, UPRIGHT, VIEW, Console, serious, tab
 from tests.console.room import ADMIN_TOKEN, MAP, Room
 
 pytestmark = pytest.mark.browser
@@ -15,11 +14,6 @@ FIELDS = ("colour", "temperature", "probability", "height", "age", "robot")
 OFFLINE_S = 100
 PNG = b"\x89PNG\r\n\x1a\n"
 HOURS_MS = 5 * 3_600_000
-OVERFLOWING = """() => [...document.querySelectorAll("header, aside, footer, main, button, .legend")]
-    .filter((e) => e.offsetParent && (e.getBoundingClientRect().right > innerWidth + 1
-        || (e.matches("aside, button, .legend") && e.scrollWidth > e.clientWidth + 1)))
-    .map((e) => `${e.tagName} ${e.className} ${e.textContent.slice(0, 40)}`)"""
-
 FOCUSED = """() => {
   const e = document.activeElement;
   e.dataset.stop ??= String(document.querySelectorAll("[data-stop]").length);
@@ -33,16 +27,6 @@ def console(request: pytest.FixtureRequest, chromium: Browser, room: Room) -> It
         found = tab(context, room)
         found.open()
         yield found
-
-
-def serious(console: Console, where: str) -> list[str]:
-    """What axe-core holds against the page as it is."""
-    violations = Axe().run(console.page).response["violations"]
-    return [
-        f"{where}: {each['id']}, {each['impact']}, at {len(each['nodes'])}: {each['nodes'][0]['html'][:160]}"
-        for each in violations
-        if each["impact"] in ("serious", "critical")
-    ]
 
 
 def test_axe_finds_nothing_serious_in_any_mode_or_panel(console: Console, room: Room) -> None:

@@ -6,9 +6,8 @@ from contextlib import contextmanager
 
 import pytest
 from playwright.sync_api import Browser, BrowserContext, Locator
-from tests.console.browsing import UPRIGHT, VIEW, Console, tab
+from tests.console.browsing import OVERFLOWING, UPRIGHT, VIEW, Console, serious, tab
 from tests.console.room import ADMIN_TOKEN, Room
-from tests.console.test_access import OVERFLOWING, serious
 from tests.fixtures.map.made import SMALL
 from tests.fixtures.server.pushes import pushed
 from tests.fixtures.server.signatures import KEY_OF, MOLE, OLD_MOLE

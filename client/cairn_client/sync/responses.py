@@ -27,6 +27,7 @@ RETRY_AFTER_MAX_S = 3600.0
 KIND = re.compile(r"[a-z][a-z_]{0,63}")
 DETAIL_LENGTH_MAX = 1000
 """Characters of a problem's detail: PROTOCOL.md 6."""
+BREAKS = re.compile("[\n\v\f\r\x1c-\x1e\x85\u2028\u2029]+")
 CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 """Control characters but tab and line feed, and marks that turn the direction of writing."""
 
@@ -82,7 +83,7 @@ def error_of(status: int, retry_after: str, body: bytes) -> CairnError:
             raise ValueError
     except ValueError:  # pydantic's ValidationError is one
         problem = Problem(kind="http", detail=f"the server answered {status}: {body[:200].decode(errors='replace')}")
-    detail = shown_text(problem.detail[:DETAIL_LENGTH_MAX])
+    detail = one_line(problem.detail[:DETAIL_LENGTH_MAX])
     if status in (429, 502, 503, 504, 507):
         wait_s = min(float(retry_after[:20]), RETRY_AFTER_MAX_S) if retry_after.isdecimal() else None
         return UnreachableError(problem.kind, detail, wait_s)
@@ -100,6 +101,11 @@ def error_of(status: int, retry_after: str, body: bytes) -> CairnError:
 def shown_text(text: str) -> str:
     """A text of another program as it may be shown: without characters that a terminal would obey."""
     return CONTROLS.sub("\N{REPLACEMENT CHARACTER}", text)
+
+
+def one_line(text: str) -> str:
+    """A text of another program as a part of a line: it cannot look like lines of the command's own."""
+    return shown_text(BREAKS.sub(" ", text))
 
 
 def unreachable(exc: Any) -> UnreachableError:

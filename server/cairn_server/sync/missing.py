@@ -86,6 +86,10 @@ class MissingQuery:
         low, high = self.box
         return all(a <= b <= c for a, b, c in zip(low, cell_of_key(key), high, strict=True))
 
+    def holds_nothing_of(self, key: CellKey) -> bool:
+        """True if the asker has no state of a cell, and does not ask for it by name."""
+        return self.cursor is None and key not in self.cells
+
     def is_reset(self, start: Cursor | None) -> bool:
         """True if a cell of this state is answered by its fingerprint: the asker finds out what it has to drop."""
         return self.compare or start in self.unproven
@@ -219,6 +223,9 @@ def reply_frames(cells: CellFrames, facts: HeaderFacts) -> Iterator[Frame]:
     cancellation = CANCELLATION.get()
     for row in in_order([row for row in snapshot.cells() if query.wants(row.key)], query.near):
         cancellation.check()
+        # All was taken out of it again: who holds nothing has the same.
+        if query.holds_nothing_of(row.key) and not row.voxels and row.fingerprint == ZERO:
+            continue
         start = listed.pop(row.key, query.cursor)
         frame = cells.frame_of(row, start)
         if frame is None:

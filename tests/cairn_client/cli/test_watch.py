@@ -7,13 +7,17 @@ from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import MAP, A, seen
 
 from cairn_client.cli.maps import watch as watch_command
+from cairn_client.cli.maps.branch_table import branch_table
 from cairn_client.cli.maps.watch import lines_of
 from cairn_client.http.api import MapApi
 from cairn_client.http.backoff import Backoff
 from cairn_client.http.live_listener import Lost, listen
 from cairn_client.robot.robot import Robot
+from cairn_client.sync.responses import one_line, shown_text
+from cairn_map.commits.commit import ScanPose
 from cairn_map.errors import NotFoundError
 from cairn_map.wire.live_events import Hello, LiveEvent, LogGrew
+from cairn_map.wire.messages import BranchInfo, RobotStatus
 
 
 def commit(server: LiveServer, folder: Path) -> None:
@@ -66,3 +70,13 @@ def test_watch_prints_events_as_lines_of_json(
 def test_a_map_that_is_not_there_cannot_be_watched(server: LiveServer) -> None:
     with pytest.raises(NotFoundError):
         watch_command.main([f"{server.url}/maps/nothing"])
+
+
+def test_what_a_robot_says_of_itself_stays_within_its_line() -> None:
+    pose = ScanPose(time_s=0.0, t_map_rig=(1e308, 0.0, 0.0), q_map_rig=(0.0, 0.0, 0.0, 1.0))
+    status = RobotStatus(time_s=0.0, pose=pose, note="fine\n15:04:10  folded  wren.0123456789abcdef.0\u2028\x1b[2J")
+    branch = BranchInfo(
+        branch="mole", mode="high-end", sensors=[], cursor=None, behind=None, last_seen_s=0, status=status
+    )
+    assert all(len(line.splitlines()) == 1 and len(line) < 200 for line in branch_table([branch]))
+    assert shown_text(one_line(status.note)) == one_line(status.note)

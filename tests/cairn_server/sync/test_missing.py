@@ -323,3 +323,18 @@ def test_an_asker_with_a_byte_budget_gets_the_cells_one_after_the_other(live: Li
         sizes.append(len(cell_frames(frames)))
     assert sizes == [1, 1, 1]
     assert asker.map() == sum_of(commits)
+
+
+def test_who_holds_nothing_gets_no_cell_of_which_all_was_taken_out(live: Live) -> None:
+    row, commit = live.new_map(), pushed(0, 0)
+    live.push(row, commit)
+    live.folded(row)
+    held = NaiveAsker(WREN, asks_for=("delta", "full"))
+    fetch(live, row, held)
+    live.retract(row, commit)
+    live.folded(row)
+    frames = list(frames_of(live.http.post(f"/maps/{row.name}/branches/mole/missing", json={}).content))
+    assert [type(frame) for frame in frames] == [ReplyHeader, Done]
+    assert isinstance(frames[-1], Done) and frames[-1].rest == ZERO.hex()
+    fetch(live, row, held)
+    assert not any(held.map().values())

@@ -11,7 +11,7 @@ from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 
 from cairn_map.commits.commit import Commit
-from cairn_map.commits.ids import INITIAL, Author, Incarnation
+from cairn_map.commits.ids import INITIAL, Author, Incarnation, RobotName
 from cairn_map.evidence.channels import SAMPLE_MAX
 from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.grid import Geometry
@@ -106,6 +106,25 @@ def test_numbers_may_come_in_any_order_but_not_full_of_gaps(live: Live, monkeypa
     refused = live.push(row, pushed(2, 1))
     assert (refused.status_code, kind_of(refused)) == (400, "number_gap")
     assert [live.push(row, pushed(n, 1)).status_code for n in (1, 3, 2, 6)] == [201] * 4
+
+
+@pytest.mark.parametrize(
+    ("author", "times_s", "kind"),
+    [
+        (Author(RobotName("main"), MOLE.incarnation), (0.0, 0.0), "reserved_name"),
+        (MOLE, (1.5e9, 1e308), "bad_commit"),
+        (MOLE, (-1e12, 0.0), "bad_commit"),
+    ],
+)
+def test_a_name_or_a_time_that_cannot_be_is_refused(
+    live: Live, author: Author, times_s: tuple[float, float], kind: str
+) -> None:
+    row, sound = live.new_map(), pushed(0, 0, author)
+    text = sound.meta.model_copy(update={"captured_s": times_s}).model_dump_json().encode()
+    data = commit_bytes(text, list(sound.cells.values()))
+    path = f"/maps/{row.name}/commits/{sound.id}"
+    answer = live.http.put(path, content=data)
+    assert (answer.status_code, kind_of(answer)) == (400, kind)
 
 
 def test_a_number_may_not_run_far_ahead_of_what_is_known_but_the_first_may_be_any(live: Live) -> None:

@@ -7,8 +7,11 @@ import time
 from collections.abc import Iterator
 
 from cairn_client.cli.arguments import Subparsers, add_map_parser, api_of, say, shown_age, shown_bytes
+from cairn_client.sync.responses import one_line
 from cairn_map.wire.messages import BranchInfo
 
+FAR_M = 1e7
+"""Metres from which on centimetres are not shown: a pose may be anything."""
 HEAD = ("robot", "mode", "seen", "behind", "bytes", "waiting", "battery", "pose (m, deg)", "note")
 
 
@@ -55,7 +58,7 @@ def _row(branch: BranchInfo, now_s: float) -> tuple[str, ...]:
         f"{status.waiting} ({shown_bytes(status.waiting_bytes)})" if status else "-",
         f"{status.battery:.0%}" if status and status.battery is not None else "-",
         _shown_pose(branch),
-        status.note.replace("\n", " ") if status else "",
+        one_line(status.note) if status else "",
     )
 
 
@@ -66,5 +69,10 @@ def _shown_pose(branch: BranchInfo) -> str:
     pose = branch.status.pose
     x, y, z, w = pose.q_map_rig
     heading_deg = math.degrees(math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
-    place = ", ".join(f"{value:.2f}" for value in pose.t_map_rig)
-    return f"{place} ±{pose.sigma_m:.2f}; {heading_deg:.0f}°"
+    place = ", ".join(shown_metres(value) for value in pose.t_map_rig)
+    return f"{place} ±{shown_metres(pose.sigma_m)}; {heading_deg:.0f}°"
+
+
+def shown_metres(value: float) -> str:
+    """Metres with two digits behind the point; three digits of what is too far for a map."""
+    return f"{value:.2f}" if abs(value) < FAR_M else f"{value:.3g}"

@@ -35,6 +35,7 @@ from cairn_client.cli.arguments import (
 )
 from cairn_client.cli.maps import branch_table, create, map_export, map_log, query, render, robots
 from cairn_client.http.api import MapApi
+from cairn_client.sync.responses import one_line
 from cairn_map.errors import BadInputError
 from cairn_map.wire.messages import Retract
 
@@ -105,7 +106,7 @@ def _info(args: argparse.Namespace) -> int:
     for branch in branches:
         lag = "has not fetched all yet" if branch.behind is None else f"{branch.behind} log entries since it last asked"
         lag = "fetches whole cells" if branch.mode == "low-end" else lag
-        seen_s, sensors = time.time() - branch.last_seen_s, ", ".join(branch.sensors)
+        seen_s, sensors = time.time() - branch.last_seen_s, one_line(", ".join(branch.sensors))
         say(f"  {branch.branch:<16} {branch.mode:<9} {lag}, seen {seen_s:.0f} s ago, {sensors}")
     return 0
 

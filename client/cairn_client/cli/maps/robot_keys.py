@@ -15,6 +15,7 @@ import argparse
 from datetime import UTC, datetime
 
 from cairn_client.cli.arguments import Subparsers, add_map_parser, api_of, say
+from cairn_client.sync.responses import one_line
 from cairn_map.commits.ids import Author, author_from_text
 from cairn_map.errors import BadInputError
 from cairn_map.wire.access_messages import RobotKeyList
@@ -44,10 +45,10 @@ def _list(args: argparse.Namespace) -> int:
         return 0
     for key in found.admitted:
         waits = "may return" if key.may_return else ""
-        say(f"{key.author:<50} {waits:<10} since {_shown(key.since_s)}, by {key.by}")
+        say(f"{key.author:<50} {waits:<10} since {_shown(key.since_s)}, by {one_line(key.by)}")
     for robot in found.asking:
         when = f"since {_shown(robot.since_s)}, last {_shown(robot.asked_s)}"
-        say(f"{robot.author:<50} {'asks':<10} {when}, by {robot.by}")
+        say(f"{robot.author:<50} {'asks':<10} {when}, by {one_line(robot.by)}")
     if not found.admitted and not found.asking:
         say("(none yet; a name is bound to the first key that comes)")
     return 0

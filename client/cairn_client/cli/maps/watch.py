@@ -21,8 +21,9 @@ from datetime import UTC, datetime
 from typing import TextIO
 
 from cairn_client.cli.arguments import add_token, api_of, parser, shown_bytes
+from cairn_client.cli.maps.branch_table import shown_metres
 from cairn_client.http.live_listener import Lost, listen
-from cairn_client.sync.responses import shown_text
+from cairn_client.sync.responses import one_line, shown_text
 from cairn_map.commits.cursor import cursor_from_text
 from cairn_map.wire.live_events import CellsEvent, HeadMoved, Hello, LiveEvent, LogGrew, RobotHeard, RobotSign
 
@@ -84,9 +85,9 @@ def _robot_line(sign: RobotSign) -> str:
         return line
     if status.pose is not None:
         x, y, z = status.pose.t_map_rig
-        line += f", at ({x:.2f}, {y:.2f}, {z:.2f}) m"
+        line += f", at ({shown_metres(x)}, {shown_metres(y)}, {shown_metres(z)}) m"
     line += f", {status.waiting} commits wait"
-    return line + (f", {status.note}" if status.note else "")
+    return line + (f", {one_line(status.note)}" if status.note else "")
 
 
 def _as_json(event: LiveEvent | Lost) -> dict[str, object]:

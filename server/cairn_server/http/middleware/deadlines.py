@@ -32,7 +32,7 @@ TICK_S = 1.0
 """Time between two looks at a connection."""
 JOINED_BYTES_MAX = 1 << 14
 HEARD_BYTES, HEARD_BYTES_PER_S = 1 << 13, 1 << 10
-"""What a listener at a WebSocket may send at once, and for each second: answers to pings, and little else."""
+"""Bytes that a listener at a WebSocket may send at once, and for each second: answers to pings, and little else."""
 PLACE = "place"
 """Name of a connection's place in the state of its requests; it has none if it is a proxy's."""
 Stage = Literal["head", "body", "answer"]
@@ -219,7 +219,7 @@ class PunctualProtocol(H11Protocol):
 class ListenerProtocol(WebSocketsSansIOProtocol):
     """uvicorn's WebSocket, aborted when the client sends more than a listener has to say.
 
-    An empty frame of six bytes takes 10 us to parse: 6 MB a second of them, and nobody else is answered.
+    An empty frame of six bytes takes 10 us to parse: 6 MB a second of them, and no other client is answered.
     """
 
     _may_send_bytes: float = HEARD_BYTES

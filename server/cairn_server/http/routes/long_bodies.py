@@ -39,7 +39,7 @@ class _Refused:
 
 @dataclass(frozen=True, slots=True)
 class _Broken:
-    """An error that nobody expected: the server tries by itself, and meets it where it is logged."""
+    """An unexpected error: the server tries by itself, and meets it where it is logged."""
 
 
 class LongBodies:
@@ -98,7 +98,7 @@ def fork_long_bodies() -> LongBodies:
 
 def parse_bodies(link: Connection) -> None:
     """Parse what the other end sends, until it is gone."""
-    # Whoever sends a long body waits for whoever sent a short one, on the processors, too.
+    # The sender of a long body waits for those of short ones, on the processors, too.
     os.nice(NICE)
     with suppress(EOFError, OSError):
         while True:

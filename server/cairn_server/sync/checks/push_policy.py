@@ -20,12 +20,16 @@ from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
 from cairn_server.access.auth import Caller
 from cairn_server.store.store_rows import MapRow
 
+MAIN = "main"
+TIME_MAX_S = 1e11
+"""As of a status. Ages are shown from the newest time: one that is infinite would make all others so."""
+
 
 def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *, cells: int) -> None:
     """Refuse a commit by its meta alone, before its evidence is decoded.
 
     Raises:
-        BadInputError: kind `other_id` or `other_geometry`.
+        BadInputError: kind `other_id`, `other_geometry`, `reserved_name` or `bad_commit`.
         DeniedError: kind `not_allowed`: made by, or retracting from, a robot that the caller is not.
         DamagedDataError: kind `empty_commit`.
     """
@@ -37,6 +41,11 @@ def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *,
     foreign = sorted(author for author in authors if not caller.may_author(author))
     if foreign:
         raise DeniedError("not_allowed", f"this token stands for {caller.robot or caller.role}, not for {foreign[0]}")
+    if meta.commit_id.author.robot == MAIN:
+        raise BadInputError("reserved_name", f"{MAIN} is not a robot's name")
+    times = [*(meta.captured_s or ()), *(scan.time_s for scan in meta.scans)]
+    if any(abs(time_s) > TIME_MAX_S for time_s in times):
+        raise BadInputError("bad_commit", f"a time of the commit is beyond {TIME_MAX_S:g} s since 1970")
     if not cells and not meta.retracts:
         raise DamagedDataError("empty_commit", "a commit must hold evidence or name commits to retract")
 
