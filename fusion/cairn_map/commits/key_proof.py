@@ -4,8 +4,8 @@
     robot -> server    Cairn-Proof: mole.1f2e3d4c5b6a7988 CHALLENGE KEY.MARK,KEY.MARK
 
 What is signed names the map, the author and a challenge of this minute, so that a proof is worth nothing for another
-robot, at another server or later. It is no secret: a stranger who is shown one can only hand it to the server whose
-challenge it answers.
+robot or later, and only at the server whose challenge it answers. It does not name that server: a hostile server can
+show a robot the challenge of another one, and hand the proof on (docs/security.md, Not defended).
 """
 
 import re

@@ -1,6 +1,7 @@
 """Bodies are bounded before they are read."""
 
 import socket
+import threading
 import zlib
 
 import pytest
@@ -10,6 +11,7 @@ from tests.fixtures.server.pushes import pushed
 
 from cairn_map.wire.messages import Problem
 from cairn_server.http.middleware.body_limit import limit_of
+from cairn_server.http.middleware.deadlines import HEAD_BYTES_MAX
 
 
 @pytest.mark.parametrize("claim", ["67108865", "9" * 18, "9" * 30])
@@ -63,3 +65,25 @@ def test_a_small_body_cannot_stand_for_much_evidence(live: Live) -> None:
     bomb = zlib.compress(b"\0" * (1 << 24))
     answer = live.http.put(f"/maps/{live.new_map().name}/commits/{pushed(0, 0).id}", content=b"CRCM\x01" + bomb)
     assert answer.status_code in (400, 413)
+
+
+@pytest.mark.parametrize("parts", [1, 3])
+def test_a_head_of_thousands_of_lines_is_refused_before_it_is_parsed(live: Live, parts: int) -> None:
+    start = head(live, "GET", "/healthz")[:-2] + b"a:b\r\n" * 12_000 + b"\r\n"
+    with socket.create_connection(("127.0.0.1", live.port), timeout=60) as link:
+        link.sendall(start if parts == 1 else start[: HEAD_BYTES_MAX + 1])
+        assert link.recv(12) == b"HTTP/1.1 400"
+
+
+def test_a_head_and_the_body_behind_it_may_be_torn_anywhere(live: Live) -> None:
+    row, commit = live.new_map(), pushed(0, 0)
+    body = commit.data.ljust(HEAD_BYTES_MAX + 1, b"x")  # refused as a commit, after all of it was read
+    start = head(live, "PUT", f"/maps/{row.name}/commits/{commit.id}", f"Content-Length: {len(body)}")
+    for cut in range(5):
+        with socket.create_connection(("127.0.0.1", live.port), timeout=60) as link:
+            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            link.sendall(start[: len(start) - cut])
+            threading.Event().wait(0.05)  # most likely read by itself; right in any case
+            link.sendall(start[len(start) - cut :] + body)
+            answer = link.recv(1 << 16)
+            assert answer.startswith(b"HTTP/1.1 400") and b"application/problem+json" in answer
