@@ -6,7 +6,7 @@ bytes at rest.
 """
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 
 from cairn_map.codec.cell_code import encode_cell
@@ -85,6 +85,18 @@ class CellCache:
         for key in self._costly:
             self._drop(key)
         self._costly.clear()
+
+    def moved(self, base: Cursor, cursor: Cursor, keys: Iterable[CellKey]) -> None:
+        """Note that another plan changed these cells, from the state of `base` to that of a cursor."""
+        if self._cursor != base:
+            return  # `begin` drops them all
+        self._cursor = cursor
+        for key in keys:
+            if key in self._cells:
+                self._drop(key)
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._cells
 
     def clear(self) -> None:
         """Drop all cells."""

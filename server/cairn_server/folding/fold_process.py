@@ -49,6 +49,7 @@ class _Ask:
     row: MapRow
     maps: int
     healed: int
+    is_news: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +102,7 @@ class FoldProcess:
         """Number of the process; None: the other end is no process of its own."""
         self._link = link
 
-    def fold(self, row: MapRow, store: FoldStore, damaged: Damage, *, maps: int) -> Folded:
+    def fold(self, row: MapRow, store: FoldStore, damaged: Damage, *, maps: int, is_news: bool = True) -> Folded:
         """Fold one group as `LocalFolding.fold` does: planned in the process, written to the store here.
 
         Raises:
@@ -111,7 +112,7 @@ class FoldProcess:
         """
         failure: BaseException | None = None
         try:
-            self._link.send(_Ask(row, maps, damaged.healed(row.name)))
+            self._link.send(_Ask(row, maps, damaged.healed(row.name), is_news))
             # Until the process says how it ended, it may ask to write, and report damage and log lines.
             while True:
                 match self._link.recv():
@@ -173,7 +174,7 @@ def answer_folds(link: Connection, readers: Readers, *, cells_bytes: int = CACHE
 
 def _answer(here: LocalFolding, ask: _Ask) -> Folded | _Failed:
     try:
-        return here.fold(ask.row, maps=ask.maps)
+        return here.fold(ask.row, maps=ask.maps, is_news=ask.is_news)
     except _NotWrittenError:
         return _Failed(None)
     except CairnError as exc:

@@ -20,6 +20,8 @@ REST_SHARE, REST_MAX_S = 3.0, 0.5
 """While robots push, each fold is followed by a rest of `REST_SHARE` times its length, at most `REST_MAX_S`. Commits
 that come in it are folded together, each cell encoded once: encoding 15 cells takes 30 ms, for one scan or for 200;
 merging a scan takes 1 ms."""
+LOOK_S = 0.02
+"""Time between two looks at a plan in the background."""
 FORGET_MAX = 64
 """Most commits whose evidence is dropped in one transaction."""
 FORGET_EVERY_S = 60.0
@@ -85,6 +87,7 @@ class FoldThread:
         self._closing.set()
         self._wake.set()
         self._thread.join()
+        self._local.close()
         if self._process is not None:
             self._process.close()
             self._process = None
@@ -106,10 +109,12 @@ class FoldThread:
         """Fold until nothing is pending, one group of each map in turn; False if a map failed."""
         failed: set[str] = set()
         maps: list[MapRow] = []
-        busy = True
-        while busy and not self._closing.is_set():
+        busy, planning = True, False
+        while (busy or planning) and not self._closing.is_set():
+            # A plan in the background tells nobody that it is done.
+            is_news = busy or self._wake.wait(LOOK_S)
             # Cleared before the look, so that a commit that comes during it wakes the thread again.
-            busy = False
+            busy = planning = False
             start_s = time.monotonic()
             self._wake.clear()
             self._watch_clocks(start_s)
@@ -123,7 +128,9 @@ class FoldThread:
                 if row.name in failed or self._closing.is_set():
                     continue
                 try:
-                    busy |= self._fold_group(row, len(maps)) > 0
+                    folded = self._fold_group(row, len(maps), is_news=is_news)
+                    busy |= folded.commits > 0
+                    planning |= folded.is_planning
                 except Exception as exc:
                     # Whatever it is, the other maps go on, and this thread must live: there is no other one.
                     # A `CairnError` says all in its message.
@@ -171,9 +178,9 @@ class FoldThread:
         before_s = min(self._store.age.now_s() - self._keep_evidence_s, self._may_forget_s(row.name))
         return self._store.forget_evidence(row, before_s=before_s, limit=FORGET_MAX)
 
-    def _fold_group(self, row: MapRow, maps: int) -> int:
+    def _fold_group(self, row: MapRow, maps: int, *, is_news: bool) -> Folded:
         start_s = time.monotonic()
-        folded = self._folded(row, maps)
+        folded = self._folded(row, maps, is_news=is_news)
         self._health.folded(row.name, folded.commits, time.monotonic() - start_s)
         if folded.waits_for is not None:
             self._health.failed(row.name, folded.waits_for)
@@ -182,17 +189,17 @@ class FoldThread:
             log.info(
                 "map %s: folded %d commits in %.0f ms", row.name, folded.commits, 1e3 * (time.monotonic() - start_s)
             )
-        return folded.commits
+        return folded
 
-    def _folded(self, row: MapRow, maps: int) -> Folded:
+    def _folded(self, row: MapRow, maps: int, *, is_news: bool) -> Folded:
         if self._process is not None:
             try:
-                return self._process.fold(row, self._store, self._damaged, maps=maps)
+                return self._process.fold(row, self._store, self._damaged, maps=maps, is_news=is_news)
             except LostProcessError:
                 log.error("the process that folds was killed; folding in the server's own until the next start")
                 self._process.close()
                 self._process = None
-        return self._local.fold(row, maps=maps)
+        return self._local.fold(row, maps=maps, is_news=is_news)
 
 
 def rest_s(took_s: float, *, is_pushed: bool) -> float:

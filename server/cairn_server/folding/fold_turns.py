@@ -69,6 +69,10 @@ class FoldTurns:
         # What has become nothing need not be remembered.
         self._spent = {robot: spent for robot, spent in self._spent.items() if self.spent_s(robot) > 1e-3}
 
+    def charge(self, robot: str, seconds: float) -> None:
+        """Count time that a robot's commits took outside of a group."""
+        self._spent[robot] = _Spent(self.spent_s(robot) + seconds, self._steady_s())
+
     def spent_s(self, robot: str) -> float:
         """Seconds that a robot's commits took of late."""
         spent = self._spent.get(robot)
@@ -78,4 +82,4 @@ class FoldTurns:
 
     def _spend(self, robot: str, seconds: float) -> None:
         self._group[robot] = self._group.get(robot, 0.0) + seconds
-        self._spent[robot] = _Spent(self.spent_s(robot) + seconds, self._steady_s())
+        self.charge(robot, seconds)

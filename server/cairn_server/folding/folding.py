@@ -117,14 +117,22 @@ def fold_commits(
     written = False
     try:
         fold = plan_fold(store, row, head, order(commits), cache)
-        written = store.fold(row, fold)
+        is_empty = not (fold.entries or fold.damaged)  # all of them are left for later
+        written = is_empty or store.fold(row, fold)
     finally:
         if not written:  # it failed, or another folding was faster, whose result is as good
             cache.clear()
+    if not written:
+        return 0
     cache.finish(fold.head)
+    audit_damaged(store, row, fold)
+    return len(fold.damaged) + sum(commit.id in fold.vector for commit in commits)
+
+
+def audit_damaged(store: FoldStore, row: MapRow, fold: Fold) -> None:
+    """Write an audit line for each commit that a fold, which is written, set aside."""
     for number, why in fold.damaged:
         store.audit("damaged_commit", f"map {row.name}: commit number {number} is set aside: {why}")
-    return len(fold.damaged) + sum(commit.id in fold.vector for commit in commits) if written else 0
 
 
 def plan_fold(store: FoldStore, row: MapRow, head: Head, commits: Iterable[StoredCommit], cache: CellCache) -> Fold:

@@ -10,6 +10,7 @@ wait, and of a map where very many do, the later commits wait, too.
 import logging
 import time
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from cairn_map.commits.ids import RobotName
@@ -17,6 +18,7 @@ from cairn_map.errors import CairnError
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_server.folding.cell_cache import CACHE_BYTES, CellCache
 from cairn_server.folding.cells_at_rest import DamagedCellError, cell_to_change
+from cairn_server.folding.fold_lanes import FoldLanes
 from cairn_server.folding.fold_turns import FoldTurns
 from cairn_server.folding.folding import GROUP_BYTES_MAX, Damage, FoldStore, Order, fold_commits
 from cairn_server.store.store_rows import MapRow, StoredCommit
@@ -29,6 +31,8 @@ WAITING_OF_ROBOT_MAX = 64
 """Most commits of a robot that wait while later ones of it are folded."""
 WAITING_MAX = 2048
 """Most commits of a map that wait while later ones of the same robots are folded: 70 kB in each reply's vector."""
+PLAN_SHARE = 0.25
+"""Share of the memory for cells under change that plans in the background have."""
 PROBE_S = 60.0
 """Time between two attempts to read a damaged cell again while none is reported as healed."""
 
@@ -151,6 +155,8 @@ class Folded:
     """Count of the commits folded."""
     waits_for: CairnError | None
     """Error of a damaged cell that other commits wait for; None: none waits."""
+    is_planning: bool = False
+    """True while costly commits, of any map, are planned in the background: look again soon."""
 
 
 class LocalFolding:
@@ -164,19 +170,34 @@ class LocalFolding:
         self._caches: dict[str, CellCache] = {}
         self._waiting: dict[str, Waiting] = {}
         self._turns: dict[str, FoldTurns] = {}
+        self._lanes = FoldLanes(store, cells_bytes=int(PLAN_SHARE * cells_bytes))
 
-    def fold(self, row: MapRow, *, maps: int) -> Folded:
+    def close(self) -> None:
+        """Wait for what is planned in the background."""
+        self._lanes.close()
+
+    def fold(self, row: MapRow, *, maps: int, is_news: bool = True) -> Folded:
         """Fold one group of a map's pending commits; `maps` maps share the memory for cells.
+
+        Without news, if nothing came since a fold that left all the rest to the background, that alone is looked at.
 
         Raises:
             CairnError: nothing was folded.
         """
+        if not is_news and self._lanes.is_planning():
+            return Folded(0, self._waiting[row.name].why if row.name in self._waiting else None, is_planning=True)
         # The cells stay decoded from one group to the next: a robot's next scans touch the same ones.
         cache = self._caches.setdefault(row.name, CellCache(row.geometry))
-        cache.limit(self._cells_bytes // maps)
+        cache.limit(int((1 - PLAN_SHARE) * self._cells_bytes) // maps)
         waiting = self._waiting.setdefault(row.name, Waiting())
         turns, start_s = self._turns.setdefault(row.name, FoldTurns()), time.monotonic()
-        count = fold_around(self._store, row, cache, waiting, self._damaged, limit=GROUP_MAX, order=turns.in_turn)
+        count = self._lanes.write_plan(row, cache, turns)
+
+        def order(commits: Sequence[StoredCommit]) -> Iterator[StoredCommit]:
+            return turns.in_turn(self._lanes.cheap(row, commits, cache))
+
+        count += fold_around(self._store, row, cache, waiting, self._damaged, limit=GROUP_MAX, order=order)
         turns.end_group(time.monotonic() - start_s)
         cache.trim()
-        return Folded(count, waiting.why)
+        self._lanes.plan_next(row, turns)
+        return Folded(count, waiting.why, is_planning=self._lanes.has_plan())

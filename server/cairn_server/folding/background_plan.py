@@ -1,0 +1,194 @@
+"""Fold of costly commits, planned in a thread of low priority while cheap commits are folded.
+
+    background    plan on the state at seq 7, 1 s long  ──────────────┐
+    folding       8 = a scan   9 = a scan   10 = a scan               └─> the same plan, written as entry 11
+
+A plan says what its cells become, and that depends on its commits and these cells alone. While it is under way no
+other commit that touches one of its cells is folded, so it can be moved onto the newest state: its entries get their
+numbers and chain values, and the stamps of its blocks those of its entries. What it read is compared again, so a plan
+that stands on anything else than the map is thrown away. It writes nothing: a kill loses time only.
+"""
+
+import os
+import threading
+import time
+from collections.abc import Collection, Iterable, Sequence
+from contextlib import AbstractContextManager, suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cairn_map.commits.cursor import ENTRY_FOLD, Cursor, next_chain
+from cairn_map.commits.ids import CommitId
+from cairn_map.evidence.grid import CellKey, Geometry
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.cells_at_rest import stored_stamps
+from cairn_server.folding.folding import FoldStore, plan_fold
+from cairn_server.store.stamps import encode_stamps
+from cairn_server.store.store import Snapshot
+from cairn_server.store.store_rows import CellRow, Entry, Fold, Head, MapRow, StoredCommit
+
+NICE = 10
+"""Priority of the thread: a tenth of the processor if others need it."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Ground:
+    """State of a map that a plan depends on."""
+
+    cells: tuple[tuple[CellKey, int, bytes], ...]
+    """Each stored cell of the plan, its last entry and its digest."""
+    commits: tuple[tuple[CommitId, bool, bool, bool], ...]
+    """Each commit that is folded or named by a retract: is it retracted, folded, dropped."""
+
+
+class BackgroundPlan:
+    """One plan and the thread that makes it."""
+
+    def __init__(self, store: FoldStore, row: MapRow, commits: Sequence[StoredCommit], *, cells_bytes: int) -> None:
+        """Start to plan folding some pending commits, with so much memory for the cells under change."""
+        self.row = row
+        self.commits = tuple(commits)
+        self.cells = frozenset(key for commit in with_targets(store, row, commits) for key in commit.diff)
+        """Cells that it changes."""
+        self.seconds = 0.0
+        """Time that it took."""
+        self._store = _NotingStore(store)
+        self._fold: Fold | None = None
+        with store.snapshot(row) as snapshot:
+            self._head = snapshot.head
+            self._ground = self._ground_in(snapshot)
+        self._thread = threading.Thread(target=self._run, args=(cells_bytes,), name="cairn-plan", daemon=True)
+        self._thread.start()
+
+    def is_done(self) -> bool:
+        """True if the plan is made, or failed."""
+        return not self._thread.is_alive()
+
+    def join(self) -> None:
+        """Wait until it is done."""
+        self._thread.join()
+
+    def is_failed(self) -> bool:
+        """True if something is damaged: the commits are to be folded without a plan, which tells what."""
+        return self.is_done() and self._fold is None
+
+    def write(self) -> Fold | None:
+        """Write the fold on top of the newest state; None if that is not what the plan stands on."""
+        if self._fold is None:
+            return None
+        with self._store.snapshot(self.row) as snapshot:
+            head = snapshot.head
+            is_same = self._ground_in(snapshot) == self._ground
+        if not is_same or any(commit.id in head.vector for commit in self.commits):
+            return None
+        known = self._store.known | {commit.number: (commit.id, commit.sha) for commit in self.commits}
+        fold = moved_fold(self._fold, head, known, self.row.geometry)
+        if not self._store.fold(self.row, fold):
+            return None
+        self._store.write_notes()
+        return fold
+
+    def _run(self, cells_bytes: int) -> None:
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
+        start_s = time.monotonic()
+        cache = CellCache(self.row.geometry, limit_bytes=cells_bytes)
+        cache.begin(self._head.cursor)
+        # Whatever it is: folding without a plan meets it again, in the thread that can report it.
+        with suppress(Exception):
+            fold = plan_fold(self._store, self.row, self._head, self.commits, cache)
+            self._fold = None if fold.damaged else fold
+        self.seconds = time.monotonic() - start_s
+
+    def _ground_in(self, snapshot: Snapshot) -> _Ground:
+        rows = (snapshot.cell(key) for key in sorted(self.cells))
+        named = [id_ for commit in self.commits for id_ in (commit.id, *commit.retracts)]
+        known = [self._store.folded(self.row, id_) for id_ in named]
+        return _Ground(
+            tuple((row.key, row.lm, row.digest) for row in rows if row is not None),
+            tuple(
+                (id_, self._store.is_retracted(self.row, id_), commit is not None, commit is not None and commit.gone)
+                for id_, commit in zip(named, known, strict=True)
+            ),
+        )
+
+
+def with_targets(store: FoldStore, row: MapRow, commits: Iterable[StoredCommit]) -> list[StoredCommit]:
+    """Commits, and the folded ones that they take out."""
+    found: list[StoredCommit] = []
+    for commit in commits:
+        targets = (store.folded(row, target) for target in commit.retracts if not store.is_retracted(row, target))
+        found += [commit, *(target for target in targets if target is not None)]
+    return found
+
+
+def moved_fold(fold: Fold, head: Head, known: dict[int, tuple[CommitId, bytes]], geometry: Geometry) -> Fold:
+    """The same fold on top of a newer state, in which its cells are unchanged.
+
+    Args:
+        fold: made from an older state.
+        head: of the newer state.
+        known: id and SHA-256 of each commit of its entries, by number.
+        geometry: of the map.
+    """
+    base, chain = head.cursor, head.cursor.chain
+    entries: list[Entry] = []
+    for entry in fold.entries:
+        chain = next_chain(chain, entry.kind, *known[entry.commit])
+        entries.append(replace(entry, chain=chain))
+    folded = [known[entry.commit][0] for entry in entries if entry.kind == ENTRY_FOLD]
+    return replace(
+        fold,
+        base=base,
+        head=Cursor(base.log_id, base.seq + len(entries), chain),
+        vector=head.vector.with_commits(folded),
+        entries=tuple(entries),
+        cells=tuple(_moved_cell(cell, fold.base.seq, base.seq - fold.base.seq, geometry) for cell in fold.cells),
+    )
+
+
+def _moved_cell(cell: CellRow, after: int, by: int, geometry: Geometry) -> CellRow:
+    """A cell whose stamps of the entries `after` one, and its own, are raised."""
+    if by == 0:
+        return cell
+    stamps = stored_stamps(cell, geometry)
+    return replace(cell, lm=cell.lm + by, stamps=encode_stamps(np.where(stamps > after, stamps + by, stamps)))
+
+
+class _NotingStore:
+    """`FoldStore` for the thread of a plan: audit lines are kept until the fold is written."""
+
+    def __init__(self, store: FoldStore) -> None:
+        self._store = store
+        self._notes: list[tuple[str, str]] = []
+        self.known: dict[int, tuple[CommitId, bytes]] = {}
+        """Id and SHA-256 of the folded commits that were asked for, by number."""
+
+    def pending(
+        self, row: MapRow, *, limit: int, size_bytes_max: int, skip: Collection[int] = ()
+    ) -> list[StoredCommit]:
+        return self._store.pending(row, limit=limit, size_bytes_max=size_bytes_max, skip=skip)
+
+    def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
+        found = self._store.folded(row, commit)
+        if found is not None:
+            self.known[found.number] = found.id, found.sha
+        return found
+
+    def is_retracted(self, row: MapRow, commit: CommitId) -> bool:
+        return self._store.is_retracted(row, commit)
+
+    def snapshot(self, row: MapRow) -> AbstractContextManager[Snapshot]:
+        return self._store.snapshot(row)
+
+    def fold(self, row: MapRow, fold: Fold) -> bool:
+        return self._store.fold(row, fold)
+
+    def audit(self, what: str, detail: str) -> None:
+        self._notes.append((what, detail))
+
+    def write_notes(self) -> None:
+        """Write the lines kept."""
+        for what, detail in self._notes:
+            self._store.audit(what, detail)

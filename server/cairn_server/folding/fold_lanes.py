@@ -1,0 +1,128 @@
+"""Two lanes of folding: cheap commits at once, costly ones planned in the background, one plan at a time.
+
+A commit waits for at most one slice of other robots' work (`commit_work.SLICE_S`), unless it touches a cell that a plan
+under way changes: then for that plan. Each robot's own commits keep their order, so those behind a costly one wait for
+it. Which robot's costly commits are next is decided as in `fold_turns`, by the time that each robot's took.
+"""
+
+import logging
+from collections.abc import Sequence
+
+from cairn_map.commits.ids import RobotName
+from cairn_map.errors import DamagedDataError
+from cairn_map.evidence.grid import CellKey
+from cairn_server.folding.background_plan import BackgroundPlan, with_targets
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.commit_work import SLICE_S, SLICE_S_PER_BYTE, commits_work_s, slice_s
+from cairn_server.folding.fold_turns import FoldTurns
+from cairn_server.folding.folding import FoldStore
+from cairn_server.store.store_rows import MapRow, StoredCommit
+
+log = logging.getLogger(__name__)
+
+PLAN_S = 1.0
+"""Work of a robot's commits that are planned at once, if the first of them does not have more."""
+
+
+class FoldLanes:
+    """The lanes of all maps of a store; one thread at a time."""
+
+    def __init__(self, store: FoldStore, *, cells_bytes: int) -> None:
+        """Plan with so much memory for the cells under change."""
+        self._store = store
+        self._cells_bytes = cells_bytes
+        self._plan: BackgroundPlan | None = None
+        self._costly: dict[RobotName, list[StoredCommit]] = {}
+        """Commits of each robot that wait for the background, of the map under way: the first is costly."""
+        self._unplanned: set[int] = set()
+        """Numbers of commits of which planning failed."""
+
+    def has_plan(self) -> bool:
+        """True if a plan is under way, or done and not written yet."""
+        return self._plan is not None
+
+    def is_planning(self) -> bool:
+        """True while a plan is under way."""
+        return self._plan is not None and not self._plan.is_done()
+
+    def close(self) -> None:
+        """Wait for the plan under way, which is not written."""
+        if self._plan is not None:
+            self._plan.join()
+
+    def write_plan(self, row: MapRow, cache: CellCache, turns: FoldTurns) -> int:
+        """Write the plan of this map if it is done; returns the count of its commits that are folded."""
+        plan, self._costly = self._plan, {}
+        if plan is None or plan.row.number != row.number or not plan.is_done():
+            return 0
+        self._plan = None
+        turns.charge(plan.commits[0].id.author.robot, plan.seconds)
+        if plan.is_failed():
+            self._unplanned.update(commit.number for commit in plan.commits)
+            return 0
+        fold = plan.write()
+        if fold is None:
+            log.info("map %s: a plan of %d commits does not fit any more", row.name, len(plan.commits))
+            return 0
+        cache.moved(fold.base, fold.head, plan.cells)
+        return len(plan.commits)
+
+    def cheap(self, row: MapRow, commits: Sequence[StoredCommit], cache: CellCache) -> list[StoredCommit]:
+        """Those of a map's pending commits that may be folded now; the costly ones are remembered for `plan_next`."""
+        self._costly = {}
+        found: list[StoredCommit] = []
+        behind: set[RobotName] = set()
+        dear_s = 0.0
+        plan = self._plan if self._plan is not None and self._plan.row.number == row.number else None
+        held = plan.cells if plan is not None else frozenset[CellKey]()
+        planned = {commit.number for commit in plan.commits} if plan is not None else set[int]()
+        for commit in commits:
+            robot = commit.id.author.robot
+            if robot in self._costly:
+                self._costly[robot].append(commit)
+            if robot in behind:
+                continue
+            changing = with_targets(self._store, row, [commit])
+            if commit.number in planned or any(not held.isdisjoint(each.diff) for each in changing):
+                behind.add(robot)
+                continue
+            work_s = self._work_s(row, changing, cache)
+            if work_s > slice_s(changing) and commit.number not in self._unplanned:
+                self._costly[robot] = [commit]
+                behind.add(robot)
+                continue
+            # Many that are nearly costly end the group as one that is.
+            dear_s += work_s if work_s > SLICE_S_PER_BYTE * _size_bytes(changing) else 0.0
+            if dear_s > SLICE_S and found:
+                behind.add(robot)
+            else:
+                found.append(commit)
+        return found
+
+    def plan_next(self, row: MapRow, turns: FoldTurns) -> None:
+        """Begin to plan the costly commits of the robot whose turn it is, unless a plan is under way."""
+        if self._plan is not None or not self._costly:
+            return
+        robot = min(self._costly, key=lambda robot: (turns.spent_s(robot), self._costly[robot][0].number))
+        chosen: list[StoredCommit] = []
+        work_s = 0.0
+        for commit in self._costly[robot]:
+            work_s += self._work_s(row, with_targets(self._store, row, [commit]), CellCache(row.geometry))
+            if chosen and work_s > PLAN_S:
+                break
+            chosen.append(commit)
+        try:
+            self._plan = BackgroundPlan(self._store, row, chosen, cells_bytes=self._cells_bytes)
+        except DamagedDataError:
+            self._unplanned.update(commit.number for commit in chosen)
+
+    def _work_s(self, row: MapRow, changing: Sequence[StoredCommit], cache: CellCache) -> float:
+        try:
+            with self._store.snapshot(row) as snapshot:
+                return commits_work_s(changing, snapshot, cache)
+        except DamagedDataError:
+            return 0.0  # a cell that cannot be read: folding finds it
+
+
+def _size_bytes(commits: Sequence[StoredCommit]) -> int:
+    return sum(len(body) for commit in commits for body in commit.diff.values())

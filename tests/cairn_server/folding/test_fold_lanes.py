@@ -1,0 +1,230 @@
+"""Lanes of folding: what a robot's costly commits take is no other robot's to wait for, and the map is the same."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from tests.fixtures.map.bombs import DEEP, cell_of_air
+from tests.fixtures.map.costly import air, dust
+from tests.fixtures.map.made import SMALL, random_evidence
+from tests.fixtures.server.pushes import MOLE, WREN, pushed
+from tests.fixtures.server.store_contract import NAMES, new_of
+from tests.memory_store.store import MemoryStore
+
+from cairn_map.codec.cell_code import encode_cell
+from cairn_map.commits.commit import Commit
+from cairn_map.commits.ids import Author, CommitId
+from cairn_map.commits.version_vector import VersionVector
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey, cell_key
+from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.folding import commit_work, fold_lanes
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.commit_work import SLICE_S, commits_work_s
+from cairn_server.folding.damaged_cells import DamagedCells
+from cairn_server.folding.folding import fold_commits, fold_pending
+from cairn_server.folding.group_folding import LocalFolding
+from cairn_server.store.sqlite.store import SqliteStore
+from cairn_server.store.stamps import decode_stamps
+from cairn_server.store.store import Store
+from cairn_server.store.store_rows import Fold, MapRow, StoredCommit
+
+WIDE = SMALL.model_copy(update={"depth": 5})
+HERE, THERE, FAR = (cell_key((n, 0, 0)) for n in range(3))
+
+
+@pytest.fixture(params=["memory", "disk"])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Store]:
+    if request.param == "memory":
+        yield MemoryStore()
+        return
+    kept = SqliteStore(tmp_path)
+    yield kept
+    kept.close()
+
+
+@pytest.fixture
+def small_slices(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Air and dust of small cells are as costly as those of large ones, so that tests are quick."""
+    for module in (commit_work, fold_lanes):
+        monkeypatch.setattr(module, "SLICE_S", 1e-4)
+        monkeypatch.setattr(module, "SLICE_S_PER_BYTE", 1e-9)
+
+
+class Folder:
+    """Folding of one map, with as many looks as it takes."""
+
+    def __init__(self, store: Store, commits: Sequence[Commit]) -> None:
+        self.store = store
+        self.row, _ = store.create_map(next(NAMES), WIDE, SensorModel())
+        self.folding = LocalFolding(store, DamagedCells())
+        self.push(commits)
+
+    def push(self, commits: Sequence[Commit]) -> None:
+        for commit in commits:
+            self.store.append(self.row, new_of(commit))
+
+    def look(self) -> int:
+        """Fold one group; the plan that was under way is done before."""
+        self.folding.close()
+        return self.folding.fold(self.row, maps=1).commits
+
+    def finish(self) -> None:
+        """Fold until nothing waits."""
+        while self.look() or self.folding.fold(self.row, maps=1).is_planning:
+            pass
+
+    def vector(self) -> VersionVector:
+        """Commits that are in the map."""
+        with self.store.snapshot(self.row) as snapshot:
+            return snapshot.head.vector
+
+    def waiting_of(self, author: Author) -> list[StoredCommit]:
+        """Pending commits of an author."""
+        waiting = self.store.pending(self.row, limit=99, size_bytes_max=1 << 26)
+        return [commit for commit in waiting if commit.id.author == author]
+
+
+def costly(n: int, evidence: Evidence, *, keys: Sequence[CellKey] = (HERE,), retracts: Sequence[Commit] = ()) -> Commit:
+    return pushed(n, 0, MOLE, geometry=WIDE, cells=dict.fromkeys(keys, evidence), scans=9, retracts=retracts)
+
+
+def scan(n: int, key: CellKey = THERE) -> Commit:
+    return pushed(n, 0, WREN, geometry=WIDE, cells={key: random_evidence(n, WIDE, voxels=9, air=0)}, scans=9)
+
+
+def cells_of(store: Store, row: MapRow) -> dict[CellKey, tuple[bytes, bytes]]:
+    with store.snapshot(row) as snapshot:
+        return {cell.key: (cell.digest, cell.fingerprint.to_bytes()) for cell in snapshot.cells()}
+
+
+def straight(commits: Sequence[Commit]) -> dict[CellKey, tuple[bytes, bytes]]:
+    """Cells of the same commits, folded one after the other, without lanes."""
+    store = MemoryStore()
+    row, _ = store.create_map(next(NAMES), WIDE, SensorModel())
+    for commit in commits:
+        store.append(row, new_of(commit))
+    while fold_pending(store, row, CellCache(WIDE), limit=1):
+        pass
+    return cells_of(store, row)
+
+
+def test_dust_and_air_are_known_to_be_costly_before_they_are_decoded_and_scans_are_not() -> None:
+    store = MemoryStore()
+    row, _ = store.create_map(next(NAMES), DEEP, SensorModel())
+    grain = encode_cell(HERE, dust(DEEP), DEEP).data
+    diffs = [
+        {cell_key((n, 0, 0)): grain for n in range(4)},
+        {HERE: cell_of_air((0, 0, 0))},
+        {HERE: encode_cell(HERE, random_evidence(1, DEEP, voxels=9000), DEEP).data},
+    ]
+    with store.snapshot(row) as snapshot:
+        works_s = [
+            commits_work_s(
+                [StoredCommit(number=n, id=CommitId(MOLE, n), sha=b"", text=b"", retracts=(), diff=diff)], snapshot, ()
+            )
+            for n, diff in enumerate(diffs)
+        ]
+    assert [work_s > SLICE_S for work_s in works_s] == [True, True, False]
+
+
+@pytest.mark.usefixtures("small_slices")
+def test_a_commit_never_waits_for_another_robot_s_costly_ones(store: Store) -> None:
+    """Thirty costly commits wait: each scan pushed now is in the map after one look, whatever is under way."""
+    attack = [costly(n, [dust(WIDE), air(WIDE)][n % 2], keys=[HERE, FAR]) for n in range(30)]
+    folder = Folder(store, attack)
+    assert folder.folding.fold(folder.row, maps=1).commits == 0
+    for n in range(4):
+        folder.push([scan(n)])
+        # The plan may be done or not: it is the scan that counts.
+        folder.folding.fold(folder.row, maps=1)
+        assert scan(n).id in folder.vector()
+    folder.finish()
+    assert cells_of(store, folder.row) == straight([*attack, *map(scan, range(4))])
+
+
+@pytest.mark.usefixtures("small_slices")
+def test_who_changes_a_cell_of_a_plan_waits_for_that_plan_and_no_longer(store: Store) -> None:
+    first, here, there = costly(0, air(WIDE)), scan(1, HERE), scan(0, THERE)
+    folder = Folder(store, [first])
+    assert folder.look() == 0
+    folder.push([there, here])
+    folder.folding.fold(folder.row, maps=1)
+    assert there.id in folder.vector()
+    assert here.id not in folder.vector() or first.id in folder.vector()
+    assert folder.look() >= 0
+    assert first.id in folder.vector()
+    folder.finish()
+    assert cells_of(store, folder.row) == straight([first, here, there])
+
+
+@pytest.mark.usefixtures("small_slices")
+def test_a_plan_is_written_behind_what_came_meanwhile_with_the_stamps_of_its_own_entry(store: Store) -> None:
+    folder = Folder(store, [costly(0, dust(WIDE))])
+    assert folder.look() == 0  # its plan begins at the empty map
+    folder.push([scan(0), scan(1)])
+    assert fold_commits(store, folder.row, CellCache(WIDE), folder.waiting_of(WREN)) == 2
+    assert folder.look() == 1
+    with store.snapshot(folder.row) as snapshot:
+        cell = snapshot.cell(HERE)
+        assert cell is not None and cell.lm == snapshot.head.cursor.seq == 3
+        assert set(decode_stamps(cell.stamps, depth=WIDE.depth, lm=3).tolist()) == {0, 3}
+
+
+@pytest.mark.usefixtures("small_slices")
+def test_a_plan_whose_cells_changed_is_thrown_away_and_made_again(store: Store) -> None:
+    folder = Folder(store, [costly(0, air(WIDE))])
+    assert folder.look() == 0
+    folder.folding.close()
+    folder.push([scan(0, HERE)])
+    assert fold_commits(store, folder.row, CellCache(WIDE), folder.waiting_of(WREN)) == 1  # by another folding
+    assert folder.look() == 0
+    folder.finish()
+    assert cells_of(store, folder.row) == straight([costly(0, air(WIDE)), scan(0, HERE)])
+
+
+@pytest.mark.usefixtures("small_slices")
+def test_retracts_of_costly_commits_are_planned_too(store: Store) -> None:
+    first, second = costly(0, air(WIDE)), costly(1, dust(WIDE), keys=[FAR])
+    folder = Folder(store, [first, second])
+    folder.finish()
+    out = pushed(2, 0, MOLE, geometry=WIDE, cells={}, scans=9, retracts=[first, second])
+    folder.push([out, scan(0)])
+    assert folder.folding.fold(folder.row, maps=1).commits == 1
+    folder.finish()
+    assert cells_of(store, folder.row) == straight([first, second, out, scan(0)])
+
+
+@pytest.mark.usefixtures("small_slices")
+def test_a_costly_commit_that_is_damaged_is_set_aside_as_any_other(tmp_path: Path) -> None:
+    store = SqliteStore(tmp_path)
+    folder = Folder(store, [costly(0, air(WIDE)), costly(1, air(WIDE))])
+    store._writer.run(lambda connection: connection.execute("UPDATE commits SET sha = zeroblob(32) WHERE n = 0"))
+    folder.finish()
+    assert cells_of(store, folder.row) == straight([costly(1, air(WIDE))])
+    assert [line.what for line in store.audit_log.page(after=0, limit=9)].count("damaged_commit") == 1
+    store.close()
+
+
+def test_what_another_folding_wrote_first_is_not_audited_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fold that is refused says nothing of the commits that it would have set aside."""
+    store = MemoryStore()
+    row, _ = store.create_map(next(NAMES), WIDE, SensorModel())
+    store.append(row, new_of(scan(0)))
+    lines: list[str] = []
+    monkeypatch.setattr(store, "audit", lambda what, detail: lines.append(what))
+    write = store.fold
+
+    def refused(row: MapRow, fold: Fold) -> bool:
+        assert fold.damaged
+        return False
+
+    (bad,) = store.pending(row, limit=9, size_bytes_max=1 << 26)
+    bad = replace(bad, sha=bytes(32))
+    monkeypatch.setattr(store, "fold", refused)
+    assert fold_commits(store, row, CellCache(WIDE), [bad]) == 0
+    assert not lines
+    monkeypatch.setattr(store, "fold", write)
+    assert fold_commits(store, row, CellCache(WIDE), [bad]) == 1
+    assert lines == ["damaged_commit"]
