@@ -111,7 +111,7 @@ class FoldThread:
         maps: list[MapRow] = []
         busy, planning = True, False
         while (busy or planning) and not self._closing.is_set():
-            # A plan in the background tells nobody that it is done.
+            # A plan in the background does not report its end.
             is_news = busy or self._wake.wait(LOOK_S)
             # Cleared before the look, so that a commit that comes during it wakes the thread again.
             busy = planning = False
