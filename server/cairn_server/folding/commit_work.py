@@ -21,7 +21,7 @@ BRICK_BYTES = 2048
 """Memory of a brick's sums."""
 SLICE_S = 0.1
 """Work that a commit of any size may take while others wait."""
-SLICE_S_PER_BYTE, SLICE_MAX_S = 1e-6, 0.5
+SLICE_S_PER_BYTE, SLICE_MAX_S = 2e-6, 0.5
 """Work that it may take for its bytes, and at most. Scans of rooms have 0.5 us a byte, and take a fifth of it."""
 
 
