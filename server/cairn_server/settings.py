@@ -40,10 +40,14 @@ class Quotas(BaseModel):
 
     commits_per_minute: Count = 6000
     """Commits that a robot may push in a minute; a hundred a second lets one catch up that was offline for long."""
-    bytes_per_day: Count = 64_000_000_000
-    """Bytes that a robot may push in a day (UTC)."""
-    cells_per_day: Count = 4_000_000
-    """Cells that a robot's commits may touch in a day, together."""
+    bytes_per_day: Count = 128_000_000_000
+    """Bytes that a robot may push in a day (UTC): a sweep of 64 beams to 80 m at 10 cm has 1.3 MB, one a second 112 GB.
+    """
+    cells_per_day: Count = 128_000_000
+    """Cells that a robot's commits may touch in a day, together: such a sweep touches 1500 of 3.2 m."""
+    bricks_per_day: Count = 16_000_000
+    """Bricks of 8^3 voxels that a robot's commits may touch in a day beyond one for each of their bytes: work of all
+    who merge them that nothing was sent for. Sweeps and images send 2.7 bytes and more for each brick."""
     registrations_per_hour: Count = 600
     """Robots that one enrolment token may register in an hour, all at once or one by one."""
     cells_per_commit: Count = None

@@ -71,6 +71,7 @@ def test_the_digests_in_the_document_are_those_of_the_code() -> None:
         ("commit", [commit.COMMIT_BYTES_MAX, commit.CELLS_MAX, commit.META_BYTES_MAX]),
         ("packed evidence of a commit", [commit.EVIDENCE_BYTES_MAX]),
         ("bricks (8^3 voxels) that a commit touches", [commit.BRICKS_MAX]),
+        ("the same, for B bytes of commit", [commit.EVIDENCE_ALLOWANCE_BYTES, commit.EVIDENCE_PER_BYTE]),
         ("scans, retracts", [commit.RETRACTS_MAX]),
         ("frame body", [1 << 28, frames.FRAME_BYTES_MAX - (1 << 28), frames.JSON_BYTES_MAX]),
         (

@@ -101,6 +101,7 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("commits a minute", Quotas().commits_per_minute),
         ("bytes a day", Quotas().bytes_per_day),
         ("cells a day, of all commits together", Quotas().cells_per_day),
+        ("bricks (8^3 voxels) a day that commits touch beyond one for each of their bytes", Quotas().bricks_per_day),
         ("longest edge of the box of a robot's cells in a map, this commit's included", Quotas().map_extent_m),
         ("robots with commits, those closed not counted", shares.ROBOTS_MAX),
         ("`incarnations`", shares.INCARNATIONS_MAX),

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
 from cairn_client.relay.round import RelayReport, Undelivered, log_report, relay_round
-from cairn_map.commits.commit_reading import open_commit
+from cairn_map.commits.commit_reading import validated_commit
 from cairn_map.commits.ids import INITIAL, OPERATOR, CommitId, commit_id_from_text
 from cairn_map.commits.signature import TEXT_MAX, check_signatures, signatures_from_text, speaks_for
 from cairn_map.commits.version_vector import EMPTY
@@ -98,7 +98,7 @@ class CarriedCommits:
             raise BadInputError(
                 "too_large", f"{commit.id} takes {size_bytes} bytes, and {self._folder} has {self._size_bytes_max}"
             )
-        found, _ = open_commit(commit.data)
+        found = validated_commit(commit.data)
         if found.id != commit.id:
             raise BadInputError("other_id", f"came as {commit.id}, and is {found.id}")
         signed = signatures_from_text(commit.signatures or "")

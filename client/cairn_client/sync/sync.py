@@ -30,7 +30,7 @@ from cairn_client.sync.requests import (
 from cairn_client.sync.uploads import PARTS, Parts, push_whole_or_in_parts
 from cairn_map.codec.cell_code import decode_cell, encode_cell
 from cairn_map.commits.commit import Commit
-from cairn_map.commits.commit_reading import open_commit
+from cairn_map.commits.commit_reading import validated_commit
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.errors import (
     BadInputError,
@@ -178,7 +178,7 @@ def keep_retracts(replica: Replica) -> Conversation[None]:
     for commit_id in replica.lacking_retracts():
         try:
             data, seal = yield from GetCommit(commit_id)
-            commit, _ = open_commit(data)
+            commit = validated_commit(data)
         except CairnError as exc:
             if isinstance(exc, UnreachableError | DeniedError):
                 raise

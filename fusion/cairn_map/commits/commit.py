@@ -32,11 +32,20 @@ CELLS_MAX = 4096
 COMMIT_BYTES_MAX = 64 << 20
 """Bytes of one encoded commit that a reader accepts."""
 RETRACTS_MAX = 4096
-EVIDENCE_BYTES_MAX = 1 << 29
-"""Bytes of all evidence of a commit, unpacked: 44 M voxels. A measurement in a large room at 2 cm has 20 M; without
-a bound a commit of 64 MB could stand for terabytes of collapsed air."""
-BRICKS_MAX = 1 << 17
-"""Bricks of 8^3 voxels that a commit touches: 4 kB each once merged, though a single voxel costs 12 bytes here."""
+EVIDENCE_BYTES_MAX = 1 << 31
+"""Bytes of all evidence of a commit, unpacked: 179 M voxels. A sweep of 64 beams to 80 m at 4 cm has 29 M to 58 M."""
+BRICKS_MAX = 1 << 22
+"""Bricks of 8^3 voxels that a commit touches; the same sweep touches 1.0 M to 1.8 M."""
+EVIDENCE_ALLOWANCE_BYTES = 1 << 29
+EVIDENCE_PER_BYTE = 1 << 12
+BRICKS_ALLOWANCE = 1 << 17
+BRICKS_PER_BYTE = 1
+"""Content that a commit of any size may stand for, and what each of its bytes adds. Merging takes microseconds at each
+brick, though 679 bytes can name 2^17. Sweeps and images of open air have 2.7 to 25 bytes for each brick, and one byte
+for 2 kB of evidence at most (decision 019)."""
+
+SMALLER = "commit after fewer scans, with a smaller max_range_m, or on a map with larger voxels"
+"""Next step after `too_large`."""
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Hex32 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -148,8 +157,8 @@ def make_commit(
     data = commit_bytes(text, cells)
     # All limits of a reader, so that no server refuses the commit later.
     _check_size(len(data), len(cells), len(text))
-    check_evidence_size(sum(evidence.size_bytes for evidence in diff.values()), EVIDENCE_BYTES_MAX)
-    check_bricks(sum(evidence.brick_count for evidence in diff.values()))
+    check_evidence_size(sum(evidence.size_bytes for evidence in diff.values()), evidence_limit_bytes(len(data)))
+    check_bricks(sum(evidence.brick_count for evidence in diff.values()), size_bytes=len(data))
     return Commit(meta, cells, commit_sha(text, digests), data)
 
 
@@ -202,15 +211,21 @@ def check_samples(samples: npt.NDArray[np.int64], geometry: Geometry) -> None:
         raise BadInputError("bad_evidence", "a channel has sums without weight")
 
 
-def check_evidence_size(size_bytes: int, limit_bytes: int) -> None:
-    """Refuse evidence that would take more memory than a reader has for a commit.
+def evidence_limit_bytes(size_bytes: int) -> int:
+    """Most evidence of a commit of so many bytes, in bytes unpacked."""
+    return min(EVIDENCE_BYTES_MAX, EVIDENCE_ALLOWANCE_BYTES + EVIDENCE_PER_BYTE * size_bytes)
+
+
+def check_evidence_size(evidence_bytes: int, limit_bytes: int) -> None:
+    """Refuse more evidence than a reader takes of a commit.
 
     Raises:
         BadInputError: kind `too_large`.
     """
-    if size_bytes > limit_bytes:
+    if evidence_bytes > limit_bytes:
         raise BadInputError(
-            "too_large", f"a commit has at most {limit_bytes} bytes of evidence, got {size_bytes}; make two of it"
+            "too_large",
+            f"a commit of this size has at most {limit_bytes} bytes of evidence, got {evidence_bytes}; {SMALLER}",
         )
 
 
@@ -222,14 +237,17 @@ def commit_bytes(text: bytes, cells: Mapping[CellKey, bytes]) -> bytes:
     return b"".join(parts)
 
 
-def check_bricks(bricks: int) -> None:
-    """Refuse a commit that touches too many bricks.
+def check_bricks(bricks: int, *, size_bytes: int) -> None:
+    """Refuse a commit that touches more bricks than its bytes may stand for.
 
     Raises:
         BadInputError: kind `too_large`.
     """
-    if bricks > BRICKS_MAX:
-        raise BadInputError("too_large", f"a commit touches at most {BRICKS_MAX} bricks, got {bricks}; make two of it")
+    bricks_max = min(BRICKS_MAX, BRICKS_ALLOWANCE + BRICKS_PER_BYTE * size_bytes)
+    if bricks > bricks_max:
+        raise BadInputError(
+            "too_large", f"a commit of {size_bytes} bytes touches at most {bricks_max} bricks, got {bricks}; {SMALLER}"
+        )
 
 
 def split_bytes(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:

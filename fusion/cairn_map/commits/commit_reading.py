@@ -3,7 +3,7 @@
 Between the two steps a server decides whether it accepts the commit, and in which process it is decoded.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from cairn_map.codec.cell_code import CanonicalCell, read_canonical_cell
@@ -16,6 +16,7 @@ from cairn_map.commits.commit import (
     check_evidence_size,
     check_samples,
     commit_sha,
+    evidence_limit_bytes,
     negative_evidence,
     split_bytes,
 )
@@ -45,24 +46,36 @@ class CommitReader:
         This needs up to about twice `evidence_bytes_max` of memory, whatever the bytes say.
 
         Raises:
+            DamagedDataError, BadInputError: as `canonical_cells`.
+        """
+        cells = {cell.key: cell for cell in self.canonical_cells(evidence_bytes_max=evidence_bytes_max)}
+        return self.commit([cell.digest for cell in cells.values()]), cells
+
+    def commit(self, digests: list[bytes]) -> Commit:
+        """The commit, of whose cells all were validated and have these digests."""
+        return Commit(self.meta, self.cells, commit_sha(self.text, digests), self.data)
+
+    def canonical_cells(self, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) -> Iterator[CanonicalCell]:
+        """The cells, one after the other, each validated completely; the commit is sound once all of them came.
+
+        A caller that keeps none needs the memory of the largest one.
+
+        Raises:
             DamagedDataError: contradictory, not canonical.
             BadInputError: too large, negative evidence, or sums without weight.
         """
-        self._check_heads(evidence_bytes_max)
-        cells: dict[CellKey, CanonicalCell] = {}
-        left, bricks = evidence_bytes_max, 0
-        # One cell after the other, each with the memory that those before it left.
+        left, bricks = min(evidence_bytes_max, evidence_limit_bytes(len(self.data))), 0
+        self._check_heads(left)
+        # Each with the evidence that those before it left.
         for reader in self.readers:
             reader.limit_evidence(left)
             cell = read_canonical_cell(reader)
             check_samples(cell.content.samples, cell.geometry)
             left -= cell.content.evidence_bytes
             bricks += cell.content.octree.brick_count
-            cells[cell.key] = cell
+            check_bricks(bricks, size_bytes=len(self.data))
             reader.forget()
-        check_bricks(bricks)
-        sha = commit_sha(self.text, [cell.digest for cell in cells.values()])
-        return Commit(self.meta, self.cells, sha, self.data), cells
+            yield cell
 
     def _check_heads(self, evidence_bytes_max: int) -> None:
         """Refuse a commit by its cells' heads alone, before anything is decoded."""
@@ -100,3 +113,13 @@ def open_commit(
         DamagedDataError, BadInputError: as `commit_reader` and `CommitReader.read`.
     """
     return commit_reader(data, evidence_bytes_max=evidence_bytes_max).read(evidence_bytes_max=evidence_bytes_max)
+
+
+def validated_commit(data: bytes) -> Commit:
+    """Commit of bytes, validated completely in the memory that its largest cell takes.
+
+    Raises:
+        DamagedDataError, BadInputError: as `commit_reader` and `CommitReader.canonical_cells`.
+    """
+    reader = commit_reader(data)
+    return reader.commit([cell.digest for cell in reader.canonical_cells()])

@@ -1,6 +1,7 @@
 """Quotas of pushes: a faulty or hostile robot must not fill the disk or blow up the map for the others.
 
-A quota is checked after the commit's head is read and before its evidence is decoded. It is taken at once, so that a
+A quota is checked after the commit's head is read and before its evidence is decoded, that of bricks after it is
+checked, which counts them. It is taken at once, so that a
 robot's parallel pushes share it, and given back if the commit is refused or was known. An exceeded rate (429) passes
 with time; a commit that is too large (400) does not. Days are those of UTC; after a start, a day's use is read from the
 store.
@@ -22,7 +23,7 @@ from cairn_server.access.rate_limits import Allowance, allowance
 from cairn_server.settings import Quotas
 from cairn_server.store.shares import REGION_BITS
 from cairn_server.store.store import Store
-from cairn_server.store.store_rows import MapRow, Robot, Use, relay_of
+from cairn_server.store.store_rows import MapRow, Robot, Use, relay_of, unpaid_bricks
 
 DAY_S = 86_400
 BOX_EVERY_S = 5.0
@@ -66,8 +67,8 @@ class Meter:
         cells: Collection[CellKey],
         author: str = "",
         via: str | None = None,
-    ) -> Iterator[Callable[[], None]]:
-        """Take a commit off its robot's quotas for the length of a `with`; the function it yields keeps it taken.
+    ) -> Iterator["Spending"]:
+        """Take a commit off its robot's quotas for the length of a `with`; what it yields may keep it taken.
 
         Where it lies is compared with the other cells of `author`, the robot that made it: what another robot has
         pushed, however far away, is no reason to refuse it.
@@ -80,7 +81,7 @@ class Meter:
             BadInputError: kind `beyond_quota`: too much at any time.
         """
         if caller.role is Role.ADMIN:
-            yield lambda: None
+            yield Spending(Use(), _charge_nothing)
             return
         robot = row.number, relay_of(via) if via else caller.robot or caller.name
         use, box, is_metered = Use(size_bytes, len(cells)), _box_of(cells), caller != UPSTREAM
@@ -89,20 +90,21 @@ class Meter:
             if is_metered:
                 self._take(robot, use)
             day = self._day
-        is_kept = False
 
-        def keep() -> None:
-            nonlocal is_kept
-            is_kept = True
+        def charge(more: Use) -> None:
+            with self._lock:
+                if is_metered:
+                    self._take_of_day(robot, more)
 
+        spending = Spending(use, charge)
         try:
-            yield keep
+            yield spending
         finally:
-            if is_kept and reach is not None and box is not None:
+            if spending.is_kept and reach is not None and box is not None:
                 reach.widen(box)
             with self._lock:
-                if is_metered and not is_kept:
-                    self._give_back(robot, use, day)
+                if is_metered and not spending.is_kept:
+                    self._give_back(robot, spending.use, day)
 
     def _check_commit(self, row: MapRow, use: Use, author: str, box: Box | None) -> "_Reach | None":
         """Refuse what no waiting mends; the reach of the author's cells, if the commit may widen it."""
@@ -130,21 +132,36 @@ class Meter:
         return reach
 
     def _take(self, robot: Robot, use: Use) -> None:
+        before = self._take_of_day(robot, use)
+        try:
+            self._take_of_minute(robot)
+        except UnreachableError:
+            self._used[robot] = before
+            raise
+
+    def _take_of_day(self, robot: Robot, use: Use) -> Use:
+        """Take from the quotas of the day, and return what was taken of them before."""
         now_s = self._wall_s()
         day = int(now_s // DAY_S)
         if self._day != day:
             self._used = dict(self._store.uses.since(day * DAY_S))
             self._day = day
-        used = self._used.get(robot, Use()) + use
+        before = self._used.get(robot, Use())
+        used = before + use
         until_midnight_s = (self._day + 1) * DAY_S - now_s
-        for what, spent, most in (
-            ("bytes", used.size_bytes, self._quotas.bytes_per_day),
-            ("cells", used.cells, self._quotas.cells_per_day),
+        for what, setting, spent, most in (
+            ("bytes", "bytes_per_day", used.size_bytes, self._quotas.bytes_per_day),
+            ("cells", "cells_per_day", used.cells, self._quotas.cells_per_day),
+            ("bricks beyond one for each byte", "bricks_per_day", used.bricks, self._quotas.bricks_per_day),
         ):
             if most is not None and spent > most:
-                raise _quota(f"{robot[1]} may push {most} {what} a day (UTC), this makes {spent}", until_midnight_s)
-        self._take_of_minute(robot)
+                raise _quota(
+                    f"{robot[1]} may push {most} {what} a day (UTC), this makes {spent}; push it again after midnight, "
+                    f"or have an administrator raise quotas.{setting}",
+                    until_midnight_s,
+                )
         self._used[robot] = used
+        return before
 
     def _take_of_minute(self, robot: Robot) -> None:
         most = self._quotas.commits_per_minute
@@ -160,6 +177,35 @@ class Meter:
             self._used[robot] -= use
         if robot in self._minutes:
             self._minutes[robot].left += 1
+
+
+class Spending:
+    """One commit's use of the quotas, taken for as long as it is checked and written."""
+
+    def __init__(self, use: Use, charge: Callable[[Use], None]) -> None:
+        """`charge` takes more of what `use` was taken from, or refuses."""
+        self.use = use
+        self.is_kept = False
+        self._charge = charge
+
+    def charge_bricks(self, bricks: int) -> None:
+        """Take the bricks that the commit touches and its bytes do not pay for.
+
+        Raises:
+            UnreachableError: kind `quota`.
+        """
+        more = Use(bricks=unpaid_bricks(bricks, size_bytes=self.use.size_bytes))
+        if more.bricks:
+            self._charge(more)
+            self.use += more
+
+    def keep(self) -> None:
+        """Keep it taken after the `with`: the commit was accepted as new."""
+        self.is_kept = True
+
+
+def _charge_nothing(_: Use) -> None:
+    """Quotas of an admin."""
 
 
 class _Reach:

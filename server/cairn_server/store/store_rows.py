@@ -44,6 +44,8 @@ class NewCommit:
     diff: Mapping[CellKey, bytes]
     tops: Mapping[int, tuple[int, ...]]
     """Largest number of each plane in each region (`shares.region_of`); they bound every sum in the map (`shares`)."""
+    bricks: int = 0
+    """Count of the bricks of 8^3 voxels that it touches."""
     rig: bytes | None = None
     """SHA-256 of the rig that its sensors were described by."""
     signatures: str | None = None
@@ -201,12 +203,19 @@ class Use:
 
     size_bytes: int = 0
     cells: int = 0
+    bricks: int = 0
+    """Bricks of 8^3 voxels touched beyond one for each byte."""
 
     def __add__(self, more: "Use") -> "Use":
-        return Use(self.size_bytes + more.size_bytes, self.cells + more.cells)
+        return Use(self.size_bytes + more.size_bytes, self.cells + more.cells, self.bricks + more.bricks)
 
     def __sub__(self, less: "Use") -> "Use":
-        return Use(self.size_bytes - less.size_bytes, self.cells - less.cells)
+        return Use(self.size_bytes - less.size_bytes, self.cells - less.cells, self.bricks - less.bricks)
+
+
+def unpaid_bricks(bricks: int, *, size_bytes: int) -> int:
+    """Bricks that a commit of so many bytes touches beyond one for each byte."""
+    return max(0, bricks - size_bytes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -95,11 +95,14 @@ class Pushes:
         author = commit.meta.commit_id.author
         with self.meter.spending(
             row, caller, size_bytes=len(data), cells=commit.cells, author=author.robot, via=via
-        ) as take:
+        ) as spending:
             grounds = _grounds(caller, speaker, author, signed)
-            is_new = self._append(row, replace(self._checked(row, commit, signed), via=via, grounds=grounds), caller)
+            checked = self._checked(row, commit, signed)
+            # What only the check knows; a commit that is known costs nothing, as the append gives it back.
+            spending.charge_bricks(checked.bricks)
+            is_new = self._append(row, replace(checked, via=via, grounds=grounds), caller)
             if is_new:
-                take()
+                spending.keep()
 
         # Durable from here on: tell those that wait for it.
         self._wanted.forget(row.name, commit.meta.commit_id)
@@ -149,7 +152,8 @@ class Pushes:
         checked = self.checks.check(commit)
         # Signatures are over the SHA-256 of the decoded evidence, which only the check knows.
         check_signatures(signed, row.name, checked.sha)
-        new = new_commit(Commit(commit.meta, commit.cells, checked.sha, commit.data), checked.tops)
+        found = Commit(commit.meta, commit.cells, checked.sha, commit.data)
+        new = new_commit(found, checked.tops, bricks=checked.bricks)
         return replace(new, signatures=signatures_to_text(signed) or None)
 
     def _append(self, row: MapRow, new: NewCommit, caller: Caller) -> bool:

@@ -1,10 +1,12 @@
 """Commits to bytes and back."""
 
 import json
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.fixtures.map.costly import air, dust
 from tests.fixtures.map.made import (
     DOSE,
     GEOMETRIES,
@@ -22,12 +24,28 @@ from tests.fixtures.map.stored import recoded
 from tests.naive import wire as naive_wire
 
 from cairn_map.codec.cell_code import encode_cell
-from cairn_map.commits.commit import CELLS_MAX, HEAD, META_BYTES_MAX, Commit, CommitMeta, make_commit
+from cairn_map.commits import commit
+from cairn_map.commits.commit import (
+    BRICKS_ALLOWANCE,
+    BRICKS_MAX,
+    BRICKS_PER_BYTE,
+    CELLS_MAX,
+    COMMIT_BYTES_MAX,
+    EVIDENCE_BYTES_MAX,
+    HEAD,
+    META_BYTES_MAX,
+    Commit,
+    CommitMeta,
+    check_bricks,
+    check_evidence_size,
+    evidence_limit_bytes,
+    make_commit,
+)
 from cairn_map.commits.commit_reading import open_commit
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError
 from cairn_map.evidence.brick_cell import difference
 from cairn_map.evidence.evidence import Evidence, empty_evidence
-from cairn_map.evidence.grid import cell_key
+from cairn_map.evidence.grid import Geometry, cell_key
 
 
 def refusal(data: bytes) -> str:
@@ -139,6 +157,33 @@ def test_a_maker_is_told_when_no_reader_would_take_the_commit() -> None:
     with pytest.raises(BadInputError) as refused:
         make_commit(made_meta(PLAIN), {cell_key((n, 0, 0)): one for n in range(CELLS_MAX + 1)}, PLAIN)
     assert refused.value.kind == "too_large"
+
+
+@given(st.integers(0, COMMIT_BYTES_MAX))
+def test_a_commit_stands_for_more_the_more_bytes_it_has_up_to_a_bound(size_bytes: int) -> None:
+    bricks = min(BRICKS_MAX, BRICKS_ALLOWANCE + BRICKS_PER_BYTE * size_bytes)
+    check_bricks(bricks, size_bytes=size_bytes)
+    check_evidence_size(evidence_limit_bytes(size_bytes), evidence_limit_bytes(size_bytes))
+    assert evidence_limit_bytes(0) <= evidence_limit_bytes(size_bytes) <= EVIDENCE_BYTES_MAX
+    with pytest.raises(BadInputError, match="fewer scans") as refused:
+        check_bricks(bricks + 1, size_bytes=size_bytes)
+    assert refused.value.kind == "too_large"
+
+
+@pytest.mark.parametrize("costly", [dust, air])
+def test_dust_and_air_are_refused_where_few_bytes_stand_for_much(
+    costly: Callable[[Geometry], Evidence], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = make_commit(made_meta(MIDDLE), {KEY: costly(MIDDLE)}, MIDDLE)
+    monkeypatch.setattr(commit, "BRICKS_ALLOWANCE", 0)
+    monkeypatch.setattr(commit, "BRICKS_PER_BYTE", 0)
+    with pytest.raises(BadInputError, match="fewer scans"):
+        make_commit(made_meta(MIDDLE), {KEY: costly(MIDDLE)}, MIDDLE)
+    assert refusal(made.data) == "too_large"
+    monkeypatch.undo()
+    monkeypatch.setattr(commit, "EVIDENCE_ALLOWANCE_BYTES", 0)
+    monkeypatch.setattr(commit, "EVIDENCE_PER_BYTE", 0)
+    assert refusal(made.data) == "too_large"
 
 
 def test_a_reader_may_set_how_much_evidence_it_takes() -> None:

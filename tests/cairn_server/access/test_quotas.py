@@ -4,6 +4,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+from tests.fixtures.map.costly import dust
 from tests.fixtures.map.made import SMALL, random_evidence
 from tests.fixtures.server import signatures
 from tests.fixtures.server.access import ADMIN, bearer, robot_token
@@ -14,7 +15,7 @@ from tests.fixtures.server.quotas import MOLE_CALLER, SIZE, Clock, assert_waits,
 from cairn_client.http.api import MapApi
 from cairn_map.commits.commit import Commit
 from cairn_map.errors import BadInputError, UnreachableError
-from cairn_map.evidence.grid import cell_key
+from cairn_map.evidence.grid import BRICK_DEPTH, Geometry, cell_key
 from cairn_map.wire.access_messages import CreateToken
 from cairn_server.access import quotas
 from cairn_server.access.auth import ADMIN_FILE, UPSTREAM, Caller, Role
@@ -40,7 +41,9 @@ def test_commits_a_minute_come_back_by_and_by(tmp_path: Path) -> None:
         assert [spend(meter, row) for _ in range(7)] == [None] * 6 + [10]
 
 
-@pytest.mark.parametrize(("quota", "what"), [("bytes_per_day", "size_bytes"), ("cells_per_day", "cells")])
+@pytest.mark.parametrize(
+    ("quota", "what"), [("bytes_per_day", "size_bytes"), ("cells_per_day", "cells"), ("bricks_per_day", "bricks")]
+)
 def test_a_days_quota_is_whole_again_at_midnight(tmp_path: Path, quota: str, what: str) -> None:
     clock = Clock()
     with metered(tmp_path, clock, **{quota: 100}) as (meter, row):
@@ -61,6 +64,26 @@ def test_what_was_not_accepted_is_given_back(tmp_path: Path) -> None:
             raise ZeroDivisionError
         assert spend(meter, row, size_bytes=10, cells=10) is None
         assert spend(meter, row, size_bytes=1) is not None
+
+
+def test_dust_is_refused_until_midnight_and_what_its_bytes_pay_for_never(tmp_path: Path) -> None:
+    wide = Geometry(voxel_edge_um=50_000, depth=7, channels=())
+    dusty = [pushed(n, n, geometry=wide, cells={KEYS[n]: dust(wide)}, scans=1) for n in range(2)]
+    unpaid = 8 ** (wide.depth - BRICK_DEPTH) - len(dusty[0].data)
+    assert unpaid > 8 * len(dusty[0].data)
+    for start in range(2):
+        with guarded(tmp_path, bricks_per_day=unpaid * 3 // 2) as live:
+            if not start:
+                row = live.new_map(wide)
+            mole = bearer(robot_token(live, row, "mole"))
+            if not start:
+                assert live.push(row, dusty[0], headers=mole).status_code == 201
+            refused = live.push(row, dusty[1], headers=mole)
+            assert_waits(refused, 1, DAY_S)
+            assert "quotas.bricks_per_day" in refused.json()["detail"]
+            for n in range(3):
+                seen = pushed(10 * start + n + 2, n, geometry=wide)
+                assert live.push(row, seen, headers=mole).status_code == 201
 
 
 def test_parallel_pushes_share_one_quota(tmp_path: Path) -> None:
@@ -164,11 +187,12 @@ def test_what_a_relay_brings_is_not_larger_or_farther_than_what_a_robot_may(tmp_
 
 
 def test_a_server_s_own_upstream_may_bring_all_of_an_old_map_at_once(tmp_path: Path) -> None:
-    with metered(tmp_path, Clock(), commits_per_minute=1, bytes_per_day=1, cells_per_day=1) as (meter, row):
+    with metered(tmp_path, Clock(), commits_per_minute=1, bytes_per_day=1, bricks_per_day=1) as (meter, row):
         for keep in (True, False, True):
-            with meter.spending(row, UPSTREAM, size_bytes=9, cells=KEYS, via=UPSTREAM.name) as kept:
+            with meter.spending(row, UPSTREAM, size_bytes=9, cells=KEYS, via=UPSTREAM.name) as spending:
+                spending.charge_bricks(100)
                 if keep:
-                    kept()
+                    spending.keep()
 
 
 def test_a_robot_s_cells_span_the_map_s_extent_and_a_retract_makes_room(

@@ -27,6 +27,7 @@ from cairn_map.wire.messages import CreateMap
 from cairn_server.sync.checks import check_pool, worker_nursery
 
 LARGE = Geometry(depth=6, channels=())
+DEEP = Geometry(depth=7, channels=())
 LIMIT_S = 2.0
 """Seconds of processor time in a worker: enough for every sound commit here."""
 
@@ -39,19 +40,27 @@ def strict(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
         yield server
 
 
-def sparse_noise(geometry: Geometry) -> Evidence:
+def noise(geometry: Geometry, *, share: float = 0.02) -> Evidence:
     """A cell full of misses, with a hit in every 50th voxel: it takes long, and a model pays."""
     counts = np.ones((8**geometry.depth, 2), np.int64)
-    counts[:, 0] = np.random.default_rng(0).random(len(counts)) < 0.02
+    counts[:, 0] = np.random.default_rng(0).random(len(counts)) < share
     return packed_evidence(np.arange(len(counts), dtype=np.uint32), counts, np.zeros((len(counts), 0)), geometry)
 
 
-def of_cells(cells: int, *, n: int = 0, profile: Profile = Profile.FAST, author: Author = MOLE) -> Commit:
+def of_cells(
+    cells: int,
+    *,
+    n: int = 0,
+    profile: Profile = Profile.FAST,
+    author: Author = MOLE,
+    geometry: Geometry = LARGE,
+    share: float = 0.02,
+) -> Commit:
     """A commit of many expensive cells."""
     pose = ScanPose(time_s=1.5e9, t_map_rig=(0.0, 0.0, 0.4), q_map_rig=(0.0, 0.0, 0.0, 1.0))
-    meta = CommitMeta(id=str(CommitId(author, n)), geometry=LARGE.digest().hex(), scans=(pose,) * 2)
-    evidence = sparse_noise(LARGE)
-    return make_commit(meta, {cell_key((i, 0, 0)): evidence for i in range(cells)}, LARGE, profile=profile)
+    meta = CommitMeta(id=str(CommitId(author, n)), geometry=geometry.digest().hex(), scans=(pose,) * 2)
+    evidence = noise(geometry, share=share)
+    return make_commit(meta, {cell_key((i, 0, 0)): evidence for i in range(cells)}, geometry, profile=profile)
 
 
 def put(live: Live, name: str, commit: str, data: bytes) -> httpx.Response:
@@ -148,11 +157,13 @@ def test_a_commit_that_takes_long_is_refused_and_the_worker_replaced(
 def test_a_commit_that_takes_much_memory_is_refused_and_large_workers_are_not_kept(tmp_path: Path) -> None:
     with Live(tmp_path, check_workers=1, check_memory_bytes=1 << 26) as server:
         server.service.sync.pushes.checks.ordinary_s = 0.0
-        small, large = server.new_map(), server.new_map(LARGE)
-        assert kind_of(server.push(large, of_cells(60))) == (400, "too_costly")
+        small, large, deep = server.new_map(), server.new_map(LARGE), server.new_map(DEEP)
+        assert kind_of(server.push(deep, of_cells(1, geometry=DEEP, share=0.5))) == (400, "too_costly")
         assert server.push(small, pushed(0, 1)).status_code == 201
         (before,) = workers_of(server)
-        assert server.push(large, of_cells(10)).status_code == 201
+        # Any number of cells takes the memory of the largest one.
+        assert server.push(large, of_cells(60)).status_code == 201
+        assert server.push(deep, of_cells(1, geometry=DEEP, share=0.05)).status_code == 201
         until(lambda: not is_alive(before), "it retired")
         assert server.push(small, pushed(1, 1)).status_code == 201
 

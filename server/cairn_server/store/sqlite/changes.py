@@ -35,8 +35,8 @@ def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit, *
     charged = take_sums(connection, row, commit)
     connection.execute(
         "INSERT INTO commits (map, robot, incarnation, n, sha, size_bytes, cells, meta, captured_first_s,"
-        " captured_last_s, retracts, received_s, received_age_s, rig, signatures, via, charged)"
-        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        " captured_last_s, retracts, received_s, received_age_s, rig, signatures, via, charged, bricks)"
+        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         (
             *key,
             commit.sha,
@@ -51,6 +51,7 @@ def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit, *
             commit.signatures,
             commit.via,
             charged,
+            commit.bricks,
         ),
     )
     _insert_diff(connection, connection.last_insert_rowid(), commit)

@@ -238,7 +238,11 @@ CREATE TABLE ended_list (id TEXT NOT NULL);         -- one row: of the list next
 ALTER TABLE token ADD COLUMN confirmed INTEGER NOT NULL DEFAULT 1;  -- 0: restored, and off until an admin confirms it
 """
 
-STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS, RECEIVED, SIGNED, HOTTEST, AGES, SHARES, KEYS, ENDED)
+BRICKS = """
+ALTER TABLE commits ADD COLUMN bricks INTEGER NOT NULL DEFAULT 0;   -- of 8^3 voxels that it touches; 0: before quotas
+"""
+
+STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS, RECEIVED, SIGNED, HOTTEST, AGES, SHARES, KEYS, ENDED, BRICKS)
 
 
 def ensure_schema(connection: apsw.Connection) -> None:

@@ -52,6 +52,7 @@ from cairn_server.store.store_rows import (
     Use,
     registration_name,
     relay_of,
+    unpaid_bricks,
 )
 
 PROBE_S = 5.0
@@ -286,10 +287,11 @@ class SqliteUses:
         found: defaultdict[Robot, Use] = defaultdict(Use)
         # Not from the newest back to the first older one: a clock may be set back, and so the order of the numbers
         # says nothing. Nor summed up by SQL, which would go through all commits to have them in groups.
-        query = "SELECT map, robot, via, size_bytes, cells FROM commits WHERE received_s >= ?"
+        query = "SELECT map, robot, via, size_bytes, cells, bricks FROM commits WHERE received_s >= ?"
         with self._readers.reading() as reader:
-            for number, robot, via, size_bytes, cells in reader.execute(query, (time_s,)):
-                found[number, relay_of(via) if via else robot] += Use(size_bytes, cells)
+            for number, robot, via, size_bytes, cells, bricks in reader.execute(query, (time_s,)):
+                use = Use(size_bytes, cells, unpaid_bricks(bricks, size_bytes=size_bytes))
+                found[number, relay_of(via) if via else robot] += use
         return found
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from cairn_map.commits.commit import Commit
+from cairn_map.commits.commit import Commit, commit_sha
 from cairn_map.commits.commit_reading import CommitReader
 from cairn_map.evidence.evidence import largest
 from cairn_map.evidence.grid import CellKey
@@ -26,6 +26,8 @@ class Checked:
     sha: bytes
     tops: Mapping[int, tuple[int, ...]]
     """Largest number of each plane in each region (`shares.region_of`)."""
+    bricks: int
+    """Count of the bricks of 8^3 voxels that it touches."""
 
 
 def check_commit(reader: CommitReader) -> Checked:
@@ -34,13 +36,19 @@ def check_commit(reader: CommitReader) -> Checked:
     Raises:
         DamagedDataError, BadInputError: as `CommitReader.read` and `push_policy.check_evidence`.
     """
-    commit, cells = reader.read()
-    tops = {key: largest(cell.content.counts, cell.content.samples) for key, cell in cells.items()}
-    check_evidence(commit.meta, cells, tops)
-    return Checked(commit.sha, _by_region(tops))
+    tops: dict[CellKey, npt.NDArray[np.int64]] = {}
+    digests: list[bytes] = []
+    bricks = 0
+    # Cell by cell, and none is kept: the memory is that of the largest one.
+    for cell in reader.canonical_cells():
+        tops[cell.key] = largest(cell.content.counts, cell.content.samples)
+        check_evidence(reader.meta, cell, tops[cell.key])
+        digests.append(cell.digest)
+        bricks += cell.content.octree.brick_count
+    return Checked(commit_sha(reader.text, digests), _by_region(tops), bricks)
 
 
-def new_commit(commit: Commit, tops: Mapping[int, tuple[int, ...]]) -> NewCommit:
+def new_commit(commit: Commit, tops: Mapping[int, tuple[int, ...]], *, bricks: int = 0) -> NewCommit:
     """Checked commit as a store keeps it."""
     return NewCommit(
         id=commit.id,
@@ -51,6 +59,7 @@ def new_commit(commit: Commit, tops: Mapping[int, tuple[int, ...]]) -> NewCommit
         retracts=commit.meta.retracted_ids,
         diff=commit.cells,
         tops=tops,
+        bricks=bricks,
         rig=bytes.fromhex(commit.meta.rig) if commit.meta.rig else None,
     )
 

@@ -4,8 +4,6 @@ Evidence is refused before it can spoil a map: counts that no scan could give wo
 and use up the range of the sums for everybody; ids full of gaps would grow every version vector without bound.
 """
 
-from collections.abc import Mapping
-
 import numpy as np
 import numpy.typing as npt
 
@@ -16,7 +14,7 @@ from cairn_map.commits.ids import INITIAL
 from cairn_map.errors import BadInputError, DamagedDataError, DeniedError
 from cairn_map.evidence.channels import SAMPLE_MAX, planes_and_squares
 from cairn_map.evidence.evidence_kernels import bounds_of_counts, channel_above
-from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
+from cairn_map.evidence.grid import Geometry, cell_of_key
 from cairn_server.access.auth import Caller
 from cairn_server.store.store_rows import MapRow
 
@@ -50,12 +48,10 @@ def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *,
         raise DamagedDataError("empty_commit", "a commit must hold evidence or name commits to retract")
 
 
-def check_evidence(
-    meta: CommitMeta, cells: Mapping[CellKey, CanonicalCell], tops: Mapping[CellKey, npt.NDArray[np.int64]]
-) -> None:
-    """Refuse more evidence than the commit's scans can have given; prior data (author `initial`) had other scans.
+def check_evidence(meta: CommitMeta, cell: CanonicalCell, tops: npt.NDArray[np.int64]) -> None:
+    """Refuse more evidence in a cell than the scans can have given; prior data (author `initial`) had other scans.
 
-    The largest number of each plane of each cell is known.
+    The largest number of each plane is known.
 
     Raises:
         BadInputError: kind `too_much_evidence`.
@@ -63,10 +59,9 @@ def check_evidence(
     if meta.commit_id.author.robot == INITIAL:
         return
     scans = max(1, len(meta.scans))
-    for key, cell in cells.items():
-        complaint = _excess(cell.content, cell.geometry, tops[key], scans)
-        if complaint:
-            raise BadInputError("too_much_evidence", f"cell {cell_of_key(key)}: {complaint} from {scans} scans")
+    complaint = _excess(cell.content, cell.geometry, tops, scans)
+    if complaint:
+        raise BadInputError("too_much_evidence", f"cell {cell_of_key(cell.key)}: {complaint} from {scans} scans")
 
 
 def _excess(content: CellContent, geometry: Geometry, tops: npt.NDArray[np.int64], scans: int) -> str | None:

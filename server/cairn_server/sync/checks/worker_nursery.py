@@ -75,7 +75,7 @@ def answer_to(data: bytes) -> dict[str, object]:
         return {"family": type(exc).__name__, "kind": exc.kind, "message": exc.message}
     except MemoryError:
         return {"memory": True}
-    return {"sha": checked.sha.hex(), "tops": list(checked.tops.items())}
+    return {"sha": checked.sha.hex(), "tops": list(checked.tops.items()), "bricks": checked.bricks}
 
 
 def checked_from(answer: dict[str, object]) -> Checked:
@@ -86,9 +86,10 @@ def checked_from(answer: dict[str, object]) -> Checked:
     """
     if "family" in answer:
         raise FAMILIES[str(answer["family"])](str(answer["kind"]), str(answer["message"]))
-    tops = answer["tops"]
+    tops, bricks = answer["tops"], answer["bricks"]
     assert isinstance(tops, list)  # noqa: S101 - `answer_to` wrote it
-    return Checked(bytes.fromhex(str(answer["sha"])), {region: tuple(top) for region, top in tops})
+    assert isinstance(bricks, int)  # noqa: S101 - and this
+    return Checked(bytes.fromhex(str(answer["sha"])), {region: tuple(top) for region, top in tops}, bricks)
 
 
 def _address_space_bytes() -> int:
