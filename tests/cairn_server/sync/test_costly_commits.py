@@ -146,7 +146,7 @@ def test_a_commit_that_takes_long_is_refused_and_the_worker_replaced(
     strict.push(strict.new_map(), pushed(0, 1))
     (worker,) = workers_of(strict)
     monkeypatch.setattr(pool_of(strict), "_limit_s", 0.03)
-    assert kind_of(strict.push(row, of_cells(3, profile=Profile.SMALL))) == (400, "too_costly")
+    assert kind_of(strict.push(row, of_cells(15, profile=Profile.SMALL))) == (400, "too_costly")
     monkeypatch.undo()
     until(lambda: not is_alive(worker), "the worker is gone")
     assert strict.push(row, of_cells(3)).status_code == 201
