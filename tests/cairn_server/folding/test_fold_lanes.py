@@ -72,8 +72,8 @@ class Folder:
 
     def finish(self) -> None:
         """Fold until nothing waits."""
-        while self.look() or self.folding.fold(self.row, maps=1).is_planning:
-            pass
+        while self.store.pending(self.row, limit=1, size_bytes_max=1 << 26):
+            self.look()
 
     def vector(self) -> VersionVector:
         """Commits that are in the map."""
