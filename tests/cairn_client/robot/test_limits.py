@@ -230,7 +230,8 @@ def test_commits_that_are_stable_go_first(server: LiveServer, tmp_path: Path) ->
         robot.sync()
         server.wait_for_fold()
         # The robot hears that it is stable, and goes on without its cells, before it fetches again.
-        robot.replica.take_header(robot._api.cell_index(MAP).header, asked_by=robot.replica.author)
+        header = robot._api.cell_index(MAP, robot.replica.author).header
+        robot.replica.take_header(header, asked_by=robot.replica.author)
         robot._rounds._budget.kept = CellCube(centre=(0, 0, 0), radius=1)
         robot.replica.commit(far)
         assert len(robot.replica.commits) == 1
