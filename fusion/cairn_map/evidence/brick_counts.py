@@ -39,11 +39,7 @@ class BrickCounts:
         new = kernels.count_new_bricks(voxels, self._brick_of)
         if new:
             used = len(self._pool)
-            if used:
-                self._pool.resize((used + new, 512, 2), refcheck=False)  # in place if possible; there is no other view
-            else:
-                # Fresh zeros come in large pages, which the kernel that adds touches first: a third of the time.
-                self._pool = np.zeros((new, 512, 2), self._pool.dtype)
+            self._pool.resize((used + new, 512, 2), refcheck=False)  # in place if possible; there is no other view
             kernels.number_bricks_into(voxels, self._brick_of, used)
         said = kernels.add_counts_into(voxels, counts, sign, self._brick_of, self._pool)
         if said >= 0 and self._bound + said <= self._limit:
