@@ -49,6 +49,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from cairn_map.errors import BadInputError
+from cairn_server.access.turns import Turns
 from cairn_server.folding.cell_cache import CACHE_BYTES
 from cairn_server.folding.fold_process import fork_folding
 from cairn_server.http.app import make_app
@@ -137,16 +138,16 @@ def _serve(service: Service, listener: socket.socket, long_bodies: LongBodies) -
     # looks at it; and what survived two sweeps of young objects is seldom a cycle.
     gc.freeze()
     gc.set_threshold(*gc.get_threshold()[:2], FULL_SWEEPS_AFTER)
-    _Server(config, service, app.state.lanes).run(sockets=[listener])
+    _Server(config, app).run(sockets=[listener])
 
 
 class _Server(uvicorn.Server):
     """uvicorn's server, which at a signal says that it is not ready and ends what would not end alone or in time."""
 
-    def __init__(self, config: uvicorn.Config, service: Service, lanes: Lanes) -> None:
+    def __init__(self, config: uvicorn.Config, app: FastAPI) -> None:
         super().__init__(config)
-        self._service = service
-        self._lanes = lanes
+        self._service: Service = app.state.service
+        self._turns: tuple[Lanes, Turns] = app.state.lanes, app.state.reading
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """End live streams, then stop as uvicorn does."""
@@ -155,7 +156,8 @@ class _Server(uvicorn.Server):
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Answer what is at work, and refuse what waits for its turn."""
-        self._lanes.close()
+        for turns in self._turns:
+            turns.close()
         await super().shutdown(sockets)
 
 

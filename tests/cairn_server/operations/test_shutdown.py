@@ -87,3 +87,13 @@ def test_sigterm_under_load_loses_nothing_answers_what_is_under_way_and_ends_in_
         assert read(bodies) == sum_of([*known, last])
     again.send(signal.SIGTERM)
     assert again.end() == (0, "")
+
+
+def test_a_body_that_never_ends_is_cut_when_the_server_stops(tmp_path: Path) -> None:
+    process = Process(tmp_path)
+    with client(process) as http:
+        make_map(http)
+        with begun_push(process, pushed(0, 2)):
+            assert http.get("/healthz").status_code == 200
+            process.send(signal.SIGTERM)
+            assert process.end() == (0, "")
