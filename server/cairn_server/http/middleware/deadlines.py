@@ -132,7 +132,8 @@ class PunctualProtocol(H11Protocol):
         if self.conn.their_state is h11.IDLE and len(data) > HEAD_BYTES_MAX:
             head_end = (self.conn.trailing_data[0] + data).find(b"\r\n\r\n")
             if not 0 <= head_end <= HEAD_BYTES_MAX:
-                self.send_400_response("The request's head is too long.")
+                error = BadInputError("too_large", f"the head of a request has at most {HEAD_BYTES_MAX} bytes")
+                self._refuse(413, b"Content Too Large", error)
                 return
         super().data_received(data)
 
@@ -154,16 +155,19 @@ class PunctualProtocol(H11Protocol):
 
     def send_400_response(self, msg: str) -> None:
         """Refuse what is no request, or has a body of unknown length, and close; what was read of it is dropped."""
-        if not self.conn.is_unsized:
+        if self.conn.is_unsized:
+            error = BadInputError("no_length", "send a body with Content-Length, not in chunks")
+            self._refuse(411, b"Length Required", error)
+        else:
             super().send_400_response(msg)
-            return
-        error = BadInputError("no_length", "send a body with Content-Length, not in chunks")
-        problem = Problem(title="no length", status=411, detail=error.message, kind=error.kind)
+
+    def _refuse(self, status: int, reason: bytes, error: BadInputError) -> None:
+        problem = Problem(title=error.kind.replace("_", " "), status=status, detail=error.message, kind=error.kind)
         body = json.dumps(problem.model_dump()).encode()
         length = b"content-length", str(len(body)).encode()
         headers = [(b"content-type", b"application/problem+json"), (b"connection", b"close"), length]
         for event in (
-            h11.Response(status_code=411, headers=headers, reason=b"Length Required"),
+            h11.Response(status_code=status, headers=headers, reason=reason),
             h11.Data(data=body),
             h11.EndOfMessage(),
         ):
