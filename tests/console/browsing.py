@@ -121,7 +121,7 @@ def skip_without_page() -> None:
 
 
 def serious(console: Console, where: str) -> list[str]:
-    """What axe-core holds against the page as it is."""
+    """Serious findings of axe-core in the page as it is."""
     violations = Axe().run(console.page).response["violations"]
     return [
         f"{where}: {each['id']}, {each['impact']}, at {len(each['nodes'])}: {each['nodes'][0]['html'][:160]}"

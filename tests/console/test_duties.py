@@ -1,4 +1,4 @@
-"""What waits for an operator: robots that ask to be let in under another key, and shares that are half used."""
+"""The panel for operators: robots that ask to be let in under another key, and shares that are half used."""
 
 import re
 from collections.abc import Iterator

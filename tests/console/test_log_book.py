@@ -25,7 +25,7 @@ LONG = "long"
 COMMITS = 300
 """More than the strip of commits shows."""
 RETRACTS = 5
-"""Of so many commits each that a page of the log ends before the last one."""
+"""Retracts that name so many commits each that a page of the log ends before the last one."""
 LOG = COMMITS + RETRACTS
 FINCH = "finch.0123456789abcdef"
 """A robot of which nothing came yet: what is named of it is taken out when it comes."""

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.browser
 
 KELVIN = 273.15
 PLACES = [[x, y] for x in range(150, 560, 6) for y in range(80, 420, 6)]
-"""Of the canvas, with nothing written over it; enough for any map that earlier tests leave in the room."""
+"""Pixels of the canvas with nothing written over them; enough for any map that earlier tests leave in the room."""
 PICKED_VOXELS = """a[0].map(([x, y]) => { const p = c.picker.at(x, y);
   return p?.isVoxel ? p.node.map((n, axis) => n + p.cell.cell[axis] * 2 ** p.depth) : null; })"""
 BAND_C = (18.5, 40.0)

@@ -1,4 +1,4 @@
-"""Who may register a robot: an enrolment token, within its quota, and for a known name only the same robot."""
+"""Registration of robots: by an enrolment token, within its quota, and under a known name only by the same robot."""
 
 import itertools
 from collections.abc import Iterator

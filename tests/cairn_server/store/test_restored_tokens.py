@@ -36,7 +36,7 @@ def serving(folder: Path) -> Iterator[tuple[Live, MapApi]]:
 
 
 def worth(live: Live, secrets: dict[str, str]) -> dict[str, str]:
-    """Of each token: `good`, or the kind of refusal."""
+    """State of each token: `good`, or the kind of refusal."""
     paths = {name: "/maps/lab" if name in ("mole", "wren", "newt") else "/maps" for name in secrets}
     answers = {name: live.http.get(paths[name], headers=bearer(secret)) for name, secret in secrets.items()}
     return {name: "good" if answer.status_code == 200 else kind_of(answer) for name, answer in answers.items()}
