@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -181,7 +182,7 @@ def test_a_ray_that_nearly_lies_in_a_plane_ends_as_one_that_does(part: float) ->
     snapshot = snapshot_with(PLAIN, WALL)
     for direction in ([1, part, 0], [part, 1, 0], [part, part, 1]):
         flat = [round(number) for number in direction]
-        ends = result_within(20.0, lambda d=direction: snapshot.cast_rays([[0, 0, 0]], [d], max_range_m=10))  # type: ignore[misc]
+        ends = result_within(20.0, partial(snapshot.cast_rays, [[0, 0, 0]], [direction], max_range_m=10))
         assert ends.distance_m.tolist() == snapshot.cast_rays([[0, 0, 0]], [flat], max_range_m=10).distance_m.tolist()
 
 
