@@ -17,7 +17,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.metrics import MetricWrapperBase
 from prometheus_client.registry import Collector
 
-from cairn_map.wire.frames import CELL_HEAD, CellFrame, Frame
+from cairn_map.wire.empty_cell_frames import EmptyCellFrames
+from cairn_map.wire.frames import CellFrame, Frame
 from cairn_server.store.shares import ALARM_PART, ROBOTS_MAX, used_bounds
 from cairn_server.store.store_rows import Backlog, RobotShares, StoreFigures
 
@@ -87,13 +88,13 @@ class ServerFigures:
     def _histogram(self, name: str, help_text: str, *labels: str) -> Bounded[Histogram]:
         return Bounded(Histogram(name, help_text, labels, registry=self.registry, buckets=SECONDS))
 
-    def counted(self, frames: Iterator[Frame]) -> Iterator[Frame]:
+    def counted(self, frames: Iterator[Frame | EmptyCellFrames]) -> Iterator[Frame | EmptyCellFrames]:
         """The same frames, counted by kind."""
         for frame in frames:
-            if isinstance(frame, CellFrame):
+            if isinstance(frame, CellFrame | EmptyCellFrames):
                 kind = frame.kind.name.lower()
-                self.frames.labels(kind).inc()
-                self.frame_bytes.labels(kind).inc(CELL_HEAD.size + len(frame.payload))
+                self.frames.labels(kind).inc(frame.count)
+                self.frame_bytes.labels(kind).inc(frame.size_bytes)
             yield frame
 
 

@@ -18,6 +18,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -77,6 +78,12 @@ class CellFrame:
     """True if the payload is only the rest of it: the asker has named the beginning as held."""
     payload: bytes = b""
     """A cell's bytes; empty for `reset`."""
+    count: ClassVar[int] = 1
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of head and payload."""
+        return CELL_HEAD.size + len(self.payload)
 
 
 Frame = ReplyHeader | CellFrame | Done | More

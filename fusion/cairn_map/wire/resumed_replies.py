@@ -16,6 +16,7 @@ from dataclasses import replace
 from cairn_map.codec.cell_reading import CELL_BYTES_MAX
 from cairn_map.errors import DamagedDataError, UnreachableError
 from cairn_map.evidence.grid import CellKey, cell_of_key
+from cairn_map.wire.empty_cell_frames import EmptyCellFrames
 from cairn_map.wire.frames import CellFrame, Frame, FrameReader
 from cairn_map.wire.messages import MissingRequest
 
@@ -35,8 +36,8 @@ def reply_digest(reply: bytes) -> str:
     return hashlib.sha256(reply).hexdigest()[:KNOWN_DIGITS]
 
 
-def without_begun(frames: Iterable[Frame], begun: Begun | None) -> Iterator[Frame]:
-    """Frames of a reply, without the beginning of a payload that the asker holds."""
+def without_begun(frames: Iterable[Frame | EmptyCellFrames], begun: Begun | None) -> Iterator[Frame | EmptyCellFrames]:
+    """Frames of a reply, without the beginning of a payload that the asker holds; empty cells come whole."""
     cell, size, sha = begun or (None, 0, "")
     for frame in frames:
         if not isinstance(frame, CellFrame) or len(frame.payload) < size or cell_of_key(frame.cell) != cell:

@@ -30,16 +30,17 @@ from cairn_server.service import Service
 
 router = APIRouter()
 ROUTERS = (
+    sync_routes.router,
     router,
     map_routes.router,
     branch_routes.router,
-    sync_routes.router,
     cell_routes.router,
     export_routes.router,
     live_routes.router,
     operations_routes.router,
     console_routes.router,
 )
+"""In the order in which the path of a request is compared with theirs: a push comes first, not after 18 others."""
 
 
 @router.get("/docs", response_class=HTMLResponse)

@@ -2,16 +2,19 @@
 
 A request may list 100 000 cells. As objects of Python they take 0.1 s to parse, and as long again for each sweep of the
 garbage collector; no other thread runs meanwhile. So a long request is parsed and made into arrays in another process
-(`http.routes.long_bodies`), and nothing but arrays comes back.
+(`http.routes.long_bodies`), and nothing but arrays comes back. They stay arrays until they are answered.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.commits.cursor import Cursor
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import cell_keys
+from cairn_map.kernels.morton_kernels import UInts
 from cairn_map.wire.messages import CURSORS_MAX, MissingRequest
 
 
@@ -21,12 +24,47 @@ class Asked:
 
     request: MissingRequest
     """All but the lists of cells, which are empty here."""
-    keys: npt.NDArray[np.uint64]
+    keys: UInts
     """Numbers of the cells listed, shape (n,), none twice."""
     states: npt.NDArray[np.int64]
     """Index in `cursors` of each of these cells, shape (n,)."""
     cursors: tuple[str | None, ...]
     """States at which the cells stand; None: the asker holds nothing of them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ListedCells:
+    """Cells that a request lists, each at its own state."""
+
+    keys: UInts
+    """Numbers of the cells, shape (n,), rising."""
+    states: npt.NDArray[np.int64]
+    """Index in `cursors` of the state of each, shape (n,)."""
+    cursors: tuple[Cursor | None, ...]
+
+    def places(self, keys: UInts) -> npt.NDArray[np.int64]:
+        """Index here of each of these cells, shape (len(keys),); -1 where it is not listed."""
+        if not len(self.keys):
+            return np.full(len(keys), -1)
+        found = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
+        return np.where(self.keys[found] == keys, found, -1)
+
+    def cursor(self, place: int) -> Cursor | None:
+        """State of the cell of this index."""
+        return self.cursors[int(self.states[place])]
+
+    def by_cursor(self, chosen: npt.NDArray[np.bool_]) -> Iterator[tuple[Cursor | None, UInts]]:
+        """Each state with those of the chosen cells that stand at it, where there are any."""
+        for n, cursor in enumerate(self.cursors):
+            keys = self.keys[chosen & (self.states == n)]
+            if len(keys):
+                yield cursor, keys
+
+
+def listed_cells(asked: Asked, cursors: tuple[Cursor | None, ...]) -> ListedCells:
+    """Cells of a request, with its cursors parsed."""
+    order = np.argsort(asked.keys)
+    return ListedCells(asked.keys[order], asked.states[order], cursors)
 
 
 def asked_of(request: MissingRequest) -> Asked:

@@ -9,12 +9,12 @@ proves it, and `lm` of each cell says whether it changed since. For each cell th
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import islice
+from dataclasses import dataclass, replace
+from itertools import compress, islice
 
 import numpy as np
+import numpy.typing as npt
 
-from cairn_map.codec.cell_code import encode_empty_cell
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.commits.ids import OPERATOR, Author, CommitId, author_from_text
 from cairn_map.commits.version_vector import VersionVector
@@ -22,8 +22,9 @@ from cairn_map.errors import ConflictError
 from cairn_map.evidence.cell_order import first_to_last
 from cairn_map.evidence.fingerprint import ZERO, Fingerprint
 from cairn_map.evidence.grid import CELL_LIMIT, Cell, CellKey, Geometry, cell_key, cell_of_key
-from cairn_map.kernels.morton_kernels import deinterleave
-from cairn_map.wire.frames import CELL_HEAD, CellFrame, Frame, FrameKind
+from cairn_map.kernels.morton_kernels import UInts, deinterleave
+from cairn_map.wire.empty_cell_frames import EmptyCellFrames
+from cairn_map.wire.frames import CellFrame, Frame, FrameKind
 from cairn_map.wire.messages import Done, More, ReplyHeader
 from cairn_server.access.cancellation import CANCELLATION
 from cairn_server.folding.cells import CellFaults
@@ -33,7 +34,7 @@ from cairn_server.folding.read_cache import ReadCache
 from cairn_server.store.history import is_proven
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import CellRow
-from cairn_server.sync.asked_cells import Asked
+from cairn_server.sync.asked_cells import Asked, ListedCells, listed_cells
 from cairn_server.sync.cell_changes import change_since
 
 log = logging.getLogger(__name__)
@@ -67,7 +68,7 @@ class MissingQuery:
     author: Author | None
     cursor: Cursor | None
     """State of every cell that is not listed; None: the asker holds none of them."""
-    cells: dict[CellKey, Cursor | None]
+    listed: ListedCells
     """Cells that the request lists, each with its own state."""
     unproven: frozenset[Cursor]
     """Cursors of the request that this log does not prove."""
@@ -79,16 +80,13 @@ class MissingQuery:
     size_bytes_max: int
     near: Cell | None
 
-    def wants(self, key: CellKey) -> bool:
-        """True if a cell lies in the box asked for."""
+    def wants(self, keys: UInts) -> npt.NDArray[np.bool_]:
+        """True for each of these cells that lies in the box asked for, shape (len(keys),)."""
         if self.box is None:
-            return True
-        low, high = self.box
-        return all(a <= b <= c for a, b, c in zip(low, cell_of_key(key), high, strict=True))
-
-    def holds_nothing_of(self, key: CellKey) -> bool:
-        """True if the asker has no state of a cell, and does not ask for it by name."""
-        return self.cursor is None and key not in self.cells
+            return np.ones(len(keys), np.bool_)
+        indices, (low, high) = deinterleave(keys) - CELL_LIMIT, self.box
+        is_beside = (indices < low) | (indices > high)
+        return ~np.asarray(is_beside.any(axis=1), np.bool_)
 
     def is_reset(self, start: Cursor | None) -> bool:
         """True if a cell of this state is answered by its fingerprint: the asker finds out what it has to drop."""
@@ -103,7 +101,8 @@ def query_of(asked: Asked, snapshot: Snapshot) -> MissingQuery:
         BadInputError: a malformed id, cursor or cell.
     """
     # Each cursor once, however many cells name it: proving one reads the log.
-    request, cursor, cursors = asked.request, _cursor(asked.request.cursor), [_cursor(text) for text in asked.cursors]
+    request, cursor = asked.request, _cursor(asked.request.cursor)
+    cursors = tuple(_cursor(text) for text in asked.cursors)
     head = snapshot.head.cursor
     unproven: set[Cursor] = set()
     cancellation = CANCELLATION.get()
@@ -113,13 +112,11 @@ def query_of(asked: Asked, snapshot: Snapshot) -> MissingQuery:
             raise ConflictError("other_log", "the cursor belongs to another server's log; start without one")
         if not is_proven(stated, snapshot):
             unproven.add(stated)
-    # From arrays to objects one by one: other threads run meanwhile.
-    cells = {CellKey(key): cursors[n] for key, n in zip(asked.keys.tolist(), asked.states.tolist(), strict=True)}
     # A reply is made in memory, so the asker may lower the server's bound on its bytes, and not raise it.
     return MissingQuery(
         author=author_from_text(request.author) if request.author else None,
         cursor=cursor,
-        cells=cells,
+        listed=listed_cells(asked, cursors),
         unproven=frozenset(unproven),
         kinds=frozenset(request.kinds),
         compare=request.compare,
@@ -184,14 +181,18 @@ class CellFrames:
         # Whole, as it is stored: a first fetch, or no smaller frame.
         return self._frame(FrameKind.FULL, row.key, start, row.fingerprint, self._body(row.key))
 
-    def frame_of_unknown(self, key: CellKey, start: Cursor | None) -> CellFrame | None:
-        """Frame of a cell that the asker lists and the server never had: as good as empty."""
+    def frames_of_unknown(self, keys: UInts, start: Cursor | None) -> EmptyCellFrames | None:
+        """Frames of cells that the asker lists at one state and the server never had: they are as good as empty."""
         if self.query.is_reset(start):
-            return self._frame(FrameKind.RESET, key, start, ZERO)
-        # Asked for with nothing held: without an answer it is asked for again. At a proven state it is empty already.
-        if start is None:
-            return self._frame(FrameKind.FULL, key, None, ZERO, encode_empty_cell(key, self.geometry))
-        return None
+            kind = FrameKind.RESET
+        # Asked for with nothing held: without an answer it is asked for again.
+        elif start is None:
+            kind = FrameKind.FULL
+        # At a proven state it is empty already.
+        else:
+            return None
+        to = self.snapshot.head.cursor
+        return EmptyCellFrames(kind=kind, cells=keys, from_cursor=start, to_cursor=to, geometry=self.geometry)
 
     def _body(self, key: CellKey) -> bytes:
         """A cell's bytes; empty if they are lost, which the asker reports while it gets all other cells."""
@@ -210,47 +211,58 @@ class CellFrames:
         return CellFrame(kind=kind, cell=key, from_cursor=start, to_cursor=to, fingerprint=fingerprint, payload=payload)
 
 
-def reply_frames(cells: CellFrames, facts: HeaderFacts) -> Iterator[Frame]:
+def reply_frames(cells: CellFrames, facts: HeaderFacts) -> Iterator[Frame | EmptyCellFrames]:
     """Header, frames of the cells that the asker misses, and the end of a reply."""
-    snapshot, query = cells.snapshot, cells.query
+    snapshot, query, listed = cells.snapshot, cells.query, cells.query.listed
     to = str(snapshot.head.cursor)
     # All from one snapshot (rule 3): what is folded meanwhile is wholly in the next reply.
     yield header_of(snapshot, query.author, facts)
     # Every cell of main: a frame, or its fingerprint in `rest`, so that the asker can check the whole map.
     rest = ZERO
     sent_bytes = 0
-    listed = dict(query.cells)
     cancellation = CANCELLATION.get()
-    for row in in_order([row for row in snapshot.cells() if query.wants(row.key)], query.near):
+    rows = in_order(_wanted(snapshot.cells(), query), query.near)
+    places = listed.places(_keys_of(rows))
+    for row, place in zip(rows, places.tolist(), strict=True):
         cancellation.check()
-        # All was taken out of it again: who holds nothing has the same.
-        if query.holds_nothing_of(row.key) and not row.voxels and row.fingerprint == ZERO:
+        start = listed.cursor(place) if place >= 0 else query.cursor
+        # All was taken out of it again: who holds nothing, and does not ask for it by name, has the same.
+        if place < 0 and start is None and not row.voxels and row.fingerprint == ZERO:
             continue
-        start = listed.pop(row.key, query.cursor)
         frame = cells.frame_of(row, start)
         if frame is None:
             rest += row.fingerprint
             continue
         # At least one frame in each reply, so that every reply brings the asker on.
-        sent_bytes += CELL_HEAD.size + len(frame.payload)
+        sent_bytes += frame.size_bytes
         yield frame
         if sent_bytes > query.size_bytes_max:
             yield More(to=to)
             return
     # What is left of the list is not in main.
-    empty_cells = 0
-    for key, start in ((key, start) for key, start in listed.items() if query.wants(key)):
+    is_unknown = query.wants(listed.keys)
+    is_unknown[places[places >= 0]] = False
+    is_whole = True
+    for start, keys in listed.by_cursor(is_unknown):
         cancellation.check()
-        unknown = cells.frame_of_unknown(key, start)
+        unknown = cells.frames_of_unknown(keys, start)
         if unknown is None:
             continue
-        yield unknown
         # Fingerprints alone are cheap, and must all come: the asker takes them as the answer to all that it listed.
-        empty_cells += unknown.kind is FrameKind.FULL
-        if empty_cells >= EMPTY_CELLS_MAX:
-            yield More(to=to)
-            return
-    yield Done(to=to, rest=rest.hex())
+        if unknown.kind is FrameKind.FULL and unknown.count > EMPTY_CELLS_MAX:
+            unknown, is_whole = replace(unknown, cells=keys[:EMPTY_CELLS_MAX]), False
+        yield unknown
+    yield Done(to=to, rest=rest.hex()) if is_whole else More(to=to)
+
+
+def _keys_of(rows: Sequence[CellRow]) -> UInts:
+    return np.fromiter((row.key for row in rows), np.uint64, len(rows))
+
+
+def _wanted(rows: Iterator[CellRow], query: MissingQuery) -> list[CellRow]:
+    """Those of these cells that lie in the box asked for."""
+    found = list(rows)
+    return found if query.box is None else list(compress(found, query.wants(_keys_of(found))))
 
 
 def _newest_retracts(vector: VersionVector, stable: VersionVector) -> list[str]:
@@ -281,7 +293,7 @@ def in_order(rows: Sequence[CellRow], near: Cell | None) -> list[CellRow]:
     Any order is right, since each frame stands alone.
     """
     order = first_to_last(
-        deinterleave(np.fromiter((row.key for row in rows), np.uint64, len(rows))) - CELL_LIMIT,
+        deinterleave(_keys_of(rows)) - CELL_LIMIT,
         near=near,
         changed=np.fromiter((row.lm for row in rows), np.int64, len(rows)),
         hottest_k=np.array([row.hottest_k for row in rows], np.float64),

@@ -1,12 +1,14 @@
 """Answers about the state of main: replies to fetch-missing, the cell index, the version vector at a cursor."""
 
 import threading
+from collections.abc import Iterable, Iterator
 
 from cairn_map.commits.cursor import ENTRY_FOLD, Cursor
 from cairn_map.commits.ids import Author
 from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.errors import ConflictError, NotFoundError
-from cairn_map.wire.frames import encode_frame, start_of_reply
+from cairn_map.wire.empty_cell_frames import EmptyCellFrames
+from cairn_map.wire.frames import Frame, encode_frame, start_of_reply
 from cairn_map.wire.messages import CellIndex
 from cairn_map.wire.resumed_replies import reply_digest, without_begun
 from cairn_server.folding.cell_index import FIRST_PAGE, IndexPage, entries_of
@@ -87,7 +89,7 @@ class MainReplies:
             query = query_of(asked, snapshot)
             cells = CellFrames(snapshot, query, row.geometry, self._cache, faults)
             frames = without_begun(reply_frames(cells, self._facts(row, snapshot)), asked.request.begun)
-            reply = b"".join([start_of_reply(), *map(encode_frame, self._figures.counted(frames))])
+            reply = b"".join([start_of_reply(), *_encoded(self._figures.counted(frames))])
         # For the list of branches and their expiry: what the server sends never depends on it.
         self._store.seen(row, branch, query.cursor)
         if query.cursor is None:
@@ -126,3 +128,11 @@ class MainReplies:
 
     def _facts(self, row: MapRow, snapshot: Snapshot) -> HeaderFacts:
         return HeaderFacts(self._stable.of(row, snapshot), self._cells.damaged(row), self._wanted.of(row.name))
+
+
+def _encoded(frames: Iterable[Frame | EmptyCellFrames]) -> Iterator[bytes]:
+    for frame in frames:
+        if isinstance(frame, EmptyCellFrames):
+            yield from frame.encoded()
+        else:
+            yield encode_frame(frame)

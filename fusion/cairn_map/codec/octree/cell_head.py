@@ -19,6 +19,8 @@ VERSION = 1
 KIND_EVIDENCE = 1
 FLAG_SIGNED = 1
 FIXED_PART = struct.Struct("<4sBBBBIiiiIIBB")
+INDICES_AT = struct.calcsize("<4sBBBBI")
+"""Offset of the three indices of the cell, bytes."""
 CHANNEL_SIZES = struct.Struct("<BBB")
 CHANNEL_SCALE = struct.Struct("<dd")
 KIND_OF_CODE = {code: kind for kind, code in CODE_OF_KIND.items()}

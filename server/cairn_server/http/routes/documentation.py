@@ -55,6 +55,10 @@ JSON_BODIES: dict[str, type[BaseModel]] = {}
 """Messages that are bodies of requests, by name: `openapi` adds their schemas to the document."""
 
 
+TAKES_TOKEN: Json = {"security": [{"HTTPBearer": []}]}
+"""Entry of a route that reads the token itself, by no dependency."""
+
+
 def json_body(model: type[BaseModel], *, example: Json | None = None) -> Json:
     """Request body of JSON; an example must be one that the server takes."""
     JSON_BODIES[model.__name__] = model

@@ -20,7 +20,7 @@ from cairn_server.http.routes.callers import (
     visiting_owner,
     visiting_robot,
 )
-from cairn_server.http.routes.documentation import also, answers, body, json_body, problems
+from cairn_server.http.routes.documentation import TAKES_TOKEN, also, answers, body, json_body, problems
 from cairn_server.http.routes.json_bodies import json_of
 from cairn_server.sync.asked_cells import Asked, asked_of
 from cairn_server.sync.handing_over import found_commit
@@ -38,7 +38,7 @@ router = APIRouter()
 @router.put(
     "/maps/{name}/commits/{commit}",
     responses=also(201, PushReceipt) | problems(409, 429, 507),
-    openapi_extra=body(COMMIT_MEDIA_TYPE),
+    openapi_extra=body(COMMIT_MEDIA_TYPE) | TAKES_TOKEN,
 )
 def push(
     commit: str,
@@ -84,7 +84,8 @@ def list_commits(service: Operations, row: Map) -> CommitList:
     "/maps/{name}/branches/{branch}/missing",
     response_class=Response,
     responses=answers({200: (REPLY_MEDIA_TYPE,), 204: ()}) | problems(410),
-    openapi_extra=json_body(MissingRequest, example={"author": "mole.1f2e3d4c5b6a7988", "kinds": ["delta", "full"]}),
+    openapi_extra=TAKES_TOKEN
+    | json_body(MissingRequest, example={"author": "mole.1f2e3d4c5b6a7988", "kinds": ["delta", "full"]}),
 )
 def missing(
     branch: str,
