@@ -12,6 +12,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from cairn_map.errors import BadInputError
 from cairn_map.machine_memory import standard_limit_bytes
+from cairn_map.wire.origins import origin_of
 
 CACHES_BYTES = 1200 << 20
 """Sum of the standard sizes of all caches: cells under change, cells read, their changes, pictures' cells and lists."""
@@ -26,6 +27,13 @@ def _networks(value: str) -> str:
     for part in value.split():
         ip_network(part)
     return value
+
+
+def _origins(value: str) -> str:
+    try:
+        return " ".join(origin_of(part) for part in value.split())
+    except BadInputError as exc:
+        raise ValueError(exc.message) from exc
 
 
 Count = Annotated[Annotated[int, Field(ge=1)] | None, BeforeValidator(_none_if_zero)]
@@ -92,6 +100,9 @@ class Settings(BaseModel):
     """Token of role relay, given by the upstream server."""
     trusted_servers: Annotated[str, Field(pattern=r"^([0-9a-f]{64}( [0-9a-f]{64})*)?$")] = ""
     """Public keys (hex, separated by spaces) of servers whose operators' retracts and prior data count here."""
+    public_urls: Annotated[str, AfterValidator(_origins)] = ""
+    """URLs under which robots ask this server (https://maps.example.org), separated by spaces, where a proxy or a name
+    service gives it names of its own: robots prove their keys to these names only."""
     quotas: Quotas = Quotas()
     """Bounds on what each robot may push."""
     limit_concurrency: Annotated[int, Field(ge=2, le=100_000)] = 500

@@ -81,12 +81,14 @@ def test_a_proof_by_a_strangers_key_opens_nothing_and_is_not_shown_to_operators(
     for name, map_name in (("mole", THERE), ("nobody", THERE), ("mole", NOT_THERE)):
         author = Author(RobotName(name), KEYS[3].incarnation)
         challenge = guarded.http.get("/challenge").json()["challenge"]
-        mark = KEYS[3].sign_bytes(proof_bytes(map_name, author, challenge))
+        mark = KEYS[3].sign_bytes(proof_bytes(f"http://127.0.0.1:{guarded.port}", map_name, author, challenge))
         answers.append(
             guarded.http.post(
                 f"/maps/{map_name}/branches",
                 json={"robot": name, "incarnation": author.incarnation},
-                headers={"Cairn-Proof": KeyProof(author, challenge, (mark,)).to_text()},
+                headers={
+                    "Cairn-Proof": KeyProof(author, challenge, f"http://127.0.0.1:{guarded.port}", (mark,)).to_text()
+                },
             )
         )
     assert {status_and_body(each)[0] for each in answers} == {401}

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Self
 from pydantic import TypeAdapter, ValidationError
 
 from cairn_client.http.answer_reading import CODING, body_of_error, header_text, parts_of, sent_again
-from cairn_client.http.origin_tokens import origin_of, without_token
+from cairn_client.http.origin_tokens import without_token
 from cairn_client.sync.requests import Box, GetUpload, PutPart
 from cairn_client.sync.responses import Answer, FetchedCell, Traffic, error_of, list_of, unreachable
 from cairn_map.commits.commit import Commit
@@ -57,6 +57,7 @@ from cairn_map.wire.messages import (
     check_json_size,
     message_from_json,
 )
+from cairn_map.wire.origins import origin_of
 from cairn_map.wire.resumed_replies import Replies
 
 OPENED = ("connection.connect_tcp.complete", "connection.start_tls.complete")

@@ -11,31 +11,12 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Self
-from urllib.parse import urlsplit
 
-from cairn_map.errors import BadInputError, DeniedError
+from cairn_map.errors import DeniedError
+from cairn_map.wire.origins import origin_of
 
-DEFAULT_PORTS = {"http": 80, "https": 443}
 NAMED = re.compile(r"(https?://[^\s=/]+)/?=(\S+)")
 """`ORIGIN=TOKEN`."""
-
-
-def origin_of(url: str) -> str:
-    """Origin of a URL: `http://base:8750`, with the host in lower case and the port in figures.
-
-    Raises:
-        BadInputError: kind `bad_url`.
-    """
-    try:
-        parts = urlsplit(url)
-        host, port = parts.hostname, parts.port
-    except ValueError:
-        host = port = None
-        parts = urlsplit("")
-    if parts.scheme not in DEFAULT_PORTS or not host:
-        raise BadInputError("bad_url", f"a server's URL is http://HOST:PORT, got {url[:200]!r}")
-    shown = f"[{host}]" if ":" in host else host
-    return f"{parts.scheme}://{shown}:{port or DEFAULT_PORTS[parts.scheme]}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,19 +5,19 @@
     token refused                  register by a proof of the key alone, which an operator lets in
 
 A server that refuses a token may be a stranger in the right one's place, so no secret answers it: neither the enrolment
-token nor anything that could be used elsewhere.
+token nor anything that could be used elsewhere. A proof names the server that it is for, as the robot's URL names it.
 """
 
 from collections.abc import Callable, Sequence
 from typing import ParamSpec, TypeVar
 
 from cairn_client.http.api import MapApi
-from cairn_client.http.origin_tokens import origin_of
 from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_state import ReplicaState
 from cairn_map.commits.key_proof import KeyProof, proof_bytes
 from cairn_map.errors import BadInputError, CairnError, DeniedError, UnreachableError
 from cairn_map.wire.messages import Mode, Register, Registered
+from cairn_map.wire.origins import origin_of
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -133,12 +133,15 @@ class Membership:
         author = self._replica.author
         try:
             challenge = self._api.challenge()
-            signed = self._replica.sign_bytes(proof_bytes(self._map_name, author, challenge))
-            proof = KeyProof(author, challenge, signed).to_text()
+            asked = self._api.origin
+            signed = self._replica.sign_bytes(proof_bytes(asked, self._map_name, author, challenge))
+            proof = KeyProof(author, challenge, asked, signed).to_text()
             return self._api.register(self._map_name, self._request(), proof=proof)
         except UnreachableError:
             raise
         except CairnError as exc:
+            if exc.kind == "other_origin":
+                raise DeniedError(refusal.kind, f"the server does not take this robot's proof: {exc.message}") from exc
             raise DeniedError(
                 refusal.kind,
                 f"the server does not let this robot in: {refusal.message}. The robot maps on, and keeps its commits. "

@@ -31,21 +31,37 @@ class Challenges:
         made = f"{round(self._steady_s() * 1000):0{TIME_DIGITS}x}"
         return made + self._code(made)
 
-    def signers(self, proof: KeyProof, *, map_name: str) -> frozenset[Incarnation]:
-        """Incarnations whose keys a proof shows.
+    def signers(self, proof: KeyProof, *, map_name: str, own: frozenset[str]) -> frozenset[Incarnation]:
+        """Incarnations whose keys a proof shows; `own`: origins of this server, as in `access.own_names`.
 
         Raises:
+            BadInputError: kind `other_origin`: the proof was made for another server.
             BadInputError: kind `bad_signature`: the challenge is none of this server's or too old, or a signature is
                 not one of it.
         """
+        check_origin(proof, own=own)
         made, code = proof.challenge[:TIME_DIGITS], proof.challenge[TIME_DIGITS:]
         if not hmac.compare_digest(code, self._code(made)):
             raise BadInputError("bad_signature", "the proof answers no challenge of this server; ask for a new one")
         if self._steady_s() - int(made, 16) / 1000 > LIFETIME_S:
             raise BadInputError("bad_signature", f"the challenge is older than {LIFETIME_S:.0f} s; ask for a new one")
-        if not are_valid(proof.signatures, proof_bytes(map_name, proof.author, proof.challenge)):
+        if not are_valid(proof.signatures, proof_bytes(proof.origin, map_name, proof.author, proof.challenge)):
             raise BadInputError("bad_signature", f"a signature of the proof is not one for {proof.author} on this map")
         return frozenset(incarnation_of(signature.key) for signature in proof.signatures)
 
     def _code(self, made: str) -> str:
         return hmac.new(self._secret, made.encode(), hashlib.sha256).hexdigest()
+
+
+def check_origin(proof: KeyProof, *, own: frozenset[str]) -> None:
+    """Refuse a proof that was made for another server.
+
+    Raises:
+        BadInputError: kind `other_origin`.
+    """
+    if proof.origin not in own:
+        raise BadInputError(
+            "other_origin",
+            f"this proof was made for {proof.origin}, and this server answers to {', '.join(sorted(own))}. If "
+            f"{proof.origin} is one of its names, its administrator starts it with --public-url {proof.origin}",
+        )

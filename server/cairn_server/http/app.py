@@ -8,6 +8,7 @@ from starlette.middleware import Middleware
 
 from cairn_server.access.body_budget import BodyBudget
 from cairn_server.access.connection_places import ConnectionPlaces
+from cairn_server.access.own_names import OwnNames
 from cairn_server.access.turns import Turns
 from cairn_server.http.middleware.body_limit import BodyLimit, turns_of_long_bodies
 from cairn_server.http.middleware.connection_shares import ConnectionShares
@@ -55,6 +56,7 @@ def make_app(service: Service, *, long_bodies: LongBodies | None = None) -> Fast
     settings = service.settings
     lanes, bodies = Lanes(), BodyBudget(settings.body_memory_bytes)
     reading = turns_of_long_bodies()
+    own_names = OwnNames.of(settings)
     places = ConnectionPlaces(settings.limit_concurrency, trusted_proxies=settings.trusted_proxies)
     app = DocumentedApp(
         title="cairn map server",
@@ -63,10 +65,11 @@ def make_app(service: Service, *, long_bodies: LongBodies | None = None) -> Fast
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,
-        middleware=list(_middleware(service, lanes, bodies, reading, places)),
+        middleware=list(_middleware(service, own_names, lanes, bodies, reading, places)),
         exception_handlers=PROBLEM_HANDLERS,
     )
     app.state.service = service
+    app.state.own_names = own_names
     app.state.lanes, app.state.bodies, app.state.reading, app.state.places = lanes, bodies, reading, places
     app.state.long_bodies = long_bodies or LongBodies()
     app.state.console_files = console_routes.ConsoleFiles()
@@ -76,7 +79,12 @@ def make_app(service: Service, *, long_bodies: LongBodies | None = None) -> Fast
 
 
 def _middleware(
-    service: Service, lanes: Lanes, bodies: BodyBudget, reading: Turns, places: ConnectionPlaces
+    service: Service,
+    own_names: OwnNames,
+    lanes: Lanes,
+    bodies: BodyBudget,
+    reading: Turns,
+    places: ConnectionPlaces,
 ) -> Iterator[Middleware]:
     """Middleware in the order in which a request passes it; the answer passes it in reverse."""
     yield Middleware(DeniedHandshakes)
@@ -85,7 +93,7 @@ def _middleware(
         yield Middleware(SameOrigin, host=service.settings.host)
     yield Middleware(ProtocolVersion)
     yield Middleware(PlainPath)
-    yield Middleware(TokenFirst, service=service)
+    yield Middleware(TokenFirst, service=service, own_names=own_names)
     yield Middleware(ConnectionShares, places=places)
     yield Middleware(BodyLimit, budget=bodies, turns=reading)
     yield Middleware(WorkTurns, lanes=lanes, stop=service.stop_time)

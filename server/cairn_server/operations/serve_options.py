@@ -53,7 +53,9 @@ SECRETS = {
     "upstream_token": "--upstream-token-file",
 }
 """Flag of each secret: the file that holds it, since other users see a process's arguments."""
-OTHER_FLAGS = {"metrics_open": "--metrics-open", "trusted_servers": "--trust-server"}
+OTHER_FLAGS = {"metrics_open": "--metrics-open", "trusted_servers": "--trust-server", "public_urls": "--public-url"}
+REPEATED = frozenset({"trusted_servers", "public_urls"})
+"""Settings whose flags may be repeated; their values are separated by spaces."""
 MOVED = {
     "--limit-concurrency": ("limit_concurrency", 1),
     "--min-rate": ("body_bytes_per_s", 1),
@@ -91,6 +93,14 @@ def serve_parser(description: str | None) -> argparse.ArgumentParser:
         action="append",
         metavar="KEY",
         help="public key of a server whose operators' retracts, brought by a relay, count here; may be repeated",
+    )
+    parser.add_argument(
+        "--public-url",
+        dest="public_urls",
+        action="append",
+        metavar="URL",
+        help="URL under which robots ask this server, where its own address or certificate does not say it (behind a "
+        "proxy, by a name of DNS): robots prove their keys to these names only; may be repeated",
     )
     parser.add_argument("--metrics-open", action="store_true", help=_help(Settings, "metrics_open"))
     forms = [str(form) for form in LogForm]
@@ -130,8 +140,8 @@ def settings_of(args: argparse.Namespace) -> Settings:
     """
     # Flags: only those given are in `args`.
     given = {name: value for name, value in vars(args).items() if name in Settings.model_fields}
-    if "trusted_servers" in given:
-        given["trusted_servers"] = " ".join(given["trusted_servers"])
+    for name in REPEATED.intersection(given):
+        given[name] = " ".join(given[name])
     for name in SECRETS:
         path = getattr(args, f"{name}_file", None)
         if path is not None:

@@ -17,7 +17,7 @@ from cairn_map.commits.key_proof import KeyProof
 from cairn_map.errors import BadInputError, CairnError, DeniedError, UnreachableError
 from cairn_map.wire.access_messages import AskingRobot, KeyInfo, RobotKeyList
 from cairn_server.access.auth import Caller, Role
-from cairn_server.access.challenges import Challenges
+from cairn_server.access.challenges import Challenges, check_origin
 from cairn_server.access.rate_limits import HOUR_S, Allowance, allowance
 from cairn_server.access.shared_places import SharedPlaces
 from cairn_server.settings import Quotas
@@ -44,19 +44,27 @@ class Admissions:
         self._asking: defaultdict[int, _Asking] = defaultdict(lambda: _Asking(ASKING_MAX))
         """By map; the asker is the name."""
 
-    def returning(self, map_name: str, proof_text: str) -> Caller:
+    def returning(self, map_name: str, proof_text: str, *, own: frozenset[str]) -> Caller:
         """Caller that shows no token, but the key of a robot that an operator lets in: it may register this robot.
 
+        Args:
+            map_name: map that the robot wants to be on.
+            proof_text: text of the header `Cairn-Proof`.
+            own: origins of this server, as in `access.own_names`.
+
         Raises:
+            BadInputError: kind `other_origin`: the proof was made for another server; kind `bad_signature`,
+                `bad_name` or `bad_id`: it is malformed.
             DeniedError: kind `no_token`: no operator said so, or the proof does not hold. It does not say which, nor
                 whether there is such a map.
         """
+        proof = KeyProof.from_text(proof_text)
+        check_origin(proof, own=own)
         with suppress(CairnError):
-            proof = KeyProof.from_text(proof_text)
             row = self._store.map(map_name)
             key = self._store.keys.of(row, proof.author.robot).get(proof.author.incarnation)
             may_return = key is not None and key.may_return
-            if may_return and proof.author.incarnation in self.challenges.signers(proof, map_name=row.name):
+            if may_return and proof.author.incarnation in self.challenges.signers(proof, map_name=row.name, own=own):
                 return Caller(Role.ENROLLER, proof.author.robot, str(proof.author), row.number, is_returning=True)
         raise DeniedError(
             "no_token",
@@ -64,12 +72,16 @@ class Admissions:
         )
 
     @contextmanager
-    def registering(self, row: MapRow, caller: Caller, author: Author, proof_text: str | None) -> Iterator[Grounds]:
+    def registering(
+        self, row: MapRow, caller: Caller, author: Author, proof_text: str | None, *, own: frozenset[str]
+    ) -> Iterator[Grounds]:
         """Context of a registration, with the grounds of its caller; one that fails costs no quota.
+
+        `own`: origins of this server, as in `access.own_names`.
 
         Raises:
             DeniedError: kind `not_allowed`: the token is for another robot.
-            BadInputError: kind `bad_signature`: the proof does not hold.
+            BadInputError: kind `bad_signature` or `other_origin`: the proof does not hold.
             UnreachableError: kind `quota`: the enrolment token registered too many for now.
         """
         is_for_robot = caller.robot == author.robot
@@ -78,7 +90,7 @@ class Admissions:
         signers: frozenset[Incarnation] = frozenset()
         if proof_text is not None:
             proof = KeyProof.from_text(proof_text)
-            signers = self.challenges.signers(proof, map_name=row.name) if proof.author == author else signers
+            signers = self.challenges.signers(proof, map_name=row.name, own=own) if proof.author == author else signers
         has_word = caller.role is Role.ADMIN or (caller.role is Role.ENROLLER and is_for_robot)
         self._take(caller)
         try:

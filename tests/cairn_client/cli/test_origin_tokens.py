@@ -16,8 +16,9 @@ from tests.fixtures.commands import cairn
 
 from cairn_client.cli.arguments import AddTokens, CommandParser
 from cairn_client.http.api import MapApi
-from cairn_client.http.origin_tokens import NO_TOKENS, origin_of
+from cairn_client.http.origin_tokens import NO_TOKENS
 from cairn_map.errors import BadInputError, CairnError, DeniedError
+from cairn_map.wire.origins import origin_of
 
 OTHER = "token-of-the-other-server"
 
@@ -121,6 +122,7 @@ def test_no_redirect_carries_a_token_on(other: Stranger) -> None:
         ("https://base:443", "https://base:443"),
         ("http://[::1]:8750/maps/lab", "http://[::1]:8750"),
         ("http://user@base:1/maps/lab", "http://base:1"),
+        ("http://bücher:80", "http://xn--bcher-kva:80"),
     ],
 )
 def test_an_origin_is_scheme_host_and_port(url: str, origin: str) -> None:

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tests.fixtures.client.hostile_server import HostileServer, forwarded
 from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import MAP, cells_of
 from tests.fixtures.client.robots import ADMIN, TOKEN, evidence_of, map_commit, robot_in
@@ -75,6 +76,32 @@ def test_a_robot_whose_token_was_ended_comes_back_by_an_operators_word_alone(
         assert robot.sync().pushed == 1
         admin.rotate_token(f"{MAP}:mole")
         assert refusal(robot).kind == "bad_token"  # the word was for one time
+
+
+def test_a_proof_that_another_server_hands_on_opens_nothing_and_one_under_a_public_name_does(
+    guarded: LiveServer, admin: MapApi, tmp_path: Path
+) -> None:
+    def hand_on(request: bytes) -> Iterator[bytes]:
+        yield forwarded(guarded.port, request)
+
+    with HostileServer(hand_on) as between:
+        there = f"{between.url}/maps/{MAP}"
+        with robot_in(tmp_path, there, token=TOKEN, stay=True) as robot:
+            map_commit(robot, 1)
+            robot.sync()
+            admin.rotate_token(f"{MAP}:mole")
+            admin.admit(MAP, robot.replica.author)
+            error = refusal(robot)
+            assert error.kind == "bad_token"
+            assert f"made for {between.url}" in error.message
+            assert f"--public-url {between.url}" in error.message
+            heads = [head for head in between.requests if b"cairn-proof" in head.lower()]
+            assert len(heads) == 1
+            guarded.stop()
+            guarded.settings = guarded.settings.model_copy(update={"public_urls": between.url})
+            guarded.start()
+            map_commit(robot, 2)
+            assert robot.sync().pushed == 1
 
 
 def test_a_robot_that_lost_its_disk_maps_on_and_is_let_in_by_an_operator(

@@ -17,6 +17,7 @@ from cairn_map.commits.ids import Author, Incarnation
 from cairn_map.commits.key_proof import KeyProof, proof_bytes
 from cairn_map.errors import BadInputError
 from cairn_map.wire.access_messages import CreateToken
+from cairn_map.wire.origins import origin_of
 from cairn_server.access import challenges
 from cairn_server.access.auth import ADMIN_FILE
 from cairn_server.access.challenges import Challenges
@@ -25,6 +26,8 @@ from cairn_server.settings import Quotas
 from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.admissions import ASKING_MAX
 
+BASE = "http://base:8750"
+
 
 @pytest.fixture(scope="module")
 def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
@@ -32,11 +35,13 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
         yield live
 
 
-def proof_of(live: Live, map_name: str, author: Author, *signers: Author) -> dict[str, str]:
+def proof_of(live: Live, map_name: str, author: Author, *signers: Author, asked: str | None = None) -> dict[str, str]:
+    """Header of a proof over the server's challenge, by a robot that asked this server or another one."""
     challenge = live.http.get("/challenge").json()["challenge"]
-    message = proof_bytes(map_name, author, challenge)
+    origin = asked or origin_of(str(live.http.base_url))
+    message = proof_bytes(origin, map_name, author, challenge)
     signatures = tuple(KEY_OF[signer].sign_bytes(message) for signer in signers or (author,))
-    return {"Cairn-Proof": KeyProof(author, challenge, signatures).to_text()}
+    return {"Cairn-Proof": KeyProof(author, challenge, origin, signatures).to_text()}
 
 
 def register(live: Live, row: MapRow, author: Author, headers: dict[str, str]) -> httpx.Response:
@@ -70,14 +75,14 @@ def test_a_proof_is_for_one_robot_on_one_map_and_a_minute(guarded: Live) -> None
     row, _ = known_mole(guarded)
     other = guarded.new_map()
     sound = proof_of(guarded, row.name, OLD_MOLE, OLD_MOLE, MOLE)["Cairn-Proof"]
-    author, challenge, marks = sound.split(" ")
+    author, challenge, origin, marks = sound.split(" ")
     wrong = [
-        f"{author} {challenge[:-1]}{'0' if challenge[-1] != '0' else '1'} {marks}",
-        f"{author} {challenge} {marks.replace(marks[70], '0' if marks[70] != '0' else '1', 1)}",
+        f"{author} {challenge[:-1]}{'0' if challenge[-1] != '0' else '1'} {origin} {marks}",
+        f"{author} {challenge} {origin} {marks.replace(marks[70], '0' if marks[70] != '0' else '1', 1)}",
         proof_of(guarded, other.name, OLD_MOLE, MOLE)["Cairn-Proof"],
         "x" * 5000,
         "mole",
-        f"{author} {challenge} -",
+        f"{author} {challenge} {origin} -",
     ]
     for text in wrong:
         answer = register(guarded, row, OLD_MOLE, bearer(ENROLLER) | {"Cairn-Proof": text})
@@ -87,16 +92,37 @@ def test_a_proof_is_for_one_robot_on_one_map_and_a_minute(guarded: Live) -> None
     assert register(guarded, row, OLD_MOLE, bearer(ENROLLER) | {"Cairn-Proof": sound}).status_code == 201
 
 
+def test_a_proof_made_for_another_server_is_refused_and_names_both(guarded: Live) -> None:
+    row, _ = known_mole(guarded)
+    own = f"127.0.0.1:{guarded.port}"
+    for asked in (BASE, f"https://{own}", f"http://127.0.0.1:{guarded.port + 1}"):
+        proof = proof_of(guarded, row.name, OLD_MOLE, OLD_MOLE, MOLE, asked=asked)
+        for shown in (bearer(ENROLLER), {}):
+            answer = register(guarded, row, OLD_MOLE, proof | shown)
+            assert (answer.status_code, kind_of(answer)) == (400, "other_origin")
+            assert f"made for {asked}" in answer.json()["detail"]
+            assert f"http://{own}" in answer.json()["detail"]
+
+
+def test_a_proof_of_the_form_that_names_no_server_is_refused_with_the_way_out(guarded: Live) -> None:
+    row, _ = known_mole(guarded)
+    author, challenge, _, marks = proof_of(guarded, row.name, MOLE)["Cairn-Proof"].split(" ")
+    for shown in (bearer(ENROLLER), {}):
+        answer = register(guarded, row, MOLE, {"Cairn-Proof": f"{author} {challenge} {marks}"} | shown)
+        assert (answer.status_code, kind_of(answer)) == (400, "bad_signature")
+        assert "update" in answer.json()["detail"]
+
+
 def test_a_challenge_ends_after_a_minute_and_with_the_process() -> None:
     now_s = itertools.count(5.0, challenges.LIFETIME_S * 0.6)
     one, other = Challenges(steady_s=lambda: next(now_s)), Challenges()
     text = one.new()
-    message = proof_bytes("lab", MOLE, text)
-    proof = KeyProof(MOLE, text, (KEY_OF[MOLE].sign_bytes(message),))
-    assert one.signers(proof, map_name="lab") == {MOLE.incarnation}
+    message = proof_bytes(BASE, "lab", MOLE, text)
+    proof = KeyProof(MOLE, text, BASE, (KEY_OF[MOLE].sign_bytes(message),))
+    assert one.signers(proof, map_name="lab", own=frozenset({BASE})) == {MOLE.incarnation}
     for asked in (one, other):
         with pytest.raises(BadInputError, match="challenge"):
-            asked.signers(proof, map_name="lab")
+            asked.signers(proof, map_name="lab", own=frozenset({BASE}))
 
 
 def test_without_a_token_only_the_key_that_an_operator_lets_in_registers_and_once(guarded: Live) -> None:

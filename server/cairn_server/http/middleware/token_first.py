@@ -11,8 +11,9 @@ import re
 from collections.abc import Hashable, Iterable, MutableMapping
 from typing import Any
 
-from cairn_map.errors import CairnError, DeniedError
+from cairn_map.errors import BadInputError, CairnError, DeniedError
 from cairn_server.access.auth import Caller, Role, caller_of
+from cairn_server.access.own_names import OwnNames
 from cairn_server.http.middleware.asgi import App, Receive, Send, send_problem
 from cairn_server.service import Service
 
@@ -27,10 +28,11 @@ STATE = "caller"
 
 
 class TokenFirst:
-    """Middleware that answers 401 to a request with a body and without a known token."""
+    """Middleware that answers 401 to a request with a body and without a known token, 400 to a proof that is none."""
 
-    def __init__(self, app: App, *, service: Service) -> None:
+    def __init__(self, app: App, *, service: Service, own_names: OwnNames) -> None:
         self._app = app
+        self._own_names = own_names
         self._service = service
 
     async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
@@ -38,11 +40,11 @@ class TokenFirst:
         if scope["type"] in ("http", "websocket"):
             try:
                 caller = self._caller(scope)
-            except DeniedError as exc:
+            except (DeniedError, BadInputError) as exc:
                 # What needs no body may need no token either: that is the route's to know.
                 if scope["type"] == "http" and scope["method"] not in WITHOUT_BODY:
                     await _drop_small_body(scope, receive)
-                    await send_problem(send, 401, exc.kind, exc.message)
+                    await send_problem(send, 401 if isinstance(exc, DeniedError) else 400, exc.kind, exc.message)
                     return
             except CairnError:
                 pass  # a store that cannot be asked is the route's to report
@@ -60,7 +62,9 @@ class TokenFirst:
             proof, path = _first(scope["headers"], b"cairn-proof"), REGISTRATION.fullmatch(scope["path"])
             if token is not None or not proof or path is None:
                 raise
-            return self._service.sync.admissions.returning(path[1], proof)
+            return self._service.sync.admissions.returning(
+                path[1], proof, own=self._own_names.origins(scope["scheme"], scope["server"])
+            )
 
 
 async def _drop_small_body(scope: MutableMapping[str, Any], receive: Receive) -> None:

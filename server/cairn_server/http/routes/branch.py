@@ -10,7 +10,17 @@ from cairn_map.commits.key_proof import PROOF_TEXT_MAX
 from cairn_map.wire.access_messages import Challenge, RobotClosed, RobotKeyList, RobotUse
 from cairn_map.wire.messages import BranchInfo, Register, Registered, RobotStatus
 from cairn_server.access.auth import Caller, Role
-from cairn_server.http.routes.callers import OWNERS, READERS, Map, Operations, allowed, body_of, own_branch, registrar
+from cairn_server.http.routes.callers import (
+    OWNERS,
+    READERS,
+    Map,
+    Operations,
+    OwnOrigins,
+    allowed,
+    body_of,
+    own_branch,
+    registrar,
+)
 from cairn_server.http.routes.documentation import answers, body, json_body, problems
 from cairn_server.http.routes.json_bodies import json_of
 from cairn_server.store.shares import used_bounds
@@ -39,11 +49,12 @@ def register(
     row: Map,
     caller: Annotated[Caller, Depends(registrar)],
     body: Annotated[Register, json_of(Register)],
+    own: OwnOrigins,
     cairn_proof: Annotated[str | None, Header(max_length=PROOF_TEXT_MAX)] = None,
 ) -> Registered:
     """Register a robot; registering again replaces its token, and takes a proof that it is the same robot."""
     author = Author(RobotName(body.robot), Incarnation(body.incarnation))
-    with service.sync.admissions.registering(row, caller, author, cairn_proof) as grounds:
+    with service.sync.admissions.registering(row, caller, author, cairn_proof, own=own) as grounds:
         registered = service.maps.register(row, body, grounds)
     service.store.audit_log.add(caller.name, "register", f"map {row.name}: {body.robot}")
     return registered

@@ -16,6 +16,7 @@ from starlette.requests import HTTPConnection
 from cairn_map.commits.key_proof import PROOF_TEXT_MAX
 from cairn_map.errors import DeniedError, NotFoundError
 from cairn_server.access.auth import READING, Caller, Role, bad_token, caller_of, require, require_all_maps
+from cairn_server.access.own_names import OwnNames
 from cairn_server.service import Service
 from cairn_server.store.store_rows import MapRow
 
@@ -103,8 +104,20 @@ def allowed(*roles: Role) -> Callable[[Caller], Awaitable[Caller]]:
     return check
 
 
+async def own_origins(request: Request) -> frozenset[str]:
+    """Origins of this server that a proof may name which came with this request."""
+    names: OwnNames = request.app.state.own_names
+    return names.origins(request.scope["scheme"], request.scope["server"])
+
+
+OwnOrigins = Annotated[frozenset[str], Depends(own_origins)]
+
+
 async def registrar(
-    row: Map, asker: Asking, cairn_proof: Annotated[str | None, Header(max_length=PROOF_TEXT_MAX)] = None
+    row: Map,
+    asker: Asking,
+    own: OwnOrigins,
+    cairn_proof: Annotated[str | None, Header(max_length=PROOF_TEXT_MAX)] = None,
 ) -> Caller:
     """The caller, if it may register robots: by a token, or without one by a key that an operator lets in."""
     try:
@@ -112,7 +125,7 @@ async def registrar(
     except DeniedError:
         if asker.credentials is not None or cairn_proof is None:
             raise
-        return asker.service.sync.admissions.returning(row.name, cairn_proof)
+        return asker.service.sync.admissions.returning(row.name, cairn_proof, own=own)
     require(caller, Role.ENROLLER)
     return caller
 
