@@ -136,6 +136,7 @@ def test_the_limits_of_push_in_the_document_are_those_of_the_code() -> None:
         f"lists {missing.RETRACTS_MAX} of them",
         f"those of {missing.PENDING_AUTHORS_MAX} authors",
         f"| {shares.INTERVALS_OF_RESERVE_MAX:_} |".replace("_", " "),
+        f"| {shares.AUTHORS_OF_RESERVE_MAX:_} |".replace("_", " "),
         f"| {shares.limits_of(shares.RESERVE, 3)[0]:_} |".replace("_", " "),
         f"| 2^{int(shares.limits_of(shares.RESERVE, 3)[2]).bit_length() - 1} |",
         f"at most {cell_changes.DELTA_ENTRIES_MAX} entries",

@@ -17,10 +17,10 @@ from cairn_server.store.admission import RobotKey
 from cairn_server.store.numbering import AGAIN_KEPT_S, EvidenceGoneError, Numbering, check_number
 from cairn_server.store.shares import (
     ALARM_PART,
-    INTERVALS_OF_RESERVE_MAX,
     RESERVE,
     Tops,
     account_of,
+    check_reserve,
     check_sums,
     used_part,
 )
@@ -267,11 +267,14 @@ class MemoryMap:
         if not own or robot in SERVERS_OWN:
             raise NotFoundError("no_author", f"robot {robot!r} has no commits in map {self.row.name} to close")
         intervals = sum(self.authors[author][1] for author in own)
-        reserved = sum(share.intervals for share in self.shares() if share.robot == RESERVE)
-        if reserved + intervals > INTERVALS_OF_RESERVE_MAX:
-            raise ConflictError("reserve_full", "there is no room for more closed authors")
+        reserved = [share for share in self.shares() if share.robot == RESERVE]
         reserve = self.held(RESERVE)
         try:
+            check_reserve(
+                authors=len(own) + sum(share.incarnations for share in reserved),
+                intervals=intervals + sum(share.intervals for share in reserved),
+                what=robot,
+            )
             for key, tops in self.held(robot).items():
                 check_sums(RESERVE, key, _sum(tops, reserve.get(key)), self.row.geometry)
         except BadInputError as exc:

@@ -8,9 +8,9 @@ from cairn_map.errors import BadInputError, ConflictError
 from cairn_server.store.shares import (
     CARRIED_ROBOTS_MAX,
     INCARNATIONS_MAX,
-    INTERVALS_OF_RESERVE_MAX,
     INTERVALS_OF_ROBOT_MAX,
     ROBOTS_MAX,
+    check_reserve,
 )
 
 AHEAD_MAX = 10_000
@@ -65,7 +65,8 @@ def check_number(commit: CommitId, known: Numbering) -> None:
     if robot in SERVERS_OWN:
         # A server's own retracts have an incarnation for each of its starts, and nothing can be in their way.
         if robot != OPERATOR:
-            _check_reserve(commit, known)
+            authors = known.incarnations + (known.top is None)
+            check_reserve(authors=authors, intervals=known.intervals + 1, what=str(commit))
         return
     closing = f"an administrator can begin its numbers again with `cairn map robots close MAP {robot}`"
     is_new = known.top is None
@@ -93,15 +94,6 @@ def check_number(commit: CommitId, known: Numbering) -> None:
             f"the numbers of robot {robot} have {known.intervals} intervals in all its incarnations, and may have "
             f"{INTERVALS_OF_ROBOT_MAX}: {commit} would begin another; push the commits between them first, or "
             f"{closing}",
-        )
-
-
-def _check_reserve(commit: CommitId, known: Numbering) -> None:
-    if known.intervals >= INTERVALS_OF_RESERVE_MAX:
-        raise BadInputError(
-            "too_many_authors",
-            f"the servers' own and closed authors have {known.intervals} intervals, and may have "
-            f"{INTERVALS_OF_RESERVE_MAX}: there is no place for {commit}; begin a new map",
         )
 
 

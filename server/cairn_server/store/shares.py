@@ -38,12 +38,16 @@ INCARNATIONS_MAX = 16
 INTERVALS_OF_ROBOT_MAX = 24
 """Most intervals of the numbers of one robot, all incarnations together. Robots push oldest first, so that each
 incarnation has one interval, and one more for each commit that the server refused for good."""
-INTERVALS_MAX = 11_264
+RESERVE_MORE = 256
+"""Room in the reserve for more than all robots at their most: the servers' own authors, and closings of before."""
+INTERVALS_OF_RESERVE_MAX = ROBOTS_MAX * INTERVALS_OF_ROBOT_MAX + RESERVE_MORE
+"""Most intervals of the servers' own and of closed authors: every place can be given back, however full its share."""
+AUTHORS_OF_RESERVE_MAX = ROBOTS_MAX * INCARNATIONS_MAX + RESERVE_MORE
+"""Most of these authors."""
+INTERVALS_MAX = ROBOTS_MAX * INTERVALS_OF_ROBOT_MAX + INTERVALS_OF_RESERVE_MAX
 """Most intervals of the numbers of all authors of a map. Its vector is in every reply: with the longest name and
 numbers an author takes 88 bytes, and each of its intervals beyond the first 34."""
-INTERVALS_OF_RESERVE_MAX = INTERVALS_MAX - ROBOTS_MAX * INTERVALS_OF_ROBOT_MAX
-"""Most intervals, and so most authors, of the servers' own and of closed robots."""
-AUTHORS_MAX = ROBOTS_MAX * INCARNATIONS_MAX + INTERVALS_OF_RESERVE_MAX
+AUTHORS_MAX = ROBOTS_MAX * INCARNATIONS_MAX + AUTHORS_OF_RESERVE_MAX
 """Most authors of a map."""
 ALARM_PART = 0.5
 """Part of a share above which it is reported."""
@@ -101,9 +105,27 @@ def check_sums(account: str, region: int, total: Tops, geometry: Geometry) -> No
 
 def used_bounds(share: RobotShares) -> dict[str, float]:
     """Part that is used of each bound, by its name."""
-    most = INTERVALS_OF_ROBOT_MAX if share.robot else INTERVALS_OF_RESERVE_MAX
-    incarnations = {"incarnations": share.incarnations / INCARNATIONS_MAX} if share.robot else {}
-    return {"sums": share.sums or 0.0, **incarnations, "intervals": share.intervals / most}
+    intervals_max = INTERVALS_OF_ROBOT_MAX if share.robot else INTERVALS_OF_RESERVE_MAX
+    authors_max = INCARNATIONS_MAX if share.robot else AUTHORS_OF_RESERVE_MAX
+    return {
+        "sums": share.sums or 0.0,
+        "incarnations": share.incarnations / authors_max,
+        "intervals": share.intervals / intervals_max,
+    }
+
+
+def check_reserve(*, authors: int, intervals: int, what: str) -> None:
+    """Refuse authors and intervals beyond the reserve; `what` would add the last of them.
+
+    Raises:
+        BadInputError: kind `too_many_authors`.
+    """
+    if authors > AUTHORS_OF_RESERVE_MAX or intervals > INTERVALS_OF_RESERVE_MAX:
+        raise BadInputError(
+            "too_many_authors",
+            f"with {what} the servers' own and closed authors would be {authors} with {intervals} intervals of "
+            f"numbers, and may be {AUTHORS_OF_RESERVE_MAX} with {INTERVALS_OF_RESERVE_MAX}: begin a new map",
+        )
 
 
 def check_old_sums(old: Tops) -> None:

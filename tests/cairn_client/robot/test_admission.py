@@ -176,3 +176,17 @@ def test_a_robot_with_a_given_token_and_a_new_key_fetches_and_says_what_it_waits
     admin.admit(MAP, robot.replica.author)
     with robot_in(folder, guarded.map_url, token=given, stay=True) as robot:
         assert robot.sync().pushed == 2
+
+
+def test_an_administrator_closes_all_robots_that_one_token_made(
+    guarded: LiveServer, admin: MapApi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CAIRN_TOKEN", ADMIN)
+    gate = admin.create_token("gate", CreateToken(role="enroller", map=MAP)).token
+    for name, token in (("mole", TOKEN), ("wren", gate), ("dove", gate)):
+        with robot_in(tmp_path, guarded.map_url, name=name, token=token, stay=True) as robot:
+            map_commit(robot, 1)
+            robot.sync()
+    closed = cairn("map", "robots", "close", guarded.map_url, "--by", "gate", folder=tmp_path).splitlines()
+    assert [line.split(":")[0] for line in closed] == ["dove", "wren"]
+    assert {use.robot for use in admin.robot_uses(MAP)} == {None, "mole"}

@@ -16,18 +16,19 @@ from hypothesis import strategies as st
 from tests.fixtures.map.made import SMALL, surface_evidence
 from tests.fixtures.server.access import ADMIN, ENROLLER, bearer, robot_token
 from tests.fixtures.server.answers import kind_of
+from tests.fixtures.server.crowded_map import add_authors, long_author
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import KEYS, pushed
 from tests.fixtures.server.shares_contract import author_of
 
 from cairn_map.commits.commit import Commit, CommitMeta, ScanPose, make_commit
 from cairn_map.commits.ids import CommitId
-from cairn_map.errors import CairnError
+from cairn_map.errors import CairnError, ConflictError
 from cairn_map.evidence.channels import SAMPLE_MAX
 from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.grid import CellKey, cell_key
 from cairn_server.access import quotas
-from cairn_server.store.shares import INCARNATIONS_MAX, INTERVALS_OF_ROBOT_MAX
+from cairn_server.store.shares import INCARNATIONS_MAX, INTERVALS_OF_ROBOT_MAX, RESERVE_MORE, ROBOTS_MAX
 from cairn_server.store.store_rows import MapRow
 
 SCANS_MAX = 4096
@@ -229,3 +230,28 @@ def test_closing_a_robot_is_an_administrator_s(guarded: Live) -> None:
     assert kind_of(guarded.http.post(url, headers=team._tokens["mole"])) == "not_allowed"
     missing = guarded.http.post(url.replace("mole", "owl"), headers=bearer(ADMIN))
     assert (missing.status_code, kind_of(missing)) == (404, "no_author")
+
+
+def test_an_administrator_gives_every_place_back_however_full_its_share(tmp_path: Path) -> None:
+    with Live(tmp_path) as live:
+        row, store = live.new_map(), live.service.store
+        beyond = INTERVALS_OF_ROBOT_MAX - INCARNATIONS_MAX
+        for robot in range(ROBOTS_MAX):
+            own = [long_author(robot, n) for n in range(INCARNATIONS_MAX)]
+            add_authors(store, row, {author: 2 if n < beyond else 1 for n, author in enumerate(own)})
+        newcomer = pushed(0, 0, author_of("newcomer"))
+        assert kind_of(live.push(row, newcomer)) == "too_many_authors"
+        for robot in range(ROBOTS_MAX):
+            store.shares.close(row, long_author(robot).robot)
+        live.push(row, newcomer).raise_for_status()
+        (fresh, reserve) = sorted(store.shares.of(row), key=lambda share: share.intervals)
+        assert (fresh.robot, reserve.incarnations, reserve.intervals) == (
+            "newcomer",
+            ROBOTS_MAX * INCARNATIONS_MAX,
+            ROBOTS_MAX * INTERVALS_OF_ROBOT_MAX,
+        )
+        more = {long_author(0, n): 1 for n in range(INCARNATIONS_MAX, 2 * INCARNATIONS_MAX)}
+        add_authors(store, row, more | {long_author(0, 99): RESERVE_MORE})
+        with pytest.raises(ConflictError) as refused:
+            store.shares.close(row, long_author(0).robot)
+        assert refused.value.kind == "reserve_full"

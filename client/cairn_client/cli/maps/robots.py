@@ -6,12 +6,14 @@
     wren              2          3  incarnations 6 %
     $ cairn map robots close http://127.0.0.1:8750/maps/lab mole
     mole: 1 incarnations closed; its next commits count from nothing
+    $ cairn map robots close http://127.0.0.1:8750/maps/lab --by lost-relay
     $ cairn map robots keys http://127.0.0.1:8750/maps/lab
     $ cairn map robots admit http://127.0.0.1:8750/maps/lab mole
 
 Each robot has shares of its own of what a map can hold, so that no robot can use up another's. `list` shows how full
 the fullest of them is, and what closed robots and the server itself use together. `close` takes nothing out of the map:
 the robot's incarnations take no more commits, the robot goes on with a new one, and all its shares are whole again.
+`--by` closes all robots that a stolen token brought, whose places it took (revoke the token first).
 A robot's name is bound to its first key: `keys` shows them, and robots that come with another one, as after the loss of
 a disk; `admit` says that it is the same robot.
 """
@@ -22,7 +24,9 @@ from collections.abc import Iterator
 
 from cairn_client.cli.arguments import Subparsers, add_map_parser, api_of, say
 from cairn_client.cli.maps.robot_keys import add_admit, add_keys
-from cairn_map.wire.access_messages import RobotUse
+from cairn_map.commits.ids import author_from_text
+from cairn_map.errors import NotFoundError
+from cairn_map.wire.access_messages import KeyInfo, RobotKeyList, RobotUse
 
 HEAD = ("robot", "incarnations", "intervals", "fullest")
 
@@ -45,7 +49,10 @@ def _add_list(commands: Subparsers) -> None:
 def _add_close(commands: Subparsers) -> None:
     text = "close a robot's incarnations, so that it begins again with whole shares; takes an admin's token"
     closing = add_map_parser(commands, "close", _close, text=text)
-    closing.add_argument("robot", metavar="NAME", help="the robot")
+    which = closing.add_mutually_exclusive_group(required=True)
+    which.add_argument("robot", metavar="NAME", nargs="?", help="the robot")
+    help_by = "all robots whose first key came by this token: of the enroller or relay that made or brought them"
+    which.add_argument("--by", metavar="TOKEN", help=help_by)
 
 
 def _list(args: argparse.Namespace) -> int:
@@ -76,6 +83,22 @@ def _row(use: RobotUse) -> tuple[str, ...]:
 def _close(args: argparse.Namespace) -> int:
     api, name = api_of(args.map, args.token)
     with api:
-        closed = api.close_robot(name, args.robot)
-    say(f"{closed.robot}: {closed.incarnations} incarnations closed; its next commits count from nothing")
+        for robot in [args.robot] if args.robot else _brought(api.keys(name), args.by, api.robot_uses(name)):
+            closed = api.close_robot(name, robot)
+            say(f"{closed.robot}: {closed.incarnations} incarnations closed; its next commits count from nothing")
     return 0
+
+
+def _brought(keys: RobotKeyList, by: str, uses: list[RobotUse]) -> list[str]:
+    """Robots to close whose first key came by a token; those without open incarnations hold no place.
+
+    Raises:
+        NotFoundError: kind `no_author`: there is none.
+    """
+    first: dict[str, KeyInfo] = {}
+    for key in sorted(keys.admitted, key=lambda key: key.since_s):
+        first.setdefault(author_from_text(key.author).robot, key)
+    found = [use.robot for use in uses if use.robot in first and first[use.robot].by == by]
+    if not found:
+        raise NotFoundError("no_author", f"no robot that may be closed came by the token {by}; see `map robots keys`")
+    return [robot for robot in found if robot is not None]

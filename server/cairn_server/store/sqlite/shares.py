@@ -16,11 +16,11 @@ from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_server.store.numbering import Numbering, check_number
 from cairn_server.store.shares import (
     ALARM_PART,
-    INTERVALS_OF_RESERVE_MAX,
     RESERVE,
     Tops,
     account_of,
     check_old_sums,
+    check_reserve,
     check_sums,
     used_part,
 )
@@ -106,17 +106,12 @@ def close_robot(connection: apsw.Connection, row: MapRow, robot: str) -> ClosedR
     authors, intervals = first(connection, f"{COUNTS} {OF_ROBOT}", (row.number, robot))
     if not authors or robot in SERVERS_OWN:
         raise NotFoundError("no_author", f"robot {robot!r} has no commits in map {row.name} that are its own to close")
-    reserved = first(connection, f"{COUNTS} map = ? AND {IS_RESERVE}", (row.number,))[1]
-    if reserved + intervals > INTERVALS_OF_RESERVE_MAX:
-        raise ConflictError(
-            "reserve_full",
-            f"closed authors and the server's own have {reserved} intervals of numbers, {robot} has {intervals}, and "
-            f"{INTERVALS_OF_RESERVE_MAX} is the most of a map: begin a new one",
-        )
+    reserved = first(connection, f"{COUNTS} map = ? AND {IS_RESERVE}", (row.number,))
     tops = _all_held(connection, row, robot)
     held = _all_held(connection, row, RESERVE)
     totals = {region: tuple(map(add, top, held[region])) if region in held else top for region, top in tops.items()}
     try:
+        check_reserve(authors=reserved[0] + authors, intervals=reserved[1] + intervals, what=robot)
         _check(connection, row, RESERVE, totals)
     except BadInputError as exc:
         raise ConflictError("reserve_full", f"{robot} cannot be closed: {exc.message}") from exc
