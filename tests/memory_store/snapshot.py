@@ -12,7 +12,16 @@ from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.wire.messages import LogEntry
-from cairn_server.store.store_rows import CellRow, ChainedEntry, Contribution, Entry, Head, Selection, Totals
+from cairn_server.store.store_rows import (
+    CAPTURED_AHEAD_MAX_S,
+    CellRow,
+    ChainedEntry,
+    Contribution,
+    Entry,
+    Head,
+    Selection,
+    Totals,
+)
 
 
 class MemorySnapshot:
@@ -56,6 +65,16 @@ class MemorySnapshot:
         """Highest folded number of an author and its SHA-256."""
         mine = [kept.new for kept in self._folded() if kept.new.id.author == author]
         return max(((commit.id.n, commit.sha) for commit in mine), default=None)
+
+    def newest_captured_s(self) -> float | None:
+        """Latest time at which a commit in the map says credibly that it was captured."""
+        times = [
+            kept.new.captured_s[1]
+            for kept in self._folded()
+            if kept.new.captured_s and kept.new.diff and not kept.unfolded_seq
+            if kept.new.captured_s[1] <= kept.received_s + CAPTURED_AHEAD_MAX_S
+        ]
+        return max(times, default=None)
 
     def commits_where(self, selection: Selection) -> list[CommitId]:
         """Every commit with evidence that fits and is not retracted, folded or not, in order of arrival."""

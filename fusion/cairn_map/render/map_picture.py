@@ -46,7 +46,8 @@ def layer_values(
         case Layer.AGE:
             if ages is None:
                 return np.full_like(seen.range_m, np.nan)
-            return ages.now - renderer.changed(snapshot, seen, ages.changes)
+            # What claims to be later than now is as new as anything.
+            return np.maximum(ages.now - renderer.changed(snapshot, seen, ages.changes), 0)
 
 
 def layer_picture(values: Values, seen: SurfaceImage, scale: Scale, spread: PoseSpread | None = None) -> Rgb:

@@ -78,6 +78,13 @@ class Snapshot(Protocol):
         """Highest folded number of an author and its SHA-256."""
         ...
 
+    def newest_captured_s(self) -> float | None:
+        """Latest time at which a commit in the map says that it was captured; None: none says it.
+
+        Commits that were taken out do not count, nor do those that came over `CAPTURED_AHEAD_MAX_S` before that time.
+        """
+        ...
+
     def commits_where(self, selection: Selection) -> list[CommitId]:
         """Every commit with evidence that fits and is not retracted, folded or not, in order of arrival."""
         ...

@@ -56,6 +56,10 @@ class NewCommit:
     """Grounds on which it speaks for its author."""
 
 
+CAPTURED_AHEAD_MAX_S = 600.0
+"""Lead of a robot's clock up to which the time that it states for a commit is believed."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredCommit:
     """A commit as it is read for folding."""

@@ -215,18 +215,19 @@ class MapViews:
         return found
 
     def _ages(self, task: _Task, drawing: Drawing) -> Ages:
-        """Times (UTC seconds) of the last measurement of everything seen, by the log's commits; now is the newest one.
+        """Times (UTC seconds) of the last measurement of everything seen; now is the newest one of what is in the map.
 
-        So the picture depends on the map alone. Where a commit states no time, the age is unknown.
+        So the picture depends on the map alone. Where a commit states no time, or one was taken out since, the age is
+        unknown.
         """
         slots = np.unique(drawing.seen.slots[drawing.seen.hit]).tolist()
         stamps = {key: self._stamps(task, key) for key in (drawing.snapshot.frozen.keys[slot] for slot in slots)}
         entries = {int(seq) for each in stamps.values() for seq in np.unique(each)} - {0}
-        head = task.snapshot.head.cursor
+        newest_s = task.snapshot.newest_captured_s()
         times = {seq: self._time_of(task, seq) for seq in sorted(entries)}
         numbers, moments = np.array([0, *times]), np.array([np.nan, *times.values()])
         changes = {key: moments[np.searchsorted(numbers, each)] for key, each in stamps.items()}
-        return Ages(changes, now=self._time_of(task, head.seq))
+        return Ages(changes, now=np.nan if newest_s is None else newest_s)
 
     def _stamps(self, task: _Task, key: CellKey) -> Stamps:
         """Stamps of a cell; if they are damaged, none, so that its age is unknown."""
@@ -240,14 +241,14 @@ class MapViews:
             return no_stamps(depth)
 
     def _time_of(self, task: _Task, seq: int) -> float:
-        """Time of the last scan of an entry's commit; NaN where it states none."""
+        """Time of the last scan of an entry's commit; NaN where it states none, or the entry takes it out."""
         chain = task.snapshot.chain_at(seq) or b""
         known = self._times.get(chain)
         if known is not None:
             return known
         task.check_time()
         entries = task.snapshot.log(after_seq=seq - 1, limit=1)
-        captured_s = entries[0].captured_s if entries else None
+        captured_s = entries[0].captured_s if entries and entries[0].kind == "+" else None
         time_s = captured_s[1] if captured_s else np.nan
         if len(self._times) >= TIMES_MAX:
             self._times.clear()  # another picture may look at the same time

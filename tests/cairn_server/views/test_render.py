@@ -130,6 +130,24 @@ def test_ages_are_counted_from_the_newest_measurement(live: Live) -> None:
     assert set(np.unique(alone["age_s"][~np.isnan(alone["age_s"])])) == {0.0}
 
 
+def test_a_time_that_only_a_commit_claims_makes_nothing_old_nor_does_its_retract(live: Live) -> None:
+    look = asking(layer=Layer.AGE, format="npz")
+    row = mapped(live, 0, 9)
+    later, earlier = (pushed(n, 1, captured_until_s=time_s) for n, time_s in ((2, 2e10), (10, 1.0)))
+    for commit in (later, earlier):
+        live.push(row, commit).raise_for_status()
+    live.folded(row)
+
+    def ages() -> set[float]:
+        told = arrays(ask(live, row, look))["age_s"]
+        return set(np.unique(told[~np.isnan(told)]).tolist())
+
+    assert ages() <= {0.0, 9.0, float(np.float32(1.5e9 + 9 - 1.0))}
+    live.retract(row, later, earlier).raise_for_status()
+    live.folded(row)
+    assert ages() <= {0.0, 9.0}
+
+
 def test_the_age_of_what_nobody_can_tell_it_of_any_more_is_unknown(live: Live) -> None:
     row, look = mapped(live, 0), asking(layer=Layer.AGE, format="npz")
     seen = ~np.isnan(arrays(ask(live, row, look))["range_m"])

@@ -8,6 +8,9 @@ import apsw
 
 from cairn_map.errors import BadInputError
 
+IS_MEASURED = "folded_seq IS NOT NULL AND unfolded_seq IS NULL AND cells > 0 AND captured_last_s <= received_s + 600"
+"""SQL of the commits in the map that say credibly when they were captured; seconds of `CAPTURED_AHEAD_MAX_S`."""
+
 FIRST = """
 CREATE TABLE map (
     number INTEGER PRIMARY KEY,
@@ -242,7 +245,11 @@ BRICKS = """
 ALTER TABLE commits ADD COLUMN bricks INTEGER NOT NULL DEFAULT 0;   -- of 8^3 voxels that it touches; 0: before quotas
 """
 
-STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS, RECEIVED, SIGNED, HOTTEST, AGES, SHARES, KEYS, ENDED, BRICKS)
+CAPTURED = f"""
+CREATE INDEX commits_captured ON commits (map, captured_last_s) WHERE {IS_MEASURED};
+"""
+
+STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS, RECEIVED, SIGNED, HOTTEST, AGES, SHARES, KEYS, ENDED, BRICKS, CAPTURED)
 
 
 def ensure_schema(connection: apsw.Connection) -> None:

@@ -14,6 +14,7 @@ from cairn_map.evidence.fingerprint import fingerprint_from_bytes
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.wire.messages import LogEntry
 from cairn_server.store.sqlite.failures import damaged_pages
+from cairn_server.store.sqlite.schema import IS_MEASURED
 from cairn_server.store.sqlite.writer import first, rows
 from cairn_server.store.store_rows import CellRow, ChainedEntry, Contribution, Head, Selection, Totals
 
@@ -111,6 +112,14 @@ class SqliteSnapshot:
             (self._map, *author),
         )
         return row
+
+    def newest_captured_s(self) -> float | None:
+        """Latest time at which a commit in the map says credibly that it was captured."""
+        query = (
+            f"SELECT captured_last_s FROM commits WHERE map = ? AND {IS_MEASURED} ORDER BY captured_last_s DESC LIMIT 1"  # noqa: S608 - our own clause
+        )
+        found: float | None = first(self._connection, query, (self._map,))
+        return found
 
     def commits_where(self, selection: Selection) -> list[CommitId]:
         """Every commit with evidence that fits and is not retracted, folded or not, in order of arrival."""
