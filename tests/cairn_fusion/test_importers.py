@@ -175,6 +175,19 @@ def test_an_image_of_another_raster_is_not_registered(folder: Path) -> None:
         import_frames(folder, OPTIONS).scan(0)
 
 
+def test_rotations_that_are_off_by_rounding_are_mapped_and_told(folder: Path) -> None:
+    for n, (frame, scale) in enumerate((("000002", 1 + 4e-4), ("000010", 1 + 1e-4))):
+        rounded = T_MAP_CAMERA.copy()
+        rounded[:3, :3] *= scale
+        np.savetxt(folder / f"f/frame-{frame}.pose.txt", rounded, fmt="%.9g")
+        recording = import_frames(folder, OPTIONS)
+        np.testing.assert_allclose(recording.scan(n).T_map_rig, T_MAP_CAMERA, atol=1e-8)
+    text = recording.rounding.text()
+    assert text is not None
+    assert text.startswith("2 of 3 poses")
+    assert text.endswith("frame-000002.pose.txt")
+
+
 @pytest.mark.parametrize(
     ("name", "text", "kind"),
     [

@@ -17,8 +17,15 @@ ROTATION_TOLERANCE = 1e-4
 """Largest deviation of R^T R from the identity that is taken for rounding in a text file."""
 
 
-def check_transform(values: npt.ArrayLike, *, name: str = "transform") -> Transform:
+def check_transform(
+    values: npt.ArrayLike, *, name: str = "transform", tolerance: float = ROTATION_TOLERANCE
+) -> Transform:
     """A (4, 4) float64 rigid transform, its rotation made orthonormal to float precision.
+
+    Args:
+        values: 4x4 numbers.
+        name: of the transform, for messages.
+        tolerance: largest `rotation_deviation` that is accepted.
 
     Raises:
         BadInputError: not 4x4, not finite, last row not 0 0 0 1, or not a rotation (a mirror or a scale).
@@ -29,10 +36,11 @@ def check_transform(values: npt.ArrayLike, *, name: str = "transform") -> Transf
     if not np.allclose(T[3], (0, 0, 0, 1), atol=1e-9):
         raise BadInputError("bad_transform", f"{name} must end in the row 0 0 0 1, got {T[3].tolist()}")
     R = T[:3, :3]
+    deviation = rotation_deviation(R)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        deviation, det = float(np.abs(R.T @ R - np.eye(3)).max()), float(np.linalg.det(R))
+        det = float(np.linalg.det(R))
     # Not `deviation > ...`: of numbers beyond 1e154 it may be NaN.
-    if not deviation <= ROTATION_TOLERANCE or det < 0:
+    if not deviation <= tolerance or det < 0:
         raise BadInputError(
             "bad_transform", f"{name} must hold a rotation: R^T R is off by {deviation:.2g}, det R is {det:.3g}"
         )
@@ -40,6 +48,12 @@ def check_transform(values: npt.ArrayLike, *, name: str = "transform") -> Transf
     T[:3, :3] = U @ Vt
     T[3] = (0, 0, 0, 1)
     return T
+
+
+def rotation_deviation(R: npt.NDArray[np.float64]) -> float:
+    """Largest absolute entry of R^T R - I of a (3, 3) matrix: 0 for a rotation or a mirror; NaN beyond 1e154."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.abs(R.T @ R - np.eye(3)).max())
 
 
 def inverse(T_dst_src: Transform) -> Transform:

@@ -20,9 +20,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cairn_calib.rig.brown import Coefficients
 from cairn_calib.rig.camera import Camera
-from cairn_calib.rig.poses import Transform, check_transform, inverse
+from cairn_calib.rig.poses import Transform, inverse
 from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.recording.images import image_header
+from cairn_fusion.recording.pose_rounding import PoseRounding
 from cairn_fusion.recording.recording import Recording, ScanFiles, measurements_of
 from cairn_fusion.recording.recording_format import (
     Convention,
@@ -111,7 +112,8 @@ def import_frames(
         unknown = ", ".join(sorted(set(frames) - set(ids))[:10]) or "of an empty choice"
         raise BadInputError("unknown_frame", f"{root} has {len(ids)} frames, but none {unknown}")
     # Times count all frames of the folder, so that a choice of them keeps its times.
-    pose = _pose_reader(root, options)
+    rounding = PoseRounding()
+    pose = _pose_reader(root, options, rounding)
     wanted = set(ids if frames is None else frames)
     files = tuple(
         _scan_files(root, options, frame_id, time_s=options.start_time_s + n / options.frame_rate_hz, pose=pose)
@@ -130,6 +132,7 @@ def import_frames(
         thermal_encodings={
             "thermal": ThermalEncoding(kelvin_per_count=options.kelvin_per_count, kelvin_at_zero=options.kelvin_at_zero)
         },
+        rounding=rounding,
     )
 
 
@@ -169,22 +172,22 @@ def _scan_files(
     )
 
 
-def _pose_reader(root: Path, options: FrameFolderOptions) -> Callable[[str], Transform]:
+def _pose_reader(root: Path, options: FrameFolderOptions, rounding: PoseRounding) -> Callable[[str], Transform]:
     """The pose of a frame id; a static pose is read once."""
     if FRAME_ID not in options.pose:
-        static = _pose(root, options.pose, options.pose_convention)
+        static = _pose(root, options.pose, options.pose_convention, rounding)
         return lambda _: static
-    return lambda frame_id: _pose(root, options.pose.replace(FRAME_ID, frame_id), options.pose_convention)
+    return lambda frame_id: _pose(root, options.pose.replace(FRAME_ID, frame_id), options.pose_convention, rounding)
 
 
-def _pose(root: Path, relative: str, convention: PoseConvention) -> Transform:
+def _pose(root: Path, relative: str, convention: PoseConvention, rounding: PoseRounding) -> Transform:
     # A 3 x 4 matrix lacks the last row, which is the same in all of them.
     values = _numbers(path_inside(root, relative))
     if values.size == 12:
         values = np.append(values, (0, 0, 0, 1))
     if values.size != 16:
         raise BadInputError("bad_transform", f"{root / relative} must hold 16 or 12 numbers, got {values.size}")
-    T = check_transform(values.reshape(4, 4), name=str(root / relative))
+    T = rounding.transform(values.reshape(4, 4), name=str(root / relative))
     return inverse(T) if convention is PoseConvention.MAP_TO_CAMERA else T
 
 

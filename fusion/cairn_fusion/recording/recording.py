@@ -20,6 +20,7 @@ import numpy as np
 from cairn_calib.rig.poses import Transform
 from cairn_calib.rig.rig import RIG_BYTES_MAX, Rig, rig_from_json
 from cairn_fusion.recording.images import read_colour, read_grey16
+from cairn_fusion.recording.pose_rounding import PoseRounding
 from cairn_fusion.recording.recording_format import (
     BODY_FILE,
     CHANNEL,
@@ -53,6 +54,11 @@ class ScanSource(Protocol):
     @property
     def rig(self) -> Rig:
         """The cameras of every scan."""
+        ...
+
+    @property
+    def rounding(self) -> PoseRounding:
+        """Poses of the source that were not quite rotations, and the largest change."""
         ...
 
     def __len__(self) -> int: ...
@@ -94,6 +100,8 @@ class Recording:
     range_encodings: Mapping[str, RangeEncoding]
     thermal_encodings: Mapping[str, ThermalEncoding] = field(default_factory=dict)
     note: str = ""
+    rounding: PoseRounding = field(default_factory=PoseRounding)
+    """Poses that were not quite rotations."""
 
     def __len__(self) -> int:
         return len(self.files)
@@ -154,7 +162,8 @@ def open_recording(path: str | Path, *, scans_per_measurement: int | None = None
     header = read_header(folder)
     rig = rig_from_json(read_text(path_inside(folder, RIG_FILE), RIG_BYTES_MAX).encode())
     check_cameras(header, rig)
-    files = _scan_files(folder, header)
+    rounding = PoseRounding()
+    files = _scan_files(folder, header, rounding)
     return Recording(
         name=header.name,
         rig=rig,
@@ -163,6 +172,7 @@ def open_recording(path: str | Path, *, scans_per_measurement: int | None = None
         range_encodings=header.range,
         thermal_encodings=header.thermal,
         note=header.note,
+        rounding=rounding,
     )
 
 
@@ -178,11 +188,11 @@ def measurements_of(scan_count: int, scans_per_measurement: int) -> tuple[range,
     return tuple(range(start, min(start + scans_per_measurement, scan_count)) for start in starts)
 
 
-def _scan_files(folder: Path, header: RecordingHeader) -> tuple[ScanFiles, ...]:
+def _scan_files(folder: Path, header: RecordingHeader, rounding: PoseRounding) -> tuple[ScanFiles, ...]:
     """One entry per range image, in order of time; other cameras' images by nearest time within `max_gap_s`."""
-    trajectory = read_trajectory(path_inside(folder, TRAJECTORY_FILE))
+    trajectory = read_trajectory(path_inside(folder, TRAJECTORY_FILE), rounding)
     body_path = path_inside(folder, BODY_FILE)
-    body = read_trajectory(body_path) if body_path.exists() else None
+    body = read_trajectory(body_path, rounding) if body_path.exists() else None
     ranges = {name: _image_list(folder, f"{name}.txt") for name in header.range}
     amplitudes = {name: _image_list(folder, f"{name}.amplitude.txt") for name in header.amplitude}
     colours = {name: _image_list(folder, f"{name}.txt") for name in header.colour}

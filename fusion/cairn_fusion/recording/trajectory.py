@@ -8,11 +8,13 @@ first and after the last line there is no pose: nothing is extrapolated.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from cairn_calib.rig.poses import Transform, quaternion_from_transform, transform_from_quaternion
+from cairn_fusion.recording.pose_rounding import PoseRounding
 from cairn_fusion.recording.timed_lists import Line, TimedList, timed_list
 from cairn_map.errors import BadInputError
 
@@ -55,13 +57,13 @@ class Trajectory:
         return interpolate_pose(self.poses.values[after - 1], self.poses.values[after], fraction)
 
 
-def read_trajectory(path: Path) -> Trajectory:
-    """The trajectory in a file.
+def read_trajectory(path: Path, rounding: PoseRounding | None = None) -> Trajectory:
+    """The trajectory in a file; quaternions that are not quite of length 1 are noted in `rounding`.
 
     Raises:
         BadInputError: missing, too large, times that do not increase, or a line that is no pose; with its number.
     """
-    return Trajectory(path, timed_list(path, _pose))
+    return Trajectory(path, timed_list(path, partial(_pose, rounding or PoseRounding())))
 
 
 def trajectory_line(time_s: float, T_map_rig: Transform) -> str:
@@ -88,9 +90,10 @@ def interpolate_pose(T_map_start: Transform, T_map_end: Transform, fraction: flo
     return transform_from_quaternion(t, weights[0] * q_start + weights[1] * q_end)
 
 
-def _pose(line: Line, text: str) -> Transform:
+def _pose(rounding: PoseRounding, line: Line, text: str) -> Transform:
     tx, ty, tz, *q_xyzw = line.numbers(text, 7)
     try:
-        return transform_from_quaternion((tx, ty, tz), q_xyzw)
+        rounding.check_quaternion(q_xyzw, name=f"{line.path}:{line.number}")
     except BadInputError as exc:
-        raise line.error(exc.message) from exc
+        raise BadInputError("bad_recording", exc.message) from exc
+    return transform_from_quaternion((tx, ty, tz), q_xyzw)

@@ -191,5 +191,7 @@ def _add_poses(index: BagIndex, message: BagMessage, topic: Topic, wire: Wire) -
             index.tree.add(edge, is_static=STATIC_NAME in topic.name)
     elif topic.type == ODOMETRY or topic.type in POSES:
         pose = read_pose(message.data, wire, type_name=topic.type)
-        track = index.tracks.setdefault(topic.name, FrameTree(f"{index.tree.source}: {topic.name}"))
+        track = index.tracks.setdefault(
+            topic.name, FrameTree(f"{index.tree.source}: {topic.name}", index.tree.rounding)
+        )
         track.add(RosTransform(pose.time_s, pose.parent or "map", pose.child or BASE, pose.pose), is_static=False)

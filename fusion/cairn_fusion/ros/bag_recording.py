@@ -86,6 +86,7 @@ class BagRecording:
         self._topics = {topic: _images_of(index, topic, name, types) for topic, name, types in _image_topics(mapping)}
         self._readers = {name: TopicReader(bag, entry) for name, entry in self._topics.items()}
         self.name = mapping.name
+        self.rounding = index.tree.rounding
         self.rig = _rig_of(index, mapping, self._topics)
         self._scans = scans_of(bag, index, mapping, self._topics)
         size = mapping.scans_per_measurement if scans_per_measurement is None else scans_per_measurement

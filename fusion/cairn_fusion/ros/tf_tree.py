@@ -15,6 +15,7 @@ from itertools import takewhile
 import numpy as np
 
 from cairn_calib.rig.poses import Transform, inverse, transform_from_quaternion
+from cairn_fusion.recording.pose_rounding import PoseRounding
 from cairn_fusion.recording.timed_lists import TimedList
 from cairn_fusion.recording.trajectory import Trajectory
 from cairn_fusion.ros.messages import RosTransform
@@ -64,6 +65,8 @@ class FrameTree:
 
     source: str
     """Name of the bag in errors."""
+    rounding: PoseRounding = field(default_factory=PoseRounding)
+    """Poses whose quaternions were not quite of length 1."""
     edges: dict[str, Edge] = field(default_factory=dict)
     _count: int = 0
 
@@ -73,12 +76,10 @@ class FrameTree:
         Raises:
             BadInputError: the frame has another parent already, or there are too many poses or frames.
         """
-        if not 0.5 < float(np.linalg.norm(found.pose[3:])) < 1.5 or not np.isfinite(found.pose).all():
-            raise BadInputError(
-                "bad_transform",
-                f"{self.source}: {found.parent} -> {found.child} at {found.time_s:.3f} s is no pose: "
-                f"{found.pose.tolist()}",
-            )
+        name = f"{self.source}: {found.parent} -> {found.child} at {found.time_s:.3f} s"
+        if not np.isfinite(found.pose).all():
+            raise BadInputError("bad_transform", f"{name} is no pose: {found.pose.tolist()}")
+        self.rounding.check_quaternion(found.pose[3:], name=name)
         edge = self.edges.setdefault(found.child, Edge(found.parent, is_static))
         if edge.parent != found.parent:
             raise BadInputError(

@@ -96,11 +96,14 @@ def _map_stops(robot: Robot, source: ScanSource, stops: Sequence[range], profile
 
 
 def _say_range(source: ScanSource) -> None:
-    """Write the ranges of the first scan: 5 m for a shelf at arm's length are wrong depth units."""
+    """Write the ranges of the first scan (5 m for a shelf at arm's length are wrong depth units), and rounded poses."""
     range_m = source.scan(0).range_m
     seen = range_m[np.isfinite(range_m)]
     median = f"median range {np.median(seen):.2f} m" if len(seen) else "no range at all"
     say(f"{source.name}: {len(source)} scans; the first has {len(seen) / range_m.size:.0%} of its pixels, {median}")
+    rounded = source.rounding.text()
+    if rounded:
+        say(rounded)
 
 
 def _replayed(state: Path) -> set[str]:
