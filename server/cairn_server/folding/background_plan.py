@@ -12,19 +12,16 @@ that stands on anything else than the map is thrown away. It writes nothing: a k
 import os
 import threading
 import time
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
-
-import numpy as np
 
 from cairn_map.commits.cursor import ENTRY_FOLD, Cursor, next_chain
 from cairn_map.commits.ids import CommitId
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_server.folding.cell_cache import CellCache
-from cairn_server.folding.cells_at_rest import stored_stamps
+from cairn_server.folding.cells_at_rest import stamps_to_change
 from cairn_server.folding.folding import FoldStore, plan_fold
-from cairn_server.store.stamps import encode_stamps
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import CellRow, Entry, Fold, Head, MapRow, StoredCommit
 
@@ -114,13 +111,14 @@ class BackgroundPlan:
         )
 
 
-def with_targets(store: FoldStore, row: MapRow, commits: Iterable[StoredCommit]) -> list[StoredCommit]:
-    """Commits, and the folded ones that they take out."""
-    found: list[StoredCommit] = []
+def with_targets(store: FoldStore, row: MapRow, commits: Iterable[StoredCommit]) -> Iterator[StoredCommit]:
+    """Commits, each before the folded ones that it takes out, read one by one."""
     for commit in commits:
-        targets = (store.folded(row, target) for target in commit.retracts if not store.is_retracted(row, target))
-        found += [commit, *(target for target in targets if target is not None)]
-    return found
+        yield commit
+        for id_ in commit.retracts:
+            target = None if store.is_retracted(row, id_) else store.folded(row, id_)
+            if target is not None:
+                yield target
 
 
 def moved_fold(fold: Fold, head: Head, known: dict[int, tuple[CommitId, bytes]], geometry: Geometry) -> Fold:
@@ -152,8 +150,9 @@ def _moved_cell(cell: CellRow, after: int, by: int, geometry: Geometry) -> CellR
     """A cell whose stamps of the entries `after` one, and its own, are raised."""
     if by == 0:
         return cell
-    stamps = stored_stamps(cell, geometry)
-    return replace(cell, lm=cell.lm + by, stamps=encode_stamps(np.where(stamps > after, stamps + by, stamps)))
+    stamps = stamps_to_change(cell, geometry)
+    stamps.raise_after(after, by)
+    return replace(cell, lm=cell.lm + by, stamps=stamps.encoded())
 
 
 class _NotingStore:

@@ -18,15 +18,15 @@ from cairn_map.evidence.compact_cell import HELD_PER_BYTE
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry
-from cairn_server.folding.cells_at_rest import stored_evidence, stored_stamps
-from cairn_server.store.stamps import Stamps, encode_stamps
+from cairn_server.folding.cells_at_rest import stamps_to_change, stored_evidence
+from cairn_server.store.stamps import CellStamps
 from cairn_server.store.store_rows import CellRow
 
 CACHE_BYTES = 512 << 20
 """Memory for the cells under change of all maps."""
 
 Step = Callable[[BrickCell, Evidence], None]
-Load = Callable[[CellKey], tuple[BrickCell, Stamps]]
+Load = Callable[[CellKey], tuple[BrickCell, CellStamps]]
 
 
 class CellCache:
@@ -37,7 +37,7 @@ class CellCache:
         self.size_bytes = 0
         self._geometry = geometry
         self._cursor: Cursor | None = None
-        self._cells: OrderedDict[CellKey, tuple[BrickCell, Stamps]] = OrderedDict()
+        self._cells: OrderedDict[CellKey, tuple[BrickCell, CellStamps]] = OrderedDict()
         self._sizes: dict[CellKey, int] = {}
         self._changed: set[CellKey] = set()
         self._drafts: dict[CellKey, CellRow] = {}
@@ -65,7 +65,7 @@ class CellCache:
         # A cell whose diff was just merged is cached and marked: stamping alone neither moves nor measures it again.
         is_here = key in self._cells and key in self._changed
         cell, stamps = self._taken(key, load)
-        stamps[blocks] = seq
+        stamps.put(blocks, seq)
         if not is_here:
             self._keep(key, cell, stamps)
 
@@ -123,16 +123,16 @@ class CellCache:
         del self._cells[key]
         self.size_bytes -= self._sizes.pop(key)
 
-    def _taken(self, key: CellKey, load: Load) -> tuple[BrickCell, Stamps]:
+    def _taken(self, key: CellKey, load: Load) -> tuple[BrickCell, CellStamps]:
         kept, draft = self._cells.get(key), self._drafts.get(key)
         # Cached, else drafted and dropped since, else in the store.
         if kept is None and draft is not None:
             cell = BrickCell(self._geometry)
             cell.merge(stored_evidence(draft))
-            return cell, stored_stamps(draft, self._geometry)
+            return cell, stamps_to_change(draft, self._geometry)
         return load(key) if kept is None else kept
 
-    def _keep(self, key: CellKey, cell: BrickCell, stamps: Stamps) -> None:
+    def _keep(self, key: CellKey, cell: BrickCell, stamps: CellStamps) -> None:
         # A draft is out of date with the first change after it.
         self._drafts.pop(key, None)
         self._changed.add(key)
@@ -149,12 +149,12 @@ class CellCache:
         encoded = encode_cell(key, evidence, self._geometry)
         return CellRow(
             key=key,
-            lm=int(stamps.max()),
+            lm=stamps.newest(),
             digest=encoded.digest,
             fingerprint=fingerprint(evidence, key),
             voxels=len(evidence),
             body=encoded.data,
             size_bytes=len(encoded.data),
-            stamps=encode_stamps(stamps),
+            stamps=stamps.encoded(),
             hottest_k=hottest_k(evidence, self._geometry),
         )

@@ -6,6 +6,7 @@ import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from typing import TypeVar
 
 from cairn_map.codec.cell_code import DecodedCell, decode_cell, decode_met, encode_cell
 from cairn_map.commits.cursor import ENTRY_FOLD
@@ -15,11 +16,12 @@ from cairn_map.evidence.cell_order import hottest_k
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.fingerprint import Fingerprint, fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
-from cairn_server.store.stamps import Stamps, decode_stamps, no_stamps
+from cairn_server.store.stamps import CellStamps, Stamps, decode_cell_stamps, decode_stamps
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import CellRow, Contribution
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 SOUND_MAX = 50_000
 """Most cells remembered as sound, some 300 bytes each."""
@@ -151,14 +153,23 @@ def sum_of_contributions(
 
 def stored_stamps(stored: CellRow, geometry: Geometry) -> Stamps:
     """Stamps of a stored cell; if they are damaged, all blocks count as changed."""
+    return _sound_stamps(stored, lambda data: decode_stamps(data, depth=geometry.depth, lm=stored.lm))
+
+
+def stamps_to_change(stored: CellRow, geometry: Geometry) -> CellStamps:
+    """`stored_stamps`, to be changed."""
+    return _sound_stamps(stored, lambda data: decode_cell_stamps(data, depth=geometry.depth, lm=stored.lm))
+
+
+def _sound_stamps(stored: CellRow, decode: Callable[[bytes], T]) -> T:
     try:
-        return decode_stamps(stored.stamps, depth=geometry.depth, lm=stored.lm)
+        return decode(stored.stamps)
     except DamagedDataError as exc:
         log.error("cell %s: %s; taking all of it as changed", cell_of_key(stored.key), exc.message)
-        return decode_stamps(b"", depth=geometry.depth, lm=stored.lm)
+        return decode(b"")
 
 
-def cell_to_change(snapshot: Snapshot, key: CellKey, geometry: Geometry) -> tuple[BrickCell, Stamps]:
+def cell_to_change(snapshot: Snapshot, key: CellKey, geometry: Geometry) -> tuple[BrickCell, CellStamps]:
     """A cell of the map, to be changed; a damaged one is rebuilt from the log.
 
     Raises:
@@ -167,8 +178,8 @@ def cell_to_change(snapshot: Snapshot, key: CellKey, geometry: Geometry) -> tupl
     stored = row_of_cell(snapshot, key)
     cell = BrickCell(geometry)
     if stored is None:
-        return cell, no_stamps(geometry.depth)
-    stamps = stored_stamps(stored, geometry)
+        return cell, CellStamps(geometry.depth)
+    stamps = stamps_to_change(stored, geometry)
     try:
         cell.merge(stored_evidence(stored))
     except DamagedDataError as exc:

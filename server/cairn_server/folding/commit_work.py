@@ -2,21 +2,24 @@
 
     40 ns for each voxel      it is decoded, added, packed, hashed and encoded      air of 2^24 voxels: 0.7 s
     2.4 us for each brick     its memory is allocated, cleared and packed           one voxel in each of 2^15: 80 ms
+    0.6 ms for each cell      however little of it: decoded twice, encoded, a row   4096 cells of one voxel: 2.5 s
 
 Cells of the map count, too, where they have to be decoded for this fold alone (decision 016). All figures are of one
 core at 2.5 GHz; only their ratio to `SLICE_S` matters.
 """
 
-from collections.abc import Container, Iterable
+from collections.abc import Container
 
 from cairn_map.codec.cell_reading import cell_reader
+from cairn_map.codec.octree.cell_head import head_sizes
 from cairn_map.errors import CairnError
 from cairn_map.evidence.compact_cell import HELD_PER_BYTE
 from cairn_map.evidence.grid import BRICK_DEPTH, CellKey
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import StoredCommit
 
-VOXEL_S, BRICK_S = 40e-9, 2.4e-6
+VOXEL_S, BRICK_S, CELL_S = 40e-9, 2.4e-6, 0.6e-3
+BRICK_VOXELS = 8**BRICK_DEPTH
 BRICK_BYTES = 2048
 """Memory of a brick's sums."""
 SLICE_S = 0.1
@@ -25,24 +28,33 @@ SLICE_S_PER_BYTE, SLICE_MAX_S = 2e-6, 0.5
 """Work that it may take for its bytes, and at most. Scans of rooms have 0.5 us a byte, and take a fifth of it."""
 
 
-def slice_s(commits: Iterable[StoredCommit]) -> float:
-    """Work that these commits, a commit and what it retracts, may take while others wait."""
-    size_bytes = sum(len(body) for commit in commits for body in commit.diff.values())
+def slice_s(size_bytes: int) -> float:
+    """Work that a commit and what it retracts, of so many bytes together, may take while others wait."""
     return min(max(SLICE_S, SLICE_S_PER_BYTE * size_bytes), SLICE_MAX_S)
 
 
-def commits_work_s(commits: Iterable[StoredCommit], snapshot: Snapshot, cached: Container[CellKey]) -> float:
-    """Estimated work of folding commits or taking them out; `cached` are the cells that need not be decoded."""
+def commit_work_s(commit: StoredCommit, snapshot: Snapshot, cached: Container[CellKey]) -> float:
+    """Estimated work of folding a commit or taking it out; `cached` are the cells that need not be decoded."""
     seconds = 0.0
-    for commit in commits:
-        for key, body in commit.diff.items():
-            seconds += _work_s(body)[0]
-            stored = None if key in cached else snapshot.cell(key)
-            if stored is not None:
-                work_s, sums_bytes = _work_s(stored.body)
-                # Any other cell stays decoded after the fold.
-                seconds += work_s if sums_bytes > HELD_PER_BYTE * len(stored.body) else 0.0
+    for key, body in commit.diff.items():
+        seconds += CELL_S + _diff_work_s(body)
+        stored = None if key in cached else snapshot.cell(key)
+        if stored is not None:
+            work_s, sums_bytes = _work_s(stored.body)
+            # Any other cell stays decoded after the fold.
+            seconds += work_s if sums_bytes > HELD_PER_BYTE * len(stored.body) else 0.0
     return seconds
+
+
+def _diff_work_s(body: bytes) -> float:
+    """Work of a diff; of most by their heads alone, since a bound says that they are worth their bytes."""
+    try:
+        depth, voxels, leaves = head_sizes(body)
+    except CairnError:
+        return 0.0
+    # A leaf is in one brick, or is whole bricks.
+    at_most_s = VOXEL_S * voxels + BRICK_S * min(leaves + voxels // BRICK_VOXELS, 8 ** max(0, depth - BRICK_DEPTH))
+    return at_most_s if at_most_s <= SLICE_S_PER_BYTE * len(body) else _work_s(body)[0]
 
 
 def _work_s(body: bytes) -> tuple[float, int]:

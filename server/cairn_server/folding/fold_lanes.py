@@ -6,14 +6,15 @@ it. Which robot's costly commits are next is decided as in `fold_turns`, by the 
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
 
 from cairn_map.commits.ids import RobotName
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.grid import CellKey
 from cairn_server.folding.background_plan import BackgroundPlan, with_targets
 from cairn_server.folding.cell_cache import CellCache
-from cairn_server.folding.commit_work import SLICE_S, SLICE_S_PER_BYTE, commits_work_s, slice_s
+from cairn_server.folding.commit_work import SLICE_S, SLICE_S_PER_BYTE, commit_work_s, slice_s
 from cairn_server.folding.fold_turns import FoldTurns
 from cairn_server.folding.folding import FoldStore
 from cairn_server.store.store_rows import MapRow, StoredCommit
@@ -22,6 +23,13 @@ log = logging.getLogger(__name__)
 
 PLAN_S = 1.0
 """Work of a robot's commits that are planned at once, if the first of them does not have more."""
+
+
+class _Weight(NamedTuple):
+    """Estimated work of a commit with what it retracts, and their bytes."""
+
+    work_s: float
+    size_bytes: int
 
 
 class FoldLanes:
@@ -34,6 +42,8 @@ class FoldLanes:
         self._plan: BackgroundPlan | None = None
         self._costly: dict[RobotName, list[StoredCommit]] = {}
         """Commits of each robot that wait for the background, of the map under way: the first is costly."""
+        self._known_costly: set[int] = set()
+        """Numbers of commits that were found to be costly, and wait."""
         self._unplanned: set[int] = set()
         """Numbers of commits of which planning failed."""
 
@@ -58,13 +68,14 @@ class FoldLanes:
         self._plan = None
         turns.charge(plan.commits[0].id.author.robot, plan.seconds)
         if plan.is_failed():
-            self._unplanned.update(commit.number for commit in plan.commits)
+            self._set_aside(plan.commits)
             return 0
         fold = plan.write()
         if fold is None:
             log.info("map %s: a plan of %d commits does not fit any more", row.name, len(plan.commits))
             return 0
         cache.moved(fold.base, fold.head, plan.cells)
+        self._known_costly.difference_update(commit.number for commit in plan.commits)
         return len(plan.commits)
 
     def cheap(self, row: MapRow, commits: Sequence[StoredCommit], cache: CellCache) -> list[StoredCommit]:
@@ -82,17 +93,24 @@ class FoldLanes:
                 self._costly[robot].append(commit)
             if robot in behind:
                 continue
-            changing = with_targets(self._store, row, [commit])
-            if commit.number in planned or any(not held.isdisjoint(each.diff) for each in changing):
+            if commit.number in planned:
                 behind.add(robot)
                 continue
-            work_s = self._work_s(row, changing, cache)
-            if work_s > slice_s(changing) and commit.number not in self._unplanned:
+            if commit.number in self._known_costly:
+                self._costly[robot] = [commit]
+                behind.add(robot)
+                continue
+            weight = self._weight(row, commit, cache, held)
+            if weight is None:
+                behind.add(robot)
+                continue
+            if weight.work_s > slice_s(weight.size_bytes) and commit.number not in self._unplanned:
+                self._known_costly.add(commit.number)
                 self._costly[robot] = [commit]
                 behind.add(robot)
                 continue
             # Many that are nearly costly end the group as one that is.
-            dear_s += work_s if work_s > SLICE_S_PER_BYTE * _size_bytes(changing) else 0.0
+            dear_s += weight.work_s if weight.work_s > SLICE_S_PER_BYTE * weight.size_bytes else 0.0
             if dear_s > SLICE_S and found:
                 behind.add(robot)
             else:
@@ -107,22 +125,34 @@ class FoldLanes:
         chosen: list[StoredCommit] = []
         work_s = 0.0
         for commit in self._costly[robot]:
-            work_s += self._work_s(row, with_targets(self._store, row, [commit]), CellCache(row.geometry))
+            weight = self._weight(row, commit, CellCache(row.geometry), held=())
+            work_s += weight.work_s if weight is not None else 0.0
             if chosen and work_s > PLAN_S:
                 break
             chosen.append(commit)
         try:
             self._plan = BackgroundPlan(self._store, row, chosen, cells_bytes=self._cells_bytes)
         except DamagedDataError:
-            self._unplanned.update(commit.number for commit in chosen)
+            self._set_aside(chosen)
 
-    def _work_s(self, row: MapRow, changing: Sequence[StoredCommit], cache: CellCache) -> float:
+    def _set_aside(self, commits: Sequence[StoredCommit]) -> None:
+        """Have these commits folded without a plan."""
+        self._unplanned.update(commit.number for commit in commits)
+        self._known_costly.difference_update(commit.number for commit in commits)
+
+    def _weight(self, row: MapRow, commit: StoredCommit, cache: CellCache, held: Collection[CellKey]) -> _Weight | None:
+        """Weight of a commit, from `PLAN_S` on not all of it; None if it changes one of the `held` cells."""
+        work_s, size_bytes = 0.0, 0
         try:
-            with self._store.snapshot(row) as snapshot:
-                return commits_work_s(changing, snapshot, cache)
+            # What a retract names is read one by one: thousands may be named, of thousands of cells.
+            for each in with_targets(self._store, row, [commit]):
+                if not each.diff.keys().isdisjoint(held):
+                    return None
+                size_bytes += sum(map(len, each.diff.values()))
+                with self._store.snapshot(row) as snapshot:
+                    work_s += commit_work_s(each, snapshot, cache)
+                if work_s > PLAN_S:
+                    break
         except DamagedDataError:
-            return 0.0  # a cell that cannot be read: folding finds it
-
-
-def _size_bytes(commits: Sequence[StoredCommit]) -> int:
-    return sum(len(body) for commit in commits for body in commit.diff.values())
+            return _Weight(0.0, size_bytes)  # a cell that cannot be read: folding finds it
+        return _Weight(work_s, size_bytes)

@@ -25,7 +25,7 @@ from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey
 from cairn_server.folding.cell_cache import CellCache, Step
 from cairn_server.folding.cells_at_rest import cell_to_change, decode_stored
-from cairn_server.store.stamps import Stamps
+from cairn_server.store.stamps import CellStamps
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import Entry, Fold, Head, MapRow, StoredCommit
 
@@ -244,7 +244,7 @@ class _Plan:
         except BadInputError as exc:
             raise DamagedCommitError("damaged_store", f"commit {commit.id} at rest: {exc.message}") from exc
 
-    def _load(self, key: CellKey) -> tuple[BrickCell, Stamps]:
+    def _load(self, key: CellKey) -> tuple[BrickCell, CellStamps]:
         # A snapshot of its own: if another folding wrote since `start`, `store.fold` refuses the whole plan.
         with self.store.snapshot(self.row) as snapshot:
             return cell_to_change(snapshot, key, self.row.geometry)

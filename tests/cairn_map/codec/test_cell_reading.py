@@ -11,10 +11,10 @@ from tests.naive import octree as naive_octree
 from cairn_map.codec.cell_code import Profile, decode_cell, encode_cell
 from cairn_map.codec.cell_reading import cell_reader
 from cairn_map.codec.octree.cell_content import evidence_of
-from cairn_map.codec.octree.cell_head import decode_head
+from cairn_map.codec.octree.cell_head import decode_head, head_sizes
 from cairn_map.codec.octree.channel_streams import stream_of_channel
 from cairn_map.codec.octree.streams import MODELLED, STORED, StoredStream, join_streams
-from cairn_map.errors import BadInputError, CairnError
+from cairn_map.errors import BadInputError, CairnError, DamagedDataError
 from cairn_map.evidence.grid import Geometry
 
 
@@ -33,6 +33,13 @@ def test_topology_is_what_the_evidence_says_whatever_the_other_streams_do(made: 
         expected = naive_octree.leaves_above(root, geometry.depth, depth)
         assert topology(data, depth) == expected
         assert topology(garbled(data, lambda number: number <= 2), depth) == expected
+
+
+def test_sizes_are_read_from_the_fixed_part_of_a_head_alone() -> None:
+    head, _ = decode_head(SURFACE)
+    assert head_sizes(SURFACE) == (head.geometry.depth, head.voxels, head.leaves)
+    with pytest.raises(DamagedDataError):
+        head_sizes(SURFACE[:20])
 
 
 @pytest.mark.parametrize("geometry", [SMALL, MIDDLE])

@@ -21,7 +21,7 @@ from cairn_map.evidence.grid import CellKey, cell_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.folding import commit_work, fold_lanes
 from cairn_server.folding.cell_cache import CellCache
-from cairn_server.folding.commit_work import SLICE_S, commits_work_s
+from cairn_server.folding.commit_work import SLICE_S, commit_work_s
 from cairn_server.folding.damaged_cells import DamagedCells
 from cairn_server.folding.folding import fold_commits, fold_pending
 from cairn_server.folding.group_folding import LocalFolding
@@ -50,6 +50,7 @@ def small_slices(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (commit_work, fold_lanes):
         monkeypatch.setattr(module, "SLICE_S", 1e-4)
         monkeypatch.setattr(module, "SLICE_S_PER_BYTE", 1e-9)
+    monkeypatch.setattr(commit_work, "CELL_S", 0.0)
 
 
 class Folder:
@@ -110,23 +111,35 @@ def straight(commits: Sequence[Commit]) -> dict[CellKey, tuple[bytes, bytes]]:
     return cells_of(store, row)
 
 
-def test_dust_and_air_are_known_to_be_costly_before_they_are_decoded_and_scans_are_not() -> None:
+def test_dust_air_and_very_many_cells_are_known_to_be_costly_before_they_are_decoded_and_scans_are_not() -> None:
     store = MemoryStore()
     row, _ = store.create_map(next(NAMES), DEEP, SensorModel())
     grain = encode_cell(HERE, dust(DEEP), DEEP).data
+    random_grain = encode_cell(HERE, random_evidence(1, DEEP, voxels=1), DEEP).data
     diffs = [
         {cell_key((n, 0, 0)): grain for n in range(4)},
         {HERE: cell_of_air((0, 0, 0))},
+        {cell_key((n, 0, 0)): random_grain for n in range(1000)},
         {HERE: encode_cell(HERE, random_evidence(1, DEEP, voxels=9000), DEEP).data},
     ]
     with store.snapshot(row) as snapshot:
         works_s = [
-            commits_work_s(
-                [StoredCommit(number=n, id=CommitId(MOLE, n), sha=b"", text=b"", retracts=(), diff=diff)], snapshot, ()
+            commit_work_s(
+                StoredCommit(number=n, id=CommitId(MOLE, n), sha=b"", text=b"", retracts=(), diff=diff), snapshot, ()
             )
             for n, diff in enumerate(diffs)
         ]
-    assert [work_s > SLICE_S for work_s in works_s] == [True, True, False]
+    assert [work_s > SLICE_S for work_s in works_s] == [True, True, True, False]
+
+
+@pytest.mark.parametrize("evidence", [dust(WIDE), air(WIDE), random_evidence(7, WIDE, voxels=99)])
+def test_work_estimated_by_a_head_alone_is_not_less_than_by_the_masks(
+    evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    body = encode_cell(HERE, evidence, WIDE).data
+    exact_s = commit_work._diff_work_s(body)
+    monkeypatch.setattr(commit_work, "SLICE_S_PER_BYTE", 1.0)
+    assert commit_work._diff_work_s(body) >= exact_s > 0
 
 
 @pytest.mark.usefixtures("small_slices")

@@ -17,7 +17,7 @@ from cairn_map.evidence.blocks import blocks_of, of_blocks, without_blocks
 from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.grid import CellKey
 from cairn_map.wire.frames import CellFrame, FrameKind
-from cairn_server.store.stamps import blocks_after, decode_stamps, encode_stamps
+from cairn_server.store.stamps import CellStamps, blocks_after, decode_cell_stamps, decode_stamps, encode_stamps
 from cairn_server.store.store_rows import MapRow
 
 SEQS = st.integers(1, (1 << 62) - 1) | st.integers(1, 40)
@@ -41,6 +41,20 @@ def test_bytes_that_are_no_stamps_are_refused(data: bytes, lm: int) -> None:
             assert exc.kind == "damaged_store"
         else:
             assert found.shape == (8,) and (found <= lm).all() and (found >= 0).all()
+
+
+@given(st.lists(st.tuples(st.sets(st.integers(0, 8**5 - 1), max_size=9), st.integers(1, 300)), max_size=9))
+def test_stamps_under_change_are_encoded_as_dense_ones_are(changes: list[tuple[set[int], int]]) -> None:
+    dense, paged = np.zeros(8**5, np.int64), CellStamps(7)
+    for chosen, seq in changes:
+        blocks = np.array(sorted(chosen), np.uint32)
+        dense[blocks] = seq
+        paged.put(blocks, seq)
+    again = decode_cell_stamps(paged.encoded(), depth=7, lm=300)
+    assert paged.encoded() == again.encoded() == encode_stamps(dense)
+    assert paged.newest() == dense.max()
+    again.raise_after(100, 7)
+    assert again.encoded() == encode_stamps(np.where(dense > 100, dense + 7, dense))
 
 
 def test_a_store_without_stamps_takes_all_blocks_for_changed_with_their_cell() -> None:

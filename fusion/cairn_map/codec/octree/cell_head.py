@@ -76,6 +76,18 @@ def _channel_bytes(geometry: Geometry) -> bytes:
     return data
 
 
+def head_sizes(data: bytes) -> tuple[int, int, int]:
+    """Depth, voxels and leaves that a head claims, from its fixed part alone, of bytes that `decode_head` reads.
+
+    Raises:
+        DamagedDataError: cut off.
+    """
+    if len(data) < FIXED_PART.size or data[:4] != MAGIC:
+        raise DamagedDataError("bad_cell", "not a cairn cell: it must begin with CRNC and a whole head")
+    _, _, _, depth, _, _, _, _, _, voxels, leaves, _, _ = FIXED_PART.unpack_from(data)
+    return depth, voxels, leaves
+
+
 def decode_head(data: bytes) -> tuple[CellHead, bytes]:
     """Head at the start of a cell's bytes, and the bytes of the head alone.
 
