@@ -151,4 +151,4 @@ class SimRobot:
 
     def _open(self, disk: MemoryDisk) -> None:
         self.disk = disk
-        self.replica = Replica(disk, robot=RobotName(self.name), map_name=MAP, geometry=GEOMETRY)
+        self.replica = Replica(disk, robot=RobotName(self.name), map_name=MAP, geometry=GEOMETRY, keep_acked_s=0.0)

@@ -5,7 +5,7 @@ import argparse
 import numpy as np
 
 from cairn_client.cli.arguments import add_token
-from cairn_client.replica.limits import Limits
+from cairn_client.replica.limits import KEEP_ACKED_S, Limits
 from cairn_client.sync.link_profile import LINKS
 from cairn_client.sync.scope import Scope
 from cairn_map.errors import BadInputError
@@ -54,6 +54,14 @@ def add_limits(command: argparse.ArgumentParser) -> None:
         ("outbox", "size of commits that the server does not have for good, above which no more are made", "no limit"),
     ):
         command.add_argument(f"--{name}-max", type=float, metavar="MB", help=f"{what} ({standard})")
+    command.add_argument(
+        "--keep-acked",
+        type=float,
+        default=KEEP_ACKED_S,
+        metavar="S",
+        help="least seconds of running for which a commit's bytes stay after the server acknowledged it, whatever the "
+        f"server says, while the limits leave room ({KEEP_ACKED_S:.0f})",
+    )
 
 
 def limits_of(args: argparse.Namespace) -> Limits:
@@ -62,7 +70,7 @@ def limits_of(args: argparse.Namespace) -> Limits:
         None if megabytes is None else round(megabytes * 1e6)
         for megabytes in (args.disk_max, args.memory_max, args.outbox_max)
     )
-    return Limits(disk_bytes_max=disk, memory_bytes_max=memory, outbox_bytes_max=outbox)
+    return Limits(disk_bytes_max=disk, memory_bytes_max=memory, outbox_bytes_max=outbox, keep_acked_s=args.keep_acked)
 
 
 def place(text: str) -> tuple[float, float, float]:

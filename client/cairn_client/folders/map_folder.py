@@ -14,10 +14,12 @@ from cairn_client.http.map_url import split_map_url
 from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_store import FILE_NAME
 from cairn_map.codec.cell_code import coding_of, decode_cell
+from cairn_map.codec.cell_reading import EVIDENCE_BYTES_MAX
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.files.cell_folder import MAP_FILE, cell_path, read_cells, read_head
+from cairn_map.machine_memory import standard_limit_bytes
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
 from cairn_map.render.map_picture import Ages
 
@@ -31,7 +33,7 @@ class FolderMap:
     """Ages of what the robot measured itself; None for a folder of cells, which have no times."""
 
 
-def open_map(place: Path | str, *, token: str | None = None) -> MapSnapshot:
+def open_map(place: Path | str, *, token: str | None = None, memory_bytes_max: int | None = None) -> MapSnapshot:
     """A map as a snapshot to ask, from a server or a folder, without a robot.
 
         open_map("http://base:8750/maps/lab").probability_at([[1.0, 2.0, 0.4]])
@@ -43,16 +45,18 @@ def open_map(place: Path | str, *, token: str | None = None) -> MapSnapshot:
         place: `http://HOST:PORT/maps/NAME`, a folder of cells that `cairn map export --cells` wrote, or the state
             folder of a robot or copy that is not running.
         token: for a server that wants one.
+        memory_bytes_max: largest size in memory of a map from a server; None: a quarter of the machine's memory.
 
     Raises:
         BadInputError: kind `no_map_folder`: the folder holds neither cells nor a robot's state; a bad URL; no token.
+            Kind `too_large`: the server's map does not fit into the memory limit.
         ConflictError: a robot has its state open.
         DamagedDataError: a cell or the state is not sound.
         NotFoundError: the server has no such map.
         UnreachableError: the server does not answer.
     """
     if isinstance(place, str) and "://" in place:
-        return _downloaded_map(place, token)
+        return _downloaded_map(place, token, memory_bytes_max or standard_limit_bytes())
     return map_of_folder(Path(place)).snapshot
 
 
@@ -81,15 +85,32 @@ def map_of_folder(folder: Path) -> FolderMap:
     )
 
 
-def _downloaded_map(map_url: str, token: str | None) -> MapSnapshot:
+def _downloaded_map(map_url: str, token: str | None, memory_bytes_max: int) -> MapSnapshot:
     server_url, name = split_map_url(map_url)
     with MapApi(server_url, token=token) as api:
         info = api.map_info(name)
         whole = EvidenceMap(info.geometry, coding=coding_of(info.geometry))
         for cell in cells_with_evidence(api, name):
-            body, decoded = download_cell(api, name, cell)
+            # What is left bounds the cell before it is decoded: few bytes may stand for much evidence.
+            left_bytes = memory_bytes_max - whole.size_bytes
+            try:
+                body, decoded = download_cell(api, name, cell, evidence_bytes_max=min(left_bytes, EVIDENCE_BYTES_MAX))
+            except BadInputError as exc:
+                if exc.kind == "too_large" and left_bytes < EVIDENCE_BYTES_MAX:
+                    raise _too_large(map_url, memory_bytes_max) from exc
+                raise
             whole.replace(decoded.key, decoded.evidence, body=body)
+            if whole.size_bytes > memory_bytes_max:
+                raise _too_large(map_url, memory_bytes_max)
     return snapshot_of(whole, info.sensor_model)
+
+
+def _too_large(map_url: str, memory_bytes_max: int) -> BadInputError:
+    return BadInputError(
+        "too_large",
+        f"{map_url} takes more than {memory_bytes_max} bytes in memory (memory_bytes_max): give it more, or save a "
+        "part of it with `cairn map export --box --npz FILE`",
+    )
 
 
 def ages_of(replica: Replica) -> Ages | None:

@@ -5,6 +5,7 @@ compressed may stand for gigabytes: so no coding is asked for, and an answer tha
 
     head    64 kB and the 100 kB that h11 waits for; texts of it that are sent again are checked (`sent_again`)
     body    read in parts of at most 64 kB; a whole body is held twice for an instant, and has a limit
+    time    bounded by the bytes that came (`request_deadline`)
     JSON    at most 200 bytes in memory for each byte (`wire.json_limits`)
 """
 
@@ -12,6 +13,7 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Protocol
 
+from cairn_client.http.request_deadline import RequestDeadline
 from cairn_client.sync.responses import Traffic
 from cairn_map.errors import BadInputError, DamagedDataError
 
@@ -43,10 +45,13 @@ def coding_of(response: RawResponse) -> str:
     return "" if found.strip().lower() in ("", CODING) else found[:80]
 
 
-def parts_of(response: RawResponse, traffic: Traffic, *, at_most_bytes: int | None) -> Iterator[bytes]:
-    """Parts of a body as they come; None: it has no limit, and no part of it is kept here.
+def parts_of(
+    response: RawResponse, traffic: Traffic, *, at_most_bytes: int | None, deadline: RequestDeadline
+) -> Iterator[bytes]:
+    """Parts of a body as they come; None: it has no limit and no deadline, and no part of it is kept here.
 
     Raises:
+        UnreachableError: kind `no_link`: the deadline is over; a body whose end is the connection's looks whole then.
         DamagedDataError: kind `encoded_answer`: the body is encoded, though no coding was asked for.
         BadInputError: kind `too_large`: it is longer than allowed, or says that it will be.
     """
@@ -60,12 +65,17 @@ def parts_of(response: RawResponse, traffic: Traffic, *, at_most_bytes: int | No
     if at_most_bytes is not None and stated.isdecimal() and int(stated[:20]) > at_most_bytes:
         raise BadInputError("too_large", f"the answer may have {at_most_bytes} bytes, this one claims {stated[:20]}")
     size_bytes = 0
+    if at_most_bytes is None:
+        deadline.end()
     for part in response.iter_raw():
         size_bytes += len(part)
         if at_most_bytes is not None and size_bytes > at_most_bytes:
             raise BadInputError("too_large", f"the server's answer is longer than {at_most_bytes} bytes")
         traffic.down_bytes += len(part)
-        yield part
+        deadline.note(len(part))
+        with deadline.resting():
+            yield part
+    deadline.check()
 
 
 def body_of_error(response: RawResponse) -> bytes:

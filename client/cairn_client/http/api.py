@@ -19,6 +19,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from cairn_client.http.answer_reading import CODING, body_of_error, header_text, parts_of, sent_again
 from cairn_client.http.origin_tokens import without_token
+from cairn_client.http.request_deadline import PACE, Pace, RequestDeadline
 from cairn_client.sync.requests import Box, GetUpload, PutPart
 from cairn_client.sync.responses import Answer, FetchedCell, Traffic, error_of, list_of, unreachable
 from cairn_map.commits.commit import Commit
@@ -111,8 +112,12 @@ class OpenSockets:
 
     def cut(self) -> None:
         """End all that is under way, and let nothing begin until `mend`; by any thread."""
+        self._is_cut = True
+        self.break_off()
+
+    def break_off(self) -> None:
+        """End all that is under way; by any thread."""
         with self._lock:
-            self._is_cut = True
             for found in list(self._sockets):
                 with contextlib.suppress(OSError):
                     # The plain socket's: that of TLS would say goodbye first.
@@ -141,7 +146,10 @@ class MapApi:
     Of https the certificate must be signed by `ca_file` (PEM), else by SSL_CERT_FILE, else by a public issuer.
     """
 
-    def __init__(self, server_url: str, *, token: str | None = None, ca_file: Path | None = None) -> None:
+    def __init__(
+        self, server_url: str, *, token: str | None = None, ca_file: Path | None = None, pace: Pace = PACE
+    ) -> None:
+        self._pace = pace
         self.traffic = Traffic()
         self.sockets = OpenSockets()
         self._vector = EMPTY
@@ -347,17 +355,17 @@ class MapApi:
         """
         reply = (replies or Replies()).reply_to(request)
         body = reply.request.model_dump_json(exclude_defaults=True).encode()
-        with self._open("POST", f"/maps/{name}/branches/{branch}/missing", content=body) as response:
+        with self._open("POST", f"/maps/{name}/branches/{branch}/missing", content=body) as (response, deadline):
             known = response.status_code == NO_CONTENT
-            parts = parts_of(response, self.traffic, at_most_bytes=REPLY_BYTES_MAX)
+            parts = parts_of(response, self.traffic, at_most_bytes=REPLY_BYTES_MAX, deadline=deadline)
             yield from reply.again() if known else reply.frames(parts)
 
     def stream(
         self, path: str, *, headers: Mapping[str, str] | None = None, at_most_bytes: int | None = None
     ) -> Generator[bytes, None, None]:
         """The parts of a long answer; None: it goes on as long as there is news, such as `/maps/{map}/events`."""
-        with self._open("GET", path, headers=headers) as response:
-            yield from parts_of(response, self.traffic, at_most_bytes=at_most_bytes)
+        with self._open("GET", path, headers=headers) as (response, deadline):
+            yield from parts_of(response, self.traffic, at_most_bytes=at_most_bytes, deadline=deadline)
 
     def probe(self, path: str) -> Answer:
         """Any answer that is no error, to see what is at the other end."""
@@ -380,8 +388,8 @@ class MapApi:
     def _send(self, method: str, path: str, **options: Any) -> Answer:
         """A whole answer, but never a longer one than a cell may have."""
         body = bytearray()
-        with self._open(method, path, **options) as response:
-            for part in parts_of(response, self.traffic, at_most_bytes=ANSWER_BYTES_MAX):
+        with self._open(method, path, **options) as (response, deadline):
+            for part in parts_of(response, self.traffic, at_most_bytes=ANSWER_BYTES_MAX, deadline=deadline):
                 body += part
             return Answer(response.status_code, response.headers, bytes(body))
 
@@ -398,7 +406,7 @@ class MapApi:
         content: bytes = b"",
         headers: Mapping[str, str] | None = None,
         params: Mapping[str, str | int] | None = None,
-    ) -> "Iterator[httpx.Response]":
+    ) -> "Iterator[tuple[httpx.Response, RequestDeadline]]":
         """Context of an answer that began well and is still to be read; errors come out as a `CairnError`."""
         import httpx
 
@@ -410,15 +418,20 @@ class MapApi:
             sent.setdefault("Content-Type", "application/json" if is_json else "application/vnd.cairn.commit")
         for field, text in sent.items():
             header_text(text, field)
+        deadline = RequestDeadline(self._pace, self.sockets.break_off, sent_bytes=len(content))
         try:
-            with self._client.stream(method, path, headers=sent, content=content, params=params) as response:
+            with (
+                deadline,
+                self._client.stream(method, path, headers=sent, content=content, params=params) as response,
+            ):
                 self.traffic.up_bytes += len(content)
                 if not response.is_success and response.status_code != NOT_MODIFIED:
                     retry_after = response.headers.get("Retry-After", "")
                     error = error_of(response.status_code, retry_after, body_of_error(response))
                     raise without_token(self.origin, error.message) if self._lacks_token(error) else error
-                yield response
+                yield response, deadline
         except httpx.TransportError as exc:
+            deadline.check()
             raise unreachable(exc) from exc
 
 

@@ -20,6 +20,7 @@ from cairn_client.sync.requests import (
     whole_index,
 )
 from cairn_map.codec.cell_code import DecodedCell, decode_cell
+from cairn_map.codec.cell_reading import EVIDENCE_BYTES_MAX
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import Cell, cell_key
@@ -94,15 +95,18 @@ def cells_with_evidence(api: MapApi, map_name: str) -> list[Cell]:
     return sorted(found, key=cell_key)
 
 
-def download_cell(api: MapApi, map_name: str, cell: Cell) -> tuple[bytes, DecodedCell]:
+def download_cell(
+    api: MapApi, map_name: str, cell: Cell, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX
+) -> tuple[bytes, DecodedCell]:
     """Bytes of one cell, and the evidence that they decode to.
 
     Raises:
+        BadInputError: kind `too_large`: the evidence would take more bytes than allowed.
         DamagedDataError: kind `fingerprint_mismatch`: it is not the cell that the server says it is.
     """
     fetched = api.cell(map_name, cell)
     body = fetched.body or b""
-    decoded = decode_cell(body)
+    decoded = decode_cell(body, evidence_bytes_max=evidence_bytes_max)
     if decoded.key != cell_key(cell) or fingerprint(decoded.evidence, decoded.key) != fetched.fingerprint:
         raise DamagedDataError("fingerprint_mismatch", f"cell {cell} is not what the server says it is")
     return body, decoded

@@ -1,6 +1,6 @@
 """Limits of what a robot keeps on the disk and in memory, and the order in which it is dropped when they are reached.
 
-    1. commits that the server has for good          (their bytes; they are in its map)
+    1. commits that the server has for good          (their bytes; they are in its map; the oldest first)
     2. cells of the server, the farthest first       (they are a cache, and come again when the robot is near)
     3. nothing more: `commit` refuses, and the measurement stays open
 
@@ -10,6 +10,7 @@ that is not held: the robot asks for it whole when it comes near, and until then
 The robot's folder remembers the limits that were given last (`replica_state`), for a robot that opens it without any.
 """
 
+import math
 from dataclasses import dataclass
 
 from cairn_map.errors import BadInputError
@@ -17,11 +18,13 @@ from cairn_map.machine_memory import standard_limit_bytes
 
 LEAST_BYTES = 1 << 16
 """Smallest limit that leaves room for anything."""
+KEEP_ACKED_S = 86_400.0
+"""Standard least time for which acknowledged bytes are kept: within a day somebody sees a server that lies."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """Limits of one robot, bytes each; None: as much as there is, but for the memory."""
+    """Limits of one robot, bytes each but the last; None: as much as there is, but for the memory."""
 
     disk_bytes_max: int | None = None
     """Largest size of the pages in use in the robot's file: commits, cells, and some 200 bytes of each commit ever
@@ -35,8 +38,14 @@ class Limits:
     memory of the machine, or of its container; 0: as much as there is. The measurement under way and the cell that is
     being decoded come on top, and of older snapshots what changed since, for as long as a caller holds them."""
 
+    keep_acked_s: float = KEEP_ACKED_S
+    """Least seconds of running for which a commit keeps its bytes after the server acknowledged it, whatever the server
+    says of it, unless another limit would refuse the next commit."""
+
     def __post_init__(self) -> None:
-        """Raises: BadInputError: a limit that leaves no room for anything."""
+        """Raises: BadInputError: a limit that leaves no room for anything, or a time that is none."""
+        if not 0 <= self.keep_acked_s < math.inf:
+            raise BadInputError("bad_option", f"keep_acked_s is 0 s or more, got {self.keep_acked_s}")
         for limit in (self.disk_bytes_max, self.outbox_bytes_max, self.memory_bytes_max or None):
             if limit is not None and limit < LEAST_BYTES:
                 raise BadInputError("bad_option", f"a limit is at least {LEAST_BYTES} bytes, got {limit}")

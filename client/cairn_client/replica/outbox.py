@@ -2,7 +2,8 @@
 
     add -> push_set -> acknowledge        the server has the bytes for good
                     -> rename             the server has other bytes under this id (SYNC.md rule 13)
-    forget                                stable and covered everywhere (rule 12): the SHA stays, the bytes go
+    forget                                stable and covered everywhere (rule 12), and acknowledged for long enough by
+                                          the robot's own clock: the SHA stays, the bytes go
 
 All methods are called under the replica's lock.
 """
@@ -190,7 +191,7 @@ class Outbox:
             self._store.add_commit(commit, seal=seal)
             self._put_successor(commit)
         # Acknowledged from the start: the server that sealed it has it.
-        self._note(replace(_kept(commit), acked=True, seal=seal))
+        self._note(replace(_kept(commit), acked=True, seal=seal, acked_age_s=self._store.age_s()))
         self._read_successors(commit.meta.retracted_ids)
 
     def knows(self, commit: CommitId) -> bool:
@@ -237,9 +238,10 @@ class Outbox:
 
     def acknowledge(self, commit: CommitId) -> None:
         """Note that the server has these bytes for good; only coverage states which commits a cell holds."""
+        age_s = self._store.age_s()
         with self._store.transaction():
-            self._store.set_acked(commit)
-        self._commits[commit] = replace(self._commits[commit], acked=True)
+            self._store.set_acked(commit, age_s=age_s)
+        self._commits[commit] = replace(self._commits[commit], acked=True, acked_age_s=age_s)
         self._acked_since_header.add(commit)
 
     def rename(self, commit: CommitId) -> Commit:

@@ -17,6 +17,7 @@ from dataclasses import replace
 from itertools import islice
 from typing import Protocol
 
+from cairn_client.replica.limits import KEEP_ACKED_S
 from cairn_client.replica.outbox import NO_FACTS, NO_NOTES, CommitFacts, Outbox
 from cairn_client.replica.replica_state import ReplicaState
 from cairn_client.replica.replica_store import BaseCell, KeptCommit, ReplicaStore
@@ -42,6 +43,8 @@ REST_S = 3600.0
 """Time after which a refused commit is tried again."""
 KINDS_OF_ALL = ("http", "unknown_protocol")
 """Kinds of refusals that say nothing about the commit: a portal's or proxy's, and those of every request."""
+FORGET_AT_ONCE = 32
+"""Commits dropped at once for room: a few, so that no more go than must."""
 RETRACTS_AT_ONCE = 1024
 """Most of the operator's retracts that one round fetches: the next one goes on."""
 
@@ -99,6 +102,7 @@ class Replica:
         geometry: Geometry,
         amendable: Callable[[], Iterable[CommitId]] = tuple,
         memory_bytes_max: int | None = None,
+        keep_acked_s: float = KEEP_ACKED_S,
     ) -> None:
         """Open or make the state.
 
@@ -110,6 +114,7 @@ class Replica:
             amendable: returns commits that may still be amended: their bytes are kept, to subtract them at once.
             memory_bytes_max: size of the view from which on no more cells of the server are read from the disk; None:
                 any.
+            keep_acked_s: least seconds, by the store's age, for which an acknowledged commit keeps its bytes.
 
         Raises:
             BadInputError: kind `other_replica`: the file is of another robot, map or grid.
@@ -118,6 +123,7 @@ class Replica:
         self.store = store
         self.state = ReplicaState(store)
         self.geometry = geometry
+        self._keep_acked_s = keep_acked_s
         self.state.identify(robot=robot, map_name=map_name, geometry=geometry)
         self._budget: StorageBudget | None = None
         self.outbox = Outbox(self.state, robot, geometry, make_room=self._make_room, amendable=amendable)
@@ -323,7 +329,9 @@ class Replica:
         """
         header.check()
         with self._lock:
-            self.state.header = header
+            with self.store.transaction():
+                self.state.header = header
+                self.store.keep_age()
             self.header = header
             self.outbox.check_tip(header, asked_by=asked_by)
 
@@ -348,6 +356,9 @@ class Replica:
     def forget_stable_commits(self, *, wanted: Callable[[Cell], bool] | None = None) -> int:
         """Drop the bytes of commits that are stable and covered in every cell they touch (rule 12); their number.
 
+        All that is the server's word, and a hostile one, or one whose clock jumped, may give it at once. So bytes stay
+        for a least time after the acknowledgement, which passes by this robot's own steady clock.
+
         A commit that another kept commit takes out keeps its bytes: the server may have forgotten its evidence, and
         asks for it again. So does one that was never acknowledged: after a roll-back of this robot's disk, the stable
         and covered commit may be another one under the same id.
@@ -356,14 +367,29 @@ class Replica:
             wanted: the cells that this robot keeps at all; default every one.
         """
         with self._lock:
-            stable = self.header.stable_vector if self.header else EMPTY
-            gone = [
-                kept.id for kept in self.outbox if kept.acked and kept.id in stable and self._is_covered(kept, wanted)
-            ]
-            named = self.outbox.named() if gone else set()
-            gone = [commit for commit in gone if commit not in named]
-            self.outbox.forget(gone)
-            return len(gone)
+            return self._forget_stable(wanted, acked_before_s=self.store.age_s() - self._keep_acked_s, at_most=None)
+
+    def make_room_of_stable_commits(self, *, wanted: Callable[[Cell], bool]) -> int:
+        """Drop the bytes of a few stable commits, the oldest first, however short ago they were acknowledged."""
+        with self._lock:
+            return self._forget_stable(wanted, acked_before_s=self.store.age_s(), at_most=FORGET_AT_ONCE)
+
+    def _forget_stable(
+        self, wanted: Callable[[Cell], bool] | None, *, acked_before_s: float, at_most: int | None
+    ) -> int:
+        stable = self.header.stable_vector if self.header else EMPTY
+        gone = [
+            kept.id
+            for kept in self.outbox
+            if kept.acked
+            and kept.acked_age_s <= acked_before_s
+            and kept.id in stable
+            and self._is_covered(kept, wanted)
+        ]
+        named = self.outbox.named() if gone else set()
+        gone = [commit for commit in gone if commit not in named][:at_most]
+        self.outbox.forget(gone)
+        return len(gone)
 
     def drop_cells(self, keys: Iterable[CellKey]) -> None:
         """Hold nothing of some held cells; the view shows of them what the robot made itself."""

@@ -7,7 +7,8 @@ itself, for as long as a transaction lasts. It calls nothing else, so a thread t
 
 import json
 import threading
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +26,7 @@ from cairn_map.evidence.fingerprint import Fingerprint, fingerprint_from_bytes
 from cairn_map.evidence.grid import CellKey
 
 FILE_NAME = "robot.sqlite"
-VERSION = 2
+VERSION = 3
 BUSY_MS = 1000
 """Milliseconds for which a folder may still be held by a robot that is just closing."""
 PRAGMAS = (
@@ -42,6 +43,7 @@ CREATE TABLE commits (
     robot TEXT NOT NULL, incarnation TEXT NOT NULL, n INTEGER NOT NULL,
     sha BLOB NOT NULL,
     acked INTEGER NOT NULL DEFAULT 0,   -- the server said once that it has exactly these bytes
+    acked_age_s REAL NOT NULL DEFAULT 0,    -- age of the store when it said so last
     cells TEXT NOT NULL,                -- numbers of the cells it touches, as JSON
     data BLOB,                          -- NULL once the commit may be forgotten
     seal TEXT,                          -- of a server's own retract, kept for it
@@ -59,7 +61,15 @@ CREATE TABLE cell (
 CREATE INDEX cell_coverage ON cell (coverage);
 """
 ONE_COMMIT = "robot = ? AND incarnation = ? AND n = ?"
-Values = tuple[str | int | bytes | None, ...]
+AGE = "age_s"
+"""Key of the text that holds the store's age."""
+STEPS = {
+    1: "ALTER TABLE commits ADD COLUMN seal TEXT",
+    # When older commits were acknowledged is unknown: they count from the first start with ages.
+    2: "ALTER TABLE commits ADD COLUMN acked_age_s REAL NOT NULL DEFAULT 0",
+}
+"""By version: what leads a store to the next one."""
+Values = tuple[str | int | float | bytes | None, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +95,8 @@ class KeptCommit:
     """False if only the SHA is remembered."""
     seal: str | None = None
     """Seal of a server's own retract, which is kept to be pushed back if the server loses it."""
+    acked_age_s: float = 0.0
+    """Age of the store when the server acknowledged it last, seconds."""
 
 
 class ReplicaStore:
@@ -92,8 +104,12 @@ class ReplicaStore:
 
     _folder_lock: BinaryIO | None = None
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, steady_s: Callable[[], float] = time.monotonic) -> None:
         """Open or make the file.
+
+        Args:
+            folder: the robot's.
+            steady_s: clock that never jumps, seconds.
 
         Raises:
             ConflictError: kind `folder_in_use`: another process has it open.
@@ -107,12 +123,12 @@ class ReplicaStore:
             self._connection = apsw.Connection(str(folder / FILE_NAME))
         try:
             self._folder_lock = lock_folder(folder, wait_s=BUSY_MS / 1000)
-            self._prepare()
+            self._prepare(steady_s)
         except BaseException:
             self.close()
             raise
 
-    def _prepare(self) -> None:
+    def _prepare(self, steady_s: Callable[[], float] = time.monotonic) -> None:
         with self._translated():
             self._connection.set_busy_timeout(BUSY_MS)
             for pragma in PRAGMAS:
@@ -122,12 +138,27 @@ class ReplicaStore:
             with self.transaction():
                 self._connection.execute(DDL)
                 self._connection.execute(f"PRAGMA user_version = {VERSION}")
-        elif version == 1:
+        elif version in STEPS:
             with self.transaction():
-                self._connection.execute("ALTER TABLE commits ADD COLUMN seal TEXT")
+                for step in range(version, VERSION):
+                    self._connection.execute(STEPS[step])
                 self._connection.execute(f"PRAGMA user_version = {VERSION}")
         elif version != VERSION:
             raise BadInputError("store_version", f"{self._folder} has version {version}, this cairn needs {VERSION}")
+        self._steady_s = steady_s
+        self._start_s = steady_s() - float(self.get(AGE) or 0)
+
+    def age_s(self) -> float:
+        """Seconds that robots were seen to run on this folder, by a steady clock; it never jumps.
+
+        Time without a robot does not count, nor what passed since `keep_age` when one was killed: what ends after an
+        age ends later then, never sooner.
+        """
+        return self._steady_s() - self._start_s
+
+    def keep_age(self) -> None:
+        """Keep the age, for the next start; in a transaction of its own, or part of the open one."""
+        self.put(AGE, repr(self.age_s()))
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
@@ -168,11 +199,14 @@ class ReplicaStore:
     def commits(self) -> list[KeptCommit]:
         """All commits, in the order in which they came."""
         rows = self._run(
-            "SELECT robot, incarnation, n, sha, cells, acked, data IS NOT NULL, seal FROM commits ORDER BY number"
+            "SELECT robot, incarnation, n, sha, cells, acked, data IS NOT NULL, seal, acked_age_s"
+            " FROM commits ORDER BY number"
         )
         return [
-            KeptCommit(CommitId(Author(r, i), n), sha, tuple(json.loads(cells)), bool(acked), bool(has_data), seal)
-            for r, i, n, sha, cells, acked, has_data, seal in rows
+            KeptCommit(
+                CommitId(Author(r, i), n), sha, tuple(json.loads(cells)), bool(acked), bool(has_data), seal, age_s
+            )
+            for r, i, n, sha, cells, acked, has_data, seal, age_s in rows
         ]
 
     def data_bytes(self, commits: Iterable[CommitId]) -> int:
@@ -188,10 +222,11 @@ class ReplicaStore:
     def add_commit(self, commit: Commit, *, seal: str | None = None) -> None:
         """Keep a commit; one with a seal is the server's own, which has it already."""
         self._run(
-            "INSERT INTO commits (robot, incarnation, n, sha, cells, data, seal, acked)"
-            " VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-            (*_values(commit.id), commit.sha, json.dumps(sorted(commit.cells)), commit.data, seal, seal is not None),
+            "INSERT INTO commits (robot, incarnation, n, sha, cells, data, seal) VALUES (?, ?, ?, ?, ?, ?, ?)",
+            (*_values(commit.id), commit.sha, json.dumps(sorted(commit.cells)), commit.data, seal),
         )
+        if seal is not None:
+            self.set_acked(commit.id, age_s=self.age_s())
 
     def replace_commit(self, commit: Commit) -> None:
         """Keep a commit with other bytes in its old place."""
@@ -200,9 +235,11 @@ class ReplicaStore:
             (commit.sha, commit.data, *commit.id.author, commit.id.n),
         )
 
-    def set_acked(self, commit: CommitId) -> None:
-        """Note that the server has exactly these bytes."""
-        self._run(f"UPDATE commits SET acked = 1 WHERE {ONE_COMMIT}", _values(commit))  # noqa: S608
+    def set_acked(self, commit: CommitId, *, age_s: float) -> None:
+        """Note that the server has exactly these bytes, and said so at this age of the store."""
+        query = f"UPDATE commits SET acked = 1, acked_age_s = ? WHERE {ONE_COMMIT}"  # noqa: S608
+        self._run(query, (age_s, *_values(commit)))
+        self.keep_age()
 
     def clear_acked(self) -> None:
         """Take all acknowledgements back: the server was replaced."""

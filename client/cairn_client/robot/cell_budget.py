@@ -122,7 +122,9 @@ class CellBudget:
         index = yield from whole_index(self._replica.author, box=self._scope_box)
         self._chosen_s = time.monotonic()
         with self._replica.changing():
-            self._replica.forget_stable_commits(wanted=self._is_kept)
+            # A box is chosen where room is short: what the server has for good goes before a cell near the robot does.
+            while self._replica.make_room_of_stable_commits(wanted=self._is_kept):
+                pass
             # Bytes of each cell that the server has, and its distance from the robot's cell.
             centre = self._centre()
             cells = np.array([entry.cell for entry in index.cells], np.int64).reshape(-1, 3)
@@ -168,8 +170,8 @@ class CellBudget:
             UnreachableError: kind `outbox_full`: nothing is left to drop; try again after a sync.
         """
         replica = self._replica
-        if self._complaint(size_bytes):
-            replica.forget_stable_commits(wanted=self._is_kept)
+        while self._complaint(size_bytes) and replica.make_room_of_stable_commits(wanted=self._is_kept):
+            pass
         while (complaint := self._complaint(size_bytes)) and complaint[0] != "outbox" and self._drop_farthest():
             pass
         if complaint:

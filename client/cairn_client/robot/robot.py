@@ -152,6 +152,7 @@ class Robot:
                 geometry=geometry,
                 amendable=self._amendable_commits,
                 memory_bytes_max=self._limits.map_bytes_max,
+                keep_acked_s=self._limits.keep_acked_s,
             )
             most = self._limits.map_bytes_max
             log.info(

@@ -12,6 +12,7 @@ from cairn_client.cli.maps import command as map_command
 from cairn_client.cli.maps import diff as diff_command
 from cairn_client.cli.maps import pull as pull_copy_command
 from cairn_client.folders.map_copy import clone, pull
+from cairn_client.folders.map_folder import open_map
 from cairn_client.folders.state_folder import opened_replica
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
@@ -122,3 +123,14 @@ def test_a_clone_that_lost_its_link_is_finished_by_a_pull(server: LiveServer, tm
         pull(copy)
     server.start()
     assert pull(copy).voxels == 2
+
+
+def test_a_map_of_a_server_is_opened_within_its_memory_limit_and_refused_beyond(
+    server: LiveServer, tmp_path: Path
+) -> None:
+    push_diffs(server, tmp_path / "mole", {A: seen(1, 2, 3)}, {B: seen(*range(512))})
+    assert open_map(server.map_url).model == open_map(server.map_url, memory_bytes_max=1 << 20).model
+    for memory_bytes_max in (1, 1000):
+        with pytest.raises(BadInputError) as caught:
+            open_map(server.map_url, memory_bytes_max=memory_bytes_max)
+        assert caught.value.kind == "too_large" and "memory_bytes_max" in caught.value.message
