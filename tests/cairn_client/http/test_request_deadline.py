@@ -73,7 +73,7 @@ def test_bytes_lengthen_the_time_and_those_of_the_body_count() -> None:
     link_bytes_per_s = 10_000 / 8
     for size_bytes in (0, 1 << 8, 1 << 18, 1 << 26):
         assert PACE.allowed_s(size_bytes) > size_bytes / link_bytes_per_s, "a link of 10 kbit/s is in time"
-    slow = Pace(grace_s=0.3, least_bytes_per_s=100)
+    slow = Pace(grace_s=2.0, least_bytes_per_s=1e6)
     with dripping("body") as url, MapApi(url, pace=slow) as api, pytest.raises(UnreachableError) as caught:
         api.probe("/x")
     found = re.search(r"longer than \d+ s for a request of which (\d+) bytes", caught.value.message)

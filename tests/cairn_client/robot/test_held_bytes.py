@@ -3,6 +3,7 @@
 import logging
 import tracemalloc
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -120,7 +121,7 @@ def test_a_quarter_of_the_memory_is_the_limit_of_a_robot_that_is_given_none(
 
 def test_a_folder_with_more_than_its_limit_is_opened_within_it(server: LiveServer, tmp_path: Path) -> None:
     diff = {key: evidence for n in range(6) for key, evidence in shifted(evidence_of(n).packed(), n).items()}
-    with robot_in(tmp_path, server.map_url, limits=NO_LIMITS) as robot:
+    with robot_in(tmp_path, server.map_url, limits=replace(NO_LIMITS, keep_acked_s=0)) as robot:
         robot.replica.commit(diff)
         robot.sync()
         server.wait_for_fold()

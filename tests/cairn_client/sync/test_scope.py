@@ -11,6 +11,7 @@ from tests.fixtures.client.team import Team
 
 from cairn_client.cli.robots import command as robot_command
 from cairn_client.http.api import MapApi
+from cairn_client.replica.limits import Limits
 from cairn_client.sync.scope import BoxMetres, Scope
 from cairn_client.sync.sync import ROUNDS_MAX
 from cairn_map.commits.ids import commit_id_from_text
@@ -66,7 +67,8 @@ def test_low_end_a_box_and_a_wish_go_together(large: LiveServer, tmp_path: Path)
 @pytest.mark.parametrize("mode", ["high-end", "low-end"])
 def test_own_commits_outside_the_box_are_not_kept_for_ever(server: LiveServer, tmp_path: Path, mode: Mode) -> None:
     far_m = ((50.0, 50.0, 50.0), (51.0, 51.0, 51.0))
-    with robot_in(tmp_path, server.map_url, mode=mode, scope=Scope(box_m=far_m)) as robot:
+    limits = Limits(keep_acked_s=0)
+    with robot_in(tmp_path, server.map_url, mode=mode, scope=Scope(box_m=far_m), limits=limits) as robot:
         commit = commit_id_from_text(map_commit(robot, 1))
         robot.sync()
         server.wait_for_fold()
