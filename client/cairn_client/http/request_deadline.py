@@ -6,7 +6,8 @@ holds its reader for ever. So a request may take
     grace_s + (bytes sent + bytes of the body that came) / least_bytes_per_s
 
 of waiting for the link; what the caller does between two parts of the body does not count. Past it, the connection is
-cut from a timer's thread, wherever the request waits: in the head, between two chunks, in the body of an error.
+cut from a timer's thread, wherever the request waits: in the head, between two chunks, in the body of an error; and cut
+again, until the request has ended: a connection may be made only after the first cut.
 """
 
 import threading
@@ -19,8 +20,8 @@ from typing import Self
 
 from cairn_map.errors import UnreachableError
 
-LEAST_CHECK_S = 0.01
-"""Shortest time of a timer."""
+LEAST_CHECK_S = 0.1
+"""Shortest time of a timer, and the time between two cuts."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,7 +42,7 @@ PACE = Pace()
 
 
 class RequestDeadline:
-    """Deadline of one request, for the length of a `with`; it calls `cut` once, from a thread of its own."""
+    """Deadline of one request, for the length of a `with`; it calls `cut` from a thread of its own."""
 
     def __init__(self, pace: Pace, cut: Callable[[], None], *, sent_bytes: int) -> None:
         self._pace = pace
@@ -119,10 +120,9 @@ class RequestDeadline:
         with self._lock:
             if self._is_ended:
                 return
-            # More came since, or the caller is busy with what came: look again when that is used up.
-            if self._since_s is None or self._left_s() > 0:
-                self._set_timer()
-                return
-            self.is_over = True
-            # Under the lock, so that no later request on these connections is cut in place of this one.
-            self._cut()
+            # Else more came since, or the caller is busy with what came: look again when that is used up.
+            if self.is_over or (self._since_s is not None and self._left_s() <= 0):
+                self.is_over = True
+                # Under the lock, so that no later request on these connections is cut in place of this one.
+                self._cut()
+            self._set_timer()

@@ -122,9 +122,12 @@ class CellBudget:
         index = yield from whole_index(self._replica.author, box=self._scope_box)
         self._chosen_s = time.monotonic()
         with self._replica.changing():
-            # A box is chosen where room is short: what the server has for good goes before a cell near the robot does.
-            while self._replica.make_room_of_stable_commits(wanted=self._is_kept):
-                pass
+            # Where the disk is short, what the server has for good goes before a cell near the robot does. Memory is no
+            # reason: the bytes of commits take none, and a server can make a map as large as it likes.
+            if self._limits.disk_bytes_max:
+                while self._replica.make_room_of_stable_commits(wanted=self._is_kept):
+                    pass
+            self._replica.forget_stable_commits(wanted=self._is_kept)
             # Bytes of each cell that the server has, and its distance from the robot's cell.
             centre = self._centre()
             cells = np.array([entry.cell for entry in index.cells], np.int64).reshape(-1, 3)

@@ -26,6 +26,7 @@ DRIPS: dict[str, tuple[bytes, Callable[[], Iterable[bytes]]]] = {
     "body-without-length": (b"HTTP/1.1 200 OK\r\n\r\n", lambda: itertools.repeat(b"x")),
     "chunk-size": (CHUNKED + b"1;", lambda: itertools.repeat(b"x")),
     "trailer": (CHUNKED + b"0\r\nX: ", lambda: itertools.repeat(b"x")),
+    "error": (b"HTTP/1.1 503 x\r\nContent-Length: 40000\r\n\r\n", lambda: itertools.repeat(b"x")),
 }
 CALLS: dict[str, Callable[[MapApi], object]] = {
     "probe": lambda api: api.probe("/healthz"),
@@ -54,19 +55,13 @@ def dripping(name: str) -> Iterator[str]:
 
 
 @pytest.mark.parametrize(
-    ("call", "name"), [*product(["probe"], DRIPS), *product(["missing"], ["processing", "trailer"])]
+    ("call", "name"), [*product(["probe"], DRIPS), *product(["missing"], ["processing", "trailer", "error"])]
 )
 def test_a_request_to_a_server_that_drips_ends(call: str, name: str) -> None:
     with dripping(name) as url, MapApi(url, pace=SHORT) as api:
         with pytest.raises(UnreachableError) as caught:
             CALLS[call](api)
         assert caught.value.kind == "no_link" and "took longer than" in caught.value.message
-
-
-def test_an_error_whose_body_drips_counts_by_its_status() -> None:
-    DRIPS["error"] = (b"HTTP/1.1 503 x\r\nContent-Length: 40000\r\n\r\n", lambda: itertools.repeat(b"x"))
-    with dripping("error") as url, MapApi(url, pace=SHORT) as api, pytest.raises(UnreachableError):
-        api.map_info(MAP)
 
 
 def test_bytes_lengthen_the_time_and_those_of_the_body_count() -> None:

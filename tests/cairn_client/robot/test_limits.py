@@ -239,6 +239,21 @@ def test_commits_that_are_stable_go_first(server: LiveServer, tmp_path: Path) ->
             robot.replica.commit(far)
 
 
+@pytest.mark.parametrize(("limits", "left"), [(Limits(memory_bytes_max=1 << 16), 1), (Limits(disk_bytes_max=66_000), 0)])
+def test_a_map_too_large_for_the_memory_drops_no_acknowledged_bytes(
+    row_server: LiveServer, tmp_path: Path, limits: Limits, left: int
+) -> None:
+    with robot_in(tmp_path, row_server.map_url, limits=limits) as robot:
+        at(robot, 3)
+        map_commit(robot, 1)
+        robot.sync()
+        row_server.wait_for_fold()
+        robot.sync()
+        robot.sync()
+        assert robot._rounds._budget.kept is not None, "a box was chosen"
+        assert len(robot.replica.commits) == left
+
+
 @pytest.mark.slow
 def test_acknowledged_commits_that_a_restore_could_lose_stay(server: LiveServer, tmp_path: Path) -> None:
     server.stop()
