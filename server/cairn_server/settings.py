@@ -98,6 +98,8 @@ class Settings(BaseModel):
     """URL of a server to hold the same commits as (http://BASE:8750)"""
     upstream_token: str | None = None
     """Token of role relay, given by the upstream server."""
+    upstream_maps_max: Annotated[int, Field(ge=0)] = 100
+    """Maps on this server from which on none is made for the upstream server; admins create more."""
     trusted_servers: Annotated[str, Field(pattern=r"^([0-9a-f]{64}( [0-9a-f]{64})*)?$")] = ""
     """Public keys (hex, separated by spaces) of servers whose operators' retracts and prior data count here."""
     public_urls: Annotated[str, AfterValidator(_origins)] = ""

@@ -26,9 +26,9 @@ from cairn_client.http.map_url import split_map_url
 from cairn_client.http.origin_tokens import OriginTokens
 from cairn_client.relay.carried_commits import CarriedCommits
 from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
-from cairn_client.relay.round import REST_S, RelayReport, RelaySide, Undelivered, log_report, relay_round
+from cairn_client.relay.round import AT_ONCE, REST_S, RelayReport, RelaySide, Undelivered, log_report, relay_round
 from cairn_client.sync.uploads import CAME_IN_PART
-from cairn_map.errors import BadInputError, UnreachableError
+from cairn_map.errors import BadInputError, CairnError, UnreachableError
 from cairn_map.wire.relay_peer import MapEnd
 
 log = logging.getLogger(__name__)
@@ -62,9 +62,10 @@ def main(argv: list[str]) -> int:
             try:
                 report = _once(here, there, resting, map_name=name, where=args.there)
                 backoff.reset()
-            except UnreachableError as exc:
-                wait_s = backoff.next_s(min(exc.retry_after_s or 0.0, REST_S))
-                log.warning("no link (%s); trying again in %.1f s", exc.message, wait_s)
+            except CairnError as exc:  # also nonsense, such as a portal's page in the place of an answer
+                asked_s = exc.retry_after_s or 0.0 if isinstance(exc, UnreachableError) else 0.0
+                wait_s = backoff.next_s(min(asked_s, REST_S))
+                log.warning("no round (%s: %s); trying again in %.1f s", exc.kind, exc.message, wait_s)
                 time.sleep(wait_s)
     return int(bool(report.kept_back or report.refused or report.split or any(map(resting.may_come_later, RelaySide))))
 
@@ -79,7 +80,7 @@ def _once(here: MapEnd, there: MapEnd, resting: Undelivered, *, map_name: str, w
         for side in RelaySide:
             total.moved[side] += report.moved[side]
         total.kept_back |= report.kept_back
-        total.refused += report.refused
+        total.refused = (total.refused + report.refused)[:AT_ONCE]
         error = report.cut or report.later
         if error:  # a commit at which this happens twice rests, so that the next ones have their turn
             cuts = 1 if any(report.moved.values()) or error.kind == CAME_IN_PART else cuts + 1

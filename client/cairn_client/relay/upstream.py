@@ -1,7 +1,8 @@
 """Upstream relay: the thread by which `cairn serve --upstream` keeps a server level with another one.
 
-All maps of the upstream server are made here if they are not, and from then on hold the same commits. Without a link
-both servers go on by themselves.
+The maps of the upstream server are made here if they are not, up to a number (`OwnServer.open`), and from then on hold
+the same commits. Without a link both servers go on by themselves. One map's answers hold up no other map: nonsense is
+reported and passed over, and after an answer that never ended the next round begins with the map behind it.
 """
 
 import logging
@@ -9,10 +10,12 @@ import threading
 import time
 
 from cairn_client.http.backoff import Backoff
+from cairn_client.http.request_deadline import PACE, Pace
 from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
-from cairn_client.relay.round import Undelivered, log_report, relay_round
+from cairn_client.relay.round import RelayReport, Undelivered, log_report, relay_round
 from cairn_map.errors import CairnError, UnreachableError
-from cairn_map.wire.relay_peer import OwnServer
+from cairn_map.wire.messages import MapInfo
+from cairn_map.wire.relay_peer import TOO_MANY_MAPS, OwnServer
 
 log = logging.getLogger(__name__)
 
@@ -25,19 +28,23 @@ SAY_AGAIN_S = 600.0
 class Upstream:
     """Relays between a server and its upstream until stopped."""
 
-    def __init__(self, url: str, token: str | None, server: OwnServer, *, every_s: float = EVERY_S) -> None:
+    def __init__(
+        self, url: str, token: str | None, server: OwnServer, *, every_s: float = EVERY_S, pace: Pace = PACE
+    ) -> None:
         """Begin.
 
         Raises:
             BadInputError: the URL is none of a server.
         """
         logging.getLogger("httpx").setLevel(logging.WARNING)  # a line for each request is no help in a server's log
-        self._api = RelayApi(url, token=token)
+        self._api = RelayApi(url, token=token, pace=pace)
         self._url = url
         self._server = server
         self._every_s = every_s
         self._resting: dict[str, Undelivered] = {}
         self._said_s: dict[str, float] = {}
+        self._last_name = ""
+        """The map that was relayed last: the next round begins behind it."""
         self._stopping = threading.Event()
         self._woken = threading.Event()
         self._thread = threading.Thread(target=self._run, name="cairn-upstream", daemon=True)
@@ -76,29 +83,59 @@ class Upstream:
                     self._woken.wait(self._every_s)
 
     def _round(self) -> bool:
-        """Relay all maps once; True if there is more to do at once."""
-        found = self._api.maps()
-        for name in sorted(set(self._server.map_names()) - {info.name for info in found}):
+        """Relay all maps once; True if there is more to do at once.
+
+        Raises:
+            UnreachableError: the link broke, or a request ran out of time.
+        """
+        found = sorted(self._api.maps(), key=lambda info: (info.name <= self._last_name, info.name))
+        own = set(self._server.map_names())
+        for name in sorted(own - {info.name for info in found}):
             self._say(logging.WARNING, f"upstream {self._url} has no map {name} for this token; create it there")
-        has_more, cut = False, None
+        has_more, cut, is_full = False, None, False
+        refused: list[tuple[str, CairnError]] = []
         for info in found:
             if self._stopping.is_set():
                 return False
-            try:
-                here = self._server.open(info)
-            except CairnError as exc:
-                self._say(logging.ERROR, f"map {info.name} cannot be joined: {exc.message}")
+            if is_full and info.name not in own:
                 continue
-            begun_s = self._server.clock_s()
-            resting = self._resting.setdefault(info.name, Undelivered())
-            report = hold_between(relay_round(resting), here, ServerEnd(self._api, info.name))
-            log_report(report, info.name, there=self._url)
+            try:
+                report = self._relay(info)
+            except UnreachableError as exc:
+                cut = exc
+                break
+            except CairnError as exc:
+                refused.append((info.name, exc))
+                is_full |= exc.kind == TOO_MANY_MAPS
+                continue
             has_more, cut = has_more or report.has_more, cut or report.cut
-            if report.is_all_there:
-                self._server.handed_over(info.name, begun_s)
+        self._say_refused(refused)
         if cut:
             raise cut
         return has_more
+
+    def _relay(self, info: MapInfo) -> RelayReport:
+        """Report of one round with one map.
+
+        Raises:
+            CairnError: the map cannot be joined, or the upstream's answers are not sound.
+        """
+        here = self._server.open(info)
+        self._last_name = info.name
+        begun_s = self._server.clock_s()
+        resting = self._resting.setdefault(info.name, Undelivered())
+        report = hold_between(relay_round(resting), here, ServerEnd(self._api, info.name))
+        log_report(report, info.name, there=self._url)
+        if report.is_all_there:
+            self._server.handed_over(info.name, begun_s)
+        return report
+
+    def _say_refused(self, refused: list[tuple[str, CairnError]]) -> None:
+        """One line for the maps that could not be relayed, however many there are."""
+        if refused:
+            name, error = refused[0]
+            others = f" (and {len(refused) - 1} others)" if len(refused) > 1 else ""
+            self._say(logging.ERROR, f"map {name}{others} cannot be joined: {error.message}")
 
     def _say(self, level: int, text: str) -> None:
         """A line of the log, the same one not again too soon."""

@@ -17,6 +17,8 @@ from cairn_map.wire.messages import WANTED_MAX, IdText, MapInfo, VectorJson
 SumText = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
 
 SUM_BYTES = 16
+TOO_MANY_MAPS = "too_many_maps"
+"""Kind of the error of a server that makes no more maps for its upstream."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +89,8 @@ class OwnServer(Protocol):
         """The server's map of the same name as the upstream's, created if there is none.
 
         Raises:
-            ConflictError: kind `map_exists`: it has another grid or sensor model.
+            ConflictError: kind `map_exists`: it has another grid or sensor model. Kind `too_many_maps`: it is not here,
+                and no more maps are made for an upstream.
         """
         ...
 

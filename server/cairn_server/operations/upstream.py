@@ -10,9 +10,9 @@ from importlib.metadata import entry_points
 from typing import Protocol
 
 from cairn_map.commits.ids import CommitId
-from cairn_map.errors import BadInputError, ConflictError
+from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_map.wire.messages import CreateMap, MapInfo
-from cairn_map.wire.relay_peer import Held, MapEnd, OwnServer, SignedCommit
+from cairn_map.wire.relay_peer import TOO_MANY_MAPS, Held, MapEnd, OwnServer, SignedCommit
 from cairn_server.access.auth import UPSTREAM
 from cairn_server.service import Service
 from cairn_server.store.store_rows import MapRow
@@ -94,12 +94,30 @@ class OwnMaps:
         return [row.name for row in self._service.store.maps()]
 
     def open(self, upstream: MapInfo) -> MapEnd:
-        """The map of the same name as one of the upstream, created if it is not there."""
+        """The map of the same name as one of the upstream, created if it is not there.
+
+        Raises:
+            ConflictError: kind `map_exists`; or `too_many_maps`: the upstream could name any number.
+        """
+        try:
+            self._service.store.map(upstream.name)
+        except NotFoundError:
+            self._check_place()
         request = CreateMap(geometry=upstream.geometry, sensor_model=upstream.sensor_model)
         _, is_new = self._service.maps.create(upstream.name, request)
         if is_new:
             self._service.store.audit_log.add(UPSTREAM.name, "create_map", upstream.name)
         return OwnEnd(self._service, self._service.store.map(upstream.name))
+
+    def _check_place(self) -> None:
+        """Raises: ConflictError: kind `too_many_maps`: no more maps are made for the upstream."""
+        count, most = len(self._service.store.maps()), self._service.settings.upstream_maps_max
+        if count >= most:
+            raise ConflictError(
+                TOO_MANY_MAPS,
+                f"this server has {count} maps, and makes none for its upstream beyond {most}; if it should have this "
+                "one, create it here (cairn map create), or raise upstream_maps_max and start again",
+            )
 
     def clock_s(self) -> float:
         """Age of the store."""

@@ -18,6 +18,7 @@ from tests.fixtures.client.world import stored_commits
 
 from cairn_client import main as cairn
 from cairn_client.cli.robots.command import main as robot_command
+from cairn_client.replica.limits import Limits
 from cairn_map.errors import UnreachableError
 
 
@@ -38,7 +39,7 @@ def test_the_status_of_a_robot_at_work_is_that_of_its_store(
     server: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "mole"
-    with robot_in(tmp_path, server.map_url, stay=True) as mole:
+    with robot_in(tmp_path, server.map_url, stay=True, limits=Limits(keep_acked_s=0)) as mole:
         map_commit(mole, 1)
         mole.sync()
         server.wait_for_fold()

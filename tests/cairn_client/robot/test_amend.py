@@ -12,6 +12,7 @@ from tests.fixtures.client.robot_program import INTEGRATOR, RIG, scan_of
 from tests.fixtures.client.world import stored_commits
 
 from cairn_calib.rig.poses import Transform, look_at
+from cairn_client.replica.limits import Limits
 from cairn_client.robot.kept_scans import OPEN
 from cairn_client.robot.robot import Robot
 from cairn_fusion.mapping.integrate import integrate_scan
@@ -25,10 +26,17 @@ NOWHERE = "http://127.0.0.1:9/maps/lab"
 PLENTY = 10_000_000
 
 
-def robot_in(folder: Path, url: str = NOWHERE, *, name: str = "mole", keep_scans_bytes: int = PLENTY) -> Robot:
+def robot_in(
+    folder: Path,
+    url: str = NOWHERE,
+    *,
+    name: str = "mole",
+    keep_scans_bytes: int = PLENTY,
+    limits: Limits | None = None,
+) -> Robot:
     return Robot(
         RIG, url, directory=folder / name, name=name, geometry=GEOMETRY, integrator=INTEGRATOR,
-        keep_scans_bytes=keep_scans_bytes,
+        keep_scans_bytes=keep_scans_bytes, limits=limits,
     )  # fmt: skip
 
 
@@ -150,7 +158,7 @@ def test_an_amend_is_seen_at_once_although_the_commit_is_stable_everywhere(serve
 
 
 def test_commits_leave_the_robot_when_their_scans_did(server: LiveServer, tmp_path: Path) -> None:
-    with robot_in(tmp_path, server.map_url, keep_scans_bytes=900) as robot:
+    with robot_in(tmp_path, server.map_url, keep_scans_bytes=900, limits=Limits(keep_acked_s=0)) as robot:
         commits = [measured(robot, seed) for seed in range(1, 7)]
         for _ in range(3):
             robot.sync()
