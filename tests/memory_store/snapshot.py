@@ -71,7 +71,7 @@ class MemorySnapshot:
         times = [
             kept.new.captured_s[1]
             for kept in self._folded()
-            if kept.new.captured_s and kept.new.diff and not kept.unfolded_seq
+            if kept.new.captured_s and kept.cells and not kept.unfolded_seq
             if kept.new.captured_s[1] <= kept.received_s + CAPTURED_AHEAD_MAX_S
         ]
         return max(times, default=None)

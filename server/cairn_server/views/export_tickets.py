@@ -13,6 +13,7 @@ import threading
 import time
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 
 from cairn_map.errors import DeniedError, UnreachableError
 from cairn_map.files.export_request import ExportRequest, ExportTicket
@@ -20,7 +21,7 @@ from cairn_server.access.auth import READING, caller_of, require, token_hash
 from cairn_server.settings import Settings
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow
-from cairn_server.views.map_exports import Export, MapExports
+from cairn_server.views.map_exports import Export, MapExports, while_allowed
 
 TICKET_BYTES = 16
 TICKET_S = 30.0
@@ -90,11 +91,14 @@ class ExportTickets:
         try:
             if time.monotonic() >= kept.until_s or (kept.row.name, kept.asked) != (name, asked):
                 raise _bad_ticket()
-            require(caller_of(kept.token, kept.row, self._store, self._settings), *READING)
+            self._check_token(kept)
         except BaseException:
             kept.export.close()
             raise
-        return kept.export
+        return while_allowed(kept.export, partial(self._check_token, kept))
+
+    def _check_token(self, kept: _Ticket) -> None:
+        require(caller_of(kept.token, kept.row, self._store, self._settings), *READING)
 
     def close(self) -> None:
         """End all tickets."""

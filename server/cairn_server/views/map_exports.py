@@ -6,16 +6,17 @@ laid aside. The file is gone as soon as the answer is, however it ends. So an ex
 whatever its size.
 """
 
+import logging
 import math
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import IO
 
-from cairn_map.errors import BadInputError, UnreachableError
+from cairn_map.errors import BadInputError, CairnError, DeniedError, UnreachableError
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey
 from cairn_map.files.export_request import ExportRequest, cell_may_have, node_geometry
@@ -27,8 +28,12 @@ from cairn_server.folding.cells_at_rest import DamagedCellError, decode_stored, 
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import CellRow, Head, MapRow
 
+log = logging.getLogger(__name__)
+
 VOXELS_EXPORTED_MAX = 1 << 28
 """Most known voxels of the cells of an export."""
+PIECE_BYTES = 1 << 16
+"""Bytes that are sent before the token is looked up again: a minute of the slowest link."""
 COUNT_S = 60.0
 COUNTS_AT_ONCE = 2
 WAIT_S = 5.0
@@ -49,6 +54,27 @@ class Export:
     def close(self) -> None:
         """Drop the temporary file of an export that is not sent."""
         self.aside.close()
+
+
+def while_allowed(export: Export, check: Callable[[], object]) -> Export:
+    """Export that a check precedes piece by piece: what it raises ends the file, since the token may have ended.
+
+    An unreadable store is no reason to cut a file off.
+    """
+
+    def pieces() -> Iterator[bytes]:
+        for part in export.parts:
+            for start in range(0, len(part), PIECE_BYTES):
+                try:
+                    check()
+                except DeniedError:
+                    export.close()
+                    raise
+                except CairnError as exc:
+                    log.warning("cannot look the token of an export up: %s", exc.message)
+                yield part[start : start + PIECE_BYTES]
+
+    return replace(export, parts=pieces())
 
 
 class MapExports:

@@ -1,5 +1,6 @@
 """Tickets for exports: a link saves exactly the file that a token asked for, once and soon, and nothing else."""
 
+import itertools
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,7 +20,7 @@ from cairn_map.wire.access_messages import CreateToken
 from cairn_server.access.auth import ADMIN_FILE
 from cairn_server.access.tokens import create_token, revoke_token, rotate_token
 from cairn_server.store.store_rows import MapRow
-from cairn_server.views import export_tickets
+from cairn_server.views import export_tickets, map_exports
 from cairn_server.views.export_tickets import TICKET_S, TICKETS_MAX, TICKETS_OF_TOKEN_MAX
 from cairn_server.views.map_exports import Export
 
@@ -226,3 +227,29 @@ def test_a_server_that_stops_lets_all_files_go(tmp_path: Path) -> None:
         ticket_of(live.http.post(f"/maps/{row.name}/main/export/tickets", json=QUERY))
         (export,) = kept(live)
     assert export.aside.closed
+
+
+@pytest.mark.parametrize("way", ["token", "link"])
+def test_an_export_on_its_way_is_cut_when_its_token_ends(
+    guarded: Live, row: MapRow, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    whole = 64 << 20  # far more than the sockets hold
+
+    def zeros(*about: object) -> Iterator[bytes]:
+        yield from itertools.repeat(bytes(1 << 20), whole >> 20)
+
+    monkeypatch.setattr(map_exports, "point_file", zeros)
+    token = reader_of(guarded, row)
+    ticket = ticket_of(ask(guarded, row, token, format="laz")) if way == "link" else None
+    query = {"format": "laz", **({"ticket": ticket} if ticket else {})}
+    url = f"http://127.0.0.1:{guarded.port}/maps/{row.name}/main/export"
+    came = 0
+    with (
+        httpx.stream("GET", url, params=query, headers={} if ticket else bearer(token), timeout=60) as answer,
+        pytest.raises(httpx.RemoteProtocolError),
+    ):
+        assert answer.status_code == 200
+        revoke_token(guarded.service.store, "eye", by=ADMIN_FILE)
+        for part in answer.iter_bytes():
+            came += len(part)
+    assert came < whole // 2

@@ -1,20 +1,34 @@
 """Routes by which a map leaves the server: as a picture, or as a file of points or an octree."""
 
+from contextlib import suppress
+from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import StreamingResponse
+from starlette.types import Send
 
+from cairn_map.errors import DeniedError
 from cairn_map.files.export_request import EXPORT_TYPES, ExportRequest, ExportTicket, TicketedExport
 from cairn_map.render.render_request import RenderRequest
 from cairn_server.http.routes.callers import READERS, Asking, Credentials, Map, Operations
 from cairn_server.http.routes.documentation import answers, json_body, problems
 from cairn_server.http.routes.json_bodies import json_of
 from cairn_server.store.store_rows import MapRow
+from cairn_server.views.map_exports import while_allowed
 
 PICTURES = {"png": "image/png", "npz": "application/x-npz"}
 
 router = APIRouter()
+
+
+class _Download(StreamingResponse):
+    """File on its way, which ends without its end once its token has ended: the connection is cut."""
+
+    async def stream_response(self, send: Send) -> None:
+        """Send the parts."""
+        with suppress(DeniedError):
+            await super().stream_response(send)
 
 
 @router.get(
@@ -52,13 +66,14 @@ def export(
     service: Operations,
     name: str,
     row: Annotated[MapRow | None, Depends(map_without_ticket)],
+    asker: Asking,
     asked: Annotated[TicketedExport, Query()],
 ) -> StreamingResponse:
     """Occupied nodes by box, heights, probability, temperature, octree depth: as points, or an octree of OctoMap's."""
     if row is None:
         made = service.views.tickets.shown(asked.ticket or "", name, asked.request)
     else:
-        made = service.views.exports.asked(row, asked.request)
+        made = while_allowed(service.views.exports.asked(row, asked.request), partial(asker.reader, name))
     headers = {
         "Cache-Control": "no-store",
         "Cairn-Cursor": str(made.head.cursor),
@@ -68,7 +83,7 @@ def export(
     }
     if made.size_bytes is not None:
         headers["Content-Length"] = str(made.size_bytes)
-    return StreamingResponse(made.parts, media_type=EXPORT_TYPES[asked.format], headers=headers)
+    return _Download(made.parts, media_type=EXPORT_TYPES[asked.format], headers=headers)
 
 
 @router.post(
