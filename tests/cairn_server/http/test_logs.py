@@ -3,6 +3,7 @@
 import json
 import logging
 import signal
+import socket
 import sys
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from tests.fixtures.server.live import Live, Process
 from tests.fixtures.server.processes import client, make_map
 from tests.fixtures.server.pushes import MOLE, pushed
 
-from cairn_server.http.middleware.log_format import REQUEST_ID, JsonFormatter, TextFormatter, fields
+from cairn_server.http.middleware.log_format import REQUEST_ID, JsonFormatter, JunkFilter, TextFormatter, fields
 
 ADMIN, ENROLLER, WRONG = "admin-secret-1234567", "enroller-secret-1234567", "wrong-secret-1234567"
 
@@ -96,3 +97,32 @@ def test_an_exception_is_told_in_either_form() -> None:
         record = logging.LogRecord("cairn", logging.ERROR, __file__, 1, "failed", (), sys.exc_info())
     assert "ValueError: why" in TextFormatter().format(record)
     assert "ValueError: why" in json.loads(JsonFormatter().format(record))["exception"]
+
+
+@pytest.mark.processes
+def test_strangers_do_not_fill_the_log_with_requests_that_are_no_http(tmp_path: Path) -> None:
+    process = Process(tmp_path / "data")
+    with client(process) as http:
+        for _ in range(30):
+            with socket.create_connection((http.base_url.host, http.base_url.port or 0), timeout=60) as link:
+                link.sendall(b"junk\r\n\r\n")
+                assert b"400" in link.recv(64)
+    process.send(signal.SIGTERM)
+    code, log = process.end()
+    assert (code, log.count("Invalid HTTP request")) == (0, 1)
+
+
+def test_a_line_of_junk_comes_once_a_minute_with_the_count_of_the_others() -> None:
+    now_s = iter((0.0, 1.0, 2.0, 30.0, 61.0, 62.0))
+    junk = JunkFilter(steady_s=lambda: next(now_s))
+
+    def written(message: str, *, name: str = "uvicorn.error", level: int = logging.WARNING) -> str | None:
+        record = logging.LogRecord(name, level, __file__, 1, message, None, None)
+        return TextFormatter().format(record).split(" ", 2)[2] if junk.filter(record) else None
+
+    assert [written("junk") for _ in range(3)] == ["junk", None, None]
+    assert written("other junk") == "other junk"
+    assert written("junk") == "junk more=2"
+    assert written("junk") is None
+    assert [written("ours", name="cairn_server") for _ in range(2)] == ["ours"] * 2
+    assert [written("broken", level=logging.ERROR) for _ in range(2)] == ["broken"] * 2

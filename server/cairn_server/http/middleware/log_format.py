@@ -8,13 +8,18 @@ Fields are given as `extra=fields(map=..., size_bytes=...)`. Tokens are never gi
 
 import json
 import logging
+import math
 import sys
 import time
+from collections import Counter
+from collections.abc import Callable
 from contextvars import ContextVar
 from enum import StrEnum
 
 REQUEST_ID: ContextVar[str] = ContextVar("request_id", default="")
 """Id of the request that this thread or task works for."""
+HTTP_LIBRARY = "uvicorn.error"
+JUNK_EVERY_S = 60.0
 Field = str | int | float | bool | None
 
 
@@ -59,9 +64,38 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(line)
 
 
+class JunkFilter(logging.Filter):
+    """Filter that passes one line a minute of each warning of the HTTP library, with the count of those left out.
+
+    Such a warning is about a request that is no HTTP, and any stranger can cause thousands in a second. Their texts are
+    the library's own, so only few are remembered.
+    """
+
+    def __init__(self, *, steady_s: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self._steady_s = steady_s
+        self._last_s: dict[str, float] = {}
+        self._left_out: Counter[str] = Counter()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """True if the line is to be written. Its handler's lock is not held: a line may be counted twice."""
+        if record.name != HTTP_LIBRARY or record.levelno != logging.WARNING:
+            return True
+        now_s, text = self._steady_s(), str(record.msg)
+        if now_s - self._last_s.get(text, -math.inf) < JUNK_EVERY_S:
+            self._left_out[text] += 1
+            return False
+        self._last_s[text] = now_s
+        more = self._left_out.pop(text, 0)
+        if more:
+            record.fields = {"more": more}
+        return True
+
+
 def start_logging(form: LogForm, level: int) -> None:
     """Log to standard error in this form, including what libraries log."""
     handler = logging.StreamHandler(sys.stderr)
+    handler.addFilter(JunkFilter())
     handler.setFormatter(JsonFormatter() if form is LogForm.JSON else TextFormatter())
     logging.basicConfig(level=level, handlers=[handler], force=True)
 
