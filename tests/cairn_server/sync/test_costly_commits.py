@@ -21,6 +21,7 @@ from cairn_map.codec.cell_code import Profile
 from cairn_map.codec.octree.cell_head import decode_head
 from cairn_map.commits.commit import Commit, CommitMeta, ScanPose, make_commit
 from cairn_map.commits.ids import Author, CommitId
+from cairn_map.errors import UnreachableError
 from cairn_map.evidence.evidence import Evidence, packed_evidence
 from cairn_map.evidence.grid import Geometry, cell_key
 from cairn_map.wire.messages import CreateMap
@@ -196,11 +197,29 @@ def test_who_waits_too_long_for_a_worker_is_told_to_come_later(strict: Live, mon
         assert answer.headers["Retry-After"] == "5"
     finally:
         pool._idle.put(taken)
-    permits = [pool._waiting.acquire() for _ in range(1 + check_pool.WAITING_MAX)]
+    others = [f"robot{n}" for n in range(1 + check_pool.WAITING_MAX)]
+    for other in others:
+        pool._take_place(other)
     assert kind_of(strict.push(row, pushed(2, 1))) == (503, "busy")
-    for _ in permits:
-        pool._waiting.release()
+    for other in others:
+        pool._leave_place(other)
     assert strict.push(row, pushed(1, 1, WREN)).status_code == 201
+
+
+def test_one_token_leaves_places_of_expensive_checks_to_others(strict: Live) -> None:
+    pool, taken = pool_of(strict), dict.fromkeys(("mole", "wren", "dove"), 0)
+    for robot in taken:
+        with pytest.raises(UnreachableError) as refused:
+            while True:
+                pool._take_place(robot)
+                taken[robot] += 1
+        assert refused.value.kind == "busy"
+    assert list(taken.values()) == sorted(taken.values(), reverse=True)
+    assert 0 < taken["dove"] <= taken["mole"] <= (1 + check_pool.WAITING_MAX + 1) // 2
+    for robot, count in taken.items():
+        for _ in range(count):
+            pool._leave_place(robot)
+    assert not pool._taken
 
 
 def test_workers_that_are_always_killed_are_told_of(strict: Live, monkeypatch: pytest.MonkeyPatch) -> None:

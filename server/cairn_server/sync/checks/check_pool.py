@@ -15,6 +15,8 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
+from collections.abc import Hashable
 from contextlib import suppress
 from pathlib import Path
 
@@ -124,14 +126,16 @@ class CheckPool:
         self._closed = False
         self._nursery: subprocess.Popen[bytes] | None = None
         self._control: socket.socket | None = None
-        self._waiting = threading.BoundedSemaphore(workers + WAITING_MAX)
+        self._places = workers + WAITING_MAX
+        self._taken: Counter[Hashable] = Counter()
+        """Places taken, by holder."""
         # Last in, first out: the same few workers serve a small load, and no others are made for it.
         self._idle: queue.LifoQueue[_Worker | None] = queue.LifoQueue()
         for _ in range(workers):
             self._idle.put(None)  # a place for a worker, made when it is needed
 
-    def check(self, data: bytes) -> Checked:
-        """Check a commit in a worker.
+    def check(self, data: bytes, holder: Hashable) -> Checked:
+        """Check a commit in a worker, in a place of the holder of a token, who has as many as it leaves free.
 
         Raises:
             BadInputError: kind `too_costly`, or what the worker found wrong.
@@ -140,8 +144,7 @@ class CheckPool:
                 kind `shutting_down`.
         """
         # More would take the web server's threads from robots whose commits are cheap.
-        if not self._waiting.acquire(blocking=False):
-            raise UnreachableError("busy", "many large commits are being checked", retry_after_s=5.0)
+        self._take_place(holder)
         try:
             for _ in range(2):  # a worker killed from outside costs one more try
                 with suppress(_LostError):
@@ -151,7 +154,20 @@ class CheckPool:
                 "check_failed", "the processes that check commits are being killed", retry_after_s=30.0
             )
         finally:
-            self._waiting.release()
+            self._leave_place(holder)
+
+    def _take_place(self, holder: Hashable) -> None:
+        """Take a place, while others are left half of what is free, as with bodies (`access.body_budget`)."""
+        with self._lock:
+            if self._taken[holder] >= self._places - self._taken.total():
+                self._taken += Counter()  # drops zeros: else every holder ever seen would stay
+                raise UnreachableError("busy", "many large commits are being checked", retry_after_s=5.0)
+            self._taken[holder] += 1
+
+    def _leave_place(self, holder: Hashable) -> None:
+        with self._lock:
+            self._taken[holder] -= 1
+            self._taken += Counter()
 
     def close(self) -> None:
         """End all workers; checks under way fail. May be called twice."""

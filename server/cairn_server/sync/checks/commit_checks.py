@@ -11,7 +11,7 @@ process busy for long or makes it grow. Each rate is twice the measured one
 """
 
 import threading
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
 
 from cairn_map.codec.cell_reading import CellReader
@@ -108,8 +108,8 @@ class CommitChecks:
             workers=settings.check_workers, limit_s=settings.check_cpu_s, memory_bytes=settings.check_memory_bytes
         )
 
-    def check(self, commit: CommitReader) -> Checked:
-        """Decode a whole commit and find it sound.
+    def check(self, commit: CommitReader, holder: Hashable) -> Checked:
+        """Decode a whole commit and find it sound; the holder of a token has a share of the expensive checks.
 
         Raises:
             BadInputError: kind `too_costly`; or as `check_commit`.
@@ -119,7 +119,7 @@ class CommitChecks:
         cost = cost_of(commit.readers)
         check_cost(cost, size_bytes=len(commit.data))
         if cost.seconds > self.ordinary_s:
-            return self._pool.check(commit.data)
+            return self._pool.check(commit.data, holder)
         with self._threads:
             return check_commit(commit)
 
