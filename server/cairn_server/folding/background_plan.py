@@ -20,8 +20,8 @@ from cairn_map.commits.cursor import ENTRY_FOLD, Cursor, next_chain
 from cairn_map.commits.ids import CommitId
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_server.folding.cell_cache import CellCache
-from cairn_server.folding.cells_at_rest import stamps_to_change
 from cairn_server.folding.folding import FoldStore, plan_fold
+from cairn_server.store.stamps import raised_stamps
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import CellRow, Entry, Fold, Head, MapRow, StoredCommit
 
@@ -150,9 +150,8 @@ def _moved_cell(cell: CellRow, after: int, by: int, geometry: Geometry) -> CellR
     """A cell whose stamps of the entries `after` one, and its own, are raised."""
     if by == 0:
         return cell
-    stamps = stamps_to_change(cell, geometry)
-    stamps.raise_after(after, by)
-    return replace(cell, lm=cell.lm + by, stamps=stamps.encoded())
+    stamps = raised_stamps(cell.stamps, after, by, depth=geometry.depth, lm=cell.lm)
+    return replace(cell, lm=cell.lm + by, stamps=stamps)
 
 
 class _NotingStore:

@@ -62,6 +62,11 @@ class CellCache:
 
     def stamp(self, key: CellKey, blocks: Blocks, seq: int, load: Load) -> None:
         """Stamp these blocks of a cell with the log entry that changed them."""
+        draft = self._drafts.get(key)
+        if draft is not None and key not in self._cells:
+            # Of a commit of more cells than fit, the first ones wait as drafts already: their sums are as they were.
+            self._drafts[key] = _stamped(draft, blocks, seq, self._geometry)
+            return
         # A cell whose diff was just merged is cached and marked: stamping alone neither moves nor measures it again.
         is_here = key in self._cells and key in self._changed
         cell, stamps = self._taken(key, load)
@@ -158,3 +163,9 @@ class CellCache:
             stamps=stamps.encoded(),
             hottest_k=hottest_k(evidence, self._geometry),
         )
+
+
+def _stamped(draft: CellRow, blocks: Blocks, seq: int, geometry: Geometry) -> CellRow:
+    stamps = stamps_to_change(draft, geometry)
+    stamps.put(blocks, seq)
+    return replace(draft, lm=stamps.newest(), stamps=stamps.encoded())

@@ -74,6 +74,21 @@ class CellStamps:
         return self._page_of.nbytes + self._pages.nbytes
 
 
+def raised_stamps(data: bytes, after: int, by: int, *, depth: int, lm: int) -> bytes:
+    """Encoded stamps in which those of the entries after `after` are raised.
+
+    Raises:
+        DamagedDataError: as `decode_stamps`.
+    """
+    # If all are, it is their common base: thousands of new cells are moved in milliseconds.
+    if len(data) >= HEAD.size and HEAD.unpack_from(data)[0] >= after:
+        before, size_bytes = HEAD.unpack_from(data)
+        return HEAD.pack(before + by, size_bytes) + data[HEAD.size :]
+    stamps = decode_cell_stamps(data, depth=depth, lm=lm)
+    stamps.raise_after(after, by)
+    return stamps.encoded()
+
+
 def encode_stamps(stamps: Stamps) -> bytes:
     """Encode stamps: 0 or the distance from the oldest stamp, in byte planes under zstd; 1 to 4 % of a cell's size."""
     known = np.flatnonzero(stamps)

@@ -17,7 +17,14 @@ from cairn_map.evidence.blocks import blocks_of, of_blocks, without_blocks
 from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.grid import CellKey
 from cairn_map.wire.frames import CellFrame, FrameKind
-from cairn_server.store.stamps import CellStamps, blocks_after, decode_cell_stamps, decode_stamps, encode_stamps
+from cairn_server.store.stamps import (
+    CellStamps,
+    blocks_after,
+    decode_cell_stamps,
+    decode_stamps,
+    encode_stamps,
+    raised_stamps,
+)
 from cairn_server.store.store_rows import MapRow
 
 SEQS = st.integers(1, (1 << 62) - 1) | st.integers(1, 40)
@@ -53,8 +60,10 @@ def test_stamps_under_change_are_encoded_as_dense_ones_are(changes: list[tuple[s
     again = decode_cell_stamps(paged.encoded(), depth=7, lm=300)
     assert paged.encoded() == again.encoded() == encode_stamps(dense)
     assert paged.newest() == dense.max()
-    again.raise_after(100, 7)
-    assert again.encoded() == encode_stamps(np.where(dense > 100, dense + 7, dense))
+    for after in (0, 100):
+        raised = raised_stamps(again.encoded(), after, 7, depth=7, lm=300)
+        expected = np.where(dense > after, dense + 7, dense)
+        assert decode_stamps(raised, depth=7, lm=307).tolist() == expected.tolist()
 
 
 def test_a_store_without_stamps_takes_all_blocks_for_changed_with_their_cell() -> None:
