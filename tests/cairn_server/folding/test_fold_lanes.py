@@ -1,7 +1,10 @@
 """Lanes of folding: what a robot's costly commits take is no other robot's to wait for, and the map is the same."""
 
+import random
+import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -12,17 +15,18 @@ from tests.fixtures.server.pushes import MOLE, WREN, pushed
 from tests.fixtures.server.store_contract import NAMES, new_of
 from tests.memory_store.store import MemoryStore
 
-from cairn_map.codec.cell_code import encode_cell
+from cairn_map.codec.cell_code import DecodedCell, encode_cell
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import VersionVector
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, cell_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
-from cairn_server.folding import commit_work, fold_lanes
+from cairn_server.folding import commit_work, fold_lanes, folding, group_folding
 from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.commit_work import SLICE_S, commit_work_s
 from cairn_server.folding.damaged_cells import DamagedCells
+from cairn_server.folding.fold_turns import FoldTurns
 from cairn_server.folding.folding import fold_commits, fold_pending
 from cairn_server.folding.group_folding import LocalFolding
 from cairn_server.store.sqlite.store import SqliteStore
@@ -155,6 +159,63 @@ def test_a_commit_never_waits_for_another_robot_s_costly_ones(store: Store) -> N
         assert scan(n).id in folder.vector()
     folder.finish()
     assert cells_of(store, folder.row) == straight([*attack, *map(scan, range(4))])
+
+
+@pytest.mark.usefixtures("small_slices")
+@pytest.mark.parametrize("seed", range(3))
+def test_whatever_a_robot_pushes_others_wait_for_no_more_than_a_slice_of_work(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Work is counted, not timed: what the thread that folds scans decodes of another robot's commits in one look."""
+    monkeypatch.setattr(commit_work, "CELL_S", 1e-5)
+    worked_s: list[float] = []
+    decode, here = folding._decoded, threading.current_thread()
+
+    def counted(commit: StoredCommit, key: CellKey, body: bytes) -> DecodedCell:
+        if commit.id.author == MOLE and threading.current_thread() is here:
+            worked_s.append(commit_work.CELL_S + commit_work._diff_work_s(body))
+        return decode(commit, key, body)
+
+    monkeypatch.setattr(folding, "_decoded", counted)
+    monkeypatch.setattr(group_folding, "FoldTurns", partial(FoldTurns, steady_s=lambda: 0.0))
+    folder, commits = Folder(MemoryStore(), []), list[Commit]()
+    chance = random.Random(seed)
+    for n in range(24):
+        commits += [mixed(n, commits, chance), scan(n)]
+        folder.push(commits[-2:])
+        worked_s.clear()
+        folder.folding.fold(folder.row, maps=1)
+        assert commits[-1].id in folder.vector()
+        assert sum(worked_s) <= 2 * commit_work.SLICE_S
+    folder.finish()
+    assert cells_of(folder.store, folder.row) == straight(commits)
+
+
+def mixed(n: int, before: Sequence[Commit], chance: random.Random) -> Commit:
+    """One of the commits that take the most work for their bytes, or a retract of some of them, or a small one."""
+    many = sorted(cell_key((k, 1, 0)) for k in range(30))
+    kinds = [(air(WIDE), [HERE]), (dust(WIDE), [HERE, FAR]), (random_evidence(n, WIDE, voxels=1, air=0), many)]
+    kinds += [(random_evidence(n, WIDE, voxels=5, air=0), [FAR])]
+    own = [commit for commit in before if commit.id.author == MOLE and commit.cells]
+    if own and chance.random() < 0.3:
+        return pushed(n, 0, MOLE, geometry=WIDE, cells={}, scans=9, retracts=chance.sample(own, min(len(own), 3)))
+    evidence, keys = chance.choice(kinds)
+    return costly(n, evidence, keys=keys)
+
+
+@pytest.mark.usefixtures("small_slices")
+def test_a_costly_commit_waits_for_one_plan_of_a_robot_of_which_thirty_wait(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fold_lanes, "PLAN_S", 1e-4)  # one commit each
+    folder = Folder(store, [costly(n, [dust(WIDE), air(WIDE)][n % 2]) for n in range(30)])
+    assert folder.look() == 0
+    sweep = pushed(0, 0, WREN, geometry=WIDE, cells={THERE: air(WIDE)}, scans=9)
+    folder.push([sweep])
+    assert folder.look() == 1  # the plan that was under way
+    assert folder.look() == 1
+    assert sweep.id in folder.vector()
+    folder.folding.close()
 
 
 @pytest.mark.usefixtures("small_slices")
