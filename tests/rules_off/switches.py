@@ -55,7 +55,7 @@ SWITCHES = (
         14,
         "the cells of an index rise in number, from page to page",
         "client/cairn_client/sync/requests.py",
-        "if int(keys[0]) <= after or (keys[1:] <= keys[:-1]).any():",
+        "if int(keys[0]) <= before or (keys[1:] <= keys[:-1]).any():",
         "if False:",
         "cairn_client/http/test_hostile_answers.py::test_an_index_whose_pages_do_not_rise_is_refused",
     ),

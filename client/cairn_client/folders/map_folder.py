@@ -90,11 +90,11 @@ def _downloaded_map(map_url: str, token: str | None, memory_bytes_max: int) -> M
     with MapApi(server_url, token=token) as api:
         info = api.map_info(name)
         whole = EvidenceMap(info.geometry, coding=coding_of(info.geometry))
-        for cell in cells_with_evidence(api, name):
+        for key in cells_with_evidence(api, name):
             # What is left bounds the cell before it is decoded: few bytes may stand for much evidence.
             left_bytes = memory_bytes_max - whole.size_bytes
             try:
-                body, decoded = download_cell(api, name, cell, evidence_bytes_max=min(left_bytes, EVIDENCE_BYTES_MAX))
+                body, decoded = download_cell(api, name, key, evidence_bytes_max=min(left_bytes, EVIDENCE_BYTES_MAX))
             except BadInputError as exc:
                 if exc.kind == "too_large" and left_bytes < EVIDENCE_BYTES_MAX:
                     raise _too_large(map_url, memory_bytes_max) from exc

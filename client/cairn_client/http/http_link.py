@@ -4,6 +4,7 @@ from collections.abc import Generator
 from typing import Any, TypeVar
 
 from cairn_client.http.api import MapApi
+from cairn_client.sync.indexed_cells import MapIndex
 from cairn_client.sync.requests import (
     Ask,
     Conversation,
@@ -23,9 +24,8 @@ from cairn_map.codec.cell_code import DecodedCell, decode_cell
 from cairn_map.codec.cell_reading import EVIDENCE_BYTES_MAX
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.fingerprint import fingerprint
-from cairn_map.evidence.grid import Cell, cell_key
+from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.wire.frames import Frame
-from cairn_map.wire.messages import CellIndex
 from cairn_map.wire.resumed_replies import Replies
 
 T = TypeVar("T")
@@ -84,19 +84,18 @@ class Link:
             self._frames = None
 
 
-def index_of(api: MapApi, map_name: str) -> CellIndex:
+def index_of(api: MapApi, map_name: str) -> MapIndex:
     """Index of all cells of a map, without their bytes, for programs that are no robots."""
     return Link(api, map_name, branch="").hold(whole_index())
 
 
-def cells_with_evidence(api: MapApi, map_name: str) -> list[Cell]:
-    """Cells of a map that hold evidence, in order of their numbers."""
-    found = [Cell(*entry.cell) for entry in index_of(api, map_name).cells if entry.voxels]
-    return sorted(found, key=cell_key)
+def cells_with_evidence(api: MapApi, map_name: str) -> list[CellKey]:
+    """Numbers of a map's cells that hold evidence, in order."""
+    return index_of(api, map_name).cells.keys_with_evidence
 
 
 def download_cell(
-    api: MapApi, map_name: str, cell: Cell, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX
+    api: MapApi, map_name: str, key: CellKey, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX
 ) -> tuple[bytes, DecodedCell]:
     """Bytes of one cell, and the evidence that they decode to.
 
@@ -104,9 +103,10 @@ def download_cell(
         BadInputError: kind `too_large`: the evidence would take more bytes than allowed.
         DamagedDataError: kind `fingerprint_mismatch`: it is not the cell that the server says it is.
     """
+    cell = cell_of_key(key)
     fetched = api.cell(map_name, cell)
     body = fetched.body or b""
     decoded = decode_cell(body, evidence_bytes_max=evidence_bytes_max)
-    if decoded.key != cell_key(cell) or fingerprint(decoded.evidence, decoded.key) != fetched.fingerprint:
+    if decoded.key != key or fingerprint(decoded.evidence, decoded.key) != fetched.fingerprint:
         raise DamagedDataError("fingerprint_mismatch", f"cell {cell} is not what the server says it is")
     return body, decoded

@@ -19,12 +19,12 @@ from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_state import CellCube
 from cairn_client.replica.server_cells import UNPROVEN
 from cairn_client.robot.robot_events import CellsDropped, Events, OutboxNearlyFull
+from cairn_client.sync.indexed_cells import IndexedCells
 from cairn_client.sync.requests import Box, Conversation, whole_index
 from cairn_map.arrays import Ints
 from cairn_map.errors import UnreachableError
 from cairn_map.evidence.compact_cell import HELD_PER_BYTE
 from cairn_map.evidence.grid import CELL_LIMIT, Cell, CellKey, cell_of_key
-from cairn_map.wire.messages import CellEntry
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +40,8 @@ CHOOSE_AGAIN_S = 300.0
 """Least seconds between two tries of a larger box, while half of the limits is free."""
 ROW_BYTES = 8192
 """Bytes of a cell on the disk beyond its content: half a page on average, and its row."""
+COUNT_MAX = 1 << 36
+"""Bytes or voxels of a listed cell that are believed: more than any cell has, and a million of them can be added."""
 VOXEL_BYTES = 16
 """Memory of a known voxel: 9 to 13 bytes were measured with all channels."""
 CELL_BYTES = 8192
@@ -130,10 +132,9 @@ class CellBudget:
             self._replica.forget_stable_commits(wanted=self._is_kept)
             # Bytes of each cell that the server has, and its distance from the robot's cell.
             centre = self._centre()
-            cells = np.array([entry.cell for entry in index.cells], np.int64).reshape(-1, 3)
-            far = np.abs(cells - centre).max(axis=1, initial=0)
-            disk = np.array([entry.size_bytes + ROW_BYTES for entry in index.cells], np.int64)
-            memory = np.array([_memory_of(entry) for entry in index.cells], np.int64)
+            far = np.abs(index.cells.cells - centre).max(axis=1, initial=0)
+            disk = np.minimum(index.cells.table["size_bytes"], COUNT_MAX) + ROW_BYTES
+            memory = _memory_of(index.cells)
             # The first ring of cells with which the sum, from the centre outwards, breaks a limit is the first one out.
             disk_max, memory_max = self._for_cells()
             order = np.argsort(far, kind="stable")
@@ -286,9 +287,11 @@ class CellBudget:
         return self._replica.kept_bytes()
 
 
-def _memory_of(entry: CellEntry) -> int:
-    """Memory that a listed cell takes at most: few bytes never take much."""
-    return min(entry.voxels * VOXEL_BYTES, entry.size_bytes * HELD_PER_BYTE) + CELL_BYTES
+def _memory_of(listed: IndexedCells) -> Ints:
+    """(N,) memory that each listed cell takes at most: few bytes never take much."""
+    voxels, size_bytes = (np.minimum(listed.table[name], COUNT_MAX) for name in ("voxels", "size_bytes"))
+    memory: Ints = np.minimum(voxels * VOXEL_BYTES, size_bytes * HELD_PER_BYTE) + CELL_BYTES
+    return memory
 
 
 def _triple(cell: Ints) -> tuple[int, int, int]:

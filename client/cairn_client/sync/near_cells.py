@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from cairn_client.sync.indexed_cells import IndexedCells
 from cairn_map.evidence.cell_order import first_to_last
 from cairn_map.evidence.grid import CELL_LIMIT, Cell
-from cairn_map.wire.messages import CellEntry
 
 Wanted = Callable[[Cell], bool]
 """True for a cell that a low-end robot keeps."""
@@ -31,12 +31,9 @@ def cell_at(position_m: Sequence[float], cell_edge_m: float) -> Cell:
     return Cell(*(max(-CELL_LIMIT, min(CELL_LIMIT - 1, math.floor(value / cell_edge_m))) for value in position_m))
 
 
-def in_order(entries: Sequence[CellEntry], near: Cell | None) -> list[CellEntry]:
-    """The cells around a cell first, and hot ones before others (`cell_order`)."""
-    order = first_to_last(
-        np.array([entry.cell for entry in entries], np.int64).reshape(-1, 3),
-        near=near,
-        changed=np.array([entry.lm for entry in entries], np.int64),
-        hottest_k=np.array([entry.hottest_k for entry in entries], np.float64),
-    )
-    return [entries[n] for n in order]
+def in_order(listed: IndexedCells, near: Cell | None) -> npt.NDArray[np.uint64]:
+    """(N,) numbers of the cells: those around a cell first, and hot ones before others (`cell_order`)."""
+    table = listed.table
+    order = first_to_last(listed.cells, near=near, changed=table["lm"], hottest_k=table["hottest_k"])
+    keys: npt.NDArray[np.uint64] = table["key"][order]
+    return keys

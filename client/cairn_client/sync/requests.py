@@ -9,17 +9,21 @@ simulator that keeps time itself.
         return len(index.cells)
 """
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
+import numpy as np
+import numpy.typing as npt
+
+from cairn_client.sync.indexed_cells import IndexedCells, MapIndex, listed_page
 from cairn_client.sync.responses import FetchedCell
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError, UnreachableError
-from cairn_map.evidence.grid import Cell, cell_keys
+from cairn_map.evidence.grid import Cell, CellKey, cell_of_key
 from cairn_map.wire.frames import Frame
-from cairn_map.wire.messages import INDEX_PAGE, CellEntry, CellIndex, MissingRequest, Upload
+from cairn_map.wire.messages import INDEX_PAGE, CellIndex, MissingRequest, Upload
 
 A = TypeVar("A")
 T = TypeVar("T")
@@ -28,7 +32,7 @@ Box = tuple[Cell, Cell]
 """Lowest and highest cell, inclusive."""
 
 INDEX_CELLS_MAX = 1 << 20
-"""Cells of a map whose index is held: a gigabyte, and five times the largest map that was measured."""
+"""Cells of a map whose index is held: 109 MB, and five times the largest map that was measured."""
 
 
 class Ask(Generic[A]):
@@ -143,7 +147,7 @@ class PutCell(Ask[None]):
     body: bytes
 
 
-def whole_index(author: Author | None = None, *, box: Box | None = None) -> Conversation[CellIndex]:
+def whole_index(author: Author | None = None, *, box: Box | None = None) -> Conversation[MapIndex]:
     """Index of all cells, page by page, under the header of the first page.
 
     An entry whose `lm` is above the header's cursor changed between two pages.
@@ -153,26 +157,29 @@ def whole_index(author: Author | None = None, *, box: Box | None = None) -> Conv
         DamagedDataError: kind `bad_message`: the cells do not rise in number, so the pages might never end.
         BadInputError: kind `too_large`: more than `INDEX_CELLS_MAX` cells.
     """
-    index = page = yield from GetIndex(author, box)
-    cells, start = list(page.cells), index.header.to_cursor
-    last_key = _last_key(page.cells, after=-1)
-    while len(page.cells) >= INDEX_PAGE:
-        page = yield from GetIndex(author, box, after=Cell(*page.cells[-1].cell))
+    page = yield from GetIndex(author, box)
+    header, start = page.header, page.header.to_cursor
+    tables = [listed_page(page.cells)]
+    count, last_key = len(page.cells), _last_key(tables[0], after=None)
+    while len(page.cells) >= INDEX_PAGE and last_key is not None:
+        page = yield from GetIndex(author, box, after=cell_of_key(last_key))
         to = page.header.to_cursor
         if to.log_id != start.log_id or to.seq < start.seq:
             raise UnreachableError("no_end", "the server's map was replaced while its cells were listed")
-        last_key = _last_key(page.cells, after=last_key)
-        cells += page.cells
-        if len(cells) > INDEX_CELLS_MAX:
+        tables.append(listed_page(page.cells))
+        last_key = _last_key(tables[-1], after=last_key)
+        count += len(page.cells)
+        if count > INDEX_CELLS_MAX:
             raise BadInputError("too_large", f"the map has more than {INDEX_CELLS_MAX} cells here; ask for a box of it")
-    return index.model_copy(update={"cells": cells})
+    return MapIndex(header, IndexedCells(np.concatenate(tables)))
 
 
-def _last_key(page: Sequence[CellEntry], *, after: int) -> int:
+def _last_key(page: npt.NDArray[np.void], *, after: CellKey | None) -> CellKey | None:
     """Number of a page's last cell; the numbers must rise, from `after` on."""
-    if not page:
+    keys = page["key"]
+    if not len(keys):
         return after
-    keys = cell_keys([entry.cell for entry in page])
-    if int(keys[0]) <= after or (keys[1:] <= keys[:-1]).any():
+    before = -1 if after is None else after
+    if int(keys[0]) <= before or (keys[1:] <= keys[:-1]).any():
         raise DamagedDataError("bad_message", "the index names a cell twice, or its cells do not rise in number")
-    return int(keys[-1])
+    return CellKey(int(keys[-1]))

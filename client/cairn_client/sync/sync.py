@@ -310,9 +310,6 @@ def fetch_cells(
     author = replica.author
     index = yield from whole_index(author, box=box)
     to, coverage = index.header.to_cursor, index.header.coverage
-    digests = {cell_key(entry.cell): entry.digest for entry in index.cells}
-    # Each page of the index is of a state of its own: a cell stamped beyond the first one's changed in between.
-    later = {cell_key(entry.cell) for entry in index.cells if entry.lm > to.seq}
     # What the index alone settles: cells that did not change move along, and cells that are gone are emptied.
     with replica.changing() as base:
         if replica.header and replica.header.to_cursor.log_id != to.log_id:
@@ -320,17 +317,22 @@ def fetch_cells(
             replica.forget_server()
         replica.take_header(index.header, asked_by=author)
         # Equal bytes hold exactly the index's commits: cursor and coverage move without a request (rule 14).
-        held = [key for key, cell in base.cells.items() if cell.etag == f'"{digests.get(key)}"']
-        same = {key for key in held if key not in later}
+        # Each page of the index is of a state of its own: a cell stamped beyond the first one's changed in between.
+        listed = {key: index.cells.find(key) for key in base.cells}
+        same = {
+            key
+            for key, entry in listed.items()
+            if entry is not None and base.cells[key].etag == f'"{entry.digest}"' and entry.lm <= to.seq
+        }
         base.move(same, to=to, coverage=coverage)
-        for key in base.cells.keys() - digests.keys():  # a server that was restored forgot them
-            if is_within(key, box):
+        for key, entry in listed.items():  # a server that was restored forgot those that it does not list
+            if entry is None and is_within(key, box):
                 base.hold_nothing(key, BaseCell(to, coverage, ZERO))
     report.healed = yield from heal_damaged(replica)
     # All other cells are fetched whole, the nearest first.
     damaged = []
-    for entry in in_order(index.cells, near):
-        key = cell_key(entry.cell)
+    for number in in_order(index.cells, near):
+        key = CellKey(int(number))
         if key in same:
             continue
         report.has_more = round_bytes_max is not None and report.size_bytes >= round_bytes_max

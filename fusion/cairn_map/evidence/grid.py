@@ -158,6 +158,11 @@ def cell_keys(cells: Sequence[tuple[int, int, int]]) -> UInts:
     return interleave(found + CELL_LIMIT)
 
 
+def cells_of_keys(keys: UInts) -> npt.NDArray[np.int64]:
+    """(N, 3) signed indices of N cell numbers; the mirror of `cell_keys`."""
+    return deinterleave(keys.astype(np.uint64)) - CELL_LIMIT
+
+
 @lru_cache(maxsize=4096)
 def cell_of_key(key: int) -> Cell:
     """Signed indices of a cell number; the mirror of `cell_key`."""

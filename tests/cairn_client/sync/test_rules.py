@@ -1,5 +1,6 @@
 """SYNC.md's rules for a client, one by one, with frames made by hand."""
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -35,7 +36,7 @@ from cairn_map.errors import ConflictError, DamagedDataError
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import cell_of_key
-from cairn_map.wire.frames import FrameKind
+from cairn_map.wire.frames import CellFrame, FrameKind
 from cairn_map.wire.messages import CellEntry, CellIndex, MissingRequest
 
 C1, C2, C3 = cursor(1), cursor(2), cursor(3)
@@ -616,5 +617,5 @@ def test_a_cell_whose_bytes_cannot_be_read_does_not_stop_the_robot(tmp_path: Pat
     mole.close()
 
 
-def _fields(frame: object) -> dict[str, object]:
-    return {name: getattr(frame, name) for name in type(frame).__dataclass_fields__}  # type: ignore[attr-defined]
+def _fields(frame: CellFrame) -> dict[str, object]:
+    return {field.name: getattr(frame, field.name) for field in dataclasses.fields(frame)}

@@ -88,7 +88,7 @@ def _get(args: argparse.Namespace) -> int:
     with api:
         info = api.map_info(name)
         cell = cell_from_text(args.cell)
-        body, decoded = download_cell(api, name, cell)
+        body, decoded = download_cell(api, name, cell_key(cell))
     if suffix == ".cell":
         data = body
     else:
@@ -178,9 +178,9 @@ def _check_memory(size_bytes: int) -> None:
 
 def fetch_map(api: MapApi, name: str) -> Iterator[tuple[bytes, DecodedCell]]:
     """All cells that hold evidence, each with its bytes, in order of their numbers."""
-    cells = cells_with_evidence(api, name)
-    for cell in with_progress(cells, "cells", total=len(cells)):
-        yield download_cell(api, name, cell)
+    keys = cells_with_evidence(api, name)
+    for key in with_progress(keys, "cells", total=len(keys)):
+        yield download_cell(api, name, key)
 
 
 def _check_outputs(*paths: Path | None) -> None:

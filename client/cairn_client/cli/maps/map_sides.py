@@ -5,9 +5,12 @@ DIR with robot.sqlite          a copy's or robot's folder: the map that it sees,
 DIR with map.json              a folder of cells (`cairn map export --cells`); it knows of no commits
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
 
 from cairn_client.cli.arguments import api_of
 from cairn_client.folders.state_folder import is_state_folder, opened_replica
@@ -16,19 +19,13 @@ from cairn_client.http.origin_tokens import OriginTokens
 from cairn_map.codec.cell_code import encode_cell
 from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.fingerprint import Fingerprint, fingerprint, fingerprint_from_hex
-from cairn_map.evidence.grid import CellKey, Geometry, cell_key
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.fingerprint import fingerprint
+from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.files.cell_folder import MAP_FILE, read_cells, read_head
 
-
-@dataclass(frozen=True, slots=True)
-class SideCell:
-    """One cell of one side."""
-
-    fingerprint: Fingerprint
-    voxels: int
-    """Known voxels."""
-    size_bytes: int
+SIDE_CELL = np.dtype([("key", np.uint64), ("fingerprint", "V16"), ("voxels", np.int64), ("size_bytes", np.int64)])
+"""One cell of one side: its number, what it holds, its known voxels, and its bytes as they are kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,20 +34,20 @@ class MapSide:
 
     name: str
     geometry: Geometry
-    cells: Mapping[CellKey, SideCell]
-    """Cells that hold evidence."""
+    cells: npt.NDArray[np.void]
+    """(N,) `SIDE_CELL`, the cells that hold evidence, by rising number: a server may list a million of them."""
     commits: VersionVector | None
     """Commits in the map; None: unknown."""
 
     @property
     def voxels(self) -> int:
         """Known voxels of all cells."""
-        return sum(cell.voxels for cell in self.cells.values())
+        return sum(self.cells["voxels"].tolist())
 
     @property
     def size_bytes(self) -> int:
         """Bytes of all cells as they are kept."""
-        return sum(cell.size_bytes for cell in self.cells.values())
+        return sum(self.cells["size_bytes"].tolist())
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,13 +101,15 @@ def difference(a: MapSide, b: MapSide) -> Difference:
             f"{a.name} and {b.name} have other grids: voxels of {a.geometry.voxel_edge_m:g} m and "
             f"{b.geometry.voxel_edge_m:g} m, or other channels",
         )
-    common = a.cells.keys() & b.cells.keys()
+    of_a, of_b = a.cells["key"], b.cells["key"]
+    common, rows_a, rows_b = np.intersect1d(of_a, of_b, assume_unique=True, return_indices=True)
+    is_other = a.cells["fingerprint"][rows_a] != b.cells["fingerprint"][rows_b]
     only_a = None if a.commits is None or b.commits is None else len(a.commits.minus(b.commits))
     only_b = None if a.commits is None or b.commits is None else len(b.commits.minus(a.commits))
     return Difference(
-        only_a=sorted(a.cells.keys() - common),
-        only_b=sorted(b.cells.keys() - common),
-        other=sorted(key for key in common if a.cells[key].fingerprint != b.cells[key].fingerprint),
+        only_a=np.setdiff1d(of_a, of_b, assume_unique=True).tolist(),
+        only_b=np.setdiff1d(of_b, of_a, assume_unique=True).tolist(),
+        other=common[is_other].tolist(),
         commits_only_a=only_a,
         commits_only_b=only_b,
     )
@@ -120,11 +119,10 @@ def _of_server(url: str, tokens: OriginTokens) -> MapSide:
     api, name = api_of(url, tokens)
     with api:
         geometry, index = api.map_info(name).geometry, index_of(api, name)
-    cells = {
-        cell_key(entry.cell): SideCell(fingerprint_from_hex(entry.fingerprint), entry.voxels, entry.size_bytes)
-        for entry in index.cells
-        if entry.voxels
-    }
+    listed = index.cells.table[index.cells.table["voxels"] > 0]
+    cells = np.zeros(len(listed), SIDE_CELL)
+    for name in SIDE_CELL.names or ():
+        cells[name] = listed[name]
     return MapSide(url, geometry, cells, index.header.coverage)
 
 
@@ -133,22 +131,19 @@ def _of_state(folder: Path) -> MapSide:
         geometry, packed = replica.geometry, replica.view.packed()
         folded = replica.header.coverage if replica.header else EMPTY
         commits = folded.with_commits(replica.commits)
-    cells = {
-        key: SideCell(fingerprint(cell, key), len(cell), len(encode_cell(key, cell, geometry).data))
-        for key, cell in packed.items()
-    }
-    return MapSide(str(folder), geometry, cells, commits)
+    return MapSide(str(folder), geometry, _side_cells(packed.items(), geometry), commits)
 
 
 def _of_cells(folder: Path) -> MapSide:
     geometry = read_head(folder).geometry
-    cells = {
-        cell.key: SideCell(
-            fingerprint(cell.evidence, cell.key),
-            len(cell.evidence),
-            len(encode_cell(cell.key, cell.evidence, geometry).data),
-        )
-        for cell in read_cells(folder, geometry)
-        if len(cell.evidence)
-    }
-    return MapSide(str(folder), geometry, cells, None)
+    cells = ((cell.key, cell.evidence) for cell in read_cells(folder, geometry) if len(cell.evidence))
+    return MapSide(str(folder), geometry, _side_cells(cells, geometry), None)
+
+
+def _side_cells(cells: Iterable[tuple[CellKey, Evidence]], geometry: Geometry) -> npt.NDArray[np.void]:
+    """(N,) `SIDE_CELL` of cells that are here, in order of their numbers."""
+    rows = [
+        (key, fingerprint(evidence, key).to_bytes(), len(evidence), len(encode_cell(key, evidence, geometry).data))
+        for key, evidence in cells
+    ]
+    return np.sort(np.array(rows, SIDE_CELL), order="key")
