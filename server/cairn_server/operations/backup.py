@@ -63,6 +63,10 @@ def back_up_command(argv: list[str]) -> int:
     return 0
 
 
+TIME_MAX_S = 1e11
+"""Latest time that is shown: the year 5138; a client's clock may have said anything."""
+
+
 def restore_command(argv: list[str]) -> int:
     """Restore a backup."""
     parser = argparse.ArgumentParser(
@@ -96,7 +100,7 @@ def _told(restored: Restored, old: Path | None) -> Iterator[str]:
         lost = ", ".join(f"{count} {what}" for what, count in restored.lost.items())
         yield f"not in the backup: {lost} of {old}"
         return
-    newest = datetime.fromtimestamp(restored.newest_s, UTC).strftime("%Y-%m-%d %H:%M:%S")
+    newest = datetime.fromtimestamp(min(restored.newest_s, TIME_MAX_S), UTC).strftime("%Y-%m-%d %H:%M:%S")
     when = f"after {newest} UTC" if restored.newest_s else "ever"
     yield f"not in the backup: commits, audit lines and tokens that came {when}; --old DIR would count them"
 
@@ -110,6 +114,9 @@ def _verified(path: Path) -> str:
     archive = SqliteArchive(path)
     try:
         outcome = check_all(archive, archive.complaints())
+    # Numbers and texts of the right kind that no store writes: a cell below 0, a vector that is no JSON.
+    except (ValueError, TypeError, OverflowError, KeyError) as exc:
+        raise DamagedDataError("damaged_store", f"the backup is damaged, take another one: {exc}") from exc
     finally:
         archive.close()
     if outcome.findings:

@@ -51,6 +51,9 @@ def main(argv: list[str]) -> int:
         archive = SqliteArchive(args.data / FILE_NAME)
         try:
             outcome = check_all(archive, archive.complaints())
+        # Values of the right kind that no store writes: a cell below 0, a vector that is no JSON.
+        except (ValueError, TypeError, OverflowError, KeyError) as exc:
+            raise DamagedDataError("damaged_store", f"{args.data}: restore a backup: {exc}") from exc
         finally:
             archive.close()
         left = [str(finding) for _, finding in outcome.findings]

@@ -195,3 +195,49 @@ def test_a_store_of_an_older_version_is_brought_up_to_date_on_the_way(tmp_path: 
     assert main(["restore", str(path), "--data", str(tmp_path / "new")]) == 0
     with Live(tmp_path / "new") as other:
         assert read(other.cells(other.service.store.map("lab"))) == sum_of([*OLD_COMMITS, *OLD_RETRACTS])
+
+
+ENDLESS = "WITH RECURSIVE c(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM c) SELECT token_1.* FROM c, token_1"
+TAMPERED = {
+    "a view that never ends": ["ALTER TABLE token RENAME TO token_1", f"CREATE VIEW token AS {ENDLESS}"],
+    "a trigger": ["CREATE TRIGGER t AFTER UPDATE ON robot_key BEGIN DELETE FROM token; END"],
+    "a column that is computed": ["ALTER TABLE token ADD COLUMN more TEXT AS (name)"],
+    "a table that is not there": ["DROP TABLE audit"],
+    "a table too many": ["CREATE TABLE more (n INTEGER)"],
+    "a text in a column of numbers": ["UPDATE map SET seq = 'many'"],
+    "a number in a column of bytes": ["UPDATE commits SET sha = 7"],
+    "a vector that is no JSON": ["UPDATE map SET vector = 'none'"],
+    "a cell below 0": ["UPDATE OR IGNORE cell SET cell = -1 - cell"],
+    "a diff of a cell below 0": ["UPDATE diff SET cell = -1 - cell"],
+}
+
+
+@pytest.mark.parametrize("statements", TAMPERED.values(), ids=TAMPERED)
+def test_a_database_that_only_looks_like_a_store_is_refused_and_nothing_is_left(
+    live: Live, row: MapRow, tmp_path: Path, statements: list[str]
+) -> None:
+    file, folder, other = tmp_path / "b.cairn", tmp_path / "restored", tmp_path / "other"
+    back_up(tmp_path / "data", file, ignore)
+    connection = apsw.Connection(str(file))
+    for statement in statements:
+        connection.execute(statement)
+    connection.close()
+    other.mkdir()
+    (other / FILE_NAME).write_bytes(file.read_bytes())
+    for command in (["restore", str(file), "--data", str(folder)], ["check", "--data", str(other)]):
+        with pytest.raises(DamagedDataError) as refused:
+            main(command)
+        assert refused.value.kind == "damaged_store"
+    assert not (folder / FILE_NAME).exists()
+
+
+def test_a_time_that_no_calendar_has_is_told_as_the_latest_one(
+    live: Live, row: MapRow, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "b.cairn"
+    back_up(tmp_path / "data", file, ignore)
+    connection = apsw.Connection(str(file))
+    connection.execute("UPDATE commits SET received_s = 1e300")
+    connection.close()
+    assert main(["restore", str(file), "--data", str(tmp_path / "restored")]) == 0
+    assert "after 5138-" in capsys.readouterr().out

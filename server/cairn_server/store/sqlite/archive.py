@@ -5,6 +5,7 @@ from pathlib import Path
 import apsw
 
 from cairn_map.errors import BadInputError, NotFoundError
+from cairn_server.store.sqlite.file_form import check_form
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.schema import STEPS
 from cairn_server.store.sqlite.store import SqliteStore
@@ -34,8 +35,13 @@ class SqliteArchive(SqliteStore):
             )
 
     def complaints(self) -> list[str]:
-        """Damage that SQLite itself finds in the file: in its pages and indexes, not in their contents."""
+        """Damage that SQLite itself finds in the file: in its pages and indexes, not in their contents.
+
+        Raises:
+            DamagedDataError: kind `damaged_store`: its tables are not those of a store, so nothing else can be read.
+        """
         with self._readers.reading() as reader:
+            check_form(reader)
             try:
                 found = [str(text) for (text,) in reader.execute(f"PRAGMA integrity_check({COMPLAINTS_MAX})")]
             except apsw.CorruptError as exc:

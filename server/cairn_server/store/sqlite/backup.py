@@ -16,6 +16,7 @@ import apsw
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, NotFoundError
 from cairn_server.store.folder_lock import LOCK_NAME, lock_folder
 from cairn_server.store.sqlite.ended_tokens import LIST_NAME, copy_list, ended_since
+from cairn_server.store.sqlite.file_form import check_form
 from cairn_server.store.sqlite.schema import STEPS, ensure_schema
 from cairn_server.store.sqlite.store import FILE_NAME
 from cairn_server.store.sqlite.writer import BUSY_MS
@@ -87,6 +88,7 @@ def restore(
             raise ConflictError("not_empty", f"{folder} is not empty, it has {found[0]}; restore into a new folder")
         with _partial(folder / FILE_NAME) as partial:
             _copy(source, partial, report)
+            _check_form(partial)
             _migrate(partial)
             verify(partial)
             ended = ended_since((old or folder) / LIST_NAME, partial)
@@ -188,6 +190,14 @@ def _settle(path: Path) -> None:
     connection = apsw.Connection(str(path))
     try:
         connection.execute("PRAGMA journal_mode = DELETE").fetchall()
+    finally:
+        connection.close()
+
+
+def _check_form(path: Path) -> None:
+    connection = _opened(path)
+    try:
+        check_form(connection)
     finally:
         connection.close()
 
