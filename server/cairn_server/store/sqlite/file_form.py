@@ -5,6 +5,8 @@ that empties the tokens; a text in a column of numbers, since SQLite keeps what 
 through the tables, so this one comes first, and reads the schema alone before it reads a row.
 """
 
+from typing import Any
+
 import apsw
 
 from cairn_map.errors import DamagedDataError
@@ -40,13 +42,13 @@ def check_form(connection: apsw.Connection) -> None:
         raise DamagedDataError("damaged_store", f"the store cannot be read: {exc}") from exc
 
 
-def _schema(connection: apsw.Connection) -> set[tuple[tuple[str, str], tuple[object, ...]]]:
+def _schema(connection: apsw.Connection) -> set[tuple[tuple[str, str], tuple[Any, ...]]]:
     """Each thing in a file by kind and name, with its table, and the columns if it is a table."""
     found = rows(connection, "SELECT type, name, tbl_name FROM sqlite_master WHERE name NOT LIKE 'sqlite_%'")
     return {((kind, name), (table, *_columns(connection, kind, name))) for kind, name, table in found}
 
 
-def _columns(connection: apsw.Connection, kind: str, name: str) -> list[tuple[object, ...]]:
+def _columns(connection: apsw.Connection, kind: str, name: str) -> list[tuple[Any, ...]]:
     # xinfo: with the columns that are computed, which no table of a store has.
     query = 'SELECT name, type, "notnull", dflt_value, pk, hidden FROM pragma_table_xinfo(?) ORDER BY cid'
     return rows(connection, query, (name,)) if kind == "table" else []
