@@ -16,6 +16,7 @@ from cairn_map.evidence.cell_order import hottest_k
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.fingerprint import Fingerprint, fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
+from cairn_server.folding.decoding_room import DECODING
 from cairn_server.store.stamps import CellStamps, Stamps, decode_cell_stamps, decode_stamps
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import CellRow, Contribution
@@ -78,13 +79,14 @@ def sound_cell(snapshot: Snapshot, key: CellKey, geometry: Geometry, healed: lis
     stored = row_of_cell(snapshot, key)
     if stored is None or _SOUND.knows(stored):
         return stored
-    try:
-        stored_evidence(stored)
-    except DamagedDataError as exc:
-        log.error("%s; rebuilding it from the log", exc.message)
-        rebuilt = _proven_rebuilt(snapshot, stored, geometry, exc)
-        healed.append(rebuilt)
-        return rebuilt
+    with DECODING.of_cell(geometry):
+        try:
+            stored_evidence(stored)
+        except DamagedDataError as exc:
+            log.error("%s; rebuilding it from the log", exc.message)
+            rebuilt = _proven_rebuilt(snapshot, stored, geometry, exc)
+            healed.append(rebuilt)
+            return rebuilt
     _SOUND.note(stored)
     return stored
 

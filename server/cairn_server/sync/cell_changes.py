@@ -15,6 +15,7 @@ from cairn_map.evidence.blocks import of_blocks
 from cairn_map.evidence.grid import Geometry, cell_of_key
 from cairn_map.wire.frames import CellFrame, FrameKind
 from cairn_server.folding.cells_at_rest import sum_of_contributions
+from cairn_server.folding.decoding_room import DECODING
 from cairn_server.folding.read_cache import Change, ChangeName, ReadCache, state_of
 from cairn_server.store.stamps import blocks_after
 from cairn_server.store.store import Snapshot
@@ -113,7 +114,8 @@ def _delta(snapshot: Snapshot, row: CellRow, foreign: list[Contribution], geomet
     if len(foreign) == 1 and foreign[0].kind == ENTRY_FOLD:
         return snapshot.diff(foreign[0].commit, row.key)  # one commit's diff is its own sum
     try:
-        evidence = sum_of_contributions(snapshot, row.key, foreign, geometry).packed()
+        with DECODING.of_cell(geometry):
+            evidence = sum_of_contributions(snapshot, row.key, foreign, geometry).packed()
     except DamagedDataError as exc:
         log.error("cell %s: a diff at rest is damaged, sending the whole cell: %s", cell_of_key(row.key), exc.message)
         return None
@@ -132,10 +134,12 @@ def _state(
             return None
         if STATE_HEAD_BYTES + row.size_bytes * len(blocks) / max(known, 1) > size_bytes_max:
             return None
-        evidence = cache.evidence(snapshot, row)  # last, since it is expensive
+        # Last, since it is expensive. All take room before they ask the cache: its maker has it, too.
+        with DECODING.of_cell(geometry):
+            changed = of_blocks(cache.evidence(snapshot, row), blocks)
     except DamagedDataError as exc:
         log.error("cell %s: %s; no changed blocks of it", cell_of_key(row.key), exc.message)
         return None
-    payload = encode_cell(row.key, of_blocks(evidence, blocks), geometry).data
+    payload = encode_cell(row.key, changed, geometry).data
     is_smaller = len(payload) + BLOCK_NUMBER_BYTES * len(blocks) < size_bytes_max
     return Change(FrameKind.STATE, payload, blocks) if is_smaller else None

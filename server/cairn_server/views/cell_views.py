@@ -22,6 +22,7 @@ from cairn_map.evidence.view import ViewStyle
 from cairn_map.files.cell_files import CELL_MEDIA_TYPE, MEDIA_TYPES, cell_file
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.cells_at_rest import stored_evidence, stored_surfaces
+from cairn_server.folding.decoding_room import DECODING
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import CellRow, Head, MapRow
 
@@ -80,7 +81,8 @@ def view_of_stored(row: MapRow, stored: CellRow, depth: int) -> bytes:
     """
     # Voxels without a hit have a probability below a half: a view that does not show them can leave out most of a cell.
     read = stored_surfaces if row.sensor_model.p_occupied >= 0.5 else stored_evidence
-    return encode_view(stored.key, read(stored), row.geometry, row.sensor_model, style=ViewStyle(depth=depth))
+    with DECODING.of_cell(row.geometry):
+        return encode_view(stored.key, read(stored), row.geometry, row.sensor_model, style=ViewStyle(depth=depth))
 
 
 class ViewCache:
@@ -213,7 +215,8 @@ class CellViews:
                 f"a cell of at most {FILE_VOXELS_MAX} known voxels comes as .{suffix[:16]}, this one has "
                 f"{stored.voxels}; take the cell itself, or an export of its box, which is made piece by piece",
             )
-        return cell_file(suffix, stored.key, stored_evidence(stored), row.geometry, row.sensor_model)[0]
+        with DECODING.of_cell(row.geometry):
+            return cell_file(suffix, stored.key, stored_evidence(stored), row.geometry, row.sensor_model)[0]
 
 
 def media_type_of(suffix: str, depth: int | None) -> str:

@@ -21,10 +21,19 @@ from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey
 from cairn_map.files.export_request import ExportRequest, cell_may_have, node_geometry
 from cairn_map.files.octomap import TREE_FORMATS, Subtree, branch_of_cell, tree_file
-from cairn_map.files.point_clouds import About, PointBounds, found_in_cell, point_file, points_of_cell, size_of_file
+from cairn_map.files.point_clouds import (
+    About,
+    PointBounds,
+    Table,
+    found_in_cell,
+    point_file,
+    points_of_cell,
+    size_of_file,
+)
 from cairn_server.access.cancellation import CANCELLATION
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.cells_at_rest import DamagedCellError, decode_stored, sound_cell, stored_evidence
+from cairn_server.folding.decoding_room import DECODING
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import CellRow, Head, MapRow
 
@@ -139,11 +148,13 @@ class _PointFile:
         return size_of_file(self.asked.format, self._found, self._about)
 
     def parts(self, bodies: Iterator[tuple[CellKey, bytes]]) -> Iterator[bytes]:
-        geometry, model = self.row.geometry, self.row.sensor_model
-        tables = (
-            points_of_cell(key, decode_stored(key, body).evidence, geometry, model, self.asked) for key, body in bodies
-        )
+        tables = (self._points(key, body) for key, body in bodies)
         return point_file(self.asked.format, self._found, tables, self._about)
+
+    def _points(self, key: CellKey, body: bytes) -> Table:
+        geometry, model = self.row.geometry, self.row.sensor_model
+        with DECODING.of_cell(geometry):
+            return points_of_cell(key, decode_stored(key, body).evidence, geometry, model, self.asked)
 
 
 class _TreeFile:
@@ -194,7 +205,8 @@ def _laid_aside(
         stored = sound_cell(snapshot, listed.key, row.geometry, healed)
         if stored is None:
             raise DamagedCellError(listed.key, "a cell is listed, but is not there")
-        kept = file.kept(stored, stored_evidence(stored))
+        with DECODING.of_cell(row.geometry):
+            kept = file.kept(stored, stored_evidence(stored))
         if until_s == math.inf:
             until_s = time.monotonic() + COUNT_S  # not from the start: with the first cell kernels may be compiled
         if kept:

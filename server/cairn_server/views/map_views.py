@@ -31,6 +31,7 @@ from cairn_map.warm_up import warm_up_pictures
 from cairn_server.access.cancellation import CANCELLATION, Cancellation
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.cells_at_rest import DamagedCellError, row_of_cell, sound_cell, stored_evidence
+from cairn_server.folding.decoding_room import DECODING
 from cairn_server.folding.read_cache import State, state_of
 from cairn_server.folding.single_flight import MadeOnce
 from cairn_server.store.stamps import Stamps, decode_stamps, no_stamps
@@ -288,7 +289,8 @@ def _ready(stored: CellRow | None, task: _Task) -> ReadCell:
     if stored is None:
         raise DamagedDataError("damaged_store", "a cell is listed, but is not there")
     geometry, model = task.row.geometry, task.row.sensor_model
-    return read_cell(brick_cell(geometry, [stored_evidence(stored)]), geometry, model, task.layer)
+    with DECODING.of_cell(geometry):
+        return read_cell(brick_cell(geometry, [stored_evidence(stored)]), geometry, model, task.layer)
 
 
 def _etag(head: Head, request: RenderRequest) -> str:

@@ -20,6 +20,7 @@ from cairn_map.wire.messages import LogEntry
 from cairn_map.wire.voxel_messages import ChannelReading, VoxelAnswer, VoxelCommit
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.cells_at_rest import decode_stored, sound_cell, stored_evidence
+from cairn_server.folding.decoding_room import DECODING
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import MapRow
 
@@ -47,9 +48,10 @@ def asked_voxel(store: Store, cells: Cells, row: MapRow, text: str) -> VoxelAnsw
         stored = sound_cell(snapshot, key, row.geometry, faults.healed)
         if stored is None:
             raise NotFoundError("no_cell", f"no robot has seen cell {','.join(map(str, cell))} of map {row.name}")
-        commits, more = _commits(snapshot, key, place)
+        commits, more = _commits(snapshot, key, place, row.geometry)
         cursor = snapshot.head.cursor
-    seen = _only(stored_evidence(stored), place)
+    with DECODING.of_cell(row.geometry):
+        seen = _only(stored_evidence(stored), place)
     voxels = voxels_of_evidence(key, seen, row.geometry, row.sensor_model, occupied_only=False)
     x, y, z = centres_of_voxels(np.array([voxel]), row.geometry)[0].tolist()
     return VoxelAnswer(
@@ -93,14 +95,15 @@ def _reading(reading: Reading, channel: Channel) -> ChannelReading:
     )
 
 
-def _commits(snapshot: Snapshot, key: CellKey, place: int) -> tuple[list[VoxelCommit], bool]:
+def _commits(snapshot: Snapshot, key: CellKey, place: int, geometry: Geometry) -> tuple[list[VoxelCommit], bool]:
     """Commits that saw a voxel, the newest first; and True if the cell has older ones."""
     found = snapshot.contributions(key, after_seq=0, newest=ENTRIES_MAX + 1)
     counts: dict[CommitId, tuple[int, int]] = {}
     for contribution in found[-ENTRIES_MAX:]:
         body = snapshot.diff(contribution.commit, key)
         if body is not None:
-            hits, misses = _only(decode_stored(key, body).evidence, place).counts.sum(axis=0).tolist()
+            with DECODING.of_cell(geometry):
+                hits, misses = _only(decode_stored(key, body).evidence, place).counts.sum(axis=0).tolist()
             sign = 1 if contribution.kind == b"+" else -1
             before = counts.get(contribution.commit, (0, 0))
             counts[contribution.commit] = (before[0] + sign * hits, before[1] + sign * misses)

@@ -1,0 +1,80 @@
+"""Memory for cells that requests decode: bounded together, in order, and taken wherever a request decodes."""
+
+import ast
+import threading
+from pathlib import Path
+
+import pytest
+
+import cairn_server
+from cairn_map.errors import UnreachableError
+from cairn_map.evidence.grid import Geometry
+from cairn_server.folding.decoding_room import DECODING_BYTES, DecodingRoom
+
+SERVER = Path(cairn_server.__file__).parent
+DECODERS = {"stored_evidence", "stored_surfaces", "decode_stored", "sum_of_contributions", "decode_cell"}
+LARGE = Geometry(voxel_edge_m=0.02, depth=8)
+SMALL = Geometry(voxel_edge_m=0.02, depth=5)
+
+
+def test_large_cells_are_decoded_one_at_a_time() -> None:
+    room = DecodingRoom(DECODING_BYTES)
+    most: list[int] = []
+
+    def decode() -> None:
+        with room.of_cell(LARGE):
+            most.append(room.taken_bytes)
+
+    threads = [threading.Thread(target=decode) for _ in range(24)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(most) == 24
+    assert set(most) == {12 << 24}
+    assert room.taken_bytes == 0
+
+
+def test_a_thread_that_is_inside_enters_again() -> None:
+    room = DecodingRoom(DECODING_BYTES, wait_s=0)
+    with room.of_cell(LARGE), room.of_cell(LARGE):
+        assert room.taken_bytes == 12 << 24
+    assert room.taken_bytes == 0
+
+
+def test_a_cell_that_finds_no_room_in_time_is_busy_and_leaves_nothing_behind() -> None:
+    room = DecodingRoom(DECODING_BYTES, wait_s=0)
+    found: list[str] = []
+
+    def decode() -> None:
+        try:
+            with room.of_cell(LARGE):
+                found.append("decoded")
+        except UnreachableError as exc:
+            found.append(exc.kind)
+
+    with room.of_cell(LARGE):
+        thread = threading.Thread(target=decode)
+        thread.start()
+        thread.join()
+    assert found == ["busy"]
+    decode()
+    assert found == ["busy", "decoded"]
+    assert room.waiting == 0
+
+
+@pytest.mark.parametrize("name", ["views", "sync", "http", "live"])
+def test_requests_decode_cells_only_where_they_have_room(name: str) -> None:
+    for path in sorted((SERVER / name).rglob("*.py")):
+        tree = ast.parse(path.read_text())
+        with_room = {
+            id(inner)
+            for block in ast.walk(tree)
+            if isinstance(block, ast.With) and any("DECODING" in ast.unparse(item) for item in block.items)
+            for inner in ast.walk(block)
+        }
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call):
+                called = ast.unparse(node.func)
+                is_decoder = called in DECODERS or called.endswith("cache.evidence")
+                assert not is_decoder or id(node) in with_room, f"{path.name}:{node.lineno} decodes without room"
