@@ -19,6 +19,7 @@ from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.wire.messages import DAMAGED_MAX
 from cairn_server.folding.cells_at_rest import sound_cell
+from cairn_server.folding.decoding_room import DECODING
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import CellRow, MapRow
 
@@ -98,7 +99,8 @@ def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes, *, by: str) 
         return False
     # Decode within the memory that a cell of as many voxels can need: what claims more is another cell.
     limit_bytes = stored.voxels * (VOXEL_BYTES + 4 + 8 * row.geometry.plane_count)
-    decoded = decode_canonical_cell(data, evidence_bytes_max=limit_bytes)
+    with DECODING.of_cell(row.geometry):
+        decoded = decode_canonical_cell(data, evidence_bytes_max=limit_bytes)
     if decoded.key != key or decoded.geometry != row.geometry:
         raise BadInputError("bad_cell", f"the body is no cell {cell_of_key(key)} of map {row.name}")
     if decoded.digest != stored.digest:

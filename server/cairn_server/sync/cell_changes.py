@@ -113,6 +113,7 @@ def _delta(snapshot: Snapshot, row: CellRow, foreign: list[Contribution], geomet
         return None
     if len(foreign) == 1 and foreign[0].kind == ENTRY_FOLD:
         return snapshot.diff(foreign[0].commit, row.key)  # one commit's diff is its own sum
+    # Of several commits: decoded and added up, one cell at a time in the room that all requests share.
     try:
         with DECODING.of_cell(geometry):
             evidence = sum_of_contributions(snapshot, row.key, foreign, geometry).packed()

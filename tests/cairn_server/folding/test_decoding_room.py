@@ -12,9 +12,9 @@ from cairn_map.evidence.grid import Geometry
 from cairn_server.folding.decoding_room import DECODING_BYTES, DecodingRoom
 
 SERVER = Path(cairn_server.__file__).parent
-DECODERS = {"stored_evidence", "stored_surfaces", "decode_stored", "sum_of_contributions", "decode_cell"}
-LARGE = Geometry(voxel_edge_m=0.02, depth=8)
-SMALL = Geometry(voxel_edge_m=0.02, depth=5)
+STORED = {"stored_evidence", "stored_surfaces", "decode_stored", "sum_of_contributions"}
+DECODERS = STORED | {"decode_cell", "decode_canonical_cell"}
+LARGE = Geometry(depth=8)
 
 
 def test_large_cells_are_decoded_one_at_a_time() -> None:
@@ -63,9 +63,10 @@ def test_a_cell_that_finds_no_room_in_time_is_busy_and_leaves_nothing_behind() -
     assert room.waiting == 0
 
 
-@pytest.mark.parametrize("name", ["views", "sync", "http", "live"])
+@pytest.mark.parametrize("name", ["views", "sync", "http", "live", "folding/damaged_cells.py", "folding/cells.py"])
 def test_requests_decode_cells_only_where_they_have_room(name: str) -> None:
-    for path in sorted((SERVER / name).rglob("*.py")):
+    room = SERVER / name
+    for path in [room] if room.is_file() else sorted(room.rglob("*.py")):
         tree = ast.parse(path.read_text())
         with_room = {
             id(inner)
