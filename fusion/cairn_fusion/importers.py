@@ -82,6 +82,12 @@ def detect_layout(folder: str | Path) -> SourceLayout:
         return SourceLayout.BAG
     looked_for = "; ".join(f"{layout}: {' and '.join(names)}" for layout, names in LAYOUT_FILES.items())
     looked_for += f"; bag: {', '.join(SUFFIXES)}"
+    if root.is_file():
+        raise BadInputError(
+            "unknown_layout",
+            f"{root} is a file that cannot be replayed: a bag of ROS ({', '.join(SUFFIXES)}) or a folder is expected; "
+            f"looked for {looked_for}",
+        )
     if not root.is_dir():
         raise BadInputError("unknown_layout", f"there is no folder {root}, and no bag ({', '.join(SUFFIXES)})")
     raise BadInputError(

@@ -30,7 +30,7 @@ OPTIONS = FrameFolderOptions(
 )
 
 
-def frames(root: Path, ids: list[str]) -> Path:
+def frames_in(root: Path, ids: list[str]) -> Path:
     """A folder that fits OPTIONS; the depth of frame n is n + 1 metres, its temperature 300 + n kelvin."""
     (root / "f").mkdir(parents=True)
     np.savetxt(root / "K.txt", [[5, 0, 2.5], [0, 5, 1.5], [0, 0, 1]])
@@ -48,7 +48,7 @@ def changed(**fields: object) -> FrameFolderOptions:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    return frames(tmp_path / "data", ["000002", "000010", "000011"])
+    return frames_in(tmp_path / "data", ["000002", "000010", "000011"])
 
 
 def test_a_frame_becomes_a_scan_in_our_units(folder: Path) -> None:
@@ -70,7 +70,7 @@ def test_the_rig_is_one_camera_at_the_origin_under_three_names(folder: Path) -> 
 
 
 def test_frames_are_in_order_of_number_and_not_of_spelling(tmp_path: Path) -> None:
-    recording = import_frames(frames(tmp_path / "d", ["2", "10", "9"]), OPTIONS)
+    recording = import_frames(frames_in(tmp_path / "d", ["2", "10", "9"]), OPTIONS)
     assert [entry.range_path.name.split(".")[0] for entry in recording.files] == ["frame-2", "frame-9", "frame-10"]
 
 
@@ -173,6 +173,41 @@ def test_an_image_of_another_raster_is_not_registered(folder: Path) -> None:
     write_colour(folder / "f/frame-000002.rgb.png", np.zeros((8, 12, 3), np.uint8))
     with pytest.raises(BadInputError, match="must be 6 x 4 pixels, got 12 x 8"):
         import_frames(folder, OPTIONS).scan(0)
+
+
+@pytest.mark.parametrize(
+    ("frames", "expected"),
+    [
+        (["2-9"], ["2", "9"]),
+        (["9-10", "2"], ["2", "9", "10"]),
+        (["10-10"], ["10"]),
+        (["0-999999999999999999"], ["2", "9", "10"]),
+        (["3-4"], ["3-4"]),
+        (["a"], ["a"]),
+    ],
+)
+def test_frames_are_chosen_by_id_and_by_range(tmp_path: Path, frames: list[str], expected: list[str]) -> None:
+    folder = frames_in(tmp_path / "d", ["2", "10", "9", "3-4", "a"])
+    chosen = import_frames(folder, OPTIONS, frames=frames)
+    assert [entry.range_path.name.removeprefix("frame-").split(".")[0] for entry in chosen.files] == expected
+    everything = import_frames(folder, OPTIONS)
+    times = {entry.range_path: entry.time_s for entry in everything.files}
+    assert [entry.time_s for entry in chosen.files] == [times[entry.range_path] for entry in chosen.files]
+
+
+@pytest.mark.parametrize("frames", [[], ["5-8"], ["10-9"], ["2", "b"], ["2-"], ["-2"]])
+def test_a_choice_of_no_frame_is_refused(tmp_path: Path, frames: list[str]) -> None:
+    with pytest.raises(BadInputError) as refused:
+        import_frames(frames_in(tmp_path / "d", ["2", "10"]), OPTIONS, frames=frames)
+    assert refused.value.kind == "unknown_frame"
+    assert "2 frames, 2 to 10" in refused.value.message
+
+
+def test_a_file_that_is_no_bag_is_not_called_a_folder_that_is_missing(tmp_path: Path) -> None:
+    (tmp_path / "scan.pcd").write_text("VERSION 0.7")
+    with pytest.raises(BadInputError, match=r"scan\.pcd is a file") as refused:
+        detect_layout(tmp_path / "scan.pcd")
+    assert refused.value.kind == "unknown_layout"
 
 
 def test_rotations_that_are_off_by_rounding_are_mapped_and_told(folder: Path) -> None:

@@ -33,7 +33,12 @@ def add_frame_arguments(command: argparse.ArgumentParser) -> None:
     group.add_argument("--kelvin-per-count", type=float, metavar="K", help="scale of the thermal image (0.01)")
     group.add_argument("--kelvin-at-zero", type=float, metavar="K", help="offset of the thermal image (0)")
     group.add_argument("--frame-rate", type=float, metavar="HZ", help="frames in a second (1)")
-    command.add_argument("--frames", type=lambda text: text.split(","), metavar="ID,ID,...", help="only these frames")
+    command.add_argument(
+        "--frames",
+        type=lambda text: text.split(","),
+        metavar="ID,A-B,...",
+        help="only these frames: ids, and ranges by number",
+    )
 
 
 def frame_options(args: argparse.Namespace) -> FrameFolderOptions | None:

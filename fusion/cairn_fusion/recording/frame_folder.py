@@ -39,6 +39,7 @@ from cairn_map.errors import BadInputError
 TEXT_BYTES_MAX = 1 << 16
 """Largest text file with a matrix."""
 FRAME_ID = "{id}"
+FRAME_RANGE = re.compile(r"([0-9]{1,18})-([0-9]{1,18})")
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -99,7 +100,8 @@ def import_frames(
     Args:
         folder: folder that the patterns are relative to.
         options: patterns and conventions.
-        frames: only these ids, each in the folder; they keep the times and the order that they have among all.
+        frames: only these ids, each in the folder, and ranges of them by number (`100-499`, both ends included);
+            they keep the times and the order that they have among all.
         scans_per_measurement: group scans by this count.
 
     Raises:
@@ -108,13 +110,10 @@ def import_frames(
     """
     root = Path(folder).resolve()
     ids = _frame_ids(root, options.depth)
-    if frames is not None and (not frames or not set(frames) <= set(ids)):
-        unknown = ", ".join(sorted(set(frames) - set(ids))[:10]) or "of an empty choice"
-        raise BadInputError("unknown_frame", f"{root} has {len(ids)} frames, but none {unknown}")
     # Times count all frames of the folder, so that a choice of them keeps its times.
     rounding = PoseRounding()
     pose = _pose_reader(root, options, rounding)
-    wanted = set(ids if frames is None else frames)
+    wanted = set(ids) if frames is None else _chosen(ids, frames, root)
     files = tuple(
         _scan_files(root, options, frame_id, time_s=options.start_time_s + n / options.frame_rate_hz, pose=pose)
         for n, frame_id in enumerate(ids)
@@ -149,6 +148,31 @@ def _frame_ids(root: Path, pattern: str) -> list[str]:
     if not ids:
         raise BadInputError("no_frames", f"no file in {root} fits {pattern}")
     return sorted(ids, key=lambda word: (0, int(word), word) if word.isdecimal() else (1, 0, word))
+
+
+def _chosen(ids: Sequence[str], frames: Sequence[str], root: Path) -> set[str]:
+    """Those of the ids that are named, or lie in a range of numbers.
+
+    Raises:
+        BadInputError: kind `unknown_frame`: nothing is chosen, or a name or range chooses nothing.
+    """
+    chosen: set[str] = set()
+    unknown: list[str] = []
+    for part in frames:
+        ends = FRAME_RANGE.fullmatch(part)
+        # A frame may be named 3-4 itself.
+        if part in ids or ends is None:
+            found = {part} & set(ids)
+        else:
+            first, last = int(ends[1]), int(ends[2])
+            found = {each for each in ids if each.isdecimal() and first <= int(each) <= last}
+        if not found:
+            unknown.append(part)
+        chosen |= found
+    if unknown or not chosen:
+        names = ", ".join(unknown[:10]) or "of an empty choice"
+        raise BadInputError("unknown_frame", f"{root} has {len(ids)} frames, {ids[0]} to {ids[-1]}, but none {names}")
+    return chosen
 
 
 def _scan_files(
