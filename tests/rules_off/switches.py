@@ -823,8 +823,8 @@ SWITCHES = (
         4,
         "a state frame has the changed blocks and no others",
         CELLS_CHANGED,
-        "payload = encode_cell(row.key, of_blocks(evidence, blocks), geometry).data",
-        "payload = encode_cell(row.key, evidence, geometry).data",
+        "changed = of_blocks(cache.evidence(snapshot, row), blocks)",
+        "changed = cache.evidence(snapshot, row)",
         "cairn_server/store/test_stamps.py::test_a_state_frame_names_the_changed_blocks_and_no_others",
     ),
     Switch(
