@@ -4,7 +4,8 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from queue import Empty, SimpleQueue
 from types import FrameType
 
 from cairn_client.cli.arguments import shown_bytes
@@ -66,10 +67,38 @@ def lines_on_stderr(stream: EventStream) -> Iterator[None]:
         writer.join()
 
 
+class Stopping:
+    """Flag that a signal's handler sets, and that the main thread waits for.
+
+    A `threading.Event` must not be set by a handler: that runs in the main thread, which may hold the event's own lock
+    at this moment, on its way into `wait`. What is put into a `SimpleQueue` needs no lock that it could hold.
+    """
+
+    def __init__(self) -> None:
+        self._is_set = False
+        self._said = SimpleQueue[None]()
+
+    def set(self) -> None:
+        """Set the flag; may be called from a handler of signals."""
+        self._is_set = True
+        self._said.put(None)
+
+    def is_set(self) -> bool:
+        """True if a signal came."""
+        return self._is_set
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait for a signal, at most so many seconds (None: without end); True if one came. For one thread."""
+        if not self._is_set:
+            with suppress(Empty):
+                self._said.get(timeout=timeout_s)
+        return self._is_set
+
+
 @contextmanager
-def until_signal() -> Iterator[threading.Event]:
-    """An event that ^C or SIGTERM sets; the second one interrupts whatever goes on, as usual."""
-    stopping = threading.Event()
+def until_signal() -> Iterator[Stopping]:
+    """A flag that ^C or SIGTERM sets; the second one interrupts whatever goes on, as usual."""
+    stopping = Stopping()
 
     def stop(number: int, frame: FrameType | None) -> None:
         stopping.set()

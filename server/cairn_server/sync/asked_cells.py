@@ -37,16 +37,19 @@ class ListedCells:
     """Cells that a request lists, each at its own state."""
 
     keys: UInts
-    """Numbers of the cells, shape (n,), rising."""
+    """Numbers of the cells, shape (n,), as the request lists them."""
     states: npt.NDArray[np.int64]
     """Index in `cursors` of the state of each, shape (n,)."""
     cursors: tuple[Cursor | None, ...]
+    rising: npt.NDArray[np.int64]
+    """Index of each cell in the order of the numbers, shape (n,)."""
 
     def places(self, keys: UInts) -> npt.NDArray[np.int64]:
         """Index here of each of these cells, shape (len(keys),); -1 where it is not listed."""
         if not len(self.keys):
             return np.full(len(keys), -1)
-        found = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
+        above = np.searchsorted(self.keys, keys, sorter=self.rising)
+        found = self.rising[np.minimum(above, len(self.keys) - 1)]
         return np.where(self.keys[found] == keys, found, -1)
 
     def cursor(self, place: int) -> Cursor | None:
@@ -63,8 +66,7 @@ class ListedCells:
 
 def listed_cells(asked: Asked, cursors: tuple[Cursor | None, ...]) -> ListedCells:
     """Cells of a request, with its cursors parsed."""
-    order = np.argsort(asked.keys)
-    return ListedCells(asked.keys[order], asked.states[order], cursors)
+    return ListedCells(asked.keys, asked.states, cursors, np.argsort(asked.keys))
 
 
 def asked_of(request: MissingRequest) -> Asked:

@@ -1,5 +1,6 @@
 """`cairn robot status`, `queue` and `sync`: a robot's folder looked at, while it is at work and while it is not."""
 
+import itertools
 import json
 import os
 import signal
@@ -8,6 +9,8 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 import pytest
 from tests.fixtures.client.live_server import LiveServer
@@ -17,6 +20,7 @@ from tests.fixtures.client.robots import NOWHERE, map_commit, robot_in
 from tests.fixtures.client.world import stored_commits
 
 from cairn_client import main as cairn
+from cairn_client.cli.event_lines import until_signal
 from cairn_client.cli.robots.command import main as robot_command
 from cairn_client.replica.limits import Limits
 from cairn_map.errors import UnreachableError
@@ -166,6 +170,31 @@ def test_wrong_options_are_refused(tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as ended:
         code_of("sync")
     assert ended.value.code == 2
+
+
+def test_a_signal_at_any_line_of_the_wait_for_it_ends_it() -> None:
+    """A handler runs in the main thread, which may hold the lock of what it waits for at that moment."""
+
+    def ended_at(line: int) -> bool | None:
+        """True if the wait ended by a signal that came at this line of it; None: it has fewer lines."""
+        lines = itertools.count()
+
+        def look(frame: FrameType, event: str, argument: object) -> Any:
+            if event == "line" and next(lines) == line:
+                signal.raise_signal(signal.SIGTERM)
+            return look
+
+        with until_signal() as stopping:
+            sys.settrace(look)
+            try:
+                stopping.wait(0.05)
+            finally:
+                sys.settrace(None)
+            return stopping.is_set() if next(lines) > line else None
+
+    ended = list(itertools.takewhile(lambda each: each is not None, map(ended_at, itertools.count())))
+    assert len(ended) > 3
+    assert all(ended)
 
 
 @pytest.mark.processes

@@ -17,12 +17,11 @@ the next start. A second ^C ends it at once, and nothing is lost.
 
 import argparse
 import logging
-import threading
 from dataclasses import dataclass
 from pathlib import Path
 
 from cairn_client.cli.arguments import Subparsers, say, shown_bytes
-from cairn_client.cli.event_lines import lines_on_stderr, until_signal
+from cairn_client.cli.event_lines import Stopping, lines_on_stderr, until_signal
 from cairn_client.cli.robot_arguments import add_limits, add_map, limits_of, scope_of
 from cairn_client.cli.robots.replay import default_name, ensure_map
 from cairn_client.folders.spool import Spool, Stop, remember
@@ -118,7 +117,7 @@ def _run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _robot(args: argparse.Namespace, spool: Spool, stopping: threading.Event) -> Robot | None:
+def _robot(args: argparse.Namespace, spool: Spool, stopping: Stopping) -> Robot | None:
     """The robot; one that knows no map yet waits for the first recording, whose channels the map needs."""
     name = args.name or default_name(args.spool.resolve().name)
     state: Path = args.state or Path(f"cairn-{name}")
@@ -145,9 +144,7 @@ def _robot(args: argparse.Namespace, spool: Spool, stopping: threading.Event) ->
     )
 
 
-def _map_what_came(
-    robot: Robot, spool: Spool, args: argparse.Namespace, tally: _Tally, stopping: threading.Event
-) -> None:
+def _map_what_came(robot: Robot, spool: Spool, args: argparse.Namespace, tally: _Tally, stopping: Stopping) -> None:
     for stop in spool.stops(robot.replica):
         robot.mount(stop.source.rig)
         for index in stop.scans:
@@ -180,7 +177,7 @@ def _leave_out(robot: Robot, stop: Stop, exc: BadInputError) -> None:
     remember(robot.replica, stop.mark_left_out())
 
 
-def _commit(robot: Robot, stop: Stop, profile: Profile, tally: _Tally, stopping: threading.Event) -> bool:
+def _commit(robot: Robot, stop: Stop, profile: Profile, tally: _Tally, stopping: Stopping) -> bool:
     """Keep a measurement together with the mark that it is done; False, and nothing is kept, if it is to stop first."""
     while not stopping.is_set():
         try:
