@@ -31,7 +31,7 @@ from cairn_fusion.ros.bag_scans import BagScan, scans_of
 from cairn_fusion.ros.images import AnyImage, Pixels, amplitude_of, colour_of, depth_of, thermal_counts_of
 from cairn_fusion.ros.messages import COMPRESSED, IMAGE, POINTS, TRANSFORMS, read_compressed_image, read_image
 from cairn_fusion.ros.open_bag import open_bag
-from cairn_fusion.ros.point_clouds import T_LIDAR_CAMERA, read_points, sweep_image
+from cairn_fusion.ros.point_clouds import T_LIDAR_CAMERA, check_beams, read_points, sweep_image
 from cairn_fusion.ros.topic_mapping import BagMapping, MappedCamera, camera_of_info, mapping_from_yaml
 from cairn_fusion.ros.topic_proposal import Proposal, propose
 from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError
@@ -146,9 +146,10 @@ class BagRecording:
         lidar = self.rig[found.camera].camera
         message = self._readers[camera.topic].message(found.images[camera.topic])
         with translate_message_damage(self._bag, message):
-            points = read_points(message.data, wire_of(self._topics[camera.topic].topic))
-            assert isinstance(lidar, SpinningLidar)  # noqa: S101 - `_camera_of` made it so
-            return sweep_image(points.xyz(), lidar)
+            xyz = read_points(message.data, wire_of(self._topics[camera.topic].topic)).xyz()
+        assert isinstance(lidar, SpinningLidar)  # noqa: S101 - `_camera_of` made it so
+        check_beams(xyz, lidar, found.camera)
+        return sweep_image(xyz, lidar)
 
     def _amplitude(self, camera: MappedCamera, found: BagScan) -> npt.NDArray[np.uint16] | None:
         has_one = camera.amplitude is not None and camera.amplitude in found.images

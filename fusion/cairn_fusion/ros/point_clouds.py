@@ -14,6 +14,7 @@ from cairn_calib.rig.lidar import SpinningLidar
 from cairn_calib.rig.raster import MAX_SIDE_PX
 from cairn_fusion.ros.bag import Wire
 from cairn_fusion.ros.messages import RosHeader, WireReader, header_of
+from cairn_map.errors import BadInputError
 
 FIELD_BYTES_MIN = 13
 FIELDS_MAX = 64
@@ -21,6 +22,15 @@ TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """NumPy types by the numbers of sensor_msgs/PointField."""
 STEP_MIN_DEG = 0.01
 """Least angle between two beams; a smaller one makes them one beam."""
+FIT_DEG, FIT_STEPS = 0.2, 0.25
+"""Greatest angle between a point and its beam: 0.2 degrees, which a driver's correction for motion may add, or a
+quarter of the step to the next beam, whichever is more. Of points anywhere between the beams half lie within it."""
+FIT_SHARE_MIN = 0.75
+"""Least share of a cloud's points that lie within it."""
+PIXEL_SHARE_MIN = 0.4
+"""Least share of points that have a pixel of their own; clouds with two returns a beam have 0.5."""
+CHECKED_POINTS_MIN = 100
+"""Points of the smallest cloud of which shares say something."""
 R_LIDAR_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Rotation from a camera's axes (x right, y down, z forward) to a lidar's in ROS (x forward, y left, z up; REP 103)."""
 T_LIDAR_CAMERA = np.block([[R_LIDAR_CAMERA, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
@@ -125,3 +135,45 @@ def sweep_image(xyz: npt.NDArray[np.float64], lidar: SpinningLidar) -> npt.NDArr
     nearest = np.full((lidar.height, lidar.width), np.inf)
     np.minimum.at(nearest, (y, x), range_m[kept])
     return np.where(np.isfinite(nearest), nearest, np.nan).astype(np.float32)
+
+
+def check_beams(xyz: npt.NDArray[np.float64], lidar: SpinningLidar, name: str) -> None:
+    """Refuse a cloud whose points another lidar must have measured: a wrong model maps them where nothing was.
+
+    Args:
+        xyz: (N, 3) metres, x forward, y left, z up; NaN where nothing came back.
+        lidar: the raster that they are to be sorted into.
+        name: name of the camera, for messages.
+
+    Raises:
+        BadInputError: kind `bad_mapping`: too few points lie on a beam, or too many share a pixel.
+    """
+    own = xyz[np.isfinite(xyz).all(axis=1) & (xyz != 0).any(axis=1)] @ R_LIDAR_CAMERA
+    if len(own) < CHECKED_POINTS_MIN:
+        return
+    beams_deg = np.array(lidar.elevations_deg)
+    steps_deg = np.abs(np.diff(beams_deg)) if lidar.height > 1 else np.array([2 * FIT_DEG])
+    # Each point with its nearest beam; of the two steps next to a beam the smaller one counts.
+    elevations_deg = np.degrees(np.arctan2(-own[:, 1], np.hypot(own[:, 0], own[:, 2])))
+    nearest = np.rint(np.interp(-elevations_deg, -beams_deg, np.arange(lidar.height))).astype(np.int64)
+    off_deg = np.abs(elevations_deg - beams_deg[nearest])
+    step_deg = np.minimum(np.append(steps_deg, steps_deg[-1]), np.append(steps_deg[0], steps_deg))
+    fits = off_deg <= np.maximum(FIT_DEG, FIT_STEPS * step_deg[nearest])
+    if (share := float(fits.mean())) < FIT_SHARE_MIN:
+        raise BadInputError(
+            "bad_mapping",
+            f"camera {name}: elevations_deg does not describe its lidar: only {share:.0%} of a cloud's {len(own)} "
+            f"points lie within {FIT_DEG:g} degrees, or {FIT_STEPS:g} of a step, of one of the {lidar.height} beams "
+            f"({np.median(off_deg):.2g} degrees off in the median, {off_deg.max():.2g} at most; the points' elevations "
+            f"are {elevations_deg.min():.1f} to {elevations_deg.max():.1f}). Take the beams of its data sheet",
+        )
+    pixels = lidar.project(own[fits])
+    pixels = pixels[np.isfinite(pixels).all(axis=1)]
+    number = np.rint(pixels[:, 1]) * lidar.width + np.rint(pixels[:, 0]) % lidar.width
+    if (used := len(np.unique(number)) / max(1, len(number))) < PIXEL_SHARE_MIN:
+        raise BadInputError(
+            "bad_mapping",
+            f"camera {name}: columns: {lidar.width} is too few: {len(number)} points of a cloud fall into "
+            f"{len(np.unique(number))} pixels ({used:.0%}), and only the nearest point of each would be mapped. Take "
+            "the columns of one turn of the lidar",
+        )

@@ -36,6 +36,8 @@ from cairn_fusion.ros.messages import RosCameraInfo
 from cairn_map.errors import BadInputError, first_error
 
 MAPPING_BYTES_MAX = 1 << 20
+DECIDE = "DECIDE"
+"""Word of a proposed file where a fact is missing that only the maker of the bag knows."""
 PLUMB_BOB = ("plumb_bob", "")
 Topic = Annotated[str, Field(pattern=r"^\S{1,1024}$")]
 Frame = Annotated[str, Field(pattern=r"^[^/\s]\S{0,254}$")]
@@ -186,7 +188,19 @@ def mapping_of(path: Path) -> BagMapping:
 
 
 def mapping_from_yaml(text: str, path: Path | str) -> BagMapping:
-    """The mapping in a YAML text; errors as `mapping_of`."""
+    """The mapping in a YAML text; errors as `mapping_of`.
+
+    Raises:
+        BadInputError: kind `undecided`: a question of the proposed file stands in it yet.
+    """
+    # A proposed file is valid but for its questions: a guess would be mapped as if it were known.
+    open_lines = [f"line {n}: {line.strip()}" for n, line in enumerate(text.splitlines(), 1) if DECIDE in line]
+    if open_lines:
+        raise BadInputError(
+            "undecided",
+            f"{path} leaves something to decide: {'; '.join(open_lines)[:2000]}. Write what is true into the file, and "
+            f"delete each line, or word, that says {DECIDE}",
+        )
     try:
         content = document_of_yaml(text)
     except ValueError as exc:

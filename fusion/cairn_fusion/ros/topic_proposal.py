@@ -20,6 +20,7 @@ from cairn_fusion.ros.bag_index import BASE, BagIndex, TopicIndex
 from cairn_fusion.ros.images import COLOURS
 from cairn_fusion.ros.messages import CAMERA_INFO, COMPRESSED, IMAGE, POINTS, TRANSFORMS
 from cairn_fusion.ros.tf_tree import FrameTree
+from cairn_fusion.ros.topic_mapping import DECIDE
 
 AMPLITUDE_WORDS = re.compile(r"infra|amplitude|intensity|(^|[_/])(ir|nir)\d*([_/]|$)")
 THERMAL_WORDS = re.compile(r"therm|lwir|flir|boson|lepton|tau2|optris|seek")
@@ -80,7 +81,7 @@ def propose(index: BagIndex, path: Path) -> Proposal:
     # Stage 3: the text, with the questions as comments.
     lines = [
         f"# Which topics of {path.name} are what: cairn robot replay {path.name} --topics THIS_FILE --map URL",
-        *(f"# DECIDE: {question}" for question in questions),
+        *(f"# {DECIDE}: {question}" for question in questions),
         f"name: {_quoted(_name(path))}",
         *pose_lines,
         f"time_tolerance_s: {tolerance_s:.2g}  # an image goes with a range image that is at most so far away in time",
@@ -224,8 +225,11 @@ def _camera_lines(camera: Guess, index: BagIndex) -> Iterator[str]:
     yield f"    spectrum: {camera.spectrum.value}"
     yield f"    topic: {_quoted(camera.entry.topic.name)}  # {camera.entry.encoding}, {camera.entry.rate_hz:.3g} Hz"
     if camera.entry.topic.type == POINTS:
-        elevations = list(camera.entry.elevations_deg or (15.0, 0.0, -15.0))
-        yield f"    lidar: {{columns: {min(camera.entry.columns, 4096)}, elevations_deg: {elevations}}}"
+        known = camera.entry.elevations_deg
+        beams = list(known) if known is not None else f"{DECIDE}  # of each beam, the highest first, such as [15, 13]"
+        yield "    lidar:"
+        yield f"      columns: {min(camera.entry.columns, 4096)}"
+        yield f"      elevations_deg: {beams}"
         yield f"    frame: {_quoted(camera.entry.frame)}  # x forward, y left, z up"
         return
     if camera.info:

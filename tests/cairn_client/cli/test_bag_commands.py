@@ -58,7 +58,13 @@ def test_inspect_lists_topics_and_writes_what_replay_takes(
     assert "to decide: camera thermal: how many kelvin" in asked
     with pytest.raises(ConflictError, match="--force"):
         main(["inspect", str(bag), "--output", str(topics)])
-    assert replayed(bag, tmp_path / "robot", "--topics", str(topics), "--name", "bagged")
+    options = "--topics", str(topics), "--name", "bagged"
+    with pytest.raises(BadInputError, match="how many kelvin one count is") as caught:
+        replayed(bag, tmp_path / "robot", *options)
+    assert caught.value.kind == "undecided"
+    decided = [line for line in topics.read_text().splitlines() if "DECIDE" not in line]
+    topics.write_text("\n".join(decided))
+    assert replayed(bag, tmp_path / "robot", *options)
 
 
 def test_inspect_in_json_has_the_proposal_too(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,8 +12,16 @@ from cairn_calib.rig.lidar import SpinningLidar
 from cairn_fusion.importers import open_source
 from cairn_fusion.ros.bag import Wire
 from cairn_fusion.ros.bag_recording import survey
-from cairn_fusion.ros.point_clouds import R_LIDAR_CAMERA, RosPoints, elevations_of, read_points, sweep_image
-from cairn_map.errors import DamagedDataError
+from cairn_fusion.ros.point_clouds import (
+    R_LIDAR_CAMERA,
+    RosPoints,
+    check_beams,
+    elevations_of,
+    read_points,
+    sweep_image,
+)
+from cairn_fusion.ros.topic_mapping import mapping_from_yaml
+from cairn_map.errors import BadInputError, DamagedDataError
 
 ELEVATIONS = (10.0, 4.0, 0.0, -3.5)
 LIDAR = SpinningLidar(width=90, height=4, elevations_deg=ELEVATIONS)
@@ -126,3 +134,56 @@ def test_a_damaged_cloud_is_told_with_its_topic(tmp_path: Path) -> None:
 
     with pytest.raises(DamagedDataError, match="/points at 1700000000"):
         open_source(write_bag(tmp_path / "bad", "mcap", messages))
+
+
+def turned(lidar: SpinningLidar, *, up_deg: float = 0.0) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """(N, 3) points that a lidar measures on a sphere, their elevations raised by an angle."""
+    beams = SpinningLidar(
+        width=lidar.width, height=lidar.height, elevations_deg=tuple(e + up_deg for e in lidar.elevations_deg)
+    )
+    return np.asarray(8.0 * beams.rays().reshape(-1, 3) @ R_LIDAR_CAMERA.T)
+
+
+SIXTEEN = SpinningLidar(width=360, height=16, elevations_deg=tuple(float(e) for e in range(15, -17, -2)))
+
+
+@pytest.mark.parametrize("lidar", [LIDAR, SIXTEEN, SpinningLidar(width=360, height=1, elevations_deg=(0.0,))])
+@pytest.mark.parametrize("up_deg", [-0.19, 0.0, 0.19])
+def test_a_cloud_fits_the_lidar_that_measured_it(lidar: SpinningLidar, up_deg: float) -> None:
+    check_beams(turned(lidar, up_deg=up_deg), lidar, "lidar")
+    check_beams(np.full((5, 3), np.nan), lidar, "lidar")  # nothing came back
+
+
+def test_a_cloud_of_another_lidar_is_refused_with_the_number_that_is_wrong() -> None:
+    three = SpinningLidar(width=360, height=3, elevations_deg=(15.0, 0.0, -15.0))
+    with pytest.raises(BadInputError, match=r"elevations_deg.* only 50% of .* one of the 3 beams"):
+        check_beams(turned(SIXTEEN), three, "lidar")
+    with pytest.raises(BadInputError, match="elevations_deg"):
+        check_beams(turned(SIXTEEN, up_deg=1.0), SIXTEEN, "lidar")
+    narrow = SpinningLidar(width=90, height=16, elevations_deg=SIXTEEN.elevations_deg)
+    with pytest.raises(BadInputError, match="columns: 90 is too few"):
+        check_beams(turned(SIXTEEN), narrow, "lidar")
+
+
+def test_beams_that_nobody_knows_are_asked_for_and_wrong_ones_end_the_reading(tmp_path: Path) -> None:
+    def messages(make: Messages) -> Iterator[Timed]:
+        for time_s, topic, message in drive(make):
+            if topic == "/points":
+                message = cloud(make, time_s, swept(0), flat=True)
+                object.__setattr__(message, "fields", message.fields[:3])  # no rings, no rows
+            yield time_s, topic, message
+
+    path = write_bag(tmp_path / "flat", "mcap", messages)
+    proposal = survey(path).proposal
+    with pytest.raises(BadInputError, match="elevations_deg: DECIDE") as caught:
+        mapping_from_yaml(proposal.text, "bag.yaml")
+    assert caught.value.kind == "undecided"
+    lines = [line for line in proposal.text.splitlines() if not line.startswith("# DECIDE")]
+    beams = next(n for n, line in enumerate(lines) if "elevations_deg" in line)
+    lines[beams - 1 : beams + 1] = ["      columns: 90", f"      elevations_deg: {list(ELEVATIONS)}"]
+    sweep = open_source(path, mapping=mapping_from_yaml("\n".join(lines), "bag.yaml")).scan(0)
+    np.testing.assert_allclose(sweep.range_m, swept(0), rtol=1e-6)
+    lines[beams] = "      elevations_deg: [15, 0, -15]"
+    wrong = open_source(path, mapping=mapping_from_yaml("\n".join(lines), "bag.yaml"))
+    with pytest.raises(BadInputError, match="elevations_deg does not describe its lidar"):
+        wrong.scan(0)
