@@ -62,6 +62,7 @@ def test_two_robots_that_share_a_recording_make_the_map_of_one(
     one, two = f"{server}/maps/one", f"{server}/maps/two"
     out = typed("robot", "replay", room_recording, "--map", one, "--voxel", VOXEL_M, folder=tmp_path)
     assert re.search(r"replayed 8 scans as 2 commits in .* scans/s\), .* 0 commits wait", out)
+    assert re.search(r"ranges: \d+\.\d% of \d+ pixels are mapped", out)
     for part in ("1/2", "2/2"):
         name = f"part{part[0]}"
         typed(

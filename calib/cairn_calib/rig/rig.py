@@ -79,6 +79,10 @@ TIME_OF_FLIGHT = RangeSensing(sigma_m=((0.0, 0.005), (3.0, 0.01), (6.0, 0.03)))
 LIDAR = RangeSensing(sigma_m=((0.0, 0.02),))
 """Usual spinning lidar: 2 cm at every range, as data sheets state."""
 
+TIME_OF_FLIGHT_REACH_M, LIDAR_REACH_M = 10.0, 100.0
+"""Greatest ranges of usual sensors, metres: beyond 10 m a time-of-flight camera wraps round (15 MHz), and the depth of
+a stereo camera is noise; a spinning lidar sees walls to 100 m and farther."""
+
 
 class Spectrum(StrEnum):
     """Quantity that a camera's pixels measure."""
@@ -176,6 +180,11 @@ class MountedCamera(BaseModel, frozen=True):
     def known_sensing(self) -> RangeSensing:
         """Stated `sensing`; one without any statement where the rig has none."""
         return self.sensing or RangeSensing()
+
+    @property
+    def usual_reach_m(self) -> float:
+        """Greatest range of a usual sensor of this kind, metres."""
+        return LIDAR_REACH_M if isinstance(self.camera, SpinningLidar) else TIME_OF_FLIGHT_REACH_M
 
     def range_sigma_m(self, range_m: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
         """(...) standard deviation of the range camera at ranges, metres: as stated, else as is usual.

@@ -38,6 +38,7 @@ from cairn_client.sync.link_profile import LINKS, LinkName
 from cairn_client.sync.responses import Traffic
 from cairn_client.sync.scope import EVERYTHING, Scope
 from cairn_client.sync.sync import RoundReport
+from cairn_fusion.mapping.beam_returns import ReturnCounts
 from cairn_fusion.mapping.integrate import Integrator
 from cairn_fusion.mapping.measurement import Measurement
 from cairn_fusion.recording.scan import Scan
@@ -116,6 +117,8 @@ class Robot:
         self._integrator = integrator or Integrator()
         self._profile = LINKS[link]
         self._stay, self._is_closed = stay, False
+        self.returns = ReturnCounts()
+        """Count of the pixels of the measurements that were closed, by what became of them."""
         self._status = OwnStatus(every_s=self._profile.tell_every_s)
         self._events = Events()
         self._api = RelayApi(server_url, token=token)
@@ -330,16 +333,19 @@ class Robot:
                 and nothing is left to drop. The measurement stays open in any case.
         """
         diff = self._measurement.diff() if self._measurement else {}
+        counts = self._measurement.counts if self._measurement else ReturnCounts()
         # No evidence is no commit, except to take others out.
         if not diff and not retracts:
             if self._measurement:
                 log.warning("%d scans gave no evidence; nothing is committed", len(self._measurement))
+                self.returns += counts
                 self.discard()
             return None
         # Until the replica has the commit on its disk, the measurement stays open: the caller may try again.
         facts = self._facts(self._measurement, note, retracts)
         commit = self._replica.commit(diff, facts, profile=profile or self._profile.commits, notes=remember)
         # It is durable. A power cut before the next two lines may cost the scans for an amend, never evidence.
+        self.returns += counts
         self._measurement = self._new_measurement()
         self._kept_scans.close_measurement(commit.id)
         self._made(commit)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from cairn_calib.rig.rig import Rig
 from cairn_fusion.mapping.integrate import Integrator, integrate_scans
 from cairn_fusion.mapping.measurement import scan_pose
 from cairn_fusion.recording.scan import Scan
@@ -54,7 +55,7 @@ class GrowingMap:
                 robot=robot.name,
                 stop=stop,
                 scans=len(scans),
-                rays=sum(self._rays(scan) for scan in scans),
+                rays=sum(self._rays(scan, robot.rig) for scan in scans),
                 integrate_s=integrated_s - start_s,
                 integrate_cpu_s=integrated_cpu_s - start_cpu_s,
                 commit_s=committed_s - integrated_s,
@@ -82,8 +83,8 @@ class GrowingMap:
             integrator=str(self.integrator),
         )
 
-    def _rays(self, scan: Scan) -> int:
-        near_m, far_m = self.integrator.min_range_m, self.integrator.max_range_m
+    def _rays(self, scan: Scan, rig: Rig) -> int:
+        near_m, far_m = self.integrator.min_range_m, self.integrator.reach_m(rig[scan.range_camera])
         return int(np.count_nonzero((scan.range_m >= near_m) & (scan.range_m <= far_m)))
 
 

@@ -12,7 +12,7 @@ A pixel in none of the three has no information. The rig's range bias is subtrac
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,34 @@ from cairn_map.arrays import Flags, Floats, Singles
 
 MARGIN_VOXELS = 1.0
 """Distance of a free voxel's centre from a surface, voxels: a little more than half a voxel's diagonal, 0.87."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReturnCounts:
+    """Count of the pixels of range images, by what became of them; each is counted once, by the first cause."""
+
+    used: int = 0
+    """Pixels with a range that counts."""
+    no_return: int = 0
+    """Pixels to which nothing came back."""
+    saturated: int = 0
+    """Pixels to which too much light came back."""
+    too_near: int = 0
+    """Pixels below `min_range_m`."""
+    too_far: int = 0
+    """Pixels beyond `max_range_m`."""
+    flying: int = 0
+    """Pixels that mix a near and a far surface."""
+    own_body: int = 0
+    """Pixels on the robot itself."""
+
+    def __add__(self, other: "ReturnCounts") -> "ReturnCounts":
+        return ReturnCounts(*(getattr(self, one.name) + getattr(other, one.name) for one in fields(self)))
+
+    @property
+    def pixels(self) -> int:
+        """Count of all pixels."""
+        return sum(getattr(self, one.name) for one in fields(self))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,6 +75,7 @@ class Returns:
     """(N,) numbers of the pixels with a range, row by row."""
     points_map: Floats
     """(N, 3) metres, map frame."""
+    counts: ReturnCounts
 
     @property
     def reach_m(self) -> float:
@@ -56,36 +85,56 @@ class Returns:
 
 
 def returns_of(
-    scan: Scan, rig: Rig, *, min_range_m: float, max_range_m: float, flying_step_m: float = math.inf
+    scan: Scan, rig: Rig, *, min_range_m: float, max_range_m: float | None, flying_step_m: float = math.inf
 ) -> Returns:
     """Returns of a scan (Eq. 1-5).
+
+    Args:
+        scan: one scan.
+        rig: its cameras.
+        min_range_m: least range of a return, metres.
+        max_range_m: greatest range of a return, metres; None: that of a usual sensor of the range camera's kind.
+        flying_step_m: as `Integrator.flying_step_m`.
 
     Raises:
         BadInputError: an image does not fit its camera.
     """
     check_scan(scan, rig)
     mounted = rig[scan.range_camera]
+    max_range_m = mounted.usual_reach_m if max_range_m is None else max_range_m
     true_m = mounted.true_ranges(scan.range_m, scan.amplitude)
     T_map_tof = scan.T_map_rig @ mounted.transform
     # Hits: within limits, not saturated; `shield_m` is taken before flying pixels and the body are left out.
     full = full_pixels(scan, mounted)
-    within = (true_m >= min_range_m) & (true_m <= max_range_m) & ~full
+    near, far, void = true_m < min_range_m, true_m > max_range_m, np.isnan(true_m)
+    within = ~(near | far | void | full)
     shield_m = np.where(within, true_m, np.float32(np.nan))
+    limited = int(np.count_nonzero(within))
     if flying_step_m < math.inf:
         within &= ~flying_pixels(true_m, flying_step_m)
+    whole = int(np.count_nonzero(within))
     # Silence means empty space only where the rig states it, and not where too much light returned.
     silent_m = min(mounted.known_sensing.no_return_clears_m or 0.0, max_range_m)
-    silent = np.isnan(true_m) & ~full & (silent_m > 0)
+    silent = void & ~full & (silent_m > 0)
     if rig.body is not None:
         T_body_tof = mounted.transform if scan.T_map_body is None else inverse(scan.T_map_body) @ T_map_tof
-        within &= ~_on_body(rig.body, true_m, mounted, T_body_tof)
+        within &= ~_on_body(rig.body, np.where(within, true_m, np.float32(np.nan)), mounted, T_body_tof)
         if silent.any():
             # A beam that the body stops may return nothing.
             beams = mounted.camera.rays() @ T_body_tof[:3, :3].T
             silent &= ~rig.body.stops(T_body_tof[:3, 3], beams, silent_m)
     range_m = np.where(within, true_m, np.float32(np.nan))
     pixels, points_map = returned_points(range_m, mounted.camera.rays(), T_map_tof)
-    return Returns(T_map_tof, range_m, shield_m, silent, silent_m, pixels, points_map)
+    counts = ReturnCounts(
+        used=len(pixels),
+        no_return=int(np.count_nonzero(void & ~full)),
+        saturated=int(np.count_nonzero(full)),
+        too_near=int(np.count_nonzero(near & ~full)),
+        too_far=int(np.count_nonzero(far & ~full)),
+        flying=limited - whole,
+        own_body=whole - len(pixels),
+    )
+    return Returns(T_map_tof, range_m, shield_m, silent, silent_m, pixels, points_map, counts)
 
 
 def full_pixels(scan: Scan, mounted: MountedCamera) -> Flags:
@@ -98,8 +147,7 @@ def full_pixels(scan: Scan, mounted: MountedCamera) -> Flags:
 
 def _on_body(body: Body, range_m: Singles, mounted: MountedCamera, T_body_tof: Transform) -> Flags:
     """(H, W) true where the point lies on the robot itself."""
-    with np.errstate(invalid="ignore"):  # an endless range along an axis: 0 times infinity
-        points_tof = mounted.camera.rays() * range_m[..., None].astype(np.float64)
+    points_tof = mounted.camera.rays() * range_m[..., None].astype(np.float64)
     return body.holds(transform_points(T_body_tof, points_tof))
 
 

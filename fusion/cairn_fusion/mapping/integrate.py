@@ -16,13 +16,14 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import StrEnum
+from threading import Lock
 
 import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.rig.poses import Transform, check_transform, inverse, transform_points
-from cairn_calib.rig.rig import LIDAR, Rig
-from cairn_fusion.mapping.beam_returns import Returns, clear_image, returns_of
+from cairn_calib.rig.rig import LIDAR, LIDAR_REACH_M, TIME_OF_FLIGHT_REACH_M, MountedCamera, Rig
+from cairn_fusion.mapping.beam_returns import ReturnCounts, Returns, clear_image, returns_of
 from cairn_fusion.mapping.brick_tally import Each, TallyPool
 from cairn_fusion.mapping.free_space import Window, carving_of, window_of
 from cairn_fusion.mapping.ray_casting import beam_evidence, clear_ends, silent_ends
@@ -51,9 +52,9 @@ class Integrator:
 
     min_range_m: float = 0.1
     """Least range of a return, metres; nearer ones are ignored."""
-    max_range_m: float = 10.0
-    """Greatest range of a return, metres: beyond it a time-of-flight camera wraps round. A farther one is ignored, and
-    is no proof of free space."""
+    max_range_m: float | None = None
+    """Greatest range of a return, metres. A farther one is ignored, and is no proof of free space. None: that of a
+    usual sensor of its kind (`rig.TIME_OF_FLIGHT_REACH_M`, `rig.LIDAR_REACH_M`)."""
     method: Method = Method.CARVE
     flying_step_m: float = 0.05
     """Difference from both neighbours, metres, beyond which a pixel of a carved image is a mixture of them
@@ -70,9 +71,10 @@ class Integrator:
     """Depth behind the nearest point of a bin beyond which a point is hidden, metres (`transfer`). Infinite: never."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.min_range_m < self.max_range_m < float("inf"):
+        farthest_m = TIME_OF_FLIGHT_REACH_M if self.max_range_m is None else self.max_range_m
+        if not 0 <= self.min_range_m < farthest_m < float("inf"):
             raise BadInputError(
-                "bad_range", f"0 <= min_range_m < max_range_m must hold, got {self.min_range_m}, {self.max_range_m}"
+                "bad_range", f"0 <= min_range_m < max_range_m must hold, got {self.min_range_m}, {farthest_m}"
             )
         if not self.flying_step_m > 0:
             raise BadInputError("bad_range", f"flying_step_m must be above 0, got {self.flying_step_m}")
@@ -87,11 +89,16 @@ class Integrator:
     def __str__(self) -> str:
         # The text goes into every commit, so that evidence can be found by how it was made; 5 is the version of the
         # integrator.
-        limits = f"min_range_m={self.min_range_m:g} max_range_m={self.max_range_m:g}"
+        farthest = "usual" if self.max_range_m is None else f"{self.max_range_m:g}"
+        limits = f"min_range_m={self.min_range_m:g} max_range_m={farthest}"
         surfaces = f"flying_step_m={self.flying_step_m:g} noise_sigmas={self.noise_sigmas:g}"
         samples = f"sample_spread_voxels={self.sample_spread_voxels:g} temperature_step_k={self.temperature_step_k:g}"
         samples += f" hidden_behind_m={self.hidden_behind_m:g}"
         return f"cairn-{self.method} 5 {limits} {surfaces} {samples}"
+
+    def reach_m(self, mounted: MountedCamera) -> float:
+        """Greatest range of a return of this range camera, metres."""
+        return mounted.usual_reach_m if self.max_range_m is None else self.max_range_m
 
 
 class Integration:
@@ -102,7 +109,12 @@ class Integration:
         self._rig = rig
         self._geometry = geometry
         self._integrator = integrator
-        self._tallies = TallyPool(geometry, max_range_m=integrator.max_range_m, around_m=around_m)
+        # Room for images; sweeps of lidars are counted ray by ray, without a tally.
+        reach_m = TIME_OF_FLIGHT_REACH_M if integrator.max_range_m is None else integrator.max_range_m
+        self._tallies = TallyPool(geometry, max_range_m=reach_m, around_m=around_m)
+        self._lock = Lock()
+        self.counts = ReturnCounts()
+        """Count of the pixels of all scans, by what became of them."""
 
     def add(self, scan: Scan) -> None:
         """Add a scan.
@@ -130,6 +142,8 @@ class Integration:
         elif returns.reach_m > 0:
             self._carve(scan, returns, window)
         self._tallies.merge(scalars)
+        with self._lock:
+            self.counts += returns.counts
 
     def add_points(
         self,
@@ -160,7 +174,10 @@ class Integration:
         # Points without a bias, within limits, and not on the robot itself; NaN is outside all limits.
         own = (points if of is None else of.true_points(points)).astype(np.float64)
         range_m = np.linalg.norm(own, axis=1)
-        kept = (range_m >= self._integrator.min_range_m) & (range_m <= self._integrator.max_range_m)
+        farthest_m = LIDAR_REACH_M if self._integrator.max_range_m is None else self._integrator.max_range_m
+        if of is not None:
+            farthest_m = self._integrator.reach_m(of)
+        kept = (range_m >= self._integrator.min_range_m) & (range_m <= farthest_m)
         if self._rig.body is not None and T_map_body is not None:
             T_body_sensor = inverse(check_transform(T_map_body, name="T_map_body")) @ T
             kept &= ~self._rig.body.holds(transform_points(T_body_sensor, own))

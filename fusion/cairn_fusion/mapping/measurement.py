@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from cairn_calib.rig.poses import Transform, quaternion_from_transform
 from cairn_calib.rig.rig import Rig
+from cairn_fusion.mapping.beam_returns import ReturnCounts
 from cairn_fusion.mapping.integrate import Integration, Integrator
 from cairn_fusion.recording.scan import Scan
 from cairn_map.commits.commit import ScanPose
@@ -76,6 +77,11 @@ class Measurement:
     def diff(self) -> dict[CellKey, Evidence]:
         """The evidence of all scans, by cell."""
         return self._integration.diff()
+
+    @property
+    def counts(self) -> ReturnCounts:
+        """Count of the pixels of all scans, by what became of them."""
+        return self._integration.counts
 
     @property
     def captured_s(self) -> tuple[float, float] | None:

@@ -10,11 +10,11 @@ import numpy as np
 
 from cairn_client.cli.arguments import Subparsers, api_of, say, shown_bytes, shown_length
 from cairn_client.cli.frame_arguments import add_frame_arguments, frame_options
+from cairn_client.cli.range_arguments import add_ranges, integrator_of, returns_line
 from cairn_client.cli.robot_arguments import add_map, scope_of
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
 from cairn_fusion.importers import open_source
-from cairn_fusion.mapping.integrate import Integrator
 from cairn_fusion.recording.recording import ScanSource
 from cairn_fusion.ros.topic_mapping import mapping_of
 from cairn_map.codec.cell_code import Profile
@@ -34,7 +34,6 @@ SYNC_EVERY_S = 2.0
 
 def _replay(args: argparse.Namespace) -> int:
     # What to replay, and on which map.
-    integrator = Integrator(min_range_m=args.min_range, max_range_m=args.max_range)
     options, size = frame_options(args), args.scans_per_measurement
     mapping = mapping_of(args.topics) if args.topics else None
     source = open_source(
@@ -61,7 +60,7 @@ def _replay(args: argparse.Namespace) -> int:
         token=args.token.of(args.map),
         mode=args.mode,
         geometry=geometry,
-        integrator=integrator,
+        integrator=integrator_of(args),
         scope=scope_of(args, args.mode),
         link=args.link,
         stay=True,
@@ -72,11 +71,12 @@ def _replay(args: argparse.Namespace) -> int:
         mapped_s = time.monotonic() - start_s
         # The second round tells the server where this robot stands now.
         is_linked = _try_sync(robot) and _try_sync(robot)
-        waiting, traffic = robot.waiting, robot.traffic
+        waiting, traffic, returns = robot.waiting, robot.traffic, robot.returns
     say(
         f"replayed {scans} scans as {commits} commits in {mapped_s:.1f} s ({scans / mapped_s:.1f} scans/s), "
         f"{shown_bytes(traffic.up_bytes)} up, {shown_bytes(traffic.down_bytes)} down, {waiting} commits wait"
     )
+    say(returns_line(returns))
     if not is_linked:
         say(f"no link to {args.map}: `cairn robot sync {state} --map URL` pushes them when there is one")
     return 0
@@ -188,16 +188,7 @@ def add_parser(commands: Subparsers) -> None:
     )
     replay.add_argument("--share", type=_share, default=(1, 1), metavar="I/N", help="every N-th measurement from I on")
     replay.add_argument("--scans-per-measurement", type=int, metavar="N", help="regroup the scans")
-    replay.add_argument(
-        "--min-range", type=float, default=Integrator().min_range_m, metavar="METRES", help="ignore nearer ranges"
-    )
-    replay.add_argument(
-        "--max-range",
-        type=float,
-        default=Integrator().max_range_m,
-        metavar="METRES",
-        help="ignore farther ranges (10)",
-    )
+    add_ranges(replay)
     replay.add_argument("--state", type=Path, metavar="DIR", help="the robot's folder (cairn-NAME)")
     replay.add_argument("--mode", choices=("high-end", "low-end"), default="high-end")
     replay.add_argument(

@@ -22,12 +22,12 @@ from pathlib import Path
 
 from cairn_client.cli.arguments import Subparsers, say, shown_bytes
 from cairn_client.cli.event_lines import Stopping, lines_on_stderr, until_signal
+from cairn_client.cli.range_arguments import add_ranges, integrator_of, returns_line
 from cairn_client.cli.robot_arguments import add_limits, add_map, limits_of, scope_of
 from cairn_client.cli.robots.replay import default_name, ensure_map
 from cairn_client.folders.spool import Spool, Stop, remember
 from cairn_client.folders.state_folder import is_state_folder
 from cairn_client.robot.robot import Robot
-from cairn_fusion.mapping.integrate import Integrator
 from cairn_map.codec.cell_code import Profile
 from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
 
@@ -57,12 +57,7 @@ def add_parser(commands: Subparsers) -> None:
     run.add_argument("spool", type=Path, metavar="SPOOL", help="the folder that recordings come into")
     add_map(run)
     run.add_argument("--voxel", type=float, metavar="METRES", help="make the map with this voxel edge if needed")
-    run.add_argument(
-        "--min-range", type=float, default=Integrator().min_range_m, metavar="METRES", help="ignore nearer ranges"
-    )
-    run.add_argument(
-        "--max-range", type=float, default=Integrator().max_range_m, metavar="METRES", help="ignore farther ranges"
-    )
+    add_ranges(run)
     run.add_argument("--state", type=Path, metavar="DIR", help="the robot's folder (cairn-NAME)")
     run.add_argument("--mode", choices=("high-end", "low-end"), default="high-end")
     run.add_argument(
@@ -114,6 +109,7 @@ def _run(args: argparse.Namespace) -> int:
         f"mapped {tally.scans} scans as {tally.commits} commits, {shown_bytes(traffic.up_bytes)} up, "
         f"{shown_bytes(traffic.down_bytes)} down; {robot.waiting} commits wait"
     )
+    say(returns_line(robot.returns))
     return 0
 
 
@@ -134,7 +130,7 @@ def _robot(args: argparse.Namespace, spool: Spool, stopping: Stopping) -> Robot 
         token=args.token.of(args.map),
         mode=args.mode,
         geometry=ensure_map(args, source) if source else None,
-        integrator=Integrator(min_range_m=args.min_range, max_range_m=args.max_range),
+        integrator=integrator_of(args),
         scope=scope_of(args, args.mode),
         limits=limits_of(args),
         link=args.link,
