@@ -1,12 +1,13 @@
 """Bag: messages that a robot with ROS recorded, one by one, from any file that ROS writes.
 
-    FILE.bag                  ROS 1                              `rosbags_bag`
-    FILE.db3                  ROS 2, SQLite                      `rosbags_bag`
+    FILE.bag                  ROS 1                              `ros1_bag`
+    FILE.db3                  ROS 2, SQLite                      `db3_bag`
     FILE.mcap                 messages of ROS 1 or ROS 2         `mcap_bag`
     DIR with one or more .db3 or .mcap, as rosbag2 makes it      each file in turn
 
-A bag may come from any source: no more bytes are read than the file has, and no chunk is unpacked into more than
-`CHUNK_BYTES_MAX`. The bag's own definitions of its messages are not used (`messages`).
+A bag may come from any source: no more bytes are read than the file has, no chunk is unpacked into more than
+`CHUNK_BYTES_MAX`, and all chunks of one pass into no more than `UnpackedBytes` allows. The bag's own definitions of its
+messages are not used (`messages`).
 """
 
 import struct
@@ -23,6 +24,10 @@ from cairn_map.errors import BadInputError, CairnError, DamagedDataError
 
 CHUNK_BYTES_MAX = 256 << 20
 """Largest unpacked chunk, and so the largest message; bags are recorded in chunks of about 1 MB."""
+UNPACKED_PER_BYTE_MAX = 1000
+UNPACKED_BYTES_MIN = 512 << 20
+MESSAGES_MAX = 20_000_000
+"""Largest number of messages; their times take 320 MB."""
 FOREIGN_ERRORS: tuple[type[Exception], ...] = (
     *(struct.error, zlib.error, EOFError, OSError, AssertionError, MemoryError, RuntimeError),
     *(LookupError, TypeError, ValueError, OverflowError, AttributeError, RecursionError),
@@ -90,17 +95,38 @@ class Bag(Protocol):
         ...
 
 
+class UnpackedBytes:
+    """Bytes unpacked in one pass over a file; a chunk counts each time that the pass comes to it.
+
+    Chunks may name the same bytes, or take turns, so the size of one chunk bounds nothing. Images that hold nothing
+    shrink to a hundredth; a file that names `UNPACKED_PER_BYTE_MAX` times its size was made to be slow.
+    """
+
+    def __init__(self, file_bytes: int) -> None:
+        self._left = file_bytes * UNPACKED_PER_BYTE_MAX + UNPACKED_BYTES_MIN
+
+    def add(self, size_bytes: int) -> None:
+        """Count a chunk.
+
+        Raises:
+            ValueError: more than the file may unpack to.
+        """
+        self._left -= size_bytes
+        if self._left < 0:
+            raise ValueError(f"its chunks unpack to more than {UNPACKED_PER_BYTE_MAX} times the file's size")
+
+
 class BoundedFile(BufferedReader):
     """File that refuses to read beyond its end, so that a false length costs no memory."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(FileIO(path))
-        self._size_bytes = path.stat().st_size
+        self.size_bytes = path.stat().st_size
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Exactly `size` bytes."""
-        if size is not None and size > self._size_bytes - self.tell():
-            raise EOFError(f"{size} bytes are expected at byte {self.tell()}, the file has {self._size_bytes}")
+        if size is not None and size > self.size_bytes - self.tell():
+            raise EOFError(f"{size} bytes are expected at byte {self.tell()}, the file has {self.size_bytes}")
         return super().read(size)
 
 

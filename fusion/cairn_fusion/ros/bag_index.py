@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from cairn_fusion.ros.bag import Bag, BagMessage, Topic, Wire
+from cairn_fusion.ros.bag import MESSAGES_MAX, Bag, BagMessage, Topic, Wire
 from cairn_fusion.ros.images import encoding_of
 from cairn_fusion.ros.messages import (
     CAMERA_INFO,
@@ -36,8 +36,6 @@ from cairn_fusion.ros.point_clouds import elevations_of, read_points
 from cairn_fusion.ros.tf_tree import FrameTree
 from cairn_map.errors import BadInputError, DamagedDataError
 
-MESSAGES_MAX = 20_000_000
-"""Largest number of messages; their times take 320 MB."""
 BASE = "base"
 """Child of a pose that names none."""
 STATIC_NAME = "static"

@@ -7,7 +7,7 @@ writer died has no index: `mcap recover` makes one.
 import heapq
 import struct
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from functools import lru_cache
 from io import SEEK_END, BytesIO
 from pathlib import Path
@@ -19,7 +19,7 @@ from mcap.exceptions import McapError
 from mcap.records import Channel, Chunk, ChunkIndex, Footer, Header, Schema, Statistics
 from mcap.stream_reader import StreamReader
 
-from cairn_fusion.ros.bag import CHUNK_BYTES_MAX, BagMessage, BoundedFile, Topic, Wire, translate_damage
+from cairn_fusion.ros.bag import CHUNK_BYTES_MAX, BagMessage, BoundedFile, Topic, UnpackedBytes, Wire, translate_damage
 from cairn_fusion.ros.messages import plain_type
 from cairn_map.errors import DamagedDataError
 
@@ -29,9 +29,50 @@ FOOTER_BYTES = 9 + 20 + 8
 RECORD_HEAD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 MESSAGE = 0x05
-WAITING_BYTES_MAX = 1 << 30
-"""Largest size of messages that wait for chunks that overlap in time."""
+WAITING_BYTES_MAX = 512 << 20
+"""Largest size of unpacked chunks that overlap in time: a message that waits keeps its chunk in memory."""
+RECORDS_MAX = 1_000_000
+"""Largest number of records in a chunk, and of messages that wait; chunks of 1 MB have some thousand."""
 Record = TypeVar("Record")
+
+
+class WaitingMessages:
+    """Messages of chunks that overlap in time, until no chunk can hold an earlier one."""
+
+    def __init__(self) -> None:
+        self._heap: list[tuple[int, int, int, BagMessage]] = []
+        self._count = 0
+        self._waiting: dict[int, int] = {}
+        """Messages that wait, by the place of their chunk."""
+        self._size_bytes: dict[int, int] = {}
+
+    def add(self, messages: Iterable[BagMessage], chunk: int, size_bytes: int) -> None:
+        """Add the messages of the chunk at a place in the file.
+
+        Raises:
+            OverflowError: too much waits.
+        """
+        self._waiting[chunk], self._size_bytes[chunk] = 0, size_bytes
+        for message in messages:
+            heapq.heappush(self._heap, (message.log_ns, self._count, chunk, message))
+            self._count += 1
+            self._waiting[chunk] += 1
+        self._forget(chunk)
+        if len(self._heap) > RECORDS_MAX or sum(self._size_bytes.values()) > WAITING_BYTES_MAX:
+            raise OverflowError("its messages lie too far out of order")
+
+    def before(self, time_ns: int | None) -> Iterator[BagMessage]:
+        """Messages recorded before a time, which wait no longer; None: all."""
+        while self._heap and (time_ns is None or self._heap[0][0] < time_ns):
+            _, _, chunk, message = heapq.heappop(self._heap)
+            self._waiting[chunk] -= 1
+            self._forget(chunk)
+            yield message
+
+    def _forget(self, chunk: int) -> None:
+        """Forget a chunk that no message keeps."""
+        if not self._waiting[chunk]:
+            del self._waiting[chunk], self._size_bytes[chunk]
 
 
 class McapBag:
@@ -55,26 +96,23 @@ class McapBag:
     def messages(self, topics: Collection[str], *, start_ns: int = 0) -> Iterator[BagMessage]:
         """Messages as `Bag.messages`; those of chunks that overlap in time are merged while they are read."""
         ids = {channel for channel, topic in self._topic_of.items() if topic in topics}
-        waiting: list[tuple[int, int, BagMessage]] = []
-        waiting_bytes = n = 0
+        waiting = WaitingMessages()
+        unpacked, packed_left = UnpackedBytes(self._file.size_bytes), self._file.size_bytes
         for chunk in self._chunks:
             if chunk.message_end_time < start_ns or not _may_hold(chunk, ids):
                 continue
-            while waiting and waiting[0][0] < chunk.message_start_time:
-                message = heapq.heappop(waiting)[2]
-                waiting_bytes -= len(message.data)
-                yield message
+            yield from waiting.before(chunk.message_start_time)
             with translate_damage(self.path, McapError, advice=ADVICE):
-                for message in self._messages_of(chunk, ids, start_ns):
-                    heapq.heappush(waiting, (message.log_ns, n, message))
-                    waiting_bytes += len(message.data)
-                    n += 1
-            if waiting_bytes > WAITING_BYTES_MAX:
-                raise DamagedDataError(
-                    "bad_bag", f"{self.path}: its messages lie too far out of order; `mcap sort FILE -o SORTED` helps"
-                )
-        while waiting:
-            yield heapq.heappop(waiting)[2]
+                data, packed = self._unpacked(chunk.chunk_start_offset)
+                unpacked.add(len(data))
+                packed_left -= packed
+                if packed_left < 0:
+                    raise ValueError("its chunks share their bytes")
+                try:
+                    waiting.add(self._messages_of(data, ids, start_ns), chunk.chunk_start_offset, len(data))
+                except OverflowError as exc:
+                    raise DamagedDataError("bad_bag", f"{self.path}: {exc}; `mcap sort FILE -o SORTED` helps") from exc
+        yield from waiting.before(None)
 
     def close(self) -> None:
         """Close the file."""
@@ -107,6 +145,8 @@ class McapBag:
                     pass
         if statistics is None or (statistics.message_count and not self._chunks):
             raise EOFError("its index names no chunks")
+        if len({chunk.chunk_start_offset for chunk in self._chunks}) < len(self._chunks):
+            raise ValueError("its index names a chunk twice")
         self._chunks.sort(key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
         self.start_ns = statistics.message_start_time
         self._topic_of = {channel.id: channel.topic for channel in channels}
@@ -127,10 +167,12 @@ class McapBag:
         limit = CHUNK_BYTES_MAX
         return StreamReader(self._file, skip_magic=skip_magic, emit_chunks=True, record_size_limit=limit)
 
-    def _messages_of(self, chunk: ChunkIndex, ids: set[int], start_ns: int) -> Iterator[BagMessage]:
-        data = self._unpacked(chunk.chunk_start_offset)
-        at = 0
+    def _messages_of(self, data: memoryview, ids: set[int], start_ns: int) -> Iterator[BagMessage]:
+        at = count = 0
         while at < len(data):
+            count += 1
+            if count > RECORDS_MAX:
+                raise ValueError(f"a chunk has more than {RECORDS_MAX} records")
             kind, size = RECORD_HEAD.unpack_from(data, at)
             at += RECORD_HEAD.size
             if size > len(data) - at:
@@ -141,7 +183,8 @@ class McapBag:
                     yield BagMessage(self._topic_of[channel], log_ns, data[at + MESSAGE_HEAD.size : at + size])
             at += size
 
-    def _unpack(self, at: int) -> memoryview:
+    def _unpack(self, at: int) -> tuple[memoryview, int]:
+        """The records of the chunk at a place, and their size in the file."""
         chunk = _first(Chunk, self._records(at))
         size = chunk.uncompressed_size
         if size > CHUNK_BYTES_MAX:
@@ -149,7 +192,7 @@ class McapBag:
         data = unpack(chunk.data, chunk.compression, size)
         if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
             raise ValueError(f"the checksum of the chunk at byte {at} does not match")
-        return memoryview(data)
+        return memoryview(data), len(chunk.data)
 
 
 def unpack(data: bytes, packing: str, size_bytes: int) -> bytes:

@@ -95,9 +95,13 @@ def _bag_of(path: Path) -> Bag:
             from cairn_fusion.ros.mcap_bag import McapBag
 
             return McapBag(path)
-        from cairn_fusion.ros.rosbags_bag import RosbagsBag
+        if path.suffix == ".db3":
+            from cairn_fusion.ros.db3_bag import Db3Bag
 
-        return RosbagsBag(path)
+            return Db3Bag(path)
+        from cairn_fusion.ros.ros1_bag import Ros1Bag
+
+        return Ros1Bag(path)
     except ModuleNotFoundError as exc:
         raise BadInputError("missing_extra", f'bags need {exc.name}: pip install "cairn-robotics[robot]"') from exc
 
