@@ -8,6 +8,7 @@ from tests.fixtures.server.live import Live
 from tests.fixtures.server.protocol_document import DOCUMENT, ROOT, ROUTE, documented_kinds, routes_of
 
 from cairn_map.commits.commit import COMMIT_BYTES_MAX, RETRACTS_MAX
+from cairn_map.files import octomap
 from cairn_map.render import render_request
 from cairn_map.wire import live_events
 from cairn_map.wire.messages import CURSORS_MAX, JSON_FIELDS_MAX, JSON_VALUES_MAX
@@ -86,6 +87,7 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("making it", map_views.RENDER_S),
         ("pictures made at once", map_views.RENDERS_AT_ONCE),
         ("known voxels of the cells that an export looks at", map_exports.VOXELS_EXPORTED_MAX),
+        ("cells at the border of a box whose unknown space is filled", octomap.BORDER_CELLS_MAX),
         ("counting an export's points", map_exports.COUNT_S),
         ("exports counted at once", map_exports.COUNTS_AT_ONCE),
         ("tickets for exports of one token", export_tickets.TICKETS_OF_TOKEN_MAX),

@@ -1,15 +1,16 @@
 """Export of part of a map: the request, and the nodes of a cell that it selects.
 
 A request is the query of `GET .../main/export`, and the options of `cairn map export`: a box, a least probability, a
-band of temperatures, an octree depth, and a file format.
+band of temperatures, an octree depth, and a file format. Probability and temperatures select occupied nodes; of free
+ones, which are in octrees alone, all in the box are there.
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
@@ -20,6 +21,8 @@ from cairn_map.evidence.view import Chance, Colours, View, ViewStyle, view_of
 
 TEMPERATURE_STEP_K = 0.01
 """Resolution of exported temperatures."""
+SLACK_M = 1e-7
+"""Rounding of coordinates, metres: a centre on the border of a box is in it, also where 3 * 0.025 is above 0.075."""
 
 Kelvin = Annotated[float, Field(ge=0, le=1e5)]
 Height = Annotated[float, Field(ge=-1e7, le=1e7)]
@@ -41,7 +44,7 @@ class ExportRequest(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     format: Literal["ply", "pcd", "laz", "npz", "ot", "bt"] = "ply"
-    """Point cloud; or one of OctoMap's octrees, `ot` with probability and colour, `bt` with neither."""
+    """Points of occupied nodes; or occupied and free nodes as an octree of OctoMap's, `ot` with log-odds and colour."""
     box: Annotated[str, Field(max_length=BOX_CHARS_MAX)] | None = None
     """x0,y0,z0,x1,y1,z1: metres, map frame, ends included; None: everywhere."""
     floor_m: Height | None = None
@@ -49,13 +52,23 @@ class ExportRequest(BaseModel):
     ceiling_m: Height | None = None
     """Greatest height of a node's centre, metres; None: any."""
     p: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Least probability, compared in steps of 1/255 as on the console; unoccupied nodes are never exported."""
+    """Least probability of occupied nodes, compared in steps of 1/255 as on the console."""
     hotter_k: Kelvin | None = None
     """Least temperature of a node's hottest voxel, kelvin; it excludes nodes without a temperature."""
     colder_k: Kelvin | None = None
     """Greatest mean temperature of a node, kelvin; it excludes nodes without a temperature."""
     depth: Annotated[int, Field(ge=1, le=64)] | None = None
     """Octree depth of the nodes; None: voxels."""
+    unknown: Literal["free", "occupied"] | None = None
+    """State that an octree gives to unknown space in the box, as if measured once; None: it stays unknown."""
+
+    @model_validator(mode="after")
+    def _fills_a_box_of_an_octree(self) -> Self:
+        if self.unknown is not None and self.format not in ("ot", "bt"):
+            raise ValueError("unknown space is filled in OctoMap's octrees only, format ot or bt")
+        if self.unknown is not None and self.box is None:
+            raise ValueError("unknown space has no end: give the box in which it is filled")
+        return self
 
     def bounds_m(self) -> tuple[Floats, Floats]:
         """(3,) lowest and highest place of a node's centre, metres, map frame; infinite where there is no bound.
@@ -183,14 +196,30 @@ def _chosen(
     step_k: float | None,
 ) -> Chosen:
     style = ViewStyle(asked.depth_in(geometry), chance=Chance.LOG_ODDS, colours=colours, temperature_step_k=step_k)
-    view, nodes = view_of(evidence, geometry, model, style), node_geometry(geometry, asked)
-    centres_m = centres_of_voxels(voxels_in_cell(view.nodes, key, nodes), nodes)
-    low, high = asked.bounds_m()
-    rows = (centres_m >= low).all(axis=1) & (centres_m <= high).all(axis=1)
+    view = view_of(evidence, geometry, model, style)
+    centres_m = _centres(view.nodes, key, geometry, asked)
+    rows = _within_bounds(centres_m, asked)
     rows &= np.rint(view.probability * 255) >= asked.p * 255 - 1e-6
     if asked.is_of_some_temperatures:
         rows &= _within_band(view, asked)
     return Chosen(view, centres_m, np.asarray(rows))
+
+
+def is_in_box(
+    nodes: npt.NDArray[np.uint32], key: CellKey, geometry: Geometry, asked: ExportRequest
+) -> npt.NDArray[np.bool_]:
+    """(N,) True for nodes of a cell, at the request's depth, with their centres in the box of a request."""
+    return _within_bounds(_centres(nodes, key, geometry, asked), asked)
+
+
+def _centres(nodes: npt.NDArray[np.uint32], key: CellKey, geometry: Geometry, asked: ExportRequest) -> Floats:
+    finer = node_geometry(geometry, asked)
+    return centres_of_voxels(voxels_in_cell(nodes, key, finer), finer)
+
+
+def _within_bounds(centres_m: Floats, asked: ExportRequest) -> npt.NDArray[np.bool_]:
+    low, high = asked.bounds_m()
+    return np.asarray((centres_m >= low - SLACK_M).all(axis=1) & (centres_m <= high + SLACK_M).all(axis=1))
 
 
 def _within_band(view: View, asked: ExportRequest) -> npt.NDArray[np.bool_]:

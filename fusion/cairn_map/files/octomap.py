@@ -1,171 +1,170 @@
 """OctoMap files (Hornung et al. 2013) of parts of a map, made cell by cell: `.ot` and `.bt`, for OctoMap's tools.
 
-    .ot   ColorOcTree: log-odds of every node, and its colour; white where no colour camera looked
-    .bt   OcTree: occupied or not, two bits a node
+    .ot   log-odds of every node, and its colour (ColorOcTree) if anything is coloured, else a plain OcTree
+    .bt   OcTree: occupied, free or unknown, two bits a node
 
 OctoMap's octree has 16 levels around the origin, and cairn's cells are its nodes at level 16 - depth: so a cell is one
-subtree, and files are written depth first, as OctoMap reads them. Inner nodes have the highest log-odds and the mean
-colour of their children, as OctoMap's `updateInnerOccupancy` makes them. A file begins with the number of its nodes,
-and the nodes above the cells come before them: so all subtrees are made before the first byte is sent.
+subtree, and files are written depth first, as OctoMap reads them. A file begins with the number of its nodes, and the
+nodes above the cells come before them: so all subtrees are made before the first byte is sent. A cell is made block by
+block, so that the rows of its voxels are never all in memory.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
+from cairn_map.evidence.grid import Cell, CellKey, Geometry, cell_key, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
-from cairn_map.evidence.view import LOG_ODDS_STEP, LOG_ODDS_ZERO
-from cairn_map.files.export_request import ExportRequest, chosen_in_cell
-from cairn_map.kernels.morton_kernels import interleave
-
-Nodes = npt.NDArray[np.void]
+from cairn_map.files.export_request import ExportRequest
+from cairn_map.files.octomap_leaves import Filling, beyond_octree, leaves_in_cell
+from cairn_map.files.octomap_nodes import (
+    BRANCH,
+    LEVELS,
+    NODE,
+    UNCOLOURED,
+    Nodes,
+    grown,
+    parts_of_file,
+    placeholder,
+    without_colours,
+)
+from cairn_map.kernels.morton_kernels import deinterleave, interleave
 
 TREE_FORMATS = ("ot", "bt")
-LEVELS = 16
-UNCOLOURED = 255
-"""White, which OctoMap takes for no colour; a node that is white is written one step darker."""
-LEAF, BRANCH = 2, 3
-"""Kinds of a child in a .bt, two bits: an occupied leaf, or a node with children."""
-NODE = np.dtype(
-    [("code", "<u8"), ("level", "u1"), ("odds", "<f4"), ("rgb", "u1", 3), ("children", "u1"), ("kinds", "<u2")]
-)
-OT_NODE = np.dtype([("odds", "<f4"), ("rgb", "u1", 3), ("children", "u1")])
-IDS = {"ot": ("OcTree file", "ColorOcTree"), "bt": ("OcTree binary file", "OcTree")}
-
-
-@dataclass(frozen=True, slots=True)
-class Subtree:
-    """One cell as a subtree: its key, log-odds and colour of its root, and its numbers of nodes and leaves."""
-
-    key: CellKey
-    odds: float
-    rgb: tuple[int, int, int]
-    nodes: int
-    leaves: int
+BLOCK_DEPTH = 6
+"""A block is 64^3 voxels: some 50 MB while its nodes are made."""
+BORDER_CELLS_MAX = 1 << 15
+"""Most cells at the border of a box whose unknown space is filled: of cells of 5.12 m, a box of 370 m along an edge."""
+NO_CODES = np.empty(0, np.uint64)
 
 
 def branch_of_cell(
     key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel, asked: ExportRequest
-) -> tuple[Subtree, bytes] | None:
-    """Subtree of a cell's selected occupied nodes, and its bytes in a file; None if no node is selected.
+) -> tuple[Nodes, bytes] | None:
+    """Root of a cell's subtree as a placeholder, and its bytes in a file, none if it is a leaf; None: all is unknown.
 
     Raises:
         BadInputError: kind `bad_box`: the cell is beyond an octree of 16 levels; `bad_style`.
     """
-    # The nodes, and a check that OctoMap can number the cell.
-    chosen = chosen_in_cell(key, evidence, geometry, model, asked)
-    if not chosen.rows.any():
-        return None
-    _code_of_cells([key], geometry)
-    # Leaves: colours in which white is free for "none", log-odds in natural units.
-    view = chosen.view
-    rgb = np.full((len(view), 3), UNCOLOURED, np.uint8)
-    rgb[view.coloured] = view.colour
-    rgb[view.coloured[(view.colour == UNCOLOURED).all(axis=1)]] -= 1
-    leaves = np.zeros(int(chosen.rows.sum()), NODE)
-    leaves["code"], leaves["rgb"] = view.nodes[chosen.rows], rgb[chosen.rows]
-    leaves["odds"] = (view.chances[chosen.rows] - LOG_ODDS_ZERO) * LOG_ODDS_STEP
-    leaves["level"] = view.depth
-    # All nodes above them up to the cell.
-    nodes = _depth_first(leaves, LEAF)
-    r, g, b = nodes[0]["rgb"].tolist()
-    return Subtree(key, float(nodes[0]["odds"]), (r, g, b), len(nodes), len(leaves)), _bytes_of(nodes, asked.format)
+    # Levels: the cell's is `top`, its blocks' `top + down`, and that of the request's nodes `top + depth`.
+    filling = Filling.of_request(asked, geometry, model)
+    depth, top = asked.depth_in(geometry), LEVELS - geometry.depth
+    down = min(depth, max(0, geometry.depth - BLOCK_DEPTH))
+    cell = _code_of_cell(key, geometry)
+    # Blocks with evidence, and those that the border of the filling divides.
+    pieces: dict[int, Evidence | None] = dict(_blocks(evidence, 3 * (geometry.depth - down)))
+    if filling is not None and cell is not None:
+        _, divided = filling.holes(cell, top, NO_CODES, top + down)
+        for number in (divided - np.uint64(cell << 3 * down)).tolist():
+            pieces.setdefault(number, None)
+    # Each a subtree of the cell's.
+    roots, bodies = [np.empty(0, NODE)], list[bytes]()
+    for number in sorted(pieces):
+        piece = pieces[number]
+        leaves = roots[0] if piece is None else leaves_in_cell(key, piece, geometry, model, asked)
+        # A cell beyond the tree is no fault as long as the request selects nothing in it.
+        if cell is None:
+            if len(leaves):
+                raise beyond_octree(geometry)
+            continue
+        leaves["code"] += np.uint64(cell << 3 * depth)
+        # Unknown space is all that is neither selected nor free.
+        if filling is not None:
+            block = (cell << 3 * down) + number
+            holes, _ = filling.holes(block, top + down, np.sort(leaves["code"]), filling.level)
+            leaves = np.concatenate([leaves, holes])
+        if len(leaves):
+            root, body = _branch(leaves, [], top + down, asked.format)
+            roots.append(root)
+            bodies += [body] if body else []
+    # The cell from its blocks, and the space between them.
+    joined = np.concatenate(roots)
+    if filling is not None and cell is not None:
+        joined = np.concatenate([joined, filling.holes(cell, top, joined["code"], top + down)[0]])
+    return _branch(joined, bodies, top, asked.format) if len(joined) else None
 
 
-def tree_file(
-    form: str, branches: Sequence[Subtree], bodies: Iterable[bytes], geometry: Geometry, about: str
-) -> Iterator[bytes]:
-    """Parts of a file of a tree; `branches`, the cells' subtrees, and their bytes rise in cell number."""
-    # The nodes above the cells, in the order of the file, with each cell's root as a placeholder.
-    nodes = _above(branches, geometry)
-    is_cell = nodes["level"] == LEVELS - geometry.depth
-    size = sum(branch.nodes for branch in branches) + int((~is_cell).sum())
-    kind, name = IDS[form]
+def cells_at_border(geometry: Geometry, model: SensorModel, asked: ExportRequest) -> list[CellKey]:
+    """Cells, rising in number, that the border of a box divides in which unknown space is filled: also those unseen.
+
+    Raises:
+        BadInputError: kind `bad_box`: it reaches beyond OctoMap's octree; `too_large`: they are too many.
+    """
+    filling = Filling.of_request(asked, geometry, model)
+    if filling is None:
+        return []
+    # Their number first, from the box alone: all of its cells less those inside.
+    side = 1 << asked.depth_in(geometry)
+    count = filling.high // side - filling.low // side + 1
+    if int(np.prod(count) - np.prod(np.maximum(count - 2, 0))) > BORDER_CELLS_MAX:
+        raise BadInputError(
+            "too_large", f"more than {BORDER_CELLS_MAX} cells are at the border of this box; ask for a smaller one"
+        )
+    # As if nothing were known: cells that hold something at the border are among them.
+    _, divided = filling.holes(0, 0, NO_CODES, LEVELS - geometry.depth)
+    cells = deinterleave(np.sort(divided)) - _half(geometry)
+    return [cell_key(Cell(*cell)) for cell in cells.tolist()]
+
+
+def tree_of_cells(roots: Sequence[Nodes], geometry: Geometry, model: SensorModel, asked: ExportRequest) -> Nodes:
+    """The nodes from the root down to the cells in the order of a file; `roots` are the cells' placeholders."""
+    joined = np.concatenate([np.empty(0, NODE), *roots])
+    filling = Filling.of_request(asked, geometry, model)
+    # Unseen cells within the box are leaves of any size; those at its border are among the roots.
+    if filling is not None:
+        holes, _ = filling.holes(0, 0, np.sort(joined["code"]), LEVELS - geometry.depth)
+        joined = np.concatenate([joined, holes])
+    return grown(joined, 0) if len(joined) else joined
+
+
+def tree_file(form: str, nodes: Nodes, bodies: Iterable[bytes], geometry: Geometry, about: str) -> Iterator[bytes]:
+    """Parts of a file of a tree: `nodes` above its cells, and the bytes of its cells that are no leaves, in turn."""
+    # The root's colour is the mean of all colours: white only where no leaf has one.
+    is_plain = form == "bt" or not len(nodes) or bool((nodes["rgb"][0] == UNCOLOURED).all())
     head = [
-        f"# Octomap {kind}",
+        "# Octomap OcTree binary file" if form == "bt" else "# Octomap OcTree file",
         "# (feel free to add / change comments, but leave the first line as it is!)",
         f"# cairn; {about}",
-        f"id {name}",
-        f"size {size}",
+        f"id {'OcTree' if is_plain else 'ColorOcTree'}",
+        f"size {nodes['nodes'][0] if len(nodes) else 0}",
         f"res {geometry.voxel_edge_m:.9g}",
         "data",
         "",
     ]
-    # Head; then nodes up to the next cell and that cell's bytes, in turns.
-    begun = "\n".join(head).encode()
-    start, cells = 0, np.nonzero(is_cell)[0]
-    for at, body in zip(cells.tolist(), bodies, strict=True):
-        yield begun + _bytes_of(nodes[start:at], form) + body
-        begun, start = b"", at + 1
-    if begun:
-        yield begun
+    yield "\n".join(head).encode()
+    for part in parts_of_file(nodes, bodies, form):
+        yield without_colours(part) if is_plain and form == "ot" else part
 
 
-def _above(branches: Sequence[Subtree], geometry: Geometry) -> Nodes:
-    """The nodes from the root down to the cells."""
-    cells = np.zeros(len(branches), NODE)
-    if not branches:
-        return cells
-    cells["code"] = _code_of_cells([branch.key for branch in branches], geometry)
-    cells["odds"] = [branch.odds for branch in branches]
-    cells["rgb"] = [branch.rgb for branch in branches]
-    cells["level"] = LEVELS - geometry.depth
-    return _depth_first(cells, BRANCH)
+def _branch(leaves: Nodes, bodies: Sequence[bytes], top: int, form: str) -> tuple[Nodes, bytes]:
+    """Root at level `top` of a subtree as a placeholder, and its bytes; none if the root is a leaf."""
+    nodes = grown(leaves, top)
+    is_leaf = nodes["kind"][0] != BRANCH
+    return placeholder(nodes), b"" if is_leaf else b"".join(parts_of_file(nodes, bodies, form))
 
 
-def _code_of_cells(keys: Sequence[CellKey], geometry: Geometry) -> npt.NDArray[np.uint64]:
-    """Morton numbers of cells among the nodes of their level, in the order of the cells' numbers."""
-    # OctoMap's numbers are not negative: the origin is in the middle of the tree.
-    half = 1 << (LEVELS - 1 - geometry.depth)
-    cells = np.array([cell_of_key(key) for key in keys], np.int64) + half
-    if (cells < 0).any() or (cells >= 2 * half).any():
-        reach_m = half * geometry.cell_edge_m
-        raise BadInputError(
-            "bad_box", f"an octree of OctoMap's ends {reach_m:g} m from the origin; ask for a box within"
-        )
-    return interleave(cells)
+def _blocks(evidence: Evidence, bits: int) -> Iterator[tuple[int, Evidence]]:
+    """Blocks of a cell's evidence, rising: the voxels whose numbers are equal but for the lowest bits."""
+    # Voxels rise in Morton number, so that a block is one run of rows; samples name theirs by row.
+    numbers = evidence.voxels >> np.uint32(bits)
+    starts = np.nonzero(np.diff(numbers, prepend=~numbers[:1]))[0].tolist()
+    for start, end in pairwise([*starts, len(numbers)]):
+        first, last = np.searchsorted(evidence.sampled, [start, end])
+        sampled = evidence.sampled[first:last] - np.uint32(start)
+        samples = evidence.samples[first:last]
+        yield int(numbers[start]), Evidence(evidence.voxels[start:end], evidence.counts[start:end], sampled, samples)
 
 
-def _depth_first(leaves: Nodes, kind: int) -> Nodes:
-    """Leaves, rising in number, and all nodes above them, in the order of a file; `kind` is that of the leaves."""
-    # Layer by layer up to the root.
-    layers, layer = [leaves], leaves
-    deepest = int(leaves["level"][0])
-    while layer["level"][0]:
-        layer, kind = _parents(layer, kind), BRANCH
-        layers.append(layer)
-    # Depth first: by the first deepest node below, and of nodes that share it the highest first.
-    nodes = np.concatenate(layers)
-    first = nodes["code"] << (3 * (deepest - nodes["level"].astype(np.uint64)))
-    return nodes[np.lexsort((nodes["level"], first))]
+def _half(geometry: Geometry) -> int:
+    """Cells to each side of the origin: OctoMap's numbers are not negative, the origin is in the middle of the tree."""
+    return 1 << (LEVELS - 1 - geometry.depth)
 
 
-def _parents(layer: Nodes, kind: int) -> Nodes:
-    # Runs of children with the same parent; `child` is 0 to 7.
-    above, child = layer["code"] >> np.uint64(3), (layer["code"] & np.uint64(7)).astype(np.uint16)
-    starts = np.nonzero(np.diff(above, prepend=~above[:1]))[0]
-    parents = np.zeros(len(starts), NODE)
-    parents["code"], parents["level"] = above[starts], layer["level"][0] - 1
-    parents["odds"] = np.maximum.reduceat(layer["odds"], starts)
-    parents["children"] = np.bitwise_or.reduceat(np.uint16(1) << child, starts)
-    parents["kinds"] = np.bitwise_or.reduceat(np.uint16(kind) << (2 * child), starts)
-    # The mean colour of the children that have one, rounded down as OctoMap does.
-    coloured = (layer["rgb"] != UNCOLOURED).any(axis=1)
-    count = np.add.reduceat(coloured.astype(np.int64), starts)
-    sums = np.add.reduceat(layer["rgb"].astype(np.int64) * coloured[:, None], starts, axis=0)
-    parents["rgb"] = np.where(count[:, None] > 0, sums // np.maximum(count, 1)[:, None], UNCOLOURED)
-    return parents
-
-
-def _bytes_of(nodes: Nodes, form: str) -> bytes:
-    if form == "bt":
-        return nodes["kinds"][nodes["children"] > 0].tobytes()
-    rows = np.empty(len(nodes), OT_NODE)
-    for name in ("odds", "rgb", "children"):
-        rows[name] = nodes[name]
-    return rows.tobytes()
+def _code_of_cell(key: CellKey, geometry: Geometry) -> int | None:
+    """Morton number of a cell among the nodes of its level; None: OctoMap's octree does not reach it."""
+    half = _half(geometry)
+    cell = np.array([cell_of_key(key)], np.int64) + half
+    return int(interleave(cell)[0]) if ((cell >= 0) & (cell < 2 * half)).all() else None

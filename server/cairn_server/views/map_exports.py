@@ -6,6 +6,7 @@ laid aside. The file is gone as soon as the answer is, however it ends. So an ex
 whatever its size.
 """
 
+import heapq
 import logging
 import math
 import tempfile
@@ -14,13 +15,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import IO
 
 from cairn_map.errors import BadInputError, CairnError, DeniedError, UnreachableError
-from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.evidence import Evidence, empty_evidence
 from cairn_map.evidence.grid import CellKey
 from cairn_map.files.export_request import ExportRequest, cell_may_have, node_geometry
-from cairn_map.files.octomap import TREE_FORMATS, Subtree, branch_of_cell, tree_file
+from cairn_map.files.octomap import TREE_FORMATS, branch_of_cell, cells_at_border, tree_file, tree_of_cells
+from cairn_map.files.octomap_nodes import Nodes
 from cairn_map.files.point_clouds import (
     About,
     PointBounds,
@@ -128,16 +131,18 @@ class MapExports:
 class _PointFile:
     """Point file: cells are laid aside as they are stored, and read a second time for their points."""
 
+    unseen_cells = ()
+
     def __init__(self, row: MapRow, asked: ExportRequest) -> None:
         self.row, self.asked = row, asked
         self._found = PointBounds()
         self._about = About(row.name, node_geometry(row.geometry, asked).voxel_edge_m)
 
-    def kept(self, stored: CellRow, evidence: Evidence) -> bytes:
+    def kept(self, key: CellKey, body: bytes, evidence: Evidence) -> bytes:
         """Bytes of a cell to be laid aside; empty if it has nothing that is asked for."""
-        found = found_in_cell(stored.key, evidence, self.row.geometry, self.row.sensor_model, self.asked)
+        found = found_in_cell(key, evidence, self.row.geometry, self.row.sensor_model, self.asked)
         self._found = self._found.joined(found)
-        return stored.body if found.count else b""
+        return body if found.count else b""
 
     @property
     def count(self) -> int:
@@ -164,24 +169,46 @@ class _TreeFile:
 
     def __init__(self, row: MapRow, asked: ExportRequest) -> None:
         self.row, self.asked = row, asked
-        self._branches: list[Subtree] = []
+        self.unseen_cells = cells_at_border(row.geometry, row.sensor_model, asked)
+        self._roots: list[Nodes] = []
 
-    def kept(self, stored: CellRow, evidence: Evidence) -> bytes:
-        """Bytes of a cell to be laid aside; empty if it has nothing that is asked for."""
-        found = branch_of_cell(stored.key, evidence, self.row.geometry, self.row.sensor_model, self.asked)
+    def kept(self, key: CellKey, _: bytes, evidence: Evidence) -> bytes:
+        """Bytes of a cell to be laid aside; empty if it has nothing that is asked for, or is one leaf."""
+        found = branch_of_cell(key, evidence, self.row.geometry, self.row.sensor_model, self.asked)
         if found is None:
             return b""
-        self._branches.append(found[0])
+        self._roots.append(found[0])
         return found[1]
+
+    @cached_property
+    def _nodes(self) -> Nodes:
+        return tree_of_cells(self._roots, self.row.geometry, self.row.sensor_model, self.asked)
 
     @property
     def count(self) -> int:
-        return sum(branch.leaves for branch in self._branches)
+        return int(self._nodes["leaves"][0]) if len(self._nodes) else 0
 
     def parts(self, bodies: Iterator[tuple[CellKey, bytes]]) -> Iterator[bytes]:
         about = str(About(self.row.name, node_geometry(self.row.geometry, self.asked).voxel_edge_m))
         in_turn = (body for _, body in bodies)
-        return tree_file(self.asked.format, self._branches, in_turn, self.row.geometry, about)
+        return tree_file(self.asked.format, self._nodes, in_turn, self.row.geometry, about)
+
+
+def _cells_in_turn(snapshot: Snapshot, file: _PointFile | _TreeFile) -> Iterator[tuple[CellKey, int]]:
+    """Cells that may have what is asked for, rising in number, with their known voxels; 0: unseen, or nothing known."""
+    listed = (
+        (cell.key, cell.voxels)
+        for cell in snapshot.cells()
+        if cell.voxels and cell_may_have(cell.key, file.row.geometry, file.asked)
+    )
+    before: CellKey | None = None
+    # Of a cell that is in both the one with voxels comes first.
+    for key, voxels in heapq.merge(
+        listed, ((key, 0) for key in file.unseen_cells), key=lambda cell: (cell[0], -cell[1])
+    ):
+        if key != before:
+            yield key, voxels
+        before = key
 
 
 def _laid_aside(
@@ -191,27 +218,28 @@ def _laid_aside(
     until_s, row = math.inf, file.row
     voxels, sizes = 0, list[tuple[CellKey, int]]()
     cancellation = CANCELLATION.get()
-    for listed in snapshot.cells():
+    for key, known in _cells_in_turn(snapshot, file):
         cancellation.check()
-        if not listed.voxels or not cell_may_have(listed.key, row.geometry, file.asked):
-            continue
-        voxels += listed.voxels
+        voxels += known
         if voxels > VOXELS_EXPORTED_MAX:
             raise BadInputError(
                 "too_large", f"more than {VOXELS_EXPORTED_MAX} voxels are in these cells; ask for a box"
             )
         if time.monotonic() > until_s:
             raise BadInputError("too_costly", f"counting the points takes more than {COUNT_S:g} s; ask for a box")
-        stored = sound_cell(snapshot, listed.key, row.geometry, healed)
-        if stored is None:
-            raise DamagedCellError(listed.key, "a cell is listed, but is not there")
         with DECODING.of_cell(row.geometry):
-            kept = file.kept(stored, stored_evidence(stored))
+            if known:
+                stored = sound_cell(snapshot, key, row.geometry, healed)
+                if stored is None:
+                    raise DamagedCellError(key, "a cell is listed, but is not there")
+                kept = file.kept(key, stored.body, stored_evidence(stored))
+            else:
+                kept = file.kept(key, b"", empty_evidence(row.geometry))
         if until_s == math.inf:
             until_s = time.monotonic() + COUNT_S  # not from the start: with the first cell kernels may be compiled
         if kept:
             aside.write(kept)
-            sizes.append((stored.key, len(kept)))
+            sizes.append((key, len(kept)))
     return sizes
 
 

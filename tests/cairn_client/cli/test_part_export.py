@@ -59,6 +59,8 @@ def test_a_band_of_temperatures_is_given_in_degrees_celsius(server: LiveServer, 
         (["--ply=a.ply", "--p=7"], "less than or equal to 1"),
         (["--laz=a.laz", "--hotter=-300"], "greater than or equal to 0"),
         (["--ply=a.ply", "--p=0.8", "--cells=there"], "--cells"),
+        (["--bt=a.bt", "--unknown=free"], "give the box"),
+        (["--ply=a.ply", "--box=0,0,0,1,1,1", "--unknown=free"], "OctoMap's octrees only"),
     ],
 )
 def test_what_cannot_be_a_part_is_said(

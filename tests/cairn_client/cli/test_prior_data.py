@@ -161,3 +161,19 @@ def test_other_files_of_a_folder_are_left_alone(tmp_path: Path, api: MapApi) -> 
     for name in ("README.md", "0_0_0.cell.new", "0_0_0.CELL", "x.cell"):
         (folder / name).write_bytes(b"x")
     assert check_all_or_none(folder, api) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("lab.bt", "an OctoMap octree"), ("lab.PLY", "a point cloud"), ("0_0_0.cell", "one cell"), ("lab.zip", "a file")],
+)
+def test_any_other_file_is_refused_by_its_kind_with_what_can_be_given(
+    api: MapApi, tmp_path: Path, name: str, kind: str
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(b"# Octomap OcTree binary file")
+    with pytest.raises(BadInputError, match=f"{name} is {kind}.*export --cells DIR.*URL.*replay") as refused:
+        push_prior_data(api, "lab-of-files", str(path))
+    assert refused.value.kind == "no_map_folder"
+    with pytest.raises(NotFoundError):
+        api.map_info("lab-of-files")

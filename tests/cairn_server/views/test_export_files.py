@@ -17,14 +17,14 @@ from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.exports import ask_export, mapped, places, points
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import pushed
-from tests.naive.octomap import Node, read_tree
+from tests.naive.octomap import read_tree, states_of
 
 from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.grid import cell_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.files.export_request import ExportRequest
 from cairn_map.files.laz import LazHead, laz_parts
-from cairn_map.files.octomap import branch_of_cell, tree_file
+from cairn_map.files.octomap import branch_of_cell, tree_file, tree_of_cells
 from cairn_map.files.point_clouds import POINT
 
 BACKENDS = [LazBackend.Lazrs, LazBackend.Laszip]
@@ -108,10 +108,13 @@ def test_an_octree_has_the_nodes_of_the_arrays_and_what_they_hold(live: Live, fo
     assert tree.size == len(tree.nodes)
     side = 1 << up
     lowest = np.floor(places(table) / (tree.edge_m * side)).astype(int) * side
-    assert {(tuple(place), side) for place in lowest.tolist()} == tree.leaves.keys()
-    assert len(tree.leaves) == int(answer.headers["Cairn-Points"]) == len(table)
+    occupied = {where: leaf for where, leaf in tree.leaves.items() if (leaf.odds or 0.0) >= 0}
+    assert len(tree.leaves) == int(answer.headers["Cairn-Points"]) > len(occupied) > 0
+    nodes = {tuple(low) for low in lowest.tolist()}
     if form == "bt":
+        assert {v for low, edge in occupied for v in nodes_in(low, edge, side)} == nodes
         return
+    assert {(low, side) for low in nodes} == occupied.keys()
     for place, point in zip(lowest.tolist(), table, strict=True):
         leaf = tree.leaves[tuple(place), side]
         assert leaf.odds is not None
@@ -121,13 +124,18 @@ def test_an_octree_has_the_nodes_of_the_arrays_and_what_they_hold(live: Live, fo
     assert len({leaf.rgb for leaf in tree.leaves.values()}) > 10
 
 
+def nodes_in(low: tuple[int, ...], edge: int, side: int) -> set[tuple[int, ...]]:
+    """Nodes of a leaf that eight or more were joined to."""
+    return {tuple(int(v) for v in low + np.array(step) * side) for step in np.ndindex((edge // side,) * 3)}
+
+
 def test_inner_nodes_of_an_octree_are_as_octomap_makes_them(live: Live) -> None:
     tree = read_tree(ask_export(live, mapped(live), format="ot").content)
     inner = [node for node in tree.nodes if node.children]
     assert len(inner) > len(tree.leaves) / 8
     for node in inner:
         children = list(node.children.values())
-        assert node.odds == max(child.odds or 0.0 for child in children)
+        assert node.odds == max(child.odds for child in children if child.odds is not None)
         coloured = [child.rgb for child in children if child.rgb != (255, 255, 255)]
         assert node.rgb == tuple(sum(part) // len(coloured) for part in zip(*coloured, strict=True) if coloured) or (
             not coloured and node.rgb == (255, 255, 255)
@@ -139,9 +147,11 @@ def test_white_is_told_from_no_colour() -> None:
     samples[0, SMALL.planes_of("colour")] = (255, 255, 255, 1)
     evidence = packed_evidence(np.array([3, 4], np.uint32), np.full((2, 2), (3, 0), np.int64), samples, SMALL)
     key = cell_key((0, 0, 0))
-    found = branch_of_cell(key, evidence, SMALL, SensorModel(), ExportRequest(format="ot"))
+    asked = ExportRequest(format="ot")
+    found = branch_of_cell(key, evidence, SMALL, SensorModel(), asked)
     assert found is not None
-    tree = read_tree(b"".join(tree_file("ot", [found[0]], [found[1]], SMALL, "a white voxel and a bare one")))
+    nodes = tree_of_cells([found[0]], SMALL, SensorModel(), asked)
+    tree = read_tree(b"".join(tree_file("ot", nodes, [found[1]], SMALL, "a white voxel and a bare one")))
     assert {low: leaf.rgb for (low, _), leaf in tree.leaves.items()} == {(1, 1, 0): (254,) * 3, (0, 0, 1): (255,) * 3}
 
 
@@ -156,15 +166,8 @@ def test_octomaps_own_tools_take_both_and_find_the_same_in_them(live: Live, tmp_
     )
     assert "WARNING" not in said.stdout + said.stderr
     own, ours = (read_tree((tmp_path / name).read_bytes()) for name in ("own.bt", "lab.bt"))
-    assert leaves_of(own.leaves) == leaves_of(ours.leaves)
-    assert len(leaves_of(ours.leaves)) > 20
-
-
-def leaves_of(found: dict[tuple[tuple[int, ...], int], Node]) -> set[tuple[int, ...]]:
-    """All voxels of a tree's leaves: OctoMap joins eight that are alike."""
-    return {
-        tuple(int(v) for v in low + np.array(step)) for (low, side) in found for step in np.ndindex(side, side, side)
-    }
+    assert states_of(own) == states_of(ours)
+    assert all(len(voxels) > 20 for voxels in states_of(ours))
 
 
 def test_an_octree_ends_where_octomaps_ends(live: Live) -> None:
@@ -177,8 +180,31 @@ def test_an_octree_ends_where_octomaps_ends(live: Live) -> None:
     answer = ask_export(live, row, format="bt")
     assert kind_of(answer) == "bad_box"
     assert "1638.4 m" in answer.json()["detail"]
+    assert "--box=-1638.4," in answer.json()["detail"]
     box = ask_export(live, row, format="bt", box="0,-10,-10,1638.3,10,10")
     assert len(read_tree(box.content).leaves) == int(box.headers["Cairn-Points"]) > 0
+
+
+def test_unknown_space_is_filled_in_the_box_between_and_beyond_the_cells(live: Live) -> None:
+    row = mapped(live)
+    edge_m = row.geometry.cell_edge_m
+    box = {"box": ",".join(f"{v * edge_m:g}" for v in (-1.3, -0.7, -0.2, 1.8, 2.1, 1.4))}
+    seen_occupied, seen_free = states_of(read_tree(ask_export(live, row, format="bt", **box).content))
+    for form in ("ot", "bt"):
+        answer = ask_export(live, row, format=form, unknown="occupied", **box)
+        tree = read_tree(answer.content)
+        occupied, free = states_of(tree)
+        assert len(tree.leaves) == int(answer.headers["Cairn-Points"])
+        assert free == seen_free
+        assert occupied > seen_occupied
+        low, high = (np.array([v * 8 for v in corner]) for corner in ((-1.3, -0.7, -0.2), (1.8, 2.1, 1.4)))
+        counts = np.floor(high - 0.5 + 1e-6) - np.ceil(low - 0.5 - 1e-6) + 1
+        assert len(occupied) + len(free) == counts.prod()
+
+
+@pytest.mark.parametrize("query", [{"format": "bt"}, {"format": "ply", "box": "0,0,0,1,1,1"}])
+def test_unknown_space_is_filled_in_a_box_of_an_octree_alone(live: Live, query: dict[str, str]) -> None:
+    assert ask_export(live, live.new_map(), unknown="free", **query).status_code == 422
 
 
 @pytest.mark.parametrize("form", ["laz", "ot", "bt"])

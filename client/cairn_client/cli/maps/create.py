@@ -26,6 +26,15 @@ CELLS_A_COMMIT = 16
 """Cells of prior data in one commit, which stays far below a commit's largest size."""
 CHECKED = CommitId(Author(INITIAL, Incarnation("0" * 16)), 0)
 """Id of the commits that are only made to see that they can be."""
+FILE_KINDS = {
+    **dict.fromkeys((".bt", ".ot"), "an OctoMap octree"),
+    **dict.fromkeys((".ply", ".pcd", ".las", ".laz", ".xyz"), "a point cloud"),
+    **dict.fromkeys((".npz", ".npy"), "a file of NumPy arrays"),
+    **dict.fromkeys((".bag", ".db3", ".mcap"), "a bag"),
+    ".cell": "one cell of a map",
+    ".view": "the view of one cell",
+}
+"""Kinds of files that one may take for a map, by their suffix."""
 CHANNELS = {"colour": COLOUR, "intensity": INTENSITY, "temperature": TEMPERATURE}
 
 
@@ -93,6 +102,7 @@ def push_prior_data(
 def _open(source: str, tokens: OriginTokens) -> tuple[FolderHead, Iterable[DecodedCell]]:
     if "://" not in source:
         folder = Path(source)
+        _check_folder(folder)
         head = read_head(folder)
         # All of it is read before the map is made: a damaged file must not leave a part of a map behind.
         for group in _groups(read_cells(folder, head.geometry)):
@@ -104,6 +114,22 @@ def _open(source: str, tokens: OriginTokens) -> tuple[FolderHead, Iterable[Decod
     api, name = api_of(source, tokens)
     info = api.map_info(name)
     return FolderHead(geometry=info.geometry, sensor_model=info.sensor_model), _fetched(api, name)
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuse a source that is a file, of a map's or another program's, by its kind.
+
+    Raises:
+        BadInputError: kind `no_map_folder`.
+    """
+    if folder.is_dir() or not folder.exists():
+        return
+    kind = FILE_KINDS.get(folder.suffix.lower(), "a file")
+    raise BadInputError(
+        "no_map_folder",
+        f"{folder} is {kind}, from which no evidence can be taken: --from takes a folder that `cairn map export "
+        "--cells DIR` wrote, or another map's URL; scans with poses become a map by `cairn robot replay`",
+    )
 
 
 def _fetched(api: MapApi, name: str) -> Iterator[DecodedCell]:

@@ -4,6 +4,8 @@ A whole map is made into files here, from its cells; a part of a map is made by 
 
     $ cairn map export http://127.0.0.1:8750/maps/lab --pcd lab.pcd --box=0,0,0,8,6,3 --ceiling 2.2 --p 0.8
     lab.pcd: 1.4 MB
+    $ cairn map export http://127.0.0.1:8750/maps/lab --bt lab.bt       # for planners: occupied and free space
+    lab.bt: 188 kB
 """
 
 import argparse
@@ -61,20 +63,28 @@ def _add_part_arguments(export: argparse.ArgumentParser) -> None:
     """Options that name a part of a map, and the kinds of file that only the server makes."""
     export.add_argument("--pcd", type=Path, metavar="FILE", help="occupied voxels for PCL and Open3D")
     export.add_argument("--laz", type=Path, metavar="FILE", help="occupied voxels for CloudCompare, PDAL, Potree, GIS")
-    export.add_argument("--ot", type=Path, metavar="FILE", help="OctoMap's octree with probability and colour")
-    export.add_argument("--bt", type=Path, metavar="FILE", help="OctoMap's octree of occupied or not, small")
+    export.add_argument(
+        "--ot", type=Path, metavar="FILE", help="OctoMap's octree of occupied and free space: log-odds, colour"
+    )
+    export.add_argument("--bt", type=Path, metavar="FILE", help="OctoMap's octree of occupied and free space, small")
     part = export.add_argument_group(
         "a part",
-        "of the occupied space, as the console shows it: made by the server, as x, y, z, colour, p, temperature",
+        "of the occupied space, as the console shows it: made by the server, as x, y, z, colour, p, temperature; "
+        "octrees have the free space, too: of the options only --box, --floor, --ceiling and --depth cut it",
     )
     part.add_argument(
         "--box", type=str.strip, metavar="X,Y,Z,X,Y,Z", help="lowest and highest corner, metres: --box=0,0,0,8,6,3"
     )
     part.add_argument("--floor", type=float, metavar="METRES", help="leave out lower voxels")
-    part.add_argument("--p", type=float, metavar="P", help="least probability, 0 to 1")
+    part.add_argument("--p", type=float, metavar="P", help="least probability of occupied nodes, 0 to 1")
     part.add_argument("--hotter", type=float, metavar="CELSIUS", help="only nodes with a voxel as hot as this")
     part.add_argument("--colder", type=float, metavar="CELSIUS", help="only nodes as cold as this in the mean")
     part.add_argument("--depth", type=int, metavar="N", help="octree depth: fewer, larger nodes (that of voxels)")
+    part.add_argument(
+        "--unknown",
+        choices=("free", "occupied"),
+        help="with --ot or --bt, take unknown space in the --box for this, as if measured once (it stays unknown)",
+    )
 
 
 def _get(args: argparse.Namespace) -> int:
@@ -206,7 +216,7 @@ def _write(path: Path, data: bytes) -> None:
 def _is_part(args: argparse.Namespace) -> bool:
     """True if the server is asked for points, not for whole cells."""
     only_parts = (args.pcd, args.laz, args.ot, args.bt)
-    asked = (args.box, args.floor, args.p, args.hotter, args.colder, args.depth)
+    asked = (args.box, args.floor, args.p, args.hotter, args.colder, args.depth, args.unknown)
     if any(value is not None for value in (*only_parts, *asked)):
         return True
     # With a picture the ceiling is the picture's, and files are of the whole map.
@@ -225,7 +235,7 @@ def _export_part(api: MapApi, name: str, args: argparse.Namespace) -> None:
         raise BadInputError("nothing_asked", f"say what to write: {', '.join(f'--{form} FILE' for form in FORMATS)}")
     about = {
         **{"box": args.box, "floor_m": args.floor, "ceiling_m": args.ceiling, "p": args.p or 0.0, "depth": args.depth},
-        **{"hotter_k": _kelvin(args.hotter), "colder_k": _kelvin(args.colder)},
+        **{"hotter_k": _kelvin(args.hotter), "colder_k": _kelvin(args.colder), "unknown": args.unknown},
     }
     for form in FORMATS:
         path: Path | None = getattr(args, form)
@@ -243,7 +253,7 @@ def _kelvin(celsius: float | None) -> float | None:
 
 
 def export_points(api: MapApi, name: str, asked: ExportRequest, path: Path) -> int:
-    """Occupied nodes of a map as a file, written as it comes; its size in bytes.
+    """Part of a map as a file, written as it comes; its size in bytes.
 
     What was there under this name stays until the new file is whole.
 

@@ -69,7 +69,7 @@ def export(
     asker: Asking,
     asked: Annotated[TicketedExport, Query()],
 ) -> StreamingResponse:
-    """Occupied nodes by box, heights, probability, temperature, octree depth: as points, or an octree of OctoMap's."""
+    """Nodes by box, heights, probability, temperature, depth: occupied ones as points, with free ones as an octree."""
     if row is None:
         made = service.views.tickets.shown(asked.ticket or "", name, asked.request)
     else:

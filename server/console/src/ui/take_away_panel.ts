@@ -11,8 +11,8 @@ const FORMS: [string, string, string][] = [
   ["pcd", "PCD", "points for PCL, Open3D, ROS"],
   ["laz", "LAZ", "points for CloudCompare, PDAL, Potree and GIS, a fifth of the size"],
   ["npz", "NPZ", "one array of records for NumPy"],
-  ["ot", "OctoMap .ot", "OctoMap's octree with probability and colour"],
-  ["bt", "OctoMap .bt", "OctoMap's octree of occupied or not, small"],
+  ["ot", "OctoMap .ot", "OctoMap's octree of occupied and free space, with probability and colour"],
+  ["bt", "OctoMap .bt", "OctoMap's octree of occupied and free space, small"],
 ];
 
 export class TakeAwayPanel {
