@@ -133,7 +133,7 @@ class MemoryNotes:
 
 
 def _backlog(state: MemoryMap, age_s: float) -> Backlog:
-    waiting = list(state.waiting())
+    waiting = list(state.due())
     return Backlog(state.row.name, len(waiting), age_s - waiting[0].received_age_s if waiting else None)
 
 

@@ -53,6 +53,7 @@ class Kept:
     folded_seq: int | None = None
     unfolded_seq: int = 0
     """Log entry that took it out again; 0 if none did."""
+    due_from: int | None = None
     is_damaged: bool = False
     is_gone: bool = False
 
@@ -60,6 +61,11 @@ class Kept:
     def is_waiting(self) -> bool:
         """Whether it is to be folded."""
         return self.folded_seq is None and not self.is_damaged
+
+    @property
+    def is_due(self) -> bool:
+        """Whether folding has still to do with it."""
+        return self.is_waiting or self.due_from is not None
 
     def stored(self) -> StoredCommit:
         """As the folder reads it."""
@@ -72,6 +78,7 @@ class Kept:
             diff=dict(sorted(self.new.diff.items())),
             gone=self.is_gone,
             signatures=self.new.signatures,
+            due_from=self.due_from,
         )
 
 
@@ -135,8 +142,10 @@ class MemoryMap:
         return self.authors[author][0] + 1 if author in self.authors else 0
 
     def fold(self, fold: Fold, *, age_s: float) -> bool:
-        """Cells, entries and head at an age of the store, if the head is still the fold's base."""
+        """Cells, entries and head at an age of the store, if head and retracts are still where the fold begins."""
         if fold.base != self.head.cursor:
+            return False
+        if any(self.commits[self.ids[step.commit]].due_from != step.before for step in fold.steps):
             return False
         self.head = Head(cursor=fold.head, vector=fold.vector)
         for entry in fold.entries:
@@ -146,6 +155,9 @@ class MemoryMap:
         for number, _ in fold.damaged:
             aside = self.ids[number]
             self.commits[aside] = replace(self.commits[aside], is_damaged=True)
+        for step in fold.steps:
+            begun = self.ids[step.commit]
+            self.commits[begun] = replace(self.commits[begun], due_from=step.after)
         for cell in fold.cells:
             before = self.cells.get(cell.key)
             self.cells[cell.key] = replace(cell, gone_seq=before.gone_seq if before else 0)
@@ -156,7 +168,8 @@ class MemoryMap:
 
         What is left of a commit is its row in the log; see `sqlite_retention`.
         """
-        pinned = {target for kept in self.commits.values() if kept.folded_seq is None for target in kept.new.retracts}
+        naming = (kept for kept in self.commits.values() if kept.folded_seq is None or kept.due_from is not None)
+        pinned = {target for kept in naming for target in kept.new.retracts}
         again_s = min(before_s, age_s - AGAIN_KEPT_S)
         old = [
             kept
@@ -177,6 +190,10 @@ class MemoryMap:
     def waiting(self) -> Iterator[Kept]:
         """Commits to be folded, in order of arrival."""
         return (kept for kept in self.commits.values() if kept.is_waiting)
+
+    def due(self) -> Iterator[Kept]:
+        """Commits that folding has still to do with, in order of arrival."""
+        return (kept for kept in self.commits.values() if kept.is_due)
 
     def heal(self, cell: CellRow) -> bool:
         """Other bytes for a cell, if it is still of the same entry; its stamps stay."""

@@ -1,7 +1,7 @@
 """Reading one state of a map in memory."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 
@@ -15,10 +15,12 @@ from cairn_map.wire.messages import LogEntry
 from cairn_server.store.store_rows import (
     CAPTURED_AHEAD_MAX_S,
     CellRow,
+    CellState,
     ChainedEntry,
     Contribution,
     Entry,
     Head,
+    NamedCommit,
     Selection,
     Totals,
 )
@@ -55,6 +57,20 @@ class MemorySnapshot:
         """Entries after `after_seq` that touch a cell, oldest first, at most so many of the newest."""
         seqs = [seq for seq in self._state.touched.get(key, ()) if seq > after_seq]
         return [self._contribution(key, seq) for seq in seqs[-(newest or len(seqs)) :]]
+
+    def cell_states(self, keys: Collection[CellKey]) -> list[CellState]:
+        """Those of these cells that are stored, without their bodies, by rising number."""
+        found = (self._state.cells[key] for key in sorted(keys) if key in self._state.cells)
+        return [CellState(cell.key, cell.lm, cell.digest) for cell in found]
+
+    def named(self, commits: Sequence[CommitId]) -> list[NamedCommit]:
+        """State of each of these commits, folded or not, in the same order."""
+        return [self._named(commit) for commit in commits]
+
+    def touched_cells(self, commits: Iterable[CommitId]) -> frozenset[CellKey]:
+        """Cells in which these commits have evidence that is kept."""
+        known = (self._state.commits[commit] for commit in commits if commit in self._state.commits)
+        return frozenset(key for kept in known for key in kept.new.diff)
 
     def diff(self, commit: CommitId, key: CellKey) -> bytes | None:
         """The bytes of a commit's evidence in a cell; None if they are not kept any more."""
@@ -119,6 +135,13 @@ class MemorySnapshot:
             if cells
             else None,
         )
+
+    def _named(self, commit: CommitId) -> NamedCommit:
+        is_retracted = commit in self._state.retracted
+        kept = self._state.commits.get(commit)
+        if kept is None or kept.folded_seq is None:
+            return NamedCommit(commit, is_retracted=is_retracted)
+        return NamedCommit(commit, True, kept.is_gone, is_retracted, kept.cells, kept.new.bricks or kept.new.size_bytes)
 
     def _folded(self) -> Iterator[Kept]:
         return (kept for kept in self._state.commits.values() if kept.folded_seq is not None)

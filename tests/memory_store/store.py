@@ -90,7 +90,7 @@ class MemoryStore:
         found: list[StoredCommit] = []
         total_bytes = 0
         with self._maps.reading(row) as state:
-            waiting = [kept for kept in state.waiting() if kept.number not in skip]
+            waiting = [kept for kept in state.due() if kept.number not in skip]
             turns: Counter[str] = Counter()
             turn_of: dict[int, int] = {}
             for kept in waiting:

@@ -845,6 +845,14 @@ SWITCHES = (
     ),
     Switch(
         11,
+        "what a retract under way has still to take out is kept",
+        RETENTION,
+        "AND due_from IS NOT NULL",
+        "AND due_from IS NULL AND number < 0",
+        "cairn_server/folding/test_retract_parts.py::test_a_retract_under_way_goes_on_after_a_start_and_from_a_backup_of_that_moment",
+    ),
+    Switch(
+        11,
         "what is gone is not retracted before its bytes came again",
         RETENTION,
         "    if gone:\n        raise EvidenceGoneError(gone)",

@@ -12,7 +12,7 @@ from tests.sync_sim.events import Events
 from tests.sync_sim.joined import JoinedHistory
 from tests.sync_sim.network import Network, Weather
 from tests.sync_sim.robot import SimRobot
-from tests.sync_sim.server import FoldOnRequest, SimServer
+from tests.sync_sim.server import FoldOnRequest, SimServer, with_more
 
 from cairn_client.replica.server_cells import ServerCells
 from cairn_client.sync.exchange import MISFIT, Exchange
@@ -21,6 +21,7 @@ from cairn_map.commits.ids import OPERATOR, CommitId
 from cairn_map.evidence.fingerprint import ZERO, fingerprint
 from cairn_map.evidence.grid import CellKey
 from cairn_server import service as service_module
+from cairn_server.folding import commit_work
 
 MODES = ("high-end", "high-end", "low-end", "viewer", "high-end")
 LENGTH_S = 120.0
@@ -57,6 +58,7 @@ class History:
 
     def __init__(self, seed: int, log: Log) -> None:
         self._random = Random(seed)
+        self._more = Random(f"{seed} more")
         self._log = log
         self._notes = 0
         self.clock_s = 1.7e9
@@ -108,7 +110,7 @@ class History:
         robot = self._mapper()
         own = [commit for commit in robot.notes() if commit.author.robot == robot.name]
         if own:
-            taken_back = (str(self._random.choice(own)),)
+            taken_back = with_more(str(self._random.choice(own)), map(str, own), self._more)
             robot.commit(self._random.randrange(60), note=self._note(), retracts=taken_back)
 
     def _sync(self) -> None:
@@ -124,7 +126,7 @@ class History:
         held = {commit for robot in self._robots for commit in robot.notes()}
         targets = sorted(str(c) for c in held | self._server.commits().keys() if c.author.robot != OPERATOR)
         if targets:
-            self._server.retract(ids.commit_id_from_text(self._random.choice(targets)))
+            self._server.retract(with_more(self._random.choice(targets), targets, self._more))
 
     def _weather(self) -> None:
         share = self._random.choice((0.0, 0.05, 0.3))
@@ -206,7 +208,7 @@ class History:
                 robot.start_round()
                 self._finish(robot)
             self._server.admit_all()
-            self._server.fold(1000)
+            self._server.fold_all()
             self._check_bases()
         assert self._all_notes() >= held, "a commit is lost"
         assert all(self._server.is_retracted(target) for target in sealed), "what an operator took out is back"
@@ -298,4 +300,6 @@ def _seeded(seed: int) -> Iterator[pytest.MonkeyPatch]:
         patch.setattr(ids.secrets, "token_hex", lambda size: random.randbytes(size).hex())
         patch.setattr(memory_map.secrets, "token_bytes", random.randbytes)
         patch.setattr(service_module, "FoldThread", FoldOnRequest)
+        # What a commit takes out is taken out one by one, and anything may happen in between.
+        patch.setattr(commit_work, "PART_NAMES_MAX", 1)
         yield patch

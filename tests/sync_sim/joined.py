@@ -12,10 +12,10 @@ from tests.sync_sim.events import Events
 from tests.sync_sim.network import Network, Weather
 from tests.sync_sim.relay import Bag, SimEnd, SimRelay
 from tests.sync_sim.robot import SimRobot
-from tests.sync_sim.server import SimServer
+from tests.sync_sim.server import SimServer, with_more
 
 from cairn_client.sync.requests import Ask
-from cairn_map.commits.ids import OPERATOR, CommitId, commit_id_from_text
+from cairn_map.commits.ids import OPERATOR, CommitId
 from cairn_map.evidence.fingerprint import ZERO, fingerprint
 from cairn_server.sync.handing_over import server_key
 
@@ -53,6 +53,7 @@ class JoinedHistory:
 
     def __init__(self, seed: int, log: Callable[[str], None]) -> None:
         self._random = Random(seed)
+        self._more = Random(f"{seed} more")
         self._log = log
         self._notes = 0
         self._has_forgotten = False
@@ -116,7 +117,7 @@ class JoinedHistory:
         robot = self._random.choice(self._mappers)
         own = [commit for commit in robot.notes() if commit.author.robot == robot.name]
         if own:
-            taken_back = (str(self._random.choice(own)),)
+            taken_back = with_more(str(self._random.choice(own)), map(str, own), self._more)
             robot.commit(self._random.randrange(60), note=self._note(), retracts=taken_back)
 
     def _sync(self) -> None:
@@ -151,7 +152,7 @@ class JoinedHistory:
         targets = sorted(str(commit) for commit in held if commit.author.robot != OPERATOR)
         if targets:
             server = self._random.choice(self._servers)
-            server.retract(commit_id_from_text(self._random.choice(targets)))
+            server.retract(with_more(self._random.choice(targets), targets, self._more))
 
     def _weather(self) -> None:
         share = self._random.choice((0.0, 0.05, 0.3))
@@ -253,7 +254,7 @@ class JoinedHistory:
             self._log(f"other bytes under the same ids: {sorted(map(str, split))}")
             held -= {server.commits()[commit] for server in self._servers for commit in split}
             for commit in split:
-                self._servers[0].retract(commit)
+                self._servers[0].retract([str(commit)])
             self._rounds()
         assert self._all_notes() >= held, "a commit is lost"
         assert all(server.is_retracted(target) for server in self._servers for target in taken_out)
@@ -287,7 +288,7 @@ class JoinedHistory:
             relay.start()
             self._events.run_while(lambda relay=relay: relay.is_busy)  # type: ignore[misc]
             for server in self._servers:
-                server.fold(1000)
+                server.fold_all()
         self._set_weather(weather)
 
     def _split_ids(self) -> set[CommitId]:

@@ -1,5 +1,7 @@
 """The map server of a simulation: the real service on a store in memory, folding on request."""
 
+from collections.abc import Iterable, Sequence
+from random import Random
 from typing import Any
 
 from tests.fixtures.client.made import GEOMETRY, MAP
@@ -170,10 +172,15 @@ class SimServer:
         fold_pending(self._store, self.row, self._cache, limit=limit)
         self._note_state()
 
-    def retract(self, target: CommitId) -> None:
-        """An operator takes out a commit that may or may not have come."""
+    def fold_all(self) -> None:
+        """Fold until nothing waits, and no retract is under way."""
+        while fold_pending(self._store, self.row, self._cache, limit=1000):
+            self._note_state()
+
+    def retract(self, targets: Sequence[str]) -> None:
+        """An operator takes out commits that may or may not have come."""
         try:
-            self.service.sync.retracts.retract(self.row, Retract(commits=[str(target)]), by=Caller(Role.ADMIN))
+            self.service.sync.retracts.retract(self.row, Retract(commits=list(targets)), by=Caller(Role.ADMIN))
         except ConflictError as exc:
             assert exc.kind == "evidence_gone"
         except BadInputError as exc:
@@ -248,6 +255,12 @@ class SimServer:
     def _note_state(self) -> None:
         with self._store.snapshot(self.row) as snapshot:
             self.states[snapshot.head.cursor] = {row.key: row.fingerprint.hex() for row in snapshot.cells()}
+
+
+def with_more(first: str, others: Iterable[str], chance: Random) -> tuple[str, ...]:
+    """An id, and up to two more of others."""
+    left = sorted({*others} - {first})
+    return first, *chance.sample(left, min(len(left), chance.randrange(3)))
 
 
 def meta_of(commit: CommitId, *, note: str, retracts: tuple[str, ...]) -> CommitMeta:

@@ -4,26 +4,31 @@
     folding       8 = a scan   9 = a scan   10 = a scan               └─> the same plan, written as entry 11
 
 A plan says what its cells become, and that depends on its commits and these cells alone. While it is under way no
-other commit that touches one of its cells is folded, so it can be moved onto the newest state: its entries get their
-numbers and chain values, and the stamps of its blocks those of its entries. What it read is compared again, so a plan
-that stands on anything else than the map is thrown away. It writes nothing: a kill loses time only.
+other commit that touches one of its cells, or is named or names one that it names, is folded, so it can be moved onto
+the newest state: its entries get their numbers and chain values, and the stamps of its blocks those of its entries.
+What it read is compared again, so a plan that stands on anything else than the map is thrown away. It writes nothing: a
+kill loses time only.
+
+The thread that folds reads no evidence to begin or to write a plan: what a commit takes out in one fold is bounded
+(`commit_work`), and only the numbers of its cells and their digests are looked up.
 """
 
 import os
 import threading
 import time
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 
 from cairn_map.commits.cursor import ENTRY_FOLD, Cursor, next_chain
 from cairn_map.commits.ids import CommitId
-from cairn_map.evidence.grid import CellKey, Geometry
+from cairn_map.evidence.grid import Geometry
 from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.commit_work import part_of
 from cairn_server.folding.folding import FoldStore, plan_fold
 from cairn_server.store.stamps import raised_stamps
 from cairn_server.store.store import Snapshot
-from cairn_server.store.store_rows import CellRow, Entry, Fold, Head, MapRow, StoredCommit
+from cairn_server.store.store_rows import CellRow, CellState, Entry, Fold, Head, MapRow, NamedCommit, StoredCommit
 
 NICE = 10
 """Priority of the thread: a tenth of the processor if others need it."""
@@ -33,10 +38,10 @@ NICE = 10
 class _Ground:
     """State of a map that a plan depends on."""
 
-    cells: tuple[tuple[CellKey, int, bytes], ...]
-    """Each stored cell of the plan, its last entry and its digest."""
-    commits: tuple[tuple[CommitId, bool, bool, bool], ...]
-    """Each commit that is folded or named by a retract: is it retracted, folded, dropped."""
+    cells: tuple[CellState, ...]
+    """Each stored cell of the plan."""
+    commits: tuple[NamedCommit, ...]
+    """Each commit that is folded or named."""
 
 
 class BackgroundPlan:
@@ -46,14 +51,17 @@ class BackgroundPlan:
         """Start to plan folding some pending commits, with so much memory for the cells under change."""
         self.row = row
         self.commits = tuple(commits)
-        self.cells = frozenset(key for commit in with_targets(store, row, commits) for key in commit.diff)
-        """Cells that it changes."""
         self.seconds = 0.0
         """Time that it took."""
         self._store = _NotingStore(store)
         self._fold: Fold | None = None
         with store.snapshot(row) as snapshot:
             self._head = snapshot.head
+            parts = [part_of(commit, snapshot) for commit in commits if commit.retracts]
+            self.cells = frozenset(key for commit in commits for key in commit.diff).union(*(p.cells for p in parts))
+            """Cells that it changes."""
+            self.named = frozenset(each.id for part in parts for each in part.named)
+            """Commits that it takes out, or notes to be taken out when they come."""
             self._ground = self._ground_in(snapshot)
         self._thread = threading.Thread(target=self._run, args=(cells_bytes,), name="cairn-plan", daemon=True)
         self._thread.start()
@@ -77,7 +85,7 @@ class BackgroundPlan:
         with self._store.snapshot(self.row) as snapshot:
             head = snapshot.head
             is_same = self._ground_in(snapshot) == self._ground
-        if not is_same or any(commit.id in head.vector for commit in self.commits):
+        if not is_same or any(commit.due_from is None and commit.id in head.vector for commit in self.commits):
             return None
         known = self._store.known | {commit.number: (commit.id, commit.sha) for commit in self.commits}
         fold = moved_fold(self._fold, head, known, self.row.geometry)
@@ -99,26 +107,8 @@ class BackgroundPlan:
         self.seconds = time.monotonic() - start_s
 
     def _ground_in(self, snapshot: Snapshot) -> _Ground:
-        rows = (snapshot.cell(key) for key in sorted(self.cells))
-        named = [id_ for commit in self.commits for id_ in (commit.id, *commit.retracts)]
-        known = [self._store.folded(self.row, id_) for id_ in named]
-        return _Ground(
-            tuple((row.key, row.lm, row.digest) for row in rows if row is not None),
-            tuple(
-                (id_, self._store.is_retracted(self.row, id_), commit is not None, commit is not None and commit.gone)
-                for id_, commit in zip(named, known, strict=True)
-            ),
-        )
-
-
-def with_targets(store: FoldStore, row: MapRow, commits: Iterable[StoredCommit]) -> Iterator[StoredCommit]:
-    """Commits, each before the folded ones that it takes out, read one by one."""
-    for commit in commits:
-        yield commit
-        for id_ in commit.retracts:
-            target = None if store.is_retracted(row, id_) else store.folded(row, id_)
-            if target is not None:
-                yield target
+        commits = {commit.id for commit in self.commits} | self.named
+        return _Ground(tuple(snapshot.cell_states(self.cells)), tuple(snapshot.named(sorted(commits))))
 
 
 def moved_fold(fold: Fold, head: Head, known: dict[int, tuple[CommitId, bytes]], geometry: Geometry) -> Fold:

@@ -1,20 +1,22 @@
 """Two lanes of folding: cheap commits at once, costly ones planned in the background, one plan at a time.
 
 A commit waits for at most one slice of other robots' work (`commit_work.SLICE_S`), unless it touches a cell that a plan
-under way changes: then for that plan. Each robot's own commits keep their order, so those behind a costly one wait for
-it. Which robot's costly commits are next is decided as in `fold_turns`, by the time that each robot's took.
+under way changes, or is named by it: then for that plan. A retract is planned part by part (`commit_work`), and in
+between others have their turn. Each robot's own commits keep their order, so those behind a costly one wait for it.
+Which robot's costly commits are next is decided as in `fold_turns`, by the time that each robot's took.
 """
 
 import logging
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
-from cairn_map.commits.ids import RobotName
+from cairn_map.commits.ids import CommitId, RobotName
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.grid import CellKey
-from cairn_server.folding.background_plan import BackgroundPlan, with_targets
+from cairn_server.folding.background_plan import BackgroundPlan
 from cairn_server.folding.cell_cache import CellCache
-from cairn_server.folding.commit_work import SLICE_S, SLICE_S_PER_BYTE, commit_work_s, slice_s
+from cairn_server.folding.commit_work import NAME_S, SLICE_S, SLICE_S_PER_BYTE, commit_work_s, part_of, slice_s
 from cairn_server.folding.fold_turns import FoldTurns
 from cairn_server.folding.folding import FoldStore
 from cairn_server.store.store_rows import MapRow, StoredCommit
@@ -23,6 +25,9 @@ log = logging.getLogger(__name__)
 
 PLAN_S = 1.0
 """Work of a robot's commits that are planned at once, if the first of them does not have more."""
+
+Piece = tuple[int, int | None]
+"""Number of a commit, and the part of its retract that is next (`StoredCommit.due_from`)."""
 
 
 class _Weight(NamedTuple):
@@ -44,8 +49,10 @@ class FoldLanes:
         """Commits of each robot that wait for the background, of the map under way: the first is costly."""
         self._known_costly: set[int] = set()
         """Numbers of commits that were found to be costly, and wait."""
-        self._unplanned: set[int] = set()
-        """Numbers of commits of which planning failed."""
+        self._misfits: set[Piece] = set()
+        """Pieces of work of which a plan was thrown away."""
+        self._unplanned: set[Piece] = set()
+        """Pieces of work of which planning failed, or twice did not fit."""
 
     def has_plan(self) -> bool:
         """True if a plan is under way, or done and not written yet."""
@@ -73,6 +80,11 @@ class FoldLanes:
         fold = plan.write()
         if fold is None:
             log.info("map %s: a plan of %d commits does not fit any more", row.name, len(plan.commits))
+            # After the second time it is folded without a plan, so that no commit waits for ever.
+            pieces = set(map(_piece, plan.commits))
+            if pieces & self._misfits:
+                self._set_aside(plan.commits)
+            self._misfits |= pieces
             return 0
         cache.moved(fold.base, fold.head, plan.cells)
         self._known_costly.difference_update(commit.number for commit in plan.commits)
@@ -86,6 +98,7 @@ class FoldLanes:
         dear_s = 0.0
         plan = self._plan if self._plan is not None and self._plan.row.number == row.number else None
         held = plan.cells if plan is not None else frozenset[CellKey]()
+        named = plan.named if plan is not None else frozenset[CommitId]()
         planned = {commit.number for commit in plan.commits} if plan is not None else set[int]()
         for commit in commits:
             robot = commit.id.author.robot
@@ -100,11 +113,13 @@ class FoldLanes:
                 self._costly[robot] = [commit]
                 behind.add(robot)
                 continue
-            weight = self._weight(row, commit, cache, held)
+            # The plan's ground: neither what it takes out, nor what it notes to be taken out, may change.
+            is_held = commit.id in named or not named.isdisjoint(commit.retracts)
+            weight = None if is_held else self._weight(row, commit, cache, held)
             if weight is None:
                 behind.add(robot)
                 continue
-            if weight.work_s > slice_s(weight.size_bytes) and commit.number not in self._unplanned:
+            if weight.work_s > slice_s(weight.size_bytes) and _piece(commit) not in self._unplanned:
                 self._known_costly.add(commit.number)
                 self._costly[robot] = [commit]
                 behind.add(robot)
@@ -137,22 +152,32 @@ class FoldLanes:
 
     def _set_aside(self, commits: Sequence[StoredCommit]) -> None:
         """Have these commits folded without a plan."""
-        self._unplanned.update(commit.number for commit in commits)
+        self._unplanned.update(map(_piece, commits))
         self._known_costly.difference_update(commit.number for commit in commits)
 
     def _weight(self, row: MapRow, commit: StoredCommit, cache: CellCache, held: Collection[CellKey]) -> _Weight | None:
         """Weight of a commit, from `PLAN_S` on not all of it; None if it changes one of the `held` cells."""
-        work_s, size_bytes = 0.0, 0
+        own = commit if commit.due_from is None else replace(commit, diff={})
+        size_bytes = sum(map(len, own.diff.values()))
         try:
-            # What a retract names is read one by one: thousands may be named, of thousands of cells.
-            for each in with_targets(self._store, row, [commit]):
-                if not each.diff.keys().isdisjoint(held):
+            with self._store.snapshot(row) as snapshot:
+                part = part_of(commit, snapshot)
+                if not (part.cells.isdisjoint(held) and own.diff.keys().isdisjoint(held)):
                     return None
-                size_bytes += sum(map(len, each.diff.values()))
-                with self._store.snapshot(row) as snapshot:
-                    work_s += commit_work_s(each, snapshot, cache)
+                work_s = NAME_S * len(part.named) + commit_work_s(own, snapshot, cache)
+            # What is taken out is read one by one, and not all of it if it is much.
+            for target in part.targets:
                 if work_s > PLAN_S:
                     break
+                known = self._store.folded(row, target)
+                if known is not None:
+                    size_bytes += sum(map(len, known.diff.values()))
+                    with self._store.snapshot(row) as snapshot:
+                        work_s += commit_work_s(known, snapshot, cache)
         except DamagedDataError:
             return _Weight(0.0, size_bytes)  # a cell that cannot be read: folding finds it
         return _Weight(work_s, size_bytes)
+
+
+def _piece(commit: StoredCommit) -> Piece:
+    return commit.number, commit.due_from

@@ -3,6 +3,7 @@
     fold a commit                 entry +     its diff is added
     retract of a folded commit    entry -     its diff is subtracted, once per target for ever
     commit retracted before it came    both, one after the other (SYNC.md rule 11)
+    retract of very much          entry +, then entries - in several folds (`commit_work`)
 
 A group of commits is folded at once, so that a cell is decoded and encoded once for all of them. A commit whose
 bytes are damaged at rest is set aside, so that it does not hold up the others; its robot will push it again.
@@ -25,9 +26,10 @@ from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey
 from cairn_server.folding.cell_cache import CellCache, Step
 from cairn_server.folding.cells_at_rest import cell_to_change, decode_stored
+from cairn_server.folding.commit_work import part_of
 from cairn_server.store.stamps import CellStamps
 from cairn_server.store.store import Snapshot
-from cairn_server.store.store_rows import Entry, Fold, Head, MapRow, StoredCommit
+from cairn_server.store.store_rows import Entry, Fold, Head, MapRow, RetractStep, StoredCommit
 
 log = logging.getLogger(__name__)
 
@@ -108,8 +110,9 @@ def fold_commits(
         return 0
     with store.snapshot(row) as snapshot:
         head = snapshot.head
-    # Another folding may have taken some of them since `pending`: its head is our base, so only the vector tells.
-    commits = [commit for commit in commits if commit.id not in head.vector]
+    # Another folding may have taken some of them since `pending`: its head is our base, so only the vector tells; of a
+    # retract under way `store.fold` finds out.
+    commits = [commit for commit in commits if commit.due_from is not None or commit.id not in head.vector]
     if not commits:
         return 0
     # Plan in memory, and write all of it or nothing.
@@ -117,7 +120,7 @@ def fold_commits(
     written = False
     try:
         fold = plan_fold(store, row, head, order(commits), cache)
-        is_empty = not (fold.entries or fold.damaged)  # all of them are left for later
+        is_empty = not (fold.entries or fold.damaged or fold.steps)  # all of them are left for later
         written = is_empty or store.fold(row, fold)
     finally:
         if not written:  # it failed, or another folding was faster, whose result is as good
@@ -126,7 +129,8 @@ def fold_commits(
         return 0
     cache.finish(fold.head)
     audit_damaged(store, row, fold)
-    return len(fold.damaged) + sum(commit.id in fold.vector for commit in commits)
+    begun = sum(entry.kind == ENTRY_FOLD for entry in fold.entries)
+    return len(fold.damaged) + begun + sum(step.before is not None for step in fold.steps)
 
 
 def audit_damaged(store: FoldStore, row: MapRow, fold: Fold) -> None:
@@ -148,6 +152,7 @@ def plan_fold(store: FoldStore, row: MapRow, head: Head, commits: Iterable[Store
         cells=cache.rows(plan.last_change),
         retracted=tuple(plan.retracted),
         damaged=tuple(plan.damaged),
+        steps=tuple(plan.steps),
     )
 
 
@@ -165,26 +170,39 @@ class _Plan:
     retracted: dict[CommitId, None] = field(default_factory=dict)
     last_change: dict[CellKey, int] = field(default_factory=dict)
     damaged: list[tuple[int, str]] = field(default_factory=list)
+    steps: list[RetractStep] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.chain = self.start.chain
 
     def take(self, commit: StoredCommit) -> None:
-        """Add a commit: its own entry, then its own retract if that came first, then what it retracts."""
+        """Add a commit: its own entry, then its own retract if that came first, then a part of what it retracts."""
+        if commit.due_from is None and not self._begin(commit):
+            return
+        if not commit.retracts:
+            return
+        with self.store.snapshot(self.row) as snapshot:
+            part = part_of(commit, snapshot)
+        # Once for ever: a second retract of the same target, in this group or in the store, changes nothing.
+        for target in (each.id for each in part.named):
+            if not self._is_retracted(target):
+                self._retract(target)
+        if commit.due_from != part.due_from:
+            self.steps.append(RetractStep(commit.number, commit.due_from, part.due_from))
+
+    def _begin(self, commit: StoredCommit) -> bool:
+        """Add a commit's own entry; False if it is damaged."""
         try:
             self._enter(ENTRY_FOLD, commit)
         except DamagedCommitError as exc:
             log.error("commit %s is set aside: %s", commit.id, exc.message)
             self.damaged.append((commit.number, exc.message))
-            return
+            return False
         self.folded[commit.id] = commit
         # Retracted before it came: both entries stand in the log, so that every robot sees the same history.
         if self._is_retracted(commit.id):
             self._enter(ENTRY_UNFOLD, commit)
-        # Once for ever: a second retract of the same target, in this group or in the store, changes nothing.
-        for target in commit.retracts:
-            if not self._is_retracted(target):
-                self._retract(target)
+        return True
 
     def _retract(self, target: CommitId) -> None:
         # A target that did not come yet is only noted; `take` finds it when it comes.

@@ -18,6 +18,7 @@ from cairn_map.errors import CairnError
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_server.folding.cell_cache import CACHE_BYTES, CellCache
 from cairn_server.folding.cells_at_rest import DamagedCellError, cell_to_change
+from cairn_server.folding.commit_work import part_of
 from cairn_server.folding.fold_lanes import FoldLanes
 from cairn_server.folding.fold_turns import FoldTurns
 from cairn_server.folding.folding import GROUP_BYTES_MAX, Damage, FoldStore, Order, fold_commits
@@ -129,13 +130,13 @@ def fold_around(
 
 
 def _touches(store: FoldStore, row: MapRow, commit: StoredCommit, cells: set[CellKey]) -> bool:
-    """True if folding a commit, or taking out what it retracts, changes one of these cells."""
+    """True if folding a commit, or taking out the next part of what it retracts, changes one of these cells."""
     if not cells:
         return False
-    if not cells.isdisjoint(commit.diff):
+    if commit.due_from is None and not cells.isdisjoint(commit.diff):
         return True
-    targets = (store.folded(row, target) for target in commit.retracts if not store.is_retracted(row, target))
-    return any(target is not None and not cells.isdisjoint(target.diff) for target in targets)
+    with store.snapshot(row) as snapshot:
+        return not cells.isdisjoint(part_of(commit, snapshot).cells)
 
 
 def _can_be_read(store: FoldStore, row: MapRow, key: CellKey) -> bool:

@@ -103,7 +103,8 @@ def _commits(store: Store, row: MapRow, checked: MapCheck) -> Iterator[StoredCom
         checked.findings.append(Finding(row.name, f"log: it ends at {seq}, the head is {head.cursor}"))
     if vector != head.vector:
         checked.findings.append(Finding(row.name, "log: the vector does not name what was folded"))
-    yield from store.pending(row, limit=PAGE, size_bytes_max=PENDING_BYTES_MAX)
+    waiting = store.pending(row, limit=PAGE, size_bytes_max=PENDING_BYTES_MAX)
+    yield from (commit for commit in waiting if commit.due_from is None)
 
 
 def _log_page(store: Store, row: MapRow, *, after_seq: int) -> list[ChainedEntry]:

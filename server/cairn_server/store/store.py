@@ -6,7 +6,7 @@ fold      cells, log entries and the new head, all or nothing, only on top of th
 snapshot  a view of one state of the map: header and frames of a reply come from one of these
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from typing import Protocol
@@ -24,6 +24,7 @@ from cairn_server.store.store_rows import (
     Backlog,
     Branch,
     CellRow,
+    CellState,
     ChainedEntry,
     ClosedRobot,
     Contribution,
@@ -31,6 +32,7 @@ from cairn_server.store.store_rows import (
     Fold,
     Head,
     MapRow,
+    NamedCommit,
     NewCommit,
     Robot,
     RobotShares,
@@ -68,6 +70,18 @@ class Snapshot(Protocol):
 
         Those up to the cell's `gone_seq` may be missing.
         """
+        ...
+
+    def cell_states(self, keys: Collection[CellKey]) -> list[CellState]:
+        """Those of these cells that are stored, without their bodies, by rising number."""
+        ...
+
+    def named(self, commits: Sequence[CommitId]) -> list[NamedCommit]:
+        """State of each of these commits, folded or not, in the same order; no evidence is read."""
+        ...
+
+    def touched_cells(self, commits: Iterable[CommitId]) -> frozenset[CellKey]:
+        """Cells in which these commits have evidence that is kept; none of it is read."""
         ...
 
     def diff(self, commit: CommitId, key: CellKey) -> bytes | None:
@@ -162,7 +176,7 @@ class StoreHealth(Protocol):
     """State of a store, for administrators and probes."""
 
     def backlogs(self) -> list[Backlog]:
-        """Commits of every map that are not folded yet."""
+        """Commits of every map that are not folded yet, or whose retract is under way."""
         ...
 
     def figures(self) -> StoreFigures:
@@ -356,7 +370,8 @@ class Store(Protocol):
     ) -> list[StoredCommit]:
         """Commits to be folded, in turn of their robots, with their diffs: at most `limit`, and one or within the size.
 
-        First the oldest of each robot, then the second of each; none whose number is in `skip`.
+        First the oldest of each robot, then the second of each; none whose number is in `skip`. Folded ones whose
+        retract is under way (`StoredCommit.due_from`) are among them.
         """
         ...
 
@@ -371,7 +386,8 @@ class Store(Protocol):
     def forget_evidence(self, row: MapRow, *, before_s: float, limit: int) -> int:
         """Drop the evidence and the meta of up to `limit` commits folded, and last pushed, before an age; their count.
 
-        Not of those that a pending commit retracts. Cells note the newest entry that this concerns (`gone_seq`).
+        Not of those that a pending commit retracts, or one whose retract is under way. Cells note the newest entry that
+        this concerns (`gone_seq`).
         """
         ...
 
@@ -380,7 +396,7 @@ class Store(Protocol):
         ...
 
     def fold(self, row: MapRow, fold: Fold) -> bool:
-        """Write a fold if the head is still its base; False (and nothing written) otherwise."""
+        """Write a fold if head and retracts are still where it begins; False (and nothing written) otherwise."""
         ...
 
     def snapshot(self, row: MapRow) -> AbstractContextManager[Snapshot]:

@@ -74,6 +74,30 @@ class StoredCommit:
     gone: bool = False
     """True if its evidence and its meta were dropped."""
     signatures: str | None = None
+    due_from: int | None = None
+    """Index in `retracts` of the first commit still to be taken out, while the retract is under way; None otherwise."""
+
+
+class NamedCommit(NamedTuple):
+    """State of a commit that another one names, without its evidence; of one not folded as if it were unknown."""
+
+    id: CommitId
+    is_folded: bool = False
+    is_gone: bool = False
+    """True if its evidence was dropped."""
+    is_retracted: bool = False
+    """True if a retract of it has taken effect, or waits for it to come."""
+    cells: int = 0
+    bricks: int = 0
+    """Count of the bricks that it touches; one for each byte where that was not counted yet."""
+
+
+class CellState(NamedTuple):
+    """State of a stored cell, without its body."""
+
+    key: CellKey
+    lm: int
+    digest: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +147,17 @@ class Entry:
     chain: bytes
 
 
+class RetractStep(NamedTuple):
+    """Progress of a retract whose commits are taken out in several folds: `StoredCommit.due_from` before and after."""
+
+    commit: int
+    """Number of the retracting commit in the store."""
+    before: int | None
+    """None: the commit itself is folded now."""
+    after: int | None
+    """None: this was the last part."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fold:
     """Changes of one fold, made from the state at `base`."""
@@ -136,6 +171,8 @@ class Fold:
     """Ids whose retract took or will take effect; each once, for ever."""
     damaged: tuple[tuple[int, str], ...] = ()
     """Numbers of commits to set aside, and why: pushed again, they are pending again."""
+    steps: tuple[RetractStep, ...] = ()
+    """Progress of retracts that do not end with the fold in which they began."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

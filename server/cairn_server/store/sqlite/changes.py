@@ -65,9 +65,13 @@ def next_number(connection: apsw.Connection, row: MapRow, author: tuple[str, str
 
 
 def write_fold(connection: apsw.Connection, row: MapRow, fold: Fold, *, age_s: float) -> bool:
-    """Cells, entries and head at an age of the store, if the head is still the fold's base."""
+    """Cells, entries and head at an age of the store, if head and retracts are still where the fold begins."""
     head = first(connection, "SELECT seq, chain FROM map WHERE number = ?", (row.number,))
     if head != (fold.base.seq, fold.base.chain):
+        return False
+    # A part in which no commit was there to be taken out leaves the head where it is.
+    query = "SELECT due_from FROM commits WHERE number = ?"
+    if any(first(connection, query, (step.commit,)) != step.before for step in fold.steps):
         return False
     connection.execute(
         "UPDATE map SET seq = ?, chain = ?, vector = ? WHERE number = ?",
@@ -95,6 +99,9 @@ def write_fold(connection: apsw.Connection, row: MapRow, fold: Fold, *, age_s: f
     )
     connection.executemany(
         "UPDATE commits SET damaged = ? WHERE number = ?", [(why, number) for number, why in fold.damaged]
+    )
+    connection.executemany(
+        "UPDATE commits SET due_from = ? WHERE number = ?", [(step.after, step.commit) for step in fold.steps]
     )
     _write_cells(connection, row, fold)
     return True

@@ -8,6 +8,7 @@ from cairn_map.commits.ids import Author, CommitId
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.sqlite.readers import Readers
+from cairn_server.store.sqlite.schema import WAITING
 from cairn_server.store.sqlite.snapshot import SqliteSnapshot, ids_from_text
 from cairn_server.store.sqlite.writer import Values, first, rows
 from cairn_server.store.store_rows import MapRow, StoredCommit
@@ -28,12 +29,13 @@ class SqliteReads:
     ) -> list[StoredCommit]:
         """Commits to be folded, in turn of their robots, with their diffs: at most `limit`, and one or within the size.
 
-        First the oldest of each robot, then the second of each: 5 ms where 5000 wait.
+        First the oldest of each robot, then the second of each: 5 ms where 5000 wait. Folded ones whose retract is
+        under way are among them.
         """
-        skipped = " AND number NOT IN (SELECT value FROM json_each(?))" if skip else ""
+        skipped = " AND number NOT IN (SELECT value FROM json_each(?3))" if skip else ""
         turn = "ROW_NUMBER() OVER (PARTITION BY robot ORDER BY number)"
-        clause = f"map = ? AND folded_seq IS NULL AND damaged IS NULL{skipped} ORDER BY {turn}, number LIMIT ?"
-        values = (row.number, json.dumps(sorted(skip)), limit) if skip else (row.number, limit)
+        clause = f"number IN {WAITING}{skipped} ORDER BY {turn}, number LIMIT ?2"
+        values = (row.number, limit, json.dumps(sorted(skip))) if skip else (row.number, limit)
         return self._commits(clause, values, size_bytes_max=size_bytes_max)
 
     def commit(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
@@ -79,12 +81,14 @@ class SqliteReads:
 
     def _commits(self, clause: str, values: Values, *, size_bytes_max: int) -> list[StoredCommit]:
         """Commits in the order asked for, as long as their bytes stay within the size; the first in any case."""
-        columns = "number, robot, incarnation, n, sha, meta, retracts, gone, size_bytes, signatures"
+        columns = "number, robot, incarnation, n, sha, meta, retracts, gone, due_from, size_bytes, signatures"
         found: list[StoredCommit] = []
         total_bytes = 0
         with self._readers.transaction() as reader:
             query = f"SELECT {columns} FROM commits WHERE {clause}"  # noqa: S608 - our own clause
-            for number, *author, n, sha, text, retracts, gone, size_bytes, signed in reader.execute(query, values):
+            for number, *author, n, sha, text, retracts, gone, due_from, size_bytes, signed in reader.execute(
+                query, values
+            ):
                 total_bytes += size_bytes
                 if found and total_bytes > size_bytes_max:
                     break
@@ -99,6 +103,7 @@ class SqliteReads:
                         diff={CellKey(cell): body or b"" for cell, body in diff},
                         gone=bool(gone),
                         signatures=signed,
+                        due_from=due_from,
                     )
                 )
         return found

@@ -77,6 +77,9 @@ def is_retracted(connection: apsw.Connection, row: MapRow, commit: CommitId) -> 
 
 
 def _pinned(connection: apsw.Connection, row: MapRow) -> set[str]:
-    """Ids that commits name which are not folded yet."""
-    query = "SELECT retracts FROM commits WHERE map = ? AND folded_seq IS NULL AND retracts <> ''"
+    """Ids that commits name which are not folded yet, or whose retract is under way."""
+    query = (
+        "SELECT retracts FROM commits WHERE map = ?1 AND folded_seq IS NULL AND retracts <> ''"
+        " UNION ALL SELECT retracts FROM commits WHERE map = ?1 AND due_from IS NOT NULL"
+    )
     return {name for (text,) in rows(connection, query, (row.number,)) for name in text.split()}

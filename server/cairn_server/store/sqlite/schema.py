@@ -8,6 +8,11 @@ import apsw
 
 from cairn_map.errors import BadInputError
 
+WAITING = (
+    "(SELECT number FROM commits WHERE map = ?1 AND folded_seq IS NULL AND damaged IS NULL"
+    " UNION ALL SELECT number FROM commits WHERE map = ?1 AND due_from IS NOT NULL)"
+)
+"""SQL of the numbers of a map's commits that folding has still to do with, along the indices of both."""
 IS_MEASURED = "folded_seq IS NOT NULL AND unfolded_seq IS NULL AND cells > 0 AND captured_last_s <= received_s + 600"
 """SQL of the commits in the map that say credibly when they were captured; seconds of `CAPTURED_AHEAD_MAX_S`."""
 
@@ -249,7 +254,27 @@ CAPTURED = f"""
 CREATE INDEX commits_captured ON commits (map, captured_last_s) WHERE {IS_MEASURED};
 """
 
-STEPS = (FIRST, STAMPS, ACCESS, BRANCH_STATUS, RECEIVED, SIGNED, HOTTEST, AGES, SHARES, KEYS, ENDED, BRICKS, CAPTURED)
+DUE = """
+ALTER TABLE commits ADD COLUMN due_from INTEGER;    -- of a folded retract: first name still to be taken out
+CREATE INDEX commits_due ON commits (map, number) WHERE due_from IS NOT NULL;
+"""
+
+STEPS = (
+    FIRST,
+    STAMPS,
+    ACCESS,
+    BRANCH_STATUS,
+    RECEIVED,
+    SIGNED,
+    HOTTEST,
+    AGES,
+    SHARES,
+    KEYS,
+    ENDED,
+    BRICKS,
+    CAPTURED,
+    DUE,
+)
 
 
 def ensure_schema(connection: apsw.Connection) -> None:

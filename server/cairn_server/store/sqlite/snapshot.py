@@ -1,7 +1,7 @@
 """Reading one state of a map from SQLite, inside one read transaction."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -16,7 +16,16 @@ from cairn_map.wire.messages import LogEntry
 from cairn_server.store.sqlite.failures import damaged_pages
 from cairn_server.store.sqlite.schema import IS_MEASURED
 from cairn_server.store.sqlite.writer import first, rows
-from cairn_server.store.store_rows import CellRow, ChainedEntry, Contribution, Head, Selection, Totals
+from cairn_server.store.store_rows import (
+    CellRow,
+    CellState,
+    ChainedEntry,
+    Contribution,
+    Head,
+    NamedCommit,
+    Selection,
+    Totals,
+)
 
 CELL_COLUMNS = "cell, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k"
 PARENT, SEEN, PLACE = (
@@ -91,6 +100,40 @@ class SqliteSnapshot:
             Contribution(seq, kind, CommitId(Author(robot, incarnation), n), size_bytes)
             for seq, kind, robot, incarnation, n, size_bytes in reversed(found)
         ]
+
+    def cell_states(self, keys: Collection[CellKey]) -> list[CellState]:
+        """Those of these cells that are stored, without their bodies, by rising number."""
+        query = "SELECT cell, lm, digest FROM cell WHERE map = ? AND cell IN (SELECT value FROM json_each(?))"
+        found = rows(self._connection, f"{query} ORDER BY cell", (self._map, json.dumps(sorted(keys))))
+        return [CellState(CellKey(cell), lm, digest) for cell, lm, digest in found]
+
+    def named(self, commits: Sequence[CommitId]) -> list[NamedCommit]:
+        """State of each of these commits, folded or not, in the same order; no evidence is read."""
+        query = (
+            "SELECT 1, gone, cells, coalesce(nullif(bricks, 0), size_bytes) FROM commits"
+            " WHERE map = ? AND robot = ? AND incarnation = ? AND n = ? AND folded_seq IS NOT NULL"
+        )
+        is_out = "SELECT 1 FROM retracted WHERE map = ? AND id = ?"
+        found: list[NamedCommit] = []
+        for commit in commits:
+            known = first(self._connection, query, (self._map, *commit.author, commit.n))
+            is_folded, is_gone, cells, bricks = known or (0, 0, 0, 0)
+            is_retracted = first(self._connection, is_out, (self._map, str(commit))) is not None
+            found.append(NamedCommit(commit, bool(is_folded), bool(is_gone), is_retracted, cells, bricks))
+        return found
+
+    def touched_cells(self, commits: Iterable[CommitId]) -> frozenset[CellKey]:
+        """Cells in which these commits have evidence that is kept; none of it is read."""
+        # The index over commit and cell answers: rows, which have the bodies, are never looked at.
+        query = (
+            "SELECT cell FROM diff WHERE commit_number ="
+            " (SELECT number FROM commits WHERE map = ? AND robot = ? AND incarnation = ? AND n = ?)"
+        )
+        return frozenset(
+            CellKey(cell)
+            for commit in commits
+            for (cell,) in rows(self._connection, query, (self._map, *commit.author, commit.n))
+        )
 
     def diff(self, commit: CommitId, key: CellKey) -> bytes | None:
         """The bytes of a commit's evidence in a cell; None if they are not kept any more."""

@@ -29,7 +29,7 @@ from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.reads import SqliteReads
 from cairn_server.store.sqlite.retention import forget_evidence
 from cairn_server.store.sqlite.robot_keys import SqliteAdmittedKeys, admit_registration
-from cairn_server.store.sqlite.schema import ensure_schema
+from cairn_server.store.sqlite.schema import WAITING, ensure_schema
 from cairn_server.store.sqlite.shares import SqliteShares
 from cairn_server.store.sqlite.tokens import (
     SqliteAuditLog,
@@ -305,12 +305,12 @@ class SqliteHealth:
         self._age = age
 
     def backlogs(self) -> list[Backlog]:
-        """Commits of every map that are not folded yet."""
-        # Both go along the index of what is pending: a folded log of any length costs nothing.
+        """Commits of every map that are not folded yet, or whose retract is under way."""
+        # Both go along the indices of what waits: a folded log of any length costs nothing.
+        waiting = WAITING.replace("?1", "map.number")
         query = (
-            "SELECT name, (SELECT count(*) FROM commits WHERE map = map.number AND folded_seq IS NULL"
-            " AND damaged IS NULL), (SELECT received_age_s FROM commits WHERE map = map.number AND folded_seq IS NULL"
-            " AND damaged IS NULL ORDER BY number LIMIT 1) FROM map ORDER BY map.number LIMIT ?"
+            f"SELECT name, (SELECT count(*) FROM {waiting}), (SELECT received_age_s FROM commits"  # noqa: S608 - our own clause
+            f" WHERE number = (SELECT min(number) FROM {waiting})) FROM map ORDER BY map.number LIMIT ?"
         )
         with self._readers.reading() as reader:
             found = rows(reader, query, (MAPS_MAX,))
