@@ -14,6 +14,10 @@ from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry, centres_of_voxels, voxels_in_cell
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 
+THERMAL_SIGMA_K = 1.0
+"""Standard uncertainty of a thermal camera itself, kelvin, which no number of scans lowers: makers of uncooled
+radiometric cameras state 2 K at best, two standard deviations, and a map does not know its cameras."""
+
 
 @dataclass(frozen=True, slots=True)
 class Reading:
@@ -23,7 +27,12 @@ class Reading:
     mean: Floats
     weight: npt.NDArray[np.int64]
     spread: Floats | None = None
-    """(N,) standard deviation of the samples, temperature only."""
+    """(N,) standard deviation of the samples, temperature only; 0 of a single sample."""
+
+    @property
+    def sigma(self) -> Floats | None:
+        """(N,) standard uncertainty of one sample, temperature only: the samples' spread and the camera's own."""
+        return None if self.spread is None else np.asarray(np.hypot(self.spread, THERMAL_SIGMA_K))
 
     def rows(self, rows: npt.NDArray[np.int64]) -> "Reading":
         """Reading of the voxels in these rows alone, in this order."""

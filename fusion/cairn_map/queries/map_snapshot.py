@@ -201,6 +201,10 @@ class MapSnapshot:
     def hottest(self, n: int, *, min_probability: float = 0.5, box_m: Box | None = None) -> Voxels:
         """The n known voxels with the highest mean temperature, hottest first, fewer if there are no more.
 
+        Voxels that were hit in two scans or that touch a surface come first; then the others, each of which may be
+        a ghost that one beam left behind an edge. `counts`, `probability` and the reading's `sigma` say how sure
+        each is.
+
         Args:
             n: number of voxels.
             min_probability: only voxels that are occupied with at least this probability.

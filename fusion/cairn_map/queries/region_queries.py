@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
@@ -16,12 +17,19 @@ from cairn_map.queries import layer_kernels, point_queries
 from cairn_map.queries import layer_kernels as kernels
 from cairn_map.queries.frozen_map import Box, FrozenMap
 from cairn_map.queries.occupancy_kernels import list_bits_into
+from cairn_map.queries.occupancy_states import State
 from cairn_map.queries.point_queries import first_of_kind
 
 PIXELS_MAX = 1 << 26
 """Pixels of an image, at most: cells may lie anywhere, and the box of all of them may be as large as a country."""
 NO_TOP = np.iinfo(np.int64).min
 """Height of a column without an occupied voxel."""
+AROUND = np.array([step for step in product((-1, 0, 1), repeat=3) if any(step)])
+"""(26, 3) steps from a voxel to its neighbours."""
+SURFACE_NEIGHBOURS = 3
+"""Occupied neighbours of a voxel on a surface, at least: a plane gives 8, its corner 3, a streak of ghosts 2."""
+CONFIRMED_AT_ONCE = 1024
+"""Voxels whose neighbours are looked up at the same time."""
 Values = npt.NDArray[np.number]
 
 
@@ -126,28 +134,59 @@ def voxels_in_box(frozen: FrozenMap, box_m: Box | None, *, occupied_only: bool) 
 
 
 def hottest(frozen: FrozenMap, n: int, *, min_probability: float, box_m: Box | None) -> Voxels:
-    """The n known voxels of the highest mean temperature, hottest first."""
+    """The n known voxels of the highest mean temperature: first those that are confirmed, each group hottest first."""
     if n < 0 or not 0 <= min_probability <= 1:
         raise BadInputError("bad_range", f"n must be 0 or more, a probability 0 to 1; got {n}, {min_probability}")
     channel = first_of_kind(frozen.geometry, ChannelKind.TEMPERATURE)
     planes = frozen.geometry.planes_of(channel.name)
     low, high = frozen.voxels_of_box(box_m)
-    parts = []
+    parts, confirmed = [], [np.empty(0, np.bool_)]
     for key, cell in zip(frozen.keys, frozen.cells, strict=True):
+        # Rows of samples that are asked for, hottest first.
         evidence = cell.packed()
-        sums = evidence.samples[:, planes]
+        sums, counts = evidence.samples[:, planes], evidence.counts[evidence.sampled]
         numbers = voxels_in_cell(evidence.voxels[evidence.sampled], key, frozen.geometry)
         # An unknown voxel's probability is NaN, and NaN is not above any number.
-        likely = frozen.model.probability(evidence.counts[evidence.sampled]) >= min_probability
-        keep = (sums[:, -1] > 0) & likely & _are_within(numbers, low, high)
-        mean = np.full(len(sums), -np.inf)
-        mean[keep] = sums[keep, 0] / sums[keep, -1]
-        top = np.argsort(-mean, kind="stable")[: min(n, int(keep.sum()))]
-        chosen = np.zeros(len(evidence), np.bool_)
-        chosen[evidence.sampled[top]] = True
+        likely = frozen.model.probability(counts) >= min_probability
+        (rows,) = np.nonzero((sums[:, -1] > 0) & likely & _are_within(numbers, low, high))
+        rows = rows[np.argsort(-sums[rows, 0] / sums[rows, -1], kind="stable")]
+        # The first n of both groups, in the order of the cell's voxels.
+        sure, doubtful = _first_confirmed(frozen, numbers[rows], counts[rows, 0], n)
+        is_sure, chosen = np.zeros((2, len(evidence)), np.bool_)
+        is_sure[evidence.sampled[rows[sure]]] = True
+        chosen[evidence.sampled[rows[np.concatenate([sure, doubtful])]]] = True
         parts.append(_voxels(frozen, key, _rows(evidence, chosen), occupied_only=False))
+        confirmed.append(is_sure[chosen])
     voxels = joined_voxels(parts or [_voxels(frozen, CellKey(0), empty_evidence(frozen.geometry), occupied_only=False)])
-    return voxels.rows(np.argsort(-voxels.readings[channel.name].mean, kind="stable")[:n])
+    kelvin = voxels.readings[channel.name].mean
+    return voxels.rows(np.lexsort((-kelvin, ~np.concatenate(confirmed)))[:n])
+
+
+def _first_confirmed(frozen: FrozenMap, numbers: Ints, hits: Values, n: int) -> tuple[Ints, Ints]:
+    """Rows of the first n voxels that are confirmed, and of the first n that are not, among at least as many rows.
+
+    A voxel is confirmed that was hit in two scans, or that touches a surface. A beam that ends on an edge leaves a
+    ghost behind it: one hit, and no surface around.
+    """
+    sure, doubtful = np.empty(0, np.int64), np.empty(0, np.int64)
+    for start in range(0, len(numbers), CONFIRMED_AT_ONCE):
+        if len(sure) >= n:
+            break
+        some = numbers[start : start + CONFIRMED_AT_ONCE]
+        is_sure = hits[start : start + CONFIRMED_AT_ONCE] > 1
+        is_sure[~is_sure] = _touch_surface(frozen, some[~is_sure])
+        sure = np.concatenate([sure, start + np.nonzero(is_sure)[0]])
+        doubtful = np.concatenate([doubtful, start + np.nonzero(~is_sure)[0]])[:n]
+    return sure[:n], doubtful
+
+
+def _touch_surface(frozen: FrozenMap, numbers: Ints) -> npt.NDArray[np.bool_]:
+    """(N,) True for voxels with at least three occupied ones among their 26 neighbours."""
+    neighbours = (numbers[:, None] + AROUND).reshape(-1, 3)
+    reach_m = frozen.reach_m - frozen.geometry.voxel_edge_m
+    points = np.clip(centres_of_voxels(neighbours, frozen.geometry), -reach_m, reach_m)
+    occupied = point_queries.states_at(frozen, points) == State.OCCUPIED
+    return np.asarray(occupied.reshape(-1, len(AROUND)).sum(axis=1) >= SURFACE_NEIGHBOURS)
 
 
 def _voxels(frozen: FrozenMap, key: CellKey, evidence: Evidence, *, occupied_only: bool) -> Voxels:

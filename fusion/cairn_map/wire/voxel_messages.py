@@ -25,7 +25,7 @@ class ChannelReading(_Model):
     mean: list[float]
     """Mean in the unit, one number or three; empty without weight."""
     sigma: float | None
-    """Standard deviation of the samples; None for all kinds but temperatures."""
+    """Standard uncertainty of one sample, the samples' spread and the camera's own; None but for temperatures."""
 
 
 class VoxelCommit(_Model):

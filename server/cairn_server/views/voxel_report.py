@@ -91,7 +91,7 @@ def _reading(reading: Reading, channel: Channel) -> ChannelReading:
         unit=channel.unit,
         weight=weight,
         mean=[float(value) for value in reading.mean.ravel()] if weight else [],
-        sigma=float(reading.spread[0]) if weight and reading.spread is not None else None,
+        sigma=float(reading.sigma[0]) if weight and reading.sigma is not None else None,
     )
 
 

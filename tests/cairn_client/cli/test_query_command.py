@@ -58,15 +58,18 @@ def test_points_tell_state_probability_and_readings(folder: Path, capsys: pytest
     assert hot["probability"] == pytest.approx(0.845, abs=0.001)
     assert hot["readings"]["temperature"]["mean"] == pytest.approx(HOT_K, abs=0.1)
     assert hot["readings"]["temperature"]["unit"] == "K"
+    assert [hot["hits"], hot["misses"]] == [2, 0]
     assert unknown == {
-        "point_m": [-0.3, 0, 0], "state": "unknown", "probability": None, "readings": {"temperature": None}
+        "point_m": [-0.3, 0, 0], "state": "unknown", "probability": None, "hits": 0, "misses": 0,
+        "readings": {"temperature": None},
     }  # fmt: skip
     head, *lines = asked(capsys, folder, "points", *points).splitlines()
     assert "x m" in head
     assert "temperature" in head
     assert "occupied" in lines[1]
-    assert "56.9 C +- 0.0" in lines[1] or "56.8 C" in lines[1]
-    assert lines[2].split() == ["-0.300", "0.000", "0.000", "unknown", "-", "-"]
+    assert lines[1].split()[3:7] == ["occupied", "0.84", "2", "0"]
+    assert "56.9 C +- 1.0" in lines[1] or "56.8 C +- 1.0" in lines[1]
+    assert lines[2].split() == ["-0.300", "0.000", "0.000", "unknown", "-", "-", "-", "-"]
 
 
 def test_a_ray_tells_how_far_it_comes(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -91,7 +94,13 @@ def test_the_hottest_voxels_in_kelvin_for_programs_and_celsius_for_people(
     (found,) = answered(capsys, folder, "hottest")
     assert found["point_m"] == pytest.approx([0.075] * 3)
     assert found["mean"] == pytest.approx(HOT_K, abs=0.1)
-    assert " C " in asked(capsys, folder, "hottest")
+    assert [found["hits"], found["misses"], found["weight"]] == [2, 0, 2]
+    assert found["probability"] == pytest.approx(0.845, abs=0.001)
+    assert found["sigma"] == pytest.approx(1.0, abs=0.01)
+    head, line = asked(capsys, folder, "hottest").splitlines()
+    assert head.split() == ["x", "m", "y", "m", "z", "m", "probability", "hits", "misses", "temperature"]
+    assert line.split()[3:6] == ["0.84", "2", "0"]
+    assert line.endswith(" C +- 1.0")
     elsewhere = asked(capsys, folder, "hottest", "--box", "-5,-5,-5,0,0,0")
     assert elsewhere == "no occupied voxel has a temperature\n"
 

@@ -1,6 +1,7 @@
 """Layers, height maps, the frontier, the hottest and boxes of voxels, against the twins."""
 
 import math
+from itertools import product
 
 import numpy as np
 import pytest
@@ -9,10 +10,11 @@ from tests.fixtures.map.worlds import random_map, snapshot_with, world_of
 from tests.naive import queries as naive
 
 from cairn_map.errors import BadInputError
+from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
-from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.grid import CellKey, Geometry, split_voxels
 from cairn_map.queries import point_queries, region_queries
-from cairn_map.queries.map_snapshot import snapshot_of
+from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
 
 DEEPER = Geometry(voxel_edge_um=50_000, depth=4, channels=())
 BOX_M = [[-0.31, -0.2, -math.inf], [0.26, math.inf, 0.3]]
@@ -110,13 +112,58 @@ def test_the_hottest_are_those_of_the_whole_map_sorted(n: int, min_probability: 
     snapshot = snapshot_of(random_map(1, SMALL))
     every = snapshot.voxels_in()
     kelvin = every.readings["temperature"].mean
-    known = ~np.isnan(kelvin) & (every.probability >= min_probability)
-    expected = np.sort(kelvin[known])[::-1][:n]
+    occupied = {tuple(voxel) for voxel in snapshot.occupied_in().numbers.tolist()}
+    groups: tuple[list[float], list[float]] = ([], [])
+    for row in np.nonzero(~np.isnan(kelvin) & (every.probability >= min_probability))[0].tolist():
+        around = [tuple(every.numbers[row] + step) for step in product((-1, 0, 1), repeat=3) if any(step)]
+        is_sure = every.counts[row, 0] > 1 or sum(voxel in occupied for voxel in around) >= 3
+        groups[0 if is_sure else 1].append(kelvin[row])
+    assert groups[0]
+    assert groups[1] or min_probability > 0.7  # that of one hit
+    expected = [kelvin for group in groups for kelvin in sorted(group, reverse=True)][:n]
     found = snapshot.hottest(n, min_probability=min_probability)
     np.testing.assert_array_equal(found.readings["temperature"].mean, expected)
     assert (found.probability >= min_probability).all()
     np.testing.assert_array_equal(snapshot.temperature_at(found.centres_m).mean, expected)
     np.testing.assert_array_equal(found.readings["colour"].weight, snapshot.colour_at(found.centres_m).weight)
+
+
+def with_kelvin(
+    counts: dict[tuple[int, int, int], tuple[int, int]], hot: dict[tuple[int, int, int], float]
+) -> MapSnapshot:
+    """A map of voxels of which some have a temperature, one sample each."""
+    whole = EvidenceMap(SMALL)
+    planes = SMALL.planes_of("temperature")
+    channel = SMALL.channel("temperature")
+    assert channel is not None
+    for voxel, seen in counts.items():
+        samples = np.zeros((1, SMALL.plane_count), np.int64)
+        if voxel in hot:
+            value = int(channel.quantise(np.array([hot[voxel]]))[0])
+            samples[0, planes] = (value, value**2, 1)
+        cells, places = split_voxels(np.array([voxel]), SMALL)
+        whole.merge({CellKey(int(cells[0])): packed_evidence(places, np.array([seen]), samples, SMALL)})
+    return snapshot_of(whole)
+
+
+def test_a_ghost_behind_a_surface_is_not_the_hottest() -> None:
+    table = {(x, y, 8): (1, 0) for x in range(-3, 4) for y in range(-3, 4)}
+    ghost, streak = (0, 0, 3), {(20, 0, z): (1, 0) for z in range(3)}
+    snapshot = with_kelvin(
+        {**table, ghost: (1, 0), **streak, (0, 9, 0): (3, 1)},
+        {(1, 1, 8): 320.0, (3, 3, 8): 315.0, ghost: 360.0, (20, 0, 1): 350.0, (0, 9, 0): 310.0},
+    )
+    found = snapshot.hottest(5)
+    assert found.numbers.tolist() == [[1, 1, 8], [3, 3, 8], [0, 9, 0], [0, 0, 3], [20, 0, 1]]
+    assert snapshot.hottest(1).numbers.tolist() == [[1, 1, 8]]
+
+
+def test_what_was_measured_once_is_as_uncertain_as_the_camera() -> None:
+    reading = with_kelvin({(0, 0, 0): (1, 0)}, {(0, 0, 0): 320.0}).hottest(1).readings["temperature"]
+    assert reading.spread is not None
+    assert reading.sigma is not None
+    assert reading.spread[0] == pytest.approx(0, abs=1e-4)
+    assert reading.sigma[0] == pytest.approx(1.0, abs=1e-4)
 
 
 def test_the_hottest_of_a_box_lie_in_it() -> None:

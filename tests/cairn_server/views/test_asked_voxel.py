@@ -8,7 +8,7 @@ from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed
 from cairn_map.codec.cell_code import decode_cell
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import cell_of_key, voxels_in_cell
-from cairn_map.evidence.voxels import voxels_of_evidence
+from cairn_map.evidence.voxels import THERMAL_SIGMA_K, voxels_of_evidence
 from cairn_server.store.store_rows import MapRow
 from cairn_server.views.voxel_report import ENTRIES_MAX
 
@@ -42,7 +42,7 @@ def test_every_voxel_of_a_cell_is_told_exactly(live: Live) -> None:
             assert channel["weight"] == reading.weight[n]
             assert channel["mean"] == (np.ravel(reading.mean[n]).tolist() if channel["weight"] else [])
             if channel["weight"] and reading.spread is not None:
-                assert channel["sigma"] == reading.spread[n]
+                assert channel["sigma"] == np.hypot(reading.spread[n], THERMAL_SIGMA_K)
 
 
 def test_those_who_saw_it_are_told_and_what_was_taken_out_is_not(live: Live) -> None:

@@ -2,12 +2,12 @@
 
     $ cairn map export http://127.0.0.1:8750/maps/lab --cells lab/
     $ cairn map query lab/ points 1.02,2.5,0.4 -0.3,0,1
-         x m     y m     z m  state     probability  colour        intensity  temperature
-       1.020   2.500   0.400  occupied         0.97  (180 92 40)      1210.0  57.3 C +- 0.4
-      -0.300   0.000   1.000  unknown             -  -                     -  -
+         x m     y m     z m  state     probability  hits misses  colour          intensity       temperature
+       1.020   2.500   0.400  occupied         0.97     9      0  (180 92 40)     1210            57.3 C +- 1.1
+      -0.300   0.000   1.000  unknown             -     -      -  -               -               -
     $ cairn map query lab/ ray 1,2,0.4 0,1,0 --range 10      # the first obstacle, and its distance
     $ cairn map query lab/ nearest 1,2,0.4 --radius 3         # the nearest occupied voxel (--unknown: unknown)
-    $ cairn map query lab/ hottest --count 5                  # where it is hot
+    $ cairn map query lab/ hottest --count 5                  # where it is hot, hit twice or on a surface first
     $ cairn map query lab/ slice 0.5                          # a horizontal layer: # occupied, . free
     $ cairn map query lab/ height --box=-5,-5,0,5,5,2         # the highest surface of each column, metres
 
@@ -38,6 +38,8 @@ from cairn_map.queries.region_queries import MapImage
 ZERO_CELSIUS_K = 273.15
 WIDTH = 100
 """Widest slice on a terminal, in characters."""
+SURENESS = f"{'probability':>12}{'hits':>6}{'misses':>7}"
+"""Heads of the columns that say how sure a voxel is."""
 SIGNS = {State.UNKNOWN: " ", State.FREE: ".", State.OCCUPIED: "#"}
 Answer = Callable[[MapSnapshot, argparse.Namespace], tuple[Any, list[str]]]
 """Answer to a question, as JSON and as lines for people."""
@@ -90,17 +92,19 @@ def _run(args: argparse.Namespace) -> int:
 def _points(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
     points = np.array(args.points)
     states, probability = snapshot.state_at(points), snapshot.probability_at(points)
+    counts = snapshot.counts_at(points).tolist()
     readings = {c.name: snapshot.reading_at(points, c.name) for c in snapshot.geometry.channels}
     widths = {name: max(14, len(name)) for name in readings}
-    lines = [f"{'x m':>8}{'y m':>8}{'z m':>8}  {'state':<9}{'probability':>12}" + _columns(widths, widths.keys())]
+    lines = [f"{'x m':>8}{'y m':>8}{'z m':>8}  {'state':<9}{SURENESS}" + _columns(widths, widths.keys())]
     found = []
     for n, (x, y, z) in enumerate(args.points):
         state, p = State(int(states[n])).name.lower(), _or_none(probability[n])
         shown = {name: _shown(reading, n) for name, reading in readings.items()}
-        text = f"{x:8.3f}{y:8.3f}{z:8.3f}  {state:<9}{'-' if p is None else f'{p:.2f}':>12}"
+        text = f"{x:8.3f}{y:8.3f}{z:8.3f}  {state:<9}{_sureness(p, *counts[n])}"
         lines.append(text + _columns(widths, shown.values()))
         values = {name: _value(reading, n) for name, reading in readings.items()}
-        found.append({"point_m": [x, y, z], "state": state, "probability": p, "readings": values})
+        sure = {"probability": p, "hits": counts[n][0], "misses": counts[n][1]}
+        found.append({"point_m": [x, y, z], "state": state, **sure, "readings": values})
     return found, lines
 
 
@@ -128,11 +132,13 @@ def _nearest(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list
 def _hottest(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
     voxels = snapshot.hottest(args.count, box_m=_corners(args))
     reading = voxels.of_kind(ChannelKind.TEMPERATURE)
-    found, lines = [], [f"{'x m':>8}{'y m':>8}{'z m':>8}  temperature"]
+    found, lines = [], [f"{'x m':>8}{'y m':>8}{'z m':>8}  {SURENESS}  temperature"]
     for n, (x, y, z) in enumerate(voxels.centres_m.tolist()):
         assert reading is not None  # noqa: S101 - or the snapshot had refused
-        found.append({"point_m": [x, y, z], **(_value(reading, n) or {})})
-        lines.append(f"{x:8.3f}{y:8.3f}{z:8.3f}  {_shown(reading, n)}")
+        p, (hits, misses) = float(voxels.probability[n]), voxels.counts[n].tolist()
+        sure = {"probability": p, "hits": hits, "misses": misses}
+        found.append({"point_m": [x, y, z], **sure, **(_value(reading, n) or {})})
+        lines.append(f"{x:8.3f}{y:8.3f}{z:8.3f}  {_sureness(p, hits, misses)}  {_shown(reading, n)}")
     return found, lines if found else ["no occupied voxel has a temperature"]
 
 
@@ -155,12 +161,21 @@ def _or_none(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
+def _sureness(p: float | None, hits: int, misses: int) -> str:
+    """Columns of probability and counts."""
+    if p is None:
+        return f"{'-':>12}{'-':>6}{'-':>7}"
+    return f"{p:12.2f}{hits:6}{misses:7}"
+
+
 def _value(reading: Reading, n: int) -> dict[str, Any] | None:
     """Reading of one voxel in a channel, with its unit; None if there is none."""
     if not reading.weight[n]:
         return None
     value = {"mean": reading.mean[n].tolist(), "unit": reading.channel.unit, "weight": int(reading.weight[n])}
-    return value | ({"spread": float(reading.spread[n])} if reading.spread is not None else {})
+    if reading.spread is None or reading.sigma is None:
+        return value
+    return value | {"spread": float(reading.spread[n]), "sigma": float(reading.sigma[n])}
 
 
 def _shown(reading: Reading, n: int) -> str:
@@ -169,8 +184,8 @@ def _shown(reading: Reading, n: int) -> str:
     mean = reading.mean[n]
     if reading.channel.kind is ChannelKind.COLOUR:
         return "({:.0f} {:.0f} {:.0f})".format(*mean)
-    if reading.channel.kind is ChannelKind.TEMPERATURE and reading.spread is not None:
-        return f"{mean - ZERO_CELSIUS_K:.1f} C +- {reading.spread[n]:.1f}"
+    if reading.channel.kind is ChannelKind.TEMPERATURE and reading.sigma is not None:
+        return f"{mean - ZERO_CELSIUS_K:.1f} C +- {reading.sigma[n]:.1f}"
     return f"{mean:.4g} {reading.channel.unit}"
 
 

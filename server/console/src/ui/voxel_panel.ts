@@ -99,7 +99,7 @@ function exact(answer: VoxelAnswer): HTMLElement {
     ...answer.channels.map(({ name, kind, unit, mean, sigma, weight }): [string, Node | string] => {
       if (!weight) return [name, "none measured"];
       if (kind === "colour") return [name, h("span", {}, swatch(mean), ` ${mean.map((value) => value.toFixed(1)).join(", ")} (${counted(weight, "sample", "samples")})`)];
-      const spread = sigma === null || weight < 2 ? "" : ` ± ${sigma.toFixed(2)} ${unit === "K" ? "°C" : unit}`;
+      const spread = sigma === null ? "" : ` ± ${sigma.toFixed(2)} ${unit === "K" ? "°C" : unit}`;
       const value = unit === "K" ? celsius(mean[0], 2) : `${mean[0].toFixed(2)} ${unit}`;
       return [name, `${value}${spread} (${counted(weight, "sample", "samples")})`];
     }),
