@@ -10,73 +10,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.fixtures.map.made import PLAIN, SMALL, random_evidence, surface_evidence
-from tests.naive.octomap import Voxel, read_tree, states_of
+from tests.fixtures.map.octomap_files import Cells, known_states, octomap_file
+from tests.naive.octomap import read_tree, states_of
 
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.evidence import Evidence, empty_evidence, packed_evidence
-from cairn_map.evidence.grid import CellKey, Geometry, cell_key
+from cairn_map.evidence.evidence import Evidence, packed_evidence
+from cairn_map.evidence.grid import Geometry, cell_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
-from cairn_map.evidence.voxels import voxels_of_evidence
 from cairn_map.files import octomap
 from cairn_map.files.export_request import ExportRequest
-from cairn_map.files.octomap import branch_of_cell, cells_at_border, tree_file, tree_of_cells
+from cairn_map.files.octomap import cells_at_border
 
 CELLS = [(0, 0, 0), (0, 0, 1), (1, 0, 0), (-1, -1, -1), (-1, 2, 0)]
 needs_octomap = pytest.mark.skipif(shutil.which("convert_octree") is None, reason="needs Debian's octomap-tools")
-Cells = dict[CellKey, Evidence]
-
-
-def octomap_file(
-    cells: Cells, geometry: Geometry, asked: ExportRequest, model: SensorModel | None = None
-) -> tuple[bytes, int]:
-    """A map as a file, and the number of leaves that its tree states."""
-    model = model or SensorModel()
-    roots, bodies = [], []
-    for key in sorted({*cells, *cells_at_border(geometry, model, asked)}):
-        found = branch_of_cell(key, cells.get(key, empty_evidence(geometry)), geometry, model, asked)
-        if found is not None:
-            roots.append(found[0])
-            bodies += [found[1]] if found[1] else []
-    nodes = tree_of_cells(roots, geometry, model, asked)
-    data = b"".join(tree_file(asked.format, nodes, bodies, geometry, "a map of the tests"))
-    return data, int(nodes["leaves"][0]) if len(nodes) else 0
-
-
-def known_states(
-    cells: Cells, geometry: Geometry, asked: ExportRequest, model: SensorModel | None = None
-) -> tuple[set[Voxel], set[Voxel]]:
-    """What the file should hold, said voxel by voxel."""
-    model = model or SensorModel()
-    side = 1 << (geometry.depth - asked.depth_in(geometry))
-    below: dict[Voxel, list[tuple[bool, float]]] = {}
-    for key, evidence in cells.items():
-        voxels = voxels_of_evidence(key, evidence, geometry, model, occupied_only=False)
-        rows = voxels.counts.any(axis=1)
-        occupied, p = model.occupied(voxels.counts)[rows].tolist(), voxels.probability[rows].tolist()
-        for number, *states in zip(voxels.numbers[rows].tolist(), occupied, p, strict=True):
-            below.setdefault(tuple(v // side for v in number), []).append((states[0], states[1]))
-    occupied_nodes, free_nodes = set[Voxel](), set[Voxel]()
-    for node, there in below.items():
-        if any(is_occupied for is_occupied, _ in there):
-            if round(max(p for _, p in there) * 255) >= asked.p * 255:
-                occupied_nodes.add(node)
-        elif len(there) == side**3:
-            free_nodes.add(node)
-    low, high = asked.bounds_m() + np.array([[-1e-7], [1e-7]])  # centres on the border are in the box
-    edge_m = geometry.voxel_edge_m * side
-    for nodes in (occupied_nodes, free_nodes):
-        nodes &= {node for node in nodes if all(low[n] <= (node[n] + 0.5) * edge_m <= high[n] for n in range(3))}
-    if asked.unknown is not None:
-        first, last = np.ceil(low / edge_m - 0.5).astype(int), np.floor(high / edge_m - 0.5).astype(int)
-        box = set(product(*(range(a, b + 1) for a, b in zip(first.tolist(), last.tolist(), strict=True))))
-        filled = box - occupied_nodes - free_nodes
-        (free_nodes if asked.unknown == "free" else occupied_nodes).update(filled)
-    return _voxels(occupied_nodes, side), _voxels(free_nodes, side)
-
-
-def _voxels(nodes: set[Voxel], side: int) -> set[Voxel]:
-    steps = list(product(range(side), repeat=3))
-    return {tuple(v * side + s for v, s in zip(node, step, strict=True)) for node in nodes for step in steps}
 
 
 def made_cells(geometry: Geometry, seed: int) -> Cells:
