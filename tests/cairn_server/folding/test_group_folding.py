@@ -11,6 +11,7 @@ from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 
 from cairn_map.commits.commit import Commit
+from cairn_server.folding import commit_work
 from cairn_server.folding import group_folding as module
 from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.damaged_cells import DamagedCells
@@ -93,6 +94,30 @@ def test_a_retract_of_what_is_in_the_damaged_cell_waits_and_one_of_what_waits_do
     assert any(text.startswith("operator.") for text in ids_pending(live, row))
     heal(live, row, whole)
     assert read(live.cells(row)) == sum_of([FIRST, elsewhere, pushed(3, 1)])
+
+
+def test_a_retract_under_way_waits_at_a_damaged_cell_and_goes_on_once_that_is_healed(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(commit_work, "PART_NAMES_MAX", 1)
+    row, whole = broken_map(live)
+    before, behind = pushed(1, 1), pushed(2, 1)
+    live.push(row, before)
+    live.push(row, behind)
+    live.folded(row)
+    assert live.retract(row, before, SECOND, behind).status_code == 201
+    until(lambda: taken_out(live, row) == [str(before.id)], "the first part is folded")
+    live.push(row, pushed(3, 1))
+    live.folded(row)
+    assert taken_out(live, row) == [str(before.id)]
+    heal(live, row, whole)
+    until(lambda: len(taken_out(live, row)) == 3, "the retract goes on")
+    assert read(live.cells(row)) == sum_of([FIRST, pushed(3, 1)])
+
+
+def taken_out(live: Live, row: MapRow) -> list[str]:
+    with live.service.store.snapshot(row) as snapshot:
+        return [entry.id for entry in snapshot.log(after_seq=0, limit=99) if entry.kind == "-"]
 
 
 @pytest.mark.parametrize("seed", range(4))
