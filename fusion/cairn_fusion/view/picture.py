@@ -1,4 +1,7 @@
-"""Picture of a map: the same occupied voxels three times, by colour, temperature and probability.
+"""Picture of a map: the same occupied voxels by colour, temperature and probability, as far as they were measured.
+
+Where no colour camera looked, the first view is by height. A view is as large as its panel lets it be; a scale that
+ends below the highest value has a mark at its end, with that value.
 
 Voxels are drawn as small cubes in a parallel view from above one corner, far ones first. Only faces that touch no
 other occupied voxel are drawn. A closed room shows nothing but its roof, unless the ceiling is cut off.
@@ -24,6 +27,8 @@ LEGEND_PX = 56
 MARGIN_PX = 16
 BACKGROUND = (24, 26, 30)
 TEXT = (230, 230, 230)
+FONT = (cv2.FONT_HERSHEY_SIMPLEX, 0.55, 1)
+"""Face, size and thickness of letters."""
 UNKNOWN = (96, 96, 96)
 """Colour of voxels that no camera of that spectrum saw: grey, never the cold end of a palette."""
 VIEW_YAW_RAD = np.radians(35.0)
@@ -46,10 +51,12 @@ class Panel:
     palette: int | None = None
     low: str = ""
     high: str = ""
+    beyond: str = ""
+    """Highest value, if the palette ends below it."""
 
 
 def write_map_picture(path: Path, voxels: Voxels, *, voxel_edge_m: float, ceiling_m: float | None = None) -> None:
-    """Write a PNG with three views of the occupied voxels.
+    """Write a PNG with views of the occupied voxels, one for each quantity that was measured.
 
     Args:
         path: of the PNG.
@@ -59,7 +66,7 @@ def write_map_picture(path: Path, voxels: Voxels, *, voxel_edge_m: float, ceilin
     """
     keep = _in_frame(voxels, ceiling_m)
     numbers = voxels.numbers[keep]
-    views = [_draw(panel, numbers, keep) for panel in _panels(voxels)]
+    views = [_draw(panel, numbers, keep) for panel in _panels(voxels, keep)]
     width = sum(view.shape[1] for view in views)
     footer = np.full((TITLE_PX, width, 3), BACKGROUND, np.uint8)
     note = f"{len(voxels)} occupied voxels of {voxel_edge_m * 100:g} cm"
@@ -80,25 +87,34 @@ def _in_frame(voxels: Voxels, ceiling_m: float | None) -> npt.NDArray[np.bool_]:
     return np.asarray(keep)
 
 
-def _panels(voxels: Voxels) -> list[Panel]:
-    panels = [Panel("colour", colours(voxels))]
-    thermal = voxels.of_kind(ChannelKind.TEMPERATURE)
-    celsius = thermal.mean - ZERO_CELSIUS_K if thermal is not None else np.full(len(voxels), np.nan)
-    panels.append(_scalar_panel("temperature (apparent)", celsius, cv2.COLORMAP_INFERNO, "{:.1f} deg C"))
-    panels.append(_scalar_panel("probability", voxels.probability, cv2.COLORMAP_CIVIDIS, "{:.2f}"))
+def _panels(voxels: Voxels, keep: npt.NDArray[np.bool_]) -> list[Panel]:
+    """Views of what was measured; scales are those of the voxels that are drawn."""
+    colour, thermal = voxels.of_kind(ChannelKind.COLOUR), voxels.of_kind(ChannelKind.TEMPERATURE)
+    panels = list[Panel]()
+    if colour is not None and (colour.weight[keep] > 0).any():
+        panels.append(Panel("colour", colours(voxels)))
+    else:
+        heights = voxels.centres_m[:, 2]
+        panels.append(_scalar_panel("height (no colour measured)", heights, keep, cv2.COLORMAP_VIRIDIS, "{:.2f} m"))
+    if thermal is not None and (thermal.weight[keep] > 0).any():
+        celsius = thermal.mean - ZERO_CELSIUS_K
+        panels.append(_scalar_panel("temperature (apparent)", celsius, keep, cv2.COLORMAP_INFERNO, "{:.1f} deg C"))
+    panels.append(_scalar_panel("probability", voxels.probability, keep, cv2.COLORMAP_CIVIDIS, "{:.2f}"))
     return panels
 
 
-def _scalar_panel(title: str, values: Floats, palette: int, form: str) -> Panel:
-    """Panel of values painted between their outer percentiles; grey where there is none."""
+def _scalar_panel(title: str, values: Floats, keep: npt.NDArray[np.bool_], palette: int, form: str) -> Panel:
+    """Panel of values painted between the outer percentiles of those that are drawn; grey where there is none."""
     known = np.isfinite(values)
     rgb = np.full((len(values), 3), UNKNOWN, np.uint8)
-    if not known.any():
-        return Panel(f"{title}: none measured", rgb)
-    low, high = np.percentile(values[known], PERCENTILES)
+    drawn = values[known & keep]
+    if not len(drawn):
+        return Panel(title, rgb)
+    low, high = np.percentile(drawn, PERCENTILES)
     level = np.clip((values[known] - low) / max(high - low, 1e-9), 0, 1)
     rgb[known] = _painted((DARKEST + level * (255 - DARKEST)).astype(np.uint8), palette)
-    return Panel(title, rgb, palette, form.format(low), form.format(high))
+    end, highest = form.format(high), form.format(drawn.max())
+    return Panel(title, rgb, palette, form.format(low), end, "" if end == highest else highest)
 
 
 def _painted(levels: npt.NDArray[np.uint8], palette: int) -> Rgb:
@@ -118,24 +134,30 @@ def _draw(panel: Panel, numbers: npt.NDArray[np.int64], keep: npt.NDArray[np.boo
         bar = _painted(np.linspace(DARKEST, 255, width - 2 * MARGIN_PX).astype(np.uint8), panel.palette)
         legend[6:20, MARGIN_PX : width - MARGIN_PX] = bar
         _text(legend, panel.low, (MARGIN_PX, 44))
-        _text(legend, panel.high, (width - MARGIN_PX - 11 * len(panel.high), 44))
+        end = panel.high
+        if panel.beyond:
+            # An arrow head at the end of the palette, in its last colour: it goes on.
+            tip = np.array([[width - MARGIN_PX, 4], [width - 4, 13], [width - MARGIN_PX, 22]], np.int32)
+            cv2.fillConvexPoly(legend, tip, [int(level) for level in bar[-1]])
+            end = f"{panel.high}, highest {panel.beyond}"
+        (text_px, _), _ = cv2.getTextSize(end, *FONT)
+        _text(legend, end, (width - MARGIN_PX - text_px, 44))
     return np.vstack([title, image, legend])
 
 
 def _draw_cubes(image: Rgb, numbers: npt.NDArray[np.int64], rgb: Rgb) -> None:
     """Paint visible faces into the image, far voxels first."""
-    # Stage 1: a parallel projection, with the middle of the map in the middle of the panel.
-    right, down, away = _axes()
+    # Stage 1: a parallel projection, with the middle of what is drawn in the middle of the panel.
+    away = _axes()[2]
     scale = _scale_px(numbers)
-    corners = numbers.min(axis=0), numbers.max(axis=0) + 1
-    middle = (corners[0] + corners[1]) / 2
-    screen = np.array([image.shape[1], image.shape[0]]) / 2
-    plane = np.stack([right, down], axis=1)
+    low, high = _extent(numbers)
+    plane = _plane()
+    offset = np.array([image.shape[1], image.shape[0]]) / 2 - (low + high) / 2 * scale
     # Stage 2: of each cube the three faces towards the viewer.
     occupied = {tuple(number) for number in numbers.tolist()}
     toward = [1 if away[axis] < 0 else -1 for axis in range(3)]
     faces = [_face(axis, toward[axis]) @ plane * scale for axis in range(3)]
-    origins = (numbers - middle) @ plane * scale + screen
+    origins = numbers @ plane * scale + offset
     shaded = [np.rint(rgb * shade).astype(int).tolist() for _, shade in FACE_SHADE]
     # Stage 3: far voxels first, so that near ones are painted over them.
     for row in np.argsort(-(numbers @ away), kind="stable").tolist():
@@ -169,14 +191,25 @@ def _axes() -> tuple[Floats, Floats, Floats]:
     return right, np.cross(away, right), away
 
 
-def _scale_px(numbers: npt.NDArray[np.int64]) -> float:
-    """Pixels along a voxel's edge, so that all voxels fit into a panel."""
+def _plane() -> Floats:
+    """(3, 2) projection of a place in voxels to the picture's right and down."""
     right, down, _ = _axes()
-    low, high = numbers.min(axis=0), numbers.max(axis=0) + 1
-    box = np.array([[(low, high)[c >> a & 1][a] for a in range(3)] for c in range(8)], dtype=np.float64)
-    spans = np.ptp(box @ np.stack([right, down], axis=1), axis=0)
-    return float(min((PANEL_PX[0] - 2 * MARGIN_PX) / spans[0], (PANEL_PX[1] - 2 * MARGIN_PX) / spans[1]))
+    return np.stack([right, down], axis=1)
+
+
+def _extent(numbers: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Lowest and highest (right, down) of the voxels' cubes, in edges: not of their box, whose corners may be empty."""
+    corners = np.array([[c >> axis & 1 for axis in range(3)] for c in range(8)]) @ _plane()
+    places = numbers @ _plane()
+    return places.min(axis=0) + corners.min(axis=0), places.max(axis=0) + corners.max(axis=0)
+
+
+def _scale_px(numbers: npt.NDArray[np.int64]) -> float:
+    """Pixels along a voxel's edge, with which the voxels fill a panel."""
+    low, high = _extent(numbers)
+    return float(((np.array(PANEL_PX) - 2 * MARGIN_PX) / (high - low)).min())
 
 
 def _text(image: Rgb, text: str, at: tuple[int, int]) -> None:
-    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.55, TEXT, 1, cv2.LINE_AA)
+    face, size, thickness = FONT
+    cv2.putText(image, text, at, face, size, TEXT, thickness, cv2.LINE_AA)

@@ -65,7 +65,10 @@ def layer_picture(values: Values, seen: SurfaceImage, scale: Scale, spread: Pose
         else:
             image[:] = NOTHING
             write_text_into(image, f"map withheld: {why}", (8, 8), WARNING)
-    return with_legend(image, scale)
+    # A mark where the scale ends below the highest value that is seen.
+    highest = float(np.nanmax(values, initial=-np.inf))
+    is_beyond = scale.layer is not Layer.COLOUR and highest > scale.high
+    return with_legend(image, scale, [f"highest: {highest:.4g}"] if is_beyond else [])
 
 
 def arrays_of(

@@ -21,9 +21,10 @@ from cairn_map.codec.cell_code import decode_cell
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import CellKey
 from cairn_map.queries.map_snapshot import snapshot_of
+from cairn_map.render.legend import with_legend
 from cairn_map.render.map_picture import layer_picture, layer_values
 from cairn_map.render.map_render import MapRenderer
-from cairn_map.render.render_picture import Layer
+from cairn_map.render.render_picture import Layer, Scale
 from cairn_map.render.render_request import RenderRequest, request_from
 from cairn_map.warm_up import warm_up_pictures
 from cairn_server.store.store_rows import MapRow
@@ -76,6 +77,13 @@ def test_a_picture_is_what_the_same_map_shows_at_home(live: Live, layer: Layer) 
     values = layer_values(renderer, snapshot, seen, layer)
     assert np.array_equal(found[..., ::-1], layer_picture(values, seen, request.scale))
     assert found.shape[0] > 48 + 30 and found.shape[1:] == (64, 3)
+    if layer is not Layer.COLOUR:
+        # A scale that ends below the highest value seen says so in its legend, and no other does.
+        highest = float(np.nanmax(values))
+        for high, notes in ((highest + 1, []), (highest - 0.01, [f"highest: {highest:.4g}"])):
+            scale = Scale(layer, high - 10, high)
+            legend = with_legend(np.zeros((48, 64, 3), np.uint8), scale, notes)[48:]
+            assert np.array_equal(layer_picture(values, seen, scale)[48:], legend)
     told = arrays(ask(live, row, asking(request, format="npz")))
     assert np.array_equal(told["range_m"], seen.range_m, equal_nan=True)
     names = {Layer.TEMPERATURE: {"temperature_k"}, Layer.DEPTH: set()}.get(layer, {str(layer)})
