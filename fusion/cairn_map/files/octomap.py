@@ -55,7 +55,7 @@ def branch_of_cell(
     down = min(depth, max(0, geometry.depth - BLOCK_DEPTH))
     cell = _code_of_cell(key, geometry)
     # Blocks with evidence, and those that the border of the filling divides.
-    pieces: dict[int, Evidence | None] = dict(_blocks(evidence, 3 * (geometry.depth - down)))
+    pieces: dict[int, Evidence | None] = dict(_blocks(evidence, geometry.depth, down))
     if filling is not None and cell is not None:
         _, divided = filling.holes(cell, top, NO_CODES, top + down)
         for number in (divided - np.uint64(cell << 3 * down)).tolist():
@@ -146,16 +146,18 @@ def _branch(leaves: Nodes, bodies: Sequence[bytes], top: int, form: str) -> tupl
     return placeholder(nodes), b"" if is_leaf else b"".join(parts_of_file(nodes, bodies, form))
 
 
-def _blocks(evidence: Evidence, bits: int) -> Iterator[tuple[int, Evidence]]:
-    """Blocks of a cell's evidence, rising: the voxels whose numbers are equal but for the lowest bits."""
+def _blocks(evidence: Evidence, depth: int, down: int) -> Iterator[tuple[int, Evidence]]:
+    """Blocks of a cell, `down` levels below it, that hold evidence: numbers, rising, and evidence."""
     # Voxels rise in Morton number, so that a block is one run of rows; samples name theirs by row.
-    numbers = evidence.voxels >> np.uint32(bits)
-    starts = np.nonzero(np.diff(numbers, prepend=~numbers[:1]))[0].tolist()
-    for start, end in pairwise([*starts, len(numbers)]):
-        first, last = np.searchsorted(evidence.sampled, [start, end])
+    firsts = np.arange(8**down + 1, dtype=np.uint32) << np.uint32(3 * (depth - down))
+    rows = np.searchsorted(evidence.voxels, firsts)
+    for number, (start, end) in enumerate(pairwise(rows.tolist())):
+        if start == end:
+            continue
+        first, last = np.searchsorted(evidence.sampled, np.array([start, end], np.uint32))
         sampled = evidence.sampled[first:last] - np.uint32(start)
         samples = evidence.samples[first:last]
-        yield int(numbers[start]), Evidence(evidence.voxels[start:end], evidence.counts[start:end], sampled, samples)
+        yield number, Evidence(evidence.voxels[start:end], evidence.counts[start:end], sampled, samples)
 
 
 def _half(geometry: Geometry) -> int:

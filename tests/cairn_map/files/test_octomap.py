@@ -61,7 +61,7 @@ def requests(draw: st.DrawFn, geometry: Geometry) -> ExportRequest:
     )
 
 
-@settings(max_examples=40)
+@settings(max_examples=30)
 @given(data=st.data(), seed=st.integers(0, 9), geometry=st.sampled_from([SMALL, PLAIN]))
 def test_a_file_holds_the_occupied_and_the_free_voxels_and_no_others(
     data: st.DataObject, seed: int, geometry: Geometry
