@@ -103,7 +103,7 @@ ROOMS = {
     "cairn_client": "replica sync http relay robot folders cli cli.maps cli.robots main",
     "cairn_sim": "scene render robots evaluation experiment study demo sim_command warm_up",
     "cairn_server": """
-        settings processes
+        memory_shares settings processes
         store store.sqlite metrics access live folding sync.checks sync views
         maps service
         http.middleware http.routes http operations

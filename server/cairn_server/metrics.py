@@ -19,6 +19,7 @@ from prometheus_client.registry import Collector
 
 from cairn_map.wire.empty_cell_frames import EmptyCellFrames
 from cairn_map.wire.frames import CellFrame, Frame
+from cairn_server.processes import used_bytes
 from cairn_server.store.shares import ALARM_PART, ROBOTS_MAX, used_bounds
 from cairn_server.store.store_rows import Backlog, RobotShares, StoreFigures
 
@@ -171,6 +172,12 @@ def share_metrics(shares: Mapping[str, Sequence[RobotShares]]) -> Iterator[Metri
         if part > ALARM_PART:
             gauge.add_metric(labels, part)
     yield gauge
+
+
+def memory_metrics(limit_bytes: int) -> Iterator[Metric]:
+    """Memory of all processes of the server, and its limit."""
+    yield GaugeMetricFamily("cairn_memory_limit_bytes", "Memory that all processes may take together.", limit_bytes)
+    yield GaugeMetricFamily("cairn_memory_bytes", "Memory that all processes take together.", used_bytes())
 
 
 def process_metrics() -> Iterator[Metric]:

@@ -25,6 +25,7 @@ from cairn_server.live.robot_reports import RobotReports
 from cairn_server.maps import Maps
 from cairn_server.metrics import (
     ServerFigures,
+    memory_metrics,
     metrics_text,
     process_metrics,
     share_metrics,
@@ -95,7 +96,7 @@ class Service:
             on_fold=self.live.folded,
             may_forget_s=upstream.may_forget_s,
             process=fold_process,
-            cells_bytes=int(settings.cache_share * CACHE_BYTES),
+            cells_bytes=int(settings.memory.cache_share * CACHE_BYTES),
         )
         self.readiness = Readiness(store.health, folds, settings, self._fold_thread.is_alive)
         self.cells = Cells(store, damaged, on_heal=self._fold_thread.wake)
@@ -104,7 +105,7 @@ class Service:
         exports = MapExports(store, self.cells)
         self.views = ViewParts(
             CellViews(store, self.cells),
-            MapViews(store, self.cells, cache_share=settings.cache_share),
+            MapViews(store, self.cells, cache_share=settings.memory.cache_share),
             exports,
             ExportTickets(store, settings, exports),
         )
@@ -125,7 +126,13 @@ class Service:
             Uploads(store, pushes),
             Retracts(store, wanted, on_new=on_new),
             MainReplies(
-                store, self.cells, self.live, wanted, self.figures, stable=stable, cache_share=settings.cache_share
+                store,
+                self.cells,
+                self.live,
+                wanted,
+                self.figures,
+                stable=stable,
+                cache_share=settings.memory.cache_share,
             ),
             HeldCommits(store, wanted),
             upstream,
@@ -136,7 +143,8 @@ class Service:
         store = store_metrics(self.store.health.figures(), self.store.health.backlogs())
         upstream = upstream_metrics(self.sync.upstream.ages_s())
         shares = share_metrics({row.name: self.store.shares.of(row) for row in self.store.maps()})
-        return metrics_text(chain(self.figures.registry.collect(), store, shares, upstream, process_metrics()))
+        memory = memory_metrics(self.settings.memory.limit_bytes)
+        return metrics_text(chain(self.figures.registry.collect(), store, shares, upstream, memory, process_metrics()))
 
     def stop_streams(self) -> None:
         """Count as not ready and end live streams, which never end alone; requests are still answered for a while."""

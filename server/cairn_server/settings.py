@@ -11,11 +11,9 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from cairn_map.errors import BadInputError
-from cairn_map.machine_memory import standard_limit_bytes
 from cairn_map.wire.origins import origin_of
+from cairn_server.memory_shares import MemoryShares, memory_shares
 
-CACHES_BYTES = 1200 << 20
-"""Sum of the standard sizes of all caches: cells under change, cells read, their changes, pictures' cells and lists."""
 LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 
 
@@ -124,29 +122,32 @@ class Settings(BaseModel):
     acknowledged is folded into it."""
     fold_lag_max_s: Annotated[float, Field(gt=0)] = 600.0
     """Seconds that a commit may wait to be folded while the server counts as ready."""
-    body_memory_bytes: Annotated[int, Field(ge=1 << 20)] = 1 << 28
+    memory_bytes: Annotated[int, Field(ge=1)] | None = None
+    """Memory of all processes of the server together, bytes, divided among its parts as it says at the start. Default:
+    a quarter of the memory of the machine, or of its container; at least 1.81 GB."""
+    body_memory_bytes: Annotated[int, Field(ge=1 << 20)] | None = None
     """Memory for bodies of requests on their way, bytes; beyond it they are answered 503. One token may fill half; a
-    commit has up to 2^26 bytes."""
-    check_workers: Annotated[int, Field(ge=1)] = 2
-    """Processes that check expensive commits, started when the first one comes."""
+    commit has up to 2^26 bytes. Default: a share of memory_bytes, 2^28 from 4.3 GB on."""
+    check_workers: Annotated[int, Field(ge=1)] | None = None
+    """Processes that check expensive commits, started when the first one comes. Default: 2, or 1 if memory_bytes is
+    small."""
     check_cpu_s: Annotated[float, Field(gt=0)] = 60.0
     """Processor time that the check of one commit may take, seconds; what its heads may claim takes some 20 s."""
-    check_memory_bytes: Annotated[int, Field(ge=1 << 24)] = 3 << 29
-    """Memory that the check of one commit may take; 2^29 bytes of evidence need twice their size."""
-
-    memory_bytes: Annotated[int, Field(ge=1 << 26)] | None = None
-    """Memory for the decoded cells of all caches, bytes; more than 1.26 GB is not taken. Default: a quarter of the
-    memory of the machine, or of its container."""
+    check_memory_bytes: Annotated[int, Field(ge=1 << 24)] | None = None
+    """Memory that the check of one commit may take; a commit that needs more is refused. Default: a share of
+    memory_bytes, 3 * 2^29 at most."""
 
     @property
-    def caches_bytes(self) -> int:
-        """Memory of all caches of decoded cells together."""
-        return min(CACHES_BYTES, standard_limit_bytes() if self.memory_bytes is None else self.memory_bytes)
+    def memory(self) -> MemoryShares:
+        """Memory of each part of the server.
 
-    @property
-    def cache_share(self) -> float:
-        """Part of its standard size that each cache takes."""
-        return self.caches_bytes / CACHES_BYTES
+        Raises:
+            BadInputError: kind `bad_setting`: too little, or the parts that are set exceed it.
+        """
+        shares = memory_shares(self.memory_bytes)
+        return shares.with_parts(
+            bodies_bytes=self.body_memory_bytes, check_workers=self.check_workers, check_bytes=self.check_memory_bytes
+        )
 
     def check_tls(self) -> None:
         """Refuse a certificate without its key, and a key without its certificate.

@@ -17,6 +17,7 @@ from cairn_server.http.routes import cell as cell_routes
 from cairn_server.http.routes import problems
 from cairn_server.live import hub as live
 from cairn_server.live import robot_reports
+from cairn_server.memory_shares import memory_shares
 from cairn_server.settings import Quotas, Settings
 from cairn_server.store import numbering, shares
 from cairn_server.store.sqlite import tokens as sqlite_tokens
@@ -123,12 +124,12 @@ def test_the_limits_in_the_document_are_those_of_the_code(row: str, number: floa
 def test_the_bounds_of_cost_in_the_document_are_those_of_the_code() -> None:
     defaults = Settings()
     assert f"and {commit_checks.PER_BYTE} for each byte of its body" in DOCUMENT
-    assert f"| {defaults.check_cpu_s:.0f} s; 3 * 2^29 bytes (settings) |" in DOCUMENT
+    assert f"| {defaults.check_cpu_s:.0f} s; a share of `memory_bytes`, 3 * 2^29 bytes at most (settings) |" in DOCUMENT
     assert commit_checks.NUMBERS_MAX == 2**25
     assert "; 2^25 modelled numbers |" in DOCUMENT
     assert JSON_FIELDS_MAX == 2**18
     assert "; 2^18 fields |" in DOCUMENT
-    assert defaults.check_memory_bytes == 3 * 2**29
+    assert memory_shares(1 << 40).check_bytes == 3 * 2**29
 
 
 def test_the_limits_of_push_in_the_document_are_those_of_the_code() -> None:

@@ -21,6 +21,7 @@ import httpx
 from tests.fixtures.map.made import SMALL
 from tests.fixtures.server.access import ADMIN, ENROLLER, bearer
 from tests.fixtures.server.live import Process
+from tests.fixtures.server.memory_watch import MemoryWatch
 from tests.siege.attacks import ATTACKS
 from tests.siege.honest import HonestLoad, Waits
 
@@ -65,19 +66,22 @@ def siege(name: str, seconds: float) -> Iterator[str]:
         token = fortress.tokens.get(ATTACKS[name][2], "none")
         port = urlsplit(fortress.url).port or 0
         arguments = [sys.executable, "-m", "tests.siege.attacks", name, str(port), token]
-        attacker = subprocess.Popen(arguments)
+        attacker, watch = subprocess.Popen(arguments), MemoryWatch(fortress.process.pid)
         try:
             time.sleep(2.0)
             during = load.live(seconds)
-            memory_mb = fortress.process.peak_mb()
+            memory_mb = watch.end() / 1e6
             start_s = time.monotonic()
             fortress.process.send(signal.SIGTERM)
             code, complaints = fortress.process.end()
             stopped_s = time.monotonic() - start_s
         finally:
+            watch.end()
             attacker.kill()
             attacker.wait()
-    _say(f"{name}: {ATTACKS[name][1]} connections; peak {memory_mb} MB; SIGTERM {stopped_s:.1f} s, exit code {code}")
+    _say(
+        f"{name}: {ATTACKS[name][1]} connections; all processes {memory_mb:.0f} MB at most; SIGTERM {stopped_s:.1f} s, exit code {code}"
+    )
     for kind in ("healthz", "push", "missing"):
         _say(f"  {kind:8} {_told(before, kind)} quiet, {_told(during, kind)} under attack")
     if during.failed or before.failed:

@@ -79,7 +79,7 @@ def sound_cell(snapshot: Snapshot, key: CellKey, geometry: Geometry, healed: lis
     stored = row_of_cell(snapshot, key)
     if stored is None or _SOUND.knows(stored):
         return stored
-    with DECODING.of_cell(geometry):
+    with DECODING.of_cell(geometry, stored.voxels):
         try:
             stored_evidence(stored)
         except DamagedDataError as exc:

@@ -99,7 +99,7 @@ def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes, *, by: str) 
         return False
     # Decode within the memory that a cell of as many voxels can need: what claims more is another cell.
     limit_bytes = stored.voxels * (VOXEL_BYTES + 4 + 8 * row.geometry.plane_count)
-    with DECODING.of_cell(row.geometry):
+    with DECODING.of_cell(row.geometry, stored.voxels):
         decoded = decode_canonical_cell(data, evidence_bytes_max=limit_bytes)
     if decoded.key != key or decoded.geometry != row.geometry:
         raise BadInputError("bad_cell", f"the body is no cell {cell_of_key(key)} of map {row.name}")

@@ -2,8 +2,9 @@
 
     256 MB    ten cells of 128^3 voxels at once, or one of 256^3
 
-A request enters for the cell's whole size at 12 bytes a voxel, whatever few bytes it comes from, and leaves when it has
-what it made of the evidence. Room is taken around single cells only, never while another thread's result is waited for.
+A request enters for the cell's whole size at 12 bytes a voxel, whatever few bytes it comes from, or for more if its
+voxels can have samples of many channels; it leaves when it has what it made of the evidence. Room is taken around
+single cells only, never while another thread's result is waited for.
 """
 
 import threading
@@ -11,13 +12,12 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from cairn_map.errors import UnreachableError
+from cairn_map.codec.cell_reading import VOXEL_BYTES
+from cairn_map.codec.octree.cell_head import head_sizes
+from cairn_map.errors import DamagedDataError, UnreachableError
 from cairn_map.evidence.grid import Geometry
+from cairn_server.memory_shares import DECODING_BYTES
 
-DECODING_BYTES = 1 << 28
-"""Memory for cells that are decoded at once; a cell of depth 8, the largest, takes 201 MB."""
-VOXEL_BYTES = 12
-"""Memory that decoding takes for each voxel of a cell, seen or not."""
 WAIT_S = 30.0
 
 
@@ -40,8 +40,8 @@ class DecodingRoom:
         return len(self._waiting)
 
     @contextmanager
-    def of_cell(self, geometry: Geometry) -> Iterator[None]:
-        """Room to decode one cell of this geometry, for the length of a `with`.
+    def of_cell(self, geometry: Geometry, voxels: int) -> Iterator[None]:
+        """Room to decode one cell of this geometry with so many known voxels, for the length of a `with`.
 
         Raises:
             UnreachableError: kind `busy`: it did not come in time.
@@ -49,7 +49,7 @@ class DecodingRoom:
         if getattr(self._inside, "is_set", False):
             yield
             return
-        size_bytes = min(VOXEL_BYTES << (3 * geometry.depth), self._limit_bytes)
+        size_bytes = min(decoded_bytes(geometry, voxels), self._limit_bytes)
         self._enter(size_bytes)
         self._inside.is_set = True
         try:
@@ -79,6 +79,20 @@ class DecodingRoom:
             finally:
                 self._waiting.remove(mine)
                 self._changed.notify_all()
+
+
+def decoded_bytes(geometry: Geometry, voxels: int) -> int:
+    """Memory that a cell takes decoded: its grid, seen or not, or all of its voxels with a sample of each channel."""
+    planes_bytes = 4 + 8 * geometry.plane_count if geometry.plane_count else 0
+    return max(VOXEL_BYTES << (3 * geometry.depth), (VOXEL_BYTES + planes_bytes) * voxels)
+
+
+def voxels_of(body: bytes) -> int:
+    """Known voxels that the head of a cell's or diff's bytes claims; 0 where it is damaged, which decoding finds."""
+    try:
+        return head_sizes(body)[1]
+    except DamagedDataError:
+        return 0
 
 
 DECODING = DecodingRoom(DECODING_BYTES)

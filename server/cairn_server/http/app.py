@@ -54,7 +54,7 @@ def docs(request: Request) -> HTMLResponse:
 def make_app(service: Service, *, long_bodies: LongBodies | None = None) -> FastAPI:
     """The app over a service, which the caller closes; without `long_bodies` they are parsed in threads."""
     settings = service.settings
-    lanes, bodies = Lanes(), BodyBudget(settings.body_memory_bytes)
+    lanes, bodies = Lanes(), BodyBudget(settings.memory.bodies_bytes)
     reading = turns_of_long_bodies()
     own_names = OwnNames.of(settings)
     places = ConnectionPlaces(settings.limit_concurrency, trusted_proxies=settings.trusted_proxies)

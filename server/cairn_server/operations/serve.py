@@ -2,7 +2,7 @@
 
     $ cairn serve --data ./cairn-data
     cairn map server on http://127.0.0.1:8750, data in cairn-data
-    memory for decoded cells: at most 1258 MB
+    memory: at most 6319 MB in all: caches 1258, checks 2 x 1610, folding 403, decoding 268, bodies 268, programs 537
 
 Robots push their measurements to it and fetch what they miss; stop it with Ctrl-C or SIGTERM. Everything
 that it acknowledged is in DIR/cairn.sqlite, so a crash or a power cut loses nothing.
@@ -107,7 +107,7 @@ def main(argv: list[str]) -> int:
     signal.signal(signal.SIGTERM, _stop)
     sys.setswitchinterval(SWITCH_S)
     # Forked before there are threads: a lock that another thread held at the fork would stay locked in the child.
-    folding = fork_folding(settings.folder / FILE_NAME, cells_bytes=int(settings.cache_share * CACHE_BYTES))
+    folding = fork_folding(settings.folder / FILE_NAME, cells_bytes=int(settings.memory.cache_share * CACHE_BYTES))
     long_bodies = fork_long_bodies()
     keep_memory_small()
     with listen(settings.host, settings.port) as listener:
@@ -132,7 +132,7 @@ def _serve(service: Service, listener: socket.socket, long_bodies: LongBodies) -
         log.warning("tokens and maps travel in the clear: give --tls-cert and --tls-key, or put a TLS proxy before it")
     tell_port(service.settings.folder, port)
     sys.stdout.write(f"cairn map server on {scheme}://{shown}:{port}, data in {service.settings.folder}\n")
-    sys.stdout.write(f"memory for decoded cells: at most {service.settings.caches_bytes / 1e6:.0f} MB\n")
+    sys.stdout.write(f"{service.settings.memory.text()}\n")
     sys.stdout.flush()
     # A full sweep of the garbage collector takes 0.1 to 0.3 s, in which all wait. What is there by now stays, so none
     # looks at it; and what survived two sweeps of young objects is seldom a cycle.

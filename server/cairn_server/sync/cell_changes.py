@@ -115,7 +115,8 @@ def _delta(snapshot: Snapshot, row: CellRow, foreign: list[Contribution], geomet
         return snapshot.diff(foreign[0].commit, row.key)  # one commit's diff is its own sum
     # Of several commits: decoded and added up, one cell at a time in the room that all requests share.
     try:
-        with DECODING.of_cell(geometry):
+        # The sum, and one of the diffs.
+        with DECODING.of_cell(geometry, 2 * row.voxels):
             evidence = sum_of_contributions(snapshot, row.key, foreign, geometry).packed()
     except DamagedDataError as exc:
         log.error("cell %s: a diff at rest is damaged, sending the whole cell: %s", cell_of_key(row.key), exc.message)
@@ -136,7 +137,7 @@ def _state(
         if STATE_HEAD_BYTES + row.size_bytes * len(blocks) / max(known, 1) > size_bytes_max:
             return None
         # Last, since it is expensive. All take room before they ask the cache: its maker has it, too.
-        with DECODING.of_cell(geometry):
+        with DECODING.of_cell(geometry, row.voxels):
             changed = of_blocks(cache.evidence(snapshot, row), blocks)
     except DamagedDataError as exc:
         log.error("cell %s: %s; no changed blocks of it", cell_of_key(row.key), exc.message)

@@ -81,7 +81,7 @@ def view_of_stored(row: MapRow, stored: CellRow, depth: int) -> bytes:
     """
     # Voxels without a hit have a probability below a half: a view that does not show them can leave out most of a cell.
     read = stored_surfaces if row.sensor_model.p_occupied >= 0.5 else stored_evidence
-    with DECODING.of_cell(row.geometry):
+    with DECODING.of_cell(row.geometry, stored.voxels):
         return encode_view(stored.key, read(stored), row.geometry, row.sensor_model, style=ViewStyle(depth=depth))
 
 
@@ -215,7 +215,7 @@ class CellViews:
                 f"a cell of at most {FILE_VOXELS_MAX} known voxels comes as .{suffix[:16]}, this one has "
                 f"{stored.voxels}; take the cell itself, or an export of its box, which is made piece by piece",
             )
-        with DECODING.of_cell(row.geometry):
+        with DECODING.of_cell(row.geometry, stored.voxels):
             return cell_file(suffix, stored.key, stored_evidence(stored), row.geometry, row.sensor_model)[0]
 
 

@@ -36,7 +36,7 @@ from cairn_map.files.point_clouds import (
 from cairn_server.access.cancellation import CANCELLATION
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.cells_at_rest import DamagedCellError, decode_stored, sound_cell, stored_evidence
-from cairn_server.folding.decoding_room import DECODING
+from cairn_server.folding.decoding_room import DECODING, voxels_of
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import CellRow, Head, MapRow
 
@@ -158,7 +158,7 @@ class _PointFile:
 
     def _points(self, key: CellKey, body: bytes) -> Table:
         geometry, model = self.row.geometry, self.row.sensor_model
-        with DECODING.of_cell(geometry):
+        with DECODING.of_cell(geometry, voxels_of(body)):
             return points_of_cell(key, decode_stored(key, body).evidence, geometry, model, self.asked)
 
 
@@ -227,7 +227,7 @@ def _laid_aside(
             )
         if time.monotonic() > until_s:
             raise BadInputError("too_costly", f"counting the points takes more than {COUNT_S:g} s; ask for a box")
-        with DECODING.of_cell(row.geometry):
+        with DECODING.of_cell(row.geometry, known):
             if known:
                 stored = sound_cell(snapshot, key, row.geometry, healed)
                 if stored is None:

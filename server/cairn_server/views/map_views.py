@@ -289,7 +289,7 @@ def _ready(stored: CellRow | None, task: _Task) -> ReadCell:
     if stored is None:
         raise DamagedDataError("damaged_store", "a cell is listed, but is not there")
     geometry, model = task.row.geometry, task.row.sensor_model
-    with DECODING.of_cell(geometry):
+    with DECODING.of_cell(geometry, stored.voxels):
         return read_cell(brick_cell(geometry, [stored_evidence(stored)]), geometry, model, task.layer)
 
 

@@ -20,7 +20,7 @@ from cairn_map.wire.messages import LogEntry
 from cairn_map.wire.voxel_messages import ChannelReading, VoxelAnswer, VoxelCommit
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.cells_at_rest import decode_stored, sound_cell, stored_evidence
-from cairn_server.folding.decoding_room import DECODING
+from cairn_server.folding.decoding_room import DECODING, voxels_of
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import MapRow
 
@@ -50,7 +50,7 @@ def asked_voxel(store: Store, cells: Cells, row: MapRow, text: str) -> VoxelAnsw
             raise NotFoundError("no_cell", f"no robot has seen cell {','.join(map(str, cell))} of map {row.name}")
         commits, more = _commits(snapshot, key, place, row.geometry)
         cursor = snapshot.head.cursor
-    with DECODING.of_cell(row.geometry):
+    with DECODING.of_cell(row.geometry, stored.voxels):
         seen = _only(stored_evidence(stored), place)
     voxels = voxels_of_evidence(key, seen, row.geometry, row.sensor_model, occupied_only=False)
     x, y, z = centres_of_voxels(np.array([voxel]), row.geometry)[0].tolist()
@@ -102,7 +102,7 @@ def _commits(snapshot: Snapshot, key: CellKey, place: int, geometry: Geometry) -
     for contribution in found[-ENTRIES_MAX:]:
         body = snapshot.diff(contribution.commit, key)
         if body is not None:
-            with DECODING.of_cell(geometry):
+            with DECODING.of_cell(geometry, voxels_of(body)):
                 hits, misses = _only(decode_stored(key, body).evidence, place).counts.sum(axis=0).tolist()
             sign = 1 if contribution.kind == b"+" else -1
             before = counts.get(contribution.commit, (0, 0))

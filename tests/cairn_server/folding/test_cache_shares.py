@@ -1,4 +1,4 @@
-"""Memory of the server's caches: a quarter of the machine's at most, unless told otherwise, and said at the start."""
+"""Memory of the server's caches: their share of the server's limit, which is said at the start."""
 
 import signal
 from pathlib import Path
@@ -6,9 +6,8 @@ from pathlib import Path
 import pytest
 from tests.fixtures.server.live import Live, Process
 
-from cairn_map.machine_memory import memory_bytes
 from cairn_server.folding import cell_cache, read_cache
-from cairn_server.settings import CACHES_BYTES, Settings
+from cairn_server.memory_shares import CACHES_BYTES, CACHES_MIN_BYTES, LIMIT_MIN_BYTES, memory_shares
 from cairn_server.views import map_views
 
 
@@ -18,22 +17,15 @@ def test_the_standard_sizes_of_all_caches_add_up() -> None:
     assert sum((cell_cache.CACHE_BYTES, *of_reading, read_cache.HISTORIES_BYTES, *of_views)) == CACHES_BYTES
 
 
-def test_caches_take_a_quarter_of_the_memory_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert Settings().caches_bytes == min(CACHES_BYTES, memory_bytes() // 4)
-    monkeypatch.setattr("cairn_map.machine_memory.memory_bytes", lambda: 1 << 30)
-    assert Settings().caches_bytes == 1 << 28
-    assert Settings(memory_bytes=1 << 27).cache_share == (1 << 27) / CACHES_BYTES
-    assert Settings(memory_bytes=1 << 40).cache_share == 1
-
-
 def test_each_cache_has_its_share(tmp_path: Path) -> None:
-    with Live(tmp_path, memory_bytes=CACHES_BYTES // 4) as live:
+    with Live(tmp_path, memory_bytes=LIMIT_MIN_BYTES) as live:
         service = live.service
+        share = CACHES_MIN_BYTES / CACHES_BYTES
         caches = service.sync.replies._cache
-        assert service._fold_thread._local._cells_bytes == cell_cache.CACHE_BYTES // 4
-        assert caches._evidence._limit_bytes == read_cache.EVIDENCE_BYTES // 4
-        assert caches.changes._limit_bytes == read_cache.CHANGES_BYTES // 4
-        assert service.views.pictures._read_cells._limit_bytes == map_views.CELLS_BYTES // 4
+        assert service._fold_thread._local._cells_bytes == int(share * cell_cache.CACHE_BYTES)
+        assert caches._evidence._limit_bytes == int(share * read_cache.EVIDENCE_BYTES)
+        assert caches.changes._limit_bytes == int(share * read_cache.CHANGES_BYTES)
+        assert service.views.pictures._read_cells._limit_bytes == int(share * map_views.CELLS_BYTES)
 
 
 @pytest.mark.processes
@@ -41,8 +33,7 @@ def test_the_limit_is_said_at_the_start(tmp_path: Path) -> None:
     server = Process(tmp_path / "data")
     try:
         assert server._process.stdout is not None
-        most_mb = min(CACHES_BYTES, memory_bytes() // 4) / 1e6
-        assert server._process.stdout.readline() == f"memory for decoded cells: at most {most_mb:.0f} MB\n"
+        assert server._process.stdout.readline() == f"{memory_shares().text()}\n"
     finally:
         server.send(signal.SIGTERM)
         server.end()

@@ -22,7 +22,7 @@ def test_large_cells_are_decoded_one_at_a_time() -> None:
     most: list[int] = []
 
     def decode() -> None:
-        with room.of_cell(LARGE):
+        with room.of_cell(LARGE, 1):
             most.append(room.taken_bytes)
 
     threads = [threading.Thread(target=decode) for _ in range(24)]
@@ -37,7 +37,7 @@ def test_large_cells_are_decoded_one_at_a_time() -> None:
 
 def test_a_thread_that_is_inside_enters_again() -> None:
     room = DecodingRoom(DECODING_BYTES, wait_s=0)
-    with room.of_cell(LARGE), room.of_cell(LARGE):
+    with room.of_cell(LARGE, 1), room.of_cell(LARGE, 1):
         assert room.taken_bytes == 12 << 24
     assert room.taken_bytes == 0
 
@@ -48,12 +48,12 @@ def test_a_cell_that_finds_no_room_in_time_is_busy_and_leaves_nothing_behind() -
 
     def decode() -> None:
         try:
-            with room.of_cell(LARGE):
+            with room.of_cell(LARGE, 1):
                 found.append("decoded")
         except UnreachableError as exc:
             found.append(exc.kind)
 
-    with room.of_cell(LARGE):
+    with room.of_cell(LARGE, 1):
         thread = threading.Thread(target=decode)
         thread.start()
         thread.join()

@@ -212,7 +212,7 @@ class CheckPool:
 
     def _read(self, answer: dict[str, object]) -> Checked:
         if "memory" in answer:
-            raise _too_costly(f"more than {self._memory_bytes} bytes of memory")
+            raise _too_costly(f"more than the {self._memory_bytes} bytes of memory that this server has for one check")
         return checked_from(answer)
 
     def _new_worker(self) -> _Worker:

@@ -104,8 +104,9 @@ class CommitChecks:
     def __init__(self, settings: Settings) -> None:
         self.ordinary_s = ORDINARY_S
         self._threads = threading.BoundedSemaphore(THREADS_MAX)
+        shares = settings.memory
         self._pool = CheckPool(
-            workers=settings.check_workers, limit_s=settings.check_cpu_s, memory_bytes=settings.check_memory_bytes
+            workers=shares.check_workers, limit_s=settings.check_cpu_s, memory_bytes=shares.check_bytes
         )
 
     def check(self, commit: CommitReader, holder: Hashable) -> Checked:
