@@ -79,9 +79,8 @@ def siege(name: str, seconds: float) -> Iterator[str]:
             watch.end()
             attacker.kill()
             attacker.wait()
-    _say(
-        f"{name}: {ATTACKS[name][1]} connections; all processes {memory_mb:.0f} MB at most; SIGTERM {stopped_s:.1f} s, exit code {code}"
-    )
+    ended = f"SIGTERM {stopped_s:.1f} s, exit code {code}"
+    _say(f"{name}: {ATTACKS[name][1]} connections; all processes {memory_mb:.0f} MB at most; {ended}")
     for kind in ("healthz", "push", "missing"):
         _say(f"  {kind:8} {_told(before, kind)} quiet, {_told(during, kind)} under attack")
     if during.failed or before.failed:
