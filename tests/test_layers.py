@@ -70,6 +70,7 @@ MAY_NAME = {
     "apsw": [
         "cairn_server/store/sqlite/*.py",
         "cairn_client/folders/sqlite_glance.py",
+        "cairn_client/replica/replica_schema.py",
         "cairn_client/replica/replica_store.py",
         "cairn_fusion/ros/db3_bag.py",
     ],

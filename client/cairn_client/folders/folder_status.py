@@ -84,13 +84,13 @@ def folder_status(folder: Path) -> FolderStatus:
     """Status of the robot of a folder; raises as `glance`."""
     seen = glance(folder)
     text = seen.meta.get
-    contact = ReplicaState.contact.read(text) or Contact()
+    contact = ReplicaState.contact.read(text, seen.file) or Contact()
     waiting = [commit for commit in seen.commits if not commit.is_acked]
     return FolderStatus(
         robot=_known(seen, ReplicaState.robot, folder),
         map=_known(seen, ReplicaState.map_name, folder),
-        url=ReplicaState.url.read(text),
-        mode=ReplicaState.mode.read(text),
+        url=ReplicaState.url.read(text, seen.file),
+        mode=ReplicaState.mode.read(text, seen.file),
         is_open=is_locked(folder),
         incarnation=_known(seen, ReplicaState.incarnation, folder),
         voxel_edge_m=_known(seen, ReplicaState.geometry, folder).voxel_edge_m,
@@ -106,7 +106,7 @@ def folder_status(folder: Path) -> FolderStatus:
         failure_kind=contact.kind,
         failure=contact.reason,
         disk_bytes=seen.disk_bytes,
-        memory_bytes_max=(ReplicaState.limits.read(text) or STANDARD_LIMITS).map_bytes_max,
+        memory_bytes_max=(ReplicaState.limits.read(text, seen.file) or STANDARD_LIMITS).map_bytes_max,
     )
 
 
@@ -145,7 +145,7 @@ def _known(seen: Glance, field: Field[T], folder: Path) -> T:
     Raises:
         DamagedDataError: kind `damaged_store`: it is not there.
     """
-    value = field.read(seen.meta.get)
+    value = field.read(seen.meta.get, seen.file)
     if value is None:
         raise DamagedDataError("damaged_store", f"the robot's folder {folder} does not say its {field.key}")
     return value

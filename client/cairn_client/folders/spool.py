@@ -18,6 +18,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict
 
 from cairn_client.replica.replica import Replica
+from cairn_client.replica.replica_schema import translate_damage
 from cairn_fusion.recording.recording import Recording, open_recording
 from cairn_fusion.recording.recording_format import HEADER_FILE
 from cairn_map.errors import BadInputError, DamagedDataError
@@ -177,7 +178,8 @@ def _stamp(folder: Path) -> Stamp | None:
 def _mark(replica: Replica, folder: Path, first_s: float) -> Mark:
     """Mark of the recording that begins at this time; another one's, under the same name, does not count."""
     text = replica.store.get(_key(folder))
-    mark = Mark.model_validate_json(text) if text else None
+    with translate_damage(replica.store.file):
+        mark = Mark.model_validate_json(text) if text else None
     return mark if mark is not None and mark.first_s == first_s else Mark(first_s=first_s, stops=0, is_done=False)
 
 

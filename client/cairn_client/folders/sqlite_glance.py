@@ -1,6 +1,7 @@
 """Glance into a robot's folder: read in one transaction, while the robot goes on.
 
-Nothing is locked, written or checked, so that a glance neither waits for a robot nor holds one up.
+Nothing is locked or written, so that a glance neither waits for a robot nor holds one up; of the file's values only
+their kinds are checked.
 """
 
 from collections.abc import Mapping
@@ -10,6 +11,7 @@ from typing import Any
 
 import apsw
 
+from cairn_client.replica.replica_schema import check_form
 from cairn_client.replica.replica_store import BUSY_MS, FILE_NAME, failure_of
 from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName
 from cairn_map.errors import NotFoundError
@@ -29,6 +31,7 @@ class KeptBytes:
 class Glance:
     """Contents of a robot's folder at one instant."""
 
+    file: Path
     meta: Mapping[str, str]
     """Texts that the folder remembers, by key (`replica_state`)."""
     commits: tuple[KeptBytes, ...]
@@ -51,10 +54,12 @@ def glance(folder: Path) -> Glance:
     with _Reader(folder) as reader:
         (cells, cells_bytes) = reader.rows("SELECT count(cursor), coalesce(sum(length(body)), 0) FROM cell")[0]
         commits = reader.rows(
-            "SELECT robot, incarnation, n, acked, json_array_length(cells), length(data) FROM commits"
+            "SELECT robot, incarnation, n, acked, json_array_length(iif(json_valid(cells), cells, '[]')), length(data)"
+            " FROM commits"
             " WHERE data IS NOT NULL ORDER BY number"
         )
         return Glance(
+            file=folder / FILE_NAME,
             meta=dict(reader.rows("SELECT key, value FROM meta")),
             commits=tuple(
                 KeptBytes(CommitId(Author(RobotName(r), Incarnation(i)), n), bool(acked), count, size)
@@ -86,10 +91,11 @@ class _Reader:
 
     def __enter__(self) -> "_Reader":
         try:
-            self._connection = self._opened("mode=ro")
-        except apsw.CantOpenError:  # nothing may be written next to it, so no robot that could change it is at work
-            self._connection = self._opened("immutable=1")
-        except apsw.Error as exc:
+            try:
+                self._connection = self._opened("mode=ro")
+            except apsw.CantOpenError:  # nothing may be written next to it, so no robot that could change it is at work
+                self._connection = self._opened("immutable=1")
+        except (apsw.Error, UnicodeDecodeError) as exc:
             raise failure_of(exc, self._path) from exc
         return self
 
@@ -100,7 +106,7 @@ class _Reader:
         """All rows of a query."""
         try:
             return self._connection.execute(query, values).fetchall()
-        except apsw.Error as exc:
+        except (apsw.Error, UnicodeDecodeError) as exc:
             raise failure_of(exc, self._path) from exc
 
     def _opened(self, how: str) -> apsw.Connection:
@@ -109,7 +115,7 @@ class _Reader:
         try:
             connection.set_busy_timeout(BUSY_MS)
             connection.execute("BEGIN")
-            connection.execute("SELECT count(*) FROM meta")
+            check_form(connection, self._path)
         except BaseException:
             connection.close()
             raise

@@ -23,7 +23,7 @@ from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId, RobotName
 from cairn_map.commits.signature import Signature
 from cairn_map.commits.version_vector import EMPTY, VersionVector
-from cairn_map.errors import BadInputError, ConflictError, first_error
+from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, first_error
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.wire.messages import ReplyHeader
@@ -234,6 +234,8 @@ class Outbox:
         if data is None:
             return None
         meta, cells = split_commit(data)
+        if meta.commit_id != commit:
+            raise DamagedDataError("bad_commit", f"the bytes kept as {commit} are those of {meta.commit_id}")
         return Commit(meta, cells, self._commits[commit].sha, data)
 
     def acknowledge(self, commit: CommitId) -> None:

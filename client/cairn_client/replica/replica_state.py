@@ -11,17 +11,19 @@ tables of their own in the store.
 import json
 from collections.abc import Callable
 from dataclasses import asdict
-from typing import Any, Generic, Self, TypeVar, cast, overload
+from pathlib import Path
+from typing import Any, Generic, Self, TypeVar, overload
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, TypeAdapter
 
 from cairn_client.replica.limits import Limits
+from cairn_client.replica.replica_schema import translate_damage
 from cairn_client.replica.replica_store import ReplicaStore
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.commits.ids import CommitId, Incarnation, RobotName, commit_id_from_text
 from cairn_map.commits.signature import SIGNATURES_MAX, Signature, SigningKey, signatures_to_text
-from cairn_map.errors import BadInputError
+from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.messages import Mode, ReplyHeader, message_from_json
@@ -73,15 +75,22 @@ class Field(Generic[T]):
     @overload
     def __get__(self, state: "ReplicaState", owner: type[Any]) -> T | None: ...
     def __get__(self, state: "ReplicaState | None", owner: type[Any]) -> Self | T | None:
-        return self if state is None else self.read(state.store.get)
+        return self if state is None else self.read(state.store.get, state.store.file)
 
     def __set__(self, state: "ReplicaState", value: T | None) -> None:
         state.store.put(self.key, None if value is None else self.encode(value))
 
-    def read(self, get: Callable[[str], str | None]) -> T | None:
-        """The value among texts by key, as `ReplicaStore.get` or a dict's `get` returns them; None if it is not set."""
+    def read(self, get: Callable[[str], str | None], file: Path) -> T | None:
+        """The value among texts by key, as `ReplicaStore.get` or a dict's `get` returns them; None if it is not set.
+
+        Raises:
+            DamagedDataError: kind `damaged_store`: the text is no such value; the message names the file.
+        """
         text = get(self.key)
-        return None if text is None else self.decode(text)
+        if text is None:
+            return None
+        with translate_damage(file):
+            return self.decode(text)
 
 
 def _model_field(key: str, model: type[Model]) -> Field[Model]:
@@ -99,7 +108,7 @@ class ReplicaState:
     """Grid of the map."""
     url: Field[str] = Field("url", str)
     """Map on its server, `http://HOST:PORT/maps/NAME`."""
-    mode: Field[Mode] = Field("mode", lambda text: cast(Mode, text))
+    mode = Field[Mode]("mode", TypeAdapter[Mode](Mode).validate_python)
     """Mode in which the robot was opened last."""
     limits = Field("limits", lambda text: Limits(**json.loads(text)), lambda limits: json.dumps(asdict(limits)))
     """Limits that were given last."""
@@ -121,7 +130,9 @@ class ReplicaState:
     """Last contact with the server, to ten seconds."""
     incarnation = Field("incarnation", Incarnation)
     """Incarnation under which the robot numbers its commits."""
-    drawn = Field[list[Incarnation]]("drawn", json.loads, json.dumps)
+    drawn = Field[list[Incarnation]](
+        "drawn", TypeAdapter[list[Incarnation]](list[Incarnation]).validate_json, json.dumps
+    )
     """Incarnations that were drawn with a key, the oldest first."""
     next_n = Field[int]("next_n", int)
     """Number of the robot's next commit."""
@@ -224,7 +235,8 @@ class RobotKeys:
 
     def _key(self, incarnation: Incarnation) -> SigningKey | None:
         seed = self._store.get(_signing_key(incarnation))
-        return SigningKey(bytes.fromhex(seed)) if seed else None
+        with translate_damage(self._store.file):
+            return SigningKey(bytes.fromhex(seed)) if seed else None
 
 
 def _signing_key(incarnation: str) -> str:
@@ -250,8 +262,18 @@ class Successors:
         return self._of.get(commit)
 
     def latest(self, commit: CommitId) -> CommitId:
-        """The commit that stands for a commit now; itself if none took it out."""
+        """The commit that stands for a commit now; itself if none took it out.
+
+        Raises:
+            DamagedDataError: kind `damaged_store`: the successors form a circle.
+        """
+        seen = {commit}
         while (successor := self._stored(commit)) is not None:
+            if successor in seen:
+                raise DamagedDataError(
+                    "damaged_store", f"{self._store.file} is damaged: commit {commit} comes after itself"
+                )
+            seen.add(successor)
             commit = successor
         return commit
 
@@ -277,7 +299,8 @@ class Successors:
 
     def _stored(self, commit: CommitId) -> CommitId | None:
         text = self._store.get(_successor_key(commit))
-        return None if text is None else commit_id_from_text(text)
+        with translate_damage(self._store.file):
+            return None if text is None else commit_id_from_text(text)
 
 
 def _successor_key(commit: CommitId) -> str:

@@ -17,16 +17,16 @@ from typing import Any, BinaryIO
 import apsw
 
 from cairn_client.replica.folder_lock import lock_folder, make_folder
+from cairn_client.replica.replica_schema import DDL, STEPS, VERSION, check_form, translate_damage
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import VersionVector, version_vector_from_json
-from cairn_map.errors import BadInputError, CairnError, ConflictError, DamagedDataError, UnreachableError
+from cairn_map.errors import CairnError, ConflictError, DamagedDataError, UnreachableError
 from cairn_map.evidence.fingerprint import Fingerprint, fingerprint_from_bytes
 from cairn_map.evidence.grid import CellKey
 
 FILE_NAME = "robot.sqlite"
-VERSION = 3
 BUSY_MS = 1000
 """Milliseconds for which a folder may still be held by a robot that is just closing."""
 PRAGMAS = (
@@ -36,39 +36,9 @@ PRAGMAS = (
     "mmap_size = 0",
     "journal_size_limit = 67108864",
 )
-DDL = """
-CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
-CREATE TABLE commits (
-    number INTEGER PRIMARY KEY,
-    robot TEXT NOT NULL, incarnation TEXT NOT NULL, n INTEGER NOT NULL,
-    sha BLOB NOT NULL,
-    acked INTEGER NOT NULL DEFAULT 0,   -- the server said once that it has exactly these bytes
-    acked_age_s REAL NOT NULL DEFAULT 0,    -- age of the store when it said so last
-    cells TEXT NOT NULL,                -- numbers of the cells it touches, as JSON
-    data BLOB,                          -- NULL once the commit may be forgotten
-    seal TEXT,                          -- of a server's own retract, kept for it
-    UNIQUE (robot, incarnation, n)
-);
-CREATE TABLE coverage (name INTEGER PRIMARY KEY, vector TEXT NOT NULL UNIQUE);
-CREATE TABLE cell (
-    cell INTEGER PRIMARY KEY,
-    cursor TEXT,                        -- NULL: not proven any more, to be fetched whole
-    coverage INTEGER NOT NULL REFERENCES coverage,
-    fingerprint BLOB NOT NULL,
-    etag TEXT,
-    body BLOB NOT NULL
-);
-CREATE INDEX cell_coverage ON cell (coverage);
-"""
 ONE_COMMIT = "robot = ? AND incarnation = ? AND n = ?"
 AGE = "age_s"
 """Key of the text that holds the store's age."""
-STEPS = {
-    1: "ALTER TABLE commits ADD COLUMN seal TEXT",
-    # When older commits were acknowledged is unknown: they count from the first start with ages.
-    2: "ALTER TABLE commits ADD COLUMN acked_age_s REAL NOT NULL DEFAULT 0",
-}
-"""By version: what leads a store to the next one."""
 Values = tuple[str | int | float | bytes | None, ...]
 
 
@@ -116,11 +86,11 @@ class ReplicaStore:
             DamagedDataError: it is no SQLite file, or a broken one.
             BadInputError: it is of another version, or the folder cannot be made.
         """
-        self._folder = folder
+        self.file = folder / FILE_NAME
         self._lock = threading.RLock()
         make_folder(folder, secret_file=FILE_NAME)
         with self._translated():
-            self._connection = apsw.Connection(str(folder / FILE_NAME))
+            self._connection = apsw.Connection(str(self.file))
         try:
             self._folder_lock = lock_folder(folder, wait_s=BUSY_MS / 1000)
             self._prepare(steady_s)
@@ -133,7 +103,7 @@ class ReplicaStore:
             self._connection.set_busy_timeout(BUSY_MS)
             for pragma in PRAGMAS:
                 self._connection.execute(f"PRAGMA {pragma}")
-        version = self._first("PRAGMA user_version", ())
+            version = check_form(self._connection, self.file)
         if version == 0:
             with self.transaction():
                 self._connection.execute(DDL)
@@ -143,10 +113,9 @@ class ReplicaStore:
                 for step in range(version, VERSION):
                     self._connection.execute(STEPS[step])
                 self._connection.execute(f"PRAGMA user_version = {VERSION}")
-        elif version != VERSION:
-            raise BadInputError("store_version", f"{self._folder} has version {version}, this cairn needs {VERSION}")
         self._steady_s = steady_s
-        self._start_s = steady_s() - float(self.get(AGE) or 0)
+        with translate_damage(self.file):
+            self._start_s = steady_s() - float(self.get(AGE) or 0)
 
     def age_s(self) -> float:
         """Seconds that robots were seen to run on this folder, by a steady clock; it never jumps.
@@ -202,12 +171,11 @@ class ReplicaStore:
             "SELECT robot, incarnation, n, sha, cells, acked, data IS NOT NULL, seal, acked_age_s"
             " FROM commits ORDER BY number"
         )
-        return [
-            KeptCommit(
-                CommitId(Author(r, i), n), sha, tuple(json.loads(cells)), bool(acked), bool(has_data), seal, age_s
-            )
-            for r, i, n, sha, cells, acked, has_data, seal, age_s in rows
-        ]
+        with translate_damage(self.file):
+            return [
+                KeptCommit(CommitId(Author(r, i), n), sha, _cells_of(cells), bool(acked), bool(has_data), seal, age_s)
+                for r, i, n, sha, cells, acked, has_data, seal, age_s in rows
+            ]
 
     def data_bytes(self, commits: Iterable[CommitId]) -> int:
         """Size of the bytes of these commits that are kept."""
@@ -256,18 +224,16 @@ class ReplicaStore:
 
     def cells(self) -> dict[CellKey, BaseCell]:
         """All cells held, without their bytes."""
-        vectors = {
-            name: version_vector_from_json(json.loads(vector))
-            for name, vector in self._run("SELECT name, vector FROM coverage")
-        }
-        return {
-            CellKey(cell): BaseCell(
-                cursor_from_text(cursor) if cursor else None, vectors[name], fingerprint_from_bytes(sums), etag
-            )
-            for cell, cursor, name, sums, etag in self._run(
-                "SELECT cell, cursor, coverage, fingerprint, etag FROM cell ORDER BY cell"
-            )
-        }
+        coverages = self._run("SELECT name, vector FROM coverage")
+        rows = self._run("SELECT cell, cursor, coverage, fingerprint, etag FROM cell ORDER BY cell")
+        with translate_damage(self.file):
+            vectors = {name: version_vector_from_json(json.loads(vector)) for name, vector in coverages}
+            return {
+                CellKey(cell): BaseCell(
+                    cursor_from_text(cursor) if cursor else None, vectors[name], fingerprint_from_bytes(sums), etag
+                )
+                for cell, cursor, name, sums, etag in rows
+            }
 
     def body(self, key: CellKey) -> bytes | None:
         """Bytes of a cell held."""
@@ -336,17 +302,25 @@ class ReplicaStore:
         with self._lock:
             try:
                 yield
-            except apsw.Error as exc:
-                raise failure_of(exc, self._folder / FILE_NAME) from exc
+            except (apsw.Error, UnicodeDecodeError) as exc:
+                raise failure_of(exc, self.file) from exc
 
 
-def failure_of(exc: apsw.Error, file: Path) -> CairnError:
-    """The `CairnError` of an error of SQLite about a robot's file."""
+def failure_of(exc: apsw.Error | UnicodeDecodeError, file: Path) -> CairnError:
+    """The `CairnError` of an error of SQLite, or of a text in it, about a robot's file."""
     if isinstance(exc, apsw.BusyError):
         return ConflictError("folder_in_use", f"another robot has {file} open; stop it, or choose another folder")
-    if isinstance(exc, apsw.CorruptError | apsw.NotADBError | apsw.SQLError):
+    if isinstance(exc, apsw.CorruptError | apsw.NotADBError | apsw.SQLError | apsw.TooBigError | UnicodeDecodeError):
         return DamagedDataError("damaged_store", f"{file} is damaged: {exc}; move it away to start again")
     return UnreachableError("store_failed", f"cannot use {file}: {exc}")
+
+
+def _cells_of(text: str) -> tuple[CellKey, ...]:
+    """Numbers of cells in a JSON text; ValueError for another list."""
+    found: object = json.loads(text)
+    if not isinstance(found, list) or any(type(each) is not int for each in found):
+        raise ValueError(f"a list of cells is expected, got {text[:80]!r}")
+    return tuple(CellKey(each) for each in found)
 
 
 def _values(commit: CommitId) -> tuple[str, str, int]:
