@@ -11,6 +11,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from cairn_fusion.recording.frame_folder import FrameFolderOptions, import_frames
+from cairn_fusion.recording.frame_poses import PoseOptions
 from cairn_fusion.recording.recording import Recording, ScanSource, open_recording
 from cairn_fusion.recording.recording_format import HEADER_FILE, RIG_FILE
 from cairn_fusion.ros.open_bag import SUFFIXES, is_bag
@@ -104,8 +105,9 @@ def open_source(
     mapping: BagMapping | None = None,
     frames: Sequence[str] | None = None,
     scans_per_measurement: int | None = None,
+    poses: PoseOptions | None = None,
 ) -> ScanSource:
-    """A recording of any layout: by `options` or `mapping` if given, else by `detect_layout`.
+    """A recording of any layout: by `options` or `mapping` if given, else by `detect_layout`; `poses` replace its own.
 
     Raises:
         BadInputError: unknown layout, `frames` of a recording (its lists say which), `mapping` of what is no bag, or as
@@ -117,11 +119,11 @@ def open_source(
     preset = options or {SourceLayout.APC_SHELF: APC_SHELF, SourceLayout.MM5: MM5}.get(layout or SourceLayout.RECORDING)
     if preset is not None:
         group = 1 if scans_per_measurement is None else scans_per_measurement
-        return import_frames(folder, preset, frames=frames, scans_per_measurement=group)
+        return import_frames(folder, preset, frames=frames, scans_per_measurement=group, poses=poses)
     if frames is not None:
         raise BadInputError("unknown_frame", f"a {layout} has no frame ids to choose by")
     if layout is SourceLayout.BAG:
         from cairn_fusion.ros.bag_recording import open_any_bag
 
-        return open_any_bag(Path(folder), mapping, scans_per_measurement=scans_per_measurement)
-    return open_recording(folder, scans_per_measurement=scans_per_measurement)
+        return open_any_bag(Path(folder), mapping, scans_per_measurement=scans_per_measurement, poses=poses)
+    return open_recording(folder, scans_per_measurement=scans_per_measurement, poses=poses)

@@ -7,8 +7,9 @@ from pydantic import ValidationError
 from cairn_calib.rig.image_files import write_grey16
 from cairn_calib.rig.poses import inverse, transform_from_quaternion, transform_points
 from cairn_fusion.importers import SourceLayout, detect_layout, import_apc_shelf, import_mm5, open_source
-from cairn_fusion.recording.frame_folder import FrameFolderOptions, PoseConvention, import_frames
+from cairn_fusion.recording.frame_folder import FrameFolderOptions, import_frames
 from cairn_fusion.recording.images import write_colour
+from cairn_fusion.recording.pose_files import PoseConvention
 from cairn_fusion.recording.recording import Recording, open_recording
 from cairn_fusion.recording.recording_format import Convention, RangeEncoding, ThermalEncoding
 from cairn_fusion.recording.recording_writer import RecordingWriter

@@ -4,17 +4,21 @@ import argparse
 
 from pydantic import ValidationError
 
-from cairn_fusion.recording.frame_folder import FrameFolderOptions, PoseConvention
+from cairn_client.cli.pose_arguments import add_convention_arguments
+from cairn_fusion.recording.frame_folder import FrameFolderOptions
 from cairn_fusion.recording.recording_format import Convention
 from cairn_map.errors import BadInputError
 
 TEXT = """Any folder with one file per frame and image: give --depth, --pose, --intrinsics, and options of other images.
 Patterns are relative to the folder and hold {id}, e.g. --depth 'frames/{id}.depth.png' --pose 'frames/{id}.pose.txt'.
-All images must be one raster (registered); a pose is a 4x4 matrix in text, without {id} one file for all frames."""
+All images must be one raster (registered); a pose is a 4x4 matrix in text, without {id} one file for all frames.
+An {id} such as 1305031102.160407 (seconds) or 1403636579763555584 (nanoseconds) is the frame's time."""
 OPTIONS = (
     *("depth", "colour", "thermal", "pose", "distortion", "depth_units", "depth_convention"),
-    *("pose_convention", "kelvin_per_count", "kelvin_at_zero", "frame_rate"),
+    *("kelvin_per_count", "kelvin_at_zero", "frame_rate"),
 )
+OPTIONS_OF_PATTERN = ("pose_convention", "axes")
+"""Options of `--pose`; with `--poses` they are the pose file's."""
 FIELD_OF_OPTION = {"depth_units": "depth_units_per_m", "frame_rate": "frame_rate_hz"}
 
 
@@ -29,7 +33,6 @@ def add_frame_arguments(command: argparse.ArgumentParser) -> None:
     group.add_argument("--distortion", type=_numbers, metavar="K1,K2,P1,P2,K3", help="Brown's model (none)")
     group.add_argument("--depth-units", type=float, metavar="N", help="depth units in a metre (1000)")
     group.add_argument("--depth-convention", choices=[c.value for c in Convention], help="along z or the beam (z)")
-    group.add_argument("--pose-convention", choices=[c.value for c in PoseConvention], help="(camera_to_map)")
     group.add_argument("--kelvin-per-count", type=float, metavar="K", help="scale of the thermal image (0.01)")
     group.add_argument("--kelvin-at-zero", type=float, metavar="K", help="offset of the thermal image (0)")
     group.add_argument("--frame-rate", type=float, metavar="HZ", help="frames in a second (1)")
@@ -39,6 +42,7 @@ def add_frame_arguments(command: argparse.ArgumentParser) -> None:
         metavar="ID,A-B,...",
         help="only these frames: ids, and ranges by number",
     )
+    add_convention_arguments(command)
 
 
 def frame_options(args: argparse.Namespace) -> FrameFolderOptions | None:
@@ -47,9 +51,12 @@ def frame_options(args: argparse.Namespace) -> FrameFolderOptions | None:
     Raises:
         BadInputError: options that do not make a whole.
     """
-    given = {
-        FIELD_OF_OPTION.get(name, name): getattr(args, name) for name in OPTIONS if getattr(args, name) is not None
-    }
+    # Commands without `add_pose_arguments` have no pose files.
+    has_file = getattr(args, "poses", None) is not None
+    if has_file and args.pose is not None:
+        raise BadInputError("bad_option", "--pose and --poses are two sources of the same poses; give one of them")
+    names = OPTIONS if has_file else (*OPTIONS, *OPTIONS_OF_PATTERN)
+    given = {FIELD_OF_OPTION.get(name, name): getattr(args, name) for name in names if getattr(args, name) is not None}
     if args.intrinsics is not None:
         given |= _intrinsics(args.intrinsics)
     if not given:

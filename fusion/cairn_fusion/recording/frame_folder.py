@@ -8,8 +8,8 @@ of its own.
 """
 
 import re
-from collections.abc import Callable, Sequence
-from enum import StrEnum
+from collections.abc import Sequence
+from dataclasses import dataclass
 from glob import escape
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Self
@@ -22,7 +22,9 @@ from cairn_calib.rig.brown import Coefficients
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.poses import Transform, inverse
 from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
+from cairn_fusion.recording.frame_poses import FrameKey, PoseOptions, axes_transform, read_frame_poses
 from cairn_fusion.recording.images import image_header
+from cairn_fusion.recording.pose_files import Axes, PoseConvention
 from cairn_fusion.recording.pose_rounding import PoseRounding
 from cairn_fusion.recording.recording import Recording, ScanFiles, measurements_of
 from cairn_fusion.recording.recording_format import (
@@ -40,14 +42,9 @@ TEXT_BYTES_MAX = 1 << 16
 """Largest text file with a matrix."""
 FRAME_ID = "{id}"
 FRAME_RANGE = re.compile(r"([0-9]{1,18})-([0-9]{1,18})")
+DECIMAL_SECONDS = re.compile(r"[0-9]{1,12}\.[0-9]{1,12}")
+NANOSECONDS = re.compile(r"[0-9]{16,19}")
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-
-
-class PoseConvention(StrEnum):
-    """Direction in which a pose file's matrix maps points."""
-
-    CAMERA_TO_MAP = "camera_to_map"
-    MAP_TO_CAMERA = "map_to_camera"
 
 
 class FrameFolderOptions(BaseModel):
@@ -61,8 +58,8 @@ class FrameFolderOptions(BaseModel):
     """16-bit PNG; its ids are the frames."""
     colour: str | None = None
     thermal: str | None = None
-    pose: str
-    """4x4 or 3x4 matrix in text; without `{id}`, one file for all frames."""
+    pose: str | None = None
+    """4x4 or 3x4 matrix in text; without `{id}`, one file for all frames; None: poses come from a pose file."""
     intrinsics_file: str | None = None
     """3x3 matrix in text; else `focal_px` and `centre_px`."""
     focal_px: tuple[Positive, Positive] | None = None
@@ -71,10 +68,12 @@ class FrameFolderOptions(BaseModel):
     depth_units_per_m: Positive = 1000.0
     depth_convention: Convention = Convention.Z
     pose_convention: PoseConvention = PoseConvention.CAMERA_TO_MAP
+    axes: Axes = Axes.OPENCV
+    """Axes of the camera that `pose` is of."""
     kelvin_per_count: Positive = 0.01
     kelvin_at_zero: Finite = 0.0
     frame_rate_hz: Positive = 1.0
-    """Frame n of the folder (ids in order, numbers by value) is n / rate after the start."""
+    """Frame n of the folder (ids in order, numbers by value) is n / rate after the start, unless ids are times."""
     start_time_s: Finite = 0.0
 
     @model_validator(mode="after")
@@ -94,6 +93,7 @@ def import_frames(
     *,
     frames: Sequence[str] | None = None,
     scans_per_measurement: int = 1,
+    poses: PoseOptions | None = None,
 ) -> Recording:
     """A folder of frames as a recording; images are read when asked for.
 
@@ -103,6 +103,7 @@ def import_frames(
         frames: only these ids, each in the folder, and ranges of them by number (`100-499`, both ends included);
             they keep the times and the order that they have among all.
         scans_per_measurement: group scans by this count.
+        poses: pose file that counts instead of the options' `pose`.
 
     Raises:
         BadInputError: no frames, an image or pose missing for one of them, a path that leads out of the folder, a
@@ -111,13 +112,13 @@ def import_frames(
     root = Path(folder).resolve()
     ids = _frame_ids(root, options.depth)
     # Times count all frames of the folder, so that a choice of them keeps its times.
-    rounding = PoseRounding()
-    pose = _pose_reader(root, options, rounding)
     wanted = set(ids) if frames is None else _chosen(ids, frames, root)
+    chosen = [(n, frame_id) for n, frame_id in enumerate(ids) if frame_id in wanted]
+    found = _frame_poses(root, options, chosen, poses)
     files = tuple(
-        _scan_files(root, options, frame_id, time_s=options.start_time_s + n / options.frame_rate_hz, pose=pose)
-        for n, frame_id in enumerate(ids)
-        if frame_id in wanted
+        _scan_files(root, options, frame_id, time_s=_time_s(options, n, frame_id), T_map_rig=T)
+        for (n, frame_id), T in zip(chosen, found.poses, strict=True)
+        if T is not None
     )
     return Recording(
         name=options.name,
@@ -131,7 +132,8 @@ def import_frames(
         thermal_encodings={
             "thermal": ThermalEncoding(kelvin_per_count=options.kelvin_per_count, kelvin_at_zero=options.kelvin_at_zero)
         },
-        rounding=rounding,
+        rounding=found.rounding,
+        pose_notes=found.notes,
     )
 
 
@@ -176,7 +178,7 @@ def _chosen(ids: Sequence[str], frames: Sequence[str], root: Path) -> set[str]:
 
 
 def _scan_files(
-    root: Path, options: FrameFolderOptions, frame_id: str, *, time_s: float, pose: Callable[[str], Transform]
+    root: Path, options: FrameFolderOptions, frame_id: str, *, time_s: float, T_map_rig: Transform
 ) -> ScanFiles:
     def image(pattern: str) -> Path:
         path = path_inside(root, pattern.replace(FRAME_ID, frame_id))
@@ -188,7 +190,7 @@ def _scan_files(
 
     return ScanFiles(
         time_s=time_s,
-        T_map_rig=pose(frame_id),
+        T_map_rig=T_map_rig,
         range_camera="depth",
         range_path=image(options.depth),
         colour={"colour": image(options.colour)} if options.colour else {},
@@ -196,15 +198,61 @@ def _scan_files(
     )
 
 
-def _pose_reader(root: Path, options: FrameFolderOptions, rounding: PoseRounding) -> Callable[[str], Transform]:
-    """The pose of a frame id; a static pose is read once."""
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """Poses of the chosen frames, None for those left out, and what is said about them."""
+
+    poses: Sequence[Transform | None]
+    rounding: PoseRounding
+    notes: tuple[str, ...] = ()
+
+
+def _frame_poses(
+    root: Path, options: FrameFolderOptions, chosen: Sequence[tuple[int, str]], poses: PoseOptions | None
+) -> _Found:
+    """The pose of each chosen frame, from a pose file or from the options' pattern; a static pose is read once."""
+    if poses is not None:
+        sheet = root / "sensor.yaml"
+        found = read_frame_poses(poses, camera_body=sheet if sheet.is_file() else None)
+        keys = [_frame_key(root, options, n, frame_id) for n, frame_id in chosen]
+        return _Found(found.of_frames(keys), found.rounding, tuple(found.report()))
+    if options.pose is None:
+        raise BadInputError(
+            "bad_option", "a folder of frames needs poses: --pose PATTERN, or --poses FILE of a published form"
+        )
+    rounding = PoseRounding()
     if FRAME_ID not in options.pose:
-        static = _pose(root, options.pose, options.pose_convention, rounding)
-        return lambda _: static
-    return lambda frame_id: _pose(root, options.pose.replace(FRAME_ID, frame_id), options.pose_convention, rounding)
+        static = _pose(root, options.pose, options, rounding)
+        return _Found([static] * len(chosen), rounding)
+    each = [_pose(root, options.pose.replace(FRAME_ID, frame_id), options, rounding) for _, frame_id in chosen]
+    return _Found(each, rounding)
 
 
-def _pose(root: Path, relative: str, convention: PoseConvention, rounding: PoseRounding) -> Transform:
+def _frame_key(root: Path, options: FrameFolderOptions, n: int, frame_id: str) -> FrameKey:
+    patterns = [pattern for pattern in (options.colour, options.depth, options.thermal) if pattern is not None]
+    # A made-up rate gives frames times that no pose file knows.
+    has_time = _id_time_s(frame_id) is not None or "frame_rate_hz" in options.model_fields_set
+    return FrameKey(
+        label=f"frame {frame_id} of {root}",
+        number=int(frame_id) if frame_id.isdecimal() else None,
+        time_s=_time_s(options, n, frame_id) if has_time else None,
+        names=(*(PurePosixPath(pattern.replace(FRAME_ID, frame_id)).stem for pattern in patterns), frame_id),
+    )
+
+
+def _time_s(options: FrameFolderOptions, n: int, frame_id: str) -> float:
+    named_s = _id_time_s(frame_id)
+    return options.start_time_s + n / options.frame_rate_hz if named_s is None else named_s
+
+
+def _id_time_s(frame_id: str) -> float | None:
+    """The time that an id is: seconds with a point, or at least 16 digits of nanoseconds; else None."""
+    if DECIMAL_SECONDS.fullmatch(frame_id):
+        return float(frame_id)
+    return int(frame_id) / 1e9 if NANOSECONDS.fullmatch(frame_id) else None
+
+
+def _pose(root: Path, relative: str, options: FrameFolderOptions, rounding: PoseRounding) -> Transform:
     # A 3 x 4 matrix lacks the last row, which is the same in all of them.
     values = _numbers(path_inside(root, relative))
     if values.size == 12:
@@ -212,7 +260,8 @@ def _pose(root: Path, relative: str, convention: PoseConvention, rounding: PoseR
     if values.size != 16:
         raise BadInputError("bad_transform", f"{root / relative} must hold 16 or 12 numbers, got {values.size}")
     T = rounding.transform(values.reshape(4, 4), name=str(root / relative))
-    return inverse(T) if convention is PoseConvention.MAP_TO_CAMERA else T
+    T = inverse(T) if options.pose_convention is PoseConvention.MAP_TO_CAMERA else T
+    return T if options.axes is Axes.OPENCV else T @ axes_transform(options.axes)
 
 
 def _registered_rig(root: Path, options: FrameFolderOptions, first_depth: Path) -> Rig:

@@ -11,7 +11,7 @@ foreign folders, so a program that replays one replays all.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from cairn_calib.rig.poses import Transform
 from cairn_calib.rig.rig import RIG_BYTES_MAX, Rig, rig_from_json
+from cairn_fusion.recording.frame_poses import FrameKey, FramePoses, PoseOptions, read_frame_poses
 from cairn_fusion.recording.images import read_colour, read_grey16
 from cairn_fusion.recording.pose_rounding import PoseRounding
 from cairn_fusion.recording.recording_format import (
@@ -39,7 +40,7 @@ from cairn_fusion.recording.recording_format import (
 )
 from cairn_fusion.recording.scan import Scan, check_scan
 from cairn_fusion.recording.timed_lists import Line, TimedList, Value, lines, read_text, time_and_rest, timed_list
-from cairn_fusion.recording.trajectory import read_trajectory
+from cairn_fusion.recording.trajectory import Trajectory, read_trajectory
 from cairn_map.errors import BadInputError, NotFoundError
 
 
@@ -59,6 +60,11 @@ class ScanSource(Protocol):
     @property
     def rounding(self) -> PoseRounding:
         """Poses of the source that were not quite rotations, and the largest change."""
+        ...
+
+    @property
+    def pose_notes(self) -> Sequence[str]:
+        """Sentences about a pose file: its form and conventions, what was left out, and doubts."""
         ...
 
     def __len__(self) -> int: ...
@@ -102,6 +108,8 @@ class Recording:
     note: str = ""
     rounding: PoseRounding = field(default_factory=PoseRounding)
     """Poses that were not quite rotations."""
+    pose_notes: Sequence[str] = ()
+    """Sentences about a pose file."""
 
     def __len__(self) -> int:
         return len(self.files)
@@ -148,12 +156,15 @@ class Recording:
         return camera.width, camera.height
 
 
-def open_recording(path: str | Path, *, scans_per_measurement: int | None = None) -> Recording:
+def open_recording(
+    path: str | Path, *, scans_per_measurement: int | None = None, poses: PoseOptions | None = None
+) -> Recording:
     """The recording in a folder: every list read and checked, no image decoded yet.
 
     Args:
         path: the folder that holds `recording.json`.
         scans_per_measurement: group scans by this count, whatever `measurements.txt` says; the last may be shorter.
+        poses: pose file that counts instead of the recording's trajectory.
 
     Raises:
         BadInputError: not a recording, unfinished, or a file or line is wrong; the message has file and line.
@@ -162,8 +173,13 @@ def open_recording(path: str | Path, *, scans_per_measurement: int | None = None
     header = read_header(folder)
     rig = rig_from_json(read_text(path_inside(folder, RIG_FILE), RIG_BYTES_MAX).encode())
     check_cameras(header, rig)
-    rounding = PoseRounding()
-    files = _scan_files(folder, header, rounding)
+    rounding, found = PoseRounding(), None
+    trajectory = None if poses is not None else read_trajectory(path_inside(folder, TRAJECTORY_FILE), rounding)
+    files = _scan_files(folder, header, rounding, trajectory)
+    if poses is not None:
+        found = read_frame_poses(poses, rig)
+        rounding = found.rounding
+        files = _with_poses(folder, files, found)
     return Recording(
         name=header.name,
         rig=rig,
@@ -173,7 +189,33 @@ def open_recording(path: str | Path, *, scans_per_measurement: int | None = None
         thermal_encodings=header.thermal,
         note=header.note,
         rounding=rounding,
+        pose_notes=() if found is None else found.report(),
     )
+
+
+def _with_poses(folder: Path, files: Sequence[ScanFiles], found: FramePoses) -> tuple[ScanFiles, ...]:
+    """Scans with the poses of a pose file; those without one are left out.
+
+    Raises:
+        BadInputError: the recording has poses of the robot's body, which are in another frame.
+    """
+    if any(entry.T_map_body is not None for entry in files):
+        raise BadInputError(
+            "bad_option",
+            f"{folder} has {BODY_FILE}, the poses of the robot's body in the frame of its own trajectory: other poses "
+            "of the rig do not fit them",
+        )
+    keys = [
+        FrameKey(
+            label=f"scan {n} of {folder} ({entry.range_path.name})",
+            number=n,
+            time_s=entry.time_s,
+            names=tuple(path.stem for path in (*entry.colour.values(), entry.range_path, *entry.thermal.values())),
+        )
+        for n, entry in enumerate(files)
+    ]
+    poses = found.of_frames(keys)
+    return tuple(replace(entry, T_map_rig=T) for entry, T in zip(files, poses, strict=True) if T is not None)
 
 
 def measurements_of(scan_count: int, scans_per_measurement: int) -> tuple[range, ...]:
@@ -188,9 +230,13 @@ def measurements_of(scan_count: int, scans_per_measurement: int) -> tuple[range,
     return tuple(range(start, min(start + scans_per_measurement, scan_count)) for start in starts)
 
 
-def _scan_files(folder: Path, header: RecordingHeader, rounding: PoseRounding) -> tuple[ScanFiles, ...]:
-    """One entry per range image, in order of time; other cameras' images by nearest time within `max_gap_s`."""
-    trajectory = read_trajectory(path_inside(folder, TRAJECTORY_FILE), rounding)
+def _scan_files(
+    folder: Path, header: RecordingHeader, rounding: PoseRounding, trajectory: Trajectory | None
+) -> tuple[ScanFiles, ...]:
+    """One entry per range image, in order of time; other cameras' images by nearest time within `max_gap_s`.
+
+    Without a trajectory the pose is the identity, until a pose file gives it.
+    """
     body_path = path_inside(folder, BODY_FILE)
     body = read_trajectory(body_path, rounding) if body_path.exists() else None
     ranges = {name: _image_list(folder, f"{name}.txt") for name in header.range}
@@ -201,7 +247,7 @@ def _scan_files(folder: Path, header: RecordingHeader, rounding: PoseRounding) -
     files = [
         ScanFiles(
             time_s=time_s,
-            T_map_rig=trajectory.pose_at(time_s, max_gap_s=header.max_pose_gap_s),
+            T_map_rig=trajectory.pose_at(time_s, max_gap_s=header.max_pose_gap_s) if trajectory else np.eye(4),
             range_camera=camera,
             range_path=path,
             amplitude_path=_near(amplitudes, time_s, header.max_gap_s).get(camera),

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.lidar import AnyCamera, SpinningLidar
 from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
+from cairn_fusion.recording.frame_poses import PoseOptions, read_frame_poses
 from cairn_fusion.recording.recording import measurements_of
 from cairn_fusion.recording.recording_format import (
     Convention,
@@ -72,7 +73,13 @@ class BagRecording:
     """Scans of a bag; see `recording.ScanSource`. The file is closed when the object is garbage collected."""
 
     def __init__(
-        self, bag: Bag, index: BagIndex, mapping: BagMapping, *, scans_per_measurement: int | None = None
+        self,
+        bag: Bag,
+        index: BagIndex,
+        mapping: BagMapping,
+        *,
+        scans_per_measurement: int | None = None,
+        poses: PoseOptions | None = None,
     ) -> None:
         """Find all scans in an index that holds the mapping's topics.
 
@@ -86,9 +93,11 @@ class BagRecording:
         self._topics = {topic: _images_of(index, topic, name, types) for topic, name, types in _image_topics(mapping)}
         self._readers = {name: TopicReader(bag, entry) for name, entry in self._topics.items()}
         self.name = mapping.name
-        self.rounding = index.tree.rounding
         self.rig = _rig_of(index, mapping, self._topics)
-        self._scans = scans_of(bag, index, mapping, self._topics)
+        found = None if poses is None else read_frame_poses(poses, self.rig)
+        self._scans = scans_of(bag, index, mapping, self._topics, found)
+        self.rounding = index.tree.rounding if found is None else found.rounding
+        self.pose_notes: Sequence[str] = () if found is None else found.report()
         size = mapping.scans_per_measurement if scans_per_measurement is None else scans_per_measurement
         self._stops = measurements_of(len(self._scans), size)
         finalize(self, bag.close)
@@ -171,6 +180,7 @@ def open_bag_recording(
     mapping: BagMapping,
     *,
     scans_per_measurement: int | None = None,
+    poses: PoseOptions | None = None,
 ) -> BagRecording:
     """Scans of a bag, indexed in one pass, its images not yet decoded.
 
@@ -181,7 +191,7 @@ def open_bag_recording(
     bag = open_bag(path)
     try:
         # One pass over the topics of the mapping, and over all transforms.
-        wanted = {*mapping.topics(), mapping.poses.topic}
+        wanted = {*mapping.topics(), *([] if poses else [mapping.poses.topic])}
         if missing := sorted(wanted - bag.topics.keys()):
             raise BadInputError(
                 "no_topic",
@@ -190,7 +200,7 @@ def open_bag_recording(
             )
         transforms = {name for name, topic in bag.topics.items() if topic.type in TRANSFORMS}
         index = index_bag(bag, wanted | transforms)
-        return BagRecording(bag, index, mapping, scans_per_measurement=scans_per_measurement)
+        return BagRecording(bag, index, mapping, scans_per_measurement=scans_per_measurement, poses=poses)
     except BaseException:
         bag.close()
         raise
@@ -277,7 +287,13 @@ def survey(path: Path, *, on_message: Callable[[], object] | None = None) -> Sur
         bag.close()
 
 
-def open_any_bag(path: Path, mapping: BagMapping | None, *, scans_per_measurement: int | None = None) -> BagRecording:
+def open_any_bag(
+    path: Path,
+    mapping: BagMapping | None,
+    *,
+    scans_per_measurement: int | None = None,
+    poses: PoseOptions | None = None,
+) -> BagRecording:
     """Scans of a bag by a mapping, or by the proposed one if it leaves no question open.
 
     Raises:
@@ -294,4 +310,4 @@ def open_any_bag(path: Path, mapping: BagMapping | None, *, scans_per_measuremen
                 "bag.yaml`, edit it, and give it with --topics bag.yaml",
             )
         mapping = mapping_from_yaml(proposal.text, f"the topics proposed for {path}")
-    return open_bag_recording(path, mapping, scans_per_measurement=scans_per_measurement)
+    return open_bag_recording(path, mapping, scans_per_measurement=scans_per_measurement, poses=poses)

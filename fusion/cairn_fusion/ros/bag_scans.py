@@ -12,6 +12,7 @@ import numpy as np
 
 from cairn_calib.rig.poses import Transform
 from cairn_calib.rig.rig import Spectrum
+from cairn_fusion.recording.frame_poses import FrameKey, FramePoses
 from cairn_fusion.recording.timed_lists import TimedList
 from cairn_fusion.ros.bag import Bag
 from cairn_fusion.ros.bag_index import BASE, BagIndex, TopicIndex
@@ -33,7 +34,13 @@ class BagScan:
     """Number of the message, by topic."""
 
 
-def scans_of(bag: Bag, index: BagIndex, mapping: BagMapping, topics: Mapping[str, TopicIndex]) -> tuple[BagScan, ...]:
+def scans_of(
+    bag: Bag,
+    index: BagIndex,
+    mapping: BagMapping,
+    topics: Mapping[str, TopicIndex],
+    poses: FramePoses | None = None,
+) -> tuple[BagScan, ...]:
     """A scan for each range image between the first and the last pose, in order of time.
 
     Args:
@@ -41,11 +48,14 @@ def scans_of(bag: Bag, index: BagIndex, mapping: BagMapping, topics: Mapping[str
         index: of its topics and transforms.
         mapping: meaning of the topics.
         topics: of all images, as they are in the index.
+        poses: pose file that counts instead of the bag's poses; then every range image must have a pose.
 
     Raises:
         BadInputError: no poses of that kind, no way between the two frames, no scan with a pose, or too long a gap.
     """
     lists = {name: _by_time(entry) for name, entry in topics.items()}
+    if poses is not None:
+        return _scans_with_poses(bag, mapping, lists, poses)
     pose_at, first_s, last_s = _poses_of(index, mapping)
     scans: list[BagScan] = []
     for name, camera in mapping.cameras.items():
@@ -71,6 +81,28 @@ def scans_of(bag: Bag, index: BagIndex, mapping: BagMapping, topics: Mapping[str
             f"{mapping.frames.base} in {mapping.frames.map}; see `cairn robot inspect` for its topics and times",
         )
     return tuple(sorted(scans, key=lambda scan: scan.time_s))
+
+
+def _scans_with_poses(
+    bag: Bag, mapping: BagMapping, lists: Mapping[str, TimedList[int]], poses: FramePoses
+) -> tuple[BagScan, ...]:
+    """A scan for each range image, its pose from a pose file; those without one are left out."""
+    found = [
+        (time_s, name, camera)
+        for name, camera in mapping.cameras.items()
+        if camera.spectrum is Spectrum.RANGE
+        for time_s in lists[camera.topic].times_s.tolist()
+    ]
+    found.sort(key=lambda entry: entry[0])
+    keys = [
+        FrameKey(label=f"the image of {camera.topic} at {time_s:.6f} s in {bag.path}", number=n, time_s=time_s)
+        for n, (time_s, _, camera) in enumerate(found)
+    ]
+    return tuple(
+        BagScan(time_s=time_s, T_map_rig=T, camera=name, images=_images_near(mapping, camera, lists, time_s))
+        for (time_s, name, camera), T in zip(found, poses.of_frames(keys), strict=True)
+        if T is not None
+    )
 
 
 def _images_near(

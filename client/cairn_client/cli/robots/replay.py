@@ -10,6 +10,7 @@ import numpy as np
 
 from cairn_client.cli.arguments import Subparsers, api_of, say, shown_bytes, shown_length
 from cairn_client.cli.frame_arguments import add_frame_arguments, frame_options
+from cairn_client.cli.pose_arguments import add_pose_arguments, pose_options
 from cairn_client.cli.range_arguments import add_ranges, integrator_of, returns_line
 from cairn_client.cli.robot_arguments import add_map, scope_of
 from cairn_client.http.api import MapApi
@@ -37,7 +38,12 @@ def _replay(args: argparse.Namespace) -> int:
     options, size = frame_options(args), args.scans_per_measurement
     mapping = mapping_of(args.topics) if args.topics else None
     source = open_source(
-        args.recording, options=options, mapping=mapping, frames=args.frames, scans_per_measurement=size
+        args.recording,
+        options=options,
+        mapping=mapping,
+        frames=args.frames,
+        scans_per_measurement=size,
+        poses=pose_options(args),
     )
     _say_range(source)
     geometry = ensure_map(args, source)
@@ -96,11 +102,13 @@ def _map_stops(robot: Robot, source: ScanSource, stops: Sequence[range], profile
 
 
 def _say_range(source: ScanSource) -> None:
-    """Write the ranges of the first scan (5 m for a shelf at arm's length are wrong depth units), and rounded poses."""
+    """Write the ranges of the first scan (5 m for a shelf at arm's length are wrong depth units), and pose notes."""
     range_m = source.scan(0).range_m
     seen = range_m[np.isfinite(range_m)]
     median = f"median range {np.median(seen):.2f} m" if len(seen) else "no range at all"
     say(f"{source.name}: {len(source)} scans; the first has {len(seen) / range_m.size:.0%} of its pixels, {median}")
+    for note in source.pose_notes:
+        say(note)
     rounded = source.rounding.text()
     if rounded:
         say(rounded)
@@ -197,6 +205,7 @@ def add_parser(commands: Subparsers) -> None:
         help="small: four tenths fewer bytes, more work (as --link wants it)",
     )
     add_frame_arguments(replay)
+    add_pose_arguments(replay)
     replay.set_defaults(run=_replay)
 
 
