@@ -13,7 +13,8 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Self
+from types import TracebackType
+from typing import Self, get_args
 
 import numpy.typing as npt
 
@@ -103,12 +104,13 @@ class Robot:
         """Open or make the robot's directory; no network unless the map's geometry is unknown.
 
         Raises:
-            BadInputError: bad URL or name, or the directory belongs to another robot or map.
+            BadInputError: bad URL, name, rig or mode, or the directory belongs to another robot or map.
             ConflictError: another process has the directory open.
             UnreachableError: the geometry is unknown and the server cannot be asked.
         """
         show_compiling()
-        # URL and name are checked before anything is opened or written.
+        # All of this is checked before anything is opened or written.
+        _check_kinds(rig, mode)
         server_url, self._map_name = split_map_url(map_url)
         self.name = robot_name(name)
         self.mode: Mode = mode
@@ -203,7 +205,18 @@ class Robot:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Close; an error inside the block discards the open measurement, which it may have cut anywhere.
+
+        A signal (`KeyboardInterrupt`, `SystemExit`) ends the block as its last line does: the scans are committed.
+        """
+        # Scans of half a measurement, or under a pose that the failed code had yet to correct, are no evidence to
+        # publish; those of earlier commits are. KeyboardInterrupt is no Exception.
+        if isinstance(error, Exception) and not self._is_closed and self._measurement:
+            log.warning("%d scans since the last commit are discarded: %s", len(self._measurement), error)
+            self.discard()
         self.close()
 
     @property
@@ -275,6 +288,7 @@ class Robot:
             BadInputError: a scan does not fit the rig, the guess is no rigid transform, the reach asks for too many
                 starts, there is no rig, or small_gicp is not installed.
         """
+        self._check_open()
         if self._rig is None:
             raise BadInputError("no_rig", "this robot was opened without a rig, so it cannot read scans")
         points = points_of_scans(scans, self._rig, self._integrator)
@@ -287,6 +301,7 @@ class Robot:
         Raises:
             BadInputError: the scan does not fit the rig or the map; nothing was added.
         """
+        self._check_open()
         if self._measurement is None:
             raise BadInputError("no_rig", "this robot was opened without a rig, so it cannot read scans")
         # The measurement first: it refuses what does not fit, before anything else has the scan.
@@ -300,6 +315,8 @@ class Robot:
         Raises:
             BadInputError: kind `open_measurement`: there are scans of the old head.
         """
+        self._check_open()
+        _check_kinds(rig, self.mode)
         # A commit names one rig, by which an operator can retract it: scans of two heads must not share one.
         if self._measurement is not None and len(self._measurement):
             raise BadInputError("open_measurement", "commit or discard the scans of the old head first")
@@ -332,6 +349,17 @@ class Robot:
             UnreachableError: kind `store_failed`: the disk is full or broken; `outbox_full`: the limits are reached,
                 and nothing is left to drop. The measurement stays open in any case.
         """
+        self._check_open()
+        return self._commit(note, retracts, profile, remember)
+
+    def _commit(
+        self,
+        note: str = "",
+        retracts: tuple[CommitId, ...] = (),
+        profile: Profile | None = None,
+        remember: Mapping[str, str] = NO_NOTES,
+    ) -> Commit | None:
+        """Commit the open measurement; `close` does it, too."""
         diff = self._measurement.diff() if self._measurement else {}
         counts = self._measurement.counts if self._measurement else ReturnCounts()
         # No evidence is no commit, except to take others out.
@@ -407,10 +435,12 @@ class Robot:
             UnreachableError: no link; try again later, nothing is lost.
             CairnError: the server refuses this robot, or its data is damaged.
         """
+        self._check_open()
         return self._rounds.sync(on_push)
 
     def start_sync(self, *, every_s: float = 5.0) -> None:
         """Sync in the background: after each commit, and at least every so many seconds while there is a link."""
+        self._check_open()
         self._rounds.start(every_s=every_s)
 
     def deregister(self) -> None:
@@ -420,13 +450,15 @@ class Robot:
             UnreachableError: no link; the robot stays on the map.
             CairnError: the server refuses.
         """
+        self._check_open()
         self._rounds.leave()
 
     def close(self, *, stay: bool = False, flush_s: float = FLUSH_S) -> None:
         """Commit the open measurement, push the commits that wait, deregister if none is left, and close.
 
         Without a link, the commits stay here, and the robot stays on the map. May be called twice. If `commit` refuses,
-        the open measurement is lost; the other commits are pushed all the same, and then its error is raised.
+        the open measurement is lost; the other commits are pushed all the same, and then its error is raised. What is
+        called later raises BadInputError of kind `robot_closed`; the map as it was may still be read.
 
         Args:
             stay: only pause: do not deregister.
@@ -441,7 +473,7 @@ class Robot:
             self._rounds.stop()
             # The last measurement first, then one push; a robot whose commit was refused does not leave the map.
             try:
-                self.commit()
+                self._commit()
             except CairnError:
                 self._rounds.finish(is_leaving=False, within_s=flush_s)
                 raise
@@ -456,7 +488,13 @@ class Robot:
     def _new_measurement(self) -> Measurement | None:
         return Measurement(self._rig, self._replica.geometry, self._integrator) if self._rig else None
 
+    def _check_open(self) -> None:
+        # One error for all, before the closed store or link would raise one of their own.
+        if self._is_closed:
+            raise BadInputError("robot_closed", f"robot {self.name} is closed: open it again with Robot(...)")
+
     def _amending(self) -> Amending:
+        self._check_open()
         # Made for each call: it works with the rig that is mounted now.
         return Amending(
             self._replica,
@@ -483,3 +521,17 @@ class Robot:
             retracts=retracts,
             note=note,
         )
+
+
+def _check_kinds(rig: object, mode: object) -> None:
+    """Check what a caller without a type checker may confuse.
+
+    Raises:
+        BadInputError: `rig` is no rig, such as the path of one, or there is no such mode.
+    """
+    # `load_rig` takes a path and `Robot` a rig: without this, the path fails later, as an attribute that is missing.
+    if rig is not None and not isinstance(rig, Rig):
+        raise BadInputError("bad_rig", f"a rig is expected, got {type(rig).__name__}: cairn.load_rig(path) reads one")
+    # A mode that is none would be found out by the server, and only when there is a link.
+    if mode not in get_args(Mode):
+        raise BadInputError("bad_mode", f"the mode is one of {', '.join(get_args(Mode))}; got {mode!r}")

@@ -5,16 +5,19 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from tests.fixtures.client.live_server import LiveServer
-from tests.fixtures.client.made import MAP
-from tests.fixtures.client.robot_program import scan_of
-from tests.fixtures.client.robots import ADMIN, NOWHERE, TOKEN, map_commit, robot_in
+from tests.fixtures.client.made import MAP, cells_of
+from tests.fixtures.client.robot_program import RIG, scan_of
+from tests.fixtures.client.robots import ADMIN, NOWHERE, TOKEN, evidence_of, map_commit, robot_in
 from tests.fixtures.client.world import stored_commits
 
 from cairn_client.http.api import MapApi
 from cairn_client.http.backoff import Backoff
+from cairn_client.robot.robot import Robot
 from cairn_map.errors import BadInputError, DeniedError, UnreachableError
 from cairn_map.evidence.grid import CellKey
 from cairn_map.wire.access_messages import CreateToken
@@ -225,3 +228,54 @@ def test_what_hangs_is_cut_by_another_thread_and_can_be_asked_again(server: Live
         api.sockets.cut()
         api.sockets.mend()
         assert len(api.maps()) == 1
+
+
+# Errors of the robot's own program
+
+
+def test_an_error_in_the_block_discards_the_open_measurement_and_keeps_the_commits(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), robot_in(tmp_path) as robot:
+        map_commit(robot, 1)
+        robot.observe(scan_of(2))
+        raise ZeroDivisionError
+    with robot_in(tmp_path) as robot:
+        assert robot.waiting == 1
+        assert cells_of(robot.map) == cells_of(evidence_of(1))
+
+
+def test_a_signal_in_the_block_commits_the_open_measurement(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), robot_in(tmp_path) as robot:
+        robot.observe(scan_of(2))
+        raise KeyboardInterrupt
+    with robot_in(tmp_path) as robot:
+        assert cells_of(robot.map) == cells_of(evidence_of(2))
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda robot: robot.observe(scan_of(1)),
+        lambda robot: robot.commit(),
+        lambda robot: robot.sync(),
+        lambda robot: robot.start_sync(),
+        lambda robot: robot.deregister(),
+        lambda robot: robot.mount(RIG),
+        lambda robot: robot.amend_all({}),
+        lambda robot: robot.align([scan_of(1)], T_map_robot=np.eye(4)),
+    ],
+)
+def test_a_closed_robot_says_that_it_is_closed(tmp_path: Path, use: Callable[[Robot], object]) -> None:
+    robot = robot_in(tmp_path)
+    robot.close()
+    with pytest.raises(BadInputError, match="robot mole is closed") as caught:
+        use(robot)
+    assert caught.value.kind == "robot_closed"
+
+
+def test_a_mode_that_is_none_and_a_path_as_rig_are_named(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"high-end, low-end, viewer; got 'lowend'"):
+        robot_in(tmp_path, mode="lowend")
+    path: Any = tmp_path / "rig.json"
+    with pytest.raises(BadInputError, match=r"got \w*Path: cairn\.load_rig"):
+        Robot(path, NOWHERE, directory=tmp_path / "mole", name="mole")
+    assert not (tmp_path / "mole").exists()
