@@ -112,11 +112,16 @@ class FoldThread:
         busy, planning = True, False
         while (busy or planning) and not self._closing.is_set():
             # A plan in the background does not report its end.
-            is_news = busy or self._wake.wait(LOOK_S)
-            # Cleared before the look, so that a commit that comes during it wakes the thread again.
+            if not busy:
+                self._wake.wait(LOOK_S)
+            # Cleared before the look, so that a commit that comes during it wakes the thread again; and only if it was
+            # set: a commit that comes when the wait has just ended would wait for the plan otherwise.
+            is_woken = self._wake.is_set()
+            if is_woken:
+                self._wake.clear()
+            is_news = busy or is_woken
             busy = planning = False
             start_s = time.monotonic()
-            self._wake.clear()
             self._watch_clocks(start_s)
             try:
                 maps = self._store.maps()
