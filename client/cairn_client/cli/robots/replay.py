@@ -17,6 +17,7 @@ from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
 from cairn_fusion.importers import open_source
 from cairn_fusion.recording.recording import ScanSource
+from cairn_fusion.recording.view_agreement import pose_doubt
 from cairn_fusion.ros.topic_mapping import mapping_of
 from cairn_map.codec.cell_code import Profile
 from cairn_map.commits.commit import Commit
@@ -46,6 +47,10 @@ def _replay(args: argparse.Namespace) -> int:
         poses=pose_options(args),
     )
     _say_range(source)
+    # Poses that somebody described may be described wrongly.
+    doubt = pose_doubt(source) if options is not None or args.poses is not None else None
+    if doubt is not None:
+        say(doubt)
     geometry = ensure_map(args, source)
     name = args.name or default_name(source.name)
     state = args.state or Path(f"cairn-{name}")
