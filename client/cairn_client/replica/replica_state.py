@@ -108,7 +108,7 @@ class ReplicaState:
     """Grid of the map."""
     url: Field[str] = Field("url", str)
     """Map on its server, `http://HOST:PORT/maps/NAME`."""
-    mode = Field[Mode]("mode", TypeAdapter[Mode](Mode).validate_python)
+    mode: Field[Mode] = Field("mode", TypeAdapter[Mode](Mode).validate_python)
     """Mode in which the robot was opened last."""
     limits = Field("limits", lambda text: Limits(**json.loads(text)), lambda limits: json.dumps(asdict(limits)))
     """Limits that were given last."""

@@ -146,15 +146,25 @@ class Ros1Bag:
 def _message_at(records: BytesIO, offset: int, log_ns: int, ids: dict[int, str]) -> BagMessage:
     """The message at a place of an unpacked chunk."""
     records.seek(offset)
-    for _ in range(CONNECTIONS_BEFORE_MAX):
-        header = Header.read(records)
-        kind = header.get_uint8("op")
-        data = read_bytes(records, read_uint32(records))
-        if kind != RecordType.CONNECTION:
+    header, data = _record(records)
+    # Connections may stand before their first message.
+    for _ in range(CONNECTIONS_BEFORE_MAX - 1):
+        if header.get_uint8("op") != RecordType.CONNECTION:
             break
-    if kind != RecordType.MSGDATA or header.get_time("time") != log_ns or header.get_uint32("conn") not in ids:
+        header, data = _record(records)
+    if (
+        header.get_uint8("op") != RecordType.MSGDATA
+        or header.get_time("time") != log_ns
+        or header.get_uint32("conn") not in ids
+    ):
         raise ValueError(f"the index names a message at {log_ns / 1e9:.6f} s that is not at its place")
     return BagMessage(ids[header.get_uint32("conn")], log_ns, data)
+
+
+def _record(records: BytesIO) -> tuple[Header, bytes]:
+    """Header and data of the next record."""
+    header = Header.read(records)
+    return header, read_bytes(records, read_uint32(records))
 
 
 def _from_bz2(data: bytes) -> bytes:
