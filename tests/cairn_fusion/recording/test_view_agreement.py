@@ -9,12 +9,17 @@ from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.image_files import write_grey16
 from cairn_calib.rig.poses import inverse, look_at
 from cairn_fusion.recording.frame_folder import FrameFolderOptions, import_frames
+from cairn_fusion.recording.recording_format import Convention
 from cairn_fusion.recording.view_agreement import pose_doubt
 
 CAMERA = Camera(width=48, height=36, focal_px=(40.0, 40.0), centre_px=(23.5, 17.5))
 LOW, HIGH = np.array([0.0, 0.0, 0.0]), np.array([5.0, 4.0, 2.5])
 OPTIONS = FrameFolderOptions(
-    depth="{id}.png", pose="{id}.txt", focal_px=CAMERA.focal_px, centre_px=CAMERA.centre_px, depth_convention="range"
+    depth="{id}.png",
+    pose="{id}.txt",
+    focal_px=CAMERA.focal_px,
+    centre_px=CAMERA.centre_px,
+    depth_convention=Convention.RANGE,
 )
 
 
