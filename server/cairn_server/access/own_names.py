@@ -20,6 +20,9 @@ from cairn_map.errors import BadInputError
 from cairn_map.wire.origins import origin_text
 from cairn_server.settings import LOOPBACK, Settings
 
+CERTIFICATES_BYTES_MAX = 1 << 20
+"""Bytes of a file of certificates that are read: the first one, the server's own, is among them."""
+
 
 @dataclass(frozen=True, slots=True)
 class OwnNames:
@@ -74,7 +77,8 @@ def _plain_address(host: str) -> str:
 def _certified_hosts(path: Path) -> frozenset[str]:
     """Names and addresses for which the first certificate of a file stands, as a URL has them."""
     try:
-        certificate = x509.load_pem_x509_certificates(path.read_bytes())[0]
+        with path.open("rb") as file:
+            certificate = x509.load_pem_x509_certificates(file.read(CERTIFICATES_BYTES_MAX))[0]
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
         return frozenset()

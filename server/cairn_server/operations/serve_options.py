@@ -34,6 +34,8 @@ from cairn_server.settings import Settings
 
 PREFIX, BETWEEN = "CAIRN_", "__"
 MEGABYTE = 1 << 20
+FILE_BYTES_MAX = MEGABYTE
+"""Largest file of a secret or of settings."""
 WIDTH = 110
 FLAGS = {
     "folder": ("--data", "DIR"),
@@ -169,7 +171,7 @@ def settings_of(args: argparse.Namespace) -> Settings:
     # Names and bounds are checked by the model, whatever source a value came from.
     try:
         return Sources(**given)
-    except SettingsError as exc:
+    except (SettingsError, RecursionError) as exc:
         raise BadInputError("bad_setting", f"environment: {exc}") from exc
     except ValidationError as exc:
         first = exc.errors()[0]
@@ -206,9 +208,16 @@ def _table_of(file: Path) -> dict[str, Any]:
 
 def _text_of(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        with path.open("rb") as file:  # a pipe, too: `--admin-token-file <(pass cairn)`
+            data = file.read(FILE_BYTES_MAX + 1)
+        text = data.decode()
     except (OSError, UnicodeDecodeError) as exc:
         raise BadInputError("bad_setting", f"cannot read {path}: {exc}") from exc
+    if len(data) > FILE_BYTES_MAX:
+        raise BadInputError(
+            "bad_setting", f"{path} has more than {FILE_BYTES_MAX} bytes: is it the file of a secret, or of settings?"
+        )
+    return text
 
 
 def _settings_help() -> str:

@@ -83,6 +83,18 @@ def test_a_variable_that_is_no_json_is_refused(monkeypatch: pytest.MonkeyPatch) 
         read()
 
 
+def test_a_variable_of_many_brackets_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAIRN_QUOTAS", "[" * 50_000)
+    with pytest.raises(BadInputError, match="environment"):
+        read()
+
+
+@pytest.mark.parametrize("flag", ["--settings", "--admin-token-file"])
+def test_a_file_without_end_is_refused_unread(flag: str) -> None:
+    with pytest.raises(BadInputError, match="/dev/zero has more than 1048576 bytes"):
+        read(flag, "/dev/zero")
+
+
 @pytest.mark.parametrize("argv", [("--port", "many"), ("--branch-expiry", "1"), ("--admin-token-file", "short")])
 def test_a_wrong_flag_is_refused_and_named(
     argv: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
