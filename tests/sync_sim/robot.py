@@ -38,6 +38,7 @@ class MemoryDisk(ReplicaStore):
 
     def __init__(self, image: bytes = b"") -> None:
         self._folder = Path("in-memory")
+        self.file = self._folder / "robot.sqlite"
         self._lock = threading.RLock()
         self._connection = apsw.Connection(":memory:")
         if image:

@@ -10,32 +10,27 @@ from pathlib import Path
 import pytest
 from tests.fixtures.map.bombs import DEEP, cell_of_air
 from tests.fixtures.map.costly import air, dust
-from tests.fixtures.map.made import SMALL, random_evidence
+from tests.fixtures.map.made import random_evidence
+from tests.fixtures.server.folding import FAR, HERE, THERE, WIDE, Folder, cells_of, costly, scan, straight
 from tests.fixtures.server.pushes import MOLE, WREN, pushed
 from tests.fixtures.server.store_contract import NAMES, new_of
 from tests.memory_store.store import MemoryStore
 
 from cairn_map.codec.cell_code import DecodedCell, encode_cell
 from cairn_map.commits.commit import Commit
-from cairn_map.commits.ids import Author, CommitId
-from cairn_map.commits.version_vector import VersionVector
+from cairn_map.commits.ids import CommitId
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, cell_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.folding import commit_work, fold_lanes, folding, group_folding
 from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.commit_work import SLICE_S, commit_work_s
-from cairn_server.folding.damaged_cells import DamagedCells
 from cairn_server.folding.fold_turns import FoldTurns
-from cairn_server.folding.folding import fold_commits, fold_pending
-from cairn_server.folding.group_folding import LocalFolding
+from cairn_server.folding.folding import fold_commits
 from cairn_server.store.sqlite.store import SqliteStore
 from cairn_server.store.stamps import decode_stamps
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import Fold, MapRow, StoredCommit
-
-WIDE = SMALL.model_copy(update={"depth": 5})
-HERE, THERE, FAR = (cell_key((n, 0, 0)) for n in range(3))
 
 
 @pytest.fixture(params=["memory", "disk"])
@@ -55,64 +50,6 @@ def small_slices(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "SLICE_S", 1e-4)
         monkeypatch.setattr(module, "SLICE_S_PER_BYTE", 1e-9)
     monkeypatch.setattr(commit_work, "CELL_S", 0.0)
-
-
-class Folder:
-    """Folding of one map, with as many looks as it takes."""
-
-    def __init__(self, store: Store, commits: Sequence[Commit]) -> None:
-        self.store = store
-        self.row, _ = store.create_map(next(NAMES), WIDE, SensorModel())
-        self.folding = LocalFolding(store, DamagedCells())
-        self.push(commits)
-
-    def push(self, commits: Sequence[Commit]) -> None:
-        for commit in commits:
-            self.store.append(self.row, new_of(commit))
-
-    def look(self) -> int:
-        """Fold one group; the plan that was under way is done before."""
-        self.folding.close()
-        return self.folding.fold(self.row, maps=1).commits
-
-    def finish(self) -> None:
-        """Fold until nothing waits."""
-        while self.store.pending(self.row, limit=1, size_bytes_max=1 << 26):
-            self.look()
-
-    def vector(self) -> VersionVector:
-        """Commits that are in the map."""
-        with self.store.snapshot(self.row) as snapshot:
-            return snapshot.head.vector
-
-    def waiting_of(self, author: Author) -> list[StoredCommit]:
-        """Pending commits of an author."""
-        waiting = self.store.pending(self.row, limit=99, size_bytes_max=1 << 26)
-        return [commit for commit in waiting if commit.id.author == author]
-
-
-def costly(n: int, evidence: Evidence, *, keys: Sequence[CellKey] = (HERE,), retracts: Sequence[Commit] = ()) -> Commit:
-    return pushed(n, 0, MOLE, geometry=WIDE, cells=dict.fromkeys(keys, evidence), scans=9, retracts=retracts)
-
-
-def scan(n: int, key: CellKey = THERE) -> Commit:
-    return pushed(n, 0, WREN, geometry=WIDE, cells={key: random_evidence(n, WIDE, voxels=9, air=0)}, scans=9)
-
-
-def cells_of(store: Store, row: MapRow) -> dict[CellKey, tuple[bytes, bytes]]:
-    with store.snapshot(row) as snapshot:
-        return {cell.key: (cell.digest, cell.fingerprint.to_bytes()) for cell in snapshot.cells()}
-
-
-def straight(commits: Sequence[Commit]) -> dict[CellKey, tuple[bytes, bytes]]:
-    """Cells of the same commits, folded one after the other, without lanes."""
-    store = MemoryStore()
-    row, _ = store.create_map(next(NAMES), WIDE, SensorModel())
-    for commit in commits:
-        store.append(row, new_of(commit))
-    while fold_pending(store, row, CellCache(WIDE), limit=1):
-        pass
-    return cells_of(store, row)
 
 
 def test_dust_air_and_very_many_cells_are_known_to_be_costly_before_they_are_decoded_and_scans_are_not() -> None:

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from tests.cairn_server.folding.test_fold_lanes import FAR, HERE, THERE, WIDE, Folder, cells_of, costly, scan, straight
 from tests.fixtures.map.costly import air, dust
 from tests.fixtures.map.made import SMALL, random_evidence
+from tests.fixtures.server.folding import FAR, HERE, THERE, WIDE, Folder, cells_of, costly, scan, straight
 from tests.fixtures.server.pushes import MOLE, WREN, pushed, read, sum_of
 from tests.fixtures.server.store_contract import NAMES, new_of
 from tests.memory_store.store import MemoryStore
