@@ -10,7 +10,7 @@ room to decode or is answered 503, a commit whose check needs more than its shar
 from dataclasses import dataclass, replace
 
 from cairn_map.errors import BadInputError
-from cairn_map.machine_memory import standard_limit_bytes
+from cairn_map.machine_memory import memory_bytes, standard_limit_bytes
 
 MIB = 1 << 20
 PROGRAMS_BYTES = 512 * MIB
@@ -85,9 +85,10 @@ class MemoryShares:
 
     def text(self) -> str:
         """One line for people."""
+        least = " (the least that it needs)" if self.limit_bytes == LIMIT_MIN_BYTES else ""
         return (
-            f"memory: at most {self.limit_bytes / 1e6:.0f} MB in all: caches {self.caches_bytes / 1e6:.0f}, checks "
-            f"{self.check_workers} x {self.check_bytes / 1e6:.0f}, folding {FOLDING_BYTES / 1e6:.0f}, decoding "
+            f"memory: at most {self.limit_bytes / 1e6:.0f} MB in all{least}: caches {self.caches_bytes / 1e6:.0f}, "
+            f"checks {self.check_workers} x {self.check_bytes / 1e6:.0f}, folding {FOLDING_BYTES / 1e6:.0f}, decoding "
             f"{DECODING_BYTES / 1e6:.0f}, bodies {self.bodies_bytes / 1e6:.0f}, programs {PROGRAMS_BYTES / 1e6:.0f}"
         )
 
@@ -96,10 +97,17 @@ def memory_shares(limit_bytes: int | None = None) -> MemoryShares:
     """Shares of a limit; without one, of a quarter of the machine's memory, or of its container's.
 
     Raises:
-        BadInputError: kind `bad_setting`: the limit is below `LIMIT_MIN_BYTES`. The standard one never is.
+        BadInputError: kind `bad_setting`: the limit is below `LIMIT_MIN_BYTES`, which the standard one never is, or
+            above the memory there is.
     """
     if limit_bytes is None:
         limit_bytes = max(standard_limit_bytes(), LIMIT_MIN_BYTES)
+    elif limit_bytes > memory_bytes():
+        raise BadInputError(
+            "bad_setting",
+            f"memory_bytes is {limit_bytes}, more than the {memory_bytes()} bytes of this machine or its container: "
+            "the kernel would end the server before it keeps to its limit",
+        )
     if limit_bytes < LIMIT_MIN_BYTES:
         raise BadInputError(
             "bad_setting",

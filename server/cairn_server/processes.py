@@ -45,14 +45,17 @@ def fork(work: Callable[[Connection], None]) -> tuple[Connection, int]:
 def used_bytes(pid: int | None = None) -> int:
     """Memory of a process (None: this one) and of all its children: what pages shared among them take counts once.
 
-    It is the proportional set size where the kernel tells it (Linux), else 0.
+    It is the proportional set size; the resident one of a process whose own the kernel does not tell.
     """
     total, waiting = 0, [os.getpid() if pid is None else pid]
     while waiting:
         folder = Path(f"/proc/{waiting.pop()}")
         with suppress(OSError):  # it has ended
-            lines = (folder / "smaps_rollup").read_text().splitlines()
-            total += sum(1024 * int(line.split()[1]) for line in lines if line.startswith("Pss:"))
+            try:
+                lines = (folder / "smaps_rollup").read_text().splitlines()
+                total += sum(1024 * int(line.split()[1]) for line in lines if line.startswith("Pss:"))
+            except OSError:
+                total += int((folder / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
             for children in folder.glob("task/*/children"):
                 waiting += map(int, children.read_text().split())
     return total

@@ -2,6 +2,7 @@
 
 import re
 import signal
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -31,6 +32,13 @@ DEEP = Geometry(depth=8, channels=())
 COLOURED = Geometry(depth=7, channels=(COLOUR, TEMPERATURE))
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _large_machine() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(memory_shares, "memory_bytes", lambda: 1 << 44)
+        yield
+
+
 @given(st.integers(LIMIT_MIN_BYTES, 1 << 42))
 def test_the_shares_add_up_to_the_limit_at_most_and_none_is_too_small_to_work(limit_bytes: int) -> None:
     shares = memory_shares.memory_shares(limit_bytes)
@@ -50,6 +58,9 @@ def test_the_limit_is_a_quarter_of_the_machine_and_never_too_small(monkeypatch: 
         assert Settings().memory.limit_bytes == limit_bytes
     with pytest.raises(BadInputError, match="memory_bytes is 1000000000; the server's processes need"):
         Settings(memory_bytes=GB).memory  # noqa: B018 - it raises
+    with pytest.raises(BadInputError, match="more than the 17592186044416 bytes of this machine"):
+        Settings(memory_bytes=1 << 45).memory  # noqa: B018 - it raises
+    assert "(the least that it needs)" in memory_shares.memory_shares(LIMIT_MIN_BYTES).text()
 
 
 def test_parts_that_are_set_are_taken_from_the_caches_or_refused() -> None:

@@ -17,7 +17,7 @@ from cairn_server.http.routes import cell as cell_routes
 from cairn_server.http.routes import problems
 from cairn_server.live import hub as live
 from cairn_server.live import robot_reports
-from cairn_server.memory_shares import memory_shares
+from cairn_server.memory_shares import CHECK_MAX_BYTES
 from cairn_server.settings import Quotas, Settings
 from cairn_server.store import numbering, shares
 from cairn_server.store.sqlite import tokens as sqlite_tokens
@@ -129,7 +129,7 @@ def test_the_bounds_of_cost_in_the_document_are_those_of_the_code() -> None:
     assert "; 2^25 modelled numbers |" in DOCUMENT
     assert JSON_FIELDS_MAX == 2**18
     assert "; 2^18 fields |" in DOCUMENT
-    assert memory_shares(1 << 40).check_bytes == 3 * 2**29
+    assert CHECK_MAX_BYTES == 3 * 2**29
 
 
 def test_the_limits_of_push_in_the_document_are_those_of_the_code() -> None:

@@ -26,6 +26,7 @@ from tests.siege.attacks import ATTACKS
 from tests.siege.honest import HonestLoad, Waits
 
 from cairn_map.wire.messages import CreateMap
+from cairn_server.memory_shares import memory_shares
 
 ROBOTS = 4
 HEALTHY_S, STOPPED_S, SLOWER = 1.0, 10.0, 3.0
@@ -86,6 +87,8 @@ def siege(name: str, seconds: float) -> Iterator[str]:
     if during.failed or before.failed:
         _say(f"  failed: quiet {dict(before.failed)}, under attack {dict(during.failed)}")
     yield from _findings(name, before, during, stopped_s)
+    if memory_mb > memory_shares().limit_bytes / 1e6:
+        yield f"{name}: {memory_mb:.0f} MB, the limit is {memory_shares().limit_bytes / 1e6:.0f} MB"
     if code or "Traceback" in complaints:
         yield f"{name}: exit code {code}, {complaints[-1000:]}"
 
