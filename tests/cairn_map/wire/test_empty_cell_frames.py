@@ -20,8 +20,10 @@ STATES = st.none() | st.builds(Cursor, SIXTEEN, st.integers(0, 1 << 60), SIXTEEN
 HEAD = Cursor(bytes(16), 7, bytes(range(16)))
 
 
-@given(keys=KEYS, start=STATES, kind=st.sampled_from([FrameKind.FULL, FrameKind.RESET]))
-def test_frames_made_at_once_have_the_bytes_of_each(keys: list[int], start: Cursor | None, kind: FrameKind) -> None:
+@given(keys=KEYS, start=STATES, kind=st.sampled_from([FrameKind.FULL, FrameKind.RESET]), rows_min=st.integers(1, 21))
+def test_frames_made_at_once_have_the_bytes_of_each(
+    keys: list[int], start: Cursor | None, kind: FrameKind, rows_min: int
+) -> None:
     """All bytes of each row, checksum included, are those of its frame encoded alone, and their sizes are counted."""
     many = EmptyCellFrames(
         kind=kind, cells=np.array(keys, np.uint64), from_cursor=start, to_cursor=HEAD, geometry=SMALL
@@ -37,7 +39,9 @@ def test_frames_made_at_once_have_the_bytes_of_each(keys: list[int], start: Curs
         )
         for key in keys
     ]
-    data = b"".join(many.encoded())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(empty_cell_frames, "ROWS_MIN", rows_min)
+        data = b"".join(many.encoded())
     assert data == b"".join(map(encode_frame, single))
     assert frames_of(start_of_reply() + data) == single
     assert (many.count, many.size_bytes) == (len(single), sum(frame.size_bytes for frame in single))
@@ -50,6 +54,17 @@ def test_many_frames_come_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     whole = b"".join(many.encoded())
     monkeypatch.setattr(empty_cell_frames, "ROWS_MAX", 3)
+    monkeypatch.setattr(empty_cell_frames, "ROWS_MIN", 2)
     pieces = list(many.encoded())
     assert len(pieces) == 4
     assert b"".join(pieces) == whole
+
+
+def test_a_few_frames_are_made_without_tables(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A request may name a state for each of 100 000 cells: a table for each took a minute."""
+    monkeypatch.setattr(empty_cell_frames, "_crc_changes", None)
+    for kind in (FrameKind.FULL, FrameKind.RESET):
+        one = EmptyCellFrames(
+            kind=kind, cells=np.array([5], np.uint64), from_cursor=None, to_cursor=HEAD, geometry=SMALL
+        )
+        assert len(b"".join(one.encoded())) > one.size_bytes
