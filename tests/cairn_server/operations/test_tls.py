@@ -4,6 +4,8 @@ import gc
 import os
 import shutil
 import signal
+import socket
+import ssl
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -45,6 +47,33 @@ def test_a_client_that_knows_the_certificate_works_over_https(url: str, certific
 
 def test_the_health_probe_finds_it_alive(url: str) -> None:
     assert why_not(int(url.rpartition(":")[2])) is None
+
+
+def test_a_websocket_that_ended_before_its_deadline_leaves_no_error_line(certificate: Path, tmp_path: Path) -> None:
+    settings = tmp_path / "server.toml"
+    settings.write_text("head_s = 1.0\n")
+    files = ("--tls-cert", str(certificate / "cert.pem"), "--tls-key", str(certificate / "key.pem"))
+    process = Process(tmp_path / "data", *files, "--settings", str(settings))
+    assert process.url
+    port = int(process.url.rpartition(":")[2])
+    upgrade = (
+        b"GET /maps/lab/live HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+        b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+    )
+    context = ssl.create_default_context(cafile=str(certificate / "cert.pem"))
+
+    def link() -> ssl.SSLSocket:
+        plain = socket.create_connection(("127.0.0.1", port), timeout=30)
+        return context.wrap_socket(plain, server_hostname="127.0.0.1")
+
+    with link() as refused:
+        refused.sendall(upgrade)
+        assert refused.recv(100).startswith(b"HTTP/1.1 403")
+    # A silent link is cut when the same time has passed, so the deadline of the one before is over.
+    with link() as silent:
+        assert silent.recv(100) == b""
+    process.send(signal.SIGTERM)
+    assert process.end() == (0, "")
 
 
 def test_the_environment_names_the_certificate_for_every_command(url: str, certificate: Path) -> None:

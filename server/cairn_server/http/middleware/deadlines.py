@@ -183,7 +183,8 @@ class PunctualProtocol(H11Protocol):
 
     def _cut_if_undecided(self) -> None:
         """Abort a WebSocket that was neither accepted nor refused: what came of its handshake is not whole."""
-        protocol = self.transport.get_protocol()
+        # A TLS transport that was lost knows no protocol any more.
+        protocol = None if self.transport.is_closing() else self.transport.get_protocol()
         if isinstance(protocol, ListenerProtocol) and not protocol.handshake_complete:
             self.transport.abort()
 
